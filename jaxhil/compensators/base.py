@@ -1,0 +1,92 @@
+"""The interface of all compensators: a force law before the integration, a position command after it.
+
+A compensator is stateless; its state is an explicit pytree of arrays of the batch shape (rings carry a
+leading axis of samples) and its gains a dict of arrays, scalar or of the batch shape. `gains` lists them with
+unit, bounds and the literature's rule: that list is what tuning, gain files and the rig's runtime go by.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+from jaxtyping import Array, Float, Int
+
+from jaxhil.mechanism import Mechanism
+
+Gains = dict[str, Array]
+
+
+class Gain(NamedTuple):
+    """One tunable number of a compensator.
+
+    unit ("1" if none), lower and upper bounds and the literature's own rule, each a function of the
+    mechanism; `logarithmic` says that the gain is searched on a logarithmic scale; `tuned` whether
+    tuning moves it for this mechanism (a threshold acts by switching and has no useful derivative).
+    """
+
+    name: str
+    unit: str
+    lower: Callable[[Mechanism], float]
+    upper: Callable[[Mechanism], float]
+    nominal: Callable[[Mechanism], float]
+    logarithmic: bool = False
+    tuned: Callable[[Mechanism], bool] = lambda mechanism: True
+
+
+class Signals(NamedTuple):
+    """What the controller knows at a tick; all of the batch shape.
+
+    force_measured [N], position_desired [m] and velocity_desired [m/s] of the numerical model,
+    position_measured [m] of the motion simulator, age: ticks since this run began (0 at its first).
+    """
+
+    force_measured: Float[Array, "*batch"]
+    position_desired: Float[Array, "*batch"]
+    velocity_desired: Float[Array, "*batch"]
+    position_measured: Float[Array, "*batch"]
+    age: Int[Array, "*batch"]
+
+
+class Constants(NamedTuple):
+    """What the controller is told of the rig: control period [s] and clearance [m], inf if one-sided."""
+
+    control_period: Float[Array, "*batch"]
+    clearance: Float[Array, "*batch"]
+
+
+class Compensator(eqx.Module):
+    """Interface; see the module's text."""
+
+    name: eqx.AbstractClassVar[str]
+    gains: eqx.AbstractClassVar[tuple[Gain, ...]]
+
+    def prepare(self, gains: Gains, constants: Constants) -> Any:
+        """What `step` needs of the gains, worked out once per run; the gains themselves by default."""
+        return gains
+
+    @abc.abstractmethod
+    def init(self, gains: Gains, constants: Constants, ring: int) -> Any:
+        """State before the first tick; `ring` is the number of samples a delay line must hold."""
+
+    @abc.abstractmethod
+    def restart(self, gains: Gains, state: Any, begins: Array, fresh: Array) -> Any:
+        """State before the first tick of the next run, on the lanes where `begins`.
+
+        Filters and delay lines restart. Where `fresh`, it is the next contact of a schedule; else the
+        same run goes on after a stretch of free flight and nothing learnt is dropped.
+        """
+
+    @abc.abstractmethod
+    def step(self, prepared: Any, state: Any, signals: Signals, tick: Array) -> tuple[Array, Any]:
+        """F_c [N] of this tick and the next state; `tick` is common to all lanes and never restarts."""
+
+    def position_command(
+        self, gains: Gains, state: Any, position: Array, velocity: Array, acceleration: Array
+    ) -> tuple[Array, Any]:
+        """Command [m] sent to the motion simulator for the model's new position; itself by default."""
+        return position, state
+
+    def identified(self, state: Any) -> tuple[Array, Array] | None:
+        """Identified stiffness [N/m] and damping [N s/m], where the law identifies them."""
+        return None

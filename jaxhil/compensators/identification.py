@@ -1,0 +1,46 @@
+"""Real-time identification of contact stiffness and damping: recursive least squares with forgetting.
+
+Model F = k d + b v. The covariance is kept as P = U D U^T, U = [[1, u], [0, 1]], D = diag(d_1, d_2)
+(Bierman 1977): every operation on it is free of cancellation, however large the initial covariance.
+With d_2 = 0 the damping stays at its initial value and the law identifies stiffness alone.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class Identified(NamedTuple):
+    """Estimate (k [N/m], b [N s/m]) and the factors (u, d_1, d_2) of its covariance."""
+
+    stiffness: Float[Array, "*batch"]
+    damping: Float[Array, "*batch"]
+    coupling: Float[Array, "*batch"]
+    stiffness_variance: Float[Array, "*batch"]
+    damping_variance: Float[Array, "*batch"]
+
+
+def update(
+    old: Identified, forgetting: Array, deflection: Array, rate: Array, force: Array, active: Array
+) -> Identified:
+    """One step of K = P phi/(lambda + phi'P phi), theta += K (F - phi'theta), P = (P - K phi'P)/lambda.
+
+    phi = (deflection, rate); lanes that are not `active` keep their estimate.
+    """
+    f_1 = deflection
+    f_2 = old.coupling * deflection + rate
+    g_1 = old.stiffness_variance * f_1
+    g_2 = old.damping_variance * f_2
+    alpha_1 = forgetting + f_1 * g_1
+    alpha_2 = alpha_1 + f_2 * g_2
+    inverse_1, inverse_2 = 1 / alpha_1, 1 / alpha_2
+    step = (force - (old.stiffness * deflection + old.damping * rate)) * inverse_2
+    new = Identified(
+        stiffness=old.stiffness + (g_1 + g_2 * old.coupling) * step,
+        damping=old.damping + g_2 * step,
+        coupling=old.coupling - g_1 * f_2 * inverse_1,
+        stiffness_variance=old.stiffness_variance * inverse_1,
+        damping_variance=old.damping_variance * alpha_1 * inverse_2 * (1 / forgetting),
+    )
+    return Identified(*(jnp.where(active, n, o) for n, o in zip(new, old, strict=True)))

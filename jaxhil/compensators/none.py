@@ -1,0 +1,21 @@
+"""No compensation: the measured force goes straight into the numerical model."""
+
+from typing import ClassVar
+
+from jaxhil.compensators.base import Compensator, Gain
+
+
+class NoCompensator(Compensator):
+    """F_c = F."""
+
+    name: ClassVar[str] = "none"
+    gains: ClassVar[tuple[Gain, ...]] = ()
+
+    def init(self, gains, constants, ring):
+        return ()
+
+    def restart(self, gains, state, begins, fresh):
+        return ()
+
+    def step(self, prepared, state, signals, tick):
+        return signals.force_measured, state

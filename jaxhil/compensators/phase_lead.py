@@ -1,0 +1,85 @@
+"""Phase-lead force compensation (Shimoji): F + T_lead dF/dt, the first-order inverse of a force delay.
+
+Realised as (1 + T_1 s)/(1 + T_2 s) by Tustin's rule at the control period, T_1 = T_lead + T_2, so that the
+net lead is T_lead. The literature's rule: T_lead is the delay of the force measurement, T_2 one period.
+"""
+
+from typing import ClassVar, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxhil.compensators.base import Compensator, Constants, Gain, Gains
+
+
+def force_delay(mechanism) -> float:
+    """The known delay [s] of the force measurement: transport plus first-order lag."""
+    sensor = mechanism.rig.force_sensor
+    return sensor.delay + sensor.time_constant
+
+
+PHASE_LEAD = Gain(
+    name="phase_lead",
+    unit="s",
+    lower=lambda mechanism: 0.0,
+    upper=lambda mechanism: 2 * force_delay(mechanism) + 0.02,
+    nominal=force_delay,
+)
+LEAD_FILTER = Gain(
+    name="lead_filter",
+    unit="s",
+    lower=lambda mechanism: 0.5 * mechanism.rig.control_period,
+    upper=lambda mechanism: 10 * mechanism.rig.control_period,
+    nominal=lambda mechanism: mechanism.rig.control_period,
+    logarithmic=True,
+)
+
+
+class LeadState(NamedTuple):
+    """Force and output of the tick before [N]."""
+
+    force: Float[Array, "*batch"]
+    output: Float[Array, "*batch"]
+
+
+class LeadFilter(NamedTuple):
+    """Coefficients of y(n) = pole y(n-1) + now F(n) + before F(n-1)."""
+
+    pole: Array
+    now: Array
+    before: Array
+
+
+def lead_filter(gains: Gains, constants: Constants) -> LeadFilter:
+    """(1 + T_1 s)/(1 + T_2 s) with T_1 = phase_lead + lead_filter, T_2 = lead_filter, by Tustin's rule."""
+    period = constants.control_period
+    slow = 2 * gains["lead_filter"]
+    fast = slow + 2 * gains["phase_lead"]
+    scale = 1 / (slow + period)
+    return LeadFilter((slow - period) * scale, (fast + period) * scale, (period - fast) * scale)
+
+
+def lead(filter_: LeadFilter, state: LeadState, force: Array) -> tuple[Array, LeadState]:
+    """One tick of the lead filter."""
+    output = filter_.pole * state.output + filter_.now * force + filter_.before * state.force
+    return output, LeadState(force, output)
+
+
+class PhaseLead(Compensator):
+    """F_c = F + T_lead dF/dt, filtered."""
+
+    name: ClassVar[str] = "phase_lead"
+    gains: ClassVar[tuple[Gain, ...]] = (PHASE_LEAD, LEAD_FILTER)
+
+    def prepare(self, gains, constants):
+        return lead_filter(gains, constants)
+
+    def init(self, gains, constants, ring):
+        zeros = jnp.zeros_like(constants.control_period)
+        return LeadState(zeros, zeros)
+
+    def restart(self, gains, state, begins, fresh):
+        return LeadState(*(jnp.where(begins, 0, leaf) for leaf in state))
+
+    def step(self, prepared, state, signals, tick):
+        return lead(prepared, state, signals.force_measured)

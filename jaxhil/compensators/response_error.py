@@ -1,0 +1,251 @@
+"""The paper's compensation: phase lead, response error and real-time identification, delay-aligned.
+
+    F_c = lead(F) + g k_hat (x_d - x_a) + g_b b_hat (v_d - v_a)      while in contact, else lead(F)
+
+The phase lead makes up for the delay of the force measurement, the response error for the dynamics of the
+motion simulator, of which no model is used (Qi et al. 2016; model.md section 4). k_hat and b_hat come from
+recursive least squares of the measured force on the measured position delayed by the same time
+(`identification_delay`): without that alignment they are biased (model.md section 6, item 6). "In contact" is
+judged on the aligned position too. v_a is a filtered difference, s/(1 + T_v s) by Tustin's rule.
+"""
+
+import math
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxhil.compensators.base import Compensator, Gain, Gains
+from jaxhil.compensators.identification import Identified, update
+from jaxhil.compensators.phase_lead import (
+    LEAD_FILTER,
+    PHASE_LEAD,
+    LeadFilter,
+    LeadState,
+    force_delay,
+    lead,
+    lead_filter,
+)
+from jaxhil.contact import deflection
+from jaxhil.ring import look_back, tie, write
+
+
+def is_damped(mechanism) -> bool:
+    """Whether the mechanism's contact law dissipates, so that damping is worth identifying."""
+    return mechanism.contact.law != "linear" and any(b > 0 for b in mechanism.contact.damping)
+
+
+def peak_force(mechanism) -> float:
+    """Order of the contact force [N]: v sqrt(k M) with the stiffest entry, as of a linear contact."""
+    contact = mechanism.contact
+    stiffness = [max(k) if isinstance(k, list | tuple) else k for k in contact.stiffness]
+    mass, velocity = mechanism.bodies.mass, mechanism.approach.velocity
+    if contact.law == "hunt_crossley":
+        order = contact.exponent + 1
+        deepest = (order * mass * velocity**2 / (2 * min(stiffness))) ** (1 / order)
+        return max(stiffness) * deepest**contact.exponent
+    return velocity * math.sqrt(max(stiffness) * mass)
+
+
+def typical_stiffness(mechanism) -> float:
+    """Order of the contact stiffness [N/m]: M omega^2 of the stiffest entry."""
+    return (peak_force(mechanism) / mechanism.approach.velocity) ** 2 / mechanism.bodies.mass
+
+
+def _noise_level(mechanism) -> float:
+    sensor = mechanism.rig.force_sensor
+    return 3 * sensor.noise_std + abs(sensor.bias) + sensor.quantum
+
+
+def _critical_damping(mechanism) -> float:
+    return 2 * math.sqrt(typical_stiffness(mechanism) * mechanism.bodies.mass)
+
+
+def _stiffness_covariance(mechanism) -> float:
+    """One sample at the contact threshold's depth settles k_hat to a thousandth."""
+    return 1e3 / (0.01 * peak_force(mechanism) / typical_stiffness(mechanism)) ** 2
+
+
+def _damping_covariance(mechanism) -> float:
+    return 10 / mechanism.approach.velocity**2
+
+
+class ResponseErrorState(NamedTuple):
+    """lead filter; measured and aligned positions [m] and their filtered rates [m/s], of the tick before;
+    the run's first reading [m] and speed [m/s]; what is identified; ring of interpolated readings [m]."""
+
+    lead: LeadState
+    position: Float[Array, "*batch"]
+    velocity: Float[Array, "*batch"]
+    aligned: Float[Array, "*batch"]
+    aligned_velocity: Float[Array, "*batch"]
+    first_position: Float[Array, "*batch"]
+    first_velocity: Float[Array, "*batch"]
+    identified: Identified
+    ring: Float[Array, "samples *batch"]
+
+
+class Prepared(NamedTuple):
+    """Gains, control period [s], clearance [m], lead filter, coefficients of the velocity filter
+    v(n) = rate_pole v(n-1) + rate_gain (x(n) - x(n-1)), alignment delay as whole periods and a rest."""
+
+    gains: Gains
+    period: Float[Array, "*batch"]
+    clearance: Float[Array, "*batch"]
+    lead: LeadFilter
+    rate_pole: Float[Array, "*batch"]
+    rate_gain: Float[Array, "*batch"]
+    lookback: Int[Array, "*batch"]
+    fraction: Float[Array, "*batch"]
+
+
+class ResponseError(Compensator):
+    """Phase lead + response error + identification; see the module's text."""
+
+    name: ClassVar[str] = "response_error"
+    gains: ClassVar[tuple[Gain, ...]] = (
+        PHASE_LEAD,
+        LEAD_FILTER,
+        Gain("response_error", "1", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0),
+        Gain(
+            "response_error_damping", "1", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0,
+            tuned=is_damped,
+        ),
+        Gain(
+            "initial_stiffness", "N/m", lambda m: 0.0, lambda m: 5 * typical_stiffness(m),
+            lambda m: 0.0,
+        ),
+        Gain(
+            "initial_damping", "N s/m", lambda m: 0.0, _critical_damping, lambda m: 0.0,
+            tuned=is_damped,
+        ),
+        Gain(
+            "stiffness_covariance", "1/m^2", lambda m: 1e-6 * _stiffness_covariance(m),
+            lambda m: 1e2 * _stiffness_covariance(m), _stiffness_covariance, logarithmic=True,
+        ),
+        Gain(
+            "damping_covariance", "s^2/m^2", lambda m: 0.0, lambda m: 10 * _damping_covariance(m),
+            lambda m: _damping_covariance(m) if is_damped(m) else 0.0, tuned=is_damped,
+        ),
+        Gain("forgetting", "1", lambda m: 0.8, lambda m: 1.0, lambda m: 0.98),
+        Gain(
+            "contact_threshold", "N", lambda m: 0.0, lambda m: max(peak_force(m), _noise_level(m)),
+            lambda m: max(0.01 * peak_force(m), _noise_level(m)), tuned=lambda m: False,
+        ),
+        Gain(
+            "identification_delay", "s", lambda m: 0.0, lambda m: 2 * force_delay(m) + 0.02,
+            force_delay,
+        ),
+        Gain(
+            "velocity_filter", "s", lambda m: 0.5 * m.rig.control_period,
+            lambda m: 20 * m.rig.control_period, lambda m: 2 * m.rig.control_period,
+            logarithmic=True, tuned=is_damped,
+        ),
+    )  # fmt: skip
+
+    def prepare(self, gains, constants):
+        period = constants.control_period
+        periods = gains["identification_delay"] / period
+        whole = jax.lax.stop_gradient(jnp.floor(periods + 1e-9))
+        smoothing = 2 * gains["velocity_filter"]
+        scale = 1 / (smoothing + period)
+        return Prepared(
+            gains,
+            period,
+            constants.clearance,
+            lead_filter(gains, constants),
+            (smoothing - period) * scale,
+            2 * scale,
+            whole.astype(jnp.int32),
+            periods - whole,
+        )
+
+    def init(self, gains, constants, ring):
+        zeros = jnp.zeros_like(constants.control_period)
+        return ResponseErrorState(
+            lead=LeadState(zeros, zeros),
+            position=zeros,
+            velocity=zeros,
+            aligned=zeros,
+            aligned_velocity=zeros,
+            first_position=zeros,
+            first_velocity=zeros,
+            identified=Identified(
+                zeros + gains["initial_stiffness"],
+                zeros + gains["initial_damping"],
+                zeros,
+                zeros + gains["stiffness_covariance"],
+                zeros + gains["damping_covariance"],
+            ),
+            ring=jnp.zeros((ring, *zeros.shape), zeros.dtype),
+        )
+
+    def restart(self, gains, state, begins, fresh):
+        old = state.identified
+        fresh = begins & fresh
+        return state._replace(
+            lead=LeadState(*(jnp.where(begins, 0, leaf) for leaf in state.lead)),
+            identified=old._replace(
+                coupling=jnp.where(fresh, 0, old.coupling),
+                stiffness_variance=jnp.where(fresh, gains["stiffness_covariance"], old.stiffness_variance),
+                damping_variance=jnp.where(fresh, gains["damping_covariance"], old.damping_variance),
+            ),
+        )
+
+    def step(self, prepared, state, signals, tick):
+        gains, period = prepared.gains, prepared.period
+        force, measured, age = signals.force_measured, signals.position_measured, signals.age
+        # Before its first tick a run is in uniform motion: that is what every filter starts from.
+        begins = age == 0
+        first_position = jnp.where(begins, measured, state.first_position)
+        first_velocity = jnp.where(begins, signals.velocity_desired, state.first_velocity)
+        stride = period * first_velocity
+        before = jnp.where(begins, measured - stride, state.position)
+
+        # The newest sample is not in the ring yet: it is looked at before it is written.
+        lookback, fraction = prepared.lookback, prepared.fraction
+        newer, older = look_back(state.ring, tick - 1, jnp.stack([jnp.maximum(lookback - 1, 0), lookback]))
+        ring = write(state.ring, tick, tie(measured, older))
+        newer = jnp.where(lookback == 0, measured, newer)
+        recalled = newer - fraction * (newer - older)
+        uniform = first_position + ((age - lookback).astype(measured.dtype) - fraction) * stride
+        aligned = jnp.where(age <= lookback, uniform, recalled)
+        aligned_before = jnp.where(begins, aligned - stride, state.aligned)
+
+        def rate(position, position_before, velocity_before):
+            velocity_before = jnp.where(begins, signals.velocity_desired, velocity_before)
+            change = position - position_before
+            return prepared.rate_pole * velocity_before + prepared.rate_gain * change
+
+        velocity = rate(measured, before, state.velocity)
+        aligned_velocity = rate(aligned, aligned_before, state.aligned_velocity)
+        depth = deflection(aligned, prepared.clearance)
+        touching = depth != 0
+        identified = update(
+            state.identified,
+            gains["forgetting"],
+            depth,
+            aligned_velocity,
+            force,
+            touching & (jnp.abs(force) > gains["contact_threshold"]),
+        )
+        led, lead_state = lead(prepared.lead, state.lead, force)
+        response = gains["response_error"] * identified.stiffness * (
+            signals.position_desired - measured
+        ) + gains["response_error_damping"] * identified.damping * (signals.velocity_desired - velocity)
+        command = jnp.where(touching, led + response, led)
+        return command, ResponseErrorState(
+            lead_state,
+            measured,
+            velocity,
+            aligned,
+            aligned_velocity,
+            first_position,
+            first_velocity,
+            identified,
+            ring,
+        )
+
+    def identified(self, state):
+        return state.identified.stiffness, state.identified.damping

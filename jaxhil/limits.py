@@ -1,0 +1,36 @@
+"""Velocity and acceleration limits of the motion simulator, as rate limits on its command."""
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+
+def limit_command(
+    command: Array,
+    previous: Array,
+    previous_step: Array,
+    model_step: Array,
+    control_period: Array,
+    velocity_limit: Array,
+    acceleration_limit: Array,
+) -> tuple[Array, Array]:
+    """The limited command c(n+1) [m] and its step c(n+1) - c(n) [m].
+
+    Velocity: |c(n+1) - c(n)| <= v_max T. Acceleration: the step changes by at most a_max T^2, and the command
+    is never overshot: the closing speed stays below what can be braked in the distance left, in whole
+    periods: r (r + a T)/(2 a) <= distance. While neither limit binds, c(n+1) is the command itself.
+    """
+    largest = velocity_limit * control_period
+    change = acceleration_limit * control_period**2
+    limited = jnp.isfinite(change)
+    change = jnp.where(limited, change, 1)
+    behind = command - model_step - previous
+    braking = change / 2 * (jnp.sqrt(1 + 8 * jnp.abs(behind) / change) - 1)
+    closing = jnp.where(jnp.abs(behind) < braking, behind, jnp.sign(behind) * braking)
+    step = jnp.where(limited, model_step + closing, command - previous)
+    step = jnp.where(limited, jnp.clip(step, previous_step - change, previous_step + change), step)
+    step = jnp.where(step > largest, largest, jnp.where(step < -largest, -largest, step))
+    untouched = (jnp.abs(step - (command - previous)) <= 1e-12 * jnp.abs(step)) & (
+        jnp.abs(behind) <= 1e-12 * jnp.abs(model_step)
+    )
+    step = jnp.where(untouched, command - previous, step)
+    return previous + step, step

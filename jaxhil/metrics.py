@@ -1,0 +1,225 @@
+"""What is said of each contact: begin, end and restitution, peaks and energies (model.md, conventions).
+
+`Watch` follows the contact under way, tick by tick, from what really happens (`Truth`) and from the command;
+`Metrics` collects the contacts that are over.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxhil.compensators.base import Signals
+from jaxhil.contact import deflection
+from jaxhil.loop import Loop, Truth
+from jaxhil.scenario import Scenario
+
+NOT_REACHED, OK, TIMEOUT, DIVERGED, NON_FINITE = -1, 0, 1, 2, 3
+STATUS_NAMES = {
+    NOT_REACHED: "not reached",
+    OK: "ok",
+    TIMEOUT: "timeout",
+    DIVERGED: "diverged",
+    NON_FINITE: "non-finite",
+}
+LONGEST_CONTACT = 10.0  # s
+LONGEST_FADING = 0.1  # s, waited for the compensator's command to die out
+FADED = 1e-6  # of the command's peak
+RUNAWAY = 1e3  # of the first approach speed: no rig survives it
+
+
+class Metrics(NamedTuple):
+    """Per contact, (slots, *batch): restitution [1]; approach_velocity [m/s]; peak_force, the real contact
+    force's, and peak_command, |F_c|'s [N]; duration, the time in touch [s]; work_in and work_out, by the
+    real force along x_a [J] (0 unless audited); status, one of `STATUS_NAMES`; ticks run by then."""
+
+    restitution: Float[Array, "slots *batch"]
+    approach_velocity: Float[Array, "slots *batch"]
+    peak_force: Float[Array, "slots *batch"]
+    peak_command: Float[Array, "slots *batch"]
+    duration: Float[Array, "slots *batch"]
+    work_in: Float[Array, "slots *batch"]
+    work_out: Float[Array, "slots *batch"]
+    status: Int[Array, "slots *batch"]
+    ticks: Int[Array, "slots *batch"]
+
+
+class Watch(NamedTuple):
+    """The contact under way. `elapsed` [ticks] since it began, 0 before; whether it is `over`; approach and
+    rebound speed [m/s]; peaks [N]; the real force at the last two ticks [N]; ticks with and since a touch;
+    works [J]; between two surfaces also the side (1 or -1), |F_c| of the last tick and what was left of
+    it when the last contact was over [N]."""
+
+    elapsed: Float[Array, "*batch"]
+    over: Bool[Array, "*batch"]
+    approach: Float[Array, "*batch"]
+    rebound: Float[Array, "*batch"]
+    peak_force: Float[Array, "*batch"]
+    peak_command: Float[Array, "*batch"]
+    recent: tuple[Array, Array]
+    touched: Float[Array, "*batch"]
+    quiet: Float[Array, "*batch"]
+    works: tuple[Array, ...]
+    side: Float[Array, "*batch"] | None
+    command: Float[Array, "*batch"] | None
+    left: Float[Array, "*batch"] | None
+
+
+class Rules(NamedTuple):
+    """When a contact is over, per lane: `quiet` ticks without force, the command faded below `level` [N] or
+    `patience` ticks without force waited."""
+
+    quiet: Float[Array, "*batch"]
+    patience: Float[Array, "*batch"]
+    level: Float[Array, "*batch"]
+
+
+def build_rules(scenario: Scenario) -> Rules:
+    """h = tau_f + 20 sensor time constants + 2 T without force; 0.1 s more for the command to fade."""
+    sensor, period = scenario.force_sensor, scenario.control_period
+    quiet = jnp.floor((sensor.delay + 20 * sensor.time_constant) / period + (2 + 1e-9)) + 1
+    level = 3 * sensor.noise_std + jnp.abs(sensor.bias) + sensor.quantum
+    return Rules(quiet, quiet + jnp.ceil(LONGEST_FADING / period), level)
+
+
+def empty_metrics(slots: int, like: Array) -> Metrics:
+    """Before any contact."""
+    numbers = jnp.full((slots, *like.shape), jnp.nan, like.dtype)
+    counts = jnp.zeros((slots, *like.shape), jnp.int32)
+    return Metrics(
+        restitution=numbers,
+        approach_velocity=numbers,
+        peak_force=numbers,
+        peak_command=numbers,
+        duration=numbers,
+        work_in=numbers,
+        work_out=numbers,
+        status=counts + NOT_REACHED,
+        ticks=counts,
+    )
+
+
+def fresh_watch(loop: Loop, like: Array) -> Watch:
+    """Nothing has touched yet, nor for long."""
+    zeros = jnp.zeros_like(like)
+    return Watch(
+        elapsed=zeros,
+        over=jnp.zeros(like.shape, bool),
+        approach=zeros,
+        rebound=zeros,
+        peak_force=zeros,
+        peak_command=zeros,
+        recent=(zeros, zeros),
+        touched=zeros,
+        quiet=zeros + 1e6,
+        works=(zeros, zeros) if loop.energies else (),
+        side=zeros + 1 if loop.is_two_sided else None,
+        command=zeros if loop.is_two_sided else None,
+        left=zeros if loop.is_two_sided else None,
+    )
+
+
+def observe(
+    loop: Loop,
+    clearance: Array,
+    rules: Rules,
+    watch: Watch,
+    signals: Signals,
+    truth: Truth,
+    command: Array,
+) -> Watch:
+    """Follow the contact through one tick; `command` is F_c."""
+    velocity, position = signals.velocity_desired, signals.position_desired
+    speed, force, magnitude = jnp.abs(velocity), jnp.abs(truth.force), jnp.abs(command)
+    touching = force > 0
+    if loop.has_force_noise or loop.has_force_bias:
+        starts = touching | (deflection(position, clearance) != 0)
+    elif watch.left is not None:
+        # What is left of the last contact's command does not begin the next one.
+        starts = touching | (magnitude > watch.left)
+    else:
+        starts = touching | (magnitude > 0)
+    fresh = watch.elapsed == 0
+    begun = ~fresh | starts
+    if watch.side is not None:
+        begun = begun & ~watch.over
+        near = jnp.where(position > -clearance / 2, 1, -1).astype(velocity.dtype)
+        side = jnp.where(fresh, near, watch.side)
+        away = side * velocity < 0
+    else:
+        side, away = None, velocity < 0
+    peak_command = jnp.maximum(watch.peak_command, magnitude)
+    quiet = jnp.where(touching, 0, watch.quiet + 1)
+    faded = magnitude <= jnp.maximum(FADED * peak_command, rules.level)
+    ends = begun & away & (quiet >= rules.quiet) & (faded | (quiet >= rules.patience))
+    works = watch.works
+    if truth.work is not None:
+        gained, returned = jnp.maximum(truth.work, 0), jnp.maximum(-truth.work, 0)
+        works = (works[0] + gained, works[1] + returned)
+    return Watch(
+        elapsed=jnp.where(begun, watch.elapsed + 1, watch.elapsed),
+        over=watch.over | ends,
+        # Each speed stops being followed at its event; the approach's is that of the tick before.
+        approach=jnp.where(begun | watch.over, watch.approach, speed),
+        rebound=jnp.where(watch.over, watch.rebound, speed),
+        peak_force=jnp.maximum(watch.peak_force, _crest(*watch.recent, force)),
+        peak_command=peak_command,
+        recent=(watch.recent[1], force),
+        touched=jnp.where(touching, watch.touched + 1, watch.touched),
+        quiet=quiet,
+        works=works,
+        side=side,
+        command=magnitude if loop.is_two_sided else None,
+        left=watch.left,
+    )
+
+
+def judge(scenario: Scenario, watch: Watch, age: Array) -> Array:
+    """Status of the contact under way, `age` ticks into its run: OK, also while it goes on."""
+    period = scenario.control_period
+    crossing = jnp.where(jnp.isfinite(scenario.clearance), 10 * scenario.clearance / scenario.velocity, 0)
+    limit = LONGEST_CONTACT / period
+    waiting = (watch.elapsed == 0) & (age.astype(period.dtype) > limit + crossing / period)
+    late = (watch.elapsed > limit) | waiting
+    status = jnp.where(late & ~watch.over, TIMEOUT, OK)
+    status = jnp.where(watch.rebound > RUNAWAY * scenario.velocity, DIVERGED, status)
+    finite = jnp.isfinite(watch.rebound) & jnp.isfinite(watch.peak_command)
+    return jnp.where(finite, status, NON_FINITE).astype(jnp.int32)
+
+
+def collect(
+    scenario: Scenario,
+    metrics: Metrics,
+    watch: Watch,
+    index: Array,
+    over: Array,
+    status: Array,
+    ticks: Array,
+) -> Metrics:
+    """Enter the contacts that are `over` at their `index`; `ticks` have run by now."""
+    period = scenario.control_period
+    no_work = jnp.zeros_like(period)
+    work_in, work_out = watch.works or (no_work, no_work)
+    values = Metrics(
+        restitution=watch.rebound / jnp.where(watch.approach > 0, watch.approach, jnp.nan),
+        approach_velocity=watch.approach,
+        peak_force=watch.peak_force,
+        peak_command=watch.peak_command,
+        duration=watch.touched * period,
+        work_in=work_in,
+        work_out=work_out,
+        status=status,
+        ticks=ticks,
+    )
+    slots = metrics.restitution.shape[0]
+    slot = jnp.arange(slots, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
+    here = (slot == index[None]) & over[None]
+    return Metrics(*(jnp.where(here, v[None], m) for v, m in zip(values, metrics, strict=True)))
+
+
+def _crest(before, middle, now):
+    """Largest force of the last period: the vertex of the parabola through three samples, if there is one."""
+    bend = 2 * middle - before - now
+    crests = (middle >= before) & (middle >= now) & (bend > 0) & (before > 0) & (now > 0)
+    vertex = middle + (now - before) ** 2 / (8 * jnp.where(crests, bend, 1))
+    return jnp.where(crests, vertex, now)

@@ -1,0 +1,277 @@
+"""Rollout: a batch of scenarios through the loop, from the first approach until the last contact is over.
+
+Ticks run in short stretches; between stretches, contacts that are over are entered into the metrics, the next
+ones begin, and free flight towards the other surface is skipped. The program ends with its slowest lane:
+nothing is computed for a fixed horizon. Forward-mode derivatives pass through to every array leaf.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxhil.compensators.base import Gains, Signals
+from jaxhil.loop import (
+    Loop,
+    LoopState,
+    Plant,
+    Rig,
+    Sensed,
+    Truth,
+    build_rig,
+    drive,
+    enter,
+    sense,
+)
+from jaxhil.metrics import (
+    FADED,
+    OK,
+    Metrics,
+    Watch,
+    build_rules,
+    collect,
+    empty_metrics,
+    fresh_watch,
+    judge,
+    observe,
+)
+from jaxhil.scenario import Scenario
+
+APPROACH = 0.02  # s of free approach before a contact, besides its phase
+SETTLED = 1e-6  # of the distance flown in a period: the motion simulator follows uniformly
+STILL = 1e-12  # of the speed, per period: nothing pushes the numerical model any more
+
+
+class Run(NamedTuple):
+    """Everything carried from tick to tick, and the ticks run so far."""
+
+    state: LoopState
+    watch: Watch
+    metrics: Metrics
+    index: Int[Array, "*batch"]
+    active: Bool[Array, "*batch"]
+    tick: Int[Array, ""]
+
+
+class Tick(NamedTuple):
+    """What is recorded of a tick: what the controller read and what it made of it, the truth, whether the
+    lane was still running, the number of the contact, what was identified [N/m, N s/m]."""
+
+    signals: Signals
+    command: Float[Array, "*batch"]
+    truth: Truth
+    active: Bool[Array, "*batch"]
+    contact: Int[Array, "*batch"]
+    identified: tuple[Array, Array] | None
+
+
+def rollout(loop: Loop, gains: Gains, scenario: Scenario, lane_axis: str | None = None) -> Metrics:
+    """Metrics (slots, *batch) of every contact of every lane: `build_rig`, then `run_contacts`.
+
+    `gains` are scalars or of the batch shape. Under `jax.vmap(..., axis_name=lane_axis)` the lanes of all
+    mapped copies run in step, which keeps the loop's condition and the rings' pointer common.
+    """
+    return run_contacts(loop, gains, build_rig(loop, scenario), lane_axis)
+
+
+def run_contacts(loop: Loop, gains: Gains, rig: Rig, lane_axis: str | None = None) -> Metrics:
+    """`rollout` on a rig built before, for when many gains are tried on it."""
+    run = start(loop, rig, gains)
+
+    def going(run):
+        some = jnp.any(run.active)
+        return lax.pmax(some, lane_axis) if lane_axis else some
+
+    def body(run):
+        run, _ = stretch(loop, rig, gains, run, record=False)
+        return turn_over(loop, rig, gains, run)
+
+    return lax.while_loop(going, body, run).metrics
+
+
+def record(loop: Loop, gains: Gains, scenario: Scenario, stretches: int) -> tuple[Metrics, Tick]:
+    """Metrics and every tick, (ticks, *batch), of `stretches` stretches; free flight is not skipped."""
+    rig = build_rig(loop, scenario)
+
+    def body(run, _):
+        run, ticks = stretch(loop, rig, gains, run, record=True)
+        return turn_over(loop, rig, gains, run, skip_flight=False), ticks
+
+    run, ticks = lax.scan(body, start(loop, rig, gains), None, length=stretches)
+    return run.metrics, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), ticks)
+
+
+def stretch_length(loop: Loop) -> int:
+    """Ticks between turn-overs. A rattling contact can end and the next begin within four."""
+    return 4 if loop.is_two_sided else 16
+
+
+def start(loop: Loop, rig: Rig, gains: Gains) -> Run:
+    """All lanes on their first approach."""
+    scenario, like = rig.scenario, rig.scenario.velocity
+    zeros = jnp.zeros_like(like)
+    index = jnp.zeros(like.shape, jnp.int32)
+    ring = jnp.zeros((loop.ring, *like.shape), like.dtype)
+    order = rig.propagation.steady_command.shape[0]
+    state = LoopState(
+        position=zeros,
+        velocity=zeros,
+        plant=Plant((zeros,) * (loop.latency + 1), zeros, (zeros,) * order),
+        sensed=Sensed(
+            force=ring,
+            position=ring,
+            reading=ring if loop.has_lag else None,
+            work=ring if loop.energies else None,
+            last=(zeros, zeros, zeros),
+            lagged=zeros,
+            first_position=zeros,
+        ),
+        law=loop.law.init(zeros),
+        controller=loop.compensator.init(gains, rig.constants, loop.controller_ring),
+        parameters=_entry(scenario.contact, index),
+        entry_velocity=zeros,
+        entry_tick=index,
+    )
+    # Rings are read up to one ring behind: start there, so that no index is negative.
+    tick = jnp.array(_first_tick(loop), jnp.int32)
+    state = enter(loop, rig, gains, state, *_approach(rig, index, like), tick)
+    slots = scenario.phase.shape[0]
+    return Run(
+        state=state,
+        watch=fresh_watch(loop, like),
+        metrics=empty_metrics(slots, like),
+        index=index,
+        active=scenario.contacts > 0,
+        tick=tick,
+    )
+
+
+def stretch(loop: Loop, rig: Rig, gains: Gains, run: Run, record: bool) -> tuple[Run, Tick | None]:
+    """A few ticks of the loop."""
+
+    rules = build_rules(rig.scenario)
+    prepared = loop.compensator.prepare(gains, rig.constants)
+    clearance = rig.scenario.clearance
+
+    def tick(carry, _):
+        state, watch, now = carry
+        signals, truth = sense(loop, rig, state, now)
+        command, controller = loop.compensator.step(prepared, state.controller, signals, now)
+        if loop.has_force_noise or loop.has_force_bias:
+            command = jnp.where(signals.age == 0, 0, command)
+        watch = observe(loop, clearance, rules, watch, signals, truth, command)
+        state = drive(loop, rig, gains, state, now, command, controller)
+        seen = None
+        if record:
+            identified = loop.compensator.identified(controller)
+            going = run.active & ~watch.over
+            seen = Tick(signals, command, truth, going, run.index, identified)
+        return (state, watch, now + 1), seen
+
+    carry = (run.state, run.watch, run.tick)
+    (state, watch, now), seen = lax.scan(tick, carry, None, length=stretch_length(loop))
+    return run._replace(state=state, watch=watch, tick=now), seen
+
+
+def turn_over(loop: Loop, rig: Rig, gains: Gains, run: Run, skip_flight: bool = True) -> Run:
+    """Enter contacts that are over, begin the next, skip the free flight between two surfaces."""
+    watch, state, scenario = run.watch, run.state, rig.scenario
+    age = run.tick - state.entry_tick
+    status = judge(scenario, watch, age)
+    over = (watch.over | (status != OK)) & run.active
+    ticks = jnp.broadcast_to(run.tick - _first_tick(loop), run.index.shape)
+    metrics = collect(scenario, run.metrics, watch, run.index, over, status, ticks)
+    index = run.index + over.astype(jnp.int32)
+    active = run.active & ~(over & ((status != OK) | (index >= scenario.contacts)))
+    blank = fresh_watch(loop, watch.approach)
+    entry = _entry(scenario.contact, jnp.minimum(index, scenario.phase.shape[0] - 1))
+    if watch.command is not None:
+        left = jnp.maximum(FADED * watch.peak_command, watch.command)
+        kept = {"quiet": watch.quiet, "recent": watch.recent, "command": watch.command}
+        watch = _choose(over, blank._replace(left=left, **kept), watch)
+        # A damped contact is over while the mechanism is still dented: its law holds until it is free.
+        free = state.sensed.last[0] <= 0
+        state = state._replace(parameters=_choose(free, entry, state.parameters))
+        if skip_flight:
+            state = _skip_flight(loop, rig, gains, state, watch, run.tick)
+    else:
+        state = state._replace(parameters=_choose(over, entry, state.parameters))
+        position, velocity = _approach(rig, index, watch.rebound)
+        entered = enter(loop, rig, gains, state, position, velocity, run.tick)
+        state = _restart(loop, gains, state, entered, over, over)
+        watch = _choose(over, blank, watch)
+    return run._replace(state=state, watch=watch, metrics=metrics, index=index, active=active)
+
+
+def _first_tick(loop):
+    return max(loop.ring, loop.controller_ring)
+
+
+def _approach(rig, index, velocity):
+    """Where a run of the schedule starts: x_d(0) = -v (0.02 s + phi T)."""
+    phase = _entry(rig.scenario.phase, jnp.minimum(index, rig.scenario.phase.shape[0] - 1))
+    return -velocity * (APPROACH + phase * rig.constants.control_period), velocity
+
+
+def _skip_flight(loop, rig, gains, state, watch, tick):
+    """Move lanes in settled free flight by whole periods to shortly before the other surface."""
+    scenario, period = rig.scenario, rig.constants.control_period
+    velocity, position = state.velocity, state.position
+    stride = period * velocity
+    left = jnp.where(velocity > 0, -position, position + scenario.clearance)
+    spare = left - APPROACH * jnp.abs(velocity)
+    strides = spare / jnp.where(stride != 0, jnp.abs(stride), 1)
+    periods = lax.stop_gradient(jnp.floor(jnp.where(stride != 0, strides, 0)))
+    arrived = enter(loop, rig, gains, state, position + periods * stride, velocity, tick)
+    here = enter(loop, rig, gains, state, position, velocity, tick)
+    follows = (watch.elapsed == 0) & (watch.quiet > _first_tick(loop))
+    for component, steady in zip(state.plant.state, here.plant.state, strict=True):
+        # Components of the state are in periods, hence of like size.
+        scale = jnp.abs(rig.propagation.steady_command[0] * stride)
+        follows = follows & (jnp.abs(component - steady) <= SETTLED * scale)
+    # A force that still moves the model, noise for one, makes the flight an event.
+    push = jnp.abs(watch.command) * period / scenario.equivalent_mass
+    still = push <= STILL * jnp.abs(velocity)
+    skipped = follows & still & (periods >= 1)
+    return _restart(loop, gains, state, arrived, skipped, jnp.zeros_like(skipped))
+
+
+def _restart(loop, gains, state, entered, begins, fresh):
+    """Take over the entered run on the lanes where it `begins`; rings and the law's parameters stay."""
+    rings = state.sensed._replace(
+        last=entered.sensed.last,
+        lagged=entered.sensed.lagged,
+        first_position=entered.sensed.first_position,
+    )
+    chosen = _choose(
+        begins,
+        entered._replace(sensed=None, controller=None, parameters=None),
+        state._replace(sensed=None, controller=None, parameters=None),
+    )
+    sensed = rings._replace(
+        last=_choose(begins, rings.last, state.sensed.last),
+        lagged=jnp.where(begins, rings.lagged, state.sensed.lagged),
+        first_position=jnp.where(begins, rings.first_position, state.sensed.first_position),
+    )
+    return chosen._replace(
+        sensed=sensed,
+        controller=loop.compensator.restart(gains, state.controller, begins, fresh),
+        parameters=state.parameters,
+    )
+
+
+def _entry(table, index):
+    """Entry `index` (per lane) of the leading axis of every leaf."""
+
+    def pick(leaf):
+        indices = jnp.broadcast_to(index, leaf.shape[1:])[None]
+        return jnp.take_along_axis(leaf, indices, axis=0, mode="promise_in_bounds")[0]
+
+    return jax.tree.map(pick, table)
+
+
+def _choose(condition, when_true, when_false):
+    """Leaf by leaf `where`; the condition is of the batch shape."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), when_true, when_false)

@@ -1,0 +1,90 @@
+"""What a compensator of the runtime is, and the table of those known.
+
+A compensator is a class with the methods of `Compensator`; `@register(name)` enters it under the
+name that gain files use.
+"""
+
+from collections.abc import Callable, Mapping
+from math import inf
+from typing import ClassVar, NamedTuple, Protocol, TypeVar
+
+
+class GainSpecification(NamedTuple):
+    """One gain of a compensator: its unit, and the values for which the law is defined.
+
+    The range is [lowest, highest], or (lowest, highest] where `exclusive`. The narrower bounds
+    used in tuning stand in the gain file itself.
+    """
+
+    unit: str
+    lowest: float = -inf
+    highest: float = inf
+    exclusive: bool = False
+
+    def admits(self, value: float) -> bool:
+        """Whether the law is defined for this value."""
+        above = value > self.lowest if self.exclusive else value >= self.lowest
+        return above and value <= self.highest
+
+    def description(self) -> str:
+        """The range in words, for an error message."""
+        parts = []
+        if self.lowest > -inf:
+            parts.append(f"{'>' if self.exclusive else '>='} {self.lowest!r}")
+        if self.highest < inf:
+            parts.append(f"<= {self.highest!r}")
+        return " and ".join(parts) or "any finite number"
+
+
+class Compensator(Protocol):
+    """One compensation law, as it is evaluated tick by tick.
+
+    Constructed from its gains by name (SI units), the control period [s] and the clearance [m] of a
+    two-sided contact (infinite when the contact is one-sided).
+    """
+
+    gains: ClassVar[Mapping[str, GainSpecification]]
+
+    def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None: ...
+
+    @property
+    def identified(self) -> tuple[float, float]:
+        """Identified stiffness [N/m] and damping [N s/m]; (0, 0) if the law identifies none."""
+        ...
+
+    def step(
+        self,
+        force_measured: float,
+        position_desired: float,
+        velocity_desired: float,
+        position_measured: float,
+    ) -> float:
+        """The force [N] that the numerical model is to feel, from this tick's finite readings."""
+        ...
+
+    def position_command(self, position: float, velocity: float, acceleration: float) -> float:
+        """The position [m] to command, from the numerical model's new motion."""
+        ...
+
+    def reset(self) -> None:
+        """Restart everything, identified parameters included."""
+        ...
+
+    def next_contact(self) -> None:
+        """Restart filters, delay lines and covariance; keep the identified parameters."""
+        ...
+
+
+AnyCompensator = TypeVar("AnyCompensator", bound=type[Compensator])
+
+COMPENSATORS: dict[str, type[Compensator]] = {}
+
+
+def register(name: str) -> Callable[[AnyCompensator], AnyCompensator]:
+    """A class decorator that enters a compensator in `COMPENSATORS` under `name`."""
+
+    def enter(compensator: AnyCompensator) -> AnyCompensator:
+        COMPENSATORS[name] = compensator
+        return compensator
+
+    return enter

@@ -1,0 +1,194 @@
+"""The motion simulator: x_a = G(s) e^{-s tau_p} x_d, propagated exactly from tick to tick.
+
+A transport delay commutes with a linear system. So G is driven by the *undelayed* command, whose corners
+are the ticks themselves; x_a at any time t is its response at t - tau_p, and a sensor with delay tau_f sees
+the response at t - tau_p - tau_f. Every delay becomes one number: how long ago the response is read. Between
+ticks ("panel" k spans t_k to t_{k+1}) the command is a straight line, and the response at the fraction s of a
+panel is a fixed row of numbers times (state, command at the panel's start, command at its end): the matrix
+exponential of the system augmented by its input. Nothing is interpolated and nothing is rounded to ticks.
+
+Time inside is in control periods. States are w, w', ..., w^(n-1) with den(p) w = u, y = num(p) w.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+SQUARINGS, TERMS = 6, 13
+
+# One array of the batch shape per component: a stacked state would be taken apart at every tick.
+State = tuple[Array, ...]
+
+
+class Delay(NamedTuple):
+    """A delay of r control periods as whole panels to look back and a place within the panel.
+
+    At tick n the newest panel is n - 1; the reading lies in panel n - 1 - `panels`, at `fraction` of it.
+    `fraction` lies in (0, 1]: a reading at a tick takes the value just before that tick acts.
+    """
+
+    panels: Int[Array, "*batch"]
+    fraction: Float[Array, "*batch"]
+
+
+class Propagation(NamedTuple):
+    """Exact discrete motion simulator; rows act on (state, command at start, command at end).
+
+    transition (order, order + 2, *batch); position and velocity rows (order + 2, *batch) at the force
+    sensor's place in the panel; measured_position likewise at the position sensor's. velocity in m/s.
+    steady_command and steady_velocity (order, *batch): the state of a uniform motion.
+    """
+
+    transition: Float[Array, "order columns *batch"]
+    position: Float[Array, "columns *batch"]
+    velocity: Float[Array, "columns *batch"]
+    measured_position: Float[Array, "columns *batch"]
+    steady_command: Float[Array, "order *batch"]
+    steady_velocity: Float[Array, "order *batch"]
+
+
+def split_delay(delay: Float[Array, "*batch"], control_period: Float[Array, "*batch"]) -> Delay:
+    """Whole panels and fraction of `delay` [s]; whole multiples of the period are met to 1e-9."""
+    periods = delay / control_period
+    whole = jax.lax.stop_gradient(jnp.floor(periods + 1e-9))
+    return Delay(whole.astype(jnp.int32), 1 - (periods - whole))
+
+
+def propagation(
+    numerator: Float[Array, "order *batch"],
+    denominator: Float[Array, "order_plus_1 *batch"],
+    control_period: Float[Array, "*batch"],
+    force_fraction: Float[Array, "*batch"],
+    position_fraction: Float[Array, "*batch"],
+    hold: str,
+) -> Propagation:
+    """Exact discretisation of num(s)/den(s) (descending powers, strictly proper; order 0 is ideal).
+
+    With z' = A z + B u in periods, z(s) = E(s) (z, u(0), u(1) - u(0)) where E(s) is the exponential of
+    s [[A, B, 0], [0, 0, 1], [0, 0, 0]] (Van Loan 1978). Gradients pass to every parameter.
+    """
+    order = denominator.shape[0] - 1
+    if order == 0:
+        return _ideal(control_period, force_fraction, position_fraction, hold)
+    system, output = _companion(numerator, denominator, control_period)
+    zero, one = jnp.zeros_like(control_period), jnp.ones_like(control_period)
+    generator = [[*row, zero, zero] for row in system]
+    generator[order - 1][order] = one
+    generator += [[zero] * (order + 1) + [one], [zero] * (order + 2)]
+    generator = jnp.stack([jnp.stack(row) for row in generator])
+    fractions = jnp.stack([one, force_fraction, position_fraction])
+    # Axes: row, column, place in the panel, batch.
+    rows = exponential(generator[:, :, None] * fractions[None, None])[: order + 1]
+    # Columns for (z, u(0), u(1)) instead of (z, u(0), u(1) - u(0)).
+    rows = rows.at[:, order].add(-rows[:, order + 1])
+    state, place = rows[:order], rows[:, :, 1]
+    rates = [*place[1:order], _combine(system[order - 1], place[:order]) + place[order]]
+    steady_command = jnp.stack([-1 / system[order - 1][0]] + [zero] * (order - 1))
+    return Propagation(
+        transition=state[:, :, 0],
+        position=_combine(output, place[:order]),
+        velocity=_combine(output, rates) / control_period[None],
+        measured_position=_combine(output, state[:, :, 2]),
+        steady_command=steady_command,
+        steady_velocity=_steady_velocity(system, state[:, :, 0], steady_command, hold),
+    )
+
+
+def exponential(matrices: Float[Array, "size size *batch"]) -> Float[Array, "size size *batch"]:
+    """Matrix exponential by scaling, Taylor and squaring, to rounding for norms up to 64.
+
+    Matrix axes come first, so that every product is a few vector operations over the batch; a library
+    call per lane costs more than the whole contact.
+    """
+    size = matrices.shape[0]
+    identity = jnp.eye(size, dtype=matrices.dtype).reshape(size, size, *[1] * (matrices.ndim - 2))
+    scaled = matrices / 2**SQUARINGS
+    start = jnp.broadcast_to(identity, matrices.shape)
+
+    # Loops, not unrolled: fused into one another the products would be computed over and over.
+    def horner(step, total):
+        return identity + _product(scaled, total) / jnp.asarray(TERMS - step, total.dtype)
+
+    total = jax.lax.fori_loop(0, TERMS, horner, start)
+    return jax.lax.fori_loop(0, SQUARINGS, lambda _, total: _product(total, total), total)
+
+
+def advance(transition: Array, state: State, start: Array, end: Array) -> State:
+    """The state one period later."""
+    return tuple(read(transition[i], state, start, end) for i in range(len(state)))
+
+
+def read(row: Array, state: State, start: Array, end: Array) -> Array:
+    """One row times (state, command at the panel's start, command at its end)."""
+    total = row[-2] * start + row[-1] * end
+    for i, component in enumerate(state):
+        total = total + row[i] * component
+    return total
+
+
+def steady_state(plant: Propagation, command: Array, step: Array) -> State:
+    """State at a tick of a uniform motion: drive input `command` now, growing by `step` per period."""
+    order = plant.steady_command.shape[0]
+    return tuple(plant.steady_command[i] * command + plant.steady_velocity[i] * step for i in range(order))
+
+
+def _ideal(control_period, force_fraction, position_fraction, hold):
+    def position(fraction):
+        return jnp.stack([1 - fraction, fraction])
+
+    slope = jnp.stack([-1 / control_period, 1 / control_period])
+    empty = jnp.zeros((0, *control_period.shape), control_period.dtype)
+    return Propagation(
+        transition=jnp.zeros((0, 2, *control_period.shape), control_period.dtype),
+        position=position(force_fraction),
+        velocity=slope if hold == "linear" else jnp.zeros_like(slope),
+        measured_position=position(position_fraction),
+        steady_command=empty,
+        steady_velocity=empty,
+    )
+
+
+def _companion(numerator, denominator, control_period):
+    """Rows of A (the last carries the coefficients) and output weights, time in periods."""
+    order = denominator.shape[0] - 1
+    powers = [control_period**i for i in range(order + 1)]
+    zero, one = jnp.zeros_like(control_period), jnp.ones_like(control_period)
+    system = [[one if j == i + 1 else zero for j in range(order)] for i in range(order - 1)]
+    system.append([-denominator[order - i] * powers[order - i] / denominator[0] for i in range(order)])
+    output = [numerator[order - 1 - i] * powers[order - i] / denominator[0] for i in range(order)]
+    return system, output
+
+
+def _steady_velocity(system, transition, steady_command, hold):
+    order = steady_command.shape[0]
+    if hold == "linear":
+        # Ramp response: w = u/a_n - a_{n-1} u'/a_n^2 and w' = u'/a_n.
+        constant = -system[order - 1][0]
+        linear = -system[order - 1][1] if order > 1 else jnp.ones_like(constant)
+        steady = jnp.zeros_like(steady_command).at[0].set(-linear / constant**2)
+        return steady.at[1].set(1 / constant) if order > 1 else steady
+    # Staircase: z(k+1) = Ad z(k) + Bd u(k+1) with z(k) = alpha u(k+1) + beta step.
+    identity = jnp.eye(order, dtype=steady_command.dtype)
+    batch_first = jnp.moveaxis(transition[:, :order], (0, 1), (-2, -1))
+    right = jnp.moveaxis(steady_command, 0, -1)[..., None]
+    solved = jnp.linalg.solve(
+        identity.reshape(*[1] * (batch_first.ndim - 2), order, order) - batch_first, right
+    )
+    return -jnp.moveaxis(solved[..., 0], -1, 0)
+
+
+def _combine(weights, rows):
+    """sum_i weights_i rows_i, rows (columns, *batch)."""
+    total = weights[0][None] * rows[0]
+    for weight, row in zip(weights[1:], rows[1:], strict=True):
+        total = total + weight[None] * row
+    return total
+
+
+def _product(left, right):
+    total = left[:, 0, None] * right[None, 0]
+    for k in range(1, left.shape[0]):
+        total = total + left[:, k, None] * right[None, k]
+    return total

@@ -1,0 +1,19 @@
+"""What every test runs under: float64, strict promotion, two host devices, checked shapes."""
+
+import os
+
+os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
+
+import jax
+from jaxtyping import install_import_hook
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# Shapes are checked where there are shapes: the modules that compute with arrays.
+ARRAY_MODULES = (
+    *("building", "contact", "integrators", "limits", "loop", "metrics", "reference"),
+    *("reference_laws", "ring", "rollout", "scenario", "sensors", "simulator", "compensators"),
+)
+install_import_hook([f"jaxhil.{name}" for name in ARRAY_MODULES], "beartype.beartype")

@@ -1,0 +1,317 @@
+"""Draws of uncertain numbers: their distributions against SciPy's, and what a draw depends on."""
+
+import copy
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from jaxhil.errors import InputError
+from jaxhil.mechanism import numeric_keys
+from jaxhil.mechanism_file import builtin_names, from_builtins, load, to_builtins
+from jaxhil.uncertainty import PHASE, draw, quasi_random
+
+CERTAIN = ["uncertainty={}", "contact.damping=[1.0, 2.0]"]
+BASE = to_builtins(load("varying", CERTAIN).mechanism)
+NOMINAL = [124355.0, 373065.0, 62177.5]
+
+
+def mechanism_with(path, entry, **values):
+    """The base mechanism with one uncertain key; `values` set other keys, `a__b` for a.b."""
+    raw = copy.deepcopy(BASE)
+    for dotted, value in values.items():
+        *tables, key = dotted.split("__")
+        node = raw
+        for table in tables:
+            node = node[table]
+        node[key] = value
+    raw["uncertainty"] = {path: entry}
+    return from_builtins(raw, "some file")
+
+
+def refusal(path, entry, **values):
+    with pytest.raises(InputError) as caught:
+        mechanism_with(path, entry, **values)
+    message = str(caught.value)
+    assert message.isprintable() and message.startswith("some file: ")
+    return message
+
+
+FREQUENCY, DELAY = "rig.simulator.natural_frequency", "rig.force_sensor.delay"
+POLYNOMIALS = {f"rig.simulator.{key}" for key in ("coefficients", "numerator", "denominator")}
+DISTRIBUTIONS = [
+    (FREQUENCY, {"distribution": "uniform", "low": 10.0, "high": 14}, stats.uniform(10, 4)),
+    (FREQUENCY, {"distribution": "uniform", "factor": [0.5, 2]}, stats.uniform(6, 18)),
+    (FREQUENCY, {"distribution": "loguniform", "factor": [0.5, 2]}, stats.loguniform(6, 24)),
+    (FREQUENCY, {"distribution": "loguniform", "low": 1, "high": 9}, stats.loguniform(1, 9)),
+    (DELAY, {"distribution": "normal", "std": 0.0005}, stats.norm(0.008, 0.0005)),
+    (DELAY, {"distribution": "normal", "std": 2.0}, stats.truncnorm(-0.004, 0.496, 0.008, 2.0)),
+    (PHASE, {"distribution": "uniform", "low": 0.2, "high": 0.4}, stats.uniform(0.2, 0.2)),
+    (PHASE, {"distribution": "normal", "std": 1}, stats.truncnorm(-1 / 3, 2 / 3, 1 / 3, 1)),
+]
+
+
+@pytest.mark.parametrize("draws", [draw, quasi_random])
+@pytest.mark.parametrize(("path", "entry", "expected"), DISTRIBUTIONS)
+def test_distribution(draws, path, entry, expected):
+    values = draws(mechanism_with(path, entry), 4096, 3)[path]
+    for column in np.reshape(values, (4096, -1)).T:
+        result = stats.kstest(column, expected.cdf)
+        # Quasi-random points are far closer to the distribution than random ones.
+        assert result.pvalue > 0.01
+        assert draws is draw or result.statistic < 1e-3
+
+
+def test_phases_are_uniform_and_each_contact_has_its_own():
+    phases = draw(from_builtins(BASE, "f"), 4096, 0)
+    assert list(phases) == [PHASE]
+    assert phases[PHASE].shape == (4096, 3)
+    for column in phases[PHASE].T:
+        assert stats.kstest(column, stats.uniform.cdf).pvalue > 0.01
+    assert np.max(np.abs(np.corrcoef(phases[PHASE].T) - np.eye(3))) < 4 / np.sqrt(4096)
+
+
+@pytest.mark.parametrize("draws", [draw, quasi_random])
+def test_lists_scale_as_one_or_entry_by_entry(draws):
+    entry = {"distribution": "loguniform", "factor": [0.3, 3.0]}
+    joint = draws(mechanism_with("contact.stiffness", entry), 4096, 1)["contact.stiffness"]
+    assert joint.shape == (4096, 3)
+    np.testing.assert_allclose(joint / NOMINAL, (joint[:, :1] / NOMINAL[0]) * np.ones(3), rtol=1e-15)
+    own = mechanism_with("contact.stiffness", entry | {"independent": True})
+    independent = draws(own, 4096, 1)["contact.stiffness"]
+    correlation = np.corrcoef(np.log(independent).T) - np.eye(3)
+    assert np.max(np.abs(correlation)) < 4 / np.sqrt(4096)
+    for factors in ((joint / NOMINAL)[:, 0], *(independent / NOMINAL).T):
+        assert stats.kstest(factors, stats.loguniform(0.3, 3.0).cdf).pvalue > 0.01
+
+
+def test_values_in_the_unit_of_a_list_belong_to_its_first_entry():
+    absolute = {"distribution": "uniform", "low": 2.0, "high": 4.0}
+    values = draw(mechanism_with("contact.damping", absolute), 1000, 1)["contact.damping"]
+    assert np.all((values[:, 0] >= 2.0) & (values[:, 0] <= 4.0))
+    np.testing.assert_allclose(values[:, 1], 2.0 * values[:, 0], rtol=1e-15)
+    normal = {"distribution": "normal", "std": 0.1}
+    values = draw(mechanism_with("contact.damping", normal), 4096, 1)["contact.damping"]
+    np.testing.assert_allclose(values[:, 1], 2.0 * values[:, 0], rtol=1e-15)
+    assert stats.kstest(values[:, 0], stats.norm(1.0, 0.1).cdf).pvalue > 0.01
+    own = draw(mechanism_with("contact.damping", normal | {"independent": True}), 4096, 1)
+    assert stats.kstest(own["contact.damping"][:, 1], stats.norm(2.0, 0.1).cdf).pvalue > 0.01
+    # Nominally undamped contact can be given damping.
+    undamped = mechanism_with("contact.damping", absolute, contact__damping=[0.0, 0.0])
+    values = draw(undamped, 1000, 1)["contact.damping"]
+    assert np.all((values >= 2.0) & (values <= 4.0)) and np.all(values[:, 0] == values[:, 1])
+
+
+def test_nested_lists_keep_their_shape():
+    mechanism = load("layered").mechanism
+    values = draw(mechanism, 5, 0)["contact.stiffness"]
+    nominal = np.array(mechanism.contact.stiffness)
+    assert values.shape == (5, 2, 3)
+    factors = values[:, :1, :1] / nominal[0, 0] * np.ones((2, 3))
+    np.testing.assert_allclose(values / nominal, factors, rtol=1e-15)
+    own = load("layered", ['uncertainty."contact.stiffness".independent=true']).mechanism
+    values = draw(own, 5, 0)["contact.stiffness"] / nominal
+    assert values.shape == (5, 2, 3) and len(np.unique(values)) == 30
+
+
+@settings(deadline=None)
+@given(
+    st.integers(0, 2**70),
+    st.integers(0, 5000),
+    st.integers(0, 30),
+    st.sampled_from(["varying", "layered"]),
+)
+def test_a_draw_depends_on_its_own_number_alone(seed, first, number, name):
+    mechanism = load(name).mechanism
+    several = draw(mechanism, number, seed, first)
+    for path, values in several.items():
+        assert values.shape[0] == number
+        for i in {0, number // 2, number - 1} & set(range(number)):
+            np.testing.assert_array_equal(values[i], draw(mechanism, 1, seed, first + i)[path][0])
+
+
+def test_draws_cross_blocks_and_differ():
+    mechanism = load().mechanism
+    whole = draw(mechanism, 5000, 7)
+    for path, values in draw(mechanism, 3000, 7, first=1500).items():
+        np.testing.assert_array_equal(values, whole[path][1500:4500])
+        assert len(np.unique(values.reshape(3000, -1)[:, 0])) == 3000
+        assert not np.any(values == draw(mechanism, 3000, 8, first=1500)[path])
+
+
+def test_a_key_is_drawn_alike_whatever_else_is_uncertain():
+    mechanism = load().mechanism
+    more = ["uncertainty.'rig.simulator.delay'={distribution='uniform', factor=[0.5, 1]}"]
+    other = draw(load("varying", [*more, "approach.contacts=5"]).mechanism, 10, 0)
+    for path, values in draw(mechanism, 10, 0).items():
+        np.testing.assert_array_equal(values, other[path][:, :3] if path == PHASE else other[path])
+
+
+def test_recorded_draws():
+    """Recorded sweeps stay reproducible: these numbers may not change between versions."""
+    values = draw(load().mechanism, 1, seed=1, first=1024)
+    np.testing.assert_allclose(
+        [values["approach.velocity"][0], values[DELAY][0], values[PHASE][0, 2]],
+        [0.004737103501163611, 0.008191897470912628, 0.636892879481792],
+        rtol=1e-13,
+    )
+
+
+def test_quasi_random_points_depend_on_the_seed_and_fill_evenly():
+    mechanism = load().mechanism
+    points = quasi_random(mechanism, 100, 5)
+    for path, values in quasi_random(mechanism, 70, 5).items():
+        assert values.shape[0] == 70
+        np.testing.assert_array_equal(values, quasi_random(mechanism, 70, 5)[path])
+        assert not np.array_equal(values, quasi_random(mechanism, 70, 6)[path])
+        assert points[path].shape[1:] == values.shape[1:]
+    phase = quasi_random(mechanism, 64, 5)[PHASE]
+    for column in phase.T:
+        # One point in each of 64 equal intervals.
+        assert sorted(np.floor(64 * column)) == list(range(64))
+
+
+def test_no_draws_and_negative_arguments():
+    mechanism = load().mechanism
+    for values in (draw(mechanism, 0, 0), quasi_random(mechanism, 0, 0)):
+        assert {path: entry.shape for path, entry in values.items()} == {
+            "contact.stiffness": (0, 3),
+            FREQUENCY: (0,),
+            DELAY: (0,),
+            "approach.velocity": (0,),
+            PHASE: (0, 3),
+        }
+    for arguments in ((-1, 0), (1, -1), (1, 0, -1)):
+        with pytest.raises(ValueError, match="found"):
+            draw(mechanism, *arguments)
+        with pytest.raises(ValueError, match="found"):
+            quasi_random(mechanism, *[-1, 0] if arguments[0] < 0 else [1, -1])
+
+
+@pytest.mark.parametrize("path", sorted(set(numeric_keys()) - POLYNOMIALS))
+@settings(deadline=None)
+@given(nominal=st.floats(0.0, 1e4), std=st.floats(0.0, exclude_min=True, allow_infinity=False))
+def test_normal_draws_are_allowed_values(path, nominal, std):
+    allowed = numeric_keys()[path]
+    nominal = float(np.clip(nominal, allowed.low + 1e-9, min(allowed.high, 1e4)))
+    raw = copy.deepcopy(BASE)
+    if path.startswith("bodies.") and "equivalent" not in path:
+        raw["bodies"] = {"chaser_mass": 1.0, "target_mass": 1.0}
+    node = raw
+    *tables, key = path.split(".")
+    for table in tables:
+        node = node[table]
+    node[key] = [nominal] if isinstance(node.get(key), list) else nominal
+    if path == "contact.clearance":
+        node[key] = nominal + 1.0
+    raw["uncertainty"] = {path: {"distribution": "normal", "std": std}}
+    values = draw(from_builtins(raw, "f"), 50, 0)[path]
+    assert all(np.isfinite(value) and allowed.allows(float(value)) for value in values.ravel())
+
+
+@pytest.mark.parametrize(
+    ("path", "entry", "reason"),
+    [
+        ("contact.stifness", {"distribution": "normal", "std": 1.0}, "did you mean contact.stiff"),
+        ("approach.contacts", {"distribution": "normal", "std": 1.0}, "numeric key"),
+        ("contact.tension", {"distribution": "normal", "std": 1.0}, "numeric key"),
+        ("contact.law", {"distribution": "normal", "std": 1.0}, "numeric key"),
+        ("contact", {"distribution": "normal", "std": 1.0}, "numeric key"),
+        ("a\nb", {"distribution": "normal", "std": 1.0}, '"a\\nb": found no such'),
+        ("rig.simulator.numerator", {"distribution": "normal", "std": 1.0}, "G(0) = 1"),
+        ("rig.simulator.time_constant", {"distribution": "normal", "std": 1.0}, "found nothing as"),
+        ("contact.depths", {"distribution": "normal", "std": 1.0}, "found [] as its value"),
+        ("contact.clearance", {"distribution": "normal", "std": 1.0}, "found inf as its value"),
+        (FREQUENCY, {"distribution": "cauchy", "std": 1.0}, ".distribution: found 'cauchy'"),
+        (FREQUENCY, {"std": 1.0}, ".distribution: found nothing"),
+        (FREQUENCY, {"distribution": "normal", "sd": 1.0}, ".sd: found an unknown key"),
+        (FREQUENCY, {"distribution": "normal"}, "found no range, allowed std"),
+        (FREQUENCY, {"distribution": "normal", "std": 0.0}, ".std: found 0.0"),
+        (FREQUENCY, {"distribution": "normal", "std": 1.0, "low": 1.0}, "found low and std"),
+        (FREQUENCY, {"distribution": "normal", "factor": [1, 2]}, "found factor, allowed std"),
+        (FREQUENCY, {"distribution": "uniform", "low": 1.0}, "found low, allowed either factor"),
+        (FREQUENCY, {"distribution": "uniform", "std": 1.0}, "found std, allowed either factor"),
+        (FREQUENCY, {"distribution": "uniform", "low": 2, "high": 1}, ".low: found [2.0, 1.0]"),
+        (FREQUENCY, {"distribution": "uniform", "low": 2, "high": 2}, ".low: found [2.0, 2.0]"),
+        (FREQUENCY, {"distribution": "uniform", "factor": [2, 1]}, ".factor: found [2.0, 1.0]"),
+        (FREQUENCY, {"distribution": "uniform", "factor": [1, 2, 3]}, ".factor: found a list of 3"),
+        (FREQUENCY, {"distribution": "uniform", "factor": [0, 2]}, ".factor[0]: found 0"),
+        (FREQUENCY, {"distribution": "uniform", "low": 0, "high": 1}, "found values as far as 0"),
+        (
+            FREQUENCY,
+            {"distribution": "uniform", "factor": [1, 1e308]},
+            "found values as far as inf",
+        ),
+        (PHASE, {"distribution": "uniform", "low": 0, "high": 1.5}, "found values as far as 1.5"),
+        (DELAY, {"distribution": "uniform", "low": -0.1, "high": 1}, "found values as far as -0.1"),
+        (DELAY, {"distribution": "loguniform", "low": 0, "high": 1}, ".low: found 0.0"),
+        ("rig.force_sensor.bias", {"distribution": "loguniform", "low": -1, "high": 1}, "found -1"),
+    ],
+)
+def test_unusable_uncertainty(path, entry, reason):
+    message = refusal(path, entry)
+    assert "uncertainty." in message and reason in message
+
+
+def test_rules_hold_over_the_whole_range():
+    third = {"model": "third_order", "coefficients": [0.1, 0.1, 0.005]}
+    path, wide = "rig.simulator.coefficients", {"distribution": "uniform", "factor": [0.4, 1.5]}
+    narrow = wide | {"factor": [0.6, 1.5]}
+    assert "not stable" in refusal(path, wide, rig__simulator=third)
+    assert "not stable" in refusal(path, narrow | {"independent": True}, rig__simulator=third)
+    assert "not stable" in refusal(path, {"distribution": "normal", "std": 1.0}, rig__simulator=third)
+    values = draw(mechanism_with(path, narrow, rig__simulator=third), 500, 0)[path]
+    assert np.all(values[:, 0] * values[:, 1] > values[:, 2])
+
+    path, factor = "contact.depths", {"distribution": "uniform", "factor": [0.5, 1.5]}
+    depths = [0.001, 0.002]
+    assert "independent: found true" in refusal(path, factor | {"independent": True}, contact__depths=depths)
+    values = draw(mechanism_with(path, factor, contact__depths=depths), 500, 0)[path]
+    assert np.all(values[:, 0] < values[:, 1])
+
+    damped = {"distribution": "uniform", "low": 1.0, "high": 2.0}
+    undamped = {"contact__damping": [0.0], "rig__command_hold": "zoh"}
+    ideal = undamped | {"rig__simulator": {"model": "ideal"}}
+    assert "rig.command_hold" in refusal("contact.damping", damped, **ideal)
+    zero = {"distribution": "uniform", "factor": [0.5, 2.0]}
+    assert not np.any(draw(mechanism_with("contact.damping", zero, **ideal), 9, 0)["contact.damping"])
+
+    start = {"contact__clearance": 2e-4}
+    fast = {"distribution": "uniform", "factor": [1.0, 2.0]}
+    assert "contact.clearance" in refusal("approach.velocity", fast, **start)
+    assert "contact.clearance" in refusal("contact.clearance", factor, **start)
+    mixed = {"contact__damping": [0.0, 2.0]}
+    assert "0 as the first entry" in refusal("contact.damping", damped, **mixed)
+    own = mechanism_with("contact.damping", damped | {"independent": True}, **mixed)
+    assert np.all(draw(own, 9, 0)["contact.damping"] >= 1.0)
+
+
+def test_negative_nominal_value_keeps_its_sign():
+    entry = {"distribution": "loguniform", "factor": [0.5, 2.0]}
+    bias = "rig.force_sensor.bias"
+    values = draw(mechanism_with(bias, entry, rig__force_sensor={"bias": -3.0}), 2000, 0)[bias]
+    assert stats.kstest(-values, stats.loguniform(1.5, 6.0).cdf).pvalue > 0.01
+
+
+def test_extreme_ranges_are_drawn_without_overflow():
+    wide = {"distribution": "loguniform", "low": 1e-300, "high": 1e300}
+    values = np.log10(draw(mechanism_with(FREQUENCY, wide), 4096, 0)[FREQUENCY])
+    assert stats.kstest(values, stats.uniform(-300, 600).cdf).pvalue > 0.01
+
+
+@pytest.mark.parametrize("name", builtin_names())
+def test_draws_of_builtins_are_valid_mechanisms(name):
+    mechanism = load(name).mechanism
+    draws = draw(mechanism, 20, 0)
+    assert set(draws) == {*mechanism.uncertainty, PHASE}
+    for i in range(20):
+        raw = to_builtins(mechanism)
+        for path, values in draws.items():
+            *tables, key = path.split(".")
+            node = raw
+            for table in tables:
+                node = node[table]
+            node[key] = (values[i, 0] if path == PHASE else values[i]).tolist()
+        assert from_builtins(raw, "f").contact.stiffness == draws["contact.stiffness"][i].tolist()

@@ -1,0 +1,1 @@
+"""Tuning, verification and the command line, on top of `jaxhil`."""
