@@ -20,7 +20,7 @@ from jaxhil.compensators.base import Compensator, Constants, Gains, Signals
 from jaxhil.contact import ContactLaw, ContactParameters, two_sided
 from jaxhil.integrators import INTEGRATORS
 from jaxhil.limits import limit_command
-from jaxhil.ring import look_back, write
+from jaxhil.ring import look_back, tie, write
 from jaxhil.scenario import Scenario
 from jaxhil.sensors import lag, quantise, sample_force, white_noise
 from jaxhil.simulator import (
@@ -34,13 +34,23 @@ from jaxhil.simulator import (
 )
 
 
+class Windows(NamedTuple):
+    """By how many panels less one the lanes' delays differ at most; 0 if that is too many to be of use.
+    Of the force reading, of the real force, of the position reading."""
+
+    force: int
+    real: int
+    position: int
+
+
 class Loop(eqx.Module):
     """What shapes the compiled loop; every field is static.
 
     law, compensator, integrator, hold ("linear" or "zoh"), latency (0 or 1 periods); which optional parts
     are present: force lag, force noise or bias, position noise, sample effects (quantum, dead zone, range),
-    command limits, a second surface; samples in the delay lines of the sensors and of the controller; whether
-    energies are audited.
+    command limits, a second surface; samples in the delay lines of the sensors and of the controller, and
+    how far the lanes' delays lie apart; whether the control period is common to all lanes; whether energies
+    are audited.
     """
 
     law: ContactLaw = eqx.field(static=True)
@@ -57,6 +67,8 @@ class Loop(eqx.Module):
     is_two_sided: bool = eqx.field(static=True)
     ring: int = eqx.field(static=True)
     controller_ring: int = eqx.field(static=True)
+    windows: Windows = eqx.field(static=True)
+    has_common_period: bool = eqx.field(static=True)
     energies: bool = eqx.field(static=True)
 
 
@@ -119,10 +131,7 @@ class Truth(NamedTuple):
 def build_rig(loop: Loop, scenario: Scenario) -> Rig:
     """Discretise the linear parts exactly and split every delay into panels and a fraction."""
     period, simulator = scenario.control_period, scenario.simulator
-    force_delay = split_delay(simulator.delay + scenario.force_sensor.delay, period)
-    position_delay = split_delay(simulator.delay + scenario.position_sensor.delay, period)
-    # The newest force sample that has happened by tick n, in real time.
-    behind = simulator.delay / period + force_delay.fraction
+    force_delay, position_delay, real_panels = split_delays(scenario)
     return Rig(
         scenario=scenario,
         propagation=propagation(
@@ -135,10 +144,22 @@ def build_rig(loop: Loop, scenario: Scenario) -> Rig:
         ),
         force_delay=force_delay,
         position_delay=position_delay,
-        real_panels=jnp.ceil(behind - 1e-9).astype(jnp.int32) - 1,
-        constants=Constants(period, scenario.clearance),
+        real_panels=real_panels,
+        constants=Constants(
+            period, scenario.clearance, period.reshape(-1)[0] if loop.has_common_period else None
+        ),
         inverse_mass=1 / scenario.equivalent_mass,
     )
+
+
+def split_delays(scenario: Scenario) -> tuple[Delay, Delay, Int[Array, "*batch"]]:
+    """Delay of the force reading and of the position reading, and how many panels back lies the newest force
+    sample that has really happened by a tick."""
+    period, simulator = scenario.control_period, scenario.simulator
+    force = split_delay(simulator.delay + scenario.force_sensor.delay, period)
+    position = split_delay(simulator.delay + scenario.position_sensor.delay, period)
+    behind = simulator.delay / period + force.fraction
+    return force, position, jnp.ceil(behind - 1e-9).astype(jnp.int32) - 1
 
 
 def enter(
@@ -189,16 +210,13 @@ def sense(loop: Loop, rig: Rig, state: LoopState, tick: Array) -> tuple[Signals,
     """Stage 1: what the sensors read at this tick, and the truth beside it."""
     scenario, sensed = rig.scenario, state.sensed
     age = tick - state.entry_tick
-    if sensed.reading is None:
-        # One look at the ring for both.
-        both = jnp.stack([rig.force_delay.panels, rig.real_panels])
-        force, real = _recall(sensed.force, tick, age, both)
-    else:
-        (force,) = _recall(sensed.reading, tick, age, rig.force_delay.panels[None])
-        (real,) = _recall(sensed.force, tick, age, rig.real_panels[None])
+    windows = loop.windows
+    force_ring = sensed.force if sensed.reading is None else sensed.reading
+    force = _recall(force_ring, tick, age, rig.force_delay.panels, windows.force)
+    real = _recall(sensed.force, tick, age, rig.real_panels, windows.real)
     work = None
     if sensed.work is not None:
-        (work,) = _recall(sensed.work, tick, age, rig.real_panels[None])
+        work = _recall(sensed.work, tick, age, rig.real_panels, windows.real)
     sensor = scenario.force_sensor
     if loop.has_force_bias:
         force = force + sensor.bias
@@ -210,7 +228,7 @@ def sense(loop: Loop, rig: Rig, state: LoopState, tick: Array) -> tuple[Signals,
     panels = rig.position_delay.panels
     stride = rig.constants.control_period * state.entry_velocity
     before = sensed.first_position + (age - panels).astype(stride.dtype) * stride
-    (after,) = look_back(sensed.position, tick - 1, panels[None])
+    after = look_back(sensed.position, tick - 1, panels, windows.position)
     position = jnp.where(age <= panels, before, after)
     if loop.has_position_noise:
         sensor = scenario.position_sensor
@@ -221,7 +239,14 @@ def sense(loop: Loop, rig: Rig, state: LoopState, tick: Array) -> tuple[Signals,
 
 
 def drive(
-    loop: Loop, rig: Rig, gains: Gains, state: LoopState, tick: Array, force: Array, controller: Any
+    loop: Loop,
+    rig: Rig,
+    gains: Gains,
+    state: LoopState,
+    tick: Array,
+    truth: Truth,
+    force: Array,
+    controller: Any,
 ) -> LoopState:
     """Stages 3 to 5: integrate the numerical model under F_c, move the rig, touch the mechanism."""
     scenario, sensed = rig.scenario, state.sensed
@@ -251,14 +276,14 @@ def drive(
         time_constant = scenario.force_sensor.time_constant
         lagged = lag(sensed.lagged, sensed.last, now, period, time_constant)
         reading = write(reading, tick, lagged)
-    if work is not None:
-        work = write(work, tick, _work(sensed.last, now))
+    if work is not None and truth.work is not None:
+        work = write(work, tick, tie(_work(sensed.last, now), truth.work))
     return state._replace(
         position=position,
         velocity=velocity,
         plant=Plant(commands[: loop.latency + 1], step, advance(plant.transition, x_now, start, end)),
         sensed=Sensed(
-            force=write(sensed.force, tick, real),
+            force=write(sensed.force, tick, tie(real, truth.force)),
             position=write(sensed.position, tick, read(plant.measured_position, x_now, start, end)),
             reading=reading,
             work=work,
@@ -271,9 +296,9 @@ def drive(
     )
 
 
-def _recall(ring, tick, age, panels):
-    """Samples of the panels `panels` before the newest one; before the run there was no force."""
-    return jnp.where(age[None] > panels, look_back(ring, tick - 1, panels), 0)
+def _recall(ring, tick, age, panels, window):
+    """Sample of the panel `panels` before the newest one; before the run there was no force."""
+    return jnp.where(age > panels, look_back(ring, tick - 1, panels, window), 0)
 
 
 def _sample(loop, rig, parameters, position, velocity, force):

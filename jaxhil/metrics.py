@@ -22,7 +22,6 @@ STATUS_NAMES = {
     DIVERGED: "diverged",
     NON_FINITE: "non-finite",
 }
-LONGEST_CONTACT = 10.0  # s
 LONGEST_FADING = 0.1  # s, waited for the compensator's command to die out
 FADED = 1e-6  # of the command's peak
 RUNAWAY = 1e3  # of the first approach speed: no rig survives it
@@ -178,7 +177,7 @@ def judge(scenario: Scenario, watch: Watch, age: Array) -> Array:
     """Status of the contact under way, `age` ticks into its run: OK, also while it goes on."""
     period = scenario.control_period
     crossing = jnp.where(jnp.isfinite(scenario.clearance), 10 * scenario.clearance / scenario.velocity, 0)
-    limit = LONGEST_CONTACT / period
+    limit = scenario.time_limit / period
     waiting = (watch.elapsed == 0) & (age.astype(period.dtype) > limit + crossing / period)
     late = (watch.elapsed > limit) | waiting
     status = jnp.where(late & ~watch.over, TIMEOUT, OK)

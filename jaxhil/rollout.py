@@ -162,7 +162,7 @@ def stretch(loop: Loop, rig: Rig, gains: Gains, run: Run, record: bool) -> tuple
         if loop.has_force_noise or loop.has_force_bias:
             command = jnp.where(signals.age == 0, 0, command)
         watch = observe(loop, clearance, rules, watch, signals, truth, command)
-        state = drive(loop, rig, gains, state, now, command, controller)
+        state = drive(loop, rig, gains, state, now, truth, command, controller)
         seen = None
         if record:
             identified = loop.compensator.identified(controller)

@@ -14,6 +14,8 @@ from jaxtyping import Array, Float, Int, UInt32
 from jaxhil.contact import ContactParameters
 from jaxhil.mechanism import Mechanism
 
+LONGEST_CONTACT = 10.0  # s
+
 
 class MotionSimulator(NamedTuple):
     """num(s)/den(s) in descending powers of s [rad/s], delay [s], limits [m/s, m/s^2] (inf if none)."""
@@ -47,8 +49,8 @@ class PositionSensor(NamedTuple):
 
 class Scenario(NamedTuple):
     """One run per lane: equivalent_mass [kg], velocity [m/s] of the first approach, number of contacts,
-    phase of each contact [1], clearance [m] (inf if one-sided), the contacts' parameters, the rig, and a
-    random key per lane (seed, index) for sensor noise."""
+    phase of each contact [1], clearance [m] (inf if one-sided), the contacts' parameters, the rig, the
+    time_limit [s] of a contact, and a random key (seed, index) for sensor noise."""
 
     equivalent_mass: Float[Array, "*batch"]
     velocity: Float[Array, "*batch"]
@@ -60,6 +62,7 @@ class Scenario(NamedTuple):
     simulator: MotionSimulator
     force_sensor: ForceSensor
     position_sensor: PositionSensor
+    time_limit: Float[Array, "*batch"]
     key: UInt32[Array, "2 *batch"]
 
 
@@ -138,6 +141,7 @@ def build_scenarios(
                 for name in PositionSensor._fields
             )
         ),
+        time_limit=scalar("", LONGEST_CONTACT),
         key=key,
     )
 

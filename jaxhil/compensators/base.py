@@ -21,8 +21,10 @@ class Gain(NamedTuple):
     """One tunable number of a compensator.
 
     unit ("1" if none), lower and upper bounds and the literature's own rule, each a function of the
-    mechanism; `logarithmic` says that the gain is searched on a logarithmic scale; `tuned` whether
-    tuning moves it for this mechanism (a threshold acts by switching and has no useful derivative).
+    mechanism; `logarithmic` says that the gain is searched on a logarithmic scale; `neutral` is the value
+    at which it does nothing, where it has one (with all of them neutral the law passes the force on);
+    `tuned` whether tuning moves it for this mechanism (a threshold acts by switching and has no useful
+    derivative).
     """
 
     name: str
@@ -31,6 +33,7 @@ class Gain(NamedTuple):
     upper: Callable[[Mechanism], float]
     nominal: Callable[[Mechanism], float]
     logarithmic: bool = False
+    neutral: float | None = None
     tuned: Callable[[Mechanism], bool] = lambda mechanism: True
 
 
@@ -49,10 +52,12 @@ class Signals(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """What the controller is told of the rig: control period [s] and clearance [m], inf if one-sided."""
+    """What the controller is told of the rig: control period [s] and clearance [m], inf if one-sided; the
+    control period once more where all lanes share it."""
 
     control_period: Float[Array, "*batch"]
     clearance: Float[Array, "*batch"]
+    common_period: Float[Array, ""] | None = None
 
 
 class Compensator(eqx.Module):

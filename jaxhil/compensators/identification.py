@@ -1,7 +1,7 @@
 """Real-time identification of contact stiffness and damping: recursive least squares with forgetting.
 
 Model F = k d + b v. The covariance is kept as P = U D U^T, U = [[1, u], [0, 1]], D = diag(d_1, d_2)
-(Bierman 1977): every operation on it is free of cancellation, however large the initial covariance.
+(Bierman 1977): it stays positive however large the initial covariance.
 With d_2 = 0 the damping stays at its initial value and the law identifies stiffness alone.
 """
 

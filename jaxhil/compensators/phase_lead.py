@@ -24,6 +24,7 @@ PHASE_LEAD = Gain(
     lower=lambda mechanism: 0.0,
     upper=lambda mechanism: 2 * force_delay(mechanism) + 0.02,
     nominal=force_delay,
+    neutral=0.0,
 )
 LEAD_FILTER = Gain(
     name="lead_filter",

@@ -28,7 +28,7 @@ from jaxhil.compensators.phase_lead import (
     lead_filter,
 )
 from jaxhil.contact import deflection
-from jaxhil.ring import look_back, tie, write
+from jaxhil.ring import look_back, look_back_rows, tie, write
 
 
 def is_damped(mechanism) -> bool:
@@ -96,8 +96,8 @@ class Prepared(NamedTuple):
     lead: LeadFilter
     rate_pole: Float[Array, "*batch"]
     rate_gain: Float[Array, "*batch"]
-    lookback: Int[Array, "*batch"]
-    fraction: Float[Array, "*batch"]
+    lookback: Int[Array, "*batch"] | Int[Array, ""]
+    fraction: Float[Array, "*batch"] | Float[Array, ""]
 
 
 class ResponseError(Compensator):
@@ -107,10 +107,10 @@ class ResponseError(Compensator):
     gains: ClassVar[tuple[Gain, ...]] = (
         PHASE_LEAD,
         LEAD_FILTER,
-        Gain("response_error", "1", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0),
+        Gain("response_error", "1", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0, neutral=0.0),
         Gain(
             "response_error_damping", "1", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0,
-            tuned=is_damped,
+            neutral=0.0, tuned=is_damped,
         ),
         Gain(
             "initial_stiffness", "N/m", lambda m: 0.0, lambda m: 5 * typical_stiffness(m),
@@ -146,7 +146,8 @@ class ResponseError(Compensator):
 
     def prepare(self, gains, constants):
         period = constants.control_period
-        periods = gains["identification_delay"] / period
+        shared = constants.common_period
+        periods = gains["identification_delay"] / (period if shared is None else shared)
         whole = jax.lax.stop_gradient(jnp.floor(periods + 1e-9))
         smoothing = 2 * gains["velocity_filter"]
         scale = 1 / (smoothing + period)
@@ -205,8 +206,16 @@ class ResponseError(Compensator):
 
         # The newest sample is not in the ring yet: it is looked at before it is written.
         lookback, fraction = prepared.lookback, prepared.fraction
-        newer, older = look_back(state.ring, tick - 1, jnp.stack([jnp.maximum(lookback - 1, 0), lookback]))
-        ring = write(state.ring, tick, tie(measured, older))
+        last = jnp.maximum(lookback - 1, 0)
+        if lookback.ndim == 0:
+            # Two rows even for no lookback, where the newer one is not used.
+            pair = jnp.stack([last, jnp.maximum(lookback, 1)])
+            newer, older = look_back_rows(state.ring, tick - 1, pair)
+            older = jnp.where(lookback == 0, newer, older)
+        else:
+            newer = look_back(state.ring, tick - 1, last)
+            older = look_back(state.ring, tick - 1, lookback)
+        ring = write(state.ring, tick, tie(measured, newer, older))
         newer = jnp.where(lookback == 0, measured, newer)
         recalled = newer - fraction * (newer - older)
         uniform = first_position + ((age - lookback).astype(measured.dtype) - fraction) * stride

@@ -1,0 +1,195 @@
+"""The hand-written C++ baseline (baseline.cpp): built on the spot, loaded with ctypes, fed by `jaxhil`.
+
+Scope: see the top of baseline.cpp. Doubles throughout, whatever the dtype of the arrays given.
+"""
+
+import ctypes
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxhil.compensators.response_error import ResponseError
+from jaxhil.contact import KelvinVoigt
+from jaxhil.loop import Loop, Rig
+from jaxhil.metrics import NOT_REACHED, build_rules
+from jaxhil.scenario import Scenario
+
+SOURCE = Path(__file__).with_name("baseline.cpp")
+# Without threaded jumps every choice between two values stays a blend; with them some become masked
+# stores, which are slow. None of the flags changes a result.
+FLAGS = (
+    "-O3", "-march=native", "-std=c++17", "-fno-trapping-math", "-fno-math-errno",
+    "-fno-thread-jumps", "-pthread",
+)  # fmt: skip
+KINDS = {"none": 0, "phase_lead": 1, "response_error": 2}
+# The order of baseline.cpp's `Gain`; a compensator that lacks one does not read it.
+GAINS = tuple(gain.name for gain in ResponseError.gains)
+RESULTS = ("restitution", "approach_velocity", "peak_force", "peak_command", "duration")
+
+_SIZES = ("lanes", "slots", "ring", "kind", "threads")
+_NUMBERS = (
+    "period", "mass", "velocity", "phase", "stiffness", "damping", "transition", "position_row",
+    "velocity_row", "measured_row", "steady_command", "steady_velocity", "quiet", "patience", "gains",
+)  # fmt: skip
+_COUNTS = ("contacts", "force_panels", "real_panels", "position_panels")
+_OUTPUT_COUNTS = ("status", "ticks")
+
+
+class _Problem(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_int64) for name in _SIZES] + [
+        (name, ctypes.c_void_p) for name in _NUMBERS + _COUNTS + RESULTS + _OUTPUT_COUNTS
+    ]
+
+
+class Baseline(NamedTuple):
+    """The compiled baseline; lanes per block as compiled."""
+
+    library: ctypes.CDLL
+    block_lanes: int
+
+    def run(
+        self,
+        loop: Loop,
+        rig: Rig,
+        gains: dict[str, Any],
+        scenario: Scenario,
+        horizon_ticks: int,
+        threads: int = 2,
+    ) -> dict[str, Any]:
+        """All contacts of every lane, and on to `horizon_ticks`: every lane runs that many ticks.
+
+        `scenario` is the one `rig` was built from, its batch one axis of lanes; `gains` are scalars or
+        (lanes,). Returns arrays (slots, lanes) named as in `jaxhil.metrics.Metrics`: restitution,
+        approach_velocity, peak_force, peak_command, duration, status (`NOT_REACHED` where the horizon
+        came first) and ticks; and "seconds" spent inside C++. Raises ValueError out of scope.
+        """
+        return self._call(self.library.run_contacts, loop, rig, gains, scenario, horizon_ticks, threads)
+
+    def run_ticks(
+        self,
+        loop: Loop,
+        rig: Rig,
+        gains: dict[str, Any],
+        scenario: Scenario,
+        ticks: int,
+        threads: int = 2,
+    ) -> dict[str, Any]:
+        """`ticks` ticks of every lane's first contact and the flight after it: the bare loop.
+
+        Like `run`, but no contact is turned over; slot 0 describes the first one if it is over by then.
+        """
+        return self._call(self.library.run_ticks, loop, rig, gains, scenario, ticks, threads)
+
+    def _call(self, function, loop, rig, gains, scenario, ticks, threads):
+        _check_scope(loop, rig, scenario)
+        lanes, slots = scenario.velocity.shape[0], scenario.phase.shape[0]
+        inputs = _inputs(rig, gains, scenario, lanes)
+        _check_reach(loop, inputs)
+        results = {name: np.full((slots, lanes), np.nan) for name in RESULTS}
+        results["status"] = np.full((slots, lanes), NOT_REACHED, np.int32)
+        results["ticks"] = np.zeros((slots, lanes), np.int32)
+        problem = _Problem(lanes, slots, loop.ring, KINDS[loop.compensator.name], max(1, threads))
+        for name, array in (inputs | results).items():
+            setattr(problem, name, array.ctypes.data)
+        seconds = function(ctypes.byref(problem), ctypes.c_int64(ticks))
+        return results | {"seconds": seconds}
+
+
+def compile_baseline(block_lanes: int | None = None) -> Baseline | None:
+    """Build and load baseline.cpp; None where there is no g++.
+
+    `block_lanes` overrides the lanes per block. Raises `subprocess.CalledProcessError` when it does
+    not compile.
+    """
+    compiler = shutil.which("g++")
+    if compiler is None:
+        return None
+    width = () if block_lanes is None else (f"-DLANES={block_lanes}",)
+    with tempfile.TemporaryDirectory(prefix="jaxhil-baseline-") as folder:
+        path = Path(folder) / "baseline.so"
+        command = [compiler, *FLAGS, *width, "-shared", "-fPIC", str(SOURCE), "-o", str(path)]
+        subprocess.run(command, check=True)
+        # The loaded library stays mapped after its file is gone.
+        library = ctypes.CDLL(str(path))
+    for function in (library.run_ticks, library.run_contacts):
+        function.argtypes = [ctypes.POINTER(_Problem), ctypes.c_int64]
+        function.restype = ctypes.c_double
+    return Baseline(library, library.block_lanes())
+
+
+def _check_scope(loop: Loop, rig: Rig, scenario: Scenario) -> None:
+    supported = {
+        "one axis of lanes": np.ndim(scenario.velocity) == 1,
+        "Kelvin-Voigt contact": isinstance(loop.law, KelvinVoigt),
+        "no tension": not np.any(scenario.contact.tension),
+        "a compensator of " + ", ".join(KINDS): loop.compensator.name in KINDS,
+        "semi_implicit_euler": loop.integrator == "semi_implicit_euler",
+        "linear hold": loop.hold == "linear",
+        "latency 0": loop.latency == 0,
+        "a motion simulator of order 2": rig.propagation.steady_command.shape[0] == 2,
+        "ideal sensors": not (
+            loop.has_lag
+            or loop.has_force_bias
+            or loop.has_force_noise
+            or loop.has_position_noise
+            or loop.has_sample_effects
+        ),
+        "no limits": not loop.has_limits,
+        "one surface": not loop.is_two_sided,
+        "no energies": not loop.energies,
+    }
+    missing = [condition for condition, met in supported.items() if not met]
+    if missing:
+        raise ValueError("the C++ baseline is written for " + ", ".join(missing))
+
+
+def _check_reach(loop: Loop, inputs: dict[str, np.ndarray]) -> None:
+    """The C++ reads its delay lines unchecked."""
+    panels = [np.max(inputs[name]) for name in _COUNTS if name.endswith("_panels")]
+    if loop.compensator.name == "response_error":
+        delay = inputs["gains"][GAINS.index("identification_delay")]
+        panels.append(np.max(delay / inputs["period"]))
+    if not max(panels) <= loop.ring - 2:
+        raise ValueError(f"delays: found {max(panels):g} periods, allowed {loop.ring - 2}")
+
+
+def _inputs(rig, gains, scenario, lanes) -> dict[str, np.ndarray]:
+    """Every input array of the C++ problem, by name; doubles and 32-bit integers, lanes last."""
+
+    def spread(array, dtype):
+        array = np.asarray(array, dtype)
+        return np.ascontiguousarray(np.broadcast_to(array, (*array.shape[:-1], lanes)))
+
+    plant, rules = rig.propagation, build_rules(scenario)
+    # Gains that the compensator lacks are multiplied, if at all, into nothing that is kept; 1 is harmless.
+    table = [np.broadcast_to(np.asarray(gains.get(name, 1.0), float), (lanes,)) for name in GAINS]
+    numbers = {
+        "period": scenario.control_period,
+        "mass": scenario.equivalent_mass,
+        "velocity": scenario.velocity,
+        "phase": scenario.phase,
+        "stiffness": scenario.contact.stiffness,
+        "damping": scenario.contact.damping,
+        "transition": plant.transition,
+        "position_row": plant.position,
+        "velocity_row": plant.velocity,
+        "measured_row": plant.measured_position,
+        "steady_command": plant.steady_command,
+        "steady_velocity": plant.steady_velocity,
+        "quiet": rules.quiet,
+        "patience": rules.patience,
+        "gains": np.stack(table),
+    }
+    counts = {
+        "contacts": scenario.contacts,
+        "force_panels": rig.force_delay.panels,
+        "real_panels": rig.real_panels,
+        "position_panels": rig.position_delay.panels,
+    }
+    return {name: spread(numbers[name], np.float64) for name in _NUMBERS} | {
+        name: spread(counts[name], np.int32) for name in _COUNTS
+    }

@@ -1,0 +1,84 @@
+"""The C++ baseline against the JAX loop: the same contacts to rounding, so that their speeds compare."""
+
+import jax
+import numpy as np
+import pytest
+from baseline import RESULTS, compile_baseline
+
+from jaxhil.building import build_loop
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.loop import build_rig
+from jaxhil.mechanism_file import load
+from jaxhil.metrics import NOT_REACHED, OK
+from jaxhil.rollout import rollout
+from jaxhil.scenario import build_scenarios
+from jaxhil.uncertainty import draw
+
+pytestmark = pytest.mark.benchmark
+
+LANES = 61  # no whole number of blocks, whatever the block
+
+
+@pytest.fixture(scope="module")
+def baseline():
+    built = compile_baseline()
+    if built is None:
+        pytest.skip("no g++ on this machine: the C++ baseline cannot be built")
+    return built
+
+
+def case(compensator, overrides=()):
+    mechanism = load("varying", overrides).mechanism
+    scenario = build_scenarios(mechanism, draw(mechanism, LANES, seed=3))
+    generator = np.random.default_rng(5)
+    gains = {
+        gain.name: gain.nominal(mechanism) * generator.uniform(0.9, 1.1, LANES)
+        for gain in COMPENSATORS[compensator].gains
+    }
+    if "forgetting" in gains:
+        gains["forgetting"] = generator.uniform(0.95, 1.0, LANES)
+        gains["initial_stiffness"] = generator.uniform(0, 5e4, LANES)
+        gains["initial_damping"] = generator.uniform(0, 20, LANES)
+    loop = build_loop(mechanism, compensator, scenario)
+    return loop, gains, scenario, jax.jit(build_rig, static_argnums=0)(loop, scenario)
+
+
+@pytest.mark.parametrize("compensator", ["none", "phase_lead", "response_error"])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_contacts_agree_with_the_jax_loop(baseline, compensator, threads):
+    loop, gains, scenario, rig = case(compensator)
+    expected = jax.jit(rollout, static_argnums=0)(loop, gains, scenario)
+    found = baseline.run(loop, rig, gains, scenario, int(np.max(expected.ticks)), threads)
+    np.testing.assert_array_equal(found["status"], expected.status)
+    # A contact that sticks until its time-out ends in rounding: its numbers are not worth comparing.
+    ended = np.asarray(expected.status) == OK
+    assert np.mean(ended[: scenario.contacts[0]]) > 0.85
+    for name in RESULTS:
+        np.testing.assert_allclose(
+            found[name][ended],
+            np.asarray(getattr(expected, name))[ended],
+            rtol=1e-11,
+            err_msg=name,
+        )
+
+
+def test_bare_ticks_make_the_first_contact(baseline):
+    loop, gains, scenario, rig = case("response_error")
+    contacts = baseline.run(loop, rig, gains, scenario, 3000)
+    bare = baseline.run_ticks(loop, rig, gains, scenario, 3000)
+    for name in RESULTS:
+        np.testing.assert_allclose(bare[name][0], contacts[name][0], rtol=1e-12, err_msg=name)
+    assert np.all(bare["status"][1:] == NOT_REACHED)
+
+
+def test_what_is_out_of_scope_is_refused(baseline):
+    loop, gains, scenario, rig = case("none", ["rig.command_hold=zoh"])
+    with pytest.raises(ValueError, match="linear hold"):
+        baseline.run(loop, rig, gains, scenario, 10)
+
+
+def test_a_delay_beyond_the_delay_lines_is_refused(baseline):
+    loop, gains, scenario, rig = case("response_error")
+    gains["identification_delay"] = np.asarray(loop.ring * scenario.control_period)
+    with pytest.raises(ValueError, match="delays: found 32 periods"):
+        baseline.run(loop, rig, gains, scenario, 10)

@@ -1,0 +1,282 @@
+"""The runtime against the jax compensators: two controllers, written independently, on the same readings.
+
+On every built-in mechanism's recorded ticks and on a million random ones the force commands agree to 1e-11 of
+the command's range. Counted and compared separately are
+
+- ticks whose decisions lie within 1e-9 of a threshold (see `tuning.verification`), and
+- lanes that magnify rounding: where successive regressors of the identification are nearly parallel, one unit
+  in the last place of every operation moves the runtime's own command by as much as the two sides differ
+  (Monte Carlo arithmetic: Parker, Pierce and Eggert 2000).
+"""
+
+import math
+import random
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from jax import lax
+
+from jaxhil.compensators import COMPENSATORS, Constants, Signals
+from jaxhil.mechanism_file import builtin_names, load
+from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
+from jaxhil.runtime.gain_file import GainFile
+from tuning.gain_file import build_document, check_document
+from tuning.recording import Lane, nominal_and_draws, record_lanes
+from tuning.verification import REPLAY_LIMIT, LaneReplay, replay
+
+RING = 256  # samples, more than any identification delay at the shortest period
+MECHANISMS = [
+    load(name, [f"rig.control_period={period}"]).mechanism
+    for name, period in (("varying", 0.00025), ("rattling", 0.001), ("claw-350kg", 0.004))
+]
+
+
+class Readings(NamedTuple):
+    """A batch of lanes: what either controller is given, (ticks, lanes), gains and constants, (lanes,)."""
+
+    signals: Signals
+    gains: dict[str, np.ndarray]
+    constants: Constants
+
+
+class Count(NamedTuple):
+    """What a comparison covered; the largest differences as fractions of the command's range."""
+
+    ticks: int
+    compared: int
+    near: int
+    parted: int
+    magnified: int
+    difference: float
+    magnified_difference: float
+
+
+@jax.jit(static_argnums=0)
+def simulate(name, signals, gains, constants):
+    """The jax compensator's force commands and identified parameters, (ticks, lanes), of any readings."""
+    law = COMPENSATORS[name]
+    prepared = law.prepare(gains, constants)
+
+    def tick(state, now):
+        index, signals = now
+        begins = (signals.age == 0) & (index > RING)
+        state = law.restart(gains, state, begins, begins)
+        command, state = law.step(prepared, state, signals, index)
+        return state, (command, law.identified(state))
+
+    ticks = jnp.arange(signals.age.shape[0], dtype=jnp.int32) + RING
+    return lax.scan(tick, law.init(gains, constants, RING), (ticks, signals))[1]
+
+
+def lane_replays(name: str, readings: Readings, ticks: list[int] | None = None) -> list[LaneReplay]:
+    """Every lane's readings, or the first `ticks` of each, through both controllers."""
+    command, identified = jax.device_get(simulate(name, *readings))
+    lanes = []
+    for lane in range(command.shape[1]):
+        end = ticks[lane] if ticks else len(command)
+        signals = Signals(*(leaf[:end, lane] for leaf in readings.signals))
+        seen = None if identified is None else (identified[0][:end, lane], identified[1][:end, lane])
+        gains = {gain: float(values[lane]) for gain, values in readings.gains.items()}
+        constants = readings.constants
+        period, clearance = float(constants.control_period[lane]), float(constants.clearance[lane])
+        gain_file = GainFile(name, gains, period, clearance)
+        lanes.append(replay(Lane(signals, command[:end, lane], seen, False), gain_file))
+    return lanes
+
+
+class Jittered(float):
+    """A float whose every result is moved to a neighbour, or not, at random."""
+
+    generator = random.Random(0)
+
+
+def _jittered(operation):
+    def operate(self, other):
+        towards = Jittered.generator.choice((-math.inf, None, math.inf))
+        result = operation(float(self), float(other))
+        return Jittered(result if towards is None else math.nextafter(result, towards))
+
+    return operate
+
+
+for _name in ("add", "radd", "sub", "rsub", "mul", "rmul", "truediv", "rtruediv"):
+    setattr(Jittered, f"__{_name}__", _jittered(getattr(float, f"__{_name}__")))
+
+
+def rounding_spread(name: str, readings: Readings, lane: int, ticks: int) -> float:
+    """How far apart [N] the runtime's own commands of the first `ticks` come when it rounds at random."""
+    gains = {gain: Jittered(values[lane]) for gain, values in readings.gains.items()}
+    period, clearance = readings.constants.control_period[lane], readings.constants.clearance[lane]
+    signals = [leaf[:ticks, lane].tolist() for leaf in readings.signals]
+    commands = []
+    for seed in range(4):
+        Jittered.generator.seed(seed)
+        controller = ON_THE_RIG[name](gains, Jittered(period), Jittered(clearance))
+        for tick, (*numbers, age) in enumerate(zip(*signals, strict=True)):
+            if age == 0 and tick > 0:
+                controller.next_contact()
+            commands.append(controller.step(*map(Jittered, numbers)))
+    return float(np.max(np.ptp(np.reshape(commands, (4, ticks)), axis=0)))
+
+
+def compare(name: str, readings: Readings, ticks: list[int] | None = None) -> Count:
+    """Both controllers on the readings; fails where they differ by more than the limit and than they may."""
+    replays = lane_replays(name, readings, ticks)
+    assert {lane.status for lane in replays} == {"ok"}
+    differences, magnified = [0.0], [0.0]
+    for number, lane in enumerate(replays):
+        difference = max(lane.difference, lane.near_difference)
+        if difference <= REPLAY_LIMIT:
+            differences.append(difference)
+            continue
+        spread = rounding_spread(name, readings, number, lane.worst_tick + 1) / lane.command_range
+        assert difference <= 10 * spread, f"lane {number}, tick {lane.worst_tick}: rounding explains {spread}"
+        magnified.append(difference)
+    return Count(
+        ticks=sum(lane.ticks for lane in replays),
+        compared=sum(lane.compared for lane in replays),
+        near=sum(lane.near for lane in replays),
+        parted=sum(lane.parted is not None for lane in replays),
+        magnified=len(magnified) - 1,
+        difference=max(differences),
+        magnified_difference=max(magnified),
+    )
+
+
+def random_gains(name: str, rng: np.random.Generator, mechanism) -> dict[str, float]:
+    """Each gain anywhere within its bounds, or in half of the cases on either or by the literature's rule."""
+    gains = {}
+    for gain in COMPENSATORS[name].gains:
+        lower, upper = gain.lower(mechanism), gain.upper(mechanism)
+        share = rng.random()
+        inside = lower * (upper / lower) ** share if gain.logarithmic else lower + (upper - lower) * share
+        choice = rng.integers(6)
+        gains[gain.name] = (lower, upper, gain.nominal(mechanism), inside, inside, inside)[choice]
+    return gains
+
+
+def random_readings(name: str, lanes: int, ticks: int, seed: int) -> Readings:
+    """White noise; contacts of all sizes, plain, noisy, coarsely quantised, or coming to a standstill."""
+    rng = np.random.default_rng(seed)
+    mechanisms = [MECHANISMS[lane % len(MECHANISMS)] for lane in range(lanes)]
+    gains = [random_gains(name, rng, mechanism) for mechanism in mechanisms]
+    period = np.array([mechanism.rig.control_period for mechanism in mechanisms])
+    clearance = np.where(rng.random(lanes) < 0.5, np.inf, 0.002)
+    size = 10 ** rng.uniform(-5, -2, lanes)
+    stiffness = 10 ** rng.uniform(4, 6, lanes)
+    rate = 2 * np.pi * rng.uniform(1, 10, lanes)
+    angle = rate * period * np.arange(ticks)[:, None] + rng.uniform(0, 2 * np.pi, lanes)
+
+    def sine(delay):
+        return size * np.sin(angle - rate * delay)
+
+    def noise(scale):
+        return scale * rng.standard_normal((ticks, lanes))
+
+    depth = sine(0.018)
+    depth = np.where(depth > 0, depth, np.where(depth < -clearance, depth + clearance, 0))
+    force, position, measured = stiffness * depth, sine(0.0), sine(0.01)
+    velocity = size * rate * np.cos(angle)
+    kind = np.arange(lanes) // len(MECHANISMS) % 5
+    white, noisy, quantised, still = (kind == n for n in (1, 2, 3, 4))
+    force = np.where(white, noise(size * stiffness), force + np.where(noisy, noise(3.0), 0))
+    position = np.where(white, noise(size), position)
+    velocity = np.where(white, noise(size * rate), velocity)
+    measured = np.where(white, noise(size), measured + np.where(noisy, noise(1e-6), 0))
+    step, quantum = size / 8, size * stiffness / 16
+    measured = np.where(quantised, step * np.round(measured / step), measured)
+    force = np.where(quantised, quantum * np.round(force / quantum), force)
+    halted = still & (np.arange(ticks)[:, None] > ticks - 200)
+    force, velocity = np.where(halted, 100.0, force), np.where(halted, 0.0, velocity)
+    position, measured = np.where(halted, size, position), np.where(halted, 0.9 * size, measured)
+    index = np.arange(ticks)[:, None]
+    begins = (rng.random((ticks, lanes)) < 1 / 400) | (index == 0)
+    age = index - np.maximum.accumulate(np.where(begins, index, 0), axis=0)
+    return Readings(
+        Signals(force, position, velocity, measured, age.astype(np.int32)),
+        {gain: np.array([lane[gain] for lane in gains]) for gain in gains[0]},
+        Constants(period, clearance),
+    )
+
+
+def test_every_compensator_is_there_twice():
+    assert set(ON_THE_RIG) == set(COMPENSATORS)
+    for name, law in COMPENSATORS.items():
+        assert {g.name: g.unit for g in law.gains} == {g: s.unit for g, s in ON_THE_RIG[name].gains.items()}
+
+
+@pytest.mark.parametrize("name", COMPENSATORS)
+def test_random_ticks(name):
+    lanes = 510 if name == "response_error" else 60
+    count = compare(name, random_readings(name, lanes, 2000, seed=1))
+    print(name, count)
+    assert count.ticks == 2000 * lanes
+    assert count.compared >= 0.98 * count.ticks
+    assert count.magnified <= 0.02 * lanes
+
+
+@pytest.mark.parametrize("mechanism_name", builtin_names())
+def test_recorded_ticks(mechanism_name):
+    mechanism, sha256, _ = load(mechanism_name)
+    law = COMPENSATORS["response_error"]
+    gains = {gain.name: gain.nominal(mechanism) for gain in law.gains}
+    loaded = check_document(build_document(law.name, gains, mechanism, sha256, {}, {}, 0, {}))
+    batch = nominal_and_draws(mechanism, 6, seed=2)
+    _, lanes = record_lanes(loaded, batch)
+    for index, lane in enumerate(lanes):
+        gain_file = GainFile(law.name, gains, mechanism.rig.control_period, mechanism.contact.clearance)
+        seen = replay(lane, gain_file)
+        assert seen.status == "ok" and seen.ticks > 100 and seen.parted is None, (index, seen)
+        assert max(seen.difference, seen.near_difference) <= REPLAY_LIMIT, (index, seen)
+    # The same readings, padded to a common length, serve every compensator with gains of any kind.
+    ticks = [len(lane.command) for lane in lanes]
+    length = 1024 * math.ceil(max(ticks) / 1024)
+    signals = Signals(
+        *(
+            np.stack([np.pad(leaf, (0, length - len(leaf)), mode="edge") for leaf in leaves], axis=1)
+            for leaves in zip(*(lane.signals for lane in lanes), strict=True)
+        )
+    )
+    rng = np.random.default_rng(3)
+    for name in COMPENSATORS:
+        drawn = [random_gains(name, rng, mechanism) for _ in lanes]
+        columns = {gain: np.array([lane[gain] for lane in drawn]) for gain in drawn[0]}
+        constants = Constants(batch.control_period, batch.clearance)
+        count = compare(name, Readings(signals, columns, constants), ticks)
+        print(mechanism_name, name, count)
+        assert count.ticks == count.compared == sum(ticks)
+        assert count.magnified == 0
+
+
+@st.composite
+def small_readings(draw):
+    """A few contacts on a lattice, where much lies exactly on a threshold, with any gains within bounds."""
+    mechanism = draw(st.sampled_from(MECHANISMS))
+    shares = hnp.arrays(np.int64, (4, 64), elements=st.integers(-8, 8))
+    force, position, velocity, measured = draw(shares) / 8.0
+    age = np.arange(64) - 32 * (np.arange(64) >= 32)
+    gains = {}
+    for gain in COMPENSATORS["response_error"].gains:
+        lower, upper = gain.lower(mechanism), gain.upper(mechanism)
+        share = draw(st.sampled_from([0.0, 1.0]) | st.floats(0.0, 1.0))
+        gains[gain.name] = np.array([min(lower + (upper - lower) * share, upper)])
+    clearance = draw(st.sampled_from([np.inf, 2.0**-9]))
+    columns = (force * 64.0, position * 2.0**-8, velocity * 2.0**-6, measured * 2.0**-8)
+    return Readings(
+        Signals(*(leaf[:, None] for leaf in columns), age[:, None].astype(np.int32)),
+        gains,
+        Constants(np.array([mechanism.rig.control_period]), np.array([clearance])),
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(small_readings())
+def test_readings_on_thresholds(readings):
+    count = compare("response_error", readings)
+    assert count.ticks == 64

@@ -1,0 +1,207 @@
+"""Verification: it passes what agrees, and tells in plain words what a wrong runtime does wrong."""
+
+import jax
+import msgspec
+import numpy as np
+import pytest
+
+from jaxhil.compensators import COMPENSATORS, Signals
+from jaxhil.mechanism_file import load
+from jaxhil.metrics import OK
+from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
+from jaxhil.runtime import Controller
+from jaxhil.runtime.gain_file import GainFile, check_gain_document
+from tuning.gain_file import build_document, check_document
+from tuning.recording import Lane, nominal_and_draws, record_lanes
+from tuning.verification import near_threshold, replay, replayed, verify
+
+
+def loaded_gains(mechanism_name, compensator, overrides=(), **changes):
+    mechanism, sha256, _ = load(mechanism_name, overrides)
+    gains = {gain.name: gain.nominal(mechanism) for gain in COMPENSATORS[compensator].gains}
+    gains.update(changes)
+    return check_document(build_document(compensator, gains, mechanism, sha256, {}, {}, 0, {}))
+
+
+# A noisy, biased, coarse rig, whose first tick the loop takes without force.
+ROUGH = (
+    "rig.force_sensor.noise_std=0.5",
+    "rig.force_sensor.bias=0.3",
+    "rig.force_sensor.quantum=0.25",
+    "rig.position_sensor.quantum=1e-6",
+    "rig.command_latency=1",
+    "approach.contacts=2",
+)
+CASES = {
+    "varying": ("varying", "response_error", ()),
+    "rattling": ("rattling", "none", ("approach.contacts=2",)),
+    "rough": ("claw-350kg", "phase_lead", ROUGH),
+}
+
+
+@pytest.fixture(scope="module")
+def varying():
+    return loaded_gains(*CASES["varying"])
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_agrees_is_verified(case):
+    loaded = loaded_gains(*CASES[case])
+    messages = []
+    report = verify(loaded, scenarios=4, seed=1, progress=messages.append)
+    assert report.verdict and report.reasons == (), report.reasons
+    assert len(report.replay) == 4 and len(messages) == 3
+    for lane in report.replay:
+        assert lane.status == "ok" and lane.compared == lane.ticks > 150 and lane.command_range > 1
+        assert lane.difference <= 1e-13
+    assert len(report.closed_loop) == loaded.mechanism.approach.contacts
+    for contact in report.closed_loop:
+        assert contact.status == contact.simulated_status == "ok"
+        assert contact.restitution is not None and contact.simulated_restitution is not None
+        assert abs(contact.restitution - contact.simulated_restitution) <= 1e-12
+    assert report.closed_loop[0].restitution != 1.0
+    assert msgspec.convert(msgspec.json.decode(msgspec.json.encode(report)), type(report)) == report
+
+
+def test_the_record_is_the_rollout(varying):
+    batch = nominal_and_draws(varying.mechanism, 4, seed=1)
+    metrics, lanes = record_lanes(varying, batch)
+    assert np.all(metrics.status[:3] == OK)
+    peaks = [np.max(np.abs(lane.command)) for lane in lanes]
+    np.testing.assert_allclose(peaks, np.max(metrics.peak_command[:3], axis=0), rtol=1e-12)
+    runs = [int(np.sum(lane.signals.age == 0)) for lane in lanes]
+    assert runs == [3, 3, 3, 3]
+
+
+def test_the_same_seed_gives_the_same_report(varying):
+    assert verify(varying, 4, seed=1) == verify(varying, 4, seed=1)
+
+
+class Late(ON_THE_RIG["response_error"]):
+    """Forgets what it identified when the next contact begins."""
+
+    def next_contact(self):
+        self.reset()
+
+
+class Loose(ON_THE_RIG["response_error"]):
+    """Rounds in single precision."""
+
+    def step(self, *signals):
+        return float(np.float32(super().step(*signals)))
+
+
+class Leading(ON_THE_RIG["response_error"]):
+    """Commands a position ahead of the numerical model."""
+
+    def position_command(self, position, velocity, acceleration):
+        return position + 1e-6 * velocity
+
+
+class Failing(ON_THE_RIG["response_error"]):
+    """Divides by zero at high force."""
+
+    def step(self, force, *others):
+        return super().step(force / (force < 20.0), *others)
+
+
+@pytest.mark.parametrize(
+    ("runtime", "start"),
+    [
+        (Late, "the nominal run, tick "),
+        (Loose, "the nominal run, tick "),
+        (Leading, "closed loop, contact 1: restitution found "),
+        (Failing, "the nominal run: the runtime's controller tripped: the arithmetic overflowed"),
+    ],
+)
+def test_a_wrong_runtime_is_told(varying, monkeypatch, runtime, start):
+    monkeypatch.setitem(ON_THE_RIG, "response_error", runtime)
+    report = verify(varying, 4, seed=1)
+    assert not report.verdict
+    assert report.reasons[0].startswith(start), report.reasons
+    assert all(reason.isprintable() for reason in report.reasons)
+    if runtime is Loose:
+        assert "of the command's range" in report.reasons[0] and report.reasons[0].endswith("allowed 1e-11")
+        worst = report.replay[0]
+        assert 1e-9 < worst.difference < 1e-7 and worst.found != worst.expected
+    if runtime is Failing:
+        assert "closed loop, contact 1: found not reached, simulated ok, allowed ok" in report.reasons
+    if runtime is Leading:
+        assert all(lane.difference <= 1e-13 for lane in report.replay)
+        assert report.reasons[0].endswith("allowed 1e-09")
+
+
+def test_single_precision_is_refused(varying):
+    with jax.enable_x64(False), pytest.raises(RuntimeError, match="jax_enable_x64"):
+        verify(varying)
+
+
+def lane_of(measured, force, gain_file):
+    """The lane whose commands the runtime itself gives for these readings."""
+    ticks = len(measured)
+    signals = Signals(
+        np.array(force, float),
+        np.linspace(-1e-3, 1e-3, ticks),
+        np.full(ticks, 5e-3),
+        np.array(measured, float),
+        np.arange(ticks, dtype=np.int32),
+    )
+    lane = Lane(signals, np.zeros(ticks), None, False)
+    command, stiffness, damping = replayed(Controller(gain_file), lane)
+    return lane._replace(command=command, identified=(stiffness, damping))
+
+
+@pytest.fixture
+def gain_file(varying):
+    file = check_gain_document(varying.document)
+    gains = {**file.gains, "identification_delay": 0.002, "contact_threshold": 10.0}
+    return file._replace(gains=gains)
+
+
+def test_ticks_near_a_threshold_are_counted(gain_file):
+    measured = np.arange(-20, 20) * 5e-6
+    measured[20] = 3e-18  # instead of 0: in contact, but by less than rounding
+    force = np.where(measured > 0, 1e5 * measured, 0.0)
+    force[30] = 10.0 * (1 + 1e-12)
+    force[3] = 10.0  # not in contact: nothing is decided by this force
+    lane = lane_of(measured, force, gain_file)
+    assert np.nonzero(near_threshold(lane.signals, gain_file))[0].tolist() == [22, 30]
+    seen = replay(lane, gain_file)
+    assert (seen.ticks, seen.compared, seen.near, seen.parted) == (40, 40, 2, None)
+    assert seen.difference == seen.near_difference == 0.0
+    # Of a second surface at -9e-5 m: the force of tick 3 decides, and so does the position at tick 4.
+    two_sided = gain_file._replace(clearance=9e-5)
+    assert np.nonzero(near_threshold(lane.signals, two_sided))[0].tolist() == [3, 4, 22, 30]
+
+
+def test_a_decision_that_fell_differently_ends_the_comparison(gain_file):
+    measured = np.arange(-20, 20) * 5e-6
+    measured[20] = 3e-18
+    force = np.where(np.arange(40) > 17, 50.0, 0.0)
+    lane = lane_of(measured, force, gain_file)
+    # The other side took the tick to be free: no response, nothing identified.
+    measured[20] = -3e-18
+    other = lane_of(measured, force, gain_file)
+    parted = replay(lane._replace(command=other.command, identified=other.identified), gain_file)
+    assert (parted.parted, parted.compared, parted.ticks, parted.near) == (22, 22, 40, 1)
+    assert parted.difference <= 1e-13
+
+
+def test_a_difference_away_from_thresholds_is_not_excused(gain_file):
+    measured = np.arange(-20, 20) * 5e-6
+    measured[20] = 3e-18
+    lane = lane_of(measured, np.where(np.arange(40) > 17, 50.0, 0.0), gain_file)
+    command = lane.command.copy()
+    command[19:] += 1e-9 * np.ptp(command)
+    seen = replay(lane._replace(command=command), gain_file)
+    assert seen.parted is None and seen.compared == 40
+    assert seen.difference == pytest.approx(1e-9, rel=1e-3) and seen.worst_tick >= 19
+
+
+def test_a_command_that_is_always_zero_allows_equality_alone():
+    ticks = np.zeros(5)
+    signals = Signals(ticks, ticks, ticks, ticks, np.arange(5, dtype=np.int32))
+    gain_file = GainFile("none", {}, 0.001, np.inf)
+    assert replay(Lane(signals, ticks, None, False), gain_file).difference == 0.0
+    signals = signals._replace(force_measured=ticks + 1e-300)
+    assert replay(Lane(signals, ticks, None, False), gain_file).difference == np.inf

@@ -1,0 +1,251 @@
+"""Tuning of one mechanism: scenarios, starts, solve, and judgement on scenarios that tuning never saw."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import qmc
+
+from jaxhil.building import build_loop
+from jaxhil.compensators import COMPENSATORS, Gain
+from jaxhil.contact import LAWS
+from jaxhil.evaluation import Outcome, evaluate, parameters_by_slot
+from jaxhil.loop import build_rig
+from jaxhil.mechanism import Mechanism
+from jaxhil.scenario import Scenario, build_scenarios
+from jaxhil.uncertainty import draw, quasi_random
+from tuning.objective import Problem, restitution_errors
+from tuning.optimiser import STATUSES, Bounds, solve
+
+# Draws of the validation come from another seed than those of training.
+VALIDATION_SEED = 0x5EED
+# In training a contact that takes longer than this many times its undelayed duration, and so many
+# seconds more, has failed.
+PATIENCE = 2.0
+SHORTEST_PATIENCE = 0.15  # s
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Numbers of scenarios to tune on, of starts, of solver steps, of scenarios to judge on; the seed."""
+
+    scenarios: int = 32
+    starts: int = 8
+    steps: int = 25
+    validation: int = 511
+    seed: int = 0
+
+
+class Figures(NamedTuple):
+    """Over all contacts of a batch: rms, 99th percentile and maximum of |e - e*|, mean of e - e*; share of
+    contacts that diverge (e > e*); largest |F_c| over the reference's peak; contacts that did not end."""
+
+    rms: float
+    p99: float
+    max: float
+    mean: float
+    diverging: float
+    peak_ratio: float
+    failed: int
+
+
+class Start(NamedTuple):
+    """One start of the solve: status, steps, rms error it ended with, after every step, and its gains."""
+
+    status: str
+    steps: int
+    rms: float
+    history: list[float]
+    gains: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What tuning found: gains (all of the compensator's), the literature's; figures of "before" (no
+    compensation), "literature" and "tuned" on the same fresh scenarios, and of their nominal run; every
+    start; outcomes and scenarios for plots; seconds spent."""
+
+    compensator: str
+    mechanism: Mechanism
+    gains: dict[str, float]
+    literature: dict[str, float]
+    figures: dict[str, Figures]
+    nominal: dict[str, Figures]
+    starts: list[Start]
+    outcomes: dict[str, Outcome]
+    scenarios: Scenario
+    settings: Settings
+    timings: dict[str, float] = field(default_factory=dict)
+
+
+def tune(
+    mechanism: Mechanism,
+    compensator: str,
+    settings: Settings,
+    report: Callable[[str], None] = lambda text: None,
+) -> Result:
+    """Tune the gains of `compensator` for `mechanism`; `report` hears of each stage."""
+    clock = _Clock()
+    law = COMPENSATORS[compensator]
+    literature = {gain.name: float(gain.nominal(mechanism)) for gain in law.gains}
+    fresh = build_scenarios(
+        mechanism,
+        draw(mechanism, settings.validation, settings.seed + VALIDATION_SEED),
+        settings.seed + VALIDATION_SEED,
+    )
+    starts, gains = [], literature
+    if any(gain.tuned(mechanism) for gain in law.gains):
+        report(f"tuning {compensator} on {settings.scenarios} scenarios from {settings.starts} starts")
+        starts = _solve(mechanism, compensator, literature, settings)
+        usable = [start for start in starts if start.status != STATUSES[2]]
+        if usable:
+            gains = min(usable, key=lambda start: start.rms).gains
+    clock.lap("tune")
+    report(f"judging on {settings.validation} fresh scenarios")
+    runs = {"before": neutral_gains(compensator, literature), "literature": literature, "tuned": gains}
+    # The nominal run is one more lane of the same batch.
+    both = jax.tree.map(
+        lambda fresh, nominal: np.concatenate([fresh, nominal], axis=-1),
+        fresh,
+        build_scenarios(mechanism),
+    )
+    loop = build_loop(mechanism, compensator, both)
+    outcomes, nominal_outcomes = {}, {}
+    for name, values in runs.items():
+        outcome = evaluate(loop, values, both)
+        outcomes[name] = jax.tree.map(lambda leaf: leaf[..., :-1], outcome)
+        nominal_outcomes[name] = jax.tree.map(lambda leaf: leaf[..., -1:], outcome)
+    clock.lap("judge")
+    return Result(
+        compensator=compensator,
+        mechanism=mechanism,
+        gains=gains,
+        literature=literature,
+        figures={name: figures(outcome) for name, outcome in outcomes.items()},
+        nominal={name: figures(outcome) for name, outcome in nominal_outcomes.items()},
+        starts=starts,
+        outcomes=outcomes,
+        scenarios=fresh,
+        settings=settings,
+        timings=clock.laps,
+    )
+
+
+def figures(outcome: Outcome) -> Figures:
+    """Summary of a batch; NaN where no contact ended."""
+    errors = outcome.error[outcome.good]
+    failed = int(np.sum(outcome.wanted & ~outcome.good))
+    if not len(errors):
+        nan = float("nan")
+        return Figures(nan, nan, nan, nan, nan, nan, failed)
+    size = np.abs(errors)
+    return Figures(
+        rms=float(np.sqrt(np.mean(errors**2))),
+        p99=float(np.percentile(size, 99)),
+        max=float(np.max(size)),
+        mean=float(np.mean(errors)),
+        diverging=float(np.mean(errors > 0)),
+        peak_ratio=float(np.max(outcome.peak_ratio[outcome.good])),
+        failed=failed,
+    )
+
+
+def neutral_gains(compensator: str, gains: dict[str, float]) -> dict[str, float]:
+    """Gains at which the compensator passes the measured force on unchanged: what "before" is judged with.
+
+    It is the same compiled program as for any other gains.
+    """
+    neutral = {
+        gain.name: gain.neutral for gain in COMPENSATORS[compensator].gains if gain.neutral is not None
+    }
+    return {**gains, **neutral}
+
+
+def _solve(mechanism, compensator, literature, settings) -> list[Start]:
+    law = COMPENSATORS[compensator]
+    tuned = [gain for gain in law.gains if gain.tuned(mechanism)]
+    names = tuple(gain.name for gain in tuned)
+    scenarios = build_scenarios(
+        mechanism, quasi_random(mechanism, settings.scenarios, settings.seed), settings.seed
+    )
+    scenarios = scenarios._replace(time_limit=_patience(mechanism, scenarios))
+    loop = build_loop(mechanism, compensator, scenarios)
+    rig = _build_rig(loop, jax.tree.map(jnp.asarray, scenarios))
+    fixed = {name: jnp.asarray(v) for name, v in literature.items() if name not in names}
+    bounds = gain_bounds(tuned, mechanism)
+    first = np.array([literature[name] for name in names])
+    solution = jax.device_get(
+        solve(
+            restitution_errors,
+            (loop, names),
+            Problem(rig, fixed),
+            bounds,
+            jnp.asarray(spread_starts(first, bounds, settings.starts, settings.seed)),
+            max_steps=settings.steps,
+        )
+    )
+    starts = []
+    for i in range(settings.starts):
+        gains = {**literature, **dict(zip(names, map(float, solution.gains[i]), strict=True))}
+        history = [float(value) for value in np.sqrt(2 * solution.history[i])]
+        status = STATUSES[int(solution.status[i])]
+        steps = int(solution.steps[i])
+        starts.append(Start(status, steps, history[-1], history[: max(steps, 1)], gains))
+    return starts
+
+
+def gain_bounds(gains: list[Gain], mechanism: Mechanism) -> Bounds:
+    """Bounds of `gains` for the optimiser."""
+    return Bounds(
+        jnp.array([float(gain.lower(mechanism)) for gain in gains]),
+        jnp.array([float(gain.upper(mechanism)) for gain in gains]),
+        jnp.array([float(gain.logarithmic) for gain in gains]),
+    )
+
+
+def spread_starts(first: np.ndarray, bounds: Bounds, number: int, seed: int) -> np.ndarray:
+    """(number, gains): the literature's gains, then Sobol points around them and over the middle of the box.
+
+    Half of the points lie within a quarter of each gain's range of the literature's value, half anywhere.
+    """
+    lower, upper = np.asarray(bounds.lower), np.asarray(bounds.upper)
+    logarithmic = np.asarray(bounds.logarithmic) > 0
+    low = np.where(logarithmic, np.log(np.where(logarithmic, lower, 1)), lower)
+    high = np.where(logarithmic, np.log(np.where(logarithmic, upper, 1)), upper)
+    place = np.where(logarithmic, np.log(np.maximum(first, np.where(logarithmic, lower, 1))), first)
+    share = np.clip((place - low) / (high - low), 0, 1)
+    points = qmc.Sobol(len(first), rng=np.random.default_rng(seed)).random(
+        1 << max(number - 1, 1).bit_length()
+    )
+    reach = np.where(np.arange(len(points)) % 2 == 0, 0.25, 1.0)[:, None]
+    shares = np.clip(share + reach * (points - 0.5), 0.02, 0.98)
+    shares = np.concatenate([share[None], shares])[:number]
+    values = low + (high - low) * shares
+    return np.where(logarithmic, np.exp(np.where(logarithmic, values, 0)), values)
+
+
+_build_rig = jax.jit(build_rig, static_argnums=0)
+
+
+def _patience(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
+    """How long [s] a contact may take in training before it has failed: some of its undelayed durations."""
+    law = LAWS[mechanism.contact.law]()
+    contact = parameters_by_slot(jax.tree.map(jnp.asarray, scenarios.contact))
+    shape = scenarios.phase.shape
+    mass = jnp.broadcast_to(jnp.asarray(scenarios.equivalent_mass), shape)
+    velocity = jnp.broadcast_to(jnp.asarray(scenarios.velocity), shape)
+    duration = np.max(jax.jit(law.reference)(contact, mass, velocity).duration, axis=0)
+    return np.minimum(PATIENCE * duration + SHORTEST_PATIENCE, scenarios.time_limit)
+
+
+class _Clock:
+    def __init__(self):
+        self.laps, self._last = {}, time.perf_counter()
+
+    def lap(self, name):
+        now = time.perf_counter()
+        self.laps[name], self._last = now - self._last, now
