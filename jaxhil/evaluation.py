@@ -77,6 +77,23 @@ def evaluate(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario) -> Outco
     `gains` are scalars, or all of them one value per lane.
     """
     number = len(scenarios.velocity)
+    order = _by_duration(scenarios)
+    outcome = jax.device_get(run_tiles(loop, *deal(scenarios, gains)))
+
+    def unfold(leaf):
+        leaf = np.moveaxis(leaf, (0, 1), (-2, -3))
+        leaf = leaf.reshape(*leaf.shape[:-3], -1)
+        back = np.empty_like(leaf[..., :number])
+        back[..., order] = leaf[..., :number]
+        return back
+
+    return jax.tree.map(unfold, outcome)
+
+
+def deal(scenarios: Scenario, gains: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any], Scenario]:
+    """Arguments of `run_tiles`: gains common to all lanes, gains per lane and scenarios as
+    (devices, tiles, ..., lanes of a tile), sorted by expected duration and padded with idle lanes."""
+    number = len(scenarios.velocity)
     devices = jax.device_count()
     tile = TILE
     while tile > SMALLEST_TILE and tile * devices >= 2 * number:
@@ -85,11 +102,10 @@ def evaluate(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario) -> Outco
     tiles = -(-number // (tile * devices))
     tiles = 1 << (tiles - 1).bit_length() if tiles <= 16 else -(-tiles // 16) * 16
     lanes = tiles * tile * devices
-    order = np.argsort(-expected_duration(scenarios), kind="stable")
-    padded = np.resize(order, lanes)
-    padding = np.arange(lanes) >= number
+    padded = np.resize(_by_duration(scenarios), lanes)
+    idle = np.arange(lanes) >= number
     scenarios = jax.tree.map(lambda leaf: np.asarray(leaf)[..., padded], scenarios)
-    contacts = np.where(padding, 0, scenarios.contacts).astype(np.int32)
+    contacts: Any = np.where(idle, 0, scenarios.contacts).astype(np.int32)
     scenarios = scenarios._replace(contacts=contacts)
     values = {name: np.asarray(value, float) for name, value in gains.items()}
     per_lane = {name: value[padded] for name, value in values.items() if value.ndim}
@@ -100,20 +116,14 @@ def evaluate(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario) -> Outco
         leaf = leaf.reshape(*leaf.shape[:-1], tiles, devices, tile)
         return np.moveaxis(leaf, (-2, -3), (0, 1))
 
-    folded = jax.tree.map(fold, (per_lane, scenarios))
-    outcome = jax.device_get(_tiles(loop, common, *folded))
-
-    def unfold(leaf):
-        leaf = np.moveaxis(leaf, (0, 1), (-2, -3))
-        leaf = leaf.reshape(*leaf.shape[:-3], lanes)
-        back = np.empty_like(leaf[..., :number])
-        back[..., order] = leaf[..., :number]
-        return back
-
-    return jax.tree.map(unfold, outcome)
+    return common, *jax.tree.map(fold, (per_lane, scenarios))
 
 
-def expected_duration(scenarios: Scenario) -> Float[Array, "*batch"]:
+def _by_duration(scenarios):
+    return np.argsort(-expected_duration(scenarios), kind="stable")
+
+
+def expected_duration(scenarios: Scenario) -> np.ndarray:
     """Order of a run's duration [s]: half a period sqrt(M/k) per contact; for sorting only."""
     stiffness = np.asarray(scenarios.contact.stiffness)
     while stiffness.ndim > 2:
@@ -124,7 +134,8 @@ def expected_duration(scenarios: Scenario) -> Float[Array, "*batch"]:
 
 
 @partial(jax.jit, static_argnums=0)
-def _tiles(loop, common, per_lane, scenarios):
+def run_tiles(loop: Loop, common: Any, per_lane: Any, scenarios: Scenario) -> Outcome:
+    """Outcome of what `deal` made, each leaf (devices, tiles, ..., lanes of a tile)."""
     mesh = jax.make_mesh((jax.device_count(),), ("device",), axis_types=(AxisType.Auto,))
 
     def one_device(common, arguments):

@@ -97,8 +97,8 @@ class Sensed(NamedTuple):
     force's lagged reading and of work increments; the last sample as `_sample` takes it, the lag's
     reading, the position sample of the panel before the run."""
 
-    force: Float[Array, "samples *batch"]
-    position: Float[Array, "samples *batch"]
+    force: Any
+    position: Any
     reading: Float[Array, "samples *batch"] | None
     work: Float[Array, "samples *batch"] | None
     last: tuple[Array, Array, Array]

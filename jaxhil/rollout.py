@@ -78,17 +78,30 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario, lane_axis: str | None 
 
 def run_contacts(loop: Loop, gains: Gains, rig: Rig, lane_axis: str | None = None) -> Metrics:
     """`rollout` on a rig built before, for when many gains are tried on it."""
-    run = start(loop, rig, gains)
 
-    def going(run):
-        some = jnp.any(run.active)
-        return lax.pmax(some, lane_axis) if lane_axis else some
+    def some(lanes):
+        found = jnp.any(lanes)
+        return lax.pmax(found, lane_axis) if lane_axis else found
 
     def body(run):
         run, _ = stretch(loop, rig, gains, run, record=False)
-        return turn_over(loop, rig, gains, run)
+        if loop.is_two_sided:
+            return turn_over(loop, rig, gains, run)
+        # Most stretches end no contact: lanes of a tile end theirs at about the same time. The rings, which
+        # a turn-over leaves alone, stay outside the branch, where they need not be copied.
+        rings = run.state.sensed
+        light = rings._replace(force=None, position=None, reading=None, work=None)
+        light = run._replace(state=run.state._replace(sensed=light))
+        light = lax.cond(
+            some(_pending(rig, run)), lambda run: turn_over(loop, rig, gains, run), lambda run: run, light
+        )
+        sensed = light.state.sensed._replace(
+            force=rings.force, position=rings.position, reading=rings.reading, work=rings.work
+        )
+        return light._replace(state=light.state._replace(sensed=sensed))
 
-    return lax.while_loop(going, body, run).metrics
+    run = start(loop, rig, gains)
+    return lax.while_loop(lambda run: some(run.active), body, run).metrics
 
 
 def record(loop: Loop, gains: Gains, scenario: Scenario, stretches: int) -> tuple[Metrics, Tick]:
@@ -178,9 +191,8 @@ def stretch(loop: Loop, rig: Rig, gains: Gains, run: Run, record: bool) -> tuple
 def turn_over(loop: Loop, rig: Rig, gains: Gains, run: Run, skip_flight: bool = True) -> Run:
     """Enter contacts that are over, begin the next, skip the free flight between two surfaces."""
     watch, state, scenario = run.watch, run.state, rig.scenario
-    age = run.tick - state.entry_tick
-    status = judge(scenario, watch, age)
-    over = (watch.over | (status != OK)) & run.active
+    status = judge(scenario, watch, run.tick - state.entry_tick)
+    over = _pending(rig, run)
     ticks = jnp.broadcast_to(run.tick - _first_tick(loop), run.index.shape)
     metrics = collect(scenario, run.metrics, watch, run.index, over, status, ticks)
     index = run.index + over.astype(jnp.int32)
@@ -203,6 +215,12 @@ def turn_over(loop: Loop, rig: Rig, gains: Gains, run: Run, skip_flight: bool = 
         state = _restart(loop, gains, state, entered, over, over)
         watch = _choose(over, blank, watch)
     return run._replace(state=state, watch=watch, metrics=metrics, index=index, active=active)
+
+
+def _pending(rig, run):
+    """Lanes whose contact is over, or has failed."""
+    status = judge(rig.scenario, run.watch, run.tick - run.state.entry_tick)
+    return (run.watch.over | (status != OK)) & run.active
 
 
 def _first_tick(loop):

@@ -9,6 +9,7 @@ from jaxhil.evaluation import compare_with_reference
 from jaxhil.loop import Loop, Rig
 from jaxhil.rollout import run_contacts
 
+SCALE = 0.01  # an error of one: the solver's first steps are damped as for residuals of order one
 FAILED = 3.0  # error of a contact that does not end, or is not reached: as bad as a wild divergence
 
 
@@ -25,8 +26,8 @@ def restitution_errors(
     problem: Problem,
     lane_axis: str | None = None,
 ) -> Float[Array, "residuals"]:
-    """e - e* of every contact of every scenario, over the root of their number: the loss is half the mean
-    square. Contacts that fail count with the constant error `FAILED`.
+    """e - e* in units of `SCALE` of every contact of every scenario, over the root of their number: the loss
+    is half the mean square. Contacts that fail count with the constant error `FAILED`.
 
     `static` is the loop and the names of the gains that are tuned.
     """
@@ -40,4 +41,4 @@ def restitution_errors(
     error = jnp.where(usable, outcome.error, FAILED)
     error = jnp.where(outcome.wanted, error, 0)
     count = jnp.sum(outcome.wanted).astype(error.dtype)
-    return (error / jnp.sqrt(count)).reshape(-1)
+    return (error / (SCALE * jnp.sqrt(count))).reshape(-1)

@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
+from jax.extend.core import jaxpr_as_fun
 from jax.sharding import AxisType, PartitionSpec
 from jaxtyping import Array, Float, Int
 
@@ -81,6 +82,8 @@ def solve(
     function = _with_jacobian(
         lambda free, arguments: residuals(static, to_gains(free, arguments[0]), arguments[1], LANES),
         len(starts),
+        starts[0],
+        (bounds, arguments),
     )
     solver = _Recording(optx.LevenbergMarquardt(rtol=rtol, atol=atol), max_steps)
 
@@ -102,10 +105,10 @@ def solve(
     return jax.vmap(one)(starts)
 
 
-def _with_jacobian(residuals, copies):
+def _with_jacobian(residuals, copies, free, arguments):
     """(residuals, loss) whose derivative is one product with a Jacobian computed once, in forward mode.
 
-    Under `jax.vmap` the mapped copies are dealt out to the devices; the solver around them is not: its
+    `free` and `arguments` are like those to come; `copies` of the function run under one `jax.vmap`. Under `jax.vmap` the mapped copies are dealt out to the devices; the solver around them is not: its
     linear algebra does not run inside `jax.shard_map`.
     """
 
@@ -120,9 +123,7 @@ def _with_jacobian(residuals, copies):
     def mapped(free, arguments):
         return jax.vmap(value_and_jacobian, (0, None), axis_name=LANES)(free, arguments)
 
-    # Jitted, so that it is traced once however often the solver asks for it.
-    @jax.jit
-    def shared(free, arguments):
+    def dealt(free, arguments):
         devices = math.gcd(jax.device_count(), copies)
         mesh = jax.make_mesh(
             (devices,), ("device",), axis_types=(AxisType.Auto,), devices=jax.devices()[:devices]
@@ -131,6 +132,16 @@ def _with_jacobian(residuals, copies):
         return jax.shard_map(mapped, mesh=mesh, in_specs=(own, common), out_specs=own, check_vma=False)(
             free, arguments
         )
+
+    # Traced once, however often the solver asks for it: tracing costs more than many a step.
+    leaves, structure = jax.tree.flatten(arguments)
+    traced = jax.make_jaxpr(lambda free, *leaves: dealt(free, jax.tree.unflatten(structure, leaves)))(
+        jax.ShapeDtypeStruct((copies, *free.shape), free.dtype),
+        *(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves),
+    )
+
+    def shared(free, arguments):
+        return tuple(jaxpr_as_fun(traced)(free, *jax.tree.leaves(arguments)))
 
     @jax.custom_batching.custom_vmap
     def several(free, arguments):

@@ -18,7 +18,7 @@ from jaxhil.loop import build_rig
 from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import draw, quasi_random
-from tuning.objective import Problem, restitution_errors
+from tuning.objective import SCALE, Problem, restitution_errors
 from tuning.optimiser import STATUSES, Bounds, solve
 
 # Draws of the validation come from another seed than those of training.
@@ -34,7 +34,7 @@ class Settings:
     """Numbers of scenarios to tune on, of starts, of solver steps, of scenarios to judge on; the seed."""
 
     scenarios: int = 32
-    starts: int = 8
+    starts: int = 4
     steps: int = 25
     validation: int = 511
     seed: int = 0
@@ -191,7 +191,7 @@ def _solve(mechanism, compensator, literature, settings) -> list[Start]:
     starts = []
     for i in range(settings.starts):
         gains = {**literature, **dict(zip(names, map(float, solution.gains[i]), strict=True))}
-        history = [float(value) for value in np.sqrt(2 * solution.history[i])]
+        history = [float(value) for value in SCALE * np.sqrt(2 * solution.history[i])]
         status = STATUSES[int(solution.status[i])]
         steps = int(solution.steps[i])
         starts.append(Start(status, steps, history[-1], history[: max(steps, 1)], gains))

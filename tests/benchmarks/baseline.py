@@ -19,12 +19,7 @@ from jaxhil.metrics import NOT_REACHED, build_rules
 from jaxhil.scenario import Scenario
 
 SOURCE = Path(__file__).with_name("baseline.cpp")
-# Without threaded jumps every choice between two values stays a blend; with them some become masked
-# stores, which are slow. None of the flags changes a result.
-FLAGS = (
-    "-O3", "-march=native", "-std=c++17", "-fno-trapping-math", "-fno-math-errno",
-    "-fno-thread-jumps", "-pthread",
-)  # fmt: skip
+FLAGS = ("-O3", "-march=native", "-std=c++17", "-pthread")
 KINDS = {"none": 0, "phase_lead": 1, "response_error": 2}
 # The order of baseline.cpp's `Gain`; a compensator that lacks one does not read it.
 GAINS = tuple(gain.name for gain in ResponseError.gains)

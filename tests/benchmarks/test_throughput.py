@@ -1,0 +1,144 @@
+"""Throughput of the loop beside the C++ baseline, cost of its gradient, and time per tick of the runtime.
+
+Everything that is compared runs in this one process, in turn, and the best of many repetitions counts: the
+machine is shared. Run with `pytest -m benchmark -s tests/benchmarks`.
+"""
+
+import time
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from baseline import compile_baseline
+from gain_documents import gain_document
+
+from jaxhil import evaluation
+from jaxhil.building import build_loop
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.loop import build_rig
+from jaxhil.mechanism_file import load
+from jaxhil.rollout import run_contacts
+from jaxhil.runtime import Controller
+from jaxhil.scenario import build_scenarios
+from jaxhil.uncertainty import draw
+
+pytestmark = pytest.mark.benchmark
+LANES = 8192
+REPEATS = 12
+
+
+# The built-in mechanisms that the baseline can run: 1, 1, 1 and 3 contacts.
+ONE_SIDED = ("rig-300kg", "rod-100n-mm", "claw-350kg", "varying")
+
+
+def case(compensator, lanes, names=("varying",)):
+    """Mechanisms, drawn, in one batch, at the literature's gains for the last of them."""
+    batches = []
+    for name in names:
+        mechanism = load(name).mechanism
+        batches.append(build_scenarios(mechanism, draw(mechanism, lanes // len(names), 1)))
+    scenarios = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *batches)
+    mechanism = load(names[-1]).mechanism
+    gains = {g.name: float(g.nominal(mechanism)) for g in COMPENSATORS[compensator].gains}
+    return build_loop(mechanism, compensator, scenarios), gains, scenarios
+
+
+def best(*calls, repeats=REPEATS):
+    """Shortest time of each call, the calls taking turns."""
+    times = [[] for _ in calls]
+    for _ in range(repeats):
+        for call, seen in zip(calls, times, strict=True):
+            seen.append(call())
+    return [min(seen) for seen in times]
+
+
+def timed(function):
+    def call():
+        begin = time.perf_counter()
+        jax.block_until_ready(function())
+        return time.perf_counter() - begin
+
+    return call
+
+
+@pytest.mark.parametrize("names", [("varying",), ONE_SIDED], ids=["varying", "several"])
+@pytest.mark.parametrize("compensator", ["none", "response_error"])
+def test_rollout_beside_the_compiled_baseline(compensator, names, capsys):
+    baseline = compile_baseline()
+    if baseline is None:
+        pytest.skip("no C++ compiler")
+    loop, gains, scenarios = case(compensator, LANES, names)
+    on_device = jax.tree.map(jnp.asarray, scenarios)
+    rig = jax.jit(build_rig, static_argnums=0)(loop, on_device)
+    arguments = evaluation.deal(scenarios, gains)
+    ticks = np.asarray(evaluation.run_tiles(loop, *arguments).metrics.ticks).max(axis=-2)
+    # A tile runs as long as its slowest lane: (devices, tiles, tile) lanes.
+    lane_steps = int(np.sum(ticks.max(axis=-1) * ticks.shape[-1]))
+    horizon = int(ticks.max())
+    jax_time, whole, cpp_time = best(
+        timed(lambda: evaluation.run_tiles(loop, *arguments)),
+        timed(lambda: evaluation.evaluate(loop, gains, scenarios)),
+        lambda: baseline.run(loop, rig, gains, on_device, horizon)["seconds"],
+    )
+    cpp_steps = LANES * horizon / cpp_time
+    with capsys.disabled():
+        label = f"{compensator}, {' + '.join(names)}"
+        print(
+            f"\n{label}: lane-steps/s of rollout over C++: {lane_steps / jax_time / cpp_steps:.2f}"
+            f" ({lane_steps / jax_time:.3g} over {cpp_steps:.3g})"
+            f"\n{label}: scenarios/s of rollout over C++ to the fixed horizon of {horizon} ticks:"
+            f" {cpp_time / jax_time:.2f} (with sorting and padding {cpp_time / whole:.2f};"
+            f" a lane needs {lane_steps / LANES / horizon:.2f} of the horizon)"
+        )
+    assert lane_steps / jax_time >= 0.35 * cpp_steps
+    if len(names) > 1:
+        assert cpp_time >= jax_time
+
+
+@pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
+def test_gradient_costs_little_more_than_its_rollouts(compensator, capsys):
+    loop, gains, scenarios = case(compensator, 256)
+    rig = jax.jit(build_rig, static_argnums=0)(loop, jax.tree.map(jnp.asarray, scenarios))
+    names = tuple(gains)
+
+    def restitution(values, rig):
+        return run_contacts(loop, dict(zip(names, values, strict=True)), rig).restitution
+
+    values = jnp.array([gains[name] for name in names])
+    primal, full = jax.jit(restitution), jax.jit(jax.jacfwd(restitution))
+    jax.block_until_ready((primal(values, rig), full(values, rig)))
+    one, jacobian = best(timed(partial(primal, values, rig)), timed(partial(full, values, rig)))
+    with capsys.disabled():
+        print(
+            f"\n{compensator}: gradient over {len(names)} gains costs {jacobian / one:.1f} rollouts,"
+            f" {jacobian / one / (1 + len(names)):.2f} (1 + P)"
+        )
+    assert jacobian <= 1.5 * (1 + len(names)) * one
+
+
+@pytest.mark.parametrize("compensator", ["none", "phase_lead", "response_error"])
+def test_time_per_tick_of_the_runtime(compensator, capsys):
+    controller = Controller.from_dict(gain_document(compensator))
+    ticks = np.arange(200_000)
+    position = 5e-4 * np.sin(ticks * 0.02) + 1e-4
+    rows = list(
+        zip(*(a.tolist() for a in (1e5 * position, position, 5e-6 * position, position)), strict=True)
+    )
+    took, empty = [], []
+    clock = time.perf_counter_ns
+    for row in rows:
+        begin = clock()
+        controller.step(*row)
+        took.append(clock() - begin)
+        begin = clock()
+        empty.append(clock() - begin)
+    median, tail = np.percentile(took, [50, 99.9]) / 1e3
+    with capsys.disabled():
+        print(
+            f"\n{compensator}: runtime {median:.2f} us per tick (median), {tail:.2f} us (99.9th percentile);"
+            f" empty loop {np.median(empty) / 1e3:.2f} and {np.percentile(empty, 99.9) / 1e3:.2f} us"
+        )
+    assert controller.status == "ok"
+    assert median <= 10

@@ -1,0 +1,344 @@
+"""The command line: exit codes, one JSON document, one line for what a user got wrong, files kept."""
+
+import json
+import os
+import subprocess
+import sys
+from typing import NamedTuple
+
+import pytest
+
+from jaxhil.mechanism_file import builtin_names, builtin_path
+from tuning import environment
+from tuning.__main__ import main
+from tuning.cli import DEFAULT_PLOT, complete_plot
+from tuning.commands.tune import folder_name, is_better
+from tuning.tune import Figures
+
+TINY = ["--scenarios", "4", "--starts", "2", "--steps", "2", "--validation", "16"]
+CONTACT_KEYS = {
+    *("restitution", "reference_restitution", "error", "peak_force", "duration", "approach_velocity"),
+}
+
+
+class Ran(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+    @property
+    def document(self):
+        return json.loads(self.out, parse_constant=pytest.fail)
+
+
+@pytest.fixture(autouse=True)
+def no_cache(monkeypatch, tmp_path):
+    """Compiled programs of tests are not kept: a folder below a file cannot be made."""
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("JAXHIL_CACHE", str(tmp_path / "file" / "cache"))
+
+
+@pytest.fixture
+def jaxhil(capsys):
+    def call(*arguments):
+        capsys.readouterr()
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as stop:
+            code = stop.code
+        return Ran(code, *capsys.readouterr())
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory):
+    """A tiny tuning, end to end: its folder."""
+    folder = tmp_path_factory.mktemp("tuned")
+    main(["tune", "rig-300kg", "--compensator", "phase_lead", "-o", str(folder), *TINY])
+    return folder / "rig-300kg"
+
+
+def refused(ran, *words):
+    """Exit code 2, nothing on standard output, one line on standard error with all `words`."""
+    assert ran.code == 2
+    assert ran.out == ""
+    assert ran.err.startswith("jaxhil: ") and ran.err.count("\n") == 1 and ran.err.endswith("\n")
+    for word in words:
+        assert word in ran.err
+
+
+def test_simulate_says_what_it_did_in_json(jaxhil):
+    ran = jaxhil("simulate", "rig-300kg", "--json")
+    assert ran.code == 1 and ran.err == ""
+    document = ran.document
+    assert document["mechanism"] == "rig-300kg"
+    assert document["compensator"] == "none"
+    assert document["status"] == "ok"
+    (contact,) = document["contacts"]
+    assert contact.keys() >= CONTACT_KEYS
+    assert contact["error"] == pytest.approx(contact["restitution"] - contact["reference_restitution"])
+    assert contact["error"] > 0.3
+    assert contact["approach_velocity"] == pytest.approx(0.005)
+
+
+def test_limit_decides_the_exit_code(jaxhil):
+    assert jaxhil("simulate", "rig-300kg", "--limit", "10").code == 0
+    ran = jaxhil("simulate", "rig-300kg", "--limit", "0.1")
+    assert ran.code == 1
+    assert "divergence" in ran.out and "0.1" in ran.out
+
+
+def test_set_reaches_the_mechanism(jaxhil):
+    ran = jaxhil("simulate", "rig-300kg", "--json", "--set", "approach.velocity=0.01", "--set", "name=other")
+    document = ran.document
+    assert document["mechanism"] == "other"
+    assert document["contacts"][0]["approach_velocity"] == pytest.approx(0.01)
+
+
+def test_a_run_that_fails_is_told(jaxhil):
+    # Only 1 N is ever measured: the bodies are not stopped within any time.
+    weak = ["--set", "rig.force_sensor.range=1e-6"]
+    ran = jaxhil("simulate", "rig-300kg", "--json", *weak)
+    assert ran.code == 1
+    document = ran.document
+    assert document["status"] == "timeout"
+    assert document["contacts"][0]["restitution"] is None
+    assert document["contacts"][0]["error"] is None
+    assert "timeout" in jaxhil("simulate", "rig-300kg", *weak).out
+
+
+def test_default_mechanism_and_mechanism_files_are_the_same_thing(jaxhil):
+    one = jaxhil("simulate", builtin_path("rig-300kg"), "--json").document
+    assert one == jaxhil("simulate", "rig-300kg", "--json").document
+
+
+def test_tune_writes_gains_and_plots(jaxhil, tuned):
+    assert {path.name for path in tuned.iterdir()} == {"gains.json", "errors.png", "loss.png", "contact.png"}
+    document = json.loads((tuned / "gains.json").read_text())
+    assert document["compensator"] == "phase_lead"
+    assert document["figures"].keys() == {"nominal", "robust"}
+    for figures in document["figures"].values():
+        assert figures.keys() == {"before", "literature", "tuned"}
+    assert (
+        document["envelope"]["contact_frequency"]["low"]
+        < 3
+        < document["envelope"]["contact_frequency"]["high"]
+    )
+
+
+def test_tune_reports_tables_or_json(jaxhil, tuned, tmp_path):
+    arguments = ["tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY]
+    table = jaxhil(*arguments)
+    assert table.code == 1
+    for word in ("before", "literature", "tuned", "rms", "99th", "lead_filter", "step limit", "exceeds 0.01"):
+        assert word in table.out
+    assert "judging on 16 fresh scenarios" in table.err
+    ran = jaxhil(*arguments, "--json", "--limit", "inf")
+    assert ran.code == 0
+    assert ran.document["verdict"] == "good"
+    (entry,) = ran.document["mechanisms"]
+    again = json.loads((tuned / "gains.json").read_text())
+    assert entry["gains"] == again["gains"]
+    assert json.loads((tmp_path / "rig-300kg" / "gains.json").read_text())["sha256"] == again["sha256"]
+
+
+def test_bad_files_do_not_stop_the_others(jaxhil, tuned, tmp_path):
+    files = ["nowhere.toml", "rig-300kg", builtin_path("rig-300kg")]
+    arguments = ["--compensator", "phase_lead", "-o", tmp_path, "--json", "--limit", "inf", *TINY]
+    ran = jaxhil("tune", *files, *arguments)
+    assert ran.code == 2
+    missing, twice = ran.document["problems"]
+    assert "nowhere.toml" in missing and "name" in twice
+    assert missing in ran.err and twice in ran.err
+    assert [entry["mechanism"] for entry in ran.document["mechanisms"]] == ["rig-300kg"]
+    assert (tmp_path / "rig-300kg" / "gains.json").exists()
+
+
+def test_interrupted_keeps_what_was_finished(jaxhil, tuned, tmp_path, monkeypatch):
+    from tuning.tune import tune
+
+    def stopped_at_the_second(mechanism, *arguments):
+        if mechanism.name == "rod-100n-mm":
+            raise KeyboardInterrupt
+        return tune(mechanism, *arguments)
+
+    monkeypatch.setattr("tuning.tune.tune", stopped_at_the_second)
+    files = ["rig-300kg", "rod-100n-mm", "--compensator", "phase_lead"]
+    ran = jaxhil("tune", *files, "-o", tmp_path, "--json", *TINY)
+    assert ran.code == 130
+    assert ran.document["interrupted"] and len(ran.document["mechanisms"]) == 1
+    assert "1 of 2" in ran.err
+    assert (tmp_path / "rig-300kg" / "gains.json").exists()
+
+
+def test_interrupt_anywhere_is_130(jaxhil, monkeypatch):
+    def interrupted(arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tuning.cli.parse", interrupted)
+    assert jaxhil("mechanisms") == Ran(130, "", "jaxhil: interrupted\n")
+
+
+def test_verify_accepts_what_tune_wrote(jaxhil, tuned):
+    ran = jaxhil("verify", tuned, "--json", "--scenarios", "2")
+    assert ran.code == 0
+    assert ran.document["verdict"] is True
+    assert len(ran.document["replay"]) == 2
+    assert "Good" in jaxhil("verify", tuned / "gains.json", "--scenarios", "2").out
+
+
+def test_verify_finds_tampering(jaxhil, tuned, tmp_path):
+    document = json.loads((tuned / "gains.json").read_text())
+    document["gains"]["phase_lead"]["value"] *= 1.001
+    path = tmp_path / "gains.json"
+    path.write_text(json.dumps(document))
+    ran = jaxhil("verify", path, "--json")
+    assert ran.code == 1
+    assert ran.document["verdict"] is False
+    assert "sha256" in ran.document["reasons"][0]
+    path.write_text("{")
+    assert jaxhil("verify", path).code == 1
+
+
+def test_simulate_with_a_gain_file(jaxhil, tuned):
+    path = tuned / "gains.json"
+    ran = jaxhil("simulate", "--gains", path, "--json")
+    document = ran.document
+    assert (document["mechanism"], document["compensator"]) == ("rig-300kg", "phase_lead")
+    gains = json.loads(path.read_text())["gains"]
+    assert document["gains"] == {name: entry["value"] for name, entry in gains.items()}
+    faster = jaxhil("simulate", "--gains", path, "--json", "--set", "approach.velocity=0.02").document
+    assert faster["contacts"][0]["approach_velocity"] == pytest.approx(0.02)
+    other = jaxhil("simulate", "rod-100n-mm", "--gains", path, "--json").document
+    assert other["mechanism"] == "rod-100n-mm"
+
+
+def test_gains_that_do_not_fit_are_refused(jaxhil, tuned):
+    path = tuned / "gains.json"
+    refused(jaxhil("simulate", "--gains", path, "--compensator", "none"), "--compensator", "phase_lead")
+    slower = ["--set", "rig.control_period=0.002"]
+    refused(jaxhil("simulate", "--gains", path, *slower), "control_period", "0.001", "0.002")
+    refused(jaxhil("simulate", "--gains", path, "--set", "bodies.weight=1"), "--set", "bodies.weight")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["simulate", "nowhere.toml"], ["nowhere.toml", "no such file"]),
+        (["simulate", "rig-300"], ["did you mean rig-300kg"]),
+        (["simulate", "--set", "approach.velocity=-1"], ["approach.velocity", "-1", "> 0"]),
+        (["simulate", "--set", "approach.speed=1"], ["approach.speed", "unknown key"]),
+        (["simulate", "--compensator", "magic"], ["magic", "none, phase_lead, response_error"]),
+        (["simulate", "--gains", "nowhere.json"], ["nowhere.json"]),
+        (["simulate", "--limit", "nan"], ["--limit"]),
+        (["simulate", "--plot=plot.doc"], ["--plot", "plot.doc", ".png"]),
+        (["simulate", "--seed", "-1"], ["--seed", "-1"]),
+        (["tune", "--starts", "0"], ["--starts", ">= 1"]),
+        (["tune", "--compensator", "magic"], ["magic", "response_error"]),
+        (["verify", "nowhere.json"], ["nowhere.json", "No such file"]),
+        (["verify", "x", "--scenarios", "0"], ["--scenarios"]),
+    ],
+)
+def test_unusable_input_is_told_in_one_line(jaxhil, arguments, words):
+    refused(jaxhil(*arguments), *words)
+
+
+def test_a_plot_that_cannot_be_written_is_told(jaxhil, tmp_path):
+    (tmp_path / "taken").touch()
+    ran = jaxhil("simulate", "rig-300kg", "--plot", tmp_path / "taken" / "plot.png")
+    refused(ran, "taken")
+
+
+def test_an_output_folder_that_cannot_be_made_is_told(jaxhil, tmp_path):
+    (tmp_path / "taken").touch()
+    refused(jaxhil("tune", "rig-300kg", "-o", tmp_path / "taken"), "taken")
+
+
+def test_what_goes_wrong_inside_is_one_line(jaxhil, monkeypatch):
+    def broken(*arguments):
+        raise ZeroDivisionError("inside")
+
+    monkeypatch.setattr("tuning.commands.mechanisms.load", broken)
+    refused(jaxhil("mechanisms"), "internal error", "ZeroDivisionError: inside")
+
+
+@pytest.mark.parametrize("arguments", [["--no-such"], ["fly"], [], ["tune", "--starts", "x"], ["verify"]])
+def test_wrong_usage_is_2(jaxhil, arguments):
+    ran = jaxhil(*arguments)
+    assert ran.code == 2 and ran.out == "" and ran.err != ""
+
+
+@pytest.mark.parametrize("command", ["simulate", "tune", "verify", "mechanisms"])
+def test_help_has_an_example(jaxhil, command):
+    ran = jaxhil(command, "--help")
+    assert ran.code == 0
+    assert f"Example: jaxhil {command}" in ran.out
+    assert "--json" in ran.out
+
+
+def test_help_and_refusals_do_not_import_jax():
+    program = (
+        "import sys\nfrom tuning.__main__ import main\n"
+        "for words in (['tune', '--help'], ['mechanisms'], ['tune', '--compensator', 'x'], ['tune', 'x']):\n"
+        "    try: main(words)\n"
+        "    except SystemExit: pass\n"
+        "assert not {'jax', 'matplotlib'} & set(sys.modules), 'slow imports'"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_module_runs_like_the_command_and_a_closed_pipe_is_quiet():
+    command = [sys.executable, "-m", "tuning", "mechanisms"]
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_mechanisms_lists_the_built_in_files(jaxhil):
+    entries = jaxhil("mechanisms", "--json").document["mechanisms"]
+    assert [entry["name"] for entry in entries] == builtin_names()
+    assert all(entry["source"] for entry in entries)
+    rig = next(entry for entry in entries if entry["name"] == "rig-300kg")
+    assert rig["contact_frequencies"] == [pytest.approx(3.0, rel=1e-5)]
+    assert all(entry["source"][:20] in jaxhil("mechanisms").out for entry in entries)
+
+
+def test_plot_without_a_name_gets_one():
+    assert complete_plot(["simulate", "--plot", "a.png", "x"]) == ["simulate", "--plot", "a.png", "x"]
+    assert complete_plot(["--plot", "--json"]) == ["--plot", DEFAULT_PLOT, "--json"]
+    assert complete_plot(["x", "--plot"]) == ["x", "--plot", DEFAULT_PLOT]
+
+
+def test_names_become_folders():
+    assert folder_name("rig-300kg") == "rig-300kg"
+    assert folder_name("../a b/c") == "a_b_c"
+    assert folder_name("..") == "mechanism"
+
+
+def test_better_means_fewer_failures_then_smaller_errors():
+    def made(rms, failed):
+        return Figures(rms, rms, rms, rms, 0.0, 1.0, failed)
+
+    assert is_better(made(0.1, 0), made(0.2, 0)) and not is_better(made(0.2, 0), made(0.1, 0))
+    assert is_better(made(0.2, 0), made(0.1, 1)) and not is_better(made(float("nan"), 0), made(0.1, 0))
+
+
+def test_flags_leave_the_user_s_alone(monkeypatch):
+    assert environment.flags("").split() == [
+        f"--xla_force_host_platform_device_count={environment.usable_cores()}",
+        "--xla_backend_optimization_level=1",
+    ]
+    given = "--xla_backend_optimization_level=3 --xla_dump_to=x"
+    assert environment.flags(given).startswith(given)
+    assert environment.flags(given).count("optimization_level") == 1
+
+
+def test_cache_folder_is_made_or_done_without(monkeypatch, tmp_path):
+    assert environment.cache_folder() is None
+    monkeypatch.setenv("JAXHIL_CACHE", str(tmp_path / "new"))
+    assert environment.cache_folder() == tmp_path / "new"
+    assert (tmp_path / "new").is_dir()

@@ -1,0 +1,83 @@
+"""Batches on every core: order, padding and tiles change no result, and most calls reuse a program."""
+
+import numpy as np
+import pytest
+
+from jaxhil import evaluation
+from jaxhil.building import build_loop
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.evaluation import evaluate
+from jaxhil.mechanism_file import load
+from jaxhil.scenario import build_scenarios
+from jaxhil.uncertainty import draw
+from tuning.tune import neutral_gains
+
+
+def setting(compensator="response_error", lanes=40, name="varying", seed=1, overrides=()):
+    mechanism = load(name, overrides).mechanism
+    scenarios = build_scenarios(mechanism, draw(mechanism, lanes, seed))
+    gains = {g.name: float(g.nominal(mechanism)) for g in COMPENSATORS[compensator].gains}
+    return build_loop(mechanism, compensator, scenarios), gains, scenarios
+
+
+def lanes_of(scenarios, lanes):
+    return type(scenarios)(*(take(leaf, lanes) for leaf in scenarios))
+
+
+def take(leaf, lanes):
+    if isinstance(leaf, tuple):
+        return type(leaf)(*(take(part, lanes) for part in leaf))
+    return np.asarray(leaf)[..., lanes]
+
+
+def test_a_lane_does_not_depend_on_its_batch():
+    loop, gains, scenarios = setting(lanes=70)
+    whole = evaluate(loop, gains, scenarios)
+    some = np.array([63, 2, 17])
+    part = evaluate(loop, gains, lanes_of(scenarios, some))
+    wanted = part.wanted
+    for field in ("error", "reference_restitution", "peak_ratio"):
+        ours, theirs = getattr(part, field)[wanted], getattr(whole, field)[..., some][wanted]
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-13)
+    np.testing.assert_array_equal(part.metrics.status, whole.metrics.status[..., some])
+
+
+def test_gains_per_lane_equal_common_gains():
+    loop, gains, scenarios = setting(lanes=20)
+    common = evaluate(loop, gains, scenarios)
+    each = evaluate(loop, {name: np.full(20, value) for name, value in gains.items()}, scenarios)
+    np.testing.assert_allclose(each.error[each.wanted], common.error[each.wanted], rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
+def test_neutral_gains_are_no_compensation(compensator):
+    loop, gains, scenarios = setting(compensator)
+    plain, _, _ = setting("none")
+    neutral = evaluate(loop, neutral_gains(compensator, gains), scenarios)
+    none = evaluate(plain, {}, scenarios)
+    np.testing.assert_allclose(neutral.error[none.wanted], none.error[none.wanted], rtol=1e-10, atol=1e-12)
+
+
+def test_other_mechanism_seed_and_number_reuse_the_program():
+    loop, gains, scenarios = setting(lanes=40)
+    evaluate(loop, gains, scenarios)
+    programs = evaluation.run_tiles._cache_size()
+    other, other_gains, other_scenarios = setting(name="claw-350kg", seed=7, lanes=35)
+    assert other == loop
+    evaluate(other, other_gains, other_scenarios)
+    evaluate(*setting(seed=3, lanes=64, overrides=("bodies.equivalent_mass=200",)))
+    assert evaluation.run_tiles._cache_size() == programs
+
+
+def test_every_contact_is_set_beside_its_own_reference():
+    loop, gains, scenarios = setting("none", lanes=5)
+    outcome = evaluate(loop, gains, scenarios)
+    damping_ratio = scenarios.contact.damping / (
+        2 * np.sqrt(scenarios.contact.stiffness * scenarios.equivalent_mass)
+    )
+    root = np.sqrt(1 - damping_ratio**2)
+    expected = np.exp(-damping_ratio / root * np.arctan2(2 * damping_ratio * root, 2 * damping_ratio**2 - 1))
+    wanted = outcome.wanted
+    np.testing.assert_allclose(outcome.reference_restitution[wanted], expected[wanted], rtol=1e-12)
+    np.testing.assert_array_equal(wanted.sum(axis=0), scenarios.contacts)
+    assert outcome.good[wanted].all()

@@ -1,0 +1,157 @@
+"""Pictures say what they show, come out the same twice, and their reference is the undelayed contact."""
+
+import math
+
+import jax
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+
+from jaxhil.contact import LAWS
+from jaxhil.evaluation import Outcome, parameters_by_slot
+from jaxhil.mechanism_file import load
+from jaxhil.metrics import Metrics
+from jaxhil.scenario import build_scenarios
+from jaxhil.uncertainty import draw
+from tuning.motion import Curve, Piece, _space
+from tuning.plots import STYLES, contact_plot, errors_plot, loss_plot, save
+from tuning.tune import Result, Settings, Start, figures
+
+LANES = 40
+
+
+def result(error_size=(0.5, 0.05, 0.005)):
+    """A result as tuning makes it, with errors drawn from a seed."""
+    mechanism = load("varying").mechanism
+    scenarios = build_scenarios(mechanism, draw(mechanism, LANES, 1), 1)
+    generator = np.random.default_rng(0)
+    shape = scenarios.phase.shape
+    outcomes = {}
+    for name, size in zip(("before", "literature", "tuned"), error_size, strict=True):
+        number = np.arange(shape[0])[:, None] + np.zeros(shape)
+        numbers = {field: np.ones(shape) for field in Metrics._fields}
+        numbers["approach_velocity"] = np.full(shape, 0.005)
+        wanted = number < mechanism.approach.contacts
+        outcomes[name] = Outcome(
+            metrics=Metrics(**numbers),
+            reference_restitution=np.ones(shape),
+            reference_peak_force=0.005 * np.sqrt(scenarios.contact.stiffness * scenarios.equivalent_mass),
+            error=size * generator.standard_normal(shape),
+            peak_ratio=np.ones(shape),
+            wanted=wanted,
+            good=wanted,
+        )
+    summaries = {name: figures(outcome) for name, outcome in outcomes.items()}
+    starts = [Start("converged", 3, 0.1 / n, [1.0, 0.5, 0.1 / n], {}) for n in (1, 3, 2)]
+    return Result(
+        "phase_lead", mechanism, {}, {}, summaries, summaries, starts, outcomes, scenarios, Settings()
+    )
+
+
+def pieces(contacts=2):
+    time = np.linspace(-0.02, 0.2, 50)
+    force = 30 * np.maximum(np.sin(np.pi * time / 0.17), 0)
+
+    def curve(scale):
+        return Curve(0.005 * scale, time, scale * force, 1e-3 * scale * time, force, time)
+
+    curves = {"in space": curve(1.0), "before": curve(1.4), "tuned": curve(1.001)}
+    return [Piece(f"contact {n + 1}", (0.0,), curves) for n in range(contacts)]
+
+
+def labels(axes):
+    return [text.get_text() for text in axes.get_legend().get_texts()]
+
+
+def test_errors_have_units_and_a_legend():
+    left, right = errors_plot(result(), 0.01).axes
+    assert "|e - e*|" in left.get_xlabel() and "share" in left.get_ylabel()
+    assert "[Hz]" in right.get_xlabel() and "divergence" in right.get_ylabel()
+    assert labels(left) == ["before: no compensation", "literature's rule", "tuned", "limit 0.01"]
+    assert labels(right)[-1] == "within 0.01"
+
+
+def test_exceedance_is_the_share_of_larger_errors():
+    made = result()
+    left = errors_plot(made, 0.01).axes[0]
+    line = next(line for line in left.lines if line.get_label() == "tuned")
+    size, share = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
+    outcome = made.outcomes["tuned"]
+    errors = np.abs(outcome.error[outcome.good])
+    for place in (0, 10, -1):
+        assert share[place] == pytest.approx(np.mean(errors >= size[place]))
+
+
+def test_contact_frequency_is_that_of_the_linear_contact():
+    made = result()
+    right = errors_plot(made, 0.01).axes[1]
+    points = np.asarray(right.lines[0].get_xdata())
+    stiffness = made.scenarios.contact.stiffness[: made.mechanism.approach.contacts]
+    expected = np.sqrt(stiffness / made.scenarios.equivalent_mass) / (2 * math.pi)
+    np.testing.assert_allclose(np.sort(points), np.sort(expected.ravel()), rtol=1e-12)
+
+
+@pytest.mark.parametrize("limit", [0.0, 0.01, math.inf])
+def test_any_limit_and_no_errors_at_all_can_be_drawn(limit, tmp_path):
+    save(errors_plot(result((0.5, 0.0, 0.0)), limit), tmp_path / "errors.png")
+    made = result()
+    nothing = {name: one._replace(good=one.good & False) for name, one in made.outcomes.items()}
+    made.outcomes.update(nothing)
+    save(errors_plot(made, limit), tmp_path / "nothing.png")
+
+
+def test_the_best_start_stands_out():
+    (axes,) = loss_plot(result()).axes
+    assert "log" == axes.get_yscale() and "step" in axes.get_xlabel() and "rms" in axes.get_ylabel()
+    assert set(labels(axes)) == {"start at the literature's gains", "best start", "other starts"}
+    best = next(line for line in axes.lines if line.get_label() == "best start")
+    assert np.asarray(best.get_ydata())[-1] == pytest.approx(0.1 / 3)
+
+
+def test_contacts_are_drawn_side_by_side_with_units():
+    figure = contact_plot(pieces(), "title")
+    force, _, position, _ = figure.axes
+    assert "[N]" in force.get_ylabel() and "[mm]" in position.get_ylabel() and "[ms]" in position.get_xlabel()
+    # The speed at which a curve entered is told where it differs visibly.
+    assert force.get_title() == "contact 1, entered at 5 mm/s\n(before: 7 mm/s)"
+    assert len(figure.legends) == 1
+    assert "the first 4 of 6 contacts" in contact_plot(pieces(6), "title").get_suptitle()
+
+
+def test_measured_signals_are_drawn_where_asked_for():
+    def measured(figure):
+        return [line for line in figure.axes[0].lines if line.get_label() == "measured"]
+
+    assert not measured(contact_plot(pieces(1), "title"))
+    assert len(measured(contact_plot(pieces(1), "title", sensors="tuned"))) == 1
+
+
+def test_a_name_is_text_and_not_a_formula(tmp_path):
+    save(contact_plot(pieces(1), r"$\frac{1$ [bold]"), tmp_path / "plot.png")
+
+
+@pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
+def test_equal_data_give_equal_files(suffix, tmp_path):
+    for name in ("one", "two"):
+        save(loss_plot(result()), tmp_path / f"{name}.{suffix}")
+    assert (tmp_path / f"one.{suffix}").read_bytes() == (tmp_path / f"two.{suffix}").read_bytes()
+
+
+def test_colours_and_lines_differ():
+    compared = [STYLES[name] for name in ("before", "literature", "tuned")]
+    assert len({to_hex(colour) for colour, _, _ in compared}) == 3
+    assert len({line for _, line, _ in compared}) == 3
+
+
+@pytest.mark.parametrize("name", ["rig-300kg", "claw-350kg", "layered"])
+def test_motion_in_space_is_the_reference(name):
+    mechanism = load(name).mechanism
+    scenarios = build_scenarios(mechanism, {"approach.phase": np.full(1, 0.5)})
+    velocity = 0.007
+    curve = _space(mechanism, scenarios, 0, velocity, 0.4)
+    contact = parameters_by_slot(jax.tree.map(jax.numpy.asarray, scenarios.contact))
+    like = jax.numpy.full(scenarios.phase.shape, velocity)
+    reference = LAWS[mechanism.contact.law]().reference(contact, 0 * like + mechanism.bodies.mass, like)
+    assert np.max(curve.force) == pytest.approx(float(reference.peak_force[0, 0]), rel=2e-3)
+    rebound = -np.diff(curve.position)[-1] / np.diff(curve.time)[-1]
+    assert rebound == pytest.approx(velocity * float(reference.restitution[0, 0]), rel=2e-3)

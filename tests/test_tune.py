@@ -1,0 +1,59 @@
+"""Tuning end to end on small settings: better than the literature on scenarios it never saw."""
+
+import numpy as np
+import pytest
+
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.mechanism_file import load
+from tuning.optimiser import STATUSES
+from tuning.tune import Settings, gain_bounds, spread_starts, tune
+
+SMALL = Settings(scenarios=16, starts=2, steps=12, validation=63)
+
+
+@pytest.fixture(scope="module")
+def result():
+    return tune(load().mechanism, "phase_lead", SMALL)
+
+
+def test_tuned_gains_beat_the_literature_on_fresh_scenarios(result):
+    before, literature, tuned = (result.figures[name] for name in ("before", "literature", "tuned"))
+    assert before.rms > literature.rms > tuned.rms
+    assert before.failed == literature.failed == tuned.failed == 0
+    assert tuned.max >= tuned.p99 >= tuned.rms
+
+
+def test_every_start_has_a_status_and_a_falling_history(result):
+    assert len(result.starts) == SMALL.starts
+    for start in result.starts:
+        assert start.status in STATUSES
+        assert len(start.history) == start.steps
+        assert (np.diff(start.history) <= 0).all()
+        assert start.history[-1] == start.rms
+
+
+def test_gains_lie_within_their_bounds(result):
+    for gain in COMPENSATORS["phase_lead"].gains:
+        assert gain.lower(result.mechanism) <= result.gains[gain.name] <= gain.upper(result.mechanism)
+
+
+def test_the_same_seed_gives_the_same_gains(result):
+    assert tune(load().mechanism, "phase_lead", SMALL).gains == result.gains
+
+
+def test_a_compensator_without_gains_is_judged_only():
+    result = tune(load().mechanism, "none", SMALL)
+    assert result.starts == [] and result.gains == {}
+    assert result.figures["before"] == result.figures["tuned"]
+
+
+def test_starts_begin_with_the_literature_and_stay_inside():
+    mechanism = load().mechanism
+    gains = [g for g in COMPENSATORS["response_error"].gains if g.tuned(mechanism)]
+    bounds = gain_bounds(gains, mechanism)
+    first = np.array([float(g.nominal(mechanism)) for g in gains])
+    starts = spread_starts(first, bounds, 9, seed=0)
+    np.testing.assert_allclose(starts[0], first, rtol=1e-12)
+    assert (starts >= np.asarray(bounds.lower) - 1e-12).all()
+    assert (starts <= np.asarray(bounds.upper) * (1 + 1e-12)).all()
+    assert len(np.unique(starts, axis=0)) == 9

@@ -1,0 +1,69 @@
+"""The command `jaxhil`, also `python -m tuning`: from arguments to an exit code, without a traceback.
+
+0 done and good; 1 done, and the verdict is bad; 2 unusable input or an impossible write, told in one line;
+130 interrupted.
+"""
+
+import io
+import os
+import sys
+from collections.abc import Sequence
+
+from jaxhil.errors import InputError, one_line
+
+GOOD, BAD, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
+TRACEBACK = "JAXHIL_TRACEBACK"  # set: what goes wrong inside is shown in full
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code. `--help` and wrong arguments end in `SystemExit`.
+
+    Raises what goes wrong inside when the environment asks for tracebacks.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        # A name that the terminal's encoding lacks is no reason to fail.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        from tuning.cli import parse
+
+        code = parse(arguments)()
+        sys.stdout.flush()
+        return code
+    except InputError as error:
+        return _complain(str(error), UNUSABLE)
+    except KeyboardInterrupt:
+        return _complain("interrupted", INTERRUPTED)
+    except BrokenPipeError:
+        _silence()
+        return BAD
+    except OSError as error:
+        where = f"{one_line(os.fspath(error.filename))}: " if isinstance(error.filename, str) else ""
+        return _complain(f"{where}{one_line(error.strerror or str(error), 200)}", UNUSABLE)
+    except Exception as error:
+        if os.environ.get(TRACEBACK):
+            raise
+        reason = one_line(f"{type(error).__name__}: {error}", 200)
+        return _complain(f"internal error: {reason} (set {TRACEBACK}=1 to see where)", UNUSABLE)
+
+
+def _complain(text: str, code: int) -> int:
+    try:
+        print(f"jaxhil: {text}", file=sys.stderr, flush=True)
+    except OSError:
+        _silence()
+    return code
+
+
+def _silence() -> None:
+    """Nobody listens any more: keep the interpreter's own flush at exit from complaining about it."""
+    try:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(nowhere, stream.fileno())
+    except (OSError, ValueError):
+        pass
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,164 @@
+"""Commands and options of `jaxhil`: what there is to say, and which module acts on it.
+
+Neither `--help` nor a wrong argument imports jax: the commands' modules are imported when they run.
+"""
+
+import importlib
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg, subcommand
+
+PICTURES = (".png", ".pdf", ".svg")
+DEFAULT_PLOT = "jaxhil-out/simulate.png"
+
+OptionalFile = Annotated[
+    Positional[str | None],
+    arg(
+        metavar="[FILE]",
+        help="Mechanism file, or the name of a built-in one; by default 'varying'.",
+        help_behavior_hint="",
+    ),
+]
+Files = Annotated[
+    Positional[tuple[str, ...]],
+    arg(
+        metavar="[FILE ...]",
+        help="Mechanism files, or names of built-in ones; by default 'varying'.",
+        help_behavior_hint="",
+    ),
+]
+Overrides = Annotated[
+    UseAppendAction[tuple[str, ...]],
+    arg(
+        name="set",
+        metavar="PATH=VALUE",
+        help="Any key of the mechanism file by its dotted path, as approach.velocity=0.01; repeatable.",
+        help_behavior_hint="",
+    ),
+]
+Limit = Annotated[float, arg(metavar="NUMBER", help="Restitution error beyond which the verdict is bad.")]
+Json = Annotated[
+    FlagCreatePairsOff[bool],
+    arg(help="One JSON document on standard output, nothing else there.", help_behavior_hint=""),
+]
+
+
+def _number(text: str):
+    return arg(metavar="NUMBER", help=text)
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """Run the contacts once; per contact restitution, reference, error, peak force, duration.
+
+    Example: jaxhil simulate rig-300kg --compensator phase_lead --set approach.velocity=0.01
+
+    Exit code 0 if every |e - e*| is within the limit, else 1.
+    """
+
+    file: OptionalFile = None
+    compensator: Annotated[
+        str | None,
+        arg(metavar="NAME", help="Compensator, at the literature's gains; 'none' by default."),
+    ] = None
+    gains: Annotated[
+        str | None,
+        arg(metavar="GAINS", help="Gain file: its compensator and gains and, without FILE, its mechanism."),
+    ] = None
+    overrides: Overrides = ()
+    plot: Annotated[
+        str | None,
+        arg(metavar="[PICTURE]", help=f"Plot to a .png, .pdf or .svg file; bare: {DEFAULT_PLOT}."),
+    ] = None
+    limit: Limit = 0.01
+    seed: Annotated[int, _number("Seed of the sensor noise.")] = 0
+    json: Json = False
+
+
+@dataclass(frozen=True)
+class Tune:
+    """Tune a compensator's gains for every mechanism; judge them on scenarios that tuning never saw.
+
+    Example: jaxhil tune rig-300kg varying --output study --starts 16
+
+    Writes DIR/NAME/gains.json and plots. Exit code 1 if a tuned rms error exceeds the limit.
+    """
+
+    files: Files = ()
+    compensator: Annotated[str, arg(metavar="NAME", help="Compensator to tune.")] = "response_error"
+    output: Annotated[str, arg(aliases=("-o",), metavar="DIR", help="Folder for what is written.")] = (
+        "jaxhil-out"
+    )
+    scenarios: Annotated[int, _number("Scenarios to tune on.")] = 32
+    starts: Annotated[int, _number("Starts of the solver.")] = 4
+    steps: Annotated[int, _number("Most solver steps from each start.")] = 25
+    validation: Annotated[int, _number("Fresh scenarios to judge on.")] = 511
+    seed: Annotated[int, _number("Seed of scenarios and starts.")] = 0
+    overrides: Overrides = ()
+    limit: Limit = 0.01
+    json: Json = False
+
+
+@dataclass(frozen=True)
+class Verify:
+    """Replay recorded signals through the rig's runtime; the exit code is the verdict.
+
+    Example: jaxhil verify jaxhil-out/varying/gains.json
+
+    Exit code 1 also for a gain file that is corrupt or was tampered with.
+    """
+
+    path: Annotated[Positional[str], arg(metavar="BUNDLE_OR_GAINS", help="Gain file, or its folder.")]
+    scenarios: Annotated[int, _number("Runs to replay: the nominal one, then draws.")] = 6
+    seed: Annotated[int, _number("Seed of the draws.")] = 0
+    json: Json = False
+
+
+@dataclass(frozen=True)
+class Mechanisms:
+    """The built-in mechanism files, with their sources.
+
+    Example: jaxhil mechanisms --json
+    """
+
+    json: Json = False
+
+
+Command = (
+    Annotated[Simulate, subcommand("simulate")]
+    | Annotated[Tune, subcommand("tune")]
+    | Annotated[Verify, subcommand("verify")]
+    | Annotated[Mechanisms, subcommand("mechanisms")]
+)
+
+
+def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
+    """The command that the arguments ask for, ready to run; it returns the exit code."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    options = tyro.cli(
+        Command,  # pyright: ignore[reportArgumentType]
+        prog="jaxhil",
+        description="Gains that keep hardware-in-the-loop docking tests from diverging.",
+        args=complete_plot(given),
+    )
+
+    def run() -> int:
+        module = importlib.import_module(f"tuning.commands.{type(options).__name__.lower()}")
+        return module.run(options)
+
+    return run
+
+
+def complete_plot(arguments: list[str]) -> list[str]:
+    """A `--plot` that no picture's name follows gets the default one."""
+    completed = []
+    for place, word in enumerate(arguments):
+        completed.append(word)
+        following = arguments[place + 1] if place + 1 < len(arguments) else ""
+        if word == "--plot" and not following.lower().endswith(PICTURES):
+            completed.append(DEFAULT_PLOT)
+    return completed

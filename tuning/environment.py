@@ -1,0 +1,57 @@
+"""What jax must be told before it starts: devices, precision, and where compiled programs are kept.
+
+Commands call `prepare` before anything that imports jax.
+"""
+
+import os
+import sys
+from pathlib import Path
+
+CACHE = "JAXHIL_CACHE"
+
+
+def prepare() -> None:
+    """Float64, one device per usable core, quick compilation, compiled programs kept between calls.
+
+    What the user says in XLA_FLAGS stands. Flags have no effect once jax runs, and are left alone then.
+    """
+    if "jax" not in sys.modules:
+        os.environ["XLA_FLAGS"] = flags(os.environ.get("XLA_FLAGS", ""))
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    folder = cache_folder()
+    chosen = getattr(jax.config, "jax_compilation_cache_dir", None)
+    if folder is not None and not chosen:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def flags(given: str) -> str:
+    """XLA_FLAGS: what the user gave, and what of ours it does not settle."""
+    # A third of the compile time, for programs that run as fast.
+    ours = {
+        "--xla_force_host_platform_device_count": usable_cores(),
+        "--xla_backend_optimization_level": 1,
+    }
+    named = {flag.split("=")[0] for flag in given.split()}
+    added = [f"{name}={value}" for name, value in ours.items() if name not in named]
+    return " ".join([*given.split(), *added])
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return max(1, len(os.sched_getaffinity(0)))
+    return os.cpu_count() or 1
+
+
+def cache_folder() -> Path | None:
+    """$JAXHIL_CACHE or ~/.cache/jaxhil, made if need be; None where it cannot be written."""
+    try:
+        folder = Path(os.environ.get(CACHE) or Path.home() / ".cache" / "jaxhil")
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError, ValueError):
+        return None
+    return folder if os.access(folder, os.W_OK | os.X_OK) else None

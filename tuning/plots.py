@@ -1,0 +1,220 @@
+"""Pictures of tuning and of a nominal run, in units and colours that a reader can tell apart.
+
+Figures are made without pyplot: nothing is shown, nothing stays open, and equal data gives equal files.
+"""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from jaxhil.errors import one_line
+from tuning.motion import Curve, Piece
+from tuning.tune import Result
+
+# Okabe and Ito's colours, told apart by every kind of sight; line styles tell them apart in print.
+BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION = "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00"
+STYLES = {
+    "in space": (BLACK, "-", 3.0),
+    "before": (VERMILION, "--", 1.5),
+    "literature": (ORANGE, "-.", 1.5),
+    "tuned": (BLUE, "-", 1.5),
+    "rig": (BLUE, "-", 1.5),
+}
+LABELS = {
+    "in space": "in space (reference)",
+    "before": "before: no compensation",
+    "literature": "literature's rule",
+    "tuned": "tuned",
+    "rig": "on the rig",
+}
+MARKERS = {"before": "^", "literature": "s", "tuned": "o"}
+MOST_PANELS = 4  # contacts drawn side by side
+
+
+def save(figure: Figure, path: str | os.PathLike[str]) -> None:
+    """Write a figure, folders on the way included. Raises OSError when that is not possible."""
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    FigureCanvasAgg(figure)
+    # Dates and versions would make equal figures differ.
+    fields = {"CreationDate": None} if target.suffix.lower() == ".pdf" else {}
+    fields = {"Date": None} if target.suffix.lower() == ".svg" else fields
+    fields = {"Software": None} if target.suffix.lower() == ".png" else fields
+    with rc_context({"svg.hashsalt": "jaxhil"}):
+        figure.savefig(target, dpi=120, metadata=fields)
+
+
+def errors_plot(result: Result, limit: float) -> Figure:
+    """How large errors are and how often, and at which contact frequency, before and after tuning."""
+    figure = _figure((11, 4.6), f"{result.mechanism.name}: restitution error on fresh scenarios")
+    left, right = figure.subplots(1, 2)
+    # A limit of 0 or inf has no place on a logarithmic axis.
+    drawn = 0 < limit < np.inf
+    sizes: list[float] = [limit] if drawn else []
+    for name, outcome in result.outcomes.items():
+        size = np.sort(np.abs(outcome.error[outcome.good]))[::-1]
+        if not len(size):
+            continue
+        colour, line, width = STYLES[name]
+        total = int(np.sum(outcome.wanted))
+        # Contacts that did not end are larger than any error: they raise the whole curve.
+        share = (np.arange(1, len(size) + 1) + total - len(size)) / total
+        left.step(
+            size, share, where="post", color=colour, linestyle=line, linewidth=width, label=LABELS[name]
+        )
+        sizes += [float(size[0]), float(np.percentile(size, 2))]
+        frequency = outcome.reference_peak_force / outcome.metrics.approach_velocity / (2 * np.pi)
+        frequency = frequency / result.scenarios.equivalent_mass
+        right.plot(
+            frequency[outcome.good],
+            outcome.error[outcome.good],
+            linestyle="none",
+            marker=MARKERS[name],
+            markersize=2.5,
+            alpha=0.6,
+            color=colour,
+            markeredgewidth=0,
+            label=LABELS[name],
+            rasterized=True,
+        )
+    if drawn:
+        left.axvline(limit, color=GREEN, linewidth=1, linestyle=":", label=f"limit {limit:g}")
+        right.axhspan(-limit, limit, color=GREEN, alpha=0.15, linewidth=0, label=f"within {limit:g}")
+    positive = [value for value in sizes if value > 0] or [1.0]
+    left.set(xscale="log", yscale="log", xlim=(min(positive) / 1.5, 1.5 * max(positive)))
+    left.set(xlabel="size of the error |e - e*| [1]", ylabel="share of contacts with a larger error [1]")
+    right.axhline(0, color=BLACK, linewidth=0.6)
+    right.set_yscale("symlog", linthresh=limit if drawn else 0.01)
+    right.set(xlabel="contact frequency [Hz]", ylabel="error e - e* [1]  (above 0: divergence)")
+    _finish(left, "lower left")
+    _finish(right, None)
+    if right.get_legend_handles_labels()[0]:
+        # Above the axes: points are everywhere inside.
+        style: dict[str, Any] = {"fontsize": 8, "frameon": False, "markerscale": 2.5, "columnspacing": 1.2}
+        legend = right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, **style)
+        for handle in legend.legend_handles:
+            if handle is not None:
+                handle.set_alpha(1 if handle.get_label() in LABELS.values() else 0.3)
+    return figure
+
+
+def loss_plot(result: Result) -> Figure:
+    """The rms error that each start of the solver had reached after each step."""
+    figure = _figure((7, 4.6), f"{result.mechanism.name}: tuning from {len(result.starts)} starts")
+    axes = figure.subplots()
+    finite = [start for start in result.starts if np.all(np.isfinite(start.history))]
+    best = min(finite, key=lambda start: start.rms) if finite else None
+    for number, start in enumerate(result.starts):
+        steps = np.arange(1, len(start.history) + 1)
+        first = number == 0
+        colour, width = (BLUE, 2.5) if start is best else (ORANGE, 1.8) if first else ("0.6", 1.0)
+        label = "best start" if start is best else None
+        if first:
+            label = "start at the literature's gains" + (" (best)" if start is best else "")
+        elif label is None and number == next(
+            (i for i, s in enumerate(result.starts) if i and s is not best), 0
+        ):
+            label = "other starts"
+        order = 3 if start is best else 2
+        axes.plot(steps, start.history, color=colour, linewidth=width, label=label, zorder=order)
+        axes.plot(steps[-1:], start.history[-1:], color=colour, marker="o", markersize=4, zorder=order)
+    axes.set_yscale("log")
+    axes.set(xlabel="solver step", ylabel="rms restitution error on training scenarios [1]")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    _finish(axes, "best")
+    return figure
+
+
+def contact_plot(pieces: Sequence[Piece], title: str, sensors: str | None = None) -> Figure:
+    """Force and position over time, contact by contact, beside the same contact in space.
+
+    `sensors` names the curve whose measured force and position are drawn too.
+    """
+    shown = list(pieces[:MOST_PANELS])
+    if len(pieces) > len(shown):
+        title += f" (the first {len(shown)} of {len(pieces)} contacts)"
+    figure = _figure((max(7.0, 3.6 * len(shown) + 1), 6.4), title)
+    grid = figure.subplots(2, len(shown), squeeze=False, sharex="col")
+    for column, piece in enumerate(shown):
+        force, position = grid[0, column], grid[1, column]
+        end = 0.0
+        for name, curve in piece.curves.items():
+            colour, line, width = STYLES[name]
+            style = {"color": colour, "linestyle": line, "linewidth": width, "label": LABELS[name]}
+            if name == "in space":
+                style.update(color="0.65")
+            force.plot(1e3 * curve.time, curve.force, **style)
+            position.plot(1e3 * curve.time, 1e3 * curve.position, **style)
+            if name == sensors and curve.force_measured is not None and curve.position_measured is not None:
+                extra = {"color": VERMILION, "linestyle": ":", "linewidth": 1.3}
+                force.plot(1e3 * curve.time, curve.force_measured, label="measured", **extra)
+                position.plot(1e3 * curve.time, 1e3 * curve.position_measured, label="measured", **extra)
+            end = max(end, _end(curve))
+        force.set_title(_entered(piece), fontsize=10)
+        force.set_xlim(-20, 1e3 * end + 20)
+        position.set_xlabel("time since first touch [ms]")
+        for surface in piece.surfaces:
+            position.axhline(1e3 * surface, color=BLACK, linewidth=0.6)
+        _limit_position(position, piece, end)
+        for axes in (force, position):
+            _finish(axes, None)
+    grid[0, 0].set_ylabel("force on the numerical model [N]")
+    grid[1, 0].set_ylabel("position of the numerical model [mm]\n(thin line: the mechanism's surface)")
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9, frameon=False)
+    return figure
+
+
+def _entered(piece: Piece) -> str:
+    """The contact and the speed it was entered at; another speed where a curve has one of its own."""
+    speed = piece.curves["in space"].velocity
+    text = f"{piece.name}, entered at {1e3 * speed:.3g} mm/s"
+    for name, curve in piece.curves.items():
+        if abs(curve.velocity - speed) > 0.005 * speed:
+            text += f"\n({name}: {1e3 * curve.velocity:.3g} mm/s)"
+    return text
+
+
+def _end(curve: Curve) -> float:
+    """When the last force is over [s]."""
+    pushed = np.flatnonzero(np.abs(curve.force) > 1e-3 * np.max(np.abs(curve.force), initial=0.0))
+    return float(curve.time[pushed[-1]]) if len(pushed) else float(curve.time[-1])
+
+
+def _limit_position(axes: Axes, piece: Piece, end: float) -> None:
+    """Show what lies within the time shown."""
+    values = []
+    for curve in piece.curves.values():
+        within = curve.time <= end + 0.02
+        values.append(1e3 * curve.position[within])
+    every = np.concatenate(values)
+    every = every[np.isfinite(every)]
+    if len(every):
+        margin = 0.05 * (np.max(every) - np.min(every)) or 1.0
+        axes.set_ylim(np.min(every) - margin, np.max(every) + margin)
+
+
+def _figure(size: tuple[float, float], title: str) -> Figure:
+    figure = Figure(figsize=size, layout="constrained")
+    # A name is text, not a formula.
+    figure.suptitle(one_line(title, 120).replace("$", r"\$"), fontsize=12)
+    return figure
+
+
+def _finish(axes: Axes, legend: Any) -> None:
+    axes.grid(True, color="0.88", linewidth=0.6)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    if not axes.get_legend_handles_labels()[0]:
+        axes.text(0.5, 0.5, "nothing to show", transform=axes.transAxes, ha="center", va="center")
+    elif legend is not None:
+        axes.legend(loc=legend, fontsize=8, framealpha=0.9)

@@ -1,0 +1,134 @@
+"""What commands print: tables and JSON on standard output, progress and notes on standard error."""
+
+import json
+import math
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from rich import box
+from rich.console import Console, RenderableType
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
+from rich.table import Table
+
+WIDTH = 110  # where there is no terminal to ask
+
+
+def emit(*things: RenderableType) -> None:
+    """Print on standard output. A reader that has gone away is no error."""
+    try:
+        console = _console(sys.stdout)
+        for thing in things:
+            console.print(thing)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _detach()
+
+
+def emit_json(document: Mapping[str, Any]) -> None:
+    """Print one JSON document; what is not finite as null."""
+    try:
+        print(json.dumps(finite(document), indent=2, allow_nan=False), flush=True)
+    except BrokenPipeError:
+        _detach()
+
+
+def note(text: str) -> None:
+    """Say something on standard error."""
+    _console(sys.stderr).print(text, soft_wrap=True)
+
+
+def table(
+    title: str, headings: Sequence[str], rows: Sequence[Sequence[Any]], texts: Sequence[int] = (0,)
+) -> Table:
+    """A table; columns whose number is in `texts` hold text, the others numbers."""
+    made = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, title_style="bold", pad_edge=False)
+    for number, heading in enumerate(headings):
+        text = number in texts
+        made.add_column(heading, justify="left" if text else "right", overflow="fold", no_wrap=not text)
+    for row in rows:
+        made.add_row(*(value if isinstance(value, str) else figure(value) for value in row))
+    return made
+
+
+def figure(value: Any, digits: int = 4) -> str:
+    """A number in `digits` significant digits; a dash for none."""
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "-"
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+
+
+def finite(value: Any) -> Any:
+    """Mappings, lists, named tuples and numbers, with None for what is not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): finite(entry) for key, entry in value.items()}
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        return finite(value._asdict())  # pyright: ignore[reportAttributeAccessIssue]
+    if isinstance(value, (list, tuple)):
+        return [finite(entry) for entry in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    return value
+
+
+class Stages:
+    """Progress through a known number of stages, told on standard error."""
+
+    def __init__(self, progress: Progress | None, task: Any):
+        self._progress, self._task, self._begun = progress, task, False
+
+    def begin(self, text: str) -> None:
+        """The stage before, if any, is over and `text` begins."""
+        if self._progress is None:
+            note(text)
+            return
+        self._progress.update(self._task, advance=int(self._begun), description=text)
+        self._begun = True
+
+
+@contextmanager
+def stages(total: int) -> Iterator[Stages]:
+    """A bar on a terminal, a plain line per stage elsewhere."""
+    console = _console(sys.stderr)
+    if not console.is_terminal:
+        yield Stages(None, None)
+        return
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=20),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console, transient=True) as progress:
+        yield Stages(progress, progress.add_task("", total=total))
+
+
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        _detach()
+
+
+def _console(stream) -> Console:
+    # Names come from files: they are text, never markup.
+    console = _Console(file=stream, markup=False, emoji=False, highlight=False)
+    if not console.is_terminal:
+        console.width = WIDTH
+    return console
+
+
+def _detach() -> None:
+    """Let what is still printed go nowhere: the exit code remains the verdict."""
+    try:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (OSError, ValueError):
+        pass
