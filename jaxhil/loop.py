@@ -101,7 +101,7 @@ class Sensed(NamedTuple):
     position: Any
     reading: Float[Array, "samples *batch"] | None
     work: Float[Array, "samples *batch"] | None
-    last: tuple[Array, Array, Array]
+    last: tuple[Array, Array, Array, Array]
     lagged: Array
     first_position: Array
 
@@ -198,7 +198,7 @@ def enter(
         velocity=velocity,
         plant=Plant(commands, stride, steady_state(rig.propagation, drive, stride)),
         sensed=state.sensed._replace(
-            last=(outside, zeros, zeros), lagged=zeros, first_position=first_position
+            last=(outside, zeros, zeros, zeros + 1), lagged=zeros, first_position=first_position
         ),
         law=loop.law.init(position),
         entry_velocity=velocity,
@@ -274,7 +274,7 @@ def drive(
         now = _sample(loop, rig, state.parameters, x_actual, v_actual, real)
     if reading is not None:
         time_constant = scenario.force_sensor.time_constant
-        lagged = lag(sensed.lagged, sensed.last, now, period, time_constant)
+        lagged = lag(sensed.lagged, sensed.last[:3], now[:3], period, time_constant)
         reading = write(reading, tick, lagged)
     if work is not None and truth.work is not None:
         work = write(work, tick, tie(_work(sensed.last, now), truth.work))
@@ -302,11 +302,11 @@ def _recall(ring, tick, age, panels, window):
 
 
 def _sample(loop, rig, parameters, position, velocity, force):
-    """(distance into the nearer surface, force, its limit at the surface), as `lag` takes them."""
+    """(distance into the nearer surface, force, its limit at the surface, side of the surface)."""
     far = -rig.scenario.clearance - position
     beyond = jnp.where(far > position, far, position)
     side = jnp.where(far > position, -1, 1).astype(position.dtype)
-    return beyond, force, side * loop.law.edge(parameters, side * velocity)
+    return beyond, force, side * loop.law.edge(parameters, side * velocity), side
 
 
 def _work(before, now):
@@ -315,4 +315,5 @@ def _work(before, now):
     depth_1 = jnp.where(now[0] > 0, now[0], 0)
     force_0 = jnp.where(before[0] > 0, before[1], now[2])
     force_1 = jnp.where(now[0] > 0, now[1], before[2])
-    return jnp.abs(force_0 + force_1) / 2 * (depth_1 - depth_0)
+    side = jnp.where(now[0] > 0, now[3], before[3])
+    return side * (force_0 + force_1) / 2 * (depth_1 - depth_0)

@@ -153,8 +153,13 @@ def observe(
     ends = begun & away & (quiet >= rules.quiet) & (faded | (quiet >= rules.patience))
     works = watch.works
     if truth.work is not None:
-        gained, returned = jnp.maximum(truth.work, 0), jnp.maximum(-truth.work, 0)
-        works = (works[0] + gained, works[1] + returned)
+        # A pulling force acts while the penetration recedes: it takes from the work returned.
+        pushing = truth.force if side is None else side * truth.force
+        grows = (truth.work > 0) & (pushing > 0)
+        works = (
+            works[0] + jnp.where(grows, truth.work, 0),
+            works[1] - jnp.where(grows, 0, truth.work),
+        )
     return Watch(
         elapsed=jnp.where(begun, watch.elapsed + 1, watch.elapsed),
         over=watch.over | ends,

@@ -137,7 +137,7 @@ def start(loop: Loop, rig: Rig, gains: Gains) -> Run:
             position=ring,
             reading=ring if loop.has_lag else None,
             work=ring if loop.energies else None,
-            last=(zeros, zeros, zeros),
+            last=(zeros, zeros, zeros, zeros),
             lagged=zeros,
             first_position=zeros,
         ),
@@ -201,7 +201,13 @@ def turn_over(loop: Loop, rig: Rig, gains: Gains, run: Run, skip_flight: bool = 
     entry = _entry(scenario.contact, jnp.minimum(index, scenario.phase.shape[0] - 1))
     if watch.command is not None:
         left = jnp.maximum(FADED * watch.peak_command, watch.command)
-        kept = {"quiet": watch.quiet, "recent": watch.recent, "command": watch.command}
+        # A touch before the turn-over begins the next contact at once, at the speed of the rebound.
+        kept = {
+            "approach": watch.rebound,
+            "quiet": watch.quiet,
+            "recent": watch.recent,
+            "command": watch.command,
+        }
         watch = _choose(over, blank._replace(left=left, **kept), watch)
         # A damped contact is over while the mechanism is still dented: its law holds until it is free.
         free = state.sensed.last[0] <= 0

@@ -221,7 +221,7 @@ def test_override_reaches_quoted_keys_tables_and_nested_lists():
         "rig.simulator.natural_frequency=3",
     ]
     mechanism = load("varying", overrides).mechanism
-    assert mechanism.uncertainty["contact.stiffness"].factor == [0.5, 3.0]
+    assert mechanism.uncertainty["contact.stiffness"].factor == [0.5, 1.6]
     assert mechanism.rig.simulator.model == "first_order"
     assert mechanism.rig.simulator.damping_ratio is None
     assert mechanism.uncertainty["rig.simulator.natural_frequency"].std == 1.0

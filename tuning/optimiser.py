@@ -108,8 +108,9 @@ def solve(
 def _with_jacobian(residuals, copies, free, arguments):
     """(residuals, loss) whose derivative is one product with a Jacobian computed once, in forward mode.
 
-    `free` and `arguments` are like those to come; `copies` of the function run under one `jax.vmap`. Under `jax.vmap` the mapped copies are dealt out to the devices; the solver around them is not: its
-    linear algebra does not run inside `jax.shard_map`.
+    `free` and `arguments` are like those to come; `copies` of the function run under one `jax.vmap`. The
+    copies are dealt out to the devices; the solver around them is not: its linear algebra does not run
+    inside `jax.shard_map`.
     """
 
     def value_and_jacobian(free, arguments):

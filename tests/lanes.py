@@ -1,0 +1,133 @@
+"""Mechanisms, gains and scenarios for tests: many lanes, each with numbers of its own, in one program."""
+
+import copy
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhil.building import build_loop
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.mechanism import Mechanism
+from jaxhil.mechanism_file import from_builtins
+from jaxhil.metrics import OK
+from jaxhil.rollout import record, rollout
+from jaxhil.scenario import Scenario, build_scenarios
+
+PERIOD = 2e-3  # coarse: errors of arithmetic show, and the oracle is quick
+MASS, VELOCITY, STIFFNESS = 350.0, 0.005, 124355.0
+IDEAL = {"model": "ideal"}
+SECOND_ORDER = {"model": "second_order", "natural_frequency": 12.0, "damping_ratio": 0.8, "delay": 0.0037}
+
+# A test's program runs once: less optimisation, a quarter of the time to compile.
+QUICK = {
+    "xla_backend_optimization_level": 0,
+    "xla_llvm_disable_expensive_passes": True,
+    "xla_cpu_use_fusion_emitters": False,
+}
+
+run_rollout = jax.jit(rollout, static_argnums=0, compiler_options=QUICK)
+run_record = jax.jit(record, static_argnums=(0, 3), compiler_options=QUICK)
+
+
+def mechanism(
+    contact: Mapping[str, Any],
+    simulator: Mapping[str, Any] = SECOND_ORDER,
+    force_delay: float = 0.0041,
+    contacts: int = 1,
+    *,
+    period: float = PERIOD,
+    velocity: float = VELOCITY,
+    phase: float = 1 / 3,
+    force_sensor: Mapping[str, float] | None = None,
+    **rig: Any,
+) -> dict[str, Any]:
+    """A mechanism file as plain data: 350 kg at 5 mm/s, Kelvin-Voigt unless `contact` says otherwise."""
+    return {
+        "schema": "jaxhil/mechanism/1",
+        "name": "case",
+        "bodies": {"equivalent_mass": MASS},
+        "approach": {"velocity": velocity, "contacts": contacts, "phase": phase},
+        "contact": {"law": "kelvin_voigt", "stiffness": [STIFFNESS], **contact},
+        "rig": {
+            "control_period": period,
+            "simulator": dict(simulator),
+            "force_sensor": {"delay": force_delay, **(force_sensor or {})},
+            **rig,
+        },
+    }
+
+
+def validated(raw: Mapping[str, Any]) -> Mechanism:
+    """The mechanism of plain data."""
+    return from_builtins(copy.deepcopy(dict(raw)), "case")
+
+
+def nominal_gains(mechanism: Mechanism, compensator: str, **values: float) -> dict[str, float]:
+    """The literature's gains for this mechanism, some replaced."""
+    gains = {gain.name: float(gain.nominal(mechanism)) for gain in COMPENSATORS[compensator].gains}
+    assert set(values) <= set(gains)
+    return gains | values
+
+
+def as_arrays(gains: Mapping[str, Any]) -> dict[str, jax.Array]:
+    """Gains as float64 arrays."""
+    return {name: jnp.asarray(value, float) for name, value in gains.items()}
+
+
+def join(scenarios: Iterable[Scenario]) -> Scenario:
+    """Scenarios of one form as the lanes of one batch, as JAX arrays."""
+
+    def joined(*leaves):
+        if jnp.issubdtype(leaves[0].dtype, jax.dtypes.prng_key):
+            return jnp.concatenate(leaves)
+        return jnp.asarray(np.concatenate([np.asarray(leaf) for leaf in leaves], axis=-1))
+
+    return jax.tree.map(joined, *scenarios)
+
+
+def spread(parsed: Mechanism, lanes: int, **leaves: Any) -> Scenario:
+    """`lanes` copies of the nominal scenario with some arrays replaced, by their names in `Scenario`.
+
+    A name of two parts, such as contact__damping, is a leaf of a part. What is given broadcasts over the
+    lanes and over successive contacts.
+    """
+    scenario = jax.tree.map(
+        lambda leaf: jnp.repeat(jnp.asarray(leaf), lanes, axis=-1), join([build_scenarios(parsed)])
+    )
+    for name, value in leaves.items():
+        part, _, leaf = name.rpartition("__")
+        owner = getattr(scenario, part) if part else scenario
+        old = getattr(owner, leaf)
+        value = jnp.asarray(np.array(value), old.dtype)
+        if leaf not in ("numerator", "denominator"):
+            value = jnp.broadcast_to(value, old.shape)
+        owner = owner._replace(**{leaf: value})
+        scenario = scenario._replace(**{part: owner}) if part else owner
+    return scenario
+
+
+def grid(*axes: Any) -> list[np.ndarray]:
+    """Every combination of the axes' values, flattened: one array per axis."""
+    return [axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")]
+
+
+def per_lane(gains: Mapping[str, Any], lanes: int) -> dict[str, jax.Array]:
+    """Gains, scalars or one number per lane, as arrays over the lanes."""
+    return {name: jnp.broadcast_to(jnp.asarray(value, float), (lanes,)) for name, value in gains.items()}
+
+
+def first_contact(
+    parsed: Mechanism,
+    scenario: Scenario,
+    compensator: str = "none",
+    gains: Mapping[str, Any] | None = None,
+    energies: bool = False,
+) -> dict[str, np.ndarray]:
+    """Metrics of every lane's first contact, all of which must be over."""
+    loop = build_loop(parsed, compensator, scenario, energies=energies)
+    metrics = run_rollout(loop, per_lane(gains or {}, scenario.velocity.shape[0]), scenario)
+    assert np.all(np.asarray(metrics.status)[0] == OK)
+    return {name: np.asarray(value)[0] for name, value in metrics._asdict().items()}

@@ -1,0 +1,118 @@
+"""Velocity and acceleration limits of the command: respected, without overshoot, inert where not binding."""
+
+import dataclasses
+
+import cases
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import Case
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from lanes import mechanism, run_record
+
+from jaxhil.limits import limit_command
+
+PERIOD, VELOCITY_LIMIT, ACCELERATION_LIMIT = 1e-3, 0.02, 0.5
+
+
+@jax.jit
+def follow(targets, velocity_limit, acceleration_limit):
+    """Limited commands c(n), n >= 1, of a numerical model at `targets`, which starts in uniform motion."""
+
+    def tick(carry, pair):
+        command, step = carry
+        before, target = pair
+        command, step = limit_command(
+            target, command, step, target - before, jnp.array(PERIOD), velocity_limit, acceleration_limit
+        )
+        return (command, step), command
+
+    pairs = jnp.stack([targets[:-1], targets[1:]], axis=1)
+    return jax.lax.scan(tick, (targets[0], targets[1] - targets[0]), pairs)[1]
+
+
+def limited(targets, velocity_limit=np.inf, acceleration_limit=np.inf):
+    """`follow` with the start in front."""
+    found = follow(jnp.asarray(targets), jnp.array(velocity_limit), jnp.array(acceleration_limit))
+    return np.concatenate([targets[:1], np.asarray(found)])
+
+
+def moves(speeds):
+    return np.concatenate([[0.0], np.cumsum(PERIOD * np.asarray(speeds))])
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.lists(st.floats(-0.08, 0.08), min_size=8, max_size=8))
+def test_both_limits_hold_for_any_motion(speeds):
+    # The first speed is one that the drives can have.
+    speeds[0] = np.clip(speeds[0], -VELOCITY_LIMIT, VELOCITY_LIMIT)
+    commands = limited(moves(np.repeat(speeds, 12)), VELOCITY_LIMIT, ACCELERATION_LIMIT)
+    steps = np.diff(commands)
+    assert np.abs(steps).max() <= VELOCITY_LIMIT * PERIOD * (1 + 1e-9)
+    assert np.abs(np.diff(steps)).max() <= ACCELERATION_LIMIT * PERIOD**2 * (1 + 1e-9)
+
+
+def gap(distance, speed=0.0):
+    """How far the command is behind a target that jumps ahead by `distance` and goes on at its speed."""
+    targets = moves(np.full(800, speed))
+    targets[2:] += distance
+    return (targets - limited(targets, VELOCITY_LIMIT, ACCELERATION_LIMIT)) * np.sign(distance)
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.003, -0.004])
+@pytest.mark.parametrize("distance", [1e-7, 3.3e-6, 1e-4, 2.7e-3, -1e-3])
+def test_a_displaced_target_is_reached(distance, speed):
+    behind = gap(distance, speed)
+    assert np.all(behind[:2] == 0) and abs(behind[-1]) < 1e-12
+    # Closing all the way, but for an eighth of the smallest change of a step.
+    assert np.diff(behind[2:]).max() < ACCELERATION_LIMIT * PERIOD**2 / 4
+    assert behind.min() > -ACCELERATION_LIMIT * PERIOD**2 / 8 * (1 + 1e-9)
+
+
+@pytest.mark.xfail(
+    strict=True, reason="r (r + a T)/(2 a) is the braking distance only where r is a whole multiple of a T"
+)
+def test_a_displaced_target_is_not_overshot():
+    assert min(gap(distance).min() for distance in np.linspace(1e-8, 1e-4, 50)) > -1e-12
+
+
+@pytest.mark.parametrize("limit", [1.0, 0.1])
+def test_a_stop_takes_the_time_it_must(limit):
+    """A jump by x takes at least 2 sqrt(x/a); to 0.99 x, a tenth of sqrt(2 x/a) less; and whole periods."""
+    distance = 1e-4
+    commands = limited(np.r_[0.0, 0.0, np.full(600, distance)], acceleration_limit=limit)
+    ticks = np.argmax(commands > 0.99 * distance) - 1
+    fastest = (2 - 0.1 * np.sqrt(2)) * np.sqrt(distance / limit) / PERIOD
+    assert fastest - 1 <= ticks <= 1.05 * fastest + 2
+
+
+def test_limits_that_do_not_bind_change_nothing():
+    time = PERIOD * np.arange(400)
+    targets = 1e-4 * np.sin(2 * np.pi * 3 * time)
+    steps = np.diff(targets)
+    loose = 1.01 * np.abs(steps).max() / PERIOD, 1.01 * np.abs(np.diff(steps)).max() / PERIOD**2
+    assert np.abs(limited(targets, *loose) - targets).max() < 1e-19
+    # Either limit 2 % lower does bind.
+    assert np.abs(limited(targets, 0.98 * loose[0], np.inf) - targets).max() > 1e-9
+    assert np.abs(limited(targets, np.inf, 0.98 * loose[1]) - targets).max() > 1e-9
+
+
+@pytest.mark.parametrize("limits", [(0.0053, np.inf), (np.inf, 0.06), (0.0053, 0.06)])
+def test_limits_of_a_whole_contact(limits):
+    """The ideal simulator without delay is where it is commanded to be: its position is the command."""
+    names = ("velocity_limit", "acceleration_limit")
+    simulator = {"model": "ideal"} | {n: x for n, x in zip(names, limits, strict=True) if np.isfinite(x)}
+    batch = cases.build_batch({"": Case(mechanism({"law": "linear"}, simulator, 0.012, period=PERIOD))})
+    loop = dataclasses.replace(batch.loop, has_limits=True)
+    ticks = run_record(loop, batch.gains, batch.scenario, 20)[1]
+    commands = np.asarray(ticks.signals.position_measured)[:, 0]
+    wanted = np.asarray(ticks.signals.position_desired)[:, 0]
+    going = np.asarray(ticks.active)[:, 0]
+    commands, wanted = commands[going], wanted[going]
+    steps = np.diff(commands)
+    assert np.abs(steps).max() <= limits[0] * PERIOD * (1 + 1e-9)
+    assert np.abs(np.diff(steps)).max() <= limits[1] * PERIOD**2 * (1 + 1e-9)
+    # They do bind here: the model is faster than the drives.
+    assert np.abs(wanted - commands).max() > 1e-6
