@@ -221,6 +221,9 @@ CASES: dict[str, Case] = {
     "lag": Case(mechanism({}, **LAGGED), "phase_lead"),
     "damped, lag": Case(mechanism({"damping": [500.0]}, **LAGGED), "phase_lead"),
     "damped, lag, 1 kHz": Case(mechanism({"damping": [500.0]}, period=1e-3, **LAGGED), "phase_lead"),
+    "stiff, damped, lag": Case(
+        mechanism({"stiffness": [3 * STIFFNESS], "damping": [1000.0]}, **LAGGED), "phase_lead"
+    ),
     "no lag beside lagged ones": Case(mechanism({"damping": [500.0]}), "phase_lead"),
     # Two surfaces.
     "rattling": Case(

@@ -33,9 +33,10 @@ from jaxhil.scenario import build_scenarios
 
 ACCURACY = {
     # Between two samples the force is taken as straight, and its end as the sample that first is 0.
-    "lag": 4e-4,
-    "damped, lag": 2e-4,
-    "damped, lag, 1 kHz": 1e-4,
+    "lag": 1e-4,
+    "damped, lag": 1e-4,
+    "damped, lag, 1 kHz": 3e-5,
+    "stiff, damped, lag": 1e-4,
     # The approach speed is that at the end of the contact before; a residual command acts until the touch.
     "rattling, the next touch at once": 1e-7,
 }
@@ -49,9 +50,12 @@ ORACLE = {"quantum": {"noise_level": 0.5}}
 
 AT_ONCE = "what a touch does in the ticks between the end of a contact and its turn-over is lost"
 TOO_EARLY = "the force of the transport delay's span is computed before the list index advances"
+STRAIGHT = "a lagged force is taken as straight between samples: beyond 1e-4 for stiff contact"
 CORNERS = "the force's corner at a tick (x_a of relative degree 0 or 1) lies between its samples"
 KNOWN = {
     ("work", "rattling, the next touch at once"): AT_ONCE,
+    ("motion", "lag"): STRAIGHT,
+    ("motion", "stiff, damped, lag"): STRAIGHT,
     ("motion", "rattling behind a long transport delay"): TOO_EARLY,
     ("work", "rattling behind a long transport delay"): TOO_EARLY,
     ("peak", "rattling behind a long transport delay"): TOO_EARLY,
