@@ -4,18 +4,15 @@ Only what shapes the program is decided here; delay lines are sized in powers of
 like delays share one compiled program.
 """
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.contact import LAWS
-from jaxhil.loop import Loop, Windows, split_delays
+from jaxhil.loop import Loop
 from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario
 
 SHORTEST_RING = 16
-SHORTEST_WINDOW, LONGEST_WINDOW = 4, 8
 
 
 def build_loop(mechanism: Mechanism, compensator: str, scenarios: Scenario, energies: bool = False) -> Loop:
@@ -31,13 +28,6 @@ def build_loop(mechanism: Mechanism, compensator: str, scenarios: Scenario, ener
         periods = float(np.max(delay / scenarios.control_period))
         return max(SHORTEST_RING, 1 << int(np.ceil(np.log2(periods + 4))))
 
-    def window(panels) -> int:
-        spread = int(np.max(panels) - np.min(panels)) + 1
-        rows = max(SHORTEST_WINDOW, 1 << (spread - 1).bit_length())
-        return rows if rows <= LONGEST_WINDOW else 0
-
-    force_delay, position_delay, real_panels = split_delays(jax.tree.map(jnp.asarray, scenarios))
-    periods = np.unique(scenarios.control_period)
     return Loop(
         law=LAWS[mechanism.contact.law](),
         compensator=law,
@@ -60,11 +50,5 @@ def build_loop(mechanism: Mechanism, compensator: str, scenarios: Scenario, ener
         is_two_sided=bool(np.any(np.isfinite(scenarios.clearance))),
         ring=samples(sensed),
         controller_ring=samples(max(aligned, default=0.0)),
-        windows=Windows(
-            force=window(force_delay.panels),
-            real=window(real_panels),
-            position=window(position_delay.panels),
-        ),
-        has_common_period=len(periods) == 1,
         energies=energies,
     )

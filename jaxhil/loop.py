@@ -20,7 +20,7 @@ from jaxhil.compensators.base import Compensator, Constants, Gains, Signals
 from jaxhil.contact import ContactLaw, ContactParameters, two_sided
 from jaxhil.integrators import INTEGRATORS
 from jaxhil.limits import limit_command
-from jaxhil.ring import look_back, tie, write
+from jaxhil.ring import look_back, tie, write_in_turn
 from jaxhil.scenario import Scenario
 from jaxhil.sensors import lag, quantise, sample_force, white_noise
 from jaxhil.simulator import (
@@ -34,23 +34,13 @@ from jaxhil.simulator import (
 )
 
 
-class Windows(NamedTuple):
-    """By how many panels less one the lanes' delays differ at most; 0 if that is too many to be of use.
-    Of the force reading, of the real force, of the position reading."""
-
-    force: int
-    real: int
-    position: int
-
-
 class Loop(eqx.Module):
     """What shapes the compiled loop; every field is static.
 
     law, compensator, integrator, hold ("linear" or "zoh"), latency (0 or 1 periods); which optional parts
     are present: force lag, force noise or bias, position noise, sample effects (quantum, dead zone, range),
-    command limits, a second surface; samples in the delay lines of the sensors and of the controller, and
-    how far the lanes' delays lie apart; whether the control period is common to all lanes; whether energies
-    are audited.
+    command limits, a second surface; samples in the delay lines of the sensors and of the controller;
+    whether energies are audited.
     """
 
     law: ContactLaw = eqx.field(static=True)
@@ -67,8 +57,6 @@ class Loop(eqx.Module):
     is_two_sided: bool = eqx.field(static=True)
     ring: int = eqx.field(static=True)
     controller_ring: int = eqx.field(static=True)
-    windows: Windows = eqx.field(static=True)
-    has_common_period: bool = eqx.field(static=True)
     energies: bool = eqx.field(static=True)
 
 
@@ -145,9 +133,7 @@ def build_rig(loop: Loop, scenario: Scenario) -> Rig:
         force_delay=force_delay,
         position_delay=position_delay,
         real_panels=real_panels,
-        constants=Constants(
-            period, scenario.clearance, period.reshape(-1)[0] if loop.has_common_period else None
-        ),
+        constants=Constants(period, scenario.clearance),
         inverse_mass=1 / scenario.equivalent_mass,
     )
 
@@ -210,13 +196,12 @@ def sense(loop: Loop, rig: Rig, state: LoopState, tick: Array) -> tuple[Signals,
     """Stage 1: what the sensors read at this tick, and the truth beside it."""
     scenario, sensed = rig.scenario, state.sensed
     age = tick - state.entry_tick
-    windows = loop.windows
     force_ring = sensed.force if sensed.reading is None else sensed.reading
-    force = _recall(force_ring, tick, age, rig.force_delay.panels, windows.force)
-    real = _recall(sensed.force, tick, age, rig.real_panels, windows.real)
+    force = _recall(force_ring, tick, age, rig.force_delay.panels)
+    real = _recall(sensed.force, tick, age, rig.real_panels)
     work = None
     if sensed.work is not None:
-        work = _recall(sensed.work, tick, age, rig.real_panels, windows.real)
+        work = _recall(sensed.work, tick, age, rig.real_panels)
     sensor = scenario.force_sensor
     if loop.has_force_bias:
         force = force + sensor.bias
@@ -228,7 +213,7 @@ def sense(loop: Loop, rig: Rig, state: LoopState, tick: Array) -> tuple[Signals,
     panels = rig.position_delay.panels
     stride = rig.constants.control_period * state.entry_velocity
     before = sensed.first_position + (age - panels).astype(stride.dtype) * stride
-    after = look_back(sensed.position, tick - 1, panels, windows.position)
+    after = look_back(sensed.position, tick - 1, panels)
     position = jnp.where(age <= panels, before, after)
     if loop.has_position_noise:
         sensor = scenario.position_sensor
@@ -269,36 +254,33 @@ def drive(
     x_actual = read(plant.position, x_now, start, end)
     v_actual = read(plant.velocity, x_now, start, end)
     real, law = two_sided(loop.law, state.parameters, state.law, x_actual, v_actual, scenario.clearance)
-    now, lagged, reading, work = sensed.last, sensed.lagged, sensed.reading, sensed.work
+    samples = {
+        "force": tie(real, truth.force),
+        "position": read(plant.measured_position, x_now, start, end),
+    }
+    now, lagged = sensed.last, sensed.lagged
     if loop.has_lag or loop.energies or loop.is_two_sided:
         now = _sample(loop, rig, state.parameters, x_actual, v_actual, real)
-    if reading is not None:
+    if sensed.reading is not None:
         time_constant = scenario.force_sensor.time_constant
         lagged = lag(sensed.lagged, sensed.last[:3], now[:3], period, time_constant)
-        reading = write(reading, tick, lagged)
-    if work is not None and truth.work is not None:
-        work = write(work, tick, tie(_work(sensed.last, now), truth.work))
+        samples["reading"] = lagged
+    if sensed.work is not None and truth.work is not None:
+        samples["work"] = tie(_work(sensed.last, now), truth.work)
+    rings = write_in_turn({name: getattr(sensed, name) for name in samples}, tick, samples)
     return state._replace(
         position=position,
         velocity=velocity,
         plant=Plant(commands[: loop.latency + 1], step, advance(plant.transition, x_now, start, end)),
-        sensed=Sensed(
-            force=write(sensed.force, tick, tie(real, truth.force)),
-            position=write(sensed.position, tick, read(plant.measured_position, x_now, start, end)),
-            reading=reading,
-            work=work,
-            last=now,
-            lagged=lagged,
-            first_position=sensed.first_position,
-        ),
+        sensed=sensed._replace(**rings, last=now, lagged=lagged),
         law=law,
         controller=controller,
     )
 
 
-def _recall(ring, tick, age, panels, window):
+def _recall(ring, tick, age, panels):
     """Sample of the panel `panels` before the newest one; before the run there was no force."""
-    return jnp.where(age > panels, look_back(ring, tick - 1, panels, window), 0)
+    return jnp.where(age > panels, look_back(ring, tick - 1, panels), 0)
 
 
 def _sample(loop, rig, parameters, position, velocity, force):

@@ -67,21 +67,17 @@ class Tick(NamedTuple):
     identified: tuple[Array, Array] | None
 
 
-def rollout(loop: Loop, gains: Gains, scenario: Scenario, lane_axis: str | None = None) -> Metrics:
+def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Metrics:
     """Metrics (slots, *batch) of every contact of every lane: `build_rig`, then `run_contacts`.
 
-    `gains` are scalars or of the batch shape. Under `jax.vmap(..., axis_name=lane_axis)` the lanes of all
-    mapped copies run in step, which keeps the loop's condition and the rings' pointer common.
+    `gains` are scalars or of the batch shape: many gains at once are many lanes, not a `jax.vmap`, under
+    which the loop's condition and the rings' pointer would be the lanes' own.
     """
-    return run_contacts(loop, gains, build_rig(loop, scenario), lane_axis)
+    return run_contacts(loop, gains, build_rig(loop, scenario))
 
 
-def run_contacts(loop: Loop, gains: Gains, rig: Rig, lane_axis: str | None = None) -> Metrics:
+def run_contacts(loop: Loop, gains: Gains, rig: Rig) -> Metrics:
     """`rollout` on a rig built before, for when many gains are tried on it."""
-
-    def some(lanes):
-        found = jnp.any(lanes)
-        return lax.pmax(found, lane_axis) if lane_axis else found
 
     def body(run):
         run, _ = stretch(loop, rig, gains, run, record=False)
@@ -93,7 +89,7 @@ def run_contacts(loop: Loop, gains: Gains, rig: Rig, lane_axis: str | None = Non
         light = rings._replace(force=None, position=None, reading=None, work=None)
         light = run._replace(state=run.state._replace(sensed=light))
         light = lax.cond(
-            some(_pending(rig, run)), lambda run: turn_over(loop, rig, gains, run), lambda run: run, light
+            jnp.any(_pending(rig, run)), lambda run: turn_over(loop, rig, gains, run), lambda run: run, light
         )
         sensed = light.state.sensed._replace(
             force=rings.force, position=rings.position, reading=rings.reading, work=rings.work
@@ -101,7 +97,7 @@ def run_contacts(loop: Loop, gains: Gains, rig: Rig, lane_axis: str | None = Non
         return light._replace(state=light.state._replace(sensed=sensed))
 
     run = start(loop, rig, gains)
-    return lax.while_loop(lambda run: some(run.active), body, run).metrics
+    return lax.while_loop(lambda run: jnp.any(run.active), body, run).metrics
 
 
 def record(loop: Loop, gains: Gains, scenario: Scenario, stretches: int) -> tuple[Metrics, Tick]:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tuning.optimiser import STATUSES, Bounds, solve, to_free, to_gains
+from tuning.optimiser import STATUSES, Bounds, _with_jacobian, solve, to_free, to_gains
 
 BOUNDS = Bounds(jnp.array([0.0, 1e-3]), jnp.array([2.0, 10.0]), jnp.array([0.0, 1.0]))
 
@@ -25,18 +25,23 @@ def test_gains_stay_within_bounds(free):
     assert (gains <= np.asarray(BOUNDS.upper) * (1 + 1e-12)).all()
 
 
-def distance(static, gains, arguments, lane_axis):
-    return static * jnp.stack([gains[0] - arguments[0], jnp.log(gains[1] / arguments[1])])
+def distance(static, gains, arguments):
+    return static * jnp.stack([gains[:, 0] - arguments[:, 0], jnp.log(gains[:, 1] / arguments[:, 1])], axis=1)
 
 
-def blows_up(static, gains, arguments, lane_axis):
-    return jnp.where(gains[0] > 1.5, jnp.nan, 1.0) * distance(static, gains, arguments, lane_axis)
+def blows_up(static, gains, arguments):
+    return jnp.where(gains[:, :1] > 1.5, jnp.nan, 1.0) * distance(static, gains, arguments)
 
 
-def test_every_start_finds_the_minimum():
-    starts = jnp.array([[0.1, 0.01], [1.9, 5.0], [1.0, 1.0]])
-    solution = solve(distance, 10.0, jnp.array([0.7, 0.2]), BOUNDS, starts, max_steps=60)
-    np.testing.assert_allclose(solution.gains, np.tile([0.7, 0.2], (3, 1)), rtol=1e-4)
+def solved(residuals, targets, starts, max_steps):
+    bounds = Bounds(*(jnp.tile(leaf, (len(starts), 1)) for leaf in BOUNDS))
+    return solve(residuals, 10.0, jnp.array(targets), bounds, jnp.array(starts), max_steps=max_steps)
+
+
+def test_every_problem_finds_its_own_minimum():
+    targets = [[0.7, 0.2], [0.7, 0.2], [1.2, 3.0]]
+    solution = solved(distance, targets, [[0.1, 0.01], [1.9, 5.0], [1.0, 1.0]], 60)
+    np.testing.assert_allclose(solution.gains, targets, rtol=1e-4)
     assert [STATUSES[i] for i in solution.status] == ["converged"] * 3
     history = np.asarray(solution.history)
     assert (np.diff(history, axis=1) <= 0).all()
@@ -44,17 +49,23 @@ def test_every_start_finds_the_minimum():
 
 
 def test_too_few_steps_and_a_start_that_is_not_finite_are_named():
-    starts = jnp.array([[0.1, 0.01], [1.9, 5.0]])
-    solution = solve(blows_up, 10.0, jnp.array([0.7, 0.2]), BOUNDS, starts, max_steps=2)
+    solution = solved(blows_up, [[0.7, 0.2]] * 2, [[0.1, 0.01], [1.9, 5.0]], 2)
     assert [STATUSES[i] for i in solution.status] == ["step limit", "not finite"]
 
 
-def test_derivative_is_that_of_the_residuals():
-    from tuning.optimiser import _with_jacobian
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_derivative_is_that_of_the_residuals(number):
+    free = jnp.linspace(0.1, 0.9, 2 * number).reshape(number, 2)
+    factors = jnp.linspace(2.0, 5.0, 2 * number).reshape(number, 2)
+    tangent = jnp.array([1.0, -0.5])
+    function = _with_jacobian(lambda free, factors: jnp.sin(free) * factors, free, factors)
 
-    free, arguments = jnp.array([0.3, 0.9]), jnp.array([2.0, 5.0])
-    function = _with_jacobian(lambda free, arguments: jnp.sin(free) * arguments, 1, free, arguments)
-    (value, loss), (slope, _) = jax.jvp(lambda x: function(x, arguments), (free,), (jnp.array([1.0, 0.0]),))
-    np.testing.assert_allclose(value, np.sin(free) * arguments)
-    np.testing.assert_allclose(loss, np.sum(np.asarray(value) ** 2) / 2)
-    np.testing.assert_allclose(slope, [2 * np.cos(0.3), 0.0], atol=1e-15)
+    def along(free, factors):
+        return jax.jvp(lambda x: function(x, factors), (free,), (tangent,))
+
+    (value, loss), (slope, _) = jax.vmap(along)(free, factors)
+    np.testing.assert_allclose(value, np.sin(free) * factors)
+    np.testing.assert_allclose(loss, np.sum(np.asarray(value) ** 2, axis=1) / 2)
+    np.testing.assert_allclose(slope, np.cos(free) * factors * tangent[None])
+    # Alone, it is the same function.
+    np.testing.assert_allclose(function(free[0], factors[0])[0], np.asarray(value)[0])

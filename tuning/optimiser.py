@@ -12,20 +12,19 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax.extend.core import jaxpr_as_fun
 from jax.sharding import AxisType, PartitionSpec
 from jaxtyping import Array, Float, Int
 
-LANES = "starts"
-
 
 class Bounds(NamedTuple):
     """Of each gain: lower and upper bound, and whether its scale is logarithmic."""
 
-    lower: Float[Array, "gains"]
-    upper: Float[Array, "gains"]
-    logarithmic: Float[Array, "gains"]
+    lower: Float[Array | np.ndarray, "*problems gains"]
+    upper: Float[Array | np.ndarray, "*problems gains"]
+    logarithmic: Float[Array | np.ndarray, "*problems gains"]
 
 
 class Solution(NamedTuple):
@@ -65,29 +64,29 @@ def to_free(gains: Float[Array, "gains"], bounds: Bounds) -> Float[Array, "gains
 
 @partial(jax.jit, static_argnames=("residuals", "static", "max_steps"))
 def solve(
-    residuals: Callable[..., Float[Array, "residuals"]],
+    residuals: Callable[..., Float[Array, "problems residuals"]],
     static: Any,
     arguments: Any,
     bounds: Bounds,
-    starts: Float[Array, "starts gains"],
+    starts: Float[Array, "problems gains"],
     max_steps: int = 30,
     rtol: float = 1e-4,
     atol: float = 1e-6,
 ) -> Solution:
-    """Minimise sum(residuals(static, gains, arguments, LANES)^2) / 2 from every start at once.
+    """Minimise sum(residuals(static, gains, arguments)^2) / 2 of many problems at once.
 
-    `residuals` runs under `jax.vmap` with the axis name `LANES`; starts are dealt out to the devices.
+    A problem is a start: its gains, their bounds and its arguments. `residuals` gets all that a device has
+    to do with a leading axis of problems, which must not mix.
     """
 
-    function = _with_jacobian(
-        lambda free, arguments: residuals(static, to_gains(free, arguments[0]), arguments[1], LANES),
-        len(starts),
-        starts[0],
-        (bounds, arguments),
-    )
+    def of_free(free, arguments):
+        bounds, arguments = arguments
+        return residuals(static, jax.vmap(to_gains)(free, bounds), arguments)
+
+    function = _with_jacobian(of_free, starts, (bounds, arguments))
     solver = _Recording(optx.LevenbergMarquardt(rtol=rtol, atol=atol), max_steps)
 
-    def one(start):
+    def one(start, bounds, arguments):
         solution = optx.least_squares(
             function,
             solver,
@@ -102,59 +101,52 @@ def solve(
         gains = to_gains(solution.value, bounds)
         return Solution(gains, jnp.min(history), history, steps.astype(jnp.int32), status)
 
-    return jax.vmap(one)(starts)
+    return jax.vmap(one)(starts, bounds, arguments)
 
 
-def _with_jacobian(residuals, copies, free, arguments):
-    """(residuals, loss) whose derivative is one product with a Jacobian computed once, in forward mode.
+def _with_jacobian(residuals, free, arguments):
+    """(residuals, loss) of one problem, to be called under a `jax.vmap` over all of them.
 
-    `free` and `arguments` are like those to come; `copies` of the function run under one `jax.vmap`. The
-    copies are dealt out to the devices; the solver around them is not: its linear algebra does not run
-    inside `jax.shard_map`.
+    Its derivative is one product with a Jacobian computed once, in forward mode, for all problems side by
+    side. They are dealt out to the devices; the solver around them is not: its linear algebra does not run
+    inside `jax.shard_map`. `free` and `arguments` are like those to come, problems first.
     """
 
     def value_and_jacobian(free, arguments):
-        def twice(free):
-            value = residuals(free, arguments)
-            return value, value
+        def along(direction):
+            every = jnp.broadcast_to(direction, free.shape)
+            return jax.jvp(lambda free: residuals(free, arguments), (free,), (every,))
 
-        jacobian, value = jax.jacfwd(twice, has_aux=True)(free)
-        return value, jacobian
-
-    def mapped(free, arguments):
-        return jax.vmap(value_and_jacobian, (0, None), axis_name=LANES)(free, arguments)
+        # Problems do not mix: one direction serves all of them.
+        basis = jnp.eye(free.shape[-1], dtype=free.dtype)
+        return jax.vmap(along, out_axes=(None, -1))(basis)
 
     def dealt(free, arguments):
-        devices = math.gcd(jax.device_count(), copies)
+        devices = math.gcd(jax.device_count(), len(free))
         mesh = jax.make_mesh(
             (devices,), ("device",), axis_types=(AxisType.Auto,), devices=jax.devices()[:devices]
         )
-        own, common = PartitionSpec("device"), PartitionSpec()
-        return jax.shard_map(mapped, mesh=mesh, in_specs=(own, common), out_specs=own, check_vma=False)(
-            free, arguments
-        )
+        own = PartitionSpec("device")
+        return jax.shard_map(
+            value_and_jacobian, mesh=mesh, in_specs=(own, own), out_specs=own, check_vma=False
+        )(free, arguments)
 
     # Traced once, however often the solver asks for it: tracing costs more than many a step.
-    leaves, structure = jax.tree.flatten(arguments)
-    traced = jax.make_jaxpr(lambda free, *leaves: dealt(free, jax.tree.unflatten(structure, leaves)))(
-        jax.ShapeDtypeStruct((copies, *free.shape), free.dtype),
-        *(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves),
-    )
-
-    def shared(free, arguments):
-        return tuple(jaxpr_as_fun(traced)(free, *jax.tree.leaves(arguments)))
+    shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), (free, arguments))
+    number = len(free)
+    traced = jaxpr_as_fun(jax.make_jaxpr(dealt)(*shapes))
 
     @jax.custom_batching.custom_vmap
     def several(free, arguments):
-        # Of the same shape as when it is mapped, hence no second program.
-        same = jnp.broadcast_to(free, (copies, *free.shape))
-        return jax.tree.map(lambda leaf: leaf[0], shared(same, arguments))
+        # One problem alone, run as often as there are problems: the program traced serves.
+        same = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (number, *leaf.shape)), (free, arguments))
+        return tuple(leaf[0] for leaf in traced(*jax.tree.leaves(same)))
 
     @several.def_vmap
     def rule(axis_size, in_batched, free, arguments):
-        if any(jax.tree.leaves(in_batched[1])) or not in_batched[0]:
-            raise NotImplementedError("only the free numbers may be mapped")
-        return shared(free, arguments), (True, True)
+        if not all(jax.tree.leaves(in_batched)):
+            raise NotImplementedError("every argument must be mapped")
+        return tuple(traced(*jax.tree.leaves((free, arguments)))), (True, True)
 
     @jax.custom_jvp
     def function(free, arguments):

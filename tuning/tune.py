@@ -3,18 +3,19 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from scipy.stats import qmc
 
 from jaxhil.building import build_loop
 from jaxhil.compensators import COMPENSATORS, Gain
-from jaxhil.contact import LAWS
 from jaxhil.evaluation import Outcome, evaluate, parameters_by_slot
-from jaxhil.loop import build_rig
+from jaxhil.loop import Loop, build_rig
 from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import draw, quasi_random
@@ -172,22 +173,14 @@ def _solve(mechanism, compensator, literature, settings) -> list[Start]:
     scenarios = build_scenarios(
         mechanism, quasi_random(mechanism, settings.scenarios, settings.seed), settings.seed
     )
-    scenarios = scenarios._replace(time_limit=_patience(mechanism, scenarios))
     loop = build_loop(mechanism, compensator, scenarios)
-    rig = _build_rig(loop, jax.tree.map(jnp.asarray, scenarios))
-    fixed = {name: jnp.asarray(v) for name, v in literature.items() if name not in names}
+    fixed = {name: value for name, value in literature.items() if name not in names}
     bounds = gain_bounds(tuned, mechanism)
     first = np.array([literature[name] for name in names])
-    solution = jax.device_get(
-        solve(
-            restitution_errors,
-            (loop, names),
-            Problem(rig, fixed),
-            bounds,
-            jnp.asarray(spread_starts(first, bounds, settings.starts, settings.seed)),
-            max_steps=settings.steps,
-        )
-    )
+    starts = spread_starts(first, bounds, settings.starts, settings.seed)
+    problem = scenarios, fixed, bounds
+    problems = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(starts), *np.shape(leaf))), problem)
+    solution = jax.device_get(_solve_problems((loop, names), problems, starts, settings.steps))
     starts = []
     for i in range(settings.starts):
         gains = {**literature, **dict(zip(names, map(float, solution.gains[i]), strict=True))}
@@ -201,9 +194,9 @@ def _solve(mechanism, compensator, literature, settings) -> list[Start]:
 def gain_bounds(gains: list[Gain], mechanism: Mechanism) -> Bounds:
     """Bounds of `gains` for the optimiser."""
     return Bounds(
-        jnp.array([float(gain.lower(mechanism)) for gain in gains]),
-        jnp.array([float(gain.upper(mechanism)) for gain in gains]),
-        jnp.array([float(gain.logarithmic) for gain in gains]),
+        np.array([float(gain.lower(mechanism)) for gain in gains]),
+        np.array([float(gain.upper(mechanism)) for gain in gains]),
+        np.array([float(gain.logarithmic) for gain in gains]),
     )
 
 
@@ -228,18 +221,26 @@ def spread_starts(first: np.ndarray, bounds: Bounds, number: int, seed: int) -> 
     return np.where(logarithmic, np.exp(np.where(logarithmic, values, 0)), values)
 
 
-_build_rig = jax.jit(build_rig, static_argnums=0)
+@partial(jax.jit, static_argnames=("static", "steps"))
+def _solve_problems(static, problems, starts, steps):
+    scenarios, fixed, bounds = problems
+
+    def rig(scenarios):
+        limited = scenarios._replace(time_limit=_patience(static[0], scenarios))
+        return build_rig(static[0], limited)
+
+    rigs = jax.vmap(rig)(scenarios)
+    return solve(restitution_errors, static, Problem(rigs, fixed), bounds, starts, max_steps=steps)
 
 
-def _patience(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
+def _patience(loop: Loop, scenarios: Scenario) -> Array:
     """How long [s] a contact may take in training before it has failed: some of its undelayed durations."""
-    law = LAWS[mechanism.contact.law]()
-    contact = parameters_by_slot(jax.tree.map(jnp.asarray, scenarios.contact))
     shape = scenarios.phase.shape
-    mass = jnp.broadcast_to(jnp.asarray(scenarios.equivalent_mass), shape)
-    velocity = jnp.broadcast_to(jnp.asarray(scenarios.velocity), shape)
-    duration = np.max(jax.jit(law.reference)(contact, mass, velocity).duration, axis=0)
-    return np.minimum(PATIENCE * duration + SHORTEST_PATIENCE, scenarios.time_limit)
+    mass = jnp.broadcast_to(scenarios.equivalent_mass, shape)
+    velocity = jnp.broadcast_to(scenarios.velocity, shape)
+    reference = loop.law.reference(parameters_by_slot(scenarios.contact), mass, velocity)
+    longest = PATIENCE * jnp.max(reference.duration, axis=0) + SHORTEST_PATIENCE
+    return jnp.minimum(longest, scenarios.time_limit)
 
 
 class _Clock:

@@ -52,12 +52,10 @@ class Signals(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """What the controller is told of the rig: control period [s] and clearance [m], inf if one-sided; the
-    control period once more where all lanes share it."""
+    """What the controller is told of the rig: control period [s] and clearance [m], inf if one-sided."""
 
     control_period: Float[Array, "*batch"]
     clearance: Float[Array, "*batch"]
-    common_period: Float[Array, ""] | None = None
 
 
 class Compensator(eqx.Module):

@@ -28,7 +28,7 @@ from jaxhil.compensators.phase_lead import (
     lead_filter,
 )
 from jaxhil.contact import deflection
-from jaxhil.ring import look_back, look_back_rows, tie, write
+from jaxhil.ring import look_back, write
 
 
 def is_damped(mechanism) -> bool:
@@ -96,8 +96,8 @@ class Prepared(NamedTuple):
     lead: LeadFilter
     rate_pole: Float[Array, "*batch"]
     rate_gain: Float[Array, "*batch"]
-    lookback: Int[Array, "*batch"] | Int[Array, ""]
-    fraction: Float[Array, "*batch"] | Float[Array, ""]
+    lookback: Int[Array, "*batch"]
+    fraction: Float[Array, "*batch"]
 
 
 class ResponseError(Compensator):
@@ -146,8 +146,7 @@ class ResponseError(Compensator):
 
     def prepare(self, gains, constants):
         period = constants.control_period
-        shared = constants.common_period
-        periods = gains["identification_delay"] / (period if shared is None else shared)
+        periods = gains["identification_delay"] / period
         whole = jax.lax.stop_gradient(jnp.floor(periods + 1e-9))
         smoothing = 2 * gains["velocity_filter"]
         scale = 1 / (smoothing + period)
@@ -204,19 +203,9 @@ class ResponseError(Compensator):
         stride = period * first_velocity
         before = jnp.where(begins, measured - stride, state.position)
 
-        # The newest sample is not in the ring yet: it is looked at before it is written.
         lookback, fraction = prepared.lookback, prepared.fraction
-        last = jnp.maximum(lookback - 1, 0)
-        if lookback.ndim == 0:
-            # Two rows even for no lookback, where the newer one is not used.
-            pair = jnp.stack([last, jnp.maximum(lookback, 1)])
-            newer, older = look_back_rows(state.ring, tick - 1, pair)
-            older = jnp.where(lookback == 0, newer, older)
-        else:
-            newer = look_back(state.ring, tick - 1, last)
-            older = look_back(state.ring, tick - 1, lookback)
-        ring = write(state.ring, tick, tie(measured, newer, older))
-        newer = jnp.where(lookback == 0, measured, newer)
+        ring = write(state.ring, tick, measured)
+        newer, older = look_back(ring, tick, lookback), look_back(ring, tick, lookback + 1)
         recalled = newer - fraction * (newer - older)
         uniform = first_position + ((age - lookback).astype(measured.dtype) - fraction) * stride
         aligned = jnp.where(age <= lookback, uniform, recalled)
