@@ -21,11 +21,17 @@ def prepare() -> None:
 
     jax.config.update("jax_enable_x64", True)
     folder = cache_folder()
-    chosen = getattr(jax.config, "jax_compilation_cache_dir", None)
-    if folder is not None and not chosen:
+    if folder is not None and not program_folder():
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def program_folder() -> str | None:
+    """Where compiled programs are kept, and what is kept beside them; None before `prepare`."""
+    import jax
+
+    return getattr(jax.config, "jax_compilation_cache_dir", None)
 
 
 def flags(given: str) -> str:

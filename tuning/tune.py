@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -19,8 +18,10 @@ from jaxhil.loop import Loop, build_rig
 from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import draw, quasi_random
+from tuning import programs
+from tuning.environment import program_folder
 from tuning.objective import SCALE, Problem, restitution_errors
-from tuning.optimiser import STATUSES, Bounds, solve
+from tuning.optimiser import STATUSES, Bounds, Solution, solve
 
 # Draws of the validation come from another seed than those of training.
 VALIDATION_SEED = 0x5EED
@@ -180,7 +181,8 @@ def _solve(mechanism, compensator, literature, settings) -> list[Start]:
     starts = spread_starts(first, bounds, settings.starts, settings.seed)
     problem = scenarios, fixed, bounds
     problems = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(starts), *np.shape(leaf))), problem)
-    solution = jax.device_get(_solve_problems((loop, names), problems, starts, settings.steps))
+    static = loop, names, settings.steps
+    solution = jax.device_get(programs.run(_solve_problems, static, (*problems, starts), program_folder()))
     starts = []
     for i in range(settings.starts):
         gains = {**literature, **dict(zip(names, map(float, solution.gains[i]), strict=True))}
@@ -221,16 +223,15 @@ def spread_starts(first: np.ndarray, bounds: Bounds, number: int, seed: int) -> 
     return np.where(logarithmic, np.exp(np.where(logarithmic, values, 0)), values)
 
 
-@partial(jax.jit, static_argnames=("static", "steps"))
-def _solve_problems(static, problems, starts, steps):
-    scenarios, fixed, bounds = problems
+def _solve_problems(static, arguments) -> Solution:
+    loop, names, steps = static
+    scenarios, fixed, bounds, starts = arguments
 
     def rig(scenarios):
-        limited = scenarios._replace(time_limit=_patience(static[0], scenarios))
-        return build_rig(static[0], limited)
+        return build_rig(loop, scenarios._replace(time_limit=_patience(loop, scenarios)))
 
-    rigs = jax.vmap(rig)(scenarios)
-    return solve(restitution_errors, static, Problem(rigs, fixed), bounds, starts, max_steps=steps)
+    problems = Problem(jax.vmap(rig)(scenarios), fixed)
+    return solve(restitution_errors, (loop, names), problems, bounds, starts, max_steps=steps)
 
 
 def _patience(loop: Loop, scenarios: Scenario) -> Array:

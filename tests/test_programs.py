@@ -1,0 +1,105 @@
+"""Programs kept in files: the same numbers, traced once, remade when anything they depend on changes."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import AxisType, PartitionSpec
+
+from jaxhil.contact import LAWS, HuntCrossley, KelvinVoigt
+from tuning import programs
+
+
+class Sums(NamedTuple):
+    total: jax.Array
+    parts: jax.Array
+
+
+traced = []
+
+
+def sums(static, arguments) -> Sums:
+    traced.append(static)
+    factor = 2.0 if isinstance(static[0], KelvinVoigt) else 3.0
+
+    def one_device(values):
+        return factor * values
+
+    mesh = jax.make_mesh((2,), ("device",), axis_types=(AxisType.Auto,), devices=jax.devices()[:2])
+    own = PartitionSpec("device")
+    parts = jax.shard_map(one_device, mesh=mesh, in_specs=own, out_specs=own)(arguments["values"])
+    return Sums(jnp.sum(parts) + static[1], parts)
+
+
+STATIC = (KelvinVoigt(), 1)
+VALUES = {"values": np.array([1.0, 2.0, 4.0, 8.0])}
+
+
+@pytest.fixture(autouse=True)
+def forgetful():
+    programs._program.cache_clear()
+    traced.clear()
+
+
+def run(folder, static=STATIC, arguments=VALUES):
+    """What a new process would find."""
+    programs._program.cache_clear()
+    result = programs.run(sums, static, arguments, folder)
+    return float(result.total), np.asarray(result.parts)
+
+
+def test_a_program_is_traced_once_and_gives_the_same_numbers(tmp_path):
+    plain = run(None)
+    assert len(traced) == 1
+    first, second = run(tmp_path), run(tmp_path)
+    assert len(traced) == 2 and len(list(tmp_path.iterdir())) == 1
+    for total, parts in (plain, first, second):
+        assert total == 31.0
+        np.testing.assert_array_equal(parts, 2 * VALUES["values"])
+
+
+@pytest.mark.parametrize("spoil", [lambda content: b"", lambda content: content[:-1000], lambda c: b"no" + c])
+def test_a_spoilt_file_is_made_anew(tmp_path, spoil):
+    run(tmp_path)
+    (file,) = tmp_path.iterdir()
+    whole = file.read_bytes()
+    file.write_bytes(spoil(whole))
+    assert run(tmp_path)[0] == 31.0
+    assert len(traced) == 2 and file.stat().st_size == len(whole)
+
+
+def test_other_statics_and_shapes_are_other_programs(tmp_path):
+    assert run(tmp_path)[0] == 31.0
+    assert run(tmp_path, (HuntCrossley(), 1))[0] == 46.0
+    assert run(tmp_path, (KelvinVoigt(), 2))[0] == 32.0
+    assert run(tmp_path, arguments={"values": np.array([1.0, 2.0])})[0] == 7.0
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+def test_changed_sources_are_another_program(tmp_path, monkeypatch):
+    run(tmp_path)
+    package = tmp_path / "package"
+    package.mkdir()
+    (package / "__init__.py").write_text("changed = True\n")
+    monkeypatch.setattr(programs.sys.modules["tuning"], "__file__", str(package / "__init__.py"))
+    run(tmp_path)
+    assert len(traced) == 2
+
+
+def test_a_law_from_elsewhere_is_not_kept(tmp_path):
+    class Mine(LAWS["linear"]):
+        pass
+
+    class Holder(eqx.Module):
+        law: eqx.Module = eqx.field(static=True)
+
+    assert run(tmp_path, (Mine(), 1))[0] == 31.0
+    run(tmp_path, (KelvinVoigt(), 1, Holder(KelvinVoigt())))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_written_costs_no_result(tmp_path):
+    assert run(tmp_path / "missing")[0] == 31.0

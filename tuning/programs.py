@@ -1,0 +1,107 @@
+"""Programs kept between calls: what tracing made of a function, beside what the compiler made of it.
+
+Tracing a solve takes longer than running it. `run` keeps the traced program in a file whose name is made of
+all it depends on: the sources, the versions of what they stand on, static arguments, shapes.
+"""
+
+import dataclasses
+import hashlib
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import export
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
+
+PACKAGES = ("jaxhil", "tuning")
+STANDS_ON = ("jax", "jaxlib", "optimistix", "equinox", "lineax", "numpy")
+# Calls into LAPACK have no promise to mean the same in other versions; the name has the version in it.
+LAPACK = ("lapack_dgeqrf_ffi", "lapack_dormqr_ffi", "lapack_dtrsm_ffi")
+
+
+def run(
+    function: Callable[..., Any], static: Any, arguments: Any, folder: str | os.PathLike[str] | None
+) -> Any:
+    """`function(static, arguments)`, a named tuple of arrays, compiled.
+
+    `function` is one of a module, with an annotated result. `static` is hashable, and its `repr` tells all of
+    it; `arguments` is a pytree of arrays. Programs are kept in `folder`; none without one, and none of
+    compensators or contact laws from elsewhere, whose sources are not known.
+    """
+    leaves, structure = jax.tree.flatten(arguments)
+    shapes = tuple((leaf.shape, str(leaf.dtype)) for leaf in leaves)
+    program = _program(function, static, structure, shapes, None if _is_foreign(static) else folder)
+    return function.__annotations__["return"](*program(*leaves))
+
+
+@cache
+def _program(function, static, structure, shapes, folder):
+    """The program of `run`, from and to flat arrays."""
+
+    def flat(*leaves):
+        return tuple(function(static, jax.tree.unflatten(structure, leaves)))
+
+    if folder is None:
+        return jax.jit(flat)
+    path = Path(folder) / f"{_name(function, static, structure, shapes)}.program"
+    exported = _read(path)
+    if exported is None:
+        like = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes]
+        checks = [export.DisabledSafetyCheck.custom_call(name) for name in LAPACK]
+        exported = export.export(jax.jit(flat), disabled_checks=checks)(*like)
+        _write(path, exported.serialize())
+    if exported.nr_devices == 1:
+        return jax.jit(exported.call)
+    devices = jax.devices()[: exported.nr_devices]
+    mesh = jax.make_mesh((len(devices),), ("device",), axis_types=(AxisType.Auto,), devices=devices)
+    return jax.jit(exported.call, in_shardings=NamedSharding(mesh, PartitionSpec()))
+
+
+def _is_foreign(value: Any) -> bool:
+    """Whether a module of another package is in it."""
+    if isinstance(value, tuple):
+        return any(_is_foreign(entry) for entry in value)
+    if not dataclasses.is_dataclass(value):
+        return False
+    home = type(value).__module__.split(".")[0]
+    fields = (getattr(value, field.name) for field in dataclasses.fields(value))
+    return home not in PACKAGES or any(_is_foreign(field) for field in fields)
+
+
+def _name(function, static, structure, shapes) -> str:
+    digest = hashlib.sha256()
+    for package in PACKAGES:
+        root = Path(str(sys.modules[package].__file__)).parent
+        for source in sorted(root.rglob("*.py")):
+            digest.update(str(source.relative_to(root)).encode() + source.read_bytes())
+    versions = [f"{name} {version(name)}" for name in STANDS_ON]
+    wide = jnp.result_type(float).name
+    flags = wide, jax.default_backend(), jax.device_count()
+    text = repr((function.__module__, function.__qualname__, static, structure, shapes, versions, flags))
+    return hashlib.sha256(digest.digest() + text.encode()).hexdigest()
+
+
+def _read(path: Path) -> export.Exported | None:
+    """The program kept in a file; None if there is none, or none that can be read."""
+    try:
+        return export.deserialize(bytearray(path.read_bytes()))
+    except Exception:
+        # A file cut short can fail in any way; it is then made anew.
+        return None
+
+
+def _write(path: Path, content: bytes | bytearray) -> None:
+    """All or nothing; a folder that has become full or read-only costs only the next call's time."""
+    try:
+        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+            file.write(content)
+        os.replace(file.name, path)
+    except OSError:
+        pass
