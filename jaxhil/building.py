@@ -36,7 +36,8 @@ def build_loop(mechanism: Mechanism, compensator: str, scenarios: Scenario, ener
         rows = max(SHORTEST_WINDOW, 1 << (spread - 1).bit_length())
         return rows if rows <= LONGEST_WINDOW else 0
 
-    force_delay, position_delay, real_panels = split_delays(jax.tree.map(jnp.asarray, scenarios))
+    is_two_sided = bool(np.any(np.isfinite(scenarios.clearance)))
+    delays = split_delays(jax.tree.map(jnp.asarray, scenarios), is_two_sided)
     periods = np.unique(scenarios.control_period)
     return Loop(
         law=LAWS[mechanism.contact.law](),
@@ -57,14 +58,22 @@ def build_loop(mechanism: Mechanism, compensator: str, scenarios: Scenario, ener
         has_limits=bool(
             np.any(np.isfinite(simulator.velocity_limit)) or np.any(np.isfinite(simulator.acceleration_limit))
         ),
-        is_two_sided=bool(np.any(np.isfinite(scenarios.clearance))),
+        first_break=_first_break(simulator.numerator, rig.command_hold),
+        is_two_sided=is_two_sided,
         ring=samples(sensed),
         controller_ring=samples(max(aligned, default=0.0)),
         windows=Windows(
-            force=window(force_delay.panels),
-            real=window(real_panels),
-            position=window(position_delay.panels),
+            force=window(delays.force.panels),
+            real=window(delays.real),
+            touch=window(delays.touch),
+            position=window(delays.position.panels),
         ),
         has_common_period=len(periods) == 1,
         energies=energies,
     )
+
+
+def _first_break(numerator, hold: str) -> int:
+    """The relative degree of the motion simulator, and one more where the command itself has no jumps."""
+    proper = [i + 1 for i in range(len(numerator)) if np.any(numerator[i] != 0)]
+    return min((proper[0] if proper else 0) + (hold == "linear"), 3)
