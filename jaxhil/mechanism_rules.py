@@ -179,7 +179,8 @@ def _greatest_lag(simulator: Simulator, extreme: Callable[[str, int], Any]) -> f
     if simulator.model == "third_order":
         return extreme(path + "coefficients", 1)[0]
     if simulator.model == "transfer_function":
-        (*_, slope, value), (*_, lead, gain) = simulator.denominator, [0.0, *simulator.numerator]
+        *_, slope, value = simulator.denominator or []
+        *_, lead, gain = 0.0, *(simulator.numerator or [])
         return slope / value - lead / gain
     return 0.0
 
