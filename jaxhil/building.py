@@ -28,6 +28,7 @@ def build_loop(mechanism: Mechanism, compensator: str, scenarios: Scenario, ener
         periods = float(np.max(delay / scenarios.control_period))
         return max(SHORTEST_RING, 1 << int(np.ceil(np.log2(periods + 4))))
 
+    is_two_sided = bool(np.any(np.isfinite(scenarios.clearance)))
     return Loop(
         law=LAWS[mechanism.contact.law](),
         compensator=law,
@@ -47,8 +48,15 @@ def build_loop(mechanism: Mechanism, compensator: str, scenarios: Scenario, ener
         has_limits=bool(
             np.any(np.isfinite(simulator.velocity_limit)) or np.any(np.isfinite(simulator.acceleration_limit))
         ),
-        is_two_sided=bool(np.any(np.isfinite(scenarios.clearance))),
+        first_break=_first_break(simulator.numerator, rig.command_hold),
+        is_two_sided=is_two_sided,
         ring=samples(sensed),
         controller_ring=samples(max(aligned, default=0.0)),
         energies=energies,
     )
+
+
+def _first_break(numerator, hold: str) -> int:
+    """The relative degree of the motion simulator, and one more where the command itself has no jumps."""
+    proper = [i + 1 for i in range(len(numerator)) if np.any(numerator[i] != 0)]
+    return min((proper[0] if proper else 0) + (hold == "linear"), 3)

@@ -52,6 +52,11 @@ class ContactLaw(eqx.Module):
         """Limit of the force [N] as the penetration goes to 0 from above: the jump of a damped touch."""
 
     @abc.abstractmethod
+    def hold(self, parameters: ContactParameters, penetration: Array, rate: Array) -> Array:
+        """Smooth and positive as long as penetrated surfaces hold on to each other, else not: they let go
+        where it goes through 0. The force before its clamp, or anything of its sign."""
+
+    @abc.abstractmethod
     def reference(self, parameters: ContactParameters, mass: Array, velocity: Array) -> Reference:
         """The same contact in space, entered at `velocity` [m/s]: see `jaxhil.reference`."""
 
@@ -67,6 +72,10 @@ class KelvinVoigt(ContactLaw):
     def edge(self, parameters, rate):
         force = parameters.damping * rate
         return jnp.where(parameters.tension | (force > 0), force, 0)
+
+    def hold(self, parameters, penetration, rate):
+        force = parameters.stiffness * penetration + parameters.damping * rate
+        return jnp.where(parameters.tension, 1, force)
 
     def reference(self, parameters, mass, velocity):
         return kelvin_voigt(mass, parameters.stiffness, parameters.damping, velocity, parameters.tension)
@@ -86,6 +95,9 @@ class HuntCrossley(ContactLaw):
     def edge(self, parameters, rate):
         return jnp.zeros_like(rate)
 
+    def hold(self, parameters, penetration, rate):
+        return 1 + 1.5 * parameters.damping * rate
+
     def reference(self, parameters, mass, velocity):
         return hunt_crossley(mass, parameters.stiffness, parameters.exponent, parameters.damping, velocity)
 
@@ -97,6 +109,10 @@ class PiecewiseLinear(ContactLaw):
     """
 
     def step(self, parameters, state, penetration, rate):
+        force = self.hold(parameters, penetration, rate)
+        return jnp.where((penetration > 0) & (force > 0), force, 0), state
+
+    def hold(self, parameters, penetration, rate):
         segments = parameters.stiffness.shape[0]
         force = parameters.damping * rate
         for i in range(segments):
@@ -106,7 +122,7 @@ class PiecewiseLinear(ContactLaw):
                 lower = 0 if i == 0 else parameters.depths[i - 1]
                 overlap = jnp.minimum(overlap, parameters.depths[i] - lower)
             force = force + parameters.stiffness[i] * overlap
-        return jnp.where((penetration > 0) & (force > 0), force, 0), state
+        return force
 
     def edge(self, parameters, rate):
         force = parameters.damping * rate

@@ -15,17 +15,18 @@ def limit_command(
 ) -> tuple[Array, Array]:
     """The limited command c(n+1) [m] and its step c(n+1) - c(n) [m].
 
-    Velocity: |c(n+1) - c(n)| <= v_max T. Acceleration: the step changes by at most a_max T^2, and the command
-    is never overshot: the closing speed stays below what can be braked in the distance left, in whole
-    periods: r (r + a T)/(2 a) <= distance. While neither limit binds, c(n+1) is the command itself.
+    Velocity: |c(n+1) - c(n)| <= v_max T. Acceleration: the step changes by at most q = a_max T^2, and a
+    command in uniform motion is not overshot. The step s that closes in on it, b behind, is the longest that
+    m more steps, each shorter by q, bring to rest on it: b = (m + 1) s - q m (m + 1)/2. While neither limit
+    binds, c(n+1) is the command itself.
     """
     largest = velocity_limit * control_period
     change = acceleration_limit * control_period**2
     limited = jnp.isfinite(change)
     change = jnp.where(limited, change, 1)
     behind = command - model_step - previous
-    braking = change / 2 * (jnp.sqrt(1 + 8 * jnp.abs(behind) / change) - 1)
-    closing = jnp.where(jnp.abs(behind) < braking, behind, jnp.sign(behind) * braking)
+    more = jnp.floor((jnp.sqrt(1 + 8 * jnp.abs(behind) / change) - 1) / 2)
+    closing = behind / (more + 1) + jnp.sign(behind) * change * more / 2
     step = jnp.where(limited, model_step + closing, command - previous)
     step = jnp.where(limited, jnp.clip(step, previous_step - change, previous_step + change), step)
     step = jnp.where(step > largest, largest, jnp.where(step < -largest, -largest, step))

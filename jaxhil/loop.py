@@ -7,22 +7,24 @@
     touch      the real contact: force where the force sensor will read it
 
 Time runs in control periods and each lane has its own. `Loop` is what is static (it shapes the compiled
-program), `Rig` what is constant during a run, `LoopState` what evolves.
+program), `Rig` what is constant during a run, `LoopState` (`jaxhil.loop_state`) what evolves.
 """
 
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxhil.compensators.base import Compensator, Constants, Gains, Signals
-from jaxhil.contact import ContactLaw, ContactParameters, two_sided
+from jaxhil.contact import ContactLaw
 from jaxhil.integrators import INTEGRATORS
 from jaxhil.limits import limit_command
+from jaxhil.loop_state import LoopState, Plant, Rings, Sensed
 from jaxhil.ring import look_back, tie, write_in_turn
 from jaxhil.scenario import Scenario
-from jaxhil.sensors import lag, quantise, sample_force, white_noise
+from jaxhil.sensors import quantise, sample_force, white_noise
 from jaxhil.simulator import (
     Delay,
     Propagation,
@@ -32,6 +34,32 @@ from jaxhil.simulator import (
     split_delay,
     steady_state,
 )
+from jaxhil.touch import (
+    Motion,
+    Panel,
+    Surfaces,
+    Truth,
+    crest,
+    no_touch,
+    sensed_lag,
+    works_along,
+    works_between,
+)
+
+
+class Delays(NamedTuple):
+    """The reading of force and of position as panels and fraction; panels to look back for the newest force
+    that has really happened by a tick; panels after which the law is evaluated.
+
+    One-sided, the law is evaluated as soon as the motion is known, by the transport delay ahead of time.
+    Between two surfaces its parameters may change meanwhile: it is evaluated when it happens, and the other
+    numbers count from then.
+    """
+
+    force: Delay
+    position: Delay
+    real: Int[Array, "*batch"]
+    touch: Int[Array, "*batch"]
 
 
 class Loop(eqx.Module):
@@ -39,8 +67,9 @@ class Loop(eqx.Module):
 
     law, compensator, integrator, hold ("linear" or "zoh"), latency (0 or 1 periods); which optional parts
     are present: force lag, force noise or bias, position noise, sample effects (quantum, dead zone, range),
-    command limits, a second surface; samples in the delay lines of the sensors and of the controller;
-    whether energies are audited.
+    command limits, a second surface; which derivative of the mechanism's position is the first to break at
+    the ticks (0: it jumps itself; 3 stands for all higher ones); samples in the delay lines of the sensors
+    and of the controller; whether energies are audited.
     """
 
     law: ContactLaw = eqx.field(static=True)
@@ -54,10 +83,21 @@ class Loop(eqx.Module):
     has_position_noise: bool = eqx.field(static=True)
     has_sample_effects: bool = eqx.field(static=True)
     has_limits: bool = eqx.field(static=True)
+    first_break: int = eqx.field(static=True)
     is_two_sided: bool = eqx.field(static=True)
     ring: int = eqx.field(static=True)
     controller_ring: int = eqx.field(static=True)
     energies: bool = eqx.field(static=True)
+
+    @property
+    def has_corners(self) -> bool:
+        """Whether the real force's peak may be a corner at a tick."""
+        return self.first_break in (1, 2)
+
+    @property
+    def follows_panels(self) -> bool:
+        """Whether the motion is needed between samples."""
+        return self.has_lag or self.has_corners or self.energies
 
 
 class Rig(NamedTuple):
@@ -65,87 +105,43 @@ class Rig(NamedTuple):
 
     scenario: Scenario
     propagation: Propagation
-    force_delay: Delay
-    position_delay: Delay
-    real_panels: Int[Array, "*batch"]
+    delays: Delays
     constants: Constants
     inverse_mass: Float[Array, "*batch"]
-
-
-class Plant(NamedTuple):
-    """Motion simulator and drives: recent commands c(n), c(n-1) [m], last step of the command [m], state."""
-
-    commands: tuple[Array, ...]
-    step: Array
-    state: tuple[Array, ...]
-
-
-class Sensed(NamedTuple):
-    """What the sensors will read: rings of true force, of position, and, where the loop has them, of the
-    force's lagged reading and of work increments; the last sample as `_sample` takes it, the lag's
-    reading, the position sample of the panel before the run."""
-
-    force: Any
-    position: Any
-    reading: Float[Array, "samples *batch"] | None
-    work: Float[Array, "samples *batch"] | None
-    last: tuple[Array, Array, Array, Array]
-    lagged: Array
-    first_position: Array
-
-
-class LoopState(NamedTuple):
-    """All that evolves: the model's position [m] and velocity [m/s], and the rest. The run under way was
-    entered at `entry_tick`, in uniform motion of `entry_velocity` [m/s]."""
-
-    position: Float[Array, "*batch"]
-    velocity: Float[Array, "*batch"]
-    plant: Plant
-    sensed: Sensed
-    law: tuple[Array, ...]
-    controller: Any
-    parameters: ContactParameters
-    entry_velocity: Float[Array, "*batch"]
-    entry_tick: Int[Array, "*batch"]
-
-
-class Truth(NamedTuple):
-    """What really happens at a tick: contact force [N] at the mechanism, work increment [J]."""
-
-    force: Float[Array, "*batch"]
-    work: Float[Array, "*batch"] | None
 
 
 def build_rig(loop: Loop, scenario: Scenario) -> Rig:
     """Discretise the linear parts exactly and split every delay into panels and a fraction."""
     period, simulator = scenario.control_period, scenario.simulator
-    force_delay, position_delay, real_panels = split_delays(scenario)
+    delays = split_delays(scenario, loop.is_two_sided)
     return Rig(
         scenario=scenario,
         propagation=propagation(
             simulator.numerator,
             simulator.denominator,
             period,
-            force_delay.fraction,
-            position_delay.fraction,
+            delays.force.fraction,
+            delays.position.fraction,
             loop.hold,
+            ends=loop.follows_panels,
         ),
-        force_delay=force_delay,
-        position_delay=position_delay,
-        real_panels=real_panels,
+        delays=delays,
         constants=Constants(period, scenario.clearance),
         inverse_mass=1 / scenario.equivalent_mass,
     )
 
 
-def split_delays(scenario: Scenario) -> tuple[Delay, Delay, Int[Array, "*batch"]]:
-    """Delay of the force reading and of the position reading, and how many panels back lies the newest force
-    sample that has really happened by a tick."""
+def split_delays(scenario: Scenario, is_two_sided: bool) -> Delays:
+    """Every delay of a scenario in panels."""
     period, simulator = scenario.control_period, scenario.simulator
     force = split_delay(simulator.delay + scenario.force_sensor.delay, period)
     position = split_delay(simulator.delay + scenario.position_sensor.delay, period)
     behind = simulator.delay / period + force.fraction
-    return force, position, jnp.ceil(behind - 1e-9).astype(jnp.int32) - 1
+    real = jnp.ceil(behind - 1e-9).astype(jnp.int32) - 1
+    now = jnp.zeros_like(real)
+    if is_two_sided:
+        return Delays(force._replace(panels=force.panels - real), position, now, real)
+    return Delays(force, position, real, now)
 
 
 def enter(
@@ -177,14 +173,12 @@ def enter(
         start,
         end,
     )
-    zeros = jnp.zeros_like(position)
-    outside = jnp.full_like(position, -1)
     return state._replace(
         position=position,
         velocity=velocity,
         plant=Plant(commands, stride, steady_state(rig.propagation, drive, stride)),
         sensed=state.sensed._replace(
-            last=(outside, zeros, zeros, zeros + 1), lagged=zeros, first_position=first_position
+            last=no_touch(position), lagged=jnp.zeros_like(position), first_position=first_position
         ),
         law=loop.law.init(position),
         entry_velocity=velocity,
@@ -196,12 +190,10 @@ def sense(loop: Loop, rig: Rig, state: LoopState, tick: Array) -> tuple[Signals,
     """Stage 1: what the sensors read at this tick, and the truth beside it."""
     scenario, sensed = rig.scenario, state.sensed
     age = tick - state.entry_tick
-    force_ring = sensed.force if sensed.reading is None else sensed.reading
-    force = _recall(force_ring, tick, age, rig.force_delay.panels)
-    real = _recall(sensed.force, tick, age, rig.real_panels)
-    work = None
-    if sensed.work is not None:
-        work = _recall(sensed.work, tick, age, rig.real_panels)
+    rings, delays = sensed.rings, rig.delays
+    force_ring = rings.truth.force if rings.reading is None else rings.reading
+    force = _recall(force_ring, tick, age, delays.force.panels)
+    truth = jax.tree.map(lambda ring: _recall(ring, tick, age, delays.real), rings.truth)
     sensor = scenario.force_sensor
     if loop.has_force_bias:
         force = force + sensor.bias
@@ -210,17 +202,17 @@ def sense(loop: Loop, rig: Rig, state: LoopState, tick: Array) -> tuple[Signals,
     if loop.has_sample_effects:
         force = sample_force(force, sensor.quantum, sensor.dead_zone, sensor.range)
 
-    panels = rig.position_delay.panels
+    panels = delays.position.panels
     stride = rig.constants.control_period * state.entry_velocity
     before = sensed.first_position + (age - panels).astype(stride.dtype) * stride
-    after = look_back(sensed.position, tick - 1, panels)
+    after = look_back(rings.position, tick - 1, panels)
     position = jnp.where(age <= panels, before, after)
     if loop.has_position_noise:
         sensor = scenario.position_sensor
         position = position + white_noise(scenario.key, 2 * tick + 1, sensor.noise_std)
     if loop.has_sample_effects:
         position = quantise(position, scenario.position_sensor.quantum)
-    return Signals(force, state.position, state.velocity, position, age), Truth(real, work)
+    return Signals(force, state.position, state.velocity, position, age), truth
 
 
 def drive(
@@ -251,28 +243,36 @@ def drive(
     end = commands[loop.latency]
     start = commands[loop.latency + 1] if loop.hold == "linear" else end
     plant, x_now = rig.propagation, state.plant.state
-    x_actual = read(plant.position, x_now, start, end)
-    v_actual = read(plant.velocity, x_now, start, end)
-    real, law = two_sided(loop.law, state.parameters, state.law, x_actual, v_actual, scenario.clearance)
-    samples = {
-        "force": tie(real, truth.force),
-        "position": read(plant.measured_position, x_now, start, end),
-    }
-    now, lagged = sensed.last, sensed.lagged
-    if loop.has_lag or loop.energies or loop.is_two_sided:
-        now = _sample(loop, rig, state.parameters, x_actual, v_actual, real)
-    if sensed.reading is not None:
+    panel = _panel(plant, x_now, start, end)
+    rings = sensed.rings
+    panels = rings.panel
+    if panels is not None:
+        panels = write_in_turn(panels, tick, panel)
+        panel = _arrived(rig, panels, tick, tick - state.entry_tick)
+    surfaces = Surfaces(loop.law, state.parameters, state.law, scenario.clearance)
+    real, law = surfaces.force(panel.sample)
+    now, lagged, reading = sensed.last, sensed.lagged, None
+    if loop.is_two_sided or loop.energies:
+        now = surfaces.touch(panel.sample, real)
+    if loop.has_lag:
+        until = rig.delays.force.fraction * period
         time_constant = scenario.force_sensor.time_constant
-        lagged = lag(sensed.lagged, sensed.last[:3], now[:3], period, time_constant)
-        samples["reading"] = lagged
-    if sensed.work is not None and truth.work is not None:
-        samples["work"] = tie(_work(sensed.last, now), truth.work)
-    rings = write_in_turn({name: getattr(sensed, name) for name in samples}, tick, samples)
+        reading, lagged = sensed_lag(surfaces, lagged, panel, until, period, time_constant)
+    works = peak = None
+    if loop.energies and loop.first_break == 0:
+        works = works_between(sensed.last, now)
+    elif loop.energies:
+        works = works_along(surfaces, panel.start, panel.end, period)
+    if loop.has_corners:
+        peak = crest(surfaces, panel.start, panel.end, period)
+    happened = jax.tree.map(tie, Truth(real, works, peak), truth)
+    samples = Rings(happened, reading, read(plant.measured_position, x_now, start, end), None)
+    rings = write_in_turn(rings._replace(panel=None), tick, samples)._replace(panel=panels)
     return state._replace(
         position=position,
         velocity=velocity,
         plant=Plant(commands[: loop.latency + 1], step, advance(plant.transition, x_now, start, end)),
-        sensed=sensed._replace(**rings, last=now, lagged=lagged),
+        sensed=Sensed(rings, now, lagged, sensed.first_position),
         law=law,
         controller=controller,
     )
@@ -283,19 +283,19 @@ def _recall(ring, tick, age, panels):
     return jnp.where(age > panels, look_back(ring, tick - 1, panels), 0)
 
 
-def _sample(loop, rig, parameters, position, velocity, force):
-    """(distance into the nearer surface, force, its limit at the surface, side of the surface)."""
-    far = -rig.scenario.clearance - position
-    beyond = jnp.where(far > position, far, position)
-    side = jnp.where(far > position, -1, 1).astype(position.dtype)
-    return beyond, force, side * loop.law.edge(parameters, side * velocity), side
+def _panel(plant, state, start, end):
+    """Motion of the real mechanism over the panel under way."""
+
+    def motion(position, velocity):
+        return Motion(read(position, state, start, end), read(velocity, state, start, end))
+
+    sample = motion(plant.position, plant.velocity)
+    if plant.start is None:
+        return Panel(sample, None, None)
+    return Panel(sample, motion(*plant.start), motion(*plant.end))
 
 
-def _work(before, now):
-    """Work [J] done on the mechanism over one period, exact for a force straight in the penetration."""
-    depth_0 = jnp.where(before[0] > 0, before[0], 0)
-    depth_1 = jnp.where(now[0] > 0, now[0], 0)
-    force_0 = jnp.where(before[0] > 0, before[1], now[2])
-    force_1 = jnp.where(now[0] > 0, now[1], before[2])
-    side = jnp.where(now[0] > 0, now[3], before[3])
-    return side * (force_0 + force_1) / 2 * (depth_1 - depth_0)
+def _arrived(rig, rings, tick, age):
+    """The panel that happens now; before the run, at rest at the surface, which does not push."""
+    panels = rig.delays.touch
+    return jax.tree.map(lambda ring: jnp.where(age >= panels, look_back(ring, tick, panels), 0), rings)

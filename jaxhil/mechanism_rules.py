@@ -8,8 +8,9 @@ any rule, so that one file serves a study over laws and models.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 
@@ -150,19 +151,38 @@ def _check_hold(mechanism: Mechanism) -> None:
 
 
 def _check_gap(mechanism: Mechanism, spans: Mapping[str, _Span]) -> None:
-    # The approach starts at x = -v (0.02 s + phase T), which has to lie inside the gap. An
-    # unbounded distribution reaches every value, so that only the nominal one can be judged.
-    def extreme(path: str, end: int) -> float:
+    # The approach starts at x_d = -v (0.02 s + phase T) with x_a behind by the motion simulator's delay and
+    # lag and the command's latency, and has to lie inside the gap. An unbounded distribution reaches every
+    # value, so that only the nominal one can be judged.
+    def extreme(path: str, end: int) -> Any:
         uncertainty = mechanism.uncertainty.get(path)
         drawn = uncertainty is not None and uncertainty.distribution != "normal"
-        return float(spans[path][end]) if drawn else value_at(mechanism, path)
+        return spans[path][end] if drawn else value_at(mechanism, path)
 
-    clearance = extreme("contact.clearance", 0)
-    velocity = extreme("approach.velocity", 1)
-    start = velocity * (0.02 + extreme("rig.control_period", 1))
+    clearance = float(extreme("contact.clearance", 0))
+    period = extreme("rig.control_period", 1)
+    behind = extreme("rig.simulator.delay", 1) + mechanism.rig.command_latency * period
+    behind += max(_greatest_lag(mechanism.rig.simulator, extreme), 0.0)
+    start = float(extreme("approach.velocity", 1) * (0.02 + period + behind))
     if clearance <= start:
-        allowed = f"a clearance > {start:g}, v (0.02 s + T): the start lies within it"
-        raise KeyProblem(("contact", "clearance"), shown(clearance), allowed)
+        allowed = f"a clearance > {start:g}, v (0.02 s + T + the motion simulator's delay and lag): "
+        raise KeyProblem(("contact", "clearance"), shown(clearance), allowed + "the start lies within it")
+
+
+def _greatest_lag(simulator: Simulator, extreme: Callable[[str, int], Any]) -> float:
+    """By how much [s] a motion simulator follows a uniform motion late, its delay apart: -G'(0)."""
+    path = "rig.simulator."
+    if simulator.model == "first_order":
+        return extreme(path + "time_constant", 1)
+    if simulator.model == "second_order":
+        return extreme(path + "damping_ratio", 1) / (math.pi * extreme(path + "natural_frequency", 0))
+    if simulator.model == "third_order":
+        return extreme(path + "coefficients", 1)[0]
+    if simulator.model == "transfer_function":
+        *_, slope, value = simulator.denominator or []
+        *_, lead, gain = 0.0, *(simulator.numerator or [])
+        return slope / value - lead / gain
+    return 0.0
 
 
 def _check_uncertainty(mechanism: Mechanism, path: str, uncertainty: Uncertainty) -> _Span:

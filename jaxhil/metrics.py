@@ -11,8 +11,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.compensators.base import Signals
 from jaxhil.contact import deflection
-from jaxhil.loop import Loop, Truth
+from jaxhil.loop import Loop
 from jaxhil.scenario import Scenario
+from jaxhil.touch import Truth
 
 NOT_REACHED, OK, TIMEOUT, DIVERGED, NON_FINITE = -1, 0, 1, 2, 3
 STATUS_NAMES = {
@@ -151,22 +152,21 @@ def observe(
     quiet = jnp.where(touching, 0, watch.quiet + 1)
     faded = magnitude <= jnp.maximum(FADED * peak_command, rules.level)
     ends = begun & away & (quiet >= rules.quiet) & (faded | (quiet >= rules.patience))
+    if truth.crest is not None:
+        peak_force = truth.crest
+    else:
+        # The force of a motion in jumps is constant between them.
+        peak_force = force if loop.first_break == 0 else _crest(*watch.recent, force)
     works = watch.works
-    if truth.work is not None:
-        # A pulling force acts while the penetration recedes: it takes from the work returned.
-        pushing = truth.force if side is None else side * truth.force
-        grows = (truth.work > 0) & (pushing > 0)
-        works = (
-            works[0] + jnp.where(grows, truth.work, 0),
-            works[1] - jnp.where(grows, 0, truth.work),
-        )
+    if truth.works is not None:
+        works = works[0] + truth.works[0], works[1] + truth.works[1]
     return Watch(
         elapsed=jnp.where(begun, watch.elapsed + 1, watch.elapsed),
         over=watch.over | ends,
         # Each speed stops being followed at its event; the approach's is that of the tick before.
         approach=jnp.where(begun | watch.over, watch.approach, speed),
         rebound=jnp.where(watch.over, watch.rebound, speed),
-        peak_force=jnp.maximum(watch.peak_force, _crest(*watch.recent, force)),
+        peak_force=jnp.maximum(watch.peak_force, peak_force),
         peak_command=peak_command,
         recent=(watch.recent[1], force),
         touched=jnp.where(touching, watch.touched + 1, watch.touched),

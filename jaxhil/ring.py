@@ -5,8 +5,9 @@ a ring in place only if it sees that the reading comes first: the sample written
 Else it copies the ring.
 """
 
-from collections.abc import Mapping
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
@@ -27,22 +28,19 @@ def write(
     return lax.dynamic_update_index_in_dim(ring, value, tick & (ring.shape[0] - 1), 0)
 
 
-def write_in_turn(
-    rings: Mapping[str, Float[Array, "samples *batch"]],
-    tick: Int[Array, ""],
-    values: Mapping[str, Float[Array, "*batch"]],
-) -> dict[str, Float[Array, "samples *batch"]]:
-    """Store each value in the ring of its name, one after the other.
+def write_in_turn(rings: Any, tick: Int[Array, ""], values: Any) -> Any:
+    """Store each leaf of `values` in the same leaf of `rings`, one after the other.
 
     Writes that know nothing of each other the compiler merges into one loop over the whole of the rings.
     """
-    written, before = {}, None
-    for name, value in values.items():
-        if before is not None:
-            oldest = (tick + 1) & (before.shape[0] - 1)
-            value = tie(value, lax.dynamic_index_in_dim(before, oldest, 0, keepdims=False))
-        written[name] = before = write(rings[name], tick, value)
-    return written
+    leaves, structure = jax.tree.flatten(rings)
+    written = []
+    for ring, value in zip(leaves, jax.tree.leaves(values), strict=True):
+        if written:
+            oldest = (tick + 1) & (ring.shape[0] - 1)
+            value = tie(value, lax.dynamic_index_in_dim(written[-1], oldest, 0, keepdims=False))
+        written.append(write(ring, tick, value))
+    return jax.tree.unflatten(structure, written)
 
 
 def tie(value: Float[Array, "*batch"], *reads: Float[Array, "*batch"]) -> Float[Array, "*batch"]:

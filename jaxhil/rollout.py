@@ -15,16 +15,13 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxhil.compensators.base import Gains, Signals
 from jaxhil.loop import (
     Loop,
-    LoopState,
-    Plant,
     Rig,
-    Sensed,
-    Truth,
     build_rig,
     drive,
     enter,
     sense,
 )
+from jaxhil.loop_state import LoopState, Plant, Rings, Sensed
 from jaxhil.metrics import (
     FADED,
     OK,
@@ -38,6 +35,7 @@ from jaxhil.metrics import (
     observe,
 )
 from jaxhil.scenario import Scenario
+from jaxhil.touch import Motion, Panel, Truth, no_touch
 
 APPROACH = 0.02  # s of free approach before a contact, besides its phase
 SETTLED = 1e-6  # of the distance flown in a period: the motion simulator follows uniformly
@@ -85,16 +83,12 @@ def run_contacts(loop: Loop, gains: Gains, rig: Rig) -> Metrics:
             return turn_over(loop, rig, gains, run)
         # Most stretches end no contact: lanes of a tile end theirs at about the same time. The rings, which
         # a turn-over leaves alone, stay outside the branch, where they need not be copied.
-        rings = run.state.sensed
-        light = rings._replace(force=None, position=None, reading=None, work=None)
-        light = run._replace(state=run.state._replace(sensed=light))
+        rings = run.state.sensed.rings
+        light = run._replace(state=run.state._replace(sensed=run.state.sensed._replace(rings=None)))
         light = lax.cond(
             jnp.any(_pending(rig, run)), lambda run: turn_over(loop, rig, gains, run), lambda run: run, light
         )
-        sensed = light.state.sensed._replace(
-            force=rings.force, position=rings.position, reading=rings.reading, work=rings.work
-        )
-        return light._replace(state=light.state._replace(sensed=sensed))
+        return light._replace(state=light.state._replace(sensed=light.state.sensed._replace(rings=rings)))
 
     run = start(loop, rig, gains)
     return lax.while_loop(lambda run: jnp.any(run.active), body, run).metrics
@@ -113,8 +107,8 @@ def record(loop: Loop, gains: Gains, scenario: Scenario, stretches: int) -> tupl
 
 
 def stretch_length(loop: Loop) -> int:
-    """Ticks between turn-overs. A rattling contact can end and the next begin within four."""
-    return 4 if loop.is_two_sided else 16
+    """Ticks between turn-overs. Between two surfaces the next contact may begin at once."""
+    return 1 if loop.is_two_sided else 16
 
 
 def start(loop: Loop, rig: Rig, gains: Gains) -> Run:
@@ -128,15 +122,7 @@ def start(loop: Loop, rig: Rig, gains: Gains) -> Run:
         position=zeros,
         velocity=zeros,
         plant=Plant((zeros,) * (loop.latency + 1), zeros, (zeros,) * order),
-        sensed=Sensed(
-            force=ring,
-            position=ring,
-            reading=ring if loop.has_lag else None,
-            work=ring if loop.energies else None,
-            last=(zeros, zeros, zeros, zeros),
-            lagged=zeros,
-            first_position=zeros,
-        ),
+        sensed=Sensed(_rings(loop, ring), no_touch(like), zeros, zeros),
         law=loop.law.init(zeros),
         controller=loop.compensator.init(gains, rig.constants, loop.controller_ring),
         parameters=_entry(scenario.contact, index),
@@ -206,7 +192,7 @@ def turn_over(loop: Loop, rig: Rig, gains: Gains, run: Run, skip_flight: bool = 
         }
         watch = _choose(over, blank._replace(left=left, **kept), watch)
         # A damped contact is over while the mechanism is still dented: its law holds until it is free.
-        free = state.sensed.last[0] <= 0
+        free = state.sensed.last.distance <= 0
         state = state._replace(parameters=_choose(free, entry, state.parameters))
         if skip_flight:
             state = _skip_flight(loop, rig, gains, state, watch, run.tick)
@@ -217,6 +203,17 @@ def turn_over(loop: Loop, rig: Rig, gains: Gains, run: Run, skip_flight: bool = 
         state = _restart(loop, gains, state, entered, over, over)
         watch = _choose(over, blank, watch)
     return run._replace(state=state, watch=watch, metrics=metrics, index=index, active=active)
+
+
+def _rings(loop, ring):
+    """Empty delay lines of what the loop has."""
+    panel = None
+    if loop.is_two_sided:
+        motion = Motion(ring, ring)
+        ends = motion if loop.follows_panels else None
+        panel = Panel(motion, ends, ends)
+    truth = Truth(ring, (ring, ring) if loop.energies else None, ring if loop.has_corners else None)
+    return Rings(truth, ring if loop.has_lag else None, ring, panel)
 
 
 def _pending(rig, run):

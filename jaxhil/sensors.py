@@ -1,7 +1,7 @@
 """The force and position sensors: what a reading makes of the physical signal.
 
 Delays are the simulator's business (`jaxhil.simulator`); here are the force sensor's first-order lag, in
-continuous time between samples, and what happens to a sample: bias and noise, quantum, dead zone, range.
+continuous time, and what happens to a sample: bias and noise, quantum, dead zone, range.
 """
 
 import jax
@@ -11,29 +11,29 @@ from jaxtyping import Array, Float, UInt32
 
 def lag(
     reading: Float[Array, "*batch"],
-    before: tuple[Array, Array, Array],
-    now: tuple[Array, Array, Array],
-    control_period: Array,
+    idle: Array,
+    touching: Array,
+    free: Array,
+    forces: list[Array],
     time_constant: Array,
 ) -> Float[Array, "*batch"]:
-    """First-order lag T_s y' = F - y over one period, exact for a force that is straight while in touch.
+    """First-order lag T_s y' = F - y, exact for a force made of parabolas.
 
-    `before` and `now` are (distance, force, edge) at the period's two ends: distance [m] is positive in
-    contact and negative outside, edge [N] is the limit of the force at the surface. Where contact begins or
-    ends within the period, the force is zero outside and straight between edge and sample inside.
+    The force is 0 for `idle` [s], goes through `forces` [N] while `touching` [s], an odd number of values at
+    equal distances, along parabolas through three of them each, and is 0 again for `free` [s].
     """
-    distance_0, force_0, edge_0 = before
-    distance_1, force_1, edge_1 = now
-    begins = (distance_0 <= 0) & (distance_1 > 0)
-    ends = (distance_0 > 0) & (distance_1 <= 0)
-    span = jnp.where(begins | ends, distance_1 - distance_0, 1)
-    inside = jnp.where(begins, distance_1 / span, jnp.where(ends, -distance_0 / span, 1))
-    ratio = control_period / jnp.maximum(time_constant, jnp.finfo(reading.dtype).tiny ** 0.5)
-    first = jnp.where(begins, 1 - inside, jnp.where(ends, inside, 0))
-    reading = _straight(reading, jnp.where(ends, force_0, 0), jnp.where(ends, edge_0, 0), first * ratio)
-    second_from = jnp.where(begins, edge_1, jnp.where(ends, 0, force_0))
-    second_to = jnp.where(ends, 0, force_1)
-    return _straight(reading, second_from, second_to, (1 - first) * ratio)
+    arc = touching / (len(forces) // 2)
+    decay, straight, bow = _parabola(arc / _longer_than_0(time_constant))
+    reading = reading * lag_decay(idle, time_constant)
+    for start, middle, end in zip(forces[:-2:2], forces[1:-1:2], forces[2::2], strict=True):
+        bend = middle - (start + end) / 2
+        reading = reading * decay + end - start * decay - (end - start) * straight + bend * bow
+    return reading * lag_decay(free, time_constant)
+
+
+def lag_decay(duration: Array, time_constant: Array) -> Array:
+    """What is left of the lag's output after `duration` [s] without force."""
+    return jnp.exp(-duration / _longer_than_0(time_constant))
 
 
 def sample_force(
@@ -67,9 +67,17 @@ def white_noise(
     return deviation * jax.vmap(draw)(keys.reshape(2, -1).T).reshape(deviation.shape)
 
 
-def _straight(reading, start, end, duration):
-    """y after `duration` time constants of an input that goes straight from start to end."""
-    safe = jnp.where(duration > 1e-6, duration, 1)
-    decay = jnp.exp(-duration)
-    mean = jnp.where(duration > 1e-6, -jnp.expm1(-safe) / safe, 1 - duration / 2)
-    return reading * decay + end - start * decay - (end - start) * mean
+def _longer_than_0(time_constant):
+    tiny = jnp.finfo(time_constant.dtype).tiny ** 0.5
+    return jnp.where(time_constant > tiny, time_constant, tiny)
+
+
+def _parabola(span):
+    """What is left after `span` time constants of y, of an input s/span, and of 4 s/span (1 - s/span)."""
+    decay = jnp.exp(-span)
+    some = jnp.where(span > 0, span, 1)
+    mean = jnp.where(span > 0, -jnp.expm1(-some) / some, 1)
+    # The closed form cancels for short spans.
+    short = jnp.where(span < 1e-2, span, 0)
+    series = 4 * short * (1 / 6 - short * (1 / 12 - short * (1 / 40 - short / 180)))
+    return decay, mean, jnp.where(span < 1e-2, series, 4 * (mean - 2 * (mean - decay) / some))

@@ -37,14 +37,17 @@ class Propagation(NamedTuple):
     """Exact discrete motion simulator; rows act on (state, command at start, command at end).
 
     transition (order, order + 2, *batch); position and velocity rows (order + 2, *batch) at the force
-    sensor's place in the panel; measured_position likewise at the position sensor's. velocity in m/s.
-    steady_command and steady_velocity (order, *batch): the state of a uniform motion.
+    sensor's place in the panel; measured_position likewise at the position sensor's; where asked for, both
+    rows at the panel's start and at its end, from within. velocity in m/s. steady_command and
+    steady_velocity (order, *batch): the state of a uniform motion.
     """
 
     transition: Float[Array, "order columns *batch"]
     position: Float[Array, "columns *batch"]
     velocity: Float[Array, "columns *batch"]
     measured_position: Float[Array, "columns *batch"]
+    start: tuple[Array, Array] | None
+    end: tuple[Array, Array] | None
     steady_command: Float[Array, "order *batch"]
     steady_velocity: Float[Array, "order *batch"]
 
@@ -63,6 +66,7 @@ def propagation(
     force_fraction: Float[Array, "*batch"],
     position_fraction: Float[Array, "*batch"],
     hold: str,
+    ends: bool = False,
 ) -> Propagation:
     """Exact discretisation of num(s)/den(s) (descending powers, strictly proper; order 0 is ideal).
 
@@ -71,26 +75,34 @@ def propagation(
     """
     order = denominator.shape[0] - 1
     if order == 0:
-        return _ideal(control_period, force_fraction, position_fraction, hold)
+        return _ideal(control_period, force_fraction, position_fraction, hold, ends)
     system, output = _companion(numerator, denominator, control_period)
     zero, one = jnp.zeros_like(control_period), jnp.ones_like(control_period)
     generator = [[*row, zero, zero] for row in system]
     generator[order - 1][order] = one
     generator += [[zero] * (order + 1) + [one], [zero] * (order + 2)]
     generator = jnp.stack([jnp.stack(row) for row in generator])
-    fractions = jnp.stack([one, force_fraction, position_fraction])
+    fractions = jnp.stack([one, force_fraction, position_fraction, zero][: 4 if ends else 3])
     # Axes: row, column, place in the panel, batch.
     rows = exponential(generator[:, :, None] * fractions[None, None])[: order + 1]
     # Columns for (z, u(0), u(1)) instead of (z, u(0), u(1) - u(0)).
     rows = rows.at[:, order].add(-rows[:, order + 1])
-    state, place = rows[:order], rows[:, :, 1]
-    rates = [*place[1:order], _combine(system[order - 1], place[:order]) + place[order]]
+    state = rows[:order]
+
+    def motion(place):
+        place = rows[:, :, place]
+        rates = [*place[1:order], _combine(system[order - 1], place[:order]) + place[order]]
+        return _combine(output, place[:order]), _combine(output, rates) / control_period[None]
+
+    position, velocity = motion(1)
     steady_command = jnp.stack([-1 / system[order - 1][0]] + [zero] * (order - 1))
     return Propagation(
         transition=state[:, :, 0],
-        position=_combine(output, place[:order]),
-        velocity=_combine(output, rates) / control_period[None],
+        position=position,
+        velocity=velocity,
         measured_position=_combine(output, state[:, :, 2]),
+        start=motion(3) if ends else None,
+        end=motion(0) if ends else None,
         steady_command=steady_command,
         steady_velocity=_steady_velocity(system, state[:, :, 0], steady_command, hold),
     )
@@ -134,17 +146,21 @@ def steady_state(plant: Propagation, command: Array, step: Array) -> State:
     return tuple(plant.steady_command[i] * command + plant.steady_velocity[i] * step for i in range(order))
 
 
-def _ideal(control_period, force_fraction, position_fraction, hold):
+def _ideal(control_period, force_fraction, position_fraction, hold, ends):
     def position(fraction):
         return jnp.stack([1 - fraction, fraction])
 
     slope = jnp.stack([-1 / control_period, 1 / control_period])
+    velocity = slope if hold == "linear" else jnp.zeros_like(slope)
+    zero = jnp.zeros_like(control_period)
     empty = jnp.zeros((0, *control_period.shape), control_period.dtype)
     return Propagation(
         transition=jnp.zeros((0, 2, *control_period.shape), control_period.dtype),
         position=position(force_fraction),
-        velocity=slope if hold == "linear" else jnp.zeros_like(slope),
+        velocity=velocity,
         measured_position=position(position_fraction),
+        start=(position(zero), velocity) if ends else None,
+        end=(position(zero + 1), velocity) if ends else None,
         steady_command=empty,
         steady_velocity=empty,
     )

@@ -130,7 +130,7 @@ def run_oracle(case: Case, **options: Any) -> list[dict[str, Any]]:
     return simulate(case.mechanism, compensator, **options)
 
 
-def _damping(ratio: float, stiffness: float = STIFFNESS) -> list[float]:
+def damping(ratio: float, stiffness: float = STIFFNESS) -> list[float]:
     return [2 * ratio * (stiffness * MASS) ** 0.5]
 
 
@@ -162,9 +162,9 @@ CASES: dict[str, Case] = {
         mechanism({}, {**SECOND_ORDER, "delay": 0.0013}, 2 * PERIOD - 0.0013)
     ),
     "a list of stiffness and damping": Case(mechanism(LIST, contacts=3)),
-    "heavy damping": Case(mechanism({"damping": _damping(0.4)})),
-    "tension": Case(mechanism({"damping": _damping(0.3), "tension": True})),
-    "overdamped": Case(mechanism({"damping": _damping(1.3)})),
+    "heavy damping": Case(mechanism({"damping": damping(0.4)})),
+    "tension": Case(mechanism({"damping": damping(0.3), "tension": True})),
+    "overdamped": Case(mechanism({"damping": damping(1.3)})),
     "two masses": Case(
         mechanism({"damping": [200.0]}) | {"bodies": {"chaser_mass": 500.0, "target_mass": 900.0}}
     ),
@@ -174,6 +174,7 @@ CASES: dict[str, Case] = {
     ),
     "transfer function with latency": Case(mechanism(LIST, TRANSFER, contacts=2, **LATE_EULER)),
     "third order with latency": Case(mechanism(LIST, THIRD_ORDER, **LATE_EULER)),
+    "first order": Case(mechanism({"damping": [300.0]}, FIRST_ORDER), "phase_lead"),
     # The ideal simulator.
     "ideal": Case(mechanism(LIST, IDEAL, contacts=2), "phase_lead"),
     "ideal with transport delay": Case(mechanism(LIST, {**IDEAL, "delay": 0.0033}), "phase_lead"),
@@ -226,6 +227,12 @@ CASES: dict[str, Case] = {
     ),
     "no lag beside lagged ones": Case(mechanism({"damping": [500.0]}), "phase_lead"),
     # Two surfaces.
+    "rattling, lag": Case(
+        mechanism(
+            {**LIST, "damping": [120.0], "clearance": 0.002}, RATTLING, 0.003, 3, velocity=0.01, **LAGGED
+        ),
+        "response_error",
+    ),
     "rattling": Case(
         mechanism({**LIST, "damping": [120.0], "clearance": 0.002}, RATTLING, 0.003, 3, velocity=0.01),
         "response_error",

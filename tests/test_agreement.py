@@ -254,6 +254,26 @@ def test_recorded_ticks(mechanism_name):
         assert count.magnified == 0
 
 
+def test_a_contact_held_for_long():
+    """Pushed in, held for 1e5 ticks, pulled out: on neither side anything winds up."""
+    forgetting = np.array([0.8, 0.9, 0.98])
+    gains = {
+        gain.name: np.full(3, gain.nominal(MECHANISMS[0])) for gain in COMPENSATORS["response_error"].gains
+    }
+    gains["forgetting"] = forgetting
+    depth = 2e-4 * np.sin(
+        np.pi / 2 * np.r_[np.arange(-50, 200) / 200, np.ones(100_000), np.arange(200, -50, -1) / 200]
+    )
+    position = np.repeat(depth[:, None], 3, axis=1)
+    period = np.full(3, 1e-3)
+    velocity = np.gradient(position, 1e-3, axis=0)
+    force = np.where(position > 0, 1.2e5 * position + 200.0 * velocity, 0)
+    age = np.repeat(np.arange(len(depth), dtype=np.int32)[:, None], 3, axis=1)
+    signals = Signals(force, position, velocity, position - 1e-3 * velocity, age)
+    count = compare("response_error", Readings(signals, gains, Constants(period, np.full(3, np.inf))))
+    assert count.ticks == 3 * len(depth) and count.compared >= 0.99 * count.ticks and count.magnified == 0
+
+
 @st.composite
 def small_readings(draw):
     """A few contacts on a lattice, where much lies exactly on a threshold, with any gains within bounds."""

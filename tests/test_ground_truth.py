@@ -212,9 +212,11 @@ def test_work_energy_of_nonlinear_contact(nonlinear, name):
     restitution, _, work_in, work_out = nonlinear[name]
     order = NONLINEAR[name][2]
     balance = work_out / work_in - restitution**2
-    assert order - 0.3 < fitted_order(balance)
+    # A damper acts by the mechanism's velocity, not by the model's: works differ by a period's motion.
+    damped = "damping" in NONLINEAR[name][0]
+    assert (1 if damped else order) - 0.3 < fitted_order(balance)
     assert np.abs(balance[-1]).max() < (2e-4 if order == 2 else 2e-3)
-    assert np.abs(work_in[-1] - 1).max() < (2e-4 if order == 2 else 4e-3)
+    assert np.abs(work_in[-1] - 1).max() < (1e-3 if damped else 2e-4)
 
 
 # Item 7; for hold and latency see above.

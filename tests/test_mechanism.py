@@ -348,6 +348,32 @@ def test_other_laws_and_models(changes):
 
 
 @pytest.mark.parametrize(
+    ("changes", "lag"),
+    [
+        ({"rig.simulator.model": "ideal", "contact.damping": 0.0}, 0.0),
+        ({"rig.simulator.model": "first_order"}, 0.01),
+        # Drawn down to 10 Hz.
+        ({}, 2 * 0.8 / (2 * math.pi * 10.0)),
+        ({"rig.simulator.model": "third_order"}, 0.1),
+        (
+            {
+                "rig.simulator.model": "transfer_function",
+                "rig.simulator.numerator": [0.3, 2.0],
+                "rig.simulator.denominator": [1e-3, 0.5, 2.0],
+            },
+            0.25 - 0.15,
+        ),
+    ],
+)
+def test_both_positions_start_inside_the_gap(changes, lag):
+    # Free approach and phase, then latency, transport delay and lag of x_a.
+    start = 0.005 * (0.02 + 0.001 + 0.001 + 0.004 + lag)
+    assert from_builtins(changed(changes | {"contact.clearance": start * (1 + 1e-9)}), "f")
+    message = refusal(changed(changes | {"contact.clearance": start * (1 - 1e-9)}))
+    assert ": contact.clearance: found " in message and f"allowed a clearance > {start:g}" in message
+
+
+@pytest.mark.parametrize(
     ("numerator", "denominator", "key"),
     [
         ([1.0, 1.0], [1.0, 1.0], "numerator"),
@@ -366,7 +392,8 @@ def test_other_laws_and_models(changes):
     ],
 )
 def test_transfer_function(numerator, denominator, key):
-    changes = {"rig.simulator.model": "transfer_function"}
+    # One-sided: a gap would have to be wider than the lag of some of these.
+    changes = {"rig.simulator.model": "transfer_function", "contact.clearance": ...}
     changes |= {"rig.simulator.numerator": numerator, "rig.simulator.denominator": denominator}
     raw = changed(changes)
     if key:

@@ -221,6 +221,7 @@ def test_delay_line_refuses_an_absurd_delay():
 @given(seed=st.integers(0, 2**32 - 1), forgetting=st.floats(0.9, 1.0))
 @settings(max_examples=30, deadline=None)
 def test_identification_is_textbook_recursive_least_squares(seed, forgetting):
+    """But for the bound on d_1 = P_11 - P_12^2/P_22 and d_2 = P_22."""
     rng = np.random.default_rng(seed)
     identification = ContactIdentification(2.0, -1.0, 5.0, 0.5, forgetting)
     theta, covariance = np.array([2.0, -1.0]), np.diag([5.0, 0.5])
@@ -229,12 +230,26 @@ def test_identification_is_textbook_recursive_least_squares(seed, forgetting):
         column = covariance @ phi / (forgetting + phi @ covariance @ phi)
         theta = theta + column * (force - phi @ theta)
         covariance = (covariance - np.outer(column, phi @ covariance)) / forgetting
+        factor = np.array([[1.0, covariance[0, 1] / covariance[1, 1]], [0.0, 1.0]])
+        d_1 = covariance[0, 0] - factor[0, 1] * covariance[0, 1]
+        covariance = factor @ np.diag([min(d_1, 5.0), min(covariance[1, 1], 0.5)]) @ factor.T
         identification.update(force, phi[0], phi[1])
     found = [identification.stiffness, identification.damping]
     np.testing.assert_allclose(found, theta, rtol=1e-8, atol=1e-10)
     expected = [covariance[0, 0], covariance[0, 1], covariance[1, 1]]
     scale = np.abs(covariance).max()
     np.testing.assert_allclose(identification.covariance, expected, rtol=0, atol=1e-9 * scale)
+
+
+def test_covariance_does_not_wind_up():
+    """Held still, a contact tells nothing of the damping, nor one without depth of the stiffness."""
+    for deflection, rate in ((2e-4, 0.0), (0.0, 1e-3), (0.0, 0.0)):
+        identification = ContactIdentification(1e5, 100.0, 1e12, 1e6, 0.8)
+        for _ in range(100_000):
+            identification.update(1.5e5 * deflection + 420.0 * rate, deflection, rate)
+        kk, kb, bb = identification.covariance
+        assert 0.0 < kk <= 1e12 and kb == 0.0 and 0.0 < bb <= 1e6
+        assert max(kk / 1e12, bb / 1e6) == 1.0
 
 
 def test_identification_finds_stiffness_and_damping():

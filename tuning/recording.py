@@ -19,13 +19,14 @@ from jaxtyping import Array
 from jaxhil.building import build_loop
 from jaxhil.compensators import Compensator, Gain, Gains, Signals
 from jaxhil.integrators import INTEGRATORS
-from jaxhil.loop import Loop, Rig, Truth, build_rig, drive, sense
+from jaxhil.loop import Loop, Rig, build_rig, drive, sense
 from jaxhil.mechanism import Mechanism, value_at
 from jaxhil.metrics import Metrics, build_rules, observe
 from jaxhil.rollout import Run, Tick, start, stretch, stretch_length, turn_over
 from jaxhil.runtime import Controller
 from jaxhil.runtime.gain_file import GainFile
 from jaxhil.scenario import Scenario, build_scenarios
+from jaxhil.touch import Truth
 from jaxhil.uncertainty import draw
 from tuning.gain_file import LoadedGains
 

@@ -2,6 +2,8 @@
 
 Model F = k d + b v. The covariance is kept as P = U D U^T, U = [[1, u], [0, 1]], D = diag(d_1, d_2)
 (Bierman 1977): it stays positive however large the initial covariance.
+Neither d grows beyond its initial value: held still, a contact tells nothing new of one of the two, whose
+variance forgetting alone would let wind up.
 With d_2 = 0 the damping stays at its initial value and the law identifies stiffness alone.
 """
 
@@ -22,11 +24,18 @@ class Identified(NamedTuple):
 
 
 def update(
-    old: Identified, forgetting: Array, deflection: Array, rate: Array, force: Array, active: Array
+    old: Identified,
+    forgetting: Array,
+    initial_variances: tuple[Array, Array],
+    deflection: Array,
+    rate: Array,
+    force: Array,
+    active: Array,
 ) -> Identified:
     """One step of K = P phi/(lambda + phi'P phi), theta += K (F - phi'theta), P = (P - K phi'P)/lambda.
 
-    phi = (deflection, rate); lanes that are not `active` keep their estimate.
+    phi = (deflection, rate); d_1 and d_2 are at most `initial_variances`; lanes that are not `active` keep
+    their estimate.
     """
     f_1 = deflection
     f_2 = old.coupling * deflection + rate
@@ -36,11 +45,16 @@ def update(
     alpha_2 = alpha_1 + f_2 * g_2
     inverse_1, inverse_2 = 1 / alpha_1, 1 / alpha_2
     step = (force - (old.stiffness * deflection + old.damping * rate)) * inverse_2
+    variances = (
+        old.stiffness_variance * inverse_1,
+        old.damping_variance * alpha_1 * inverse_2 * (1 / forgetting),
+    )
+    bounded = [jnp.where(d < most, d, most) for d, most in zip(variances, initial_variances, strict=True)]
     new = Identified(
         stiffness=old.stiffness + (g_1 + g_2 * old.coupling) * step,
         damping=old.damping + g_2 * step,
         coupling=old.coupling - g_1 * f_2 * inverse_1,
-        stiffness_variance=old.stiffness_variance * inverse_1,
-        damping_variance=old.damping_variance * alpha_1 * inverse_2 * (1 / forgetting),
+        stiffness_variance=bounded[0],
+        damping_variance=bounded[1],
     )
     return Identified(*(jnp.where(active, n, o) for n, o in zip(new, old, strict=True)))

@@ -223,6 +223,7 @@ class ResponseError(Compensator):
         identified = update(
             state.identified,
             gains["forgetting"],
+            (gains["stiffness_covariance"], gains["damping_covariance"]),
             depth,
             aligned_velocity,
             force,

@@ -7,7 +7,9 @@ class ContactIdentification:
     With regressor phi = (p, p'), the textbook recursion is K = P phi/(lambda + phi' P phi), theta
     += K (F - phi' theta), P = (P - K phi' P)/lambda. Here P = U D U' with U = [[1, u], [0, 1]] and
     D = diag(d1, d2), which stays symmetric and positive whatever the rounding (Bierman,
-    "Factorization Methods for Discrete Sequential Estimation", 1977).
+    "Factorization Methods for Discrete Sequential Estimation", 1977). d1 and d2 never exceed their
+    initial values: held still, a contact tells nothing new of one of the two, whose variance
+    forgetting alone would let wind up.
 
     Initial stiffness in N/m and damping in N s/m, initial covariance 1/m^2 and s^2/m^2 (relative
     to the force's variance), forgetting in (0, 1].
@@ -72,5 +74,8 @@ class ContactIdentification:
         self.stiffness = stiffness + (g1 + g2 * u) / a2 * innovation
         self.damping = damping + g2 / a2 * innovation
         self._u = u - g1 * f2 / a1
-        self._d1 = d1 / a1
-        self._d2 = d2 * a1 / (a2 * forgetting)
+        d1 /= a1
+        d2 *= a1 / (a2 * forgetting)
+        most1, most2 = self._initial_covariance
+        self._d1 = d1 if d1 < most1 else most1
+        self._d2 = d2 if d2 < most2 else most2

@@ -330,8 +330,10 @@ private:
         b.identified_stiffness[l] = new_k;
         b.identified_damping[l] = new_c;
         b.coupling[l] = update ? u - g_1 * f_2 * inverse_1 : u;
-        b.stiffness_variance[l] = update ? d_1 * inverse_1 : d_1;
-        b.damping_variance[l] = update ? d_2 * alpha_1 * inverse_2 * b.inverse_forgetting[l] : d_2;
+        const double new_1 = d_1 * inverse_1, new_2 = d_2 * alpha_1 * inverse_2 * b.inverse_forgetting[l];
+        const double most_1 = b.stiffness_covariance[l], most_2 = b.damping_covariance[l];
+        b.stiffness_variance[l] = update ? (new_1 < most_1 ? new_1 : most_1) : d_1;
+        b.damping_variance[l] = update ? (new_2 < most_2 ? new_2 : most_2) : d_2;
         const double response = b.response[l] * new_k * (x - measured) + b.response_damping[l] * new_c * (v - rate);
         return touching ? led + response : led;
     }

@@ -181,9 +181,9 @@ def _inputs(rig, gains, scenario, lanes) -> dict[str, np.ndarray]:
     }
     counts = {
         "contacts": scenario.contacts,
-        "force_panels": rig.force_delay.panels,
-        "real_panels": rig.real_panels,
-        "position_panels": rig.position_delay.panels,
+        "force_panels": rig.delays.force.panels,
+        "real_panels": rig.delays.real,
+        "position_panels": rig.delays.position.panels,
     }
     return {name: spread(numbers[name], np.float64) for name in _NUMBERS} | {
         name: spread(counts[name], np.int32) for name in _COUNTS

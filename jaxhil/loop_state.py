@@ -1,0 +1,51 @@
+"""What evolves in the loop from tick to tick, but for what the compensator keeps to itself."""
+
+from typing import Any, NamedTuple
+
+from jaxtyping import Array, Float, Int
+
+from jaxhil.contact import ContactParameters
+from jaxhil.touch import Panel, Touch, Truth
+
+
+class Plant(NamedTuple):
+    """Motion simulator and drives: recent commands c(n), c(n-1) [m], last step of the command [m], state."""
+
+    commands: tuple[Array, ...]
+    step: Array
+    state: tuple[Array, ...]
+
+
+class Rings(NamedTuple):
+    """Delay lines: of the truth, of what a lagging sensor makes of the force (else None), of the position,
+    and of the panels whose contact is still to come (else None)."""
+
+    truth: Truth
+    reading: Float[Array, "samples *batch"] | None
+    position: Float[Array, "samples *batch"]
+    panel: Panel | None
+
+
+class Sensed(NamedTuple):
+    """What the sensors will read: delay lines; the last sample of the contact, the lag's reading at the end
+    of its panel, the position sample of the panel before the run."""
+
+    rings: Any
+    last: Touch
+    lagged: Array
+    first_position: Array
+
+
+class LoopState(NamedTuple):
+    """All that evolves: the model's position [m] and velocity [m/s], and the rest. The run under way was
+    entered at `entry_tick`, in uniform motion of `entry_velocity` [m/s]."""
+
+    position: Float[Array, "*batch"]
+    velocity: Float[Array, "*batch"]
+    plant: Plant
+    sensed: Sensed
+    law: tuple[Array, ...]
+    controller: Any
+    parameters: ContactParameters
+    entry_velocity: Float[Array, "*batch"]
+    entry_tick: Int[Array, "*batch"]

@@ -1,0 +1,39 @@
+"""Delay lines against a plain list of the samples."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxhil.ring import look_back, tie, write, write_in_turn
+
+SAMPLES, LANES = 8, 3
+
+
+@given(st.integers(0, 40), st.lists(st.integers(0, SAMPLES - 1), min_size=LANES, max_size=LANES))
+def test_a_ring_gives_back_its_last_samples(extra, ticks):
+    history = np.random.default_rng(extra).normal(size=(SAMPLES + extra, LANES))
+    ring = jnp.zeros((SAMPLES, LANES))
+    for tick, sample in enumerate(history):
+        ring = write(ring, jnp.array(tick, jnp.int32), jnp.asarray(sample))
+    newest = len(history) - 1
+    read = look_back(ring, jnp.array(newest, jnp.int32), jnp.array(ticks, jnp.int32))
+    np.testing.assert_array_equal(read, history[newest - np.array(ticks), np.arange(LANES)])
+
+
+def test_written_in_turn_or_at_once_is_the_same():
+    generator = np.random.default_rng(1)
+    rings = {name: jnp.asarray(generator.normal(size=(SAMPLES, LANES))) for name in "abc"}
+    values = {name: jnp.asarray(generator.normal(size=LANES)) for name in "abc"}
+    for tick in (jnp.array(number, jnp.int32) for number in range(2 * SAMPLES)):
+        one_by_one = {name: write(rings[name], tick, values[name]) for name in rings}
+        jax.tree.map(np.testing.assert_array_equal, write_in_turn(rings, tick, values), one_by_one)
+
+
+def test_a_tie_changes_no_value_and_no_derivative():
+    value, read = jnp.array([1.0, 2.0, 3.0]), jnp.array([4.0, -0.0, jnp.inf])
+    np.testing.assert_array_equal(tie(value, read), value)
+    tangents = jnp.ones(3), 5 * jnp.ones(3)
+    np.testing.assert_array_equal(jax.jvp(tie, (value, read), tangents)[1], tangents[0])
+    assert np.isnan(tie(value, read.at[1].set(jnp.nan))[1])
