@@ -94,16 +94,18 @@ def run_contacts(loop: Loop, gains: Gains, rig: Rig) -> Metrics:
     return lax.while_loop(lambda run: jnp.any(run.active), body, run).metrics
 
 
-def record(loop: Loop, gains: Gains, scenario: Scenario, stretches: int) -> tuple[Metrics, Tick]:
-    """Metrics and every tick, (ticks, *batch), of `stretches` stretches; free flight is not skipped."""
+def record(loop: Loop, gains: Gains, scenario: Scenario, ticks: int) -> tuple[Metrics, Tick]:
+    """Metrics and every tick, (ticks, *batch), of so many ticks or a few more, up to a whole number of
+    stretches; free flight is not skipped."""
     rig = build_rig(loop, scenario)
 
     def body(run, _):
-        run, ticks = stretch(loop, rig, gains, run, record=True)
-        return turn_over(loop, rig, gains, run, skip_flight=False), ticks
+        run, seen = stretch(loop, rig, gains, run, record=True)
+        return turn_over(loop, rig, gains, run, skip_flight=False), seen
 
-    run, ticks = lax.scan(body, start(loop, rig, gains), None, length=stretches)
-    return run.metrics, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), ticks)
+    stretches = -(-ticks // stretch_length(loop))
+    run, seen = lax.scan(body, start(loop, rig, gains), None, length=stretches)
+    return run.metrics, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), seen)
 
 
 def stretch_length(loop: Loop) -> int:

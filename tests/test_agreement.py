@@ -255,14 +255,14 @@ def test_recorded_ticks(mechanism_name):
 
 
 def test_a_contact_held_for_long():
-    """Pushed in, held for 1e5 ticks, pulled out: on neither side anything winds up."""
+    """Pushed in, held for 1e4 ticks, pulled out: on neither side anything winds up."""
     forgetting = np.array([0.8, 0.9, 0.98])
     gains = {
         gain.name: np.full(3, gain.nominal(MECHANISMS[0])) for gain in COMPENSATORS["response_error"].gains
     }
     gains["forgetting"] = forgetting
     depth = 2e-4 * np.sin(
-        np.pi / 2 * np.r_[np.arange(-50, 200) / 200, np.ones(100_000), np.arange(200, -50, -1) / 200]
+        np.pi / 2 * np.r_[np.arange(-50, 200) / 200, np.ones(10_000), np.arange(200, -50, -1) / 200]
     )
     position = np.repeat(depth[:, None], 3, axis=1)
     period = np.full(3, 1e-3)

@@ -328,9 +328,11 @@ def test_better_means_fewer_failures_then_smaller_errors():
 
 
 def test_flags_leave_the_user_s_alone(monkeypatch):
-    assert environment.flags("").split() == [
-        f"--xla_force_host_platform_device_count={environment.usable_cores()}",
-        "--xla_backend_optimization_level=1",
+    names = [flag.split("=")[0] for flag in environment.flags("").split()]
+    assert names == [
+        "--xla_force_host_platform_device_count",
+        "--xla_backend_optimization_level",
+        "--xla_backend_extra_options",
     ]
     given = "--xla_backend_optimization_level=3 --xla_dump_to=x"
     assert environment.flags(given).startswith(given)

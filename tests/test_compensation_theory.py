@@ -110,7 +110,7 @@ def persistent(parsed, compensator, seconds, gains, **leaves):
     scenario = spread(parsed, lanes, clearance=np.zeros(lanes), **leaves)
     loop = build_loop(parsed, compensator, scenario)
     period = parsed.rig.control_period
-    ticks = run_record(loop, per_lane(gains, lanes), scenario, round(seconds / period / 4))[1]
+    ticks = run_record(loop, per_lane(gains, lanes), scenario, round(seconds / period))[1]
     return jax.tree.map(np.asarray, ticks)
 
 

@@ -165,7 +165,7 @@ def events(loop, scenario, values):
     Whether something is so at a tick, (ticks, runs), or a number of whole periods, (runs,).
     """
     gains, changed = problem(scenario, {name: jnp.asarray(value) for name, value in values.items()})
-    ticks = jax.tree.map(np.asarray, run_record(loop, gains, changed, LONGEST // 16)[1])
+    ticks = jax.tree.map(np.asarray, run_record(loop, gains, changed, LONGEST)[1])
     force, measured = ticks.signals.force_measured, ticks.signals.position_measured
     aligned = np.empty_like(measured)
     for lane, delay in enumerate(values["identification_delay"]):

@@ -19,10 +19,13 @@ from lanes import (
     grid,
     join,
     mechanism,
+    run_record,
     spread,
     validated,
 )
 from scipy.special import lambertw
+
+from jaxhil.building import build_loop
 
 OMEGA = 2 * pi * 3.0
 STIFFNESS = MASS * OMEGA**2
@@ -236,3 +239,42 @@ def test_delay_of_integrator(integrator, latency, periods):
     delay = 2 / (pi * OMEGA) * error.mean(axis=1)
     assert np.all(np.abs(delay[1:]) < 0.02 * PERIODS[1:])
     assert 1.7 < fitted_order(error) < 2.6
+
+
+# Item 10.
+
+
+def test_noise_of_a_stiffness_fitted_early_in_a_contact():
+    """Least squares of F on x with an intercept: sigma_k = sigma_F sqrt(12 T) / (v t^1.5); on increments, the
+    noise of the first and last force alone counts: sqrt(t / 6 T) times that."""
+    lanes, samples, deviation, period = 1500, 40, 0.01, 1e-3
+    # Soft enough that x = v t while it is fitted.
+    parsed = validated(
+        mechanism(
+            {"law": "linear", "stiffness": [200.0]},
+            IDEAL,
+            0.0,
+            period=period,
+            force_sensor={"noise_std": deviation},
+        )
+    )
+    keys = np.stack([np.zeros(lanes, np.uint32), np.arange(lanes, dtype=np.uint32)])
+    scenario = spread(parsed, lanes, key=keys)
+    loop = build_loop(parsed, "none", scenario)
+    signals = run_record(loop, {}, scenario, 80)[1].signals
+    force, position = np.asarray(signals.force_measured), np.asarray(signals.position_measured)
+    first = int(np.argmax(position[:, 0] > 0))
+    force, position = force[first : first + samples], position[first : first + samples]
+    duration = samples * period
+    assert np.ptp(position) == pytest.approx(VELOCITY * (duration - period), rel=2e-3)
+
+    centred = position - position.mean(axis=0)
+    fitted = np.sum(centred * force, axis=0) / np.sum(centred**2, axis=0)
+    steps = np.diff(position, axis=0)
+    on_increments = np.sum(steps * np.diff(force, axis=0), axis=0) / np.sum(steps**2, axis=0)
+    predicted = deviation * np.sqrt(12 * period) / (VELOCITY * duration**1.5)
+    # The standard deviation of so many lanes is known to 4 / sqrt(2 lanes).
+    accuracy = 4 / np.sqrt(2 * lanes)
+    assert fitted.mean() == pytest.approx(200.0, abs=4 * predicted / np.sqrt(lanes))
+    assert fitted.std() == pytest.approx(predicted, rel=accuracy)
+    assert on_increments.std() / fitted.std() == pytest.approx(np.sqrt(duration / (6 * period)), rel=accuracy)

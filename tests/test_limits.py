@@ -118,7 +118,7 @@ def test_limits_of_a_whole_contact(limits):
     simulator = {"model": "ideal"} | {n: x for n, x in zip(names, limits, strict=True) if np.isfinite(x)}
     batch = cases.build_batch({"": Case(mechanism({"law": "linear"}, simulator, 0.012, period=PERIOD))})
     loop = dataclasses.replace(batch.loop, has_limits=True)
-    ticks = run_record(loop, batch.gains, batch.scenario, 20)[1]
+    ticks = run_record(loop, batch.gains, batch.scenario, 320)[1]
     commands = np.asarray(ticks.signals.position_measured)[:, 0]
     wanted = np.asarray(ticks.signals.position_desired)[:, 0]
     going = np.asarray(ticks.active)[:, 0]

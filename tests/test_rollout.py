@@ -121,7 +121,7 @@ RECORDED = ("response error", "late position", "dead zone", "quantum", "range", 
 @pytest.fixture(scope="module")
 def recorded():
     batch = cases.batches()["response error"]
-    metrics, ticks = run_record(batch.loop, batch.gains, batch.scenario, 16)
+    metrics, ticks = run_record(batch.loop, batch.gains, batch.scenario, 256)
     return batch, jax.tree.map(np.asarray, metrics), jax.tree.map(np.asarray, ticks)
 
 
@@ -283,7 +283,7 @@ def noise():
     """What is added to force and position, (ticks, lanes): the readings of a mechanism that does not push."""
     loop, gains, scenario = noisy_batch(6)
     soft = scenario.contact._replace(stiffness=scenario.contact.stiffness * 1e-300)
-    signals = run_record(loop, gains, scenario._replace(contact=soft), 25)[1].signals
+    signals = run_record(loop, gains, scenario._replace(contact=soft), 400)[1].signals
     assert np.all(np.diff(signals.age, axis=0) == 1)
     # The ideal simulator is where it was told to be.
     return np.asarray(signals.force_measured) - 0.7, np.asarray(
