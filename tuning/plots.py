@@ -54,7 +54,7 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
 
 def errors_plot(result: Result, limit: float) -> Figure:
     """How large errors are and how often, and at which contact frequency, before and after tuning."""
-    figure = _figure((11, 4.6), f"{result.mechanism.name}: restitution error on fresh scenarios")
+    figure = _figure((11, 4.6), f"{result.mechanism.name}: restitution error on fresh scenarios", above=0.75)
     left, right = figure.subplots(1, 2)
     # A limit of 0 or inf has no place on a logarithmic axis.
     drawn = 0 < limit < np.inf
@@ -141,7 +141,8 @@ def contact_plot(pieces: Sequence[Piece], title: str, sensors: str | None = None
     shown = list(pieces[:MOST_PANELS])
     if len(pieces) > len(shown):
         title += f" (the first {len(shown)} of {len(pieces)} contacts)"
-    figure = _figure((max(7.0, 3.6 * len(shown) + 1), 6.4), title)
+    # Two lines of title above the axes; the legend below.
+    figure = _figure((max(7.0, 3.6 * len(shown) + 1), 6.4), title, above=1.0, below=0.95)
     grid = figure.subplots(2, len(shown), squeeze=False, sharex="col")
     for column, piece in enumerate(shown):
         force, position = grid[0, column], grid[1, column]
@@ -166,10 +167,11 @@ def contact_plot(pieces: Sequence[Piece], title: str, sensors: str | None = None
         _limit_position(position, piece, end)
         for axes in (force, position):
             _finish(axes, None)
-    grid[0, 0].set_ylabel("force on the numerical model [N]")
-    grid[1, 0].set_ylabel("position of the numerical model [mm]\n(thin line: the mechanism's surface)")
+    grid[0, 0].set_ylabel("force on the model [N]")
+    grid[1, 0].set_ylabel("position of the model [mm]\n(thin line: a surface)")
+    figure.align_ylabels(grid[:, 0])
     handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9, frameon=False)
+    figure.legend(handles, labels, loc="lower center", ncols=len(labels), fontsize=9, frameon=False)
     return figure
 
 
@@ -202,10 +204,17 @@ def _limit_position(axes: Axes, piece: Piece, end: float) -> None:
         axes.set_ylim(np.min(every) - margin, np.max(every) + margin)
 
 
-def _figure(size: tuple[float, float], title: str) -> Figure:
-    figure = Figure(figsize=size, layout="constrained")
+def _figure(size: tuple[float, float], title: str, above: float = 0.55, below: float = 0.6) -> Figure:
+    """A figure with room [inches] above and below its axes, of labels and titles of known sizes: an automatic
+    layout draws everything twice."""
+    width, height = size
+    figure = Figure(figsize=size)
+    figure.subplots_adjust(
+        left=0.9 / width, right=1 - 0.25 / width, bottom=below / height, top=1 - above / height,
+        wspace=0.24, hspace=0.12,
+    )  # fmt: skip
     # A name is text, not a formula.
-    figure.suptitle(one_line(title, 120).replace("$", r"\$"), fontsize=12)
+    figure.suptitle(one_line(title, 120).replace("$", r"\$"), fontsize=12, y=1 - 0.12 / height, va="top")
     return figure
 
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -99,16 +100,6 @@ def tune(
         draw(mechanism, settings.validation, settings.seed + VALIDATION_SEED),
         settings.seed + VALIDATION_SEED,
     )
-    starts, gains = [], literature
-    if any(gain.tuned(mechanism) for gain in law.gains):
-        report(f"tuning {compensator} on {settings.scenarios} scenarios from {settings.starts} starts")
-        starts = _solve(mechanism, compensator, literature, settings)
-        usable = [start for start in starts if start.status != STATUSES[2]]
-        if usable:
-            gains = min(usable, key=lambda start: start.rms).gains
-    clock.lap("tune")
-    report(f"judging on {settings.validation} fresh scenarios")
-    runs = {"before": neutral_gains(compensator, literature), "literature": literature, "tuned": gains}
     # The nominal run is one more lane of the same batch.
     both = jax.tree.map(
         lambda fresh, nominal: np.concatenate([fresh, nominal], axis=-1),
@@ -116,11 +107,23 @@ def tune(
         build_scenarios(mechanism),
     )
     loop = build_loop(mechanism, compensator, both)
-    outcomes, nominal_outcomes = {}, {}
-    for name, values in runs.items():
-        outcome = evaluate(loop, values, both)
-        outcomes[name] = jax.tree.map(lambda leaf: leaf[..., :-1], outcome)
-        nominal_outcomes[name] = jax.tree.map(lambda leaf: leaf[..., -1:], outcome)
+    known = {"before": neutral_gains(compensator, literature), "literature": literature}
+    starts, gains = [], literature
+    # What does not wait for tuning is compiled and run while the solver's program compiles, on one core.
+    with ThreadPoolExecutor(1) as meanwhile:
+        judged = {name: meanwhile.submit(evaluate, loop, values, both) for name, values in known.items()}
+        if any(gain.tuned(mechanism) for gain in law.gains):
+            report(f"tuning {compensator} on {settings.scenarios} scenarios from {settings.starts} starts")
+            starts = _solve(mechanism, compensator, literature, settings)
+            usable = [start for start in starts if start.status != STATUSES[2]]
+            if usable:
+                gains = min(usable, key=lambda start: start.rms).gains
+        clock.lap("tune")
+        report(f"judging on {settings.validation} fresh scenarios")
+        every = {name: outcome.result() for name, outcome in judged.items()}
+    every["tuned"] = evaluate(loop, gains, both)
+    outcomes = {name: jax.tree.map(lambda leaf: leaf[..., :-1], one) for name, one in every.items()}
+    nominal_outcomes = {name: jax.tree.map(lambda leaf: leaf[..., -1:], one) for name, one in every.items()}
     clock.lap("judge")
     return Result(
         compensator=compensator,

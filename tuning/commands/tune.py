@@ -1,6 +1,7 @@
 """`jaxhil tune`: gains for every mechanism file, judged on scenarios that tuning never saw."""
 
 import re
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +107,10 @@ def _tune_one(options: Tune, loaded: LoadedMechanism, begin) -> tuple[Any, dict[
     from tuning.tune import Settings, tune
 
     settings = Settings(options.scenarios, options.starts, options.steps, options.validation, options.seed)
-    result = tune(loaded.mechanism, options.compensator, settings, begin)
+    # Drawing needs a program and a library of its own; the solver's program leaves a core idle meanwhile.
+    with ThreadPoolExecutor(1) as meanwhile:
+        meanwhile.submit(_prepare_drawing, loaded.mechanism, options.compensator)
+        result = tune(loaded.mechanism, options.compensator, settings, begin)
     folder = Path(options.output) / folder_name(loaded.mechanism.name)
     folder.mkdir(exist_ok=True)
     document = build_document(
@@ -140,6 +144,15 @@ def _tune_one(options: Tune, loaded: LoadedMechanism, begin) -> tuple[Any, dict[
         "verdict": "good" if good else "bad",
     }
     return result, entry
+
+
+def _prepare_drawing(mechanism, compensator: str) -> None:
+    from jaxhil.compensators import COMPENSATORS
+    from tuning import plots  # noqa: F401
+    from tuning.motion import nominal_motion
+
+    literature = {gain.name: float(gain.nominal(mechanism)) for gain in COMPENSATORS[compensator].gains}
+    nominal_motion(mechanism, compensator, {"before": literature, "tuned": literature})
 
 
 def is_better(figures, other) -> bool:
