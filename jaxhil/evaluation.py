@@ -90,6 +90,11 @@ def evaluate(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario) -> Outco
     return jax.tree.map(unfold, outcome)
 
 
+def prepare_evaluation(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario) -> None:
+    """Compile the program that `evaluate` will run on such arguments, without running it."""
+    run_tiles.lower(loop, *deal(scenarios, gains)).compile()
+
+
 def deal(scenarios: Scenario, gains: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any], Scenario]:
     """Arguments of `run_tiles`: gains common to all lanes, gains per lane and scenarios as
     (devices, tiles, ..., lanes of a tile), sorted by expected duration and padded with idle lanes."""

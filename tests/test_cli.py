@@ -156,20 +156,44 @@ def test_bad_files_do_not_stop_the_others(jaxhil, tuned, tmp_path):
 
 
 def test_interrupted_keeps_what_was_finished(jaxhil, tuned, tmp_path, monkeypatch):
-    from tuning.tune import tune
+    from tuning.tune import tune_all
 
-    def stopped_at_the_second(mechanism, *arguments):
-        if mechanism.name == "rod-100n-mm":
-            raise KeyboardInterrupt
-        return tune(mechanism, *arguments)
+    def stopped_after_the_first(*arguments):
+        yield next(tune_all(*arguments))
+        raise KeyboardInterrupt
 
-    monkeypatch.setattr("tuning.tune.tune", stopped_at_the_second)
+    monkeypatch.setattr("tuning.tune.tune_all", stopped_after_the_first)
     files = ["rig-300kg", "rod-100n-mm", "--compensator", "phase_lead"]
     ran = jaxhil("tune", *files, "-o", tmp_path, "--json", *TINY)
     assert ran.code == 130
     assert ran.document["interrupted"] and len(ran.document["mechanisms"]) == 1
     assert "1 of 2" in ran.err
     assert (tmp_path / "rig-300kg" / "gains.json").exists()
+
+
+def test_a_folder_stands_for_its_files(jaxhil, tmp_path):
+    (tmp_path / "files").mkdir()
+    text = builtin_path("rig-300kg").read_text()
+    for number in range(5):
+        name = f"like-{number}"
+        changed = text.replace('name = "rig-300kg"', f'name = "{name}"')
+        (tmp_path / "files" / f"{name}.toml").write_text(changed)
+    (tmp_path / "files" / "notes.txt").write_text("no mechanism")
+    arguments = ["--compensator", "phase_lead", "-o", tmp_path / "out", "--limit", "inf", *TINY]
+    ran = jaxhil("tune", tmp_path / "files", *arguments)
+    assert ran.code == 0
+    assert all(f"like-{number}" in ran.out for number in range(5))
+    # Many mechanisms share one picture.
+    written = sorted(str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*"))
+    assert written == [*(f"like-{number}/gains.json" for number in range(5)), "overview.png"]
+    gains = [json.loads(path.read_text())["gains"] for path in (tmp_path / "out").rglob("gains.json")]
+    assert all(one == gains[0] for one in gains)
+
+
+def test_a_folder_without_mechanisms_is_refused(jaxhil, tmp_path):
+    ran = jaxhil("tune", tmp_path, "-o", tmp_path / "out")
+    assert ran.code == 2 and ran.err.count("\n") == 1
+    assert "found no mechanism file" in ran.err
 
 
 def test_interrupt_anywhere_is_130(jaxhil, monkeypatch):

@@ -33,9 +33,11 @@ def blows_up(static, gains, arguments):
     return jnp.where(gains[:, :1] > 1.5, jnp.nan, 1.0) * distance(static, gains, arguments)
 
 
-def solved(residuals, targets, starts, max_steps):
+def solved(residuals, targets, starts, steps):
     bounds = Bounds(*(jnp.tile(leaf, (len(starts), 1)) for leaf in BOUNDS))
-    return solve(residuals, 10.0, jnp.array(targets), bounds, jnp.array(starts), max_steps=max_steps)
+    return solve(
+        residuals, 10.0, jnp.array(targets), bounds, jnp.array(starts), jnp.array(steps), longest=64, tile=2
+    )
 
 
 def test_every_problem_finds_its_own_minimum():
@@ -46,6 +48,13 @@ def test_every_problem_finds_its_own_minimum():
     history = np.asarray(solution.history)
     assert (np.diff(history, axis=1) <= 0).all()
     np.testing.assert_allclose(history[:, -1], solution.loss)
+
+
+def test_equal_bounds_hold_a_gain():
+    bounds = Bounds(jnp.array([[0.4, 1e-3]] * 2), jnp.array([[0.4, 10.0]] * 2), jnp.array([[1.0, 1.0]] * 2))
+    arguments, starts = jnp.array([[0.7, 0.2]] * 2), jnp.array([[0.4, 1.0], [0.4, 5.0]])
+    solution = solve(distance, 10.0, arguments, bounds, starts, jnp.array(30))
+    np.testing.assert_allclose(solution.gains, [[0.4, 0.2]] * 2, rtol=1e-4)
 
 
 def test_too_few_steps_and_a_start_that_is_not_finite_are_named():

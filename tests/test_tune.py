@@ -6,7 +6,8 @@ import pytest
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.mechanism_file import load
 from tuning.optimiser import STATUSES
-from tuning.tune import Settings, gain_bounds, spread_starts, tune
+from tuning.problems import build_task, gain_bounds, spread_starts, tuned_names
+from tuning.tune import Settings, tune
 
 SMALL = Settings(scenarios=16, starts=2, steps=12, validation=63)
 
@@ -48,10 +49,10 @@ def test_a_compensator_without_gains_is_judged_only():
 
 
 def test_starts_begin_with_the_literature_and_stay_inside():
-    mechanism = load().mechanism
-    gains = [g for g in COMPENSATORS["response_error"].gains if g.tuned(mechanism)]
-    bounds = gain_bounds(gains, mechanism)
-    first = np.array([float(g.nominal(mechanism)) for g in gains])
+    task = build_task(load().mechanism, "response_error", 8, 0)
+    names = tuned_names([task])
+    bounds = gain_bounds(task, names)
+    first = np.array([task.literature[name] for name in names])
     starts = spread_starts(first, bounds, 9, seed=0)
     np.testing.assert_allclose(starts[0], first, rtol=1e-12)
     assert (starts >= np.asarray(bounds.lower) - 1e-12).all()

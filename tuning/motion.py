@@ -15,7 +15,7 @@ from jaxhil.mechanism import Mechanism
 from jaxhil.rollout import APPROACH
 from jaxhil.scenario import Scenario, build_scenarios
 from tuning.gain_file import LoadedGains
-from tuning.recording import Lane, record_lanes
+from tuning.recording import Lane, prepare_recording, record_lanes
 
 STEPS = 8000  # of the integration in space
 POINTS = 800  # of them kept
@@ -47,11 +47,8 @@ def nominal_motion(
     mechanism: Mechanism, compensator: str, gains: Mapping[str, Mapping[str, float]], seed: int = 0
 ) -> list[Piece]:
     """The pieces of the nominal run under each of `gains`; the run in space enters as the last of them."""
-    phase = np.full(len(gains), mechanism.approach.phase)
-    scenarios = build_scenarios(mechanism, {"approach.phase": phase}, seed)
-    names = next(iter(gains.values()))
-    lanes: Any = {name: np.array([one[name] for one in gains.values()]) for name in names}
-    _, recorded = record_lanes(LoadedGains({}, compensator, lanes, mechanism), scenarios)
+    loaded, scenarios = _lanes(mechanism, compensator, gains, seed)
+    _, recorded = record_lanes(loaded, scenarios)
     runs = {name: _split(lane, mechanism) for name, lane in zip(gains, recorded, strict=True)}
     leading = list(runs.values())[-1]
     clearance = mechanism.contact.clearance
@@ -64,6 +61,20 @@ def nominal_motion(
         name = f"{mechanism.approach.contacts} contacts" if two else f"contact {number + 1}"
         pieces.append(Piece(name, surfaces, {"in space": space, **others}))
     return pieces
+
+
+def prepare_motion(mechanism: Mechanism, compensator: str, gains: Mapping[str, Mapping[str, float]]) -> None:
+    """Compile what `nominal_motion` will run under so many gains."""
+    prepare_recording(*_lanes(mechanism, compensator, gains, 0))
+
+
+def _lanes(mechanism, compensator, gains, seed) -> tuple[LoadedGains, Scenario]:
+    """The nominal scenario in as many lanes as there are gains."""
+    phase = np.full(len(gains), mechanism.approach.phase)
+    scenarios = build_scenarios(mechanism, {"approach.phase": phase}, seed)
+    names = next(iter(gains.values()))
+    lanes: Any = {name: np.array([one[name] for one in gains.values()]) for name in names}
+    return LoadedGains({}, compensator, lanes, mechanism), scenarios
 
 
 def _split(lane: Lane, mechanism: Mechanism) -> list[Curve]:

@@ -45,7 +45,7 @@ def restitution_errors(
     error = jnp.where(outcome.wanted, error, 0)
     slots = error.shape[0]
     error, wanted = (leaf.reshape(slots, number, lanes) for leaf in (error, outcome.wanted))
-    count = jnp.sum(wanted, axis=(0, 2)).astype(error.dtype)
+    count = jnp.maximum(jnp.sum(wanted, axis=(0, 2)), 1).astype(error.dtype)
     errors = error / (SCALE * jnp.sqrt(count))[None, :, None]
     return jnp.moveaxis(errors, 0, 1).reshape(number, -1)
 

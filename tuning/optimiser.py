@@ -51,40 +51,47 @@ def to_gains(free: Float[Array, "gains"], bounds: Bounds) -> Float[Array, "gains
 
 
 def to_free(gains: Float[Array, "gains"], bounds: Bounds) -> Float[Array, "gains"]:
-    """Inverse of `to_gains`; a gain on a bound is moved inside by a thousandth of the range."""
+    """Inverse of `to_gains`; a gain on a bound is moved inside by a thousandth of the range.
+
+    A gain whose bounds are equal stays what it is, whatever its free number.
+    """
     span = bounds.upper - bounds.lower
     share = (gains - bounds.lower) / jnp.where(span > 0, span, 1)
-    positive = jnp.where(bounds.logarithmic > 0, jnp.maximum(gains, bounds.lower), 1)
-    low = jnp.log(jnp.where(bounds.logarithmic > 0, bounds.lower, 1))
-    high = jnp.log(jnp.where(bounds.logarithmic > 0, bounds.upper, 2))
-    share = jnp.where(bounds.logarithmic > 0, (jnp.log(positive) - low) / (high - low), share)
+    logarithmic = (bounds.logarithmic > 0) & (span > 0)
+    positive = jnp.where(logarithmic, jnp.maximum(gains, bounds.lower), 1)
+    low = jnp.log(jnp.where(logarithmic, bounds.lower, 1))
+    high = jnp.log(jnp.where(logarithmic, bounds.upper, 2))
+    share = jnp.where(logarithmic, (jnp.log(positive) - low) / (high - low), share)
     share = jnp.clip(share, 1e-3, 1 - 1e-3)
     return jnp.log(share) - jnp.log1p(-share)
 
 
-@partial(jax.jit, static_argnames=("residuals", "static", "max_steps"))
+@partial(jax.jit, static_argnames=("residuals", "static", "longest", "tile"))
 def solve(
     residuals: Callable[..., Float[Array, "problems residuals"]],
     static: Any,
     arguments: Any,
     bounds: Bounds,
     starts: Float[Array, "problems gains"],
-    max_steps: int = 30,
+    steps: Int[Array, ""],
+    longest: int = 32,
+    tile: int | None = None,
     rtol: float = 1e-4,
     atol: float = 1e-6,
 ) -> Solution:
-    """Minimise sum(residuals(static, gains, arguments)^2) / 2 of many problems at once.
+    """Minimise sum(residuals(static, gains, arguments)^2) / 2 of many problems at once, in at most `steps`
+    steps, themselves at most `longest`.
 
-    A problem is a start: its gains, their bounds and its arguments. `residuals` gets all that a device has
-    to do with a leading axis of problems, which must not mix.
+    A problem is a start: its gains, their bounds and its arguments. `residuals` gets several, a leading axis
+    of problems, which must not mix: `tile` of them at a time, by default all that a device has to do.
     """
 
     def of_free(free, arguments):
         bounds, arguments = arguments
         return residuals(static, jax.vmap(to_gains)(free, bounds), arguments)
 
-    function = _with_jacobian(of_free, starts, (bounds, arguments))
-    solver = _Recording(optx.LevenbergMarquardt(rtol=rtol, atol=atol), max_steps)
+    function = _with_jacobian(of_free, starts, (bounds, arguments), tile)
+    solver = _Recording(optx.LevenbergMarquardt(rtol=rtol, atol=atol), steps, longest)
 
     def one(start, bounds, arguments):
         solution = optx.least_squares(
@@ -93,18 +100,19 @@ def solve(
             to_free(start, bounds),
             args=(bounds, arguments),
             has_aux=True,
-            max_steps=max_steps,
+            max_steps=longest,
             throw=False,
         )
-        history, steps = solution.stats["history"], solution.stats["num_steps"]
-        status = _status(solution.result, jnp.min(history))
+        stats = solution.stats
+        loss = jnp.min(stats["history"])
+        status = _status(solution.result, stats["converged"], loss)
         gains = to_gains(solution.value, bounds)
-        return Solution(gains, jnp.min(history), history, steps.astype(jnp.int32), status)
+        return Solution(gains, loss, stats["history"], stats["num_steps"].astype(jnp.int32), status)
 
     return jax.vmap(one)(starts, bounds, arguments)
 
 
-def _with_jacobian(residuals, free, arguments):
+def _with_jacobian(residuals, free, arguments, tile=None):
     """(residuals, loss) of one problem, to be called under a `jax.vmap` over all of them.
 
     Its derivative is one product with a Jacobian computed once, in forward mode, for all problems side by
@@ -127,9 +135,17 @@ def _with_jacobian(residuals, free, arguments):
             (devices,), ("device",), axis_types=(AxisType.Auto,), devices=jax.devices()[:devices]
         )
         own = PartitionSpec("device")
-        return jax.shard_map(
-            value_and_jacobian, mesh=mesh, in_specs=(own, own), out_specs=own, check_vma=False
-        )(free, arguments)
+        return jax.shard_map(in_tiles, mesh=mesh, in_specs=(own, own), out_specs=own, check_vma=False)(
+            free, arguments
+        )
+
+    def in_tiles(free, arguments):
+        # A tile ends with its own slowest lane, and its numbers stay in the cache.
+        size = math.gcd(len(free), tile or len(free))
+        shape = len(free) // size, size
+        tiles = jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), (free, arguments))
+        done = jax.lax.map(lambda one: value_and_jacobian(*one), tiles)
+        return jax.tree.map(lambda leaf: leaf.reshape(len(free), *leaf.shape[2:]), done)
 
     # Traced once, however often the solver asks for it: tracing costs more than many a step.
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), (free, arguments))
@@ -165,40 +181,43 @@ def _with_jacobian(residuals, free, arguments):
 
 
 class _Recording(optx.AbstractLeastSquaresSolver):
-    """A solver that keeps the loss of every accepted iterate."""
+    """A solver that keeps the loss of every accepted iterate, and ends after `steps` of them, a number that
+    is no part of the program."""
 
     rtol: float
     atol: float
     norm: Callable[[Any], Array]
     inner: optx.AbstractLeastSquaresSolver
-    max_steps: int = eqx.field(static=True)
+    steps: Int[Array, ""]
+    longest: int = eqx.field(static=True)
 
-    def __init__(self, inner: optx.AbstractLeastSquaresSolver, max_steps: int):
+    def __init__(self, inner: optx.AbstractLeastSquaresSolver, steps: Int[Array, ""], longest: int):
         self.rtol, self.atol, self.norm = inner.rtol, inner.atol, inner.norm
-        self.inner, self.max_steps = inner, max_steps
+        self.inner, self.steps, self.longest = inner, steps, longest
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         inner = self.inner.init(fn, y, args, options, f_struct, aux_struct, tags)
-        history = jnp.full(self.max_steps, jnp.inf, y.dtype)
+        history = jnp.full(self.longest, jnp.inf, y.dtype)
         return inner, history, jnp.array(0)
 
     def step(self, fn, y, args, options, state, tags):
         inner, history, count = state
         y, inner, loss = self.inner.step(fn, y, args, options, inner, tags)
         best = jnp.minimum(loss, jnp.where(count > 0, history[count - 1], jnp.inf))
-        history = jnp.where(jnp.arange(self.max_steps) >= count, best, history)
+        history = jnp.where(jnp.arange(self.longest) >= count, best, history)
         return y, (inner, history, count + 1), loss
 
     def terminate(self, fn, y, args, options, state, tags):
-        return self.inner.terminate(fn, y, args, options, state[0], tags)
+        converged, result = self.inner.terminate(fn, y, args, options, state[0], tags)
+        return converged | (state[2] >= self.steps), result
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        converged, _ = self.inner.terminate(fn, y, args, options, state[0], tags)
         y, aux, stats = self.inner.postprocess(fn, y, aux, args, options, state[0], tags, result)
-        return y, aux, {**stats, "history": state[1]}
+        return y, aux, {**stats, "history": state[1], "converged": converged}
 
 
-def _status(result, loss):
-    converged = result == optx.RESULTS.successful
-    limit = result == optx.RESULTS.nonlinear_max_steps_reached
-    status = jnp.where(converged, 0, jnp.where(limit, 1, 3))
+def _status(result, converged, loss):
+    ended = (result == optx.RESULTS.successful) | (result == optx.RESULTS.nonlinear_max_steps_reached)
+    status = jnp.where(ended, jnp.where(converged, 0, 1), 3)
     return jnp.where(jnp.isfinite(loss), status, 2).astype(jnp.int32)

@@ -133,6 +133,27 @@ def loss_plot(result: Result) -> Figure:
     return figure
 
 
+def overview_plot(results: Sequence[Result], limit: float) -> Figure:
+    """The rms restitution error of every mechanism before tuning, with the literature's gains, and tuned."""
+    height = 1.6 + 0.2 * len(results)
+    figure = _figure((8, height), f"Restitution error of {len(results)} mechanisms on fresh scenarios", 0.9)
+    longest = max(len(result.mechanism.name) for result in results)
+    figure.subplots_adjust(left=min(0.45, (0.5 + 0.085 * min(longest, 40)) / 8))
+    axes = figure.subplots()
+    rows = np.arange(len(results))
+    for name in ("before", "literature", "tuned"):
+        rms = [result.figures[name].rms for result in results]
+        style = {"linestyle": "none", "marker": MARKERS[name], "color": STYLES[name][0], "markersize": 5}
+        axes.plot(rms, rows, label=LABELS[name], **style)
+    if 0 < limit < np.inf:
+        axes.axvline(limit, color=GREEN, linewidth=1, linestyle=":", label=f"limit {limit:g}")
+    axes.set_yticks(rows, [one_line(r.mechanism.name, 40).replace("$", r"\$") for r in results], fontsize=8)
+    axes.set(xscale="log", xlabel="rms of the restitution error e - e* [1]", ylim=(len(results) - 0.5, -0.5))
+    _finish(axes, None)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, fontsize=8, frameon=False)
+    return figure
+
+
 def contact_plot(pieces: Sequence[Piece], title: str, sensors: str | None = None) -> Figure:
     """Force and position over time, contact by contact, beside the same contact in space.
 

@@ -78,6 +78,15 @@ def record_lanes(loaded: LoadedGains, batch: Scenario) -> tuple[Metrics, list[La
     ]
 
 
+def prepare_recording(loaded: LoadedGains, batch: Scenario) -> None:
+    """Compile what `record_lanes` will run on such arguments, without running it."""
+    program = _compiled(build_loop(loaded.mechanism, loaded.compensator, batch))
+    gains = _arrays(loaded.gains)
+    rig, run = jax.eval_shape(program.begin, gains, batch)
+    program.begin.lower(gains, batch).compile()
+    program.record_chunk.lower(rig, gains, run).compile()
+
+
 def run_closed_loop(loaded: LoadedGains, gain_file: GainFile, batch: Scenario) -> Metrics:
     """Metrics (slots, 1) of the batch's first lane under the runtime's controller made of `gain_file`.
 

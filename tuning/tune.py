@@ -1,35 +1,28 @@
-"""Tuning of one mechanism: scenarios, starts, solve, and judgement on scenarios that tuning never saw."""
+"""Tuning of mechanisms: scenarios, starts, solve, and judgement on scenarios that tuning never saw."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
-from scipy.stats import qmc
 
 from jaxhil.building import build_loop
-from jaxhil.compensators import COMPENSATORS, Gain
-from jaxhil.evaluation import Outcome, evaluate, parameters_by_slot
-from jaxhil.loop import Loop, build_rig
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.evaluation import Outcome, evaluate, prepare_evaluation
+from jaxhil.loop import Loop
 from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario, build_scenarios
-from jaxhil.uncertainty import draw, quasi_random
-from tuning import programs
+from jaxhil.uncertainty import draw
 from tuning.environment import program_folder
-from tuning.objective import SCALE, Problem, restitution_errors
-from tuning.optimiser import STATUSES, Bounds, Solution, solve
+from tuning.problems import Task, alike, build_task, common_loop
+from tuning.rounds import Start, solve_tasks
 
 # Draws of the validation come from another seed than those of training.
 VALIDATION_SEED = 0x5EED
-# In training a contact that takes longer than this many times its undelayed duration, and so many
-# seconds more, has failed.
-PATIENCE = 2.0
-SHORTEST_PATIENCE = 0.15  # s
+BLOCK = 16  # mechanisms tuned and judged together: what is done when work is interrupted is kept
 
 
 @dataclass(frozen=True)
@@ -54,16 +47,6 @@ class Figures(NamedTuple):
     diverging: float
     peak_ratio: float
     failed: int
-
-
-class Start(NamedTuple):
-    """One start of the solve: status, steps, rms error it ended with, after every step, and its gains."""
-
-    status: str
-    steps: int
-    rms: float
-    history: list[float]
-    gains: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -92,52 +75,112 @@ def tune(
     report: Callable[[str], None] = lambda text: None,
 ) -> Result:
     """Tune the gains of `compensator` for `mechanism`; `report` hears of each stage."""
+    return next(tune_all([mechanism], compensator, settings, report))[1]
+
+
+def tune_all(
+    mechanisms: Sequence[Mechanism],
+    compensator: str,
+    settings: Settings,
+    report: Callable[[str], None] = lambda text: None,
+) -> Iterator[tuple[int, Result]]:
+    """(index, result) of every mechanism, as they are done: like ones together, in one program."""
+    tasks = [build_task(m, compensator, settings.scenarios, settings.seed) for m in mechanisms]
+    for group in alike([task.loop for task in tasks], [task.scenarios for task in tasks]):
+        for begin in range(0, len(group), BLOCK):
+            block = group[begin : begin + BLOCK]
+            results = _tune_block([tasks[index] for index in block], settings, report)
+            yield from zip(block, results, strict=True)
+
+
+def _tune_block(tasks: list[Task], settings: Settings, report: Callable[[str], None]) -> list[Result]:
     clock = _Clock()
-    law = COMPENSATORS[compensator]
-    literature = {gain.name: float(gain.nominal(mechanism)) for gain in law.gains}
-    fresh = build_scenarios(
-        mechanism,
-        draw(mechanism, settings.validation, settings.seed + VALIDATION_SEED),
-        settings.seed + VALIDATION_SEED,
-    )
-    # The nominal run is one more lane of the same batch.
-    both = jax.tree.map(
-        lambda fresh, nominal: np.concatenate([fresh, nominal], axis=-1),
-        fresh,
-        build_scenarios(mechanism),
-    )
-    loop = build_loop(mechanism, compensator, both)
-    known = {"before": neutral_gains(compensator, literature), "literature": literature}
-    starts, gains = [], literature
-    # What does not wait for tuning is compiled and run while the solver's program compiles, on one core.
+    name = tasks[0].mechanism.name if len(tasks) == 1 else f"{len(tasks)} mechanisms"
+    compensator = tasks[0].compensator
+    trial = _Trial(tasks, settings)
+    known = {
+        "before": [neutral_gains(compensator, task.literature) for task in tasks],
+        "literature": [task.literature for task in tasks],
+    }
+    best, starts = known["literature"], [[] for _ in tasks]
     with ThreadPoolExecutor(1) as meanwhile:
-        judged = {name: meanwhile.submit(evaluate, loop, values, both) for name, values in known.items()}
-        if any(gain.tuned(mechanism) for gain in law.gains):
-            report(f"tuning {compensator} on {settings.scenarios} scenarios from {settings.starts} starts")
-            starts = _solve(mechanism, compensator, literature, settings)
-            usable = [start for start in starts if start.status != STATUSES[2]]
-            if usable:
-                gains = min(usable, key=lambda start: start.rms).gains
-        clock.lap("tune")
-        report(f"judging on {settings.validation} fresh scenarios")
-        every = {name: outcome.result() for name, outcome in judged.items()}
-    every["tuned"] = evaluate(loop, gains, both)
-    outcomes = {name: jax.tree.map(lambda leaf: leaf[..., :-1], one) for name, one in every.items()}
-    nominal_outcomes = {name: jax.tree.map(lambda leaf: leaf[..., -1:], one) for name, one in every.items()}
+        if program_folder() is not None:
+            # The solver's program compiles on one core. Nothing runs beside it: programs on several devices
+            # could wait for one another for ever.
+            meanwhile.submit(trial.prepare, known["literature"])
+        if any(task.tuned for task in tasks):
+            report(f"{name}: tuning {compensator} on {settings.scenarios} scenarios each")
+            starts = solve_tasks(
+                tasks, settings.starts, settings.steps, settings.seed, lambda text: report(f"{name}: {text}")
+            )
+            best = [_best(own, task.literature) for own, task in zip(starts, tasks, strict=True)]
+    clock.lap("tune")
+    report(f"{name}: judging on {settings.validation} fresh scenarios")
+    outcomes = {key: trial.judge(gains) for key, gains in known.items()}
+    outcomes["tuned"] = trial.judge(best)
     clock.lap("judge")
-    return Result(
-        compensator=compensator,
-        mechanism=mechanism,
-        gains=gains,
-        literature=literature,
-        figures={name: figures(outcome) for name, outcome in outcomes.items()},
-        nominal={name: figures(outcome) for name, outcome in nominal_outcomes.items()},
-        starts=starts,
-        outcomes=outcomes,
-        scenarios=fresh,
-        settings=settings,
-        timings=clock.laps,
-    )
+    results = []
+    for i, task in enumerate(tasks):
+        own = {key: every[i] for key, every in outcomes.items()}
+        fresh = {key: jax.tree.map(lambda leaf: leaf[..., :-1], one) for key, one in own.items()}
+        nominal = {key: jax.tree.map(lambda leaf: leaf[..., -1:], one) for key, one in own.items()}
+        results.append(
+            Result(
+                compensator=compensator,
+                mechanism=task.mechanism,
+                gains=best[i],
+                literature=task.literature,
+                figures={key: figures(outcome) for key, outcome in fresh.items()},
+                nominal={key: figures(outcome) for key, outcome in nominal.items()},
+                starts=starts[i],
+                outcomes=fresh,
+                scenarios=trial.fresh[i],
+                settings=settings,
+                timings=clock.laps,
+            )
+        )
+    return results
+
+
+def _best(starts: list[Start], literature: dict[str, float]) -> dict[str, float]:
+    usable = [start for start in starts if np.isfinite(start.rms)]
+    return min(usable, key=lambda start: start.rms).gains if usable else literature
+
+
+class _Trial:
+    """Fresh scenarios of like tasks, and the nominal run of each as one more lane of its own."""
+
+    def __init__(self, tasks: list[Task], settings: Settings):
+        seed = settings.seed + VALIDATION_SEED
+        self.fresh: list[Scenario] = []
+        every, loops = [], []
+        for task in tasks:
+            drawn = draw(task.mechanism, settings.validation, seed)
+            self.fresh.append(build_scenarios(task.mechanism, drawn, seed))
+            every.append(_join([self.fresh[-1], build_scenarios(task.mechanism)]))
+            loops.append(build_loop(task.mechanism, task.compensator, every[-1]))
+        self.loop: Loop = common_loop(loops)
+        self.scenarios: Scenario = _join(every)
+        self.lanes = settings.validation + 1
+
+    def prepare(self, gains: list[dict[str, float]]) -> None:
+        """Compile what `judge` will run, into the compile cache."""
+        prepare_evaluation(self.loop, self._values(gains), self.scenarios)
+
+    def judge(self, gains: list[dict[str, float]]) -> list[Outcome]:
+        """Outcome of every task under its gains, the nominal run last."""
+        outcome = evaluate(self.loop, self._values(gains), self.scenarios)
+        cuts = [slice(i * self.lanes, (i + 1) * self.lanes) for i in range(len(gains))]
+        return [jax.tree.map(lambda leaf, cut=cut: leaf[..., cut], outcome) for cut in cuts]
+
+    def _values(self, gains: list[dict[str, float]]) -> dict[str, Any]:
+        if len(gains) == 1:
+            return dict(gains[0])
+        return {name: np.repeat([one[name] for one in gains], self.lanes) for name in gains[0]}
+
+
+def _join(batches: list[Scenario]) -> Any:
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *batches)
 
 
 def figures(outcome: Outcome) -> Figures:
@@ -168,83 +211,6 @@ def neutral_gains(compensator: str, gains: dict[str, float]) -> dict[str, float]
         gain.name: gain.neutral for gain in COMPENSATORS[compensator].gains if gain.neutral is not None
     }
     return {**gains, **neutral}
-
-
-def _solve(mechanism, compensator, literature, settings) -> list[Start]:
-    law = COMPENSATORS[compensator]
-    tuned = [gain for gain in law.gains if gain.tuned(mechanism)]
-    names = tuple(gain.name for gain in tuned)
-    scenarios = build_scenarios(
-        mechanism, quasi_random(mechanism, settings.scenarios, settings.seed), settings.seed
-    )
-    loop = build_loop(mechanism, compensator, scenarios)
-    fixed = {name: value for name, value in literature.items() if name not in names}
-    bounds = gain_bounds(tuned, mechanism)
-    first = np.array([literature[name] for name in names])
-    starts = spread_starts(first, bounds, settings.starts, settings.seed)
-    problem = scenarios, fixed, bounds
-    problems = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(starts), *np.shape(leaf))), problem)
-    static = loop, names, settings.steps
-    solution = jax.device_get(programs.run(_solve_problems, static, (*problems, starts), program_folder()))
-    starts = []
-    for i in range(settings.starts):
-        gains = {**literature, **dict(zip(names, map(float, solution.gains[i]), strict=True))}
-        history = [float(value) for value in SCALE * np.sqrt(2 * solution.history[i])]
-        status = STATUSES[int(solution.status[i])]
-        steps = int(solution.steps[i])
-        starts.append(Start(status, steps, history[-1], history[: max(steps, 1)], gains))
-    return starts
-
-
-def gain_bounds(gains: list[Gain], mechanism: Mechanism) -> Bounds:
-    """Bounds of `gains` for the optimiser."""
-    return Bounds(
-        np.array([float(gain.lower(mechanism)) for gain in gains]),
-        np.array([float(gain.upper(mechanism)) for gain in gains]),
-        np.array([float(gain.logarithmic) for gain in gains]),
-    )
-
-
-def spread_starts(first: np.ndarray, bounds: Bounds, number: int, seed: int) -> np.ndarray:
-    """(number, gains): the literature's gains, then Sobol points around them and over the middle of the box.
-
-    Half of the points lie within a quarter of each gain's range of the literature's value, half anywhere.
-    """
-    lower, upper = np.asarray(bounds.lower), np.asarray(bounds.upper)
-    logarithmic = np.asarray(bounds.logarithmic) > 0
-    low = np.where(logarithmic, np.log(np.where(logarithmic, lower, 1)), lower)
-    high = np.where(logarithmic, np.log(np.where(logarithmic, upper, 1)), upper)
-    place = np.where(logarithmic, np.log(np.maximum(first, np.where(logarithmic, lower, 1))), first)
-    share = np.clip((place - low) / (high - low), 0, 1)
-    points = qmc.Sobol(len(first), rng=np.random.default_rng(seed)).random(
-        1 << max(number - 1, 1).bit_length()
-    )
-    reach = np.where(np.arange(len(points)) % 2 == 0, 0.25, 1.0)[:, None]
-    shares = np.clip(share + reach * (points - 0.5), 0.02, 0.98)
-    shares = np.concatenate([share[None], shares])[:number]
-    values = low + (high - low) * shares
-    return np.where(logarithmic, np.exp(np.where(logarithmic, values, 0)), values)
-
-
-def _solve_problems(static, arguments) -> Solution:
-    loop, names, steps = static
-    scenarios, fixed, bounds, starts = arguments
-
-    def rig(scenarios):
-        return build_rig(loop, scenarios._replace(time_limit=_patience(loop, scenarios)))
-
-    problems = Problem(jax.vmap(rig)(scenarios), fixed)
-    return solve(restitution_errors, (loop, names), problems, bounds, starts, max_steps=steps)
-
-
-def _patience(loop: Loop, scenarios: Scenario) -> Array:
-    """How long [s] a contact may take in training before it has failed: some of its undelayed durations."""
-    shape = scenarios.phase.shape
-    mass = jnp.broadcast_to(scenarios.equivalent_mass, shape)
-    velocity = jnp.broadcast_to(scenarios.velocity, shape)
-    reference = loop.law.reference(parameters_by_slot(scenarios.contact), mass, velocity)
-    longest = PATIENCE * jnp.max(reference.duration, axis=0) + SHORTEST_PATIENCE
-    return jnp.minimum(longest, scenarios.time_limit)
 
 
 class _Clock:

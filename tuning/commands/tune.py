@@ -10,9 +10,10 @@ from jaxhil.mechanism_file import LoadedMechanism, load
 from tuning import report
 from tuning.cli import Tune
 from tuning.commands import checks
-from tuning.environment import prepare
+from tuning.environment import prepare, program_folder
 
-STAGES = 3  # of one mechanism: tune, judge, draw
+STAGES = 3  # of a block of mechanisms: tune, judge, draw
+MOST_DRAWN = 4  # mechanisms whose plots are drawn; of more there is one picture of all
 
 
 def run(options: Tune) -> int:
@@ -58,7 +59,7 @@ class _Interrupted(Exception):
 def _load(options: Tune) -> tuple[list[LoadedMechanism], list[str]]:
     """The files that can be used, and what is wrong with the others."""
     loaded, problems, folders = [], [], {}
-    for file in options.files or (None,):
+    for file in _expand(options.files, problems):
         try:
             one = load(file, options.overrides)
             folder = folder_name(one.mechanism.name)
@@ -75,6 +76,21 @@ def _load(options: Tune) -> tuple[list[LoadedMechanism], list[str]]:
     return loaded, problems
 
 
+def _expand(files: tuple[str, ...], problems: list[str]) -> list[str | None]:
+    """Every file, a directory standing for its .toml files; the default mechanism if nothing is given."""
+    expanded: list[str | None] = []
+    for file in files:
+        if not Path(file).is_dir():
+            expanded.append(file)
+            continue
+        found = sorted(str(path) for path in Path(file).glob("*.toml"))
+        if not found:
+            problems.append(f"{one_line(file)}: found no mechanism file, allowed a folder with .toml files")
+            report.note(f"jaxhil: {problems[-1]}")
+        expanded.extend(found)
+    return expanded if files else [None]
+
+
 def folder_name(name: str) -> str:
     """A mechanism's name as the name of a folder."""
     return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._") or "mechanism"
@@ -82,35 +98,41 @@ def folder_name(name: str) -> str:
 
 def _tune_all(options: Tune, loaded: list[LoadedMechanism], problems: list[str]) -> list[dict[str, Any]]:
     prepare()
-    entries = []
-    with report.stages(STAGES * len(loaded)) as stages:
-        for one in loaded:
-            name = one.mechanism.name
-            try:
-                result, entry = _tune_one(
-                    options, one, lambda text, name=name: stages.begin(f"{name}: {text}")
-                )
-            except KeyboardInterrupt:
-                raise _Interrupted(entries) from None
-            except InputError as error:
-                problems.append(str(error))
-                report.note(f"jaxhil: {error}")
-                continue
-            entries.append(entry)
-            if not options.json:
-                _print(options, result, entry)
-    return entries
-
-
-def _tune_one(options: Tune, loaded: LoadedMechanism, begin) -> tuple[Any, dict[str, Any]]:
-    from tuning.gain_file import build_document, validity_envelope, write_gain_file
-    from tuning.tune import Settings, tune
+    from tuning.tune import Settings, tune_all
 
     settings = Settings(options.scenarios, options.starts, options.steps, options.validation, options.seed)
-    # Drawing needs a program and a library of its own; the solver's program leaves a core idle meanwhile.
-    with ThreadPoolExecutor(1) as meanwhile:
-        meanwhile.submit(_prepare_drawing, loaded.mechanism, options.compensator)
-        result = tune(loaded.mechanism, options.compensator, settings, begin)
+    mechanisms = [one.mechanism for one in loaded]
+    entries, done = {}, {}
+    drawn = len(loaded) <= MOST_DRAWN
+    with report.stages(STAGES * len(loaded)) as stages, ThreadPoolExecutor(1) as meanwhile:
+        if drawn and program_folder() is not None:
+            meanwhile.submit(_prepare_drawing, mechanisms[0], options.compensator)
+        try:
+            for index, result in tune_all(mechanisms, options.compensator, settings, stages.begin):
+                try:
+                    entries[index] = _finish(options, loaded[index], result, drawn, stages.begin)
+                except InputError as error:
+                    problems.append(str(error))
+                    report.note(f"jaxhil: {error}")
+                    continue
+                done[index] = result
+                if not options.json and drawn:
+                    _print(options, result, entries[index])
+        except KeyboardInterrupt:
+            raise _Interrupted(_in_order(entries)) from None
+    if len(loaded) > 1 and done:
+        _overview(options, _in_order(done), _in_order(entries), drawn)
+    return _in_order(entries)
+
+
+def _in_order(by_index: dict[int, Any]) -> list[Any]:
+    return [by_index[index] for index in sorted(by_index)]
+
+
+def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, begin) -> dict[str, Any]:
+    """Write what was found for one mechanism."""
+    from tuning.gain_file import build_document, validity_envelope, write_gain_file
+
     folder = Path(options.output) / folder_name(loaded.mechanism.name)
     folder.mkdir(exist_ok=True)
     document = build_document(
@@ -124,11 +146,13 @@ def _tune_one(options: Tune, loaded: LoadedMechanism, begin) -> tuple[Any, dict[
         result.timings,
     )
     write_gain_file(folder / "gains.json", document)
-    begin("drawing")
-    plots = _draw(result, options, folder)
+    plots = []
+    if drawn:
+        begin(f"{loaded.mechanism.name}: drawing")
+        plots = _draw(result, options, folder)
     tuned = result.figures["tuned"]
     good = tuned.failed == 0 and tuned.rms <= options.limit
-    entry = {
+    return {
         "mechanism": loaded.mechanism.name,
         "file": loaded.label,
         "compensator": options.compensator,
@@ -143,16 +167,44 @@ def _tune_one(options: Tune, loaded: LoadedMechanism, begin) -> tuple[Any, dict[
         "better_than_literature": is_better(result.figures["tuned"], result.figures["literature"]),
         "verdict": "good" if good else "bad",
     }
-    return result, entry
+
+
+def _overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], drawn: bool) -> None:
+    """All mechanisms side by side."""
+    if not drawn:
+        from tuning.plots import overview_plot, save
+
+        save(overview_plot(results, options.limit), Path(options.output) / "overview.png")
+    if options.json:
+        return
+    rows = []
+    for result, entry in zip(results, entries, strict=True):
+        tuned = result.figures["tuned"]
+        best = min(result.starts, key=lambda start: start.rms).status if result.starts else "nothing to tune"
+        verdict = entry["verdict"] if entry["better_than_literature"] else "NOT better than the literature's"
+        rms = (result.figures[key].rms for key in ("before", "literature", "tuned"))
+        rows.append((entry["mechanism"], *rms, tuned.p99, tuned.peak_ratio, tuned.failed, best, verdict))
+    headings = ["mechanism", "before", "literature", "tuned", "99th pct", "peak ratio", "not ended"]
+    report.emit(
+        report.table(
+            f"rms of e - e* on {options.validation} fresh scenarios each, {options.compensator}",
+            [*headings, "best start", "verdict"],
+            rows,
+            texts=(0, 7, 8),
+        )
+    )
+    if not drawn:
+        report.emit(f"wrote {options.output}/NAME/gains.json and {options.output}/overview.png", "")
 
 
 def _prepare_drawing(mechanism, compensator: str) -> None:
-    from jaxhil.compensators import COMPENSATORS
+    """Import and compile what drawing needs, while the solver's program compiles on another core."""
     from tuning import plots  # noqa: F401
-    from tuning.motion import nominal_motion
+    from tuning.motion import prepare_motion
+    from tuning.problems import literature_gains
 
-    literature = {gain.name: float(gain.nominal(mechanism)) for gain in COMPENSATORS[compensator].gains}
-    nominal_motion(mechanism, compensator, {"before": literature, "tuned": literature})
+    gains = literature_gains(mechanism, compensator)
+    prepare_motion(mechanism, compensator, {"before": gains, "tuned": gains})
 
 
 def is_better(figures, other) -> bool:

@@ -1,0 +1,55 @@
+"""Many problems through one program: the same optima as alone, hopeless starts left, bad ones harmless."""
+
+import numpy as np
+import pytest
+
+from jaxhil.mechanism_file import load
+from tuning import rounds
+from tuning.problems import alike, build_task
+from tuning.rounds import GIVEN_UP, solve_tasks
+
+STARTS, STEPS = 5, 14
+# Stiff, soft, and one that times out at the literature's gains.
+OVERRIDES = (["contact.stiffness=[1e5]"], ["contact.stiffness=[4e4]"], ["contact.stiffness=[2e5]"])
+
+
+@pytest.fixture(scope="module")
+def tasks():
+    mechanisms = [load("rig-300kg", [*own, f"name=m{i}"]).mechanism for i, own in enumerate(OVERRIDES)]
+    return [build_task(mechanism, "phase_lead", 8, 0) for mechanism in mechanisms]
+
+
+@pytest.fixture(scope="module")
+def solved(tasks):
+    assert alike([task.loop for task in tasks], [task.scenarios for task in tasks]) == [[0, 1, 2]]
+    return solve_tasks(tasks, STARTS, STEPS, 0)
+
+
+def test_every_start_is_accounted_for(solved):
+    for starts in solved:
+        assert len(starts) == STARTS
+        for start in starts:
+            assert len(start.history) == start.steps <= STEPS
+            assert (np.diff(start.history) <= 0).all()
+            assert start.rms == start.history[-1]
+        left = [start for start in starts if start.status == GIVEN_UP]
+        assert len(left) <= STARTS - rounds.PROMISING
+        assert all(start.steps == rounds.FIRST_ROUND for start in left)
+        if left:
+            assert min(start.rms for start in left) >= min(start.rms for start in starts)
+
+
+def test_each_task_ends_as_it_does_alone(tasks, solved):
+    for task, together in zip(tasks, solved, strict=True):
+        (alone,) = solve_tasks([task], STARTS, STEPS, 0)
+        best = min(start.rms for start in alone)
+        assert min(start.rms for start in together) == pytest.approx(best, rel=1e-6)
+
+
+def test_a_task_that_fails_harms_no_other(tasks, solved):
+    broken = tasks[1].scenarios._replace(equivalent_mass=np.full(8, np.nan))
+    sick = rounds.dataclasses.replace(tasks[1], scenarios=broken)
+    starts = solve_tasks([tasks[0], sick, tasks[2]], STARTS, STEPS, 0)
+    for i in (0, 2):
+        assert [start.gains for start in starts[i]] == [start.gains for start in solved[i]]
+    assert all(start.rms == pytest.approx(3.0) or not np.isfinite(start.rms) for start in starts[1])

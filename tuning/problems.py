@@ -1,0 +1,111 @@
+"""What there is to solve: mechanisms with their training scenarios, and which of them share a program."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from scipy.stats import qmc
+
+from jaxhil.building import build_loop
+from jaxhil.compensators import COMPENSATORS, Gain
+from jaxhil.loop import Loop
+from jaxhil.mechanism import Mechanism
+from jaxhil.scenario import Scenario, build_scenarios
+from jaxhil.uncertainty import quasi_random
+from tuning.optimiser import Bounds
+
+
+@dataclass(frozen=True)
+class Task:
+    """A mechanism to tune: the compensator's literature gains, the scenarios to tune on and their loop."""
+
+    mechanism: Mechanism
+    compensator: str
+    literature: dict[str, float]
+    scenarios: Scenario
+    loop: Loop
+
+    @property
+    def tuned(self) -> tuple[Gain, ...]:
+        """The gains that tuning moves for this mechanism."""
+        return tuple(gain for gain in COMPENSATORS[self.compensator].gains if gain.tuned(self.mechanism))
+
+
+def build_task(mechanism: Mechanism, compensator: str, scenarios: int, seed: int) -> Task:
+    """Training scenarios are quasi-random: they fill the range evenly."""
+    batch = build_scenarios(mechanism, quasi_random(mechanism, scenarios, seed), seed)
+    return Task(
+        mechanism,
+        compensator,
+        literature_gains(mechanism, compensator),
+        batch,
+        build_loop(mechanism, compensator, batch),
+    )
+
+
+def literature_gains(mechanism: Mechanism, compensator: str) -> dict[str, float]:
+    """What the literature's rules set the compensator's gains to."""
+    return {gain.name: float(gain.nominal(mechanism)) for gain in COMPENSATORS[compensator].gains}
+
+
+def alike(loops: list[Loop], scenarios: list[Scenario]) -> list[list[int]]:
+    """Indices of what one program serves: loops that differ by the length of their delay lines alone, with
+    scenario arrays of the same shapes but for the number of lanes. In the order in which they come."""
+    groups: dict[Any, list[int]] = {}
+    for index, (loop, batch) in enumerate(zip(loops, scenarios, strict=True)):
+        shapes = tuple(leaf.shape[:-1] for leaf in jax.tree.leaves(batch))
+        groups.setdefault((_with_rings([loop], 0, 0), shapes), []).append(index)
+    return list(groups.values())
+
+
+def common_loop(loops: list[Loop]) -> Loop:
+    """The loop of like ones, with the longest of their delay lines."""
+    return _with_rings(loops, max(loop.ring for loop in loops), max(loop.controller_ring for loop in loops))
+
+
+def _with_rings(loops: list[Loop], ring: int, controller_ring: int) -> Loop:
+    return dataclasses.replace(loops[0], ring=ring, controller_ring=controller_ring)
+
+
+def tuned_names(tasks: list[Task]) -> tuple[str, ...]:
+    """Names of all gains that are tuned for at least one of the tasks."""
+    tuned = {gain.name for task in tasks for gain in task.tuned}
+    return tuple(gain.name for gain in COMPENSATORS[tasks[0].compensator].gains if gain.name in tuned)
+
+
+def gain_bounds(task: Task, names: tuple[str, ...]) -> Bounds:
+    """Bounds (gains,) of a task; of a gain that is not tuned for it both are the literature's value."""
+    gains = {gain.name: gain for gain in COMPENSATORS[task.compensator].gains}
+    moved = {gain.name for gain in task.tuned}
+
+    def bounds(name: str) -> tuple[float, float, float]:
+        gain, mechanism = gains[name], task.mechanism
+        if name not in moved:
+            return task.literature[name], task.literature[name], 0.0
+        return float(gain.lower(mechanism)), float(gain.upper(mechanism)), float(gain.logarithmic)
+
+    return Bounds(*np.array([bounds(name) for name in names]).T)
+
+
+def spread_starts(first: np.ndarray, bounds: Bounds, number: int, seed: int) -> np.ndarray:
+    """(number, gains): the literature's gains, then Sobol points around them and over the middle of the box.
+
+    Half of the points lie within a quarter of each gain's range of the literature's value, half anywhere.
+    """
+    lower, upper = np.asarray(bounds.lower), np.asarray(bounds.upper)
+    logarithmic = np.asarray(bounds.logarithmic) > 0
+    low = np.where(logarithmic, np.log(np.where(logarithmic, lower, 1)), lower)
+    high = np.where(logarithmic, np.log(np.where(logarithmic, upper, 1)), upper)
+    place = np.where(logarithmic, np.log(np.maximum(first, np.where(logarithmic, lower, 1))), first)
+    span = np.where(high > low, high - low, 1)
+    share = np.clip((place - low) / span, 0, 1)
+    points = qmc.Sobol(len(first), rng=np.random.default_rng(seed)).random(
+        1 << max(number - 1, 1).bit_length()
+    )
+    reach = np.where(np.arange(len(points)) % 2 == 0, 0.25, 1.0)[:, None]
+    shares = np.clip(share + reach * (points - 0.5), 0.02, 0.98)
+    shares = np.concatenate([share[None], shares])[:number]
+    values = low + (high - low) * shares
+    return np.where(logarithmic, np.exp(np.where(logarithmic, values, 0)), values)
