@@ -2,10 +2,11 @@
 
 import os
 
-from tuning.environment import flags
+from tuning.environment import settings
 
 # The programs tested are those that users run, on two devices wherever the tests run.
-os.environ["XLA_FLAGS"] = flags(os.environ.get("XLA_FLAGS", "--xla_force_host_platform_device_count=2"))
+DEVICES = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+os.environ.update(settings({**DEVICES, **os.environ}))
 
 import hypothesis
 import jax

@@ -6,6 +6,7 @@ Commands call `prepare` before anything that imports jax.
 import gc
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 CACHE = "JAXHIL_CACHE"
@@ -17,7 +18,7 @@ def prepare() -> None:
     What the user says in XLA_FLAGS stands. Flags have no effect once jax runs, and are left alone then.
     """
     if "jax" not in sys.modules:
-        os.environ["XLA_FLAGS"] = flags(os.environ.get("XLA_FLAGS", ""))
+        os.environ.update(settings(os.environ))
     import jax
 
     # Tracing makes objects by the million, few of them in cycles: looking for those takes a tenth of the time
@@ -36,6 +37,16 @@ def program_folder() -> str | None:
     import jax
 
     return getattr(jax.config, "jax_compilation_cache_dir", None)
+
+
+def settings(given: Mapping[str, str]) -> dict[str, str]:
+    """Environment variables that jax reads when it starts, made of those `given`.
+
+    XLA's devices share one pool of threads. One that cuts up a large piece of work waits for another thread to
+    be free, and with no thread to spare all of them wait for ever.
+    """
+    threads = given.get("NPROC", str(4 * usable_cores()))
+    return {"XLA_FLAGS": flags(given.get("XLA_FLAGS", "")), "NPROC": threads}
 
 
 def flags(given: str) -> str:

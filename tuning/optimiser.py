@@ -90,10 +90,13 @@ def solve(
         bounds, arguments = arguments
         return residuals(static, jax.vmap(to_gains)(free, bounds), arguments)
 
-    function = _with_jacobian(of_free, starts, (bounds, arguments), tile)
     solver = _Recording(optx.LevenbergMarquardt(rtol=rtol, atol=atol), steps, longest)
 
-    def one(start, bounds, arguments):
+    def one_device(starts, bounds, arguments):
+        function = _with_jacobian(of_free, starts, (bounds, arguments), tile)
+        return jax.vmap(partial(one, function))(starts, bounds, arguments)
+
+    def one(function, start, bounds, arguments):
         solution = optx.least_squares(
             function,
             solver,
@@ -109,7 +112,20 @@ def solve(
         gains = to_gains(solution.value, bounds)
         return Solution(gains, loss, stats["history"], stats["num_steps"].astype(jnp.int32), status)
 
-    return jax.vmap(one)(starts, bounds, arguments)
+    devices = math.gcd(jax.device_count(), len(starts))
+    # Traced outside of `jax.shard_map`, inside of which the solver's linear algebra does not trace.
+    leaves, structure = jax.tree.flatten((starts, bounds, arguments))
+    local = [jax.ShapeDtypeStruct((len(leaf) // devices, *leaf.shape[1:]), leaf.dtype) for leaf in leaves]
+    traced = jax.make_jaxpr(lambda *leaves: one_device(*jax.tree.unflatten(structure, leaves)))(*local)
+    mesh = jax.make_mesh(
+        (devices,), ("device",), axis_types=(AxisType.Auto,), devices=jax.devices()[:devices]
+    )
+    own = PartitionSpec("device")
+    # Each device goes its own way to the end: nothing is exchanged, nothing waits for another.
+    found = jax.shard_map(jaxpr_as_fun(traced), mesh=mesh, in_specs=own, out_specs=own, check_vma=False)(
+        *leaves
+    )
+    return Solution(*found)
 
 
 def _with_jacobian(residuals, free, arguments, tile=None):
@@ -129,16 +145,6 @@ def _with_jacobian(residuals, free, arguments, tile=None):
         basis = jnp.eye(free.shape[-1], dtype=free.dtype)
         return jax.vmap(along, out_axes=(None, -1))(basis)
 
-    def dealt(free, arguments):
-        devices = math.gcd(jax.device_count(), len(free))
-        mesh = jax.make_mesh(
-            (devices,), ("device",), axis_types=(AxisType.Auto,), devices=jax.devices()[:devices]
-        )
-        own = PartitionSpec("device")
-        return jax.shard_map(in_tiles, mesh=mesh, in_specs=(own, own), out_specs=own, check_vma=False)(
-            free, arguments
-        )
-
     def in_tiles(free, arguments):
         # A tile ends with its own slowest lane, and its numbers stay in the cache.
         size = math.gcd(len(free), tile or len(free))
@@ -150,7 +156,7 @@ def _with_jacobian(residuals, free, arguments, tile=None):
     # Traced once, however often the solver asks for it: tracing costs more than many a step.
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), (free, arguments))
     number = len(free)
-    traced = jaxpr_as_fun(jax.make_jaxpr(dealt)(*shapes))
+    traced = jaxpr_as_fun(jax.make_jaxpr(in_tiles)(*shapes))
 
     @jax.custom_batching.custom_vmap
     def several(free, arguments):
