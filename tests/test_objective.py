@@ -20,7 +20,7 @@ from jaxhil.uncertainty import draw
 from tuning.objective import (
     FAILED,
     OBJECTIVES,
-    POWER,
+    POWERS,
     SCALE,
     Objective,
     Problem,
@@ -112,7 +112,7 @@ def test_residuals_are_those_of_an_evaluation(outcomes, known):
 
 
 @pytest.mark.parametrize("name", OBJECTIVES)
-def test_the_sum_of_squares_is_the_stated_value(outcomes, name):
+def test_the_sum_of_squares_is_the_stated_value_or_just_above(outcomes, name):
     objective = of_name(name)
     for gains, outcome in zip(GAINS, outcomes, strict=True):
         terms = contact_terms(outcome)
@@ -120,10 +120,10 @@ def test_the_sum_of_squares_is_the_stated_value(outcomes, name):
         noise = amplification(gains)
         value = objective_value(objective, error, excess, noise)
         ours = np.sqrt(sum_of_squares(objective, error, excess, noise))
-        if name == "worst":
-            assert value < ours < value * len(error) ** (1 / POWER)
-        else:
+        if name == "rms":
             np.testing.assert_allclose(ours, value, rtol=1e-12)
+        else:
+            assert value < ours < 1.5 * value
 
 
 def test_derivatives_are_central_differences(batch, known):
@@ -198,7 +198,10 @@ def test_cvar_is_the_mean_of_the_worst_twentieth(number, tail):
     errors[::2] *= -1
     expected = np.mean(np.arange(number - tail + 1, number + 1)) / number
     assert objective_value(Objective("cvar"), errors) == pytest.approx(expected, rel=1e-14)
-    np.testing.assert_allclose(sum_of_squares(Objective("cvar"), errors), expected**2, rtol=1e-14)
+    # What the solver sees is an upper bound: the root of the mean of powers.
+    bound = (np.sum(np.abs(errors) ** POWERS["cvar"]) / tail) ** (1 / POWERS["cvar"])
+    np.testing.assert_allclose(sum_of_squares(Objective("cvar"), errors), bound**2, rtol=1e-13)
+    assert expected <= bound
 
 
 def test_known_errors_have_known_figures():
@@ -220,7 +223,8 @@ def test_known_errors_have_known_figures():
 
 def test_a_high_norm_stands_for_the_worst():
     errors = np.random.default_rng(0).normal(size=96)
-    norm = np.sum(np.abs(errors) ** POWER) ** (1 / POWER)
+    norm = np.sum(np.abs(errors) ** POWERS["worst"]) ** (1 / POWERS["worst"])
+    assert np.abs(errors).max() < norm < 1.3 * np.abs(errors).max()
     np.testing.assert_allclose(sum_of_squares(Objective("worst"), errors), norm**2, rtol=1e-13)
     # Neither wild errors nor tiny ones leave the range of numbers.
     for size in (1e100, 1e-100):

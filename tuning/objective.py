@@ -7,8 +7,15 @@ With e - e* of every contact, divergence weighted against convergence (`Objectiv
     worst   the largest magnitude
 
 and the penalties a command that peaks above the reference's force and a compensator that amplifies the noise
-of the force sensor. Levenberg-Marquardt wants sums of squares: `residuals` has the square of the figure and
-of the penalties as its sum of squares, so that all are in one unit, that of a restitution error.
+of the force sensor, all in one unit, that of a restitution error. `objective_value` has them exactly.
+
+Levenberg-Marquardt wants smooth sums of squares. That of `residuals` is the square of the norm
+
+    (sum of |E|^p / m)^(1/p)    rms: p = 2, m contacts;  cvar: p = 6, m the worst 5 %;  worst: p = 8, m = 1
+
+which is the rms, and never below the other two: the mean of the worst is at most the p-th root of the mean
+of their p-th powers. The exact tail is no use to a solver that linearises: contacts outside it weigh nothing,
+and a step that spoils one of them is not foreseen. By this norm the tail ends lower.
 """
 
 import math
@@ -28,9 +35,9 @@ from jaxhil.rollout import run_contacts
 
 SCALE = 0.01  # an error of one: the solver's first steps are damped as for residuals of order one
 FAILED = 3.0  # error of a contact that does not end, or is not reached: as bad as a wild divergence
-OBJECTIVES = ("rms", "cvar", "worst")
 TAIL = 20  # cvar: the worst one in so many contacts, at least one
-POWER = 16  # worst: the exponent of the norm that stands for the maximum; even
+POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # of the norms in the residuals; even
+OBJECTIVES = tuple(POWERS)
 
 
 @dataclass(frozen=True)
@@ -81,11 +88,9 @@ def residuals(
 ) -> Float[Array, "problems residuals"]:
     """(J / `SCALE`)^2 of every problem as a sum of squares, J as of `Objective`; the loss is half of it.
 
-    One residual per contact slot of every scenario for the figure, as many for the command and one for the
-    noise, where their weights are not 0. Contacts that fail count with the constant error and excess
-    `FAILED`. `rms` and `cvar` are exact; which contacts are the worst is not differentiated. For `worst`
-    stands the norm (sum of |E|^`POWER`)^(1/`POWER`): never below the maximum, nor above contacts^(1/`POWER`)
-    times that.
+    One residual per contact slot of every scenario for the figure, or the norm that stands for it, as many
+    for the command and one for the noise, where their weights are not 0. Contacts that fail count with the
+    constant error and excess `FAILED`.
 
     `static` is the loop, the names of the gains that are tuned and the objective. The scenarios of all
     problems run side by side, as the lanes of one batch.
@@ -124,9 +129,10 @@ def weigh(
     """The residuals of `contact_terms` and of the noise's amplification."""
     count = jnp.sum(wanted, axis=1, dtype=jnp.int32)[:, None]
     diverging = math.sqrt(objective.divergence_weight) * error
-    parts = [_FIGURES[objective.name](jnp.where(error > 0, diverging, error), count)]
+    number = {"rms": count, "cvar": _tail(count), "worst": jnp.ones_like(count)}[objective.name]
+    parts = [_norm(jnp.where(error > 0, diverging, error), number, POWERS[objective.name])]
     if objective.command_weight > 0:
-        parts.append(objective.command_weight * _mean_square(excess, count))
+        parts.append(objective.command_weight * _norm(excess, count, 2))
     if objective.noise_weight > 0:
         beyond = amplification[:, None] - 1
         parts.append(objective.noise_weight * jnp.where(beyond > 0, beyond, 0))
@@ -175,36 +181,17 @@ def _tail(count):
     return -(-count // TAIL)
 
 
-def _mean_square(error: Float[Array, "problems contacts"], count: Int[Array, "problems 1"]) -> Array:
-    """Sum of squares: the mean square of the first `count`, the others being 0."""
-    return error / jnp.sqrt(count.astype(error.dtype))
+def _norm(error: Float[Array, "problems contacts"], number: Int[Array, "problems 1"], power: int) -> Array:
+    """Sum of squares: (sum of |E|^p / m)^(2/p); residuals E (|E| / |E|_p)^(p/2 - 1) / m^(1/p).
 
-
-def _tail_mean(error: Float[Array, "problems contacts"], count: Int[Array, "problems 1"]) -> Array:
-    """Sum of squares: the square of the mean magnitude C of the worst; residuals sqrt(|E| C / their number).
-
-    Of first degree in the errors, unlike sqrt(|E|), whose Gauss-Newton step overshoots twofold.
+    They are of first degree in the errors, so that Gauss-Newton steps neither overshoot nor fall short.
     """
-    size, tail = jnp.abs(error), _tail(count)
-    order = jnp.argsort(lax.stop_gradient(-size), axis=1)
-    chosen = jnp.argsort(order, axis=1).astype(tail.dtype) < tail
-    number = tail.astype(size.dtype)
-    mean = jnp.sum(jnp.where(chosen, size, 0), axis=1, keepdims=True) / number
-    square = jnp.where(chosen, size * mean / number, 0)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
-
-
-def _high_norm(error: Float[Array, "problems contacts"], count: Int[Array, "problems 1"]) -> Array:
-    """Sum of squares: the square of the norm |E|_p, p = `POWER`; residuals E (|E| / |E|_p)^(p/2 - 1)."""
     size = jnp.abs(error)
     largest = lax.stop_gradient(jnp.max(size, axis=1, keepdims=True))
     unit = jnp.where(largest > 0, largest, 1)
-    total = jnp.sum((size / unit) ** POWER, axis=1, keepdims=True)
-    norm = unit * jnp.where(largest > 0, total, 1) ** (1 / POWER)
-    return error * (size / norm) ** (POWER // 2 - 1)
-
-
-_FIGURES = {"rms": _mean_square, "cvar": _tail_mean, "worst": _high_norm}
+    total = jnp.sum((size / unit) ** power, axis=1, keepdims=True)
+    norm = unit * jnp.where(largest > 0, total, 1) ** (1 / power)
+    return error * (size / norm) ** (power // 2 - 1) / number.astype(error.dtype) ** (1 / power)
 
 
 def _side_by_side(leaf: Array) -> Array:
