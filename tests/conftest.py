@@ -5,8 +5,10 @@ import os
 from tuning.environment import settings
 
 # The programs tested are those that users run, on two devices wherever the tests run.
-DEVICES = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
-os.environ.update(settings({**DEVICES, **os.environ}))
+os.environ["XLA_FLAGS"] = settings(
+    {"XLA_FLAGS": os.environ.get("XLA_FLAGS", "--xla_force_host_platform_device_count=2")}
+)["XLA_FLAGS"]
+os.environ["NPROC"] = settings(os.environ)["NPROC"]
 
 import hypothesis
 import jax

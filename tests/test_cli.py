@@ -190,6 +190,12 @@ def test_a_folder_stands_for_its_files(jaxhil, tmp_path):
     assert all(one == gains[0] for one in gains)
 
 
+def test_an_unknown_objective_or_a_bad_weight_is_refused(jaxhil, tmp_path):
+    for wrong in (["--objective", "mean"], ["--divergence-weight", "0"], ["--noise-weight", "-1"]):
+        ran = jaxhil("tune", "-o", tmp_path, *wrong, *TINY)
+        assert ran.code == 2 and ran.err.count("\n") == 1 and "allowed" in ran.err
+
+
 def test_a_folder_without_mechanisms_is_refused(jaxhil, tmp_path):
     ran = jaxhil("tune", tmp_path, "-o", tmp_path / "out")
     assert ran.code == 2 and ran.err.count("\n") == 1

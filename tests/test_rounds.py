@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from jaxhil.evaluation import evaluate
 from jaxhil.mechanism_file import load
 from tuning import rounds
+from tuning.objective import RMS, Objective, objective_value
 from tuning.problems import alike, build_task
 from tuning.rounds import GIVEN_UP, solve_tasks
 
@@ -53,3 +55,25 @@ def test_a_task_that_fails_harms_no_other(tasks, solved):
     for i in (0, 2):
         assert [start.gains for start in starts[i]] == [start.gains for start in solved[i]]
     assert all(start.rms == pytest.approx(3.0) or not np.isfinite(start.rms) for start in starts[1])
+
+
+def test_the_objective_is_what_is_lowered(tasks):
+    """Where a squared divergence counts 16 times, less diverges."""
+    plain, cautious = (
+        min(solve_tasks(tasks[:1], 2, STEPS, 0, objective)[0], key=lambda start: start.rms)
+        for objective in (RMS, Objective(divergence_weight=16.0))
+    )
+    errors = [restitution_errors_of(tasks[0], start.gains) for start in (plain, cautious)]
+    for start, objective, own in (
+        (plain, RMS, errors[0]),
+        (cautious, Objective(divergence_weight=16.0), errors[1]),
+    ):
+        # The last step, shorter than the solver's tolerance, is not in the history.
+        assert start.rms == pytest.approx(objective_value(objective, own), rel=1e-4)
+    assert np.maximum(errors[1], 0).sum() < np.maximum(errors[0], 0).sum()
+
+
+def restitution_errors_of(task, gains):
+    outcome = evaluate(task.loop, gains, task.scenarios)
+    assert outcome.good[outcome.wanted].all()
+    return outcome.error[outcome.wanted]

@@ -97,6 +97,22 @@ class Tune:
     starts: Annotated[int, _number("Starts of the solver.")] = 4
     steps: Annotated[int, _number("Most solver steps from each start.")] = 25
     validation: Annotated[int, _number("Fresh scenarios to judge on.")] = 511
+    objective: Annotated[
+        str,
+        arg(
+            metavar="NAME",
+            help="Of the errors e - e*: rms, cvar (mean of the worst 5 percent) or worst.",
+        ),
+    ] = "rms"
+    divergence_weight: Annotated[
+        float, _number("How much more a squared divergence (e > e*) counts than a squared convergence.")
+    ] = 1.0
+    command_weight: Annotated[
+        float, _number("Restitution error that weighs as much as a command one reference peak too high.")
+    ] = 0.0
+    noise_weight: Annotated[
+        float, _number("Restitution error that weighs as much as one time the sensor noise more.")
+    ] = 0.0
     seed: Annotated[int, _number("Seed of scenarios and starts.")] = 0
     overrides: Overrides = ()
     limit: Limit = 0.01

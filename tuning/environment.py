@@ -42,8 +42,8 @@ def program_folder() -> str | None:
 def settings(given: Mapping[str, str]) -> dict[str, str]:
     """Environment variables that jax reads when it starts, made of those `given`.
 
-    XLA's devices share one pool of threads. One that cuts up a large piece of work waits for another thread to
-    be free, and with no thread to spare all of them wait for ever.
+    XLA's devices share one pool of threads. One that cuts up a large piece of work waits for another thread
+    to be free, and with no thread to spare all of them wait for ever.
     """
     threads = given.get("NPROC", str(4 * usable_cores()))
     return {"XLA_FLAGS": flags(given.get("XLA_FLAGS", "")), "NPROC": threads}

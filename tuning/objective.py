@@ -1,17 +1,79 @@
-"""What tuning minimises: the restitution errors of a batch of scenarios, contact by contact."""
+"""What tuning minimises: a figure of the restitution errors of a batch of scenarios, and penalties beside it.
 
+With e - e* of every contact, divergence weighted against convergence (`Objective`), the figures are
+
+    rms     root of the mean square
+    cvar    mean magnitude of the worst 5 % of the contacts (the conditional value at risk)
+    worst   the largest magnitude
+
+and the penalties a command that peaks above the reference's force and a compensator that amplifies the noise
+of the force sensor, all in one unit, that of a restitution error. `objective_value` has them exactly.
+
+Levenberg-Marquardt wants smooth sums of squares. That of `residuals` is the square of the norm
+
+    (sum of |E|^p / m)^(1/p)    rms: p = 2, m contacts;  cvar: p = 6, m the worst 5 %;  worst: p = 8, m = 1
+
+which is the rms, and never below the other two: the mean of the worst is at most the p-th root of the mean
+of their p-th powers. The exact tail is no use to a solver that linearises: contacts outside it weigh nothing,
+and a step that spoils one of them is not foreseen. By this norm the tail ends lower.
+"""
+
+import math
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxhil.evaluation import compare_with_reference
+from jaxhil.errors import InputError, shown
+from jaxhil.evaluation import Outcome, compare_with_reference
 from jaxhil.loop import Loop, Rig
 from jaxhil.rollout import run_contacts
 
 SCALE = 0.01  # an error of one: the solver's first steps are damped as for residuals of order one
 FAILED = 3.0  # error of a contact that does not end, or is not reached: as bad as a wild divergence
+TAIL = 20  # cvar: the worst one in so many contacts, at least one
+POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # of the norms in the residuals; even
+OBJECTIVES = tuple(POWERS)
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What to minimise, J with
+
+        J^2 = figure(E)^2 + (command_weight rms(C))^2 + (noise_weight N)^2
+
+    E: per contact the restitution error e - e* [1], times sqrt(divergence_weight) where it is positive:
+    divergence_weight [1] is how much more a squared divergence (e > e*) counts than a squared convergence.
+    C: per contact max(0, peak |F_c| / the reference's peak force - 1) [1].
+    N: max(0, A - 1) [1], A the amplification of the force sensor's white noise, from the gains alone
+    (`Compensator.noise_amplification`); a quieter command than the measured force earns nothing.
+
+    name: `figure`, one of `OBJECTIVES`. The weights of command and noise [1] are restitution errors: that
+    which weighs as much as a command one reference peak too high, as an amplification one too large.
+
+    Raises `InputError` for another name or a weight that is negative or not finite, or 0 for divergence.
+    """
+
+    name: str = "rms"
+    divergence_weight: float = 1.0
+    command_weight: float = 0.0
+    noise_weight: float = 0.0
+
+    def __post_init__(self):
+        if self.name not in OBJECTIVES:
+            raise InputError(f"objective: found {shown(self.name)}, allowed {', '.join(OBJECTIVES)}")
+        for name in ("divergence_weight", "command_weight", "noise_weight"):
+            weight, may_be_0 = getattr(self, name), name != "divergence_weight"
+            if not (0 < weight < math.inf or (may_be_0 and weight == 0)):
+                allowed = f"allowed finite numbers {'>=' if may_be_0 else '>'} 0"
+                raise InputError(f"objective: {name}: found {shown(weight)}, {allowed}")
+
+
+RMS = Objective()
 
 
 class Problem(NamedTuple):
@@ -22,32 +84,109 @@ class Problem(NamedTuple):
     fixed: dict[str, Array]
 
 
-def restitution_errors(
-    static: tuple[Loop, tuple[str, ...]],
+def residuals(
+    static: tuple[Loop, tuple[str, ...], Objective],
     gains: Float[Array, "problems gains"],
     problems: Problem,
 ) -> Float[Array, "problems residuals"]:
-    """e - e* in units of `SCALE` of every contact of every scenario, over the root of their number: the loss
-    is half the mean square. Contacts that fail count with the constant error `FAILED`.
+    """(J / `SCALE`)^2 of every problem as a sum of squares, J as of `Objective`; the loss is half of it.
 
-    `static` is the loop and the names of the gains that are tuned. The scenarios of all problems run side by
-    side, as the lanes of one batch.
+    One residual per contact slot of every scenario for the figure, or the norm that stands for it, as many
+    for the command and one for the noise, where their weights are not 0. Contacts that fail count with the
+    constant error and excess `FAILED`.
+
+    `static` is the loop, the names of the gains that are tuned and the objective. The scenarios of all
+    problems run side by side, as the lanes of one batch.
     """
-    loop, names = static
+    loop, names, objective = static
     number, lanes = problems.rig.inverse_mass.shape
     rig = jax.tree.map(_side_by_side, problems.rig)
     values: dict[str, Any] = {name: gains[:, i] for i, name in enumerate(names)}
     values = {name: jnp.repeat(value, lanes) for name, value in {**problems.fixed, **values}.items()}
     outcome = compare_with_reference(loop, rig.scenario, run_contacts(loop, values, rig))
+
+    def by_problem(leaf):
+        return jnp.moveaxis(leaf.reshape(-1, number, lanes), 1, 0).reshape(number, -1)
+
+    error, excess = map(by_problem, contact_terms(outcome))
+    amplification = jnp.mean(by_problem(loop.compensator.noise_amplification(values, rig.constants)), axis=1)
+    return weigh(objective, error, excess, by_problem(outcome.wanted), amplification)
+
+
+def weigh(
+    objective: Objective,
+    error: Float[Array, "problems contacts"],
+    excess: Float[Array, "problems contacts"],
+    wanted: Bool[Array, "problems contacts"],
+    amplification: Float[Array, "problems"],
+) -> Float[Array, "problems residuals"]:
+    """The residuals of `contact_terms` and of the noise's amplification."""
+    # A problem that asks for no contact, which fills up a call, has errors of 0.
+    count = jnp.maximum(jnp.sum(wanted, axis=1, dtype=jnp.int32), 1)[:, None]
+    diverging = math.sqrt(objective.divergence_weight) * error
+    number = {"rms": count, "cvar": _tail(count), "worst": jnp.ones_like(count)}[objective.name]
+    parts = [_norm(jnp.where(error > 0, diverging, error), number, POWERS[objective.name])]
+    if objective.command_weight > 0:
+        parts.append(objective.command_weight * _norm(excess, count, 2))
+    if objective.noise_weight > 0:
+        beyond = amplification[:, None] - 1
+        parts.append(objective.noise_weight * jnp.where(beyond > 0, beyond, 0))
+    return jnp.concatenate(parts, axis=1) / SCALE
+
+
+def contact_terms(
+    outcome: Outcome,
+) -> tuple[Float[Array, "slots *batch"], Float[Array, "slots *batch"]]:
+    """Per contact the restitution error and the command's excess over the reference's peak force, relative
+    to it: `FAILED` for contacts that failed, 0 for those not asked for."""
     # The inner `where` keeps what a failed contact leaves behind out of the derivative.
-    usable = outcome.good & jnp.isfinite(outcome.error)
+    usable = outcome.good & jnp.isfinite(outcome.error) & jnp.isfinite(outcome.peak_ratio)
     error = jnp.where(usable, outcome.error, FAILED)
-    error = jnp.where(outcome.wanted, error, 0)
-    slots = error.shape[0]
-    error, wanted = (leaf.reshape(slots, number, lanes) for leaf in (error, outcome.wanted))
-    count = jnp.maximum(jnp.sum(wanted, axis=(0, 2)), 1).astype(error.dtype)
-    errors = error / (SCALE * jnp.sqrt(count))[None, :, None]
-    return jnp.moveaxis(errors, 0, 1).reshape(number, -1)
+    beyond = jnp.where(usable, outcome.peak_ratio, 1 + FAILED) - 1
+    excess = jnp.where(beyond > 0, beyond, 0)
+    return jnp.where(outcome.wanted, error, 0), jnp.where(outcome.wanted, excess, 0)
+
+
+def objective_value(
+    objective: Objective,
+    errors: Float[np.ndarray, "contacts"],
+    excesses: Float[np.ndarray, "contacts"] | None = None,
+    amplification: float = 1.0,
+) -> float:
+    """J [1] of `Objective`, exactly, for all three names: what a table of results is made of.
+
+    `errors` and `excesses` (none: no part in it) are those of `contact_terms`, of the contacts asked for;
+    what is not finite counts as `FAILED`.
+    """
+    error, excess = (
+        np.where(np.isfinite(term), term, FAILED)
+        for term in (np.ravel(errors), np.zeros(1) if excesses is None else np.ravel(excesses))
+    )
+    size = np.sort(np.abs(np.where(error > 0, math.sqrt(objective.divergence_weight) * error, error)))
+    figure = {
+        "rms": np.sqrt(np.mean(size**2)),
+        "cvar": np.mean(size[-_tail(len(size)) :]),
+        "worst": size[-1],
+    }[objective.name]
+    command = objective.command_weight * np.sqrt(np.mean(excess**2))
+    return math.hypot(figure, command, objective.noise_weight * max(0.0, float(amplification) - 1))
+
+
+def _tail(count):
+    return -(-count // TAIL)
+
+
+def _norm(error: Float[Array, "problems contacts"], number: Int[Array, "problems 1"], power: int) -> Array:
+    """Sum of squares: (sum of |E|^p / m)^(2/p); residuals E (|E| / |E|_p)^(p/2 - 1) / m^(1/p).
+
+    They are of first degree in the errors, so that Gauss-Newton steps neither overshoot nor fall short.
+    """
+    size = jnp.abs(error)
+    largest = lax.stop_gradient(jnp.max(size, axis=1, keepdims=True))
+    unit = jnp.where(largest > 0, largest, 1)
+    total = jnp.sum((size / unit) ** power, axis=1, keepdims=True)
+    norm = unit * jnp.where(largest > 0, total, 1) ** (1 / power)
+    return error * (size / norm) ** (power // 2 - 1) / number.astype(error.dtype) ** (1 / power)
 
 
 def _side_by_side(leaf: Array) -> Array:

@@ -107,7 +107,7 @@ def errors_plot(result: Result, limit: float) -> Figure:
 
 
 def loss_plot(result: Result) -> Figure:
-    """The rms error that each start of the solver had reached after each step."""
+    """The objective that each start of the solver had reached after each step."""
     figure = _figure((7, 4.6), f"{result.mechanism.name}: tuning from {len(result.starts)} starts")
     axes = figure.subplots()
     finite = [start for start in result.starts if np.all(np.isfinite(start.history))]
@@ -127,7 +127,7 @@ def loss_plot(result: Result) -> Figure:
         axes.plot(steps, start.history, color=colour, linewidth=width, label=label, zorder=order)
         axes.plot(steps[-1:], start.history[-1:], color=colour, marker="o", markersize=4, zorder=order)
     axes.set_yscale("log")
-    axes.set(xlabel="solver step", ylabel="rms restitution error on training scenarios [1]")
+    axes.set(xlabel="solver step", ylabel=f"{result.settings.objective.name} on training scenarios [1]")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     _finish(axes, "best")
     return figure

@@ -20,7 +20,7 @@ from jaxhil.loop import Loop, build_rig
 from jaxhil.scenario import Scenario
 from tuning import programs
 from tuning.environment import program_folder
-from tuning.objective import SCALE, Problem, restitution_errors
+from tuning.objective import RMS, SCALE, Objective, Problem, residuals
 from tuning.optimiser import STATUSES, Solution, solve
 from tuning.problems import Task, common_loop, gain_bounds, spread_starts, tuned_names
 
@@ -39,7 +39,8 @@ SHORTEST_PATIENCE = 0.15  # s
 
 
 class Start(NamedTuple):
-    """One start of the solve: status, steps, rms error it ended with, after every step, and its gains."""
+    """One start of the solve: status, steps, value of the objective (its norm, `tuning.objective`) it ended
+    with and had after every step, and its gains."""
 
     status: str
     steps: int
@@ -67,6 +68,7 @@ def solve_tasks(
     starts: int,
     steps: int,
     seed: int,
+    objective: Objective = RMS,
     report: Callable[[str], None] = lambda text: None,
 ) -> list[list[Start]]:
     """Every start of every task; the tasks are alike (`tuning.problems.alike`)."""
@@ -77,7 +79,7 @@ def solve_tasks(
         first = np.array([task.literature[name] for name in names])
         for gains in spread_starts(first, bounds[index], starts, seed):
             problems.append(_Problem(index, gains))
-    advance = _stepper(tasks, names, bounds, len(problems))
+    advance = _stepper(tasks, names, bounds, objective, len(problems))
     # Neighbours in a call take about as long.
     order = np.argsort([-float(np.max(expected_duration(task.scenarios))) for task in tasks], kind="stable")
     rank = {int(task): place for place, task in enumerate(order)}
@@ -119,7 +121,7 @@ def _finished(problem: _Problem, names: tuple[str, ...], task: Task) -> Start:
     return Start(status, len(history), history[-1], history, {**task.literature, **found})
 
 
-def _stepper(tasks, names, bounds, number) -> Callable[[list[_Problem], int], None]:
+def _stepper(tasks, names, bounds, objective, number) -> Callable[[list[_Problem], int], None]:
     """A function that takes problems up to so many steps further."""
     loop = common_loop([task.loop for task in tasks])
     fixed = [{k: v for k, v in task.literature.items() if k not in names} for task in tasks]
@@ -127,7 +129,7 @@ def _stepper(tasks, names, bounds, number) -> Callable[[list[_Problem], int], No
     table = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *each)
     size = FEW if number <= FEW else MANY
     lanes = len(tasks[0].scenarios.velocity)
-    static = loop, names, LONGEST, max(1, TILE // lanes)
+    static = (loop, names, objective), LONGEST, max(1, TILE // lanes)
 
     def advance(problems: list[_Problem], limit: int) -> None:
         for begin in range(0, len(problems), size):
@@ -158,16 +160,16 @@ def _take(problem: _Problem, solution: Solution, i: int) -> None:
         problem.gains = np.asarray(solution.gains[i])
 
 
-def _advance(static: tuple[Loop, tuple[str, ...], int, int], arguments: Any) -> Solution:
-    loop, names, longest, tile = static
+def _advance(static: tuple[Any, int, int], arguments: Any) -> Solution:
+    what, longest, tile = static
+    loop = what[0]
     scenarios, fixed, bounds, starts, limit = arguments
 
     def rig(scenarios):
         return build_rig(loop, scenarios._replace(time_limit=_patience(loop, scenarios)))
 
     problems = Problem(jax.vmap(rig)(scenarios), fixed)
-    residuals = restitution_errors
-    return solve(residuals, (loop, names), problems, bounds, starts, limit, longest=longest, tile=tile)
+    return solve(residuals, what, problems, bounds, starts, limit, longest=longest, tile=tile)
 
 
 def _patience(loop: Loop, scenarios: Scenario) -> Array:

@@ -17,6 +17,7 @@ from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import draw
 from tuning.environment import program_folder
+from tuning.objective import RMS, Objective
 from tuning.problems import Task, alike, build_task, common_loop
 from tuning.rounds import Start, solve_tasks
 
@@ -27,13 +28,15 @@ BLOCK = 16  # mechanisms tuned and judged together: what is done when work is in
 
 @dataclass(frozen=True)
 class Settings:
-    """Numbers of scenarios to tune on, of starts, of solver steps, of scenarios to judge on; the seed."""
+    """Numbers of scenarios to tune on, of starts, of solver steps, of scenarios to judge on; the seed; what
+    to minimise."""
 
     scenarios: int = 32
     starts: int = 4
     steps: int = 25
     validation: int = 511
     seed: int = 0
+    objective: Objective = RMS
 
 
 class Figures(NamedTuple):
@@ -111,7 +114,12 @@ def _tune_block(tasks: list[Task], settings: Settings, report: Callable[[str], N
         if any(task.tuned for task in tasks):
             report(f"{name}: tuning {compensator} on {settings.scenarios} scenarios each")
             starts = solve_tasks(
-                tasks, settings.starts, settings.steps, settings.seed, lambda text: report(f"{name}: {text}")
+                tasks,
+                settings.starts,
+                settings.steps,
+                settings.seed,
+                settings.objective,
+                lambda text: report(f"{name}: {text}"),
             )
             best = [_best(own, task.literature) for own, task in zip(starts, tasks, strict=True)]
     clock.lap("tune")

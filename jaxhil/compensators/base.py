@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxhil.mechanism import Mechanism
@@ -89,6 +90,11 @@ class Compensator(eqx.Module):
     ) -> tuple[Array, Any]:
         """Command [m] sent to the motion simulator for the model's new position; itself by default."""
         return position, state
+
+    def noise_amplification(self, gains: Gains, constants: Constants) -> Float[Array, "*batch"]:
+        """Standard deviation of F_c over that of white noise on the force readings, both tick by tick, in
+        steady contact [1]: 1 by default, the measured force passed on. Differentiable by the gains."""
+        return jnp.ones_like(constants.control_period)
 
     def identified(self, state: Any) -> tuple[Array, Array] | None:
         """Identified stiffness [N/m] and damping [N s/m], where the law identifies them."""

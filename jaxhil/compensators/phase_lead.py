@@ -66,6 +66,16 @@ def lead(filter_: LeadFilter, state: LeadState, force: Array) -> tuple[Array, Le
     return output, LeadState(force, output)
 
 
+def lead_amplification(filter_: LeadFilter) -> Array:
+    """Standard deviation of the filter's output over that of white noise at its input.
+
+    The variance of y(n) = p y(n-1) + a F(n) + b F(n-1) for F of unit variance, stationary:
+    (a^2 + b^2 + 2 a b p)/(1 - p^2), the sum of the squares of its impulse response a, pa + b, p(pa + b), ...
+    """
+    pole, now, before = filter_
+    return jnp.sqrt((now**2 + before**2 + 2 * now * before * pole) / (1 - pole**2))
+
+
 class PhaseLead(Compensator):
     """F_c = F + T_lead dF/dt, filtered."""
 
@@ -74,6 +84,9 @@ class PhaseLead(Compensator):
 
     def prepare(self, gains, constants):
         return lead_filter(gains, constants)
+
+    def noise_amplification(self, gains, constants):
+        return lead_amplification(lead_filter(gains, constants))
 
     def init(self, gains, constants, ring):
         zeros = jnp.zeros_like(constants.control_period)

@@ -100,7 +100,14 @@ def _tune_all(options: Tune, loaded: list[LoadedMechanism], problems: list[str])
     prepare()
     from tuning.tune import Settings, tune_all
 
-    settings = Settings(options.scenarios, options.starts, options.steps, options.validation, options.seed)
+    settings = Settings(
+        options.scenarios,
+        options.starts,
+        options.steps,
+        options.validation,
+        options.seed,
+        _objective(options),
+    )
     mechanisms = [one.mechanism for one in loaded]
     entries, done = {}, {}
     drawn = len(loaded) <= MOST_DRAWN
@@ -123,6 +130,14 @@ def _tune_all(options: Tune, loaded: list[LoadedMechanism], problems: list[str])
     if len(loaded) > 1 and done:
         _overview(options, _in_order(done), _in_order(entries), drawn)
     return _in_order(entries)
+
+
+def _objective(options: Tune):
+    from tuning.objective import Objective
+
+    return Objective(
+        options.objective, options.divergence_weight, options.command_weight, options.noise_weight
+    )
 
 
 def _in_order(by_index: dict[int, Any]) -> list[Any]:
@@ -276,7 +291,7 @@ def _print(options: Tune, result, entry) -> None:
     )
     starts = report.table(
         "Starts",
-        ["start", "status", "steps", "rms on training scenarios"],
+        ["start", "status", "steps", f"{options.objective} on training scenarios"],
         [[n, s.status, s.steps, s.rms] for n, s in enumerate(result.starts, start=1)],
         texts=(1,),
     )

@@ -1,0 +1,363 @@
+"""Objectives: their residuals against a plain recomputation, derivatives, failures; noise from the gains."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from lanes import QUICK, join, mechanism, nominal_gains, per_lane, run_record, spread, validated
+from scipy.signal import bilinear, lfilter
+
+from jaxhil.building import build_loop
+from jaxhil.compensators import COMPENSATORS, Constants
+from jaxhil.errors import InputError
+from jaxhil.evaluation import evaluate
+from jaxhil.loop import build_rig
+from jaxhil.mechanism_file import load
+from jaxhil.scenario import build_scenarios
+from jaxhil.uncertainty import draw
+from tuning.objective import (
+    FAILED,
+    OBJECTIVES,
+    POWERS,
+    SCALE,
+    Objective,
+    Problem,
+    contact_terms,
+    objective_value,
+    residuals,
+    weigh,
+)
+
+NAMES = ("phase_lead", "lead_filter")
+GAINS = np.array([[0.004, 0.001], [0.0077, 0.0031], [0.002, 0.0008]])
+SCENARIOS = 6
+SLOTS = 144
+SHORT = 2  # the scenario whose time is too short for its contacts
+STATED = Objective("rms", 2.0, 0.3, 0.004)
+
+
+def of_name(name):
+    return Objective(name, STATED.divergence_weight, STATED.command_weight, STATED.noise_weight)
+
+
+@pytest.fixture(scope="module")
+def batch():
+    """(loop, scenarios, problems): the scenario `SHORT` fails under all gains."""
+    parsed = load().mechanism
+    scenarios = build_scenarios(parsed, draw(parsed, SCENARIOS, 5), 5)
+    limit = np.where(np.arange(SCENARIOS) == SHORT, 0.05, scenarios.time_limit)
+    scenarios = scenarios._replace(time_limit=limit)
+    loop = build_loop(parsed, "phase_lead", scenarios)
+    rig = jax.jit(build_rig, static_argnums=0, compiler_options=QUICK)(loop, join([scenarios]))
+    rigs = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(GAINS), *leaf.shape)), rig)
+    return loop, scenarios, Problem(rigs, {})
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICK)
+def with_jacobian(static, gains, problems):
+    """Residuals (problems, residuals); by every gain of every problem, (gain's problem, gain, ...)."""
+
+    def along(direction):
+        return jax.jvp(lambda gains: residuals(static, gains, problems), (gains,), (direction,))
+
+    basis = jnp.eye(gains.size).reshape(-1, *gains.shape)
+    value, jacobian = jax.vmap(along, out_axes=(None, 0))(basis)
+    return value, jacobian.reshape(*gains.shape, *value.shape)
+
+
+def run(batch, gains=GAINS, objective=STATED):
+    loop, _, problems = batch
+    return [np.asarray(a) for a in with_jacobian((loop, NAMES, objective), jnp.asarray(gains), problems)]
+
+
+@pytest.fixture(scope="module")
+def known(batch):
+    return run(batch)
+
+
+@pytest.fixture(scope="module")
+def outcomes(batch):
+    loop, scenarios, _ = batch
+    return [evaluate(loop, dict(zip(NAMES, gains, strict=True)), scenarios) for gains in GAINS]
+
+
+def amplification(gains, period=1e-3):
+    """Of the lead filter: the root of the sum of the squares of its impulse response, filtered by SciPy."""
+    lead, smoothing = gains
+    numerator, denominator = bilinear([lead + smoothing, 1], [smoothing, 1], 1 / period)
+    impulse = np.zeros(3000)
+    impulse[0] = 1
+    return np.sqrt(np.sum(lfilter(numerator, denominator, impulse) ** 2))
+
+
+def test_residuals_are_those_of_an_evaluation(outcomes, known):
+    for gains, outcome, row in zip(GAINS, outcomes, known[0], strict=True):
+        good, wanted = outcome.good, outcome.wanted
+        assert (wanted & ~good).sum() == 3 and not good[:, SHORT].any()
+        count = wanted.sum()
+        error = np.where(good, outcome.error, 3.0)
+        error = np.where(wanted, np.where(error > 0, np.sqrt(2.0) * error, error), 0)
+        excess = np.where(wanted, np.where(good, np.maximum(0, outcome.peak_ratio - 1), 3.0), 0)
+        assert (error[good] > 0).any() and (excess[good] > 0).any()
+        expected = np.concatenate(
+            [
+                error.ravel() / np.sqrt(count),
+                0.3 * excess.ravel() / np.sqrt(count),
+                [0.004 * (amplification(gains) - 1)],
+            ]
+        )
+        np.testing.assert_allclose(SCALE * row, expected, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_the_sum_of_squares_is_the_stated_value_or_just_above(outcomes, name):
+    objective = of_name(name)
+    for gains, outcome in zip(GAINS, outcomes, strict=True):
+        terms = contact_terms(outcome)
+        error, excess = (np.asarray(term)[outcome.wanted] for term in terms)
+        noise = amplification(gains)
+        value = objective_value(objective, error, excess, noise)
+        ours = np.sqrt(sum_of_squares(objective, error, excess, noise))
+        if name == "rms":
+            np.testing.assert_allclose(ours, value, rtol=1e-12)
+        else:
+            assert value < ours < 1.5 * value
+
+
+def test_derivatives_are_central_differences(batch, known):
+    value, jacobian = known
+    own = np.stack([jacobian[i, :, i] for i in range(len(GAINS))])  # (problem, gain, residual)
+    for gain in range(len(NAMES)):
+        step = 1e-6 * GAINS[:, gain]
+        up, down = GAINS.copy(), GAINS.copy()
+        up[:, gain] += step
+        down[:, gain] -= step
+        difference = (run(batch, up)[0] - run(batch, down)[0]) / (2 * step[:, None])
+        scale = np.abs(own[:, gain]).max()
+        np.testing.assert_allclose(own[:, gain], difference, rtol=1e-5, atol=1e-7 * scale)
+    slots = value.shape[1] // 2
+    parts = own[..., :slots], own[..., slots:-1], own[..., -1:]
+    assert all((np.abs(part).max(axis=2) > 0).all() for part in parts)
+
+
+def test_problems_do_not_mix(batch, known):
+    value, jacobian = known
+    for mine in range(len(GAINS)):
+        others = np.arange(len(GAINS)) != mine
+        assert not jacobian[mine][:, others].any()
+    moved = GAINS.copy()
+    moved[1] *= 1.3
+    changed = run(batch, moved)[0] != value
+    assert changed[1].any() and not changed[[0, 2]].any()
+
+
+def test_failed_contacts_count_and_have_no_derivative(batch, known):
+    value, jacobian = known
+    slots = np.reshape(value[:, :-1], (len(GAINS), 2, -1, SCENARIOS))
+    slopes = np.reshape(jacobian[..., :-1], (*GAINS.shape, len(GAINS), 2, -1, SCENARIOS))
+    contacts = SCENARIOS * 3
+    failed = FAILED / (SCALE * np.sqrt(contacts)) * np.array([np.sqrt(2.0), 0.3])
+    np.testing.assert_allclose(
+        slots[:, :, :3, SHORT], np.broadcast_to(failed[None, :, None], (len(GAINS), 2, 3)), rtol=1e-14
+    )
+    assert np.isfinite(jacobian).all()
+    assert not slopes[..., SHORT].any()
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICK)
+def weighed(objective, terms, tangents):
+    """Residuals of one problem's (errors, excesses, wanted, amplification), and their derivative."""
+    error, excess, wanted, noise = terms
+
+    def value(error, excess, noise):
+        return weigh(objective, error[None], excess[None], wanted[None], noise[None])[0]
+
+    return jax.jvp(value, (error, excess, noise), tangents)
+
+
+def padded(contacts):
+    return np.pad(np.asarray(contacts, float), (0, SLOTS - len(contacts)))
+
+
+def alone(objective, errors, excesses=(), noise=1.0, tangents=((), (), 0.0)):
+    """Residuals of one problem with these contacts, in more slots than were asked for; their derivative."""
+    terms = padded(errors), padded(excesses), np.arange(SLOTS) < len(errors), np.asarray(noise)
+    tangents = padded(tangents[0]), padded(tangents[1]), np.asarray(tangents[2])
+    return tuple(map(np.asarray, weighed(objective, terms, tangents)))
+
+
+def sum_of_squares(*arguments):
+    return SCALE**2 * np.sum(alone(*arguments)[0] ** 2)
+
+
+@pytest.mark.parametrize("number, tail", [(1, 1), (19, 1), (20, 1), (21, 2), (40, 2), (41, 3), (140, 7)])
+def test_cvar_is_the_mean_of_the_worst_twentieth(number, tail):
+    errors = np.random.default_rng(number).permutation(np.arange(1, number + 1)) / number
+    errors[::2] *= -1
+    expected = np.mean(np.arange(number - tail + 1, number + 1)) / number
+    assert objective_value(Objective("cvar"), errors) == pytest.approx(expected, rel=1e-14)
+    # What the solver sees is an upper bound: the root of the mean of powers.
+    bound = (np.sum(np.abs(errors) ** POWERS["cvar"]) / tail) ** (1 / POWERS["cvar"])
+    np.testing.assert_allclose(sum_of_squares(Objective("cvar"), errors), bound**2, rtol=1e-13)
+    assert expected <= bound
+
+
+def test_known_errors_have_known_figures():
+    errors = np.array([0.03, -0.04, *[0.0] * 18])
+    assert objective_value(Objective("rms"), errors) == pytest.approx(0.05 / np.sqrt(20), rel=1e-14)
+    assert objective_value(Objective("cvar"), errors) == objective_value(Objective("worst"), errors) == 0.04
+    # Twice the weight on divergence makes it the worst.
+    for name in ("cvar", "worst"):
+        assert objective_value(Objective(name, 2.0), errors) == pytest.approx(np.sqrt(2) * 0.03, rel=1e-14)
+    assert objective_value(Objective("worst"), np.array([0.1, np.nan])) == FAILED
+    stated = Objective("worst", 1.0, 0.1, 0.01)
+    excesses = np.array([0.1, 0.3])
+    whole = np.sqrt(0.04**2 + 0.01 * (0.01 + 0.09) / 2 + 0.01**2 * 9)
+    assert objective_value(stated, errors, excesses, 4.0) == pytest.approx(whole, rel=1e-14)
+    # A command quieter than the measured force earns nothing.
+    assert objective_value(stated, errors, None, 0.5) == 0.04
+    assert alone(stated, errors, (), 0.5)[0][-1] == 0
+
+
+def test_a_high_norm_stands_for_the_worst():
+    errors = np.random.default_rng(0).normal(size=96)
+    norm = np.sum(np.abs(errors) ** POWERS["worst"]) ** (1 / POWERS["worst"])
+    assert np.abs(errors).max() < norm < 1.3 * np.abs(errors).max()
+    np.testing.assert_allclose(sum_of_squares(Objective("worst"), errors), norm**2, rtol=1e-13)
+    # Neither wild errors nor tiny ones leave the range of numbers.
+    for size in (1e100, 1e-100):
+        value = SCALE * alone(Objective("worst"), size * errors)[0]
+        np.testing.assert_allclose(np.sqrt(np.sum((value / size) ** 2)), norm, rtol=1e-13)
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_derivatives_by_the_errors(name):
+    objective, generator = Objective(name, 3.0, 0.2, 0.01), np.random.default_rng(1)
+    errors, excesses = generator.normal(size=45), np.maximum(0, generator.normal(size=45))
+
+    for _ in range(3):
+        way = generator.normal(size=45), np.where(excesses > 0, generator.normal(size=45), 0), 1.0
+        _, slope = alone(objective, errors, excesses, 2.0, way)
+        up, down = (
+            alone(objective, errors + h * way[0], excesses + h * way[1], 2.0 + h)[0] for h in (1e-6, -1e-6)
+        )
+        np.testing.assert_allclose(slope, (up - down) / 2e-6, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_no_error_at_all_has_a_finite_derivative(name):
+    objective = Objective(name, 3.0, 0.2, 0.01)
+    for largest in (0.0, 0.1):
+        errors = np.where(np.arange(30) == 7, largest, 0)
+        value, slope = alone(objective, errors, np.zeros(30), 1.0, (np.ones(30), np.ones(30), 1.0))
+        assert np.isfinite(slope).all()
+        assert value.any() == (largest > 0)
+
+
+@pytest.mark.parametrize(
+    "values, message",
+    [
+        ({"name": "mean"}, "objective: found 'mean', allowed rms, cvar, worst"),
+        ({"divergence_weight": 0.0}, "objective: divergence_weight: found 0.0, allowed finite numbers > 0"),
+        ({"noise_weight": -1.0}, "objective: noise_weight: found -1.0, allowed finite numbers >= 0"),
+        ({"command_weight": np.inf}, "objective: command_weight: found inf, allowed finite numbers >= 0"),
+    ],
+)
+def test_an_objective_that_is_none_is_refused(values, message):
+    with pytest.raises(InputError) as refused:
+        Objective(**values)
+    assert str(refused.value) == message
+
+
+# Noise
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICK)
+def _amplified(compensator, gains, period):
+    def value(gains):
+        return COMPENSATORS[compensator].noise_amplification(gains, Constants(period, jnp.inf))
+
+    return value(gains), jax.jacfwd(value)(gains) if gains else {}
+
+
+def amplified(compensator, gains, period=1e-3):
+    """Amplification of noise, and its derivative by every gain."""
+    gains = {name: np.asarray(value, float) for name, value in gains.items()}
+    return _amplified(compensator, gains, np.asarray(period))
+
+
+@pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
+def test_amplification_is_that_of_the_filter(compensator):
+    for gains in GAINS:
+        values = dict(zip(NAMES, gains, strict=True))
+        ours, slopes = amplified(compensator, values)
+        np.testing.assert_allclose(ours, amplification(gains), rtol=1e-12)
+        numerator, denominator = bilinear([sum(gains), 1], [gains[1], 1], 1e3)
+        noise = np.random.default_rng(2).normal(size=1_000_000)
+        np.testing.assert_allclose(ours, np.std(lfilter(numerator, denominator, noise)), rtol=4e-3)
+        for gain in NAMES:
+            step = 1e-5 * values[gain]
+            low, high = (amplified(compensator, {**values, gain: values[gain] + h})[0] for h in (-step, step))
+            np.testing.assert_allclose(slopes[gain], (high - low) / (2 * step), rtol=1e-7)
+
+
+def test_no_compensation_and_no_lead_pass_the_noise_on():
+    assert amplified("none", {})[0] == 1
+    no_lead = {"phase_lead": 0, "lead_filter": 0.003}
+    np.testing.assert_allclose(amplified("phase_lead", no_lead)[0], 1, rtol=1e-14)
+
+
+TICKS, LANES, DEVIATION = 3000, 16, 2.0
+LEAD_ALONE = {"response_error": 0.0, "response_error_damping": 0.0}
+
+
+def noisy_contact(velocity, damping=0.0, bodies=None, **values):
+    """Gains of response_error; F_c and the real force [N] of a noisy contact, (ticks, lanes)."""
+    contact, sensor = {"damping": [damping]}, {"noise_std": DEVIATION}
+    raw = mechanism(contact, period=1e-3, velocity=velocity, force_sensor=sensor)
+    parsed = validated(raw | ({"bodies": bodies} if bodies else {}))
+    scenario = spread(parsed, LANES, key=np.stack([np.zeros(LANES), np.arange(LANES)]))
+    gains = nominal_gains(parsed, "response_error", **values)
+    loop = build_loop(parsed, "response_error", scenario)
+    _, seen = run_record(loop, per_lane(gains, LANES), scenario, TICKS)
+    return gains, np.asarray(seen.command)[:TICKS], np.asarray(seen.truth.force)[:TICKS]
+
+
+def steady_contact(**values):
+    """Gains; what F_c deviates from its straight line [N], (ticks, lanes): a heavy body that hardly moves,
+    seconds of contact under a force that rises slowly."""
+    gains, command, force = noisy_contact(1e-3, bodies={"equivalent_mass": 1e9}, **values)
+    assert force[500:].min() > 3 * DEVIATION
+    command, time = command[500:], np.arange(TICKS - 500)
+    line = np.polynomial.polynomial.polyfit(time, command, 1)
+    return gains, command - np.polynomial.polynomial.polyval(time, line).T
+
+
+def test_amplification_is_that_of_the_loop_in_steady_contact():
+    gains, whole = steady_contact()
+    _, lead = steady_contact(**LEAD_ALONE)
+    expected = amplified("response_error", gains)[0]
+    assert expected > 3
+    # 40000 samples, neighbours of which are anticorrelated.
+    np.testing.assert_allclose(np.std(lead) / DEVIATION, expected, rtol=0.005)
+    np.testing.assert_allclose(np.std(whole) / DEVIATION, expected, rtol=0.01)
+    # The noise is the same: identification adds a tenth, independently, which is half a percent in all.
+    assert 0 < np.std(whole - lead) < 0.15 * np.std(lead)
+
+
+def test_a_young_contact_is_noisier_by_what_is_identified():
+    gains, command, force = noisy_contact(0.005, 300.0)
+    _, lead, lead_force = noisy_contact(0.005, 300.0, **LEAD_ALONE)
+    expected = amplified("response_error", gains)[0] * DEVIATION
+
+    def noise(command, force):
+        touching = np.flatnonzero((force > 0).all(axis=1))
+        spans = np.array_split(np.std(command, axis=1)[touching[0] : touching[-1]], 10)
+        return np.array([np.sqrt(np.mean(span**2)) for span in spans]) / expected
+
+    # By tenths of the contact.
+    np.testing.assert_allclose(noise(lead, lead_force), 1, atol=0.1)
+    young, *older = noise(command, force)
+    assert young > 1.5 and max(older) < 1.4
