@@ -51,8 +51,8 @@ def test_a_known_shape_spares_the_learning():
         return np.einsum("...i,ij,...j->...", away, hessian, away)
 
     start = np.full(10, 0.5) + 0.05 * turned[:, 0] + 1e-4 * turned[:, 9]
-    blind = polish(losses, start, 640)
-    shaped = polish(losses, start, 640, covariance=np.linalg.inv(hessian))
+    blind = polish(losses, start, 640, reach=0.02)
+    shaped = polish(losses, start, 640, reach=0.02, covariance=np.linalg.inv(hessian))
     assert shaped.loss < 0.1 * blind.loss
 
 

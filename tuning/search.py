@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import qmc
 
-CANDIDATES = 32  # of a generation of `polish`
+CANDIDATES = 16  # of a generation of `polish`
+PER_BASIN = 32  # of a generation of `certify`, for each basin of its first round
 BASINS = 8  # that `certify` goes down into at once
 SCAN = 8  # the part of its budget that is the scan
 REACHES = 0.1, 0.2, 0.01  # of its first round, of those between, of the last
@@ -52,7 +53,7 @@ def polish(
     evaluations: int,
     *,
     candidates: int = CANDIDATES,
-    reach: float = 0.02,
+    reach: float = 0.1,
     covariance: Float[np.ndarray, "*starts gains gains"] | None = None,
     seed: int = 0,
 ) -> Found:
@@ -63,8 +64,9 @@ def polish(
     generations of `candidates`, at least one. The first generation holds the start itself.
 
     `reach` is the first standard deviation as a share of the box, of a gain on average; `covariance`, of
-    any scale, is the first distribution's shape: an inverse Hessian (J^T J)^-1 spares the search its
-    learning. Points outside the box are mirrored back into it.
+    any scale, is the first distribution's shape: an inverse Hessian of least squares, (J^T J / (2 L) + 16)^-1
+    with the residuals' Jacobian J and the loss L, spares the search its learning; the 16 keeps what nothing
+    depends on to a quarter of the box. Points outside the box are mirrored back into it.
 
     Source: Hansen, "The CMA Evolution Strategy: A Tutorial" (2016), with positive weights and the default
     constants for the number of candidates.
@@ -100,7 +102,7 @@ def certify(
     budget: int,
     *,
     known: Float[np.ndarray, "known gains"] | None = None,
-    candidates: int = CANDIDATES,
+    candidates: int = PER_BASIN,
     basins: int = BASINS,
     seed: int = 0,
 ) -> Certificate:
