@@ -1,0 +1,160 @@
+"""The derivative-free search finds known minima: curved valleys, kinks, many basins, and bounds."""
+
+import numpy as np
+import pytest
+
+from tuning.search import certify, mirror, polish
+
+
+def rosenbrock(points):
+    """0 at a share of 0.75 of each gain's range, at the end of a curved valley."""
+    x = 4 * points - 2
+    return np.sum(100 * (x[..., 1:] - x[..., :-1] ** 2) ** 2 + (1 - x[..., :-1]) ** 2, axis=-1)
+
+
+def kinked(points):
+    """0 at 0.3, 0.4, ..: kinks and curvature, one gain weighing a thousand times less than another."""
+    gains = points.shape[-1]
+    away = points - np.linspace(0.3, 0.7, gains)
+    return np.sum(np.geomspace(1, 1e-3, gains) * (np.abs(away) + 10 * away**2), axis=-1)
+
+
+def rippled(points):
+    """0 at 0.6: Rastrigin's function, a bowl with 5^gains basins."""
+    x = 5 * (points - 0.6)
+    return np.sum(x**2 + 10 * (1 - np.cos(2 * np.pi * x)), axis=-1)
+
+
+@pytest.mark.parametrize("gains", [2, 6, 12])
+def test_polish_follows_a_curved_valley(gains):
+    start = np.full(gains, 0.6)
+    found = polish(rosenbrock, start, 1200 * gains, reach=0.05)
+    assert found.loss < 1e-3 * rosenbrock(start)
+    longer = polish(rosenbrock, start, 3000 * gains, reach=0.05)
+    np.testing.assert_allclose(longer.free, 0.75, atol=1e-4)
+
+
+@pytest.mark.parametrize("gains", [2, 6, 12])
+def test_polish_settles_at_a_kink(gains):
+    start = np.full(gains, 0.52)
+    found = polish(kinked, start, 400 * gains, reach=0.05)
+    assert found.loss < 1e-3 * kinked(start)
+
+
+def test_a_known_shape_spares_the_learning():
+    generator = np.random.default_rng(0)
+    turned, _ = np.linalg.qr(generator.standard_normal((10, 10)))
+    hessian = (turned * np.geomspace(1, 1e6, 10)) @ turned.T
+
+    def losses(points):
+        away = points - 0.5
+        return np.einsum("...i,ij,...j->...", away, hessian, away)
+
+    start = np.full(10, 0.5) + 0.05 * turned[:, 0] + 1e-4 * turned[:, 9]
+    blind = polish(losses, start, 640, reach=0.02)
+    shaped = polish(losses, start, 640, reach=0.02, covariance=np.linalg.inv(hessian))
+    assert shaped.loss < 0.1 * blind.loss
+
+
+def test_polish_is_never_worse_than_its_start():
+    # At the minimum, and so wide a reach that nothing drawn is better.
+    start = np.array([0.3, 0.7])
+    found = polish(kinked, start, 64, reach=0.4)
+    assert found.loss == kinked(start) == 0
+    np.testing.assert_array_equal(found.free, start)
+
+
+def test_starts_are_searched_side_by_side_and_do_not_depend_on_each_other():
+    starts = np.random.default_rng(1).random((3, 4))
+    together = polish(rosenbrock, starts, 320)
+    for start, free, loss in zip(starts, together.free, together.loss, strict=True):
+        alone = polish(rosenbrock, start, 320)
+        np.testing.assert_allclose(alone.free, free, rtol=1e-9)
+        assert alone.loss == pytest.approx(loss, rel=1e-9)
+    assert together.evaluations == 320
+
+
+def test_the_same_seed_finds_the_same_and_calls_are_all_alike():
+    shapes = []
+
+    def losses(points):
+        shapes.append(points.shape)
+        assert (points >= 0).all() and (points <= 1).all()
+        return rippled(points)
+
+    first, second = (polish(losses, np.full(3, 0.99), 200, candidates=16, reach=0.3) for _ in range(2))
+    np.testing.assert_array_equal(first.free, second.free)
+    assert set(shapes) == {(16, 3)}
+    # Whole generations, no more than asked for.
+    assert first.evaluations == 192 and len(shapes) == 2 * 12
+
+
+def test_a_minimum_on_the_bound_is_found():
+    target = np.array([0.0, 0.4, 1.0])
+    found = polish(lambda points: np.sum(np.abs(points - target), axis=-1), np.full(3, 0.5), 1500, reach=0.1)
+    np.testing.assert_allclose(found.free, target, atol=1e-3)
+
+
+def test_what_is_not_a_number_is_the_worst():
+    def losses(points):
+        return np.where(points[..., 0] > 0.55, np.nan, rosenbrock(points))
+
+    found = polish(losses, np.full(2, 0.5), 1000, reach=0.1)
+    # Up to the wall the valley leads down to (1 - x)^2 at x = 0.2.
+    assert found.loss == pytest.approx(0.64, rel=1e-3)
+    assert found.free[0] <= 0.55
+    nowhere = polish(lambda points: np.full(len(points), np.nan), np.full(2, 0.5), 64)
+    np.testing.assert_array_equal(nowhere.free, 0.5)
+
+
+@pytest.mark.parametrize("gains", [2, 5, 10])
+def test_certify_finds_the_best_of_many_basins(gains):
+    found = certify(rippled, gains, 10_000 * gains)
+    np.testing.assert_allclose(found.free, 0.6, atol=1e-3)
+    assert found.loss < 1e-3
+
+
+def test_certify_finds_what_a_local_search_misses():
+    def losses(points):
+        """A wide basin at 0.2, a narrow and deeper one at 0.8."""
+        wide = np.sum((points - 0.2) ** 2, axis=-1)
+        narrow = 20 * np.sum((points - 0.8) ** 2, axis=-1) - 0.5
+        return np.minimum(wide, narrow)
+
+    local = polish(losses, np.full(4, 0.3), 4000)
+    assert local.loss == pytest.approx(0, abs=1e-6)
+    found = certify(losses, 4, 20_000)
+    assert found.loss == pytest.approx(-0.5, abs=1e-6)
+    assert found.loss == losses(found.free)
+
+
+def test_certify_keeps_to_its_budget_and_to_one_shape_of_call():
+    shapes = []
+
+    def losses(points):
+        shapes.append(points.shape)
+        return kinked(points)
+
+    found = certify(losses, 3, 3000, candidates=8, basins=4)
+    assert set(shapes) == {(32, 3)}
+    assert found.evaluations == 32 * len(shapes) <= 3000
+    assert found.evaluations > 3000 - 64
+    assert (np.diff(found.basin_losses) >= 0).all() and (np.diff(found.scanned) >= 0).all()
+    assert found.loss == found.basin_losses[0] == kinked(found.free)
+    assert found.basins.shape == (4, 3)
+
+
+def test_what_is_known_is_looked_at():
+    hole = np.array([0.123, 0.456, 0.789, 0.321, 0.654])
+
+    def losses(points):
+        """Flat but for a hole that a scan does not meet."""
+        return 1 - np.exp(-np.sum(((points - hole) / 0.01) ** 2, axis=-1))
+
+    known = hole[None] + 0.002
+    assert certify(losses, 5, 4096).loss > 0.5
+    assert certify(losses, 5, 4096, known=known).loss < 0.05 < losses(known)
+
+
+def test_mirrored_points_are_inside():
+    np.testing.assert_allclose(mirror(np.array([-0.2, 0.3, 1.2, 2.1, -1.4])), [0.2, 0.3, 0.8, 0.1, 0.6])
