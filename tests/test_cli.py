@@ -117,9 +117,13 @@ def test_tune_writes_gains_and_plots(jaxhil, tuned):
     assert {path.name for path in tuned.iterdir()} == {"gains.json", "errors.png", "loss.png", "contact.png"}
     document = json.loads((tuned / "gains.json").read_text())
     assert document["compensator"] == "phase_lead"
-    assert document["figures"].keys() == {"nominal", "robust"}
-    for figures in document["figures"].values():
-        assert figures.keys() == {"before", "literature", "tuned"}
+    figures = document["figures"]
+    assert figures.keys() == {"nominal", "robust", "tuned_intervals"}
+    for name in ("nominal", "robust"):
+        assert figures[name].keys() == {"before", "literature", "tuned"}
+    for name in ("rms", "p99"):
+        interval = figures["tuned_intervals"][name]
+        assert interval["low"] <= figures["robust"]["tuned"][name] <= interval["high"]
     assert (
         document["envelope"]["contact_frequency"]["low"]
         < 3

@@ -20,6 +20,7 @@ from tuning.environment import program_folder
 from tuning.objective import RMS, Objective
 from tuning.problems import Task, alike, build_task, common_loop
 from tuning.rounds import Start, solve_tasks
+from tuning.trust import Intervals, interval
 
 # Draws of the validation come from another seed than those of training.
 VALIDATION_SEED = 0x5EED
@@ -56,7 +57,8 @@ class Figures(NamedTuple):
 class Result:
     """What tuning found: gains (all of the compensator's), the literature's; figures of "before" (no
     compensation), "literature" and "tuned" on the same fresh scenarios, and of their nominal run; every
-    start; outcomes and scenarios for plots; seconds spent."""
+    start; outcomes and scenarios for plots; seconds spent; 95 % confidence
+    intervals of the tuned figures."""
 
     compensator: str
     mechanism: Mechanism
@@ -69,6 +71,7 @@ class Result:
     scenarios: Scenario
     settings: Settings
     timings: dict[str, float] = field(default_factory=dict)
+    intervals: Intervals | None = None
 
 
 def tune(
@@ -145,6 +148,7 @@ def _tune_block(tasks: list[Task], settings: Settings, report: Callable[[str], N
                 scenarios=trial.fresh[i],
                 settings=settings,
                 timings=clock.laps,
+                intervals=interval(fresh["tuned"].error, fresh["tuned"].good),
             )
         )
     return results

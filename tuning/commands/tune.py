@@ -132,6 +132,11 @@ def _tune_all(options: Tune, loaded: list[LoadedMechanism], problems: list[str])
     return _in_order(entries)
 
 
+def _intervals(result) -> dict[str, Any]:
+    """95 % confidence intervals of the tuned figures, as plain data."""
+    return {name: one._asdict() for name, one in result.intervals._asdict().items()}
+
+
 def _objective(options: Tune):
     from tuning.objective import Objective
 
@@ -156,7 +161,7 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, begin) 
         loaded.mechanism,
         loaded.sha256,
         validity_envelope(loaded.mechanism, result.scenarios),
-        {"nominal": result.nominal, "robust": result.figures},
+        {"nominal": result.nominal, "robust": result.figures, "tuned_intervals": _intervals(result)},
         options.seed,
         result.timings,
     )
@@ -177,6 +182,7 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, begin) 
         "literature": result.literature,
         "figures": result.figures,
         "nominal": result.nominal,
+        "tuned_intervals": _intervals(result),
         "starts": result.starts,
         "timings": result.timings,
         "better_than_literature": is_better(result.figures["tuned"], result.figures["literature"]),
@@ -296,12 +302,14 @@ def _print(options: Tune, result, entry) -> None:
         texts=(1,),
     )
     tuned = result.figures["tuned"]
+    low, high = result.intervals.rms
+    sure = f" (95 %: {low:.2g} to {high:.2g})"
     if entry["verdict"] == "good":
-        verdict = f"Good: the tuned rms error {tuned.rms:.2g} is within {options.limit:g}."
+        verdict = f"Good: the tuned rms error {tuned.rms:.2g}{sure} is within {options.limit:g}."
     elif tuned.failed:
         verdict = f"Bad: {tuned.failed} contacts did not end with the tuned gains."
     else:
-        verdict = f"Bad: the tuned rms error {tuned.rms:.2g} exceeds {options.limit:g}."
+        verdict = f"Bad: the tuned rms error {tuned.rms:.2g}{sure} exceeds {options.limit:g}."
     seconds = ", ".join(f"{stage} {time:.1f} s" for stage, time in result.timings.items())
     written = [entry["gain_file"], *entry["plots"]]
     tables = [errors] + ([gains] if law else []) + ([starts] if result.starts else [])
