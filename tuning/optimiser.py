@@ -80,7 +80,7 @@ def solve(
     atol: float = 1e-6,
 ) -> Solution:
     """Minimise sum(residuals(static, gains, arguments)^2) / 2 of many problems at once, in at most `steps`
-    steps, themselves at most `longest`.
+    steps, themselves at most `longest`. Problems are dealt out to the devices.
 
     A problem is a start: its gains, their bounds and its arguments. `residuals` gets several, a leading axis
     of problems, which must not mix: `tile` of them at a time, by default all that a device has to do.
@@ -132,8 +132,7 @@ def _with_jacobian(residuals, free, arguments, tile=None):
     """(residuals, loss) of one problem, to be called under a `jax.vmap` over all of them.
 
     Its derivative is one product with a Jacobian computed once, in forward mode, for all problems side by
-    side. They are dealt out to the devices; the solver around them is not: its linear algebra does not run
-    inside `jax.shard_map`. `free` and `arguments` are like those to come, problems first.
+    side, `tile` at a time. `free` and `arguments` are like those to come, problems first.
     """
 
     def value_and_jacobian(free, arguments):

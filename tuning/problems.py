@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from jaxhil.building import build_loop
-from jaxhil.compensators import COMPENSATORS, Gain
+from jaxhil.compensators import COMPENSATORS, Gain, literature_gains
 from jaxhil.loop import Loop
 from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario, build_scenarios
@@ -43,11 +43,6 @@ def build_task(mechanism: Mechanism, compensator: str, scenarios: int, seed: int
         batch,
         build_loop(mechanism, compensator, batch),
     )
-
-
-def literature_gains(mechanism: Mechanism, compensator: str) -> dict[str, float]:
-    """What the literature's rules set the compensator's gains to."""
-    return {gain.name: float(gain.nominal(mechanism)) for gain in COMPENSATORS[compensator].gains}
 
 
 def alike(loops: list[Loop], scenarios: list[Scenario]) -> list[list[int]]:

@@ -94,6 +94,18 @@ class Stages:
         self._progress.update(self._task, advance=int(self._begun), description=text)
         self._begun = True
 
+    def say(self, text: str) -> None:
+        """What is going on; no stage is over by it."""
+        if self._progress is None:
+            note(text)
+        else:
+            self._progress.update(self._task, description=text)
+
+    def finish(self) -> None:
+        """One stage is over, whatever comes next."""
+        if self._progress is not None:
+            self._progress.update(self._task, advance=1)
+
 
 @contextmanager
 def stages(total: int) -> Iterator[Stages]:

@@ -101,13 +101,12 @@ def simulate(
 
 def _gains(options: Simulate, mechanism: Mechanism | None) -> tuple[Mechanism, str, dict[str, float]]:
     """Mechanism, compensator and gains: the gain file's, or the literature's gains."""
-    from jaxhil.compensators import COMPENSATORS
+    from jaxhil.compensators import literature_gains
 
     if options.gains is None:
         assert mechanism is not None
         compensator = options.compensator or "none"
-        law = COMPENSATORS[compensator]
-        return mechanism, compensator, {gain.name: float(gain.nominal(mechanism)) for gain in law.gains}
+        return mechanism, compensator, literature_gains(mechanism, compensator)
 
     from tuning.gain_file import load_gain_file
 

@@ -10,9 +10,9 @@ from jaxhil.mechanism_file import LoadedMechanism, load
 from tuning import report
 from tuning.cli import Tune
 from tuning.commands import checks
+from tuning.commands.tune_tables import print_one, print_overview
 from tuning.environment import prepare, program_folder
 
-STAGES = 3  # of a block of mechanisms: tune, judge, draw
 MOST_DRAWN = 4  # mechanisms whose plots are drawn; of more there is one picture of all
 
 
@@ -111,24 +111,31 @@ def _tune_all(options: Tune, loaded: list[LoadedMechanism], problems: list[str])
     mechanisms = [one.mechanism for one in loaded]
     entries, done = {}, {}
     drawn = len(loaded) <= MOST_DRAWN
-    with report.stages(STAGES * len(loaded)) as stages, ThreadPoolExecutor(1) as meanwhile:
+    with report.stages(len(loaded)) as stages, ThreadPoolExecutor(1) as meanwhile:
         if drawn and program_folder() is not None:
             meanwhile.submit(_prepare_drawing, mechanisms[0], options.compensator)
         try:
-            for index, result in tune_all(mechanisms, options.compensator, settings, stages.begin):
+            for index, result in tune_all(mechanisms, options.compensator, settings, stages.say):
                 try:
-                    entries[index] = _finish(options, loaded[index], result, drawn, stages.begin)
+                    entries[index] = _finish(options, loaded[index], result, drawn, stages.say)
                 except InputError as error:
                     problems.append(str(error))
                     report.note(f"jaxhil: {error}")
                     continue
                 done[index] = result
+                stages.finish()
                 if not options.json and drawn:
-                    _print(options, result, entries[index])
+                    print_one(options, result, entries[index])
         except KeyboardInterrupt:
             raise _Interrupted(_in_order(entries)) from None
     if len(loaded) > 1 and done:
-        _overview(options, _in_order(done), _in_order(entries), drawn)
+        results, finished = _in_order(done), _in_order(entries)
+        if not drawn:
+            from tuning.plots import overview_plot, save
+
+            save(overview_plot(results, options.limit), Path(options.output) / "overview.png")
+        if not options.json:
+            print_overview(options, results, finished, drawn)
     return _in_order(entries)
 
 
@@ -149,7 +156,7 @@ def _in_order(by_index: dict[int, Any]) -> list[Any]:
     return [by_index[index] for index in sorted(by_index)]
 
 
-def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, begin) -> dict[str, Any]:
+def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) -> dict[str, Any]:
     """Write what was found for one mechanism."""
     from tuning.gain_file import build_document, validity_envelope, write_gain_file
 
@@ -168,7 +175,7 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, begin) 
     write_gain_file(folder / "gains.json", document)
     plots = []
     if drawn:
-        begin(f"{loaded.mechanism.name}: drawing")
+        say(f"{loaded.mechanism.name}: drawing")
         plots = _draw(result, options, folder)
     tuned = result.figures["tuned"]
     good = tuned.failed == 0 and tuned.rms <= options.limit
@@ -190,39 +197,11 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, begin) 
     }
 
 
-def _overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], drawn: bool) -> None:
-    """All mechanisms side by side."""
-    if not drawn:
-        from tuning.plots import overview_plot, save
-
-        save(overview_plot(results, options.limit), Path(options.output) / "overview.png")
-    if options.json:
-        return
-    rows = []
-    for result, entry in zip(results, entries, strict=True):
-        tuned = result.figures["tuned"]
-        best = min(result.starts, key=lambda start: start.rms).status if result.starts else "nothing to tune"
-        verdict = entry["verdict"] if entry["better_than_literature"] else "NOT better than the literature's"
-        rms = (result.figures[key].rms for key in ("before", "literature", "tuned"))
-        rows.append((entry["mechanism"], *rms, tuned.p99, tuned.peak_ratio, tuned.failed, best, verdict))
-    headings = ["mechanism", "before", "literature", "tuned", "99th pct", "peak ratio", "not ended"]
-    report.emit(
-        report.table(
-            f"rms of e - e* on {options.validation} fresh scenarios each, {options.compensator}",
-            [*headings, "best start", "verdict"],
-            rows,
-            texts=(0, 7, 8),
-        )
-    )
-    if not drawn:
-        report.emit(f"wrote {options.output}/NAME/gains.json and {options.output}/overview.png", "")
-
-
 def _prepare_drawing(mechanism, compensator: str) -> None:
     """Import and compile what drawing needs, while the solver's program compiles on another core."""
+    from jaxhil.compensators import literature_gains
     from tuning import plots  # noqa: F401
     from tuning.motion import prepare_motion
-    from tuning.problems import literature_gains
 
     gains = literature_gains(mechanism, compensator)
     prepare_motion(mechanism, compensator, {"before": gains, "tuned": gains})
@@ -258,59 +237,3 @@ def _verdict(entries, problems, interrupted) -> str:
     if problems:
         return "unusable input"
     return "good" if all(entry["verdict"] == "good" for entry in entries) else "bad"
-
-
-def _print(options: Tune, result, entry) -> None:
-    from jaxhil.compensators import COMPENSATORS
-
-    law, mechanism = COMPENSATORS[options.compensator].gains, result.mechanism
-    names = {"before": "before (no compensation)", "literature": "literature's rule", "tuned": "tuned"}
-    rows = []
-    for key, label in names.items():
-        one = result.figures[key]
-        if key == "tuned" and not entry["better_than_literature"]:
-            label = "tuned (NOT better than the literature's)"
-        rows.append(
-            (
-                *(label, one.rms, one.p99, one.max, f"{one.mean:+.4f}", f"{100 * one.diverging:.0f} %"),
-                *(f"{one.peak_ratio:.3f}", one.failed),
-            )
-        )
-    count = int(result.outcomes["tuned"].wanted.sum())
-    errors = report.table(
-        f"{mechanism.name}: errors e - e* of {count} contacts in {options.validation} fresh scenarios",
-        ["gains", "rms", "99th pct", "max", "mean", "e > e*", "peak ratio", "not ended"],
-        rows,
-    )
-    gains = report.table(
-        f"Gains of {options.compensator}",
-        ["gain", "unit", "lower", "upper", "literature", "tuned"],
-        [
-            (
-                *(gain.name, gain.unit, float(gain.lower(mechanism)), float(gain.upper(mechanism))),
-                result.literature[gain.name],
-                result.gains[gain.name] if gain.tuned(mechanism) else "(not tuned)",
-            )
-            for gain in law
-        ],
-        texts=(0, 1),
-    )
-    starts = report.table(
-        "Starts",
-        ["start", "status", "steps", f"{options.objective} on training scenarios"],
-        [[n, s.status, s.steps, s.rms] for n, s in enumerate(result.starts, start=1)],
-        texts=(1,),
-    )
-    tuned = result.figures["tuned"]
-    low, high = result.intervals.rms
-    sure = f" (95 %: {low:.2g} to {high:.2g})"
-    if entry["verdict"] == "good":
-        verdict = f"Good: the tuned rms error {tuned.rms:.2g}{sure} is within {options.limit:g}."
-    elif tuned.failed:
-        verdict = f"Bad: {tuned.failed} contacts did not end with the tuned gains."
-    else:
-        verdict = f"Bad: the tuned rms error {tuned.rms:.2g}{sure} exceeds {options.limit:g}."
-    seconds = ", ".join(f"{stage} {time:.1f} s" for stage, time in result.timings.items())
-    written = [entry["gain_file"], *entry["plots"]]
-    tables = [errors] + ([gains] if law else []) + ([starts] if result.starts else [])
-    report.emit(*tables, *(f"wrote {path}" for path in written), f"took: {seconds}", verdict, "")

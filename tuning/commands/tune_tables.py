@@ -1,0 +1,86 @@
+"""What `jaxhil tune` prints of its results: one mechanism in detail, or many side by side."""
+
+import math
+from typing import Any
+
+from tuning import report
+from tuning.cli import Tune
+
+
+def print_overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], drawn: bool) -> None:
+    """All mechanisms side by side."""
+    rows = []
+    for result, entry in zip(results, entries, strict=True):
+        tuned = result.figures["tuned"]
+        best = min(result.starts, key=lambda start: start.rms).status if result.starts else "nothing to tune"
+        verdict = entry["verdict"] if entry["better_than_literature"] else "NOT better than the literature's"
+        rms = (result.figures[key].rms for key in ("before", "literature", "tuned"))
+        rows.append((entry["mechanism"], *rms, tuned.p99, tuned.peak_ratio, tuned.failed, best, verdict))
+    headings = ["mechanism", "before", "literature", "tuned", "99th pct", "peak ratio", "not ended"]
+    report.emit(
+        report.table(
+            f"rms of e - e* on {options.validation} fresh scenarios each, {options.compensator}",
+            [*headings, "best start", "verdict"],
+            rows,
+            texts=(0, 7, 8),
+        )
+    )
+    if not drawn:
+        report.emit(f"wrote {options.output}/NAME/gains.json and {options.output}/overview.png", "")
+
+
+def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
+    """Errors, gains and starts of one mechanism, and the verdict."""
+    from jaxhil.compensators import COMPENSATORS
+
+    law, mechanism = COMPENSATORS[options.compensator].gains, result.mechanism
+    names = {"before": "before (no compensation)", "literature": "literature's rule", "tuned": "tuned"}
+    rows = []
+    for key, label in names.items():
+        one = result.figures[key]
+        if key == "tuned" and not entry["better_than_literature"]:
+            label = "tuned (NOT better than the literature's)"
+        rows.append(
+            (
+                *(label, one.rms, one.p99, one.max, f"{one.mean:+.4f}", f"{100 * one.diverging:.0f} %"),
+                *(f"{one.peak_ratio:.3f}", one.failed),
+            )
+        )
+    count = int(result.outcomes["tuned"].wanted.sum())
+    errors = report.table(
+        f"{mechanism.name}: errors e - e* of {count} contacts in {options.validation} fresh scenarios",
+        ["gains", "rms", "99th pct", "max", "mean", "e > e*", "peak ratio", "not ended"],
+        rows,
+    )
+    gains = report.table(
+        f"Gains of {options.compensator}",
+        ["gain", "unit", "lower", "upper", "literature", "tuned"],
+        [
+            (
+                *(gain.name, gain.unit, float(gain.lower(mechanism)), float(gain.upper(mechanism))),
+                result.literature[gain.name],
+                result.gains[gain.name] if gain.tuned(mechanism) else "(not tuned)",
+            )
+            for gain in law
+        ],
+        texts=(0, 1),
+    )
+    starts = report.table(
+        "Starts",
+        ["start", "status", "steps", f"{options.objective} on training scenarios"],
+        [[n, s.status, s.steps, s.rms] for n, s in enumerate(result.starts, start=1)],
+        texts=(1,),
+    )
+    tuned = result.figures["tuned"]
+    low, high = result.intervals.rms
+    sure = f" (95 %: {low:.2g} to {high:.2g})" if math.isfinite(low + high) else ""
+    if entry["verdict"] == "good":
+        verdict = f"Good: the tuned rms error {tuned.rms:.2g}{sure} is within {options.limit:g}."
+    elif tuned.failed:
+        verdict = f"Bad: {tuned.failed} contacts did not end with the tuned gains."
+    else:
+        verdict = f"Bad: the tuned rms error {tuned.rms:.2g}{sure} exceeds {options.limit:g}."
+    seconds = ", ".join(f"{stage} {time:.1f} s" for stage, time in result.timings.items())
+    written = [entry["gain_file"], *entry["plots"]]
+    tables = [errors] + ([gains] if law else []) + ([starts] if result.starts else [])
+    report.emit(*tables, *(f"wrote {path}" for path in written), f"took: {seconds}", verdict, "")
