@@ -71,14 +71,15 @@ def parameters_by_slot(contact: ContactParameters) -> ContactParameters:
     )
 
 
-def evaluate(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario) -> Outcome:
+def evaluate(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least: int = 1) -> Outcome:
     """Outcome (NumPy arrays) of `scenarios` (NumPy arrays, one batch axis), on every device.
 
-    `gains` are scalars, or all of them one value per lane.
+    `gains` are scalars, or all of them one value per lane. Batches of up to `at_least` lanes share the
+    compiled program of that many.
     """
     number = len(scenarios.velocity)
     order = _by_duration(scenarios)
-    outcome = jax.device_get(run_tiles(loop, *deal(scenarios, gains)))
+    outcome = jax.device_get(run_tiles(loop, *deal(scenarios, gains, at_least)))
 
     def unfold(leaf):
         leaf = np.moveaxis(leaf, (0, 1), (-2, -3))
@@ -95,16 +96,19 @@ def prepare_evaluation(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario
     run_tiles.lower(loop, *deal(scenarios, gains)).compile()
 
 
-def deal(scenarios: Scenario, gains: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any], Scenario]:
+def deal(
+    scenarios: Scenario, gains: Mapping[str, Any], at_least: int = 1
+) -> tuple[dict[str, Any], dict[str, Any], Scenario]:
     """Arguments of `run_tiles`: gains common to all lanes, gains per lane and scenarios as
     (devices, tiles, ..., lanes of a tile), sorted by expected duration and padded with idle lanes."""
     number = len(scenarios.velocity)
+    room = max(number, at_least)
     devices = jax.device_count()
     tile = TILE
-    while tile > SMALLEST_TILE and tile * devices >= 2 * number:
+    while tile > SMALLEST_TILE and tile * devices >= 2 * room:
         tile //= 2
     # Tiles per device in powers of two up to 16, then multiples of 16: few programs, little padding.
-    tiles = -(-number // (tile * devices))
+    tiles = -(-room // (tile * devices))
     tiles = 1 << (tiles - 1).bit_length() if tiles <= 16 else -(-tiles // 16) * 16
     lanes = tiles * tile * devices
     padded = np.resize(_by_duration(scenarios), lanes)

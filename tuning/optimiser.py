@@ -1,7 +1,8 @@
-"""Levenberg-Marquardt over bounded gains, many starts in one program: the one file that imports optimistix.
+"""Levenberg-Marquardt in the unit box, many starts in one program: the one file that imports optimistix.
 
-Least squares knows no bounds: every gain is a sigmoid (on a linear or logarithmic scale) of a free number.
-The residuals' Jacobian is computed in forward mode, once per step and next to the residuals themselves.
+A step minimises the damped linear model within the box: gains that the model would push through a bound end
+on it, and the others move as if those were constants (`_BoxedDescent`). The residuals' Jacobian is computed
+in forward mode, once per step and next to the residuals themselves.
 """
 
 import math
@@ -12,58 +13,32 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
 from jax.extend.core import jaxpr_as_fun
+from jax.scipy.linalg import cho_solve
 from jax.sharding import AxisType, PartitionSpec
 from jaxtyping import Array, Float, Int
 
-
-class Bounds(NamedTuple):
-    """Of each gain: lower and upper bound, and whether its scale is logarithmic."""
-
-    lower: Float[Array | np.ndarray, "*problems gains"]
-    upper: Float[Array | np.ndarray, "*problems gains"]
-    logarithmic: Float[Array | np.ndarray, "*problems gains"]
+from tuning.box import Bounds, to_gains
 
 
 class Solution(NamedTuple):
-    """Per start: gains; loss, half the sum of squared residuals; loss after every step, the last repeated;
-    steps taken; status, an index into `STATUSES`."""
+    """Per start: shares of the gains' ranges; loss, half the sum of squared residuals; J^T J there, J the
+    residuals' Jacobian by the shares; loss after every step, the last repeated; steps taken; status, an index
+    into `STATUSES`."""
 
-    gains: Float[Array, "starts gains"]
+    shares: Float[Array, "starts gains"]
+    curvature: Float[Array, "starts gains gains"]
     loss: Float[Array, "starts"]
     history: Float[Array, "starts steps"]
     steps: Int[Array, "starts"]
     status: Int[Array, "starts"]
 
 
+DAMPING = 0.1  # of the first step, relative to the mean diagonal of J^T J
+STANDSTILL = 1e-6  # of the box: a step no longer than that is the end
+PATIENCE, PROGRESS = 5, 1e-3  # steps in which the loss must fall by that share of itself
 STATUSES = ("converged", "step limit", "not finite", "failed")
-
-
-def to_gains(free: Float[Array, "gains"], bounds: Bounds) -> Float[Array, "gains"]:
-    """Gains strictly inside their bounds for any free numbers."""
-    share = jax.nn.sigmoid(free)
-    straight = bounds.lower + (bounds.upper - bounds.lower) * share
-    low = jnp.log(jnp.where(bounds.logarithmic > 0, bounds.lower, 1))
-    high = jnp.log(jnp.where(bounds.logarithmic > 0, bounds.upper, 1))
-    return jnp.where(bounds.logarithmic > 0, jnp.exp(low + (high - low) * share), straight)
-
-
-def to_free(gains: Float[Array, "gains"], bounds: Bounds) -> Float[Array, "gains"]:
-    """Inverse of `to_gains`; a gain on a bound is moved inside by a thousandth of the range.
-
-    A gain whose bounds are equal stays what it is, whatever its free number.
-    """
-    span = bounds.upper - bounds.lower
-    share = (gains - bounds.lower) / jnp.where(span > 0, span, 1)
-    logarithmic = (bounds.logarithmic > 0) & (span > 0)
-    positive = jnp.where(logarithmic, jnp.maximum(gains, bounds.lower), 1)
-    low = jnp.log(jnp.where(logarithmic, bounds.lower, 1))
-    high = jnp.log(jnp.where(logarithmic, bounds.upper, 2))
-    share = jnp.where(logarithmic, (jnp.log(positive) - low) / (high - low), share)
-    share = jnp.clip(share, 1e-3, 1 - 1e-3)
-    return jnp.log(share) - jnp.log1p(-share)
 
 
 @partial(jax.jit, static_argnames=("residuals", "static", "longest", "tile"))
@@ -82,25 +57,27 @@ def solve(
     """Minimise sum(residuals(static, gains, arguments)^2) / 2 of many problems at once, in at most `steps`
     steps, themselves at most `longest`. Problems are dealt out to the devices.
 
-    A problem is a start: its gains, their bounds and its arguments. `residuals` gets several, a leading axis
-    of problems, which must not mix: `tile` of them at a time, by default all that a device has to do.
+    A problem is a start: shares of its gains' ranges, their bounds and its arguments. It has converged when
+    residuals and shares have settled (`rtol`, `atol`), when a step is shorter than `STANDSTILL`, or when the
+    loss has fallen by less than `PROGRESS` of itself in `PATIENCE` steps. `residuals` gets several, a leading
+    axis of problems, which must not mix: `tile` of them at a time, by default all that a device has to do.
     """
 
-    def of_free(free, arguments):
+    def of_shares(shares, arguments):
         bounds, arguments = arguments
-        return residuals(static, jax.vmap(to_gains)(free, bounds), arguments)
+        return residuals(static, to_gains(shares, bounds), arguments)
 
-    solver = _Recording(optx.LevenbergMarquardt(rtol=rtol, atol=atol), steps, longest)
+    solver = _Recording(_BoxedLevenbergMarquardt(rtol, atol), steps, longest)
 
     def one_device(starts, bounds, arguments):
-        function = _with_jacobian(of_free, starts, (bounds, arguments), tile)
+        function = _with_jacobian(of_shares, starts, (bounds, arguments), tile)
         return jax.vmap(partial(one, function))(starts, bounds, arguments)
 
     def one(function, start, bounds, arguments):
         solution = optx.least_squares(
             function,
             solver,
-            to_free(start, bounds),
+            start,
             args=(bounds, arguments),
             has_aux=True,
             max_steps=longest,
@@ -109,8 +86,8 @@ def solve(
         stats = solution.stats
         loss = jnp.min(stats["history"])
         status = _status(solution.result, stats["converged"], loss)
-        gains = to_gains(solution.value, bounds)
-        return Solution(gains, loss, stats["history"], stats["num_steps"].astype(jnp.int32), status)
+        steps = stats["num_steps"].astype(jnp.int32)
+        return Solution(solution.value, stats["curvature"], loss, stats["history"], steps, status)
 
     devices = math.gcd(jax.device_count(), len(starts))
     # Traced outside of `jax.shard_map`, inside of which the solver's linear algebra does not trace.
@@ -185,6 +162,69 @@ def _with_jacobian(residuals, free, arguments, tile=None):
     return with_loss
 
 
+class _Model(NamedTuple):
+    """What a step is made of: where it begins, J^T J and the loss's gradient J^T r there."""
+
+    shares: Float[Array, "gains"]
+    curvature: Float[Array, "gains gains"]
+    gradient: Float[Array, "gains"]
+
+
+class _BoxedDescent(optx.AbstractDescent):
+    """The step d in the unit box from the damped linear model: (J^T J + D) d = -J^T r for the gains that are
+    free, D = `DAMPING` mean(diag(J^T J)) / step_size."""
+
+    def init(self, y, f_info_struct):
+        return _Model(y, jnp.zeros((len(y), len(y)), y.dtype), jnp.zeros_like(y))
+
+    def query(self, y, f_info, state):
+        basis = jnp.eye(len(y), dtype=y.dtype)
+        jacobian = jax.vmap(f_info.jac.mv, out_axes=-1)(basis)
+        return _Model(y, jacobian.T @ jacobian, jacobian.T @ f_info.residual)
+
+    def step(self, step_size, state):
+        shares, curvature, gradient = state
+        number, dtype = len(shares), shares.dtype
+        damping = DAMPING * jnp.trace(curvature) / number / step_size.astype(dtype)
+        identity = jnp.eye(number, dtype=dtype)
+        # What no residual depends on has no curvature; it stays.
+        damped = curvature + (damping + jnp.finfo(dtype).tiny ** 0.5) * identity
+        room = -shares, 1 - shares
+        free = ~((shares <= 0) & (gradient > 0) | (shares >= 1) & (gradient < 0))
+
+        def bind(_, found):
+            free, step = found
+            step = jnp.where(free, 0, step)
+            both = free[:, None] & free[None, :]
+            matrix = jnp.where(both, damped, identity)
+            force = jnp.where(free, -gradient - curvature @ step, 0)
+            wanted = cho_solve((jnp.linalg.cholesky(matrix), True), force)
+            inside = jnp.clip(wanted, *room)
+            return free & (wanted == inside), jnp.where(free, inside, step)
+
+        # Each turn binds at least one gain more, or none ever after.
+        _, step = jax.lax.fori_loop(0, number + 1, bind, (free, jnp.zeros_like(shares)))
+        return step, optx.RESULTS.successful
+
+
+class _BoxedLevenbergMarquardt(optx.AbstractGaussNewton):
+    """Levenberg-Marquardt whose steps end in the unit box."""
+
+    rtol: float
+    atol: float
+    norm: Callable[[Any], Array]
+    descent: _BoxedDescent
+    search: optx.ClassicalTrustRegion
+    verbose: Callable[..., None]
+
+    def __init__(self, rtol: float, atol: float):
+        self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
+        self.descent = _BoxedDescent()
+        # Longer steps wherever the model holds roughly: it is never as good as the default asks for.
+        self.search = optx.ClassicalTrustRegion(0.75, 1e-3, 3.0, 0.25)
+        self.verbose = lambda **_: None
+
+
 class _Recording(optx.AbstractLeastSquaresSolver):
     """A solver that keeps the loss of every accepted iterate, and ends after `steps` of them, a number that
     is no part of the program."""
@@ -207,19 +247,29 @@ class _Recording(optx.AbstractLeastSquaresSolver):
 
     def step(self, fn, y, args, options, state, tags):
         inner, history, count = state
-        y, inner, loss = self.inner.step(fn, y, args, options, inner, tags)
-        best = jnp.minimum(loss, jnp.where(count > 0, history[count - 1], jnp.inf))
+        y, inner, aux = self.inner.step(fn, y, args, options, inner, tags)
+        # What it returns is one step old.
+        best = jnp.minimum(inner.aux, jnp.where(count > 0, history[count - 1], jnp.inf))
         history = jnp.where(jnp.arange(self.longest) >= count, best, history)
-        return y, (inner, history, count + 1), loss
+        return y, (inner, history, count + 1), aux
 
     def terminate(self, fn, y, args, options, state, tags):
-        converged, result = self.inner.terminate(fn, y, args, options, state[0], tags)
+        converged, result = self._converged(fn, y, args, options, state, tags)
         return converged | (state[2] >= self.steps), result
 
+    def _converged(self, fn, y, args, options, state, tags):
+        inner, history, count = state
+        converged, result = self.inner.terminate(fn, y, args, options, inner, tags)
+        still = jnp.max(jnp.abs(inner.y_eval - y)) < STANDSTILL
+        before = history[jnp.maximum(count - 1 - PATIENCE, 0)]
+        slow = (count > PATIENCE) & (history[count - 1] > (1 - PROGRESS) * before)
+        return converged | ((count > 0) & (still | slow)), result
+
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        converged, _ = self.inner.terminate(fn, y, args, options, state[0], tags)
+        converged, _ = self._converged(fn, y, args, options, state, tags)
         y, aux, stats = self.inner.postprocess(fn, y, aux, args, options, state[0], tags, result)
-        return y, aux, {**stats, "history": state[1], "converged": converged}
+        curvature = state[0].descent_state.curvature
+        return y, aux, {**stats, "history": state[1], "converged": converged, "curvature": curvature}
 
 
 def _status(result, converged, loss):

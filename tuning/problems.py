@@ -2,19 +2,29 @@
 
 import dataclasses
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from scipy.stats import qmc
 
 from jaxhil.building import build_loop
 from jaxhil.compensators import COMPENSATORS, Gain, literature_gains
+from jaxhil.contact import ContactLaw
+from jaxhil.evaluation import parameters_by_slot
 from jaxhil.loop import Loop
 from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import quasi_random
-from tuning.optimiser import Bounds
+from tuning.box import Bounds, to_gains, to_shares
+
+# In training a contact that takes longer than this many times its undelayed duration, and so many
+# seconds more, has failed.
+PATIENCE = 2.0
+SHORTEST_PATIENCE = 0.15  # s
 
 
 @dataclass(frozen=True)
@@ -34,15 +44,11 @@ class Task:
 
 
 def build_task(mechanism: Mechanism, compensator: str, scenarios: int, seed: int) -> Task:
-    """Training scenarios are quasi-random: they fill the range evenly."""
+    """Training scenarios are quasi-random: they fill the range evenly. Their contacts must end in time."""
     batch = build_scenarios(mechanism, quasi_random(mechanism, scenarios, seed), seed)
-    return Task(
-        mechanism,
-        compensator,
-        literature_gains(mechanism, compensator),
-        batch,
-        build_loop(mechanism, compensator, batch),
-    )
+    loop = build_loop(mechanism, compensator, batch)
+    batch = batch._replace(time_limit=np.asarray(_patience(loop.law, batch)))
+    return Task(mechanism, compensator, literature_gains(mechanism, compensator), batch, loop)
 
 
 def alike(loops: list[Loop], scenarios: list[Scenario]) -> list[list[int]]:
@@ -81,26 +87,31 @@ def gain_bounds(task: Task, names: tuple[str, ...]) -> Bounds:
             return task.literature[name], task.literature[name], 0.0
         return float(gain.lower(mechanism)), float(gain.upper(mechanism)), float(gain.logarithmic)
 
-    return Bounds(*np.array([bounds(name) for name in names]).T)
+    return Bounds(*np.array([bounds(name) for name in names]).reshape(-1, 3).T)
 
 
-def spread_starts(first: np.ndarray, bounds: Bounds, number: int, seed: int) -> np.ndarray:
-    """(number, gains): the literature's gains, then Sobol points around them and over the middle of the box.
-
-    Half of the points lie within a quarter of each gain's range of the literature's value, half anywhere.
-    """
-    lower, upper = np.asarray(bounds.lower), np.asarray(bounds.upper)
-    logarithmic = np.asarray(bounds.logarithmic) > 0
-    low = np.where(logarithmic, np.log(np.where(logarithmic, lower, 1)), lower)
-    high = np.where(logarithmic, np.log(np.where(logarithmic, upper, 1)), upper)
-    place = np.where(logarithmic, np.log(np.maximum(first, np.where(logarithmic, lower, 1))), first)
-    span = np.where(high > low, high - low, 1)
-    share = np.clip((place - low) / span, 0, 1)
+def spread_points(first: np.ndarray, number: int, seed: int) -> np.ndarray:
+    """(number, gains) shares of the unit box: `first`, then Sobol points, every other one of them within a
+    quarter of each gain's range of `first`, the rest anywhere."""
     points = qmc.Sobol(len(first), rng=np.random.default_rng(seed)).random(
         1 << max(number - 1, 1).bit_length()
     )
     reach = np.where(np.arange(len(points)) % 2 == 0, 0.25, 1.0)[:, None]
-    shares = np.clip(share + reach * (points - 0.5), 0.02, 0.98)
-    shares = np.concatenate([share[None], shares])[:number]
-    values = low + (high - low) * shares
-    return np.where(logarithmic, np.exp(np.where(logarithmic, values, 0)), values)
+    near = np.clip(first + reach * (points - 0.5), 0, 1)
+    return np.concatenate([first[None], np.where(reach < 1, near, points)])[:number]
+
+
+def spread_starts(first: np.ndarray, bounds: Bounds, number: int, seed: int) -> np.ndarray:
+    """(number, gains): `spread_points` around the gains `first`, as gains."""
+    return to_gains(spread_points(to_shares(first, bounds), number, seed), bounds)
+
+
+@partial(jax.jit, static_argnums=0)
+def _patience(law: ContactLaw, scenarios: Scenario) -> Float[Array, "*batch"]:
+    """How long [s] a contact may take in training before it has failed: some of its undelayed durations."""
+    shape = scenarios.phase.shape
+    mass = jnp.broadcast_to(scenarios.equivalent_mass, shape)
+    velocity = jnp.broadcast_to(scenarios.velocity, shape)
+    reference = law.reference(parameters_by_slot(scenarios.contact), mass, velocity)
+    longest = PATIENCE * jnp.max(reference.duration, axis=0) + SHORTEST_PATIENCE
+    return jnp.minimum(longest, scenarios.time_limit)

@@ -23,7 +23,7 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 PACKAGES = ("jaxhil", "tuning")
 STANDS_ON = ("jax", "jaxlib", "optimistix", "equinox", "lineax", "numpy")
 # Calls into LAPACK have no promise to mean the same in other versions; the name has the version in it.
-LAPACK = ("lapack_dgeqrf_ffi", "lapack_dormqr_ffi", "lapack_dtrsm_ffi")
+LAPACK = ("lapack_dpotrf_ffi", "lapack_dtrsm_ffi")
 
 
 def run(
@@ -35,10 +35,22 @@ def run(
     it; `arguments` is a pytree of arrays. Programs are kept in `folder`; none without one, and none of
     compensators or contact laws from elsewhere, whose sources are not known.
     """
+    program, leaves = _look_up(function, static, arguments, folder)
+    return function.__annotations__["return"](*program(*leaves))
+
+
+def prepare(
+    function: Callable[..., Any], static: Any, arguments: Any, folder: str | os.PathLike[str] | None
+) -> None:
+    """Trace and compile what `run` will run on such arguments, into `folder` and the compile cache."""
+    program, leaves = _look_up(function, static, arguments, folder)
+    program.lower(*leaves).compile()
+
+
+def _look_up(function, static, arguments, folder):
     leaves, structure = jax.tree.flatten(arguments)
     shapes = tuple((leaf.shape, str(leaf.dtype)) for leaf in leaves)
-    program = _program(function, static, structure, shapes, None if _is_foreign(static) else folder)
-    return function.__annotations__["return"](*program(*leaves))
+    return _program(function, static, structure, shapes, None if _is_foreign(static) else folder), leaves
 
 
 @cache

@@ -1,8 +1,9 @@
 """Solving many tasks from many starts: a short round for all, further ones for what is worth it.
 
-A start of a task is a problem. One compiled program takes a fixed number of problems at a time; hard ones do
-not hold up easy ones, since every round deals out anew what has not converged. After the first round only the
-most promising starts of a task go on.
+`choose_starts` looks around, `solve_tasks` descends by derivatives, `finish` goes on without them where the
+starts do not agree. A start of a task is a problem. One compiled program takes a fixed number of problems at
+a time; hard ones do not hold up easy ones, since every round deals out anew what has not converged. After the
+first round only the most promising starts of a task go on.
 """
 
 import dataclasses
@@ -11,18 +12,19 @@ from operator import itemgetter
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Float
 
-from jaxhil.evaluation import expected_duration, parameters_by_slot
-from jaxhil.loop import Loop, build_rig
-from jaxhil.scenario import Scenario
+from jaxhil.evaluation import expected_duration
+from jaxhil.loop import build_rig
 from tuning import programs
+from tuning.box import Bounds, to_gains, to_shares
 from tuning.environment import program_folder
 from tuning.objective import RMS, SCALE, Objective, Problem, residuals
 from tuning.optimiser import STATUSES, Solution, solve
-from tuning.problems import Task, common_loop, gain_bounds, spread_starts, tuned_names
+from tuning.problems import Task, common_loop, gain_bounds, spread_points, tuned_names
+from tuning.search import apart, polish
+from tuning.trial import Trial
 
 FEW, MANY = 4, 32  # problems in one call of the program
 TILE = 128  # lanes computed side by side on a device: more leave the cache
@@ -32,21 +34,23 @@ LONGEST = 32  # steps of one call
 CONVERGED, STEP_LIMIT, NOT_FINITE = STATUSES.index("converged"), STATUSES.index("step limit"), 2
 GIVEN_UP = "given up"
 
-# In training a contact that takes longer than this many times its undelayed duration, and so many
-# seconds more, has failed.
-PATIENCE = 2.0
-SHORTEST_PATIENCE = 0.15  # s
+SCANNED, SCAN_SCENARIOS = 64, 32  # points looked at before the first round, and on how many scenarios
+AGREED = 0.005  # relative difference of two starts' values that count as the same minimum
+REACH = 0.05  # of the box: first standard deviation of the search without derivatives
 
 
 class Start(NamedTuple):
     """One start of the solve: status, steps, value of the objective (its norm, `tuning.objective`) it ended
-    with and had after every step, and its gains."""
+    with and had after every step, and its gains; of those that are tuned for any of the tasks also the shares
+    of their ranges, and J^T J by them."""
 
     status: str
     steps: int
     rms: float
     history: list[float]
     gains: dict[str, float]
+    shares: np.ndarray = np.empty(0)
+    curvature: np.ndarray = np.empty((0, 0))
 
 
 @dataclasses.dataclass
@@ -54,7 +58,8 @@ class _Problem:
     """A start on its way: gains now, loss after every step so far."""
 
     task: int
-    gains: np.ndarray
+    shares: np.ndarray
+    curvature: np.ndarray
     status: int | str = STEP_LIMIT
     history: list[float] = dataclasses.field(default_factory=list)
 
@@ -63,22 +68,37 @@ class _Problem:
         return self.history[-1] if self.history and np.isfinite(self.history[-1]) else np.inf
 
 
+def choose_starts(
+    trial: Trial, starts: int, seed: int, objective: Objective = RMS
+) -> list[Float[np.ndarray, "starts gains"]]:
+    """Shares to start from, of every task: the literature's gains, then the best of some Sobol points that
+    lie apart from each other."""
+    tasks = range(len(trial.tasks))
+    first = [
+        to_shares(np.array([task.literature[name] for name in trial.names]), bounds)
+        for task, bounds in zip(trial.tasks, trial.bounds, strict=True)
+    ]
+    if starts == 1:
+        return [one[None] for one in first]
+    points = np.stack([spread_points(one, max(SCANNED, 2 * starts), seed) for one in first])
+    values = trial.losses(objective, list(tasks), points, SCAN_SCENARIOS)
+    order = np.argsort(np.where(np.isfinite(values), values, np.inf), axis=1, kind="stable")
+    return [apart(points[i][order[i]], first[i][None], starts) for i in tasks]
+
+
 def solve_tasks(
     tasks: list[Task],
-    starts: int,
+    starts: list[Float[np.ndarray, "starts gains"]],
     steps: int,
-    seed: int,
     objective: Objective = RMS,
     report: Callable[[str], None] = lambda text: None,
 ) -> list[list[Start]]:
-    """Every start of every task; the tasks are alike (`tuning.problems.alike`)."""
+    """Every start of every task; the tasks are alike (`tuning.problems.alike`). `starts` are shares of the
+    ranges of those gains that are tuned for any of the tasks."""
     names = tuned_names(tasks)
     bounds = [gain_bounds(task, names) for task in tasks]
-    problems = []
-    for index, task in enumerate(tasks):
-        first = np.array([task.literature[name] for name in names])
-        for gains in spread_starts(first, bounds[index], starts, seed):
-            problems.append(_Problem(index, gains))
+    nothing = np.zeros((len(names), len(names)))
+    problems = [_Problem(index, shares, nothing) for index, own in enumerate(starts) for shares in own]
     advance = _stepper(tasks, names, bounds, objective, len(problems))
     # Neighbours in a call take about as long.
     order = np.argsort([-float(np.max(expected_duration(task.scenarios))) for task in tasks], kind="stable")
@@ -89,7 +109,7 @@ def solve_tasks(
         going = [problem for problem in problems if problem.status == STEP_LIMIT]
         if not going:
             break
-        several = done == 0 and starts > PROMISING
+        several = done == 0 and max(map(len, starts)) > PROMISING
         limit = min(steps - done, FIRST_ROUND if several else LONGEST)
         report(f"{len(going)} of {len(problems)} starts, {limit} steps")
         advance(going, limit)
@@ -97,7 +117,7 @@ def solve_tasks(
         if done < steps:
             _give_up(problems)
     return [
-        [_finished(p, names, tasks[index]) for p in problems if p.task == index]
+        [_finished(p, names, bounds[index], tasks[index]) for p in problems if p.task == index]
         for index in range(len(tasks))
     ]
 
@@ -113,16 +133,87 @@ def _give_up(problems: list[_Problem]) -> None:
                 problem.status = GIVEN_UP
 
 
-def _finished(problem: _Problem, names: tuple[str, ...], task: Task) -> Start:
+def finish(
+    trial: Trial,
+    solved: list[list[Start]],
+    evaluations: int,
+    seed: int,
+    objective: Objective = RMS,
+) -> list[Start | None]:
+    """The best start of every task, none if all failed; where no second start agrees with it, polished
+    without derivatives (`tuning.search.polish`) by so many evaluations each."""
+    best = [_ranked(own) for own in solved]
+    unsure = [i for i, own in enumerate(best) if own and not _agree(own)]
+    if unsure and evaluations > 0:
+        tops = [best[i][0] for i in unsure]
+        starts = np.stack([top.shares for top in tops])
+
+        def losses(points):
+            return trial.losses(objective, unsure, points)
+
+        shapes = np.stack([_shape(top) for top in tops])
+        found = polish(losses, starts, evaluations, reach=REACH, covariance=shapes, seed=seed)
+        before = losses(starts[:, None])[:, 0]
+        for i, top, shares, loss, old in zip(unsure, tops, found.free, found.loss, before, strict=True):
+            if loss < old:
+                gains = trial.gains(i, shares)
+                history = [*top.history, float(loss)]
+                best[i][0] = top._replace(rms=float(loss), gains=gains, shares=shares, history=history)
+    return [own[0] if own else None for own in best]
+
+
+def _ranked(starts: list[Start]) -> list[Start]:
+    return sorted((start for start in starts if np.isfinite(start.rms)), key=lambda start: start.rms)
+
+
+def _agree(ranked: list[Start]) -> bool:
+    return len(ranked) > 1 and ranked[1].rms <= (1 + AGREED) * ranked[0].rms
+
+
+def _shape(start: Start) -> np.ndarray:
+    """Inverse Hessian of least squares, its widths at most a quarter of the box."""
+    loss = (start.rms / SCALE) ** 2 / 2
+    return np.linalg.inv(start.curvature / (2 * max(loss, 1e-12)) + 16 * np.eye(len(start.shares)))
+
+
+def _finished(problem: _Problem, names: tuple[str, ...], bounds: Bounds, task: Task) -> Start:
     moved = {gain.name for gain in task.tuned}
-    found = {name: float(gain) for name, gain in zip(names, problem.gains, strict=True) if name in moved}
+    gains = to_gains(problem.shares, bounds)
+    found = {name: float(gain) for name, gain in zip(names, gains, strict=True) if name in moved}
     history = [float(value) for value in SCALE * np.sqrt(2 * np.array(problem.history))]
     status = problem.status if isinstance(problem.status, str) else STATUSES[problem.status]
-    return Start(status, len(history), history[-1], history, {**task.literature, **found})
+    own = {**task.literature, **found}
+    return Start(status, len(history), history[-1], history, own, problem.shares, problem.curvature)
+
+
+def prepare_solver(tasks: list[Task], starts: int, objective: Objective = RMS) -> None:
+    """Compile what `solve_tasks` will run, into the compile cache."""
+    names = tuned_names(tasks)
+    bounds = [gain_bounds(task, names) for task in tasks]
+    nothing = np.zeros(len(names))
+    problems = [_Problem(index, nothing, nothing) for index in range(len(tasks)) for _ in range(starts)]
+    static, call = _calls(tasks, names, bounds, objective, len(problems))
+    some = problems[: FEW if len(problems) <= FEW else MANY]
+    programs.prepare(_advance, static, call(some, 1), program_folder())
 
 
 def _stepper(tasks, names, bounds, objective, number) -> Callable[[list[_Problem], int], None]:
     """A function that takes problems up to so many steps further."""
+    static, call = _calls(tasks, names, bounds, objective, number)
+    size = FEW if number <= FEW else MANY
+
+    def advance(problems: list[_Problem], limit: int) -> None:
+        for begin in range(0, len(problems), size):
+            some = problems[begin : begin + size]
+            solution = jax.device_get(programs.run(_advance, static, call(some, limit), program_folder()))
+            for i, problem in enumerate(some):
+                _take(problem, solution, i)
+
+    return advance
+
+
+def _calls(tasks, names, bounds, objective, number):
+    """Static part and, as a function of some problems and a number of steps, arguments of the program."""
     loop = common_loop([task.loop for task in tasks])
     fixed = [{k: v for k, v in task.literature.items() if k not in names} for task in tasks]
     each = [(task.scenarios, f, b) for task, f, b in zip(tasks, fixed, bounds, strict=True)]
@@ -131,22 +222,16 @@ def _stepper(tasks, names, bounds, objective, number) -> Callable[[list[_Problem
     lanes = len(tasks[0].scenarios.velocity)
     static = (loop, names, objective), LONGEST, max(1, TILE // lanes)
 
-    def advance(problems: list[_Problem], limit: int) -> None:
-        for begin in range(0, len(problems), size):
-            some = problems[begin : begin + size]
-            index = np.array([p.task for p in some] + [some[0].task] * (size - len(some)))
-            starts = np.stack([p.gains for p in some] + [some[0].gains] * (size - len(some)))
-            scenarios, others, limits = jax.tree.map(itemgetter(index), table)
-            # Nothing runs in the lanes that only fill the call.
-            idle = np.arange(size)[:, None] >= len(some)
-            contacts = np.where(idle, 0, scenarios.contacts).astype(np.int32)
-            scenarios = scenarios._replace(contacts=contacts)
-            arguments = scenarios, others, limits, starts, np.array(limit)
-            solution = jax.device_get(programs.run(_advance, static, arguments, program_folder()))
-            for i, problem in enumerate(some):
-                _take(problem, solution, i)
+    def call(some: list[_Problem], limit: int):
+        index = np.array([p.task for p in some] + [some[0].task] * (size - len(some)))
+        starts = np.stack([p.shares for p in some] + [some[0].shares] * (size - len(some)))
+        scenarios, others, limits = jax.tree.map(itemgetter(index), table)
+        # Nothing runs in the lanes that only fill the call.
+        idle = np.arange(size)[:, None] >= len(some)
+        contacts = np.where(idle, 0, scenarios.contacts).astype(np.int32)
+        return scenarios._replace(contacts=contacts), others, limits, starts, np.array(limit)
 
-    return advance
+    return static, call
 
 
 def _take(problem: _Problem, solution: Solution, i: int) -> None:
@@ -157,7 +242,8 @@ def _take(problem: _Problem, solution: Solution, i: int) -> None:
     problem.status = int(solution.status[i])
     # A round begins anew with cautious steps; none of them is worse than where it began.
     if np.isfinite(solution.loss[i]):
-        problem.gains = np.asarray(solution.gains[i])
+        problem.shares = np.clip(np.asarray(solution.shares[i]), 0, 1)
+        problem.curvature = np.asarray(solution.curvature[i])
 
 
 def _advance(static: tuple[Any, int, int], arguments: Any) -> Solution:
@@ -165,18 +251,5 @@ def _advance(static: tuple[Any, int, int], arguments: Any) -> Solution:
     loop = what[0]
     scenarios, fixed, bounds, starts, limit = arguments
 
-    def rig(scenarios):
-        return build_rig(loop, scenarios._replace(time_limit=_patience(loop, scenarios)))
-
-    problems = Problem(jax.vmap(rig)(scenarios), fixed)
+    problems = Problem(jax.vmap(lambda scenarios: build_rig(loop, scenarios))(scenarios), fixed)
     return solve(residuals, what, problems, bounds, starts, limit, longest=longest, tile=tile)
-
-
-def _patience(loop: Loop, scenarios: Scenario) -> Array:
-    """How long [s] a contact may take in training before it has failed: some of its undelayed durations."""
-    shape = scenarios.phase.shape
-    mass = jnp.broadcast_to(scenarios.equivalent_mass, shape)
-    velocity = jnp.broadcast_to(scenarios.velocity, shape)
-    reference = loop.law.reference(parameters_by_slot(scenarios.contact), mass, velocity)
-    longest = PATIENCE * jnp.max(reference.duration, axis=0) + SHORTEST_PATIENCE
-    return jnp.minimum(longest, scenarios.time_limit)

@@ -125,7 +125,7 @@ def certify(
     points = points.reshape(scan, lot, gains)
     scanned = np.concatenate([_finite(losses(part)) for part in points])
     points = points.reshape(-1, gains)
-    starts = _apart(points[np.argsort(scanned, kind="stable")], known, basins)
+    starts = apart(points[np.argsort(scanned, kind="stable")], known, basins)
 
     used = scan * lot
     rounds = [basins >> turn for turn in range(basins.bit_length())] + [1]
@@ -266,7 +266,7 @@ def _finite(losses):
     return np.where(np.isfinite(losses), losses, WORST)
 
 
-def _apart(ranked, known, number):
+def apart(ranked, known, number):
     """The known points and the best of the `ranked` ones that lie apart, so many in all.
 
     Apart is a tenth of the box's diagonal, less where there are not enough of them.

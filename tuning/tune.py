@@ -4,33 +4,29 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from jaxhil.building import build_loop
 from jaxhil.compensators import COMPENSATORS
-from jaxhil.evaluation import Outcome, evaluate, prepare_evaluation
-from jaxhil.loop import Loop
+from jaxhil.evaluation import Outcome
 from jaxhil.mechanism import Mechanism
-from jaxhil.scenario import Scenario, build_scenarios
-from jaxhil.uncertainty import draw
+from jaxhil.scenario import Scenario
 from tuning.environment import program_folder
 from tuning.objective import RMS, Objective
-from tuning.problems import Task, alike, build_task, common_loop
-from tuning.rounds import Start, solve_tasks
+from tuning.problems import Task, alike, build_task
+from tuning.rounds import Start, choose_starts, finish, prepare_solver, solve_tasks
+from tuning.trial import Trial
 from tuning.trust import Intervals, interval
 
-# Draws of the validation come from another seed than those of training.
-VALIDATION_SEED = 0x5EED
 BLOCK = 16  # mechanisms tuned and judged together: what is done when work is interrupted is kept
 
 
 @dataclass(frozen=True)
 class Settings:
     """Numbers of scenarios to tune on, of starts, of solver steps, of scenarios to judge on; the seed; what
-    to minimise."""
+    to minimise; evaluations without derivatives where starts disagree."""
 
     scenarios: int = 32
     starts: int = 4
@@ -38,6 +34,7 @@ class Settings:
     validation: int = 511
     seed: int = 0
     objective: Objective = RMS
+    polish: int = 320
 
 
 class Figures(NamedTuple):
@@ -103,28 +100,16 @@ def _tune_block(tasks: list[Task], settings: Settings, report: Callable[[str], N
     clock = _Clock()
     name = tasks[0].mechanism.name if len(tasks) == 1 else f"{len(tasks)} mechanisms"
     compensator = tasks[0].compensator
-    trial = _Trial(tasks, settings)
+    trial = Trial(tasks, settings.validation, settings.seed)
     known = {
         "before": [neutral_gains(compensator, task.literature) for task in tasks],
         "literature": [task.literature for task in tasks],
     }
     best, starts = known["literature"], [[] for _ in tasks]
-    with ThreadPoolExecutor(1) as meanwhile:
-        if program_folder() is not None:
-            # The solver's program compiles on one core. Nothing runs beside it: programs on several devices
-            # could wait for one another for ever.
-            meanwhile.submit(trial.prepare, known["literature"])
-        if any(task.tuned for task in tasks):
-            report(f"{name}: tuning {compensator} on {settings.scenarios} scenarios each")
-            starts = solve_tasks(
-                tasks,
-                settings.starts,
-                settings.steps,
-                settings.seed,
-                settings.objective,
-                lambda text: report(f"{name}: {text}"),
-            )
-            best = [_best(own, task.literature) for own, task in zip(starts, tasks, strict=True)]
+    if any(task.tuned for task in tasks):
+        report(f"{name}: tuning {compensator} on {settings.scenarios} scenarios each")
+        starts, found = _search(trial, settings, lambda text: report(f"{name}: {text}"))
+        best = [one.gains if one else task.literature for one, task in zip(found, tasks, strict=True)]
     clock.lap("tune")
     report(f"{name}: judging on {settings.validation} fresh scenarios")
     outcomes = {key: trial.judge(gains) for key, gains in known.items()}
@@ -154,45 +139,23 @@ def _tune_block(tasks: list[Task], settings: Settings, report: Callable[[str], N
     return results
 
 
-def _best(starts: list[Start], literature: dict[str, float]) -> dict[str, float]:
-    usable = [start for start in starts if np.isfinite(start.rms)]
-    return min(usable, key=lambda start: start.rms).gains if usable else literature
-
-
-class _Trial:
-    """Fresh scenarios of like tasks, and the nominal run of each as one more lane of its own."""
-
-    def __init__(self, tasks: list[Task], settings: Settings):
-        seed = settings.seed + VALIDATION_SEED
-        self.fresh: list[Scenario] = []
-        every, loops = [], []
-        for task in tasks:
-            drawn = draw(task.mechanism, settings.validation, seed)
-            self.fresh.append(build_scenarios(task.mechanism, drawn, seed))
-            every.append(_join([self.fresh[-1], build_scenarios(task.mechanism)]))
-            loops.append(build_loop(task.mechanism, task.compensator, every[-1]))
-        self.loop: Loop = common_loop(loops)
-        self.scenarios: Scenario = _join(every)
-        self.lanes = settings.validation + 1
-
-    def prepare(self, gains: list[dict[str, float]]) -> None:
-        """Compile what `judge` will run, into the compile cache."""
-        prepare_evaluation(self.loop, self._values(gains), self.scenarios)
-
-    def judge(self, gains: list[dict[str, float]]) -> list[Outcome]:
-        """Outcome of every task under its gains, the nominal run last."""
-        outcome = evaluate(self.loop, self._values(gains), self.scenarios)
-        cuts = [slice(i * self.lanes, (i + 1) * self.lanes) for i in range(len(gains))]
-        return [jax.tree.map(lambda leaf, cut=cut: leaf[..., cut], outcome) for cut in cuts]
-
-    def _values(self, gains: list[dict[str, float]]) -> dict[str, Any]:
-        if len(gains) == 1:
-            return dict(gains[0])
-        return {name: np.repeat([one[name] for one in gains], self.lanes) for name in gains[0]}
-
-
-def _join(batches: list[Scenario]) -> Any:
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *batches)
+def _search(
+    trial: Trial, settings: Settings, report: Callable[[str], None]
+) -> tuple[list[list[Start]], list[Start | None]]:
+    """Every start of every task, and what is best for each."""
+    seed, objective = settings.seed, settings.objective
+    with ThreadPoolExecutor(1) as meanwhile:
+        # The programs compile on one core each. Only one of them runs: programs on several devices could
+        # wait for one another for ever.
+        ready = None
+        if program_folder() is not None:
+            ready = meanwhile.submit(prepare_solver, trial.tasks, settings.starts, objective)
+        chosen = choose_starts(trial, settings.starts, seed, objective)
+        if ready is not None:
+            ready.result()
+    starts = solve_tasks(trial.tasks, chosen, settings.steps, objective, report)
+    report("searching without derivatives where starts disagree")
+    return starts, finish(trial, starts, settings.polish, seed, objective)
 
 
 def figures(outcome: Outcome) -> Figures:

@@ -190,11 +190,15 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) ->
         "figures": result.figures,
         "nominal": result.nominal,
         "tuned_intervals": _intervals(result),
-        "starts": result.starts,
+        "starts": [_start(start) for start in result.starts],
         "timings": result.timings,
         "better_than_literature": is_better(result.figures["tuned"], result.figures["literature"]),
         "verdict": "good" if good else "bad",
     }
+
+
+def _start(start) -> dict[str, Any]:
+    return {name: value for name, value in start._asdict().items() if name not in ("shares", "curvature")}
 
 
 def _prepare_drawing(mechanism, compensator: str) -> None:

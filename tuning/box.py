@@ -1,0 +1,43 @@
+"""Gains as points of the unit box: shares of each gain's range, on its own linear or logarithmic scale."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+class Bounds(NamedTuple):
+    """Of each gain: lower and upper bound, and whether its scale is logarithmic (1) or not (0)."""
+
+    lower: Float[Array | np.ndarray, "*problems gains"]
+    upper: Float[Array | np.ndarray, "*problems gains"]
+    logarithmic: Float[Array | np.ndarray, "*problems gains"]
+
+
+def to_gains(shares: Float[Any, "*points gains"], bounds: Bounds) -> Float[Any, "*points gains"]:
+    """Gains at `shares` of their ranges; NumPy in, NumPy out. A share outside [0, 1] counts as the nearest
+    one inside, with the derivative of one inside."""
+    xp = jnp if isinstance(shares, jax.Array) else np
+    inside = xp.clip(shares, 0, 1)
+    if xp is jnp:
+        inside = shares + jax.lax.stop_gradient(inside - shares)
+    curved = bounds.logarithmic > 0
+    straight = bounds.lower + (bounds.upper - bounds.lower) * inside
+    low, high = (xp.log(xp.where(curved, bound, 1)) for bound in (bounds.lower, bounds.upper))
+    return xp.where(curved, xp.exp(xp.where(curved, low + (high - low) * inside, 0)), straight)
+
+
+def to_shares(
+    gains: Float[np.ndarray, "*points gains"], bounds: Bounds
+) -> Float[np.ndarray, "*points gains"]:
+    """Inverse of `to_gains`; of a gain beyond its bounds the nearest bound's, 0 where both bounds are one."""
+    lower, upper = np.asarray(bounds.lower), np.asarray(bounds.upper)
+    curved = (np.asarray(bounds.logarithmic) > 0) & (upper > lower)
+    span = np.where(upper > lower, upper - lower, 1)
+    share = (gains - lower) / span
+    low, high = np.log(np.where(curved, lower, 1)), np.log(np.where(curved, upper, 2))
+    positive = np.where(curved, np.maximum(gains, lower), 1)
+    share = np.where(curved, (np.log(positive) - low) / (high - low), share)
+    return np.clip(np.where(upper > lower, share, 0), 0, 1)

@@ -1,0 +1,126 @@
+"""Trying out gains without derivatives: on fresh scenarios to judge them, on training scenarios to search.
+
+Both go through one compiled program, that of `jaxhil.evaluation`, with as many lanes at every call.
+"""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxhil.building import build_loop
+from jaxhil.compensators.base import Constants
+from jaxhil.evaluation import Outcome, evaluate, prepare_evaluation
+from jaxhil.loop import Loop
+from jaxhil.scenario import Scenario, build_scenarios
+from jaxhil.uncertainty import draw
+from tuning.box import Bounds, to_gains
+from tuning.objective import Objective, contact_terms, objective_value
+from tuning.problems import Task, common_loop, gain_bounds, tuned_names
+
+# Draws of the validation come from another seed than those of training.
+VALIDATION_SEED = 0x5EED
+
+
+class Trial:
+    """Like tasks with fresh scenarios, and the nominal run of each as one more lane of its own.
+
+    fresh: (tasks) scenarios of each; names, bounds: of the gains that are tuned for any of the tasks.
+    """
+
+    def __init__(self, tasks: list[Task], validation: int, seed: int):
+        seed = seed + VALIDATION_SEED
+        self.tasks = tasks
+        self.fresh: list[Scenario] = []
+        every, loops = [], [task.loop for task in tasks]
+        for task in tasks:
+            drawn = draw(task.mechanism, validation, seed)
+            self.fresh.append(build_scenarios(task.mechanism, drawn, seed))
+            every.append(_join([self.fresh[-1], build_scenarios(task.mechanism)]))
+            loops.append(build_loop(task.mechanism, task.compensator, every[-1]))
+        self.loop: Loop = common_loop(loops)
+        self.names = tuned_names(tasks)
+        self.bounds: list[Bounds] = [gain_bounds(task, self.names) for task in tasks]
+        self._scenarios: Scenario = _join(every)
+        self._training: Any = jax.tree.map(
+            lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]),
+            *[task.scenarios for task in tasks],
+        )
+        self._each = validation + 1
+        self._lanes = self._each * len(tasks)
+
+    def prepare(self) -> None:
+        """Compile what all the rest will run, into the compile cache."""
+        prepare_evaluation(self.loop, self._values([t.literature for t in self.tasks]), self._scenarios)
+
+    def judge(self, gains: list[dict[str, float]]) -> list[Outcome]:
+        """Outcome on the fresh scenarios of every task under its gains, the nominal run last."""
+        outcome = evaluate(self.loop, self._values(gains), self._scenarios)
+        cuts = [slice(i * self._each, (i + 1) * self._each) for i in range(len(gains))]
+        return [jax.tree.map(lambda leaf, cut=cut: leaf[..., cut], outcome) for cut in cuts]
+
+    def losses(
+        self,
+        objective: Objective,
+        which: list[int],
+        shares: Float[np.ndarray, "which points gains"],
+        scenarios: int | None = None,
+    ) -> Float[np.ndarray, "which points"]:
+        """`objective_value` of points of the unit box on the training scenarios of the tasks `which`, or on
+        the first so many `scenarios` of each."""
+        number = self._training.velocity.shape[-1]
+        number = min(scenarios or number, number)
+        points = shares.shape[1]
+        pairs = [(i, point) for i in range(len(which)) for point in range(points)]
+        found = np.empty((len(which), points))
+        at_once = max(1, self._lanes // number)
+        for begin in range(0, len(pairs), at_once):
+            some = pairs[begin : begin + at_once]
+            outcome, amplification = self._run(objective, which, shares, some, number)
+            # (slots, pairs, scenarios)
+            error, excess = (
+                np.asarray(term).reshape(-1, len(some), number) for term in contact_terms(outcome)
+            )
+            wanted = outcome.wanted.reshape(error.shape)
+            for k, (i, point) in enumerate(some):
+                asked = wanted[:, k]
+                found[i, point] = objective_value(
+                    objective, error[:, k][asked], excess[:, k][asked], amplification[k]
+                )
+        return found
+
+    def _run(self, objective, which, shares, some, number) -> tuple[Outcome, np.ndarray]:
+        index = np.array([which[i] for i, _ in some])
+        rows = [self._row(which[i], shares[i, point]) for i, point in some]
+        values = {name: np.repeat([row[name] for row in rows], number) for name in rows[0]}
+
+        def side_by_side(leaf):
+            picked = np.moveaxis(leaf[index][..., :number], 0, -2)
+            return picked.reshape(*picked.shape[:-2], picked.shape[-2] * picked.shape[-1])
+
+        scenarios = jax.tree.map(side_by_side, self._training)
+        outcome = evaluate(self.loop, values, scenarios, at_least=self._lanes)
+        if objective.noise_weight == 0:
+            return outcome, np.ones(len(some))
+        first = slice(None, None, number)
+        constants = Constants(scenarios.control_period[first], scenarios.clearance[first])
+        own: Any = {name: value[first] for name, value in values.items()}
+        return outcome, np.asarray(self.loop.compensator.noise_amplification(own, constants))
+
+    def _row(self, task: int, shares: np.ndarray) -> dict[str, float]:
+        gains = to_gains(shares, self.bounds[task])
+        moved = {gain.name for gain in self.tasks[task].tuned}
+        found = zip(self.names, gains, strict=True)
+        return {**self.tasks[task].literature, **{n: float(g) for n, g in found if n in moved}}
+
+    def gains(self, task: int, shares: Float[np.ndarray, "gains"]) -> dict[str, float]:
+        """All of the compensator's gains at a point of the unit box."""
+        return self._row(task, shares)
+
+    def _values(self, gains: list[dict[str, float]]) -> dict[str, Any]:
+        return {name: np.repeat([one[name] for one in gains], self._each) for name in gains[0]}
+
+
+def _join(batches: list[Scenario]) -> Any:
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *batches)
