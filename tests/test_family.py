@@ -4,6 +4,8 @@ import math
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import numpy as np
@@ -23,28 +25,26 @@ def members():
     return family()
 
 
-def undelayed(members, damped: bool) -> Reference:
-    """The nominal contacts in space, by the package's own reference, in the order of the members."""
-    number = len(members)
-    found = Reference(*(np.empty(number) for _ in Reference._fields))
+def undelayed(members, damped: bool) -> Any:
+    """`Reference` of the nominal contacts in space, by the package's own, in the order of the members."""
+    found = {name: np.empty(len(members)) for name in Reference._fields}
     for name in LAWS:
         own = [i for i, m in enumerate(members) if m.contact.law == name]
         contacts = [members[i].contact for i in own]
-        parameters = ContactParameters(
+        parameters: dict[str, Any] = {
             # Segments and depths come first.
-            stiffness=np.moveaxis(np.array([c.stiffness[0] for c in contacts]), 0, -1),
-            damping=np.array([c.damping[0] if damped else 0.0 for c in contacts]),
-            exponent=np.array([c.exponent for c in contacts]),
-            depths=np.moveaxis(np.array([c.depths for c in contacts]), 0, -1),
-            tension=np.zeros(len(own), bool),
-        )
+            "stiffness": np.moveaxis(np.array([c.stiffness[0] for c in contacts]), 0, -1),
+            "damping": np.array([c.damping[0] if damped else 0.0 for c in contacts]),
+            "exponent": np.array([c.exponent for c in contacts]),
+            "depths": np.moveaxis(np.array([c.depths for c in contacts]), 0, -1),
+            "tension": np.zeros(len(own), bool),
+        }
         mass = np.array([members[i].bodies.mass for i in own])
         velocity = np.array([members[i].approach.velocity for i in own])
-        law = CONTACT_LAWS[name]()
-        reference = jax.jit(law.reference, compiler_options=QUICK)(parameters, mass, velocity)
-        for field, values in zip(found, reference, strict=True):
-            field[own] = values
-    return found
+        reference = jax.jit(CONTACT_LAWS[name]().reference, compiler_options=QUICK)
+        for field, values in reference(ContactParameters(**parameters), mass, velocity)._asdict().items():
+            found[field][own] = values
+    return SimpleNamespace(**found)
 
 
 def test_written_files_load_and_are_the_family(tmp_path, members):
