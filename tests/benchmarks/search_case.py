@@ -31,7 +31,7 @@ from tuning.rounds import _patience as patience
 COMPENSATOR = "response_error"
 SCENARIOS = 128
 SEED = 0  # of the scenarios
-CAPACITY = 256  # points of one call, at most
+CAPACITY = 256  # points of one call of the program
 SIDE_BY_SIDE = 128  # lanes that a device computes at once where there are many points
 
 
@@ -52,8 +52,11 @@ class Case:
         return self.task.mechanism.name
 
     def losses(self, points: Float[np.ndarray, "points gains"]) -> Float[np.ndarray, "points"]:
-        """Loss of every point; at most `CAPACITY` points."""
+        """Loss of every point."""
         number = len(points)
+        if number > CAPACITY:
+            rest = self.losses(points[CAPACITY:])
+            return np.concatenate([self.losses(points[:CAPACITY]), rest])
         # One point alone gets a program of its own, in which nothing is computed beside it.
         together = 1 if number == 1 else max(1, SIDE_BY_SIDE * _devices() // SCENARIOS)
         capacity = 1 if number == 1 else CAPACITY

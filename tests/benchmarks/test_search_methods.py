@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from family import family
 from lanes import QUICK
-from search_case import Case, build_cases, several
+from search_case import CAPACITY, Case, build_cases, several
 from search_methods import OTHERS, Recorder, TimeIsUp, Trace, record
 from search_ours import ours, warm_up
 from search_table import Results, judge, medians, ratios, table
@@ -93,6 +93,8 @@ def test_every_program_has_the_loss_of_tuning(cases):
         rows = jax.jit(residuals, static_argnums=0, compiler_options=QUICK)(static, gains, problems)
         np.testing.assert_allclose(together, np.sum(np.asarray(rows) ** 2, axis=1) / 2, rtol=1e-9)
         np.testing.assert_allclose(case.shares_of(gains), points, atol=1e-12)
+        many = np.resize(points, (CAPACITY + 3, points.shape[1]))
+        np.testing.assert_allclose(case.losses(many), np.resize(together, len(many)), rtol=1e-9)
 
 
 def bowl(points):
