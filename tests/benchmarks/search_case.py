@@ -1,0 +1,195 @@
+"""What every method of the comparison is given: a mechanism to tune and one compiled loss, whoever calls it.
+
+A point is a vector of shares, in [0, 1], of each tuned gain's range on its own scale; its loss is half the
+sum of squares of `tuning.objective.residuals` over all scenarios. The scenarios, not the points, are dealt
+out to the devices: one point alone keeps all of them busy, and so does a generation of any size.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float
+
+from jaxhil.evaluation import expected_duration
+from jaxhil.loop import Loop, Rig, build_rig
+from jaxhil.mechanism import Mechanism
+from jaxhil.scenario import Scenario
+from tuning.objective import RMS, Problem, residuals
+from tuning.optimiser import Bounds
+from tuning.problems import Task, alike, build_task, common_loop, gain_bounds, spread_starts, tuned_names
+
+# How long a contact may take is part of the loss: the same for all as in tuning.
+from tuning.rounds import _patience as patience
+
+COMPENSATOR = "response_error"
+SCENARIOS = 128
+SEED = 0  # of the scenarios
+CAPACITY = 256  # points of one call of the program
+SIDE_BY_SIDE = 128  # lanes that a device computes at once where there are many points
+
+
+@dataclass(frozen=True)
+class Case:
+    """A task, the loop it shares with its like, names and bounds of the gains tuned for it; on the devices
+    its rig, dealt out to them, with the gains that stay as they are, and the bounds once more."""
+
+    task: Task
+    loop: Loop
+    names: tuple[str, ...]
+    bounds: Bounds
+    problem: Problem
+    placed_bounds: Bounds
+
+    @property
+    def name(self) -> str:
+        return self.task.mechanism.name
+
+    def losses(self, points: Float[np.ndarray, "points gains"]) -> Float[np.ndarray, "points"]:
+        """Loss of every point."""
+        number = len(points)
+        if number > CAPACITY:
+            rest = self.losses(points[CAPACITY:])
+            return np.concatenate([self.losses(points[:CAPACITY]), rest])
+        # One point alone gets a program of its own, in which nothing is computed beside it.
+        together = 1 if number == 1 else max(1, SIDE_BY_SIDE * _devices() // SCENARIOS)
+        capacity = 1 if number == 1 else CAPACITY
+        padded = np.concatenate([points, np.broadcast_to(points[-1:], (capacity - number, len(self.names)))])
+        static = self.loop, self.names, together
+        parts = _losses(static, padded, np.array(number, np.int32), self.problem, self.placed_bounds)
+        # Every device had as many contacts: the mean over all is the mean of theirs.
+        return np.mean(np.asarray(parts), axis=0)[:number]
+
+    def warm_up(self) -> None:
+        """Compile what `losses` runs for one point and for several."""
+        for number in (1, 2):
+            self.losses(np.full((number, len(self.names)), 0.5))
+
+    def starts(self, number: int, seed: int) -> Float[np.ndarray, "starts gains"]:
+        """Where tuning would start from: the literature's gains, then points around them and anywhere."""
+        first = np.array([self.task.literature[name] for name in self.names])
+        return self.shares_of(spread_starts(first, self.bounds, number, seed))
+
+    def gains_of(self, shares: Float[np.ndarray, "*points gains"]) -> Float[np.ndarray, "*points gains"]:
+        """Gains in their own units."""
+        return to_gains(shares, self.bounds)
+
+    def shares_of(self, gains: Float[np.ndarray, "*points gains"]) -> Float[np.ndarray, "*points gains"]:
+        """Inverse of `gains_of`, inside the box."""
+        low, high, logarithmic = _scale(self.bounds)
+        values = np.where(logarithmic, np.log(np.where(logarithmic, gains, 1)), gains)
+        return np.clip((values - low) / (high - low), 0, 1)
+
+
+def build_cases(mechanisms: Sequence[Mechanism]) -> list[Case]:
+    """The cases of the mechanisms; like ones that tune the same gains share their programs."""
+    tasks = [build_task(mechanism, COMPENSATOR, SCENARIOS, SEED) for mechanism in mechanisms]
+    cases: dict[int, Case] = {}
+    for group in alike([task.loop for task in tasks], [task.scenarios for task in tasks]):
+        loop = common_loop([tasks[i].loop for i in group])
+        for i in group:
+            cases[i] = _build_case(tasks[i], loop)
+    return [cases[i] for i in range(len(tasks))]
+
+
+def to_gains(shares: Any, bounds: Bounds) -> Any:
+    """Gains (*points, gains) at shares of their ranges; of NumPy's arrays or JAX's."""
+    numpy = jnp if isinstance(shares, jax.Array) else np
+    low, high, logarithmic = _scale(bounds)
+    values = low + (high - low) * shares
+    return numpy.where(logarithmic, numpy.exp(numpy.where(logarithmic, values, 0)), values)
+
+
+def several(tree: Any, number: int) -> Any:
+    """A leading axis of so many of the same, as NumPy arrays."""
+    return jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), (number, *leaf.shape)), tree)
+
+
+def over_scenarios(function: Callable[..., Array], problem: Problem, *arguments: Any) -> Array:
+    """`function(problem, *arguments)` on every device with its share of the scenarios; (devices, ...)."""
+    everywhere = PartitionSpec()
+    lanes_last = Problem(
+        jax.tree.map(_lanes_last, problem.rig), jax.tree.map(lambda leaf: everywhere, problem.fixed)
+    )
+    return jax.shard_map(
+        lambda *given: function(*given)[None],
+        mesh=_mesh(),
+        in_specs=(lanes_last, *[everywhere] * len(arguments)),
+        out_specs=PartitionSpec("device"),
+        check_vma=False,
+    )(problem, *arguments)
+
+
+def _build_case(task: Task, loop: Loop) -> Case:
+    if np.ptp(task.scenarios.contacts) > 0:
+        raise ValueError(f"{task.mechanism.name}: scenarios of different numbers of contacts")
+    names = tuned_names([task])
+    rig = jax.jit(_build_rig, static_argnums=0)(loop, _dealt(task.scenarios))
+    fixed: Any = {name: np.asarray(value) for name, value in task.literature.items() if name not in names}
+    mesh = _mesh()
+    lanes_last = jax.tree.map(lambda leaf: NamedSharding(mesh, _lanes_last(leaf)), rig)
+    rig = jax.device_put(rig, lanes_last)
+    bounds = gain_bounds(task, names)
+    fixed, placed_bounds = jax.device_put((fixed, bounds), NamedSharding(mesh, PartitionSpec()))
+    return Case(task, loop, names, bounds, Problem(rig, fixed), placed_bounds)
+
+
+def _build_rig(loop: Loop, scenarios: Scenario) -> Rig:
+    return build_rig(loop, scenarios._replace(time_limit=patience(loop, scenarios)))
+
+
+def _dealt(scenarios: Scenario) -> Scenario:
+    """Scenarios ordered so that every device has its share of long ones."""
+    order = np.argsort(expected_duration(scenarios), kind="stable")
+    order = np.concatenate([order[device :: _devices()] for device in range(_devices())])
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[..., order], scenarios)
+
+
+@partial(jax.jit, static_argnums=0)
+def _losses(static, points, number, problem, bounds) -> Float[Array, "devices points"]:
+    """The mean over the scenarios of each device, for the first `number` of the points."""
+    loop, names, together = static
+
+    def one_device(problem, points, number, bounds):
+        copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (together, *leaf.shape)), problem)
+
+        def some(i, found):
+            shares = jax.lax.dynamic_slice_in_dim(points, i * together, together)
+            rows = residuals((loop, names, RMS), jax.vmap(to_gains, (0, None))(shares, bounds), copies)
+            losses = jnp.sum(rows**2, axis=1) / 2
+            return jax.lax.dynamic_update_slice_in_dim(found, losses, i * together, 0)
+
+        found = jnp.zeros(len(points), points.dtype)
+        return jax.lax.fori_loop(0, (number + together - 1) // together, some, found)
+
+    return over_scenarios(one_device, problem, points, number, bounds)
+
+
+def _scale(bounds: Bounds) -> Any:
+    """Low and high end of each gain on its own scale, and whether that is logarithmic."""
+    numpy = jnp if isinstance(bounds.lower, jax.Array) else np
+    logarithmic = bounds.logarithmic > 0
+
+    def scaled(end):
+        return numpy.where(logarithmic, numpy.log(numpy.where(logarithmic, end, 1)), end)
+
+    return scaled(bounds.lower), scaled(bounds.upper), logarithmic
+
+
+def _lanes_last(leaf) -> PartitionSpec:
+    return PartitionSpec(*[None] * (leaf.ndim - 1), "device")
+
+
+def _devices() -> int:
+    return math.gcd(jax.device_count(), SCENARIOS)
+
+
+def _mesh() -> Mesh:
+    devices = jax.devices()[: _devices()]
+    return jax.make_mesh((len(devices),), ("device",), axis_types=(AxisType.Auto,), devices=devices)

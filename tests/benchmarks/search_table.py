@@ -1,0 +1,90 @@
+"""What the traces of several methods say: how often, after how many rollouts and how long a method succeeds.
+
+A start succeeds when it comes within `CLOSE` of the best loss that any method reaches from any start of the
+mechanism. With the share p of starts that do, and the median cost c at which they first did, a user who
+starts anew until it succeeds expects to pay c/p.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from search_methods import Trace
+
+CLOSE = 0.01
+
+
+class Success(NamedTuple):
+    """Share of starts that succeed; rollouts and seconds to be expected until one does, inf if none did; over
+    the starts, the best and the median loss at the end, as a multiple of the best of all; rollouts and
+    seconds spent on a start."""
+
+    share: float
+    rollouts: float
+    seconds: float
+    best: float
+    median: float
+    rollouts_done: float
+    seconds_done: float
+
+
+Results = Mapping[str, Success]
+
+
+def judge(traces: Mapping[str, Sequence[Trace]]) -> tuple[float, dict[str, Success]]:
+    """The best loss of all, and the success of every method on one mechanism."""
+    best = min(float(np.min(trace.loss)) for several in traces.values() for trace in several)
+    return best, {name: _success(several, best) for name, several in traces.items()}
+
+
+def medians(results: Sequence[Results]) -> dict[str, Success]:
+    """Over mechanisms, of every method."""
+    return {name: Success(*np.median([one[name] for one in results], axis=0).tolist()) for name in results[0]}
+
+
+def ratios(ours: Success, others: Sequence[Success]) -> tuple[float, float]:
+    """Expected rollouts and seconds of ours over the best of the others; inf where ours never succeeds."""
+
+    def ratio(field: str) -> float:
+        own, best = getattr(ours, field), min(getattr(other, field) for other in others)
+        return own / best if np.isfinite(own) else np.inf
+
+    return ratio("rollouts"), ratio("seconds")
+
+
+def table(results: Results) -> str:
+    """One line per method: `Success`, with the losses as what they exceed the best by."""
+    lines = [
+        f"{'':24}{'starts that':>12}  {'to be expected':>19}  {'loss above best':>17}"
+        f"  {'spent on a start':>19}",
+        f"{'':24}{'succeed':>12}  {'rollouts':>9} {'seconds':>9}  {'least':>8} {'median':>8}"
+        f"  {'rollouts':>9} {'seconds':>9}",
+    ]
+    for name, own in results.items():
+        lines.append(
+            f"{name:24}{own.share:>12.0%}  {own.rollouts:>9.0f} {own.seconds:>9.2f}"
+            f"  {own.best - 1:>8.1%} {own.median - 1:>8.1%}"
+            f"  {own.rollouts_done:>9.0f} {own.seconds_done:>9.2f}"
+        )
+    return "\n".join(lines)
+
+
+def _success(traces: Sequence[Trace], best: float) -> Success:
+    ends = np.array([trace.loss[-1] for trace in traces]) / best
+    # Losses fall: the first entry that is close enough.
+    first = [int(np.argmax(trace.loss <= (1 + CLOSE) * best)) for trace in traces]
+    there = [(trace, i) for trace, i, end in zip(traces, first, ends, strict=True) if end <= 1 + CLOSE]
+    share = len(there) / len(traces)
+
+    def expected(field: str) -> float:
+        return float(np.median([getattr(trace, field)[i] for trace, i in there])) / share if there else np.inf
+
+    return Success(
+        share=share,
+        rollouts=expected("rollouts"),
+        seconds=expected("seconds"),
+        best=float(np.min(ends)),
+        median=float(np.median(ends)),
+        rollouts_done=float(np.median([trace.rollouts[-1] for trace in traces])),
+        seconds_done=float(np.median([trace.seconds[-1] for trace in traces])),
+    )

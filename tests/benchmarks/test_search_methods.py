@@ -1,0 +1,148 @@
+"""Our tuning beside what users would pick, on the same loss with the same time for each start.
+
+Every method tunes the same mechanisms of the family from the same starts; what counts is how often a start
+ends within 1 % of the best that any of them finds, and after how many rollouts and how long. Compilation is
+outside of all times. Run with `pytest -m benchmark -s tests/benchmarks/test_search_methods.py`, for a few
+mechanisms with `-k "03 or 48 or bar"`.
+"""
+
+import os
+
+import jax
+import numpy as np
+import pytest
+from family import family
+from lanes import QUICK
+from search_case import CAPACITY, Case, build_cases, several
+from search_methods import OTHERS, Recorder, TimeIsUp, Trace, record
+from search_ours import ours, warm_up
+from search_table import Results, judge, medians, ratios, table
+
+from tuning.objective import RMS, SCALE, residuals
+
+pytestmark = pytest.mark.benchmark
+
+# Contact from 1.4 to 6.2 Hz, every law, simulators fast and slow, one undamped (19).
+MEMBERS = 3, 8, 9, 18, 19, 20, 37, 48
+STARTS = 8
+SEED = 0  # of the starts
+BUDGET = 1.0  # time of a start of the others, over ours
+SHARE, COST = 0.9, 0.5  # the bar: starts that succeed; rollouts and seconds over the best of the others
+
+NAMES = [mechanism.name for i, mechanism in enumerate(family()) if i in MEMBERS]
+
+
+@pytest.fixture(scope="module")
+def cases() -> dict[str, Case]:
+    # All of them whatever runs, so that a mechanism's program does not depend on which others are compared.
+    every = family()
+    return {case.name: case for case in build_cases([every[i] for i in MEMBERS])}
+
+
+@pytest.fixture(scope="module")
+def compared() -> dict[str, Results]:
+    return {}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_methods_on(name, cases, compared, capsys):
+    case = cases[name]
+    starts = case.starts(STARTS, SEED)
+    case.warm_up()
+    warm_up(case, starts)
+    traces = {"ours": ours(case, starts)} | {method: [] for method in OTHERS}
+    seconds = BUDGET * traces["ours"][0].seconds[-1]
+    for seed, start in enumerate(starts):
+        # In turn: what else the machine does meets all of them.
+        for method, function in OTHERS.items():
+            traces[method].append(record(function, case.losses, start, seed, seconds))
+    best, compared[name] = judge(traces)
+    with capsys.disabled():
+        print(
+            f"\n\n{name}: {len(case.names)} gains, {STARTS} starts, {seconds:.2f} s for each;"
+            f" best rms error {SCALE * np.sqrt(2 * best):.3g}; {os.getloadavg()[0]:.1f} processes on"
+            f" {os.cpu_count()} cores\n{table(compared[name])}"
+        )
+
+
+def test_bar(compared, capsys):
+    if not compared:
+        pytest.skip("no mechanism has been compared")
+    middle = medians(list(compared.values()))
+    share = float(np.mean([one["ours"].share for one in compared.values()]))
+    rollouts, seconds = ratios(middle["ours"], [middle[method] for method in OTHERS])
+    with capsys.disabled():
+        print(
+            f"\n\nmedians over {len(compared)} mechanisms\n{table(middle)}\n"
+            f"ours succeeds from {share:.0%} of its starts (bar: {SHARE:.0%}), with {rollouts:.2f} of the"
+            f" rollouts and {seconds:.2f} of the seconds of the best of the others (bar: {COST})"
+        )
+    assert share >= SHARE
+    assert rollouts <= COST
+    assert seconds <= COST
+
+
+def test_every_program_has_the_loss_of_tuning(cases):
+    # One of each program is enough.
+    for case in {(case.loop, case.names): case for case in cases.values()}.values():
+        points = case.starts(5, 1)
+        together = case.losses(points)
+        np.testing.assert_allclose([case.losses(point[None])[0] for point in points], together, rtol=1e-9)
+        gains, static = case.gains_of(points), (case.loop, case.names, RMS)
+        problems = several(case.problem, len(points))
+        rows = jax.jit(residuals, static_argnums=0, compiler_options=QUICK)(static, gains, problems)
+        np.testing.assert_allclose(together, np.sum(np.asarray(rows) ** 2, axis=1) / 2, rtol=1e-9)
+        np.testing.assert_allclose(case.shares_of(gains), points, atol=1e-12)
+        many = np.resize(points, (CAPACITY + 3, points.shape[1]))
+        np.testing.assert_allclose(case.losses(many), np.resize(together, len(many)), rtol=1e-9)
+
+
+def bowl(points):
+    """1 at its lowest, a share of 0.3 of every gain's range."""
+    assert (points >= 0).all() and (points <= 1).all()
+    return 1 + np.sum((points - 0.3) ** 2, axis=-1)
+
+
+@pytest.mark.parametrize("method", OTHERS)
+def test_every_method_finds_the_bottom_of_a_bowl_and_goes_on_from_its_start(method):
+    start = np.full(4, 0.31)
+    trace = record(OTHERS[method], bowl, start, 0, 0.5)
+    assert trace.loss[0] <= bowl(start) + (0.35 if method == "Nelder-Mead" else 0)
+    assert trace.loss[-1] < 1.0005
+    assert (np.diff(trace.loss) <= 0).all() and (np.diff(trace.seconds) > 0).all()
+    assert (np.diff(trace.rollouts) >= 1).all()
+    # A call begun in time counts, and none after it.
+    assert trace.seconds[-2] < 0.5 and trace.seconds[-1] > 0.4
+
+
+def test_a_recorder_counts_and_ends():
+    recorder = Recorder(bowl, 1e3)
+    recorder(np.full((3, 2), 0.5))
+    recorder(np.array([[0.3, 0.3]]))
+    recorder(np.full((4, 2), 0.9))
+    trace = recorder.trace
+    np.testing.assert_array_equal(trace.rollouts, [3, 4, 8])
+    np.testing.assert_allclose(trace.loss, [1.08, 1, 1])
+    with pytest.raises(TimeIsUp):
+        Recorder(bowl, 0.0)(np.full((1, 2), 0.5))
+
+
+def test_expected_cost_is_the_median_over_the_share():
+    def trace(*losses):
+        calls = np.arange(1, 1 + len(losses))
+        return Trace(10.0 * calls, 0.5 * calls, np.array(losses))
+
+    best, found = judge(
+        {
+            "ours": [trace(5, 2.01, 2), trace(2.02, 2.02, 2.02), trace(9, 9, 9), trace(3, 2.03, 2.021)],
+            "theirs": [trace(3, 3)],
+        }
+    )
+    assert best == 2
+    # Within 1 % after 20 rollouts, after 10; two never.
+    assert found["ours"].share == 0.5
+    assert found["ours"].rollouts == 30 and found["ours"].seconds == 1.5
+    assert found["theirs"].share == 0 and found["theirs"].rollouts == np.inf
+    assert found["theirs"].best == found["theirs"].median == 1.5
+    assert ratios(found["ours"], [found["theirs"]]) == (0, 0)
+    assert ratios(found["theirs"], [found["ours"]]) == (np.inf, np.inf)
