@@ -37,6 +37,7 @@ ACCURACY = {
 }
 # Corners of layers, and the panel in which a contact is over, are not split.
 WORK_ACCURACY = {
+    "layers": 1e-4,
     "damped layers": 1e-4,
     "rattling against layers": 1e-4,
     "rattling, the next touch at once": 3e-4,

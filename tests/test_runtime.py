@@ -52,7 +52,8 @@ def by_matrices(document: dict[str, Any], ticks: list[Reading]) -> tuple[np.ndar
     """F_c and theta per tick of the response-error law, written with whole signals and matrices.
 
     Lead and velocity are state-space models discretised by the bilinear transform; the delay is an
-    interpolation of the whole record; the identification is textbook recursive least squares.
+    interpolation of the whole record, the contact's share of each period a length on the polygon;
+    the identification is textbook recursive least squares, weighted, with its covariance bounded.
     """
     gain = {name: entry["value"] for name, entry in document["gains"].items()}
     period = document["control_period"]
@@ -79,20 +80,47 @@ def by_matrices(document: dict[str, Any], ticks: list[Reading]) -> tuple[np.ndar
     )
     measured_velocity, aligned_velocity = differentiate(measured), differentiate(aligned)
     depth = np.where(aligned > 0, aligned, np.where(aligned < -clearance, aligned + clearance, 0.0))
+    start = aligned[0] - period * velocity[0]
+    contact = triangle(measure(aligned, start, 0.0, np.inf) + measure(aligned, start, -np.inf, -clearance))
+    size = np.abs(force)
+    weight = contact * triangle(measure(size, 0.0, gain["contact_threshold"], np.inf))
 
     theta = np.array([gain["initial_stiffness"], gain["initial_damping"]])
-    covariance = np.diag([gain["stiffness_covariance"], gain["damping_covariance"]])
+    initial = gain["stiffness_covariance"], gain["damping_covariance"]
+    covariance = np.diag(initial)
     history = np.empty((count, 2))
     for n in range(count):
-        if depth[n] != 0.0 and abs(force[n]) > gain["contact_threshold"]:
-            phi = np.array([depth[n], aligned_velocity[n]])
-            column = covariance @ phi / (gain["forgetting"] + phi @ covariance @ phi)
-            theta = theta + column * (force[n] - phi @ theta)
-            covariance = (covariance - np.outer(column, phi @ covariance)) / gain["forgetting"]
+        phi = np.array([depth[n], aligned_velocity[n]])
+        kept = 1.0 - weight[n] * (1.0 - gain["forgetting"])
+        column = weight[n] * covariance @ phi / (kept + weight[n] * phi @ covariance @ phi)
+        theta = theta + column * (force[n] - phi @ theta)
+        covariance = bounded((covariance - np.outer(column, phi @ covariance)) / kept, initial)
         history[n] = theta
     response = gain["response_error"] * history[:, 0] * (desired - measured)
     response += gain["response_error_damping"] * history[:, 1] * (velocity - measured_velocity)
-    return led + np.where(depth != 0.0, response, 0.0), history
+    return led + contact * response, history
+
+
+def bounded(covariance: np.ndarray, most: tuple[float, float]) -> np.ndarray:
+    """The covariance with d_1 = P_11 - P_12^2/P_22 and d_2 = P_22 at most their initial values."""
+    factor = np.array([[1.0, covariance[0, 1] / covariance[1, 1]], [0.0, 1.0]])
+    d_1 = covariance[0, 0] - factor[0, 1] * covariance[0, 1]
+    return factor @ np.diag([min(d_1, most[0]), min(covariance[1, 1], most[1])]) @ factor.T
+
+
+def measure(signal: np.ndarray, start: float, low: float, high: float) -> np.ndarray:
+    """The share of each period that the polygon through `start` and the signal lies in (low, high)."""
+    ends = np.stack([np.concatenate([[start], signal[:-1]]), signal])
+    bottom, top = ends.min(axis=0), ends.max(axis=0)
+    inside = np.maximum(np.minimum(top, high) - np.maximum(bottom, low), 0.0)
+    still = (signal > low) & (signal < high)
+    return np.divide(inside, top - bottom, out=still.astype(float), where=top > bottom)
+
+
+def triangle(share: np.ndarray) -> np.ndarray:
+    """Two periods' triangle over the time beyond a threshold, of which each period has a share."""
+    before = np.concatenate([[0.0], share[:-1]])
+    return (share**2 + before**2) / 2 + share * before * (2 - share - before)
 
 
 def bilinear(
@@ -164,15 +192,24 @@ def test_every_law_commands_the_position_itself(name):
     assert controller.position_command(0.25, 3.0, -7.0) == 0.25
 
 
-def test_response_term_stops_where_the_aligned_position_leaves_contact():
-    document = gain_document(identification_delay=0.0, initial_stiffness=1e5)
-    lead = Controller.from_dict(gain_document("phase_lead"))
-    controller = Controller.from_dict(document)
-    # No force, so nothing is identified: only the side of the surface decides.
+def test_response_term_acts_where_the_aligned_position_is_in_contact():
+    controller = Controller.from_dict(gain_document(identification_delay=0.0, initial_stiffness=1e5))
+    # No force, so nothing is identified: only the side of the surface decides, and for how long.
     for measured, stiffness in [(-1e-4, 0.0), (1e-4, 9e4), (-1e-9, 0.0), (0.0, 0.0), (1e-9, 9e4)]:
         controller.reset()
-        force = controller.step(0.0, measured + 1e-5, 0.0, measured)
-        assert force == pytest.approx(lead.step(0.0, 0.0, 0.0, 0.0) + stiffness * 1e-5, rel=1e-12)
+        forces = [controller.step(0.0, measured + 1e-5, 0.0, measured) for _ in range(4)]
+        expected = stiffness * 1e-5 * np.array([0.5, 1.0, 1.0, 1.0])
+        assert forces == pytest.approx(expected, rel=1e-12)
+
+
+def test_response_term_fades_by_where_the_surface_was_left():
+    document = gain_document(identification_delay=0.0, initial_stiffness=1e5, response_error_damping=0.0)
+    for left in (0.0, 0.25, 0.5, 1.0):  # of the period after the last tick in contact
+        controller = Controller.from_dict(document)
+        places = [1e-6, 1e-6, left * 1e-6, (left - 1) * 1e-6, -1e-6, -1e-6]
+        forces = [controller.step(0.0, x + 1e-5, 0.0, x) for x in places]
+        expected = [1 - (1 - left) ** 2 / 2, left**2 / 2, 0.0]
+        assert forces[3:] == pytest.approx([9e4 * 1e-5 * gate for gate in expected], rel=1e-12)
 
 
 # Parts
@@ -220,20 +257,18 @@ def test_delay_line_refuses_an_absurd_delay():
 
 @given(seed=st.integers(0, 2**32 - 1), forgetting=st.floats(0.9, 1.0))
 @settings(max_examples=30, deadline=None)
-def test_identification_is_textbook_recursive_least_squares(seed, forgetting):
-    """But for the bound on d_1 = P_11 - P_12^2/P_22 and d_2 = P_22."""
+def test_identification_is_weighted_recursive_least_squares(seed, forgetting):
+    """With its bound on the covariance."""
     rng = np.random.default_rng(seed)
     identification = ContactIdentification(2.0, -1.0, 5.0, 0.5, forgetting)
     theta, covariance = np.array([2.0, -1.0]), np.diag([5.0, 0.5])
-    for _ in range(40):
+    for weight in rng.choice([0.0, 0.3, 1.0], 40):
         phi, force = rng.normal(size=2), rng.normal()
-        column = covariance @ phi / (forgetting + phi @ covariance @ phi)
+        kept = 1.0 - weight * (1.0 - forgetting)
+        column = weight * covariance @ phi / (kept + weight * phi @ covariance @ phi)
         theta = theta + column * (force - phi @ theta)
-        covariance = (covariance - np.outer(column, phi @ covariance)) / forgetting
-        factor = np.array([[1.0, covariance[0, 1] / covariance[1, 1]], [0.0, 1.0]])
-        d_1 = covariance[0, 0] - factor[0, 1] * covariance[0, 1]
-        covariance = factor @ np.diag([min(d_1, 5.0), min(covariance[1, 1], 0.5)]) @ factor.T
-        identification.update(force, phi[0], phi[1])
+        covariance = bounded((covariance - np.outer(column, phi @ covariance)) / kept, (5.0, 0.5))
+        identification.update(force, phi[0], phi[1], weight)
     found = [identification.stiffness, identification.damping]
     np.testing.assert_allclose(found, theta, rtol=1e-8, atol=1e-10)
     expected = [covariance[0, 0], covariance[0, 1], covariance[1, 1]]
@@ -246,7 +281,7 @@ def test_covariance_does_not_wind_up():
     for deflection, rate in ((2e-4, 0.0), (0.0, 1e-3), (0.0, 0.0)):
         identification = ContactIdentification(1e5, 100.0, 1e12, 1e6, 0.8)
         for _ in range(100_000):
-            identification.update(1.5e5 * deflection + 420.0 * rate, deflection, rate)
+            identification.update(1.5e5 * deflection + 420.0 * rate, deflection, rate, 1.0)
         kk, kb, bb = identification.covariance
         assert 0.0 < kk <= 1e12 and kb == 0.0 and 0.0 < bb <= 1e6
         assert max(kk / 1e12, bb / 1e6) == 1.0
@@ -256,7 +291,7 @@ def test_identification_finds_stiffness_and_damping():
     identification = ContactIdentification(0.0, 0.0, 1e16, 1e14, 1.0)
     for n in range(100):
         p, v = 1e-4 * math.sin(0.03 * n), 2e-3 * math.cos(0.03 * n)
-        identification.update(1.5e5 * p + 420.0 * v, p, v)
+        identification.update(1.5e5 * p + 420.0 * v, p, v, 1.0)
     assert identification.stiffness == pytest.approx(1.5e5, rel=1e-6)
     assert identification.damping == pytest.approx(420.0, rel=1e-6)
 

@@ -176,15 +176,28 @@ def test_ticks_near_a_threshold_are_counted(gain_file):
 
 def test_a_decision_that_fell_differently_ends_the_comparison(gain_file):
     measured = np.arange(-20, 20) * 5e-6
+    measured[20:23] = -3e-18, 3e-18, 6e-18  # a standstill at the surface: rounding has the say
+    force = np.where(np.arange(40) > 17, 50.0, 0.0)
+    lane = lane_of(measured, force, gain_file)
+    # The other side took the second of these ticks to be free: no response, nothing identified.
+    measured[21] = -3e-18
+    other = lane_of(measured, force, gain_file)
+    parted = replay(lane._replace(command=other.command, identified=other.identified), gain_file)
+    assert (parted.parted, parted.compared, parted.ticks, parted.near) == (23, 23, 40, 3)
+    assert parted.difference <= 1e-13
+
+
+def test_a_tick_beside_the_surface_does_not_decide(gain_file):
+    """A contact that begins a hair before a tick or after it begins at the same time."""
+    measured = np.arange(-20, 20) * 5e-6
     measured[20] = 3e-18
     force = np.where(np.arange(40) > 17, 50.0, 0.0)
     lane = lane_of(measured, force, gain_file)
-    # The other side took the tick to be free: no response, nothing identified.
     measured[20] = -3e-18
     other = lane_of(measured, force, gain_file)
-    parted = replay(lane._replace(command=other.command, identified=other.identified), gain_file)
-    assert (parted.parted, parted.compared, parted.ticks, parted.near) == (22, 22, 40, 1)
-    assert parted.difference <= 1e-13
+    seen = replay(lane._replace(command=other.command, identified=other.identified), gain_file)
+    assert (seen.parted, seen.compared, seen.near) == (None, 40, 1)
+    assert seen.difference <= 1e-11 and seen.near_difference <= 1e-11
 
 
 def test_a_difference_away_from_thresholds_is_not_excused(gain_file):

@@ -24,8 +24,7 @@ class Gain(NamedTuple):
     unit ("1" if none), lower and upper bounds and the literature's own rule, each a function of the
     mechanism; `logarithmic` says that the gain is searched on a logarithmic scale; `neutral` is the value
     at which it does nothing, where it has one (with all of them neutral the law passes the force on);
-    `tuned` whether tuning moves it for this mechanism (a threshold acts by switching and has no useful
-    derivative).
+    `tuned` whether tuning moves it for this mechanism; if not, it stays at the literature's value.
     """
 
     name: str

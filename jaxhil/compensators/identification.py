@@ -1,7 +1,8 @@
-"""Real-time identification of contact stiffness and damping: recursive least squares with forgetting.
+"""Real-time identification of contact stiffness and damping: weighted recursive least squares, forgetting.
 
-Model F = k d + b v. The covariance is kept as P = U D U^T, U = [[1, u], [0, 1]], D = diag(d_1, d_2)
-(Bierman 1977): it stays positive however large the initial covariance.
+Model F = k d + b v; a reading counts by its weight, from 0 (outside contact) to 1. The covariance is kept as
+P = U D U^T, U = [[1, u], [0, 1]], D = diag(d_1, d_2) (Bierman 1977): it stays positive however large the
+initial covariance.
 Neither d grows beyond its initial value: held still, a contact tells nothing new of one of the two, whose
 variance forgetting alone would let wind up.
 With d_2 = 0 the damping stays at its initial value and the law identifies stiffness alone.
@@ -30,31 +31,33 @@ def update(
     deflection: Array,
     rate: Array,
     force: Array,
-    active: Array,
+    weight: Array,
 ) -> Identified:
-    """One step of K = P phi/(lambda + phi'P phi), theta += K (F - phi'theta), P = (P - K phi'P)/lambda.
+    """One reading of weight w: K = w P phi/(lambda_w + w phi'P phi), theta += K (F - phi'theta),
+    P = (P - K phi'P)/lambda_w, with phi = (deflection, rate) and lambda_w = 1 - w (1 - lambda).
 
-    phi = (deflection, rate); d_1 and d_2 are at most `initial_variances`; lanes that are not `active` keep
-    their estimate.
+    It minimises the sum of w (F - phi'theta)^2, past terms and the initial one times lambda_w with every
+    reading. A weight of 1 is the textbook's recursion, one of 0 changes nothing; between them it is smooth.
+    d_1 and d_2 are at most `initial_variances`.
     """
+    kept = 1 - weight * (1 - forgetting)
     f_1 = deflection
     f_2 = old.coupling * deflection + rate
-    g_1 = old.stiffness_variance * f_1
-    g_2 = old.damping_variance * f_2
-    alpha_1 = forgetting + f_1 * g_1
+    g_1 = weight * old.stiffness_variance * f_1
+    g_2 = weight * old.damping_variance * f_2
+    alpha_1 = kept + f_1 * g_1
     alpha_2 = alpha_1 + f_2 * g_2
     inverse_1, inverse_2 = 1 / alpha_1, 1 / alpha_2
     step = (force - (old.stiffness * deflection + old.damping * rate)) * inverse_2
     variances = (
         old.stiffness_variance * inverse_1,
-        old.damping_variance * alpha_1 * inverse_2 * (1 / forgetting),
+        old.damping_variance * alpha_1 * inverse_2 / kept,
     )
     bounded = [jnp.where(d < most, d, most) for d, most in zip(variances, initial_variances, strict=True)]
-    new = Identified(
+    return Identified(
         stiffness=old.stiffness + (g_1 + g_2 * old.coupling) * step,
         damping=old.damping + g_2 * step,
         coupling=old.coupling - g_1 * f_2 * inverse_1,
         stiffness_variance=bounded[0],
         damping_variance=bounded[1],
     )
-    return Identified(*(jnp.where(active, n, o) for n, o in zip(new, old, strict=True)))

@@ -1,12 +1,16 @@
 """The paper's compensation: phase lead, response error and real-time identification, delay-aligned.
 
-    F_c = lead(F) + g k_hat (x_d - x_a) + g_b b_hat (v_d - v_a)      while in contact, else lead(F)
+    F_c = lead(F) + gate (g k_hat (x_d - x_a) + g_b b_hat (v_d - v_a))
 
 The phase lead makes up for the delay of the force measurement, the response error for the dynamics of the
 motion simulator, of which no model is used (Qi et al. 2016; model.md section 4). k_hat and b_hat come from
 recursive least squares of the measured force on the measured position delayed by the same time
-(`identification_delay`): without that alignment they are biased (model.md section 6, item 6). "In contact" is
-judged on the aligned position too. v_a is a filtered difference, s/(1 + T_v s) by Tustin's rule.
+(`identification_delay`): without that alignment they are biased (model.md section 6, item 6). v_a is a
+filtered difference, s/(1 + T_v s) by Tustin's rule.
+
+`gate` is 1 while the aligned position is in contact and 0 outside; it opens and closes within two periods, by
+where between two ticks the surface was met (see `gates`). A reading's weight in the identification is that
+gate times another, of the measured force above `contact_threshold`: nothing jumps as a delay crosses a tick.
 """
 
 import math
@@ -17,6 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxhil.compensators.base import Compensator, Gain, Gains
+from jaxhil.compensators.gates import gate, share_beyond
 from jaxhil.compensators.identification import Identified, update
 from jaxhil.compensators.phase_lead import (
     LEAD_FILTER,
@@ -64,17 +69,24 @@ def _critical_damping(mechanism) -> float:
 
 
 def _stiffness_covariance(mechanism) -> float:
-    """One sample at the contact threshold's depth settles k_hat to a thousandth."""
-    return 1e3 / (0.01 * peak_force(mechanism) / typical_stiffness(mechanism)) ** 2
+    """One sample at 3 % of the largest depth settles half of k_hat."""
+    return 1 / (0.03 * peak_force(mechanism) / typical_stiffness(mechanism)) ** 2
 
 
 def _damping_covariance(mechanism) -> float:
-    return 10 / mechanism.approach.velocity**2
+    """One sample at the approach velocity settles half of b_hat."""
+    return 1 / mechanism.approach.velocity**2
+
+
+def _never(mechanism) -> bool:
+    """Of gains whose tuning would lower the error by less than a fifth and blur the search for the others."""
+    return False
 
 
 class ResponseErrorState(NamedTuple):
     """lead filter; measured and aligned positions [m] and their filtered rates [m/s], of the tick before;
-    the run's first reading [m] and speed [m/s]; what is identified; ring of interpolated readings [m]."""
+    the run's first reading [m] and speed [m/s]; shares [1] of the last period in contact and with a force
+    above the threshold; what is identified; ring of interpolated readings [m]."""
 
     lead: LeadState
     position: Float[Array, "*batch"]
@@ -83,6 +95,8 @@ class ResponseErrorState(NamedTuple):
     aligned_velocity: Float[Array, "*batch"]
     first_position: Float[Array, "*batch"]
     first_velocity: Float[Array, "*batch"]
+    contact_share: Float[Array, "*batch"]
+    force_share: Float[Array, "*batch"]
     identified: Identified
     ring: Float[Array, "samples *batch"]
 
@@ -107,7 +121,7 @@ class ResponseError(Compensator):
     name: ClassVar[str] = "response_error"
     gains: ClassVar[tuple[Gain, ...]] = (
         PHASE_LEAD,
-        LEAD_FILTER,
+        LEAD_FILTER._replace(tuned=_never),
         Gain("response_error", "1", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0, neutral=0.0),
         Gain(
             "response_error_damping", "1", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0,
@@ -115,24 +129,24 @@ class ResponseError(Compensator):
         ),
         Gain(
             "initial_stiffness", "N/m", lambda m: 0.0, lambda m: 5 * typical_stiffness(m),
-            lambda m: 0.0,
+            lambda m: 0.0, tuned=_never,
         ),
         Gain(
             "initial_damping", "N s/m", lambda m: 0.0, _critical_damping, lambda m: 0.0,
-            tuned=is_damped,
+            tuned=_never,
         ),
         Gain(
-            "stiffness_covariance", "1/m^2", lambda m: 1e-6 * _stiffness_covariance(m),
-            lambda m: 1e2 * _stiffness_covariance(m), _stiffness_covariance, logarithmic=True,
+            "stiffness_covariance", "1/m^2", lambda m: 1e-3 * _stiffness_covariance(m),
+            lambda m: 1e1 * _stiffness_covariance(m), _stiffness_covariance, logarithmic=True,
         ),
         Gain(
             "damping_covariance", "s^2/m^2", lambda m: 0.0, lambda m: 10 * _damping_covariance(m),
-            lambda m: _damping_covariance(m) if is_damped(m) else 0.0, tuned=is_damped,
+            lambda m: _damping_covariance(m) if is_damped(m) else 0.0, tuned=_never,
         ),
-        Gain("forgetting", "1", lambda m: 0.8, lambda m: 1.0, lambda m: 0.98),
+        Gain("forgetting", "1", lambda m: 0.8, lambda m: 1.0, lambda m: 0.98, tuned=_never),
         Gain(
             "contact_threshold", "N", lambda m: 0.0, lambda m: max(peak_force(m), _noise_level(m)),
-            lambda m: max(0.01 * peak_force(m), _noise_level(m)), tuned=lambda m: False,
+            lambda m: max(0.01 * peak_force(m), _noise_level(m)), tuned=_never,
         ),
         Gain(
             "identification_delay", "s", lambda m: 0.0, lambda m: 2 * force_delay(m) + 0.02,
@@ -141,7 +155,7 @@ class ResponseError(Compensator):
         Gain(
             "velocity_filter", "s", lambda m: 0.5 * m.rig.control_period,
             lambda m: 20 * m.rig.control_period, lambda m: 2 * m.rig.control_period,
-            logarithmic=True, tuned=is_damped,
+            logarithmic=True, tuned=_never,
         ),
     )  # fmt: skip
 
@@ -172,6 +186,8 @@ class ResponseError(Compensator):
             aligned_velocity=zeros,
             first_position=zeros,
             first_velocity=zeros,
+            contact_share=zeros,
+            force_share=zeros,
             identified=Identified(
                 zeros + gains["initial_stiffness"],
                 zeros + gains["initial_damping"],
@@ -187,6 +203,8 @@ class ResponseError(Compensator):
         fresh = begins & fresh
         return state._replace(
             lead=LeadState(*(jnp.where(begins, 0, leaf) for leaf in state.lead)),
+            contact_share=jnp.where(begins, 0, state.contact_share),
+            force_share=jnp.where(begins, 0, state.force_share),
             identified=old._replace(
                 coupling=jnp.where(fresh, 0, old.coupling),
                 stiffness_variance=jnp.where(fresh, gains["stiffness_covariance"], old.stiffness_variance),
@@ -220,7 +238,13 @@ class ResponseError(Compensator):
         velocity = rate(measured, before, state.velocity)
         aligned_velocity = rate(aligned, aligned_before, state.aligned_velocity)
         depth = deflection(aligned, prepared.clearance)
-        touching = depth != 0
+        depth_before = deflection(aligned_before, prepared.clearance)
+        contact_share = share_beyond(depth, depth_before, aligned - aligned_before)
+        contact_gate = gate(contact_share, state.contact_share)
+        threshold = gains["contact_threshold"]
+        size, size_before = jnp.abs(force), jnp.abs(state.lead.force)
+        excess, excess_before = (jnp.where(f > threshold, f - threshold, 0) for f in (size, size_before))
+        force_share = share_beyond(excess, excess_before, size - size_before)
         identified = update(
             state.identified,
             gains["forgetting"],
@@ -228,13 +252,13 @@ class ResponseError(Compensator):
             depth,
             aligned_velocity,
             force,
-            touching & (jnp.abs(force) > gains["contact_threshold"]),
+            contact_gate * gate(force_share, state.force_share),
         )
         led, lead_state = lead(prepared.lead, state.lead, force)
         response = gains["response_error"] * identified.stiffness * (
             signals.position_desired - measured
         ) + gains["response_error_damping"] * identified.damping * (signals.velocity_desired - velocity)
-        command = jnp.where(touching, led + response, led)
+        command = led + contact_gate * response
         return command, ResponseErrorState(
             lead_state,
             measured,
@@ -243,6 +267,8 @@ class ResponseError(Compensator):
             aligned_velocity,
             first_position,
             first_velocity,
+            contact_share,
+            force_share,
             identified,
             ring,
         )
@@ -250,7 +276,8 @@ class ResponseError(Compensator):
     def noise_amplification(self, gains, constants):
         # The lead filter's alone. Noise reaches k_hat too, whose part in F_c is smaller by (x_d - x_a)/depth
         # and by the root of the number of samples remembered: half a percent of the whole in steady contact.
-        # Not so while a contact is young and k_hat rests on a few shallow samples: up to fivefold in all.
+        # A young contact, whose k_hat rests on a few shallow samples, is noisier: by a sixth over its first
+        # tenth with the literature's covariance, by half with a very large one.
         return lead_amplification(lead_filter(gains, constants))
 
     def identified(self, state):

@@ -1,12 +1,13 @@
-"""Recursive identification of contact stiffness and damping from F = k p + b p'."""
+"""Weighted recursive identification of contact stiffness and damping from F = k p + b p'."""
 
 
 class ContactIdentification:
-    """Recursive least squares with forgetting, in Bierman's factored form.
+    """Weighted recursive least squares with forgetting, in Bierman's factored form.
 
-    With regressor phi = (p, p'), the textbook recursion is K = P phi/(lambda + phi' P phi), theta
-    += K (F - phi' theta), P = (P - K phi' P)/lambda. Here P = U D U' with U = [[1, u], [0, 1]] and
-    D = diag(d1, d2), which stays symmetric and positive whatever the rounding (Bierman,
+    With regressor phi = (p, p') and a reading's weight w, the recursion is K = w P phi/(lambda_w + w
+    phi' P phi), theta += K (F - phi' theta), P = (P - K phi' P)/lambda_w, lambda_w = 1 - w (1 -
+    lambda): the textbook's where w = 1, nothing where w = 0. Here P = U D U' with U = [[1, u], [0,
+    1]] and D = diag(d1, d2), which stays symmetric and positive whatever the rounding (Bierman,
     "Factorization Methods for Discrete Sequential Estimation", 1977). d1 and d2 never exceed their
     initial values: held still, a contact tells nothing new of one of the two, whose variance
     forgetting alone would let wind up.
@@ -55,19 +56,19 @@ class ContactIdentification:
         u, d1, d2 = self._u, self._d1, self._d2
         return d1 + u * d2 * u, u * d2, d2
 
-    def update(self, force: float, deflection: float, rate: float) -> None:
-        """Take in one reading: force [N], signed deflection [m] and its rate [m/s]."""
+    def update(self, force: float, deflection: float, rate: float, weight: float) -> None:
+        """Take in one reading: force [N], signed deflection [m], its rate [m/s] and its weight."""
         u = self._u
         d1 = self._d1
         d2 = self._d2
         stiffness = self.stiffness
         damping = self.damping
-        forgetting = self._forgetting
+        kept = 1.0 - weight * (1.0 - self._forgetting)
 
         f2 = u * deflection + rate
-        g1 = d1 * deflection
-        g2 = d2 * f2
-        a1 = forgetting + deflection * g1
+        g1 = weight * d1 * deflection
+        g2 = weight * d2 * f2
+        a1 = kept + deflection * g1
         a2 = a1 + f2 * g2
         innovation = force - (stiffness * deflection + damping * rate)
 
@@ -75,7 +76,7 @@ class ContactIdentification:
         self.damping = damping + g2 / a2 * innovation
         self._u = u - g1 * f2 / a1
         d1 /= a1
-        d2 *= a1 / (a2 * forgetting)
+        d2 *= a1 / (a2 * kept)
         most1, most2 = self._initial_covariance
         self._d1 = d1 if d1 < most1 else most1
         self._d2 = d2 if d2 < most2 else most2

@@ -1,9 +1,10 @@
 """Response-error force compensation with real-time identification of the contact.
 
-F_c = y + g k (x_d - x_m) + g_b b (v_d - v_m): y is the phase-led force, k and b the identified
-contact stiffness and damping, x_d - x_m the position by which the motion simulator lags the
-numerical model. No model of the simulator is used. The response term acts only while the
-delay-aligned position is in contact, and F_c is not clamped: a clamp makes the divergence worse.
+F_c = y + gate (g k (x_d - x_m) + g_b b (v_d - v_m)): y is the phase-led force, k and b the
+identified contact stiffness and damping, x_d - x_m the position by which the motion simulator lags
+the numerical model. No model of the simulator is used. The gate lets the response term act while
+the delay-aligned position is in contact, and opens and closes within two periods by where between
+the ticks the surface was met. F_c is not clamped: a clamp makes the divergence worse.
 
 Source: Qi, Zhao, Gao, Ren, Hu, "Divergence compensation for hardware-in-the-loop simulation of
 stiffness-varying discrete contact in space", Acta Astronautica 2016, and later papers of that
@@ -14,6 +15,7 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from .filters import DelayLine, LeadFilter, VelocityFilter
+from .gates import gate, share_beyond
 from .identification import ContactIdentification
 from .registry import GainSpecification, register
 
@@ -25,15 +27,21 @@ class ResponseError:
     The measured force is late against the measured position, so the identification regresses it on
     the position delayed by `identification_delay` (the delay-aligned position). That position x
     deflects the contact by x where x > 0, by x + clearance where x < -clearance, and by 0 in
-    between.
+    between. A reading counts by the gate of the contact times that of the force above
+    `contact_threshold`.
     """
 
     __slots__ = (
+        "_aligned",
         "_aligned_velocity",
         "_alignment",
         "_clearance",
+        "_contact_share",
+        "_force",
+        "_force_share",
         "_identification",
         "_lead",
+        "_period",
         "_response_error",
         "_response_error_damping",
         "_started",
@@ -57,6 +65,7 @@ class ResponseError:
     }
 
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
+        self._period = period
         self._clearance = clearance
         self._threshold = gains["contact_threshold"]
         self._response_error = gains["response_error"]
@@ -72,6 +81,10 @@ class ResponseError:
             gains["damping_covariance"],
             gains["forgetting"],
         )
+        self._aligned = 0.0
+        self._force = 0.0
+        self._contact_share = 0.0
+        self._force_share = 0.0
         self._started = False
 
     @property
@@ -94,32 +107,53 @@ class ResponseError:
         aligned = self._alignment.step(position_measured)
         aligned_velocity = self._aligned_velocity.step(aligned)
 
-        clearance = self._clearance
-        if aligned > 0.0:
-            deflection = aligned
-        elif aligned < -clearance:
-            deflection = aligned + clearance
-        else:
-            return force
-
-        identification = self._identification
+        aligned_before = self._aligned
+        deflection = self._deflection(aligned)
+        contact_share = share_beyond(deflection, self._deflection(aligned_before), aligned - aligned_before)
+        contact_gate = gate(contact_share, self._contact_share)
         threshold = self._threshold
-        if force_measured > threshold or force_measured < -threshold:
-            identification.update(force_measured, deflection, aligned_velocity)
-        return (
-            force
-            + self._response_error * identification.stiffness * (position_desired - position_measured)
+        size = abs(force_measured)
+        size_before = self._force
+        force_share = share_beyond(
+            size - threshold if size > threshold else 0.0,
+            size_before - threshold if size_before > threshold else 0.0,
+            size - size_before,
+        )
+        force_gate = gate(force_share, self._force_share)
+        self._aligned = aligned
+        self._force = size
+        self._contact_share = contact_share
+        self._force_share = force_share
+
+        if contact_gate == 0.0:
+            return force
+        identification = self._identification
+        if force_gate != 0.0:
+            identification.update(force_measured, deflection, aligned_velocity, contact_gate * force_gate)
+        return force + contact_gate * (
+            self._response_error * identification.stiffness * (position_desired - position_measured)
             + self._response_error_damping * identification.damping * (velocity_desired - velocity_measured)
         )
+
+    def _deflection(self, position: float) -> float:
+        if position > 0.0:
+            return position
+        far = position + self._clearance
+        return far if far < 0.0 else 0.0
 
     def _start(self, position: float, velocity: float) -> None:
         # Before the first tick the motion is uniform, so every filter begins in steady state.
         alignment = self._alignment
         alignment.start(position, velocity)
         self._velocity.start(position, velocity)
-        self._aligned_velocity.start(alignment.step(position), velocity)
+        aligned = alignment.step(position)
+        self._aligned_velocity.start(aligned, velocity)
+        self._aligned = aligned - self._period * velocity
         # That step only asked for the aligned position: the tick itself takes the sample in.
         alignment.start(position, velocity)
+        self._force = 0.0
+        self._contact_share = 0.0
+        self._force_share = 0.0
         self._started = True
 
     def position_command(self, position: float, velocity: float, acceleration: float) -> float:

@@ -99,7 +99,7 @@ struct alignas(64) Block {
     Lanes transition[2][4], position_row[4], velocity_row[4], measured_row[4], steady_command[2], steady_velocity[2];
     Lanes stiffness, damping;  // of the contact under way
     Lanes lead_keep, lead_now, lead_before;
-    Lanes response, response_damping, stiffness_covariance, damping_covariance, forgetting, inverse_forgetting;
+    Lanes response, response_damping, stiffness_covariance, damping_covariance, forgetting;
     Lanes threshold, fraction, rate_keep, rate_gain;
     int64_t force_back[W], real_back[W], position_back[W], aligned_back[W];
 
@@ -107,7 +107,7 @@ struct alignas(64) Block {
     Lanes position, velocity, command, plant[2];
     // Compensators.
     Lanes lead_force, lead_output;
-    Lanes measured, measured_rate, aligned, aligned_rate, older;
+    Lanes measured, measured_rate, aligned, aligned_rate, older, contact_share, force_share;
     Lanes identified_stiffness, identified_damping, coupling, stiffness_variance, damping_variance;
     // The contact under way.
     Lanes elapsed, approach, peak_force, peak_command, before, middle, touched, quiet;
@@ -116,6 +116,16 @@ struct alignas(64) Block {
     int32_t index[W];
     bool active[W];
 };
+
+// Share of a period that a reading, straight between two ticks, spends beyond a threshold.
+inline double share_beyond(double now, double before, double threshold) {
+    const bool beyond = now > threshold, crossed = beyond != (before > threshold);
+    const double inside = (beyond ? now : before) - threshold, moved = std::fabs(now - before);
+    return crossed ? inside / (crossed ? moved : 1) : beyond;
+}
+
+// The time beyond, weighed with a triangle two periods wide, from its shares of the last two periods.
+inline double gate(double s, double l) { return (s * s + l * l) / 2 + s * l * (2 - s - l); }
 
 double dot(const Lanes (&row)[4], int l, double z_0, double z_1, double start, double end) {
     return row[0][l] * z_0 + row[1][l] * z_1 + row[2][l] * start + row[3][l] * end;
@@ -183,7 +193,6 @@ private:
             b.stiffness_covariance[l] = gain(STIFFNESS_COVARIANCE);
             b.damping_covariance[l] = gain(DAMPING_COVARIANCE);
             b.forgetting[l] = gain(FORGETTING);
-            b.inverse_forgetting[l] = 1 / gain(FORGETTING);
             b.threshold[l] = gain(THRESHOLD);
             const double periods = gain(IDENTIFICATION_DELAY) / period, whole = std::floor(periods + 1e-9);
             b.fraction[l] = periods - whole;
@@ -223,6 +232,7 @@ private:
             b.measured_rate[l] = b.aligned_rate[l] = velocity;
             aligned_line.fill(l, tick - 1, measured - stride, stride);
             b.older[l] = measured - (std::floor(delay + 1e-9) + 1) * stride;
+            b.contact_share[l] = b.force_share[l] = 0;
             b.coupling[l] = 0;
             b.stiffness_variance[l] = b.stiffness_covariance[l];
             b.damping_variance[l] = b.damping_covariance[l];
@@ -251,6 +261,7 @@ private:
         int64_t any = 0;
         for (int l = 0; l < W; ++l) {
             const double x = b.position[l], v = b.velocity[l];
+            const double force_before = b.lead_force[l];
             double command = force[l];
             if (kind != NONE) {
                 command = b.lead_keep[l] * b.lead_output[l] + b.lead_now[l] * force[l]
@@ -258,7 +269,8 @@ private:
                 b.lead_force[l] = force[l];
                 b.lead_output[l] = command;
             }
-            if (kind == RESPONSE_ERROR) command = respond(l, command, force[l], measured[l], newer[l], x, v);
+            if (kind == RESPONSE_ERROR)
+                command = respond(l, command, force[l], force_before, measured[l], newer[l], x, v);
 
             // The contact under way: begin, end, peaks.
             const double magnitude = std::fabs(command), speed = std::fabs(v), truth = real[l];
@@ -305,37 +317,41 @@ private:
 
     // Response error on the identified contact: F_c from the led force.
     inline __attribute__((always_inline)) double respond(
-        int l, double led, double force, double measured, double newer, double x, double v) {
+        int l, double led, double force, double force_before, double measured, double newer, double x, double v) {
         const double aligned = newer - b.fraction[l] * (newer - b.older[l]);
         const double rate = b.rate_keep[l] * b.measured_rate[l] + b.rate_gain[l] * (measured - b.measured[l]);
         const double aligned_rate
             = b.rate_keep[l] * b.aligned_rate[l] + b.rate_gain[l] * (aligned - b.aligned[l]);
+        const double share = share_beyond(aligned, b.aligned[l], 0), open = gate(share, b.contact_share[l]);
+        const double force_share = share_beyond(std::fabs(force), std::fabs(force_before), b.threshold[l]);
+        const double weight = open * gate(force_share, b.force_share[l]);
+        b.contact_share[l] = share;
+        b.force_share[l] = force_share;
         b.older[l] = newer;
         b.measured[l] = measured;
         b.measured_rate[l] = rate;
         b.aligned[l] = aligned;
         b.aligned_rate[l] = aligned_rate;
 
-        // Recursive least squares on the factors of the covariance.
-        const bool touching = aligned > 0, update = touching & (std::fabs(force) > b.threshold[l]);
+        // Weighted recursive least squares on the factors of the covariance.
+        const double depth = aligned > 0 ? aligned : 0, kept = 1 - weight * (1 - b.forgetting[l]);
         const double k = b.identified_stiffness[l], c = b.identified_damping[l], u = b.coupling[l];
         const double d_1 = b.stiffness_variance[l], d_2 = b.damping_variance[l];
-        const double f_2 = u * aligned + aligned_rate;
-        const double g_1 = d_1 * aligned, g_2 = d_2 * f_2;
-        const double alpha_1 = b.forgetting[l] + aligned * g_1, alpha_2 = alpha_1 + f_2 * g_2;
+        const double f_2 = u * depth + aligned_rate;
+        const double g_1 = weight * d_1 * depth, g_2 = weight * d_2 * f_2;
+        const double alpha_1 = kept + depth * g_1, alpha_2 = alpha_1 + f_2 * g_2;
         const double inverse_1 = 1 / alpha_1, inverse_2 = 1 / alpha_2;
-        const double innovation = (force - (k * aligned + c * aligned_rate)) * inverse_2;
-        const double new_k = update ? k + (g_1 + g_2 * u) * innovation : k;
-        const double new_c = update ? c + g_2 * innovation : c;
+        const double innovation = (force - (k * depth + c * aligned_rate)) * inverse_2;
+        const double new_k = k + (g_1 + g_2 * u) * innovation, new_c = c + g_2 * innovation;
         b.identified_stiffness[l] = new_k;
         b.identified_damping[l] = new_c;
-        b.coupling[l] = update ? u - g_1 * f_2 * inverse_1 : u;
-        const double new_1 = d_1 * inverse_1, new_2 = d_2 * alpha_1 * inverse_2 * b.inverse_forgetting[l];
+        b.coupling[l] = u - g_1 * f_2 * inverse_1;
+        const double new_1 = d_1 * inverse_1, new_2 = d_2 * alpha_1 * inverse_2 / kept;
         const double most_1 = b.stiffness_covariance[l], most_2 = b.damping_covariance[l];
-        b.stiffness_variance[l] = update ? (new_1 < most_1 ? new_1 : most_1) : d_1;
-        b.damping_variance[l] = update ? (new_2 < most_2 ? new_2 : most_2) : d_2;
+        b.stiffness_variance[l] = new_1 < most_1 ? new_1 : most_1;
+        b.damping_variance[l] = new_2 < most_2 ? new_2 : most_2;
         const double response = b.response[l] * new_k * (x - measured) + b.response_damping[l] * new_c * (v - rate);
-        return touching ? led + response : led;
+        return led + open * response;
     }
 
     // Enter the contacts that were over at `tick` into the results and begin the next ones.

@@ -1,0 +1,119 @@
+"""The gates of either side, jax and the rig's: a triangle of two periods over the time beyond a threshold."""
+
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxhil.compensators.gates import gate, share_beyond
+from jaxhil.contact import deflection
+from jaxhil.runtime import gates as on_the_rig
+
+CLEARANCE = 3.0
+TICKS = np.arange(-4, 40)
+PHASES = np.linspace(0, 1, 21)
+
+
+def on_jax(positions, clearance=np.inf):
+    """Gate at every tick of a reading (ticks, lanes), but for the first."""
+    excess = deflection(jnp.asarray(positions), jnp.full(np.shape(positions), clearance))
+    shares = share_beyond(excess[1:], excess[:-1], jnp.asarray(np.diff(positions, axis=0)))
+    before = jnp.concatenate([jnp.zeros_like(shares[:1]), shares[:-1]])
+    return np.asarray(gate(shares, before))
+
+
+def rig(positions, clearance=np.inf):
+    def beyond(x):
+        return float(x) if x > 0 else float(min(x + clearance, 0.0))
+
+    def lane(x):
+        shares = [
+            on_the_rig.share_beyond(beyond(now), beyond(last), float(now - last)) for last, now in pairwise(x)
+        ]
+        return [on_the_rig.gate(s, last) for s, last in zip(shares, [0.0, *shares], strict=False)]
+
+    return np.array([lane(x) for x in np.asarray(positions).T]).T
+
+
+SIDES = pytest.mark.parametrize("gates", [on_jax, rig])
+
+
+def crossing(enters, leaves):
+    """(ticks, lanes) of a reading that is beyond 0 from one time to the other, in periods."""
+    rising, falling = TICKS[:, None] - enters, leaves - TICKS[:, None]
+    return np.where(rising < falling, rising, falling)
+
+
+@SIDES
+def test_the_sum_is_the_time_beyond_and_the_delay_one_period(gates):
+    enters, duration = (leaf.ravel() for leaf in np.meshgrid(PHASES, 7.3 + PHASES))
+    leaves = enters + duration
+    found = gates(crossing(enters, leaves))
+    np.testing.assert_allclose(found.sum(axis=0), duration, rtol=0, atol=1e-13)
+    moment = np.einsum("t,tn->n", TICKS[1:], found)
+    np.testing.assert_allclose(moment, (leaves**2 - enters**2) / 2 + duration, rtol=0, atol=1e-11)
+
+
+@SIDES
+def test_inside_one_outside_zero_and_between_them_the_triangle(gates):
+    found = gates(crossing(PHASES, PHASES + 20))
+    age = TICKS[1:, None] - PHASES
+    # The integral of the triangle over the time since the entry, up to two periods.
+    entered = np.where(age < 1, age**2 / 2, 1 - (2 - age) ** 2 / 2)
+    entered = np.where(age < 0, 0, np.where(age > 2, 1, entered))
+    early = TICKS[1:] < 15
+    np.testing.assert_allclose(found[early], entered[early], rtol=0, atol=1e-14)
+    # The way out mirrors the way in.
+    left = gates(crossing(PHASES - 20, PHASES))
+    np.testing.assert_allclose(left[early][1:], 1 - entered[early][1:], rtol=0, atol=1e-14)
+    assert np.all((found >= 0) & (found <= 1)) and np.any(found == 1) and np.any(found == 0)
+
+
+def test_once_differentiable_in_the_time_of_the_crossing():
+    def gates_of(enters):
+        x = jnp.asarray(TICKS, float) - enters
+        excess = jnp.where(x > 0, x, 0)
+        shares = share_beyond(excess[1:], excess[:-1], jnp.diff(x))
+        return gate(shares[1:], shares[:-1])
+
+    for at in (-1.0, 0.0, 2.0):  # where an entry moves to another tick
+        slopes = [jax.jacfwd(gates_of)(jnp.asarray(at + side)) for side in (-1e-9, 0.0, 1e-9)]
+        np.testing.assert_allclose(slopes[0], slopes[2], rtol=0, atol=1e-8)
+        np.testing.assert_allclose(slopes[1], slopes[2], rtol=0, atol=1e-8)
+        assert np.abs(slopes[0]).max() > 0.9
+
+
+@SIDES
+def test_two_surfaces(gates):
+    """A reading that crosses the gap is free for the time in the gap; less if that is under two periods."""
+    speed = np.array([0.5, 1.1, 2.9, 6.0, 30.0])
+    down = 10.5 * speed - speed * TICKS[:, None]
+    found = gates(down, CLEARANCE)[8:]
+    free = (1 - found).sum(axis=0)
+    np.testing.assert_allclose(free[:2], CLEARANCE / speed[:2], rtol=0, atol=1e-12)
+    assert np.all((free[2:] > 0) & (free[2:] < CLEARANCE / speed[2:]))
+    assert np.all(gates(np.full((5, 1), -1.0), CLEARANCE) == 0)
+    assert np.all(gates(np.full((5, 1), -4.0), CLEARANCE)[1:] == 1)
+    assert np.all(gates(np.array([[1.0], [-1.0], [2.0]]), 0.0)[1:] == 1)
+
+
+READINGS = st.floats(-1e3, 1e3) | st.sampled_from([0.0, 1e-300, -1e-300, -CLEARANCE])
+
+
+@given(st.lists(READINGS, min_size=3, max_size=3), st.sampled_from([np.inf, 0.0, CLEARANCE]))
+def test_both_sides_agree_and_have_derivatives_anywhere(readings, clearance):
+    x = np.array(readings)[:, None]
+    np.testing.assert_allclose(on_jax(x, clearance), rig(x, clearance), rtol=0, atol=1e-12)
+
+    def last(x):
+        excess = deflection(x, jnp.full(x.shape, clearance))
+        shares = share_beyond(excess[1:], excess[:-1], jnp.diff(x))
+        return gate(shares[1], shares[0])
+
+    # A change of a few denormals has a slope that no float holds.
+    if np.abs(np.diff(x, axis=0))[np.diff(x, axis=0) != 0].min(initial=1.0) > 1e-150:
+        assert np.all(np.isfinite(jax.grad(last)(jnp.asarray(x[:, 0]))))

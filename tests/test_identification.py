@@ -1,0 +1,69 @@
+"""Both identifications, jax and the rig's, against weighted batch least squares."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxhil.compensators.identification import Identified, update
+from jaxhil.runtime.identification import ContactIdentification
+
+INITIAL = (2.0, -1.0)
+VARIANCES = (5.0, 0.5)
+
+
+def on_jax(readings, weights, forgetting):
+    start = (*INITIAL, 0.0, *VARIANCES)
+    state = Identified(*(jnp.asarray(value) for value in start))
+    most = tuple(jnp.asarray(d) for d in VARIANCES)
+    for (depth, rate, force), weight in zip(readings, weights, strict=True):
+        values = (jnp.asarray(value) for value in (depth, rate, force, weight))
+        state = update(state, jnp.asarray(forgetting), most, *values)
+    return [float(leaf) for leaf in state]
+
+
+def rig(readings, weights, forgetting):
+    state = ContactIdentification(*INITIAL, *VARIANCES, forgetting)
+    for (depth, rate, force), weight in zip(readings, weights, strict=True):
+        state.update(float(force), float(depth), float(rate), float(weight))
+    kk, kb, bb = state.covariance
+    return [state.stiffness, state.damping, kb / bb, kk - kb * kb / bb, bb]
+
+
+def batch(readings, weights, forgetting):
+    """theta and P that minimise the prior's and the readings' squares, each faded by all later readings."""
+    kept = 1 - weights * (1 - forgetting)
+    faded = np.append(np.cumprod(kept[::-1])[::-1][1:], 1.0)
+    phi, force = readings[:, :2], readings[:, 2]
+    prior = np.prod(kept) * np.diag(1 / np.array(VARIANCES))
+    information = prior + np.einsum("n,ni,nj->ij", weights * faded, phi, phi)
+    covariance = np.linalg.inv(information)
+    theta = covariance @ (prior @ INITIAL + np.einsum("n,ni,n->i", weights * faded, phi, force))
+    coupling = covariance[0, 1] / covariance[1, 1]
+    return [*theta, coupling, covariance[0, 0] - coupling * covariance[0, 1], covariance[1, 1]]
+
+
+SIDES = pytest.mark.parametrize("identify", [on_jax, rig])
+
+
+@SIDES
+@pytest.mark.parametrize("forgetting", [0.9, 0.98, 1.0])
+def test_weighted_batch_least_squares(identify, forgetting):
+    rng = np.random.default_rng(0)
+    # Large regressors first: the bound on the covariance never acts.
+    readings = rng.normal(size=(30, 3)) + np.array([[3.0, 6.0, 0.0], [-5.0, 5.0, 0.0]] + 28 * [[0.0] * 3])
+    weights = np.r_[1.0, 1.0, rng.uniform(0, 1, 28)]
+    expected = batch(readings, weights, forgetting)
+    assert abs(expected[0] - INITIAL[0]) > 0.5
+    np.testing.assert_allclose(identify(readings, weights, forgetting), expected, rtol=1e-10)
+
+
+@SIDES
+def test_no_weight_changes_nothing_and_a_little_changes_little(identify):
+    rng = np.random.default_rng(1)
+    readings = rng.normal(size=(3, 3))
+    weights = np.array([1.0, 0.5, 0.0])
+    before = identify(readings[:2], weights[:2], 0.9)
+    np.testing.assert_allclose(identify(readings, weights, 0.9), before, rtol=1e-15)
+    moved = [np.array(identify(readings, np.array([1.0, 0.5, w]), 0.9)) - before for w in (1e-6, 2e-6)]
+    np.testing.assert_allclose(moved[1], 2 * moved[0], rtol=1e-4)
+    assert np.all(np.abs(moved[0]) < 1e-5) and np.any(moved[0] != 0)
