@@ -69,7 +69,7 @@ class Loop(eqx.Module):
     are present: force lag, force noise or bias, position noise, sample effects (quantum, dead zone, range),
     command limits, a second surface; which derivative of the mechanism's position is the first to break at
     the ticks (0: it jumps itself; 3 stands for all higher ones); samples in the delay lines of the sensors
-    and of the controller; whether energies are audited.
+    and of the controller; whether energies are audited and the command's swings followed.
     """
 
     law: ContactLaw = eqx.field(static=True)
@@ -88,6 +88,7 @@ class Loop(eqx.Module):
     ring: int = eqx.field(static=True)
     controller_ring: int = eqx.field(static=True)
     energies: bool = eqx.field(static=True)
+    chatter: bool = eqx.field(static=True)
 
     @property
     def has_corners(self) -> bool:

@@ -195,7 +195,8 @@ def test_a_folder_stands_for_its_files(jaxhil, tmp_path):
 
 
 def test_an_unknown_objective_or_a_bad_weight_is_refused(jaxhil, tmp_path):
-    for wrong in (["--objective", "mean"], ["--divergence-weight", "0"], ["--noise-weight", "-1"]):
+    weights = ["--divergence-weight", "0"], ["--noise-weight", "-1"], ["--chatter-weight", "nan"]
+    for wrong in (["--objective", "mean"], *weights):
         ran = jaxhil("tune", "-o", tmp_path, *wrong, *TINY)
         assert ran.code == 2 and ran.err.count("\n") == 1 and "allowed" in ran.err
 
@@ -355,7 +356,7 @@ def test_names_become_folders():
 
 def test_better_means_fewer_failures_then_smaller_errors():
     def made(rms, failed):
-        return Figures(rms, rms, rms, rms, 0.0, 1.0, failed)
+        return Figures(rms, rms, rms, rms, 0.0, 1.0, 0.0, failed)
 
     assert is_better(made(0.1, 0), made(0.2, 0)) and not is_better(made(0.2, 0), made(0.1, 0))
     assert is_better(made(0.2, 0), made(0.1, 1)) and not is_better(made(float("nan"), 0), made(0.1, 0))

@@ -113,6 +113,9 @@ class Tune:
     noise_weight: Annotated[
         float, _number("Restitution error that weighs as much as one time the sensor noise more.")
     ] = 0.0
+    chatter_weight: Annotated[
+        float, _number("Restitution error that weighs as much as a command that swings once too often.")
+    ] = 0.0
     seed: Annotated[int, _number("Seed of scenarios and starts.")] = 0
     overrides: Overrides = ()
     limit: Limit = 0.01

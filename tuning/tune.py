@@ -42,7 +42,8 @@ class Settings:
 
 class Figures(NamedTuple):
     """Over all contacts of a batch: rms, 99th percentile and maximum of |e - e*|, mean of e - e*; share of
-    contacts that diverge (e > e*); largest |F_c| over the reference's peak; contacts that did not end."""
+    contacts that diverge (e > e*); largest |F_c| over the reference's peak; root of the mean square of the
+    chatter (`jaxhil.evaluation.Outcome`); contacts that did not end."""
 
     rms: float
     p99: float
@@ -50,6 +51,7 @@ class Figures(NamedTuple):
     mean: float
     diverging: float
     peak_ratio: float
+    chatter: float
     failed: int
 
 
@@ -170,7 +172,7 @@ class _Trial:
             drawn = draw(task.mechanism, settings.validation, seed)
             self.fresh.append(build_scenarios(task.mechanism, drawn, seed))
             every.append(_join([self.fresh[-1], build_scenarios(task.mechanism)]))
-            loops.append(build_loop(task.mechanism, task.compensator, every[-1]))
+            loops.append(build_loop(task.mechanism, task.compensator, every[-1], chatter=True))
         self.loop: Loop = common_loop(loops)
         self.scenarios: Scenario = _join(every)
         self.lanes = settings.validation + 1
@@ -201,7 +203,7 @@ def figures(outcome: Outcome) -> Figures:
     failed = int(np.sum(outcome.wanted & ~outcome.good))
     if not len(errors):
         nan = float("nan")
-        return Figures(nan, nan, nan, nan, nan, nan, failed)
+        return Figures(nan, nan, nan, nan, nan, nan, nan, failed)
     size = np.abs(errors)
     return Figures(
         rms=float(np.sqrt(np.mean(errors**2))),
@@ -210,6 +212,7 @@ def figures(outcome: Outcome) -> Figures:
         mean=float(np.mean(errors)),
         diverging=float(np.mean(errors > 0)),
         peak_ratio=float(np.max(outcome.peak_ratio[outcome.good])),
+        chatter=float(np.sqrt(np.mean(outcome.chatter[outcome.good] ** 2))),
         failed=failed,
     )
 

@@ -148,7 +148,11 @@ def _objective(options: Tune):
     from tuning.objective import Objective
 
     return Objective(
-        options.objective, options.divergence_weight, options.command_weight, options.noise_weight
+        options.objective,
+        options.divergence_weight,
+        options.command_weight,
+        options.noise_weight,
+        options.chatter_weight,
     )
 
 

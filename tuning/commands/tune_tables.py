@@ -43,13 +43,13 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
         rows.append(
             (
                 *(label, one.rms, one.p99, one.max, f"{one.mean:+.4f}", f"{100 * one.diverging:.0f} %"),
-                *(f"{one.peak_ratio:.3f}", one.failed),
+                *(f"{one.peak_ratio:.3f}", f"{one.chatter:.3f}", one.failed),
             )
         )
     count = int(result.outcomes["tuned"].wanted.sum())
     errors = report.table(
         f"{mechanism.name}: errors e - e* of {count} contacts in {options.validation} fresh scenarios",
-        ["gains", "rms", "99th pct", "max", "mean", "e > e*", "peak ratio", "not ended"],
+        ["gains", "rms", "99th pct", "max", "mean", "e > e*", "peak ratio", "chatter", "not ended"],
         rows,
     )
     gains = report.table(
