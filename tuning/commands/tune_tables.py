@@ -34,7 +34,7 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
     from jaxhil.compensators import COMPENSATORS
 
     law, mechanism = COMPENSATORS[options.compensator].gains, result.mechanism
-    names = {"before": "before (no compensation)", "literature": "literature's rule", "tuned": "tuned"}
+    names = {"before": "before (uncompensated)", "literature": "literature's rule", "tuned": "tuned"}
     rows = []
     for key, label in names.items():
         one = result.figures[key]
