@@ -44,10 +44,9 @@ def of_name(name):
     return replace(STATED, name=name)
 
 
-@pytest.fixture(scope="module")
-def batch():
+def build_batch(overrides=()):
     """(loop, scenarios, problems): the scenario `SHORT` fails under all gains."""
-    parsed = load().mechanism
+    parsed = load("varying", overrides).mechanism
     scenarios = build_scenarios(parsed, draw(parsed, SCENARIOS, 5), 5)
     limit = np.where(np.arange(SCENARIOS) == SHORT, 0.05, scenarios.time_limit)
     scenarios = scenarios._replace(time_limit=limit)
@@ -55,6 +54,11 @@ def batch():
     rig = jax.jit(build_rig, static_argnums=0, compiler_options=QUICK)(loop, join([scenarios]))
     rigs = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(GAINS), *leaf.shape)), rig)
     return loop, scenarios, Problem(rigs, {})
+
+
+@pytest.fixture(scope="module")
+def batch():
+    return build_batch()
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
@@ -131,9 +135,9 @@ def test_the_sum_of_squares_is_the_stated_value_or_just_above(outcomes, name):
             assert value < ours < 1.5 * value
 
 
-def test_derivatives_are_central_differences(batch, known):
-    _, jacobian = known
-    own = np.stack([jacobian[i, :, i] for i in range(len(GAINS))])  # (problem, gain, residual)
+def against_differences(batch, jacobian):
+    """Derivatives (problem, gain, residual), which are compared with central differences."""
+    own = np.stack([jacobian[i, :, i] for i in range(len(GAINS))])
     for gain in range(len(NAMES)):
         step = 1e-6 * GAINS[:, gain]
         up, down = GAINS.copy(), GAINS.copy()
@@ -142,8 +146,23 @@ def test_derivatives_are_central_differences(batch, known):
         difference = (run(batch, up)[0] - run(batch, down)[0]) / (2 * step[:, None])
         scale = np.abs(own[:, gain]).max()
         np.testing.assert_allclose(own[:, gain], difference, rtol=1e-5, atol=1e-7 * scale)
+    return own
+
+
+def test_derivatives_are_central_differences(batch, known):
+    own = against_differences(batch, known[1])
     parts = *np.split(own[..., :-1], 3, axis=-1), own[..., -1:]
     assert all((np.abs(part).max(axis=2) > 0).all() for part in parts)
+
+
+def test_sensor_noise_is_the_same_for_all_gains(known):
+    """The same noise at every call, and gains that change a little change the residuals a little: that is
+    what derivatives are for."""
+    noisy = build_batch(["rig.force_sensor.noise_std=2.667", "rig.position_sensor.noise_std=1e-6"])
+    value, jacobian = run(noisy)
+    assert np.all(np.max(np.abs(value - known[0]), axis=1) > 0.3)
+    np.testing.assert_array_equal(run(noisy)[0], value)
+    against_differences(noisy, jacobian)
 
 
 def test_problems_do_not_mix(batch, known):
