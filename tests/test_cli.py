@@ -135,13 +135,15 @@ def test_tune_reports_tables_or_json(jaxhil, tuned, tmp_path):
     arguments = ["tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY]
     table = jaxhil(*arguments)
     assert table.code == 1
-    for word in ("before", "literature", "tuned", "rms", "99th", "lead_filter", "step limit", "exceeds 0.01"):
+    words = ("before", "literature", "tuned", "rms", "99th", "chatter", "lead_filter", "step limit")
+    for word in (*words, "exceeds 0.01", "No sensor noise"):
         assert word in table.out
     assert "judging on 16 fresh scenarios" in table.err
     ran = jaxhil(*arguments, "--json", "--limit", "inf")
     assert ran.code == 0
     assert ran.document["verdict"] == "good"
     (entry,) = ran.document["mechanisms"]
+    assert entry["sensor_noise"] is False and entry["figures"]["tuned"]["chatter"] >= 0
     again = json.loads((tuned / "gains.json").read_text())
     assert entry["gains"] == again["gains"]
     assert json.loads((tmp_path / "rig-300kg" / "gains.json").read_text())["sha256"] == again["sha256"]

@@ -10,7 +10,14 @@ from jaxhil.mechanism_file import load
 from jaxhil.scenario import build_scenarios
 from jaxhil.uncertainty import draw
 from tuning.optimiser import STATUSES
-from tuning.problems import build_task, gain_bounds, spread_starts, tuned_names
+from tuning.problems import (
+    NOISY_SCENARIOS,
+    SCENARIOS,
+    build_task,
+    gain_bounds,
+    spread_starts,
+    tuned_names,
+)
 from tuning.rounds import solve_tasks
 from tuning.tune import Settings, figures, tune
 
@@ -50,6 +57,20 @@ def test_gains_tuned_with_sensor_noise_are_better_where_there_is_noise(result):
     assert noiseless.failed == ours.failed == 0
     assert ours.rms < 0.9 * noiseless.rms
     assert tuned["lead_filter"] > 2 * result.gains["lead_filter"]
+
+
+@pytest.mark.parametrize(
+    "override, number",
+    [
+        ("approach.velocity=0.01", SCENARIOS),
+        ("rig.position_sensor.noise_std=1e-6", NOISY_SCENARIOS),
+        ("uncertainty.'rig.force_sensor.noise_std'={distribution='uniform', low=0, high=3}", NOISY_SCENARIOS),
+    ],
+)
+def test_noisy_mechanisms_get_more_scenarios(override, number):
+    mechanism = load("claw-350kg", [override]).mechanism
+    assert len(build_task(mechanism, "none", None, 0).scenarios.velocity) == number
+    assert len(build_task(mechanism, "none", 5, 0).scenarios.velocity) == 5
 
 
 def test_gains_lie_within_their_bounds(result):

@@ -16,6 +16,8 @@ from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import quasi_random
 from tuning.optimiser import Bounds
 
+SCENARIOS, NOISY_SCENARIOS = 32, 128  # to tune on, without and with sensor noise
+
 
 @dataclass(frozen=True)
 class Task:
@@ -33,15 +35,29 @@ class Task:
         return tuple(gain for gain in COMPENSATORS[self.compensator].gains if gain.tuned(self.mechanism))
 
 
-def build_task(mechanism: Mechanism, compensator: str, scenarios: int, seed: int) -> Task:
-    """Training scenarios are quasi-random: they fill the range evenly."""
-    batch = build_scenarios(mechanism, quasi_random(mechanism, scenarios, seed), seed)
+def build_task(mechanism: Mechanism, compensator: str, scenarios: int | None, seed: int) -> Task:
+    """Training scenarios are quasi-random: they fill the range evenly.
+
+    Each comes with a realisation of the sensors' noise of its own. Gains can be fitted to a few of them, so
+    that there are more, unless a number is given, where there is noise.
+    """
+    number = scenarios or (NOISY_SCENARIOS if has_sensor_noise(mechanism) else SCENARIOS)
+    batch = build_scenarios(mechanism, quasi_random(mechanism, number, seed), seed)
     return Task(
         mechanism,
         compensator,
         literature_gains(mechanism, compensator),
         batch,
         build_loop(mechanism, compensator, batch),
+    )
+
+
+def has_sensor_noise(mechanism: Mechanism) -> bool:
+    """Whether either sensor is noisy, in some scenarios at least."""
+    rig = mechanism.rig
+    paths = "rig.force_sensor.noise_std", "rig.position_sensor.noise_std"
+    return max(rig.force_sensor.noise_std, rig.position_sensor.noise_std) > 0 or any(
+        path in mechanism.uncertainty for path in paths
     )
 
 

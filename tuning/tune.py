@@ -29,10 +29,10 @@ BLOCK = 16  # mechanisms tuned and judged together: what is done when work is in
 
 @dataclass(frozen=True)
 class Settings:
-    """Numbers of scenarios to tune on, of starts, of solver steps, of scenarios to judge on; the seed; what
-    to minimise."""
+    """Numbers of scenarios to tune on (None: `tuning.problems` knows), of starts, of solver steps, of
+    scenarios to judge on; the seed; what to minimise."""
 
-    scenarios: int = 32
+    scenarios: int | None = None
     starts: int = 4
     steps: int = 25
     validation: int = 511
@@ -117,7 +117,8 @@ def _tune_block(tasks: list[Task], settings: Settings, report: Callable[[str], N
             # could wait for one another for ever.
             meanwhile.submit(trial.prepare, known["literature"])
         if any(task.tuned for task in tasks):
-            report(f"{name}: tuning {compensator} on {settings.scenarios} scenarios each")
+            number = len(tasks[0].scenarios.velocity)
+            report(f"{name}: tuning {compensator} on {number} scenarios each")
             starts = solve_tasks(
                 tasks,
                 settings.starts,

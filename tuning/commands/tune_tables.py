@@ -81,6 +81,9 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
     else:
         verdict = f"Bad: the tuned rms error {tuned.rms:.2g}{sure} exceeds {options.limit:g}."
     seconds = ", ".join(f"{stage} {time:.1f} s" for stage, time in result.timings.items())
+    told = [f"took: {seconds}", verdict]
+    if not entry["sensor_noise"]:
+        told.insert(0, "No sensor noise in the mechanism; with it: --set rig.force_sensor.noise_std=2.67")
     written = [entry["gain_file"], *entry["plots"]]
     tables = [errors] + ([gains] if law else []) + ([starts] if result.starts else [])
-    report.emit(*tables, *(f"wrote {path}" for path in written), f"took: {seconds}", verdict, "")
+    report.emit(*tables, *(f"wrote {path}" for path in written), *told, "")
