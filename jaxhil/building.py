@@ -15,8 +15,17 @@ from jaxhil.scenario import Scenario
 SHORTEST_RING = 16
 
 
-def build_loop(mechanism: Mechanism, compensator: str, scenarios: Scenario, energies: bool = False) -> Loop:
-    """The loop of `mechanism` under the compensator called `compensator`, for all `scenarios` at once."""
+def build_loop(
+    mechanism: Mechanism,
+    compensator: str,
+    scenarios: Scenario,
+    energies: bool = False,
+    chatter: bool = False,
+) -> Loop:
+    """The loop of `mechanism` under the compensator called `compensator`, for all `scenarios` at once.
+
+    Works of the real force, and the command's excess variation, are told of contacts only where asked for.
+    """
     rig, force, position = mechanism.rig, scenarios.force_sensor, scenarios.position_sensor
     simulator = scenarios.simulator
     law = COMPENSATORS[compensator]
@@ -53,6 +62,7 @@ def build_loop(mechanism: Mechanism, compensator: str, scenarios: Scenario, ener
         ring=samples(sensed),
         controller_ring=samples(max(aligned, default=0.0)),
         energies=energies,
+        chatter=chatter,
     )
 
 

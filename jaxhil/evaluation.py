@@ -27,14 +27,16 @@ SMALLEST_TILE = 16
 
 class Outcome(NamedTuple):
     """Per contact, (slots, *batch): the run's metrics; restitution and peak force [N] of the undelayed
-    reference entered at the same speed; error e - e*; |F_c|'s peak over the reference's peak; whether
-    the contact was asked for, and whether it was reached and ended well."""
+    reference entered at the same speed; error e - e*; |F_c|'s peak over the reference's peak; chatter, F_c's
+    excess variation (`Metrics`) over the reference's peak; whether the contact was asked for, and whether
+    it was reached and ended well."""
 
     metrics: Metrics
     reference_restitution: Float[Array, "slots *batch"]
     reference_peak_force: Float[Array, "slots *batch"]
     error: Float[Array, "slots *batch"]
     peak_ratio: Float[Array, "slots *batch"]
+    chatter: Float[Array, "slots *batch"]
     wanted: Bool[Array, "slots *batch"]
     good: Bool[Array, "slots *batch"]
 
@@ -57,6 +59,7 @@ def compare_with_reference(loop: Loop, scenario: Scenario, metrics: Metrics) -> 
         reference_peak_force=reference.peak_force,
         error=metrics.restitution - reference.restitution,
         peak_ratio=metrics.peak_command / reference.peak_force,
+        chatter=metrics.excess_variation / reference.peak_force,
         wanted=wanted,
         good=good,
     )

@@ -24,7 +24,7 @@ from jaxhil.limits import limit_command
 from jaxhil.loop_state import LoopState, Plant, Rings, Sensed
 from jaxhil.ring import look_back, tie, write_in_turn
 from jaxhil.scenario import Scenario
-from jaxhil.sensors import quantise, sample_force, white_noise
+from jaxhil.sensors import Noise, quantise, sample_force
 from jaxhil.simulator import (
     Delay,
     Propagation,
@@ -69,7 +69,7 @@ class Loop(eqx.Module):
     are present: force lag, force noise or bias, position noise, sample effects (quantum, dead zone, range),
     command limits, a second surface; which derivative of the mechanism's position is the first to break at
     the ticks (0: it jumps itself; 3 stands for all higher ones); samples in the delay lines of the sensors
-    and of the controller; whether energies are audited.
+    and of the controller; whether energies are audited and the command's swings followed.
     """
 
     law: ContactLaw = eqx.field(static=True)
@@ -88,6 +88,7 @@ class Loop(eqx.Module):
     ring: int = eqx.field(static=True)
     controller_ring: int = eqx.field(static=True)
     energies: bool = eqx.field(static=True)
+    chatter: bool = eqx.field(static=True)
 
     @property
     def has_corners(self) -> bool:
@@ -186,8 +187,8 @@ def enter(
     )
 
 
-def sense(loop: Loop, rig: Rig, state: LoopState, tick: Array) -> tuple[Signals, Truth]:
-    """Stage 1: what the sensors read at this tick, and the truth beside it."""
+def sense(loop: Loop, rig: Rig, state: LoopState, tick: Array, noise: Noise) -> tuple[Signals, Truth]:
+    """Stage 1: what the sensors read at this tick, noise included, and the truth beside it."""
     scenario, sensed = rig.scenario, state.sensed
     age = tick - state.entry_tick
     rings, delays = sensed.rings, rig.delays
@@ -197,8 +198,8 @@ def sense(loop: Loop, rig: Rig, state: LoopState, tick: Array) -> tuple[Signals,
     sensor = scenario.force_sensor
     if loop.has_force_bias:
         force = force + sensor.bias
-    if loop.has_force_noise:
-        force = force + white_noise(scenario.key, 2 * tick, sensor.noise_std)
+    if noise.force is not None:
+        force = force + noise.force
     if loop.has_sample_effects:
         force = sample_force(force, sensor.quantum, sensor.dead_zone, sensor.range)
 
@@ -207,9 +208,8 @@ def sense(loop: Loop, rig: Rig, state: LoopState, tick: Array) -> tuple[Signals,
     before = sensed.first_position + (age - panels).astype(stride.dtype) * stride
     after = look_back(rings.position, tick - 1, panels)
     position = jnp.where(age <= panels, before, after)
-    if loop.has_position_noise:
-        sensor = scenario.position_sensor
-        position = position + white_noise(scenario.key, 2 * tick + 1, sensor.noise_std)
+    if noise.position is not None:
+        position = position + noise.position
     if loop.has_sample_effects:
         position = quantise(position, scenario.position_sensor.quantum)
     return Signals(force, state.position, state.velocity, position, age), truth

@@ -30,13 +30,21 @@ RUNAWAY = 1e3  # of the first approach speed: no rig survives it
 
 class Metrics(NamedTuple):
     """Per contact, (slots, *batch): restitution [1]; approach_velocity [m/s]; peak_force, the real contact
-    force's, and peak_command, |F_c|'s [N]; duration, the time in touch [s]; work_in and work_out, by the
-    real force along x_a [J] (0 unless audited); status, one of `STATUS_NAMES`; ticks run by then."""
+    force's, and peak_command, |F_c|'s [N]; excess_variation of F_c [N] (0 unless followed); duration, the
+    time in touch [s]; work_in and work_out, by the real force along x_a [J] (0 unless audited); status, one
+    of `STATUS_NAMES`; ticks run by then.
+
+    excess_variation is V / 2 - (max F_c - min F_c), V the total variation sum |F_c(n+1) - F_c(n)| of the
+    command, which counts as 0 before the contact and after it. The least V / 2 there is, max - min, is that
+    of a command that swings but once: up to its maximum, down to its minimum and back to 0. What is beyond
+    is chatter: max - min for every whole swing too many.
+    """
 
     restitution: Float[Array, "slots *batch"]
     approach_velocity: Float[Array, "slots *batch"]
     peak_force: Float[Array, "slots *batch"]
     peak_command: Float[Array, "slots *batch"]
+    excess_variation: Float[Array, "slots *batch"]
     duration: Float[Array, "slots *batch"]
     work_in: Float[Array, "slots *batch"]
     work_out: Float[Array, "slots *batch"]
@@ -44,11 +52,21 @@ class Metrics(NamedTuple):
     ticks: Int[Array, "slots *batch"]
 
 
+class Swings(NamedTuple):
+    """F_c of the contact under way [N]: its last value, the highest and the lowest so far, and its total
+    variation; all of them begin with the 0 before the contact."""
+
+    last: Float[Array, "*batch"]
+    highest: Float[Array, "*batch"]
+    lowest: Float[Array, "*batch"]
+    variation: Float[Array, "*batch"]
+
+
 class Watch(NamedTuple):
     """The contact under way. `elapsed` [ticks] since it began, 0 before; whether it is `over`; approach and
     rebound speed [m/s]; peaks [N]; the real force at the last two ticks [N]; ticks with and since a touch;
-    works [J]; between two surfaces also the side (1 or -1), |F_c| of the last tick and what was left of
-    it when the last contact was over [N]."""
+    works [J] and the command's swings, where followed; between two surfaces also the side (1 or -1), |F_c| of
+    the last tick and what was left of it when the last contact was over [N]."""
 
     elapsed: Float[Array, "*batch"]
     over: Bool[Array, "*batch"]
@@ -60,6 +78,7 @@ class Watch(NamedTuple):
     touched: Float[Array, "*batch"]
     quiet: Float[Array, "*batch"]
     works: tuple[Array, ...]
+    swings: Swings | None
     side: Float[Array, "*batch"] | None
     command: Float[Array, "*batch"] | None
     left: Float[Array, "*batch"] | None
@@ -91,6 +110,7 @@ def empty_metrics(slots: int, like: Array) -> Metrics:
         approach_velocity=numbers,
         peak_force=numbers,
         peak_command=numbers,
+        excess_variation=numbers,
         duration=numbers,
         work_in=numbers,
         work_out=numbers,
@@ -113,6 +133,7 @@ def fresh_watch(loop: Loop, like: Array) -> Watch:
         touched=zeros,
         quiet=zeros + 1e6,
         works=(zeros, zeros) if loop.energies else (),
+        swings=Swings(zeros, zeros, zeros, zeros) if loop.chatter else None,
         side=zeros + 1 if loop.is_two_sided else None,
         command=zeros if loop.is_two_sided else None,
         left=zeros if loop.is_two_sided else None,
@@ -172,6 +193,7 @@ def observe(
         touched=jnp.where(touching, watch.touched + 1, watch.touched),
         quiet=quiet,
         works=works,
+        swings=watch.swings and _swing(watch.swings, command, begun & ~watch.over, ends),
         side=side,
         command=magnitude if loop.is_two_sided else None,
         left=watch.left,
@@ -202,13 +224,17 @@ def collect(
 ) -> Metrics:
     """Enter the contacts that are `over` at their `index`; `ticks` have run by now."""
     period = scenario.control_period
-    no_work = jnp.zeros_like(period)
-    work_in, work_out = watch.works or (no_work, no_work)
+    none = jnp.zeros_like(period)
+    work_in, work_out = watch.works or (none, none)
+    excess = none
+    if watch.swings is not None:
+        excess = watch.swings.variation / 2 - (watch.swings.highest - watch.swings.lowest)
     values = Metrics(
         restitution=watch.rebound / jnp.where(watch.approach > 0, watch.approach, jnp.nan),
         approach_velocity=watch.approach,
         peak_force=watch.peak_force,
         peak_command=watch.peak_command,
+        excess_variation=excess,
         duration=watch.touched * period,
         work_in=work_in,
         work_out=work_out,
@@ -219,6 +245,17 @@ def collect(
     slot = jnp.arange(slots, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
     here = (slot == index[None]) & over[None]
     return Metrics(*(jnp.where(here, v[None], m) for v, m in zip(values, metrics, strict=True)))
+
+
+def _swing(swings: Swings, command: Array, lasts: Array, ends: Array) -> Swings:
+    """One tick further, where the contact `lasts`; where it `ends` with this tick, the command is 0 next."""
+    step = jnp.abs(command - swings.last) + jnp.where(ends, jnp.abs(command), 0)
+    return Swings(
+        last=jnp.where(lasts, command, swings.last),
+        highest=jnp.where(lasts & (command > swings.highest), command, swings.highest),
+        lowest=jnp.where(lasts & (command < swings.lowest), command, swings.lowest),
+        variation=swings.variation + jnp.where(lasts, step, 0),
+    )
 
 
 def _crest(before, middle, now):

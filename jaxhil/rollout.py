@@ -35,6 +35,7 @@ from jaxhil.metrics import (
     observe,
 )
 from jaxhil.scenario import Scenario
+from jaxhil.sensors import Noise, draw_noise
 from jaxhil.touch import Motion, Panel, Truth, no_touch
 
 APPROACH = 0.02  # s of free approach before a contact, besides its phase
@@ -152,9 +153,9 @@ def stretch(loop: Loop, rig: Rig, gains: Gains, run: Run, record: bool) -> tuple
     prepared = loop.compensator.prepare(gains, rig.constants)
     clearance = rig.scenario.clearance
 
-    def tick(carry, _):
+    def tick(carry, noise):
         state, watch, now = carry
-        signals, truth = sense(loop, rig, state, now)
+        signals, truth = sense(loop, rig, state, now, noise)
         command, controller = loop.compensator.step(prepared, state.controller, signals, now)
         if loop.has_force_noise or loop.has_force_bias:
             command = jnp.where(signals.age == 0, 0, command)
@@ -167,9 +168,16 @@ def stretch(loop: Loop, rig: Rig, gains: Gains, run: Run, record: bool) -> tuple
             seen = Tick(signals, command, truth, going, run.index, identified)
         return (state, watch, now + 1), seen
 
-    carry = (run.state, run.watch, run.tick)
-    (state, watch, now), seen = lax.scan(tick, carry, None, length=stretch_length(loop))
+    carry, length = (run.state, run.watch, run.tick), stretch_length(loop)
+    (state, watch, now), seen = lax.scan(tick, carry, noise_ahead(loop, rig, run, length), length=length)
     return run._replace(state=state, watch=watch, tick=now), seen
+
+
+def noise_ahead(loop: Loop, rig: Rig, run: Run, ticks: int) -> Noise:
+    """The sensors' noise, (ticks, *batch), at this tick and those that follow within a stretch."""
+    ahead = jnp.arange(ticks, dtype=jnp.int32).reshape(-1, *[1] * run.index.ndim)
+    age = run.tick + ahead - run.state.entry_tick[None]
+    return draw_noise(loop.has_force_noise, loop.has_position_noise, rig.scenario, run.index, age)
 
 
 def turn_over(loop: Loop, rig: Rig, gains: Gains, run: Run, skip_flight: bool = True) -> Run:

@@ -2,11 +2,48 @@
 
 Delays are the simulator's business (`jaxhil.simulator`); here are the force sensor's first-order lag, in
 continuous time, and what happens to a sample: bias and noise, quantum, dead zone, range.
+
+Noise is a function of a lane's key, the number of the contact and the tick within its run alone: whatever the
+gains, and however long the contacts before have taken, a contact meets the same noise (common random
+numbers, without which no two gains could be compared).
 """
 
-import jax
+from typing import Any, NamedTuple
+
 import jax.numpy as jnp
-from jaxtyping import Array, Float, UInt32
+from jax import lax
+from jaxtyping import Array, Float, Int, UInt32
+
+from jaxhil.scenario import Scenario
+
+ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))  # of threefry's rounds, bits
+PARITY = 0x1BD11BDA  # of its key schedule
+
+
+class Noise(NamedTuple):
+    """What noise adds to the readings of force [N] and position [m], (ticks, *batch) or at one tick; None for
+    a sensor without."""
+
+    force: Array | None
+    position: Array | None
+
+
+def draw_noise(
+    has_force: bool,
+    has_position: bool,
+    scenario: Scenario,
+    contact: Int[Array, "*batch"],
+    age: Int[Array, "ticks *batch"],
+) -> Noise:
+    """Noise of both sensors at the ticks that are `age` into the run of contact number `contact`."""
+
+    def white(sensor, deviation):
+        return deviation[None] * white_noise(scenario.key, contact, 2 * age + sensor, deviation.dtype)
+
+    return Noise(
+        white(0, scenario.force_sensor.noise_std) if has_force else None,
+        white(1, scenario.position_sensor.noise_std) if has_position else None,
+    )
 
 
 def lag(
@@ -56,15 +93,34 @@ def quantise(value: Array, quantum: Array) -> Array:
 
 
 def white_noise(
-    keys: UInt32[Array, "2 *batch"], tick: Array, deviation: Float[Array, "*batch"]
-) -> Float[Array, "*batch"]:
-    """Gaussian samples of the given standard deviation; a function of (key of the lane, tick) alone."""
+    key: UInt32[Array, "2 *batch"],
+    contact: Int[Array, "*batch"],
+    count: Int[Array, "ticks *batch"],
+    dtype: Any,
+) -> Float[Array, "ticks *batch"]:
+    """Independent samples of the standard normal distribution, for every (key, contact, count)."""
+    bits, _ = threefry(key[0][None], key[1][None], contact[None].astype("uint32"), count.astype("uint32"))
+    # Odd multiples of a power of two between -1 and 1, neither of which would do.
+    digits = min(32, jnp.finfo(dtype).nmant)
+    share = (2 * (bits >> (32 - digits)).astype(dtype) + 1) * 2**-digits - 1
+    return 2**0.5 * lax.erf_inv(share)
 
-    def draw(key):
-        typed = jax.random.wrap_key_data(key, impl="threefry2x32")
-        return jax.random.normal(jax.random.fold_in(typed, tick), dtype=deviation.dtype)
 
-    return deviation * jax.vmap(draw)(keys.reshape(2, -1).T).reshape(deviation.shape)
+def threefry(key_0: Array, key_1: Array, count_0: Array, count_1: Array) -> tuple[Array, Array]:
+    """64 random bits, as two words, for every key of two words and counter of two words [uint32].
+
+    Threefry-2x32 with 20 rounds: Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3"
+    (2011). That of `jax.random` is a loop of its own on a CPU, inside of the loop over ticks.
+    """
+    keys = key_0, key_1, key_0 ^ key_1 ^ PARITY
+    left, right = count_0 + keys[0], count_1 + keys[1]
+    for turn in range(5):
+        for rotation in ROTATIONS[turn % 2]:
+            left = left + right
+            right = left ^ ((right << rotation) | (right >> (32 - rotation)))
+        left = left + keys[(turn + 1) % 3]
+        right = right + keys[(turn + 2) % 3] + (turn + 1)
+    return left, right
 
 
 def _longer_than_0(time_constant):

@@ -67,7 +67,7 @@ def build_batch(cases: Mapping[str, Case]) -> Batch:
     longest = max(mechanisms.values(), key=force_delay)
     return Batch(
         tuple(cases),
-        build_loop(longest, compensator, scenario, energies=True),
+        build_loop(longest, compensator, scenario, energies=True, chatter=True),
         {name: jnp.array([lane[name] for lane in gains]) for name in gains[0]},
         scenario,
     )

@@ -125,9 +125,10 @@ def first_contact(
     compensator: str = "none",
     gains: Mapping[str, Any] | None = None,
     energies: bool = False,
+    chatter: bool = False,
 ) -> dict[str, np.ndarray]:
     """Metrics of every lane's first contact, all of which must be over."""
-    loop = build_loop(parsed, compensator, scenario, energies=energies)
+    loop = build_loop(parsed, compensator, scenario, energies, chatter)
     metrics = run_rollout(loop, per_lane(gains or {}, scenario.velocity.shape[0]), scenario)
     assert np.all(np.asarray(metrics.status)[0] == OK)
     return {name: np.asarray(value)[0] for name, value in metrics._asdict().items()}

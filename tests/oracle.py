@@ -76,9 +76,9 @@ def simulate(
     """Run the contacts of a mechanism (the mechanism file, parsed); one dict per contact.
 
     Keys: restitution, approach_velocity, peak_force [N], work_in, work_out [J], ticks (end_tick -
-    begin_tick), begin_tick, end_tick, peak_command [N], status ('over' or 'timeout');
-    `record=True` adds per-tick `signals` (of the whole run), among them the force just before the
-    tick (`force`).
+    begin_tick), begin_tick, end_tick, peak_command [N], excess_variation of the command [N], status
+    ('over' or 'timeout'); `record=True` adds per-tick `signals` (of the whole run), among them the
+    force just before the tick (`force`).
 
     The compensator has `reset()` and `step(force, x_d, v_d, x_measured)`; with
     `position_command(x, v, a)` it leads the command, and `next_contact()`, if there, replaces
@@ -500,6 +500,7 @@ class _Run:
             "begin_tick": begin,
             "end_tick": end,
             "peak_command": peak_command,
+            "excess_variation": _excess_variation([tick[-1] for tick in self.log[begin:n]]),
             "status": status,
         }
         return result, n
@@ -685,6 +686,12 @@ def _roots(function, a, b, samples=8):
         elif f_high == 0.0 and high < b:
             found.append(float(high))
     return found
+
+
+def _excess_variation(commands):
+    """Half of the command's total variation, from 0 to 0, less its range."""
+    path = np.array([0.0, *commands, 0.0])
+    return float(np.sum(np.abs(np.diff(path))) / 2.0 - np.ptp(path))
 
 
 def _as_list(value):

@@ -135,13 +135,15 @@ def test_tune_reports_tables_or_json(jaxhil, tuned, tmp_path):
     arguments = ["tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY]
     table = jaxhil(*arguments)
     assert table.code == 1
-    for word in ("before", "literature", "tuned", "rms", "99th", "lead_filter", "step limit", "exceeds 0.01"):
+    words = ("before", "literature", "tuned", "rms", "99th", "chatter", "lead_filter", "step limit")
+    for word in (*words, "exceeds 0.01", "No sensor noise"):
         assert word in table.out
     assert "judging on 16 fresh scenarios" in table.err
     ran = jaxhil(*arguments, "--json", "--limit", "inf")
     assert ran.code == 0
     assert ran.document["verdict"] == "good"
     (entry,) = ran.document["mechanisms"]
+    assert entry["sensor_noise"] is False and entry["figures"]["tuned"]["chatter"] >= 0
     again = json.loads((tuned / "gains.json").read_text())
     assert entry["gains"] == again["gains"]
     assert json.loads((tmp_path / "rig-300kg" / "gains.json").read_text())["sha256"] == again["sha256"]
@@ -195,7 +197,8 @@ def test_a_folder_stands_for_its_files(jaxhil, tmp_path):
 
 
 def test_an_unknown_objective_or_a_bad_weight_is_refused(jaxhil, tmp_path):
-    for wrong in (["--objective", "mean"], ["--divergence-weight", "0"], ["--noise-weight", "-1"]):
+    weights = ["--divergence-weight", "0"], ["--noise-weight", "-1"], ["--chatter-weight", "nan"]
+    for wrong in (["--objective", "mean"], *weights):
         ran = jaxhil("tune", "-o", tmp_path, *wrong, *TINY)
         assert ran.code == 2 and ran.err.count("\n") == 1 and "allowed" in ran.err
 
@@ -355,7 +358,7 @@ def test_names_become_folders():
 
 def test_better_means_fewer_failures_then_smaller_errors():
     def made(rms, failed):
-        return Figures(rms, rms, rms, rms, 0.0, 1.0, failed)
+        return Figures(rms, rms, rms, rms, 0.0, 1.0, 0.0, failed)
 
     assert is_better(made(0.1, 0), made(0.2, 0)) and not is_better(made(0.2, 0), made(0.1, 0))
     assert is_better(made(0.2, 0), made(0.1, 1)) and not is_better(made(float("nan"), 0), made(0.1, 0))

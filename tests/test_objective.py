@@ -1,5 +1,6 @@
 """Objectives: their residuals against a plain recomputation, derivatives, failures; noise from the gains."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -35,17 +36,16 @@ GAINS = np.array([[0.004, 0.001], [0.0077, 0.0031], [0.002, 0.0008]])
 SCENARIOS = 6
 SLOTS = 144
 SHORT = 2  # the scenario whose time is too short for its contacts
-STATED = Objective("rms", 2.0, 0.3, 0.004)
+STATED = Objective("rms", 2.0, 0.3, 0.004, 0.05)
 
 
 def of_name(name):
-    return Objective(name, STATED.divergence_weight, STATED.command_weight, STATED.noise_weight)
+    return replace(STATED, name=name)
 
 
-@pytest.fixture(scope="module")
-def batch():
+def build_batch(overrides=()):
     """(loop, scenarios, problems): the scenario `SHORT` fails under all gains."""
-    parsed = load().mechanism
+    parsed = load("varying", overrides).mechanism
     scenarios = build_scenarios(parsed, draw(parsed, SCENARIOS, 5), 5)
     limit = np.where(np.arange(SCENARIOS) == SHORT, 0.05, scenarios.time_limit)
     scenarios = scenarios._replace(time_limit=limit)
@@ -53,6 +53,11 @@ def batch():
     rig = jax.jit(build_rig, static_argnums=0, compiler_options=QUICK)(loop, join([scenarios]))
     rigs = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(GAINS), *leaf.shape)), rig)
     return loop, scenarios, Problem(rigs, {})
+
+
+@pytest.fixture(scope="module")
+def batch():
+    return build_batch()
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
@@ -80,6 +85,7 @@ def known(batch):
 @pytest.fixture(scope="module")
 def outcomes(batch):
     loop, scenarios, _ = batch
+    loop = replace(loop, chatter=True)
     return [evaluate(loop, dict(zip(NAMES, gains, strict=True)), scenarios) for gains in GAINS]
 
 
@@ -100,11 +106,13 @@ def test_residuals_are_those_of_an_evaluation(outcomes, known):
         error = np.where(good, outcome.error, 3.0)
         error = np.where(wanted, np.where(error > 0, np.sqrt(2.0) * error, error), 0)
         excess = np.where(wanted, np.where(good, np.maximum(0, outcome.peak_ratio - 1), 3.0), 0)
-        assert (error[good] > 0).any() and (excess[good] > 0).any()
+        swings = np.where(wanted, np.where(good, outcome.chatter, 3.0), 0)
+        assert all((term[good] > 1e-3).any() for term in (error, excess, swings))
         expected = np.concatenate(
             [
                 error.ravel() / np.sqrt(count),
                 0.3 * excess.ravel() / np.sqrt(count),
+                0.05 * swings.ravel() / np.sqrt(count),
                 [0.004 * (amplification(gains) - 1)],
             ]
         )
@@ -116,19 +124,19 @@ def test_the_sum_of_squares_is_the_stated_value_or_just_above(outcomes, name):
     objective = of_name(name)
     for gains, outcome in zip(GAINS, outcomes, strict=True):
         terms = contact_terms(outcome)
-        error, excess = (np.asarray(term)[outcome.wanted] for term in terms)
+        error, excess, swings = (np.asarray(term)[outcome.wanted] for term in terms)
         noise = amplification(gains)
-        value = objective_value(objective, error, excess, noise)
-        ours = np.sqrt(sum_of_squares(objective, error, excess, noise))
+        value = objective_value(objective, error, excess, noise, swings)
+        ours = np.sqrt(sum_of_squares(objective, error, excess, noise, swings))
         if name == "rms":
             np.testing.assert_allclose(ours, value, rtol=1e-12)
         else:
             assert value < ours < 1.5 * value
 
 
-def test_derivatives_are_central_differences(batch, known):
-    value, jacobian = known
-    own = np.stack([jacobian[i, :, i] for i in range(len(GAINS))])  # (problem, gain, residual)
+def against_differences(batch, jacobian):
+    """Derivatives (problem, gain, residual), which are compared with central differences."""
+    own = np.stack([jacobian[i, :, i] for i in range(len(GAINS))])
     for gain in range(len(NAMES)):
         step = 1e-6 * GAINS[:, gain]
         up, down = GAINS.copy(), GAINS.copy()
@@ -137,9 +145,23 @@ def test_derivatives_are_central_differences(batch, known):
         difference = (run(batch, up)[0] - run(batch, down)[0]) / (2 * step[:, None])
         scale = np.abs(own[:, gain]).max()
         np.testing.assert_allclose(own[:, gain], difference, rtol=1e-5, atol=1e-7 * scale)
-    slots = value.shape[1] // 2
-    parts = own[..., :slots], own[..., slots:-1], own[..., -1:]
+    return own
+
+
+def test_derivatives_are_central_differences(batch, known):
+    own = against_differences(batch, known[1])
+    parts = *np.split(own[..., :-1], 3, axis=-1), own[..., -1:]
     assert all((np.abs(part).max(axis=2) > 0).all() for part in parts)
+
+
+def test_sensor_noise_is_the_same_for_all_gains(known):
+    """The same noise at every call, and gains that change a little change the residuals a little: that is
+    what derivatives are for."""
+    noisy = build_batch(["rig.force_sensor.noise_std=2.667", "rig.position_sensor.noise_std=1e-6"])
+    value, jacobian = run(noisy)
+    assert np.all(np.max(np.abs(value - known[0]), axis=1) > 0.3)
+    np.testing.assert_array_equal(run(noisy)[0], value)
+    against_differences(noisy, jacobian)
 
 
 def test_problems_do_not_mix(batch, known):
@@ -155,12 +177,12 @@ def test_problems_do_not_mix(batch, known):
 
 def test_failed_contacts_count_and_have_no_derivative(batch, known):
     value, jacobian = known
-    slots = np.reshape(value[:, :-1], (len(GAINS), 2, -1, SCENARIOS))
-    slopes = np.reshape(jacobian[..., :-1], (*GAINS.shape, len(GAINS), 2, -1, SCENARIOS))
+    slots = np.reshape(value[:, :-1], (len(GAINS), 3, -1, SCENARIOS))
+    slopes = np.reshape(jacobian[..., :-1], (*GAINS.shape, len(GAINS), 3, -1, SCENARIOS))
     contacts = SCENARIOS * 3
-    failed = FAILED / (SCALE * np.sqrt(contacts)) * np.array([np.sqrt(2.0), 0.3])
+    failed = FAILED / (SCALE * np.sqrt(contacts)) * np.array([np.sqrt(2.0), 0.3, 0.05])
     np.testing.assert_allclose(
-        slots[:, :, :3, SHORT], np.broadcast_to(failed[None, :, None], (len(GAINS), 2, 3)), rtol=1e-14
+        slots[:, :, :3, SHORT], np.broadcast_to(failed[None, :, None], (len(GAINS), 3, 3)), rtol=1e-14
     )
     assert np.isfinite(jacobian).all()
     assert not slopes[..., SHORT].any()
@@ -168,23 +190,24 @@ def test_failed_contacts_count_and_have_no_derivative(batch, known):
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def weighed(objective, terms, tangents):
-    """Residuals of one problem's (errors, excesses, wanted, amplification), and their derivative."""
-    error, excess, wanted, noise = terms
+    """Residuals of one problem's (errors, excesses, chatter, wanted, amplification), and their derivative."""
+    *contacts, wanted, noise = terms
 
-    def value(error, excess, noise):
-        return weigh(objective, error[None], excess[None], wanted[None], noise[None])[0]
+    def value(error, excess, chatter, noise):
+        return weigh(objective, error[None], excess[None], chatter[None], wanted[None], noise[None])[0]
 
-    return jax.jvp(value, (error, excess, noise), tangents)
+    return jax.jvp(value, (*contacts, noise), tangents)
 
 
 def padded(contacts):
     return np.pad(np.asarray(contacts, float), (0, SLOTS - len(contacts)))
 
 
-def alone(objective, errors, excesses=(), noise=1.0, tangents=((), (), 0.0)):
+def alone(objective, errors, excesses=(), noise=1.0, chatter=(), tangents=((), (), (), 0.0)):
     """Residuals of one problem with these contacts, in more slots than were asked for; their derivative."""
-    terms = padded(errors), padded(excesses), np.arange(SLOTS) < len(errors), np.asarray(noise)
-    tangents = padded(tangents[0]), padded(tangents[1]), np.asarray(tangents[2])
+    wanted = np.arange(SLOTS) < len(errors)
+    terms = padded(errors), padded(excesses), padded(chatter), wanted, np.asarray(noise)
+    tangents = *map(padded, tangents[:-1]), np.asarray(tangents[-1])
     return tuple(map(np.asarray, weighed(objective, terms, tangents)))
 
 
@@ -216,6 +239,10 @@ def test_known_errors_have_known_figures():
     excesses = np.array([0.1, 0.3])
     whole = np.sqrt(0.04**2 + 0.01 * (0.01 + 0.09) / 2 + 0.01**2 * 9)
     assert objective_value(stated, errors, excesses, 4.0) == pytest.approx(whole, rel=1e-14)
+    swings = objective_value(
+        replace(stated, chatter_weight=0.02), errors, excesses, 4.0, np.array([3.0, 1.0])
+    )
+    assert swings == pytest.approx(np.sqrt(whole**2 + 0.02**2 * 5), rel=1e-14)
     # A command quieter than the measured force earns nothing.
     assert objective_value(stated, errors, None, 0.5) == 0.04
     assert alone(stated, errors, (), 0.5)[0][-1] == 0
@@ -234,24 +261,28 @@ def test_a_high_norm_stands_for_the_worst():
 
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_derivatives_by_the_errors(name):
-    objective, generator = Objective(name, 3.0, 0.2, 0.01), np.random.default_rng(1)
+    objective, generator = Objective(name, 3.0, 0.2, 0.01, 0.03), np.random.default_rng(1)
     errors, excesses = generator.normal(size=45), np.maximum(0, generator.normal(size=45))
+    terms = errors, excesses, 2.0, generator.uniform(0, 3, 45)
 
     for _ in range(3):
         way = generator.normal(size=45), np.where(excesses > 0, generator.normal(size=45), 0), 1.0
-        _, slope = alone(objective, errors, excesses, 2.0, way)
+        way = *way, generator.normal(size=45)
+        _, slope = alone(objective, *terms, (way[0], way[1], way[3], way[2]))
         up, down = (
-            alone(objective, errors + h * way[0], excesses + h * way[1], 2.0 + h)[0] for h in (1e-6, -1e-6)
+            alone(objective, *(term + h * along for term, along in zip(terms, way, strict=True)))[0]
+            for h in (1e-6, -1e-6)
         )
         np.testing.assert_allclose(slope, (up - down) / 2e-6, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_no_error_at_all_has_a_finite_derivative(name):
-    objective = Objective(name, 3.0, 0.2, 0.01)
+    objective = Objective(name, 3.0, 0.2, 0.01, 0.03)
     for largest in (0.0, 0.1):
         errors = np.where(np.arange(30) == 7, largest, 0)
-        value, slope = alone(objective, errors, np.zeros(30), 1.0, (np.ones(30), np.ones(30), 1.0))
+        ones, zeros = np.ones((3, 30)), np.zeros(30)
+        value, slope = alone(objective, errors, zeros, 1.0, zeros, (*ones, 1.0))
         assert np.isfinite(slope).all()
         assert value.any() == (largest > 0)
 
@@ -262,6 +293,7 @@ def test_no_error_at_all_has_a_finite_derivative(name):
         ({"name": "mean"}, "objective: found 'mean', allowed rms, cvar, worst"),
         ({"divergence_weight": 0.0}, "objective: divergence_weight: found 0.0, allowed finite numbers > 0"),
         ({"noise_weight": -1.0}, "objective: noise_weight: found -1.0, allowed finite numbers >= 0"),
+        ({"chatter_weight": -0.1}, "objective: chatter_weight: found -0.1, allowed finite numbers >= 0"),
         ({"command_weight": np.inf}, "objective: command_weight: found inf, allowed finite numbers >= 0"),
     ],
 )
@@ -313,16 +345,16 @@ TICKS, LANES, DEVIATION = 3000, 16, 2.0
 LEAD_ALONE = {"response_error": 0.0, "response_error_damping": 0.0}
 
 
-def noisy_contact(velocity, damping=0.0, bodies=None, **values):
+def noisy_contact(velocity, damping=0.0, bodies=None, lanes=LANES, ticks=TICKS, **values):
     """Gains of response_error; F_c and the real force [N] of a noisy contact, (ticks, lanes)."""
     contact, sensor = {"damping": [damping]}, {"noise_std": DEVIATION}
     raw = mechanism(contact, period=1e-3, velocity=velocity, force_sensor=sensor)
     parsed = validated(raw | ({"bodies": bodies} if bodies else {}))
-    scenario = spread(parsed, LANES, key=np.stack([np.zeros(LANES), np.arange(LANES)]))
+    scenario = spread(parsed, lanes, key=np.stack([np.zeros(lanes), np.arange(lanes)]))
     gains = nominal_gains(parsed, "response_error", **values)
     loop = build_loop(parsed, "response_error", scenario)
-    _, seen = run_record(loop, per_lane(gains, LANES), scenario, TICKS)
-    return gains, np.asarray(seen.command)[:TICKS], np.asarray(seen.truth.force)[:TICKS]
+    _, seen = run_record(loop, per_lane(gains, lanes), scenario, ticks)
+    return gains, np.asarray(seen.command)[:ticks], np.asarray(seen.truth.force)[:ticks]
 
 
 def steady_contact(**values):
@@ -348,7 +380,8 @@ def test_amplification_is_that_of_the_loop_in_steady_contact():
 
 
 def test_a_young_contact_is_noisier_by_what_is_identified():
-    """The more, the larger the initial covariance; with the literature's, by less than a quarter."""
+    """The more, the larger the initial covariance, and by less than a quarter: a force above the contact
+    threshold is hardly ever noise."""
 
     def noise(**values):
         gains, command, force = noisy_contact(0.005, 300.0, **values)
@@ -362,5 +395,5 @@ def test_a_young_contact_is_noisier_by_what_is_identified():
     gains, own = noise()
     covariance = gains["stiffness_covariance"]
     known, large, huge = (noise(stiffness_covariance=covariance * times)[1] for times in (0, 10, 1e4))
-    assert known[0] < 1.05 < own[0] < 1.25 < large[0] < huge[0] and huge[0] > 1.4
+    assert known[0] < 1 < 1.05 < own[0] < large[0] < huge[0] < 1.25
     assert max(max(spans[1:]) for spans in (own, large, huge)) < 1.25

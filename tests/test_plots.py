@@ -38,6 +38,7 @@ def result(error_size=(0.5, 0.05, 0.005)):
             reference_peak_force=0.005 * np.sqrt(scenarios.contact.stiffness * scenarios.equivalent_mass),
             error=size * generator.standard_normal(shape),
             peak_ratio=np.ones(shape),
+            chatter=np.zeros(shape),
             wanted=wanted,
             good=wanted,
         )

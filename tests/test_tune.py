@@ -3,11 +3,24 @@
 import numpy as np
 import pytest
 
+from jaxhil.building import build_loop
 from jaxhil.compensators import COMPENSATORS
+from jaxhil.evaluation import evaluate
 from jaxhil.mechanism_file import load
+from jaxhil.scenario import build_scenarios
+from jaxhil.uncertainty import draw
 from tuning.optimiser import STATUSES
-from tuning.problems import build_task, gain_bounds, spread_starts, tuned_names
-from tuning.tune import Settings, tune
+from tuning.problems import (
+    NOISY_SCENARIOS,
+    SCENARIOS,
+    build_task,
+    gain_bounds,
+    spread_starts,
+    tuned_names,
+)
+from tuning.rounds import choose_starts, solve_tasks
+from tuning.trial import Trial
+from tuning.tune import Settings, figures, tune
 
 SMALL = Settings(scenarios=16, starts=2, steps=12, validation=63)
 
@@ -31,6 +44,35 @@ def test_every_start_has_a_status_and_a_falling_history(result):
         assert len(start.history) == start.steps
         assert (np.diff(start.history) <= 0).all()
         assert start.history[-1] == start.rms
+
+
+def test_gains_tuned_with_sensor_noise_are_better_where_there_is_noise(result):
+    """Three times the published noise, on scenarios that neither of the two has seen."""
+    noisy = load("varying", ["rig.force_sensor.noise_std=8"]).mechanism
+    task = build_task(noisy, "phase_lead", SMALL.scenarios, SMALL.seed)
+    trial = Trial([task], 15, SMALL.seed)
+    (starts,) = solve_tasks([task], choose_starts(trial, SMALL.starts, SMALL.seed), SMALL.steps)
+    tuned = min(starts, key=lambda start: start.rms).gains
+    fresh = build_scenarios(noisy, draw(noisy, 255, 99), 99)
+    loop = build_loop(noisy, "phase_lead", fresh)
+    noiseless, ours = (figures(evaluate(loop, gains, fresh)) for gains in (result.gains, tuned))
+    assert noiseless.failed == ours.failed == 0
+    assert ours.rms < 0.9 * noiseless.rms
+    assert tuned["lead_filter"] > 2 * result.gains["lead_filter"]
+
+
+@pytest.mark.parametrize(
+    "override, number",
+    [
+        ("approach.velocity=0.01", SCENARIOS),
+        ("rig.position_sensor.noise_std=1e-6", NOISY_SCENARIOS),
+        ("uncertainty.'rig.force_sensor.noise_std'={distribution='uniform', low=0, high=3}", NOISY_SCENARIOS),
+    ],
+)
+def test_noisy_mechanisms_get_more_scenarios(override, number):
+    mechanism = load("claw-350kg", [override]).mechanism
+    assert len(build_task(mechanism, "none", None, 0).scenarios.velocity) == number
+    assert len(build_task(mechanism, "none", 5, 0).scenarios.velocity) == 5
 
 
 def test_gains_lie_within_their_bounds(result):

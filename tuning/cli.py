@@ -93,7 +93,14 @@ class Tune:
     output: Annotated[str, arg(aliases=("-o",), metavar="DIR", help="Folder for what is written.")] = (
         "jaxhil-out"
     )
-    scenarios: Annotated[int, _number("Scenarios to tune on.")] = 32
+    scenarios: Annotated[
+        int | None,
+        arg(
+            metavar="NUMBER",
+            help="Scenarios to tune on; by default 32, or 128 where sensors are noisy.",
+            help_behavior_hint="",
+        ),
+    ] = None
     starts: Annotated[int, _number("Starts of the solver.")] = 4
     steps: Annotated[int, _number("Most solver steps from each start.")] = 25
     validation: Annotated[int, _number("Fresh scenarios to judge on.")] = 511
@@ -112,6 +119,9 @@ class Tune:
     ] = 0.0
     noise_weight: Annotated[
         float, _number("Restitution error that weighs as much as one time the sensor noise more.")
+    ] = 0.0
+    chatter_weight: Annotated[
+        float, _number("Restitution error that weighs as much as a command that swings once too often.")
     ] = 0.0
     seed: Annotated[int, _number("Seed of scenarios and starts.")] = 0
     overrides: Overrides = ()

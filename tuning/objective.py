@@ -6,8 +6,9 @@ With e - e* of every contact, divergence weighted against convergence (`Objectiv
     cvar    mean magnitude of the worst 5 % of the contacts (the conditional value at risk)
     worst   the largest magnitude
 
-and the penalties a command that peaks above the reference's force and a compensator that amplifies the noise
-of the force sensor, all in one unit, that of a restitution error. `objective_value` has them exactly.
+and the penalties a command that peaks above the reference's force, one that chatters, and a compensator that
+amplifies the noise of the force sensor, all in one unit, that of a restitution error. `objective_value` has
+them exactly.
 
 Levenberg-Marquardt wants smooth sums of squares. That of `residuals` is the square of the norm
 
@@ -18,6 +19,7 @@ of their p-th powers. The exact tail is no use to a solver that linearises: cont
 and a step that spoils one of them is not foreseen. By this norm the tail ends lower.
 """
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -44,16 +46,19 @@ OBJECTIVES = tuple(POWERS)
 class Objective:
     """What to minimise, J with
 
-        J^2 = figure(E)^2 + (command_weight rms(C))^2 + (noise_weight N)^2
+        J^2 = figure(E)^2 + (command_weight rms(C))^2 + (chatter_weight rms(S))^2 + (noise_weight N)^2
 
     E: per contact the restitution error e - e* [1], times sqrt(divergence_weight) where it is positive:
     divergence_weight [1] is how much more a squared divergence (e > e*) counts than a squared convergence.
     C: per contact max(0, peak |F_c| / the reference's peak force - 1) [1].
+    S: per contact the chatter [1]: how far F_c goes up and down beyond a single swing (`jaxhil.metrics`),
+    over the reference's peak force. Where the sensors are noisy it holds what the noise does to F_c.
     N: max(0, A - 1) [1], A the amplification of the force sensor's white noise, from the gains alone
     (`Compensator.noise_amplification`); a quieter command than the measured force earns nothing.
 
-    name: `figure`, one of `OBJECTIVES`. The weights of command and noise [1] are restitution errors: that
-    which weighs as much as a command one reference peak too high, as an amplification one too large.
+    name: `figure`, one of `OBJECTIVES`. The weights of command, noise and chatter [1] are restitution errors:
+    that which weighs as much as a command one reference peak too high, as an amplification one too large, as
+    one swing over the reference's peak too many.
 
     Raises `InputError` for another name or a weight that is negative or not finite, or 0 for divergence.
     """
@@ -62,11 +67,12 @@ class Objective:
     divergence_weight: float = 1.0
     command_weight: float = 0.0
     noise_weight: float = 0.0
+    chatter_weight: float = 0.0
 
     def __post_init__(self):
         if self.name not in OBJECTIVES:
             raise InputError(f"objective: found {shown(self.name)}, allowed {', '.join(OBJECTIVES)}")
-        for name in ("divergence_weight", "command_weight", "noise_weight"):
+        for name in ("divergence_weight", "command_weight", "noise_weight", "chatter_weight"):
             weight, may_be_0 = getattr(self, name), name != "divergence_weight"
             if not (0 < weight < math.inf or (may_be_0 and weight == 0)):
                 allowed = f"allowed finite numbers {'>=' if may_be_0 else '>'} 0"
@@ -92,13 +98,15 @@ def residuals(
     """(J / `SCALE`)^2 of every problem as a sum of squares, J as of `Objective`; the loss is half of it.
 
     One residual per contact slot of every scenario for the figure, or the norm that stands for it, as many
-    for the command and one for the noise, where their weights are not 0. Contacts that fail count with the
-    constant error and excess `FAILED`.
+    for the command, as many for its chatter and one for the noise, where their weights are not 0. Contacts
+    that fail count with the constant error, excess and chatter `FAILED`.
 
     `static` is the loop, the names of the gains that are tuned and the objective. The scenarios of all
     problems run side by side, as the lanes of one batch.
     """
     loop, names, objective = static
+    if objective.chatter_weight > 0:
+        loop = dataclasses.replace(loop, chatter=True)
     number, lanes = problems.rig.inverse_mass.shape
     rig = jax.tree.map(_side_by_side, problems.rig)
     values: dict[str, Any] = {name: gains[:, i] for i, name in enumerate(names)}
@@ -108,15 +116,16 @@ def residuals(
     def by_problem(leaf):
         return jnp.moveaxis(leaf.reshape(-1, number, lanes), 1, 0).reshape(number, -1)
 
-    error, excess = map(by_problem, contact_terms(outcome))
+    error, excess, chatter = map(by_problem, contact_terms(outcome))
     amplification = jnp.mean(by_problem(loop.compensator.noise_amplification(values, rig.constants)), axis=1)
-    return weigh(objective, error, excess, by_problem(outcome.wanted), amplification)
+    return weigh(objective, error, excess, chatter, by_problem(outcome.wanted), amplification)
 
 
 def weigh(
     objective: Objective,
     error: Float[Array, "problems contacts"],
     excess: Float[Array, "problems contacts"],
+    chatter: Float[Array, "problems contacts"],
     wanted: Bool[Array, "problems contacts"],
     amplification: Float[Array, "problems"],
 ) -> Float[Array, "problems residuals"]:
@@ -128,6 +137,8 @@ def weigh(
     parts = [_norm(jnp.where(error > 0, diverging, error), number, POWERS[objective.name])]
     if objective.command_weight > 0:
         parts.append(objective.command_weight * _norm(excess, count, 2))
+    if objective.chatter_weight > 0:
+        parts.append(objective.chatter_weight * _norm(chatter, count, 2))
     if objective.noise_weight > 0:
         beyond = amplification[:, None] - 1
         parts.append(objective.noise_weight * jnp.where(beyond > 0, beyond, 0))
@@ -136,15 +147,18 @@ def weigh(
 
 def contact_terms(
     outcome: Outcome,
-) -> tuple[Float[Array, "slots *batch"], Float[Array, "slots *batch"]]:
-    """Per contact the restitution error and the command's excess over the reference's peak force, relative
-    to it: `FAILED` for contacts that failed, 0 for those not asked for."""
+) -> tuple[Float[Array, "slots *batch"], Float[Array, "slots *batch"], Float[Array, "slots *batch"]]:
+    """Per contact the restitution error, the command's excess over the reference's peak force, relative to
+    it, and the chatter: `FAILED` for contacts that failed, 0 for those not asked for."""
     # The inner `where` keeps what a failed contact leaves behind out of the derivative.
     usable = outcome.good & jnp.isfinite(outcome.error) & jnp.isfinite(outcome.peak_ratio)
+    usable = usable & jnp.isfinite(outcome.chatter)
     error = jnp.where(usable, outcome.error, FAILED)
     beyond = jnp.where(usable, outcome.peak_ratio, 1 + FAILED) - 1
     excess = jnp.where(beyond > 0, beyond, 0)
-    return jnp.where(outcome.wanted, error, 0), jnp.where(outcome.wanted, excess, 0)
+    chatter = jnp.where(usable, outcome.chatter, FAILED)
+    wanted = outcome.wanted
+    return jnp.where(wanted, error, 0), jnp.where(wanted, excess, 0), jnp.where(wanted, chatter, 0)
 
 
 def objective_value(
@@ -152,15 +166,16 @@ def objective_value(
     errors: Float[np.ndarray, "contacts"],
     excesses: Float[np.ndarray, "contacts"] | None = None,
     amplification: float = 1.0,
+    chatter: Float[np.ndarray, "contacts"] | None = None,
 ) -> float:
     """J [1] of `Objective`, exactly, for all three names: what a table of results is made of.
 
-    `errors` and `excesses` (none: no part in it) are those of `contact_terms`, of the contacts asked for;
-    what is not finite counts as `FAILED`.
+    `errors`, `excesses` and `chatter` (none: no part in it) are those of `contact_terms`, of the contacts
+    asked for; what is not finite counts as `FAILED`.
     """
-    error, excess = (
+    error, excess, swings = (
         np.where(np.isfinite(term), term, FAILED)
-        for term in (np.ravel(errors), np.zeros(1) if excesses is None else np.ravel(excesses))
+        for term in (np.zeros(1) if term is None else np.ravel(term) for term in (errors, excesses, chatter))
     )
     size = np.sort(np.abs(np.where(error > 0, math.sqrt(objective.divergence_weight) * error, error)))
     figure = {
@@ -169,7 +184,9 @@ def objective_value(
         "worst": size[-1],
     }[objective.name]
     command = objective.command_weight * np.sqrt(np.mean(excess**2))
-    return math.hypot(figure, command, objective.noise_weight * max(0.0, float(amplification) - 1))
+    restless = objective.chatter_weight * np.sqrt(np.mean(swings**2))
+    noise = objective.noise_weight * max(0.0, float(amplification) - 1)
+    return math.hypot(figure, command, restless, noise)
 
 
 def _tail(count):

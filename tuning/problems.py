@@ -26,6 +26,8 @@ from tuning.box import Bounds, to_gains, to_shares
 PATIENCE = 2.0
 SHORTEST_PATIENCE = 0.15  # s
 
+SCENARIOS, NOISY_SCENARIOS = 32, 128  # to tune on, without and with sensor noise
+
 
 @dataclass(frozen=True)
 class Task:
@@ -43,12 +45,26 @@ class Task:
         return tuple(gain for gain in COMPENSATORS[self.compensator].gains if gain.tuned(self.mechanism))
 
 
-def build_task(mechanism: Mechanism, compensator: str, scenarios: int, seed: int) -> Task:
-    """Training scenarios are quasi-random: they fill the range evenly. Their contacts must end in time."""
-    batch = build_scenarios(mechanism, quasi_random(mechanism, scenarios, seed), seed)
+def build_task(mechanism: Mechanism, compensator: str, scenarios: int | None, seed: int) -> Task:
+    """Training scenarios are quasi-random: they fill the range evenly. Their contacts must end in time.
+
+    Each comes with a realisation of the sensors' noise of its own. Gains can be fitted to a few of them, so
+    that there are more, unless a number is given, where there is noise.
+    """
+    number = scenarios or (NOISY_SCENARIOS if has_sensor_noise(mechanism) else SCENARIOS)
+    batch = build_scenarios(mechanism, quasi_random(mechanism, number, seed), seed)
     loop = build_loop(mechanism, compensator, batch)
     batch = batch._replace(time_limit=np.asarray(_patience(loop.law, batch)))
     return Task(mechanism, compensator, literature_gains(mechanism, compensator), batch, loop)
+
+
+def has_sensor_noise(mechanism: Mechanism) -> bool:
+    """Whether either sensor is noisy, in some scenarios at least."""
+    rig = mechanism.rig
+    paths = "rig.force_sensor.noise_std", "rig.position_sensor.noise_std"
+    return max(rig.force_sensor.noise_std, rig.position_sensor.noise_std) > 0 or any(
+        path in mechanism.uncertainty for path in paths
+    )
 
 
 def alike(loops: list[Loop], scenarios: list[Scenario]) -> list[list[int]]:
@@ -56,7 +72,7 @@ def alike(loops: list[Loop], scenarios: list[Scenario]) -> list[list[int]]:
     scenario arrays of the same shapes but for the number of lanes. In the order in which they come."""
     groups: dict[Any, list[int]] = {}
     for index, (loop, batch) in enumerate(zip(loops, scenarios, strict=True)):
-        shapes = tuple(leaf.shape[:-1] for leaf in jax.tree.leaves(batch))
+        shapes = tuple(leaf.shape for leaf in jax.tree.leaves(batch))
         groups.setdefault((_with_rings([loop], 0, 0), shapes), []).append(index)
     return list(groups.values())
 

@@ -22,7 +22,7 @@ from jaxhil.integrators import INTEGRATORS
 from jaxhil.loop import Loop, Rig, build_rig, drive, sense
 from jaxhil.mechanism import Mechanism, value_at
 from jaxhil.metrics import Metrics, build_rules, observe
-from jaxhil.rollout import Run, Tick, start, stretch, stretch_length, turn_over
+from jaxhil.rollout import Run, Tick, noise_ahead, start, stretch, stretch_length, turn_over
 from jaxhil.runtime import Controller
 from jaxhil.runtime.gain_file import GainFile
 from jaxhil.scenario import Scenario, build_scenarios
@@ -204,7 +204,8 @@ def _record_chunk(loop: Loop, rig: Rig, gains: Gains, run: Run) -> tuple[Run, Ti
 
 
 def _sense(loop: Loop, rig: Rig, run: Run) -> tuple[Signals, Truth]:
-    return sense(loop, rig, run.state, run.tick)
+    noise = jax.tree.map(lambda leaf: leaf[0], noise_ahead(loop, rig, run, 1))
+    return sense(loop, rig, run.state, run.tick, noise)
 
 
 def _integrate(loop: Loop, rig: Rig, run: Run, command: Array) -> tuple[Array, Array, Array]:

@@ -33,12 +33,13 @@ class Trial:
         seed = seed + VALIDATION_SEED
         self.tasks = tasks
         self.fresh: list[Scenario] = []
-        every, loops = [], [task.loop for task in tasks]
+        every, loops = [], []
         for task in tasks:
             drawn = draw(task.mechanism, validation, seed)
             self.fresh.append(build_scenarios(task.mechanism, drawn, seed))
             every.append(_join([self.fresh[-1], build_scenarios(task.mechanism)]))
-            loops.append(build_loop(task.mechanism, task.compensator, every[-1]))
+            both = _join([every[-1], task.scenarios])
+            loops.append(build_loop(task.mechanism, task.compensator, both, chatter=True))
         self.loop: Loop = common_loop(loops)
         self.names = tuned_names(tasks)
         self.bounds: list[Bounds] = [gain_bounds(task, self.names) for task in tasks]
@@ -79,15 +80,11 @@ class Trial:
             some = pairs[begin : begin + at_once]
             outcome, amplification = self._run(objective, which, shares, some, number)
             # (slots, pairs, scenarios)
-            error, excess = (
-                np.asarray(term).reshape(-1, len(some), number) for term in contact_terms(outcome)
-            )
-            wanted = outcome.wanted.reshape(error.shape)
+            terms = [np.asarray(term).reshape(-1, len(some), number) for term in contact_terms(outcome)]
+            wanted = outcome.wanted.reshape(terms[0].shape)
             for k, (i, point) in enumerate(some):
-                asked = wanted[:, k]
-                found[i, point] = objective_value(
-                    objective, error[:, k][asked], excess[:, k][asked], amplification[k]
-                )
+                error, excess, chatter = (term[:, k][wanted[:, k]] for term in terms)
+                found[i, point] = objective_value(objective, error, excess, amplification[k], chatter)
         return found
 
     def _run(self, objective, which, shares, some, number) -> tuple[Outcome, np.ndarray]:

@@ -25,10 +25,11 @@ BLOCK = 16  # mechanisms tuned and judged together: what is done when work is in
 
 @dataclass(frozen=True)
 class Settings:
-    """Numbers of scenarios to tune on, of starts, of solver steps, of scenarios to judge on; the seed; what
-    to minimise; evaluations without derivatives where starts disagree."""
+    """Numbers of scenarios to tune on (None: `tuning.problems` knows), of starts, of solver steps, of
+    scenarios to judge on; the seed; what to minimise; evaluations without derivatives where starts
+    disagree."""
 
-    scenarios: int = 32
+    scenarios: int | None = None
     starts: int = 4
     steps: int = 25
     validation: int = 511
@@ -39,7 +40,8 @@ class Settings:
 
 class Figures(NamedTuple):
     """Over all contacts of a batch: rms, 99th percentile and maximum of |e - e*|, mean of e - e*; share of
-    contacts that diverge (e > e*); largest |F_c| over the reference's peak; contacts that did not end."""
+    contacts that diverge (e > e*); largest |F_c| over the reference's peak; root of the mean square of the
+    chatter (`jaxhil.evaluation.Outcome`); contacts that did not end."""
 
     rms: float
     p99: float
@@ -47,6 +49,7 @@ class Figures(NamedTuple):
     mean: float
     diverging: float
     peak_ratio: float
+    chatter: float
     failed: int
 
 
@@ -107,7 +110,8 @@ def _tune_block(tasks: list[Task], settings: Settings, report: Callable[[str], N
     }
     best, starts = known["literature"], [[] for _ in tasks]
     if any(task.tuned for task in tasks):
-        report(f"{name}: tuning {compensator} on {settings.scenarios} scenarios each")
+        number = len(tasks[0].scenarios.velocity)
+        report(f"{name}: tuning {compensator} on {number} scenarios each")
         starts, found = _search(trial, settings, lambda text: report(f"{name}: {text}"))
         best = [one.gains if one else task.literature for one, task in zip(found, tasks, strict=True)]
     clock.lap("tune")
@@ -164,7 +168,7 @@ def figures(outcome: Outcome) -> Figures:
     failed = int(np.sum(outcome.wanted & ~outcome.good))
     if not len(errors):
         nan = float("nan")
-        return Figures(nan, nan, nan, nan, nan, nan, failed)
+        return Figures(nan, nan, nan, nan, nan, nan, nan, failed)
     size = np.abs(errors)
     return Figures(
         rms=float(np.sqrt(np.mean(errors**2))),
@@ -173,6 +177,7 @@ def figures(outcome: Outcome) -> Figures:
         mean=float(np.mean(errors)),
         diverging=float(np.mean(errors > 0)),
         peak_ratio=float(np.max(outcome.peak_ratio[outcome.good])),
+        chatter=float(np.sqrt(np.mean(outcome.chatter[outcome.good] ** 2))),
         failed=failed,
     )
 

@@ -19,8 +19,9 @@ MOST_DRAWN = 4  # mechanisms whose plots are drawn; of more there is one picture
 def run(options: Tune) -> int:
     """Tune file by file. What is finished is written at once and stays, whatever happens to the rest."""
     checks.limit(options.limit)
-    checks.at_least(1, scenarios=options.scenarios, starts=options.starts, steps=options.steps)
-    checks.at_least(1, validation=options.validation)
+    checks.at_least(1, starts=options.starts, steps=options.steps, validation=options.validation)
+    if options.scenarios is not None:
+        checks.at_least(1, scenarios=options.scenarios)
     checks.at_least(0, seed=options.seed)
     checks.compensator(options.compensator)
     loaded, problems = _load(options)
@@ -148,7 +149,11 @@ def _objective(options: Tune):
     from tuning.objective import Objective
 
     return Objective(
-        options.objective, options.divergence_weight, options.command_weight, options.noise_weight
+        options.objective,
+        options.divergence_weight,
+        options.command_weight,
+        options.noise_weight,
+        options.chatter_weight,
     )
 
 
@@ -159,6 +164,7 @@ def _in_order(by_index: dict[int, Any]) -> list[Any]:
 def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) -> dict[str, Any]:
     """Write what was found for one mechanism."""
     from tuning.gain_file import build_document, validity_envelope, write_gain_file
+    from tuning.problems import has_sensor_noise
 
     folder = Path(options.output) / folder_name(loaded.mechanism.name)
     folder.mkdir(exist_ok=True)
@@ -192,6 +198,7 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) ->
         "tuned_intervals": _intervals(result),
         "starts": [_start(start) for start in result.starts],
         "timings": result.timings,
+        "sensor_noise": has_sensor_noise(loaded.mechanism),
         "better_than_literature": is_better(result.figures["tuned"], result.figures["literature"]),
         "verdict": "good" if good else "bad",
     }

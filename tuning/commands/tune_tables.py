@@ -34,7 +34,7 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
     from jaxhil.compensators import COMPENSATORS
 
     law, mechanism = COMPENSATORS[options.compensator].gains, result.mechanism
-    names = {"before": "before (no compensation)", "literature": "literature's rule", "tuned": "tuned"}
+    names = {"before": "before (uncompensated)", "literature": "literature's rule", "tuned": "tuned"}
     rows = []
     for key, label in names.items():
         one = result.figures[key]
@@ -43,13 +43,13 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
         rows.append(
             (
                 *(label, one.rms, one.p99, one.max, f"{one.mean:+.4f}", f"{100 * one.diverging:.0f} %"),
-                *(f"{one.peak_ratio:.3f}", one.failed),
+                *(f"{one.peak_ratio:.3f}", f"{one.chatter:.3f}", one.failed),
             )
         )
     count = int(result.outcomes["tuned"].wanted.sum())
     errors = report.table(
         f"{mechanism.name}: errors e - e* of {count} contacts in {options.validation} fresh scenarios",
-        ["gains", "rms", "99th pct", "max", "mean", "e > e*", "peak ratio", "not ended"],
+        ["gains", "rms", "99th pct", "max", "mean", "e > e*", "peak ratio", "chatter", "not ended"],
         rows,
     )
     gains = report.table(
@@ -81,6 +81,9 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
     else:
         verdict = f"Bad: the tuned rms error {tuned.rms:.2g}{sure} exceeds {options.limit:g}."
     seconds = ", ".join(f"{stage} {time:.1f} s" for stage, time in result.timings.items())
+    told = [f"took: {seconds}", verdict]
+    if not entry["sensor_noise"]:
+        told.insert(0, "No sensor noise in the mechanism; with it: --set rig.force_sensor.noise_std=2.67")
     written = [entry["gain_file"], *entry["plots"]]
     tables = [errors] + ([gains] if law else []) + ([starts] if result.starts else [])
-    report.emit(*tables, *(f"wrote {path}" for path in written), f"took: {seconds}", verdict, "")
+    report.emit(*tables, *(f"wrote {path}" for path in written), *told, "")

@@ -1,0 +1,123 @@
+"""The command's excess variation: sequences of commands with known swings, through a contact's begin and end.
+
+The mechanism touches, with a given command at every tick; what is told of it is compared with the sum over
+the sequence by hand. Runs of the loop are compared with the oracle in test_rollout.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from lanes import QUICK, first_contact, join, mechanism, nominal_gains, spread, validated
+
+from jaxhil.building import build_loop
+from jaxhil.compensators import Signals
+from jaxhil.metrics import build_rules, collect, empty_metrics, fresh_watch, observe
+from jaxhil.scenario import build_scenarios
+from jaxhil.touch import Truth
+
+PARSED = validated(mechanism({}))
+SCENARIO = join([build_scenarios(PARSED)])
+LOOP = build_loop(PARSED, "none", SCENARIO, chatter=True)
+BEFORE, AFTER = 5, 40  # ticks without force
+
+
+@partial(jax.jit, compiler_options=QUICK)
+def excess(commands, touching):
+    """Excess variation [N] of commands (ticks,), while the mechanism touches or not."""
+    rules = build_rules(SCENARIO)
+    zeros = jnp.zeros(1)
+
+    def tick(watch, now):
+        command, touches = now
+        # It turns round at once, so that what ends the contact is the quiet after it.
+        signals = Signals(zeros, zeros, zeros - 1, zeros, jnp.zeros(1, jnp.int32))
+        truth = Truth(jnp.where(touches, 10.0, 0.0)[None], None, None)
+        return observe(LOOP, SCENARIO.clearance, rules, watch, signals, truth, command[None]), None
+
+    watch, _ = jax.lax.scan(tick, fresh_watch(LOOP, zeros), (commands, touching))
+    index = jnp.zeros(1, jnp.int32)
+    metrics = collect(SCENARIO, empty_metrics(4, zeros), watch, index, watch.over, index, index)
+    return metrics.excess_variation[0, 0]
+
+
+def told(commands, after=()):
+    """Excess variation of a contact with these commands; `after` it is over, others."""
+    quiet = np.zeros(AFTER)
+    late = AFTER - len(after)
+    quiet[late:] = after
+    padded = np.concatenate([np.zeros(BEFORE), commands, quiet])
+    touching = np.concatenate([np.zeros(BEFORE, bool), np.ones(len(commands), bool), np.zeros(AFTER, bool)])
+    pad = 400 - len(padded)
+    return float(excess(np.pad(padded, (0, pad)), np.pad(touching, (0, pad))))
+
+
+HUMP = 60 * np.sin(np.linspace(0, np.pi, 101))
+
+
+@pytest.mark.parametrize(
+    "commands, expected",
+    [
+        (HUMP, 0),
+        (-HUMP, 0),
+        # An undershoot belongs to the swing, wherever it is.
+        (np.concatenate([HUMP, -0.2 * HUMP]), 0),
+        (np.concatenate([-0.2 * HUMP, HUMP]), 0),
+        # A second hump, a third: a swing each.
+        (np.concatenate([HUMP, HUMP]), 60),
+        (np.concatenate([HUMP, 0.25 * HUMP, HUMP]), 75),
+        # A spike of ten peaks on the way up is a swing to the peak: the hump is one too many.
+        (np.concatenate([[600], HUMP]), 60),
+        (np.concatenate([[600, -200], HUMP]), 60),
+        # Ripple of 2 N on a plateau of 60: 20 times up, of which one belongs to the swing.
+        (60 + np.tile([0, 2], 20), 2 * 19),
+        # A limit cycle: ten swings through the whole range of 100 N.
+        (np.tile([50, -50], 10), 9 * 100),
+    ],
+)
+def test_known_sequences(commands, expected):
+    assert told(commands) == pytest.approx(expected, abs=1e-11)
+
+
+def test_a_hand_made_sum():
+    commands = 60 * np.random.default_rng(0).normal(size=200)
+    path = np.array([0, *commands, 0])
+    assert told(commands) == pytest.approx(np.abs(np.diff(path)).sum() / 2 - np.ptp(path), rel=1e-13)
+
+
+def test_what_comes_after_the_contact_is_none_of_it():
+    assert told(HUMP, after=[70, -70, 70]) == pytest.approx(0, abs=1e-11)
+
+
+def test_a_command_that_is_left_at_the_end_goes_back_to_nothing():
+    """Half the undershoot is still there when patience ends."""
+    commands = np.concatenate([HUMP, np.full(120, -10.0)])
+    touching = np.zeros(400, bool)
+    touching[BEFORE : BEFORE + len(HUMP)] = True
+    padded = np.pad(commands, (BEFORE, 400 - BEFORE - len(commands)))
+    assert float(excess(padded, touching)) == pytest.approx(0, abs=1e-11)
+
+
+def test_derivatives_are_those_of_the_sum():
+    generator = np.random.default_rng(1)
+    touching = (np.arange(400) >= BEFORE) & (np.arange(400) < BEFORE + len(HUMP))
+    commands, way = np.zeros((2, 400))
+    commands[touching] = HUMP + generator.normal(size=len(HUMP))
+    way[touching] = generator.normal(size=len(HUMP))
+
+    def slope(commands):
+        return jax.jvp(lambda commands: excess(commands, touching), (commands,), (way,))[1]
+
+    up, down = (float(excess(commands + step * way, touching)) for step in (1e-6, -1e-6))
+    assert float(slope(commands)) == pytest.approx((up - down) / 2e-6, rel=1e-7)
+    # Where nothing moves, neither way is preferred.
+    assert np.isfinite(slope(np.where(touching, 60.0, 0.0)))
+
+
+def test_contacts_without_identification_swing_once():
+    """The undershoot of a phase lead belongs to its one swing."""
+    for compensator, gains in (("none", {}), ("phase_lead", nominal_gains(PARSED, "phase_lead"))):
+        told = first_contact(PARSED, spread(PARSED, 1), compensator, gains, chatter=True)
+        assert told["excess_variation"] == pytest.approx(0, abs=1e-11 * told["peak_command"][0])

@@ -1,0 +1,43 @@
+"""Sensor noise: the generator against published vectors and `jax.random`, its samples against the normal."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.extend.random import threefry_2x32
+from scipy.stats import kstest
+
+from jaxhil.sensors import threefry, white_noise
+
+
+# Of the authors' library, Random123: key, counter, result.
+@pytest.mark.parametrize(
+    "key, counter, result",
+    [
+        ((0, 0), (0, 0), (0x6B200159, 0x99BA4EFE)),
+        ((0xFFFFFFFF, 0xFFFFFFFF), (0xFFFFFFFF, 0xFFFFFFFF), (0x1CB996FC, 0xBB002BE7)),
+        ((0x13198A2E, 0x03707344), (0x243F6A88, 0x85A308D3), (0xC4923A9C, 0x483DF7A0)),
+    ],
+)
+def test_published_vectors(key, counter, result):
+    assert tuple(int(word) for word in threefry(*map(jnp.uint32, (*key, *counter)))) == result
+
+
+def test_bits_are_those_of_jax():
+    words = np.random.default_rng(0).integers(0, 1 << 32, (4, 8), dtype=np.uint32)
+    ours = np.stack(threefry(*map(jnp.asarray, words)))
+    theirs = np.stack([threefry_2x32(*(jnp.asarray(w) for w in np.split(lane, 2))) for lane in words.T])
+    np.testing.assert_array_equal(ours, theirs.T)
+
+
+@pytest.mark.parametrize("dtype, largest", [("float32", 5.3), ("float64", 6.4)])
+def test_samples_are_normal(dtype, largest):
+    keys = np.stack([np.full(100, 7), np.arange(100)]).astype(np.uint32)
+    count = np.broadcast_to(np.arange(5000, dtype=np.int32)[:, None], (5000, 100))
+    contact = np.zeros(100, np.int32)
+    drawn = white_noise(*map(jnp.asarray, (keys, contact, count)), dtype)
+    assert drawn.dtype == dtype
+    samples = np.asarray(drawn, float)
+    assert kstest(samples.ravel(), "norm").pvalue > 0.01
+    # The kurtosis tells of the tails; that of a normal sample is 3 +- sqrt(96 / number).
+    assert np.mean(samples**4) == pytest.approx(3, abs=4 * np.sqrt(96 / samples.size))
+    assert 4 < np.abs(samples).max() < largest
