@@ -123,6 +123,14 @@ class Tune:
     chatter_weight: Annotated[
         float, _number("Restitution error that weighs as much as a command that swings once too often.")
     ] = 0.0
+    certify: Annotated[
+        bool,
+        arg(
+            name="certify",
+            metavar="",
+            help="Also search all gains' whole ranges, with 50 times the evaluations: is there better?",
+        ),
+    ] = False
     seed: Annotated[int, _number("Seed of scenarios and starts.")] = 0
     overrides: Overrides = ()
     limit: Limit = 0.01
