@@ -1,4 +1,4 @@
-"""The certificate: a search that knows nothing of the tuned gains, and how far they are from what it found."""
+"""The certificate: a search that knows nothing of the tuned gains; how far they are from what it found."""
 
 import numpy as np
 import pytest
