@@ -21,12 +21,9 @@ from jaxhil.evaluation import expected_duration
 from jaxhil.loop import Loop, Rig, build_rig
 from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario
+from tuning.box import Bounds, to_gains, to_shares
 from tuning.objective import RMS, Problem, residuals
-from tuning.optimiser import Bounds
 from tuning.problems import Task, alike, build_task, common_loop, gain_bounds, spread_starts, tuned_names
-
-# How long a contact may take is part of the loss: the same for all as in tuning.
-from tuning.rounds import _patience as patience
 
 COMPENSATOR = "response_error"
 SCENARIOS = 128
@@ -82,9 +79,7 @@ class Case:
 
     def shares_of(self, gains: Float[np.ndarray, "*points gains"]) -> Float[np.ndarray, "*points gains"]:
         """Inverse of `gains_of`, inside the box."""
-        low, high, logarithmic = _scale(self.bounds)
-        values = np.where(logarithmic, np.log(np.where(logarithmic, gains, 1)), gains)
-        return np.clip((values - low) / (high - low), 0, 1)
+        return to_shares(gains, self.bounds)
 
 
 def build_cases(mechanisms: Sequence[Mechanism]) -> list[Case]:
@@ -96,14 +91,6 @@ def build_cases(mechanisms: Sequence[Mechanism]) -> list[Case]:
         for i in group:
             cases[i] = _build_case(tasks[i], loop)
     return [cases[i] for i in range(len(tasks))]
-
-
-def to_gains(shares: Any, bounds: Bounds) -> Any:
-    """Gains (*points, gains) at shares of their ranges; of NumPy's arrays or JAX's."""
-    numpy = jnp if isinstance(shares, jax.Array) else np
-    low, high, logarithmic = _scale(bounds)
-    values = low + (high - low) * shares
-    return numpy.where(logarithmic, numpy.exp(numpy.where(logarithmic, values, 0)), values)
 
 
 def several(tree: Any, number: int) -> Any:
@@ -141,7 +128,7 @@ def _build_case(task: Task, loop: Loop) -> Case:
 
 
 def _build_rig(loop: Loop, scenarios: Scenario) -> Rig:
-    return build_rig(loop, scenarios._replace(time_limit=patience(loop, scenarios)))
+    return build_rig(loop, scenarios)
 
 
 def _dealt(scenarios: Scenario) -> Scenario:
@@ -169,17 +156,6 @@ def _losses(static, points, number, problem, bounds) -> Float[Array, "devices po
         return jax.lax.fori_loop(0, (number + together - 1) // together, some, found)
 
     return over_scenarios(one_device, problem, points, number, bounds)
-
-
-def _scale(bounds: Bounds) -> Any:
-    """Low and high end of each gain on its own scale, and whether that is logarithmic."""
-    numpy = jnp if isinstance(bounds.lower, jax.Array) else np
-    logarithmic = bounds.logarithmic > 0
-
-    def scaled(end):
-        return numpy.where(logarithmic, numpy.log(numpy.where(logarithmic, end, 1)), end)
-
-    return scaled(bounds.lower), scaled(bounds.upper), logarithmic
 
 
 def _lanes_last(leaf) -> PartitionSpec:

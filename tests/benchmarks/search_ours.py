@@ -5,83 +5,97 @@ and seconds; `warm_up` compiles what it will run. Nothing else of this file is u
 """
 
 import time
-from functools import partial
 
 import jax
 import numpy as np
 from jaxtyping import Float
-from search_case import Case, over_scenarios, several, to_gains
+from search_case import Case, several
 from search_methods import Trace
 
 from tuning.objective import RMS, residuals
 from tuning.optimiser import solve
-from tuning.search import polish
+from tuning.problems import spread_points
+from tuning.rounds import AGREED, FIRST_ROUND, REACH
+from tuning.search import apart, polish
 
+SCANNED, DESCENTS, GO_ON = 64, 6, 3  # points looked at, those descended from, those that go on; of a start
 STEPS = 25  # of Levenberg-Marquardt
-POLISH = 320  # evaluations
+POLISH = 160  # evaluations, of a start whose descents do not agree
 LONGEST = 32  # steps that the program is made for
 
 
-def ours(
-    case: Case, starts: Float[np.ndarray, "starts gains"], steps: int = STEPS, evaluations: int = POLISH
-) -> list[Trace]:
-    """Levenberg-Marquardt, then the derivative-free polish, from every start (in the unit box) in one batch.
+def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = False) -> list[Trace]:
+    """What tuning does, from every start (in the unit box) on its own: look around, descend by
+    Levenberg-Marquardt in two rounds, polish without derivatives where the descents disagree.
 
-    A trace has an entry for every step, 1 + P rollouts, and every generation. Its seconds are those of the
-    batch over the number of starts; the steps of a solve, which is one program, count as equally long.
+    A trace has an entry for every stage. Its seconds are those of the batch over the number of starts.
     """
     number, gains = starts.shape
-    static = case.loop, case.names, RMS
-    problems, bounds = several((case.problem, case.bounds), number)
     begin = time.perf_counter()
+    stages = _Stages(number, begin)
 
-    def elapsed():
-        return (time.perf_counter() - begin) / number
-
-    solution = jax.device_get(
-        solve(residuals, static, problems, bounds, case.gains_of(starts), np.array(steps), LONGEST, tile=1)
+    points = np.stack([spread_points(start, SCANNED, seed) for seed, start in enumerate(starts)])
+    values = case.losses(points.reshape(-1, gains)).reshape(number, -1)
+    stages.add(np.full(number, SCANNED), np.min(values, axis=1))
+    order = np.argsort(values, axis=1)
+    first = np.concatenate(
+        [apart(own[ranks], None, DESCENTS) for own, ranks in zip(points, order, strict=True)]
     )
-    last = max(1, int(np.max(solution.steps)))
-    seconds = list(elapsed() * np.arange(1, last + 1) / last)
-    rollouts = [(1 + gains) * np.clip(solution.steps, 1, step) for step in range(1, last + 1)]
-    best = list(solution.history[:, :last].T)
+    shares, loss, steps, curvature = _descend(case, first, 1 if warming else FIRST_ROUND)
+    loss = loss.reshape(number, DESCENTS)
+    stages.add((1 + gains) * steps.reshape(number, -1).sum(axis=1), np.min(loss, axis=1))
+    best = np.argsort(loss, axis=1)[:, :GO_ON] + DESCENTS * np.arange(number)[:, None]
+    shares, loss, steps, curvature = _descend(
+        case, shares[best.reshape(-1)], 1 if warming else STEPS - FIRST_ROUND
+    )
+    loss = loss.reshape(number, GO_ON)
+    stages.add((1 + gains) * steps.reshape(number, -1).sum(axis=1), np.min(loss, axis=1))
 
-    shares = case.shares_of(solution.gains)
-    shape = _curvature(static, case.problem, shares, case.placed_bounds)
-    shape = np.mean(np.asarray(shape), axis=0) / (2 * solution.loss[:, None, None]) + 16 * np.eye(gains)
-    of_shape = 1 + gains
+    # AGREED is of the rms error, the root of the loss.
+    unsure = np.ptp(loss, axis=1) > 2 * AGREED * np.min(loss, axis=1)
+    if unsure.any():
+        rows = (np.argmin(loss, axis=1) + GO_ON * np.arange(number))[unsure]
+        scale = 2 * np.min(loss, axis=1)[unsure]
+        shape = np.linalg.inv(curvature[rows] / scale[:, None, None] + 16 * np.eye(gains))
 
-    def losses(points):
-        nonlocal of_shape
-        found = case.losses(points.reshape(-1, gains)).reshape(points.shape[:-1])
-        seconds.append(elapsed())
-        rollouts.append(rollouts[-1] + of_shape + points.shape[-2])
-        best.append(np.min(found, axis=-1))
-        of_shape = 0
-        return found
+        def losses(points):
+            return case.losses(points.reshape(-1, gains)).reshape(points.shape[:-1])
 
-    polish(losses, shares, evaluations, covariance=np.linalg.inv(shape))
-    lowest = np.minimum.accumulate(best)
-    return [Trace(np.array(rollouts, float)[:, i], np.array(seconds), lowest[:, i]) for i in range(number)]
+        found = polish(losses, shares[rows], 1 if warming else POLISH, reach=REACH, covariance=shape)
+        polished = np.full(number, np.inf)
+        polished[unsure] = found.loss
+        stages.add(POLISH * unsure, polished)
+    return stages.traces()
 
 
 def warm_up(case: Case, starts: Float[np.ndarray, "starts gains"]) -> None:
     """Compile what `ours` runs for as many starts."""
-    ours(case, starts, steps=1, evaluations=1)
+    ours(case, starts, warming=True)
 
 
-@partial(jax.jit, static_argnums=0)
-def _curvature(static, problem, points, bounds):
-    """J^T J at each point, J the residuals' Jacobian by the shares; (devices, points, gains, gains)."""
+def _descend(case: Case, shares, steps):
+    """Shares, loss, steps and J^T J of every descent."""
+    problems, bounds = several((case.problem, case.bounds), len(shares))
+    static = case.loop, case.names, RMS
+    found = jax.device_get(
+        solve(residuals, static, problems, bounds, shares, np.array(steps), LONGEST, tile=1)
+    )
+    return np.clip(found.shares, 0, 1), np.asarray(found.loss), found.steps, np.asarray(found.curvature)
 
-    def one_device(problem, points, bounds):
-        def one(shares):
-            alone = jax.tree.map(lambda leaf: leaf[None], problem)
-            jacobian = jax.jacfwd(lambda shares: residuals(static, to_gains(shares, bounds)[None], alone)[0])(
-                shares
-            )
-            return jacobian.T @ jacobian
 
-        return jax.lax.map(one, points)
+class _Stages:
+    """Of every start rollouts, seconds and best loss after each stage."""
 
-    return over_scenarios(one_device, problem, points, bounds)
+    def __init__(self, number: int, begin: float):
+        self.number, self.begin = number, begin
+        self.rollouts, self.seconds, self.best = [], [], []
+
+    def add(self, rollouts, best) -> None:
+        before = self.rollouts[-1] if self.rollouts else 0
+        self.rollouts.append(before + rollouts)
+        self.seconds.append((time.perf_counter() - self.begin) / self.number)
+        self.best.append(np.minimum(best, self.best[-1] if self.best else np.inf))
+
+    def traces(self) -> list[Trace]:
+        rollouts, best = np.array(self.rollouts, float), np.array(self.best)
+        return [Trace(rollouts[:, i], np.array(self.seconds), best[:, i]) for i in range(self.number)]
