@@ -24,6 +24,9 @@ from tuning.objective import (
     SCALE,
     Objective,
     Problem,
+    Terms,
+    Weights,
+    common_terms,
     contact_terms,
     objective_value,
     residuals,
@@ -44,7 +47,7 @@ def of_name(name):
 
 @pytest.fixture(scope="module")
 def batch():
-    """(loop, scenarios, problems): the scenario `SHORT` fails under all gains."""
+    """(loop, scenarios, rigs): the scenario `SHORT` fails under all gains."""
     parsed = load().mechanism
     scenarios = build_scenarios(parsed, draw(parsed, SCENARIOS, 5), 5)
     limit = np.where(np.arange(SCENARIOS) == SHORT, 0.05, scenarios.time_limit)
@@ -52,7 +55,7 @@ def batch():
     loop = build_loop(parsed, "phase_lead", scenarios)
     rig = jax.jit(build_rig, static_argnums=0, compiler_options=QUICK)(loop, join([scenarios]))
     rigs = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(GAINS), *leaf.shape)), rig)
-    return loop, scenarios, Problem(rigs, {})
+    return loop, scenarios, rigs
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
@@ -68,8 +71,18 @@ def with_jacobian(static, gains, problems):
 
 
 def run(batch, gains=GAINS, objective=STATED):
-    loop, _, problems = batch
-    return [np.asarray(a) for a in with_jacobian((loop, NAMES, objective), jnp.asarray(gains), problems)]
+    loop, _, rigs = batch
+    objectives = [objective] * len(GAINS) if isinstance(objective, Objective) else objective
+    problems = Problem(rigs, {}, stacked(objectives))
+    static = loop, NAMES, common_terms(objectives)
+    return [np.asarray(a) for a in with_jacobian(static, jnp.asarray(gains), problems)]
+
+
+def stacked(objectives):
+    """Weights of problems."""
+    return Weights(
+        *(jnp.asarray(column) for column in zip(*(one.weights for one in objectives), strict=True))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +139,31 @@ def test_the_sum_of_squares_is_the_stated_value_or_just_above(outcomes, name):
             assert value < ours < 1.5 * value
 
 
+def test_every_problem_has_weights_of_its_own(batch):
+    """In one program each has the residuals that it has where all are weighed alike."""
+    several = [STATED, Objective("rms", 1.0, 0.2, 0.02), Objective("rms", 5.0, 0.1, 0.001)]
+    together = run(batch, objective=several)[0]
+    for i, objective in enumerate(several):
+        np.testing.assert_allclose(together[i], run(batch, objective=objective)[0][i], rtol=1e-13)
+
+
+def test_a_part_of_weight_0_is_no_part():
+    errors, excesses, noise = np.array([0.1, -0.2]), np.array([0.3, 0.4]), 3.0
+    terms = padded(errors), padded(excesses), np.arange(SLOTS) < 2, np.asarray(noise)
+    none = padded([]), padded([]), np.asarray(0.0)
+    whole, _ = weighed(Terms("rms", True, True), stacked([Objective()]), terms, none)
+    plain, _ = weighed(Terms("rms", False, False), stacked([Objective()]), terms, none)
+    assert not whole[len(plain) :].any()
+    np.testing.assert_array_equal(whole[: len(plain)], plain)
+
+
+def test_terms_are_those_of_any():
+    assert common_terms([Objective(), Objective(noise_weight=0.1)]) == ("rms", False, True)
+    assert common_terms([Objective("cvar", 2.0, 0.1)]) == ("cvar", True, False)
+    with pytest.raises(ValueError):
+        common_terms([Objective("rms"), Objective("cvar")])
+
+
 def test_derivatives_are_central_differences(batch, known):
     value, jacobian = known
     own = np.stack([jacobian[i, :, i] for i in range(len(GAINS))])  # (problem, gain, residual)
@@ -167,12 +205,12 @@ def test_failed_contacts_count_and_have_no_derivative(batch, known):
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
-def weighed(objective, terms, tangents):
+def weighed(static, weights, terms, tangents):
     """Residuals of one problem's (errors, excesses, wanted, amplification), and their derivative."""
     error, excess, wanted, noise = terms
 
     def value(error, excess, noise):
-        return weigh(objective, error[None], excess[None], wanted[None], noise[None])[0]
+        return weigh(static, weights, error[None], excess[None], wanted[None], noise[None])[0]
 
     return jax.jvp(value, (error, excess, noise), tangents)
 
@@ -185,7 +223,8 @@ def alone(objective, errors, excesses=(), noise=1.0, tangents=((), (), 0.0)):
     """Residuals of one problem with these contacts, in more slots than were asked for; their derivative."""
     terms = padded(errors), padded(excesses), np.arange(SLOTS) < len(errors), np.asarray(noise)
     tangents = padded(tangents[0]), padded(tangents[1]), np.asarray(tangents[2])
-    return tuple(map(np.asarray, weighed(objective, terms, tangents)))
+    static = common_terms([objective])
+    return tuple(map(np.asarray, weighed(static, stacked([objective]), terms, tangents)))
 
 
 def sum_of_squares(*arguments):

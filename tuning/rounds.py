@@ -6,7 +6,7 @@ most promising starts of a task go on.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from jaxhil.loop import Loop, build_rig
 from jaxhil.scenario import Scenario
 from tuning import programs
 from tuning.environment import program_folder
-from tuning.objective import RMS, SCALE, Objective, Problem, residuals
+from tuning.objective import RMS, SCALE, Objective, Problem, common_terms, residuals
 from tuning.optimiser import STATUSES, Solution, solve
 from tuning.problems import Task, common_loop, gain_bounds, spread_starts, tuned_names
 
@@ -68,10 +68,14 @@ def solve_tasks(
     starts: int,
     steps: int,
     seed: int,
-    objective: Objective = RMS,
+    objective: Objective | Sequence[Objective] = RMS,
     report: Callable[[str], None] = lambda text: None,
 ) -> list[list[Start]]:
-    """Every start of every task; the tasks are alike (`tuning.problems.alike`)."""
+    """Every start of every task; the tasks are alike (`tuning.problems.alike`).
+
+    `objective` is that of all tasks, or one of each, which differ by their weights alone: tasks may be the
+    same but for it.
+    """
     names = tuned_names(tasks)
     bounds = [gain_bounds(task, names) for task in tasks]
     problems = []
@@ -79,7 +83,8 @@ def solve_tasks(
         first = np.array([task.literature[name] for name in names])
         for gains in spread_starts(first, bounds[index], starts, seed):
             problems.append(_Problem(index, gains))
-    advance = _stepper(tasks, names, bounds, objective, len(problems))
+    objectives = [objective] * len(tasks) if isinstance(objective, Objective) else list(objective)
+    advance = _stepper(tasks, names, bounds, objectives, len(problems))
     # Neighbours in a call take about as long.
     order = np.argsort([-float(np.max(expected_duration(task.scenarios))) for task in tasks], kind="stable")
     rank = {int(task): place for place, task in enumerate(order)}
@@ -121,27 +126,28 @@ def _finished(problem: _Problem, names: tuple[str, ...], task: Task) -> Start:
     return Start(status, len(history), history[-1], history, {**task.literature, **found})
 
 
-def _stepper(tasks, names, bounds, objective, number) -> Callable[[list[_Problem], int], None]:
+def _stepper(tasks, names, bounds, objectives, number) -> Callable[[list[_Problem], int], None]:
     """A function that takes problems up to so many steps further."""
     loop = common_loop([task.loop for task in tasks])
     fixed = [{k: v for k, v in task.literature.items() if k not in names} for task in tasks]
-    each = [(task.scenarios, f, b) for task, f, b in zip(tasks, fixed, bounds, strict=True)]
+    weights = [one.weights for one in objectives]
+    each = [(t.scenarios, f, b, w) for t, f, b, w in zip(tasks, fixed, bounds, weights, strict=True)]
     table = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *each)
     size = FEW if number <= FEW else MANY
     lanes = len(tasks[0].scenarios.velocity)
-    static = (loop, names, objective), LONGEST, max(1, TILE // lanes)
+    static = (loop, names, common_terms(objectives)), LONGEST, max(1, TILE // lanes)
 
     def advance(problems: list[_Problem], limit: int) -> None:
         for begin in range(0, len(problems), size):
             some = problems[begin : begin + size]
             index = np.array([p.task for p in some] + [some[0].task] * (size - len(some)))
             starts = np.stack([p.gains for p in some] + [some[0].gains] * (size - len(some)))
-            scenarios, others, limits = jax.tree.map(itemgetter(index), table)
+            scenarios, others, limits, weighed = jax.tree.map(itemgetter(index), table)
             # Nothing runs in the lanes that only fill the call.
             idle = np.arange(size)[:, None] >= len(some)
             contacts = np.where(idle, 0, scenarios.contacts).astype(np.int32)
             scenarios = scenarios._replace(contacts=contacts)
-            arguments = scenarios, others, limits, starts, np.array(limit)
+            arguments = scenarios, others, weighed, limits, starts, np.array(limit)
             solution = jax.device_get(programs.run(_advance, static, arguments, program_folder()))
             for i, problem in enumerate(some):
                 _take(problem, solution, i)
@@ -163,12 +169,12 @@ def _take(problem: _Problem, solution: Solution, i: int) -> None:
 def _advance(static: tuple[Any, int, int], arguments: Any) -> Solution:
     what, longest, tile = static
     loop = what[0]
-    scenarios, fixed, bounds, starts, limit = arguments
+    scenarios, fixed, weights, bounds, starts, limit = arguments
 
     def rig(scenarios):
         return build_rig(loop, scenarios._replace(time_limit=_patience(loop, scenarios)))
 
-    problems = Problem(jax.vmap(rig)(scenarios), fixed)
+    problems = Problem(jax.vmap(rig)(scenarios), fixed, weights)
     return solve(residuals, what, problems, bounds, starts, limit, longest=longest, tile=tile)
 
 
