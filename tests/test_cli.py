@@ -194,6 +194,30 @@ def test_a_folder_stands_for_its_files(jaxhil, tmp_path):
     assert all(one == gains[0] for one in gains)
 
 
+def test_a_start_at_gains_tuned_before_never_ends_worse(jaxhil, tuned, tmp_path):
+    arguments = ["tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY]
+    cold = jaxhil(*arguments, "--json").document["mechanisms"][0]
+    assert cold["carried_over"] == []
+    warm = jaxhil(*arguments, "--json", "--start", tuned).document["mechanisms"][0]
+    assert warm["carried_over"] == [
+        {"start": 2, "source": str(tuned), "mechanism": "rig-300kg", "distance": 0.0}
+    ]
+    assert warm["starts"][0] == cold["starts"][0]
+    assert warm["starts"][1]["rms"] <= min(start["rms"] for start in cold["starts"])
+    table = jaxhil(*arguments, "--starts", "1", "--start", tuned / "gains.json").out
+    assert "begins at" in table and "literature" in table and "gains of" in table
+
+
+def test_gains_to_start_at_that_cannot_be_used_are_refused(jaxhil, tuned, tmp_path):
+    (tmp_path / "broken.json").write_text("{")
+    start = ["tune", "rig-300kg", "-o", tmp_path / "out", "--start"]
+    refused(jaxhil(*start, tuned), "--start", str(tuned)[:20], "phase_lead", "response_error")
+    refused(jaxhil(*start, tuned, "nowhere.json"), "allowed gains of response_error")
+    refused(jaxhil(*start, tmp_path / "broken.json"), "broken.json")
+    refused(jaxhil(*start, "nowhere.json"), "nowhere.json", "No such file")
+    assert not (tmp_path / "out").exists()
+
+
 def test_an_unknown_objective_or_a_bad_weight_is_refused(jaxhil, tmp_path):
     for wrong in (["--objective", "mean"], ["--divergence-weight", "0"], ["--noise-weight", "-1"]):
         ran = jaxhil("tune", "-o", tmp_path, *wrong, *TINY)

@@ -95,6 +95,15 @@ class Tune:
     )
     scenarios: Annotated[int, _number("Scenarios to tune on.")] = 32
     starts: Annotated[int, _number("Starts of the solver.")] = 4
+    start: Annotated[
+        tuple[str, ...],
+        arg(
+            metavar="GAINS [GAINS ...]",
+            help="Gain files of the same compensator: each mechanism is tuned from the gains of the nearest "
+            "of their mechanisms too.",
+            help_behavior_hint="",
+        ),
+    ] = ()
     steps: Annotated[int, _number("Most solver steps from each start.")] = 25
     validation: Annotated[int, _number("Fresh scenarios to judge on.")] = 511
     objective: Annotated[

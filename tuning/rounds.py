@@ -6,7 +6,7 @@ most promising starts of a task go on.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from jaxhil.scenario import Scenario
 from tuning import programs
 from tuning.environment import program_folder
 from tuning.objective import RMS, SCALE, Objective, Problem, common_terms, residuals
-from tuning.optimiser import STATUSES, Solution, solve
+from tuning.optimiser import STATUSES, Bounds, Solution, solve
 from tuning.problems import Task, common_loop, gain_bounds, spread_starts, tuned_names
 
 FEW, MANY = 4, 32  # problems in one call of the program
@@ -51,10 +51,11 @@ class Start(NamedTuple):
 
 @dataclasses.dataclass
 class _Problem:
-    """A start on its way: gains now, loss after every step so far."""
+    """A start on its way: gains now, loss after every step so far; the gains it was told to begin at."""
 
     task: int
     gains: np.ndarray
+    told: np.ndarray | None = None
     status: int | str = STEP_LIMIT
     history: list[float] = dataclasses.field(default_factory=list)
 
@@ -70,19 +71,25 @@ def solve_tasks(
     seed: int,
     objective: Objective | Sequence[Objective] = RMS,
     report: Callable[[str], None] = lambda text: None,
+    first: Sequence[Sequence[Mapping[str, float]]] = (),
 ) -> list[list[Start]]:
     """Every start of every task; the tasks are alike (`tuning.problems.alike`).
 
     `objective` is that of all tasks, or one of each, which differ by their weights alone: tasks may be the
-    same but for it.
+    same but for it. `first` has, of each task, gains within its bounds to begin at: they take the places of
+    its last starts, and none of these starts ends worse than at the very gains.
     """
     names = tuned_names(tasks)
     bounds = [gain_bounds(task, names) for task in tasks]
     problems = []
     for index, task in enumerate(tasks):
-        first = np.array([task.literature[name] for name in names])
-        for gains in spread_starts(first, bounds[index], starts, seed):
-            problems.append(_Problem(index, gains))
+        literature = np.array([task.literature[name] for name in names])
+        told = [np.array([gains[name] for name in names]) for gains in (first[index] if first else ())]
+        others = starts - len(told)
+        if others > 0:
+            spread = spread_starts(literature, bounds[index], others, seed)
+            problems.extend(_Problem(index, gains) for gains in spread)
+        problems.extend(_Problem(index, gains, told=gains) for gains in told)
     objectives = [objective] * len(tasks) if isinstance(objective, Objective) else list(objective)
     advance = _stepper(tasks, names, bounds, objectives, len(problems))
     # Neighbours in a call take about as long.
@@ -101,6 +108,7 @@ def solve_tasks(
         done += limit
         if done < steps:
             _give_up(problems)
+    _take_back(problems, tasks, names, objectives)
     return [
         [_finished(p, names, tasks[index]) for p in problems if p.task == index]
         for index in range(len(tasks))
@@ -116,6 +124,25 @@ def _give_up(problems: list[_Problem]) -> None:
         for problem in sorted(own, key=lambda problem: problem.loss)[PROMISING:]:
             if problem.status == STEP_LIMIT:
                 problem.status = GIVEN_UP
+
+
+def _take_back(problems: list[_Problem], tasks, names, objectives) -> None:
+    """Put what ended worse than at the gains it was told to begin at back to them.
+
+    The solver works strictly inside the bounds: it begins beside gains that lie on one.
+    """
+    told = [problem for problem in problems if problem.told is not None]
+    if not told:
+        return
+    # A gain whose bounds are equal is what they are: so the program that solves can tell the loss at a point.
+    points = [_Problem(index, np.asarray(problem.told)) for index, problem in enumerate(told)]
+    pinned = [Bounds(point.gains, point.gains, np.zeros(len(names))) for point in points]
+    own = [problem.task for problem in told]
+    advance = _stepper([tasks[i] for i in own], names, pinned, [objectives[i] for i in own], len(problems))
+    advance(points, 1)
+    for problem, point in zip(told, points, strict=True):
+        if point.loss < problem.loss:
+            problem.gains, problem.history[-1] = point.gains, point.loss
 
 
 def _finished(problem: _Problem, names: tuple[str, ...], task: Task) -> Start:

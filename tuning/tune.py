@@ -20,6 +20,7 @@ from tuning.environment import program_folder
 from tuning.objective import RMS, Objective
 from tuning.problems import Task, alike, build_task, common_loop
 from tuning.rounds import Start, solve_tasks
+from tuning.transfer import Tuned, carry_over, nearest
 from tuning.trust import Intervals, interval
 
 # Draws of the validation come from another seed than those of training.
@@ -58,7 +59,7 @@ class Result:
     """What tuning found: gains (all of the compensator's), the literature's; figures of "before" (no
     compensation), "literature" and "tuned" on the same fresh scenarios, and of their nominal run; every
     start; outcomes and scenarios for plots; seconds spent; 95 % confidence
-    intervals of the tuned figures."""
+    intervals of the tuned figures; what the last of the starts took their gains from."""
 
     compensator: str
     mechanism: Mechanism
@@ -72,6 +73,7 @@ class Result:
     settings: Settings
     timings: dict[str, float] = field(default_factory=dict)
     intervals: Intervals | None = None
+    first: tuple[Tuned, ...] = ()
 
 
 def tune(
@@ -89,17 +91,33 @@ def tune_all(
     compensator: str,
     settings: Settings,
     report: Callable[[str], None] = lambda text: None,
+    tuned: Sequence[Tuned] = (),
 ) -> Iterator[tuple[int, Result]]:
-    """(index, result) of every mechanism, as they are done: like ones together, in one program."""
+    """(index, result) of every mechanism, as they are done: like ones together, in one program.
+
+    The gains of the nearest of those `tuned` before, with the same compensator, are a start for each, and so
+    are those of the nearest that an earlier block found: in the places of the last other starts, never of the
+    literature's.
+    """
     tasks = [build_task(m, compensator, settings.scenarios, settings.seed) for m in mechanisms]
+    found: list[Tuned] = []
     for group in alike([task.loop for task in tasks], [task.scenarios for task in tasks]):
         for begin in range(0, len(group), BLOCK):
             block = group[begin : begin + BLOCK]
-            results = _tune_block([tasks[index] for index in block], settings, report)
+            sources = [known for known in (tuned, found) if known]
+            sources = sources[: max(settings.starts - 1, 1 if tuned else 0)]
+            near = [[nearest(mechanisms[i], known) for known in sources] for i in block]
+            results = _tune_block([tasks[index] for index in block], settings, report, near)
+            found.extend(Tuned(one.mechanism, one.gains, one.mechanism.name) for one in results)
             yield from zip(block, results, strict=True)
 
 
-def _tune_block(tasks: list[Task], settings: Settings, report: Callable[[str], None]) -> list[Result]:
+def _tune_block(
+    tasks: list[Task],
+    settings: Settings,
+    report: Callable[[str], None],
+    near: list[list[Tuned]],
+) -> list[Result]:
     clock = _Clock()
     name = tasks[0].mechanism.name if len(tasks) == 1 else f"{len(tasks)} mechanisms"
     compensator = tasks[0].compensator
@@ -116,13 +134,18 @@ def _tune_block(tasks: list[Task], settings: Settings, report: Callable[[str], N
             meanwhile.submit(trial.prepare, known["literature"])
         if any(task.tuned for task in tasks):
             report(f"{name}: tuning {compensator} on {settings.scenarios} scenarios each")
+            first = [
+                [carry_over(compensator, one.gains, one.mechanism, task.mechanism) for one in own]
+                for task, own in zip(tasks, near, strict=True)
+            ]
             starts = solve_tasks(
                 tasks,
-                settings.starts,
+                max(settings.starts, 1 + max(map(len, first))),
                 settings.steps,
                 settings.seed,
                 settings.objective,
                 lambda text: report(f"{name}: {text}"),
+                first,
             )
             best = [_best(own, task.literature) for own, task in zip(starts, tasks, strict=True)]
     clock.lap("tune")
@@ -149,6 +172,7 @@ def _tune_block(tasks: list[Task], settings: Settings, report: Callable[[str], N
                 settings=settings,
                 timings=clock.laps,
                 intervals=interval(fresh["tuned"].error, fresh["tuned"].good),
+                first=tuple(near[i]),
             )
         )
     return results

@@ -23,13 +23,14 @@ def run(options: Tune) -> int:
     checks.at_least(1, validation=options.validation)
     checks.at_least(0, seed=options.seed)
     checks.compensator(options.compensator)
+    known = _known(options)
     loaded, problems = _load(options)
     entries, interrupted = [], False
     if loaded:
         # Before jax starts: a folder that cannot be written costs no tuning.
         Path(options.output).mkdir(parents=True, exist_ok=True)
         try:
-            entries = _tune_all(options, loaded, problems)
+            entries = _tune_all(options, loaded, problems, known)
         except _Interrupted as stop:
             entries, interrupted = stop.entries, True
     if options.json:
@@ -54,6 +55,27 @@ def run(options: Tune) -> int:
 class _Interrupted(Exception):
     def __init__(self, entries: list[dict[str, Any]]):
         self.entries = entries
+
+
+def _known(options: Tune) -> list[Any]:
+    """What the gain files to begin at hold, as `tuning.transfer.Tuned`. Raises `InputError`."""
+    if not options.start:
+        return []
+    prepare()
+    from tuning.gain_file import load_gain_file
+    from tuning.transfer import Tuned
+
+    known = []
+    for given in options.start:
+        path = Path(given) / "gains.json" if Path(given).is_dir() else given
+        found = load_gain_file(path)
+        if found.compensator != options.compensator:
+            raise InputError(
+                f"--start: {one_line(given)}: found gains of {found.compensator}, allowed gains of "
+                f"{options.compensator}"
+            )
+        known.append(Tuned(found.mechanism, found.gains, str(given)))
+    return known
 
 
 def _load(options: Tune) -> tuple[list[LoadedMechanism], list[str]]:
@@ -96,7 +118,9 @@ def folder_name(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._") or "mechanism"
 
 
-def _tune_all(options: Tune, loaded: list[LoadedMechanism], problems: list[str]) -> list[dict[str, Any]]:
+def _tune_all(
+    options: Tune, loaded: list[LoadedMechanism], problems: list[str], known: list[Any]
+) -> list[dict[str, Any]]:
     prepare()
     from tuning.tune import Settings, tune_all
 
@@ -115,7 +139,7 @@ def _tune_all(options: Tune, loaded: list[LoadedMechanism], problems: list[str])
         if drawn and program_folder() is not None:
             meanwhile.submit(_prepare_drawing, mechanisms[0], options.compensator)
         try:
-            for index, result in tune_all(mechanisms, options.compensator, settings, stages.say):
+            for index, result in tune_all(mechanisms, options.compensator, settings, stages.say, known):
                 try:
                     entries[index] = _finish(options, loaded[index], result, drawn, stages.say)
                 except InputError as error:
@@ -191,10 +215,27 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) ->
         "nominal": result.nominal,
         "tuned_intervals": _intervals(result),
         "starts": result.starts,
+        "carried_over": _carried_over(result),
         "timings": result.timings,
         "better_than_literature": is_better(result.figures["tuned"], result.figures["literature"]),
         "verdict": "good" if good else "bad",
     }
+
+
+def _carried_over(result) -> list[dict[str, Any]]:
+    """Which starts began at gains tuned before, and for what mechanism."""
+    from tuning.transfer import distance
+
+    before = len(result.starts) - len(result.first)
+    return [
+        {
+            "start": before + number,
+            "source": one.source,
+            "mechanism": one.mechanism.name,
+            "distance": distance(result.mechanism, one.mechanism),
+        }
+        for number, one in enumerate(result.first, start=1)
+    ]
 
 
 def _prepare_drawing(mechanism, compensator: str) -> None:
