@@ -122,6 +122,9 @@ class Tune:
     noise_weight: Annotated[
         float, _number("Restitution error that weighs as much as one time the sensor noise more.")
     ] = 0.0
+    pareto: Annotated[
+        int, _number("Points of the trade-off of restitution error against sensor noise, each a gain file.")
+    ] = 0
     seed: Annotated[int, _number("Seed of scenarios and starts.")] = 0
     overrides: Overrides = ()
     limit: Limit = 0.01

@@ -121,7 +121,7 @@ def _tune_block(
     clock = _Clock()
     name = tasks[0].mechanism.name if len(tasks) == 1 else f"{len(tasks)} mechanisms"
     compensator = tasks[0].compensator
-    trial = _Trial(tasks, settings)
+    trial = Trial(tasks, settings)
     known = {
         "before": [neutral_gains(compensator, task.literature) for task in tasks],
         "literature": [task.literature for task in tasks],
@@ -183,7 +183,7 @@ def _best(starts: list[Start], literature: dict[str, float]) -> dict[str, float]
     return min(usable, key=lambda start: start.rms).gains if usable else literature
 
 
-class _Trial:
+class Trial:
     """Fresh scenarios of like tasks, and the nominal run of each as one more lane of its own."""
 
     def __init__(self, tasks: list[Task], settings: Settings):

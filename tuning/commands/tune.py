@@ -9,7 +9,7 @@ from jaxhil.errors import InputError, one_line
 from jaxhil.mechanism_file import LoadedMechanism, load
 from tuning import report
 from tuning.cli import Tune
-from tuning.commands import checks
+from tuning.commands import checks, tune_pareto
 from tuning.commands.tune_tables import print_one, print_overview
 from tuning.environment import prepare, program_folder
 
@@ -23,6 +23,7 @@ def run(options: Tune) -> int:
     checks.at_least(1, validation=options.validation)
     checks.at_least(0, seed=options.seed)
     checks.compensator(options.compensator)
+    tune_pareto.check(options)
     known = _known(options)
     loaded, problems = _load(options)
     entries, interrupted = [], False
@@ -133,9 +134,12 @@ def _tune_all(
         _objective(options),
     )
     mechanisms = [one.mechanism for one in loaded]
-    entries, done = {}, {}
+    entries, done, traded = {}, {}, {}
     drawn = len(loaded) <= MOST_DRAWN
-    with report.stages(len(loaded)) as stages, ThreadPoolExecutor(1) as meanwhile:
+    with (
+        report.stages(len(loaded) * (2 if options.pareto else 1)) as stages,
+        ThreadPoolExecutor(1) as meanwhile,
+    ):
         if drawn and program_folder() is not None:
             meanwhile.submit(_prepare_drawing, mechanisms[0], options.compensator)
         try:
@@ -150,6 +154,8 @@ def _tune_all(
                 stages.finish()
                 if not options.json and drawn:
                     print_one(options, result, entries[index])
+            if options.pareto and done:
+                traded = tune_pareto.trade(options, loaded, done, entries, problems, stages)
         except KeyboardInterrupt:
             raise _Interrupted(_in_order(entries)) from None
     if len(loaded) > 1 and done:
@@ -160,6 +166,13 @@ def _tune_all(
             save(overview_plot(results, options.limit), Path(options.output) / "overview.png")
         if not options.json:
             print_overview(options, results, finished, drawn)
+    if not options.json and drawn:
+        for index in sorted(traded):
+            tune_pareto.print_front(options, done[index], traded[index], entries[index]["pareto"])
+    elif not options.json and traded:
+        report.emit(
+            f"wrote {options.output}/NAME/pareto/NN/gains.json and {options.output}/NAME/pareto.png", ""
+        )
     return _in_order(entries)
 
 
