@@ -158,14 +158,15 @@ def overview_plot(results: Sequence[Result], limit: float) -> Figure:
 def front_plot(front: Front, result: Result, limit: float) -> Figure:
     """Restitution error against amplification of sensor noise: numbered points, the front as a line of what
     is reached, the literature's gains and those tuned beside."""
-    figure = _figure((7, 5), f"{result.mechanism.name}: accuracy against sensor noise")
+    figure = _figure(
+        (7, 5), f"{result.mechanism.name}: restitution error against sensor noise, fresh scenarios"
+    )
     axes = figure.subplots()
     kept = sorted((one for one in front.points if one.on_front), key=lambda one: one.amplification)
-    beaten = [one for one in front.points if not one.on_front]
     axes.step([p.amplification for p in kept], [p.error for p in kept], where="post", color=BLUE)
     for points, label, marker, size, edge, face in (
         (kept, "front", "o", 7, BLUE, BLUE),
-        (beaten, "beaten by another point", "o", 7, BLUE, "white"),
+        ([one for one in front.points if not one.on_front], "beaten by another", "o", 7, BLUE, "white"),
         ([front.literature], LABELS["literature"], "s", 7, ORANGE, ORANGE),
         # Open: what was tuned before may be a point too.
         ([front.tuned], LABELS["tuned"], "D", 10, BLACK, "none"),
@@ -178,17 +179,15 @@ def front_plot(front: Front, result: Result, limit: float) -> Figure:
         axes.axhline(limit, color=GREEN, linewidth=1, linestyle=":", label=f"limit {limit:g}")
     numbers: dict[tuple[float, float], list[str]] = {}  # points that came out alike share a place
     for number, one in enumerate(front.points, start=1):
-        numbers.setdefault(one.place[::-1], []).append(str(number))
-    for turn, place in enumerate(sorted(numbers)):
-        # Above and below in turn: neighbours do not write over each other.
-        where = {"xytext": (6, -14 if turn % 2 else 6), "textcoords": "offset points"}
-        axes.annotate(", ".join(numbers[place]), place, fontsize=8, **where)
-    shown = [*front.points, front.literature, front.tuned]
-    _scale(axes, "x", [one.amplification for one in shown])
-    _scale(axes, "y", [one.error for one in shown])
+        numbers.setdefault(one.place, []).append(str(number))
+    for turn, (error, noise) in enumerate(sorted(numbers)):
+        where = {"xytext": (6, -14 if turn % 2 else 6), "textcoords": "offset points"}  # one above, one below
+        axes.annotate(", ".join(numbers[error, noise]), (noise, error), fontsize=8, **where)
+    _scale(axes, "x", [one.amplification for one in (*front.points, front.literature, front.tuned)])
+    _scale(axes, "y", [one.error for one in (*front.points, front.literature, front.tuned)])
     axes.margins(0.08, 0.12)
-    axes.set_xlabel("noise of the command over noise of the force sensor (standard deviations) [1]")
-    axes.set_ylabel(f"{result.settings.objective.name} of e - e* on fresh scenarios [1]")
+    name = result.settings.objective.name
+    axes.set(xlabel="noise of the command over noise of the force sensor [1]", ylabel=f"{name} of e - e* [1]")
     _finish(axes, "best")
     return figure
 
@@ -243,8 +242,8 @@ def _scale(axes: Axes, name: str, values: Sequence[float]) -> None:
     axes.set(**{f"{name}scale": "log"})
     axis = {"x": axes.xaxis, "y": axes.yaxis}[name]
     axis.set_minor_locator(LogLocator(subs=(2, 3, 5) if high > 5 * low else range(2, 10)))
-    axis.set_major_formatter(lambda value, _: f"{value:g}")
-    axis.set_minor_formatter(lambda value, _: f"{value:g}")
+    for plainly in (axis.set_major_formatter, axis.set_minor_formatter):
+        plainly(lambda value, _: f"{value:g}")
 
 
 def _entered(piece: Piece) -> str:
