@@ -13,7 +13,7 @@ from jaxtyping import Float
 from search_case import Case, over_scenarios, several, to_gains
 from search_methods import Trace
 
-from tuning.objective import RMS, residuals
+from tuning.objective import RMS, common_terms, residuals
 from tuning.optimiser import solve
 from tuning.search import polish
 
@@ -31,7 +31,7 @@ def ours(
     batch over the number of starts; the steps of a solve, which is one program, count as equally long.
     """
     number, gains = starts.shape
-    static = case.loop, case.names, RMS
+    static = case.loop, case.names, common_terms([RMS])
     problems, bounds = several((case.problem, case.bounds), number)
     begin = time.perf_counter()
 
