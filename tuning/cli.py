@@ -135,6 +135,14 @@ class Tune:
     pareto: Annotated[
         int, _number("Points of the trade-off of restitution error against sensor noise, each a gain file.")
     ] = 0
+    certify: Annotated[
+        bool,
+        arg(
+            name="certify",
+            metavar="",
+            help="Also search all gains' whole ranges, with 50 times the evaluations: is there better?",
+        ),
+    ] = False
     seed: Annotated[int, _number("Seed of scenarios and starts.")] = 0
     overrides: Overrides = ()
     limit: Limit = 0.01

@@ -13,13 +13,14 @@ from jaxhil.compensators import COMPENSATORS
 from jaxhil.evaluation import Outcome
 from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario
+from tuning.certificate import Certified, certified
 from tuning.environment import program_folder
-from tuning.objective import RMS, Objective
+from tuning.objective import RMS, SCALE, Objective
 from tuning.problems import Task, alike, build_task
 from tuning.rounds import Start, choose_starts, finish, prepare_solver, solve_tasks
 from tuning.transfer import Tuned, carry_over, nearest
 from tuning.trial import Trial
-from tuning.trust import Intervals, interval
+from tuning.trust import Intervals, interval, sensitivity
 
 BLOCK = 16  # mechanisms tuned and judged together: what is done when work is interrupted is kept
 
@@ -28,7 +29,7 @@ BLOCK = 16  # mechanisms tuned and judged together: what is done when work is in
 class Settings:
     """Numbers of scenarios to tune on (None: `tuning.problems` knows), of starts, of solver steps, of
     scenarios to judge on; the seed; what to minimise; evaluations without derivatives where starts
-    disagree."""
+    disagree; whether to search the whole box for something better."""
 
     scenarios: int | None = None
     starts: int = 4
@@ -37,6 +38,7 @@ class Settings:
     seed: int = 0
     objective: Objective = RMS
     polish: int = 320
+    certify: bool = False
 
 
 class Figures(NamedTuple):
@@ -54,12 +56,21 @@ class Figures(NamedTuple):
     failed: int
 
 
+class Freedom(NamedTuple):
+    """How far a gain may move, as a share of its range, before the loss rises by a hundredth: the others
+    held, and the others moved along."""
+
+    alone: float
+    together: float
+
+
 @dataclass(frozen=True)
 class Result:
     """What tuning found: gains (all of the compensator's), the literature's; figures of "before" (no
     compensation), "literature" and "tuned" on the same fresh scenarios, and of their nominal run; every
     start; outcomes and scenarios for plots; seconds spent; 95 % confidence
-    intervals of the tuned figures; what the last of the starts took their gains from."""
+    intervals of the tuned figures; of each tuned gain how far it may move (`tuning.trust.sensitivity`); how
+    far from the best anywhere, if asked for; what the last of the starts took their gains from."""
 
     compensator: str
     mechanism: Mechanism
@@ -74,6 +85,8 @@ class Result:
     timings: dict[str, float] = field(default_factory=dict)
     intervals: Intervals | None = None
     first: tuple[Tuned, ...] = ()
+    freedom: dict[str, Freedom] = field(default_factory=dict)
+    certified: Certified | None = None
 
 
 def tune(
@@ -126,7 +139,7 @@ def _tune_block(
         "before": [neutral_gains(compensator, task.literature) for task in tasks],
         "literature": [task.literature for task in tasks],
     }
-    best, starts = known["literature"], [[] for _ in tasks]
+    best, starts, found = known["literature"], [[] for _ in tasks], [None for _ in tasks]
     if any(task.tuned for task in tasks):
         number = len(tasks[0].scenarios.velocity)
         report(f"{name}: tuning {compensator} on {number} scenarios each")
@@ -141,6 +154,9 @@ def _tune_block(
     outcomes = {key: trial.judge(gains) for key, gains in known.items()}
     outcomes["tuned"] = trial.judge(best)
     clock.lap("judge")
+    certificates = _certify(trial, settings, found, starts, lambda text: report(f"{name}: {text}"))
+    if settings.certify:
+        clock.lap("certify")
     results = []
     for i, task in enumerate(tasks):
         own = {key: every[i] for key, every in outcomes.items()}
@@ -161,6 +177,8 @@ def _tune_block(
                 timings=clock.laps,
                 intervals=interval(fresh["tuned"].error, fresh["tuned"].good),
                 first=tuple(near[i]),
+                freedom=_freedom(task, trial.names, found[i]),
+                certified=certificates[i],
             )
         )
     return results
@@ -187,6 +205,30 @@ def _search(
     starts = solve_tasks(trial.tasks, chosen, settings.steps, objective, report)
     report("searching without derivatives where starts disagree")
     return starts, finish(trial, starts, settings.polish, seed, objective)
+
+
+def _certify(trial: Trial, settings: Settings, found, starts, report) -> list[Certified | None]:
+    certificates: list[Certified | None] = []
+    for i, (own, every) in enumerate(zip(found, starts, strict=True)):
+        if not settings.certify or own is None:
+            certificates.append(None)
+            continue
+        report(f"searching everywhere, {i + 1} of {len(found)}")
+        objective, polish, seed = settings.objective, settings.polish, settings.seed
+        certificates.append(certified(trial, i, own, every, objective, polish, seed))
+    return certificates
+
+
+def _freedom(task: Task, names: tuple[str, ...], found: Start | None) -> dict[str, Freedom]:
+    """Of the gains tuned for the task, from the solver's last J^T J."""
+    moved = [i for i, name in enumerate(names) if name in {gain.name for gain in task.tuned}]
+    if found is None or not moved:
+        return {}
+    values, vectors = np.linalg.eigh(found.curvature[np.ix_(moved, moved)])
+    root = np.sqrt(np.maximum(values, 0))[:, None] * vectors.T
+    known = sensitivity(root, (found.rms / SCALE) ** 2 / 2)
+    pairs = zip(known.alone, known.together, strict=True)
+    return {names[i]: Freedom(float(a), float(b)) for i, (a, b) in zip(moved, pairs, strict=True)}
 
 
 def figures(outcome: Outcome) -> Figures:

@@ -133,6 +133,7 @@ def _tune_all(
         options.validation,
         options.seed,
         _objective(options),
+        certify=options.certify,
     )
     mechanisms = [one.mechanism for one in loaded]
     entries, done, traded = {}, {}, {}
@@ -235,6 +236,8 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) ->
         "tuned_intervals": _intervals(result),
         "starts": [_start(start) for start in result.starts],
         "carried_over": _carried_over(result),
+        "freedom": {name: one._asdict() for name, one in result.freedom.items()},
+        "certified": result.certified._asdict() if result.certified else None,
         "timings": result.timings,
         "sensor_noise": has_sensor_noise(loaded.mechanism),
         "better_than_literature": is_better(result.figures["tuned"], result.figures["literature"]),

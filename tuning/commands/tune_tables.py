@@ -15,14 +15,18 @@ def print_overview(options: Tune, results: list[Any], entries: list[dict[str, An
         best = min(result.starts, key=lambda start: start.rms).status if result.starts else "nothing to tune"
         verdict = entry["verdict"] if entry["better_than_literature"] else "NOT better than the literature's"
         rms = (result.figures[key].rms for key in ("before", "literature", "tuned"))
-        rows.append((entry["mechanism"], *rms, tuned.p99, tuned.peak_ratio, tuned.failed, best, verdict))
+        above = [f"{100 * result.certified.above:+.1f} %"] if result.certified else []
+        rows.append(
+            (entry["mechanism"], *rms, tuned.p99, tuned.peak_ratio, tuned.failed, *above, best, verdict)
+        )
     headings = ["mechanism", "before", "literature", "tuned", "99th pct", "peak ratio", "not ended"]
+    headings += ["above best"] if results[0].certified else []
     report.emit(
         report.table(
             f"rms of e - e* on {options.validation} fresh scenarios each, {options.compensator}",
             [*headings, "best start", "verdict"],
             rows,
-            texts=(0, 7, 8),
+            texts=(0, len(headings), len(headings) + 1),
         )
     )
     if not drawn:
@@ -54,12 +58,14 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
     )
     gains = report.table(
         f"Gains of {options.compensator}",
-        ["gain", "unit", "lower", "upper", "literature", "tuned"],
+        ["gain", "unit", "lower", "upper", "literature", "tuned", "free alone", "together"],
         [
             (
                 *(gain.name, gain.unit, float(gain.lower(mechanism)), float(gain.upper(mechanism))),
                 result.literature[gain.name],
                 result.gains[gain.name] if gain.tuned(mechanism) else "(not tuned)",
+                *(f"{100 * share:.1f} %" for share in result.freedom.get(gain.name, ())),
+                *([""] * (0 if gain.name in result.freedom else 2)),
             )
             for gain in law
         ],
@@ -80,8 +86,20 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
     if not entry["sensor_noise"]:
         told.insert(0, "No sensor noise in the mechanism; with it: --set rig.force_sensor.noise_std=2.67")
     written = [entry["gain_file"], *entry["plots"]]
+    sure_of = []
+    if result.freedom:
+        sure_of.append(
+            "Free: the share of its range by which a gain may move, alone or with the others moved along, "
+            "before the loss rises by 1 %."
+        )
+    if result.certified:
+        one = result.certified
+        sure_of.append(
+            f"Best of {one.evaluations} evaluations anywhere: {one.best:.4g}; tuned, with {one.spent}: "
+            f"{one.tuned:.4g}, {100 * abs(one.above):.1f} % {'above' if one.above > 0 else 'below'} it."
+        )
     tables = [errors] + ([gains] if law else []) + ([starts] if result.starts else [])
-    report.emit(*tables, *(f"wrote {path}" for path in written), *told, "")
+    report.emit(*tables, *sure_of, *(f"wrote {path}" for path in written), *told, "")
 
 
 def _starts(options: Tune, result: Any) -> Any:
