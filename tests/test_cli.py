@@ -196,6 +196,63 @@ def test_a_folder_stands_for_its_files(jaxhil, tmp_path):
     assert all(one == gains[0] for one in gains)
 
 
+def test_a_start_at_gains_tuned_before_never_ends_worse(jaxhil, tuned, tmp_path):
+    arguments = ["tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY]
+    cold = jaxhil(*arguments, "--json").document["mechanisms"][0]
+    assert cold["carried_over"] == []
+    warm = jaxhil(*arguments, "--json", "--start", tuned).document["mechanisms"][0]
+    assert warm["carried_over"] == [
+        {"start": 2, "source": str(tuned), "mechanism": "rig-300kg", "distance": 0.0}
+    ]
+    assert warm["starts"][0] == cold["starts"][0]
+    assert warm["starts"][1]["rms"] <= min(start["rms"] for start in cold["starts"])
+    table = jaxhil(*arguments, "--starts", "1", "--start", tuned / "gains.json").out
+    assert "begins at" in table and "literature" in table and "gains of" in table
+
+
+def test_a_front_is_a_gain_file_for_each_point(jaxhil, tmp_path):
+    folder = tmp_path / "rig-300kg"
+    # Of a longer front that was here before.
+    (folder / "pareto" / "07").mkdir(parents=True)
+    (folder / "pareto" / "07" / "gains.json").write_text("{}")
+    arguments = ["tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY]
+    ran = jaxhil(*arguments, "--pareto", "3", "--json", "--limit", "inf")
+    assert ran.code == 0
+    front = ran.document["mechanisms"][0]["pareto"]
+    assert [point["noise_weight"] == 0 for point in front["points"]] == [True, False, False]
+    paths = [folder / "pareto" / f"0{number}" / "gains.json" for number in (1, 2, 3)]
+    assert sorted((folder / "pareto").rglob("*.*")) == paths
+    for point, path in zip(front["points"], paths, strict=True):
+        written = json.loads(path.read_text())
+        assert point["gain_file"] == str(path)
+        assert point["gains"] == written["gains"]
+        assert written["figures"]["robust"]["tuned"] == point["figures"]
+        assert written["figures"]["pareto"]["noise_amplification"] == point["noise_amplification"]
+    assert front["plot"] == str(folder / "pareto.png") and (folder / "pareto.png").stat().st_size > 0
+    assert jaxhil("verify", paths[2], "--scenarios", "1").code == 0
+    table = jaxhil(*arguments, "--pareto", "3", "--limit", "1")
+    for word in ("noise weight", "literature's rule", "front", "Quietest within 1: point", "pareto.png"):
+        assert word in table.out
+
+
+def test_a_front_that_there_is_not_is_refused(jaxhil, tmp_path):
+    arguments = ["tune", "rig-300kg", "-o", tmp_path / "out"]
+    refused(jaxhil(*arguments, "--pareto", "8", "--compensator", "none"), "--pareto", "none", "no trade-off")
+    refused(jaxhil(*arguments, "--pareto", "1"), "--pareto", "0 or an integer >= 2")
+    refused(jaxhil(*arguments, "--pareto", "-3"), "--pareto", "-3")
+    assert not (tmp_path / "out").exists()
+
+
+def test_gains_to_start_at_that_cannot_be_used_are_refused(jaxhil, tuned, tmp_path):
+    (tmp_path / "broken.json").write_text("{")
+    start = ["tune", "rig-300kg", "-o", tmp_path / "out", "--start"]
+    refused(jaxhil(*start, tuned), "--start", str(tuned)[:20], "phase_lead", "response_error")
+    refused(jaxhil(*start, tuned, "nowhere.json"), "allowed gains of response_error")
+    refused(jaxhil(*start, tmp_path / "broken.json"), "broken.json")
+    refused(jaxhil(*start, "nowhere.json"), "nowhere.json", "No such file")
+    assert not (tmp_path / "out").exists()
+
+
 def test_an_unknown_objective_or_a_bad_weight_is_refused(jaxhil, tmp_path):
     weights = ["--divergence-weight", "0"], ["--noise-weight", "-1"], ["--chatter-weight", "nan"]
     for wrong in (["--objective", "mean"], *weights):

@@ -25,6 +25,9 @@ from tuning.objective import (
     SCALE,
     Objective,
     Problem,
+    Terms,
+    Weights,
+    common_terms,
     contact_terms,
     objective_value,
     residuals,
@@ -44,7 +47,7 @@ def of_name(name):
 
 
 def build_batch(overrides=()):
-    """(loop, scenarios, problems): the scenario `SHORT` fails under all gains."""
+    """(loop, scenarios, rigs): the scenario `SHORT` fails under all gains."""
     parsed = load("varying", overrides).mechanism
     scenarios = build_scenarios(parsed, draw(parsed, SCENARIOS, 5), 5)
     limit = np.where(np.arange(SCENARIOS) == SHORT, 0.05, scenarios.time_limit)
@@ -52,7 +55,7 @@ def build_batch(overrides=()):
     loop = build_loop(parsed, "phase_lead", scenarios)
     rig = jax.jit(build_rig, static_argnums=0, compiler_options=QUICK)(loop, join([scenarios]))
     rigs = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(GAINS), *leaf.shape)), rig)
-    return loop, scenarios, Problem(rigs, {})
+    return loop, scenarios, rigs
 
 
 @pytest.fixture(scope="module")
@@ -73,8 +76,18 @@ def with_jacobian(static, gains, problems):
 
 
 def run(batch, gains=GAINS, objective=STATED):
-    loop, _, problems = batch
-    return [np.asarray(a) for a in with_jacobian((loop, NAMES, objective), jnp.asarray(gains), problems)]
+    loop, _, rigs = batch
+    objectives = [objective] * len(GAINS) if isinstance(objective, Objective) else objective
+    problems = Problem(rigs, {}, stacked(objectives))
+    static = loop, NAMES, common_terms(objectives)
+    return [np.asarray(a) for a in with_jacobian(static, jnp.asarray(gains), problems)]
+
+
+def stacked(objectives):
+    """Weights of problems."""
+    return Weights(
+        *(jnp.asarray(column) for column in zip(*(one.weights for one in objectives), strict=True))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -134,6 +147,32 @@ def test_the_sum_of_squares_is_the_stated_value_or_just_above(outcomes, name):
             assert value < ours < 1.5 * value
 
 
+def test_every_problem_has_weights_of_its_own(batch):
+    """In one program each has the residuals that it has where all are weighed alike."""
+    several = [STATED, Objective("rms", 1.0, 0.2, 0.02, 0.3), Objective("rms", 5.0, 0.1, 0.001, 0.01)]
+    together = run(batch, objective=several)[0]
+    for i, objective in enumerate(several):
+        np.testing.assert_allclose(together[i], run(batch, objective=objective)[0][i], rtol=1e-13)
+
+
+def test_a_part_of_weight_0_is_no_part():
+    errors, excesses, swings, noise = [0.1, -0.2], [0.3, 0.4], [0.5, 0.6], 3.0
+    terms = *map(padded, (errors, excesses, swings)), np.arange(SLOTS) < 2, np.asarray(noise)
+    none = *[padded([])] * 3, np.asarray(0.0)
+    whole, _ = weighed(Terms("rms", True, True, True), stacked([Objective()]), terms, none)
+    plain, _ = weighed(Terms("rms", False, False, False), stacked([Objective()]), terms, none)
+    assert len(whole) == 3 * len(plain) + 1 and not whole[len(plain) :].any()
+    np.testing.assert_array_equal(whole[: len(plain)], plain)
+
+
+def test_terms_are_those_of_any():
+    assert common_terms([Objective(), Objective(noise_weight=0.1)]) == ("rms", False, True, False)
+    assert common_terms([Objective("cvar", 2.0, 0.1)]) == ("cvar", True, False, False)
+    assert common_terms([Objective(chatter_weight=0.1), Objective()]) == ("rms", False, False, True)
+    with pytest.raises(ValueError):
+        common_terms([Objective("rms"), Objective("cvar")])
+
+
 def against_differences(batch, jacobian):
     """Derivatives (problem, gain, residual), which are compared with central differences."""
     own = np.stack([jacobian[i, :, i] for i in range(len(GAINS))])
@@ -189,12 +228,13 @@ def test_failed_contacts_count_and_have_no_derivative(batch, known):
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
-def weighed(objective, terms, tangents):
+def weighed(static, weights, terms, tangents):
     """Residuals of one problem's (errors, excesses, chatter, wanted, amplification), and their derivative."""
     *contacts, wanted, noise = terms
 
     def value(error, excess, chatter, noise):
-        return weigh(objective, error[None], excess[None], chatter[None], wanted[None], noise[None])[0]
+        several = (term[None] for term in (error, excess, chatter, wanted, noise))
+        return weigh(static, weights, *several)[0]
 
     return jax.jvp(value, (*contacts, noise), tangents)
 
@@ -208,7 +248,8 @@ def alone(objective, errors, excesses=(), noise=1.0, chatter=(), tangents=((), (
     wanted = np.arange(SLOTS) < len(errors)
     terms = padded(errors), padded(excesses), padded(chatter), wanted, np.asarray(noise)
     tangents = *map(padded, tangents[:-1]), np.asarray(tangents[-1])
-    return tuple(map(np.asarray, weighed(objective, terms, tangents)))
+    static = common_terms([objective])
+    return tuple(map(np.asarray, weighed(static, stacked([objective]), terms, tangents)))
 
 
 def sum_of_squares(*arguments):

@@ -14,7 +14,8 @@ from jaxhil.metrics import Metrics
 from jaxhil.scenario import build_scenarios
 from jaxhil.uncertainty import draw
 from tuning.motion import Curve, Piece, _space
-from tuning.plots import STYLES, contact_plot, errors_plot, loss_plot, save
+from tuning.pareto import Front, Point
+from tuning.plots import STYLES, contact_plot, errors_plot, front_plot, loss_plot, save
 from tuning.tune import Result, Settings, Start, figures
 
 LANES = 40
@@ -107,6 +108,46 @@ def test_the_best_start_stands_out():
     assert set(labels(axes)) == {"start at the literature's gains", "best start", "other starts"}
     best = next(line for line in axes.lines if line.get_label() == "best start")
     assert np.asarray(best.get_ydata())[-1] == pytest.approx(0.1 / 3)
+
+
+def front(places=((0.01, 3.0), (0.01, 3.0), (0.02, 2.0), (0.03, 2.5), (0.04, 1.1))):
+    """Points at (error, amplification), the fourth beaten by the third."""
+    made = result()
+
+    def point(error, noise, on_front):
+        one = made.figures["tuned"]
+        return Point({}, 0.1, noise, error, one, one, made.intervals, on_front)
+
+    points = [point(*place, number != 3) for number, place in enumerate(places)]
+    return made, Front(points, point(0.1, 4.0, False), point(0.012, 3.5, False))
+
+
+def test_a_front_has_units_numbers_and_the_literature_beside():
+    made, drawn = front()
+    (axes,) = front_plot(drawn, made, 0.015).axes
+    assert (
+        "noise" in axes.get_xlabel() and "[1]" in axes.get_xlabel() and "rms of e - e*" in axes.get_ylabel()
+    )
+    assert labels(axes) == [
+        *("front", "beaten by another", "literature's rule", "tuned", "limit 0.015"),
+    ]
+    # Points that came out alike share a place.
+    assert {text.get_text(): text.xy for text in axes.texts} == {
+        **{"1, 2": (3.0, 0.01), "3": (2.0, 0.02), "4": (2.5, 0.03), "5": (1.1, 0.04)},
+    }
+    line = next(line for line in axes.lines if line.get_drawstyle() == "steps-post")
+    assert list(np.asarray(line.get_xdata())) == [1.1, 2.0, 3.0, 3.0]
+    colours = {to_hex(line.get_color()) for line in axes.lines if line.get_label() in labels(axes)[:4]}
+    assert len(colours) == 3
+
+
+@pytest.mark.parametrize("limit", [0.0, 0.01, math.inf])
+def test_any_front_can_be_drawn(limit, tmp_path):
+    for number, places in enumerate(
+        [((0.5, 1.0),) * 2, ((0.0, 1.0), (2.0, 0.9)), ((1e-3, 40.0), (1.0, 1.0))]
+    ):
+        made, drawn = front(places)
+        save(front_plot(drawn, made, limit), tmp_path / f"{number}.png")
 
 
 def test_contacts_are_drawn_side_by_side_with_units():

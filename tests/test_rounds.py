@@ -78,16 +78,14 @@ def test_a_task_that_fails_harms_no_other(tasks, solved):
 
 
 def test_the_objective_is_what_is_lowered(tasks):
-    """Where a squared divergence counts 16 times, less diverges."""
+    """Where a squared divergence counts 16 times, less diverges; both objectives in one call."""
+    objectives = [RMS, Objective(divergence_weight=16.0)]
     plain, cautious = (
-        min(solve_tasks(tasks[:1], spread(tasks[:1], 2), STEPS, objective)[0], key=lambda start: start.rms)
-        for objective in (RMS, Objective(divergence_weight=16.0))
+        min(starts, key=lambda start: start.rms)
+        for starts in solve_tasks([tasks[0], tasks[0]], spread([tasks[0], tasks[0]], 2), STEPS, objectives)
     )
     errors = [restitution_errors_of(tasks[0], start.gains) for start in (plain, cautious)]
-    for start, objective, own in (
-        (plain, RMS, errors[0]),
-        (cautious, Objective(divergence_weight=16.0), errors[1]),
-    ):
+    for start, objective, own in zip((plain, cautious), objectives, errors, strict=True):
         assert start.rms == pytest.approx(objective_value(objective, own), rel=1e-9)
     assert np.maximum(errors[1], 0).sum() < np.maximum(errors[0], 0).sum()
 
@@ -99,6 +97,23 @@ def test_the_search_sees_what_the_solver_sees(tasks, solved, trial):
         np.testing.assert_allclose(values, [start.rms for start in starts], rtol=1e-9)
         alone = evaluate(tasks[index].loop, starts[0].gains, tasks[index].scenarios)
         assert values[0] == pytest.approx(objective_value(RMS, alone.error[alone.wanted]), rel=1e-9)
+
+
+def test_every_task_is_searched_under_its_own_objective(tasks, trial):
+    """The values, starts and ends of tasks together are those that each has alone under its objective."""
+    several = [Objective(divergence_weight=4.0), Objective(noise_weight=0.01), Objective(noise_weight=0.1)]
+    points = np.random.default_rng(0).random((2, 5, 2))
+    together = trial.losses(several, [2, 0], points)
+    for i, task in enumerate([2, 0]):
+        np.testing.assert_array_equal(together[i], trial.losses(several[task], [task], points[i : i + 1])[0])
+        assert (np.abs(together[i] / trial.losses(RMS, [task], points[i : i + 1])[0] - 1) > 1e-4).any()
+    several = [Objective(divergence_weight=weight) for weight in (1.0, 4.0, 16.0)]
+    chosen = choose_starts(trial, 3, 0, several)
+    polished = finish(trial, solve_tasks(tasks, chosen, 2, several), 16, 0, several)
+    for i, (objective, end) in enumerate(zip(several, polished, strict=True)):
+        np.testing.assert_array_equal(chosen[i], choose_starts(trial, 3, 0, objective)[i])
+        assert end is not None
+        assert end.rms == pytest.approx(trial.losses(objective, [i], end.shares[None, None])[0, 0], rel=1e-9)
 
 
 def test_starts_are_the_literature_and_the_best_of_a_scan(tasks, trial):

@@ -102,6 +102,15 @@ class Tune:
         ),
     ] = None
     starts: Annotated[int, _number("Starts of the solver.")] = 4
+    start: Annotated[
+        tuple[str, ...],
+        arg(
+            metavar="GAINS [GAINS ...]",
+            help="Gain files of the same compensator: each mechanism is tuned from the gains of the nearest "
+            "of their mechanisms too.",
+            help_behavior_hint="",
+        ),
+    ] = ()
     steps: Annotated[int, _number("Most solver steps from each start.")] = 25
     validation: Annotated[int, _number("Fresh scenarios to judge on.")] = 511
     objective: Annotated[
@@ -123,6 +132,9 @@ class Tune:
     chatter_weight: Annotated[
         float, _number("Restitution error that weighs as much as a command that swings once too often.")
     ] = 0.0
+    pareto: Annotated[
+        int, _number("Points of the trade-off of restitution error against sensor noise, each a gain file.")
+    ] = 0
     certify: Annotated[
         bool,
         arg(

@@ -21,6 +21,7 @@ and a step that spoils one of them is not foreseen. By this norm the tail ends l
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -78,34 +79,79 @@ class Objective:
                 allowed = f"allowed finite numbers {'>=' if may_be_0 else '>'} 0"
                 raise InputError(f"objective: {name}: found {shown(weight)}, {allowed}")
 
+    @property
+    def weights(self) -> "Weights":
+        """The numbers in it, each a scalar array."""
+        numbers = self.divergence_weight, self.command_weight, self.noise_weight, self.chatter_weight
+        return Weights(*(jnp.asarray(float(number)) for number in numbers))
+
 
 RMS = Objective()
 
 
+class Terms(NamedTuple):
+    """What of an objective shapes the program: its figure, and whether command, noise and chatter have a
+    part."""
+
+    name: str
+    command: bool
+    noise: bool
+    chatter: bool
+
+
+class Weights(NamedTuple):
+    """The weights of an objective, see there: numbers that one program takes, each problem its own."""
+
+    divergence: Float[Array, "*problems"]
+    command: Float[Array, "*problems"]
+    noise: Float[Array, "*problems"]
+    chatter: Float[Array, "*problems"]
+
+
 class Problem(NamedTuple):
-    """A rig built for a batch of scenarios, and the gains that stay as they are; where there are several
-    problems, each leaf has a leading axis of them."""
+    """A rig built for a batch of scenarios, the gains that stay as they are and the objective's weights;
+    where there are several problems, each leaf has a leading axis of them."""
 
     rig: Rig
     fixed: dict[str, Array]
+    weights: Weights
+
+
+def one_each(objective: Objective | Sequence[Objective], number: int) -> list[Objective]:
+    """The objective of each of so many tasks, from that of all of them or a list of them."""
+    return [objective] * number if isinstance(objective, Objective) else list(objective)
+
+
+def common_terms(objectives: Sequence[Objective]) -> Terms:
+    """The terms of objectives of one name: a part that one of them has, all have, some with a weight of 0.
+
+    Raises ValueError for objectives of several names.
+    """
+    (name,) = {objective.name for objective in objectives}
+    return Terms(
+        name,
+        any(objective.command_weight > 0 for objective in objectives),
+        any(objective.noise_weight > 0 for objective in objectives),
+        any(objective.chatter_weight > 0 for objective in objectives),
+    )
 
 
 def residuals(
-    static: tuple[Loop, tuple[str, ...], Objective],
+    static: tuple[Loop, tuple[str, ...], Terms],
     gains: Float[Array, "problems gains"],
     problems: Problem,
 ) -> Float[Array, "problems residuals"]:
     """(J / `SCALE`)^2 of every problem as a sum of squares, J as of `Objective`; the loss is half of it.
 
     One residual per contact slot of every scenario for the figure, or the norm that stands for it, as many
-    for the command, as many for its chatter and one for the noise, where their weights are not 0. Contacts
+    for the command, as many for its chatter and one for the noise, where they are among the terms. Contacts
     that fail count with the constant error, excess and chatter `FAILED`.
 
-    `static` is the loop, the names of the gains that are tuned and the objective. The scenarios of all
-    problems run side by side, as the lanes of one batch.
+    `static` is the loop, the names of the gains that are tuned and the objective's terms. The scenarios of
+    all problems run side by side, as the lanes of one batch.
     """
-    loop, names, objective = static
-    if objective.chatter_weight > 0:
+    loop, names, terms = static
+    if terms.chatter:
         loop = dataclasses.replace(loop, chatter=True)
     number, lanes = problems.rig.inverse_mass.shape
     rig = jax.tree.map(_side_by_side, problems.rig)
@@ -118,11 +164,12 @@ def residuals(
 
     error, excess, chatter = map(by_problem, contact_terms(outcome))
     amplification = jnp.mean(by_problem(loop.compensator.noise_amplification(values, rig.constants)), axis=1)
-    return weigh(objective, error, excess, chatter, by_problem(outcome.wanted), amplification)
+    return weigh(terms, problems.weights, error, excess, chatter, by_problem(outcome.wanted), amplification)
 
 
 def weigh(
-    objective: Objective,
+    terms: Terms,
+    weights: Weights,
     error: Float[Array, "problems contacts"],
     excess: Float[Array, "problems contacts"],
     chatter: Float[Array, "problems contacts"],
@@ -132,16 +179,16 @@ def weigh(
     """The residuals of `contact_terms` and of the noise's amplification."""
     # A problem that asks for no contact, which fills up a call, has errors of 0.
     count = jnp.maximum(jnp.sum(wanted, axis=1, dtype=jnp.int32), 1)[:, None]
-    diverging = math.sqrt(objective.divergence_weight) * error
-    number = {"rms": count, "cvar": _tail(count), "worst": jnp.ones_like(count)}[objective.name]
-    parts = [_norm(jnp.where(error > 0, diverging, error), number, POWERS[objective.name])]
-    if objective.command_weight > 0:
-        parts.append(objective.command_weight * _norm(excess, count, 2))
-    if objective.chatter_weight > 0:
-        parts.append(objective.chatter_weight * _norm(chatter, count, 2))
-    if objective.noise_weight > 0:
-        beyond = amplification[:, None] - 1
-        parts.append(objective.noise_weight * jnp.where(beyond > 0, beyond, 0))
+    diverging = jnp.sqrt(weights.divergence)[:, None] * error
+    number = {"rms": count, "cvar": _tail(count), "worst": jnp.ones_like(count)}[terms.name]
+    parts = [_norm(jnp.where(error > 0, diverging, error), number, POWERS[terms.name])]
+    if terms.command:
+        parts.append(weights.command[:, None] * _norm(excess, count, 2))
+    if terms.chatter:
+        parts.append(weights.chatter[:, None] * _norm(chatter, count, 2))
+    if terms.noise:
+        beyond = amplification - 1
+        parts.append((weights.noise * jnp.where(beyond > 0, beyond, 0))[:, None])
     return jnp.concatenate(parts, axis=1) / SCALE
 
 

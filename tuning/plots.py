@@ -13,10 +13,11 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator
 
 from jaxhil.errors import one_line
 from tuning.motion import Curve, Piece
+from tuning.pareto import Front
 from tuning.tune import Result
 
 # Okabe and Ito's colours, told apart by every kind of sight; line styles tell them apart in print.
@@ -154,6 +155,43 @@ def overview_plot(results: Sequence[Result], limit: float) -> Figure:
     return figure
 
 
+def front_plot(front: Front, result: Result, limit: float) -> Figure:
+    """Restitution error against amplification of sensor noise: numbered points, the front as a line of what
+    is reached, the literature's gains and those tuned beside."""
+    figure = _figure(
+        (7, 5), f"{result.mechanism.name}: restitution error against sensor noise, fresh scenarios"
+    )
+    axes = figure.subplots()
+    kept = sorted((one for one in front.points if one.on_front), key=lambda one: one.amplification)
+    axes.step([p.amplification for p in kept], [p.error for p in kept], where="post", color=BLUE)
+    for points, label, marker, size, edge, face in (
+        (kept, "front", "o", 7, BLUE, BLUE),
+        ([one for one in front.points if not one.on_front], "beaten by another", "o", 7, BLUE, "white"),
+        ([front.literature], LABELS["literature"], "s", 7, ORANGE, ORANGE),
+        # Open: what was tuned before may be a point too.
+        ([front.tuned], LABELS["tuned"], "D", 10, BLACK, "none"),
+    ):
+        if points:
+            places = [one.amplification for one in points], [one.error for one in points]
+            style: dict[str, Any] = {"linestyle": "none", "marker": marker, "markersize": size}
+            axes.plot(*places, color=edge, markerfacecolor=face, label=label, zorder=3, **style)
+    if 0 < limit < np.inf:
+        axes.axhline(limit, color=GREEN, linewidth=1, linestyle=":", label=f"limit {limit:g}")
+    numbers: dict[tuple[float, float], list[str]] = {}  # points that came out alike share a place
+    for number, one in enumerate(front.points, start=1):
+        numbers.setdefault(one.place, []).append(str(number))
+    for turn, (error, noise) in enumerate(sorted(numbers)):
+        where = {"xytext": (6, -14 if turn % 2 else 6), "textcoords": "offset points"}  # one above, one below
+        axes.annotate(", ".join(numbers[error, noise]), (noise, error), fontsize=8, **where)
+    _scale(axes, "x", [one.amplification for one in (*front.points, front.literature, front.tuned)])
+    _scale(axes, "y", [one.error for one in (*front.points, front.literature, front.tuned)])
+    axes.margins(0.08, 0.12)
+    name = result.settings.objective.name
+    axes.set(xlabel="noise of the command over noise of the force sensor [1]", ylabel=f"{name} of e - e* [1]")
+    _finish(axes, "best")
+    return figure
+
+
 def contact_plot(pieces: Sequence[Piece], title: str, sensors: str | None = None) -> Figure:
     """Force and position over time, contact by contact, beside the same contact in space.
 
@@ -194,6 +232,18 @@ def contact_plot(pieces: Sequence[Piece], title: str, sensors: str | None = None
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower center", ncols=len(labels), fontsize=9, frameon=False)
     return figure
+
+
+def _scale(axes: Axes, name: str, values: Sequence[float]) -> None:
+    """A logarithmic axis, its ticks plain numbers, where values of different orders are on it."""
+    low, high = min(values), max(values)
+    if not 0 < 3 * low < high:
+        return
+    axes.set(**{f"{name}scale": "log"})
+    axis = {"x": axes.xaxis, "y": axes.yaxis}[name]
+    axis.set_minor_locator(LogLocator(subs=(2, 3, 5) if high > 5 * low else range(2, 10)))
+    for plainly in (axis.set_major_formatter, axis.set_minor_formatter):
+        plainly(lambda value, _: f"{value:g}")
 
 
 def _entered(piece: Piece) -> str:

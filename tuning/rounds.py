@@ -7,7 +7,7 @@ first round only the most promising starts of a task go on.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from jaxhil.loop import build_rig
 from tuning import programs
 from tuning.box import Bounds, to_gains, to_shares
 from tuning.environment import program_folder
-from tuning.objective import RMS, SCALE, Objective, Problem, residuals
+from tuning.objective import RMS, SCALE, Objective, Problem, common_terms, one_each, residuals
 from tuning.optimiser import STATUSES, Solution, solve
 from tuning.problems import Task, common_loop, gain_bounds, spread_points, tuned_names
 from tuning.search import apart, polish
@@ -69,37 +69,55 @@ class _Problem:
 
 
 def choose_starts(
-    trial: Trial, starts: int, seed: int, objective: Objective = RMS
+    trial: Trial,
+    starts: int,
+    seed: int,
+    objective: Objective | Sequence[Objective] = RMS,
+    first: Sequence[Sequence[Mapping[str, float]]] | None = None,
 ) -> list[Float[np.ndarray, "starts gains"]]:
     """Shares to start from, of every task: the literature's gains, then the best of some Sobol points that
-    lie apart from each other."""
+    lie apart from each other. `first` has, of each task, gains that take the places of the last of these,
+    never of the literature's."""
     tasks = range(len(trial.tasks))
-    first = [
-        to_shares(np.array([task.literature[name] for name in trial.names]), bounds)
-        for task, bounds in zip(trial.tasks, trial.bounds, strict=True)
+    known = [
+        np.stack(
+            [_shares(trial, i, gains) for gains in (trial.tasks[i].literature, *(first[i] if first else ()))]
+        )
+        for i in tasks
     ]
-    if starts == 1:
-        return [one[None] for one in first]
-    points = np.stack([spread_points(one, max(SCANNED, 2 * starts), seed) for one in first])
+    usual = [max(starts - (len(own) - 1), 1) for own in known]
+    if max(usual) == 1:
+        return known
+    points = np.stack([spread_points(own[0], max(SCANNED, 2 * starts), seed) for own in known])
     values = trial.losses(objective, list(tasks), points, SCAN_SCENARIOS)
     order = np.argsort(np.where(np.isfinite(values), values, np.inf), axis=1, kind="stable")
-    return [apart(points[i][order[i]], first[i][None], starts) for i in tasks]
+    best = [apart(points[i][order[i]], known[i][:1], usual[i]) for i in tasks]
+    return [np.concatenate([best[i], known[i][1:]]) for i in tasks]
+
+
+def _shares(trial: Trial, task: int, gains: Mapping[str, float]) -> Float[np.ndarray, "gains"]:
+    return to_shares(np.array([gains[name] for name in trial.names]), trial.bounds[task])
 
 
 def solve_tasks(
     tasks: list[Task],
     starts: list[Float[np.ndarray, "starts gains"]],
     steps: int,
-    objective: Objective = RMS,
+    objective: Objective | Sequence[Objective] = RMS,
     report: Callable[[str], None] = lambda text: None,
 ) -> list[list[Start]]:
     """Every start of every task; the tasks are alike (`tuning.problems.alike`). `starts` are shares of the
-    ranges of those gains that are tuned for any of the tasks."""
+    ranges of those gains that are tuned for any of the tasks; none ends worse than it began.
+
+    `objective` is that of all tasks, or one of each, which differ by their weights alone: tasks may be the
+    same but for it.
+    """
     names = tuned_names(tasks)
     bounds = [gain_bounds(task, names) for task in tasks]
     nothing = np.zeros((len(names), len(names)))
     problems = [_Problem(index, shares, nothing) for index, own in enumerate(starts) for shares in own]
-    advance = _stepper(tasks, names, bounds, objective, len(problems))
+    objectives = one_each(objective, len(tasks))
+    advance = _stepper(tasks, names, bounds, objectives, len(problems))
     # Neighbours in a call take about as long.
     order = np.argsort([-float(np.max(expected_duration(task.scenarios))) for task in tasks], kind="stable")
     rank = {int(task): place for place, task in enumerate(order)}
@@ -138,7 +156,7 @@ def finish(
     solved: list[list[Start]],
     evaluations: int,
     seed: int,
-    objective: Objective = RMS,
+    objective: Objective | Sequence[Objective] = RMS,
 ) -> list[Start | None]:
     """The best start of every task, none if all failed; where no second start agrees with it, polished
     without derivatives (`tuning.search.polish`) by so many evaluations each."""
@@ -186,20 +204,20 @@ def _finished(problem: _Problem, names: tuple[str, ...], bounds: Bounds, task: T
     return Start(status, len(history), history[-1], history, own, problem.shares, problem.curvature)
 
 
-def prepare_solver(tasks: list[Task], starts: int, objective: Objective = RMS) -> None:
+def prepare_solver(tasks: list[Task], starts: int, objective: Objective | Sequence[Objective] = RMS) -> None:
     """Compile what `solve_tasks` will run, into the compile cache."""
     names = tuned_names(tasks)
     bounds = [gain_bounds(task, names) for task in tasks]
     nothing = np.zeros(len(names))
     problems = [_Problem(index, nothing, nothing) for index in range(len(tasks)) for _ in range(starts)]
-    static, call = _calls(tasks, names, bounds, objective, len(problems))
+    static, call = _calls(tasks, names, bounds, one_each(objective, len(tasks)), len(problems))
     some = problems[: FEW if len(problems) <= FEW else MANY]
     programs.prepare(_advance, static, call(some, 1), program_folder())
 
 
-def _stepper(tasks, names, bounds, objective, number) -> Callable[[list[_Problem], int], None]:
+def _stepper(tasks, names, bounds, objectives, number) -> Callable[[list[_Problem], int], None]:
     """A function that takes problems up to so many steps further."""
-    static, call = _calls(tasks, names, bounds, objective, number)
+    static, call = _calls(tasks, names, bounds, objectives, number)
     size = FEW if number <= FEW else MANY
 
     def advance(problems: list[_Problem], limit: int) -> None:
@@ -212,24 +230,25 @@ def _stepper(tasks, names, bounds, objective, number) -> Callable[[list[_Problem
     return advance
 
 
-def _calls(tasks, names, bounds, objective, number):
+def _calls(tasks, names, bounds, objectives, number):
     """Static part and, as a function of some problems and a number of steps, arguments of the program."""
     loop = common_loop([task.loop for task in tasks])
     fixed = [{k: v for k, v in task.literature.items() if k not in names} for task in tasks]
-    each = [(task.scenarios, f, b) for task, f, b in zip(tasks, fixed, bounds, strict=True)]
+    weights = [one.weights for one in objectives]
+    each = [(t.scenarios, f, w, b) for t, f, w, b in zip(tasks, fixed, weights, bounds, strict=True)]
     table = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *each)
     size = FEW if number <= FEW else MANY
     lanes = len(tasks[0].scenarios.velocity)
-    static = (loop, names, objective), LONGEST, max(1, TILE // lanes)
+    static = (loop, names, common_terms(objectives)), LONGEST, max(1, TILE // lanes)
 
     def call(some: list[_Problem], limit: int):
         index = np.array([p.task for p in some] + [some[0].task] * (size - len(some)))
         starts = np.stack([p.shares for p in some] + [some[0].shares] * (size - len(some)))
-        scenarios, others, limits = jax.tree.map(itemgetter(index), table)
+        scenarios, others, weighed, limits = jax.tree.map(itemgetter(index), table)
         # Nothing runs in the lanes that only fill the call.
         idle = np.arange(size)[:, None] >= len(some)
         contacts = np.where(idle, 0, scenarios.contacts).astype(np.int32)
-        return scenarios._replace(contacts=contacts), others, limits, starts, np.array(limit)
+        return scenarios._replace(contacts=contacts), others, weighed, limits, starts, np.array(limit)
 
     return static, call
 
@@ -249,7 +268,8 @@ def _take(problem: _Problem, solution: Solution, i: int) -> None:
 def _advance(static: tuple[Any, int, int], arguments: Any) -> Solution:
     what, longest, tile = static
     loop = what[0]
-    scenarios, fixed, bounds, starts, limit = arguments
+    scenarios, fixed, weights, bounds, starts, limit = arguments
 
-    problems = Problem(jax.vmap(lambda scenarios: build_rig(loop, scenarios))(scenarios), fixed)
+    rigs = jax.vmap(lambda scenarios: build_rig(loop, scenarios))(scenarios)
+    problems = Problem(rigs, fixed, weights)
     return solve(residuals, what, problems, bounds, starts, limit, longest=longest, tile=tile)

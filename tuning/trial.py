@@ -3,9 +3,11 @@
 Both go through one compiled program, that of `jaxhil.evaluation`, with as many lanes at every call.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -16,7 +18,7 @@ from jaxhil.loop import Loop
 from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import draw
 from tuning.box import Bounds, to_gains
-from tuning.objective import Objective, contact_terms, objective_value
+from tuning.objective import Objective, contact_terms, objective_value, one_each
 from tuning.problems import Task, common_loop, gain_bounds, tuned_names
 
 # Draws of the validation come from another seed than those of training.
@@ -63,13 +65,15 @@ class Trial:
 
     def losses(
         self,
-        objective: Objective,
+        objective: Objective | Sequence[Objective],
         which: list[int],
         shares: Float[np.ndarray, "which points gains"],
         scenarios: int | None = None,
     ) -> Float[np.ndarray, "which points"]:
         """`objective_value` of points of the unit box on the training scenarios of the tasks `which`, or on
-        the first so many `scenarios` of each."""
+        the first so many `scenarios` of each; the objective is that of all tasks, or one of each."""
+        objectives = one_each(objective, len(self.tasks))
+        noise = any(objectives[task].noise_weight > 0 for task in which)
         number = self._training.velocity.shape[-1]
         number = min(scenarios or number, number)
         points = shares.shape[1]
@@ -78,16 +82,17 @@ class Trial:
         at_once = max(1, self._lanes // number)
         for begin in range(0, len(pairs), at_once):
             some = pairs[begin : begin + at_once]
-            outcome, amplification = self._run(objective, which, shares, some, number)
+            outcome, amplification = self._run(noise, which, shares, some, number)
             # (slots, pairs, scenarios)
             terms = [np.asarray(term).reshape(-1, len(some), number) for term in contact_terms(outcome)]
             wanted = outcome.wanted.reshape(terms[0].shape)
             for k, (i, point) in enumerate(some):
                 error, excess, chatter = (term[:, k][wanted[:, k]] for term in terms)
-                found[i, point] = objective_value(objective, error, excess, amplification[k], chatter)
+                own = objectives[which[i]]
+                found[i, point] = objective_value(own, error, excess, amplification[k], chatter)
         return found
 
-    def _run(self, objective, which, shares, some, number) -> tuple[Outcome, np.ndarray]:
+    def _run(self, noise, which, shares, some, number) -> tuple[Outcome, np.ndarray]:
         index = np.array([which[i] for i, _ in some])
         rows = [self._row(which[i], shares[i, point]) for i, point in some]
         values = {name: np.repeat([row[name] for row in rows], number) for name in rows[0]}
@@ -98,11 +103,14 @@ class Trial:
 
         scenarios = jax.tree.map(side_by_side, self._training)
         outcome = evaluate(self.loop, values, scenarios, at_least=self._lanes)
-        if objective.noise_weight == 0:
+        if not noise:
             return outcome, np.ones(len(some))
         first = slice(None, None, number)
-        constants = Constants(scenarios.control_period[first], scenarios.clearance[first])
-        own: Any = {name: value[first] for name, value in values.items()}
+        period, clearance = (
+            jnp.asarray(one[first]) for one in (scenarios.control_period, scenarios.clearance)
+        )
+        constants = Constants(period, clearance)
+        own: Any = {name: jnp.asarray(value[first]) for name, value in values.items()}
         return outcome, np.asarray(self.loop.compensator.noise_amplification(own, constants))
 
     def _row(self, task: int, shares: np.ndarray) -> dict[str, float]:

@@ -18,6 +18,7 @@ from tuning.environment import program_folder
 from tuning.objective import RMS, SCALE, Objective
 from tuning.problems import Task, alike, build_task
 from tuning.rounds import Start, choose_starts, finish, prepare_solver, solve_tasks
+from tuning.transfer import Tuned, carry_over, nearest
 from tuning.trial import Trial
 from tuning.trust import Intervals, interval, sensitivity
 
@@ -69,7 +70,7 @@ class Result:
     compensation), "literature" and "tuned" on the same fresh scenarios, and of their nominal run; every
     start; outcomes and scenarios for plots; seconds spent; 95 % confidence
     intervals of the tuned figures; of each tuned gain how far it may move (`tuning.trust.sensitivity`); how
-    far from the best anywhere, if asked for."""
+    far from the best anywhere, if asked for; what the last of the starts took their gains from."""
 
     compensator: str
     mechanism: Mechanism
@@ -83,6 +84,7 @@ class Result:
     settings: Settings
     timings: dict[str, float] = field(default_factory=dict)
     intervals: Intervals | None = None
+    first: tuple[Tuned, ...] = ()
     freedom: dict[str, Freedom] = field(default_factory=dict)
     certified: Certified | None = None
 
@@ -102,17 +104,33 @@ def tune_all(
     compensator: str,
     settings: Settings,
     report: Callable[[str], None] = lambda text: None,
+    tuned: Sequence[Tuned] = (),
 ) -> Iterator[tuple[int, Result]]:
-    """(index, result) of every mechanism, as they are done: like ones together, in one program."""
+    """(index, result) of every mechanism, as they are done: like ones together, in one program.
+
+    The gains of the nearest of those `tuned` before, with the same compensator, are a start for each, and so
+    are those of the nearest that an earlier block found: in the places of the last other starts, never of the
+    literature's.
+    """
     tasks = [build_task(m, compensator, settings.scenarios, settings.seed) for m in mechanisms]
+    found: list[Tuned] = []
     for group in alike([task.loop for task in tasks], [task.scenarios for task in tasks]):
         for begin in range(0, len(group), BLOCK):
             block = group[begin : begin + BLOCK]
-            results = _tune_block([tasks[index] for index in block], settings, report)
+            sources = [known for known in (tuned, found) if known]
+            sources = sources[: max(settings.starts - 1, 1 if tuned else 0)]
+            near = [[nearest(mechanisms[i], known) for known in sources] for i in block]
+            results = _tune_block([tasks[index] for index in block], settings, report, near)
+            found.extend(Tuned(one.mechanism, one.gains, one.mechanism.name) for one in results)
             yield from zip(block, results, strict=True)
 
 
-def _tune_block(tasks: list[Task], settings: Settings, report: Callable[[str], None]) -> list[Result]:
+def _tune_block(
+    tasks: list[Task],
+    settings: Settings,
+    report: Callable[[str], None],
+    near: list[list[Tuned]],
+) -> list[Result]:
     clock = _Clock()
     name = tasks[0].mechanism.name if len(tasks) == 1 else f"{len(tasks)} mechanisms"
     compensator = tasks[0].compensator
@@ -125,7 +143,11 @@ def _tune_block(tasks: list[Task], settings: Settings, report: Callable[[str], N
     if any(task.tuned for task in tasks):
         number = len(tasks[0].scenarios.velocity)
         report(f"{name}: tuning {compensator} on {number} scenarios each")
-        starts, found = _search(trial, settings, lambda text: report(f"{name}: {text}"))
+        first = [
+            [carry_over(compensator, one.gains, one.mechanism, task.mechanism) for one in own]
+            for task, own in zip(tasks, near, strict=True)
+        ]
+        starts, found = _search(trial, settings, first, lambda text: report(f"{name}: {text}"))
         best = [one.gains if one else task.literature for one, task in zip(found, tasks, strict=True)]
     clock.lap("tune")
     report(f"{name}: judging on {settings.validation} fresh scenarios")
@@ -154,6 +176,7 @@ def _tune_block(tasks: list[Task], settings: Settings, report: Callable[[str], N
                 settings=settings,
                 timings=clock.laps,
                 intervals=interval(fresh["tuned"].error, fresh["tuned"].good),
+                first=tuple(near[i]),
                 freedom=_freedom(task, trial.names, found[i]),
                 certified=certificates[i],
             )
@@ -162,17 +185,21 @@ def _tune_block(tasks: list[Task], settings: Settings, report: Callable[[str], N
 
 
 def _search(
-    trial: Trial, settings: Settings, report: Callable[[str], None]
+    trial: Trial,
+    settings: Settings,
+    first: list[list[dict[str, float]]],
+    report: Callable[[str], None],
 ) -> tuple[list[list[Start]], list[Start | None]]:
-    """Every start of every task, and what is best for each."""
+    """Every start of every task, the last of them at the gains `first`, and what is best for each."""
     seed, objective = settings.seed, settings.objective
+    number = max(settings.starts, 1 + max(map(len, first)))
     with ThreadPoolExecutor(1) as meanwhile:
         # The programs compile on one core each. Only one of them runs: programs on several devices could
         # wait for one another for ever.
         ready = None
         if program_folder() is not None:
-            ready = meanwhile.submit(prepare_solver, trial.tasks, settings.starts, objective)
-        chosen = choose_starts(trial, settings.starts, seed, objective)
+            ready = meanwhile.submit(prepare_solver, trial.tasks, number, objective)
+        chosen = choose_starts(trial, number, seed, objective, first)
         if ready is not None:
             ready.result()
     starts = solve_tasks(trial.tasks, chosen, settings.steps, objective, report)

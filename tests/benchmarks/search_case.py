@@ -22,7 +22,7 @@ from jaxhil.loop import Loop, Rig, build_rig
 from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario
 from tuning.box import Bounds, to_gains, to_shares
-from tuning.objective import RMS, Problem, residuals
+from tuning.objective import RMS, Problem, common_terms, residuals
 from tuning.problems import Task, alike, build_task, common_loop, gain_bounds, spread_starts, tuned_names
 
 COMPENSATOR = "response_error"
@@ -102,7 +102,8 @@ def over_scenarios(function: Callable[..., Array], problem: Problem, *arguments:
     """`function(problem, *arguments)` on every device with its share of the scenarios; (devices, ...)."""
     everywhere = PartitionSpec()
     lanes_last = Problem(
-        jax.tree.map(_lanes_last, problem.rig), jax.tree.map(lambda leaf: everywhere, problem.fixed)
+        jax.tree.map(_lanes_last, problem.rig),
+        *jax.tree.map(lambda leaf: everywhere, (problem.fixed, problem.weights)),
     )
     return jax.shard_map(
         lambda *given: function(*given)[None],
@@ -123,8 +124,8 @@ def _build_case(task: Task, loop: Loop) -> Case:
     lanes_last = jax.tree.map(lambda leaf: NamedSharding(mesh, _lanes_last(leaf)), rig)
     rig = jax.device_put(rig, lanes_last)
     bounds = gain_bounds(task, names)
-    fixed, placed_bounds = jax.device_put((fixed, bounds), NamedSharding(mesh, PartitionSpec()))
-    return Case(task, loop, names, bounds, Problem(rig, fixed), placed_bounds)
+    fixed, weights, placed_bounds = jax.device_put((fixed, RMS.weights, bounds), everywhere)
+    return Case(task, loop, names, bounds, Problem(rig, fixed, weights), placed_bounds)
 
 
 def _build_rig(loop: Loop, scenarios: Scenario) -> Rig:
@@ -148,7 +149,9 @@ def _losses(static, points, number, problem, bounds) -> Float[Array, "devices po
 
         def some(i, found):
             shares = jax.lax.dynamic_slice_in_dim(points, i * together, together)
-            rows = residuals((loop, names, RMS), jax.vmap(to_gains, (0, None))(shares, bounds), copies)
+            rows = residuals(
+                (loop, names, common_terms([RMS])), jax.vmap(to_gains, (0, None))(shares, bounds), copies
+            )
             losses = jnp.sum(rows**2, axis=1) / 2
             return jax.lax.dynamic_update_slice_in_dim(found, losses, i * together, 0)
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from search_case import Case, several
 from search_methods import Trace
 
-from tuning.objective import RMS, residuals
+from tuning.objective import RMS, common_terms, residuals
 from tuning.optimiser import solve
 from tuning.problems import spread_points
 from tuning.rounds import AGREED, FIRST_ROUND, REACH
@@ -76,7 +76,7 @@ def warm_up(case: Case, starts: Float[np.ndarray, "starts gains"]) -> None:
 def _descend(case: Case, shares, steps):
     """Shares, loss, steps and J^T J of every descent."""
     problems, bounds = several((case.problem, case.bounds), len(shares))
-    static = case.loop, case.names, RMS
+    static = case.loop, case.names, common_terms([RMS])
     found = jax.device_get(
         solve(residuals, static, problems, bounds, shares, np.array(steps), LONGEST, tile=1)
     )

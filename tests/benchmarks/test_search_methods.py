@@ -18,7 +18,7 @@ from search_methods import OTHERS, Recorder, TimeIsUp, Trace, record
 from search_ours import ours, warm_up
 from search_table import Results, judge, medians, ratios, table
 
-from tuning.objective import RMS, SCALE, residuals
+from tuning.objective import RMS, SCALE, common_terms, residuals
 
 pytestmark = pytest.mark.benchmark
 
@@ -75,7 +75,8 @@ def test_bar(compared, capsys):
         print(
             f"\n\nmedians over {len(compared)} mechanisms\n{table(middle)}\n"
             f"ours succeeds from {share:.0%} of its starts, in the median (bar: {SHARE:.0%}), with"
-            f" {rollouts:.2f} of the rollouts and {seconds:.2f} of the seconds of the best of the others (bar: {COST})"
+            f" {rollouts:.2f} of the rollouts and {seconds:.2f} of the seconds of the best of the others"
+            f" (bar: {COST})"
         )
     assert share >= SHARE
     assert rollouts <= COST
@@ -88,7 +89,7 @@ def test_every_program_has_the_loss_of_tuning(cases):
         points = case.starts(5, 1)
         together = case.losses(points)
         np.testing.assert_allclose([case.losses(point[None])[0] for point in points], together, rtol=1e-9)
-        gains, static = case.gains_of(points), (case.loop, case.names, RMS)
+        gains, static = case.gains_of(points), (case.loop, case.names, common_terms([RMS]))
         problems = several(case.problem, len(points))
         rows = jax.jit(residuals, static_argnums=0, compiler_options=QUICK)(static, gains, problems)
         np.testing.assert_allclose(together, np.sum(np.asarray(rows) ** 2, axis=1) / 2, rtol=1e-9)

@@ -9,7 +9,7 @@ from jaxhil.errors import InputError, one_line
 from jaxhil.mechanism_file import LoadedMechanism, load
 from tuning import report
 from tuning.cli import Tune
-from tuning.commands import checks
+from tuning.commands import checks, tune_pareto
 from tuning.commands.tune_tables import print_one, print_overview
 from tuning.environment import prepare, program_folder
 
@@ -24,13 +24,15 @@ def run(options: Tune) -> int:
         checks.at_least(1, scenarios=options.scenarios)
     checks.at_least(0, seed=options.seed)
     checks.compensator(options.compensator)
+    tune_pareto.check(options)
+    known = _known(options)
     loaded, problems = _load(options)
     entries, interrupted = [], False
     if loaded:
         # Before jax starts: a folder that cannot be written costs no tuning.
         Path(options.output).mkdir(parents=True, exist_ok=True)
         try:
-            entries = _tune_all(options, loaded, problems)
+            entries = _tune_all(options, loaded, problems, known)
         except _Interrupted as stop:
             entries, interrupted = stop.entries, True
     if options.json:
@@ -55,6 +57,27 @@ def run(options: Tune) -> int:
 class _Interrupted(Exception):
     def __init__(self, entries: list[dict[str, Any]]):
         self.entries = entries
+
+
+def _known(options: Tune) -> list[Any]:
+    """What the gain files to begin at hold, as `tuning.transfer.Tuned`. Raises `InputError`."""
+    if not options.start:
+        return []
+    prepare()
+    from tuning.gain_file import load_gain_file
+    from tuning.transfer import Tuned
+
+    known = []
+    for given in options.start:
+        path = Path(given) / "gains.json" if Path(given).is_dir() else given
+        found = load_gain_file(path)
+        if found.compensator != options.compensator:
+            raise InputError(
+                f"--start: {one_line(given)}: found gains of {found.compensator}, allowed gains of "
+                f"{options.compensator}"
+            )
+        known.append(Tuned(found.mechanism, found.gains, str(given)))
+    return known
 
 
 def _load(options: Tune) -> tuple[list[LoadedMechanism], list[str]]:
@@ -97,7 +120,9 @@ def folder_name(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._") or "mechanism"
 
 
-def _tune_all(options: Tune, loaded: list[LoadedMechanism], problems: list[str]) -> list[dict[str, Any]]:
+def _tune_all(
+    options: Tune, loaded: list[LoadedMechanism], problems: list[str], known: list[Any]
+) -> list[dict[str, Any]]:
     prepare()
     from tuning.tune import Settings, tune_all
 
@@ -111,13 +136,16 @@ def _tune_all(options: Tune, loaded: list[LoadedMechanism], problems: list[str])
         certify=options.certify,
     )
     mechanisms = [one.mechanism for one in loaded]
-    entries, done = {}, {}
+    entries, done, traded = {}, {}, {}
     drawn = len(loaded) <= MOST_DRAWN
-    with report.stages(len(loaded)) as stages, ThreadPoolExecutor(1) as meanwhile:
+    with (
+        report.stages(len(loaded) * (2 if options.pareto else 1)) as stages,
+        ThreadPoolExecutor(1) as meanwhile,
+    ):
         if drawn and program_folder() is not None:
             meanwhile.submit(_prepare_drawing, mechanisms[0], options.compensator)
         try:
-            for index, result in tune_all(mechanisms, options.compensator, settings, stages.say):
+            for index, result in tune_all(mechanisms, options.compensator, settings, stages.say, known):
                 try:
                     entries[index] = _finish(options, loaded[index], result, drawn, stages.say)
                 except InputError as error:
@@ -128,6 +156,8 @@ def _tune_all(options: Tune, loaded: list[LoadedMechanism], problems: list[str])
                 stages.finish()
                 if not options.json and drawn:
                     print_one(options, result, entries[index])
+            if options.pareto and done:
+                traded = tune_pareto.trade(options, loaded, done, entries, problems, stages)
         except KeyboardInterrupt:
             raise _Interrupted(_in_order(entries)) from None
     if len(loaded) > 1 and done:
@@ -138,6 +168,13 @@ def _tune_all(options: Tune, loaded: list[LoadedMechanism], problems: list[str])
             save(overview_plot(results, options.limit), Path(options.output) / "overview.png")
         if not options.json:
             print_overview(options, results, finished, drawn)
+    if not options.json and drawn:
+        for index in sorted(traded):
+            tune_pareto.print_front(options, done[index], traded[index], entries[index]["pareto"])
+    elif not options.json and traded:
+        report.emit(
+            f"wrote {options.output}/NAME/pareto/NN/gains.json and {options.output}/NAME/pareto.png", ""
+        )
     return _in_order(entries)
 
 
@@ -198,6 +235,7 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) ->
         "nominal": result.nominal,
         "tuned_intervals": _intervals(result),
         "starts": [_start(start) for start in result.starts],
+        "carried_over": _carried_over(result),
         "freedom": {name: one._asdict() for name, one in result.freedom.items()},
         "certified": result.certified._asdict() if result.certified else None,
         "timings": result.timings,
@@ -209,6 +247,22 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) ->
 
 def _start(start) -> dict[str, Any]:
     return {name: value for name, value in start._asdict().items() if name not in ("shares", "curvature")}
+
+
+def _carried_over(result) -> list[dict[str, Any]]:
+    """Which starts began at gains tuned before, and for what mechanism."""
+    from tuning.transfer import distance
+
+    before = len(result.starts) - len(result.first)
+    return [
+        {
+            "start": before + number,
+            "source": one.source,
+            "mechanism": one.mechanism.name,
+            "distance": distance(result.mechanism, one.mechanism),
+        }
+        for number, one in enumerate(result.first, start=1)
+    ]
 
 
 def _prepare_drawing(mechanism, compensator: str) -> None:

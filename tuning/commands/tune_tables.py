@@ -71,12 +71,7 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
         ],
         texts=(0, 1),
     )
-    starts = report.table(
-        "Starts",
-        ["start", "status", "steps", f"{options.objective} on training scenarios"],
-        [[n, s.status, s.steps, s.rms] for n, s in enumerate(result.starts, start=1)],
-        texts=(1,),
-    )
+    starts = _starts(options, result)
     tuned = result.figures["tuned"]
     low, high = result.intervals.rms
     sure = f" (95 %: {low:.2g} to {high:.2g})" if math.isfinite(low + high) else ""
@@ -105,3 +100,15 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
         )
     tables = [errors] + ([gains] if law else []) + ([starts] if result.starts else [])
     report.emit(*tables, *sure_of, *(f"wrote {path}" for path in written), *told, "")
+
+
+def _starts(options: Tune, result: Any) -> Any:
+    """Every start; a column of where they began, where one did not begin as usual."""
+    headings = ["start", "status", "steps", f"{options.objective} on training scenarios"]
+    rows: list[list[Any]] = [[n, s.status, s.steps, s.rms] for n, s in enumerate(result.starts, start=1)]
+    if not result.first:
+        return report.table("Starts", headings, rows, texts=(1,))
+    usual = len(rows) - len(result.first)
+    begun = ["literature", *["spread"] * (usual - 1), *(f"gains of {one.source}" for one in result.first)]
+    rows = [[*row, place] for row, place in zip(rows, begun, strict=True)]
+    return report.table("Starts", [*headings, "begins at"], rows, texts=(1, 4))

@@ -1,0 +1,182 @@
+"""The trade-off of accuracy against noise: a ladder in units of the objective, points that beat each other
+nowhere, all in one program; every figure against an evaluation of its own."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from scipy.signal import bilinear, lfilter
+
+from jaxhil.building import build_loop
+from jaxhil.compensators import COMPENSATORS, literature_gains
+from jaxhil.evaluation import evaluate
+from jaxhil.mechanism_file import load
+from jaxhil.scenario import build_scenarios
+from jaxhil.uncertainty import draw
+from tuning import pareto, programs
+from tuning.objective import Objective, objective_value
+from tuning.pareto import ENDS, amplification, dominated, fronts, has_trade_off, ladder
+from tuning.problems import build_task
+from tuning.trial import VALIDATION_SEED, Trial
+from tuning.tune import Settings, tune_all
+
+POINTS = 5
+SETTINGS = Settings(scenarios=8, starts=2, steps=10, validation=16, objective=Objective(noise_weight=2e-3))
+MECHANISMS = [
+    load("varying", [f"contact.stiffness=[{k}]", "approach.contacts=1", f"name='{k}'"]).mechanism
+    for k in ("5e4", "9e4")
+]
+
+
+@pytest.fixture(scope="module")
+def results():
+    every = dict(tune_all(MECHANISMS, "phase_lead", SETTINGS))
+    return [every[index] for index in range(len(MECHANISMS))]
+
+
+@pytest.fixture(scope="module")
+def made(results):
+    """Fronts, and how many programs they took to solve."""
+    programs._program.cache_clear()
+    every = dict(fronts(results, POINTS))
+    count = programs._program.cache_info().misses
+    return [every[index] for index in range(len(MECHANISMS))], count
+
+
+def errors_of(loop, scenarios, gains):
+    outcome = evaluate(loop, gains, scenarios)
+    assert outcome.good[outcome.wanted].all()
+    return outcome.error[outcome.wanted]
+
+
+# What a point is judged by
+
+
+def test_the_ladder_is_in_units_of_the_objective():
+    light, heavy = ENDS
+    weights = ladder(8, error=0.012, excess=3.0)
+    assert weights[0] == 0
+    assert 3.0 * weights[1] == pytest.approx(light * 0.012)
+    assert 3.0 * weights[-1] == pytest.approx(heavy * 0.012)
+    np.testing.assert_allclose(np.diff(np.log(weights[1:])), math.log(heavy / light) / 6, rtol=1e-12)
+    assert ladder(2, 0.012, 3.0) == pytest.approx([0, heavy * 0.004])
+    # Next to no noise to begin with: still weights, and finite ones.
+    assert np.isfinite(ladder(8, 0.012, 0.0)).all()
+
+
+def test_a_point_is_beaten_by_what_is_better_in_one_and_no_worse_in_the_other():
+    places = [(0.01, 3.0), (0.02, 2.0), (0.02, 2.5), (0.03, 1.0), (0.03, 1.0), (0.04, 1.0)]
+    assert dominated(places) == [False, False, True, False, False, True]
+    generator = np.random.default_rng(0)
+    places = [tuple(place) for place in generator.integers(0, 6, (60, 2)).astype(float)]
+    beaten = dominated(places)
+    for place, lost in zip(places, beaten, strict=True):
+        others = [other for other, beat in zip(places, beaten, strict=True) if not beat]
+        better = [o for o in others if o != place and o[0] <= place[0] and o[1] <= place[1]]
+        assert bool(better) == lost
+
+
+@pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
+def test_amplification_is_that_of_the_lead_filter(compensator):
+    mechanism = load("varying", ["rig.control_period=0.002"]).mechanism
+    gains = {**literature_gains(mechanism, compensator), "phase_lead": 0.006, "lead_filter": 0.0017}
+    impulse = np.zeros(3000)
+    impulse[0] = 1
+    response = lfilter(*bilinear([0.0077, 1], [0.0017, 1], 1 / 0.002), impulse)
+    expected = np.sqrt(np.sum(response**2))
+    assert amplification(mechanism, compensator, gains) == pytest.approx(expected, rel=1e-10)
+
+
+def test_only_what_amplifies_has_something_to_trade():
+    assert [name for name in COMPENSATORS if not has_trade_off(name)] == ["none"]
+    assert amplification(load().mechanism, "none", {}) == 1
+
+
+# Fronts
+
+
+def test_every_point_s_figures_are_those_of_an_evaluation(results, made):
+    for mechanism, result, front in zip(MECHANISMS, results, made[0], strict=True):
+        seed = SETTINGS.seed + VALIDATION_SEED
+        scenarios = build_scenarios(mechanism, draw(mechanism, SETTINGS.validation, seed), seed)
+        loop = build_loop(mechanism, "phase_lead", scenarios)
+        for point in (*front.points, front.literature, front.tuned):
+            rms = np.sqrt(np.mean(errors_of(loop, scenarios, point.gains) ** 2))
+            assert point.error == pytest.approx(rms, rel=1e-9)
+            assert point.figures.rms == pytest.approx(rms, rel=1e-9)
+            low, high = point.intervals.rms
+            assert low < rms < high
+            assert point.amplification == amplification(mechanism, "phase_lead", point.gains)
+        assert front.literature.gains == result.literature and front.tuned.gains == result.gains
+        assert front.literature.figures == result.figures["literature"]
+        assert front.tuned.figures == result.figures["tuned"]
+        assert [point.on_front for point in front.points] == [
+            not lost for lost in dominated([point.place for point in front.points])
+        ]
+
+
+def test_no_point_is_better_under_another_s_weight(results, made):
+    """On the scenarios that they were tuned on: none beats another at its own weight, nor do the gains that
+    were tuned before. So the heavier the weight, the quieter and the less accurate."""
+    for mechanism, front in zip(MECHANISMS, made[0], strict=True):
+        task = build_task(mechanism, "phase_lead", SETTINGS.scenarios, SETTINGS.seed)
+        every = [*front.points, front.tuned, front.literature]
+        errors = [errors_of(task.loop, task.scenarios, point.gains) for point in every]
+        for own, point in zip(errors[:POINTS], front.points, strict=True):
+            objective = Objective(noise_weight=point.noise_weight)
+            values = [
+                objective_value(objective, error, None, other.amplification)
+                for error, other in zip(errors, every, strict=True)
+            ]
+            # As exact as what a start tells of itself: its last step is not in its history.
+            assert objective_value(objective, own, None, point.amplification) <= min(values) * (1 + 2e-4)
+        weights = [point.noise_weight for point in front.points]
+        assert weights[0] == 0 and weights == sorted(weights) and len(weights) == POINTS
+        noise = [point.amplification for point in front.points]
+        assert (np.diff(noise) <= 1e-9).all() and noise[0] > 1.1 * noise[-1]
+        rms = [np.sqrt(np.mean(error**2)) for error in errors[:POINTS]]
+        assert (np.diff(rms) >= -2e-4 * rms[0]).all() and rms[-1] > 1.2 * rms[0]
+
+
+def test_all_weights_of_all_mechanisms_share_one_program(made):
+    assert made[1] == 1
+
+
+def test_points_begin_at_what_their_neighbours_found():
+    found = [pareto._Found({"gain": float(n)}, 0.1, 1.0) for n in (1, 2, 2, 4)]
+    assert [[gains["gain"] for gains in own] for own in pareto._neighbourhoods(found)] == [
+        [1, 2],
+        [2, 1],
+        [2, 4],
+        [4, 2],
+    ]
+
+
+def test_what_a_start_reached_is_told_apart_from_its_noise():
+    task = build_task(MECHANISMS[0], "phase_lead", 8, 0)
+    excess = amplification(task.mechanism, "phase_lead", task.literature) - 1
+    start = pareto.Start("converged", 1, math.hypot(0.02, 0.003 * excess), [], task.literature)
+    broken = start._replace(rms=math.nan)
+    (one,) = pareto._found(task, 0.003, [broken, start])
+    assert one.excess == pytest.approx(excess) and one.error == pytest.approx(0.02, rel=1e-12)
+    assert one.value(0.003) == pytest.approx(start.rms, rel=1e-12)
+    # Where nothing is usable there are the literature's gains.
+    assert pareto._found(task, 0.003, [broken])[0].gains == task.literature
+
+
+def test_settings_other_than_the_weight_stay(results, monkeypatch):
+    seen = []
+
+    def solve(tasks, starts, steps, objectives, report):
+        seen.append(objectives)
+        return [[pareto.Start("made up", 1, 0.1, [0.1], task.literature)] for task in tasks]
+
+    monkeypatch.setattr(pareto, "solve_tasks", solve)
+    objective = Objective("cvar", 3.0, 0.1, 0.5, 0.2)
+    settings = dataclasses.replace(SETTINGS, objective=objective)
+    trial = Trial([build_task(MECHANISMS[0], "phase_lead", 8, 0)], settings.validation, settings.seed)
+    pareto._solve(trial, results[:1], 3, settings, print)
+    for objectives in seen:
+        assert [dataclasses.replace(one, noise_weight=0.5) for one in objectives] == [objective] * 3
+    assert len(seen) == 2  # the second found nothing better

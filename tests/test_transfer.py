@@ -1,0 +1,230 @@
+"""Gains carried from mechanism to mechanism: exact on the same, within bounds on another, never a loss."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from jaxhil.compensators import COMPENSATORS, literature_gains
+from jaxhil.evaluation import evaluate
+from jaxhil.mechanism_file import builtin_names, load
+from tuning import tune
+from tuning.objective import RMS, objective_value
+from tuning.problems import build_task
+from tuning.rounds import choose_starts, solve_tasks
+from tuning.transfer import Tuned, carry_over, distance, nearest, traits
+from tuning.trial import Trial
+
+MASS, STIFFNESS = 350.0, 124355.0
+OMEGA = math.sqrt(STIFFNESS / MASS)
+
+
+def claw(*overrides):
+    return load("claw-350kg", overrides).mechanism
+
+
+def anywhere(mechanism, compensator, seed=0):
+    """Gains anywhere within their bounds."""
+    generator, gains = np.random.default_rng(seed), {}
+    for gain in COMPENSATORS[compensator].gains:
+        lower, upper = gain.lower(mechanism), gain.upper(mechanism)
+        if gain.logarithmic:
+            gains[gain.name] = math.exp(generator.uniform(math.log(lower), math.log(upper)))
+        else:
+            gains[gain.name] = generator.uniform(lower, upper)
+    return gains
+
+
+# Distance
+
+
+def test_distance_is_nothing_to_itself_and_the_same_both_ways():
+    mechanisms = [load(name).mechanism for name in builtin_names()]
+    for a in mechanisms:
+        assert distance(a, a) == 0
+        for b in mechanisms:
+            assert distance(a, b) == distance(b, a) >= 0
+            assert (distance(a, b) == 0) == (a is b)
+
+
+@pytest.mark.parametrize(
+    "override, expected",
+    [
+        # Four times as stiff is twice as fast; damping of the same damper counts half as much.
+        ("contact.stiffness=[497420.0]", math.hypot(math.log(2), math.pi * 0.015)),
+        ("contact.damping=[0.0]", math.pi * 0.03),
+        ("rig.force_sensor.delay=0.009", math.pi / 2 * OMEGA * 0.005),
+        ("rig.force_sensor.time_constant=0.005", math.pi / 2 * OMEGA * 0.005),
+        ("rig.simulator.delay=0.0", math.pi / 2 * OMEGA * 0.004),
+        # Lag 2 zeta / omega_n = zeta / (pi f_n).
+        ("rig.simulator.natural_frequency=6.0", math.pi / 2 * OMEGA * 0.8 / math.pi * (1 / 6 - 1 / 12)),
+        ("rig.command_latency=1", math.pi / 2 * OMEGA * 0.001),
+        ("rig.command_hold='zoh'", math.pi / 2 * OMEGA * 0.0005),
+        ("rig.control_period=0.003", math.pi / 2 * OMEGA * 0.002),
+        ("contact.law='linear'", math.hypot(1, math.pi * 0.03)),
+        ("contact.clearance=0.1", 1.0),
+        # What the restitution does not hang on.
+        ("approach.velocity=0.01", 0.0),
+        ("name='other'", 0.0),
+    ],
+)
+def test_each_trait_counts_by_what_it_does_to_the_restitution(override, expected):
+    assert distance(claw(), claw(override)) == pytest.approx(expected, rel=2e-4, abs=1e-12)
+
+
+def test_traits_do_not_hang_on_how_a_simulator_is_written():
+    second = traits(claw("rig.simulator.natural_frequency=10.0", "rig.simulator.damping_ratio=0.7"))
+    omega = 2 * math.pi * 10
+    written = claw(
+        "rig.simulator.model='transfer_function'",
+        f"rig.simulator.numerator=[{omega**2}]",
+        f"rig.simulator.denominator=[1.0, {1.4 * omega}, {omega**2}]",
+    )
+    assert traits(written).simulator_delay == pytest.approx(second.simulator_delay, rel=1e-12)
+    leading = claw(
+        "rig.simulator.model='transfer_function'",
+        "rig.simulator.numerator=[0.01, 1.0]",
+        "rig.simulator.denominator=[0.0001, 0.03, 1.0]",
+    )
+    assert traits(leading).simulator_delay == pytest.approx(0.004 + 0.02, rel=1e-12)
+    assert traits(claw("rig.simulator.model='ideal'")).simulator_delay == 0.004
+
+
+def test_damping_of_every_law_is_that_of_its_restitution():
+    """Hunt and Crossley's e = 1 - chi v."""
+    hertz = traits(claw("contact.law='hunt_crossley'", "contact.damping=[4.0]"))
+    assert math.exp(-math.pi * hertz.damping_ratio) == pytest.approx(1 - 4.0 * 0.005, rel=1e-3)
+    assert traits(claw()).damping_ratio == pytest.approx(0.03, rel=1e-3)
+
+
+def test_the_nearest_is_the_least_distant_and_the_first_of_equals():
+    stiff, soft = claw("contact.stiffness=[3e5]"), claw("contact.stiffness=[6e4]")
+    known = [Tuned(stiff, {}, "stiff"), Tuned(soft, {}, "soft"), Tuned(soft, {}, "again")]
+    assert nearest(claw("contact.stiffness=[2e5]"), known).source == "stiff"
+    assert nearest(claw("contact.stiffness=[8e4]"), known).source == "soft"
+
+
+# Carrying over
+
+
+@pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
+@pytest.mark.parametrize("name", builtin_names())
+def test_on_the_same_mechanism_gains_are_the_very_gains(compensator, name):
+    mechanism = load(name).mechanism
+    gains = anywhere(mechanism, compensator)
+    assert carry_over(compensator, gains, mechanism, load(name).mechanism) == gains
+
+
+@pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
+def test_the_literature_s_gains_become_the_literature_s(compensator):
+    source, target = claw(), load("varying", ["rig.control_period=0.002"]).mechanism
+    carried = carry_over(compensator, literature_gains(source, compensator), source, target)
+    for name, value in literature_gains(target, compensator).items():
+        assert carried[name] == pytest.approx(value, rel=1e-12)
+
+
+def test_gains_move_with_the_literature_and_the_range():
+    source = claw()
+    target = claw("contact.stiffness=[497420.0]", "rig.force_sensor.delay=0.01", "rig.control_period=0.002")
+    gains = {**literature_gains(source, "response_error"), "initial_stiffness": 1e5, "lead_filter": 1.5e-3}
+    carried = carry_over("response_error", {**gains, "phase_lead": 0.0054}, source, target)
+    # A range of 2 tau + 0.02 s, of which 1.4 ms beyond the delay are a twentieth.
+    assert carried["phase_lead"] == pytest.approx(0.01 + 0.05 * 0.04, rel=1e-12)
+    assert carried["initial_stiffness"] == pytest.approx(4e5, rel=1e-12)
+    # Logarithmic: one and a half times the literature's one period.
+    assert carried["lead_filter"] == pytest.approx(3e-3, rel=1e-12)
+
+
+def test_carried_gains_are_within_the_bounds():
+    names = builtin_names()
+    for seed, name in enumerate(names):
+        source, target = load(name).mechanism, load(names[seed - 1], ["rig.control_period=0.003"]).mechanism
+        carried = carry_over("response_error", anywhere(source, "response_error", seed), source, target)
+        for gain in COMPENSATORS["response_error"].gains:
+            assert gain.lower(target) <= carried[gain.name] <= gain.upper(target)
+
+
+# Starts of the solver
+
+
+@pytest.fixture(scope="module")
+def task():
+    return build_task(load("rig-300kg").mechanism, "phase_lead", 8, 0)
+
+
+@pytest.fixture(scope="module")
+def trial(task):
+    return Trial([task], 15, 0)
+
+
+@pytest.fixture(scope="module")
+def solved(task, trial):
+    (starts,) = solve_tasks([task], choose_starts(trial, 3, 0), 6)
+    return starts
+
+
+def test_starts_told_take_the_places_of_the_last(task, trial):
+    told = {"phase_lead": 0.011, "lead_filter": 0.0007}
+    (usual,) = choose_starts(trial, 3, 0)
+    (points,) = choose_starts(trial, 3, 0, first=[[told]])
+    np.testing.assert_array_equal(points[:2], usual[:2])
+    assert trial.gains(0, points[2]) == pytest.approx(told, rel=1e-12)
+    # It begins at the very gains: its first value is theirs.
+    (starts,) = solve_tasks([task], [points], 6)
+    errors = np.where(task.scenarios.contacts > 0, evaluate(task.loop, told, task.scenarios).error[0], 0)
+    assert starts[2].history[0] == pytest.approx(objective_value(RMS, errors), rel=1e-9)
+
+
+@pytest.mark.parametrize("starts", [1, 2])
+def test_the_literature_s_gains_stay_beside_those_told(task, trial, starts):
+    told = [{"phase_lead": 0.011, "lead_filter": 0.0007}, {"phase_lead": 0.002, "lead_filter": 0.0005}]
+    (points,) = choose_starts(trial, starts, 0, first=[told])
+    for gains, point in zip([task.literature, *told], points, strict=True):
+        assert trial.gains(0, point) == pytest.approx(gains, rel=1e-12)
+
+
+def test_a_start_told_never_ends_worse_than_it_was_told(task, trial, solved):
+    """Tuned gains lie at a bound here."""
+    best = min(solved, key=lambda start: start.rms)
+    upper = COMPENSATORS["phase_lead"].gains[0].upper(task.mechanism)
+    assert best.gains["phase_lead"] == pytest.approx(upper, rel=1e-12)
+    (again,) = solve_tasks([task], choose_starts(trial, 2, 0, first=[[best.gains]]), 1)
+    assert again[-1].rms <= best.rms * (1 + 1e-12)
+
+
+# Blocks of mechanisms
+
+
+@pytest.fixture
+def in_blocks(monkeypatch):
+    """Where starts come from when mechanisms of 1e5, 3e5 and 2.9e5 N/m are tuned two at a time."""
+    monkeypatch.setattr(tune, "BLOCK", 2)
+
+    def block(tasks, settings, report, near):
+        return [
+            SimpleNamespace(mechanism=t.mechanism, gains={}, near=own)
+            for t, own in zip(tasks, near, strict=True)
+        ]
+
+    monkeypatch.setattr(tune, "_tune_block", block)
+
+    def call(starts, tuned=()):
+        mechanisms = [claw(f"contact.stiffness=[{k}]", f"name='{k}'") for k in ("1e5", "3e5", "2.9e5")]
+        settings = tune.Settings(scenarios=4, starts=starts)
+        every = dict(tune.tune_all(mechanisms, "phase_lead", settings, tuned=tuned))
+        return [[one.source for one in every[i].near] for i in range(3)]
+
+    return call
+
+
+def test_later_blocks_begin_at_what_earlier_ones_found(in_blocks):
+    assert in_blocks(starts=3) == [[], [], ["3e5"]]
+    assert in_blocks(starts=2) == [[], [], ["3e5"]]
+
+
+def test_gains_given_come_before_those_and_the_literature_s_stay(in_blocks):
+    file = Tuned(claw("contact.stiffness=[1.1e5]"), {}, "file")
+    assert in_blocks(3, [file]) == [["file"], ["file"], ["file", "3e5"]]
+    assert in_blocks(2, [file]) == in_blocks(1, [file]) == [["file"]] * 3
+    assert in_blocks(1) == [[]] * 3
