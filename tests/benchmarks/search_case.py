@@ -124,7 +124,9 @@ def _build_case(task: Task, loop: Loop) -> Case:
     lanes_last = jax.tree.map(lambda leaf: NamedSharding(mesh, _lanes_last(leaf)), rig)
     rig = jax.device_put(rig, lanes_last)
     bounds = gain_bounds(task, names)
-    fixed, weights, placed_bounds = jax.device_put((fixed, RMS.weights, bounds), everywhere)
+    fixed, weights, placed_bounds = jax.device_put(
+        (fixed, RMS.weights, bounds), NamedSharding(mesh, PartitionSpec())
+    )
     return Case(task, loop, names, bounds, Problem(rig, fixed, weights), placed_bounds)
 
 

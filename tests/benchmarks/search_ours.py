@@ -13,7 +13,7 @@ from search_case import Case, several
 from search_methods import Trace
 
 from tuning.objective import RMS, common_terms, residuals
-from tuning.optimiser import solve
+from tuning.optimiser import Solution, solve
 from tuning.problems import spread_points
 from tuning.rounds import AGREED, FIRST_ROUND, REACH
 from tuning.search import apart, polish
@@ -28,7 +28,9 @@ def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = 
     """What tuning does, from every start (in the unit box) on its own: look around, descend by
     Levenberg-Marquardt in two rounds, polish without derivatives where the descents disagree.
 
-    A trace has an entry for every stage. Its seconds are those of the batch over the number of starts.
+    A trace has an entry for every step of a start's descents and for the stages before and after. Its seconds
+    are those of the batch over the number of starts; the steps of a round, which is one program, count as
+    equally long.
     """
     number, gains = starts.shape
     begin = time.perf_counter()
@@ -41,29 +43,29 @@ def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = 
     first = np.concatenate(
         [apart(own[ranks], None, DESCENTS) for own, ranks in zip(points, order, strict=True)]
     )
-    shares, loss, steps, curvature = _descend(case, first, 1 if warming else FIRST_ROUND)
-    loss = loss.reshape(number, DESCENTS)
-    stages.add((1 + gains) * steps.reshape(number, -1).sum(axis=1), np.min(loss, axis=1))
+    found = _descend(case, first, 1 if warming else FIRST_ROUND)
+    loss = np.asarray(found.loss).reshape(number, DESCENTS)
+    stages.add_steps(1 + gains, found)
     best = np.argsort(loss, axis=1)[:, :GO_ON] + DESCENTS * np.arange(number)[:, None]
-    shares, loss, steps, curvature = _descend(
-        case, shares[best.reshape(-1)], 1 if warming else STEPS - FIRST_ROUND
-    )
-    loss = loss.reshape(number, GO_ON)
-    stages.add((1 + gains) * steps.reshape(number, -1).sum(axis=1), np.min(loss, axis=1))
+    found = _descend(case, found.shares[best.reshape(-1)], 1 if warming else STEPS - FIRST_ROUND)
+    loss = np.asarray(found.loss).reshape(number, GO_ON)
+    stages.add_steps(1 + gains, found)
 
     # AGREED is of the rms error, the root of the loss.
     unsure = np.ptp(loss, axis=1) > 2 * AGREED * np.min(loss, axis=1)
     if unsure.any():
         rows = (np.argmin(loss, axis=1) + GO_ON * np.arange(number))[unsure]
         scale = 2 * np.min(loss, axis=1)[unsure]
-        shape = np.linalg.inv(curvature[rows] / scale[:, None, None] + 16 * np.eye(gains))
+        shape = np.linalg.inv(np.asarray(found.curvature)[rows] / scale[:, None, None] + 16 * np.eye(gains))
 
         def losses(points):
             return case.losses(points.reshape(-1, gains)).reshape(points.shape[:-1])
 
-        found = polish(losses, shares[rows], 1 if warming else POLISH, reach=REACH, covariance=shape)
+        last = polish(
+            losses, np.asarray(found.shares)[rows], 1 if warming else POLISH, reach=REACH, covariance=shape
+        )
         polished = np.full(number, np.inf)
-        polished[unsure] = found.loss
+        polished[unsure] = last.loss
         stages.add(POLISH * unsure, polished)
     return stages.traces()
 
@@ -73,14 +75,13 @@ def warm_up(case: Case, starts: Float[np.ndarray, "starts gains"]) -> None:
     ours(case, starts, warming=True)
 
 
-def _descend(case: Case, shares, steps):
-    """Shares, loss, steps and J^T J of every descent."""
+def _descend(case: Case, shares, steps) -> Solution:
     problems, bounds = several((case.problem, case.bounds), len(shares))
     static = case.loop, case.names, common_terms([RMS])
-    found = jax.device_get(
+    shares = np.clip(shares, 0, 1)
+    return jax.device_get(
         solve(residuals, static, problems, bounds, shares, np.array(steps), LONGEST, tile=1)
     )
-    return np.clip(found.shares, 0, 1), np.asarray(found.loss), found.steps, np.asarray(found.curvature)
 
 
 class _Stages:
@@ -95,6 +96,19 @@ class _Stages:
         self.rollouts.append(before + rollouts)
         self.seconds.append((time.perf_counter() - self.begin) / self.number)
         self.best.append(np.minimum(best, self.best[-1] if self.best else np.inf))
+
+    def add_steps(self, rollouts: int, found: Solution) -> None:
+        """Descents of all starts, as many of each: an entry for every step."""
+        begin = self.seconds[-1]
+        end = (time.perf_counter() - self.begin) / self.number
+        steps = np.asarray(found.steps).reshape(self.number, -1)
+        history = np.asarray(found.history).reshape(*steps.shape, -1)
+        before, last = 0, max(1, int(np.max(steps)))
+        for step in range(1, last + 1):
+            taken = rollouts * np.minimum(steps, step).sum(axis=1)
+            self.add(taken - before, np.min(history[..., step - 1], axis=1))
+            self.seconds[-1] = begin + (end - begin) * step / last
+            before = taken
 
     def traces(self) -> list[Trace]:
         rollouts, best = np.array(self.rollouts, float), np.array(self.best)
