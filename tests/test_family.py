@@ -95,7 +95,7 @@ def test_every_law_is_there_and_undamped_members_have_fewer_gains(members):
     number = [sum(g.tuned(m) for g in COMPENSATORS["response_error"].gains) for m in members]
     damped = [m.contact.damping[0] > 0 for m in members]
     assert sum(damped) == NUMBER - NUMBER // 8
-    assert all(n == (11 if d else 7) for n, d in zip(number, damped, strict=True))
+    assert all(n == (5 if d else 4) for n, d in zip(number, damped, strict=True))
 
 
 def test_every_member_is_uncertain_in_stiffness_force_delay_and_phase(members):
