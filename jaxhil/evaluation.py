@@ -94,11 +94,6 @@ def evaluate(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least
     return jax.tree.map(unfold, outcome)
 
 
-def prepare_evaluation(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario) -> None:
-    """Compile the program that `evaluate` will run on such arguments, without running it."""
-    run_tiles.lower(loop, *deal(scenarios, gains)).compile()
-
-
 def deal(
     scenarios: Scenario, gains: Mapping[str, Any], at_least: int = 1
 ) -> tuple[dict[str, Any], dict[str, Any], Scenario]:

@@ -69,7 +69,7 @@ def has_sensor_noise(mechanism: Mechanism) -> bool:
 
 def alike(loops: list[Loop], scenarios: list[Scenario]) -> list[list[int]]:
     """Indices of what one program serves: loops that differ by the length of their delay lines alone, with
-    scenario arrays of the same shapes but for the number of lanes. In the order in which they come."""
+    scenario arrays of the same shapes. In the order in which they come."""
     groups: dict[Any, list[int]] = {}
     for index, (loop, batch) in enumerate(zip(loops, scenarios, strict=True)):
         shapes = tuple(leaf.shape for leaf in jax.tree.leaves(batch))
@@ -104,6 +104,15 @@ def gain_bounds(task: Task, names: tuple[str, ...]) -> Bounds:
         return float(gain.lower(mechanism)), float(gain.upper(mechanism)), float(gain.logarithmic)
 
     return Bounds(*np.array([bounds(name) for name in names]).reshape(-1, 3).T)
+
+
+def gains_at(
+    task: Task, names: tuple[str, ...], bounds: Bounds, shares: Float[np.ndarray, "gains"]
+) -> dict[str, float]:
+    """All of the compensator's gains: `names` at `shares` of their ranges, as far as tuned for the task."""
+    moved = {gain.name for gain in task.tuned}
+    found = zip(names, to_gains(shares, bounds), strict=True)
+    return {**task.literature, **{name: float(gain) for name, gain in found if name in moved}}
 
 
 def spread_points(first: np.ndarray, number: int, seed: int) -> np.ndarray:

@@ -18,11 +18,11 @@ from jaxtyping import Float
 from jaxhil.evaluation import expected_duration
 from jaxhil.loop import build_rig
 from tuning import programs
-from tuning.box import Bounds, to_gains, to_shares
+from tuning.box import Bounds, to_shares
 from tuning.environment import program_folder
 from tuning.objective import RMS, SCALE, Objective, Problem, common_terms, one_each, residuals
 from tuning.optimiser import STATUSES, Solution, solve
-from tuning.problems import Task, common_loop, gain_bounds, spread_points, tuned_names
+from tuning.problems import Task, common_loop, gain_bounds, gains_at, spread_points, tuned_names
 from tuning.search import apart, polish
 from tuning.trial import Trial
 
@@ -31,7 +31,7 @@ TILE = 128  # lanes computed side by side on a device: more leave the cache
 FIRST_ROUND = 8  # steps
 PROMISING = 3  # starts of a task that go on after the first round
 LONGEST = 32  # steps of one call
-CONVERGED, STEP_LIMIT, NOT_FINITE = STATUSES.index("converged"), STATUSES.index("step limit"), 2
+STEP_LIMIT = STATUSES.index("step limit")
 GIVEN_UP = "given up"
 
 SCANNED, SCAN_SCENARIOS = 64, 32  # points looked at before the first round, and on how many scenarios
@@ -55,7 +55,7 @@ class Start(NamedTuple):
 
 @dataclasses.dataclass
 class _Problem:
-    """A start on its way: gains now, loss after every step so far."""
+    """A start on its way: shares now, J^T J there, loss after every step so far."""
 
     task: int
     shares: np.ndarray
@@ -195,13 +195,10 @@ def _shape(start: Start) -> np.ndarray:
 
 
 def _finished(problem: _Problem, names: tuple[str, ...], bounds: Bounds, task: Task) -> Start:
-    moved = {gain.name for gain in task.tuned}
-    gains = to_gains(problem.shares, bounds)
-    found = {name: float(gain) for name, gain in zip(names, gains, strict=True) if name in moved}
     history = [float(value) for value in SCALE * np.sqrt(2 * np.array(problem.history))]
     status = problem.status if isinstance(problem.status, str) else STATUSES[problem.status]
-    own = {**task.literature, **found}
-    return Start(status, len(history), history[-1], history, own, problem.shares, problem.curvature)
+    gains = gains_at(task, names, bounds, problem.shares)
+    return Start(status, len(history), history[-1], history, gains, problem.shares, problem.curvature)
 
 
 def prepare_solver(tasks: list[Task], starts: int, objective: Objective | Sequence[Objective] = RMS) -> None:
@@ -211,14 +208,14 @@ def prepare_solver(tasks: list[Task], starts: int, objective: Objective | Sequen
     nothing = np.zeros(len(names))
     problems = [_Problem(index, nothing, nothing) for index in range(len(tasks)) for _ in range(starts)]
     static, call = _calls(tasks, names, bounds, one_each(objective, len(tasks)), len(problems))
-    some = problems[: FEW if len(problems) <= FEW else MANY]
+    some = problems[: _size(len(problems))]
     programs.prepare(_advance, static, call(some, 1), program_folder())
 
 
 def _stepper(tasks, names, bounds, objectives, number) -> Callable[[list[_Problem], int], None]:
     """A function that takes problems up to so many steps further."""
     static, call = _calls(tasks, names, bounds, objectives, number)
-    size = FEW if number <= FEW else MANY
+    size = _size(number)
 
     def advance(problems: list[_Problem], limit: int) -> None:
         for begin in range(0, len(problems), size):
@@ -230,6 +227,11 @@ def _stepper(tasks, names, bounds, objectives, number) -> Callable[[list[_Proble
     return advance
 
 
+def _size(number: int) -> int:
+    """Problems in one call, of so many in all."""
+    return FEW if number <= FEW else MANY
+
+
 def _calls(tasks, names, bounds, objectives, number):
     """Static part and, as a function of some problems and a number of steps, arguments of the program."""
     loop = common_loop([task.loop for task in tasks])
@@ -237,7 +239,7 @@ def _calls(tasks, names, bounds, objectives, number):
     weights = [one.weights for one in objectives]
     each = [(t.scenarios, f, w, b) for t, f, w, b in zip(tasks, fixed, weights, bounds, strict=True)]
     table = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *each)
-    size = FEW if number <= FEW else MANY
+    size = _size(number)
     lanes = len(tasks[0].scenarios.velocity)
     static = (loop, names, common_terms(objectives)), LONGEST, max(1, TILE // lanes)
 

@@ -13,13 +13,13 @@ from jaxtyping import Float
 
 from jaxhil.building import build_loop
 from jaxhil.compensators.base import Constants
-from jaxhil.evaluation import Outcome, evaluate, prepare_evaluation
+from jaxhil.evaluation import Outcome, evaluate
 from jaxhil.loop import Loop
 from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import draw
-from tuning.box import Bounds, to_gains
+from tuning.box import Bounds
 from tuning.objective import Objective, contact_terms, objective_value, one_each
-from tuning.problems import Task, common_loop, gain_bounds, tuned_names
+from tuning.problems import Task, common_loop, gain_bounds, gains_at, tuned_names
 
 # Draws of the validation come from another seed than those of training.
 VALIDATION_SEED = 0x5EED
@@ -52,10 +52,6 @@ class Trial:
         )
         self._each = validation + 1
         self._lanes = self._each * len(tasks)
-
-    def prepare(self) -> None:
-        """Compile what all the rest will run, into the compile cache."""
-        prepare_evaluation(self.loop, self._values([t.literature for t in self.tasks]), self._scenarios)
 
     def judge(self, gains: list[dict[str, float]]) -> list[Outcome]:
         """Outcome on the fresh scenarios of every task under its gains, the nominal run last."""
@@ -94,7 +90,7 @@ class Trial:
 
     def _run(self, noise, which, shares, some, number) -> tuple[Outcome, np.ndarray]:
         index = np.array([which[i] for i, _ in some])
-        rows = [self._row(which[i], shares[i, point]) for i, point in some]
+        rows = [self.gains(which[i], shares[i, point]) for i, point in some]
         values = {name: np.repeat([row[name] for row in rows], number) for name in rows[0]}
 
         def side_by_side(leaf):
@@ -113,15 +109,9 @@ class Trial:
         own: Any = {name: jnp.asarray(value[first]) for name, value in values.items()}
         return outcome, np.asarray(self.loop.compensator.noise_amplification(own, constants))
 
-    def _row(self, task: int, shares: np.ndarray) -> dict[str, float]:
-        gains = to_gains(shares, self.bounds[task])
-        moved = {gain.name for gain in self.tasks[task].tuned}
-        found = zip(self.names, gains, strict=True)
-        return {**self.tasks[task].literature, **{n: float(g) for n, g in found if n in moved}}
-
     def gains(self, task: int, shares: Float[np.ndarray, "gains"]) -> dict[str, float]:
         """All of the compensator's gains at a point of the unit box."""
-        return self._row(task, shares)
+        return gains_at(self.tasks[task], self.names, self.bounds[task], shares)
 
     def _values(self, gains: list[dict[str, float]]) -> dict[str, Any]:
         return {name: np.repeat([one[name] for one in gains], self._each) for name in gains[0]}
