@@ -171,9 +171,9 @@ def finish(
 
         shapes = np.stack([_shape(top) for top in tops])
         found = polish(losses, starts, evaluations, reach=REACH, covariance=shapes, seed=seed)
-        before = losses(starts[:, None])[:, 0]
-        for i, top, shares, loss, old in zip(unsure, tops, found.free, found.loss, before, strict=True):
-            if loss < old:
+        for i, top, shares, loss in zip(unsure, tops, found.free, found.loss, strict=True):
+            # It keeps the start itself where nothing is better.
+            if (shares != top.shares).any():
                 gains = trial.gains(i, shares)
                 history = [*top.history, float(loss)]
                 best[i][0] = top._replace(rms=float(loss), gains=gains, shares=shares, history=history)
