@@ -9,7 +9,7 @@ from tuning import rounds
 from tuning.box import to_shares
 from tuning.objective import RMS, Objective, objective_value
 from tuning.problems import alike, build_task, gain_bounds, spread_points, tuned_names
-from tuning.rounds import GIVEN_UP, choose_starts, finish, solve_tasks
+from tuning.rounds import GIVEN_UP, solve_tasks
 from tuning.trial import Trial
 
 STARTS, STEPS = 5, 14
@@ -107,41 +107,6 @@ def test_every_task_is_searched_under_its_own_objective(tasks, trial):
     for i, task in enumerate([2, 0]):
         np.testing.assert_array_equal(together[i], trial.losses(several[task], [task], points[i : i + 1])[0])
         assert (np.abs(together[i] / trial.losses(RMS, [task], points[i : i + 1])[0] - 1) > 1e-4).any()
-    several = [Objective(divergence_weight=weight) for weight in (1.0, 4.0, 16.0)]
-    chosen = choose_starts(trial, 3, 0, several)
-    polished = finish(trial, solve_tasks(tasks, chosen, 2, several), 16, 0, several)
-    for i, (objective, end) in enumerate(zip(several, polished, strict=True)):
-        np.testing.assert_array_equal(chosen[i], choose_starts(trial, 3, 0, objective)[i])
-        assert end is not None
-        assert end.rms == pytest.approx(trial.losses(objective, [i], end.shares[None, None])[0, 0], rel=1e-9)
-
-
-def test_starts_are_the_literature_and_the_best_of_a_scan(tasks, trial):
-    chosen = choose_starts(trial, 4, seed=3)
-    for index, (task, points) in enumerate(zip(tasks, chosen, strict=True)):
-        assert trial.gains(index, points[0]) == pytest.approx(task.literature)
-        values = trial.losses(RMS, [index], points[None])[0]
-        looked_at = spread_points(points[0], rounds.SCANNED, 3)
-        every = trial.losses(RMS, [index], looked_at[None])[0]
-        assert values[1] == pytest.approx(np.min(every[1:]))
-        assert (values[1:] < np.median(every)).all()
-        assert (np.diff(values[1:]) >= 0).all()
-
-
-def test_where_starts_disagree_the_best_is_polished(tasks, trial):
-    """Stopped far too early, no two starts agree; agreeing ones are left as they are."""
-    early = solve_tasks(tasks, spread(tasks, 3), 2)
-    polished = finish(trial, early, 64, seed=0)
-    for index, (own, found) in enumerate(zip(early, polished, strict=True)):
-        assert found is not None
-        assert found.rms < min(start.rms for start in own)
-        value = trial.losses(RMS, [index], found.shares[None, None])[0, 0]
-        assert found.rms == pytest.approx(value, rel=1e-12)
-        assert found.gains == trial.gains(index, found.shares)
-    agreeing = [[own[0], own[0]._replace(rms=own[0].rms * 1.001)] for own in early]
-    assert finish(trial, agreeing, 64, seed=0) == [own[0] for own in early]
-    failed = [[own[0]._replace(rms=np.nan)] for own in early]
-    assert finish(trial, failed, 64, seed=0) == [None] * 3
 
 
 def restitution_errors_of(task, gains):

@@ -10,9 +10,10 @@ from jaxhil.compensators import COMPENSATORS, literature_gains
 from jaxhil.evaluation import evaluate
 from jaxhil.mechanism_file import builtin_names, load
 from tuning import tune
+from tuning.finding import choose_starts
 from tuning.objective import RMS, objective_value
 from tuning.problems import build_task
-from tuning.rounds import choose_starts, solve_tasks
+from tuning.rounds import solve_tasks
 from tuning.transfer import Tuned, carry_over, distance, nearest, traits
 from tuning.trial import Trial
 

@@ -7,12 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tuning.finding import Found
 from tuning.objective import Objective
-from tuning.rounds import SCANNED, Start
 from tuning.search import certify
 from tuning.trial import Trial
 
 FACTOR = 50
+LANES = 8192  # side by side, which is quicker than few at a time
 
 
 class Certified(NamedTuple):
@@ -31,30 +32,21 @@ class Certified(NamedTuple):
 def certified(
     trial: Trial,
     task: int,
-    found: Start,
-    starts: list[Start],
+    found: Found,
     objective: Objective,
-    polish: int,
     seed: int,
     factor: int = FACTOR,
-) -> Certified:
-    """Search the box of one task with `factor` times the evaluations that tuning took."""
-    number = len(trial.names)
-    spent = evaluations(found, starts, number, polish)
+) -> Certified | None:
+    """Search the box of one task with `factor` times the evaluations that tuning took; none where all starts
+    failed."""
+    if found.best is None:
+        return None
 
     def losses(points):
-        return trial.losses(objective, [task], points[None])[0]
+        return trial.losses(objective, [task], points[None], lanes=LANES)[0]
 
-    everywhere = certify(losses, number, factor * spent, seed=seed + 1)
-    tuned = float(losses(found.shares[None])[0])
+    everywhere = certify(losses, len(trial.names), factor * found.evaluations, seed=seed + 1)
+    tuned = float(losses(found.best.shares[None])[0])
     gains = trial.gains(task, everywhere.free)
     above = tuned / everywhere.loss - 1 if everywhere.loss > 0 else np.inf
-    return Certified(tuned, everywhere.loss, above, spent, everywhere.evaluations, gains)
-
-
-def evaluations(found: Start, starts: list[Start], gains: int, polish: int) -> int:
-    """Evaluations that tuning took for one task: the scan, the steps, the polish if there was one."""
-    scanned = max(SCANNED, 2 * len(starts)) if len(starts) > 1 else 0
-    stepped = sum(start.steps for start in starts) * (1 + gains)
-    polished = all(found.shares is not start.shares for start in starts)
-    return scanned + stepped + polish * polished
+    return Certified(tuned, everywhere.loss, above, found.evaluations, everywhere.evaluations, gains)

@@ -101,7 +101,7 @@ class Tune:
             help_behavior_hint="",
         ),
     ] = None
-    starts: Annotated[int, _number("Starts of the solver.")] = 4
+    starts: Annotated[int, _number("Starts of the solver, and of each further lot where they disagree.")] = 4
     start: Annotated[
         tuple[str, ...],
         arg(

@@ -20,9 +20,10 @@ from jaxhil.compensators import COMPENSATORS, Compensator, Constants
 from jaxhil.evaluation import Outcome
 from jaxhil.mechanism import Mechanism
 from tuning.box import to_shares
+from tuning.finding import choose_starts
 from tuning.objective import FAILED, Objective, contact_terms, objective_value
 from tuning.problems import Task, alike, build_task
-from tuning.rounds import Start, choose_starts, solve_tasks
+from tuning.rounds import Start, solve_tasks
 from tuning.trial import Trial
 from tuning.trust import Intervals, interval
 from tuning.tune import BLOCK, Figures, Result, Settings, figures

@@ -19,7 +19,7 @@ from jaxhil.loop import Loop
 from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import quasi_random
-from tuning.box import Bounds, to_gains, to_shares
+from tuning.box import Bounds, to_gains
 
 # In training a contact that takes longer than this many times its undelayed duration, and so many
 # seconds more, has failed.
@@ -115,7 +115,7 @@ def gains_at(
     return {**task.literature, **{name: float(gain) for name, gain in found if name in moved}}
 
 
-def spread_points(first: np.ndarray, number: int, seed: int) -> np.ndarray:
+def spread_points(first: np.ndarray, number: int, seed: int | tuple[int, ...]) -> np.ndarray:
     """(number, gains) shares of the unit box: `first`, then Sobol points, every other one of them within a
     quarter of each gain's range of `first`, the rest anywhere."""
     points = qmc.Sobol(len(first), rng=np.random.default_rng(seed)).random(
@@ -124,11 +124,6 @@ def spread_points(first: np.ndarray, number: int, seed: int) -> np.ndarray:
     reach = np.where(np.arange(len(points)) % 2 == 0, 0.25, 1.0)[:, None]
     near = np.clip(first + reach * (points - 0.5), 0, 1)
     return np.concatenate([first[None], np.where(reach < 1, near, points)])[:number]
-
-
-def spread_starts(first: np.ndarray, bounds: Bounds, number: int, seed: int) -> np.ndarray:
-    """(number, gains): `spread_points` around the gains `first`, as gains."""
-    return to_gains(spread_points(to_shares(first, bounds), number, seed), bounds)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -1,13 +1,12 @@
 """Solving many tasks from many starts: a short round for all, further ones for what is worth it.
 
-`choose_starts` looks around, `solve_tasks` descends by derivatives, `finish` goes on without them where the
-starts do not agree. A start of a task is a problem. One compiled program takes a fixed number of problems at
-a time; hard ones do not hold up easy ones, since every round deals out anew what has not converged. After the
-first round only the most promising starts of a task go on.
+A start of a task is a problem. One compiled program takes a fixed number of problems at a time; hard ones do
+not hold up easy ones, since every round deals out anew what has not converged. After the first round only the
+most promising starts of a task go on.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -18,13 +17,11 @@ from jaxtyping import Float
 from jaxhil.evaluation import expected_duration
 from jaxhil.loop import build_rig
 from tuning import programs
-from tuning.box import Bounds, to_shares
+from tuning.box import Bounds
 from tuning.environment import program_folder
 from tuning.objective import RMS, SCALE, Objective, Problem, common_terms, one_each, residuals
 from tuning.optimiser import STATUSES, Solution, solve
-from tuning.problems import Task, common_loop, gain_bounds, gains_at, spread_points, tuned_names
-from tuning.search import apart, polish
-from tuning.trial import Trial
+from tuning.problems import Task, common_loop, gain_bounds, gains_at, tuned_names
 
 FEW, MANY = 4, 32  # problems in one call of the program
 TILE = 128  # lanes computed side by side on a device: more leave the cache
@@ -33,10 +30,6 @@ PROMISING = 3  # starts of a task that go on after the first round
 LONGEST = 32  # steps of one call
 STEP_LIMIT = STATUSES.index("step limit")
 GIVEN_UP = "given up"
-
-SCANNED, SCAN_SCENARIOS = 64, 32  # points looked at before the first round, and on how many scenarios
-AGREED = 0.005  # relative difference of two starts' values that count as the same minimum
-REACH = 0.05  # of the box: first standard deviation of the search without derivatives
 
 
 class Start(NamedTuple):
@@ -68,37 +61,6 @@ class _Problem:
         return self.history[-1] if self.history and np.isfinite(self.history[-1]) else np.inf
 
 
-def choose_starts(
-    trial: Trial,
-    starts: int,
-    seed: int,
-    objective: Objective | Sequence[Objective] = RMS,
-    first: Sequence[Sequence[Mapping[str, float]]] | None = None,
-) -> list[Float[np.ndarray, "starts gains"]]:
-    """Shares to start from, of every task: the literature's gains, then the best of some Sobol points that
-    lie apart from each other. `first` has, of each task, gains that take the places of the last of these,
-    never of the literature's."""
-    tasks = range(len(trial.tasks))
-    known = [
-        np.stack(
-            [_shares(trial, i, gains) for gains in (trial.tasks[i].literature, *(first[i] if first else ()))]
-        )
-        for i in tasks
-    ]
-    usual = [max(starts - (len(own) - 1), 1) for own in known]
-    if max(usual) == 1:
-        return known
-    points = np.stack([spread_points(own[0], max(SCANNED, 2 * starts), seed) for own in known])
-    values = trial.losses(objective, list(tasks), points, SCAN_SCENARIOS)
-    order = np.argsort(np.where(np.isfinite(values), values, np.inf), axis=1, kind="stable")
-    best = [apart(points[i][order[i]], known[i][:1], usual[i]) for i in tasks]
-    return [np.concatenate([best[i], known[i][1:]]) for i in tasks]
-
-
-def _shares(trial: Trial, task: int, gains: Mapping[str, float]) -> Float[np.ndarray, "gains"]:
-    return to_shares(np.array([gains[name] for name in trial.names]), trial.bounds[task])
-
-
 def solve_tasks(
     tasks: list[Task],
     starts: list[Float[np.ndarray, "starts gains"]],
@@ -117,7 +79,8 @@ def solve_tasks(
     nothing = np.zeros((len(names), len(names)))
     problems = [_Problem(index, shares, nothing) for index, own in enumerate(starts) for shares in own]
     objectives = one_each(objective, len(tasks))
-    advance = _stepper(tasks, names, bounds, objectives, len(problems))
+    # As many as if every task had as many starts: where few go on, the same program serves.
+    advance = _stepper(tasks, names, bounds, objectives, len(tasks) * max(map(len, starts)))
     # Neighbours in a call take about as long.
     order = np.argsort([-float(np.max(expected_duration(task.scenarios))) for task in tasks], kind="stable")
     rank = {int(task): place for place, task in enumerate(order)}
@@ -151,47 +114,13 @@ def _give_up(problems: list[_Problem]) -> None:
                 problem.status = GIVEN_UP
 
 
-def finish(
-    trial: Trial,
-    solved: list[list[Start]],
-    evaluations: int,
-    seed: int,
-    objective: Objective | Sequence[Objective] = RMS,
-) -> list[Start | None]:
-    """The best start of every task, none if all failed; where no second start agrees with it, polished
-    without derivatives (`tuning.search.polish`) by so many evaluations each."""
-    best = [_ranked(own) for own in solved]
-    unsure = [i for i, own in enumerate(best) if own and not _agree(own)]
-    if unsure and evaluations > 0:
-        tops = [best[i][0] for i in unsure]
-        starts = np.stack([top.shares for top in tops])
-
-        def losses(points):
-            return trial.losses(objective, unsure, points)
-
-        shapes = np.stack([_shape(top) for top in tops])
-        found = polish(losses, starts, evaluations, reach=REACH, covariance=shapes, seed=seed)
-        for i, top, shares, loss in zip(unsure, tops, found.free, found.loss, strict=True):
-            # It keeps the start itself where nothing is better.
-            if (shares != top.shares).any():
-                gains = trial.gains(i, shares)
-                history = [*top.history, float(loss)]
-                best[i][0] = top._replace(rms=float(loss), gains=gains, shares=shares, history=history)
-    return [own[0] if own else None for own in best]
-
-
-def _ranked(starts: list[Start]) -> list[Start]:
-    return sorted((start for start in starts if np.isfinite(start.rms)), key=lambda start: start.rms)
-
-
-def _agree(ranked: list[Start]) -> bool:
-    return len(ranked) > 1 and ranked[1].rms <= (1 + AGREED) * ranked[0].rms
-
-
-def _shape(start: Start) -> np.ndarray:
-    """Inverse Hessian of least squares, its widths at most a quarter of the box."""
-    loss = (start.rms / SCALE) ** 2 / 2
-    return np.linalg.inv(start.curvature / (2 * max(loss, 1e-12)) + 16 * np.eye(len(start.shares)))
+def inverse_hessian(
+    curvature: Float[np.ndarray, "gains gains"], value: float
+) -> Float[np.ndarray, "gains gains"]:
+    """That of the value of the objective, over it, from J^T J of the loss; widths at most a quarter of the
+    box: the shape of the region in which the value rises by little."""
+    loss = (value / SCALE) ** 2 / 2
+    return np.linalg.inv(curvature / (2 * max(loss, 1e-12)) + 16 * np.eye(len(curvature)))
 
 
 def _finished(problem: _Problem, names: tuple[str, ...], bounds: Bounds, task: Task) -> Start:

@@ -65,9 +65,11 @@ class Trial:
         which: list[int],
         shares: Float[np.ndarray, "which points gains"],
         scenarios: int | None = None,
+        lanes: int = 0,
     ) -> Float[np.ndarray, "which points"]:
         """`objective_value` of points of the unit box on the training scenarios of the tasks `which`, or on
-        the first so many `scenarios` of each; the objective is that of all tasks, or one of each."""
+        the first so many `scenarios` of each; the objective is that of all tasks, or one of each. At least so
+        many `lanes` are computed at a time."""
         objectives = one_each(objective, len(self.tasks))
         noise = any(objectives[task].noise_weight > 0 for task in which)
         number = self._training.velocity.shape[-1]
@@ -75,10 +77,11 @@ class Trial:
         points = shares.shape[1]
         pairs = [(i, point) for i in range(len(which)) for point in range(points)]
         found = np.empty((len(which), points))
-        at_once = max(1, self._lanes // number)
+        lanes = max(lanes, self._lanes)
+        at_once = max(1, lanes // number)
         for begin in range(0, len(pairs), at_once):
             some = pairs[begin : begin + at_once]
-            outcome, amplification = self._run(noise, which, shares, some, number)
+            outcome, amplification = self._run(noise, which, shares, some, number, lanes)
             # (slots, pairs, scenarios)
             terms = [np.asarray(term).reshape(-1, len(some), number) for term in contact_terms(outcome)]
             wanted = outcome.wanted.reshape(terms[0].shape)
@@ -88,7 +91,7 @@ class Trial:
                 found[i, point] = objective_value(own, error, excess, amplification[k], chatter)
         return found
 
-    def _run(self, noise, which, shares, some, number) -> tuple[Outcome, np.ndarray]:
+    def _run(self, noise, which, shares, some, number, lanes) -> tuple[Outcome, np.ndarray]:
         index = np.array([which[i] for i, _ in some])
         rows = [self.gains(which[i], shares[i, point]) for i, point in some]
         values = {name: np.repeat([row[name] for row in rows], number) for name in rows[0]}
@@ -98,7 +101,7 @@ class Trial:
             return picked.reshape(*picked.shape[:-2], picked.shape[-2] * picked.shape[-1])
 
         scenarios = jax.tree.map(side_by_side, self._training)
-        outcome = evaluate(self.loop, values, scenarios, at_least=self._lanes)
+        outcome = evaluate(self.loop, values, scenarios, at_least=lanes)
         if not noise:
             return outcome, np.ones(len(some))
         first = slice(None, None, number)

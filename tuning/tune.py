@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -14,10 +13,10 @@ from jaxhil.evaluation import Outcome
 from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario
 from tuning.certificate import Certified, certified
-from tuning.environment import program_folder
+from tuning.finding import Found, find
 from tuning.objective import RMS, SCALE, Objective
 from tuning.problems import Task, alike, build_task
-from tuning.rounds import Start, choose_starts, finish, prepare_solver, solve_tasks
+from tuning.rounds import Start
 from tuning.transfer import Tuned, carry_over, nearest
 from tuning.trial import Trial
 from tuning.trust import Intervals, interval, sensitivity
@@ -27,9 +26,9 @@ BLOCK = 16  # mechanisms tuned and judged together: what is done when work is in
 
 @dataclass(frozen=True)
 class Settings:
-    """Numbers of scenarios to tune on (None: `tuning.problems` knows), of starts, of solver steps, of
-    scenarios to judge on; the seed; what to minimise; evaluations without derivatives where starts
-    disagree; whether to search the whole box for something better."""
+    """Numbers of scenarios to tune on (None: `tuning.problems` knows), of starts of a lot
+    (`tuning.finding`), of solver steps, of scenarios to judge on; the seed; what to minimise; evaluations
+    without derivatives where starts disagree; whether to search the whole box for something better."""
 
     scenarios: int | None = None
     starts: int = 4
@@ -37,7 +36,7 @@ class Settings:
     validation: int = 511
     seed: int = 0
     objective: Objective = RMS
-    polish: int = 320
+    polish: int = 640
     certify: bool = False
 
 
@@ -87,6 +86,11 @@ class Result:
     first: tuple[Tuned, ...] = ()
     freedom: dict[str, Freedom] = field(default_factory=dict)
     certified: Certified | None = None
+
+    @property
+    def usual_starts(self) -> int:
+        """Starts before those that began at gains known before: the rest of the first lot."""
+        return max(self.settings.starts, 1 + len(self.first)) - len(self.first)
 
 
 def tune(
@@ -139,7 +143,7 @@ def _tune_block(
         "before": [neutral_gains(compensator, task.literature) for task in tasks],
         "literature": [task.literature for task in tasks],
     }
-    best, starts, found = known["literature"], [[] for _ in tasks], [None for _ in tasks]
+    found = [Found(None, [], 0) for _ in tasks]
     if any(task.tuned for task in tasks):
         number = len(tasks[0].scenarios.velocity)
         report(f"{name}: tuning {compensator} on {number} scenarios each")
@@ -147,15 +151,25 @@ def _tune_block(
             [carry_over(compensator, one.gains, one.mechanism, task.mechanism) for one in own]
             for task, own in zip(tasks, near, strict=True)
         ]
-        starts, found = _search(trial, settings, first, lambda text: report(f"{name}: {text}"))
-        best = [one.gains if one else task.literature for one, task in zip(found, tasks, strict=True)]
+        found = find(
+            trial,
+            settings.starts,
+            settings.steps,
+            settings.polish,
+            settings.seed,
+            settings.objective,
+            first,
+            lambda text: report(f"{name}: {text}"),
+        )
+    best = [one.best.gains if one.best else task.literature for one, task in zip(found, tasks, strict=True)]
     clock.lap("tune")
     report(f"{name}: judging on {settings.validation} fresh scenarios")
     outcomes = {key: trial.judge(gains) for key, gains in known.items()}
     outcomes["tuned"] = trial.judge(best)
     clock.lap("judge")
-    certificates = _certify(trial, settings, found, starts, lambda text: report(f"{name}: {text}"))
+    certificates: list[Certified | None] = [None for _ in tasks]
     if settings.certify:
+        certificates = _certify(trial, settings, found, lambda text: report(f"{name}: {text}"))
         clock.lap("certify")
     results = []
     for i, task in enumerate(tasks):
@@ -170,52 +184,25 @@ def _tune_block(
                 literature=task.literature,
                 figures={key: figures(outcome) for key, outcome in fresh.items()},
                 nominal={key: figures(outcome) for key, outcome in nominal.items()},
-                starts=starts[i],
+                starts=found[i].starts,
                 outcomes=fresh,
                 scenarios=trial.fresh[i],
                 settings=settings,
                 timings=clock.laps,
                 intervals=interval(fresh["tuned"].error, fresh["tuned"].good),
                 first=tuple(near[i]),
-                freedom=_freedom(task, trial.names, found[i]),
+                freedom=_freedom(task, trial.names, found[i].best),
                 certified=certificates[i],
             )
         )
     return results
 
 
-def _search(
-    trial: Trial,
-    settings: Settings,
-    first: list[list[dict[str, float]]],
-    report: Callable[[str], None],
-) -> tuple[list[list[Start]], list[Start | None]]:
-    """Every start of every task, the last of them at the gains `first`, and what is best for each."""
-    seed, objective = settings.seed, settings.objective
-    number = max(settings.starts, 1 + max(map(len, first)))
-    with ThreadPoolExecutor(1) as meanwhile:
-        # The programs compile on one core each. Only one of them runs: programs on several devices could
-        # wait for one another for ever.
-        ready = None
-        if program_folder() is not None:
-            ready = meanwhile.submit(prepare_solver, trial.tasks, number, objective)
-        chosen = choose_starts(trial, number, seed, objective, first)
-        if ready is not None:
-            ready.result()
-    starts = solve_tasks(trial.tasks, chosen, settings.steps, objective, report)
-    report("searching without derivatives where starts disagree")
-    return starts, finish(trial, starts, settings.polish, seed, objective)
-
-
-def _certify(trial: Trial, settings: Settings, found, starts, report) -> list[Certified | None]:
-    certificates: list[Certified | None] = []
-    for i, (own, every) in enumerate(zip(found, starts, strict=True)):
-        if not settings.certify or own is None:
-            certificates.append(None)
-            continue
+def _certify(trial: Trial, settings: Settings, found: list[Found], report) -> list[Certified | None]:
+    certificates = []
+    for i, one in enumerate(found):
         report(f"searching everywhere, {i + 1} of {len(found)}")
-        objective, polish, seed = settings.objective, settings.polish, settings.seed
-        certificates.append(certified(trial, i, own, every, objective, polish, seed))
+        certificates.append(certified(trial, i, one, settings.objective, settings.seed))
     return certificates
 
 

@@ -23,7 +23,7 @@ from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario
 from tuning.box import Bounds, to_gains, to_shares
 from tuning.objective import RMS, Problem, common_terms, residuals
-from tuning.problems import Task, alike, build_task, common_loop, gain_bounds, spread_starts, tuned_names
+from tuning.problems import Task, alike, build_task, common_loop, gain_bounds, spread_points, tuned_names
 
 COMPENSATOR = "response_error"
 SCENARIOS = 128
@@ -71,7 +71,7 @@ class Case:
     def starts(self, number: int, seed: int) -> Float[np.ndarray, "starts gains"]:
         """Where tuning would start from: the literature's gains, then points around them and anywhere."""
         first = np.array([self.task.literature[name] for name in self.names])
-        return self.shares_of(spread_starts(first, self.bounds, number, seed))
+        return spread_points(self.shares_of(first), number, seed)
 
     def gains_of(self, shares: Float[np.ndarray, "*points gains"]) -> Float[np.ndarray, "*points gains"]:
         """Gains in their own units."""

@@ -253,10 +253,9 @@ def _carried_over(result) -> list[dict[str, Any]]:
     """Which starts began at gains tuned before, and for what mechanism."""
     from tuning.transfer import distance
 
-    before = len(result.starts) - len(result.first)
     return [
         {
-            "start": before + number,
+            "start": result.usual_starts + number,
             "source": one.source,
             "mechanism": one.mechanism.name,
             "distance": distance(result.mechanism, one.mechanism),

@@ -108,7 +108,8 @@ def _starts(options: Tune, result: Any) -> Any:
     rows: list[list[Any]] = [[n, s.status, s.steps, s.rms] for n, s in enumerate(result.starts, start=1)]
     if not result.first:
         return report.table("Starts", headings, rows, texts=(1,))
-    usual = len(rows) - len(result.first)
-    begun = ["literature", *["spread"] * (usual - 1), *(f"gains of {one.source}" for one in result.first)]
+    begun = ["literature", *["spread"] * (len(rows) - 1)]
+    for number, one in enumerate(result.first, start=result.usual_starts):
+        begun[number] = f"gains of {one.source}"
     rows = [[*row, place] for row, place in zip(rows, begun, strict=True)]
     return report.table("Starts", [*headings, "begins at"], rows, texts=(1, 4))

@@ -1,0 +1,131 @@
+"""The best gains of many tasks: scans, lots of starts until several agree, the polish of what is doubtful."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jaxhil.mechanism_file import load
+from tuning import finding
+from tuning.finding import SCANNED, choose_starts, find, finish
+from tuning.objective import RMS, Objective
+from tuning.problems import build_task, spread_points
+from tuning.rounds import solve_tasks
+from tuning.trial import Trial
+
+# A motion simulator that a phase lead can make up for.
+FAST = ["rig.simulator.natural_frequency=60", "rig.simulator.delay=0.001"]
+OVERRIDES = (["contact.stiffness=[1e5]"], ["contact.stiffness=[4e4]"], ["contact.stiffness=[2e5]"])
+
+
+@pytest.fixture(scope="module")
+def tasks():
+    mechanisms = [load("rig-300kg", [*own, *FAST, f"name=m{i}"]).mechanism for i, own in enumerate(OVERRIDES)]
+    return [build_task(mechanism, "phase_lead", 8, 0) for mechanism in mechanisms]
+
+
+@pytest.fixture(scope="module")
+def trial(tasks):
+    return Trial(tasks, 15, 0)
+
+
+def value(trial, index, start, objective=RMS):
+    return trial.losses(objective, [index], start.shares[None, None])[0, 0]
+
+
+def test_every_task_is_found_under_its_own_objective(tasks, trial):
+    """Starts and ends of tasks together are those that each has alone under its objective."""
+    several = [Objective(divergence_weight=weight) for weight in (1.0, 4.0, 16.0)]
+    chosen = choose_starts(trial, 3, 0, several)
+    polished = finish(trial, solve_tasks(tasks, chosen, 2, several), [0, 1, 2], 32, 0, several)
+    for i, (objective, end) in enumerate(zip(several, polished, strict=True)):
+        np.testing.assert_array_equal(chosen[i], choose_starts(trial, 3, 0, objective)[i])
+        assert end is not None
+        assert end.rms == pytest.approx(value(trial, i, end, objective), rel=1e-9)
+
+
+def test_starts_are_the_literature_and_the_best_of_a_scan(tasks, trial):
+    chosen = choose_starts(trial, 4, seed=3)
+    for index, (task, points) in enumerate(zip(tasks, chosen, strict=True)):
+        assert trial.gains(index, points[0]) == pytest.approx(task.literature)
+        values = trial.losses(RMS, [index], points[None])[0]
+        looked_at = spread_points(points[0], SCANNED, 3)
+        every = trial.losses(RMS, [index], looked_at[None])[0]
+        # The best lies apart from the literature's gains, as all of them do from each other.
+        assert np.min(every) <= values[1] <= np.quantile(every, 0.05)
+        assert (values[1:] < np.median(every)).all()
+        assert (np.diff(values[1:]) >= 0).all()
+        apart = np.linalg.norm(points[:, None] - points, axis=-1)[np.triu_indices(4, 1)]
+        assert (apart >= 0.1 * np.sqrt(points.shape[1]) - 1e-12).all()
+
+
+def test_where_starts_disagree_the_best_is_polished(tasks, trial):
+    """Stopped far too early, starts end apart; what is not doubtful is left as it is."""
+    early = solve_tasks(tasks, choose_starts(trial, 3, 0), 1)
+    polished = finish(trial, early, [0, 2], 128, seed=0)
+    for index, (own, found) in enumerate(zip(early, polished, strict=True)):
+        assert found is not None
+        best = min(own, key=lambda start: start.rms)
+        if index == 1:
+            assert found is best
+            continue
+        assert found.rms < best.rms
+        assert found.rms == pytest.approx(value(trial, index, found), rel=1e-12)
+        assert found.gains == trial.gains(index, found.shares)
+    failed = [[own[0]._replace(rms=np.nan)] for own in early]
+    assert finish(trial, failed, [0, 1, 2], 64, seed=0) == [None] * 3
+
+
+def test_lots_follow_until_starts_agree(tasks, trial, monkeypatch):
+    """One task's starts never agree, whatever they end at; the others' do at once."""
+    asked = []
+
+    def solve(tasks, starts, steps, objective, report):
+        asked.append([len(own) for own in starts])
+        ended = solve_tasks(tasks, starts, 1, objective)
+        lot = len(asked)
+        return [
+            [s._replace(rms=0.1 if i != 1 else 0.1 * 0.9**lot * 1.2**n) for n, s in enumerate(own)]
+            for i, own in enumerate(ended)
+        ]
+
+    monkeypatch.setattr(finding, "solve_tasks", solve)
+    heard = []
+    found = find(trial, 3, 9, 32, 0, report=heard.append)
+    assert asked == [[3, 3, 3]] + [[0, 3, 0]] * (finding.LOTS - 1)
+    assert [len(one.starts) for one in found] == [3, 3 * finding.LOTS, 3]
+    assert sum("lot" in text for text in heard) == finding.LOTS - 1
+    points = np.stack([start.shares for start in found[1].starts])
+    assert len(np.unique(points, axis=0)) == len(points)
+    # Steps of 1 + 2 evaluations, the scan at full cost on no more than 32 scenarios, the polish.
+    assert found[0].evaluations == SCANNED + 3 * 3
+    assert found[1].evaluations == finding.LOTS * (SCANNED + 3 * 3) + 32
+
+
+def test_a_start_alone_is_the_literature_s_and_polished(tasks, trial):
+    found = find(trial, 1, 2, 64, 0)
+    for index, one in enumerate(found):
+        (start,) = one.starts
+        assert one.best is not None and one.best.rms <= start.rms
+        assert one.evaluations == 3 * start.steps + 64
+        assert one.best.rms == pytest.approx(value(trial, index, one.best), rel=1e-9)
+
+
+def test_the_best_is_the_best_by_the_objective_itself(tasks, trial):
+    """The solver lowers a norm in place of the mean of the worst contacts; what counts is that mean."""
+    objective = Objective("cvar")
+    for index, one in enumerate(find(trial, 3, 4, 32, 0, objective)):
+        assert one.best is not None
+        values = [value(trial, index, start, objective) for start in one.starts]
+        assert [start.rms for start in one.starts] == pytest.approx(values, rel=1e-12)
+        assert one.best.rms == pytest.approx(value(trial, index, one.best, objective), rel=1e-12)
+        assert one.best.rms <= min(values)
+
+
+def test_a_task_that_fails_leaves_the_others_their_best(tasks, trial):
+    broken = tasks[1].scenarios._replace(equivalent_mass=np.full(8, np.nan))
+    sick = Trial([tasks[0], dataclasses.replace(tasks[1], scenarios=broken)], 15, 0)
+    found = find(sick, 3, 6, 32, 0)
+    (alone,) = find(Trial([tasks[0]], 15, 0), 3, 6, 32, 0)
+    assert found[0].best is not None and alone.best is not None
+    assert found[0].best.rms == pytest.approx(alone.best.rms, rel=1e-6)
