@@ -5,6 +5,7 @@ and seconds; `warm_up` compiles what it will run. Nothing else of this file is u
 """
 
 import time
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -12,76 +13,111 @@ from jaxtyping import Float
 from search_case import Case, several
 from search_methods import Trace
 
-from tuning.objective import RMS, common_terms, residuals
+from tuning.finding import AGREED, CANDIDATES, LOTS, REACH, SURE
+from tuning.objective import RMS, SCALE, common_terms, residuals
 from tuning.optimiser import Solution, solve
 from tuning.problems import spread_points
-from tuning.rounds import AGREED, FIRST_ROUND, REACH
+from tuning.rounds import FIRST_ROUND, inverse_hessian
 from tuning.search import apart, polish
 
-SCANNED, DESCENTS, GO_ON = 64, 6, 3  # points looked at, those descended from, those that go on; of a start
+SCANNED, DESCENTS, GO_ON = 64, 6, 3  # points looked at, those descended from, those that go on; of a lot
 STEPS = 25  # of Levenberg-Marquardt
-POLISH = 160  # evaluations, of a start whose descents do not agree
+POLISH = 320  # evaluations, of a start whose descents do not agree
 LONGEST = 32  # steps that the program is made for
 
 
 def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = False) -> list[Trace]:
     """What tuning does, from every start (in the unit box) on its own: look around, descend by
-    Levenberg-Marquardt in two rounds, polish without derivatives where the descents disagree.
+    Levenberg-Marquardt in two rounds; again and then polish without derivatives where the descents disagree.
 
     A trace has an entry for every step of a start's descents and for the stages before and after. Its seconds
     are those of the batch over the number of starts; the steps of a round, which is one program, count as
     equally long.
     """
     number, gains = starts.shape
-    begin = time.perf_counter()
-    stages = _Stages(number, begin)
+    stages = _Stages(number, time.perf_counter())
+    ends = [_Ends(np.empty(0), np.empty((0, gains)), np.empty((0, gains, gains))) for _ in starts]
+    going, doubtful = np.arange(number), np.empty(0, int)
+    for lot in range(1 if warming else LOTS):
+        points = np.stack([spread_points(starts[i], SCANNED, (int(i), lot)) for i in going])
+        values = case.losses(points.reshape(-1, gains)).reshape(len(going), -1)
+        stages.add(going, SCANNED, np.min(values, axis=1))
+        order = np.argsort(values, axis=1)
+        first = [apart(own[ranks], None, DESCENTS) for own, ranks in zip(points, order, strict=True)]
+        found = _descend(case, np.concatenate(first), 1 if warming else FIRST_ROUND, number * DESCENTS)
+        loss = np.asarray(found.loss).reshape(len(going), DESCENTS)
+        stages.add_steps(going, 1 + gains, found)
+        best = np.argsort(loss, axis=1)[:, :GO_ON] + DESCENTS * np.arange(len(going))[:, None]
+        left = 1 if warming else STEPS - FIRST_ROUND
+        found = _descend(case, found.shares[best.reshape(-1)], left, number * GO_ON)
+        stages.add_steps(going, 1 + gains, found)
+        several = [
+            np.asarray(leaf).reshape(len(going), GO_ON, *leaf.shape[1:])
+            for leaf in (found.loss, found.shares, found.curvature)
+        ]
+        for i, *own in zip(going, *several, strict=True):
+            ends[i] = _Ends(*(np.concatenate(both) for both in zip(ends[i], own, strict=True)))
+        going = going[[not _agree(ends[i].loss, lot) for i in going]]
+        doubtful = going if lot == 0 else doubtful
+        if not len(going):
+            break
 
-    points = np.stack([spread_points(start, SCANNED, seed) for seed, start in enumerate(starts)])
-    values = case.losses(points.reshape(-1, gains)).reshape(number, -1)
-    stages.add(np.full(number, SCANNED), np.min(values, axis=1))
-    order = np.argsort(values, axis=1)
-    first = np.concatenate(
-        [apart(own[ranks], None, DESCENTS) for own, ranks in zip(points, order, strict=True)]
-    )
-    found = _descend(case, first, 1 if warming else FIRST_ROUND)
-    loss = np.asarray(found.loss).reshape(number, DESCENTS)
-    stages.add_steps(1 + gains, found)
-    best = np.argsort(loss, axis=1)[:, :GO_ON] + DESCENTS * np.arange(number)[:, None]
-    found = _descend(case, found.shares[best.reshape(-1)], 1 if warming else STEPS - FIRST_ROUND)
-    loss = np.asarray(found.loss).reshape(number, GO_ON)
-    stages.add_steps(1 + gains, found)
-
-    # AGREED is of the rms error, the root of the loss.
-    unsure = np.ptp(loss, axis=1) > 2 * AGREED * np.min(loss, axis=1)
-    if unsure.any():
-        rows = (np.argmin(loss, axis=1) + GO_ON * np.arange(number))[unsure]
-        scale = 2 * np.min(loss, axis=1)[unsure]
-        shape = np.linalg.inv(np.asarray(found.curvature)[rows] / scale[:, None, None] + 16 * np.eye(gains))
+    if len(doubtful):
+        tops = [int(np.argmin(ends[i].loss)) for i in doubtful]
+        shares = np.stack([ends[i].shares[top] for i, top in zip(doubtful, tops, strict=True)])
+        shapes = [
+            inverse_hessian(ends[i].curvature[top], SCALE * np.sqrt(2 * ends[i].loss[top]))
+            for i, top in zip(doubtful, tops, strict=True)
+        ]
 
         def losses(points):
             return case.losses(points.reshape(-1, gains)).reshape(points.shape[:-1])
 
         last = polish(
-            losses, np.asarray(found.shares)[rows], 1 if warming else POLISH, reach=REACH, covariance=shape
-        )
-        polished = np.full(number, np.inf)
-        polished[unsure] = last.loss
-        stages.add(POLISH * unsure, polished)
+            losses, shares, 1 if warming else POLISH,
+            candidates=CANDIDATES, reach=REACH, covariance=np.stack(shapes),
+        )  # fmt: skip
+        stages.add(doubtful, POLISH, last.loss)
     return stages.traces()
+
+
+class _Ends(NamedTuple):
+    """Where the descents of a start ended."""
+
+    loss: np.ndarray
+    shares: np.ndarray
+    curvature: np.ndarray
+
+
+def _agree(losses: np.ndarray, lot: int) -> bool:
+    # AGREED is of the rms error, the root of the loss.
+    ranked = np.sort(losses)
+    return bool(ranked[SURE[min(lot, 1)] - 1] <= (1 + AGREED) ** 2 * ranked[0])
 
 
 def warm_up(case: Case, starts: Float[np.ndarray, "starts gains"]) -> None:
     """Compile what `ours` runs for as many starts."""
     ours(case, starts, warming=True)
+    for size in _sizes(len(starts)):
+        for descents in (DESCENTS, GO_ON):
+            _descend(case, np.repeat(starts[:1], size * descents, axis=0), 1, len(starts) * descents)
 
 
-def _descend(case: Case, shares, steps) -> Solution:
-    problems, bounds = several((case.problem, case.bounds), len(shares))
+def _sizes(number: int) -> list[int]:
+    """Numbers that programs are compiled for, so that few starts do not take the time of all."""
+    return [max(1, number >> halvings) for halvings in range(3)]
+
+
+def _descend(case: Case, shares, steps, most) -> Solution:
+    """From some shares, of `most` at any time, in the smallest program that takes so many."""
+    size = min(one for one in _sizes(most) if one >= len(shares))
+    padded = np.concatenate([shares, np.repeat(shares[:1], size - len(shares), axis=0)])
+    problems, bounds = several((case.problem, case.bounds), size)
     static = case.loop, case.names, common_terms([RMS])
-    shares = np.clip(shares, 0, 1)
-    return jax.device_get(
-        solve(residuals, static, problems, bounds, shares, np.array(steps), LONGEST, tile=1)
+    found = solve(
+        residuals, static, problems, bounds, np.clip(padded, 0, 1), np.array(steps), LONGEST, tile=1
     )
+    return jax.tree.map(lambda leaf: leaf[: len(shares)], jax.device_get(found))
 
 
 class _Stages:
@@ -89,27 +125,30 @@ class _Stages:
 
     def __init__(self, number: int, begin: float):
         self.number, self.begin = number, begin
-        self.rollouts, self.seconds, self.best = [], [], []
+        self.rollouts, self.seconds, self.best = [np.zeros(number)], [0.0], [np.full(number, np.inf)]
 
-    def add(self, rollouts, best) -> None:
-        before = self.rollouts[-1] if self.rollouts else 0
-        self.rollouts.append(before + rollouts)
+    def add(self, which, rollouts, best) -> None:
+        """Of some of the starts."""
+        spent, reached = self.rollouts[-1].copy(), self.best[-1].copy()
+        spent[which] += rollouts
+        reached[which] = np.minimum(reached[which], best)
+        self.rollouts.append(spent)
+        self.best.append(reached)
         self.seconds.append((time.perf_counter() - self.begin) / self.number)
-        self.best.append(np.minimum(best, self.best[-1] if self.best else np.inf))
 
-    def add_steps(self, rollouts: int, found: Solution) -> None:
-        """Descents of all starts, as many of each: an entry for every step."""
+    def add_steps(self, which, rollouts: int, found: Solution) -> None:
+        """Descents of some of the starts, as many of each: an entry for every step."""
         begin = self.seconds[-1]
         end = (time.perf_counter() - self.begin) / self.number
-        steps = np.asarray(found.steps).reshape(self.number, -1)
+        steps = np.asarray(found.steps).reshape(len(which), -1)
         history = np.asarray(found.history).reshape(*steps.shape, -1)
         before, last = 0, max(1, int(np.max(steps)))
         for step in range(1, last + 1):
             taken = rollouts * np.minimum(steps, step).sum(axis=1)
-            self.add(taken - before, np.min(history[..., step - 1], axis=1))
+            self.add(which, taken - before, np.min(history[..., step - 1], axis=1))
             self.seconds[-1] = begin + (end - begin) * step / last
             before = taken
 
     def traces(self) -> list[Trace]:
-        rollouts, best = np.array(self.rollouts, float), np.array(self.best)
-        return [Trace(rollouts[:, i], np.array(self.seconds), best[:, i]) for i in range(self.number)]
+        rollouts, best = np.array(self.rollouts[1:]), np.array(self.best[1:])
+        return [Trace(rollouts[:, i], np.array(self.seconds[1:]), best[:, i]) for i in range(self.number)]
