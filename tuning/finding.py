@@ -27,7 +27,7 @@ from tuning.trial import Trial
 
 SCANNED, SCAN_SCENARIOS = 256, 32  # points looked at before a lot, and on how many scenarios
 LOTS = 4  # of starts, at most
-SURE = 2, 3  # starts that have to agree: of the first lot, and once that has shown that there are many minima
+SURE = 3  # starts that have to agree: two may have met in a poor basin
 AGREED = 0.005  # relative difference of values that count as the same minimum
 REACH, CANDIDATES = 0.1, 16  # of the search without derivatives: first standard deviation in the box, lot
 
@@ -85,8 +85,8 @@ def find(
             own.evaluations += (1 + len(trial.names)) * sum(start.steps for start in ended[i])
             if lot > 0 or number > 1 + len(told[i]):
                 own.evaluations += _scan_evaluations(trial, number)
-            own.doubtful |= not _agree(own.starts, lot)
-        going = [i for i in going if not _agree(searches[i].starts, lot)]
+            own.doubtful |= not _agree(own.starts)
+        going = [i for i in going if not _agree(searches[i].starts)]
         if not going:
             break
     doubtful = [i for i, own in enumerate(searches) if own.doubtful]
@@ -211,7 +211,7 @@ def _ranked(starts: list[Start]) -> list[Start]:
     return sorted((start for start in starts if np.isfinite(start.rms)), key=lambda start: start.rms)
 
 
-def _agree(starts: list[Start], lot: int) -> bool:
+def _agree(starts: list[Start]) -> bool:
     """Whether enough of the best starts do."""
-    ranked, sure = _ranked(starts), SURE[min(lot, 1)]
-    return len(ranked) >= sure and ranked[sure - 1].rms <= (1 + AGREED) * ranked[0].rms
+    ranked = _ranked(starts)
+    return len(ranked) >= SURE and ranked[SURE - 1].rms <= (1 + AGREED) * ranked[0].rms

@@ -57,7 +57,7 @@ def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = 
         ]
         for i, *own in zip(going, *several, strict=True):
             ends[i] = _Ends(*(np.concatenate(both) for both in zip(ends[i], own, strict=True)))
-        going = going[[not _agree(ends[i].loss, lot) for i in going]]
+        going = going[[not _agree(ends[i].loss) for i in going]]
         doubtful = going if lot == 0 else doubtful
         if not len(going):
             break
@@ -89,10 +89,10 @@ class _Ends(NamedTuple):
     curvature: np.ndarray
 
 
-def _agree(losses: np.ndarray, lot: int) -> bool:
+def _agree(losses: np.ndarray) -> bool:
     # AGREED is of the rms error, the root of the loss.
     ranked = np.sort(losses)
-    return bool(ranked[SURE[min(lot, 1)] - 1] <= (1 + AGREED) ** 2 * ranked[0])
+    return bool(ranked[SURE - 1] <= (1 + AGREED) ** 2 * ranked[0])
 
 
 def warm_up(case: Case, starts: Float[np.ndarray, "starts gains"]) -> None:
