@@ -2,8 +2,8 @@
 
 Below the quantile of order q lie, of n independent values, a binomial number of them: the order statistics of
 ranks that this number does not leave enclose the quantile, whatever the distribution. The values themselves
-need not be kept. `counts` sorts them into bins of fixed edges, each 1 % above the last: counts of parts add up,
-and the same order statistics are then known to a bin, outward.
+need not be kept. `counts` sorts them into bins of fixed edges, each 1 % above the last: counts of parts add
+up, and the same order statistics are then known to a bin, outward.
 """
 
 import numpy as np
@@ -21,17 +21,15 @@ EDGES = 10.0 ** _DECADES[0] * (1.0 + RESOLUTION) ** np.arange(
 BINS = len(EDGES) + 1
 
 
-def ranks(
-    number: int, order: float, level: float = LEVEL, sequential: bool = False
-) -> tuple[int, int]:
+def ranks(number: int, order: float, level: float = LEVEL, sequential: bool = False) -> tuple[int, int]:
     """Ranks (1 the least, 0 and `number` + 1 beyond all) of the order statistics around a quantile.
 
     Between X_(low) and X_(high), ends included, is the quantile of order q with probability `level` or more
     (David and Nagaraja 2003, section 7.1, with ties too). Fixed number: low and high - 1 are the quantiles
     (1 -+ level) / 2 of the binomial distribution of n and q. Sequential: they are the counts k at which the
-    martingale of `tuning.verdict.confidence_sequence` at p = q stays below 1 / (1 - level), so that the interval
-    covers whenever one stops (Howard and Ramdas 2022, "Sequential estimation of quantiles"). Raises ValueError
-    unless number >= 0, 0 < order < 1 and 0 < level < 1.
+    martingale of `tuning.verdict.confidence_sequence` at p = q stays below 1 / (1 - level), so that the
+    interval covers whenever one stops (Howard and Ramdas 2022, "Sequential estimation of quantiles"). Raises
+    ValueError unless number >= 0, 0 < order < 1 and 0 < level < 1.
     """
     if number < 0 or not (0 < order < 1 and 0 < level < 1):
         raise ValueError(

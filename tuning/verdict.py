@@ -6,8 +6,9 @@ Three ways to sample, three intervals, each covering the true probability with a
 - *as many as it takes*, looking again and again until the interval is narrow enough: an exact interval looked
   at repeatedly is no longer exact, since one stops at a lucky moment. `confidence_sequence` covers at all
   numbers at once, so at whichever one stops; `Running` carries it from look to look;
-- *a few independent scramblings of a Sobol sequence*: `replicate_interval`. Points of one scrambling depend on
-  each other, so no binomial law holds; the scramblings are independent of each other, and their spread tells.
+- *a few independent scramblings of a Sobol sequence*: `replicate_interval`. Points of one scrambling depend
+  on each other, so no binomial law holds; the scramblings are independent of each other, and their spread
+  tells.
 
 Pure functions of counts, which broadcast; NumPy and SciPy alone.
 """
@@ -50,9 +51,9 @@ def binomial_interval(failures: ArrayLike, number: ArrayLike, level: float = LEV
     """Exact interval of the probability behind `failures` among `number` independent scenarios.
 
     Its ends are the p at which as many failures or more, or as many or fewer, have probability
-    (1 - level) / 2: quantiles of beta distributions (Clopper and Pearson 1934). It covers with at least `level`
-    for every p, when `number` was fixed beforehand. No scenarios: 0 to 1, with estimate nan. Raises ValueError
-    unless 0 <= failures <= number and 0 < level < 1.
+    (1 - level) / 2: quantiles of beta distributions (Clopper and Pearson 1934). It covers with at least
+    `level` for every p, when `number` was fixed beforehand. No scenarios: 0 to 1, with estimate nan. Raises
+    ValueError unless 0 <= failures <= number and 0 < level < 1.
     """
     failures, number = _counts(failures, number, level)
     tail = (1.0 - level) / 2.0
@@ -96,8 +97,8 @@ def confidence_sequence(failures: ArrayLike, number: ArrayLike, level: float = L
 def updated(running: Running, failures: int, number: int) -> Running:
     """`running` after a look at `number` further scenarios, `failures` of them failed.
 
-    The interval is the intersection of all looks', which covers as they do, all at once. Scenarios must come in
-    an order that knows nothing of their outcome (by index, say, not as they finish: failures may finish
+    The interval is the intersection of all looks', which covers as they do, all at once. Scenarios must come
+    in an order that knows nothing of their outcome (by index, say, not as they finish: failures may finish
     sooner). An empty intersection has probability at most 1 - level; there the last look's interval starts
     over. Raises ValueError as `binomial_interval` does.
     """
@@ -147,8 +148,8 @@ def replicate_interval(failures: ArrayLike, number: int, level: float = LEVEL) -
       none with probability at most 1 / (1 + n p / (1 - p)) (Cantelli's inequality), all R with the Rth power:
       p is below c / (n + c), c = ((1 - level) / 2)^(-1/R) - 1. No success likewise.
 
-    Owen 1997 ("Scrambled net variance for integrals of smooth functions") on randomised replicates and spread.
-    Raises ValueError for less than two replicates, and as `binomial_interval` does.
+    Owen 1997 ("Scrambled net variance for integrals of smooth functions") on randomised replicates and
+    spread. Raises ValueError for less than two replicates, and as `binomial_interval` does.
     """
     failures, _ = _counts(failures, number, level)
     replicates = failures.shape[-1] if failures.ndim else 0
