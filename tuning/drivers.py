@@ -15,10 +15,10 @@ several columns: what is drawn independently for each contact is one input.
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy import special
 
 from tuning.verdict import LEVEL, Interval
 
@@ -56,7 +56,7 @@ def saltelli_design(inputs: int | Sequence[int], number: int, seed: int) -> np.n
     a, b = points[:, :total], points[:, total:]
     edges = np.cumsum([0, *columns])
     mixed = []
-    for start, end in zip(edges[:-1], edges[1:], strict=True):
+    for start, end in pairwise(edges):
         mixed.append(a.copy())
         mixed[-1][:, start:end] = b[:, start:end]
     return np.concatenate([a, b, *mixed])

@@ -100,10 +100,13 @@ def subset_simulation(
     to about 10^-levels. The same seed gives the same result.
 
     Where the performance says nothing of how close a scenario is to failing (plateaus, islands of failure
-    without a slope towards them) no such method finds its way. A replicate that ends without a failure makes
-    the interval reach from 0 to what that replicate did reach. Raises ValueError unless inputs >= 1, seed >=
-    0, samples is a multiple of 10 above 0, replicates >= 2, levels >= 1, 0 < level < 1 and the limit is
-    finite.
+    without a slope towards them) no such method finds its way. Where it misleads, and a second way to fail
+    takes over only beyond the thresholds that lead to the first (Breitung 2019, "The geometry of limit state
+    function graphs and subset simulation: counterexamples"), most replicates miss it: the interval then
+    covers less than stated, and more samples help. A coefficient of variation far above the formula's is the
+    sign. A replicate that ends without a failure makes the interval reach from 0 to what that replicate did
+    reach. Raises ValueError unless inputs >= 1, seed >= 0, samples is a multiple of 10 above 0, replicates >=
+    2, levels >= 1, 0 < level < 1 and the limit is finite.
     """
     _check(inputs, limit, seed, samples, replicates, level, levels)
     rng = np.random.default_rng(seed)

@@ -22,7 +22,7 @@ from scipy import special
 LEVEL = 0.95
 PRIOR = 0.5  # both parameters of the mixing beta distribution: Jeffreys' and Krichevsky-Trofimov's choice
 FEW = 100  # failures (or successes) of all replicates below which Student's law is not trusted alone
-_STEPS = 100  # of bisection, from a bracket of 1500 down to rounding
+_STEPS = 62  # of bisection, from a bracket of 1500 down to rounding
 
 
 class Interval(NamedTuple):
@@ -76,8 +76,8 @@ def confidence_sequence(failures: ArrayLike, number: ArrayLike, level: float = L
     most 1 - level, so that {p: M_n(p) < 1 / (1 - level)} covers at any stopping rule. -log M_n is concave in
     p: the set is an interval, found by bisection in log(p / (1 - p)). Robbins 1970, "Statistical methods
     related to the law of the iterated logarithm"; Howard, Ramdas, McAuliffe, Sekhon 2021, "Time-uniform,
-    nonparametric, nonasymptotic confidence sequences". Its price is a width about sqrt(log(n) / 3.84) times
-    the exact interval's, which covers at one n alone. Raises ValueError as `binomial_interval` does.
+    nonparametric, nonasymptotic confidence sequences". Its price is a width 1.8 times that of the exact
+    interval at n = 1000, 2.3 times at a million. Raises ValueError as `binomial_interval` does.
     """
     failures, number = _counts(failures, number, level)
     passes = number - failures
