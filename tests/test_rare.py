@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tuning.rare import lognormal_interval, subset_simulation, to_uniform
+from tuning.rare import subset_simulation, to_uniform
 from tuning.verdict import binomial_interval
 
 
@@ -156,13 +156,15 @@ def test_steps_are_climbed(quantum):
 def test_frequent_failures_get_the_exact_interval(probability):
     """Passed or failed, and nothing between: two values of performance."""
     limit = stats.norm.isf(probability)
-    result = subset_simulation(lambda u: np.where(u[:, 0] > limit, 1.0, 0.0), 2, 0.5, seed=5)
-    assert result.evaluations == 10_000 and len(result.thresholds) == 1
-    failures = round(result.probability * 10_000)
-    expected = binomial_interval(failures, 10_000)
-    assert (result.low, result.high) == pytest.approx((expected.low, expected.high), rel=1e-12)
-    assert result.low <= probability <= result.high
-    assert (result.coefficient_of_variation == np.inf) == (probability == 0.0)
+    inside = 0
+    for seed in range(100):
+        result = subset_simulation(lambda u: np.where(u[:, 0] > limit, 1.0, 0.0), 2, 0.5, seed)
+        assert result.evaluations == 10_000 and len(result.thresholds) == 1
+        expected = binomial_interval(round(result.probability * 10_000), 10_000)
+        np.testing.assert_allclose([result.low, result.high], [expected.low, expected.high], rtol=1e-12)
+        assert (result.coefficient_of_variation == np.inf) == (probability == 0.0)
+        inside += result.low <= probability <= result.high
+    assert inside >= 93
 
 
 def test_what_cannot_be_climbed_is_not_called_safe():
@@ -180,19 +182,6 @@ def test_the_number_of_levels_is_a_limit():
     result = subset_simulation(lambda u: u[:, 0], 1, 4.75, seed=7, levels=3)
     assert len(result.thresholds) == 3 and result.evaluations == 10_000 + 2 * 9_000
     assert result.low == 0.0 and 1e-6 < result.high < 0.02
-
-
-@pytest.mark.parametrize("variation", (0.1, 0.3, 0.6))
-@pytest.mark.parametrize("replicates", (5, 10, 20))
-def test_intervals_of_lognormal_estimates_cover_their_mean(variation, replicates):
-    rng = np.random.default_rng(8)
-    sigma = np.sqrt(np.log1p(variation**2))
-    drawn = 1e-5 * np.exp(sigma * rng.standard_normal((4000, replicates)) - sigma**2 / 2)
-    ends = np.array([lognormal_interval(row, row, np.zeros(replicates)) for row in drawn])
-    assert np.mean((ends[:, 0] <= 1e-5) & (1e-5 <= ends[:, 1])) >= 0.94
-    # Estimates that agree by chance are not believed to be exact.
-    low, high = lognormal_interval(np.full(10, 1e-5), np.ones(10), np.full(10, 0.3))
-    assert low < 0.85e-5 and high > 1.15e-5
 
 
 def test_uniform_numbers_stay_within():

@@ -12,6 +12,7 @@ from tuning.verdict import (
     binomial_interval,
     confidence_sequence,
     enough,
+    lognormal_interval,
     replicate_interval,
     scenarios_needed,
     updated,
@@ -260,6 +261,19 @@ def test_replicates_that_all_agree():
     assert (1 + 1000 * none.high / (1 - none.high)) ** -16 == pytest.approx(0.025, rel=1e-9)
     assert none.high == pytest.approx(1 - every.low, rel=1e-12)
     assert none.high > binomial_interval(0, 16000).high
+
+
+@pytest.mark.parametrize("variation", (0.1, 0.3, 0.6))
+@pytest.mark.parametrize("replicates", (5, 10, 20))
+def test_intervals_of_lognormal_estimates_cover_their_mean(variation, replicates):
+    rng = np.random.default_rng(8)
+    sigma = np.sqrt(np.log1p(variation**2))
+    drawn = 1e-5 * np.exp(sigma * rng.standard_normal((4000, replicates)) - sigma**2 / 2)
+    ends = np.array([lognormal_interval(row, row, np.zeros(replicates)) for row in drawn])
+    assert np.mean((ends[:, 0] <= 1e-5) & (1e-5 <= ends[:, 1])) >= 0.94
+    # Estimates that agree by chance are not believed to be exact.
+    low, high = lognormal_interval(np.full(10, 1e-5), np.ones(10), np.full(10, 0.3))
+    assert low < 0.85e-5 and high > 1.15e-5
 
 
 @pytest.mark.parametrize(

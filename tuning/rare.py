@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
-from tuning.verdict import LEVEL, binomial_interval
+from tuning.verdict import LEVEL, binomial_interval, lognormal_interval
 
 Performance = Callable[[np.ndarray], np.ndarray]
 
@@ -139,7 +139,9 @@ def subset_simulation(
         low, high = lognormal_interval(state.estimates, state.reached, formula, level)
     mean = np.mean(state.estimates)
     spread = np.std(state.estimates, ddof=1) / np.sqrt(replicates)
-    combined = np.sqrt(np.sum((state.estimates * formula) ** 2)) / replicates
+    # Without a failure the formula is infinite, and the estimate says so.
+    weighted = state.estimates * np.where(state.estimates > 0.0, formula, 0.0)
+    combined = np.sqrt(np.sum(weighted**2)) / replicates
     return Rare(
         probability=float(mean),
         low=float(low),
@@ -153,37 +155,6 @@ def subset_simulation(
         worst_points=worst.points,
         worst_values=worst.values,
     )
-
-
-def lognormal_interval(
-    estimates: np.ndarray, reached: np.ndarray, least: np.ndarray, level: float = LEVEL
-) -> tuple[float, float]:
-    """Interval of the mean of a lognormal distribution from independent `estimates` (replicates,) drawn of
-    it.
-
-    With m and s^2 mean and variance of their R logarithms and t Student's quantile of R - 1 degrees,
-
-        exp(m + s^2 / 2 +- t sqrt(s^2 / R + s^4 / (2 (R - 1)))),
-
-    under the root not less for s^2 than the mean square of `least` (replicates,), coefficients of variation;
-    cut at 1 (Cox's method as modified by Olsson 2005, "Confidence intervals for the mean of a log-normal
-    distribution"). An interval of Student's for the estimates themselves would neglect their skewness, one
-    for their logarithms would cover the median, which lies below. Where an estimate is 0 the interval begins
-    at 0 and ends where Student's ends with what was `reached`, (replicates,) >= estimates, in the place of
-    zeros.
-    """
-    number = len(estimates)
-    student = special.stdtrit(number - 1, 0.5 + level / 2.0)
-    if np.any(estimates <= 0.0):
-        bounds = np.where(estimates > 0.0, estimates, reached)
-        high = np.mean(bounds) + student * np.std(bounds, ddof=1) / np.sqrt(number)
-        return 0.0, float(min(high, 1.0))
-    logarithms = np.log(estimates)
-    variance = np.var(logarithms, ddof=1)
-    centre = np.mean(logarithms) + variance / 2.0
-    variance = max(variance, np.mean(least**2))
-    half = student * np.sqrt(variance / number + variance**2 / (2.0 * (number - 1)))
-    return float(min(np.exp(centre - half), 1.0)), float(min(np.exp(centre + half), 1.0))
 
 
 def to_uniform(normals: np.ndarray) -> np.ndarray:
