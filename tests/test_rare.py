@@ -157,14 +157,14 @@ def test_frequent_failures_get_the_exact_interval(probability):
     """Passed or failed, and nothing between: two values of performance."""
     limit = stats.norm.isf(probability)
     inside = 0
-    for seed in range(100):
+    for seed in range(40):
         result = subset_simulation(lambda u: np.where(u[:, 0] > limit, 1.0, 0.0), 2, 0.5, seed)
         assert result.evaluations == 10_000 and len(result.thresholds) == 1
         expected = binomial_interval(round(result.probability * 10_000), 10_000)
         np.testing.assert_allclose([result.low, result.high], [expected.low, expected.high], rtol=1e-12)
         assert (result.coefficient_of_variation == np.inf) == (probability == 0.0)
         inside += result.low <= probability <= result.high
-    assert inside >= 93
+    assert inside >= 36
 
 
 def test_what_cannot_be_climbed_is_not_called_safe():

@@ -8,7 +8,7 @@ up, and the same order statistics are then known to a bin, outward.
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import special, stats
+from scipy import special
 
 from tuning.verdict import LEVEL, PRIOR, Interval
 
@@ -38,6 +38,9 @@ def ranks(number: int, order: float, level: float = LEVEL, sequential: bool = Fa
     if number == 0:
         return 0, 1
     if not sequential:
+        # Takes most of a second to import, and only this branch needs it.
+        from scipy import stats
+
         tail = (1.0 - level) / 2.0
         low, high = stats.binom.ppf([tail, 1.0 - tail], number, order)
         return int(low), int(high) + 1
