@@ -14,11 +14,11 @@ The whole algorithm runs `replicates` times, independently and side by side, and
 spread of their estimates. The usual formula for one run's coefficient of variation knows the correlation
 along the chains (the factors gamma), but takes chains and levels to be independent of each other, which they
 are not: they descend from the same few scenarios. It is too small by a tenth to a fifth on a plane, and by
-far more where a run may lose one of several failure regions, which no single run can notice. Replicates show
-it. Their estimates are skewed, close to lognormal, with the probability as their mean but for a bias of the
-order of 1 / samples (with 1000, 3 % at 1e-4 and 6 % at 1e-6): the interval is the one for the mean of a
-lognormal distribution, with the formula's coefficient as the least spread, lest a few replicates agree by
-chance.
+far more where a run may lose one of several failure regions, which no single run can notice. Replicates do,
+unless nearly all lose it. Their estimates are skewed, close to lognormal, with the probability as their mean
+but for a bias of the order of 1 / samples (with 1000, 3 % at 1e-4 and 6 % at 1e-6): the interval is the one
+for the mean of a lognormal distribution, with the formula's coefficient as the least spread, lest a few
+replicates agree by chance.
 """
 
 from collections.abc import Callable
