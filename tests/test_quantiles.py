@@ -1,0 +1,112 @@
+"""Quantiles of |error|: intervals that cover whatever the distribution, from values or from their bins."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from tuning.quantiles import BINS, EDGES, RESOLUTION, binned_quantile, counts, quantile, ranks
+
+
+@pytest.mark.parametrize("number", (1, 20, 300, 5000))
+@pytest.mark.parametrize("order", (0.05, 0.5, 0.95, 0.999))
+def test_the_ranks_leave_out_at_most_what_is_stated(number, order):
+    """P(X_(low) <= quantile <= X_(high)) = P(low <= B < high) of a binomial B, exactly."""
+    low, high = ranks(number, order)
+    law = stats.binom(number, order)
+    below, above = law.cdf(low - 1), law.sf(high - 1)
+    assert below <= 0.025 and above <= 0.025
+    # And no rank more could be left out.
+    assert law.cdf(low) >= 0.025 and law.sf(high - 2) >= 0.025
+    wider = ranks(number, order, sequential=True)
+    assert wider[0] <= low and wider[1] >= high
+
+
+def test_ranks_of_sequences_hold_at_all_numbers_at_once():
+    rng = np.random.default_rng(0)
+    numbers = np.arange(50, 5001, 50)
+    for order in (0.5, 0.95):
+        below = np.cumsum(rng.binomial(50, order, (1000, len(numbers))), axis=1)
+        low, high = np.array([ranks(int(n), order, sequential=True) for n in numbers]).T
+        assert np.mean(np.all((low <= below) & (below < high), axis=1)) >= 0.95
+        low, high = np.array([ranks(int(n), order) for n in numbers]).T
+        assert np.mean(np.all((low <= below) & (below < high), axis=1)) < 0.85
+
+
+@pytest.mark.parametrize("order", (0.5, 0.95, 0.99))
+def test_repeated_sweeps_cover_the_quantile(order, capsys):
+    """|error| half normal, its quantile in closed form; from the values, and from the bins of two halves."""
+    truth = stats.halfnorm.ppf(order)
+    rng = np.random.default_rng(1)
+    exact, binned, widths = [], [], []
+    for _ in range(1000):
+        values = rng.standard_normal(500)
+        interval = quantile(values, order)
+        parts = counts(values[:200]) + counts(values[200:])
+        wider = binned_quantile(parts, order)
+        assert interval.low / (1 + RESOLUTION) < wider.low <= interval.low
+        assert interval.high <= wider.high <= interval.high * (1 + RESOLUTION)
+        assert wider.estimate == pytest.approx(interval.estimate, rel=RESOLUTION / 2)
+        exact.append(interval.low <= truth <= interval.high)
+        binned.append(wider.low <= truth <= wider.high)
+        widths.append(wider.high - wider.low)
+    with capsys.disabled():
+        print(
+            f"\nquantile {order}: coverage {np.mean(exact):.3f}, of bins {np.mean(binned):.3f}, median "
+            f"width of bins {np.median(widths):.4f}",
+            end="",
+        )
+    assert np.mean(exact) >= 0.935 and np.mean(binned) >= np.mean(exact)
+
+
+def test_ties_cover_too():
+    """Three values only: the quantile is one of them, and both ends may be."""
+    rng = np.random.default_rng(2)
+    inside = []
+    for _ in range(500):
+        interval = quantile(rng.choice([1.0, 2.0, 5.0], 200, p=[0.3, 0.4, 0.3]), 0.7)
+        inside.append(interval.low <= 2.0 <= interval.high)
+    assert np.mean(inside) >= 0.95
+
+
+def test_bins_merge_and_hold_everything():
+    assert EDGES[0] == 1e-9 and EDGES[-1] >= 1e3 and BINS == len(EDGES) + 1 < 3000
+    assert np.max(EDGES[1:] / EDGES[:-1]) <= 1 + RESOLUTION + 1e-12
+    rng = np.random.default_rng(3)
+    values = np.concatenate([10 ** rng.uniform(-12, 6, 1000), [0.0, np.nan, np.inf, -np.inf], EDGES, -EDGES])
+    whole = counts(values)
+    assert whole.dtype == np.int64 and whole.shape == (BINS,) and np.sum(whole) == len(values)
+    split = rng.permutation(values)
+    np.testing.assert_array_equal(sum(counts(part) for part in np.split(split, [10, 999])), whole)
+    assert whole[-1] == np.sum(~(np.abs(values) < EDGES[-1]))
+    assert whole[0] == np.sum(np.abs(values) < EDGES[0])
+    np.testing.assert_array_equal(counts(EDGES)[1:], 1)
+    np.testing.assert_array_equal(counts(np.float32([0.5])), counts([0.5]))
+
+
+def test_failed_runs_are_the_largest_errors():
+    values = [1.0] * 90 + [np.nan] * 10
+    for interval in (quantile(values, 0.95), binned_quantile(counts(values), 0.95)):
+        assert np.isinf(interval.estimate) and np.isinf(interval.high)
+    assert quantile(values, 0.5) == (1.0, 1.0, 1.0)
+    small = binned_quantile(counts(np.zeros(50)), 0.5)
+    assert (small.estimate, small.low, small.high) == (0.0, 0.0, EDGES[0])
+
+
+@pytest.mark.parametrize("interval", (quantile([], 0.5), binned_quantile(counts([]), 0.5)))
+def test_without_values_nothing_is_known(interval):
+    assert np.isnan(interval.estimate) and interval.low == 0.0 and np.isinf(interval.high)
+
+
+def test_few_values_do_not_bound_a_far_quantile():
+    values = np.arange(1.0, 11.0)
+    assert np.isinf(quantile(values, 0.99).high) and quantile(values, 0.01).low == 0.0
+    # 100 n q in whole numbers: the rank is not rounded up.
+    assert quantile(np.arange(1.0, 101.0), 0.07).estimate == 7.0
+
+
+@pytest.mark.parametrize(
+    "number, order, level", ((-1, 0.5, 0.9), (5, 0.0, 0.9), (5, 1.0, 0.9), (5, 0.5, 1.0))
+)
+def test_impossible_orders_are_refused(number, order, level):
+    with pytest.raises(ValueError, match="number, order, level: found"):
+        ranks(number, order, level)
