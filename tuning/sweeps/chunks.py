@@ -4,7 +4,7 @@ One compiled program serves every chunk. Its delay lines are made for the extrem
 for what a chunk happens to draw, so that a scenario's rows are the same to the bit in any chunk.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -34,6 +34,14 @@ class Sweep(NamedTuple):
     gains: dict[str, float]
 
 
+class _Batch(NamedTuple):
+    """Scenarios to run and what they are made of."""
+
+    first: int
+    draws: dict[str, np.ndarray]
+    scenarios: Scenario
+
+
 def build_sweep(manifest: Manifest) -> Sweep:
     """Raises `InputError` for a manifest with an impossible gain file."""
     loaded = loaded_gains(manifest)
@@ -55,17 +63,23 @@ def run_chunk(sweep: Sweep, first: int, number: int, precision: str | None = Non
 
     A run that fails, or whose numbers are no longer finite, is a row that says so.
     """
-    return begin_chunk(sweep, first, number, precision)()
+    return _begin(sweep, _draw(sweep, first, number, precision))()
 
 
-def begin_chunk(sweep: Sweep, first: int, number: int, precision: str | None = None) -> Callable[[], Rows]:
-    """Like `run_chunk`, without waiting: what is returned waits for the rows and returns them."""
-    manifest = sweep.manifest
-    draws, scenarios = drawn_scenarios(sweep.mechanism, manifest.sampling, manifest.seed, first, number)
-    scenarios = in_precision(scenarios, precision or manifest.precision)
-    outcome = begin_evaluation(sweep.loop, sweep.gains, scenarios, at_least=manifest.chunk)
-    limit, works = manifest.largest_error, manifest.works
-    return lambda: rows_of(sweep.mechanism, first, draws, scenarios, outcome(), limit, works)
+def run_parts(sweep: Sweep, parts: Iterable[int]) -> Iterator[tuple[int, Rows]]:
+    """Part by part its number and rows. While the caller uses them, the next part is computed already."""
+    held = None
+    waiting = iter(parts)
+    drawn = _draw_part(sweep, next(waiting, None))
+    while drawn is not None:
+        part, batch = drawn
+        rows = _begin(sweep, batch)
+        drawn = _draw_part(sweep, next(waiting, None))
+        if held is not None:
+            yield held
+        held = part, rows()
+    if held is not None:
+        yield held
 
 
 def in_precision(scenarios: Scenario, precision: str) -> Scenario:
@@ -76,3 +90,21 @@ def in_precision(scenarios: Scenario, precision: str) -> Scenario:
         return leaf.astype(precision) if leaf.dtype.kind == "f" else leaf
 
     return jax.tree.map(cast, scenarios)
+
+
+def _draw(sweep: Sweep, first: int, number: int, precision: str | None) -> _Batch:
+    manifest = sweep.manifest
+    draws, scenarios = drawn_scenarios(sweep.mechanism, manifest.sampling, manifest.seed, first, number)
+    return _Batch(first, draws, in_precision(scenarios, precision or manifest.precision))
+
+
+def _draw_part(sweep: Sweep, part: int | None) -> tuple[int, _Batch] | None:
+    return None if part is None else (part, _draw(sweep, *sweep.manifest.part_rows(part), None))
+
+
+def _begin(sweep: Sweep, batch: _Batch) -> Callable[[], Rows]:
+    """Start computing; what is returned waits for the rows."""
+    manifest = sweep.manifest
+    outcome = begin_evaluation(sweep.loop, sweep.gains, batch.scenarios, at_least=manifest.chunk)
+    limit, works = manifest.largest_error, manifest.works
+    return lambda: rows_of(sweep.mechanism, *batch, outcome(), limit, works)

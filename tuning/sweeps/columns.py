@@ -21,11 +21,14 @@ STATUSES = tuple(STATUS_NAMES.values())
 # From harmless to worst; the status of a run that failed is a cause by itself.
 OUTCOMES = (GOOD, BEYOND, SATURATED, *(STATUS_NAMES[s] for s in (NOT_REACHED, TIMEOUT, DIVERGED, NON_FINITE)))
 
-Kind = Literal["integer", "number", "flag", "text"]
+Kind = Literal["integer", "input", "number", "flag", "text"]
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A column's name, kind, SI unit ("" for none, "1" for a ratio) and meaning."""
+    """A column's name, kind, SI unit ("" for none, "1" for a ratio) and meaning.
+
+    Inputs are in float64, numbers in the sweep's precision.
+    """
 
     name: str
     kind: Kind
@@ -76,7 +79,7 @@ def sweep_columns(mechanism: Mechanism, works: bool) -> list[Column]:
     """The columns of a sweep over `mechanism`, in their order."""
     columns = [Column("index", "integer", "", "number of the scenario")]
     columns += [
-        Column(name, "number", unit_of(mechanism, path), f"{path}, drawn")
+        Column(name, "input", unit_of(mechanism, path), f"{path}, drawn")
         for path in dimensions(mechanism)
         for name in input_names(mechanism, path)
     ]
@@ -137,7 +140,7 @@ def rows_of(
     for path, values in draws.items():
         entries = np.reshape(values, (number, -1)).T
         rows.update(zip(input_names(mechanism, path), entries, strict=True))
-    status = metrics.status[:made]
+    status = np.asarray(metrics.status[:made])
     ended, reached = status == OK, status != NOT_REACHED
     rebound = metrics.restitution * metrics.approach_velocity
     half_mass = (scenarios.equivalent_mass / 2).astype(rebound.dtype)

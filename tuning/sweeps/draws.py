@@ -17,9 +17,7 @@ from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import at_points, dimensions, draw
 
-SAMPLINGS = ("random", "sobol")
 REPLICATES = 16
-MOST = 2**32  # scenarios: the noise's keys have 32 bits for the index
 BITS = 30  # of a Sobol point's coordinate
 
 

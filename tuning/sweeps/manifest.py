@@ -6,6 +6,7 @@ part of the store, so that no part of another sweep is taken for one of this.
 
 import json
 import math
+import os
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,8 +18,9 @@ from msgspec import Meta
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.runtime import digest
 from tuning.gain_file import LoadedGains, check_document, versions
+from tuning.sweeps import LARGEST_CHUNK, LARGEST_SEED, MOST
 from tuning.sweeps.columns import Column, sweep_columns
-from tuning.sweeps.draws import MOST, REPLICATES
+from tuning.sweeps.draws import REPLICATES
 
 SCHEMA = "jaxhil/sweep/1"
 NAME = "manifest.json"
@@ -30,12 +32,13 @@ Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """scenarios, chunk [scenarios], seed, sampling, Sobol replicates (1 for random), precision, limit of the
     restitution error (None: no limit), whether works are audited; columns; gain file with its digest and its
-    mechanism file's; versions, date, digest of all but the date."""
+    mechanism file's; versions, flags of the compiler, date, digest of all but the
+    date."""
 
     schema: Literal["jaxhil/sweep/1"]
     scenarios: Annotated[int, Meta(ge=1, le=MOST)]
-    chunk: Annotated[int, Meta(ge=1, le=2**20)]
-    seed: Annotated[int, Meta(ge=0, lt=2**63)]
+    chunk: Annotated[int, Meta(ge=1, le=LARGEST_CHUNK)]
+    seed: Annotated[int, Meta(ge=0, le=LARGEST_SEED)]
     sampling: Literal["random", "sobol"]
     replicates: Annotated[int, Meta(ge=1)]
     precision: Literal["float64", "float32"]
@@ -46,6 +49,7 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     mechanism_sha256: Digest
     gain_file: dict[str, Any]
     versions: dict[str, str]
+    xla_flags: str
     created: str
     sha256: Digest
 
@@ -89,9 +93,15 @@ def build_manifest(loaded: LoadedGains, choices: Choices) -> Manifest:
         "mechanism_sha256": loaded.document["mechanism_sha256"],
         "gain_file": loaded.document,
         "versions": versions(),
+        "xla_flags": rounding_flags(os.environ.get("XLA_FLAGS", "")),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     return _decode({**document, "sha256": digest(document)}, "sweep")
+
+
+def rounding_flags(flags: str) -> str:
+    """What of XLA_FLAGS may change the last bits of a result: all but the number of devices."""
+    return " ".join(sorted(flag for flag in flags.split() if "device_count" not in flag))
 
 
 def encode(manifest: Manifest) -> bytes:
@@ -119,7 +129,9 @@ def read_manifest(folder: Path) -> Manifest:
         with path.open("rb") as file:
             content = file.read(LARGEST + 1)
     except FileNotFoundError:
-        raise InputError(f"{source}: found no such file, allowed a folder that `jaxhil sweep` wrote") from None
+        raise InputError(
+            f"{source}: found no such file, allowed a folder that `jaxhil sweep` wrote"
+        ) from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{source}: cannot be read: {one_line(reason, 100)}") from None
@@ -136,7 +148,17 @@ def loaded_gains(manifest: Manifest, source: str = "sweep") -> LoadedGains:
 def differences(old: Manifest, new: Manifest) -> list[str]:
     """What of the inputs is not the same, each as "key: found OLD, asked for NEW"."""
     told = []
-    for key in ("gains_sha256", "scenarios", "seed", "sampling", "precision", "limit", "works", "chunk"):
+    for key in (
+        "gains_sha256",
+        "scenarios",
+        "seed",
+        "sampling",
+        "precision",
+        "limit",
+        "works",
+        "chunk",
+        "xla_flags",
+    ):
         before, now = getattr(old, key), getattr(new, key)
         if before != now:
             told.append(f"{key}: found {_short(before)}, asked for {_short(now)}")

@@ -89,13 +89,14 @@ def write_part(store: Store, part: int, rows: Mapping[str, np.ndarray]) -> None:
     from pyarrow import parquet
 
     buffer = pa.BufferOutputStream()
+    texts = [column.name for column in store.manifest.columns if column.kind == "text"]
     parquet.write_table(
         to_table(store.manifest, rows),
         buffer,
         compression="zstd",
         compression_level=1,
         # Numbers hardly repeat.
-        use_dictionary=[column.name for column in store.manifest.columns if column.kind == "text"],
+        use_dictionary=texts,  # pyright: ignore[reportArgumentType]
         write_page_checksum=True,
     )
     path = store.part_path(part)
@@ -156,18 +157,17 @@ def schema(manifest: Manifest) -> Any:
     """The Arrow schema of every part; units and meanings are metadata of the fields."""
     import pyarrow as pa
 
-    drawn = pa.float64()
-    numbers = pa.float64() if manifest.precision == "float64" else pa.float32()
     kinds = {
         "integer": pa.int64(),
+        "input": pa.float64(),
+        "number": pa.float64() if manifest.precision == "float64" else pa.float32(),
         "flag": pa.bool_(),
         "text": pa.dictionary(pa.int8(), pa.string()),
     }
 
     def field(column: Column):
-        kind = kinds.get(column.kind) or (drawn if column.meaning.endswith(", drawn") else numbers)
         metadata = {"unit": column.unit, "meaning": column.meaning}
-        return pa.field(column.name, kind, metadata=metadata)
+        return pa.field(column.name, kinds[column.kind], metadata=metadata)
 
     return pa.schema([field(column) for column in manifest.columns], metadata={DIGEST: manifest.sha256})
 
