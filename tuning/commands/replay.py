@@ -33,7 +33,7 @@ def run(options: Replay) -> int:
     if options.plot is not None:
         from tuning.plots import contact_plot, save
 
-        title = f"{document['mechanism']}, scenario {options.index} of {options.store}"
+        title = f"{document['mechanism']}, scenario {options.index} of {store.folder.resolve().name}"
         save(contact_plot(motion_of(found.sweep, options.index), title, sensors="rig"), options.plot)
         report.note(f"wrote {options.plot}")
     if options.json:
