@@ -12,7 +12,7 @@ UNCERTAIN = {
     "contact.stiffness": {"distribution": "loguniform", "factor": [0.3, 3.0]},
     "rig.force_sensor.delay": {"distribution": "normal", "std": 0.0005},
 }
-NOISY = {"noise_std": 1.0, "time_constant": 0.002}
+NOISY = {"noise_std": 1.0}
 
 
 def case(

@@ -88,7 +88,8 @@ def test_sweep_beside_the_compiled_baseline(precision, tmp_path, capsys):
             f"\nsweep, {precision}: scenarios/s over C++ to the fixed horizon of {horizon} ticks:"
             f" {rate / compiled:.2f} ({rate:.3g} over {compiled:.3g}); median of the ratios"
             f" {np.median(np.array(theirs) / ours) * PARTS * CHUNK / BASELINE_LANES:.2f}; encoding and"
-            f" writing parts, while the next is computed: {shares[min(ours)]:.0%} of the time; {drawing:.3g} draws/s"
+            f" writing parts, while the next is computed: {shares[min(ours)]:.0%} of the time;"
+            f" {drawing:.3g} draws/s"
         )
     assert rate >= 0.6 * compiled
 

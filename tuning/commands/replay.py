@@ -18,18 +18,14 @@ def run(options: Replay) -> int:
     if options.plot is not None:
         checks.picture(options.plot)
     prepare()
-    from tuning.gain_file import versions
+    from tuning.sweeps.manifest import unlike_here
     from tuning.sweeps.replay import motion_of, replay
     from tuning.sweeps.store import read_store
 
     store = read_store(Path(options.store))
     found = replay(store, options.index)
     document = _document(options, store, found)
-    document["versions"] = {
-        name: [made, here]
-        for name, made in store.manifest.versions.items()
-        if (here := versions().get(name)) != made
-    }
+    document["unlike"] = unlike_here(store.manifest)
     if options.plot is not None:
         from tuning.plots import contact_plot, save
 
@@ -92,6 +88,5 @@ def _print(document: dict[str, Any]) -> None:
         lines.append("Good: every number is the stored one, to the bit.")
     else:
         lines.append(f"Bad: differs from what is stored in {', '.join(document['different'][:8])}.")
-    for name, (made, here) in document["versions"].items():
-        lines.append(f"The store was made with {name} {made}; here it is {here}.")
+    lines += [f"The store was made elsewhere: {told}." for told in document["unlike"]]
     report.emit(inputs, report.table("Contacts", headings, rows, texts=(7,)), *lines)

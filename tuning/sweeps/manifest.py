@@ -162,13 +162,27 @@ def differences(old: Manifest, new: Manifest) -> list[str]:
         before, now = getattr(old, key), getattr(new, key)
         if before != now:
             told.append(f"{key}: found {_short(before)}, asked for {_short(now)}")
-    for name in sorted(old.versions.keys() | new.versions.keys()):
-        before, now = old.versions.get(name), new.versions.get(name)
-        if before != now:
-            told.append(f"versions.{name}: found {_short(before)}, here {_short(now)}")
+    told += _other_versions(old.versions, new.versions)
     if old.columns != new.columns:
         told.append("columns: found others than this version writes")
     return told
+
+
+def unlike_here(manifest: Manifest) -> list[str]:
+    """What of this process is not as the manifest says, so that its rows may differ in their last bits."""
+    flags = rounding_flags(os.environ.get("XLA_FLAGS", ""))
+    told = _other_versions(manifest.versions, versions())
+    if flags != manifest.xla_flags:
+        told.append(f"xla_flags: found {_short(manifest.xla_flags)}, here {_short(flags)}")
+    return told
+
+
+def _other_versions(old: Mapping[str, str], new: Mapping[str, str]) -> list[str]:
+    return [
+        f"versions.{name}: found {_short(old.get(name))}, here {_short(new.get(name))}"
+        for name in sorted(old.keys() | new.keys())
+        if old.get(name) != new.get(name)
+    ]
 
 
 def _decode(document: Mapping[str, Any], source: str) -> Manifest:

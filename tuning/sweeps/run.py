@@ -14,12 +14,11 @@ import numpy as np
 from jaxhil.errors import InputError, one_line, shown
 from tuning.sweeps.chunks import Rows, Sweep, build_sweep, run_chunk, run_parts
 from tuning.sweeps.columns import OUTCOMES
-from tuning.sweeps.manifest import Manifest, decode, encode
+from tuning.sweeps.manifest import Manifest, decode, encode, unlike_here
 from tuning.sweeps.store import Store, read_part, write_part
 from tuning.sweeps.tally import Tally, add_rows, empty_tally
 
 COMPARED = 4096  # scenarios that a float32 sweep runs in float64 too
-LOST_WORKERS = 10  # that a part may meet before the sweep gives up
 
 # Called with the number of rows that are there now and the tally so far: those found, then those computed.
 Progress = Callable[[int, Tally], None]
@@ -88,7 +87,7 @@ def describe_outcomes(tally: Tally) -> dict[str, int]:
 def _run_on_cluster(manifest: Manifest, parts: list[int], address: str) -> Iterator[tuple[int, Rows]]:
     """The parts in the order in which workers finish them; a few are under way per worker."""
     try:
-        from distributed import Client, as_completed
+        from distributed import Client, KilledWorker, as_completed
     except ImportError:
         missing = "nothing installed for it, allowed once `pip install jaxhil[distributed]` was done"
         raise InputError(f"--scheduler: found {missing}") from None
@@ -106,12 +105,16 @@ def _run_on_cluster(manifest: Manifest, parts: list[int], address: str) -> Itera
             if part is None:
                 return []
             key = f"jaxhil-{manifest.sha256[:16]}-{part}"
-            return [client.submit(_remote_part, content, part, key=key, pure=False, retries=LOST_WORKERS)]
+            return [client.submit(_remote_part, content, part, key=key, pure=False)]
 
         at_once = max(2, 2 * len(client.scheduler_info(n_workers=-1)["workers"]))
-        futures = as_completed([future for _ in range(at_once) for future in submit()])
+        first = [future for _ in range(at_once) for future in submit()]
+        futures = as_completed(first, loop=client.loop)
         for future in futures:
-            part, rows = future.result()
+            try:
+                part, rows = future.result()
+            except KilledWorker:
+                raise InputError(f"--scheduler: {address}: several workers died of one part") from None
             future.release()
             for more in submit():
                 futures.add(more)
@@ -129,6 +132,8 @@ def _remote_part(content: bytes, part: int) -> tuple[int, Rows]:
 
         prepare()
         sweep = _remote_sweep(content)
+        if told := unlike_here(sweep.manifest):
+            raise InputError(f"--scheduler: a worker: {told[0]}: its rows would differ")
         return part, run_chunk(sweep, *sweep.manifest.part_rows(part))
 
 
