@@ -5,7 +5,7 @@ tiles are dealt out to the devices in turn. Batches are padded to a few sizes, s
 compiled program.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -77,12 +77,20 @@ def parameters_by_slot(contact: ContactParameters) -> ContactParameters:
 def evaluate(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least: int = 1) -> Outcome:
     """Outcome (NumPy arrays) of `scenarios` (NumPy arrays, one batch axis), on every device.
 
-    `gains` are scalars, or all of them one value per lane. Batches of up to `at_least` lanes share the
-    compiled program of that many.
+    `gains` are scalars, or all of them one value per lane; they are taken in the scenarios' precision.
+    Batches of up to `at_least` lanes share the compiled program of that many. To the bit, a lane's outcome
+    depends neither on the lanes beside it nor on its place among them.
     """
+    return begin_evaluation(loop, gains, scenarios, at_least)()
+
+
+def begin_evaluation(
+    loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least: int = 1
+) -> Callable[[], Outcome]:
+    """Like `evaluate`, without waiting: what is returned waits for the outcome and returns it."""
     number = len(scenarios.velocity)
     order = _by_duration(scenarios)
-    outcome = jax.device_get(run_tiles(loop, *deal(scenarios, gains, at_least)))
+    running = run_tiles(loop, *deal(scenarios, gains, at_least))
 
     def unfold(leaf):
         leaf = np.moveaxis(leaf, (0, 1), (-2, -3))
@@ -91,7 +99,7 @@ def evaluate(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least
         back[..., order] = leaf[..., :number]
         return back
 
-    return jax.tree.map(unfold, outcome)
+    return lambda: jax.tree.map(unfold, jax.device_get(running))
 
 
 def deal(
@@ -114,7 +122,8 @@ def deal(
     scenarios = jax.tree.map(lambda leaf: np.asarray(leaf)[..., padded], scenarios)
     contacts: Any = np.where(idle, 0, scenarios.contacts).astype(np.int32)
     scenarios = scenarios._replace(contacts=contacts)
-    values = {name: np.asarray(value, float) for name, value in gains.items()}
+    # The scenarios' precision is that of the program.
+    values = {name: np.asarray(value, scenarios.velocity.dtype) for name, value in gains.items()}
     per_lane = {name: value[padded] for name, value in values.items() if value.ndim}
     common = {name: value for name, value in values.items() if not value.ndim}
 

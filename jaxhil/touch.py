@@ -153,7 +153,9 @@ def sensed_lag(
         return sample, _lag_along(surfaces, sample, panel.sample, panel.end, rest, time_constant)
 
     def fade(reading, panel):
-        return tuple(reading * lag_decay(time, time_constant) for time in (until, duration))
+        # In the same steps as `follow`: to the bit, no lane depends on whether others touch.
+        sample = reading * lag_decay(until, time_constant)
+        return sample, sample * lag_decay(duration - until, time_constant)
 
     # Most of the time no lane touches.
     outside = [deflection(motion.position, surfaces.clearance) == 0 for motion in panel]

@@ -28,12 +28,13 @@ from scipy import special
 
 from jaxhil.mechanism import Mechanism, Range, Uncertainty, numeric_keys, value_at
 
-__all__ = ["PHASE", "draw", "quasi_random"]
+__all__ = ["PHASE", "at_points", "dimensions", "draw", "extremes", "quasi_random"]
 
 PHASE = "approach.phase"
 BLOCK = 1024
 
 _TINY = 2.0**-54
+_LARGEST = 1.0 - 2.0**-53  # of a generator's uniform numbers
 _UNIFORM_PHASE = Uncertainty(distribution="uniform", low=0.0, high=1.0)
 
 
@@ -47,7 +48,7 @@ def draw(mechanism: Mechanism, number: int, seed: int, first: int = 0) -> dict[s
     """
     if number < 0 or seed < 0 or first < 0:
         raise ValueError(f"number, seed, first: found {number}, {seed}, {first}, allowed >= 0")
-    columns = _columns(mechanism)
+    columns = dimensions(mechanism)
     return _values(
         mechanism,
         {path: _uniform(path, count, number, seed, first) for path, count in columns.items()},
@@ -66,14 +67,29 @@ def quasi_random(mechanism: Mechanism, number: int, seed: int) -> dict[str, np.n
 
     if number < 0 or seed < 0:
         raise ValueError(f"number, seed: found {number}, {seed}, allowed integers >= 0")
-    columns = _columns(mechanism)
+    columns = dimensions(mechanism)
     sequence = qmc.Sobol(sum(columns.values()), scramble=True, rng=np.random.default_rng(seed))
     points = sequence.random_base2(max(0, math.ceil(math.log2(max(number, 1)))))[:number]
+    return at_points(mechanism, points)
+
+
+def at_points(mechanism: Mechanism, points: np.ndarray) -> dict[str, np.ndarray]:
+    """The draws that belong to points of the unit box, (number, sum of `dimensions`), as `draw` returns them.
+
+    Each coordinate goes through the inverse of its distribution function; 0 stands for the least draw.
+    """
+    columns = dimensions(mechanism)
     edges = np.cumsum(list(columns.values()))[:-1]
     return _values(mechanism, dict(zip(columns, np.split(points, edges, axis=1), strict=True)))
 
 
-def _columns(mechanism: Mechanism) -> dict[str, int]:
+def extremes(mechanism: Mechanism) -> dict[str, np.ndarray]:
+    """Two draws: every uncertain number at one end of what can be drawn, then at the other."""
+    ends = np.array([[0.0], [_LARGEST]])
+    return at_points(mechanism, np.repeat(ends, sum(dimensions(mechanism).values()), axis=1))
+
+
+def dimensions(mechanism: Mechanism) -> dict[str, int]:
     """How many uniform numbers each key takes: sorted by path, the phases last."""
     columns = {}
     for path in sorted(set(mechanism.uncertainty) - {PHASE}):

@@ -81,3 +81,17 @@ def test_every_contact_is_set_beside_its_own_reference():
     np.testing.assert_allclose(outcome.reference_restitution[wanted], expected[wanted], rtol=1e-12)
     np.testing.assert_array_equal(wanted.sum(axis=0), scenarios.contacts)
     assert outcome.good[wanted].all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["varying", "rattling"])
+def test_to_the_bit_a_lane_does_not_depend_on_its_batch(name):
+    # A lagging sensor skips work where no lane of a tile touches.
+    overrides = ("rig.force_sensor.time_constant=0.002",)
+    loop, gains, scenarios = setting(lanes=600, name=name, overrides=overrides)
+    whole = evaluate(loop, gains, scenarios)
+    for some in (np.arange(0, 600, 2), np.array([3]), np.random.default_rng(0).permutation(600)):
+        part = evaluate(loop, gains, lanes_of(scenarios, some), at_least=600)
+        for ours, theirs in zip(part.metrics, whole.metrics, strict=True):
+            np.testing.assert_array_equal(ours, theirs[..., some])
+        np.testing.assert_array_equal(part.error, whole.error[..., some])

@@ -11,7 +11,7 @@ from scipy import stats
 from jaxhil.errors import InputError
 from jaxhil.mechanism import numeric_keys
 from jaxhil.mechanism_file import builtin_names, from_builtins, load, to_builtins
-from jaxhil.uncertainty import PHASE, draw, quasi_random
+from jaxhil.uncertainty import PHASE, at_points, dimensions, draw, extremes, quasi_random
 
 CERTAIN = ["uncertainty={}", "contact.damping=[1.0, 2.0]"]
 BASE = to_builtins(load("varying", CERTAIN).mechanism)
@@ -315,3 +315,19 @@ def test_draws_of_builtins_are_valid_mechanisms(name):
                 node = node[table]
             node[key] = (values[i, 0] if path == PHASE else values[i]).tolist()
         assert from_builtins(raw, "f").contact.stiffness == draws["contact.stiffness"][i].tolist()
+
+
+@pytest.mark.parametrize("name", builtin_names())
+def test_every_draw_lies_between_the_extremes(name):
+    parsed = load(name).mechanism
+    ends = extremes(parsed)
+    for path, values in draw(parsed, 2000, 5).items():
+        assert np.all(np.minimum(*ends[path]) <= values) and np.all(values <= np.maximum(*ends[path]))
+        # They are ends that can be reached, not any bounds.
+        assert np.all(np.ptp(ends[path], axis=0) <= 4 * np.ptp(values, axis=0))
+
+
+def test_points_of_the_box_are_what_quasi_random_draws_are_made_of():
+    parsed = from_builtins(BASE, "f")
+    points = np.full((2, sum(dimensions(parsed).values())), 0.25)
+    np.testing.assert_array_equal(at_points(parsed, points)[PHASE], np.full((2, 3), 0.25))

@@ -14,6 +14,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg, subc
 
 PICTURES = (".png", ".pdf", ".svg")
 DEFAULT_PLOT = "jaxhil-out/simulate.png"
+DEFAULT_REPLAY_PLOT = "jaxhil-out/replay.png"
 
 OptionalFile = Annotated[
     Positional[str | None],
@@ -150,6 +151,68 @@ class Tune:
 
 
 @dataclass(frozen=True)
+class Sweep:
+    """Monte Carlo robustness: how probable is a failure, how close do the worst scenarios come to one?
+
+    Example: jaxhil sweep jaxhil-out/varying/gains.json --scenarios 1000000 --output study/sweep
+
+    Exit code 0 if no scenario failed or, with --acceptable, if the interval ends below it; else 1.
+    """
+
+    gains: Annotated[Positional[str], arg(metavar="GAINS", help="Gain file, or its folder.")]
+    scenarios: Annotated[int, _number("Scenarios to draw and run.")] = 100_000
+    seed: Annotated[int, _number("Seed; scenario i depends on it and on i alone.")] = 0
+    sampling: Annotated[
+        str, arg(metavar="NAME", help="random, or sobol (scrambled, several replicates).")
+    ] = "random"
+    precision: Annotated[
+        str, arg(metavar="NAME", help="float64, or float32: faster, and compared with float64 on a subset.")
+    ] = "float64"
+    works: Annotated[
+        bool, arg(name="works", metavar="", help="Also the real contact force's works; 3 times the time.")
+    ] = False
+    limit: Limit = 0.01
+    acceptable: Annotated[
+        float | None,
+        arg(
+            metavar="PROBABILITY",
+            help="Failure probability that the interval's upper end may reach; by default no run may fail.",
+            help_behavior_hint="",
+        ),
+    ] = None
+    output: Annotated[str, arg(aliases=("-o",), metavar="DIR", help="Folder of the store.")] = (
+        "jaxhil-out/sweep"
+    )
+    resume: Annotated[
+        bool, arg(name="resume", metavar="", help="Go on with a sweep that was interrupted.")
+    ] = False
+    chunk: Annotated[int, _number("Scenarios computed at a time, and rows of each part.")] = 16384
+    scheduler: Annotated[
+        str | None,
+        arg(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster that computes the parts."),
+    ] = None
+    json: Json = False
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Run one scenario of a sweep again, and see whether it does the same, to the bit.
+
+    Example: jaxhil replay jaxhil-out/sweep 1234 --plot worst.png
+
+    Exit code 1 if any number differs from the stored one.
+    """
+
+    store: Annotated[Positional[str], arg(metavar="STORE", help="Folder that a sweep wrote.")]
+    index: Annotated[Positional[int], arg(metavar="INDEX", help="Number of the scenario.")]
+    plot: Annotated[
+        str | None,
+        arg(metavar="[PICTURE]", help=f"Plot to a .png, .pdf or .svg file; bare: {DEFAULT_REPLAY_PLOT}."),
+    ] = None
+    json: Json = False
+
+
+@dataclass(frozen=True)
 class Verify:
     """Replay recorded signals through the rig's runtime; the exit code is the verdict.
 
@@ -177,6 +240,8 @@ class Mechanisms:
 Command = (
     Annotated[Simulate, subcommand("simulate")]
     | Annotated[Tune, subcommand("tune")]
+    | Annotated[Sweep, subcommand("sweep")]
+    | Annotated[Replay, subcommand("replay")]
     | Annotated[Verify, subcommand("verify")]
     | Annotated[Mechanisms, subcommand("mechanisms")]
 )
@@ -202,9 +267,10 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
 def complete_plot(arguments: list[str]) -> list[str]:
     """A `--plot` that no picture's name follows gets the default one."""
     completed = []
+    default = DEFAULT_REPLAY_PLOT if arguments[:1] == ["replay"] else DEFAULT_PLOT
     for place, word in enumerate(arguments):
         completed.append(word)
         following = arguments[place + 1] if place + 1 < len(arguments) else ""
         if word == "--plot" and not following.lower().endswith(PICTURES):
-            completed.append(DEFAULT_PLOT)
+            completed.append(default)
     return completed

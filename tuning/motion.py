@@ -48,19 +48,12 @@ def nominal_motion(
 ) -> list[Piece]:
     """The pieces of the nominal run under each of `gains`; the run in space enters as the last of them."""
     loaded, scenarios = _lanes(mechanism, compensator, gains, seed)
-    _, recorded = record_lanes(loaded, scenarios)
-    runs = {name: _split(lane, mechanism) for name, lane in zip(gains, recorded, strict=True)}
-    leading = list(runs.values())[-1]
-    clearance = mechanism.contact.clearance
-    two = bool(np.isfinite(clearance))
-    surfaces = (0.0, -clearance) if two else (0.0,)
-    pieces = []
-    for number, curve in enumerate(leading):
-        others = {name: run[number] for name, run in runs.items() if number < len(run)}
-        space = _space(mechanism, scenarios, number, curve.velocity, float(curve.time[-1]))
-        name = f"{mechanism.approach.contacts} contacts" if two else f"contact {number + 1}"
-        pieces.append(Piece(name, surfaces, {"in space": space, **others}))
-    return pieces
+    return _pieces(loaded, scenarios, list(gains))
+
+
+def scenario_motion(loaded: LoadedGains, scenarios: Scenario, name: str = "rig") -> list[Piece]:
+    """The pieces of one scenario's run, a batch of one lane, which the plots call `name`."""
+    return _pieces(loaded, scenarios, [name])
 
 
 def prepare_motion(mechanism: Mechanism, compensator: str, gains: Mapping[str, Mapping[str, float]]) -> None:
@@ -77,15 +70,33 @@ def _lanes(mechanism, compensator, gains, seed) -> tuple[LoadedGains, Scenario]:
     return LoadedGains({}, compensator, lanes, mechanism), scenarios
 
 
-def _split(lane: Lane, mechanism: Mechanism) -> list[Curve]:
+def _pieces(loaded: LoadedGains, scenarios: Scenario, names: list[str]) -> list[Piece]:
+    """A lane for each of the names; the lanes differ by their gains alone."""
+    _, recorded = record_lanes(loaded, scenarios)
+    lanes = zip(names, recorded, strict=True)
+    runs = {name: _split(lane, scenarios) for name, lane in lanes}
+    leading = list(runs.values())[-1]
+    clearance = float(scenarios.clearance[0])
+    two = bool(np.isfinite(clearance))
+    surfaces = (0.0, -clearance) if two else (0.0,)
+    pieces = []
+    for number, curve in enumerate(leading):
+        others = {name: run[number] for name, run in runs.items() if number < len(run)}
+        space = _space(loaded.mechanism, scenarios, number, curve.velocity, float(curve.time[-1]))
+        name = f"{loaded.mechanism.approach.contacts} contacts" if two else f"contact {number + 1}"
+        pieces.append(Piece(name, surfaces, {"in space": space, **others}))
+    return pieces
+
+
+def _split(lane: Lane, scenarios: Scenario) -> list[Curve]:
     """A lane's runs."""
     signals = lane.signals
     begins = np.flatnonzero(signals.age == 0)
     ends = np.append(begins[1:], len(signals.age))
-    period = mechanism.rig.control_period
-    touch = APPROACH + mechanism.approach.phase * period
+    period = float(scenarios.control_period[0])
     pieces = []
-    for begin, end in zip(begins, ends, strict=True):
+    for number, (begin, end) in enumerate(zip(begins, ends, strict=True)):
+        touch = APPROACH + float(scenarios.phase[number, 0]) * period
         part = slice(begin, end)
         curve = Curve(
             float(signals.velocity_desired[begin]),

@@ -4,16 +4,17 @@ import json
 import math
 import os
 import sys
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+import rich.progress
 from rich import box
 from rich.console import Console, RenderableType
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
-    Progress,
     SpinnerColumn,
     TextColumn,
     TimeElapsedColumn,
@@ -21,6 +22,7 @@ from rich.progress import (
 from rich.table import Table
 
 WIDTH = 110  # where there is no terminal to ask
+SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal for a bar
 
 
 def emit(*things: RenderableType) -> None:
@@ -83,7 +85,7 @@ def finite(value: Any) -> Any:
 class Stages:
     """Progress through a known number of stages, told on standard error."""
 
-    def __init__(self, progress: Progress | None, task: Any):
+    def __init__(self, progress: rich.progress.Progress | None, task: Any):
         self._progress, self._task, self._begun = progress, task, False
 
     def begin(self, text: str) -> None:
@@ -121,8 +123,60 @@ def stages(total: int) -> Iterator[Stages]:
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
-    with Progress(*columns, console=console, transient=True) as progress:
-        yield Stages(progress, progress.add_task("", total=total))
+    with rich.progress.Progress(*columns, console=console, transient=True) as bar:
+        yield Stages(bar, bar.add_task("", total=total))
+
+
+class Progress:
+    """Progress through a known number of equal pieces of work, told on standard error."""
+
+    def __init__(self, total: int, unit: str, bar: rich.progress.Progress | None, task: Any):
+        self._total, self._unit, self._bar, self._task = total, unit, bar, task
+        self._done, self._skipped = 0, 0
+        self._begun = self._told = time.monotonic()
+
+    @property
+    def rate(self) -> float | None:
+        """Pieces per second, of those that were worked on."""
+        worked, took = self._done - self._skipped, time.monotonic() - self._begun
+        return worked / took if worked > 0 and took > 0 else None
+
+    def skip(self, number: int) -> None:
+        """So many pieces were done before."""
+        self._done += number
+        self._skipped += number
+        self._begun = time.monotonic()
+
+    def advance(self, number: int, text: str) -> None:
+        """So many pieces more are done; `text` says what is known by now."""
+        self._done += number
+        rate = self.rate
+        left = (self._total - self._done) / rate if rate else None
+        pace = f"{figure(rate, 3)} {self._unit}/s, {_span(left)} left"
+        if self._bar is not None:
+            self._bar.update(self._task, completed=self._done, description=f"{pace}, {text}")
+        elif time.monotonic() - self._told >= SECONDS_BETWEEN_LINES and self._done < self._total:
+            self._told = time.monotonic()
+            note(f"{self._done} of {self._total} {self._unit}, {pace}, {text}")
+
+
+@contextmanager
+def progress(total: int, unit: str) -> Iterator[Progress]:
+    """A bar on a terminal, a plain line now and then elsewhere."""
+    console = _console(sys.stderr)
+    if not console.is_terminal:
+        yield Progress(total, unit, None, None)
+        return
+    columns = (BarColumn(bar_width=20), MofNCompleteColumn(), TextColumn("{task.description}", markup=False))
+    with rich.progress.Progress(*columns, console=console, transient=True) as bar:
+        yield Progress(total, unit, bar, bar.add_task("", total=total))
+
+
+def _span(seconds: float | None) -> str:
+    if seconds is None:
+        return "-"
+    whole = round(seconds)
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
 
 
 class _Console(Console):

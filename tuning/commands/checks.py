@@ -1,9 +1,10 @@
 """Checks of options that commands share; each raises `InputError`, one line. Nothing here imports jax."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
-from jaxhil.errors import InputError, shown
+from jaxhil.errors import InputError, one_line, shown
 from tuning.cli import PICTURES
 
 
@@ -12,6 +13,13 @@ def at_least(least: int, **options: int) -> None:
     for name, value in options.items():
         if value < least:
             raise InputError(f"--{name}: found {value}, allowed an integer >= {least}")
+
+
+def one_of(allowed: Sequence[str], **options: str) -> None:
+    """Every option is one of the `allowed` names."""
+    for name, value in options.items():
+        if value not in allowed:
+            raise InputError(f"--{name}: found {shown(value)}, allowed {', '.join(allowed)}")
 
 
 def limit(value: float) -> None:
@@ -26,6 +34,20 @@ def picture(path: str) -> None:
     if target.suffix.lower() not in PICTURES:
         raise InputError(f"--plot: found {shown(path)}, allowed a name that ends in {', '.join(PICTURES)}")
     target.parent.mkdir(parents=True, exist_ok=True)
+
+
+def gain_file(given: str) -> Path:
+    """The gain file at `given`, or in the folder there. Raises `InputError` if it cannot be read at all."""
+    try:
+        path = Path(given)
+        if path.is_dir():
+            path = path / "gains.json"
+        with path.open("rb") as file:
+            file.read(1)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{one_line(given) or repr(given)}: cannot be read: {one_line(reason)}") from None
+    return path
 
 
 def compensator(name: str) -> None:

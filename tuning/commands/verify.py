@@ -1,9 +1,8 @@
 """`jaxhil verify`: does the runtime on the rig do what was simulated and tuned? The exit code says so."""
 
-from pathlib import Path
 from typing import Any
 
-from jaxhil.errors import InputError, one_line
+from jaxhil.errors import InputError
 from tuning import report
 from tuning.cli import Verify
 from tuning.commands import checks
@@ -14,7 +13,7 @@ def run(options: Verify) -> int:
     """0 if the runtime agrees; 1 if not, or if the file is corrupt; 2 if there is nothing to read."""
     checks.at_least(1, scenarios=options.scenarios)
     checks.at_least(0, seed=options.seed)
-    path = _readable(options.path)
+    path = checks.gain_file(options.path)
     prepare()
     import msgspec
 
@@ -35,20 +34,6 @@ def run(options: Verify) -> int:
     else:
         _print(document)
     return 0 if document["verdict"] else 1
-
-
-def _readable(given: str) -> Path:
-    """The gain file at `given`, or in the folder there. Raises `InputError` if it cannot be read at all."""
-    try:
-        path = Path(given)
-        if path.is_dir():
-            path = path / "gains.json"
-        with path.open("rb") as file:
-            file.read(1)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"{one_line(given) or repr(given)}: cannot be read: {one_line(reason)}") from None
-    return path
 
 
 def _exponential(value: float | None) -> str:

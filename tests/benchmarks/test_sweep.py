@@ -1,0 +1,109 @@
+"""Sweeps end to end beside the C++ baseline: sampling, metrics and writing included; and their memory.
+
+Run with `pytest -m benchmark -s tests/benchmarks/test_sweep.py`.
+"""
+
+import json
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from baseline import compile_baseline
+
+from jaxhil.compensators import literature_gains
+from jaxhil.loop import build_rig
+from jaxhil.mechanism_file import load
+from tuning.gain_file import build_document, check_document, write_gain_file
+from tuning.sweeps.chunks import build_sweep, run_parts
+from tuning.sweeps.draws import drawn_scenarios
+from tuning.sweeps.manifest import CHUNK, Choices, build_manifest
+from tuning.sweeps.store import open_store, write_part
+from tuning.sweeps.tally import add_rows, empty_tally
+
+pytestmark = pytest.mark.benchmark
+REPEATS = 5
+PARTS = 6
+BASELINE_LANES = 8192
+
+# Its memory is that of a process of its own; Linux counts in KiB.
+MEASURED = """
+import json, resource, sys
+from tuning.__main__ import main
+code = main(sys.argv[1:])
+peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+print(json.dumps({"code": code, "peak_MiB": peak}))
+"""
+
+
+def default_gains():
+    loaded = load("varying")
+    gains = literature_gains(loaded.mechanism, "response_error")
+    return build_document("response_error", gains, loaded.mechanism, loaded.sha256, {}, {}, 0, {})
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_sweep_beside_the_compiled_baseline(precision, tmp_path, capsys):
+    baseline = compile_baseline()
+    if baseline is None:
+        pytest.skip("no C++ compiler")
+    loaded = check_document(default_gains())
+    manifest = build_manifest(loaded, Choices(PARTS * CHUNK, precision=precision))
+    sweep = build_sweep(manifest)
+    store = open_store(tmp_path / "store", manifest, resume=False)
+    shares = {}
+
+    def sweep_seconds():
+        begin, tally, written = time.perf_counter(), empty_tally(1), 0.0
+        for part, rows in run_parts(sweep, range(PARTS)):
+            started = time.perf_counter()
+            write_part(store, part, rows)
+            written += time.perf_counter() - started
+            tally = add_rows(tally, rows)
+        took = time.perf_counter() - begin
+        shares[took] = written / took
+        return took
+
+    _, scenarios = drawn_scenarios(sweep.mechanism, "random", 0, 0, BASELINE_LANES)
+    on_device = jax.tree.map(jnp.asarray, scenarios)
+    rig = jax.jit(build_rig, static_argnums=0)(sweep.loop, on_device)
+    # Every scenario ends within the horizon.
+    found = baseline.run(sweep.loop, rig, sweep.gains, on_device, 4000)
+    horizon = int(found["ticks"][: sweep.mechanism.approach.contacts].max())
+    drawing = time.perf_counter()
+    for part in range(32):
+        drawn_scenarios(sweep.mechanism, "random", 0, part * CHUNK, CHUNK)
+    drawing = 32 * CHUNK / (time.perf_counter() - drawing)
+    sweep_seconds()
+    ours, theirs = [], []
+    for _ in range(REPEATS):
+        ours.append(sweep_seconds())
+        theirs.append(baseline.run(sweep.loop, rig, sweep.gains, on_device, horizon)["seconds"])
+    rate, compiled = PARTS * CHUNK / min(ours), BASELINE_LANES / min(theirs)
+    with capsys.disabled():
+        print(
+            f"\nsweep, {precision}: scenarios/s over C++ to the fixed horizon of {horizon} ticks:"
+            f" {rate / compiled:.2f} ({rate:.3g} over {compiled:.3g}); median of the ratios"
+            f" {np.median(np.array(theirs) / ours) * PARTS * CHUNK / BASELINE_LANES:.2f}; encoding and"
+            f" writing parts, while the next is computed: {shares[min(ours)]:.0%} of the time;"
+            f" {drawing:.3g} draws/s"
+        )
+    assert rate >= 0.6 * compiled
+
+
+def test_memory_does_not_grow_with_the_number_of_scenarios(tmp_path, capsys):
+    write_gain_file(tmp_path / "gains.json", default_gains())
+    peaks = {}
+    for number in (100_000, 200_000):
+        arguments = ["sweep", str(tmp_path / "gains.json"), "--scenarios", str(number)]
+        arguments += ["-o", str(tmp_path / str(number))]
+        command = [sys.executable, "-c", MEASURED, *arguments]
+        done = subprocess.run(command, check=True, capture_output=True, text=True)
+        peaks[number] = json.loads(done.stdout.splitlines()[-1])["peak_MiB"]
+    with capsys.disabled():
+        told = ", ".join(f"{peak:.0f} MiB for {number}" for number, peak in peaks.items())
+        print(f"\npeak memory of a sweep: {told}")
+    assert peaks[200_000] < min(1.1 * peaks[100_000], 1536)

@@ -1,0 +1,31 @@
+"""Small sweeps for tests: one contact in coarse ticks, a few uncertain numbers."""
+
+import math
+from typing import Any
+
+from cases import SECOND_ORDER, mechanism, nominal_gains, validated
+
+from tuning.gain_file import build_document, check_document
+from tuning.sweeps.manifest import Choices, Manifest, build_manifest
+
+UNCERTAIN = {
+    "contact.stiffness": {"distribution": "loguniform", "factor": [0.3, 3.0]},
+    "rig.force_sensor.delay": {"distribution": "normal", "std": 0.0005},
+}
+NOISY = {"noise_std": 1.0}
+
+
+def case(
+    contacts: int = 1, compensator: str = "none", force_sensor: Any = None, uncertainty: Any = UNCERTAIN
+) -> dict[str, Any]:
+    """A gain document for a mechanism of some contacts."""
+    raw = mechanism({}, SECOND_ORDER, contacts=contacts, force_sensor=force_sensor)
+    parsed = validated({**raw, "uncertainty": uncertainty})
+    gains = nominal_gains(parsed, compensator)
+    return build_document(compensator, gains, parsed, "0" * 64, {}, {}, 0, {})
+
+
+def manifest(document: dict[str, Any] | None = None, scenarios: int = 100, **choices: Any) -> Manifest:
+    """A sweep over `case()`, in chunks of 32."""
+    loaded = check_document(document or case())
+    return build_manifest(loaded, Choices(scenarios, **{"chunk": 32, "limit": math.inf, **choices}))

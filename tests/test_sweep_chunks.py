@@ -1,0 +1,63 @@
+"""Chunks: rows are the same to the bit whatever the chunks, in either precision, of good runs and bad."""
+
+import numpy as np
+import pytest
+from sweep_cases import NOISY, case, manifest
+
+from tuning.sweeps.chunks import build_sweep, run_chunk, run_parts
+from tuning.sweeps.columns import OUTCOMES
+from tuning.sweeps.store import same_rows
+
+
+def joined(pieces):
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+
+
+@pytest.fixture(scope="module", params=[("random", None), ("sobol", NOISY)], ids=["random", "sobol-noisy"])
+def sweep(request):
+    sampling, sensor = request.param
+    return build_sweep(manifest(case(2, "phase_lead", sensor), sampling=sampling))
+
+
+def test_rows_do_not_depend_on_the_chunks(sweep):
+    whole = run_chunk(sweep, 0, 100)
+    assert same_rows(joined([rows for _, rows in run_parts(sweep, range(4))]), whole) == []
+    uneven = [
+        run_chunk(sweep, first, until - first) for first, until in ((0, 1), (1, 20), (20, 77), (77, 100))
+    ]
+    assert same_rows(joined(uneven), whole) == []
+    assert np.ptp(whole["error_1"]) > 1e-3
+
+
+def test_parts_come_one_by_one_in_the_order_asked_for(sweep):
+    assert [part for part, _ in run_parts(sweep, [3, 0])] == [3, 0]
+    assert list(run_parts(sweep, [])) == []
+
+
+def test_the_program_serves_whatever_can_be_drawn():
+    uncertain = {
+        "rig.force_sensor.delay": {"distribution": "normal", "std": 0.05},
+        "rig.control_period": {"distribution": "uniform", "low": 0.001, "high": 0.002},
+    }
+    few = build_sweep(manifest(case(uncertainty=uncertain)))
+    # 8.2 standard deviations above 4.1 ms, and the simulator's delay, in periods of 1 ms.
+    assert few.loop.ring == 512
+
+
+def test_float32_is_near_float64():
+    sweep = build_sweep(manifest(precision="float32"))
+    single, double = run_chunk(sweep, 0, 32), run_chunk(sweep, 0, 32, "float64")
+    assert single["error_1"].dtype == np.float32 and double["error_1"].dtype == np.float64
+    assert single["contact.stiffness_1"].dtype == np.float64
+    difference = np.abs(single["error_1"] - double["error_1"])
+    assert 0 < np.max(difference) < 1e-4
+
+
+def test_runs_that_fail_are_rows():
+    # A sensor that reads next to nothing: the bodies are never stopped.
+    uncertain = {"rig.force_sensor.range": {"distribution": "loguniform", "low": 1e-7, "high": 1e3}}
+    sweep = build_sweep(manifest(case(force_sensor={"range": 1.0}, uncertainty=uncertain)))
+    rows = run_chunk(sweep, 0, 32)
+    names = {OUTCOMES[place] for place in rows["outcome"]}
+    assert {"timeout", "saturated", "good"} <= names
+    assert np.isnan(rows["restitution_1"][rows["outcome"] == OUTCOMES.index("timeout")]).all()

@@ -1,0 +1,107 @@
+"""Rows of a sweep: what is kept of good runs and of failed ones."""
+
+import numpy as np
+import pytest
+from sweep_cases import case
+
+from jaxhil.evaluation import Outcome
+from jaxhil.mechanism_file import load
+from jaxhil.metrics import DIVERGED, NON_FINITE, NOT_REACHED, OK, TIMEOUT, Metrics
+from jaxhil.scenario import build_scenarios
+from tuning.gain_file import check_document
+from tuning.sweeps.columns import OUTCOMES, STATUSES, rows_of, sweep_columns, unit_of
+
+LIMIT = 0.01
+NAN = np.nan
+
+
+def rows(errors, status, peak_force=10.0, force_range=np.inf):
+    """Rows of a sweep of two contacts; errors and status (2, lanes)."""
+    parsed = check_document(case(2, force_sensor={"range": 1e6})).mechanism
+    errors, status = np.array(errors, float), np.array(status, np.int32)
+    lanes = errors.shape[1]
+    pad = np.zeros((2, lanes))
+    error = np.concatenate([errors, pad])
+    status = np.concatenate([status, pad.astype(np.int32) + NOT_REACHED])
+    draws = {"approach.phase": np.zeros((lanes, 2))}
+    scenarios = build_scenarios(parsed, draws)
+    sensor = scenarios.force_sensor._replace(range=np.full(lanes, force_range))
+    scenarios = scenarios._replace(force_sensor=sensor)
+    like = np.ones_like(error)
+    metrics = Metrics(
+        restitution=0.9 + error,
+        approach_velocity=2 * like,
+        peak_force=peak_force * like,
+        **dict.fromkeys(("peak_command", "excess_variation", "duration", "work_in", "work_out"), like),
+        status=status,
+        ticks=status,
+    )
+    outcome = Outcome(metrics, 0.9 * like, like, error, like, like, status == OK, status == OK)
+    return rows_of(parsed, 7, draws, scenarios, outcome, LIMIT, False)
+
+
+def outcomes(found):
+    return [OUTCOMES[place] for place in found["outcome"]]
+
+
+def test_error_of_largest_magnitude_decides():
+    found = rows([[0.005, 0.002, -0.03], [-0.009, 0.02, 0.02]], [[OK] * 3, [OK] * 3])
+    np.testing.assert_array_equal(found["worst_error"], [-0.009, 0.02, -0.03])
+    assert outcomes(found) == ["good", "error beyond limit", "error beyond limit"]
+    np.testing.assert_array_equal(found["failed"], [False, True, True])
+    np.testing.assert_array_equal(found["index"], [7, 8, 9])
+
+
+def test_a_failed_run_is_a_row_with_a_cause():
+    errors = [[NAN, 0.5, 0.0, 0.0], [0.0, 0.0, NAN, 0.0]]
+    status = [[NON_FINITE, DIVERGED, OK, OK], [NOT_REACHED, NOT_REACHED, TIMEOUT, NOT_REACHED]]
+    found = rows(errors, status)
+    assert outcomes(found) == ["non-finite", "diverged", "timeout", "not reached"]
+    assert found["failed"].all()
+    np.testing.assert_array_equal(found["worst_error"], [NAN, NAN, 0.0, 0.0])
+    assert [STATUSES[place] for place in found["status_2"]] == ["not reached"] * 2 + [
+        "timeout",
+        "not reached",
+    ]
+    # What is known of a contact that did not end stays; what only its end tells is missing.
+    np.testing.assert_array_equal(np.isnan(found["restitution_1"]), [True, True, False, False])
+    assert np.isfinite(found["peak_force_1"]).all()
+    np.testing.assert_array_equal(np.isnan(found["peak_force_2"]), [True, True, False, True])
+
+
+def test_a_force_beyond_the_sensors_range_is_saturation():
+    assert outcomes(rows([[0.0], [0.0]], [[OK], [OK]], 10.0, 9.0)) == ["saturated"]
+    assert outcomes(rows([[0.0], [0.0]], [[OK], [OK]], 10.0, 11.0)) == ["good"]
+
+
+def test_energies_are_kinetic_energies_of_the_numerical_model():
+    found = rows([[0.1], [0.0]], [[OK], [OK]])
+    np.testing.assert_allclose(found["energy_in_1"], 350 / 2 * 2**2, rtol=1e-15)
+    np.testing.assert_allclose(found["energy_out_1"], 350 / 2 * 2**2 * (0.9 + 0.1) ** 2, rtol=1e-15)
+
+
+def test_columns_and_rows_have_the_same_names():
+    found = rows([[0.0], [0.0]], [[OK], [OK]])
+    parsed = check_document(case(2, uncertainty={})).mechanism
+    assert [column.name for column in sweep_columns(parsed, False)] == list(found)
+
+
+@pytest.mark.parametrize(
+    ("path", "unit"),
+    [
+        ("contact.stiffness", "N/m"),
+        ("contact.damping", "N s/m"),
+        ("rig.force_sensor.noise_std", "N"),
+        ("rig.position_sensor.noise_std", "m"),
+        ("rig.simulator.natural_frequency", "Hz"),
+        ("approach.phase", "1"),
+    ],
+)
+def test_units(path, unit):
+    assert unit_of(load("varying").mechanism, path) == unit
+
+
+def test_every_contact_has_its_own_columns():
+    names = [column.name for column in sweep_columns(load("varying").mechanism, True)]
+    assert {"contact.stiffness_3", "approach.phase_3", "error_3", "work_in_3", "status_3"} <= set(names)
+    assert len(names) == len(set(names)) and "error_4" not in names

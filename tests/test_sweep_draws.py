@@ -1,0 +1,60 @@
+"""Scenario i is a function of the seed and of i alone."""
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxhil.mechanism_file import load
+from tuning.sweeps import SAMPLINGS
+from tuning.sweeps.draws import REPLICATES, drawn_scenarios, sobol_points
+
+MECHANISM = load("varying").mechanism
+WHOLE = {sampling: drawn_scenarios(MECHANISM, sampling, 3, 0, 3000) for sampling in SAMPLINGS}
+
+
+def leaves(found, part=slice(None)):
+    draws, scenarios = found
+    return [*(values[part] for values in draws.values())], [
+        np.asarray(leaf)[..., part] for leaf in jax.tree.leaves(scenarios)
+    ]
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+@given(first=st.integers(0, 2990), number=st.integers(0, 1500))
+@settings(max_examples=25)
+def test_any_chunk_is_a_part_of_the_whole(sampling, first, number):
+    number = min(number, 3000 - first)
+    found = leaves(drawn_scenarios(MECHANISM, sampling, 3, first, number))
+    expected = leaves(WHOLE[sampling], slice(first, first + number))
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_seeds_differ(sampling):
+    other, _ = drawn_scenarios(MECHANISM, sampling, 4, 0, 100)
+    for path, values in WHOLE[sampling][0].items():
+        assert not np.any(values[:100] == other[path])
+
+
+def test_noise_keys_are_the_seed_and_the_index():
+    _, scenarios = drawn_scenarios(MECHANISM, "sobol", 9, 70_000, 3)
+    np.testing.assert_array_equal(scenarios.key, [[9, 9, 9], [70_000, 70_001, 70_002]])
+
+
+def test_each_replicate_is_a_sobol_sequence_and_no_two_are_the_same():
+    points = sobol_points(5, 1, 0, 64 * REPLICATES)
+    replicates = points.reshape(64, REPLICATES, 5)
+    for replicate in range(REPLICATES):
+        for column in replicates[:, replicate].T:
+            # One point in each of 64 equal cells: what scrambling keeps of the sequence.
+            np.testing.assert_array_equal(np.sort(np.floor(column * 64)), np.arange(64))
+    assert len(np.unique(points[:REPLICATES, 0])) == REPLICATES
+    assert np.all((points > 0) & (points < 1))
+
+
+def test_means_of_replicates_scatter_less_than_random_ones():
+    points = sobol_points(3, 2, 0, 256 * REPLICATES).reshape(256, REPLICATES, 3)
+    deviation = np.std(np.mean(np.prod(points, axis=2), axis=0), ddof=1)
+    assert deviation < 0.2 * np.std(np.prod(points, axis=2)) / np.sqrt(256)

@@ -1,0 +1,92 @@
+"""Manifests: what is written is read; what was changed is refused in one line."""
+
+import json
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sweep_cases import case, manifest
+
+from jaxhil.errors import InputError
+from jaxhil.runtime import digest
+from tuning.sweeps.manifest import decode, differences, encode, rounding_flags
+
+GOOD = manifest()
+DOCUMENT = json.loads(encode(GOOD))
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+def refusal(content):
+    with pytest.raises(InputError) as caught:
+        decode(content, "store/manifest.json")
+    message = str(caught.value)
+    assert message.startswith("store/manifest.json: ") and message.isprintable()
+    return message
+
+
+def test_round_trip():
+    assert decode(encode(GOOD), "f") == GOOD
+    endless = manifest(limit=0)
+    assert decode(encode(endless), "f") == endless and endless.largest_error == 0
+    assert GOOD.largest_error == float("inf")
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_refused(content):
+    refusal(content)
+
+
+@given(st.sampled_from(sorted(DOCUMENT)), JSON, st.booleans())
+@settings(max_examples=200)
+def test_any_other_value_is_refused_or_taken_as_signed(key, value, signed):
+    changed = {**DOCUMENT, key: value}
+    if signed:
+        changed["sha256"] = digest(changed)
+    try:
+        found = decode(json.dumps(changed).encode(), "store/manifest.json")
+    except InputError as error:
+        assert str(error).startswith("store/manifest.json: ") and str(error).isprintable()
+    else:
+        # Nothing is read as something else than what was written.
+        assert msgspec.to_builtins(found) == changed
+        assert signed or key in ("created", "sha256") or DOCUMENT[key] == value
+
+
+def test_missing_and_unknown_keys_are_named():
+    assert "seed" in refusal(json.dumps({k: v for k, v in DOCUMENT.items() if k != "seed"}).encode())
+    assert "speed" in refusal(json.dumps({**DOCUMENT, "speed": 1}).encode())
+    assert "jaxhil/sweep/1" in refusal(b"[]")
+    assert "NaN" in refusal(encode(GOOD).replace(b'"seed": 0', b'"seed": NaN'))
+
+
+def test_parts_cover_all_scenarios():
+    assert GOOD.parts == 4
+    assert [GOOD.part_rows(part) for part in range(4)] == [(0, 32), (32, 32), (64, 32), (96, 4)]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("seed", 1), ("scenarios", 99), ("sampling", "sobol"), ("precision", "float32"), ("limit", 0.1)],
+)
+def test_what_differs_is_named(key, value):
+    (told,) = differences(GOOD, manifest(**{key: value}))
+    assert told.startswith(f"{key}: found ")
+
+
+def test_other_gains_and_versions_differ():
+    (told,) = differences(GOOD, manifest(case(compensator="phase_lead")))
+    assert told.startswith("gains_sha256: ")
+    newer = msgspec.structs.replace(GOOD, versions={**GOOD.versions, "jax": "9.9"})
+    (told,) = differences(GOOD, newer)
+    assert told.startswith("versions.jax: ") and "9.9" in told
+    assert not differences(GOOD, manifest())
+
+
+def test_only_flags_that_may_change_a_result_count():
+    ours = rounding_flags("--xla_force_host_platform_device_count=8 --b=1 --a=2")
+    assert ours == rounding_flags("--a=2 --b=1") == "--a=2 --b=1"

@@ -1,0 +1,174 @@
+"""Sweeps that are interrupted, resumed, spread over workers: the store is the same, row for row."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sweep_cases import case, manifest
+
+from jaxhil.errors import InputError
+from tuning.gain_file import write_gain_file
+from tuning.sweeps.replay import motion_of, replay
+from tuning.sweeps.run import compare_precisions, describe_outcomes, run_sweep
+from tuning.sweeps.store import open_store, read_part, read_store, same_rows
+
+MANIFEST = manifest(case(), scenarios=300, limit=1.5)
+HERE = Path(__file__).parent
+
+
+class Log(list):
+    """Rows told of, found and computed."""
+
+    def __init__(self):
+        self.found, self.computed = 0, 0
+
+    def sweep(self, folder, resume=True, label=MANIFEST, **options):
+        store = open_store(folder, label, resume)
+
+        def found(rows, tally):
+            self.found += rows
+
+        def computed(rows, tally):
+            self.computed += rows
+
+        return store, *run_sweep(store, found, computed, **options)
+
+
+def all_rows(store):
+    parts = [read_part(store, part) for part in range(store.manifest.parts)]
+    assert all(part is not None for part in parts)
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A sweep without interruptions: rows, sweep and tally."""
+    store, sweep, tally = Log().sweep(tmp_path_factory.mktemp("whole") / "store", resume=False)
+    return store, all_rows(store), sweep, tally
+
+
+def test_the_tally_is_that_of_the_rows(whole):
+    _, rows, _, tally = whole
+    assert tally.scenarios == 300 and tally.failed == np.sum(rows["failed"])
+    assert 0 < tally.failed < 300
+    assert describe_outcomes(tally) == {"good": 300 - tally.failed, "error beyond limit": tally.failed}
+    worst = np.argsort(-np.abs(rows["worst_error"]))[:10]
+    np.testing.assert_array_equal([index for _, _, index in tally.worst], worst)
+
+
+def test_what_is_missing_or_damaged_is_made_again(whole, tmp_path):
+    _, rows, _, tally = whole
+    store, _, _ = Log().sweep(tmp_path / "store")
+    store.part_path(0).unlink()
+    store.part_path(9).unlink()
+    content = store.part_path(4).read_bytes()
+    store.part_path(4).write_bytes(content[: len(content) // 2])
+    (tmp_path / "store" / "parts" / ".part-000004.parquet.1.tmp").write_bytes(content[:100])
+    log = Log()
+    store, _, again = log.sweep(tmp_path / "store")
+    assert (log.found, log.computed) == (300 - 32 - 32 - 12, 32 + 32 + 12)
+    assert same_rows(all_rows(store), rows) == [] and again == tally
+    assert len(list((tmp_path / "store" / "parts").iterdir())) == 10
+
+
+def test_an_interruption_keeps_what_was_written(whole, tmp_path):
+    _, rows, _, tally = whole
+    store = open_store(tmp_path / "store", MANIFEST, resume=False)
+
+    def interrupted(number, tally):
+        if tally.scenarios >= 96:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_sweep(store, lambda *_: None, interrupted)
+    log = Log()
+    store, _, again = log.sweep(tmp_path / "store")
+    assert log.found == 96
+    assert same_rows(all_rows(store), rows) == [] and again == tally
+
+
+def test_killed_and_resumed_is_the_same(whole, tmp_path):
+    _, rows, _, _ = whole
+    write_gain_file(tmp_path / "gains.json", case())
+    folder = tmp_path / "store"
+    program = "import conftest, sys; from tuning.__main__ import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, "sweep", str(tmp_path / "gains.json"), "--resume", "--json"]
+    command += ["--scenarios", "300", "--chunk", "32", "--limit", "1.5", "-o", str(folder)]
+    path = os.pathsep.join([str(HERE.parent), str(HERE)])
+    environment = {**os.environ, "PYTHONPATH": path, "JAXHIL_CACHE": str(tmp_path / "cache")}
+    silent = {"env": environment, "cwd": HERE, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    for parts in (1, 4):
+        with subprocess.Popen(command, **silent) as process:
+            while process.poll() is None and len(list(folder.glob("parts/part-*"))) < parts:
+                time.sleep(0.002)
+            process.send_signal(signal.SIGKILL)
+    assert 4 <= len(list(folder.glob("parts/part-*"))) < 10
+    log = Log()
+    store, _, _ = log.sweep(folder)
+    assert log.found >= 4 * 32
+    assert same_rows(all_rows(store), rows) == []
+
+
+def test_any_row_replays_to_the_bit(whole):
+    store, rows, _, _ = whole
+    for index in np.random.default_rng(0).integers(0, 300, 6):
+        found = replay(read_store(store.folder), int(index))
+        assert found.different == []
+        np.testing.assert_array_equal(found.again["error_1"], rows["error_1"][index])
+
+
+def test_a_row_that_was_changed_is_found_out(whole, monkeypatch):
+    store, rows, _, _ = whole
+    changed = {name: values[5:6].copy() for name, values in rows.items()}
+    changed["peak_force_1"] = np.nextafter(changed["peak_force_1"], np.inf)
+    monkeypatch.setattr("tuning.sweeps.replay.read_row", lambda *_: changed)
+    assert replay(store, 5).different == ["peak_force_1"]
+
+
+def test_the_motion_is_that_of_the_scenario(whole):
+    _, rows, sweep, _ = whole
+    (piece,) = motion_of(sweep, 17)
+    curve = piece.curves["rig"]
+    rebound = -np.diff(curve.position)[-1] / 2e-3
+    np.testing.assert_allclose(rebound / curve.velocity, rows["restitution_1"][17], rtol=1e-9)
+
+
+def test_precisions_compare_the_same_scenarios(whole):
+    _, rows, sweep, _ = whole
+    found = compare_precisions(sweep, 64)
+    assert found.scenarios == 32 and found.failed_float64 == np.sum(rows["failed"][:32])
+    assert found.largest_difference is not None and 0 < found.largest_difference < 1e-4
+    assert found.changed_outcomes == abs(found.failed_float64 - found.failed_float32)
+
+
+def test_a_scheduler_that_is_not_there_is_one_line(tmp_path):
+    pytest.importorskip("distributed")
+    with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
+        Log().sweep(tmp_path / "store", scheduler="nowhere://x")
+
+
+@pytest.mark.slow
+def test_a_cluster_makes_the_same_rows_though_a_worker_is_killed(whole, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    _, rows, _, tally = whole
+    killed = []
+
+    def kill_one(number, tally):
+        # Midway: the other worker takes over.
+        if not killed and tally.scenarios >= 64:
+            killed.append(next(iter(cluster.workers.values())).process.pid)
+            os.kill(killed[0], signal.SIGKILL)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with distributed.LocalCluster(n_workers=2, threads_per_worker=2, dashboard_address=None) as cluster:
+            store = open_store(tmp_path / "store", MANIFEST, resume=False)
+            _, again = run_sweep(store, lambda *_: None, kill_one, cluster.scheduler_address)
+    assert killed
+    assert same_rows(all_rows(store), rows) == [] and again == tally

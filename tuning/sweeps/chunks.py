@@ -1,0 +1,110 @@
+"""Chunks of a sweep: scenarios by index through the loop, on every core, as rows of the store.
+
+One compiled program serves every chunk. Its delay lines are made for the extremes of what can be drawn, not
+for what a chunk happens to draw, so that a scenario's rows are the same to the bit in any chunk.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxhil.building import build_loop
+from jaxhil.evaluation import begin_evaluation
+from jaxhil.loop import Loop
+from jaxhil.mechanism import Mechanism
+from jaxhil.scenario import Scenario, build_scenarios
+from jaxhil.uncertainty import extremes
+from tuning.gain_file import LoadedGains
+from tuning.sweeps.columns import rows_of
+from tuning.sweeps.draws import drawn_scenarios
+from tuning.sweeps.manifest import Manifest, loaded_gains
+
+Rows = dict[str, np.ndarray]
+PERIOD = "rig.control_period"
+
+
+class Sweep(NamedTuple):
+    """What a manifest asks for, ready to run."""
+
+    manifest: Manifest
+    mechanism: Mechanism
+    loop: Loop
+    gains: dict[str, float]
+
+
+class _Batch(NamedTuple):
+    """Scenarios to run and what they are made of."""
+
+    first: int
+    draws: dict[str, np.ndarray]
+    scenarios: Scenario
+
+
+def build_sweep(manifest: Manifest) -> Sweep:
+    """Raises `InputError` for a manifest with an impossible gain file."""
+    loaded = loaded_gains(manifest)
+    return Sweep(manifest, loaded.mechanism, widest_loop(loaded, manifest.works), loaded.gains)
+
+
+def widest_loop(loaded: LoadedGains, works: bool) -> Loop:
+    """The loop that serves whatever can be drawn."""
+    draws = extremes(loaded.mechanism)
+    if PERIOD in draws:
+        # The longest delay counted in the shortest periods.
+        draws[PERIOD] = draws[PERIOD][::-1]
+    scenarios = build_scenarios(loaded.mechanism, draws)
+    return build_loop(loaded.mechanism, loaded.compensator, scenarios, energies=works)
+
+
+def run_chunk(sweep: Sweep, first: int, number: int, precision: str | None = None) -> Rows:
+    """Rows of the scenarios number `first` to `first + number - 1`; `number` is at most the chunk's.
+
+    A run that fails, or whose numbers are no longer finite, is a row that says so.
+    """
+    return _begin(sweep, _draw(sweep, first, number, precision))()
+
+
+def run_parts(sweep: Sweep, parts: Iterable[int]) -> Iterator[tuple[int, Rows]]:
+    """Part by part its number and rows. While the caller uses them, the next part is computed already."""
+    held = None
+    waiting = iter(parts)
+    drawn = _draw_part(sweep, next(waiting, None))
+    while drawn is not None:
+        part, batch = drawn
+        rows = _begin(sweep, batch)
+        drawn = _draw_part(sweep, next(waiting, None))
+        if held is not None:
+            yield held
+        held = part, rows()
+    if held is not None:
+        yield held
+
+
+def in_precision(scenarios: Scenario, precision: str) -> Scenario:
+    """Scenarios whose numbers make the program one of that precision."""
+
+    def cast(leaf: Any) -> Any:
+        leaf = np.asarray(leaf)
+        return leaf.astype(precision) if leaf.dtype.kind == "f" else leaf
+
+    return jax.tree.map(cast, scenarios)
+
+
+def _draw(sweep: Sweep, first: int, number: int, precision: str | None) -> _Batch:
+    manifest = sweep.manifest
+    draws, scenarios = drawn_scenarios(sweep.mechanism, manifest.sampling, manifest.seed, first, number)
+    return _Batch(first, draws, in_precision(scenarios, precision or manifest.precision))
+
+
+def _draw_part(sweep: Sweep, part: int | None) -> tuple[int, _Batch] | None:
+    return None if part is None else (part, _draw(sweep, *sweep.manifest.part_rows(part), None))
+
+
+def _begin(sweep: Sweep, batch: _Batch) -> Callable[[], Rows]:
+    """Start computing; what is returned waits for the rows."""
+    manifest = sweep.manifest
+    outcome = begin_evaluation(sweep.loop, sweep.gains, batch.scenarios, at_least=manifest.chunk)
+    limit, works = manifest.largest_error, manifest.works
+    return lambda: rows_of(sweep.mechanism, *batch, outcome(), limit, works)

@@ -1,0 +1,210 @@
+"""The manifest of a sweep: everything that its rows follow from (`schema = "jaxhil/sweep/1"`), as JSON.
+
+It is the plan before the sweep and the label of the store afterwards. `digest` of its content is in every
+part of the store, so that no part of another sweep is taken for one of this.
+"""
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import msgspec
+from msgspec import Meta
+
+from jaxhil.errors import InputError, one_line, shown
+from jaxhil.runtime import digest
+from tuning.gain_file import LoadedGains, check_document, versions
+from tuning.sweeps import LARGEST_CHUNK, LARGEST_SEED, MOST
+from tuning.sweeps.columns import Column, sweep_columns
+from tuning.sweeps.draws import REPLICATES
+
+SCHEMA = "jaxhil/sweep/1"
+NAME = "manifest.json"
+CHUNK = 16384  # scenarios
+LARGEST = 8 * 1024 * 1024  # bytes
+Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+
+
+class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """scenarios, chunk [scenarios], seed, sampling, Sobol replicates (1 for random), precision, limit of the
+    restitution error (None: no limit), whether works are audited; columns; gain file with its digest and its
+    mechanism file's; versions, flags of the compiler, date, digest of all but the
+    date."""
+
+    schema: Literal["jaxhil/sweep/1"]
+    scenarios: Annotated[int, Meta(ge=1, le=MOST)]
+    chunk: Annotated[int, Meta(ge=1, le=LARGEST_CHUNK)]
+    seed: Annotated[int, Meta(ge=0, le=LARGEST_SEED)]
+    sampling: Literal["random", "sobol"]
+    replicates: Annotated[int, Meta(ge=1)]
+    precision: Literal["float64", "float32"]
+    limit: Annotated[float, Meta(ge=0)] | None
+    works: bool
+    columns: list[Column]
+    gains_sha256: Digest
+    mechanism_sha256: Digest
+    gain_file: dict[str, Any]
+    versions: dict[str, str]
+    xla_flags: str
+    created: str
+    sha256: Digest
+
+    @property
+    def parts(self) -> int:
+        """Number of parts of the store, all of `chunk` rows but the last."""
+        return -(-self.scenarios // self.chunk)
+
+    @property
+    def largest_error(self) -> float:
+        """The limit of the restitution error; infinite if there is none."""
+        return math.inf if self.limit is None else self.limit
+
+    def part_rows(self, part: int) -> tuple[int, int]:
+        """Index of the first scenario of a part, and the number of its scenarios."""
+        first = part * self.chunk
+        return first, min(self.chunk, self.scenarios - first)
+
+
+class Choices(NamedTuple):
+    """What a sweep's caller chooses; see `Manifest`."""
+
+    scenarios: int
+    seed: int = 0
+    sampling: str = "random"
+    precision: str = "float64"
+    limit: float = 0.01
+    works: bool = False
+    chunk: int = CHUNK
+
+
+def build_manifest(loaded: LoadedGains, choices: Choices) -> Manifest:
+    """The manifest of a sweep of a checked gain file. Raises `InputError` for an impossible choice."""
+    document = {
+        "schema": SCHEMA,
+        **choices._asdict(),
+        "limit": float(choices.limit) if math.isfinite(choices.limit) else None,
+        "replicates": REPLICATES if choices.sampling == "sobol" else 1,
+        "columns": msgspec.to_builtins(sweep_columns(loaded.mechanism, choices.works)),
+        "gains_sha256": loaded.document["sha256"],
+        "mechanism_sha256": loaded.document["mechanism_sha256"],
+        "gain_file": loaded.document,
+        "versions": versions(),
+        "xla_flags": rounding_flags(os.environ.get("XLA_FLAGS", "")),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    return _decode({**document, "sha256": digest(document)}, "sweep")
+
+
+def rounding_flags(flags: str) -> str:
+    """What of XLA_FLAGS may change the last bits of a result: all but the number of devices."""
+    return " ".join(sorted(flag for flag in flags.split() if "device_count" not in flag))
+
+
+def encode(manifest: Manifest) -> bytes:
+    """The manifest file's content."""
+    document = msgspec.to_builtins(manifest)
+    return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode("ascii")
+
+
+def decode(content: bytes, source: str) -> Manifest:
+    """The manifest in a file called `source`. Raises `InputError`, one line, for whatever is wrong."""
+    try:
+        document = json.loads(content.decode("utf-8"), parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{source}: not valid JSON: {one_line(str(error), 100)}") from None
+    if not isinstance(document, dict):
+        raise InputError(f"{source}: found {shown(document)}, allowed a JSON object, {SCHEMA}")
+    return _decode(document, source)
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """The manifest of the store in `folder`. Raises `InputError` if there is none, or none that will do."""
+    path = folder / NAME
+    source = one_line(str(path))
+    try:
+        with path.open("rb") as file:
+            content = file.read(LARGEST + 1)
+    except FileNotFoundError:
+        raise InputError(
+            f"{source}: found no such file, allowed a folder that `jaxhil sweep` wrote"
+        ) from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{source}: cannot be read: {one_line(reason, 100)}") from None
+    if len(content) > LARGEST:
+        raise InputError(f"{source}: found more than {LARGEST} bytes, allowed a manifest, {SCHEMA}")
+    return decode(content, source)
+
+
+def loaded_gains(manifest: Manifest, source: str = "sweep") -> LoadedGains:
+    """The gain file within a manifest, checked as if it were read."""
+    return check_document(manifest.gain_file, f"{source}: gain_file")
+
+
+def differences(old: Manifest, new: Manifest) -> list[str]:
+    """What of the inputs is not the same, each as "key: found OLD, asked for NEW"."""
+    told = []
+    for key in (
+        "gains_sha256",
+        "scenarios",
+        "seed",
+        "sampling",
+        "precision",
+        "limit",
+        "works",
+        "chunk",
+        "xla_flags",
+    ):
+        before, now = getattr(old, key), getattr(new, key)
+        if before != now:
+            told.append(f"{key}: found {_short(before)}, asked for {_short(now)}")
+    told += _other_versions(old.versions, new.versions)
+    if old.columns != new.columns:
+        told.append("columns: found others than this version writes")
+    return told
+
+
+def unlike_here(manifest: Manifest) -> list[str]:
+    """What of this process is not as the manifest says, so that its rows may differ in their last bits."""
+    flags = rounding_flags(os.environ.get("XLA_FLAGS", ""))
+    told = _other_versions(manifest.versions, versions())
+    if flags != manifest.xla_flags:
+        told.append(f"xla_flags: found {_short(manifest.xla_flags)}, here {_short(flags)}")
+    return told
+
+
+def _other_versions(old: Mapping[str, str], new: Mapping[str, str]) -> list[str]:
+    return [
+        f"versions.{name}: found {_short(old.get(name))}, here {_short(new.get(name))}"
+        for name in sorted(old.keys() | new.keys())
+        if old.get(name) != new.get(name)
+    ]
+
+
+def _decode(document: Mapping[str, Any], source: str) -> Manifest:
+    try:
+        manifest = msgspec.convert(document, Manifest)
+    except (msgspec.ValidationError, RecursionError) as error:
+        raise InputError(f"{source}: {one_line(str(error), 160)}") from None
+    try:
+        found = digest(document)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise InputError(f"{source}: {one_line(str(error), 160)}") from None
+    if found != manifest.sha256:
+        raise InputError(f"{source}: sha256: found {manifest.sha256[:12]}..., allowed {found[:12]}...")
+    for key, inner in (("gains_sha256", "sha256"), ("mechanism_sha256", "mechanism_sha256")):
+        if manifest.gain_file.get(inner) != getattr(manifest, key):
+            raise InputError(f"{source}: {key}: found another than the gain file's, allowed the same")
+    return manifest
+
+
+def _short(value: Any) -> str:
+    return f"{value[:12]}..." if isinstance(value, str) and len(value) > 24 else shown(value)
+
+
+def _no_constant(name: str) -> None:
+    raise ValueError(f"found {name}")

@@ -1,0 +1,42 @@
+"""Replay: one scenario of a store again, to the bit, and its motion for a picture."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from tuning.motion import Piece, scenario_motion
+from tuning.sweeps.chunks import Sweep, build_sweep, run_chunk
+from tuning.sweeps.draws import drawn_scenarios
+from tuning.sweeps.manifest import loaded_gains
+from tuning.sweeps.store import Store, read_row, same_rows
+
+
+class Replay(NamedTuple):
+    """The stored row, the row made again (arrays of length 1), and the names of the columns that differ."""
+
+    sweep: Sweep
+    stored: dict[str, np.ndarray]
+    again: dict[str, np.ndarray]
+    different: list[str]
+
+
+def replay(store: Store, index: int) -> Replay:
+    """Run scenario `index` again, by itself, in the program that ran its chunk.
+
+    Raises `InputError` for an index that the store does not hold.
+    """
+    stored = read_row(store, index)
+    sweep = build_sweep(store.manifest)
+    again = run_chunk(sweep, index, 1)
+    return Replay(sweep, stored, again, same_rows(stored, again))
+
+
+def motion_of(sweep: Sweep, index: int) -> list[Piece]:
+    """The scenario's motion tick by tick, for plots, in float64."""
+    manifest = sweep.manifest
+    _, scenarios = drawn_scenarios(sweep.mechanism, manifest.sampling, manifest.seed, index, 1)
+    loaded = loaded_gains(manifest)
+    gains: Any = {name: np.full(1, value) for name, value in loaded.gains.items()}
+    lane = jax.tree.map(np.asarray, scenarios)
+    return scenario_motion(loaded._replace(gains=gains), lane)

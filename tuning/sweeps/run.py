@@ -1,0 +1,142 @@
+"""Running a sweep: the parts that its store lacks, computed here or by a cluster, written here.
+
+What is computed where makes no difference to the rows. Interrupted at any moment, the store keeps the parts
+that were written, and running again goes on with those that are missing.
+"""
+
+import threading
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxhil.errors import InputError, one_line, shown
+from tuning.sweeps.chunks import Rows, Sweep, build_sweep, run_chunk, run_parts
+from tuning.sweeps.columns import OUTCOMES
+from tuning.sweeps.manifest import Manifest, decode, encode, unlike_here
+from tuning.sweeps.store import Store, read_part, write_part
+from tuning.sweeps.tally import Tally, add_rows, empty_tally
+
+COMPARED = 4096  # scenarios that a float32 sweep runs in float64 too
+
+# Called with the number of rows that are there now and the tally so far: those found, then those computed.
+Progress = Callable[[int, Tally], None]
+
+
+class Precision(NamedTuple):
+    """The first `scenarios` in float64 beside float32: largest and median difference of a contact's error
+    where both ended (None if none did), scenarios with another outcome, and failures in either."""
+
+    scenarios: int
+    largest_difference: float | None
+    median_difference: float | None
+    changed_outcomes: int
+    failed_float32: int
+    failed_float64: int
+
+
+def run_sweep(
+    store: Store, found: Progress, computed: Progress, scheduler: str | None = None
+) -> tuple[Sweep, Tally]:
+    """Compute and write every part that is missing: the sweep and its tally.
+
+    `scheduler` is the address of a `dask.distributed` scheduler. Raises `InputError` when a part cannot be
+    written or the cluster cannot be reached.
+    """
+    manifest = store.manifest
+    sweep = build_sweep(manifest)
+    tally, missing = empty_tally(manifest.replicates), []
+    for part in range(manifest.parts):
+        rows = read_part(store, part)
+        if rows is None:
+            missing.append(part)
+            continue
+        tally = add_rows(tally, rows)
+        found(len(rows["index"]), tally)
+    parts = run_parts(sweep, missing) if scheduler is None else _run_on_cluster(manifest, missing, scheduler)
+    for part, rows in parts:
+        write_part(store, part, rows)
+        tally = add_rows(tally, rows)
+        computed(len(rows["index"]), tally)
+    return sweep, tally
+
+
+def compare_precisions(sweep: Sweep, number: int = COMPARED) -> Precision:
+    """What float32 changes, on the first `number` scenarios."""
+    number = min(number, sweep.manifest.chunk, sweep.manifest.scenarios)
+    single, double = (run_chunk(sweep, 0, number, precision) for precision in ("float32", "float64"))
+    names = [f"error_{contact + 1}" for contact in range(sweep.mechanism.approach.contacts)]
+    both = np.concatenate([np.abs(single[name].astype(float) - double[name]) for name in names])
+    both = both[np.isfinite(both)]
+    return Precision(
+        number,
+        float(np.max(both)) if len(both) else None,
+        float(np.median(both)) if len(both) else None,
+        int(np.sum(single["outcome"] != double["outcome"])),
+        int(np.sum(single["failed"])),
+        int(np.sum(double["failed"])),
+    )
+
+
+def describe_outcomes(tally: Tally) -> dict[str, int]:
+    """Number of scenarios of each outcome that was met."""
+    return {name: count for name, count in zip(OUTCOMES, tally.outcomes, strict=True) if count}
+
+
+def _run_on_cluster(manifest: Manifest, parts: list[int], address: str) -> Iterator[tuple[int, Rows]]:
+    """The parts in the order in which workers finish them; a few are under way per worker."""
+    try:
+        from distributed import Client, KilledWorker, as_completed
+    except ImportError:
+        missing = "nothing installed for it, allowed once `pip install jaxhil[distributed]` was done"
+        raise InputError(f"--scheduler: found {missing}") from None
+    try:
+        client = Client(address, timeout=10, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        reason = one_line(str(error), 100)
+        raise InputError(f"--scheduler: found {shown(address)}, allowed a scheduler's: {reason}") from None
+    with client:
+        content = encode(manifest)
+        waiting = iter(parts)
+
+        def submit() -> list[Any]:
+            part = next(waiting, None)
+            if part is None:
+                return []
+            key = f"jaxhil-{manifest.sha256[:16]}-{part}"
+            return [client.submit(_remote_part, content, part, key=key, pure=False)]
+
+        at_once = max(2, 2 * len(client.scheduler_info(n_workers=-1)["workers"]))
+        first = [future for _ in range(at_once) for future in submit()]
+        futures = as_completed(first, loop=client.loop)
+        for future in futures:
+            try:
+                part, rows = future.result()
+            except KilledWorker:
+                raise InputError(f"--scheduler: {address}: several workers died of one part") from None
+            future.release()
+            for more in submit():
+                futures.add(more)
+            yield part, rows
+
+
+# A worker may have several threads, and no two programs may run at a time.
+_one_at_a_time = threading.Lock()
+
+
+def _remote_part(content: bytes, part: int) -> tuple[int, Rows]:
+    """A part's rows, on a worker."""
+    with _one_at_a_time:
+        from tuning.environment import prepare
+
+        prepare()
+        sweep = _remote_sweep(content)
+        if told := unlike_here(sweep.manifest):
+            raise InputError(f"--scheduler: a worker: {told[0]}: its rows would differ")
+        return part, run_chunk(sweep, *sweep.manifest.part_rows(part))
+
+
+@lru_cache(maxsize=2)
+def _remote_sweep(content: bytes) -> Sweep:
+    return build_sweep(decode(content, "sweep"))
