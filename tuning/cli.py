@@ -185,7 +185,7 @@ class Sweep:
         int | None,
         arg(
             metavar="[NUMBER]",
-            help=f"Also Sobol indices: which input drives the error. A power of two; bare: {DEFAULT_DRIVERS}.",
+            help=f"Also Sobol indices: what drives the error. A power of two; bare: {DEFAULT_DRIVERS}.",
             help_behavior_hint="",
         ),
     ] = None
@@ -193,7 +193,7 @@ class Sweep:
         float | None,
         arg(
             metavar="[LIMIT]",
-            help="Also subset simulation, down to 1e-12, of an error beyond this; bare, or 0: beyond --limit.",
+            help="Also subset simulation of an error beyond this, however rare; bare, or 0: --limit.",
             help_behavior_hint="",
         ),
     ] = None

@@ -37,7 +37,7 @@ def run(options: Sweep) -> int:
             def told(tally) -> str:
                 known = failure_probability(tally)
                 text = f"failed {known.value:.3g} ({known.low:.2g} to {known.high:.2g})"
-                if tally.looks is None:
+                if options.until_width is None:
                     return text
                 needed = scenarios_needed(known.value, options.until_width)
                 return f"{text}, about {needed} wanted"

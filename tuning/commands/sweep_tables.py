@@ -64,7 +64,12 @@ def _quantiles(document: dict[str, Any]):
         "Worst |e - e*| of a scenario",
         ["share of scenarios", "|error| up to", "95 % from", "to"],
         [
-            (f"{100 * one['order']:g} %", *(_size(one[key]) for key in ("value", "low", "high")))
+            (
+                f"{100 * one['order']:g} %",
+                _size(one["value"]),
+                _size(one["low"]),
+                _size(one["high"], "no bound"),
+            )
             for one in document["error_quantiles"]
         ],
     )
@@ -74,7 +79,7 @@ def _drivers(drivers: dict[str, Any]):
     return report.table(
         f"What drives the worst |e - e*|, errors cut at {drivers['cap']:g} ({drivers['capped']} of "
         f"{drivers['evaluations']} runs): shares of the variance",
-        ["input", "alone", "95 % from", "to", "in all", "95 % from", "to"],
+        ["input", "first order", "95 % from", "to", "total", "95 % from", "to"],
         [
             (one.input, *("-" if number != number else f"{number:.3f}" for number in one[1:]))
             for one in drivers["inputs"]
@@ -85,7 +90,15 @@ def _drivers(drivers: dict[str, Any]):
 def _rare(rare: dict[str, Any]):
     return report.table(
         "Subset simulation",
-        ["|error| beyond", "probability", "95 % from", "to", "variation", "by formula", "scenarios"],
+        [
+            "|error| beyond",
+            "probability",
+            "95 % from",
+            "to",
+            "coefficient of variation",
+            "by formula",
+            "scenarios",
+        ],
         [
             (
                 f"{rare['limit']:g}",
@@ -110,8 +123,8 @@ def _sequential(document: dict[str, Any]) -> list[str]:
     return [f"Not as narrow as wanted after all {most} scenarios: {found:.3g} wide, {width:g} wanted."]
 
 
-def _size(value: float) -> str:
-    return "no result" if value == float("inf") else f"{value:.4g}"
+def _size(value: float, endless: str = "no result") -> str:
+    return endless if value == float("inf") else f"{value:.4g}"
 
 
 def _share(value: float) -> str:
