@@ -21,7 +21,7 @@ from tuning.sweeps.tally import error_sizes
 
 NOISE = "sensor noise"
 CAP_LIMITS = 10.0  # largest error that drivers look at, over the limit
-CAP_UNLIMITED = 1.0  # the same where there is no limit
+CAP_UNLIMITED = 10.0  # the same where there is no limit
 FAR_ABOVE = 2.0  # replicates that spread so much more than the formula says have not seen the same failures
 
 Done = Callable[[int], None]  # told of the number of scenarios that were run
