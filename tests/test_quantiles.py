@@ -70,7 +70,7 @@ def test_repeated_sweeps_cover_the_quantile(order, capsys):
 @pytest.mark.parametrize("order", (0.5, 0.99))
 @pytest.mark.parametrize("sampling", ("independent", "sobol"))
 def test_replicates_cover_the_quantile(order, sampling, capsys):
-    """|u_1 + u_2 - 1|, triangular on 0..1 with the quantile 1 - sqrt(1 - q), of 16 replicates of 64 points."""
+    """|u_1 + u_2 - 1|, triangular on 0..1, the quantile 1 - sqrt(1 - q), of 16 replicates of 64 points."""
     truth, rng = 1 - np.sqrt(1 - order), np.random.default_rng(4)
     inside, widths = [], []
     for _ in range(200):

@@ -191,7 +191,7 @@ def test_a_sweep_that_stopped_stays_where_it_is(stopped):
     _, _, again = log.sweep(store.folder, label=UNTIL)
     assert again == tally and parts_of(store) == parts
     assert (log.found, log.computed) == (tally.scenarios, 0)
-    with pytest.raises(InputError, match="until_width: found 0.25, asked for 0.1"):
+    with pytest.raises(InputError, match=r"until_width: found 0\.25, asked for 0\.1"):
         Log().sweep(store.folder, label=manifest(case(), scenarios=300, limit=1.5, until_width=0.1))
 
 

@@ -1,4 +1,4 @@
-"""Studies beside a sweep: the inputs that drive the error, and rare failures, beside what brute force finds."""
+"""Studies beside a sweep: what drives the error, and rare failures, beside what brute force finds."""
 
 import numpy as np
 import pytest
@@ -75,7 +75,7 @@ TIGHT = {"distribution": "uniform", "factor": [0.99999, 1.00001]}
 
 
 def test_errors_beyond_the_cap_count_as_the_cap(whole):
-    sweep, rows = whole
+    _, rows = whole
     limit = float(np.quantile(np.abs(rows["worst_error"]), 0.5)) / 10
     limited = sweep_of(case(uncertainty=UNCERTAIN | IDLE), limit=limit)
     found = error_drivers(limited, 128)
