@@ -250,3 +250,15 @@ def test_a_cluster_makes_the_same_rows_though_a_worker_is_killed(whole, tmp_path
             _, again = run_sweep(store, lambda *_: None, kill_one, cluster.scheduler_address)
     assert killed
     assert same_rows(all_rows(store), rows) == [] and again == tally
+
+
+@pytest.mark.slow
+def test_a_cluster_stops_at_the_same_look(stopped, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    _, parts, tally = stopped
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+            address = cluster.scheduler_address
+            store, _, again = Log().sweep(tmp_path / "store", False, UNTIL, scheduler=address)
+    assert again == tally and parts_of(store) == parts
