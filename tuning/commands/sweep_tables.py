@@ -39,7 +39,9 @@ def emit(document: dict[str, Any]) -> None:
     ]
     lines += _sequential(document)
     if left_out := document["left_out_of_replicates"]:
-        lines.append(f"The last {left_out} scenarios, in no whole replicate, count in outcomes alone.")
+        lines.append(
+            f"The last {left_out} scenarios, in no whole replicate, are in neither probability nor quantiles."
+        )
     if document.get("rare", {}).get("spread_beyond_formula"):
         lines.append(
             "The replicates of the subset simulation differ far more than its formula explains: some have "
