@@ -11,7 +11,7 @@ import pytest
 from jaxhil.mechanism_file import builtin_names, builtin_path
 from tuning import environment
 from tuning.__main__ import main
-from tuning.cli import DEFAULT_PLOT, complete_plot
+from tuning.cli import DEFAULT_DRIVERS, DEFAULT_PLOT, complete_bare
 from tuning.commands.tune import folder_name, is_better
 from tuning.tune import Figures
 
@@ -402,9 +402,15 @@ def test_mechanisms_lists_the_built_in_files(jaxhil):
 
 
 def test_plot_without_a_name_gets_one():
-    assert complete_plot(["simulate", "--plot", "a.png", "x"]) == ["simulate", "--plot", "a.png", "x"]
-    assert complete_plot(["--plot", "--json"]) == ["--plot", DEFAULT_PLOT, "--json"]
-    assert complete_plot(["x", "--plot"]) == ["x", "--plot", DEFAULT_PLOT]
+    assert complete_bare(["simulate", "--plot", "a.png", "x"]) == ["simulate", "--plot", "a.png", "x"]
+    assert complete_bare(["--plot", "--json"]) == ["--plot", DEFAULT_PLOT, "--json"]
+    assert complete_bare(["x", "--plot"]) == ["x", "--plot", DEFAULT_PLOT]
+
+
+def test_studies_without_a_number_get_one():
+    assert complete_bare(["--drivers", "64", "--rare", "0.02"]) == ["--drivers", "64", "--rare", "0.02"]
+    assert complete_bare(["--rare", "gains.json"]) == ["--rare", "0", "gains.json"]
+    assert complete_bare(["--drivers", "--rare"]) == ["--drivers", str(DEFAULT_DRIVERS), "--rare", "0"]
 
 
 def test_names_become_folders():

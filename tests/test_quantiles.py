@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tuning.quantiles import BINS, EDGES, RESOLUTION, binned_quantile, counts, quantile, ranks
+from tuning.quantiles import (
+    BINS,
+    EDGES,
+    RESOLUTION,
+    binned_quantile,
+    counts,
+    quantile,
+    ranks,
+    replicate_quantile,
+)
 
 
 @pytest.mark.parametrize("number", (1, 20, 300, 5000))
@@ -56,6 +65,44 @@ def test_repeated_sweeps_cover_the_quantile(order, capsys):
             end="",
         )
     assert np.mean(exact) >= 0.935 and np.mean(binned) >= np.mean(exact)
+
+
+@pytest.mark.parametrize("order", (0.5, 0.99))
+@pytest.mark.parametrize("sampling", ("independent", "sobol"))
+def test_replicates_cover_the_quantile(order, sampling, capsys):
+    """|u_1 + u_2 - 1|, triangular on 0..1, the quantile 1 - sqrt(1 - q), of 16 replicates of 64 points."""
+    truth, rng = 1 - np.sqrt(1 - order), np.random.default_rng(4)
+    inside, widths = [], []
+    for _ in range(200):
+        if sampling == "sobol":
+            points = np.stack([stats.qmc.Sobol(2, rng=rng).random(64) for _ in range(16)])
+        else:
+            points = rng.random((16, 64, 2))
+        counted = np.stack([counts(values) for values in np.sum(points, axis=-1) - 1])
+        interval = replicate_quantile(counted, order)
+        assert interval.low < interval.estimate < interval.high
+        inside.append(interval.low <= truth <= interval.high)
+        widths.append(interval.width)
+    with capsys.disabled():
+        print(
+            f"\nquantile {order}, {sampling} replicates: coverage {np.mean(inside):.3f}, median width "
+            f"{np.median(widths):.4f}",
+            end="",
+        )
+    assert np.mean(inside) >= 0.935
+    if sampling == "sobol" and order == 0.5:
+        _, low, high = binned_quantile(np.sum(counted, axis=0), order)
+        assert np.median(widths) < 0.6 * (high - low)
+
+
+def test_replicates_without_results_have_no_bound():
+    none = np.stack([counts([np.nan] * 10)] * 4)
+    interval = replicate_quantile(none, 0.5)
+    assert interval.estimate == np.inf and interval.high == np.inf and interval.low >= EDGES[-2]
+    zero = np.stack([counts([0.0] * 10)] * 4)
+    assert replicate_quantile(zero, 0.5) == (0.0, 0.0, EDGES[0])
+    with pytest.raises(ValueError, match="allowed equal numbers"):
+        replicate_quantile(np.stack([counts([1.0]), counts([1.0, 2.0])]), 0.5)
 
 
 def test_ties_cover_too():

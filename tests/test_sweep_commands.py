@@ -87,6 +87,44 @@ def test_float32_is_compared_with_float64(jaxhil, gains, tmp_path):
     assert compared["scenarios"] == 64 and 0 < compared["largest_difference"] < 1e-4
 
 
+def test_a_width_stops_the_sweep(jaxhil, gains, tmp_path):
+    wide = ["sweep", gains, "--scenarios", "1000", "--chunk", "64", "--limit", "1.5", "-o", tmp_path / "n"]
+    wide += ["--until-width", "0.3"]
+    ran = jaxhil(*wide, "--json")
+    found = document(ran)
+    assert ran[0] == 1 and found["scenarios"] < found["most_scenarios"] == 1000
+    probability = found["failure_probability"]
+    assert probability["high"] - probability["low"] <= 0.3 and "repeated looks" in probability["method"]
+    code, out, _ = jaxhil(*wide, "--resume")
+    assert code == 1 and f"Stopped after {found['scenarios']} of at most 1000" in out
+    assert "valid under repeated" in out
+    assert jaxhil("replay", tmp_path / "n", 0)[0] == 0
+    refused(jaxhil("replay", tmp_path / "n", 999), "before the sweep stopped")
+
+
+def test_quantiles_are_told(jaxhil, gains, store):
+    again = ["sweep", gains, *TINY, "-o", store, "--limit", "1.5", "--resume"]
+    found = document(jaxhil(*again, "--json"))["error_quantiles"]
+    assert [one["order"] for one in found] == [0.5, 0.95, 0.99, 0.999]
+    assert found[0]["low"] < found[0]["value"] < found[0]["high"] < found[1]["value"]
+    out = jaxhil(*again)[1]
+    assert "99.9 %" in out and "no bound" in out
+
+
+def test_studies_are_told(jaxhil, gains, store):
+    again = ["sweep", gains, *TINY, "-o", store, "--limit", "1.5", "--resume", "--drivers", "16", "--rare"]
+    found = document(jaxhil(*again, "--json"))
+    drivers, rare = found["drivers"], found["rare"]
+    assert drivers["evaluations"] == 16 * 5 and drivers["cap"] == 15
+    names = [one["input"] for one in drivers["inputs"]]
+    assert sorted(names) == ["approach.phase", "contact.stiffness", "rig.force_sensor.delay"]
+    assert rare["limit"] == 1.5 and rare["low"] < rare["probability"] < rare["high"]
+    brute = found["failure_probability"]
+    assert brute["low"] < rare["probability"] < brute["high"]
+    out = jaxhil(*again)[1]
+    assert "Subset simulation" in out and "first order" in out and names[0] in out
+
+
 def test_replay_is_the_same_to_the_bit(jaxhil, store, tmp_path):
     ran = jaxhil("replay", store, 77, "--json", "--plot", tmp_path / "pictures" / "77.png")
     found = document(ran)
@@ -117,6 +155,12 @@ def test_what_cannot_be_is_refused(jaxhil, gains, store, tmp_path):
     refused(jaxhil("sweep", gains, *new, "--precision", "half"), "--precision", "float32")
     refused(jaxhil("sweep", gains, *new, "--limit", "nan"), "--limit")
     refused(jaxhil("sweep", gains, *new, "--acceptable", "2"), "--acceptable")
+    refused(jaxhil("sweep", gains, *new, "--until-width", "0"), "--until-width: found 0")
+    sobol = ["--until-width", "0.1", "--sampling", "sobol"]
+    refused(jaxhil("sweep", gains, *new, *sobol), "--until-width: found with --sampling sobol")
+    refused(jaxhil("sweep", gains, *new, "--drivers", "100"), "--drivers: found 100", "power of two")
+    refused(jaxhil("sweep", gains, *new, "--rare", "0.001"), "--rare: found 0.001", "at least --limit")
+    refused(jaxhil("sweep", gains, *new, "--rare", "--limit", "inf"), "--rare")
     refused(jaxhil("sweep", tmp_path / "none.json", *new), "none.json")
     refused(jaxhil("sweep", gains, *TINY, "-o", store), "--resume")
     refused(jaxhil("sweep", gains, *TINY, "-o", store, "--resume"), "limit: found 1.5, asked for 0.01")

@@ -36,6 +36,16 @@ def test_round_trip():
     assert GOOD.largest_error == float("inf")
 
 
+def test_a_width_is_kept_where_there_is_one():
+    # Without it a manifest is what it was before there were any.
+    assert b"until_width" not in encode(GOOD) and "until_width" not in DOCUMENT
+    wide = manifest(until_width=0.1)
+    assert decode(encode(wide), "f") == wide and wide.until_width == 0.1
+    assert differences(GOOD, wide) == ["until_width: found nothing, asked for 0.1"]
+    with pytest.raises(InputError, match="until_width: found with sobol, allowed with random"):
+        manifest(until_width=0.1, sampling="sobol")
+
+
 @given(st.binary(max_size=200))
 def test_any_bytes_are_refused(content):
     refusal(content)

@@ -8,15 +8,18 @@ import time
 import warnings
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from sweep_cases import case, manifest
 
 from jaxhil.errors import InputError
 from tuning.gain_file import write_gain_file
+from tuning.sweeps.chunks import run_chunk
 from tuning.sweeps.replay import motion_of, replay
 from tuning.sweeps.run import compare_precisions, describe_outcomes, run_sweep
 from tuning.sweeps.store import open_store, read_part, read_store, same_rows
+from tuning.verdict import Running, enough, updated
 
 MANIFEST = manifest(case(), scenarios=300, limit=1.5)
 HERE = Path(__file__).parent
@@ -147,6 +150,81 @@ def test_precisions_compare_the_same_scenarios(whole):
     assert found.changed_outcomes == abs(found.failed_float64 - found.failed_float32)
 
 
+WIDE = 0.25  # a width that 300 scenarios reach, and 64 do not
+UNTIL = manifest(case(), scenarios=300, limit=1.5, until_width=WIDE)
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """A sweep until its interval is narrow: store, parts, tally."""
+    store, _, tally = Log().sweep(tmp_path_factory.mktemp("until") / "store", resume=False, label=UNTIL)
+    return store, parts_of(store), tally
+
+
+def parts_of(store):
+    return sorted(path.name for path in store.folder.glob("parts/part-*"))
+
+
+def test_a_sweep_stops_at_the_first_look_that_is_narrow_enough(whole, stopped):
+    _, rows, _, _ = whole
+    store, parts, tally = stopped
+    failed, running = rows["failed"], Running()
+    for looks in range(1, 11):
+        part = failed[32 * (looks - 1) : 32 * looks]
+        running = updated(running, int(np.sum(part)), len(part))
+        if enough(running, WIDE):
+            break
+    assert 2 < looks < 9 and tally.looks == running
+    assert tally.scenarios == 32 * looks and len(parts) == looks
+    for number in range(looks):
+        made = read_part(store, number)
+        assert made is not None
+        assert same_rows(made, {k: v[32 * number : 32 * number + 32] for k, v in rows.items()}) == []
+    assert replay(read_store(store.folder), 32 * looks - 1).different == []
+    with pytest.raises(InputError, match="allowed those before the sweep stopped"):
+        replay(store, 299)
+
+
+def test_a_sweep_that_stopped_stays_where_it_is(stopped):
+    store, parts, tally = stopped
+    log = Log()
+    _, _, again = log.sweep(store.folder, label=UNTIL)
+    assert again == tally and parts_of(store) == parts
+    assert (log.found, log.computed) == (tally.scenarios, 0)
+    with pytest.raises(InputError, match=r"until_width: found 0\.25, asked for 0\.1"):
+        Log().sweep(store.folder, label=manifest(case(), scenarios=300, limit=1.5, until_width=0.1))
+
+
+def test_parts_in_any_order_stop_it_at_the_same_look(whole, stopped, tmp_path, monkeypatch):
+    _, _, sweep, _ = whole
+    _, parts, tally = stopped
+
+    def shuffled(label, missing, address):
+        for part in np.random.default_rng(0).permutation(list(missing)):
+            yield int(part), run_chunk(sweep, *label.part_rows(int(part)))
+
+    monkeypatch.setattr("tuning.sweeps.run._run_on_cluster", shuffled)
+    store, _, again = Log().sweep(tmp_path / "store", label=UNTIL, scheduler="any")
+    assert again == tally and parts_of(store) == parts
+    # With gaps too.
+    store.part_path(0).unlink()
+    store.part_path(2).unlink()
+    log = Log()
+    assert log.sweep(tmp_path / "store", label=UNTIL)[2] == tally and parts_of(store) == parts
+    assert (log.found, log.computed) == (tally.scenarios - 64, 64)
+
+
+def test_the_most_is_the_most(whole, tmp_path):
+    _, rows, _, _ = whole
+    label = manifest(case(), scenarios=300, limit=1.5, until_width=1e-6)
+    store, _, tally = Log().sweep(tmp_path / "store", label=label)
+    assert tally.scenarios == 300 and same_rows(all_rows(store), rows) == []
+    # What lies beyond the stop of a sweep is removed, should an interruption have left it.
+    wide = read_store(store.folder)._replace(manifest=msgspec.structs.replace(label, until_width=WIDE))
+    _, tally = run_sweep(wide, lambda *_: None, lambda *_: None)
+    assert tally.scenarios < 300 and len(parts_of(store)) == -(-tally.scenarios // 32)
+
+
 def test_a_scheduler_that_is_not_there_is_one_line(tmp_path):
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
@@ -172,3 +250,15 @@ def test_a_cluster_makes_the_same_rows_though_a_worker_is_killed(whole, tmp_path
             _, again = run_sweep(store, lambda *_: None, kill_one, cluster.scheduler_address)
     assert killed
     assert same_rows(all_rows(store), rows) == [] and again == tally
+
+
+@pytest.mark.slow
+def test_a_cluster_stops_at_the_same_look(stopped, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    _, parts, tally = stopped
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+            address = cluster.scheduler_address
+            store, _, again = Log().sweep(tmp_path / "store", False, UNTIL, scheduler=address)
+    assert again == tally and parts_of(store) == parts

@@ -3,9 +3,18 @@
 import numpy as np
 import pytest
 
+from tuning.quantiles import quantile
 from tuning.sweeps.columns import GOOD, OUTCOMES
-from tuning.sweeps.tally import WORST, add_rows, empty_tally, failure_probability
-from tuning.verdict import replicate_interval
+from tuning.sweeps.tally import (
+    ORDERS,
+    WORST,
+    add_rows,
+    empty_tally,
+    error_quantiles,
+    error_sizes,
+    failure_probability,
+)
+from tuning.verdict import Running, confidence_sequence, replicate_interval, updated
 
 
 def made_up(number, seed=0, share=0.3):
@@ -57,10 +66,64 @@ def test_interval_without_failures_is_known_in_closed_form():
     assert found.high == pytest.approx(1 - 0.025 ** (1 / 500), rel=1e-12)
 
 
-def test_interval_of_replicates_is_over_their_means():
+def test_interval_of_replicates_is_students():
     rows = made_up(16 * 64)
     found = failure_probability(add_rows(empty_tally(16), rows))
-    counts = rows["failed"].reshape(64, 16).sum(axis=0)
-    low, high = replicate_interval(counts, 64)[1:]
-    assert found.value == pytest.approx(np.mean(rows["failed"]))
-    assert (found.low, found.high) == (low, high)
+    means = rows["failed"].reshape(64, 16).mean(axis=0)
+    half = 2.131449545559323 * np.std(means, ddof=1) / 4
+    assert found.value == pytest.approx(np.mean(means))
+    assert (found.low, found.high) == pytest.approx((found.value - half, found.value + half))
+
+
+def test_a_remainder_is_in_no_replicate():
+    rows = made_up(16 * 64 + 5)
+    tally = add_rows(empty_tally(16, 16 * 64 + 5), rows)
+    assert tally.scenarios == 16 * 64 + 5 and tally.left_out == 5
+    whole = piece(rows, slice(16 * 64))
+    expected = replicate_interval(whole["failed"].reshape(64, 16).sum(axis=0), 64)
+    found = failure_probability(tally)
+    assert (found.value, found.low, found.high) == pytest.approx(tuple(map(float, expected)))
+    assert found == failure_probability(add_rows(empty_tally(16, 16 * 64), whole))
+    assert error_quantiles(tally) == error_quantiles(add_rows(empty_tally(16, 16 * 64), whole))
+
+
+def test_replicates_of_unequal_size_have_no_interval_yet():
+    tally = add_rows(empty_tally(16, 1600), made_up(100))
+    found = failure_probability(tally)
+    assert (found.low, found.high) == (0, 1) and 0 < found.value < 1 and "yet" in found.method
+    assert all((one.low, one.high) == (0, np.inf) for one in error_quantiles(tally))
+    assert failure_probability(add_rows(empty_tally(16, 10), made_up(10))).high == 1
+
+
+def test_looks_are_the_confidence_sequences():
+    rows = made_up(1000)
+    tally, running = empty_tally(1, 10**6, looked_at=True), Running()
+    for part in np.split(np.arange(1000), 10):
+        tally = add_rows(tally, piece(rows, part))
+        running = updated(running, int(np.sum(rows["failed"][part])), 100)
+    assert tally.looks == running
+    found, (_, low, high) = failure_probability(tally), confidence_sequence(tally.failed, 1000)
+    assert low <= found.low < found.value < found.high <= high
+    assert "repeated looks" in found.method
+    fixed = add_rows(empty_tally(1), rows)
+    assert found.high - found.low > failure_probability(fixed).high - failure_probability(fixed).low
+    for one, other in zip(error_quantiles(tally), error_quantiles(fixed), strict=True):
+        assert one.low <= other.low and other.high <= one.high
+    assert error_quantiles(tally)[0] != error_quantiles(fixed)[0]
+
+
+@pytest.mark.parametrize("replicates", [1, 16])
+def test_quantiles_are_those_of_the_errors(replicates):
+    rows = made_up(1600, share=0.01)
+    sizes = error_sizes(rows)
+    assert np.array_equal(np.isinf(sizes), rows["outcome"] > 2) and np.any(np.isinf(sizes))
+    found = error_quantiles(add_rows(empty_tally(replicates, 1600), rows))
+    assert [one.order for one in found] == list(ORDERS)
+    for one in found[:3]:
+        exact = quantile(sizes, one.order)
+        assert one.value == pytest.approx(float(exact.estimate), rel=0.01)
+        assert one.low == pytest.approx(float(exact.low), rel=0.05)
+        assert one.high == pytest.approx(float(exact.high), rel=0.2)
+        assert one.low < one.value < one.high
+    # Six runs in a thousand have no result.
+    assert found[3].value == found[3].high == np.inf

@@ -15,6 +15,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg, subc
 PICTURES = (".png", ".pdf", ".svg")
 DEFAULT_PLOT = "jaxhil-out/simulate.png"
 DEFAULT_REPLAY_PLOT = "jaxhil-out/replay.png"
+DEFAULT_DRIVERS = 1024
 
 OptionalFile = Annotated[
     Positional[str | None],
@@ -172,6 +173,30 @@ class Sweep:
         bool, arg(name="works", metavar="", help="Also the real contact force's works; 3 times the time.")
     ] = False
     limit: Limit = 0.01
+    until_width: Annotated[
+        float | None,
+        arg(
+            metavar="WIDTH",
+            help="Stop once the probability's interval is so narrow; --scenarios is then the most.",
+            help_behavior_hint="",
+        ),
+    ] = None
+    drivers: Annotated[
+        int | None,
+        arg(
+            metavar="[NUMBER]",
+            help=f"Also Sobol indices: what drives the error. A power of two; bare: {DEFAULT_DRIVERS}.",
+            help_behavior_hint="",
+        ),
+    ] = None
+    rare: Annotated[
+        float | None,
+        arg(
+            metavar="[LIMIT]",
+            help="Also subset simulation of an error beyond this, however rare; bare, or 0: --limit.",
+            help_behavior_hint="",
+        ),
+    ] = None
     acceptable: Annotated[
         float | None,
         arg(
@@ -254,7 +279,7 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
         Command,  # pyright: ignore[reportArgumentType]
         prog="jaxhil",
         description="Gains that keep hardware-in-the-loop docking tests from diverging.",
-        args=complete_plot(given),
+        args=complete_bare(given),
     )
 
     def run() -> int:
@@ -264,13 +289,23 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
     return run
 
 
-def complete_plot(arguments: list[str]) -> list[str]:
-    """A `--plot` that no picture's name follows gets the default one."""
+def complete_bare(arguments: list[str]) -> list[str]:
+    """A `--plot`, `--drivers` or `--rare` that no value follows gets the default one."""
     completed = []
-    default = DEFAULT_REPLAY_PLOT if arguments[:1] == ["replay"] else DEFAULT_PLOT
+    plot = DEFAULT_REPLAY_PLOT if arguments[:1] == ["replay"] else DEFAULT_PLOT
     for place, word in enumerate(arguments):
         completed.append(word)
         following = arguments[place + 1] if place + 1 < len(arguments) else ""
         if word == "--plot" and not following.lower().endswith(PICTURES):
-            completed.append(default)
+            completed.append(plot)
+        elif word in ("--drivers", "--rare") and not _is_number(following):
+            completed.append(str(DEFAULT_DRIVERS) if word == "--drivers" else "0")
     return completed
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

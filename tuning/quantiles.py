@@ -3,14 +3,15 @@
 Below the quantile of order q lie, of n independent values, a binomial number of them: the order statistics of
 ranks that this number does not leave enclose the quantile, whatever the distribution. The values themselves
 need not be kept. `counts` sorts them into bins of fixed edges, each 1 % above the last: counts of parts add
-up, and the same order statistics are then known to a bin, outward.
+up, and the same order statistics are then known to a bin, outward. `replicate_quantile` does it for
+scramblings of a Sobol sequence, whose points no binomial law describes.
 """
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from tuning.verdict import LEVEL, PRIOR, Interval
+from tuning.verdict import LEVEL, PRIOR, Interval, replicate_interval
 
 RESOLUTION = 0.01  # of an edge, to the next one
 _DECADES = -9, 3
@@ -103,6 +104,29 @@ def binned_quantile(
     inner = 0 < place < BINS - 1
     estimate = np.sqrt(bounds[place] * bounds[place + 1]) if inner else (0.0 if place == 0 else np.inf)
     return Interval(np.asarray(estimate), np.asarray(lower), np.asarray(upper))
+
+
+def replicate_quantile(counted: np.ndarray, order: float, level: float = LEVEL) -> Interval:
+    """As `binned_quantile`, from the `counts` (replicates, BINS) of equally many points of each of several
+    independent scramblings of a Sobol sequence.
+
+    The share of |values| below an edge has the interval of `tuning.verdict.replicate_interval`. The quantile
+    lies between the edge before the first one where that reaches up to `order`, and the edge after the last
+    one where it reaches down to it: this fails only if the share's interval does at one of the two edges
+    around the quantile, each to its side. Raises ValueError as `ranks` and `replicate_interval` do, and for
+    unequal numbers.
+    """
+    counted = np.asarray(counted)
+    numbers = np.sum(counted, axis=-1)
+    if np.any(numbers != numbers[0]):
+        raise ValueError(f"counted: found {numbers.tolist()} values per replicate, allowed equal numbers")
+    estimate = binned_quantile(np.sum(counted, axis=0), order, level).estimate
+    bounds = np.concatenate([[0.0], EDGES, [np.inf]])
+    # Bin i ends at bounds[i + 1].
+    _, low, high = replicate_interval(np.cumsum(counted, axis=-1).T, int(numbers[0]), level)
+    first = int(np.argmax(high >= order))
+    last = int(np.max(np.nonzero(low[:-1] <= order)[0], initial=-1))
+    return Interval(estimate, bounds[first], bounds[last + 2])
 
 
 def _rank(number: int, order: float) -> int:

@@ -1,14 +1,18 @@
 """`jaxhil sweep`: many scenarios, a failure probability with its interval, and the worst of them."""
 
+import math
 from pathlib import Path
 from typing import Any
 
-from jaxhil.errors import InputError, one_line
+from jaxhil.errors import InputError
 from tuning import report
 from tuning.cli import Sweep
-from tuning.commands import checks
+from tuning.commands import checks, sweep_tables
 from tuning.environment import prepare
 from tuning.sweeps import LARGEST_CHUNK, LARGEST_SEED, MOST, PRECISIONS, SAMPLINGS
+
+MOST_DRIVERS = 2**20  # scenarios for each input
+STAGE = 10_000  # scenarios between two lines of progress
 
 
 def run(options: Sweep) -> int:
@@ -21,6 +25,7 @@ def run(options: Sweep) -> int:
     from tuning.sweeps.run import compare_precisions, run_sweep
     from tuning.sweeps.store import locked, open_store
     from tuning.sweeps.tally import failure_probability
+    from tuning.verdict import scenarios_needed
 
     choices = Choices(**{name: getattr(options, name) for name in Choices._fields})
     manifest = build_manifest(load_gain_file(path), choices)
@@ -31,7 +36,11 @@ def run(options: Sweep) -> int:
 
             def told(tally) -> str:
                 known = failure_probability(tally)
-                return f"failed {known.value:.3g} ({known.low:.2g} to {known.high:.2g})"
+                text = f"failed {known.value:.3g} ({known.low:.2g} to {known.high:.2g})"
+                if options.until_width is None:
+                    return text
+                needed = scenarios_needed(known.value, options.until_width)
+                return f"{text}, about {needed} wanted"
 
             sweep, tally = run_sweep(
                 store,
@@ -43,10 +52,14 @@ def run(options: Sweep) -> int:
     document = _document(options, store, sweep, tally, rate)
     if manifest.precision == "float32":
         document["float32"] = compare_precisions(sweep)._asdict()
+    if options.drivers is not None:
+        document["drivers"] = _drivers(options, sweep)
+    if options.rare is not None:
+        document["rare"] = _rare(options, sweep)
     if options.json:
         report.emit_json(document)
     else:
-        _print(document)
+        sweep_tables.emit(document)
     return 0 if document["verdict"] == "good" else 1
 
 
@@ -59,14 +72,31 @@ def _check(options: Sweep) -> None:
     checks.one_of(SAMPLINGS, sampling=options.sampling)
     checks.one_of(PRECISIONS, precision=options.precision)
     checks.limit(options.limit)
+    _check_studies(options)
+    if (width := options.until_width) is not None:
+        if not 0 < width <= 1:
+            raise InputError(f"--until-width: found {width}, allowed a width above 0, at most 1")
+        if options.sampling != "random":
+            raise InputError(f"--until-width: found with --sampling {options.sampling}, allowed with random")
     if options.acceptable is not None and not 0 <= options.acceptable <= 1:
         raise InputError(f"--acceptable: found {options.acceptable}, allowed a probability, 0 to 1")
+
+
+def _check_studies(options: Sweep) -> None:
+    drivers, rare = options.drivers, options.rare
+    if drivers is not None and not (2 <= drivers <= MOST_DRIVERS and drivers & (drivers - 1) == 0):
+        raise InputError(f"--drivers: found {drivers}, allowed a power of two, 2 to {MOST_DRIVERS}")
+    if rare is not None:
+        if not (rare == 0 or (math.isfinite(rare) and rare >= options.limit)):
+            raise InputError(f"--rare: found {rare}, allowed a finite error, at least --limit")
+        if rare == 0 and not math.isfinite(options.limit):
+            raise InputError("--rare: found without a limit, allowed with a finite --limit")
 
 
 def _document(options: Sweep, store, sweep, tally, rate) -> dict[str, Any]:
     from tuning.sweeps.run import describe_outcomes
     from tuning.sweeps.store import read_row
-    from tuning.sweeps.tally import failure_probability
+    from tuning.sweeps.tally import error_quantiles, failure_probability
 
     manifest = store.manifest
     texts = {column.name for column in manifest.columns if column.kind == "text"}
@@ -94,14 +124,53 @@ def _document(options: Sweep, store, sweep, tally, rate) -> dict[str, Any]:
         "gains_sha256": manifest.gains_sha256,
         "mechanism": sweep.mechanism.name,
         "compensator": sweep.loop.compensator.name,
-        **{key: getattr(manifest, key) for key in ("scenarios", "seed", "sampling", "precision", "limit")},
+        "scenarios": tally.scenarios,
+        "most_scenarios": manifest.scenarios,
+        **{key: getattr(manifest, key) for key in ("seed", "sampling", "precision", "limit", "until_width")},
         "failed": tally.failed,
         "failure_probability": probability._asdict(),
+        "left_out_of_replicates": tally.left_out,
+        "error_quantiles": [one._asdict() for one in error_quantiles(tally)],
         "outcomes": describe_outcomes(tally),
         "worst": worst,
         "scenarios_per_second": rate,
         "acceptable": options.acceptable,
         "verdict": "good" if good else "bad",
+    }
+
+
+def _drivers(options: Sweep, sweep) -> dict[str, Any]:
+    from jaxhil.uncertainty import dimensions
+    from tuning.drivers import evaluations
+    from tuning.sweeps.studies import error_drivers
+
+    number: Any = options.drivers
+    # Noise, if there is any, adds an input; the bar need not know.
+    with report.progress(evaluations(len(dimensions(sweep.mechanism)), number), "scenarios") as progress:
+        return error_drivers(sweep, number, lambda more: progress.advance(more, "drivers"))._asdict()
+
+
+def _rare(options: Sweep, sweep) -> dict[str, Any]:
+    from tuning.sweeps.studies import rare_failure, spread_beyond_formula
+
+    limit = options.rare or options.limit
+    ran = 0
+    with report.stages(1) as stages:
+        stages.begin("subset simulation")
+
+        def done(more: int) -> None:
+            nonlocal ran
+            ran += more
+            if ran % STAGE == 0:
+                stages.say(f"subset simulation: {ran} scenarios")
+
+        found = rare_failure(sweep, limit, done)
+    kept = ("probability", "low", "high", "coefficient_of_variation", "formula_coefficient_of_variation")
+    return {
+        "limit": limit,
+        **{name: getattr(found, name) for name in (*kept, "evaluations")},
+        "estimates": found.estimates.tolist(),
+        "spread_beyond_formula": spread_beyond_formula(found),
     }
 
 
@@ -115,46 +184,3 @@ def _text(name: str, row: dict[str, Any]) -> str:
     from tuning.sweeps.columns import texts_of
 
     return texts_of(name)[int(row[name][0])]
-
-
-def _print(document: dict[str, Any]) -> None:
-    probability, number = document["failure_probability"], document["scenarios"]
-    limit = document["limit"]
-    title = f"{document['mechanism']}, compensation: {document['compensator']}, {number} scenarios"
-    outcomes = report.table(
-        f"{title} ({document['sampling']}, {document['precision']})",
-        ["outcome", "scenarios", "share"],
-        [(name, count, count / number) for name, count in document["outcomes"].items()],
-    )
-    # All inputs beside each other would not fit; `replay` and the store have them.
-    worst = report.table(
-        "Worst scenarios",
-        ["index", "outcome", "error", "contact"],
-        [
-            (one["index"], one["outcome"], _signed(one["worst_error"]), report.figure(one["worst_contact"]))
-            for one in document["worst"]
-        ],
-        texts=(1,),
-    )
-    within = "nothing" if limit is None else f"{limit:g}"
-    lines = [
-        f"Failure probability {probability['value']:.4g}, 95 % interval {probability['low']:.3g} to "
-        f"{probability['high']:.3g} ({probability['method']}); {document['failed']} of {number} failed, "
-        f"restitution error allowed {within}."
-    ]
-    if (compared := document.get("float32")) is not None:
-        lines.append(
-            f"float32 beside float64 on {compared['scenarios']} scenarios: errors differ by at most "
-            f"{report.figure(compared['largest_difference'], 2)}, {compared['changed_outcomes']} outcomes "
-            f"changed, {compared['failed_float32']} and {compared['failed_float64']} failed."
-        )
-    if document["scenarios_per_second"]:
-        lines.append(f"{document['scenarios_per_second']:.0f} scenarios per second.")
-    acceptable = document["acceptable"]
-    wanted = "no scenario may fail" if acceptable is None else f"acceptable up to {acceptable:g}"
-    lines.append(f"{document['verdict'].capitalize()}: {wanted}. Wrote {one_line(document['store'])}")
-    report.emit(outcomes, worst, *lines)
-
-
-def _signed(value: float | None) -> str:
-    return "-" if value is None or value != value else f"{value:+.4f}"

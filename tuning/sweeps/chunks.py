@@ -4,7 +4,7 @@ One compiled program serves every chunk. Its delay lines are made for the extrem
 for what a chunk happens to draw, so that a scenario's rows are the same to the bit in any chunk.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -66,7 +66,7 @@ def run_chunk(sweep: Sweep, first: int, number: int, precision: str | None = Non
     return _begin(sweep, _draw(sweep, first, number, precision))()
 
 
-def run_parts(sweep: Sweep, parts: Iterable[int]) -> Iterator[tuple[int, Rows]]:
+def run_parts(sweep: Sweep, parts: Iterable[int]) -> Generator[tuple[int, Rows], None, None]:
     """Part by part its number and rows. While the caller uses them, the next part is computed already."""
     held = None
     waiting = iter(parts)

@@ -29,11 +29,12 @@ LARGEST = 8 * 1024 * 1024  # bytes
 Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 
 
-class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
     """scenarios, chunk [scenarios], seed, sampling, Sobol replicates (1 for random), precision, limit of the
     restitution error (None: no limit), whether works are audited; columns; gain file with its digest and its
     mechanism file's; versions, flags of the compiler, date, digest of all but the
-    date."""
+    date. Where there is `until_width`, `scenarios` is the most: the sweep ends with the first part after
+    which the confidence sequence is that narrow, and the rows say which one it is."""
 
     schema: Literal["jaxhil/sweep/1"]
     scenarios: Annotated[int, Meta(ge=1, le=MOST)]
@@ -52,6 +53,7 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     xla_flags: str
     created: str
     sha256: Digest
+    until_width: Annotated[float, Meta(gt=0, le=1)] | None = None
 
     @property
     def parts(self) -> int:
@@ -79,6 +81,7 @@ class Choices(NamedTuple):
     limit: float = 0.01
     works: bool = False
     chunk: int = CHUNK
+    until_width: float | None = None
 
 
 def build_manifest(loaded: LoadedGains, choices: Choices) -> Manifest:
@@ -101,6 +104,8 @@ def build_manifest(loaded: LoadedGains, choices: Choices) -> Manifest:
         "xla_flags": rounding_flags(os.environ.get("XLA_FLAGS", "")),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+    if choices.until_width is None:
+        del document["until_width"]
     return _decode({**document, "sha256": digest(document)}, "sweep")
 
 
@@ -162,6 +167,7 @@ def differences(old: Manifest, new: Manifest) -> list[str]:
         "limit",
         "works",
         "chunk",
+        "until_width",
         "xla_flags",
     ):
         before, now = getattr(old, key), getattr(new, key)
@@ -201,6 +207,8 @@ def _decode(document: Mapping[str, Any], source: str) -> Manifest:
         raise InputError(f"{source}: {one_line(str(error), 160)}") from None
     if found != manifest.sha256:
         raise InputError(f"{source}: sha256: found {manifest.sha256[:12]}..., allowed {found[:12]}...")
+    if manifest.until_width is not None and manifest.sampling != "random":
+        raise InputError(f"{source}: until_width: found with {manifest.sampling}, allowed with random")
     for key, inner in (("gains_sha256", "sha256"), ("mechanism_sha256", "mechanism_sha256")):
         if manifest.gain_file.get(inner) != getattr(manifest, key):
             raise InputError(f"{source}: {key}: found another than the gain file's, allowed the same")

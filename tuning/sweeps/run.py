@@ -2,10 +2,15 @@
 
 What is computed where makes no difference to the rows. Interrupted at any moment, the store keeps the parts
 that were written, and running again goes on with those that are missing.
+
+A sweep until its interval is as narrow as wanted looks at its parts in the order of their numbers, whatever
+order they come in, and ends at the first after which it is: where, follows from the rows alone, and parts
+beyond are removed.
 """
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterable
+from contextlib import closing
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -15,8 +20,9 @@ from jaxhil.errors import InputError, one_line, shown
 from tuning.sweeps.chunks import Rows, Sweep, build_sweep, run_chunk, run_parts
 from tuning.sweeps.columns import OUTCOMES
 from tuning.sweeps.manifest import Manifest, decode, encode, unlike_here
-from tuning.sweeps.store import Store, read_part, write_part
+from tuning.sweeps.store import Store, read_part, remove_parts, write_part
 from tuning.sweeps.tally import Tally, add_rows, empty_tally
+from tuning.verdict import enough
 
 COMPARED = 4096  # scenarios that a float32 sweep runs in float64 too
 
@@ -39,14 +45,16 @@ class Precision(NamedTuple):
 def run_sweep(
     store: Store, found: Progress, computed: Progress, scheduler: str | None = None
 ) -> tuple[Sweep, Tally]:
-    """Compute and write every part that is missing: the sweep and its tally.
+    """Compute and write every part that is missing, as far as it goes: the sweep and its tally.
 
     `scheduler` is the address of a `dask.distributed` scheduler. Raises `InputError` when a part cannot be
     written or the cluster cannot be reached.
     """
     manifest = store.manifest
     sweep = build_sweep(manifest)
-    tally, missing = empty_tally(manifest.replicates), []
+    if manifest.until_width is not None:
+        return sweep, _run_until(store, sweep, found, computed, scheduler)
+    tally, missing = empty_tally(manifest.replicates, manifest.scenarios), []
     for part in range(manifest.parts):
         rows = read_part(store, part)
         if rows is None:
@@ -54,8 +62,7 @@ def run_sweep(
             continue
         tally = add_rows(tally, rows)
         found(len(rows["index"]), tally)
-    parts = run_parts(sweep, missing) if scheduler is None else _run_on_cluster(manifest, missing, scheduler)
-    for part, rows in parts:
+    for part, rows in _computed_parts(sweep, missing, scheduler):
         write_part(store, part, rows)
         tally = add_rows(tally, rows)
         computed(len(rows["index"]), tally)
@@ -84,7 +91,56 @@ def describe_outcomes(tally: Tally) -> dict[str, int]:
     return {name: count for name, count in zip(OUTCOMES, tally.outcomes, strict=True) if count}
 
 
-def _run_on_cluster(manifest: Manifest, parts: list[int], address: str) -> Iterator[tuple[int, Rows]]:
+def _run_until(
+    store: Store, sweep: Sweep, found: Progress, computed: Progress, scheduler: str | None
+) -> Tally:
+    """The tally at the first part after which the interval is narrow enough, or at the last one."""
+    manifest = store.manifest
+    tally = empty_tally(manifest.replicates, manifest.scenarios, looked_at=True)
+    width: Any = manifest.until_width
+    following, own = 0, set()
+
+    def look(rows: Rows) -> bool:
+        """Take the following part; whether it is the last."""
+        nonlocal tally, following
+        tally = add_rows(tally, rows)
+        tell = computed if following in own else found
+        tell(len(rows["index"]), tally)
+        following += 1
+        assert tally.looks is not None
+        return enough(tally.looks, width) or following == manifest.parts
+
+    def look_at_stored() -> bool:
+        """Take what is there, up to the first gap."""
+        while (rows := read_part(store, following)) is not None:
+            if look(rows):
+                return True
+        return False
+
+    if not look_at_stored():
+        missing = (part for part in range(following, manifest.parts) if read_part(store, part) is None)
+        with closing(_computed_parts(sweep, missing, scheduler)) as parts:
+            for part, rows in parts:
+                write_part(store, part, rows)
+                own.add(part)
+                # A cluster's come in any order: one that comes early waits in the store.
+                if part == following and (look(rows) or look_at_stored()):
+                    break
+    remove_parts(store, following)
+    return tally
+
+
+def _computed_parts(
+    sweep: Sweep, parts: Iterable[int], scheduler: str | None
+) -> Generator[tuple[int, Rows], None, None]:
+    if scheduler is None:
+        return run_parts(sweep, parts)
+    return _run_on_cluster(sweep.manifest, parts, scheduler)
+
+
+def _run_on_cluster(
+    manifest: Manifest, parts: Iterable[int], address: str
+) -> Generator[tuple[int, Rows], None, None]:
     """The parts in the order in which workers finish them; a few are under way per worker."""
     try:
         from distributed import Client, KilledWorker, as_completed

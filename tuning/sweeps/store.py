@@ -129,6 +129,15 @@ def read_part(store: Store, part: int) -> dict[str, np.ndarray] | None:
     return rows if np.array_equal(rows["index"], np.arange(first, first + number)) else None
 
 
+def remove_parts(store: Store, first: int) -> None:
+    """Remove the parts from number `first` on. Raises `InputError` when they cannot be."""
+    with _writing(store.folder / PARTS):
+        for path in (store.folder / PARTS).glob("part-*.parquet"):
+            number = path.stem.removeprefix("part-")
+            if number.isdigit() and int(number) >= first:
+                path.unlink(missing_ok=True)
+
+
 def read_row(store: Store, index: int) -> dict[str, Any]:
     """One row, arrays of length 1. Raises `InputError` for an index that the store does not hold."""
     manifest = store.manifest
@@ -139,6 +148,8 @@ def read_row(store: Store, index: int) -> dict[str, Any]:
     rows = read_part(store, part)
     if rows is None:
         name = store.part_path(part).name
+        if manifest.until_width is not None and not store.part_path(part).exists():
+            raise InputError(f"{shown}: index: found {index}, allowed those before the sweep stopped")
         raise InputError(f"{shown}: {PARTS}/{name}: missing or damaged (`jaxhil sweep --resume` makes it)")
     return {name: values[place : place + 1] for name, values in rows.items()}
 

@@ -1,0 +1,119 @@
+"""Studies beside a sweep: what drives the error, and rare failures, beside what brute force finds."""
+
+import numpy as np
+import pytest
+from sweep_cases import NOISY, UNCERTAIN, case, manifest
+
+from jaxhil.uncertainty import dimensions
+from tuning.drivers import evaluations
+from tuning.sweeps.chunks import build_sweep, run_chunk
+from tuning.sweeps.studies import NOISE, error_drivers, rare_failure, run_points, spread_beyond_formula
+from tuning.sweeps.tally import add_rows, empty_tally, error_sizes, failure_probability
+
+# Of a linear contact the error does not depend on how fast it is entered.
+IDLE = {"approach.velocity": {"distribution": "uniform", "factor": [0.5, 2.0]}}
+
+
+def sweep_of(document, **choices):
+    return build_sweep(manifest(document, **{"scenarios": 2048, "chunk": 1024, **choices}))
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """A sweep with an input that does nothing, and the rows of all its scenarios."""
+    sweep = sweep_of(case(uncertainty=UNCERTAIN | IDLE))
+    halves = [run_chunk(sweep, first, 1024) for first in (0, 1024)]
+    return sweep, {name: np.concatenate([half[name] for half in halves]) for name in halves[0]}
+
+
+def test_an_input_that_does_nothing_drives_nothing(whole):
+    sweep, _ = whole
+    ran = []
+    found = error_drivers(sweep, 128, ran.append)
+    assert found.evaluations == sum(ran) == evaluations(4, 128) == 768
+    assert {one.input for one in found.inputs} == set(dimensions(sweep.mechanism))
+    totals = [one.total for one in found.inputs]
+    assert totals == sorted(totals, reverse=True)
+    idle = next(one for one in found.inputs if one.input == "approach.velocity")
+    assert idle.total_low <= 1e-9 and idle.total_high < 1e-6 and abs(idle.first_order) < 1e-3
+    first, *_ = found.inputs
+    assert first.input == "contact.stiffness" and first.total_low > 0.5
+    assert first.first_order_low <= first.first_order <= first.first_order_high
+
+
+def test_the_variance_of_one_input_is_all_its_own():
+    # One input beside the phase; the law of total variance, by brute force, with the phase's mean in cells.
+    sweep = sweep_of(case(uncertainty={"contact.stiffness": UNCERTAIN["contact.stiffness"]}))
+    found = {one.input: one for one in error_drivers(sweep, 256).inputs}
+    cells = (np.arange(64) + 0.5) / 64
+    grid = np.stack([axis.ravel() for axis in np.meshgrid(cells, cells, indexing="ij")], axis=1)
+    sizes = error_sizes(run_points(sweep, grid, np.zeros(len(grid)))).reshape(64, 64)
+    assert np.max(sizes) < 10  # which is the cap
+    share = np.var(np.mean(sizes, axis=1)) / np.var(sizes)
+    stiffness, phase = found["contact.stiffness"], found["approach.phase"]
+    assert stiffness.first_order_low < share < stiffness.first_order_high
+    assert phase.total_low < 1 - share < phase.total_high
+
+
+def test_noise_is_an_input():
+    document = case(force_sensor=NOISY, uncertainty={"bodies.equivalent_mass": TIGHT})
+    found = error_drivers(sweep_of(document), 64)
+    shares = {one.input: one for one in found.inputs}
+    assert found.evaluations == 64 * 5 and shares.keys() == {
+        "bodies.equivalent_mass",
+        "approach.phase",
+        NOISE,
+    }
+    assert shares[NOISE].total_low > 0.1 and found.inputs[0].input != "bodies.equivalent_mass"
+    assert shares["bodies.equivalent_mass"].total_high < 1e-3
+    # Without noise nothing is left of it.
+    quiet = error_drivers(sweep_of(case(uncertainty={"bodies.equivalent_mass": TIGHT})), 64)
+    assert NOISE not in {one.input for one in quiet.inputs}
+
+
+TIGHT = {"distribution": "uniform", "factor": [0.99999, 1.00001]}
+
+
+def test_errors_beyond_the_cap_count_as_the_cap(whole):
+    _, rows = whole
+    limit = float(np.quantile(np.abs(rows["worst_error"]), 0.5)) / 10
+    limited = sweep_of(case(uncertainty=UNCERTAIN | IDLE), limit=limit)
+    found = error_drivers(limited, 128)
+    assert found.cap == 10 * limit
+    assert 0.4 < found.capped / found.evaluations < 0.6
+
+
+@pytest.mark.parametrize("share", [0.2, 0.05])
+def test_rare_failures_are_as_frequent_as_in_the_sweep(whole, share):
+    sweep, rows = whole
+    limit = float(np.quantile(np.abs(rows["worst_error"]), 1 - share))
+    rows = {**rows, "outcome": (np.abs(rows["worst_error"]) > limit).astype(np.int8)}
+    counted = add_rows(empty_tally(1), {**rows, "failed": rows["outcome"] > 0})
+    brute = failure_probability(counted)
+    found = rare_failure(sweep, limit, samples=200, replicates=6)
+    assert brute.value == pytest.approx(share, abs=1e-3)
+    assert found.low < brute.high and brute.low < found.high
+    assert found.low < found.probability < found.high
+    assert not spread_beyond_formula(found)
+    assert spread_beyond_formula(found._replace(coefficient_of_variation=0.9))
+
+
+def test_rare_failures_are_the_same_again(whole):
+    sweep, rows = whole
+    limit = float(np.quantile(np.abs(rows["worst_error"]), 0.97))
+    first, again = (rare_failure(sweep, limit, samples=50, replicates=2) for _ in range(2))
+    np.testing.assert_array_equal(first.estimates, again.estimates)
+
+
+def test_what_fails_otherwise_fails_at_any_limit():
+    # A force sensor that reads no more than a little of the force.
+    sweep = sweep_of(case(force_sensor={"range": 1e-3}), chunk=64)
+    assert rare_failure(sweep, 1e9, samples=20, replicates=2).probability == 1
+
+
+def test_points_run_alike_in_any_chunk(whole):
+    sweep, _ = whole
+    points = np.random.default_rng(1).random((40, 4))
+    one = run_points(sweep, points, np.arange(40))
+    other = run_points(sweep_of(case(uncertainty=UNCERTAIN | IDLE), chunk=16), points, np.arange(40))
+    np.testing.assert_array_equal(one["worst_error"], other["worst_error"])

@@ -1,0 +1,127 @@
+"""Two studies beside a sweep: which uncertain input drives the error, and how probable a rare failure is.
+
+Both choose their scenarios themselves, as points of the unit box of all uncertain numbers, and run them
+through the sweep's own program. The sensors' noise is one more uncertain input, not a number that can be
+chosen: its realisation is addressed by an index.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxhil.evaluation import evaluate
+from jaxhil.scenario import build_scenarios
+from jaxhil.uncertainty import at_points, dimensions
+from tuning.drivers import saltelli_design, sobol_indices
+from tuning.rare import Rare, subset_simulation, to_uniform
+from tuning.sweeps.chunks import Rows, Sweep, in_precision
+from tuning.sweeps.columns import OUTCOMES, SATURATED, rows_of
+from tuning.sweeps.tally import error_sizes
+
+NOISE = "sensor noise"
+CAP_LIMITS = 10.0  # largest error that drivers look at, over the limit
+CAP_UNLIMITED = 10.0  # the same where there is no limit
+FAR_ABOVE = 2.0  # replicates that spread so much more than the formula says have not seen the same failures
+
+Done = Callable[[int], None]  # told of the number of scenarios that were run
+
+
+class Driver(NamedTuple):
+    """An uncertain input's first-order and total Sobol index, with intervals of 95 %; nan where nothing
+    varies."""
+
+    input: str
+    first_order: float
+    first_order_low: float
+    first_order_high: float
+    total: float
+    total_low: float
+    total_high: float
+
+
+class Drivers(NamedTuple):
+    """Inputs, those of largest total index first, of the worst |error| cut at `cap`; scenarios that were run,
+    and how many of them reached the cap or had no error."""
+
+    inputs: tuple[Driver, ...]
+    cap: float
+    evaluations: int
+    capped: int
+
+
+def error_drivers(sweep: Sweep, number: int, done: Done = lambda _: None) -> Drivers:
+    """Sobol indices of the worst |error|, from `number` (a power of two) times inputs + 2 scenarios.
+
+    An input is a key of the mechanism's uncertainty, with all its entries; the phases of all contacts are
+    one, and so is noise where sensors have any: the scenarios of A have one realisation each, those of B
+    another. An error beyond `CAP_LIMITS` limits, or a run without one, counts as that, lest a few runs that
+    diverge make up all of the variance.
+    """
+    columns = dimensions(sweep.mechanism)
+    names, entries = list(columns), list(columns.values())
+    if _noisy(sweep):
+        # A column of the design that stands for nothing but which realisation it is.
+        names, entries = [*names, NOISE], [*entries, 1]
+    points = saltelli_design(entries, number, sweep.manifest.seed)[:, : sum(columns.values())]
+    block, row = np.divmod(np.arange(len(points)), number)
+    of_b = (block == 1) | ((block == len(points) // number - 1) & _noisy(sweep))
+    sizes = error_sizes(run_points(sweep, points, row + number * of_b, done))
+    limit = sweep.manifest.limit
+    cap = CAP_LIMITS * limit if limit else CAP_UNLIMITED
+    indices = sobol_indices(sizes, entries, number, sweep.manifest.seed, cap=cap)
+    numbers = np.stack([*indices.first_order, *indices.total], axis=1)
+    found = [Driver(name, *row.tolist()) for name, row in zip(names, numbers, strict=True)]
+    found.sort(key=lambda one: -np.nan_to_num(one.total))
+    return Drivers(tuple(found), cap, len(points), int(np.sum(sizes >= cap)))
+
+
+def rare_failure(
+    sweep: Sweep, limit: float, done: Done = lambda _: None, samples: int = 1000, replicates: int = 10
+) -> Rare:
+    """Subset simulation of the probability that a scenario fails, with `limit` in the place of the sweep's.
+
+    The performance is the worst |error|, infinite where the scenario fails otherwise. Noise has a realisation
+    of its own in every scenario. A chain that accepts a scenario accepts its noise with it: that is a
+    proposal of noise independent of the last, so that the chain is as valid as without noise.
+    """
+    saturated, run = OUTCOMES.index(SATURATED), 0
+
+    def performance(normals: np.ndarray) -> np.ndarray:
+        nonlocal run
+        indices = np.arange(run, run + len(normals))
+        rows = run_points(sweep, to_uniform(normals), indices, done)
+        run += len(normals)
+        return np.where(rows["outcome"] >= saturated, np.inf, error_sizes(rows))
+
+    inputs = sum(dimensions(sweep.mechanism).values())
+    return subset_simulation(performance, inputs, limit, sweep.manifest.seed, samples, replicates)
+
+
+def spread_beyond_formula(rare: Rare) -> bool:
+    """Whether replicates differ by far more than one run's chains can explain."""
+    return rare.coefficient_of_variation > FAR_ABOVE * rare.formula_coefficient_of_variation
+
+
+def run_points(sweep: Sweep, points: np.ndarray, noise: np.ndarray, done: Done = lambda _: None) -> Rows:
+    """`outcome` and `worst_error` of the scenarios at points (number, inputs) of the unit box, in order.
+
+    `noise` (number,) are indices of realisations. They run in chunks of the sweep's, by its program.
+    """
+    manifest = sweep.manifest
+    found: list[Rows] = []
+    for start in range(0, len(points), manifest.chunk):
+        part = slice(start, start + manifest.chunk)
+        draws = at_points(sweep.mechanism, points[part])
+        scenarios = build_scenarios(sweep.mechanism, draws, manifest.seed)
+        key = np.stack([scenarios.key[0], noise[part].astype(np.uint32)])
+        scenarios = in_precision(scenarios._replace(key=key), manifest.precision)
+        outcome = evaluate(sweep.loop, sweep.gains, scenarios, at_least=manifest.chunk)
+        rows = rows_of(sweep.mechanism, 0, {}, scenarios, outcome, manifest.largest_error, manifest.works)
+        found.append({name: rows[name] for name in ("outcome", "worst_error")})
+        done(len(rows["outcome"]))
+    return {name: np.concatenate([rows[name] for rows in found]) for name in found[0]}
+
+
+def _noisy(sweep: Sweep) -> bool:
+    return sweep.loop.has_force_noise or sweep.loop.has_position_noise
