@@ -18,6 +18,7 @@ def run(options: Sweep) -> int:
     prepare()
     from tuning.gain_file import load_gain_file
     from tuning.sweeps.manifest import Choices, build_manifest
+    from tuning.sweeps.pictures import write_pictures
     from tuning.sweeps.run import compare_precisions, run_sweep
     from tuning.sweeps.store import locked, open_store
     from tuning.sweeps.tally import failure_probability
@@ -40,7 +41,8 @@ def run(options: Sweep) -> int:
                 options.scheduler,
             )
         rate = progress.rate
-    document = _document(options, store, sweep, tally, rate)
+        plots = write_pictures(store, options.acceptable)
+    document = _document(options, store, sweep, tally, rate) | {"plots": plots}
     if manifest.precision == "float32":
         document["float32"] = compare_precisions(sweep)._asdict()
     if options.json:
@@ -153,6 +155,7 @@ def _print(document: dict[str, Any]) -> None:
     acceptable = document["acceptable"]
     wanted = "no scenario may fail" if acceptable is None else f"acceptable up to {acceptable:g}"
     lines.append(f"{document['verdict'].capitalize()}: {wanted}. Wrote {one_line(document['store'])}")
+    lines += [f"Wrote {one_line(path)}" for path in document["plots"]]
     report.emit(outcomes, worst, *lines)
 
 
