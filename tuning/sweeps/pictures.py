@@ -3,6 +3,7 @@
 Written into the store's folder once its parts are there; they say nothing that the rows do not.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,8 @@ FEW = 20  # contacts of a cell below which it has no quantile: a 95th percentile
 # Every quantile of the profile: its order, label, colour, line.
 PROFILE = (
     (0.5, "half of the contacts", SKY, "-"),
-    (0.95, "95 %", BLUE, "--"),
-    (0.99, "99 %", BLACK, "-."),
+    (0.95, "95 %", BLUE, "-"),
+    (0.99, "99 %", ORANGE, "-."),
 )
 
 
@@ -68,7 +69,7 @@ def error_map(plan: Plan, regions: Regions, manifest: Manifest, name: str) -> Fi
     """Quantiles of |e - e*| over the first input and, as a map, over both."""
     figure = new_figure((8.6, 7.2), f"{name}: restitution error of {regions.scenarios} scenarios")
     two = len(plan.per_contact) == 2
-    figure.subplots_adjust(left=0.095, right=0.93, hspace=0.12, wspace=0.03)
+    figure.subplots_adjust(left=0.095, right=0.88, hspace=0.12, wspace=0.03)
     grid: Any = figure.subplots(2 if two else 1, 2, squeeze=False, gridspec_kw={"width_ratios": (40, 1)})
     grid[0, 1].axis("off")
     if not plan.per_contact:
@@ -89,12 +90,14 @@ def failure_region(plan: Plan, regions: Regions, manifest: Manifest, name: str) 
     number = len(plan.per_scenario)
     points, limit = regions.points, _drawn_limit(manifest)
     size = (13, 4.9) if number == 2 else (7, 4.9)
-    figure = new_figure(size, f"{name}: scenarios that fail", below=1.0)
+    said = f"{regions.failed} of {regions.scenarios} scenarios failed"
+    figure = new_figure(size, f"{name}: {said}", below=1.0)
+    figure.subplots_adjust(wspace=0.32)
     panels: Any = figure.subplots(1, 3 if number == 2 else 1, squeeze=False)[0]
     if number == 2:
         _draw_points(panels[0], points.inputs[0], points.inputs[1], points.failed, points.size)
-        _name_axis(panels[0].xaxis, plan.per_scenario[0])
-        _name_axis(panels[0].yaxis, plan.per_scenario[1])
+        _name_axis(panels[0].xaxis, plan.per_scenario[0], points.inputs[0])
+        _name_axis(panels[0].yaxis, plan.per_scenario[1], points.inputs[1])
     finite = points.size[np.isfinite(points.size) & (points.size > 0)]
     values = [*finite, *([limit] if limit else [])] or [1.0]
     low, high = min(values) / 1.5, max(values) * 1.5
@@ -105,10 +108,11 @@ def failure_region(plan: Plan, regions: Regions, manifest: Manifest, name: str) 
         shown = np.clip(np.where(np.isfinite(points.size), points.size, high), low, None)
         _draw_points(axes, points.inputs[place], shown, points.failed, points.size)
         if limit:
-            axes.axhline(limit, color=GREEN, linewidth=1.5, linestyle=":", label=f"limit {limit:g}", zorder=4)
-        _name_axis(axes.xaxis, one)
-        axes.set(yscale="log", ylim=(low, high * 1.1))
-        axes.yaxis.set_label_text("worst error of the scenario |e - e*| [1]" if place == 0 else "")
+            axes.axhline(
+                limit, color=BLACK, linewidth=1.5, linestyle="--", label=f"limit {limit:g}", zorder=4
+            )
+        _name_axis(axes.xaxis, one, points.inputs[place])
+        axes.set(yscale="log", ylim=(low, high * 1.1), ylabel="worst error of the scenario |e - e*| [1]")
         _plain_ticks(axes.yaxis, low, high)
     for axes in panels:
         finish(axes, None)
@@ -181,7 +185,7 @@ def _draw_profile(axes: Axes, one: Input, cells: int, sizes: np.ndarray, limit: 
         axes.plot([], [], " ", label=f"({100 * share:.2g} % did not end)")
     axes.set_yscale("log")
     if limit:
-        axes.axhline(limit, color=GREEN, linewidth=1.5, linestyle=":", label=f"limit {limit:g}")
+        axes.axhline(limit, color=BLACK, linewidth=1.5, linestyle="--", label=f"limit {limit:g}")
     _name_axis(axes.xaxis, one)
     axes.set(xlabel="", ylabel="|e - e*| not exceeded by [1]")
     _plain_ticks(axes.yaxis, *axes.get_ylim())
@@ -198,9 +202,11 @@ def _draw_map(
     finite = values[np.isfinite(values)]
     low, high = (np.min(finite), np.max(finite)) if len(finite) else (1e-3, 1e-1)
     if limit:
-        ratio = np.clip(max(limit / low, high / limit), 1.5, 100)
-        low, high = limit / ratio, limit * ratio
-        colours = LinearSegmentedColormap.from_list("limit", [BLUE, SKY, "white", ORANGE, VERMILION])
+        low, high = np.clip(low, limit / 100, limit / 1.5), max(high, 1.5 * limit)
+        middle = float(np.log(limit / low) / np.log(high / low))
+        places = (0.0, middle / 2, middle, (1 + middle) / 2, 1.0)
+        anchors = list(zip(places, (BLUE, SKY, "white", ORANGE, VERMILION), strict=True))
+        colours = LinearSegmentedColormap.from_list("limit", anchors)
     else:
         high = max(high, 1.5 * low)
         colours = LinearSegmentedColormap.from_list("sizes", ["white", SKY, BLUE, BLACK])
@@ -232,7 +238,7 @@ def _draw_points(
     for which, label, colour, marker, width in (
         (~failed, "not failed", SKY, "o", 2.0),
         (failed & ended, "failed", VERMILION, "x", 3.5),
-        (failed & ~ended, "failed: a contact did not end", BLACK, "^", 3.5),
+        (failed & ~ended, "of those: a contact did not end", BLACK, "^", 3.5),
     ):
         if np.any(which):
             style: dict[str, Any] = {"linestyle": "none", "marker": marker, "markersize": width}
@@ -259,17 +265,19 @@ def _limit_probability(axes: Axes, looks, share, low, high, acceptable: float | 
         _plain_ticks(axes.yaxis, least / 3, 3 * top)
 
 
-def _name_axis(axis: Axis, one: Input) -> None:
+def _name_axis(axis: Axis, one: Input, values: Sequence[float] | np.ndarray = ()) -> None:
+    """Name, scale and ends of an input's axis; `values` that are to be on it may reach further."""
     axis.set_label_text(one.label)
+    low, high = float(np.min(values, initial=one.low)), float(np.max(values, initial=one.high))
     axes, across = axis.axes, axis is axis.axes.xaxis
     scale: Any = axes.set_xscale if across else axes.set_yscale
     limits: Any = axes.set_xlim if across else axes.set_ylim
     if one.logarithmic:
         scale("log")
-        _plain_ticks(axis, one.low, one.high)
+        _plain_ticks(axis, low, high)
     else:
         axis.set_major_locator(MaxNLocator(6))
-    limits(one.low, one.high)
+    limits(low, high)
 
 
 def _plain_ticks(axis: Axis, low: float, high: float) -> None:

@@ -22,7 +22,7 @@ PREFERRED = ("contact.stiffness", "rig.force_sensor.delay")
 NAMES = {"contact.stiffness": "contact stiffness", "rig.force_sensor.delay": "force delay"}
 # Display units: factor and unit.
 UNITS = {"s": (1e3, "ms"), "m": (1e3, "mm"), "m/s": (1e3, "mm/s"), "N/m": (1e-3, "kN/m")}
-SIZES = 10.0 ** np.linspace(-7, 3, 401)  # edges of the bins of |error|, each 6 % above the last
+SIZES = 10.0 ** np.linspace(-7, 3, 1201)  # edges of the bins of |error|, each 2 % above the last
 ENDS = 0.001, 0.999  # probabilities between which the grid lies; what is outside counts in its outer cells
 PER_CELL = 150  # contacts, on average
 MOST_CELLS = 28  # along an axis
@@ -135,7 +135,8 @@ def empty_regions(plan: Plan) -> Regions:
 def add_rows(plan: Plan, regions: Regions, rows: Rows) -> Regions:
     """With some more rows: inputs, `index`, `error_*`, `status_*`, `worst_error`, `outcome`, `failed`."""
     index, failed = rows["index"], rows["failed"]
-    inputs = np.array([one.values(rows) for one in plan.per_scenario]).reshape(-1, len(index))
+    inputs = np.array([one.values(rows) for one in plan.per_scenario])
+    inputs = inputs.reshape(len(plan.per_scenario), len(index))
     found = Points(index, inputs, _worst_size(rows), failed)
     joined = Points(*(np.concatenate(pair, axis=-1) for pair in zip(regions.points, found, strict=True)))
     place = np.searchsorted(plan.looks, index, side="right") * plan.replicates + index % plan.replicates
@@ -152,7 +153,7 @@ def add_rows(plan: Plan, regions: Regions, rows: Rows) -> Regions:
 
 
 def quantile(sizes: np.ndarray, order: float, least: int) -> np.ndarray:
-    """The quantile of |error| along the last axis of `sizes`, to 3 %; NaN where less than `least` are."""
+    """The quantile of |error| along the last axis of `sizes`, to 1 %; NaN where less than `least` are."""
     below = np.cumsum(sizes, axis=-1)
     total = below[..., -1]
     rank = np.maximum(np.ceil(order * total * (1 - 1e-14)), 1)
