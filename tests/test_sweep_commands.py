@@ -113,6 +113,7 @@ def test_what_cannot_be_is_refused(jaxhil, gains, store, tmp_path):
     refused(jaxhil("sweep", gains, *new, "--scenarios", "0"), "--scenarios", "found 0")
     refused(jaxhil("sweep", gains, *new, "--scenarios", 2**33), "--scenarios", str(2**32))
     refused(jaxhil("sweep", gains, *new, "--sampling", "dice"), "--sampling", "random, sobol")
+    refused(jaxhil("sweep", gains, *TINY, *new, "--sampling", "sobol"), "--scenarios: found 100", "16")
     refused(jaxhil("sweep", gains, *new, "--precision", "half"), "--precision", "float32")
     refused(jaxhil("sweep", gains, *new, "--limit", "nan"), "--limit")
     refused(jaxhil("sweep", gains, *new, "--acceptable", "2"), "--acceptable")

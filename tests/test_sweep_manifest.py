@@ -71,10 +71,10 @@ def test_parts_cover_all_scenarios():
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("seed", 1), ("scenarios", 99), ("sampling", "sobol"), ("precision", "float32"), ("limit", 0.1)],
+    [("seed", 1), ("scenarios", 96), ("sampling", "sobol"), ("precision", "float32"), ("limit", 0.1)],
 )
 def test_what_differs_is_named(key, value):
-    (told,) = differences(GOOD, manifest(**{key: value}))
+    (told,) = differences(manifest(scenarios=112), manifest(**{"scenarios": 112, key: value}))
     assert told.startswith(f"{key}: found ")
 
 
@@ -90,3 +90,9 @@ def test_other_gains_and_versions_differ():
 def test_only_flags_that_may_change_a_result_count():
     ours = rounding_flags("--xla_force_host_platform_device_count=8 --b=1 --a=2")
     assert ours == rounding_flags("--a=2 --b=1") == "--a=2 --b=1"
+
+
+@pytest.mark.parametrize("choices", [{"scenarios": 100}, {"scenarios": 64, "chunk": 24}])
+def test_sobol_replicates_are_of_one_size(choices):
+    with pytest.raises(InputError, match="allowed a multiple of 16"):
+        manifest(sampling="sobol", **choices)

@@ -5,6 +5,7 @@ import pytest
 
 from tuning.sweeps.columns import GOOD, OUTCOMES
 from tuning.sweeps.tally import WORST, add_rows, empty_tally, failure_probability
+from tuning.verdict import replicate_interval
 
 
 def made_up(number, seed=0, share=0.3):
@@ -56,10 +57,10 @@ def test_interval_without_failures_is_known_in_closed_form():
     assert found.high == pytest.approx(1 - 0.025 ** (1 / 500), rel=1e-12)
 
 
-def test_interval_of_replicates_is_students():
+def test_interval_of_replicates_is_over_their_means():
     rows = made_up(16 * 64)
     found = failure_probability(add_rows(empty_tally(16), rows))
-    means = rows["failed"].reshape(64, 16).mean(axis=0)
-    half = 2.131449545559323 * np.std(means, ddof=1) / 4
-    assert found.value == pytest.approx(np.mean(means))
-    assert (found.low, found.high) == pytest.approx((found.value - half, found.value + half))
+    counts = rows["failed"].reshape(64, 16).sum(axis=0)
+    low, high = replicate_interval(counts, 64)[1:]
+    assert found.value == pytest.approx(np.mean(rows["failed"]))
+    assert (found.low, found.high) == (low, high)

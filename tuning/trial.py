@@ -104,13 +104,11 @@ class Trial:
         outcome = evaluate(self.loop, values, scenarios, at_least=lanes)
         if not noise:
             return outcome, np.ones(len(some))
-        first = slice(None, None, number)
-        period, clearance = (
-            jnp.asarray(one[first]) for one in (scenarios.control_period, scenarios.clearance)
-        )
-        constants = Constants(period, clearance)
-        own: Any = {name: jnp.asarray(value[first]) for name, value in values.items()}
-        return outcome, np.asarray(self.loop.compensator.noise_amplification(own, constants))
+        # The mean over the scenarios, as `tuning.objective.residuals` has it.
+        constants = Constants(jnp.asarray(scenarios.control_period), jnp.asarray(scenarios.clearance))
+        own: Any = {name: jnp.asarray(value) for name, value in values.items()}
+        amplification = np.asarray(self.loop.compensator.noise_amplification(own, constants))
+        return outcome, np.mean(amplification.reshape(len(some), number), axis=1)
 
     def gains(self, task: int, shares: Float[np.ndarray, "gains"]) -> dict[str, float]:
         """All of the compensator's gains at a point of the unit box."""

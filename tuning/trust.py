@@ -33,6 +33,10 @@ class Intervals(NamedTuple):
     rms: Interval
     p99: Interval
 
+    def plain(self) -> dict[str, dict[str, float]]:
+        """As plain data, for files."""
+        return {name: one._asdict() for name, one in self._asdict().items()}
+
 
 class Sensitivity(NamedTuple):
     """What the Jacobian says of each gain and of each direction in the space of gains; see `sensitivity`.

@@ -178,11 +178,6 @@ def _tune_all(
     return _in_order(entries)
 
 
-def _intervals(result) -> dict[str, Any]:
-    """95 % confidence intervals of the tuned figures, as plain data."""
-    return {name: one._asdict() for name, one in result.intervals._asdict().items()}
-
-
 def _objective(options: Tune):
     from tuning.objective import Objective
 
@@ -212,7 +207,7 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) ->
         loaded.mechanism,
         loaded.sha256,
         validity_envelope(loaded.mechanism, result.scenarios),
-        {"nominal": result.nominal, "robust": result.figures, "tuned_intervals": _intervals(result)},
+        {"nominal": result.nominal, "robust": result.figures, "tuned_intervals": result.intervals.plain()},
         options.seed,
         result.timings,
     )
@@ -233,7 +228,7 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) ->
         "literature": result.literature,
         "figures": result.figures,
         "nominal": result.nominal,
-        "tuned_intervals": _intervals(result),
+        "tuned_intervals": result.intervals.plain(),
         "starts": [_start(start) for start in result.starts],
         "carried_over": _carried_over(result),
         "freedom": {name: one._asdict() for name, one in result.freedom.items()},

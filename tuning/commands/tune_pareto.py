@@ -110,7 +110,7 @@ def _write(options: Tune, sha256: str, result: Any, front: Any, folder: Path) ->
         figures = {
             "nominal": {**result.nominal, "tuned": point.nominal},
             "robust": {**result.figures, "tuned": point.figures},
-            "tuned_intervals": {name: one._asdict() for name, one in point.intervals._asdict().items()},
+            "tuned_intervals": point.intervals.plain(),
         }
         document = build_document(
             options.compensator,

@@ -4,7 +4,7 @@ Whatever the chunks, the devices, the number of scenarios or the interruptions, 
 sensors' noise included.
 
 - `random`: independent draws, from counter-based generators (`jaxhil.uncertainty.draw`).
-- `sobol`: `REPLICATES` scrambled Sobol sequences, each scrambled by itself; scenario i is point i // R of
+- `sobol`: R = `REPLICATES` scrambled Sobol sequences, each scrambled by itself; scenario i is point i // R of
   sequence i % R. The means of the R sequences are independent and alike, so that an interval can be stated
   (Owen, "Monte Carlo theory, methods and examples", ch. 17: randomised quasi-Monte Carlo).
 """

@@ -10,9 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from tuning.sweeps.columns import GOOD, OUTCOMES
+from tuning.verdict import LEVEL as CONFIDENCE
+from tuning.verdict import Interval, binomial_interval, replicate_interval
 
 WORST = 10
-CONFIDENCE = 0.95
 
 
 class Tally(NamedTuple):
@@ -70,19 +71,16 @@ def add_rows(tally: Tally, rows: Mapping[str, np.ndarray]) -> Tally:
 
 
 def failure_probability(tally: Tally) -> Probability:
-    """Exact binomial interval (Clopper and Pearson 1934) of independent draws; of Sobol replicates the
-    interval of Student's t over the replicates' means."""
-    number, failed = tally.scenarios, tally.failed
-    shares = [k / n for n, k in tally.replicates if n]
-    if len(shares) < 2 or not 0 < failed < number:
-        from scipy.stats import binomtest
+    """Of independent draws with the exact binomial interval; of Sobol replicates, which must be of one size,
+    with the interval over the replicates (`tuning.verdict`)."""
+    if len(tally.replicates) == 1:
+        found = binomial_interval(tally.failed, tally.scenarios, CONFIDENCE)
+        return _probability(found, "binomial, exact")
+    (each,) = {number for number, _ in tally.replicates}
+    failures = [failed for _, failed in tally.replicates]
+    found = replicate_interval(failures, each, CONFIDENCE)
+    return _probability(found, f"{len(failures)} scrambled Sobol replicates")
 
-        interval = binomtest(failed, number).proportion_ci(CONFIDENCE, method="exact")
-        return Probability(failed / number, float(interval.low), float(interval.high), "binomial, exact")
-    from scipy.special import stdtrit
 
-    spread = np.std(shares, ddof=1) / np.sqrt(len(shares))
-    reach = float(stdtrit(len(shares) - 1, (1 + CONFIDENCE) / 2) * spread)
-    value = failed / number
-    low, high = max(0.0, value - reach), min(1.0, value + reach)
-    return Probability(value, low, high, f"{len(shares)} scrambled Sobol replicates, Student's t")
+def _probability(found: Interval, method: str) -> Probability:
+    return Probability(float(found.estimate), float(found.low), float(found.high), method)
