@@ -17,7 +17,7 @@ from tuning.sweeps.regions import SIZES, add_rows, empty_regions, make_plan, qua
 from tuning.sweeps.store import PICTURES
 from tuning.verdict import binomial_interval, replicate_interval
 
-NUMBER = 100
+NUMBER = 96
 LOST = {
     "contact.stiffness": {"distribution": "loguniform", "factor": [0.3, 3.0]},
     # A sensor that reads next to nothing: some bodies are never stopped.
@@ -27,7 +27,7 @@ LOST = {
 
 def ran(document, **choices):
     made = manifest(document, NUMBER, **choices)
-    return made, check_document(document).mechanism, run_chunk(build_sweep(made), 0, 100)
+    return made, check_document(document).mechanism, run_chunk(build_sweep(made), 0, NUMBER)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def flat(found):
 
 
 @pytest.mark.parametrize(
-    "cuts", [[(n, n + 1) for n in range(NUMBER)], [(0, 1), (1, 1), (1, 37), (37, 100)], [(60, 100), (0, 60)]]
+    "cuts", [[(n, n + 1) for n in range(NUMBER)], [(0, 1), (1, 1), (1, 37), (37, NUMBER)], [(60, NUMBER), (0, 60)]]
 )
 def test_any_split_gives_the_same(swept, few_points, cuts):
     made, mechanism, rows = swept
