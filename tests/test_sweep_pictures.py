@@ -32,14 +32,16 @@ def ran(document, **choices):
 
 @pytest.fixture(scope="module")
 def usual():
-    made, mechanism, rows = ran(case(2, "phase_lead"), chunk=100, limit=0.2)
+    made, mechanism, rows = ran(case(2, "phase_lead"), chunk=NUMBER, limit=0.2)
     size = np.abs(rows["worst_error"])
     return made, mechanism, {**rows, "failed": size > np.quantile(size, 0.6)}
 
 
 @pytest.fixture(scope="module")
 def lost():
-    return ran(case(2, force_sensor={"range": 1.0}, uncertainty=LOST), chunk=100, limit=1.5, sampling="sobol")
+    return ran(
+        case(2, force_sensor={"range": 1.0}, uncertainty=LOST), chunk=NUMBER, limit=1.5, sampling="sobol"
+    )
 
 
 @pytest.fixture(params=["usual", "lost"])
@@ -65,7 +67,8 @@ def flat(found):
 
 
 @pytest.mark.parametrize(
-    "cuts", [[(n, n + 1) for n in range(NUMBER)], [(0, 1), (1, 1), (1, 37), (37, NUMBER)], [(60, NUMBER), (0, 60)]]
+    "cuts",
+    [[(n, n + 1) for n in range(NUMBER)], [(0, 1), (1, 1), (1, 37), (37, NUMBER)], [(60, NUMBER), (0, 60)]],
 )
 def test_any_split_gives_the_same(swept, few_points, cuts):
     made, mechanism, rows = swept
@@ -179,7 +182,7 @@ def test_convergence_ends_at_the_verdict(swept):
 
 @pytest.fixture(scope="module")
 def phases():
-    return ran(case(1, uncertainty={}), chunk=100)
+    return ran(case(1, uncertainty={}), chunk=NUMBER)
 
 
 @pytest.mark.parametrize("limit", [0.2, 0.0, None, 1e-9, 1e9])
