@@ -11,7 +11,7 @@ from nbclient import NotebookClient
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-LARGEST = 400_000  # bytes
+LARGEST = 500_000  # bytes
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
 SOLVER = re.compile(r"\b(?:tune|tune_all|fronts)\(")
 MACHINE_PATH = re.compile(r"(?:/(?:home|root|tmp|work|Users|usr|opt)/|[A-Z]:\\\\)[\w.-]")

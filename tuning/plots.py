@@ -55,7 +55,9 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
 
 def errors_plot(result: Result, limit: float) -> Figure:
     """How large errors are and how often, and at which contact frequency, before and after tuning."""
-    figure = _figure((11, 4.6), f"{result.mechanism.name}: restitution error on fresh scenarios", above=0.75)
+    figure = new_figure(
+        (11, 4.6), f"{result.mechanism.name}: restitution error on fresh scenarios", above=0.75
+    )
     left, right = figure.subplots(1, 2)
     # A limit of 0 or inf has no place on a logarithmic axis.
     drawn = 0 < limit < np.inf
@@ -95,8 +97,8 @@ def errors_plot(result: Result, limit: float) -> Figure:
     right.axhline(0, color=BLACK, linewidth=0.6)
     right.set_yscale("symlog", linthresh=limit if drawn else 0.01)
     right.set(xlabel="contact frequency [Hz]", ylabel="error e - e* [1]  (above 0: divergence)")
-    _finish(left, "lower left")
-    _finish(right, None)
+    finish(left, "lower left")
+    finish(right, None)
     if right.get_legend_handles_labels()[0]:
         # Above the axes: points are everywhere inside.
         style: dict[str, Any] = {"fontsize": 8, "frameon": False, "markerscale": 2.5, "columnspacing": 1.2}
@@ -109,7 +111,7 @@ def errors_plot(result: Result, limit: float) -> Figure:
 
 def loss_plot(result: Result) -> Figure:
     """The objective that each start of the solver had reached after each step."""
-    figure = _figure((7, 4.6), f"{result.mechanism.name}: tuning from {len(result.starts)} starts")
+    figure = new_figure((7, 4.6), f"{result.mechanism.name}: tuning from {len(result.starts)} starts")
     axes = figure.subplots()
     finite = [start for start in result.starts if np.all(np.isfinite(start.history))]
     best = min(finite, key=lambda start: start.rms) if finite else None
@@ -130,14 +132,16 @@ def loss_plot(result: Result) -> Figure:
     axes.set_yscale("log")
     axes.set(xlabel="solver step", ylabel=f"{result.settings.objective.name} on training scenarios [1]")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    _finish(axes, "best")
+    finish(axes, "best")
     return figure
 
 
 def overview_plot(results: Sequence[Result], limit: float) -> Figure:
     """The rms restitution error of every mechanism before tuning, with the literature's gains, and tuned."""
     height = 1.6 + 0.2 * len(results)
-    figure = _figure((8, height), f"Restitution error of {len(results)} mechanisms on fresh scenarios", 0.9)
+    figure = new_figure(
+        (8, height), f"Restitution error of {len(results)} mechanisms on fresh scenarios", 0.9
+    )
     longest = max(len(result.mechanism.name) for result in results)
     figure.subplots_adjust(left=min(0.45, (0.5 + 0.085 * min(longest, 40)) / 8))
     axes = figure.subplots()
@@ -150,7 +154,7 @@ def overview_plot(results: Sequence[Result], limit: float) -> Figure:
         axes.axvline(limit, color=GREEN, linewidth=1, linestyle=":", label=f"limit {limit:g}")
     axes.set_yticks(rows, [one_line(r.mechanism.name, 40).replace("$", r"\$") for r in results], fontsize=8)
     axes.set(xscale="log", xlabel="rms of the restitution error e - e* [1]", ylim=(len(results) - 0.5, -0.5))
-    _finish(axes, None)
+    finish(axes, None)
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, fontsize=8, frameon=False)
     return figure
 
@@ -158,7 +162,7 @@ def overview_plot(results: Sequence[Result], limit: float) -> Figure:
 def front_plot(front: Front, result: Result, limit: float) -> Figure:
     """Restitution error against amplification of sensor noise: numbered points, the front as a line of what
     is reached, the literature's gains and those tuned beside."""
-    figure = _figure(
+    figure = new_figure(
         (7, 5), f"{result.mechanism.name}: restitution error against sensor noise, fresh scenarios"
     )
     axes = figure.subplots()
@@ -188,7 +192,7 @@ def front_plot(front: Front, result: Result, limit: float) -> Figure:
     axes.margins(0.08, 0.12)
     name = result.settings.objective.name
     axes.set(xlabel="noise of the command over noise of the force sensor [1]", ylabel=f"{name} of e - e* [1]")
-    _finish(axes, "best")
+    finish(axes, "best")
     return figure
 
 
@@ -201,7 +205,7 @@ def contact_plot(pieces: Sequence[Piece], title: str, sensors: str | None = None
     if len(pieces) > len(shown):
         title += f" (the first {len(shown)} of {len(pieces)} contacts)"
     # Two lines of title above the axes; the legend below.
-    figure = _figure((max(7.0, 3.6 * len(shown) + 1), 6.4), title, above=1.0, below=0.95)
+    figure = new_figure((max(7.0, 3.6 * len(shown) + 1), 6.4), title, above=1.0, below=0.95)
     grid = figure.subplots(2, len(shown), squeeze=False, sharex="col")
     for column, piece in enumerate(shown):
         force, position = grid[0, column], grid[1, column]
@@ -225,13 +229,39 @@ def contact_plot(pieces: Sequence[Piece], title: str, sensors: str | None = None
             position.axhline(1e3 * surface, color=BLACK, linewidth=0.6)
         _limit_position(position, piece, end)
         for axes in (force, position):
-            _finish(axes, None)
+            finish(axes, None)
     grid[0, 0].set_ylabel("force on the model [N]")
     grid[1, 0].set_ylabel("position of the model [mm]\n(thin line: a surface)")
     figure.align_ylabels(grid[:, 0])
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower center", ncols=len(labels), fontsize=9, frameon=False)
     return figure
+
+
+def new_figure(size: tuple[float, float], title: str, above: float = 0.55, below: float = 0.6) -> Figure:
+    """A figure with room [inches] above and below its axes, of labels and titles of known sizes: an automatic
+    layout draws everything twice."""
+    width, height = size
+    figure = Figure(figsize=size)
+    figure.subplots_adjust(
+        left=0.9 / width, right=1 - 0.25 / width, bottom=below / height, top=1 - above / height,
+        wspace=0.24, hspace=0.12,
+    )  # fmt: skip
+    # A name is text, not a formula.
+    figure.suptitle(one_line(title, 120).replace("$", r"\$"), fontsize=12, y=1 - 0.12 / height, va="top")
+    return figure
+
+
+def finish(axes: Axes, legend: Any) -> None:
+    """Grid, spines and legend (its place, None for none) of axes that are drawn."""
+    axes.grid(True, color="0.88", linewidth=0.6)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    if not axes.get_legend_handles_labels()[0]:
+        axes.text(0.5, 0.5, "nothing to show", transform=axes.transAxes, ha="center", va="center")
+    elif legend is not None:
+        axes.legend(loc=legend, fontsize=8, framealpha=0.9)
 
 
 def _scale(axes: Axes, name: str, values: Sequence[float]) -> None:
@@ -273,28 +303,3 @@ def _limit_position(axes: Axes, piece: Piece, end: float) -> None:
     if len(every):
         margin = 0.05 * (np.max(every) - np.min(every)) or 1.0
         axes.set_ylim(np.min(every) - margin, np.max(every) + margin)
-
-
-def _figure(size: tuple[float, float], title: str, above: float = 0.55, below: float = 0.6) -> Figure:
-    """A figure with room [inches] above and below its axes, of labels and titles of known sizes: an automatic
-    layout draws everything twice."""
-    width, height = size
-    figure = Figure(figsize=size)
-    figure.subplots_adjust(
-        left=0.9 / width, right=1 - 0.25 / width, bottom=below / height, top=1 - above / height,
-        wspace=0.24, hspace=0.12,
-    )  # fmt: skip
-    # A name is text, not a formula.
-    figure.suptitle(one_line(title, 120).replace("$", r"\$"), fontsize=12, y=1 - 0.12 / height, va="top")
-    return figure
-
-
-def _finish(axes: Axes, legend: Any) -> None:
-    axes.grid(True, color="0.88", linewidth=0.6)
-    axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    if not axes.get_legend_handles_labels()[0]:
-        axes.text(0.5, 0.5, "nothing to show", transform=axes.transAxes, ha="center", va="center")
-    elif legend is not None:
-        axes.legend(loc=legend, fontsize=8, framealpha=0.9)

@@ -22,6 +22,7 @@ def run(options: Sweep) -> int:
     prepare()
     from tuning.gain_file import load_gain_file
     from tuning.sweeps.manifest import Choices, build_manifest
+    from tuning.sweeps.pictures import write_pictures
     from tuning.sweeps.run import compare_precisions, run_sweep
     from tuning.sweeps.store import locked, open_store
     from tuning.sweeps.tally import failure_probability
@@ -49,7 +50,8 @@ def run(options: Sweep) -> int:
                 options.scheduler,
             )
         rate = progress.rate
-    document = _document(options, store, sweep, tally, rate)
+        plots = write_pictures(store, options.acceptable)
+    document = _document(options, store, sweep, tally, rate) | {"plots": plots}
     if manifest.precision == "float32":
         document["float32"] = compare_precisions(sweep)._asdict()
     if options.drivers is not None:

@@ -58,6 +58,7 @@ def emit(document: dict[str, Any]) -> None:
     acceptable = document["acceptable"]
     wanted = "no scenario may fail" if acceptable is None else f"acceptable up to {acceptable:g}"
     lines.append(f"{document['verdict'].capitalize()}: {wanted}. Wrote {one_line(document['store'])}")
+    lines += [f"Wrote {one_line(path)}" for path in document["plots"]]
     report.emit(*tables, *lines)
 
 

@@ -2,6 +2,7 @@
 
     DIR/manifest.json
     DIR/parts/part-000000.parquet, part-000001.parquet, ...
+    DIR/errors.png, failures.png, convergence.png
 
 `DIR/parts` is a Parquet dataset, for pandas, DuckDB or Arrow; units are in the fields' metadata. A part is
 there as a whole or not at all: it is written under another name, forced to disk, then renamed. It carries the
@@ -23,6 +24,7 @@ from tuning.sweeps.columns import Column, texts_of
 from tuning.sweeps.manifest import NAME, Manifest, differences, encode, read_manifest
 
 PARTS = "parts"
+PICTURES = ("errors.png", "failures.png", "convergence.png")  # made of the rows, not part of them
 LOCK = ".lock"
 TEMPORARY = ".tmp"
 DIGEST = b"jaxhil.sweep.sha256"
@@ -45,11 +47,11 @@ def open_store(folder: Path, manifest: Manifest, resume: bool) -> Store:
     and is not to be resumed, when its store was made with other inputs, or when it cannot be written.
     """
     shown = one_line(str(folder))
-    with _writing(folder):
+    with writing(folder):
         (folder / PARTS).mkdir(parents=True, exist_ok=True)
         for stale in (*folder.glob(f".*{TEMPORARY}"), *(folder / PARTS).glob(f".*{TEMPORARY}")):
             stale.unlink(missing_ok=True)
-        held = {entry.name for entry in folder.iterdir()} - {LOCK, PARTS}
+        held = {entry.name for entry in folder.iterdir()} - {LOCK, PARTS, *PICTURES}
         parts = any((folder / PARTS).iterdir())
     if NAME in held and resume:
         old = read_manifest(folder)
@@ -59,7 +61,7 @@ def open_store(folder: Path, manifest: Manifest, resume: bool) -> Store:
     if held or parts:
         allowed = "an empty folder, or a store and --resume" if not resume else "a store with its manifest"
         raise InputError(f"{shown}: found a folder with something in it, allowed {allowed}")
-    with _writing(folder / NAME):
+    with writing(folder / NAME):
         _write_whole(folder / NAME, encode(manifest))
     return Store(folder, manifest)
 
@@ -72,7 +74,7 @@ def read_store(folder: Path) -> Store:
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Nobody else writes to the store meanwhile. Raises `InputError` if somebody does."""
-    with _writing(folder):
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         file = (folder / LOCK).open("wb")
     with file:
@@ -100,7 +102,7 @@ def write_part(store: Store, part: int, rows: Mapping[str, np.ndarray]) -> None:
         write_page_checksum=True,
     )
     path = store.part_path(part)
-    with _writing(path):
+    with writing(path):
         _write_whole(path, buffer.getvalue())
 
 
@@ -131,7 +133,7 @@ def read_part(store: Store, part: int) -> dict[str, np.ndarray] | None:
 
 def remove_parts(store: Store, first: int) -> None:
     """Remove the parts from number `first` on. Raises `InputError` when they cannot be."""
-    with _writing(store.folder / PARTS):
+    with writing(store.folder / PARTS):
         for path in (store.folder / PARTS).glob("part-*.parquet"):
             number = path.stem.removeprefix("part-")
             if number.isdigit() and int(number) >= first:
@@ -162,6 +164,18 @@ def same_rows(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) ->
         if one[name].dtype != other[name].dtype
         or not np.array_equal(one[name], other[name], equal_nan=one[name].dtype.kind == "f")
     ]
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """What cannot be written there is an `InputError`, one line."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{one_line(str(path))}: cannot be written: {one_line(reason, 100)}") from None
 
 
 def schema(manifest: Manifest) -> Any:
@@ -232,14 +246,3 @@ def _write_whole(path: Path, content: Any) -> None:
         os.fsync(folder)
     finally:
         os.close(folder)
-
-
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"{one_line(str(path))}: cannot be written: {one_line(reason, 100)}") from None

@@ -1,0 +1,221 @@
+"""Pictures of a sweep: what they accumulate is what NumPy finds in the whole, however it is split."""
+
+import json
+
+import msgspec
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from sweep_cases import case, manifest
+
+from tuning.__main__ import main
+from tuning.gain_file import check_document, write_gain_file
+from tuning.sweeps import pictures, regions
+from tuning.sweeps.chunks import build_sweep, run_chunk
+from tuning.sweeps.columns import OUTCOMES, STATUSES
+from tuning.sweeps.regions import SIZES, add_rows, empty_regions, make_plan, quantile
+from tuning.sweeps.store import PICTURES
+from tuning.verdict import binomial_interval, replicate_interval
+
+NUMBER = 96
+LOST = {
+    "contact.stiffness": {"distribution": "loguniform", "factor": [0.3, 3.0]},
+    # A sensor that reads next to nothing: some bodies are never stopped.
+    "rig.force_sensor.range": {"distribution": "loguniform", "low": 1e-7, "high": 1e3},
+}
+
+
+def ran(document, **choices):
+    made = manifest(document, NUMBER, **choices)
+    return made, check_document(document).mechanism, run_chunk(build_sweep(made), 0, NUMBER)
+
+
+@pytest.fixture(scope="module")
+def usual():
+    made, mechanism, rows = ran(case(2, "phase_lead"), chunk=NUMBER, limit=0.2)
+    size = np.abs(rows["worst_error"])
+    return made, mechanism, {**rows, "failed": size > np.quantile(size, 0.6)}
+
+
+@pytest.fixture(scope="module")
+def lost():
+    return ran(
+        case(2, force_sensor={"range": 1.0}, uncertainty=LOST), chunk=NUMBER, limit=1.5, sampling="sobol"
+    )
+
+
+@pytest.fixture(params=["usual", "lost"])
+def swept(request):
+    return request.getfixturevalue(request.param)
+
+
+@pytest.fixture
+def few_points(monkeypatch):
+    monkeypatch.setattr(regions, "POINTS", 10)
+    monkeypatch.setattr(regions, "FAILED_POINTS", 20)
+
+
+def accumulated(plan, rows, cuts):
+    found = empty_regions(plan)
+    for first, until in cuts:
+        found = add_rows(plan, found, {name: values[first:until] for name, values in rows.items()})
+    return found
+
+
+def flat(found):
+    return [found.sizes, found.seen, found.failures, *found.points]
+
+
+@pytest.mark.parametrize(
+    "cuts",
+    [[(n, n + 1) for n in range(NUMBER)], [(0, 1), (1, 1), (1, 37), (37, NUMBER)], [(60, NUMBER), (0, 60)]],
+)
+def test_any_split_gives_the_same(swept, few_points, cuts):
+    made, mechanism, rows = swept
+    plan = make_plan(made, mechanism, rows)
+    whole = accumulated(plan, rows, [(0, NUMBER)])
+    for one, other in zip(flat(whole), flat(accumulated(plan, rows, cuts)), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_stiffness_and_force_delay_come_first(usual):
+    made, mechanism, rows = usual
+    plan = make_plan(made, mechanism, rows)
+    assert [one.label for one in plan.per_contact] == ["contact stiffness [kN/m]", "force delay [ms]"]
+    assert all(one.low < np.median(one.values(rows)) < one.high for one in plan.per_contact)
+
+
+def test_else_the_inputs_with_the_strongest_rank_correlation(lost):
+    made, mechanism, rows = lost
+    assert make_plan(made, mechanism, rows).per_scenario[1].columns == ("rig.force_sensor.range",)
+    # What drives the error is made known to the plan, against the real one.
+    size = rows["approach.phase_2"]
+    made_up = {**rows, "worst_error": size, "outcome": np.zeros(NUMBER, int)}
+    assert make_plan(made, mechanism, made_up).per_scenario[1].columns == ("approach.phase_2",)
+
+
+def test_counts_of_cells_are_a_histogram_of_the_whole(usual):
+    made, mechanism, rows = usual
+    plan = make_plan(made, mechanism, rows)
+    sizes = accumulated(plan, rows, [(0, NUMBER)]).sizes
+    sample, edges = [], [one.edges(plan.cells) for one in plan.per_contact]
+    for number in (1, 2):
+        across = np.clip(1e-3 * rows["contact.stiffness_1"], edges[0][0], edges[0][-1])
+        up = np.clip(1e3 * rows["rig.force_sensor.delay"], edges[1][0], edges[1][-1])
+        sample.append(np.stack([across, up, np.abs(rows[f"error_{number}"])], axis=1))
+    inner = sizes[..., 1:-1]
+    direct, _ = np.histogramdd(np.concatenate(sample), bins=[*edges, SIZES])
+    np.testing.assert_array_equal(inner, direct)
+    assert inner.sum() == sizes.sum() == 2 * NUMBER and np.count_nonzero(inner) > 50
+
+
+def test_a_quantile_is_that_of_the_values():
+    values = np.abs(np.random.default_rng(0).standard_normal(3000)) * 10.0 ** np.linspace(-4, 0, 3000)
+    counts = np.bincount(np.searchsorted(SIZES, values, side="right"), minlength=len(SIZES) + 1)
+    for order in (0.5, 0.95, 0.99):
+        direct = np.quantile(values, order, method="inverted_cdf")
+        assert quantile(counts, order, 20) == pytest.approx(direct, rel=0.0097)
+    assert np.isnan(quantile(counts, 0.5, 3001)) and np.isnan(quantile(0 * counts, 0.5, 0))
+    counts[-1] = 200
+    assert quantile(counts, 0.95, 20) == np.inf and np.isfinite(quantile(counts, 0.9, 20))
+
+
+def test_what_did_not_end_is_infinite_and_what_comes_after_it_nothing(lost):
+    made, mechanism, rows = lost
+    plan = make_plan(made, mechanism, rows)
+    found = accumulated(plan, rows, [(0, NUMBER)])
+    ended = [rows[f"status_{number}"] == STATUSES.index("ok") for number in (1, 2)]
+    first, second = np.sum(~ended[0]), np.sum(ended[0] & ~ended[1])
+    assert first > 10
+    assert found.sizes[..., -1].sum() == first + second
+    assert found.sizes.sum() == NUMBER + ended[0].sum()
+    bad = rows["outcome"] > OUTCOMES.index("saturated")
+    np.testing.assert_array_equal(np.isinf(found.points.size), bad)
+
+
+def test_failures_are_counted_up_to_each_look(swept):
+    made, mechanism, rows = swept
+    plan = make_plan(made, mechanism, rows)
+    found = accumulated(plan, rows, [(0, NUMBER)])
+    assert (found.scenarios, found.failed) == (NUMBER, rows["failed"].sum())
+    assert plan.looks[-1] == NUMBER // plan.replicates * plan.replicates
+    assert not np.any(plan.looks % plan.replicates)
+    counted = np.cumsum(found.failures, axis=0)
+    for look, each in zip(plan.looks, counted, strict=False):
+        direct = [rows["failed"][:look][k :: plan.replicates].sum() for k in range(plan.replicates)]
+        np.testing.assert_array_equal(each, direct)
+
+
+def test_points_are_the_first_and_the_first_that_failed(usual, few_points):
+    made, mechanism, rows = usual
+    found = accumulated(make_plan(made, mechanism, rows), rows, [(0, NUMBER)])
+    failed = np.flatnonzero(rows["failed"])[:20]
+    wanted = np.union1d(np.arange(10), failed)
+    assert len(wanted) > 20
+    np.testing.assert_array_equal(found.points.index, wanted)
+    np.testing.assert_array_equal(found.points.size, np.abs(rows["worst_error"])[wanted])
+    np.testing.assert_array_equal(found.points.inputs[1], 1e3 * rows["rig.force_sensor.delay"][wanted])
+
+
+def test_convergence_ends_at_the_verdict(swept):
+    made, mechanism, rows = swept
+    plan = make_plan(made, mechanism, rows)
+    found = accumulated(plan, rows, [(0, NUMBER)])
+    figure = pictures.convergence(plan, found, made, "name")
+    axes = figure.axes[0]
+    drawn = {line.get_label(): line.get_data() for line in axes.lines}
+    (number,), (share,) = [
+        [values[-1]] for label, pair in drawn.items() if label.startswith("share") for values in pair
+    ]
+    assert number == plan.looks[-1] and share == np.mean(rows["failed"][:number])
+    band = axes.collections[0].get_paths()[0].vertices
+    ends = band[band[:, 0] == number][:, 1]
+    failed = rows["failed"][:number]
+    if plan.replicates == 1:
+        interval = binomial_interval(failed.sum(), number)
+    else:
+        each = failed.reshape(-1, plan.replicates).sum(axis=0)
+        interval = replicate_interval(each, number // plan.replicates)
+    assert ends.min() == pytest.approx(float(interval.low))
+    assert ends.max() == pytest.approx(float(interval.high))
+
+
+@pytest.fixture(scope="module")
+def phases():
+    return ran(case(1, uncertainty={}), chunk=NUMBER)
+
+
+@pytest.mark.parametrize("limit", [0.2, 0.0, None, 1e-9, 1e9])
+@pytest.mark.parametrize("name", ["phases", "usual", "lost"])
+def test_every_axis_is_named_with_its_unit(request, name, limit):
+    made, mechanism, rows = request.getfixturevalue(name)
+    made = msgspec.structs.replace(made, limit=limit)
+    plan = make_plan(made, mechanism, rows)
+    assert len(plan.per_contact) == (1 if name == "phases" else 2)
+    found = accumulated(plan, rows, [(0, NUMBER)])
+    drawn = [draw(plan, found, made, name) for draw in (pictures.error_map, pictures.failure_region)]
+    for figure in (*drawn, pictures.convergence(plan, found, made, name, 0.1)):
+        FigureCanvasAgg(figure).draw()
+        named = [axes for axes in figure.axes if axes.axison]
+        assert named
+        # Above a map no axis is named twice, and a colour bar has one.
+        mapped = figure is drawn[0] and name != "phases"
+        across = named[1:2] if mapped else named
+        labels = [*(axes.get_ylabel() for axes in named), *(axes.get_xlabel() for axes in across)]
+        assert all(label.endswith("]") for label in labels), labels
+
+
+def test_the_command_writes_them_and_resumes_over_them(tmp_path, capsys):
+    gains, store = tmp_path / "gains.json", tmp_path / "store"
+    write_gain_file(gains, case())
+    command = ["sweep", str(gains), "--scenarios", "70", "--chunk", "64", "-o", str(store), "--json"]
+    main(command)
+    found = json.loads(capsys.readouterr().out)
+    assert found["plots"] == [str(store / name) for name in PICTURES]
+    before = [path.read_bytes() for path in map(store.joinpath, PICTURES)]
+    (store / PICTURES[0]).unlink()
+    (store / "parts" / "part-000001.parquet").unlink()
+    main([*command, "--resume"])
+    assert json.loads(capsys.readouterr().out)["failed"] == found["failed"]
+    assert [path.read_bytes() for path in map(store.joinpath, PICTURES)] == before
+    assert main(command) == 2 and "--resume" in capsys.readouterr().err

@@ -1,0 +1,255 @@
+"""Where errors are large and scenarios fail, over two inputs: what pictures of a sweep show.
+
+Accumulated part by part in constant memory: counts of errors per cell of a grid, the first scenarios as
+points, failures counted up to some numbers of scenarios. Parts may come in any order and size; the grid
+follows from the manifest, not from what was drawn.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxhil.mechanism import Mechanism, value_at
+from jaxhil.metrics import OK, STATUS_NAMES
+from jaxhil.uncertainty import PHASE, at_points, dimensions
+from tuning.sweeps.columns import OUTCOMES, SATURATED, STATUSES, input_names, unit_of
+from tuning.sweeps.manifest import Manifest
+
+Rows = Mapping[str, np.ndarray]
+
+PREFERRED = ("contact.stiffness", "rig.force_sensor.delay")
+NAMES = {"contact.stiffness": "contact stiffness", "rig.force_sensor.delay": "force delay"}
+# Display units: factor and unit.
+UNITS = {"s": (1e3, "ms"), "m": (1e3, "mm"), "m/s": (1e3, "mm/s"), "N/m": (1e-3, "kN/m")}
+SIZES = 10.0 ** np.linspace(-7, 3, 1201)  # edges of the bins of |error|, each 2 % above the last
+ENDS = 0.001, 0.999  # probabilities between which the grid lies; what is outside counts in its outer cells
+PER_CELL = 150  # contacts, on average
+MOST_CELLS = 28  # along an axis
+POINTS, FAILED_POINTS = 4000, 2000  # the first scenarios, and the first failed ones
+LOOKS = 200  # numbers of scenarios at which the failures are counted
+
+
+class Input(NamedTuple):
+    """An input as an axis: its name and unit, the column of each contact, what makes displayed values of
+    theirs, the ends of the axis (displayed), and whether it is logarithmic."""
+
+    name: str
+    unit: str
+    columns: tuple[str, ...]
+    factor: float
+    low: float
+    high: float
+    logarithmic: bool
+
+    @property
+    def label(self) -> str:
+        return f"{self.name} [{self.unit or '1'}]"
+
+    def edges(self, cells: int) -> np.ndarray:
+        """Edges of equal cells, (cells + 1,)."""
+        spaced = np.geomspace if self.logarithmic else np.linspace
+        return spaced(self.low, self.high, cells + 1)
+
+    def values(self, rows: Rows, contact: int = 0) -> np.ndarray:
+        """Of each row, as displayed."""
+        return self.factor * rows[self.columns[contact]]
+
+
+class Plan(NamedTuple):
+    """What to accumulate: inputs (one or two, or none where nothing varies) as every contact has them and as
+    a scenario has them, cells along an axis, numbers of scenarios to look at, contacts, replicates."""
+
+    per_contact: tuple[Input, ...]
+    per_scenario: tuple[Input, ...]
+    cells: int
+    looks: np.ndarray
+    contacts: int
+    replicates: int
+
+
+class Points(NamedTuple):
+    """Scenarios as points, by index: each input (inputs, points), size of the worst error (infinite where a
+    contact did not end), whether failed; (points,)."""
+
+    index: np.ndarray
+    inputs: np.ndarray
+    size: np.ndarray
+    failed: np.ndarray
+
+
+class Regions(NamedTuple):
+    """Contacts per cell and bin of |error| (cells, ..., bins), the last bin infinite too; points; scenarios
+    and failures between looks, per replicate, (looks + 1, replicates)."""
+
+    sizes: np.ndarray
+    points: Points
+    seen: np.ndarray
+    failures: np.ndarray
+
+    @property
+    def scenarios(self) -> int:
+        return int(np.sum(self.seen))
+
+    @property
+    def failed(self) -> int:
+        return int(np.sum(self.failures))
+
+
+def make_plan(manifest: Manifest, mechanism: Mechanism, rows: Rows) -> Plan:
+    """Stiffness and force delay where they are drawn; else the inputs with the strongest rank correlation
+    with |error| among `rows`, of the first part."""
+    size = _worst_size(rows)
+    strengths = {path: _strengths(mechanism, path, rows, size) for path in dimensions(mechanism)}
+    varying = {path: found for path, found in strengths.items() if np.any(np.isfinite(found))}
+    by_strength = sorted(varying, key=lambda path: -np.nanmax(varying[path]))
+    paths = [path for path in PREFERRED if path in varying]
+    paths = [*paths, *(path for path in by_strength if path not in paths)][:2]
+    contacts, of = mechanism.approach.contacts, manifest.replicates
+    looks = np.geomspace(min(10, manifest.scenarios), manifest.scenarios, LOOKS)
+    looks = np.unique(np.round(looks / of).astype(np.int64)) * of
+    ends = manifest.chunk * np.arange(1, min(manifest.parts, LOOKS))
+    looks = np.unique([*looks, *ends[ends % of == 0], manifest.scenarios // of * of])
+    looks = looks[(looks > 0) & (looks <= manifest.scenarios)]
+    cells = round(np.sqrt(manifest.scenarios * contacts / PER_CELL))
+    return Plan(
+        tuple(_per_contact(mechanism, path) for path in paths),
+        tuple(_per_scenario(mechanism, path, int(np.nanargmax(varying[path]))) for path in paths),
+        int(np.clip(cells, 2, MOST_CELLS)),
+        looks,
+        contacts,
+        of,
+    )
+
+
+def empty_regions(plan: Plan) -> Regions:
+    """Before any scenario."""
+    inputs = len(plan.per_contact)
+    none = np.empty(0)
+    points = Points(none.astype(np.int64), np.empty((inputs, 0)), none, none.astype(bool))
+    counts = np.zeros((len(plan.looks) + 1, plan.replicates), np.int64)
+    sizes = np.zeros((*(plan.cells,) * inputs, len(SIZES) + 1), np.int64)
+    return Regions(sizes, points, counts, counts)
+
+
+def add_rows(plan: Plan, regions: Regions, rows: Rows) -> Regions:
+    """With some more rows: inputs, `index`, `error_*`, `status_*`, `worst_error`, `outcome`, `failed`."""
+    index, failed = rows["index"], rows["failed"]
+    inputs = np.array([one.values(rows) for one in plan.per_scenario])
+    inputs = inputs.reshape(len(plan.per_scenario), len(index))
+    found = Points(index, inputs, _worst_size(rows), failed)
+    joined = Points(*(np.concatenate(pair, axis=-1) for pair in zip(regions.points, found, strict=True)))
+    place = np.searchsorted(plan.looks, index, side="right") * plan.replicates + index % plan.replicates
+
+    def counted(where: np.ndarray) -> np.ndarray:
+        return np.bincount(where, minlength=regions.seen.size).reshape(regions.seen.shape)
+
+    return Regions(
+        regions.sizes + _sizes(plan, rows, regions.sizes.shape),
+        _first(joined),
+        regions.seen + counted(place),
+        regions.failures + counted(place[failed]),
+    )
+
+
+def quantile(sizes: np.ndarray, order: float, least: int) -> np.ndarray:
+    """The quantile of |error| along the last axis of `sizes`, to 1 %; NaN where less than `least` are."""
+    below = np.cumsum(sizes, axis=-1)
+    total = below[..., -1]
+    rank = np.maximum(np.ceil(order * total * (1 - 1e-14)), 1)
+    place = np.argmax(below >= rank[..., None], axis=-1)
+    middles = np.concatenate([SIZES[:1], np.sqrt(SIZES[:-1] * SIZES[1:]), [np.inf]])
+    return np.where(total >= max(least, 1), middles[place], np.nan)
+
+
+def _sizes(plan: Plan, rows: Rows, shape: tuple[int, ...]) -> np.ndarray:
+    counts = np.zeros(int(np.prod(shape)), np.int64)
+    good = np.ones(len(rows["index"]), bool)
+    for contact in range(plan.contacts):
+        # A contact that did not end is larger than any error; what would come after it does not count.
+        counted = good
+        good = good & (rows[f"status_{contact + 1}"] == STATUSES.index(STATUS_NAMES[OK]))
+        size = np.where(good, np.abs(rows[f"error_{contact + 1}"].astype(float)), np.inf)
+        place = np.zeros(len(size), np.int64)
+        for one in plan.per_contact:
+            edges = one.edges(plan.cells)[1:-1]
+            place = place * plan.cells + np.searchsorted(edges, one.values(rows, contact), side="right")
+        size = np.nan_to_num(size, nan=np.inf, posinf=np.inf)
+        place = place * shape[-1] + np.searchsorted(SIZES, size, side="right")
+        counts += np.bincount(place[counted], minlength=len(counts))
+    return counts.reshape(shape)
+
+
+def _first(points: Points) -> Points:
+    order = np.argsort(points.index, kind="stable")
+    failed = points.failed[order]
+    kept = order[(np.arange(len(order)) < POINTS) | (failed & (np.cumsum(failed) <= FAILED_POINTS))]
+    return Points(*(values[..., kept] for values in points))
+
+
+def _worst_size(rows: Rows) -> np.ndarray:
+    """|error|, infinite where a contact did not end."""
+    size = np.abs(rows["worst_error"].astype(float))
+    return np.where((rows["outcome"] > OUTCOMES.index(SATURATED)) | np.isnan(size), np.inf, size)
+
+
+def _strengths(mechanism: Mechanism, path: str, rows: Rows, size: np.ndarray) -> np.ndarray:
+    """|rank correlation| (Spearman 1904) of each entry's column with `size`; NaN for what does not vary."""
+    _, low, high = _ends(mechanism, path)
+
+    def ranks(values: np.ndarray) -> np.ndarray:
+        found = np.empty(len(values))
+        found[np.argsort(values, kind="stable")] = np.arange(len(values))
+        return found - np.mean(found)
+
+    of_size = ranks(size)
+    spread = max(float(np.sum(of_size**2)), 1.0)
+    found = [abs(float(ranks(rows[name]) @ of_size)) / spread for name in input_names(mechanism, path)]
+    return np.where(high > low, found, np.nan)
+
+
+def _ends(mechanism: Mechanism, path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nominal value, low end and high end of each entry of an input."""
+    points = np.repeat(np.array(ENDS)[:, None], sum(dimensions(mechanism).values()), axis=1)
+    low, high = at_points(mechanism, points)[path].reshape(2, -1)
+    nominal = value_at(mechanism, path) if path != PHASE else np.zeros(len(low))
+    return np.broadcast_to(np.ravel(nominal), low.shape).astype(float), low, high
+
+
+def _per_contact(mechanism: Mechanism, path: str) -> Input:
+    """Every contact has its own entry of a list of them."""
+    names, (_, low, high) = input_names(mechanism, path), _ends(mechanism, path)
+    contacts = range(mechanism.approach.contacts)
+    if path == PHASE or (path in ("contact.stiffness", "contact.damping") and _is_list(mechanism, path)):
+        used = [min(contact, len(names) - 1) for contact in contacts]
+        factor, unit = UNITS.get(unit_of(mechanism, path), (1.0, unit_of(mechanism, path)))
+        low, high = factor * np.min(low[used]), factor * np.max(high[used])
+        columns = tuple(names[place] for place in used)
+        name = NAMES.get(path, path)
+        return Input(name, unit, columns, factor, low, high, _logarithmic(mechanism, path, low, high))
+    one = _per_scenario(mechanism, path, 0)
+    return one._replace(columns=one.columns * mechanism.approach.contacts)
+
+
+def _per_scenario(mechanism: Mechanism, path: str, entry: int) -> Input:
+    """An entry of a list stands for all where they are drawn as one, as a share of its nominal value."""
+    names, (nominal, low, high) = input_names(mechanism, path), _ends(mechanism, path)
+    name = NAMES.get(path, path)
+    factor, unit = UNITS.get(unit_of(mechanism, path), (1.0, unit_of(mechanism, path)))
+    if len(names) > 1:
+        together = path != PHASE and not mechanism.uncertainty[path].independent
+        if together and nominal[entry]:
+            name, factor, unit = f"{name} over nominal", 1 / nominal[entry], "1"
+        else:
+            name = f"{name}, entry {entry + 1}" if path != PHASE else f"{name} of contact {entry + 1}"
+    low, high = sorted((factor * low[entry], factor * high[entry]))
+    return Input(name, unit, (names[entry],), factor, low, high, _logarithmic(mechanism, path, low, high))
+
+
+def _logarithmic(mechanism: Mechanism, path: str, low: float, high: float) -> bool:
+    drawn = mechanism.uncertainty.get(path)
+    return low > 0 and ((drawn is not None and drawn.distribution == "loguniform") or high > 5 * low)
+
+
+def _is_list(mechanism: Mechanism, path: str) -> bool:
+    return np.ndim(value_at(mechanism, path)) == 1
