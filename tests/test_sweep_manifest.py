@@ -43,7 +43,7 @@ def test_a_width_is_kept_where_there_is_one():
     assert decode(encode(wide), "f") == wide and wide.until_width == 0.1
     assert differences(GOOD, wide) == ["until_width: found nothing, asked for 0.1"]
     with pytest.raises(InputError, match="until_width: found with sobol, allowed with random"):
-        manifest(until_width=0.1, sampling="sobol")
+        manifest(until_width=0.1, sampling="sobol", scenarios=96, chunk=32)
 
 
 @given(st.binary(max_size=200))
