@@ -143,7 +143,7 @@ def _run_on_cluster(
 ) -> Generator[tuple[int, Rows], None, None]:
     """The parts in the order in which workers finish them; a few are under way per worker."""
     try:
-        from distributed import Client, KilledWorker, as_completed
+        from distributed import Client, KilledWorker, as_completed  # pyright: ignore[reportMissingImports]
     except ImportError:
         missing = "nothing installed for it, allowed once `pip install jaxhil[distributed]` was done"
         raise InputError(f"--scheduler: found {missing}") from None
