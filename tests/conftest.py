@@ -1,6 +1,9 @@
-"""What every test runs under: float64, strict promotion, two host devices, checked shapes."""
+"""What every test runs under: float64, strict promotion, two host devices, checked shapes. The command line,
+as tests call it."""
 
+import json
 import os
+from typing import NamedTuple
 
 from tuning.environment import settings
 
@@ -12,6 +15,7 @@ os.environ["NPROC"] = settings(os.environ)["NPROC"]
 
 import hypothesis
 import jax
+import pytest
 from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
@@ -28,3 +32,39 @@ install_import_hook([f"jaxhil.{name}" for name in ARRAY_MODULES], "beartype.bear
 # A shared machine has no deadlines to keep, and a test that fails must fail again.
 hypothesis.settings.register_profile("jaxhil", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("jaxhil")
+
+
+class Ran(NamedTuple):
+    """Exit code, standard output, standard error."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def document(self):
+        return json.loads(self.out, parse_constant=pytest.fail)
+
+
+@pytest.fixture
+def no_cache(monkeypatch, tmp_path):
+    """Compiled programs of tests are not kept: a folder below a file cannot be made."""
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("JAXHIL_CACHE", str(tmp_path / "file" / "cache"))
+
+
+@pytest.fixture
+def jaxhil(capsys):
+    """`jaxhil ARGUMENTS` in this process."""
+    # After the import hook.
+    from tuning.__main__ import main
+
+    def call(*arguments):
+        capsys.readouterr()
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as stop:
+            code = stop.code
+        return Ran(code, *capsys.readouterr())
+
+    return call

@@ -2,19 +2,17 @@
 
 import numpy as np
 import pytest
+from lead_cases import lead_task
 
-from jaxhil.mechanism_file import load
 from tuning.certificate import certified
 from tuning.finding import Found, find
 from tuning.objective import RMS
-from tuning.problems import build_task
 from tuning.trial import Trial
 
 
 @pytest.fixture(scope="module")
 def trial():
-    fast = ["rig.simulator.natural_frequency=60", "rig.simulator.delay=0.001"]
-    return Trial([build_task(load("rig-300kg", fast).mechanism, "phase_lead", 8, 0)], 255, 0)
+    return Trial([lead_task()], 255, 0)
 
 
 def test_a_gradient_optimum_is_confirmed_and_a_bad_one_exposed(trial):

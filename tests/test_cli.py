@@ -4,9 +4,9 @@ import json
 import os
 import subprocess
 import sys
-from typing import NamedTuple
 
 import pytest
+from conftest import Ran
 
 from jaxhil.mechanism_file import builtin_names, builtin_path
 from tuning import environment
@@ -21,34 +21,7 @@ CONTACT_KEYS = {
 }
 
 
-class Ran(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-    @property
-    def document(self):
-        return json.loads(self.out, parse_constant=pytest.fail)
-
-
-@pytest.fixture(autouse=True)
-def no_cache(monkeypatch, tmp_path):
-    """Compiled programs of tests are not kept: a folder below a file cannot be made."""
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("JAXHIL_CACHE", str(tmp_path / "file" / "cache"))
-
-
-@pytest.fixture
-def jaxhil(capsys):
-    def call(*arguments):
-        capsys.readouterr()
-        try:
-            code = main([str(argument) for argument in arguments])
-        except SystemExit as stop:
-            code = stop.code
-        return Ran(code, *capsys.readouterr())
-
-    return call
+pytestmark = pytest.mark.usefixtures("no_cache")
 
 
 @pytest.fixture(scope="module")

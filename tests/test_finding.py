@@ -4,24 +4,19 @@ import dataclasses
 
 import numpy as np
 import pytest
+from lead_cases import lead_tasks
 
-from jaxhil.mechanism_file import load
 from tuning import finding
 from tuning.finding import SCANNED, choose_starts, find, finish
 from tuning.objective import RMS, Objective
-from tuning.problems import build_task, spread_points
+from tuning.problems import spread_points
 from tuning.rounds import solve_tasks
 from tuning.trial import Trial
-
-# A motion simulator that a phase lead can make up for.
-FAST = ["rig.simulator.natural_frequency=60", "rig.simulator.delay=0.001"]
-OVERRIDES = (["contact.stiffness=[1e5]"], ["contact.stiffness=[4e4]"], ["contact.stiffness=[2e5]"])
 
 
 @pytest.fixture(scope="module")
 def tasks():
-    mechanisms = [load("rig-300kg", [*own, *FAST, f"name=m{i}"]).mechanism for i, own in enumerate(OVERRIDES)]
-    return [build_task(mechanism, "phase_lead", 8, 0) for mechanism in mechanisms]
+    return lead_tasks()
 
 
 @pytest.fixture(scope="module")

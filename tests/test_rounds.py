@@ -2,26 +2,22 @@
 
 import numpy as np
 import pytest
+from lead_cases import lead_tasks
 
 from jaxhil.evaluation import evaluate
-from jaxhil.mechanism_file import load
 from tuning import rounds
 from tuning.box import to_shares
 from tuning.objective import RMS, Objective, objective_value
-from tuning.problems import alike, build_task, gain_bounds, spread_points, tuned_names
+from tuning.problems import alike, gain_bounds, spread_points, tuned_names
 from tuning.rounds import GIVEN_UP, solve_tasks
 from tuning.trial import Trial
 
 STARTS, STEPS = 5, 14
-# A motion simulator that a phase lead can make up for.
-FAST = ["rig.simulator.natural_frequency=60", "rig.simulator.delay=0.001"]
-OVERRIDES = (["contact.stiffness=[1e5]"], ["contact.stiffness=[4e4]"], ["contact.stiffness=[2e5]"])
 
 
 @pytest.fixture(scope="module")
 def tasks():
-    mechanisms = [load("rig-300kg", [*own, *FAST, f"name=m{i}"]).mechanism for i, own in enumerate(OVERRIDES)]
-    return [build_task(mechanism, "phase_lead", 8, 0) for mechanism in mechanisms]
+    return lead_tasks()
 
 
 def spread(tasks, number=STARTS):

@@ -14,20 +14,7 @@ from tuning.sweeps.store import read_part, read_store, write_part
 TINY = ["--scenarios", "100", "--chunk", "64"]
 
 
-@pytest.fixture(autouse=True)
-def no_cache(monkeypatch, tmp_path):
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("JAXHIL_CACHE", str(tmp_path / "file" / "cache"))
-
-
-@pytest.fixture
-def jaxhil(capsys):
-    def call(*arguments):
-        capsys.readouterr()
-        code = main([str(argument) for argument in arguments])
-        return code, *capsys.readouterr()
-
-    return call
+pytestmark = pytest.mark.usefixtures("no_cache")
 
 
 @pytest.fixture(scope="module")

@@ -44,11 +44,10 @@ class Found(NamedTuple):
 
 @dataclasses.dataclass
 class _Search:
-    """Of one task: every start so far, evaluations so far, whether the first lot's starts disagreed."""
+    """Of one task: every start so far, evaluations so far."""
 
     starts: list[Start] = dataclasses.field(default_factory=list)
     evaluations: int = 0
-    doubtful: bool = False
 
 
 def find(
@@ -71,7 +70,7 @@ def find(
     chosen = _while_compiling(
         trial, number, objectives, lambda: choose_starts(trial, number, seed, objectives, told)
     )
-    going = list(range(len(tasks)))
+    going, doubtful = list(range(len(tasks))), []
     for lot in range(LOTS if number > 1 else 1):
         if lot > 0:
             report(f"lot {lot + 1} of starts, {len(going)} of {len(tasks)} mechanisms")
@@ -85,11 +84,10 @@ def find(
             own.evaluations += (1 + len(trial.names)) * sum(start.steps for start in ended[i])
             if lot > 0 or number > 1 + len(told[i]):
                 own.evaluations += _scan_evaluations(trial, number)
-            own.doubtful |= not _agree(own.starts)
         going = [i for i in going if not _agree(searches[i].starts)]
+        doubtful = going if lot == 0 else doubtful
         if not going:
             break
-    doubtful = [i for i, own in enumerate(searches) if own.doubtful]
     report("searching without derivatives where starts disagreed")
     best = finish(trial, [own.starts for own in searches], doubtful, polishing, seed, objectives)
     for i in doubtful:

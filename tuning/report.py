@@ -69,6 +69,11 @@ def figure(value: Any, digits: int = 4) -> str:
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
+def signed(value: float | None) -> str:
+    """A restitution error with its sign; a dash for none."""
+    return "-" if value is None or value != value else f"{value:+.4f}"
+
+
 def finite(value: Any) -> Any:
     """Mappings, lists, named tuples and numbers, with None for what is not finite."""
     if isinstance(value, Mapping):

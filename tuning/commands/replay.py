@@ -73,11 +73,10 @@ def _print(document: dict[str, Any]) -> None:
     )
     rows = []
     for number, contact in enumerate(document["contacts"], start=1):
-        error = contact["error"]
         rows.append(
             (
                 *(number, contact["restitution"], contact["reference_restitution"]),
-                "-" if error != error else f"{error:+.4f}",
+                report.signed(contact["error"]),
                 *(contact["peak_force"], 1e3 * contact["duration"], 1e3 * contact["approach_velocity"]),
                 contact["status"],
             )

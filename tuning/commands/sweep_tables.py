@@ -21,7 +21,12 @@ def emit(document: dict[str, Any]) -> None:
         "Worst scenarios",
         ["index", "outcome", "error", "contact"],
         [
-            (one["index"], one["outcome"], _signed(one["worst_error"]), report.figure(one["worst_contact"]))
+            (
+                one["index"],
+                one["outcome"],
+                report.signed(one["worst_error"]),
+                report.figure(one["worst_contact"]),
+            )
             for one in document["worst"]
         ],
         texts=(1,),
@@ -132,7 +137,3 @@ def _size(value: float, endless: str = "no result") -> str:
 
 def _share(value: float) -> str:
     return "-" if value == float("inf") else f"{100 * value:.3g} %"
-
-
-def _signed(value: float | None) -> str:
-    return "-" if value is None or value != value else f"{value:+.4f}"

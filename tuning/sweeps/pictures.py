@@ -16,8 +16,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from tuning.plots import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION, finish, new_figure, save
-from tuning.sweeps.chunks import build_sweep
-from tuning.sweeps.manifest import Manifest
+from tuning.sweeps.manifest import Manifest, loaded_gains
 from tuning.sweeps.regions import Input, Plan, Regions, add_rows, empty_regions, make_plan, quantile
 from tuning.sweeps.store import PICTURES, Store, read_part, writing
 from tuning.verdict import binomial_interval, confidence_sequence, replicate_interval
@@ -36,7 +35,7 @@ def draw_store(store: Store, acceptable: float | None = None) -> dict[str, Figur
 
     One part at a time is read. `acceptable`, a probability, is drawn where the estimate converges.
     """
-    manifest, mechanism = store.manifest, build_sweep(store.manifest).mechanism
+    manifest, mechanism = store.manifest, loaded_gains(store.manifest).mechanism
     plan = regions = None
     for part in range(manifest.parts):
         rows = read_part(store, part)

@@ -13,8 +13,9 @@ import numpy as np
 from jaxhil.mechanism import Mechanism, value_at
 from jaxhil.metrics import OK, STATUS_NAMES
 from jaxhil.uncertainty import PHASE, at_points, dimensions
-from tuning.sweeps.columns import OUTCOMES, SATURATED, STATUSES, input_names, unit_of
+from tuning.sweeps.columns import STATUSES, input_names, unit_of
 from tuning.sweeps.manifest import Manifest
+from tuning.sweeps.tally import error_sizes
 
 Rows = Mapping[str, np.ndarray]
 
@@ -99,7 +100,7 @@ class Regions(NamedTuple):
 def make_plan(manifest: Manifest, mechanism: Mechanism, rows: Rows) -> Plan:
     """Stiffness and force delay where they are drawn; else the inputs with the strongest rank correlation
     with |error| among `rows`, of the first part."""
-    size = _worst_size(rows)
+    size = error_sizes(rows)
     strengths = {path: _strengths(mechanism, path, rows, size) for path in dimensions(mechanism)}
     varying = {path: found for path, found in strengths.items() if np.any(np.isfinite(found))}
     by_strength = sorted(varying, key=lambda path: -np.nanmax(varying[path]))
@@ -137,7 +138,7 @@ def add_rows(plan: Plan, regions: Regions, rows: Rows) -> Regions:
     index, failed = rows["index"], rows["failed"]
     inputs = np.array([one.values(rows) for one in plan.per_scenario])
     inputs = inputs.reshape(len(plan.per_scenario), len(index))
-    found = Points(index, inputs, _worst_size(rows), failed)
+    found = Points(index, inputs, error_sizes(rows), failed)
     joined = Points(*(np.concatenate(pair, axis=-1) for pair in zip(regions.points, found, strict=True)))
     place = np.searchsorted(plan.looks, index, side="right") * plan.replicates + index % plan.replicates
 
@@ -185,12 +186,6 @@ def _first(points: Points) -> Points:
     failed = points.failed[order]
     kept = order[(np.arange(len(order)) < POINTS) | (failed & (np.cumsum(failed) <= FAILED_POINTS))]
     return Points(*(values[..., kept] for values in points))
-
-
-def _worst_size(rows: Rows) -> np.ndarray:
-    """|error|, infinite where a contact did not end."""
-    size = np.abs(rows["worst_error"].astype(float))
-    return np.where((rows["outcome"] > OUTCOMES.index(SATURATED)) | np.isnan(size), np.inf, size)
 
 
 def _strengths(mechanism: Mechanism, path: str, rows: Rows, size: np.ndarray) -> np.ndarray:

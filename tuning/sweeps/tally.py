@@ -105,8 +105,8 @@ def add_rows(tally: Tally, rows: Mapping[str, np.ndarray]) -> Tally:
 
 def error_sizes(rows: Mapping[str, np.ndarray]) -> np.ndarray:
     """The worst |error| of every scenario; infinite where not every contact ended."""
-    ended = rows["outcome"] <= OUTCOMES.index(SATURATED)
-    return np.where(ended, np.abs(rows["worst_error"].astype(float)), np.inf)
+    size = np.abs(rows["worst_error"].astype(float))
+    return np.where((rows["outcome"] > OUTCOMES.index(SATURATED)) | np.isnan(size), np.inf, size)
 
 
 def failure_probability(tally: Tally) -> Probability:
