@@ -13,15 +13,16 @@ from matplotlib.axis import Axis
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from tuning.plots import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION, finish, new_figure, save
 from tuning.sweeps.manifest import Manifest, loaded_gains
-from tuning.sweeps.regions import Input, Plan, Regions, add_rows, empty_regions, make_plan, quantile
+from tuning.sweeps.regions import Input, Plan, Points, Regions, add_rows, empty_regions, make_plan, quantile
 from tuning.sweeps.store import PICTURES, Store, read_part, writing
 from tuning.verdict import binomial_interval, confidence_sequence, replicate_interval
 
 FEW = 20  # contacts of a cell below which it has no quantile: a 95th percentile needs as many
+FAILED, UNENDED = "failed", "failed, a contact did not end: drawn at the top"
 # Every quantile of the profile: its order, label, colour, line.
 PROFILE = (
     (0.5, "half of the contacts", SKY, "-"),
@@ -66,7 +67,7 @@ def write_pictures(store: Store, acceptable: float | None = None) -> list[str]:
 
 def error_map(plan: Plan, regions: Regions, manifest: Manifest, name: str) -> Figure:
     """Quantiles of |e - e*| over the first input and, as a map, over both."""
-    figure = new_figure((8.6, 7.2), f"{name}: restitution error of {regions.scenarios} scenarios")
+    figure = new_figure((8.6, 7.4), f"{name}: restitution error of {regions.scenarios} scenarios", below=0.85)
     two = len(plan.per_contact) == 2
     figure.subplots_adjust(left=0.095, right=0.88, hspace=0.12, wspace=0.03)
     grid: Any = figure.subplots(2 if two else 1, 2, squeeze=False, gridspec_kw={"width_ratios": (40, 1)})
@@ -88,9 +89,9 @@ def failure_region(plan: Plan, regions: Regions, manifest: Manifest, name: str) 
     """Scenarios as points: which failed, over both inputs, and the worst error over each."""
     number = len(plan.per_scenario)
     points, limit = regions.points, _drawn_limit(manifest)
-    size = (13, 4.9) if number == 2 else (7, 4.9)
+    size = (13, 4.9) if number == 2 else (7, 5.3)
     said = f"{regions.failed} of {regions.scenarios} scenarios failed"
-    figure = new_figure(size, f"{name}: {said}", below=1.0)
+    figure = new_figure(size, f"{name}: {said}", below=1.0 if number == 2 else 1.4)
     figure.subplots_adjust(wspace=0.32)
     panels: Any = figure.subplots(1, 3 if number == 2 else 1, squeeze=False)[0]
     if number == 2:
@@ -116,13 +117,9 @@ def failure_region(plan: Plan, regions: Regions, manifest: Manifest, name: str) 
     for axes in panels:
         finish(axes, None)
     handles, labels = panels[-1].get_legend_handles_labels()
-    counts = {
-        "not failed": (np.sum(~points.failed), regions.scenarios - regions.failed),
-        "failed": (np.sum(points.failed), regions.failed),
-    }
-    labels = [_counted(label, *counts[label]) if label in counts else label for label in labels]
-    style: dict[str, Any] = {"fontsize": 9, "frameon": False, "ncols": 4, "markerscale": 2}
-    figure.legend(handles, labels, loc="lower center", **style)
+    labels = [_counted(label, points, regions) for label in labels]
+    style: dict[str, Any] = {"fontsize": 9, "frameon": False, "markerscale": 2}
+    figure.legend(handles, labels, loc="lower center", ncols=2 if number == 2 else 1, **style)
     return figure
 
 
@@ -131,6 +128,7 @@ def convergence(
 ) -> Figure:
     """Failure probability and its interval against the number of scenarios, in the order of the index."""
     figure = new_figure((7.6, 5.2), f"{name}: failure probability as scenarios are added", below=1.05)
+    figure.subplots_adjust(right=0.93)  # the last number is a long one
     axes = figure.subplots()
     axes.set(xlabel="number of scenarios [1]", ylabel="failure probability [1]")
     looks = plan.looks[plan.looks <= regions.scenarios]
@@ -165,6 +163,7 @@ def convergence(
         )
     _limit_probability(axes, looks, share, low, high, acceptable)
     finish(axes, None)
+    axes.set_xlim(looks[0] / 1.05, looks[-1] * 1.05)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}".replace(",", " ")))
     figure.legend(loc="lower center", fontsize=9, frameon=False, ncols=2)
     return figure
@@ -216,9 +215,13 @@ def _draw_map(
         first.edges(plan.cells), second.edges(plan.cells), shown.T, cmap=colours, norm=LogNorm(low, high),
         rasterized=True,
     )  # fmt: skip
-    colour_bar = figure.colorbar(mesh, cax=bar, extend="max" if unended else "neither")
+    below = bool(len(finite) and np.min(finite) < low)
+    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(
+        (below, unended), "neither"
+    )
+    colour_bar = figure.colorbar(mesh, cax=bar, extend=extend)
     colour_bar.set_label("|e - e*| not exceeded by 95 % of contacts [1]")
-    _plain_ticks(bar.yaxis, low, high)
+    _bar_ticks(bar.yaxis, low, high)
     if limit:
         bar.axhline(limit, color=BLACK, linewidth=1.5)
     _name_axis(axes.xaxis, first)
@@ -227,7 +230,8 @@ def _draw_map(
     if unended:
         handles.append(Patch(color=BLACK, label="more than 5 % did not end"))
     if handles:
-        axes.legend(handles=handles, loc="upper left", fontsize=8, framealpha=0.9)
+        # Below the axes: cells are everywhere inside.
+        figure.legend(handles=handles, loc="lower center", fontsize=8, frameon=False, ncols=2)
 
 
 def _draw_points(
@@ -236,8 +240,8 @@ def _draw_points(
     ended = np.isfinite(size)
     for which, label, colour, marker, width in (
         (~failed, "not failed", SKY, "o", 2.0),
-        (failed & ended, "failed", VERMILION, "x", 3.5),
-        (failed & ~ended, "of those: a contact did not end", BLACK, "^", 3.5),
+        (failed & ended, FAILED, VERMILION, "x", 3.5),
+        (failed & ~ended, UNENDED, BLACK, "^", 3.5),
     ):
         if np.any(which):
             style: dict[str, Any] = {"linestyle": "none", "marker": marker, "markersize": width}
@@ -245,8 +249,31 @@ def _draw_points(
             axes.plot(across[which], up[which], color=colour, label=label, **style)
 
 
-def _counted(label: str, shown: int, of: int) -> str:
+def _counted(label: str, points: Points, regions: Regions) -> str:
+    """The label of points, with their number and what it is a part of."""
+    shown, of = int(np.sum(points.failed)), regions.failed
+    unended = int(np.sum(points.failed & ~np.isfinite(points.size)))
+    if label in (FAILED, UNENDED) and unended:
+        part = "" if shown == of else f" of the first {shown} of {of}"
+        if label == FAILED:
+            return f"failed, every contact ended ({shown - unended}{part})"
+        return f"{label} ({unended}{part})"
+    if label == "not failed":
+        shown, of = len(points.failed) - shown, regions.scenarios - of
+    elif label != FAILED:
+        return label
     return f"{label} ({of})" if shown == of else f"{label} (the first {shown} of {of})"
+
+
+def _bar_ticks(axis: Axis, low: float, high: float) -> None:
+    """Ticks of a colour bar: both ends, and between them what is not too close to one."""
+    places = LogLocator(subs=(1.0, 2.0, 5.0)).tick_values(low, high)
+    room = (high / low) ** 0.06
+    inner = [float(place) for place in places if low * room < place < high / room]
+    axis.set_major_locator(FixedLocator([low, *inner, high]))
+    axis.set_minor_locator(NullLocator())
+    ends = {low: f"{float(f'{low:.2g}'):g}", high: f"{float(f'{high:.2g}'):g}"}
+    axis.set_major_formatter(FuncFormatter(lambda value, _: ends.get(value, f"{value:g}")))
 
 
 def _limit_probability(axes: Axes, looks, share, low, high, acceptable: float | None) -> None:
@@ -265,7 +292,8 @@ def _limit_probability(axes: Axes, looks, share, low, high, acceptable: float | 
 
 
 def _name_axis(axis: Axis, one: Input, values: Sequence[float] | np.ndarray = ()) -> None:
-    """Name, scale and ends of an input's axis; `values` that are to be on it may reach further."""
+    """Name, scale and ends of an input's axis; `values` that are to be on it, with room for their markers,
+    may reach further."""
     axis.set_label_text(one.label)
     low, high = float(np.min(values, initial=one.low)), float(np.max(values, initial=one.high))
     axes, across = axis.axes, axis is axis.axes.xaxis
@@ -275,8 +303,11 @@ def _name_axis(axis: Axis, one: Input, values: Sequence[float] | np.ndarray = ()
         scale("log")
         _plain_ticks(axis, low, high)
     else:
-        axis.set_major_locator(MaxNLocator(6))
-    limits(low, high)
+        axis.set_major_locator(MaxNLocator(6, steps=(1, 2, 2.5, 5, 10)))
+    room = 0.02 if len(values) else 0.0
+    ends = np.log([low, high]) if one.logarithmic else np.array([low, high])
+    ends = ends + room * (ends[1] - ends[0]) * np.array([-1, 1])
+    limits(*(np.exp(ends) if one.logarithmic else ends))
 
 
 def _plain_ticks(axis: Axis, low: float, high: float) -> None:
@@ -284,7 +315,7 @@ def _plain_ticks(axis: Axis, low: float, high: float) -> None:
     decades = np.log10(high / low)
     some = (1.0,) if decades > 5 else (1.0, 3.0) if decades > 2.2 else (1.0, 2.0, 5.0)
     if decades < 0.9:
-        axis.set_major_locator(MaxNLocator(6))
+        axis.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10)))
     else:
         axis.set_major_locator(LogLocator(subs=some))
     axis.set_minor_locator(NullLocator())
