@@ -205,6 +205,33 @@ def test_every_axis_is_named_with_its_unit(request, name, limit):
         assert all(label.endswith("]") for label in labels), labels
 
 
+@pytest.mark.parametrize("limit", [0.2, None, 1e-9, 1e9])
+def test_both_ends_of_the_colour_scale_are_labelled(usual, limit):
+    made, mechanism, rows = usual
+    made = msgspec.structs.replace(made, limit=limit)
+    plan = make_plan(made, mechanism, rows)
+    figure = pictures.error_map(plan, accumulated(plan, rows, [(0, NUMBER)]), made, "usual")
+    FigureCanvasAgg(figure).draw()
+    (bar,) = (axes for axes in figure.axes if "not exceeded by 95 %" in axes.get_ylabel())
+    ticks = bar.get_yticks()
+    assert ticks[[0, -1]] == pytest.approx(bar.get_ylim(), rel=1e-9)
+    labels = [float(text.get_text()) for text in bar.get_yticklabels()]
+    assert labels == pytest.approx(ticks, rel=0.05)
+
+
+def test_the_legend_counts_failures_by_kind(lost, few_points):
+    made, mechanism, rows = lost
+    plan = make_plan(made, mechanism, rows)
+    found = accumulated(plan, rows, [(0, NUMBER)])
+    endless = int(np.sum(found.points.failed & np.isinf(found.points.size)))
+    failed, of = int(np.sum(found.points.failed)), int(np.sum(rows["failed"]))
+    assert 0 < endless < failed < of
+    (legend,) = pictures.failure_region(plan, found, made, "lost").legends
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert f"failed, every contact ended ({failed - endless} of the first {failed} of {of})" in labels
+    assert f"{pictures.UNENDED} ({endless} of the first {failed} of {of})" in labels
+
+
 def test_the_command_writes_them_and_resumes_over_them(tmp_path, capsys):
     gains, store = tmp_path / "gains.json", tmp_path / "store"
     write_gain_file(gains, case())

@@ -117,9 +117,10 @@ def failure_region(plan: Plan, regions: Regions, manifest: Manifest, name: str) 
     for axes in panels:
         finish(axes, None)
     handles, labels = panels[-1].get_legend_handles_labels()
+    columns = (2 if UNENDED in labels else 4) if number == 2 else (1 if UNENDED in labels else 2)
     labels = [_counted(label, points, regions) for label in labels]
     style: dict[str, Any] = {"fontsize": 9, "frameon": False, "markerscale": 2}
-    figure.legend(handles, labels, loc="lower center", ncols=2 if number == 2 else 1, **style)
+    figure.legend(handles, labels, loc="lower center", ncols=columns, **style)
     return figure
 
 
@@ -315,7 +316,7 @@ def _plain_ticks(axis: Axis, low: float, high: float) -> None:
     decades = np.log10(high / low)
     some = (1.0,) if decades > 5 else (1.0, 3.0) if decades > 2.2 else (1.0, 2.0, 5.0)
     if decades < 0.9:
-        axis.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10)))
+        axis.set_major_locator(MaxNLocator(5, steps=(1, 2, 2.5, 5, 10)))
     else:
         axis.set_major_locator(LogLocator(subs=some))
     axis.set_minor_locator(NullLocator())
