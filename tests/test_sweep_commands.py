@@ -68,6 +68,18 @@ def test_no_failure_is_good(jaxhil, gains, tmp_path):
     assert code == 0 and "Good" in out and "Failure probability 0," in out
 
 
+def test_the_last_few_of_a_sobol_sweep_are_outcomes_alone(jaxhil, gains, tmp_path):
+    sobol = ["sweep", gains, *TINY, "--sampling", "sobol", "--limit", "1.5", "-o", tmp_path / "new"]
+    ran = jaxhil(*sobol, "--json")
+    found = document(ran)
+    assert sum(found["outcomes"].values()) == 100 and found["left_out_of_replicates"] == 4
+    probability = found["failure_probability"]
+    assert 0 < probability["low"] < probability["value"] < probability["high"] < 1
+    assert (probability["value"] * 96).is_integer()
+    code, out, _ = jaxhil(*sobol, "--resume")
+    assert code == 1 and "The last 4 scenarios" in out
+
+
 def test_float32_is_compared_with_float64(jaxhil, gains, tmp_path):
     ran = jaxhil("sweep", gains, *TINY, "-o", tmp_path / "n", "--precision", "float32", "--json")
     compared = document(ran)["float32"]
@@ -138,7 +150,8 @@ def test_what_cannot_be_is_refused(jaxhil, gains, store, tmp_path):
     refused(jaxhil("sweep", gains, *new, "--scenarios", "0"), "--scenarios", "found 0")
     refused(jaxhil("sweep", gains, *new, "--scenarios", 2**33), "--scenarios", str(2**32))
     refused(jaxhil("sweep", gains, *new, "--sampling", "dice"), "--sampling", "random, sobol")
-    refused(jaxhil("sweep", gains, *TINY, *new, "--sampling", "sobol"), "--scenarios: found 100", "16")
+    few = ["--scenarios", "15", "--sampling", "sobol"]
+    refused(jaxhil("sweep", gains, *few, *new), "--scenarios: found 15", "16")
     refused(jaxhil("sweep", gains, *new, "--precision", "half"), "--precision", "float32")
     refused(jaxhil("sweep", gains, *new, "--limit", "nan"), "--limit")
     refused(jaxhil("sweep", gains, *new, "--acceptable", "2"), "--acceptable")
