@@ -198,6 +198,10 @@ def test_an_interruption_keeps_verdict_and_studies_so_far(jaxhil, own, quick, mo
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
+        patched.setattr("tuning.sweeps.pictures.write_pictures", interrupted)
+        assert jaxhil(*again, *STUDIES)[:2] == (130, "")
+    assert json.loads((folder / "verdict.json").read_text())["verdict"] == "bad"
+    with monkeypatch.context() as patched:
         patched.setattr("tuning.sweeps.studies.rare_failure", interrupted)
         assert jaxhil(*again, *STUDIES)[:2] == (130, "")
     so_far = json.loads((folder / "verdict.json").read_text())
