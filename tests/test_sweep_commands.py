@@ -1,8 +1,12 @@
 """`jaxhil sweep` and `jaxhil replay`: exit codes, one JSON document, refusals of one line."""
 
 import json
+import resource
+import shutil
 import subprocess
 import sys
+from functools import partial
+from pathlib import Path
 
 import pytest
 from sweep_cases import case
@@ -10,6 +14,7 @@ from sweep_cases import case
 from tuning.__main__ import main
 from tuning.gain_file import write_gain_file
 from tuning.sweeps.store import read_part, read_store, write_part
+from tuning.sweeps.studies import rare_failure
 
 TINY = ["--scenarios", "100", "--chunk", "64"]
 
@@ -29,6 +34,14 @@ def store(gains, tmp_path_factory):
     folder = tmp_path_factory.mktemp("sweep") / "store"
     assert main(["sweep", str(gains), *TINY, "-o", str(folder), "--limit", "1.5"]) == 1
     return folder
+
+
+@pytest.fixture
+def own(gains, store, tmp_path):
+    """A store that only one test sees, and the command that goes on with it."""
+    folder = tmp_path / "own"
+    shutil.copytree(store, folder)
+    return folder, ["sweep", gains, *TINY, "-o", folder, "--limit", "1.5", "--resume"]
 
 
 def refused(ran, *words):
@@ -68,6 +81,18 @@ def test_no_failure_is_good(jaxhil, gains, tmp_path):
     assert code == 0 and "Good" in out and "Failure probability 0," in out
 
 
+def test_the_last_few_of_a_sobol_sweep_are_outcomes_alone(jaxhil, gains, tmp_path):
+    sobol = ["sweep", gains, *TINY, "--sampling", "sobol", "--limit", "1.5", "-o", tmp_path / "new"]
+    ran = jaxhil(*sobol, "--json")
+    found = document(ran)
+    assert sum(found["outcomes"].values()) == 100 and found["left_out_of_replicates"] == 4
+    probability = found["failure_probability"]
+    assert 0 < probability["low"] < probability["value"] < probability["high"] < 1
+    assert (probability["value"] * 96).is_integer()
+    code, out, _ = jaxhil(*sobol, "--resume")
+    assert code == 1 and "The last 4 scenarios" in out
+
+
 def test_float32_is_compared_with_float64(jaxhil, gains, tmp_path):
     ran = jaxhil("sweep", gains, *TINY, "-o", tmp_path / "n", "--precision", "float32", "--json")
     compared = document(ran)["float32"]
@@ -98,8 +123,8 @@ def test_quantiles_are_told(jaxhil, gains, store):
     assert "99.9 %" in out and "no bound" in out
 
 
-def test_studies_are_told(jaxhil, gains, store):
-    again = ["sweep", gains, *TINY, "-o", store, "--limit", "1.5", "--resume", "--drivers", "16", "--rare"]
+def test_studies_are_told(jaxhil, own):
+    again = [*own[1], "--drivers", "16", "--rare"]
     found = document(jaxhil(*again, "--json"))
     drivers, rare = found["drivers"], found["rare"]
     assert drivers["evaluations"] == 16 * 5 and drivers["cap"] == 15
@@ -110,6 +135,128 @@ def test_studies_are_told(jaxhil, gains, store):
     assert brute["low"] < rare["probability"] < brute["high"]
     out = jaxhil(*again)[1]
     assert "Subset simulation" in out and "first order" in out and names[0] in out
+
+
+STUDIES = ["--drivers", "16", "--rare", "1.6"]
+KEPT = ("studies/drivers-16.json", "studies/rare-1.6-10x1000.json")
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Subset simulation with few samples, and no pictures."""
+    monkeypatch.setattr("tuning.sweeps.studies.rare_failure", partial(rare_failure, samples=20))
+    monkeypatch.setattr("tuning.sweeps.pictures.write_pictures", lambda *_: [])
+
+
+def no_study(monkeypatch, *names):
+    for name in names:
+        monkeypatch.setattr(f"tuning.sweeps.studies.{name}", lambda *_: pytest.fail("run again"))
+
+
+def test_the_verdict_is_kept_as_it_was_printed(jaxhil, own):
+    folder, again = own
+    ran = jaxhil(*again, "--json")
+    assert (folder / "verdict.json").read_text() == ran[1]
+    (folder / "verdict.json").unlink()
+    assert jaxhil(*again, "--acceptable", "1")[0] == 0
+    found = json.loads((folder / "verdict.json").read_text())
+    assert found["verdict"] == "good" and found == {**document(ran), "acceptable": 1.0, "verdict": "good"}
+    assert jaxhil("replay", folder, 5)[0] == 0
+
+
+def test_studies_are_run_once(jaxhil, own, quick, monkeypatch):
+    folder, again = own
+    first = jaxhil(*again, *STUDIES, "--json")
+    assert (folder / "verdict.json").read_text() == first[1] and "as kept" not in first[2]
+    assert sorted(path.name for path in (folder / "studies").iterdir()) == [Path(one).name for one in KEPT]
+    no_study(monkeypatch, "error_drivers", "rare_failure")
+    second = jaxhil(*again, *STUDIES, "--json")
+    assert second[1] == first[1]
+    assert all(f"as kept in {folder / one}\n" in second[2] for one in KEPT)
+    # Of another argument nothing is kept.
+    with pytest.raises(pytest.fail.Exception):
+        jaxhil(*again, "--drivers", "32")
+
+
+def test_a_new_sweep_runs_its_studies(jaxhil, gains, own, quick, tmp_path):
+    folder, again = own
+    jaxhil(*again, *STUDIES)
+    new = [*("sweep", gains, *TINY, "-o", tmp_path / "other", "--limit", "1.5"), *STUDIES]
+    ran = jaxhil(*new)
+    assert ran[0] == 1 and "as kept" not in ran[2]
+    # The same manifest: the same studies, to the bit.
+    for one in KEPT:
+        assert (tmp_path / "other" / one).read_bytes() == (folder / one).read_bytes()
+    refused(jaxhil(*new), "other", "--resume")
+
+
+def test_an_interruption_keeps_verdict_and_studies_so_far(jaxhil, own, quick, monkeypatch):
+    folder, again = own
+    (folder / "verdict.json").unlink()
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("tuning.sweeps.pictures.write_pictures", interrupted)
+        assert jaxhil(*again, *STUDIES)[:2] == (130, "")
+    assert json.loads((folder / "verdict.json").read_text())["verdict"] == "bad"
+    with monkeypatch.context() as patched:
+        patched.setattr("tuning.sweeps.studies.rare_failure", interrupted)
+        assert jaxhil(*again, *STUDIES)[:2] == (130, "")
+    so_far = json.loads((folder / "verdict.json").read_text())
+    assert so_far["verdict"] == "bad" and so_far["drivers"]["evaluations"] == 80 and "rare" not in so_far
+    assert [(folder / one).exists() for one in KEPT] == [True, False]
+    no_study(monkeypatch, "error_drivers")
+    found = document(jaxhil(*again, *STUDIES, "--json"))
+    assert found["drivers"] == so_far["drivers"] and found["rare"]["limit"] == 1.6
+
+
+def test_a_damaged_study_is_run_again(jaxhil, own, quick):
+    folder, again = own
+    first = jaxhil(*again, *STUDIES, "--json")
+    contents = {folder / one: (folder / one).read_bytes() for one in KEPT}
+    for path, content in contents.items():
+        path.write_bytes(content.replace(b'"evaluations": ', b'"evaluations": 1'))
+    second = jaxhil(*again, *STUDIES, "--json")
+    assert second[1] == first[1] and "as kept" not in second[2]
+    assert {path: path.read_bytes() for path in contents} == contents
+
+
+def unwritable(ran, name):
+    """One line and exit code 2; the verdict was printed nevertheless."""
+    code, out, err = ran
+    assert code == 2 and err.splitlines()[-1].startswith("jaxhil: ") and err.count("jaxhil: ") == 1
+    assert f"{name}: cannot be written: " in err.splitlines()[-1]
+    return json.loads(out)
+
+
+def test_a_study_that_cannot_be_written_costs_no_verdict(jaxhil, own, quick):
+    folder, again = own
+    (folder / "studies").touch()
+    found = unwritable(jaxhil(*again, *STUDIES, "--json"), KEPT[0])
+    assert (
+        found["verdict"] == "bad" and found["drivers"]["evaluations"] == 80 and found["rare"]["limit"] == 1.6
+    )
+    assert json.loads((folder / "verdict.json").read_text()) == found
+    (folder / "studies").unlink()
+    assert document(jaxhil(*again, *STUDIES, "--json")) == found
+
+
+def test_a_full_disk_costs_no_verdict(jaxhil, own, quick):
+    folder, again = own
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        ran = jaxhil(*again, *STUDIES, "--json")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    found = unwritable(ran, "verdict.json")
+    assert (
+        found["verdict"] == "bad" and found["drivers"]["evaluations"] == 80 and found["rare"]["limit"] == 1.6
+    )
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
 def test_replay_is_the_same_to_the_bit(jaxhil, store, tmp_path):
@@ -138,7 +285,8 @@ def test_what_cannot_be_is_refused(jaxhil, gains, store, tmp_path):
     refused(jaxhil("sweep", gains, *new, "--scenarios", "0"), "--scenarios", "found 0")
     refused(jaxhil("sweep", gains, *new, "--scenarios", 2**33), "--scenarios", str(2**32))
     refused(jaxhil("sweep", gains, *new, "--sampling", "dice"), "--sampling", "random, sobol")
-    refused(jaxhil("sweep", gains, *TINY, *new, "--sampling", "sobol"), "--scenarios: found 100", "16")
+    few = ["--scenarios", "15", "--sampling", "sobol"]
+    refused(jaxhil("sweep", gains, *few, *new), "--scenarios: found 15", "16")
     refused(jaxhil("sweep", gains, *new, "--precision", "half"), "--precision", "float32")
     refused(jaxhil("sweep", gains, *new, "--limit", "nan"), "--limit")
     refused(jaxhil("sweep", gains, *new, "--acceptable", "2"), "--acceptable")

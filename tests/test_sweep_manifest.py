@@ -102,7 +102,7 @@ def test_only_flags_that_may_change_a_result_count():
     assert ours == rounding_flags("--a=2 --b=1") == "--a=2 --b=1"
 
 
-@pytest.mark.parametrize("choices", [{"scenarios": 100}, {"scenarios": 64, "chunk": 24}])
-def test_sobol_replicates_are_of_one_size(choices):
-    with pytest.raises(InputError, match="allowed a multiple of 16"):
-        manifest(sampling="sobol", **choices)
+def test_every_sobol_replicate_has_a_scenario():
+    assert manifest(sampling="sobol", scenarios=16, chunk=5).replicates == 16
+    with pytest.raises(InputError, match="--scenarios: found 15, allowed 16 or more"):
+        manifest(sampling="sobol", scenarios=15)

@@ -10,10 +10,11 @@ from sweep_cases import case, manifest
 
 from tuning.__main__ import main
 from tuning.gain_file import check_document, write_gain_file
+from tuning.quantiles import EDGES
 from tuning.sweeps import pictures, regions
 from tuning.sweeps.chunks import build_sweep, run_chunk
 from tuning.sweeps.columns import OUTCOMES, STATUSES
-from tuning.sweeps.regions import SIZES, add_rows, empty_regions, make_plan, quantile
+from tuning.sweeps.regions import add_rows, empty_regions, make_plan, quantile
 from tuning.sweeps.store import PICTURES
 from tuning.verdict import binomial_interval, replicate_interval
 
@@ -104,17 +105,17 @@ def test_counts_of_cells_are_a_histogram_of_the_whole(usual):
         up = np.clip(1e3 * rows["rig.force_sensor.delay"], edges[1][0], edges[1][-1])
         sample.append(np.stack([across, up, np.abs(rows[f"error_{number}"])], axis=1))
     inner = sizes[..., 1:-1]
-    direct, _ = np.histogramdd(np.concatenate(sample), bins=[*edges, SIZES])
+    direct, _ = np.histogramdd(np.concatenate(sample), bins=[*edges, EDGES])
     np.testing.assert_array_equal(inner, direct)
     assert inner.sum() == sizes.sum() == 2 * NUMBER and np.count_nonzero(inner) > 50
 
 
 def test_a_quantile_is_that_of_the_values():
     values = np.abs(np.random.default_rng(0).standard_normal(3000)) * 10.0 ** np.linspace(-4, 0, 3000)
-    counts = np.bincount(np.searchsorted(SIZES, values, side="right"), minlength=len(SIZES) + 1)
+    counts = np.bincount(np.searchsorted(EDGES, values, side="right"), minlength=len(EDGES) + 1)
     for order in (0.5, 0.95, 0.99):
         direct = np.quantile(values, order, method="inverted_cdf")
-        assert quantile(counts, order, 20) == pytest.approx(direct, rel=0.0097)
+        assert quantile(counts, order, 20) == pytest.approx(direct, rel=0.005)
     assert np.isnan(quantile(counts, 0.5, 3001)) and np.isnan(quantile(0 * counts, 0.5, 0))
     counts[-1] = 200
     assert quantile(counts, 0.95, 20) == np.inf and np.isfinite(quantile(counts, 0.9, 20))

@@ -145,6 +145,31 @@ def test_resuming_removes_what_was_left_unfinished(store):
     assert not stale.exists()
 
 
+def test_nothing_unfinished_is_left_beside_the_rows(store):
+    (store.folder / "studies").mkdir()
+    left = [store.folder / ".verdict.json.1.tmp", store.folder / "studies" / ".drivers-2.json.1.tmp"]
+    kept = [store.folder / "verdict.json", store.folder / "studies" / "drivers-2.json"]
+    for path in (*left, *kept):
+        path.write_text("{}")
+    open_store(store.folder, MANIFEST, resume=True)
+    assert [path.exists() for path in (*left, *kept)] == [False, False, True, True]
+
+
+def test_a_new_store_takes_over_no_study_and_no_verdict(store):
+    (store.folder / "manifest.json").unlink()
+    for part in range(MANIFEST.parts):
+        store.part_path(part).unlink()
+    (store.folder / "studies").mkdir()
+    for resume in (False, True):
+        with refused("store: found a folder with something in it"):
+            open_store(store.folder, MANIFEST, resume)
+    (store.folder / "studies").rmdir()
+    (store.folder / "verdict.json").touch()
+    for resume in (False, True):
+        with refused("store: found a folder with something in it"):
+            open_store(store.folder, MANIFEST, resume)
+
+
 def test_a_full_disk_is_one_line_and_keeps_what_is_there(store):
     before = store.part_path(0).read_bytes()
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -2,8 +2,9 @@
 
 The first lot of starts are the literature's gains and the best points of a scan. Where they do not end at the
 same value there may be something better: further lots begin at the best points of other scans, until several
-starts agree on the best, and that is then improved without derivatives. How many minima there are is not
-known; that the best one was met again and again is the sign that few are left.
+starts agree on the best. How many minima there are is not known; that the best one was met again and again is
+the sign that few are left. Contacts begin and end at ticks: the objective has kinks, on which a descent may
+stop, so that the best is then improved without derivatives.
 
 Source: multistart until a minimum recurs, Boender and Rinnooy Kan, "Bayesian stopping rules for multistart
 global optimization methods" (1987).
@@ -61,8 +62,8 @@ def find(
     report: Callable[[str], None] = lambda text: None,
 ) -> list[Found]:
     """Best gains of every task, from lots of so many starts of so many steps, and a polish of so many
-    evaluations. `first` has, of each task, gains to start at, in the places of the last starts of its first
-    lot, never of the literature's. One start alone is the literature's, and the only lot."""
+    evaluations for each gain. `first` has, of each task, gains to start at, in the places of the last starts
+    of its first lot, never of the literature's. One start alone is the literature's, and the only lot."""
     tasks, objectives = trial.tasks, one_each(objective, len(trial.tasks))
     told = [list(own) for own in first] if first else [[] for _ in tasks]
     number = max(starts, 1 + max(map(len, told)))
@@ -70,7 +71,7 @@ def find(
     chosen = _while_compiling(
         trial, number, objectives, lambda: choose_starts(trial, number, seed, objectives, told)
     )
-    going, doubtful = list(range(len(tasks))), []
+    going = list(range(len(tasks)))
     for lot in range(LOTS if number > 1 else 1):
         if lot > 0:
             report(f"lot {lot + 1} of starts, {len(going)} of {len(tasks)} mechanisms")
@@ -85,14 +86,15 @@ def find(
             if lot > 0 or number > 1 + len(told[i]):
                 own.evaluations += _scan_evaluations(trial, number)
         going = [i for i in going if not _agree(searches[i].starts)]
-        doubtful = going if lot == 0 else doubtful
         if not going:
             break
-    report("searching without derivatives where starts disagreed")
-    best = finish(trial, [own.starts for own in searches], doubtful, polishing, seed, objectives)
-    for i in doubtful:
-        searches[i].evaluations += polishing if best[i] else 0
-    return [Found(top, own.starts, own.evaluations) for top, own in zip(best, searches, strict=True)]
+    report("searching on without derivatives")
+    polishing *= len(trial.names)
+    best = finish(trial, [own.starts for own in searches], polishing, seed, objectives)
+    return [
+        Found(top, own.starts, own.evaluations + (polishing if top else 0))
+        for top, own in zip(best, searches, strict=True)
+    ]
 
 
 def _exactly(trial: Trial, task: int, starts: list[Start], objectives: list[Objective]) -> list[Start]:
@@ -174,28 +176,27 @@ def _shares(
 def finish(
     trial: Trial,
     solved: list[list[Start]],
-    doubtful: list[int],
     evaluations: int,
     seed: int,
     objective: Objective | Sequence[Objective] = RMS,
 ) -> list[Start | None]:
-    """The best start of every task, none if all failed; of those that are doubtful polished without
-    derivatives (`tuning.search.polish`) by so many evaluations each."""
+    """The best start of every task, none if all failed, polished without derivatives (`tuning.search.polish`)
+    by so many evaluations each."""
     best = [ranked[0] if (ranked := _ranked(own)) else None for own in solved]
-    doubtful = [i for i in doubtful if best[i]]
-    if not doubtful or evaluations == 0:
+    some = [i for i, top in enumerate(best) if top]
+    if not some or evaluations == 0:
         return best
-    tops = [top for i in doubtful if (top := best[i])]
+    tops = [top for top in best if top]
     starts = np.stack([top.shares for top in tops])
     shapes = np.stack([inverse_hessian(top.curvature, top.rms) for top in tops])
 
     def losses(points):
-        return trial.losses(objective, doubtful, points)
+        return trial.losses(objective, some, points)
 
     found = polish(
         losses, starts, evaluations, candidates=CANDIDATES, reach=REACH, covariance=shapes, seed=seed
     )
-    for i, top, shares, loss in zip(doubtful, tops, found.free, found.loss, strict=True):
+    for i, top, shares, loss in zip(some, tops, found.free, found.loss, strict=True):
         # It keeps the start itself where nothing is better.
         if (shares != top.shares).any():
             history = [*top.history, float(loss)]

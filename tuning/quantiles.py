@@ -91,19 +91,19 @@ def binned_quantile(
     number = int(np.sum(counted))
     below = np.cumsum(counted)
     bounds = np.concatenate([[0.0], EDGES, [np.inf]])
-
-    def bin_of(rank: int) -> int:
-        return int(np.searchsorted(below, rank, side="left"))
-
     low, high = ranks(number, order, level, sequential)
-    lower = bounds[bin_of(low)] if low > 0 else 0.0
-    upper = bounds[bin_of(high) + 1] if high <= number else np.inf
-    if not number:
-        return Interval(np.asarray(np.nan), np.asarray(lower), np.asarray(upper))
-    place = bin_of(_rank(number, order))
-    inner = 0 < place < BINS - 1
-    estimate = np.sqrt(bounds[place] * bounds[place + 1]) if inner else (0.0 if place == 0 else np.inf)
-    return Interval(np.asarray(estimate), np.asarray(lower), np.asarray(upper))
+    lower = bounds[np.searchsorted(below, low)] if low > 0 else 0.0
+    upper = bounds[np.searchsorted(below, high) + 1] if high <= number else np.inf
+    return Interval(binned_estimate(counted, order), np.asarray(lower), np.asarray(upper))
+
+
+def binned_estimate(counted: np.ndarray, order: float) -> np.ndarray:
+    """The estimate of `binned_quantile` alone, (...), from `counts` (..., BINS); nan without values."""
+    below = np.cumsum(counted, axis=-1)
+    number = below[..., -1]
+    place = np.argmax(below >= _rank(number, order)[..., None], axis=-1)
+    middles = np.concatenate([[0.0], np.sqrt(EDGES[:-1] * EDGES[1:]), [np.inf]])
+    return np.where(number > 0, middles[place], np.nan)
 
 
 def replicate_quantile(counted: np.ndarray, order: float, level: float = LEVEL) -> Interval:
@@ -120,7 +120,7 @@ def replicate_quantile(counted: np.ndarray, order: float, level: float = LEVEL) 
     numbers = np.sum(counted, axis=-1)
     if np.any(numbers != numbers[0]):
         raise ValueError(f"counted: found {numbers.tolist()} values per replicate, allowed equal numbers")
-    estimate = binned_quantile(np.sum(counted, axis=0), order, level).estimate
+    estimate = binned_estimate(np.sum(counted, axis=0), order)
     bounds = np.concatenate([[0.0], EDGES, [np.inf]])
     # Bin i ends at bounds[i + 1].
     _, low, high = replicate_interval(np.cumsum(counted, axis=-1).T, int(numbers[0]), level)
@@ -129,9 +129,10 @@ def replicate_quantile(counted: np.ndarray, order: float, level: float = LEVEL) 
     return Interval(estimate, bounds[first], bounds[last + 2])
 
 
-def _rank(number: int, order: float) -> int:
+def _rank(number: ArrayLike, order: float) -> np.ndarray:
     # Rounding must not lift an exact product to the next rank.
-    return min(max(int(np.ceil(order * number * (1.0 - 1e-14))), 1), max(number, 1))
+    rank = np.ceil(order * np.asarray(number) * (1.0 - 1e-14))
+    return np.clip(rank, 1, np.maximum(number, 1)).astype(np.int64)
 
 
 def _last(inside, within: int, beyond: int) -> int:

@@ -37,11 +37,16 @@ def emit(*things: RenderableType) -> None:
 
 
 def emit_json(document: Mapping[str, Any]) -> None:
-    """Print one JSON document; what is not finite as null."""
+    """Print one JSON document, as `as_json` has it."""
     try:
-        print(json.dumps(finite(document), indent=2, allow_nan=False), flush=True)
+        print(as_json(document), end="", flush=True)
     except BrokenPipeError:
         _detach()
+
+
+def as_json(document: Mapping[str, Any]) -> str:
+    """A document as lines of JSON, in ASCII; what is not finite as null."""
+    return json.dumps(finite(document), indent=2, allow_nan=False) + "\n"
 
 
 def note(text: str) -> None:

@@ -28,7 +28,7 @@ BLOCK = 16  # mechanisms tuned and judged together: what is done when work is in
 class Settings:
     """Numbers of scenarios to tune on (None: `tuning.problems` knows), of starts of a lot
     (`tuning.finding`), of solver steps, of scenarios to judge on; the seed; what to minimise; evaluations
-    without derivatives where starts disagree; whether to search the whole box for something better."""
+    without derivatives at the end, for each gain; whether to search the whole box for something better."""
 
     scenarios: int | None = None
     starts: int = 4
@@ -36,7 +36,7 @@ class Settings:
     validation: int = 511
     seed: int = 0
     objective: Objective = RMS
-    polish: int = 640
+    polish: int = 160
     certify: bool = False
 
 

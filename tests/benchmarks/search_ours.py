@@ -22,13 +22,13 @@ from tuning.search import apart, polish
 
 SCANNED, DESCENTS, GO_ON = 64, 6, 3  # points looked at, those descended from, those that go on; of a lot
 STEPS = 25  # of Levenberg-Marquardt
-POLISH = 320  # evaluations, of a start whose descents do not agree
+POLISH = 320  # evaluations
 LONGEST = 32  # steps that the program is made for
 
 
 def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = False) -> list[Trace]:
     """What tuning does, from every start (in the unit box) on its own: look around, descend by
-    Levenberg-Marquardt in two rounds; again and then polish without derivatives where the descents disagree.
+    Levenberg-Marquardt in two rounds, again where the descents disagree; polish without derivatives.
 
     A trace has an entry for every step of a start's descents and for the stages before and after. Its seconds
     are those of the batch over the number of starts; the steps of a round, which is one program, count as
@@ -37,7 +37,7 @@ def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = 
     number, gains = starts.shape
     stages = _Stages(number, time.perf_counter())
     ends = [_Ends(np.empty(0), np.empty((0, gains)), np.empty((0, gains, gains))) for _ in starts]
-    going, doubtful = np.arange(number), np.empty(0, int)
+    going = np.arange(number)
     for lot in range(1 if warming else LOTS):
         points = np.stack([spread_points(starts[i], SCANNED, (int(i), lot)) for i in going])
         values = case.losses(points.reshape(-1, gains)).reshape(len(going), -1)
@@ -58,26 +58,24 @@ def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = 
         for i, *own in zip(going, *several, strict=True):
             ends[i] = _Ends(*(np.concatenate(both) for both in zip(ends[i], own, strict=True)))
         going = going[[not _agree(ends[i].loss) for i in going]]
-        doubtful = going if lot == 0 else doubtful
         if not len(going):
             break
 
-    if len(doubtful):
-        tops = [int(np.argmin(ends[i].loss)) for i in doubtful]
-        shares = np.stack([ends[i].shares[top] for i, top in zip(doubtful, tops, strict=True)])
-        shapes = [
-            inverse_hessian(ends[i].curvature[top], SCALE * np.sqrt(2 * ends[i].loss[top]))
-            for i, top in zip(doubtful, tops, strict=True)
-        ]
+    tops = [int(np.argmin(own.loss)) for own in ends]
+    shares = np.stack([own.shares[top] for own, top in zip(ends, tops, strict=True)])
+    shapes = [
+        inverse_hessian(own.curvature[top], SCALE * np.sqrt(2 * own.loss[top]))
+        for own, top in zip(ends, tops, strict=True)
+    ]
 
-        def losses(points):
-            return case.losses(points.reshape(-1, gains)).reshape(points.shape[:-1])
+    def losses(points):
+        return case.losses(points.reshape(-1, gains)).reshape(points.shape[:-1])
 
-        last = polish(
-            losses, shares, 1 if warming else POLISH,
-            candidates=CANDIDATES, reach=REACH, covariance=np.stack(shapes),
-        )  # fmt: skip
-        stages.add(doubtful, POLISH, last.loss)
+    last = polish(
+        losses, shares, 1 if warming else POLISH,
+        candidates=CANDIDATES, reach=REACH, covariance=np.stack(shapes),
+    )  # fmt: skip
+    stages.add(np.arange(number), POLISH, last.loss)
     return stages.traces()
 
 

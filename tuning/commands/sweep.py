@@ -1,18 +1,18 @@
 """`jaxhil sweep`: many scenarios, a failure probability with its interval, and the worst of them."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError
 from tuning import report
 from tuning.cli import Sweep
-from tuning.commands import checks, sweep_tables
+from tuning.commands import checks, sweep_studies, sweep_tables
 from tuning.environment import prepare
 from tuning.sweeps import LARGEST_CHUNK, LARGEST_SEED, MOST, PRECISIONS, SAMPLINGS
 
 MOST_DRIVERS = 2**20  # scenarios for each input
-STAGE = 10_000  # scenarios between two lines of progress
 
 
 def run(options: Sweep) -> int:
@@ -22,8 +22,7 @@ def run(options: Sweep) -> int:
     prepare()
     from tuning.gain_file import load_gain_file
     from tuning.sweeps.manifest import Choices, build_manifest
-    from tuning.sweeps.pictures import write_pictures
-    from tuning.sweeps.run import compare_precisions, run_sweep
+    from tuning.sweeps.run import run_sweep
     from tuning.sweeps.store import locked, open_store
     from tuning.sweeps.tally import failure_probability
     from tuning.verdict import scenarios_needed
@@ -49,20 +48,49 @@ def run(options: Sweep) -> int:
                 lambda rows, tally: progress.advance(rows, told(tally)),
                 options.scheduler,
             )
-        rate = progress.rate
-        plots = write_pictures(store, options.acceptable)
-    document = _document(options, store, sweep, tally, rate) | {"plots": plots}
-    if manifest.precision == "float32":
-        document["float32"] = compare_precisions(sweep)._asdict()
-    if options.drivers is not None:
-        document["drivers"] = _drivers(options, sweep)
-    if options.rare is not None:
-        document["rare"] = _rare(options, sweep)
+        document = _document(options, store, sweep, tally, progress.rate)
+        unwritten = _complete(options, store, sweep, document)
     if options.json:
         report.emit_json(document)
     else:
         sweep_tables.emit(document)
+    if unwritten:
+        raise unwritten[0]
     return 0 if document["verdict"] == "good" else 1
+
+
+def _complete(options: Sweep, store, sweep, document: dict[str, Any]) -> list[InputError]:
+    """Add what belongs beside the verdict, and keep all that is known in the store after every step.
+
+    What could not be written is returned, to be told after the verdict, which no full disk is to cost.
+    """
+    from tuning.sweeps.kept import write_verdict
+    from tuning.sweeps.pictures import write_pictures
+    from tuning.sweeps.run import compare_precisions
+
+    unwritten: list[InputError] = []
+
+    def plots() -> list[str]:
+        with sweep_studies.put_off(unwritten):
+            return write_pictures(store, options.acceptable)
+        return []
+
+    def keep() -> None:
+        with sweep_studies.put_off(unwritten):
+            write_verdict(store, report.as_json(document))
+
+    steps: dict[str, Callable[[], Any]] = {"plots": plots}
+    if store.manifest.precision == "float32":
+        steps["float32"] = lambda: compare_precisions(sweep)._asdict()
+    if options.drivers is not None:
+        steps["drivers"] = lambda: sweep_studies.drivers(options, store, sweep, unwritten)
+    if options.rare is not None:
+        steps["rare"] = lambda: sweep_studies.rare(options, store, sweep, unwritten)
+    keep()
+    for key, step in steps.items():
+        document[key] = step()
+        keep()
+    return unwritten
 
 
 def _check(options: Sweep) -> None:
@@ -138,41 +166,6 @@ def _document(options: Sweep, store, sweep, tally, rate) -> dict[str, Any]:
         "scenarios_per_second": rate,
         "acceptable": options.acceptable,
         "verdict": "good" if good else "bad",
-    }
-
-
-def _drivers(options: Sweep, sweep) -> dict[str, Any]:
-    from jaxhil.uncertainty import dimensions
-    from tuning.drivers import evaluations
-    from tuning.sweeps.studies import error_drivers
-
-    number: Any = options.drivers
-    # Noise, if there is any, adds an input; the bar need not know.
-    with report.progress(evaluations(len(dimensions(sweep.mechanism)), number), "scenarios") as progress:
-        return error_drivers(sweep, number, lambda more: progress.advance(more, "drivers"))._asdict()
-
-
-def _rare(options: Sweep, sweep) -> dict[str, Any]:
-    from tuning.sweeps.studies import rare_failure, spread_beyond_formula
-
-    limit = options.rare or options.limit
-    ran = 0
-    with report.stages(1) as stages:
-        stages.begin("subset simulation")
-
-        def done(more: int) -> None:
-            nonlocal ran
-            ran += more
-            if ran % STAGE == 0:
-                stages.say(f"subset simulation: {ran} scenarios")
-
-        found = rare_failure(sweep, limit, done)
-    kept = ("probability", "low", "high", "coefficient_of_variation", "formula_coefficient_of_variation")
-    return {
-        "limit": limit,
-        **{name: getattr(found, name) for name in (*kept, "evaluations")},
-        "estimates": found.estimates.tolist(),
-        "spread_beyond_formula": spread_beyond_formula(found),
     }
 
 

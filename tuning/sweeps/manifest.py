@@ -87,11 +87,9 @@ class Choices(NamedTuple):
 
 def build_manifest(loaded: LoadedGains, choices: Choices) -> Manifest:
     """The manifest of a sweep of a checked gain file. Raises `InputError` for an impossible choice."""
-    if choices.sampling == "sobol":
-        for name, value in (("scenarios", choices.scenarios), ("chunk", choices.chunk)):
-            if value % REPLICATES:
-                allowed = f"a multiple of {REPLICATES}, the replicates of sobol sampling"
-                raise InputError(f"--{name}: found {value}, allowed {allowed}")
+    if choices.sampling == "sobol" and choices.scenarios < REPLICATES:
+        allowed = f"{REPLICATES} or more, the replicates of sobol sampling"
+        raise InputError(f"--scenarios: found {choices.scenarios}, allowed {allowed}")
     document = {
         "schema": SCHEMA,
         **choices._asdict(),

@@ -13,6 +13,7 @@ import numpy as np
 from jaxhil.mechanism import Mechanism, value_at
 from jaxhil.metrics import OK, STATUS_NAMES
 from jaxhil.uncertainty import PHASE, at_points, dimensions
+from tuning.quantiles import BINS, EDGES, binned_estimate
 from tuning.sweeps.columns import STATUSES, input_names, unit_of
 from tuning.sweeps.manifest import Manifest
 from tuning.sweeps.tally import error_sizes
@@ -23,7 +24,6 @@ PREFERRED = ("contact.stiffness", "rig.force_sensor.delay")
 NAMES = {"contact.stiffness": "contact stiffness", "rig.force_sensor.delay": "force delay"}
 # Display units: factor and unit.
 UNITS = {"s": (1e3, "ms"), "m": (1e3, "mm"), "m/s": (1e3, "mm/s"), "N/m": (1e-3, "kN/m")}
-SIZES = 10.0 ** np.linspace(-7, 3, 1201)  # edges of the bins of |error|, each 2 % above the last
 ENDS = 0.001, 0.999  # probabilities between which the grid lies; what is outside counts in its outer cells
 PER_CELL = 150  # contacts, on average
 MOST_CELLS = 28  # along an axis
@@ -129,7 +129,7 @@ def empty_regions(plan: Plan) -> Regions:
     none = np.empty(0)
     points = Points(none.astype(np.int64), np.empty((inputs, 0)), none, none.astype(bool))
     counts = np.zeros((len(plan.looks) + 1, plan.replicates), np.int64)
-    sizes = np.zeros((*(plan.cells,) * inputs, len(SIZES) + 1), np.int64)
+    sizes = np.zeros((*(plan.cells,) * inputs, BINS), np.int64)
     return Regions(sizes, points, counts, counts)
 
 
@@ -154,13 +154,10 @@ def add_rows(plan: Plan, regions: Regions, rows: Rows) -> Regions:
 
 
 def quantile(sizes: np.ndarray, order: float, least: int) -> np.ndarray:
-    """The quantile of |error| along the last axis of `sizes`, to 1 %; NaN where less than `least` are."""
-    below = np.cumsum(sizes, axis=-1)
-    total = below[..., -1]
-    rank = np.maximum(np.ceil(order * total * (1 - 1e-14)), 1)
-    place = np.argmax(below >= rank[..., None], axis=-1)
-    middles = np.concatenate([SIZES[:1], np.sqrt(SIZES[:-1] * SIZES[1:]), [np.inf]])
-    return np.where(total >= max(least, 1), middles[place], np.nan)
+    """The quantile of |error| along the last axis of `sizes`, within 0.5 %, at least the first edge of the
+    bins, so that it has a logarithm; NaN where less than `least` are."""
+    found = np.maximum(binned_estimate(sizes, order), EDGES[0])
+    return np.where(np.sum(sizes, axis=-1) >= least, found, np.nan)
 
 
 def _sizes(plan: Plan, rows: Rows, shape: tuple[int, ...]) -> np.ndarray:
@@ -176,7 +173,7 @@ def _sizes(plan: Plan, rows: Rows, shape: tuple[int, ...]) -> np.ndarray:
             edges = one.edges(plan.cells)[1:-1]
             place = place * plan.cells + np.searchsorted(edges, one.values(rows, contact), side="right")
         size = np.nan_to_num(size, nan=np.inf, posinf=np.inf)
-        place = place * shape[-1] + np.searchsorted(SIZES, size, side="right")
+        place = place * shape[-1] + np.searchsorted(EDGES, size, side="right")
         counts += np.bincount(place[counted], minlength=len(counts))
     return counts.reshape(shape)
 

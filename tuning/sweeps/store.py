@@ -3,6 +3,7 @@
     DIR/manifest.json
     DIR/parts/part-000000.parquet, part-000001.parquet, ...
     DIR/errors.png, failures.png, convergence.png
+    DIR/verdict.json, studies/drivers-1024.json, ... (`tuning.sweeps.kept`)
 
 `DIR/parts` is a Parquet dataset, for pandas, DuckDB or Arrow; units are in the fields' metadata. A part is
 there as a whole or not at all: it is written under another name, forced to disk, then renamed. It carries the
@@ -25,6 +26,8 @@ from tuning.sweeps.manifest import NAME, Manifest, differences, encode, read_man
 
 PARTS = "parts"
 PICTURES = ("errors.png", "failures.png", "convergence.png")  # made of the rows, not part of them
+STUDIES = "studies"
+VERDICT = "verdict.json"
 LOCK = ".lock"
 TEMPORARY = ".tmp"
 DIGEST = b"jaxhil.sweep.sha256"
@@ -49,8 +52,9 @@ def open_store(folder: Path, manifest: Manifest, resume: bool) -> Store:
     shown = one_line(str(folder))
     with writing(folder):
         (folder / PARTS).mkdir(parents=True, exist_ok=True)
-        for stale in (*folder.glob(f".*{TEMPORARY}"), *(folder / PARTS).glob(f".*{TEMPORARY}")):
-            stale.unlink(missing_ok=True)
+        for place in (folder, folder / PARTS, folder / STUDIES):
+            for stale in place.glob(f".*{TEMPORARY}"):
+                stale.unlink(missing_ok=True)
         held = {entry.name for entry in folder.iterdir()} - {LOCK, PARTS, *PICTURES}
         parts = any((folder / PARTS).iterdir())
     if NAME in held and resume:
@@ -62,7 +66,7 @@ def open_store(folder: Path, manifest: Manifest, resume: bool) -> Store:
         allowed = "an empty folder, or a store and --resume" if not resume else "a store with its manifest"
         raise InputError(f"{shown}: found a folder with something in it, allowed {allowed}")
     with writing(folder / NAME):
-        _write_whole(folder / NAME, encode(manifest))
+        write_whole(folder / NAME, encode(manifest))
     return Store(folder, manifest)
 
 
@@ -103,7 +107,7 @@ def write_part(store: Store, part: int, rows: Mapping[str, np.ndarray]) -> None:
     )
     path = store.part_path(part)
     with writing(path):
-        _write_whole(path, buffer.getvalue())
+        write_whole(path, buffer.getvalue())
 
 
 def read_part(store: Store, part: int) -> dict[str, np.ndarray] | None:
@@ -226,8 +230,8 @@ def from_table(manifest: Manifest, table: Any) -> dict[str, np.ndarray]:
     return rows
 
 
-def _write_whole(path: Path, content: Any) -> None:
-    """The file is there as a whole, on disk, or as it was."""
+def write_whole(path: Path, content: Any) -> None:
+    """The file is there as a whole, on disk, or as it was. Raises OSError when it cannot be written."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY}")
     try:
         with temporary.open("wb") as file:

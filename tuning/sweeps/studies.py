@@ -22,6 +22,7 @@ from tuning.sweeps.tally import error_sizes
 NOISE = "sensor noise"
 CAP_LIMITS = 10.0  # largest error that drivers look at, over the limit
 CAP_UNLIMITED = 10.0  # the same where there is no limit
+SAMPLES, REPLICATES = 1000, 10  # of subset simulation: per level and replicate, and how often it runs
 FAR_ABOVE = 2.0  # replicates that spread so much more than the formula says have not seen the same failures
 
 Done = Callable[[int], None]  # told of the number of scenarios that were run
@@ -77,7 +78,11 @@ def error_drivers(sweep: Sweep, number: int, done: Done = lambda _: None) -> Dri
 
 
 def rare_failure(
-    sweep: Sweep, limit: float, done: Done = lambda _: None, samples: int = 1000, replicates: int = 10
+    sweep: Sweep,
+    limit: float,
+    done: Done = lambda _: None,
+    samples: int = SAMPLES,
+    replicates: int = REPLICATES,
 ) -> Rare:
     """Subset simulation of the probability that a scenario fails, with `limit` in the place of the sweep's.
 

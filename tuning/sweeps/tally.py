@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tuning.quantiles import BINS, binned_quantile, counts, replicate_quantile
+from tuning.quantiles import BINS, binned_estimate, binned_quantile, counts, replicate_quantile
 from tuning.sweeps import MOST
 from tuning.sweeps.columns import BEYOND, GOOD, OUTCOMES, SATURATED
 from tuning.verdict import Running, binomial_interval, replicate_interval, updated
@@ -141,8 +141,7 @@ def error_quantiles(tally: Tally) -> list[Quantile]:
         elif _equal(np.sum(errors, axis=1)):
             interval = replicate_quantile(errors, order)
         else:
-            value = binned_quantile(np.sum(errors, axis=0), order).estimate
-            interval = value, 0.0, np.inf
+            interval = binned_estimate(np.sum(errors, axis=0), order), 0.0, np.inf
         found.append(Quantile(order, *(float(number) for number in interval)))
     return found
 

@@ -1,0 +1,79 @@
+"""Intervals of whole sweeps cover the truth: scenarios drawn, run, judged and counted as the command does.
+
+The truth is known in closed form: a linear contact of speed v, stiffness k and equivalent mass m presses with
+at most v sqrt(k m), so that a force sensor of range R saturates when v > R / sqrt(k m). Of v uniform from low
+to high that is a share of (high - R / sqrt(k m)) / (high - low). Ticks are short beside the contact, and
+neither motion simulator nor sensors are late.
+"""
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from cases import IDEAL, MASS, STIFFNESS, mechanism, nominal_gains, validated
+from sweep_cases import manifest
+
+from tuning.gain_file import build_document
+from tuning.sweeps.chunks import build_sweep, run_chunk
+from tuning.sweeps.tally import Probability, add_rows, empty_tally, failure_probability
+from tuning.verdict import enough
+
+pytestmark = pytest.mark.slow
+
+BAR = 0.935  # of repeated sweeps, for stated 95 %
+SWEEPS, NUMBER = 1000, 256
+LOOK = 32  # scenarios
+LOW, HIGH = 0.002, 0.006  # m/s
+SPEEDS = {"approach.velocity": {"distribution": "uniform", "low": LOW, "high": HIGH}}
+TRUTHS = 0.3, 0.05
+
+
+def repeated(truth, sampling):
+    """The rows of sweeps that differ by their seeds."""
+    sensor = {"range": (HIGH - truth * (HIGH - LOW)) * math.sqrt(STIFFNESS * MASS)}
+    raw = mechanism({}, IDEAL, 0.0, period=2e-4, force_sensor=sensor)
+    parsed = validated({**raw, "uncertainty": SPEEDS})
+    document = build_document("none", nominal_gains(parsed, "none"), parsed, "0" * 64, {}, {}, 0, {})
+    sweep = build_sweep(manifest(document, NUMBER, sampling=sampling, chunk=NUMBER))
+    for seed in range(SWEEPS):
+        own = msgspec.structs.replace(sweep.manifest, seed=seed)
+        yield run_chunk(sweep._replace(manifest=own), 0, NUMBER)
+
+
+def check(found: list[Probability], truth: float, name: str, capsys) -> None:
+    inside = np.mean([one.low <= truth <= one.high for one in found])
+    width = np.mean([one.high - one.low for one in found])
+    value = np.mean([one.value for one in found])
+    with capsys.disabled():
+        stated = f"coverage {inside:.3f}, mean width {width:.4f}, mean {value:.4f}"
+        print(f"\n{name}, p = {truth}: {stated}", end="")
+    assert inside >= BAR
+
+
+@pytest.mark.parametrize("truth", TRUTHS)
+@pytest.mark.parametrize("sampling", ["random", "sobol"])
+def test_intervals_of_repeated_sweeps_cover_the_truth(truth, sampling, capsys):
+    replicates = 16 if sampling == "sobol" else 1
+    found = [
+        failure_probability(add_rows(empty_tally(replicates, NUMBER), rows))
+        for rows in repeated(truth, sampling)
+    ]
+    # The pooled sweeps see the closed form itself.
+    pooled = np.mean([one.value for one in found])
+    assert pooled == pytest.approx(truth, abs=4 * math.sqrt(truth * (1 - truth) / (SWEEPS * NUMBER)))
+    check(found, truth, sampling, capsys)
+
+
+@pytest.mark.parametrize("truth", TRUTHS)
+def test_stopping_at_a_width_covers_the_truth(truth, capsys):
+    found = []
+    for rows in repeated(truth, "random"):
+        tally = empty_tally(1, NUMBER, looked_at=True)
+        for first in range(0, NUMBER, LOOK):
+            tally = add_rows(tally, {name: column[first : first + LOOK] for name, column in rows.items()})
+            assert tally.looks is not None
+            if enough(tally.looks, 0.3 if truth > 0.1 else 0.12):
+                break
+        found.append(failure_probability(tally))
+    check(found, truth, "sequential", capsys)
