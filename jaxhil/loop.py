@@ -177,7 +177,12 @@ def enter(
     return state._replace(
         position=position,
         velocity=velocity,
-        plant=Plant(commands, stride, steady_state(rig.propagation, drive, stride)),
+        plant=Plant(
+            commands,
+            stride,
+            steady_state(rig.propagation, drive, stride),
+            commands[0] if loop.has_limits else None,
+        ),
         sensed=state.sensed._replace(
             last=no_touch(position), lagged=jnp.zeros_like(position), first_position=first_position
         ),
@@ -233,10 +238,11 @@ def drive(
     command, controller = loop.compensator.position_command(
         gains, controller, position, velocity, acceleration
     )
-    step = state.plant.step
-    if loop.has_limits:
+    step, wanted = state.plant.step, state.plant.wanted
+    if wanted is not None:
+        before, wanted = wanted, command
         command, step = limit_command(
-            command, state.plant.commands[0], state.plant.step, position - state.position, period,
+            wanted, before, state.plant.commands[0], step, period,
             scenario.simulator.velocity_limit, scenario.simulator.acceleration_limit,
         )  # fmt: skip
     commands = (command, *state.plant.commands)
@@ -271,7 +277,7 @@ def drive(
     return state._replace(
         position=position,
         velocity=velocity,
-        plant=Plant(commands[: loop.latency + 1], step, advance(plant.transition, x_now, start, end)),
+        plant=Plant(commands[: loop.latency + 1], step, advance(plant.transition, x_now, start, end), wanted),
         sensed=Sensed(rings, now, lagged, sensed.first_position),
         law=law,
         controller=controller,

@@ -9,11 +9,18 @@ from jaxhil.touch import Panel, Touch, Truth
 
 
 class Plant(NamedTuple):
-    """Motion simulator and drives: recent commands c(n), c(n-1) [m], last step of the command [m], state."""
+    """Motion simulator and drives: recent commands c(n), c(n-1) [m], last step of the command [m], state;
+    c(n) before the limits, where there are any (else None)."""
 
     commands: tuple[Array, ...]
     step: Array
     state: tuple[Array, ...]
+    wanted: Float[Array, "*batch"] | None
+
+    @property
+    def shortfall(self) -> Float[Array, "*batch"] | None:
+        """How far the limits keep c(n) from what was wanted [m], where there are any."""
+        return None if self.wanted is None else abs(self.wanted - self.commands[0])
 
 
 class Rings(NamedTuple):

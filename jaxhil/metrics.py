@@ -30,14 +30,19 @@ RUNAWAY = 1e3  # of the first approach speed: no rig survives it
 
 class Metrics(NamedTuple):
     """Per contact, (slots, *batch): restitution [1]; approach_velocity [m/s]; peak_force, the real contact
-    force's, and peak_command, |F_c|'s [N]; excess_variation of F_c [N] (0 unless followed); duration, the
-    time in touch [s]; work_in and work_out, by the real force along x_a [J] (0 unless audited); status, one
-    of `STATUS_NAMES`; ticks run by then.
+    force's, and peak_command, |F_c|'s [N]; excess_variation of F_c [N] (0 unless followed);
+    position_shortfall, how far the motion simulator's limits bound [m]; duration, the time in touch [s];
+    work_in and work_out, by the real force along x_a [J] (0 unless audited); status, one of `STATUS_NAMES`;
+    ticks run by then.
 
     excess_variation is V / 2 - (max F_c - min F_c), V the total variation sum |F_c(n+1) - F_c(n)| of the
     command, which counts as 0 before the contact and after it. The least V / 2 there is, max - min, is that
     of a command that swings but once: up to its maximum, down to its minimum and back to 0. What is beyond
     is chatter: max - min for every whole swing too many.
+
+    position_shortfall is the largest |c - c'| at any tick of the contact, c the position command that the
+    compensator asks for and c' the one that velocity and acceleration limits let through to the drives: 0, to
+    the bit, where neither bound. Where a loop has none, it is 0 from the start.
     """
 
     restitution: Float[Array, "slots *batch"]
@@ -45,6 +50,7 @@ class Metrics(NamedTuple):
     peak_force: Float[Array, "slots *batch"]
     peak_command: Float[Array, "slots *batch"]
     excess_variation: Float[Array, "slots *batch"]
+    position_shortfall: Float[Array, "slots *batch"]
     duration: Float[Array, "slots *batch"]
     work_in: Float[Array, "slots *batch"]
     work_out: Float[Array, "slots *batch"]
@@ -65,8 +71,9 @@ class Swings(NamedTuple):
 class Watch(NamedTuple):
     """The contact under way. `elapsed` [ticks] since it began, 0 before; whether it is `over`; approach and
     rebound speed [m/s]; peaks [N]; the real force at the last two ticks [N]; ticks with and since a touch;
-    works [J] and the command's swings, where followed; between two surfaces also the side (1 or -1), |F_c| of
-    the last tick and what was left of it when the last contact was over [N]."""
+    works [J] and the command's swings, where followed; the largest shortfall of the position command [m],
+    where it has limits; between two surfaces also the side (1 or -1), |F_c| of the last tick and what was
+    left of it when the last contact was over [N]."""
 
     elapsed: Float[Array, "*batch"]
     over: Bool[Array, "*batch"]
@@ -79,6 +86,7 @@ class Watch(NamedTuple):
     quiet: Float[Array, "*batch"]
     works: tuple[Array, ...]
     swings: Swings | None
+    shortfall: Float[Array, "*batch"] | None
     side: Float[Array, "*batch"] | None
     command: Float[Array, "*batch"] | None
     left: Float[Array, "*batch"] | None
@@ -101,7 +109,7 @@ def build_rules(scenario: Scenario) -> Rules:
     return Rules(quiet, quiet + jnp.ceil(LONGEST_FADING / period), level)
 
 
-def empty_metrics(slots: int, like: Array) -> Metrics:
+def empty_metrics(loop: Loop, slots: int, like: Array) -> Metrics:
     """Before any contact."""
     numbers = jnp.full((slots, *like.shape), jnp.nan, like.dtype)
     counts = jnp.zeros((slots, *like.shape), jnp.int32)
@@ -111,6 +119,7 @@ def empty_metrics(slots: int, like: Array) -> Metrics:
         peak_force=numbers,
         peak_command=numbers,
         excess_variation=numbers,
+        position_shortfall=numbers if loop.has_limits else jnp.zeros_like(numbers),
         duration=numbers,
         work_in=numbers,
         work_out=numbers,
@@ -134,6 +143,7 @@ def fresh_watch(loop: Loop, like: Array) -> Watch:
         quiet=zeros + 1e6,
         works=(zeros, zeros) if loop.energies else (),
         swings=Swings(zeros, zeros, zeros, zeros) if loop.chatter else None,
+        shortfall=zeros if loop.has_limits else None,
         side=zeros + 1 if loop.is_two_sided else None,
         command=zeros if loop.is_two_sided else None,
         left=zeros if loop.is_two_sided else None,
@@ -148,8 +158,9 @@ def observe(
     signals: Signals,
     truth: Truth,
     command: Array,
+    shortfall: Array | None,
 ) -> Watch:
-    """Follow the contact through one tick; `command` is F_c."""
+    """Follow the contact through one tick; `command` is F_c, `shortfall` that of `Plant`."""
     velocity, position = signals.velocity_desired, signals.position_desired
     speed, force, magnitude = jnp.abs(velocity), jnp.abs(truth.force), jnp.abs(command)
     touching = force > 0
@@ -181,6 +192,10 @@ def observe(
     works = watch.works
     if truth.works is not None:
         works = works[0] + truth.works[0], works[1] + truth.works[1]
+    lasts = begun & ~watch.over
+    largest = watch.shortfall
+    if largest is not None and shortfall is not None:
+        largest = jnp.where(lasts, jnp.maximum(largest, shortfall), largest)
     return Watch(
         elapsed=jnp.where(begun, watch.elapsed + 1, watch.elapsed),
         over=watch.over | ends,
@@ -193,7 +208,8 @@ def observe(
         touched=jnp.where(touching, watch.touched + 1, watch.touched),
         quiet=quiet,
         works=works,
-        swings=watch.swings and _swing(watch.swings, command, begun & ~watch.over, ends),
+        swings=watch.swings and _swing(watch.swings, command, lasts, ends),
+        shortfall=largest,
         side=side,
         command=magnitude if loop.is_two_sided else None,
         left=watch.left,
@@ -235,6 +251,7 @@ def collect(
         peak_force=watch.peak_force,
         peak_command=watch.peak_command,
         excess_variation=excess,
+        position_shortfall=none if watch.shortfall is None else watch.shortfall,
         duration=watch.touched * period,
         work_in=work_in,
         work_out=work_out,
@@ -244,7 +261,11 @@ def collect(
     slots = metrics.restitution.shape[0]
     slot = jnp.arange(slots, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
     here = (slot == index[None]) & over[None]
-    return Metrics(*(jnp.where(here, v[None], m) for v, m in zip(values, metrics, strict=True)))
+    entered = Metrics(*(jnp.where(here, v[None], m) for v, m in zip(values, metrics, strict=True)))
+    if watch.shortfall is None:
+        # Still what it was before any contact: no work in every turn-over.
+        return entered._replace(position_shortfall=metrics.position_shortfall)
+    return entered
 
 
 def _swing(swings: Swings, command: Array, lasts: Array, ends: Array) -> Swings:

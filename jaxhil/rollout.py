@@ -124,7 +124,9 @@ def start(loop: Loop, rig: Rig, gains: Gains) -> Run:
     state = LoopState(
         position=zeros,
         velocity=zeros,
-        plant=Plant((zeros,) * (loop.latency + 1), zeros, (zeros,) * order),
+        plant=Plant(
+            (zeros,) * (loop.latency + 1), zeros, (zeros,) * order, zeros if loop.has_limits else None
+        ),
         sensed=Sensed(_rings(loop, ring), no_touch(like), zeros, zeros),
         law=loop.law.init(zeros),
         controller=loop.compensator.init(gains, rig.constants, loop.controller_ring),
@@ -139,7 +141,7 @@ def start(loop: Loop, rig: Rig, gains: Gains) -> Run:
     return Run(
         state=state,
         watch=fresh_watch(loop, like),
-        metrics=empty_metrics(slots, like),
+        metrics=empty_metrics(loop, slots, like),
         index=index,
         active=scenario.contacts > 0,
         tick=tick,
@@ -159,7 +161,7 @@ def stretch(loop: Loop, rig: Rig, gains: Gains, run: Run, record: bool) -> tuple
         command, controller = loop.compensator.step(prepared, state.controller, signals, now)
         if loop.has_force_noise or loop.has_force_bias:
             command = jnp.where(signals.age == 0, 0, command)
-        watch = observe(loop, clearance, rules, watch, signals, truth, command)
+        watch = observe(loop, clearance, rules, watch, signals, truth, command, state.plant.shortfall)
         state = drive(loop, rig, gains, state, now, truth, command, controller)
         seen = None
         if record:

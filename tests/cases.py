@@ -237,6 +237,13 @@ CASES: dict[str, Case] = {
         mechanism({**LIST, "damping": [120.0], "clearance": 0.002}, RATTLING, 0.003, 3, velocity=0.01),
         "response_error",
     ),
+    "rattling, faster than the drives at first": Case(
+        mechanism(
+            {"damping": [500.0], "clearance": 0.002},
+            {**RATTLING, "velocity_limit": 0.0098}, 0.003, 3, velocity=0.01,
+        ),
+        "response_error",
+    ),
     "rattling with tension": Case(
         mechanism(
             {"damping": [400.0], "tension": True, "clearance": 0.0015}, RATTLING, 0.003, 2, velocity=0.01

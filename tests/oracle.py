@@ -76,7 +76,8 @@ def simulate(
     """Run the contacts of a mechanism (the mechanism file, parsed); one dict per contact.
 
     Keys: restitution, approach_velocity, peak_force [N], work_in, work_out [J], ticks (end_tick -
-    begin_tick), begin_tick, end_tick, peak_command [N], excess_variation of the command [N], status
+    begin_tick), begin_tick, end_tick, peak_command [N], excess_variation of the command [N],
+    position_shortfall [m], what the velocity limit takes off the position command at most, status
     ('over' or 'timeout'); `record=True` adds per-tick `signals` (of the whole run), among them the
     force just before the tick (`force`).
 
@@ -412,7 +413,7 @@ class _Run:
         self.last_force_end, self.last_side = -inf, 1
         self.jump_position = None
         self.died_out, self.armed = 0.0, True
-        self.log = []
+        self.log, self.shortfalls = [], [0.0]
 
     def contacts(self, count):
         results, n = [], 0
@@ -501,6 +502,7 @@ class _Run:
             "end_tick": end,
             "peak_command": peak_command,
             "excess_variation": _excess_variation([tick[-1] for tick in self.log[begin:n]]),
+            "position_shortfall": 0.0 if begin is None else max(self.shortfalls[begin:n]),
             "status": status,
         }
         return result, n
@@ -518,7 +520,11 @@ class _Run:
             self.v += T * a
         last, limit = self.motion.commands[-1], self.velocity_limit * T
         wanted = self._lead(self.x, self.v, a)
-        self.motion.append(last + min(max(wanted - last, -limit), limit) if isfinite(limit) else wanted)
+        if abs(wanted - last) > limit * (1.0 + 1e-12):
+            self.motion.append(last + limit if wanted > last else last - limit)
+        else:
+            self.motion.append(wanted)
+        self.shortfalls.append(abs(wanted - self.motion.commands[-1]))
 
     def _lead(self, x, v, a):
         lead = getattr(self.compensator, "position_command", None)

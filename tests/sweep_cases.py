@@ -16,10 +16,14 @@ NOISY = {"noise_std": 1.0}
 
 
 def case(
-    contacts: int = 1, compensator: str = "none", force_sensor: Any = None, uncertainty: Any = UNCERTAIN
+    contacts: int = 1,
+    compensator: str = "none",
+    force_sensor: Any = None,
+    uncertainty: Any = UNCERTAIN,
+    **simulator: float,
 ) -> dict[str, Any]:
     """A gain document for a mechanism of some contacts."""
-    raw = mechanism({}, SECOND_ORDER, contacts=contacts, force_sensor=force_sensor)
+    raw = mechanism({}, {**SECOND_ORDER, **simulator}, contacts=contacts, force_sensor=force_sensor)
     parsed = validated({**raw, "uncertainty": uncertainty})
     gains = nominal_gains(parsed, compensator)
     return build_document(compensator, gains, parsed, "0" * 64, {}, {}, 0, {})

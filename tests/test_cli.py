@@ -67,6 +67,7 @@ def test_set_reaches_the_mechanism(jaxhil):
     document = ran.document
     assert document["mechanism"] == "other"
     assert document["contacts"][0]["approach_velocity"] == pytest.approx(0.01)
+    assert document["contacts"][0]["position_shortfall"] == 0
 
 
 def test_a_run_that_fails_is_told(jaxhil):

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from lanes import mechanism, run_record
 
 from jaxhil.limits import limit_command
+from jaxhil.metrics import OK
 
 PERIOD, VELOCITY_LIMIT, ACCELERATION_LIMIT = 1e-3, 0.02, 0.5
 
@@ -24,8 +25,9 @@ def follow(targets, velocity_limit, acceleration_limit):
     def tick(carry, pair):
         command, step = carry
         before, target = pair
+        period = jnp.asarray(PERIOD, targets.dtype)
         command, step = limit_command(
-            target, command, step, target - before, jnp.array(PERIOD), velocity_limit, acceleration_limit
+            target, before, command, step, period, velocity_limit, acceleration_limit
         )
         return (command, step), command
 
@@ -35,8 +37,8 @@ def follow(targets, velocity_limit, acceleration_limit):
 
 def limited(targets, velocity_limit=np.inf, acceleration_limit=np.inf):
     """`follow` with the start in front."""
-    found = follow(jnp.asarray(targets), jnp.array(velocity_limit), jnp.array(acceleration_limit))
-    return np.concatenate([targets[:1], np.asarray(found)])
+    limits = np.array([velocity_limit, acceleration_limit], np.asarray(targets).dtype)
+    return np.concatenate([targets[:1], np.asarray(follow(jnp.asarray(targets), *limits))])
 
 
 def moves(speeds):
@@ -100,15 +102,39 @@ def test_a_stop_takes_the_time_it_must(limit):
     assert fastest - 1 <= ticks <= 1.05 * fastest + 2
 
 
-def test_limits_that_do_not_bind_change_nothing():
+@pytest.mark.parametrize(("dtype", "margin"), [("float64", 1.01), ("float32", 1.05)])
+@pytest.mark.parametrize("offset", [0, 1e-3, -0.1])
+def test_limits_that_do_not_bind_change_nothing_to_the_bit(offset, dtype, margin):
     time = PERIOD * np.arange(400)
-    targets = 1e-4 * np.sin(2 * np.pi * 3 * time)
-    steps = np.diff(targets)
-    loose = 1.01 * np.abs(steps).max() / PERIOD, 1.01 * np.abs(np.diff(steps)).max() / PERIOD**2
-    assert np.abs(limited(targets, *loose) - targets).max() < 1e-19
-    # Either limit 2 % lower does bind.
-    assert np.abs(limited(targets, 0.98 * loose[0], np.inf) - targets).max() > 1e-9
-    assert np.abs(limited(targets, np.inf, 0.98 * loose[1]) - targets).max() > 1e-9
+    smooth = offset + 0.01 * np.sin(2 * np.pi * 3 * time)
+    steps = np.diff(smooth)
+    loose = margin * np.abs(steps).max() / PERIOD, margin * np.abs(np.diff(steps)).max() / PERIOD**2
+    targets = smooth.astype(dtype)
+    for limits in (loose, (loose[0], np.inf), (np.inf, loose[1])):
+        np.testing.assert_array_equal(limited(targets, *limits), targets)
+    # Either limit that much lower does bind.
+    assert np.abs(limited(targets, loose[0] / margin**2, np.inf) - targets).max() > 1e-6
+    assert np.abs(limited(targets, np.inf, loose[1] / margin**2) - targets).max() > 1e-7
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("origin", [0.0, 0.05])
+def test_a_limit_that_is_just_reached_does_not_bind(origin, dtype):
+    """Uniform motion as fast as the drives go, through 0 and far from it."""
+    speed, period = np.array(VELOCITY_LIMIT, dtype), np.array(PERIOD, dtype)
+    targets = np.full(400, origin - 0.004, dtype)
+    for n in range(1, len(targets)):
+        targets[n] = targets[n - 1] + period * speed
+    np.testing.assert_array_equal(limited(targets, speed, ACCELERATION_LIMIT), targets)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.floats(1e-9, 1e-3), st.floats(-VELOCITY_LIMIT / 4, VELOCITY_LIMIT / 4), st.floats(-0.05, 0.05))
+def test_a_displaced_target_that_was_reached_is_followed_to_the_bit(distance, speed, origin):
+    targets = origin + moves(np.full(800, speed))
+    targets[2:] += distance
+    commands = limited(targets, VELOCITY_LIMIT, ACCELERATION_LIMIT)
+    np.testing.assert_array_equal(commands[-50:], targets[-50:])
 
 
 @pytest.mark.parametrize("limits", [(0.0053, np.inf), (np.inf, 0.06), (0.0053, 0.06)])
@@ -118,13 +144,17 @@ def test_limits_of_a_whole_contact(limits):
     simulator = {"model": "ideal"} | {n: x for n, x in zip(names, limits, strict=True) if np.isfinite(x)}
     batch = cases.build_batch({"": Case(mechanism({"law": "linear"}, simulator, 0.012, period=PERIOD))})
     loop = dataclasses.replace(batch.loop, has_limits=True)
-    ticks = run_record(loop, batch.gains, batch.scenario, 320)[1]
+    metrics, ticks = run_record(loop, batch.gains, batch.scenario, 320)
     commands = np.asarray(ticks.signals.position_measured)[:, 0]
     wanted = np.asarray(ticks.signals.position_desired)[:, 0]
     going = np.asarray(ticks.active)[:, 0]
-    commands, wanted = commands[going], wanted[going]
-    steps = np.diff(commands)
+    behind = np.abs(wanted - commands)
+    steps = np.diff(commands[going])
     assert np.abs(steps).max() <= limits[0] * PERIOD * (1 + 1e-9)
     assert np.abs(np.diff(steps)).max() <= limits[1] * PERIOD**2 * (1 + 1e-9)
-    # They do bind here: the model is faster than the drives.
-    assert np.abs(wanted - commands).max() > 1e-6
+    # They do bind here, in the contact: the model is faster than the drives.
+    assert metrics.status[0, 0] == OK
+    # From the first touch to the tick at which the contact is over, with which it is no longer active.
+    begin, end = np.argmax(np.asarray(ticks.truth.force)[:, 0] != 0), np.argmin(going)
+    largest = behind[begin : end + 1].max()
+    assert largest > 1e-6 and metrics.position_shortfall[0, 0] == pytest.approx(largest, rel=1e-9)

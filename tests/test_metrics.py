@@ -35,11 +35,11 @@ def excess(commands, touching):
         # It turns round at once, so that what ends the contact is the quiet after it.
         signals = Signals(zeros, zeros, zeros - 1, zeros, jnp.zeros(1, jnp.int32))
         truth = Truth(jnp.where(touches, 10.0, 0.0)[None], None, None)
-        return observe(LOOP, SCENARIO.clearance, rules, watch, signals, truth, command[None]), None
+        return observe(LOOP, SCENARIO.clearance, rules, watch, signals, truth, command[None], None), None
 
     watch, _ = jax.lax.scan(tick, fresh_watch(LOOP, zeros), (commands, touching))
     index = jnp.zeros(1, jnp.int32)
-    metrics = collect(SCENARIO, empty_metrics(4, zeros), watch, index, watch.over, index, index)
+    metrics = collect(SCENARIO, empty_metrics(LOOP, 4, zeros), watch, index, watch.over, index, index)
     return metrics.excess_variation[0, 0]
 
 

@@ -68,9 +68,21 @@ def test_motion_of_every_contact(name):
             expected["approach_velocity"], rel=min(accuracy, 1e-7)
         )
         assert found["peak_command"] == pytest.approx(expected["peak_command"], rel=accuracy)
+        # Nothing, to the bit, where no limit binds.
+        shortfall = expected["position_shortfall"]
+        assert found["position_shortfall"] == pytest.approx(shortfall, rel=1e-8, abs=0)
+        assert shortfall == 0 or "velocity_limit" in CASES[name].mechanism["rig"]["simulator"]
         assert found["excess_variation"] == pytest.approx(
             expected["excess_variation"], rel=accuracy, abs=accuracy * expected["peak_command"]
         )
+
+
+def test_drives_that_have_caught_up_fall_short_no_more():
+    rattling, always = (
+        [found["position_shortfall"] for found in cases.loop_contacts(name)]
+        for name in ("rattling, faster than the drives at first", "velocity limit")
+    )
+    assert rattling[0] > 1e-6 and rattling[1:] == [0, 0] and min(always) > 1e-6
 
 
 @every_case
@@ -226,11 +238,12 @@ def test_status_of_every_lane(mixed):
 def test_padding_is_inert(mixed):
     batch, run, metrics = mixed
     lane = batch.names.index("padding")
-    values = metrics._replace(status=metrics.status * 1.0, ticks=metrics.ticks * 1.0)
-    assert all(
-        np.isnan(v[:, lane]).all() for k, v in values._asdict().items() if k not in ("status", "ticks")
-    )
-    assert np.all(metrics.ticks[:, lane] == 0)
+    for name, values in metrics._asdict().items():
+        if name == "status":
+            continue
+        # There are no limits that a command could fall short by.
+        expected = 0 if name in ("ticks", "position_shortfall") else np.nan
+        np.testing.assert_array_equal(values[:, lane], expected, err_msg=name)
     # With nothing but padding the program does not even start.
     idle = batch.scenario._replace(contacts=jnp.zeros_like(batch.scenario.contacts))
     assert np.all(np.asarray(run(batch.loop, batch.gains, idle).status) == NOT_REACHED)

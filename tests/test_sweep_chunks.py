@@ -6,7 +6,8 @@ from sweep_cases import NOISY, case, manifest
 
 from tuning.sweeps.chunks import build_sweep, run_chunk, run_parts
 from tuning.sweeps.columns import OUTCOMES
-from tuning.sweeps.store import same_rows
+from tuning.sweeps.replay import replay
+from tuning.sweeps.store import open_store, same_rows, write_part
 
 
 def joined(pieces):
@@ -61,3 +62,23 @@ def test_runs_that_fail_are_rows():
     names = {OUTCOMES[place] for place in rows["outcome"]}
     assert {"timeout", "saturated", "good"} <= names
     assert np.isnan(rows["restitution_1"][rows["outcome"] == OUTCOMES.index("timeout")]).all()
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_a_simulator_slower_than_the_model_is_saturated(tmp_path, precision):
+    """Without damping or compensation the force only ever pushes back: the model is fastest before the
+    contact or after it."""
+    uncertain = {"rig.simulator.velocity_limit": {"distribution": "loguniform", "low": 0.006, "high": 0.024}}
+    label = manifest(case(uncertainty=uncertain, velocity_limit=0.01), 32, precision=precision)
+    sweep = build_sweep(label)
+    rows = run_chunk(sweep, 0, 32)
+    approach, rebound = rows["approach_velocity_1"], rows["restitution_1"] * rows["approach_velocity_1"]
+    too_slow = np.maximum(approach, rebound) > rows["rig.simulator.velocity_limit"]
+    assert 4 < np.sum(too_slow) < 28
+    np.testing.assert_array_equal(rows["position_shortfall_1"] > 0, too_slow)
+    assert np.all(rows["position_shortfall_1"] >= 0)
+    np.testing.assert_array_equal(rows["outcome"] == OUTCOMES.index("saturated"), too_slow)
+    store = open_store(tmp_path / "store", label, resume=False)
+    write_part(store, 0, rows)
+    for index in (np.argmax(too_slow), np.argmin(too_slow)):
+        assert replay(store, int(index)).different == []

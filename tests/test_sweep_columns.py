@@ -15,7 +15,7 @@ LIMIT = 0.01
 NAN = np.nan
 
 
-def rows(errors, status, peak_force=10.0, force_range=np.inf):
+def rows(errors, status, peak_force=10.0, force_range=np.inf, shortfall=0.0):
     """Rows of a sweep of two contacts; errors and status (2, lanes)."""
     parsed = check_document(case(2, force_sensor={"range": 1e6})).mechanism
     errors, status = np.array(errors, float), np.array(status, np.int32)
@@ -32,6 +32,7 @@ def rows(errors, status, peak_force=10.0, force_range=np.inf):
         restitution=0.9 + error,
         approach_velocity=2 * like,
         peak_force=peak_force * like,
+        position_shortfall=shortfall * like,
         **dict.fromkeys(("peak_command", "excess_variation", "duration", "work_in", "work_out"), like),
         status=status,
         ticks=status,
@@ -72,6 +73,15 @@ def test_a_failed_run_is_a_row_with_a_cause():
 def test_a_force_beyond_the_sensors_range_is_saturation():
     assert outcomes(rows([[0.0], [0.0]], [[OK], [OK]], 10.0, 9.0)) == ["saturated"]
     assert outcomes(rows([[0.0], [0.0]], [[OK], [OK]], 10.0, 11.0)) == ["good"]
+
+
+def test_a_limit_of_the_motion_simulator_that_binds_is_saturation():
+    errors, status = [[0.0, 0.5, 0.0], [0.0, 0.0, NAN]], [[OK] * 3, [OK, OK, TIMEOUT]]
+    found = rows(errors, status, shortfall=1e-9)
+    # It says more than an error, and less than a contact that does not end; it is known of that one, too.
+    assert outcomes(found) == ["saturated", "saturated", "timeout"] and found["failed"].all()
+    np.testing.assert_array_equal(found["position_shortfall_2"], 1e-9)
+    assert outcomes(rows(errors, status)) == ["good", "error beyond limit", "timeout"]
 
 
 def test_energies_are_kinetic_energies_of_the_numerical_model():

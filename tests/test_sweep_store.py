@@ -3,13 +3,16 @@
 import os
 import resource
 
+import msgspec
 import numpy as np
 import pytest
 from sweep_cases import case, manifest
 
 from jaxhil.errors import InputError
+from jaxhil.runtime import digest
 from tuning.sweeps.columns import OUTCOMES, STATUSES
-from tuning.sweeps.store import locked, open_store, read_part, read_row, same_rows, write_part
+from tuning.sweeps.manifest import unlike_here
+from tuning.sweeps.store import locked, open_store, read_part, read_row, read_store, same_rows, write_part
 
 MANIFEST = manifest(case(2))
 
@@ -120,6 +123,19 @@ def test_a_folder_with_something_in_it_is_refused(store, tmp_path):
 def test_other_inputs_are_refused_by_name(store):
     with refused("other inputs", "seed: found 0, asked for 7"):
         open_store(store.folder, manifest(case(2), seed=7), resume=True)
+
+
+def test_a_store_without_a_column_is_refused_by_name(tmp_path):
+    columns = [column for column in MANIFEST.columns if not column.name.startswith("position_shortfall")]
+    assert len(columns) == len(MANIFEST.columns) - 2
+    old = msgspec.structs.replace(MANIFEST, columns=columns)
+    old = msgspec.structs.replace(old, sha256=digest(msgspec.to_builtins(old)))
+    folder = open_store(tmp_path / "store", old, resume=False).folder
+    told = "columns: found others than this version writes"
+    with refused("other inputs", told):
+        open_store(folder, MANIFEST, resume=True)
+    # It can still be read, with a word of warning.
+    assert unlike_here(read_store(folder).manifest) == [told] and not unlike_here(MANIFEST)
 
 
 def test_resuming_removes_what_was_left_unfinished(store):

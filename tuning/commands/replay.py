@@ -9,7 +9,7 @@ from tuning.commands import checks
 from tuning.environment import prepare
 
 KEYS = ("restitution", "reference_restitution", "error", "peak_force", "peak_command", "duration")
-KEYS = (*KEYS, "approach_velocity", "energy_in", "energy_out")
+KEYS = (*KEYS, "position_shortfall", "approach_velocity", "energy_in", "energy_out")
 
 
 def run(options: Replay) -> int:

@@ -86,6 +86,7 @@ def simulate(
                 "peak_force": value(metrics.peak_force),
                 "reference_peak_force": value(outcome.reference_peak_force, ended),
                 "peak_command": value(metrics.peak_command),
+                "position_shortfall": value(metrics.position_shortfall),
                 "duration": value(metrics.duration),
                 "approach_velocity": value(metrics.approach_velocity),
                 "status": STATUS_NAMES[status],

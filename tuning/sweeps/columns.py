@@ -17,6 +17,7 @@ from jaxhil.scenario import Scenario
 from jaxhil.uncertainty import PHASE, dimensions
 
 GOOD, BEYOND, SATURATED = "good", "error beyond limit", "saturated"
+SATURATION = "a force beyond the sensor's range, or a limit of the motion simulator that bound"
 STATUSES = tuple(STATUS_NAMES.values())
 # From harmless to worst; the status of a run that failed is a cause by itself.
 OUTCOMES = (GOOD, BEYOND, SATURATED, *(STATUS_NAMES[s] for s in (NOT_REACHED, TIMEOUT, DIVERGED, NON_FINITE)))
@@ -51,6 +52,7 @@ PER_CONTACT = (
     PerContact("peak_force", "N", "largest real contact force"),
     PerContact("peak_command", "N", "largest force on the numerical model"),
     PerContact("peak_ratio", "1", "peak command over the reference's peak force"),
+    PerContact("position_shortfall", "m", "most that the motion simulator's limits took off its command"),
     PerContact("duration", "s", "time in touch"),
     PerContact("approach_velocity", "m/s", "speed at which the contact was entered"),
     PerContact("energy_in", "J", "kinetic energy of the numerical model before the contact"),
@@ -61,7 +63,14 @@ WORKS = (
     PerContact("work_out", "J", "work returned by the mechanism"),
 )
 # Of what did not end, as the run's state is then, these are still known.
-KNOWN_UNENDED = ("peak_force", "peak_command", "duration", "approach_velocity", "energy_in")
+KNOWN_UNENDED = (
+    "peak_force",
+    "peak_command",
+    "position_shortfall",
+    "duration",
+    "approach_velocity",
+    "energy_in",
+)
 
 _UNITS = {
     **dict.fromkeys(("equivalent_mass", "chaser_mass", "target_mass"), "kg"),
@@ -92,7 +101,9 @@ def sweep_columns(mechanism: Mechanism, works: bool) -> list[Column]:
     return [
         *columns,
         Column("worst_error", "number", "1", "the error of largest magnitude of all contacts that ended"),
-        Column("outcome", "text", "", "good, or why the scenario counts as failed"),
+        Column(
+            "outcome", "text", "", f"good, or why the scenario counts as failed; {SATURATED}: {SATURATION}"
+        ),
         Column("failed", "flag", "", "whether the scenario counts as failed"),
     ]
 
@@ -164,7 +175,8 @@ def rows_of(
     worst = np.take_along_axis(error, np.argmax(size, axis=0)[None], axis=0)[0]
     rows["worst_error"] = worst
     force_range = np.asarray(scenarios.force_sensor.range)
-    saturated = np.any(reached & (metrics.peak_force[:made] > force_range), axis=0)
+    beyond_range = metrics.peak_force[:made] > force_range
+    saturated = np.any(reached & (beyond_range | (metrics.position_shortfall[:made] > 0)), axis=0)
     rows["outcome"] = _outcomes(status, ~(np.abs(worst) <= limit), saturated)
     rows["failed"] = rows["outcome"] != OUTCOMES.index(GOOD)
     return rows

@@ -26,6 +26,7 @@ SCHEMA = "jaxhil/sweep/1"
 NAME = "manifest.json"
 CHUNK = 16384  # scenarios
 LARGEST = 8 * 1024 * 1024  # bytes
+OTHER_COLUMNS = "columns: found others than this version writes"
 Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 
 
@@ -173,7 +174,7 @@ def differences(old: Manifest, new: Manifest) -> list[str]:
             told.append(f"{key}: found {_short(before)}, asked for {_short(now)}")
     told += _other_versions(old.versions, new.versions)
     if old.columns != new.columns:
-        told.append("columns: found others than this version writes")
+        told.append(OTHER_COLUMNS)
     return told
 
 
@@ -183,6 +184,8 @@ def unlike_here(manifest: Manifest) -> list[str]:
     told = _other_versions(manifest.versions, versions())
     if flags != manifest.xla_flags:
         told.append(f"xla_flags: found {_short(manifest.xla_flags)}, here {_short(flags)}")
+    if manifest.columns != sweep_columns(loaded_gains(manifest).mechanism, manifest.works):
+        told.append(OTHER_COLUMNS)
     return told
 
 

@@ -1,0 +1,140 @@
+"""How far the motion simulator's limits bind in a contact: nothing, to the bit, where they do not, else what
+the oracle finds.
+"""
+
+import dataclasses
+import functools
+
+import cases
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import pytest
+from cases import Case
+from lanes import SECOND_ORDER, VELOCITY, mechanism, run_rollout
+
+from jaxhil.compensators.none import NoCompensator
+from jaxhil.loop import build_rig
+from jaxhil.metrics import OK
+from jaxhil.rollout import start
+
+LATE = 0.011  # s of force delay: uncompensated, a contact ends faster than it begins
+LIMITS = {  # m/s, and whether it binds
+    "none": (np.inf, False),
+    "far above": (100 * VELOCITY, False),
+    "above the rebounds": (7 * VELOCITY, False),
+    "below the rebounds": (1.1 * VELOCITY, True),
+    "the approach": (VELOCITY, True),
+    "below the approach": (0.95 * VELOCITY, True),
+}
+
+
+class Leading(NoCompensator):
+    """Commands where the model will be a little later."""
+
+    lead: float
+
+    def position_command(self, gains, state, position, velocity, acceleration):
+        return position + self.lead * velocity, state
+
+
+class LeadingOracle(oracle.NoCompensator):
+    """The same, for the oracle."""
+
+    def __init__(self, lead):
+        self.lead = lead
+
+    def position_command(self, position, velocity, acceleration):
+        return position + self.lead * velocity
+
+
+def limited(limit, damping, force_delay=LATE):
+    """Two contacts under a velocity limit [m/s]."""
+    simulator = SECOND_ORDER | ({"velocity_limit": limit} if np.isfinite(limit) else {})
+    return Case(mechanism({"damping": [damping]}, simulator, force_delay, contacts=2))
+
+
+CONTACTS = {name: limited(limit, 300.0) for name, (limit, _) in LIMITS.items()}
+# As fast as the drives go, exactly, and slower ever after.
+CONTACTS["just reached"] = limited(VELOCITY, 6000.0, 0.0)
+BINDING = [name for name, (_, binds) in LIMITS.items() if binds]
+
+
+def single(scenario):
+    def cast(leaf):
+        return leaf.astype(np.float32) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+
+    return jax.tree.map(cast, scenario)
+
+
+@functools.cache
+def oracle_shortfalls(name):
+    return [contact["position_shortfall"] for contact in cases.run_oracle(CONTACTS[name])]
+
+
+@pytest.fixture(scope="module")
+def batch():
+    return cases.build_batch(CONTACTS)
+
+
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def told(request, batch):
+    """Shortfalls [m] of both contacts, by the case's name."""
+    scenario = batch.scenario if request.param == "float64" else single(batch.scenario)
+    metrics = batch._replace(scenario=scenario).run()
+    assert metrics.position_shortfall.dtype == request.param and np.all(metrics.status[:2] == OK)
+    return dict(zip(batch.names, metrics.position_shortfall[:2].T, strict=True))
+
+
+def test_a_limit_that_does_not_bind_is_no_shortfall_to_the_bit(told):
+    assert {name for name, shortfalls in told.items() if np.all(shortfalls > 0)} == set(BINDING)
+    for name in set(told) - set(BINDING):
+        np.testing.assert_array_equal(told[name], 0, err_msg=name)
+
+
+@pytest.mark.parametrize("name", BINDING)
+def test_shortfall_is_the_oracles(told, name):
+    expected = oracle_shortfalls(name)
+    assert min(expected) > 1e-6
+    accuracy = 1e-10 if told[name].dtype == "float64" else 1e-3
+    np.testing.assert_allclose(told[name], expected, rtol=accuracy)
+
+
+def test_drives_slower_than_the_approach_are_behind_when_the_contact_begins(told):
+    """By 0.05 v times the 20 ms that the approach takes, at the least."""
+    assert told["below the approach"][0] > 0.05 * VELOCITY * 0.02
+
+
+def test_shortfall_broadcasts_over_trailing_axes(batch):
+    def fold(leaf):
+        wide = jnp.concatenate([leaf, leaf[..., :1]], axis=-1)
+        return wide.reshape(*leaf.shape[:-1], 2, 4)
+
+    scenario = jax.tree.map(fold, batch.scenario)
+    found = np.asarray(run_rollout(batch.loop, {}, scenario).position_shortfall)[:2].reshape(2, 8)
+    np.testing.assert_allclose(found[:, :7], batch.run().position_shortfall[:2], rtol=1e-12)
+
+
+def test_what_falls_short_is_the_command_of_a_law_that_leads():
+    lead = 0.008
+    laned = {times: limited(times * VELOCITY, 300.0) for times in (1.05, 20.0)}
+    leading = cases.build_batch(laned)
+    loop = dataclasses.replace(leading.loop, compensator=Leading(lead))
+    metrics = jax.tree.map(np.asarray, run_rollout(loop, {}, leading.scenario))
+    for lane, (times, case) in enumerate(laned.items()):
+        for number, expected in enumerate(oracle.simulate(case.mechanism, LeadingOracle(lead))):
+            shortfall = expected["position_shortfall"]
+            assert (shortfall > 0) == (times < 20)
+            assert metrics.restitution[number, lane] == pytest.approx(expected["restitution"], abs=1e-11)
+            assert metrics.position_shortfall[number, lane] == pytest.approx(shortfall, rel=1e-9, abs=0)
+
+
+def test_a_loop_without_limits_keeps_nothing_of_them(batch):
+    free = cases.build_batch({"": CONTACTS["none"]})
+    assert batch.loop.has_limits and not free.loop.has_limits
+    for one in (batch, free):
+        rig = jax.eval_shape(functools.partial(build_rig, one.loop), one.scenario)
+        run = jax.eval_shape(functools.partial(start, one.loop), rig, one.gains)
+        kept = run.watch.shortfall, run.state.plant.wanted
+        assert [leaf is not None for leaf in kept] == [one.loop.has_limits] * 2
