@@ -79,6 +79,8 @@ def test_the_acceptable_probability_decides(jaxhil, gains, store):
 def test_no_failure_is_good(jaxhil, gains, tmp_path):
     code, out, _ = jaxhil("sweep", gains, *TINY, "-o", tmp_path / "new", "--limit", "inf")
     assert code == 0 and "Good" in out and "Failure probability 0," in out
+    # A title stays in one line above a table that is narrower.
+    assert "case, compensation: none, 100 scenarios (random, float64)\n" in out
 
 
 def test_the_last_few_of_a_sobol_sweep_are_outcomes_alone(jaxhil, gains, tmp_path):

@@ -20,6 +20,7 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 from rich.table import Table
+from rich.text import Text
 
 WIDTH = 110  # where there is no terminal to ask
 SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal for a bar
@@ -58,7 +59,9 @@ def table(
     title: str, headings: Sequence[str], rows: Sequence[Sequence[Any]], texts: Sequence[int] = (0,)
 ) -> Table:
     """A table; columns whose number is in `texts` hold text, the others numbers."""
-    made = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, title_style="bold", pad_edge=False)
+    # In one line, also above a narrow table.
+    heading = Text(title, style="bold", no_wrap=True, overflow="ignore")
+    made = Table(title=heading, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for number, heading in enumerate(headings):
         text = number in texts
         made.add_column(heading, justify="left" if text else "right", overflow="fold", no_wrap=not text)

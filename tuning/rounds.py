@@ -6,6 +6,7 @@ most promising starts of a task go on.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
@@ -150,8 +151,9 @@ def _stepper(tasks, names, bounds, objectives, number) -> Callable[[list[_Proble
         for begin in range(0, len(problems), size):
             some = problems[begin : begin + size]
             solution = jax.device_get(programs.run(_advance, static, call(some, limit), program_folder()))
-            for i, problem in enumerate(some):
-                _take(problem, solution, i)
+            for place, i in enumerate(_dealt(size)):
+                if i < len(some):
+                    _take(some[i], solution, place)
 
     return advance
 
@@ -159,6 +161,13 @@ def _stepper(tasks, names, bounds, objectives, number) -> Callable[[list[_Proble
 def _size(number: int) -> int:
     """Problems in one call, of so many in all."""
     return FEW if number <= FEW else MANY
+
+
+def _dealt(size: int) -> np.ndarray:
+    """Which problem is in each place of a call: in turn for each device, whose places are side by side, so
+    that all of them have as many of the long ones."""
+    devices = math.gcd(jax.device_count(), size)
+    return np.arange(size).reshape(-1, devices).T.ravel()
 
 
 def _calls(tasks, names, bounds, objectives, number):
@@ -173,11 +182,13 @@ def _calls(tasks, names, bounds, objectives, number):
     static = (loop, names, common_terms(objectives)), LONGEST, max(1, TILE // lanes)
 
     def call(some: list[_Problem], limit: int):
-        index = np.array([p.task for p in some] + [some[0].task] * (size - len(some)))
-        starts = np.stack([p.shares for p in some] + [some[0].shares] * (size - len(some)))
+        dealt = _dealt(size)
+        # Nothing runs in the places that only fill the call.
+        filled = [some[i] if i < len(some) else some[0] for i in dealt]
+        idle = dealt[:, None] >= len(some)
+        index = np.array([p.task for p in filled])
+        starts = np.stack([p.shares for p in filled])
         scenarios, others, weighed, limits = jax.tree.map(itemgetter(index), table)
-        # Nothing runs in the lanes that only fill the call.
-        idle = np.arange(size)[:, None] >= len(some)
         contacts = np.where(idle, 0, scenarios.contacts).astype(np.int32)
         return scenarios._replace(contacts=contacts), others, weighed, limits, starts, np.array(limit)
 

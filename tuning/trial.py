@@ -3,7 +3,7 @@
 Both go through one compiled program, that of `jaxhil.evaluation`, with as many lanes at every call.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jaxhil.building import build_loop
 from jaxhil.compensators.base import Constants
-from jaxhil.evaluation import Outcome, evaluate
+from jaxhil.evaluation import Outcome, begin_evaluation, evaluate
 from jaxhil.loop import Loop
 from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import draw
@@ -79,9 +79,11 @@ class Trial:
         found = np.empty((len(which), points))
         lanes = max(lanes, self._lanes)
         at_once = max(1, lanes // number)
-        for begin in range(0, len(pairs), at_once):
-            some = pairs[begin : begin + at_once]
-            outcome, amplification = self._run(noise, which, shares, some, number, lanes)
+        parts = [pairs[begin : begin + at_once] for begin in range(0, len(pairs), at_once)]
+        # A part is prepared, and another one looked through, while one between them runs.
+        running = [self._begin(noise, which, shares, some, number, lanes) for some in parts]
+        for some, ended in zip(parts, running, strict=True):
+            outcome, amplification = ended()
             # (slots, pairs, scenarios)
             terms = [np.asarray(term).reshape(-1, len(some), number) for term in contact_terms(outcome)]
             wanted = outcome.wanted.reshape(terms[0].shape)
@@ -91,7 +93,8 @@ class Trial:
                 found[i, point] = objective_value(own, error, excess, amplification[k], chatter)
         return found
 
-    def _run(self, noise, which, shares, some, number, lanes) -> tuple[Outcome, np.ndarray]:
+    def _begin(self, noise, which, shares, some, number, lanes) -> Callable[[], tuple[Outcome, np.ndarray]]:
+        """Start some pairs; what is returned waits for their outcome and noise amplification."""
         index = np.array([which[i] for i, _ in some])
         rows = [self.gains(which[i], shares[i, point]) for i, point in some]
         values = {name: np.repeat([row[name] for row in rows], number) for name in rows[0]}
@@ -101,14 +104,14 @@ class Trial:
             return picked.reshape(*picked.shape[:-2], picked.shape[-2] * picked.shape[-1])
 
         scenarios = jax.tree.map(side_by_side, self._training)
-        outcome = evaluate(self.loop, values, scenarios, at_least=lanes)
+        ended = begin_evaluation(self.loop, values, scenarios, at_least=lanes)
         if not noise:
-            return outcome, np.ones(len(some))
+            return lambda: (ended(), np.ones(len(some)))
         # The mean over the scenarios, as `tuning.objective.residuals` has it.
         constants = Constants(jnp.asarray(scenarios.control_period), jnp.asarray(scenarios.clearance))
         own: Any = {name: jnp.asarray(value) for name, value in values.items()}
         amplification = np.asarray(self.loop.compensator.noise_amplification(own, constants))
-        return outcome, np.mean(amplification.reshape(len(some), number), axis=1)
+        return lambda: (ended(), np.mean(amplification.reshape(len(some), number), axis=1))
 
     def gains(self, task: int, shares: Float[np.ndarray, "gains"]) -> dict[str, float]:
         """All of the compensator's gains at a point of the unit box."""
