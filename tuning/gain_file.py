@@ -26,6 +26,7 @@ from jaxhil.mechanism_file import from_builtins, to_builtins
 from jaxhil.runtime import GainFileError, digest
 from jaxhil.runtime.gain_file import SCHEMA, check_gain_document, read_gain_document
 from jaxhil.scenario import Scenario
+from tuning.files import write_whole, writing
 
 VERSIONED = ("jaxhil", "jax", "numpy", "optimistix")
 ROUNDING = 1e-9  # by which a bound worked out elsewhere may differ
@@ -84,19 +85,8 @@ def write_gain_file(path: str | os.PathLike[str], document: Mapping[str, Any]) -
     target = Path(path)
     signed = {**document, "sha256": digest(document)}
     text = json.dumps(signed, indent=2, sort_keys=True, allow_nan=False) + "\n"
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-    try:
-        try:
-            with temporary.open("w", encoding="ascii") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, target)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"{one_line(str(target))}: cannot be written: {one_line(reason, 100)}") from None
+    with writing(target):
+        write_whole(target, text.encode("ascii"))
 
 
 def load_gain_file(path: str | os.PathLike[str]) -> LoadedGains:

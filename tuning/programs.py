@@ -8,8 +8,8 @@ import dataclasses
 import hashlib
 import os
 import sys
-import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -19,6 +19,8 @@ import jax
 import jax.numpy as jnp
 from jax import export
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
+
+from tuning.files import write_whole
 
 PACKAGES = ("jaxhil", "tuning")
 STANDS_ON = ("jax", "jaxlib", "optimistix", "equinox", "lineax", "numpy")
@@ -111,9 +113,5 @@ def _read(path: Path) -> export.Exported | None:
 
 def _write(path: Path, content: bytes | bytearray) -> None:
     """All or nothing; a folder that has become full or read-only costs only the next call's time."""
-    try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-            file.write(content)
-        os.replace(file.name, path)
-    except OSError:
-        pass
+    with suppress(OSError):
+        write_whole(path, content)

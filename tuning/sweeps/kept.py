@@ -20,10 +20,11 @@ import numpy as np
 from msgspec import Meta
 
 from jaxhil.runtime import digest
+from tuning.files import write_whole, writing
 from tuning.rare import Rare
 from tuning.sweeps import LARGEST_SEED
 from tuning.sweeps.manifest import LARGEST, Digest, Manifest
-from tuning.sweeps.store import STUDIES, VERDICT, Store, write_whole, writing
+from tuning.sweeps.store import STUDIES, VERDICT, Store
 from tuning.sweeps.studies import REPLICATES, SAMPLES, Driver, Drivers
 
 SCHEMA = "jaxhil/study/1"

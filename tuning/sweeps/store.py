@@ -12,7 +12,6 @@ later, and the store is the same, row for row.
 """
 
 import fcntl
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxhil.errors import InputError, one_line
+from tuning.files import TEMPORARY, write_whole, writing
 from tuning.sweeps.columns import Column, texts_of
 from tuning.sweeps.manifest import NAME, Manifest, differences, encode, read_manifest
 
@@ -29,7 +29,6 @@ PICTURES = ("errors.png", "failures.png", "convergence.png")  # made of the rows
 STUDIES = "studies"
 VERDICT = "verdict.json"
 LOCK = ".lock"
-TEMPORARY = ".tmp"
 DIGEST = b"jaxhil.sweep.sha256"
 
 
@@ -170,18 +169,6 @@ def same_rows(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) ->
     ]
 
 
-@contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """What cannot be written there is an `InputError`, one line."""
-    try:
-        yield
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"{one_line(str(path))}: cannot be written: {one_line(reason, 100)}") from None
-
-
 def schema(manifest: Manifest) -> Any:
     """The Arrow schema of every part; units and meanings are metadata of the fields."""
     import pyarrow as pa
@@ -228,25 +215,3 @@ def from_table(manifest: Manifest, table: Any) -> dict[str, np.ndarray]:
         else:
             rows[column.name] = array.to_numpy(zero_copy_only=False)
     return rows
-
-
-def write_whole(path: Path, content: Any) -> None:
-    """The file is there as a whole, on disk, or as it was. Raises OSError when it cannot be written."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY}")
-    try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        try:
-            temporary.unlink(missing_ok=True)
-        except OSError:
-            pass
-    # The new name, too, has to survive a power cut.
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
