@@ -1,0 +1,220 @@
+"""The controller in C beside the one in Python: compiled, loaded, and both run on the same rows.
+
+A row is what happens in one tick (see `c99_driver.c`), a result what either side makes of it.
+"""
+
+import ctypes
+import functools
+import math
+import re
+import shutil
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gain_documents import GAINS, gain_document, sign
+
+from jaxhil.runtime import COMPENSATORS, Controller
+from jaxhil.runtime.gain_file import GainFile
+from tuning.rig.c99 import FLAGS, c99_texts
+
+COMPILER = shutil.which("cc")
+DRIVER = Path(__file__).with_name("c99_driver.c")
+ROW = ("event", "force", "desired", "velocity", "measured", "time", "timed", "x", "v", "a")
+RESULT = ("force", "position", "stiffness", "damping", "tripped", "missed_ticks")
+TICK, RESET, NEXT_CONTACT = 0.0, 1.0, 2.0
+PERIOD = 0.001
+CAPACITY = 64  # periods of delay that the compiled laws hold
+SANITIZED = ("-fsanitize=undefined,address,float-cast-overflow", "-fno-sanitize-recover=all", "-g")
+HOSTILE = np.array(
+    [
+        *(
+            0.0,
+            -0.0,
+            5e-324,
+            -5e-324,
+            1e-310,
+            2.3e-308,
+            1e-160,
+            1e-16,
+            1.0,
+            -1.0,
+            1e16,
+            -1e160,
+            1e300,
+            -1e308,
+        ),
+        *(1.7976931348623157e308, -1.7976931348623157e308, math.inf, -math.inf, math.nan),
+    ]
+)
+
+
+class Batch:
+    """The compiled controller of one law, which runs rows."""
+
+    def __init__(self, library: Path, law: str) -> None:
+        self._library = ctypes.CDLL(str(library))
+        self._library.driver_size.restype = ctypes.c_size_t
+        self._state = (ctypes.c_double * (self._library.driver_size() // 8 + 1))()
+        self.law = law
+
+    def exported(self) -> np.ndarray:
+        """The gains compiled in."""
+        gains = np.empty(2 + len(COMPENSATORS[self.law].gains))
+        self._library.driver_gains.restype = ctypes.c_size_t
+        assert self._library.driver_gains(_pointer(gains)) == gains.size
+        return gains
+
+    def begin(self, gains: np.ndarray) -> bool:
+        return bool(self._library.driver_init(self._state, _pointer(gains)))
+
+    def run(self, rows: np.ndarray, guarded: bool) -> np.ndarray:
+        results = np.empty((len(rows), len(RESULT)))
+        run = self._library.driver_run if guarded else self._library.driver_law
+        run(self._state, ctypes.c_size_t(len(rows)), _pointer(rows), _pointer(results))
+        return results
+
+
+def _pointer(values: np.ndarray):
+    assert values.dtype == np.float64 and values.flags.c_contiguous
+    return values.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
+
+
+def write_sources(folder: Path, document: Mapping[str, Any]) -> Path:
+    """The controller's files and the driver in `folder`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in c99_texts(document).items():
+        (folder / name).write_text(text)
+    shutil.copy(DRIVER, folder)
+    return folder
+
+
+def compiled(folder: Path, source: str, output: str, *options: str) -> Path:
+    """`source` in `folder`, compiled as the contract says."""
+    command = [str(COMPILER), *FLAGS, *options, source, "-o", output, "-lm"]
+    ran = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stderr == ""
+    return folder / output
+
+
+def long_document(law: str) -> dict[str, Any]:
+    """A document of `law` whose delays are as long as the tests need."""
+    document = gain_document(law)
+    for name in delays(law):
+        document["gains"][name] |= {"value": CAPACITY * PERIOD, "upper": 1.0}
+    return sign(document)
+
+
+@functools.cache
+def delays(law: str) -> frozenset[str]:
+    """The gains that a line of the law in C delays by."""
+    header = c99_texts(gain_document(law))["jaxhil_controller.h"]
+    return frozenset(name.lower() for name in re.findall(r"#define JAXHIL_(\w+)_SAMPLES", header))
+
+
+def packed(law: str, gain_file: GainFile) -> np.ndarray:
+    """The gains as the struct in C holds them."""
+    gains = [gain_file.gains[name] for name in COMPENSATORS[law].gains]
+    return np.array([gain_file.control_period, gain_file.clearance, *gains])
+
+
+def drawn_gains(law: str, rng: np.random.Generator, hostile: bool) -> GainFile:
+    """Admissible gains: about the nominal ones, or from the whole range of doubles."""
+    gains = {}
+    period = PERIOD * float(rng.choice([0.25, 1.0, 1.7]))
+    for name, specification in COMPENSATORS[law].gains.items():
+        value = GAINS[law][name]["value"] * float(np.exp(0.5 * rng.standard_normal()))
+        if hostile and rng.random() < 0.5:
+            value = float(rng.choice(HOSTILE)) if rng.random() < 0.5 else float(10 ** rng.uniform(-320, 300))
+        if name in delays(law):
+            value = float(rng.choice([0.0, 1.0, 7.0, rng.uniform(0, CAPACITY)])) * period
+        value = min(max(value, specification.lowest), specification.highest)
+        if not (math.isfinite(value) and specification.admits(value)):
+            value = GAINS[law][name]["value"]
+        gains[name] = value
+    clearance = float(rng.choice([math.inf, 0.0, 1e-4, 0.02]))
+    return GainFile(law, gains, period, clearance)
+
+
+def drawn_rows(kind: str, count: int, rng: np.random.Generator, period: float) -> np.ndarray:
+    """Ticks of a `contact`, of `random` size, or `hostile`; now and then a reset or the next contact."""
+    time = period * np.arange(count)
+    phase = rng.uniform(0, 2 * np.pi)
+    rate, amplitude = rng.uniform(10, 60), 10 ** rng.uniform(-5, -3)
+
+    def motion(late: float) -> np.ndarray:
+        return amplitude * (np.sin(rate * (time - late) + phase) - 0.3)
+
+    speed = amplitude * rate * np.cos(rate * time + phase)
+    force = 1.2e5 * np.maximum(motion(0.009), 0.0) + rng.standard_normal(count)
+    measured = motion(0.006) + 1e-7 * rng.standard_normal(count)
+    rows = np.zeros((count, len(ROW)))
+    rows[:, 1:] = np.stack(
+        [force, motion(0), speed, measured, time, np.ones(count), motion(0), speed, -force / 350], axis=1
+    )
+    if kind != "contact":
+        size = 10 ** rng.uniform(-12, 12, (count, 9))
+        rows[:, 1:] = np.where(
+            rng.random((count, 9)) < 0.5, rows[:, 1:], size * rng.standard_normal((count, 9))
+        )
+        rows[:, 6] = rng.random(count) < 0.7
+        rows[:, 5] = time + period * rng.choice([0.0, 0.4, -1.0, 3.0], count)
+    if kind == "hostile":
+        taken = rng.random((count, 9)) < rng.choice([0.001, 0.03, 0.5])
+        taken[:, 5] = False
+        rows[:, 1:] = np.where(taken, rng.choice(HOSTILE, (count, 9)), rows[:, 1:])
+        rows[:, 5] = np.where(np.abs(rows[:, 5]) < 1e9, rows[:, 5], math.nan)
+    rows[:, 0] = rng.choice([TICK, RESET, NEXT_CONTACT], count, p=[0.98, 0.01, 0.01])
+    return rows
+
+
+def law_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
+    """What the Python runtime's law makes of the rows, without the controller's guards."""
+    law = COMPENSATORS[gain_file.compensator](gain_file.gains, gain_file.control_period, gain_file.clearance)
+    results = np.zeros((len(rows), len(RESULT)))
+    for row, result in zip(rows.tolist(), results, strict=True):
+        if row[0] == RESET:
+            law.reset()
+        elif row[0] == NEXT_CONTACT:
+            law.next_contact()
+        try:
+            force = law.step(*row[1:5])
+        except ArithmeticError:
+            force = math.nan
+        result[:4] = force, law.position_command(*row[7:]), *law.identified
+    return results
+
+
+def controller_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
+    """What the Python runtime's controller makes of the rows."""
+    controller = Controller(gain_file)
+    results = np.zeros((len(rows), len(RESULT)))
+    for row, result in zip(rows.tolist(), results, strict=True):
+        if row[0] == RESET:
+            controller.reset()
+        elif row[0] == NEXT_CONTACT:
+            controller.next_contact()
+        force = controller.step(*row[1:5], row[5] if row[6] else None)
+        position = controller.position_command(*row[7:])
+        tripped = controller.status != "ok"
+        result[:] = force, position, *controller.identified, tripped, controller.missed_ticks
+    return results
+
+
+def same_bits(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Where two arrays of doubles are the same bits, or both not a number."""
+    return (found.view(np.uint64) == expected.view(np.uint64)) | (np.isnan(found) & np.isnan(expected))
+
+
+def assert_same(found: np.ndarray, expected: np.ndarray, rows: np.ndarray) -> None:
+    """Raises AssertionError with the first tick and column in which C and Python differ."""
+    same = same_bits(found, expected)
+    if not same.all():
+        tick, column = (int(index) for index in np.argwhere(~same)[0])
+        raise AssertionError(
+            f"tick {tick}: {RESULT[column]}: C {found[tick, column]!r}, Python {expected[tick, column]!r}, "
+            f"row {rows[tick].tolist()}"
+        )
