@@ -18,16 +18,52 @@ from gain_documents import GAINS, gain_document, sign
 
 from jaxhil.runtime import COMPENSATORS, Controller
 from jaxhil.runtime.gain_file import GainFile
+from jaxhil.runtime.limits import LIMITS, NO_LIMITS, complete
 from tuning.rig.c99 import FLAGS, c99_texts
 
 COMPILER = shutil.which("cc")
 DRIVER = Path(__file__).with_name("c99_driver.c")
 ROW = ("event", "force", "desired", "velocity", "measured", "time", "timed", "x", "v", "a")
-RESULT = ("force", "position", "stiffness", "damping", "tripped", "missed_ticks")
-TICK, RESET, NEXT_CONTACT = 0.0, 1.0, 2.0
+RESULT = (
+    *("force", "position", "stiffness", "damping", "faults", "seen", "cause", "missed_ticks", "late_ticks"),
+    *("at_rest", "tripped", "bias", "answer", "contacts", "restitution", "expected", "balance"),
+)
+TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE = (float(code) for code in range(6))
 PERIOD = 0.001
 CAPACITY = 64  # periods of delay that the compiled laws hold
 SANITIZED = ("-fsanitize=undefined,address,float-cast-overflow", "-fno-sanitize-recover=all", "-g")
+SANE_LIMITS = {
+    "force_range": 2000.0,
+    "measured_lowest": -1e-3,
+    "measured_highest": 2e-3,
+    "held_readings": 3.0,
+    "force_stuck_travel": 2e-4,
+    "position_stuck_travel": 1e-4,
+    "free_distance": 1e-4,
+    "settling": 0.01,
+    "free_force": 1.0,
+    "late_fraction": 0.25,
+    "missed_in_a_row": 4.0,
+    "tare_ticks": 3.0,
+    "tare_spread": 4.0,
+    "bias_limit": 20.0,
+    "force_limit": 1000.0,
+    "force_slew": 1e5,
+    "limited_in_a_row": 3.0,
+    "command_lowest": -1e-3,
+    "command_highest": 1e-3,
+    "velocity_limit": 0.05,
+    "deceleration": 0.5,
+    "retreat_velocity": 0.01,
+    "equivalent_mass": 350.0,
+    "longest_contact": 0.2,
+    "energy_balance": 10.0,
+    "restitution_margin": 5.0,
+    "reference_stiffness": 1.2e5,
+    "reference_velocity": 0.005,
+    "softness_lowest": -0.5,
+    "speed_lowest": -0.5,
+}
 HOSTILE = np.array(
     [
         *(
@@ -61,14 +97,18 @@ class Batch:
         self.law = law
 
     def exported(self) -> np.ndarray:
-        """The gains compiled in."""
-        gains = np.empty(2 + len(COMPENSATORS[self.law].gains))
-        self._library.driver_gains.restype = ctypes.c_size_t
-        assert self._library.driver_gains(_pointer(gains)) == gains.size
-        return gains
+        """The gains and limits compiled in."""
+        parameters = np.empty(2 + len(COMPENSATORS[self.law].gains) + len(LIMITS))
+        self._library.driver_exported.restype = ctypes.c_size_t
+        assert self._library.driver_exported(_pointer(parameters)) == parameters.size
+        return parameters
 
-    def begin(self, gains: np.ndarray) -> bool:
-        return bool(self._library.driver_init(self._state, _pointer(gains)))
+    def fault_name(self, bit: int) -> str:
+        self._library.jaxhil_fault_name.restype = ctypes.c_char_p
+        return self._library.jaxhil_fault_name(ctypes.c_uint32(bit)).decode()
+
+    def begin(self, parameters: np.ndarray) -> bool:
+        return bool(self._library.driver_init(self._state, _pointer(parameters)))
 
     def run(self, rows: np.ndarray, guarded: bool) -> np.ndarray:
         results = np.empty((len(rows), len(RESULT)))
@@ -103,22 +143,27 @@ def compiled(folder: Path, source: str, output: str, *options: str) -> Path:
 def long_document(law: str) -> dict[str, Any]:
     """A document of `law` whose delays are as long as the tests need."""
     document = gain_document(law)
+    document["limits"] = {}
     for name in delays(law):
-        document["gains"][name] |= {"value": CAPACITY * PERIOD, "upper": 1.0}
+        if name in document["gains"]:
+            document["gains"][name] |= {"value": CAPACITY * PERIOD, "upper": 1.0}
+        else:
+            document["limits"][name] = {"value": CAPACITY * PERIOD, "unit": LIMITS[name].unit}
     return sign(document)
 
 
 @functools.cache
 def delays(law: str) -> frozenset[str]:
-    """The gains that a line of the law in C delays by."""
+    """The gains and limits that a line of the controller in C delays by."""
     header = c99_texts(gain_document(law))["jaxhil_controller.h"]
     return frozenset(name.lower() for name in re.findall(r"#define JAXHIL_(\w+)_SAMPLES", header))
 
 
 def packed(law: str, gain_file: GainFile) -> np.ndarray:
-    """The gains as the struct in C holds them."""
+    """The gains and limits as the structs in C hold them."""
     gains = [gain_file.gains[name] for name in COMPENSATORS[law].gains]
-    return np.array([gain_file.control_period, gain_file.clearance, *gains])
+    limits = [gain_file.limits[name] for name in LIMITS]
+    return np.array([gain_file.control_period, gain_file.clearance, *gains, *limits])
 
 
 def drawn_gains(law: str, rng: np.random.Generator, hostile: bool) -> GainFile:
@@ -136,7 +181,26 @@ def drawn_gains(law: str, rng: np.random.Generator, hostile: bool) -> GainFile:
             value = GAINS[law][name]["value"]
         gains[name] = value
     clearance = float(rng.choice([math.inf, 0.0, 1e-4, 0.02]))
-    return GainFile(law, gains, period, clearance)
+    return GainFile(law, gains, period, clearance, drawn_limits(law, rng, hostile, period))
+
+
+def drawn_limits(law: str, rng: np.random.Generator, hostile: bool, period: float) -> Mapping[str, float]:
+    """Limits that bind now and then on drawn rows, some of them left out; hostile, of any size."""
+    limits = {}
+    for name, specification in LIMITS.items():
+        if rng.random() < 0.3:
+            continue
+        value = SANE_LIMITS.get(name, 1.0) * float(np.exp(0.5 * rng.standard_normal()))
+        if hostile and rng.random() < 0.3:
+            value = float(rng.choice(HOSTILE)) if rng.random() < 0.5 else float(10 ** rng.uniform(-320, 300))
+        if name in delays(law):
+            value = float(rng.choice([0.0, 1.0, 7.0, rng.uniform(0, CAPACITY)])) * period
+        if math.isfinite(value) and value >= specification.lowest:
+            limits[name] = value
+    try:
+        return complete(limits)
+    except ValueError:
+        return NO_LIMITS
 
 
 def drawn_rows(kind: str, count: int, rng: np.random.Generator, period: float) -> np.ndarray:
@@ -166,8 +230,15 @@ def drawn_rows(kind: str, count: int, rng: np.random.Generator, period: float) -
         taken = rng.random((count, 9)) < rng.choice([0.001, 0.03, 0.5])
         taken[:, 5] = False
         rows[:, 1:] = np.where(taken, rng.choice(HOSTILE, (count, 9)), rows[:, 1:])
-        rows[:, 5] = np.where(np.abs(rows[:, 5]) < 1e9, rows[:, 5], math.nan)
-    rows[:, 0] = rng.choice([TICK, RESET, NEXT_CONTACT], count, p=[0.98, 0.01, 0.01])
+    events = [TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE]
+    rows[:, 0] = rng.choice(events, count, p=[0.9, 0.03, 0.02, 0.002, 0.01, 0.038])
+    if rng.random() < 0.5:  # a rig that begins with a tare, and whose force sensor then resolves little
+        rows[:6, 0] = TARE
+        rows[:, 1] = np.where(np.abs(rows[:, 1]) < 1e6, 50.0 * np.round(rows[:, 1] / 50.0), rows[:, 1])
+        rows[:6, 1] = 3.0 * rng.standard_normal(6)
+    if rng.random() < 0.3:  # a position sensor that hangs
+        begin = int(rng.integers(count))
+        rows[begin : begin + count // 5, 4] = rows[begin, 4]
     return rows
 
 
@@ -191,17 +262,32 @@ def law_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
 def controller_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
     """What the Python runtime's controller makes of the rows."""
     controller = Controller(gain_file)
+    watchdog = controller._watchdog
     results = np.zeros((len(rows), len(RESULT)))
     for row, result in zip(rows.tolist(), results, strict=True):
-        if row[0] == RESET:
-            controller.reset()
-        elif row[0] == NEXT_CONTACT:
-            controller.next_contact()
-        force = controller.step(*row[1:5], row[5] if row[6] else None)
-        position = controller.position_command(*row[7:])
-        tripped = controller.status != "ok"
-        result[:] = force, position, *controller.identified, tripped, controller.missed_ticks
+        answer = _event(controller, row[0], row[1])
+        result[0] = controller.step(*row[1:5], row[5] if row[6] else None)
+        result[1] = controller.position_command(*row[7:])
+        result[2:4] = controller.identified
+        result[4:7] = controller.faults, controller.seen, controller.cause
+        result[7:] = (
+            *(controller.missed_ticks, controller.late_ticks, controller.at_rest, controller.tripped),
+            *(controller.bias, answer),
+            *(watchdog.contacts, watchdog.restitution, watchdog.expected, watchdog.balance),
+        )
     return results
+
+
+def _event(controller: Controller, code: float, force: float) -> bool:
+    if code == RESET:
+        return controller.reset()
+    if code == TARE:
+        return controller.tare(force)
+    if code == NEXT_CONTACT:
+        controller.next_contact()
+    elif code in (STOP, RELEASE):
+        controller.emergency_stop(code == STOP)
+    return False
 
 
 def same_bits(found: np.ndarray, expected: np.ndarray) -> np.ndarray:

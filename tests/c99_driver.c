@@ -9,13 +9,14 @@
 #include "jaxhil_gains.h"
 
 /* A row: event, force, desired position and velocity, measured position, time, whether it is given, the
- * model's position, velocity and acceleration. A result: see below. */
-enum { ROW = 10, RESULT = 6, GAINS = sizeof(jaxhil_gains) / sizeof(double) };
-enum { TICK, RESET, NEXT_CONTACT };
+ * model's position, velocity and acceleration. A result: see `result`. */
+enum { ROW = 10, RESULT = 17 };
+enum { TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE };
+enum { GAINS = sizeof(jaxhil_gains) / sizeof(double), LIMITS = sizeof(jaxhil_limits) / sizeof(double) };
 
 size_t driver_size(void);
-size_t driver_gains(double *gains);
-int driver_init(jaxhil_controller *controller, const double *gains);
+size_t driver_exported(double *parameters);
+int driver_init(jaxhil_controller *controller, const double *parameters);
 void driver_law(jaxhil_controller *controller, size_t count, const double *rows, double *results);
 void driver_run(jaxhil_controller *controller, size_t count, const double *rows, double *results);
 
@@ -23,15 +24,18 @@ size_t driver_size(void) {
     return sizeof(jaxhil_controller);
 }
 
-size_t driver_gains(double *gains) {
-    memcpy(gains, &jaxhil_exported_gains, sizeof jaxhil_exported_gains);
-    return GAINS;
+size_t driver_exported(double *parameters) {
+    memcpy(parameters, &jaxhil_exported_gains, sizeof jaxhil_exported_gains);
+    memcpy(parameters + GAINS, &jaxhil_exported_limits, sizeof jaxhil_exported_limits);
+    return GAINS + LIMITS;
 }
 
-int driver_init(jaxhil_controller *controller, const double *gains) {
-    jaxhil_gains loaded;
-    memcpy(&loaded, gains, sizeof loaded);
-    return jaxhil_init(controller, &loaded);
+int driver_init(jaxhil_controller *controller, const double *parameters) {
+    jaxhil_gains gains;
+    jaxhil_limits limits;
+    memcpy(&gains, parameters, sizeof gains);
+    memcpy(&limits, parameters + GAINS, sizeof limits);
+    return jaxhil_init(controller, &gains, &limits);
 }
 
 void driver_law(jaxhil_controller *controller, size_t count, const double *rows, double *results) {
@@ -42,36 +46,59 @@ void driver_law(jaxhil_controller *controller, size_t count, const double *rows,
         } else if (rows[0] == NEXT_CONTACT) {
             jaxhil_law_next_contact(law);
         }
+        memset(results, 0, RESULT * sizeof *results);
         results[0] = jaxhil_law_step(law, rows[1], rows[2], rows[3], rows[4]);
         results[1] = jaxhil_law_position_command(law, rows[7], rows[8], rows[9]);
         jaxhil_law_identified(law, &results[2], &results[3]);
-        results[4] = 0.0;
-        results[5] = 0.0;
     }
+}
+
+static double event(jaxhil_controller *controller, double code, double force) {
+    if (code == RESET) {
+        return jaxhil_reset(controller);
+    }
+    if (code == TARE) {
+        return jaxhil_tare(controller, force);
+    }
+    if (code == NEXT_CONTACT) {
+        jaxhil_next_contact(controller);
+    } else if (code == STOP || code == RELEASE) {
+        jaxhil_emergency_stop(controller, code == STOP);
+    }
+    return 0.0;
 }
 
 void driver_run(jaxhil_controller *controller, size_t count, const double *rows, double *results) {
     for (size_t n = 0; n < count; n++, rows += ROW, results += RESULT) {
-        if (rows[0] == RESET) {
-            jaxhil_reset(controller);
-        } else if (rows[0] == NEXT_CONTACT) {
-            jaxhil_next_contact(controller);
-        }
-        results[0] =
-            jaxhil_step(controller, rows[1], rows[2], rows[3], rows[4], rows[6] != 0.0 ? &rows[5] : NULL);
-        results[1] = jaxhil_position_command(controller, rows[7], rows[8], rows[9]);
-        jaxhil_identified(controller, &results[2], &results[3]);
-        results[4] = controller->status == JAXHIL_OK ? 0.0 : 1.0;
-        results[5] = (double)controller->missed_ticks;
+        double *result = results;
+        const double answer = event(controller, rows[0], rows[1]);
+        const double *time = rows[6] != 0.0 ? &rows[5] : NULL;
+        *result++ = jaxhil_step(controller, rows[1], rows[2], rows[3], rows[4], time);
+        *result++ = jaxhil_position_command(controller, rows[7], rows[8], rows[9]);
+        jaxhil_identified(controller, result, result + 1);
+        result += 2;
+        *result++ = controller->faults;
+        *result++ = controller->seen;
+        *result++ = controller->cause;
+        *result++ = (double)jaxhil_missed_ticks(controller);
+        *result++ = (double)jaxhil_late_ticks(controller);
+        *result++ = jaxhil_at_rest(controller);
+        *result++ = jaxhil_tripped(controller);
+        *result++ = jaxhil_bias(controller);
+        *result++ = answer;
+        *result++ = (double)controller->watchdog.contacts;
+        *result++ = controller->watchdog.restitution;
+        *result++ = controller->watchdog.expected;
+        *result++ = controller->watchdog.balance;
     }
 }
 
 #ifdef DRIVER_MAIN
 int main(int count, char **arguments) {
     static jaxhil_controller controller;
-    double gains[GAINS], row[ROW], result[RESULT];
+    double parameters[GAINS + LIMITS], row[ROW], result[RESULT];
     (void)arguments;
-    if (fread(gains, sizeof gains, 1, stdin) != 1 || !driver_init(&controller, gains)) {
+    if (fread(parameters, sizeof parameters, 1, stdin) != 1 || !driver_init(&controller, parameters)) {
         return 2;
     }
     while (fread(row, sizeof row, 1, stdin) == 1) {

@@ -1,13 +1,9 @@
 /* No compensation: the numerical model feels the measured force, F_c = F. */
-#include <math.h>
 #include <stdbool.h>
 
-/* == Declarations == */
+#include "gains_table.c"
 
-typedef struct {
-    double control_period; /* s */
-    double clearance;      /* m, of a two-sided contact; infinite if one-sided */
-} jaxhil_gains;
+/* == Declarations == */
 
 typedef struct {
     char stateless; /* C has no empty structs */
@@ -16,8 +12,9 @@ typedef struct {
 /* == Definitions == */
 
 static bool jaxhil_law_init(jaxhil_law *law, const jaxhil_gains *gains) {
+    (void)gains;
     law->stateless = 0;
-    return isfinite(gains->control_period) && gains->control_period > 0.0 && gains->clearance >= 0.0;
+    return true;
 }
 
 static double jaxhil_law_step(jaxhil_law *law, double force_measured, double position_desired,

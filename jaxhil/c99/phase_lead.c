@@ -1,19 +1,12 @@
 /* Phase-lead force compensation, the filtered first-order inverse of a force delay:
  * F_c = (1 + T_1 s)/(1 + T_2 s) F by Tustin's rule, T_1 = phase_lead + lead_filter, T_2 = lead_filter.
  */
-#include <math.h>
 #include <stdbool.h>
 
 #include "filters.c"
+#include "gains_table.c"
 
 /* == Declarations == */
-
-typedef struct {
-    double control_period; /* s */
-    double clearance;      /* m, of a two-sided contact; infinite if one-sided */
-    double phase_lead;     /* s */
-    double lead_filter;    /* s, > 0 */
-} jaxhil_gains;
 
 typedef struct {
     jaxhil_lead_filter lead;
@@ -23,8 +16,7 @@ typedef struct {
 
 static bool jaxhil_law_init(jaxhil_law *law, const jaxhil_gains *gains) {
     jaxhil_lead_filter_init(&law->lead, gains->phase_lead, gains->lead_filter, gains->control_period);
-    return isfinite(gains->control_period) && gains->control_period > 0.0 && gains->clearance >= 0.0 &&
-           isfinite(gains->phase_lead) && isfinite(gains->lead_filter) && gains->lead_filter > 0.0;
+    return true;
 }
 
 static double jaxhil_law_step(jaxhil_law *law, double force_measured, double position_desired,

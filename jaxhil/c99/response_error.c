@@ -8,27 +8,11 @@
 #include <stdbool.h>
 
 #include "filters.c"
+#include "gains_table.c"
 #include "gates.c"
 #include "identification.c"
 
 /* == Declarations == */
-
-typedef struct {
-    double control_period;         /* s */
-    double clearance;              /* m, of a two-sided contact; infinite if one-sided */
-    double phase_lead;             /* s */
-    double lead_filter;            /* s, > 0 */
-    double response_error;         /* 1 */
-    double response_error_damping; /* 1 */
-    double initial_stiffness;      /* N/m */
-    double initial_damping;        /* N s/m */
-    double stiffness_covariance;   /* 1/m^2, >= 0 */
-    double damping_covariance;     /* s^2/m^2, >= 0 */
-    double forgetting;             /* 1, in (0, 1] */
-    double contact_threshold;      /* N, >= 0 */
-    double identification_delay;   /* s, >= 0, within the delay line */
-    double velocity_filter;        /* s, >= 0 */
-} jaxhil_gains;
 
 typedef struct {
     double period, clearance, threshold, response_error, response_error_damping;
@@ -60,16 +44,7 @@ static bool jaxhil_law_init(jaxhil_law *law, const jaxhil_gains *gains) {
     law->contact_share = 0.0;
     law->force_share = 0.0;
     law->started = false;
-    return isfinite(period) && period > 0.0 && gains->clearance >= 0.0 && isfinite(gains->phase_lead) &&
-           isfinite(gains->lead_filter) && gains->lead_filter > 0.0 && isfinite(gains->response_error) &&
-           isfinite(gains->response_error_damping) && isfinite(gains->initial_stiffness) &&
-           isfinite(gains->initial_damping) && isfinite(gains->stiffness_covariance) &&
-           gains->stiffness_covariance >= 0.0 && isfinite(gains->damping_covariance) &&
-           gains->damping_covariance >= 0.0 && gains->forgetting > 0.0 && gains->forgetting <= 1.0 &&
-           isfinite(gains->contact_threshold) && gains->contact_threshold >= 0.0 &&
-           isfinite(gains->identification_delay) && gains->identification_delay >= 0.0 &&
-           isfinite(gains->velocity_filter) && gains->velocity_filter >= 0.0 &&
-           jaxhil_delay_line_init(&law->alignment, law->samples, JAXHIL_IDENTIFICATION_DELAY_SAMPLES,
+    return jaxhil_delay_line_init(&law->alignment, law->samples, JAXHIL_IDENTIFICATION_DELAY_SAMPLES,
                                   gains->identification_delay, period);
 }
 

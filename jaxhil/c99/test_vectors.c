@@ -84,7 +84,7 @@ int main(int count, char **arguments) {
             return unreadable(name, number, "not a row of numbers");
         }
         if (row[EVENT] == 1.0) {
-            if (!jaxhil_init(&controller, &jaxhil_exported_gains)) {
+            if (!jaxhil_init(&controller, &jaxhil_exported_gains, &jaxhil_exported_limits)) {
                 return unreadable(name, number, "the controller refuses its own gains");
             }
             begun = 1;
@@ -103,6 +103,9 @@ int main(int count, char **arguments) {
         }
         if (!is_same(position, row[POSITION_COMMAND])) {
             return differs(name, number, "position_command", position, row[POSITION_COMMAND]);
+        }
+        if (!is_same((double)controller.faults, row[FAULTS])) {
+            return differs(name, number, "faults", (double)controller.faults, row[FAULTS]);
         }
     }
     if (ferror(file) || number < 2) {

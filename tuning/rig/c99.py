@@ -3,19 +3,20 @@
 The sources stand as fragments in `jaxhil/c99`, one file per subject, as the Python runtime does. A fragment
 opens with a comment and its `#include` lines; `/* == Declarations == */` begins what goes into the header,
 `/* == Definitions == */` what goes into the source. It includes the fragments that it needs by name; `law.c`
-stands for the exported law's own file, which has the law's name. Where a fragment sizes an array by
-`JAXHIL_<GAIN>_SAMPLES`, that constant is the length of a line which delays by that gain.
+stands for the exported law's own file, which has the law's name, `..._table.c` for what `c99_tables` makes of
+the runtime's tables. Where a fragment sizes an array by `JAXHIL_<NAME>_SAMPLES`, that constant is the length
+of a line which delays by the gain or limit of that name.
 """
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping
 from importlib import resources
 from typing import Any, NamedTuple
 
 from jaxhil.errors import InputError, one_line
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
-from jaxhil.runtime.registry import COMPENSATORS
+from tuning.rig.c99_tables import Table, constants, faults_table, gains_table, limits_table
 
 HEADER, SOURCE, GAINS, TEST = (
     "jaxhil_controller.h",
@@ -38,7 +39,7 @@ _HEADER = """\
  * C99, no allocation, no library but math.h. The caller owns the struct:
  *
  *     static jaxhil_controller controller;
- *     jaxhil_init(&controller, &jaxhil_exported_gains);
+ *     jaxhil_init(&controller, &jaxhil_exported_gains, &jaxhil_exported_limits);
  *
  * Compile with -ffp-contract=off (and never -ffast-math): the results then are those of the runtime in
  * Python bit for bit, which test_vectors.c checks.
@@ -57,7 +58,7 @@ _HEADER = """\
 #if FLT_EVAL_METHOD != 0 && FLT_EVAL_METHOD != 1
 #error "a double has to be computed as one (on a 32-bit x86: -msse2 -mfpmath=sse)"
 #endif
-{constants}
+{lengths}
 #ifdef __cplusplus
 extern "C" {{
 #endif
@@ -81,7 +82,7 @@ _SOURCE = """\
 {definitions}"""
 
 _GAINS = """\
-/* Gains of the compensator `{law}`, from the gain file whose content has the SHA-256
+/* Gains of the compensator `{law}` and limits, from the gain file whose content has the SHA-256
  * {digest}.
  * Decimal, 17 significant digits: a compiler reads back the same doubles.
  */
@@ -92,11 +93,16 @@ _GAINS = """\
 
 #include "jaxhil_controller.h"
 
-static const jaxhil_gains jaxhil_exported_gains = {{
-{entries}}};
-
+{constants}
 #endif
 """
+
+
+_TABLES: Mapping[str, Callable[[str], Table]] = {
+    "gains_table.c": gains_table,
+    "limits_table.c": lambda law: limits_table(),
+    "faults_table.c": lambda law: faults_table(),
+}
 
 
 class _Fragment(NamedTuple):
@@ -126,21 +132,13 @@ def c99_texts(document: Mapping[str, Any], source: str = "gain document") -> dic
         HEADER: _HEADER.format(
             law=law,
             includes="".join(f"#include <{name}>\n" for name in system),
-            constants=_constants(declarations, gain_file),
+            lengths=_lengths(declarations, gain_file),
             declarations=declarations,
         ),
         SOURCE: _SOURCE.format(definitions=definitions),
-        GAINS: _GAINS.format(law=law, digest=document["sha256"], entries=_entries(gain_file)),
+        GAINS: _GAINS.format(law=law, digest=document["sha256"], constants=constants(gain_file)),
         TEST: _read(TEST),
     }
-
-
-def decimal(value: float) -> str:
-    """A double as C writes it: 17 significant digits, which are read back as the same double."""
-    if math.isinf(value):
-        return "INFINITY" if value > 0.0 else "-INFINITY"
-    text = f"{value:.17g}"
-    return text if "." in text or "e" in text else f"{text}.0"
 
 
 def _in_order(root: str, law: str) -> list[_Fragment]:
@@ -152,7 +150,7 @@ def _in_order(root: str, law: str) -> list[_Fragment]:
         if name in visited:
             return
         visited.add(name)
-        fragment = _fragment(name)
+        fragment = _fragment(name, law)
         for needed in fragment.local:
             visit(f"{law}.c" if needed == LAW else needed)
         found[name] = fragment
@@ -161,7 +159,9 @@ def _in_order(root: str, law: str) -> list[_Fragment]:
     return list(found.values())
 
 
-def _fragment(name: str) -> _Fragment:
+def _fragment(name: str, law: str) -> _Fragment:
+    if name in _TABLES:
+        return _Fragment(("math.h", "stdbool.h", "stdint.h"), (), *_TABLES[name](law))
     head, declared, rest = _read(name).partition(DECLARATIONS)
     declarations, defined, definitions = rest.partition(DEFINITIONS)
     if not declared or not defined:
@@ -183,23 +183,13 @@ def _read(name: str) -> str:
         raise InputError(one_line(f"jaxhil/c99/{name}: found no such file, allowed one per law")) from None
 
 
-def _constants(declarations: str, gain_file: GainFile) -> str:
+def _lengths(declarations: str, gain_file: GainFile) -> str:
     lines = []
+    delays = {**gain_file.limits, **gain_file.gains}
     for name in dict.fromkeys(_SAMPLES.findall(declarations)):
-        whole = math.floor(gain_file.gains[name.lower()] / gain_file.control_period + 1e-9)
+        whole = math.floor(delays[name.lower()] / gain_file.control_period + 1e-9)
         lines.append(
             f"\n/* Samples of the line that delays by `{name.lower()}`: raise it to load longer delays. */\n"
             f"#define JAXHIL_{name}_SAMPLES {whole + 2}\n"
         )
     return "".join(lines)
-
-
-def _entries(gain_file: GainFile) -> str:
-    units = {"control_period": "s", "clearance": "m"}
-    units |= {name: gain.unit for name, gain in COMPENSATORS[gain_file.compensator].gains.items()}
-    values: Iterable[tuple[str, float]] = (
-        ("control_period", gain_file.control_period),
-        ("clearance", gain_file.clearance),
-        *gain_file.gains.items(),
-    )
-    return "".join(f"    .{name} = {decimal(value)}, /* {units[name]} */\n" for name, value in values)
