@@ -21,7 +21,7 @@ typedef struct {
     double restitution, expected, balance;
     int64_t contacts;
     bool on, known, open;
-    double clearance, middle, period, mass, quiet_ticks, faded, longest, free_force, margin, tolerance;
+    double clearance, middle, period, mass, quiet_ticks, faded, longest, fading, margin, tolerance;
     double entry, side, velocity, force, aligned, peak, work;
     double sxx, sxv, svv, sxf, svf;
     int64_t quiet, ticks;
@@ -32,8 +32,8 @@ typedef struct {
 
 /* == Definitions == */
 
-#define JAXHIL_FADED 1e-3    /* of the largest force of the contact */
-#define JAXHIL_PATIENCE 0.02 /* s, that the force is given to die out */
+#define JAXHIL_FADED 1e-6   /* of the largest force of the contact */
+#define JAXHIL_PATIENCE 0.1 /* s, that the force is given to die out */
 
 static void jaxhil_watchdog_clear(jaxhil_watchdog *watchdog) {
     watchdog->quiet = 0;
@@ -72,7 +72,7 @@ static bool jaxhil_watchdog_init(jaxhil_watchdog *watchdog, const jaxhil_limits 
     watchdog->quiet_ticks = limits->settling / period;
     watchdog->faded = (limits->settling + JAXHIL_PATIENCE) / period;
     watchdog->longest = limits->longest_contact / period;
-    watchdog->free_force = limits->free_force;
+    watchdog->fading = limits->fading;
     watchdog->margin = limits->restitution_margin;
     watchdog->tolerance = limits->energy_balance;
     watchdog->limits = *limits;
@@ -161,15 +161,13 @@ static uint32_t jaxhil_watchdog_conclude(jaxhil_watchdog *watchdog, double given
 
 /* Take in the interval between two ticks, if both its ends are in contact. */
 static void jaxhil_watchdog_regress(jaxhil_watchdog *watchdog, double force, double deflection) {
+    /* Not by the force as well: of noisy readings it would pick the larger ones, and bias the stiffness. */
     const double side = watchdog->side;
-    const double least = watchdog->free_force;
     const double before = watchdog->aligned;
-    const double force_before = watchdog->force;
-    if (deflection * side > 0.0 && before * side > 0.0 && force * side > least &&
-        force_before * side > least) {
+    if (deflection * side > 0.0 && before * side > 0.0) {
         const double middle = side * (deflection + before) * 0.5;
         const double rate = side * (deflection - before) / watchdog->period;
-        const double mean = side * (force + force_before) * 0.5;
+        const double mean = side * (force + watchdog->force) * 0.5;
         watchdog->sxx += middle * middle;
         watchdog->sxv += middle * rate;
         watchdog->svv += rate * rate;
@@ -210,7 +208,7 @@ static uint32_t jaxhil_watchdog_tick(jaxhil_watchdog *watchdog, double given, do
             watchdog->peak = size;
         }
         jaxhil_watchdog_regress(watchdog, force, deflection);
-        const bool faded = size <= JAXHIL_FADED * watchdog->peak || size <= watchdog->free_force ||
+        const bool faded = size <= JAXHIL_FADED * watchdog->peak || size <= watchdog->fading ||
                            (double)watchdog->quiet >= watchdog->faded;
         const bool leaving = (double)watchdog->quiet >= watchdog->quiet_ticks &&
                              watchdog->side * velocity < 0.0 && faded;

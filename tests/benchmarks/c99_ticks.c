@@ -1,6 +1,6 @@
-/* Time of a tick: `c99_ticks ROWS REPEATS` runs the driver's rows (doubles, standard input) REPEATS times through
- * the controller, and through a loop that only adds them up. Prints nanoseconds a tick, the best of the repeats:
- * the bare loop's, the controller's; the ticks that were in contact; the cause of a trip, 0 if there was none.
+/* Time of a tick: `c99_ticks ROWS REPEATS` runs the driver's rows (doubles, standard input) REPEATS times
+ * through the controller, and through a loop that only adds them up. Prints nanoseconds a tick, the best of
+ * the repeats: the bare loop's, the controller's; the ticks in contact; the cause of a trip, 0 if none.
  */
 #include <stdio.h>
 #include <stdlib.h>
