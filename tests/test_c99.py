@@ -172,6 +172,14 @@ def test_faults_are_those_of_the_runtime(batch):
 # Gains and limits
 
 
+@pytest.mark.parametrize("delay", [101_000.0 * PERIOD, 1e306])
+def test_delay_that_the_runtime_refuses_is_refused(delay):
+    document = gain_document()
+    document["gains"]["identification_delay"] |= {"value": delay, "upper": delay}
+    with pytest.raises(GainFileError, match="delay"):
+        c99_texts(sign(document))
+
+
 @pytest.mark.parametrize("law", LAWS)
 def test_compiler_reads_the_gains_back_exactly(law, tmp_path):
     """Gains of every size, each of them where its law is defined."""
@@ -392,29 +400,44 @@ def test_same_bits_over_ten_million_ticks(law, batch):
 # Vectors
 
 
-def vectors(document) -> list[str]:
-    """A vectors.csv of the Python controller's own ticks, as lines."""
-    gain_file = check_gain_document(document)
+VECTORS_LIMITS = {"held_readings": 4.0, "late_fraction": 0.25, "force_slew": 1e5, "limited_in_a_row": 50.0}
+
+
+def vectors_document():
+    """A gain document whose limits bind now and then, without a trip at once."""
+    document = gain_document()
+    document["limits"] = {
+        name: {"value": value, "unit": LIMITS[name].unit} for name, value in VECTORS_LIMITS.items()
+    }
+    return sign(document)
+
+
+def vectors(*kinds: str) -> list[str]:
+    """A vectors.csv of the Python controller's own ticks, one run per kind of rows, as lines."""
+    gain_file = check_gain_document(vectors_document())
     lines = [
         "run,event,force_measured,position_desired,velocity_desired,position_measured,time,position,velocity,"
         "acceleration,force_command,position_command,faults,force_simulated"
     ]
-    for run in range(2):
-        rows = drawn_rows("contact", 200, np.random.default_rng([9, run]), PERIOD)
+    for run, kind in enumerate(kinds):
+        rows = drawn_rows(kind, 200, np.random.default_rng([9, run]), PERIOD)
         rows[:, 0] = c99_cases.TICK
         rows[100, 0] = c99_cases.NEXT_CONTACT
         results = c99_cases.controller_in_python(gain_file, rows)
         for n, (row, result) in enumerate(zip(rows.tolist(), results.tolist(), strict=True)):
             event = 1 if n == 0 else int(row[0])
-            numbers = [*row[1:6], *row[7:], *result[:2], int(result[4]), math.nan]
-            lines.append(",".join([str(run), str(event), *(repr(number) for number in numbers)]))
+            readings = [repr(number) for number in row[1:6]]
+            if not row[6]:
+                readings[-1] = ""
+            numbers = [*row[7:], *result[:2], int(result[4]), math.nan]
+            lines.append(",".join([str(run), str(event), *readings, *(repr(number) for number in numbers)]))
     return lines
 
 
 @pytest.fixture(scope="module")
 def replay(tmp_path_factory):
     """`replay(lines)`: exit code and output of the exported test program."""
-    folder = c99_cases.write_sources(tmp_path_factory.mktemp("vectors"), gain_document())
+    folder = c99_cases.write_sources(tmp_path_factory.mktemp("vectors"), vectors_document())
     program = compiled(folder, "test_vectors.c", "test_vectors", "-O2", "jaxhil_controller.c")
 
     def run(lines):
@@ -426,12 +449,24 @@ def replay(tmp_path_factory):
 
 
 def test_recorded_vectors_are_replayed(replay):
-    assert replay(vectors(gain_document())) == (0, "vectors.csv: 400 ticks, the same bit for bit\n")
+    """Of contacts, and of what is not finite, late, or without a time."""
+    lines = vectors("contact", "contact", "random", "hostile", "hostile")
+    assert len({line.split(",")[12] for line in lines[1:]}) > 3
+    assert replay(lines) == (0, "vectors.csv: 1000 ticks, the same bit for bit\n")
+
+
+def test_one_expected_fault_that_did_not_happen_is_found(replay):
+    lines = vectors("contact")
+    fields = lines[20].split(",")
+    fields[12] = str(int(fields[12]) ^ 8)
+    lines[20] = ",".join(fields)
+    code, output = replay(lines)
+    assert code == 1 and output.startswith("vectors.csv:21: faults: found ")
 
 
 @pytest.mark.parametrize("column", ["force_command", "position_command"])
 def test_one_bit_of_an_expected_command_is_found(column, replay):
-    lines = vectors(gain_document())
+    lines = vectors("contact", "contact")
     place = lines[0].split(",").index(column)
     fields = lines[150].split(",")
     value = float(fields[place])
@@ -452,5 +487,5 @@ def test_one_bit_of_an_expected_command_is_found(column, replay):
     ],
 )
 def test_vectors_that_cannot_be_read_are_named(change, message, replay):
-    code, output = replay(change(vectors(gain_document())))
+    code, output = replay(change(vectors("contact")))
     assert code == 2 and message in output

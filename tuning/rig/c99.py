@@ -15,6 +15,7 @@ from importlib import resources
 from typing import Any, NamedTuple
 
 from jaxhil.errors import InputError, one_line
+from jaxhil.runtime.controller import Controller
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
 from tuning.rig.c99_tables import Table, constants, faults_table, gains_table, limits_table
 
@@ -120,6 +121,7 @@ def c99_texts(document: Mapping[str, Any], source: str = "gain document") -> dic
     C file. Same document, same texts.
     """
     gain_file = check_gain_document(document, source)
+    Controller(gain_file, source)  # refuses delays that no line can hold
     law = gain_file.compensator
     fragments = _in_order("controller.c", law)
     declarations = "\n".join(
