@@ -245,6 +245,46 @@ def drawn_rows(kind: str, count: int, rng: np.random.Generator, period: float) -
     return rows
 
 
+def drawn_exactly(law: str, count: int, rng: np.random.Generator) -> tuple[GainFile, np.ndarray]:
+    """Gains, limits and rows of small whole numbers, so that much is equal which is compared."""
+    period = 2.0**-10
+    per_period = {"N/s": 1 / period, "m/s": 1 / period, "m/s^2": 1 / period**2, "s": period}
+    limits = {}
+    for name, specification in LIMITS.items():
+        if rng.random() < 0.4 and name != "equivalent_mass":
+            continue
+        value = float(rng.integers(1, 5)) * per_period.get(specification.unit, 1.0)
+        if name in ("late_fraction", "restitution_margin", "softness_lowest", "speed_lowest", "loss_lowest"):
+            value *= 0.25
+        if name.startswith("expected"):
+            value *= 0.125
+        limits[name] = -value if name in ("measured_lowest", "command_lowest") else value
+    try:
+        limits = complete(limits)
+    except ValueError:
+        limits = NO_LIMITS
+    clearance = float(rng.choice([math.inf, 1.0, 2.0, 4.0]))
+    gain_file = drawn_gains(law, rng, hostile=False)._replace(
+        control_period=period, clearance=clearance, limits=limits
+    )
+    if "forgetting" in gain_file.gains:
+        whole = {name: float(rng.integers(1, 4)) for name in gain_file.gains}
+        whole |= {"identification_delay": whole["identification_delay"] * period, "forgetting": 0.5}
+        gain_file = gain_file._replace(gains=whole)
+    rows = np.zeros((count, len(ROW)))
+    rows[:, 1:] = rng.integers(-3, 4, (count, 9))
+    smooth = rng.random() < 0.7
+    if smooth:  # walks, which stay on one side for a while
+        rows[:, 1:] = np.clip(np.cumsum(rng.integers(-1, 2, (count, 9)), axis=0), -4, 4)
+        rows[:, 4] = np.where(rng.random(count) < 0.5, rows[:, 2], rows[:, 4])
+    gaps = rng.choice([1.0, 1.25, 1.5, 2.0, 3.0, 5.0, 1e6 - 0.5], count, p=[0.9, 0.03, 0.03, *[0.01] * 4])
+    rows[:, 5] = period * np.cumsum(gaps)
+    rows[:, 6] = 1.0
+    events = [TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE]
+    rows[:, 0] = rng.choice(events, count, p=[0.8, 0.08, 0.02, 0.005, 0.045, 0.05])
+    return gain_file, rows
+
+
 def law_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
     """What the Python runtime's law makes of the rows, without the controller's guards."""
     law = COMPENSATORS[gain_file.compensator](gain_file.gains, gain_file.control_period, gain_file.clearance)
