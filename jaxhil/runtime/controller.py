@@ -64,7 +64,10 @@ class Controller:
         self._clock = Clock(limits, period)
         self._tare = Tare(limits)
         self._inputs = InputGuard(limits, period, clearance)
-        self._watchdog = Watchdog(limits, period, clearance)
+        try:
+            self._watchdog = Watchdog(limits, period, clearance)
+        except ValueError as error:
+            raise refusal(source, "limits.alignment", str(error), "a delay that fits") from None
         self._forces = ForceGuard(limits, period)
         self._positions = PositionGuard(limits, period, clearance)
         self._stopped = False
@@ -170,7 +173,7 @@ class Controller:
         fatal |= inputs.fatal
         watchdog = self._watchdog
         if watchdog.on and not fatal:
-            fatal = watchdog.tick(forces.output, position, velocity, inputs.measured)
+            fatal = watchdog.tick(forces.output, inputs.force, position, velocity, inputs.measured)
             faults |= fatal
         if not fatal:
             try:

@@ -9,6 +9,8 @@ from math import inf
 from types import MappingProxyType
 from typing import NamedTuple
 
+MINUTE = 1e-30  # where 0 would be divided by
+
 
 class LimitSpecification(NamedTuple):
     """One limit: its unit, its value where a file has none, its least value, what it is."""
@@ -47,21 +49,37 @@ LIMITS: dict[str, LimitSpecification] = {
     "command_highest": LimitSpecification("m", inf, -inf, "largest position command"),
     "velocity_limit": LimitSpecification("m/s", inf, 0.0, "fastest change of the position command"),
     "deceleration": LimitSpecification("m/s^2", inf, 0.0, "braking and starting after a trip"),
+    "retreat_velocity": LimitSpecification("m/s", 0.0, 0.0, "speed of the way out of contact after a trip"),
     "equivalent_mass": LimitSpecification("kg", 0.0, 0.0, "of the numerical model; 0: the watchdog is off"),
-    "expected_restitution": LimitSpecification("1", 1.0, 0.0, "restitution that a contact is to have"),
+    "longest_contact": LimitSpecification("s", inf, 0.0, "longest contact"),
+    "energy_balance": LimitSpecification("1", inf, 0.0, "energy out of balance, of the approach's"),
     "restitution_margin": LimitSpecification(
         "1", inf, 0.0, "largest difference from the expected restitution"
     ),
-    "energy_tolerance": LimitSpecification("1", inf, 0.0, "energy out of balance, of the kinetic energy"),
-    "longest_contact": LimitSpecification("s", inf, 0.0, "longest contact"),
-    "retreat_velocity": LimitSpecification("m/s", 0.0, 0.0, "speed of the way out of contact after a trip"),
+    "alignment": LimitSpecification("s", 0.0, 0.0, "delay of the force reading against the position reading"),
+    "reference_stiffness": LimitSpecification("N/m", 1.0, MINUTE, "stiffness at which p is 0"),
+    "reference_velocity": LimitSpecification("m/s", 1.0, MINUTE, "approach speed at which w is 0"),
+    "softness_lowest": LimitSpecification("1", 0.0, -inf, "least p"),
+    "softness_highest": LimitSpecification("1", 0.0, -inf, "largest p"),
+    "speed_lowest": LimitSpecification("1", 0.0, -inf, "least w"),
+    "speed_highest": LimitSpecification("1", 0.0, -inf, "largest w"),
+    "loss_lowest": LimitSpecification("1", 0.0, -inf, "least z"),
+    "loss_highest": LimitSpecification("1", 0.0, -inf, "largest z"),
+    "expected_1": LimitSpecification("1", 1.0, -inf, "expected restitution at p = w = z = 0"),
+    **{
+        f"expected_{term}": LimitSpecification("1", 0.0, -inf, f"coefficient of {' '.join(term)} in it")
+        for term in ("p", "pp", "ppp", "w", "ww", "pw", "z", "zz", "pz", "wz")
+    },
 }
 
 
 def complete(limits: Mapping[str, float]) -> dict[str, float]:
     """All limits, those that are not given at their defaults. Raises ValueError for limits that clash."""
     found = {name: limits.get(name, one.default) for name, one in LIMITS.items()}
-    for low, high in (("measured_lowest", "measured_highest"), ("command_lowest", "command_highest")):
+    for low, high in (
+        ("measured_lowest", "measured_highest"),
+        ("command_lowest", "command_highest"),
+    ):
         if not found[low] < found[high]:
             raise ValueError(f"{low} {found[low]!r} is not below {high} {found[high]!r}")
     if found["retreat_velocity"] > found["velocity_limit"]:
