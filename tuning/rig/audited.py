@@ -11,10 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxhil.runtime.filters import DelayLine
+from jaxhil.runtime.watchdog import FADED, PATIENCE
 from tuning.rig.recorded import Signals
-
-FADED = 1e-6  # of the contact's largest command: it has died out
-PATIENCE = 0.1  # s, that the command is given to die out
 
 
 class Rules(NamedTuple):
@@ -33,7 +31,7 @@ class Rules(NamedTuple):
 class Audited(NamedTuple):
     """Contact by contact, (slots, lanes): speed before and after [m/s], identified stiffness [N/m] and damping
     [N s/m] (0 where there is nothing to identify them from), energy out of balance over the approach's,
-    duration [s] until the audit; whether there was such a contact, and whether it was audited."""
+    duration [s] until the audit; the tick on which it began; whether there was such a contact."""
 
     approach: Float[np.ndarray, "slots lanes"]
     rebound: Float[np.ndarray, "slots lanes"]
@@ -41,6 +39,7 @@ class Audited(NamedTuple):
     damping: Float[np.ndarray, "slots lanes"]
     imbalance: Float[np.ndarray, "slots lanes"]
     duration: Float[np.ndarray, "slots lanes"]
+    tick: Float[np.ndarray, "slots lanes"]
     begun: Bool[np.ndarray, "slots lanes"]
 
     @property
@@ -67,7 +66,7 @@ class _Lanes:
         self.found = {name: np.full((slots, lanes), np.nan) for name in Audited._fields[:-1]}
         self.begun = np.zeros((slots, lanes), bool)
 
-    def begin(self, where: Bool[np.ndarray, "lanes"], entry: np.ndarray, side: np.ndarray) -> None:
+    def begin(self, where: Bool[np.ndarray, "lanes"], tick: int, entry: np.ndarray, side: np.ndarray) -> None:
         """A contact begins."""
         self.open |= where
         self.entry[where] = entry[where]
@@ -75,7 +74,9 @@ class _Lanes:
         for each in (self.peak, self.work, self.quiet, self.ticks, *self.sums.values()):
             each[where] = 0.0
         known = where & (self.count < self.slots)
-        self.begun[self.count[known], np.nonzero(known)[0]] = True
+        place = self.count[known], np.nonzero(known)[0]
+        self.begun[place] = True
+        self.found["tick"][place] = tick
 
     def audit(self, where: Bool[np.ndarray, "lanes"], velocity: np.ndarray, extra: np.ndarray) -> None:
         """Contacts are over, with this velocity; `extra` work of the last command comes in besides."""
@@ -133,7 +134,7 @@ def audit_contacts(signals: Signals, rules: Rules, slots: int) -> Audited:
             side = np.where(position > middle, 1.0, -1.0)
             fresh = live & ~state.open & touching
             if np.any(fresh):
-                state.begin(fresh, velocity_before, side)
+                state.begin(fresh, tick, velocity_before, side)
             going = live & state.open
             if np.any(going):
                 state.quiet = np.where(touching, 0.0, state.quiet + 1)

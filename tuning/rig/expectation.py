@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 TERMS = ("1", "p", "pp", "ppp", "w", "ww", "pw", "z", "zz", "pz", "wz")
-# Tried in this order: the first that is about as good as the best is taken.
-FEATURES = (("1",), ("1", "p", "pp", "ppp"), TERMS[:7], ("1", "z", "zz"), TERMS)
+# Tried in this order: the first that is good enough, or about as good as the best, is taken.
+FEATURES = (("1",), ("1", "p", "pp", "ppp"), TERMS[:7], TERMS)
 AS_GOOD = 1.25  # times the best rms residual
 WIDER = 0.1  # of a range, on each side
 SINGULAR = 1e-9
@@ -62,12 +62,18 @@ def expected_restitution(expectation: Expectation, features: Features, mass: flo
 
 
 def fit_expectation(
-    features: Features, reference: Float[np.ndarray, "contacts"], run: np.ndarray, mass: float
+    features: Features,
+    reference: Float[np.ndarray, "contacts"],
+    run: np.ndarray,
+    mass: float,
+    enough: float,
 ) -> Expectation:
     """Least squares over contacts, of `reference` restitution e*, each of the run with that number.
 
-    Of `FEATURES`, the simplest that is about as good as the best one on runs left out of the fit is taken, then
-    fitted to all. Without contacts whose stiffness is known, the mean is expected.
+    Of `FEATURES`, the simplest is taken whose rms residual on runs left out of the fit is `enough`, or about
+    that of the best; it is then fitted to all. Simple is safe: a feature that adds next to nothing over the
+    sweep may mislead about a rig that is not as the sweep supposed. Without contacts whose stiffness is known,
+    the mean is expected.
     """
     known = features.stiffness > 0
     if not np.any(known):
@@ -83,8 +89,7 @@ def fit_expectation(
     )
     fitted = np.isin(run % 4, (0, 1))
     residuals = [_left_out(columns, terms, reference, fitted) for terms in FEATURES]
-    # What rounding leaves is no reason to prefer one to another.
-    enough = AS_GOOD * min(residuals) + 1e-6
+    enough = max(enough, AS_GOOD * min(residuals))
     terms = next(one for one, residual in zip(FEATURES, residuals, strict=True) if residual <= enough)
     solved = _solve(columns, terms, reference, np.ones(len(p), bool))
     coefficients = {**dict.fromkeys(TERMS, 0.0), **dict(zip(terms, map(float, solved), strict=True))}
