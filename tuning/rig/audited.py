@@ -85,7 +85,7 @@ class _Lanes:
         entry, speed = self.entry[lanes], velocity[lanes]
         xx, xv, vv, xf, vf = (self.sums[name][lanes] for name in SUMS)
         energy = 0.5 * mass * entry * entry
-        balance = 0.5 * mass * speed * speed - energy + self.work[lanes] + extra[lanes]
+        balance = 0.5 * mass * speed * speed - energy + (self.work[lanes] + extra[lanes])
         with np.errstate(invalid="ignore", divide="ignore"):
             determinant = xx * vv - xv * xv
             found = {

@@ -19,7 +19,7 @@ from tuning.gain_file import LoadedGains
 from tuning.rig.audited import Audited, Rules, audit_contacts, first_reached
 from tuning.rig.expectation import Expectation, Features, expected_restitution, fit_expectation
 from tuning.rig.extent import Extent, extent_of
-from tuning.rig.recorded import Chunk, Scenarios, recorded_chunks
+from tuning.rig.recorded import LANES, Chunk, Scenarios, recorded_chunks
 from tuning.sweeps.draws import drawn_scenarios
 from tuning.sweeps.store import Store, read_part
 from tuning.verdict import binomial_interval
@@ -62,13 +62,15 @@ def calibrate(
     store: Store | None = None,
     scenarios: int | None = None,
     limit: float | None = None,
+    lanes: int = LANES,
     progress: Callable[[int], None] = lambda runs: None,
 ) -> Calibration:
     """Limits for the rig, and the watchdog's rates of false and missed alarms.
 
     Args: `loaded`, the gain file; `store`, a sweep's of that gain file, whose scenarios are run again, all of
     them or the first so many `scenarios`; without a store so many draws of the file's own uncertainty (512).
-    `limit` of the restitution error: the store's own by default, else 0.01. `progress` is told how many more
+    `limit` of the restitution error: the store's own by default, else 0.01. So many `lanes` are run at a time.
+    `progress` is told how many more
     runs are done. Raises `InputError` for a store of another gain file, or a number that it does not hold.
     """
     chosen = _chosen(loaded, store, scenarios)
@@ -79,7 +81,7 @@ def calibrate(
         raise InputError(f"--limit: found {limit!r}, allowed a number above 0")
     rules, free_distance = watchdog_rules(loaded)
     parts = []
-    for chunk in recorded_chunks(loaded, chosen):
+    for chunk in recorded_chunks(loaded, chosen, lanes):
         parts.append(judge_chunk(chunk, rules, free_distance))
         progress(len(parts[-1].index))
     runs = _joined(parts)
@@ -160,9 +162,7 @@ def reached(runs: Judged, limit: float) -> Bool[np.ndarray, "slots lanes"]:
     return (np.arange(len(bad))[:, None] <= first) & runs.audited.begun
 
 
-def fit_reached(
-    runs: Judged, limit: float, mass: float, chosen: Bool[np.ndarray, "lanes"]
-) -> Expectation:
+def fit_reached(runs: Judged, limit: float, mass: float, chosen: Bool[np.ndarray, "lanes"]) -> Expectation:
     """The expectation, fitted to the contacts reached in the chosen runs."""
     use = reached(runs, limit) & (runs.status == OK) & chosen & (runs.audited.approach > 0)
     index = np.broadcast_to(runs.index, use.shape)[use]

@@ -84,9 +84,7 @@ def fit_expectation(
     reference, run = reference[known], run[known]
     stiffness, velocity = float(np.median(features.stiffness)), float(np.median(features.velocity))
     p, w, z = _shares(features, stiffness, velocity, mass)
-    columns = np.stack(
-        [np.ones_like(p), p, p * p, p**3, w, w * w, p * w, z, z * z, p * z, w * z], axis=1
-    )
+    columns = np.stack([np.ones_like(p), p, p * p, p**3, w, w * w, p * w, z, z * z, p * z, w * z], axis=1)
     fitted = np.isin(run % 4, (0, 1))
     residuals = [_left_out(columns, terms, reference, fitted) for terms in FEATURES]
     enough = max(enough, AS_GOOD * min(residuals))

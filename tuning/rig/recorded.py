@@ -22,6 +22,8 @@ from tuning.sweeps.draws import drawn_scenarios
 
 LANES = 1024  # recorded at a time
 
+_compared = jax.jit(compare_with_reference, static_argnums=0)
+
 
 class Scenarios(NamedTuple):
     """Which scenarios: how they are drawn (`tuning.sweeps.draws`), from which seed, how many from the first."""
@@ -84,7 +86,7 @@ def recorded_chunks(
 def record_chunk(loop: Loop, loaded: LoadedGains, scenarios: Scenario, first: int = 0) -> Chunk:
     """The scenarios' runs under the gains, recorded."""
     metrics, seen = record_ticks(loop, loaded.gains, scenarios)
-    outcome = jax.device_get(compare_with_reference(loop, scenarios, metrics))
+    outcome = jax.device_get(_compared(loop, scenarios, metrics))
     made = loaded.mechanism.approach.contacts
     contacts = Contacts(
         *(
@@ -102,7 +104,9 @@ def record_chunk(loop: Loop, loaded: LoadedGains, scenarios: Scenario, first: in
         command = np.where(begins, 0.0, command)
     finite = np.all([np.isfinite(one) for one in (force, position, velocity, measured, command)], axis=0)
     live &= np.logical_and.accumulate(finite | ~live, axis=0)
-    return Chunk(first, scenarios, Signals(force, position, velocity, measured, command, live, begins), contacts)
+    return Chunk(
+        first, scenarios, Signals(force, position, velocity, measured, command, live, begins), contacts
+    )
 
 
 def _first_lanes(chunk: Chunk, number: int) -> Chunk:

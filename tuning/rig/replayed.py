@@ -51,4 +51,3 @@ def replay_lane(controller: Controller, signals: Signals, lane: int, mass: float
     if controller.tripped:
         return Tripped(ticks, controller.status)
     return None
-
