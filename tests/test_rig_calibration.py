@@ -1,4 +1,4 @@
-"""Limits for the rig, calibrated: the watchdog's audit, what it expects, what it misses, what it stops in vain."""
+"""Limits for the rig, calibrated: the watchdog's audit, what it expects, misses and stops in vain."""
 
 import functools
 import math
@@ -233,7 +233,8 @@ def signals(**columns):
     shape = next(iter(columns.values())).shape
     live, begins = np.ones(shape, bool), np.zeros(shape, bool)
     begins[0] = True
-    return Signals(*(columns.get(name, np.zeros(shape)) for name in Signals._fields[:5]), live, begins)
+    every: dict = {name: columns.get(name, np.zeros(shape)) for name in Signals._fields[:5]}
+    return Signals(**every, live=live, begins=begins)
 
 
 def test_the_extent_of_a_run():
@@ -274,5 +275,5 @@ def test_margins_are_on_good_runs_alone(calibrated):
 
 @pytest.mark.parametrize("keywords", [{"scenarios": 1}, {"limit": 0.0}, {"limit": math.nan}])
 def test_impossible_choices_are_refused(keywords):
-    with pytest.raises(InputError, match="found .*, allowed"):
+    with pytest.raises(InputError, match=r"found .*, allowed"):
         calibrate(ONE_SIDED, **keywords)

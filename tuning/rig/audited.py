@@ -16,8 +16,8 @@ from tuning.rig.recorded import Signals
 
 
 class Rules(NamedTuple):
-    """Control period [s], clearance [m], equivalent mass [kg] by which the numerical model is audited; delay of
-    the force reading against the position reading [s], time that force and command need to die out [s],
+    """Control period [s], clearance [m], equivalent mass [kg] by which the numerical model is audited; delay
+    of the force reading against the position reading [s], time that force and command need to die out [s],
     command that counts as died out [N]."""
 
     period: float
@@ -29,8 +29,8 @@ class Rules(NamedTuple):
 
 
 class Audited(NamedTuple):
-    """Contact by contact, (slots, lanes): speed before and after [m/s], identified stiffness [N/m] and damping
-    [N s/m] (0 where there is nothing to identify them from), energy out of balance over the approach's,
+    """Contact by contact, (slots, lanes): speed before and after [m/s], identified stiffness [N/m] and
+    damping [N s/m] (0 where there is nothing to identify them from), energy out of balance over the approach's,
     duration [s] until the audit; the tick on which it began; whether there was such a contact."""
 
     approach: Float[np.ndarray, "slots lanes"]
@@ -157,7 +157,7 @@ def audit_contacts(signals: Signals, rules: Rules, slots: int) -> Audited:
             velocity_before = np.where(live, velocity, velocity_before)
             given = np.where(live, command, given)
             force_before, aligned_before = force, deflection
-    return Audited(*(state.found[name] for name in Audited._fields[:-1]), state.begun)
+    return Audited(**state.found, begun=state.begun)
 
 
 class _Alignment:

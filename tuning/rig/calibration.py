@@ -1,9 +1,9 @@
 """The limits of a gain file, from what good runs did: `calibrate`.
 
-The scenarios of a sweep's store are run again, recorded, and judged: a run is good if no contact's restitution
-error exceeds the sweep's limit. Every limit is a margin on what the good runs needed. The watchdog's expected
-restitution is fitted to one half of the runs; with what shares of the other half it raises false alarms or
-misses is stated with exact intervals.
+The scenarios of a sweep's store are run again, recorded, and judged: a run is good if no contact's error
+exceeds the sweep's limit. Limits are margins on what the good ones of every fourth run needed, and the
+watchdog's expected restitution is fitted to those; what shares of the other runs are stopped for nothing, or
+missed, is stated with exact intervals.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,11 +20,11 @@ from tuning.rig.audited import Audited, Rules, audit_contacts, first_reached
 from tuning.rig.expectation import Expectation, Features, expected_restitution, fit_expectation
 from tuning.rig.extent import Extent, extent_of
 from tuning.rig.recorded import LANES, Chunk, Scenarios, recorded_chunks
-from tuning.sweeps.draws import drawn_scenarios
 from tuning.sweeps.store import Store, read_part
 from tuning.verdict import binomial_interval
 
 MARGIN = 1.5  # on what good runs did
+FITTED = 4  # one run of so many is fitted to, the others judge
 SMALLEST = 0.02  # of the largest force reading: what a limit on forces leaves a sensor at least
 WITHOUT_STORE = 512  # draws
 LIMIT = 0.01  # of the restitution error, where no sweep states one
@@ -69,9 +69,9 @@ def calibrate(
 
     Args: `loaded`, the gain file; `store`, a sweep's of that gain file, whose scenarios are run again, all of
     them or the first so many `scenarios`; without a store so many draws of the file's own uncertainty (512).
-    `limit` of the restitution error: the store's own by default, else 0.01. So many `lanes` are run at a time.
-    `progress` is told how many more
-    runs are done. Raises `InputError` for a store of another gain file, or a number that it does not hold.
+    `limit` of the restitution error: the store's own by default, else 0.01. So many `lanes` are run at a
+    time; `progress` is told how many more runs are done. Raises `InputError` for a store of another gain file,
+    or a number that it does not hold.
     """
     chosen = _chosen(loaded, store, scenarios)
     if limit is None:
@@ -85,26 +85,26 @@ def calibrate(
         parts.append(judge_chunk(chunk, rules, free_distance))
         progress(len(parts[-1].index))
     runs = _joined(parts)
-    good = good_runs(runs, limit)
-    used = good if np.sum(good) >= 2 else np.all((runs.status == OK), axis=0)
+    fitted = runs.index % FITTED == 0
+    good = good_runs(runs, limit) & fitted
+    used = good if np.any(good) else np.all(runs.status == OK, axis=0) & fitted
     if not np.any(used):
-        raise InputError("limits: found no run all of whose contacts end, allowed gains that do")
-    half = runs.index % 2 == 0
-    expectation = fit_reached(runs, limit, rules.mass, half)
-    margin = restitution_margin(runs, expectation, limit, rules.mass, half)
+        raise InputError("limits: found no run all of whose contacts end, allowed gains with which they do")
+    expectation = fit_reached(runs, limit, rules.mass, fitted)
+    margin = restitution_margin(runs, expectation, limit, rules.mass, fitted)
     limits = {
         **guard_limits(loaded, runs, used, rules, free_distance),
         **expectation.limits(),
         "restitution_margin": margin,
     }
     found = {name: limits.get(name) for name in LIMITS}
-    rates = watchdog_rates(runs, expectation, found, limit, rules.mass, ~half)
+    rates = watchdog_rates(runs, expectation, found, limit, rules.mass, ~fitted)
     rates["calibrated_on"] = {
         "scenarios": chosen.number,
         "sampling": chosen.sampling,
         "seed": chosen.seed,
         "sweep_sha256": None if store is None else store.manifest.sha256,
-        "runs": "good" if used is good else "that ended: hardly any is good",
+        "runs": "good" if used is good else "ended, none good",
         "number": int(np.sum(used)),
         "margin": MARGIN,
     }
@@ -167,7 +167,7 @@ def fit_reached(runs: Judged, limit: float, mass: float, chosen: Bool[np.ndarray
     use = reached(runs, limit) & (runs.status == OK) & chosen & (runs.audited.approach > 0)
     index = np.broadcast_to(runs.index, use.shape)[use]
     features = Features(*(leaf[use] for leaf in _features(runs.audited)))
-    return fit_expectation(features, runs.reference[use], index // 2, mass, ENOUGH * limit)
+    return fit_expectation(features, runs.reference[use], index // FITTED, mass, ENOUGH * limit)
 
 
 def restitution_margin(
@@ -197,11 +197,13 @@ def watchdog_rates(
 ) -> dict[str, Any]:
     """False and missed alarms among the chosen runs, with exact intervals of 95 %.
 
-    A run is good if no error exceeds half the limit, and a false alarm if the watchdog stops it. It has to be
-    stopped if some contact does not end or has an error beyond the limit, and is missed if the watchdog has
-    not tripped by the end of that contact.
+    A run is good if no error exceeds half the limit, and a false alarm if the watchdog or another guard stops
+    it. It has to be stopped if some contact does not end or has an error beyond the limit, and is missed if
+    the watchdog has not tripped by the end of that contact.
     """
-    first_alarm = first_reached(alarms(runs, expectation, limits, mass))
+    alarmed = alarms(runs, expectation, limits, mass)
+    first_alarm = first_reached(alarmed)
+    stopped_anyhow = np.any(alarmed, axis=0) | guard_trips(runs.extent, limits)
     good = chosen & good_runs(runs, TOLD_ERRORS[0] * limit)
     bad = (runs.status != OK) | ~(np.abs(runs.error) <= TOLD_ERRORS[1] * limit)
     first_bad = first_reached(bad)
@@ -215,7 +217,7 @@ def watchdog_rates(
         "terms": [term for term, value in expectation.coefficients.items() if value],
         "expectation_rms": float(np.sqrt(np.mean(apart**2))) if len(apart) else None,
         "expectation_largest": float(np.max(apart)) if len(apart) else None,
-        "false_alarms": _rate(first_alarm[good] < len(bad)),
+        "false_alarms": _rate(stopped_anyhow[good]),
         "missed_alarms": _rate(first_alarm[stopped] > first_bad[stopped]),
         "held_out_runs": int(np.sum(chosen)),
     }
@@ -238,6 +240,32 @@ def alarms(
             & (audited.duration <= longest)
         )
     return audited.begun & ~quiet & ~(audited.approach == 0)
+
+
+def guard_trips(extent: Extent, limits: Mapping[str, float | None]) -> Bool[np.ndarray, "lanes"]:
+    """Runs that a guard other than the watchdog would stop, or flag readings of."""
+
+    def most(name: str) -> float:
+        value = limits[name]
+        return np.inf if value is None else value
+
+    def least(name: str) -> float:
+        value = limits[name]
+        return -np.inf if value is None else value
+
+    return (
+        (extent.reading >= most("force_range"))
+        | (extent.measured_lowest < least("measured_lowest"))
+        | (extent.measured_highest > most("measured_highest"))
+        | (extent.desired_lowest < least("command_lowest"))
+        | (extent.desired_highest > most("command_highest"))
+        | (extent.force_stuck > most("force_stuck_travel"))
+        | (extent.position_stuck > most("position_stuck_travel"))
+        | (extent.flight_force > most("free_force"))
+        | (extent.command > most("force_limit"))
+        | (extent.slew > most("force_slew"))
+        | (extent.speed > most("velocity_limit"))
+    )
 
 
 def guard_limits(

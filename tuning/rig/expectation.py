@@ -21,7 +21,7 @@ SINGULAR = 1e-9
 
 
 class Expectation(NamedTuple):
-    """Coefficients by term; reference stiffness [N/m] and velocity [m/s]; ranges of p, w and z fitted over."""
+    """Coefficients by term; reference stiffness [N/m] and velocity [m/s]; ranges of p, w, z fitted over."""
 
     coefficients: dict[str, float]
     stiffness: float
@@ -72,8 +72,8 @@ def fit_expectation(
 
     Of `FEATURES`, the simplest is taken whose rms residual on runs left out of the fit is `enough`, or about
     that of the best; it is then fitted to all. Simple is safe: a feature that adds next to nothing over the
-    sweep may mislead about a rig that is not as the sweep supposed. Without contacts whose stiffness is known,
-    the mean is expected.
+    sweep may mislead about a rig that is not as the sweep supposed. Without contacts whose stiffness is
+    known, the mean is expected.
     """
     known = features.stiffness > 0
     if not np.any(known):

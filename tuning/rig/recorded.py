@@ -1,6 +1,6 @@
 """Scenarios by index, recorded tick by tick: what a controller on the rig would have read and commanded.
 
-Scenario i is the one that a sweep of the same seed has at index i, sensor noise included; chunks of them share
+Scenario i is that of a sweep of the same seed at index i, sensor noise included; chunks of them share
 one compiled program and bounded memory.
 """
 
@@ -26,7 +26,7 @@ _compared = jax.jit(compare_with_reference, static_argnums=0)
 
 
 class Scenarios(NamedTuple):
-    """Which scenarios: how they are drawn (`tuning.sweeps.draws`), from which seed, how many from the first."""
+    """How scenarios are drawn (`tuning.sweeps.draws`), from which seed, how many from the first."""
 
     sampling: str
     seed: int
@@ -97,7 +97,7 @@ def record_chunk(loop: Loop, loaded: LoadedGains, scenarios: Scenario, first: in
     ticks = np.arange(len(seen.active))[:, None]
     # What follows the last active tick is nobody's; a pause between two contacts still is the controller's.
     live = ticks <= np.max(np.where(seen.active, ticks, -1), axis=0)
-    force, position, velocity, measured, age = seen.signals
+    force, position, velocity, measured, age = (np.asarray(leaf) for leaf in seen.signals)
     begins = live & (age == 0)
     command = np.asarray(seen.command)
     if loop.has_force_noise or loop.has_force_bias:
