@@ -30,8 +30,8 @@ class Rules(NamedTuple):
 
 class Audited(NamedTuple):
     """Contact by contact, (slots, lanes): speed before and after [m/s], identified stiffness [N/m] and
-    damping [N s/m] (0 where there is nothing to identify them from), energy out of balance over the approach's,
-    duration [s] until the audit; the tick on which it began; whether there was such a contact."""
+    damping [N s/m] (0 where there is nothing to identify them from), energy out of balance over the
+    approach's, duration [s] until the audit; the tick on which it began; whether there was such a contact."""
 
     approach: Float[np.ndarray, "slots lanes"]
     rebound: Float[np.ndarray, "slots lanes"]
