@@ -9,7 +9,9 @@ from cases import SECOND_ORDER, mechanism, nominal_gains, validated
 from sweep_cases import NOISY, UNCERTAIN, case
 from sweep_cases import manifest as sweep_manifest
 
+from jaxhil.compensators import literature_gains
 from jaxhil.errors import InputError
+from jaxhil.mechanism_file import load
 from jaxhil.metrics import OK
 from jaxhil.runtime.limits import LIMITS, complete
 from jaxhil.runtime.watchdog import Watchdog
@@ -225,6 +227,32 @@ def test_a_store_is_run_again(tmp_path):
         calibrate(loaded, store, scenarios=129)
     with pytest.raises(InputError, match="gains_sha256"):
         calibrate(ONE_SIDED, store)
+
+
+@pytest.mark.slow
+def test_of_a_hundred_thousand_scenarios_none_is_missed():
+    """The built-in claw, gains a little off the literature's, so that many runs are good and many are not."""
+    parsed = load("claw-350kg").mechanism
+    law = literature_gains(parsed, "response_error")
+    law |= {"response_error": 0.93 * law["response_error"], "phase_lead": 1.1 * law["phase_lead"]}
+    loaded = check_document(build_document("response_error", law, parsed, "0" * 64, {}, {}, 0, {}))
+    limit = 0.05
+    limits, rates = calibrate(loaded, scenarios=100_000, limit=limit)
+    print(rates)
+    false, missed = rates["false_alarms"], rates["missed_alarms"]
+    assert false["runs"] + missed["runs"] > 60_000 and missed["runs"] > 10_000
+    assert missed["alarms"] == 0 and missed["high"] < 5e-4
+    assert false["high"] < 1e-4
+    # The same verdicts by the controller itself, on other draws.
+    rules, distance = watchdog_rules(loaded)
+    controller = limited_controller(loaded, limits_section(limits))
+    (chunk,) = recorded_chunks(loaded, Scenarios("random", 1, 1024))
+    judged = judge_chunk(chunk, rules, distance)
+    error = np.abs(judged.error[0])
+    for lane in range(1024):
+        tripped = replay_lane(controller, chunk.signals, lane, rules.mass)
+        assert (tripped is not None) >= (not error[lane] <= limit)
+        assert (tripped is None) >= (error[lane] <= limit / 2)
 
 
 def signals(**columns):

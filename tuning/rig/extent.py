@@ -10,10 +10,10 @@ from tuning.rig.recorded import Signals
 
 class Extent(NamedTuple):
     """Of every run, (lanes,), all at least 0 but the positions: largest |force reading| [N]; least and
-    largest measured and desired position [m]; largest |F_c| [N] and its fastest change [N/s]; fastest change of
-    the desired position [m/s] and of its velocity [m/s^2]; longest travel [m] of the measured position in contact
-    under one force reading, and of the desired one under one position reading; largest |force reading| in
-    flight [N], and the most by which two of them differ [N]."""
+    largest measured and desired position [m]; largest |F_c| [N] and its fastest change [N/s]; fastest change
+    of the desired position [m/s] and of its velocity [m/s^2]; longest travel [m] of the measured position in
+    contact under one force reading, and of the desired one under one position reading; largest |force
+    reading| in flight [N], and the most by which two of them differ [N]."""
 
     reading: Float[np.ndarray, "lanes"]
     measured_lowest: Float[np.ndarray, "lanes"]
