@@ -1,1 +1,1 @@
-"""What goes to the rig: the bundle, its controller in Python and in C, and the loop in real time."""
+"""What goes to the rig: bundles, the controller in C, limits and their calibration, the loop over UDP."""
