@@ -11,7 +11,7 @@ import io
 import random
 from collections.abc import Iterator, Sequence
 from math import inf, nan
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -185,7 +185,7 @@ def _through(
 ) -> tuple[list[Row], list[tuple[float, float]]]:
     """The runtime's rows, and the stiffness and damping identified at each."""
     rows, identified = [], []
-    move: Any = INTEGRATORS[integrator]
+    move = INTEGRATORS[integrator]
     inverse_mass, period = 1.0 / mass, gain_file.control_period
     for one in inputs:
         if one.event == NEXT_CONTACT:
