@@ -5,9 +5,11 @@ Euler T. All arrays broadcast, plain floats stay such; position [m], velocity [m
 control period T [s].
 """
 
+from typing import TypeVar
+
 from jaxtyping import Array
 
-Number = Array | float
+Number = TypeVar("Number", Array, float)
 
 
 def semi_implicit_euler(position: Number, velocity: Number, acceleration: Number, control_period: Number):

@@ -13,11 +13,7 @@ from tuning.rig.bundle import build_bundle
 from tuning.rig.manifest import manifest_text
 
 TICKS = 240  # of the small bundle: the nominal run
-LIMITS = {
-    "force_limit": {"value": 900.0, "unit": "N"},
-    "held_readings": {"value": 3.0, "unit": "1"},
-    "velocity_limit": {"value": None, "unit": "m/s"},
-}
+LIMITS = {"force_limit": 900.0, "held_readings": 3.0, "velocity_limit": None}
 
 
 def document(

@@ -24,9 +24,8 @@ def run(options: Export) -> int:
     from tuning.gain_file import load_gain_file
 
     loaded = load_gain_file(path)
-    with report.stages(3) as stages:
-        stages.begin("working out the limits")
-        limits, rates = _calibrated(loaded, options)
+    limits, rates = _calibrated(loaded, options)
+    with report.stages(2) as stages:
         bundle = build_bundle(loaded.document, formats, limits, rates, options.seed, stages.begin)
         if not bundle.reasons:
             write_bundle(folder, bundle.files)
@@ -56,14 +55,23 @@ def run(options: Export) -> int:
 
 
 def _calibrated(loaded, options: Export) -> tuple[Any, Any]:
-    """The limits for the rig, and the rates that a sweep tells of them."""
+    """The limits for the rig, and what is known of the watchdog's alarms."""
     if find_spec("tuning.rig.calibration") is None:
         if options.sweep is not None:
             raise InputError("--sweep: found a store, allowed none: limits cannot be worked out yet")
         return None, None
-    from tuning.rig.calibration import calibrate  # pyright: ignore[reportMissingImports]
+    from tuning.rig.calibration import (  # pyright: ignore[reportMissingImports]
+        WITHOUT_STORE,
+        calibrate,
+    )
+    from tuning.sweeps.store import read_store
 
-    found = calibrate(loaded, None if options.sweep is None else Path(options.sweep), seed=options.seed)
+    store = None if options.sweep is None else read_store(Path(options.sweep))
+    runs = WITHOUT_STORE if store is None else store.manifest.scenarios
+    with report.progress(runs, "runs") as progress:
+        found = calibrate(
+            loaded, store, progress=lambda number: progress.advance(number, "working out the limits")
+        )
     return found.limits, found.rates
 
 
@@ -89,7 +97,9 @@ def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
         if end
     ]
     if document["rates"]:
-        lines += [f"{key.replace('_', ' ')}: {_rate(value)}" for key, value in document["rates"].items()]
+        from tuning.rig.summary import told_rates
+
+        lines += [f"Watchdog: {text}" for text in told_rates(document["rates"])]
     if document["bundle"]:
         lines += [
             f"wrote {len(sizes)} files, {sum(sizes.values()) / 1e6:.2g} MB, to {document['bundle']}",
@@ -103,9 +113,3 @@ def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
             "are those simulated."
         )
     report.emit(*tables, *lines)
-
-
-def _rate(value: Any) -> str:
-    if isinstance(value, dict) and {"value", "low", "high"} <= value.keys():
-        return f"{value['value']:.3g} ({value['low']:.2g} to {value['high']:.2g})"
-    return report.figure(value) if isinstance(value, (int, float, str)) or value is None else str(value)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.runtime import digest
+from jaxhil.runtime.limits import LIMITS
 from tuning.files import TEMPORARY, writing
 from tuning.rig import selftest
 from tuning.rig.manifest import is_bundle, manifest_text
@@ -37,15 +38,15 @@ class Bundle(NamedTuple):
 def build_bundle(
     document: Mapping[str, Any],
     formats: Sequence[str],
-    limits: Mapping[str, Any] | None = None,
+    limits: Mapping[str, float | None] | None = None,
     rates: Mapping[str, Any] | None = None,
     seed: int = 0,
     progress: Callable[[str], None] = lambda message: None,
 ) -> Bundle:
-    """The bundle of a checked gain document, with `limits` for the rig if there are any.
+    """The bundle of a checked gain document, with `limits` for the rig [SI units] if there are any.
 
-    `rates` are those of false and missed alarms that belong to the limits. `progress` is told what begins.
-    Raises `InputError` for limits that the runtime refuses, or a compensator that a format lacks.
+    `rates`, plain data, say what is known of the watchdog's alarms under these limits. `progress` is
+    told what begins. Raises `InputError` for limits that the runtime refuses, or a compensator that a format lacks.
     """
     from tuning.gain_file import check_document
     from tuning.rig.readme import readme_text
@@ -54,7 +55,7 @@ def build_bundle(
     from tuning.rig.vectors import as_csv, make_vectors
     from tuning.rig.writers import WRITERS
 
-    exported = with_limits(document, limits)
+    exported = with_limits(document, limits, rates)
     loaded = check_document(exported)
     progress("recording test vectors")
     vectors = make_vectors(loaded, seed)
@@ -65,7 +66,7 @@ def build_bundle(
         ),
         "jaxhil_runtime.py": runtime_source(loaded.compensator).encode(),
         "vectors.csv": as_csv(vectors.rows).encode("ascii"),
-        "summary.html": summary_html(exported, rates),
+        "summary.html": summary_html(exported),
         **{name: (HERE / name).read_bytes() for name in COPIED if (HERE / name).exists()},
     }
     for name in formats:
@@ -76,11 +77,20 @@ def build_bundle(
     return Bundle(exported, files, len(vectors.rows), runs, vectors.ended, vectors.reasons)
 
 
-def with_limits(document: Mapping[str, Any], limits: Mapping[str, Any] | None) -> dict[str, Any]:
-    """The gain document with these limits, signed anew; with None as it is."""
+def with_limits(
+    document: Mapping[str, Any],
+    limits: Mapping[str, float | None] | None,
+    rates: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """The gain document with these limits, None for no limit, signed anew; without limits as it is.
+
+    The rates become `figures.watchdog`.
+    """
     if limits is None:
         return dict(document)
-    changed = {**document, "limits": dict(limits)}
+    entries = {name: {"value": value, "unit": LIMITS[name].unit} for name, value in limits.items()}
+    figures = {**document["figures"], **({"watchdog": rates} if rates else {})}
+    changed = {**document, "limits": entries, "figures": figures}
     return {**changed, "sha256": digest(changed)}
 
 

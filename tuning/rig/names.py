@@ -72,7 +72,8 @@ def renamed(
     """A copy of the statement, its names replaced as `occurrences` has them."""
     made = copy.deepcopy(statement)
     replaced = {id(one.node): one for one in occurrences(made, names, modules)}
-    return _Renaming(replaced).visit(made)
+    _Renaming(replaced).visit(made)
+    return made
 
 
 class _Renaming(ast.NodeTransformer):

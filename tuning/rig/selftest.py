@@ -76,6 +76,8 @@ def differences(folder):
             raise ValueError("not the entries of a manifest")
     except Exception as error:
         return {}, [*problems, (MANIFEST, f"cannot be read: {describe(error)}")]
+    if problems:
+        return files, problems  # nothing is to be learnt from it about others
     for name, entry in files.items():
         try:
             found = read(os.path.join(folder, *name.split("/")))
@@ -177,7 +179,8 @@ def check_runtime(folder, damaged):
     try:
         # Not by import: a cache of an older source may lie about, and the folder is on no path with -I.
         exec(compile(read(path), "jaxhil_runtime.py", "exec"), runtime)
-        runtime["Controller"], runtime["GainFileError"]
+        if not {"Controller", "GainFileError"} <= {*runtime}:
+            raise NameError("it has no Controller or no GainFileError")
     except BaseException as error:
         return fail("jaxhil_runtime.py", f"cannot be run: {describe(error)}")
     return runtime

@@ -27,6 +27,14 @@ QUANTITIES = {
     "force": ("contact force", "N", 1.0),
 }
 
+FITTED = (
+    "expected_",
+    "softness_",
+    "speed_",
+    "loss_",
+    "reference_",
+)  # what the watchdog's expectation is made of
+
 STYLE = """
 @page { size: A4; margin: 11mm 12mm; }
 * { box-sizing: border-box; }
@@ -42,8 +50,8 @@ td, th { white-space: nowrap; } img { width: 100%; margin-top: 2mm; } .note { co
 """
 
 
-def summary_html(document: Mapping[str, Any], rates: Mapping[str, Any] | None = None) -> bytes:
-    """The page of a checked gain document; `rates` of alarms, as the calibration has them."""
+def summary_html(document: Mapping[str, Any]) -> bytes:
+    """The page of a checked gain document."""
     mechanism = document["mechanism"]
     name = escape(one_line(mechanism["name"], 80))
     picture = base64.b64encode(picture_png(document)).decode("ascii")
@@ -63,7 +71,7 @@ def summary_html(document: Mapping[str, Any], rates: Mapping[str, Any] | None = 
         '<div class="columns"><div>',
         *_gains(document),
         "</div><div>",
-        *_limits(document, rates),
+        *_limits(document),
         "</div></div>",
         "</body></html>",
     ]
@@ -190,22 +198,33 @@ def _gains(document: Mapping[str, Any]) -> Iterator[str]:
         yield "<h2>Gains</h2><p>None: the measured force is passed on.</p>"
 
 
-def _limits(document: Mapping[str, Any], rates: Mapping[str, Any] | None) -> Iterator[str]:
+def _limits(document: Mapping[str, Any]) -> Iterator[str]:
     entries: dict[str, Entry] = limit_entries(document)
     given = [name for name, one in document.get("limits", {}).items() if one["value"] is not None]
     if not given:
         yield "<h2>Limits and watchdog</h2><p>None: only what is not finite trips the controller.</p>"
-    else:
-        rows = [(name, _number(entries[name].value, 5), entries[name].unit) for name in given]
-        yield from _table("Limits and watchdog", ("limit", "value", "unit"), rows, (1,))
-        unset = [name for name in entries if name not in given]
-        if unset:
-            yield f'<p class="note">Not limited: {escape(", ".join(unset))}.</p>'
-    if rates:
-        told = "; ".join(f"{key.replace('_', ' ')}: {_rate(value)}" for key, value in rates.items())
-        yield f"<p>{escape(one_line(told, 600))}.</p>"
-    elif given:
-        yield '<p class="note">Without a sweep, rates of false and missed alarms are not known.</p>'
+        return
+    listed = [name for name in given if not name.startswith(FITTED)]
+    rows = [(name, _number(entries[name].value, 5), entries[name].unit) for name in listed]
+    yield from _table("Limits and watchdog", ("limit", "value", "unit"), rows, (1,))
+    fitted = len(given) - len(listed)
+    if fitted:
+        yield f"<p>The watchdog's expected restitution: {fitted} fitted numbers in the gain file.</p>"
+    unset = [name for name in entries if name not in given]
+    if unset:
+        yield f'<p class="note">Not limited: {escape(", ".join(unset))}.</p>'
+    rates = document["figures"].get("watchdog")
+    told = "; ".join(told_rates(rates)) if isinstance(rates, Mapping) else ""
+    yield f"<p>{escape(one_line(told, 600)) or 'Rates of false and missed alarms are not known'}.</p>"
+
+
+def told_rates(rates: Mapping[str, Any]) -> Iterator[str]:
+    """In words, how often the watchdog stops a good run and misses a bad one."""
+    for name, runs in (("false_alarms", "good runs"), ("missed_alarms", "runs to be stopped")):
+        one = rates.get(name)
+        if isinstance(one, Mapping) and {"runs", "alarms", "low", "high"} <= one.keys():
+            interval = f"95 %: {_number(one['low'], 2)} to {_number(one['high'], 2)}"
+            yield f"{name.replace('_', ' ')} {one['alarms']} of {one['runs']} {runs} ({interval})"
 
 
 def _table(
@@ -224,14 +243,6 @@ def _table(
     yield f"<h2>{escape(title)}</h2><table><tr>{cells('th', heads)}</tr>"
     yield from (f"<tr>{cells('td', row)}</tr>" for row in rows)
     yield "</table>"
-
-
-def _rate(value: Any) -> str:
-    if isinstance(value, Mapping):
-        if {"value", "low", "high"} <= value.keys():
-            return f"{_number(value['value'])} ({_number(value['low'])} to {_number(value['high'])})"
-        return ", ".join(f"{key.replace('_', ' ')} {_rate(one)}" for key, one in value.items())
-    return str(value) if isinstance(value, (str, int)) else _number(value)
 
 
 def _number(value: Any, digits: int = 4) -> str:

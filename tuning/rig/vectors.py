@@ -69,10 +69,11 @@ class Row(NamedTuple):
 
 
 class Recorded(NamedTuple):
-    """The rows of recorded runs; of each run the fault or status that ended the comparison with jax, or None;
-    what disagrees, in words."""
+    """The rows of recorded runs and the nominal run's mass [kg]; of each run what ended the comparison with
+    jax, or None; what disagrees, in words."""
 
     rows: list[Row]
+    mass: float
     ended: list[str | None]
     reasons: list[str]
 
@@ -93,19 +94,20 @@ def recorded(loaded: LoadedGains, gain_file: GainFile, seed: int, draws: int = D
         ended.append(end)
         if reason:
             reasons.append(f"{'the nominal run' if run == 0 else f'draw {run}'}, {reason}")
-    return Recorded(rows, ended, reasons)
+    return Recorded(rows, float(batch.equivalent_mass[0]), ended, reasons)
 
 
-def hostile(nominal: Sequence[Row], mechanism: Mechanism, gain_file: GainFile, seed: int) -> list[Row]:
-    """Pieces of the nominal run, damaged, through the runtime; numbered after `nominal`'s run."""
+def hostile(
+    nominal: Sequence[Row], integrator: str, mass: float, gain_file: GainFile, seed: int
+) -> list[Row]:
+    """Pieces of the nominal run, damaged, through the runtime; mass [kg] of the numerical model."""
     source = random.Random(seed)
     rows: list[Row] = []
-    mass = mechanism.bodies.equivalent_mass
     for run in range(HOSTILE_RUNS):
         begin = source.randrange(max(1, len(nominal) - HOSTILE_TICKS))
         piece = nominal[begin : begin + HOSTILE_TICKS]
         inputs = list(_damaged(source, run, piece, gain_file.control_period))
-        rows += _through(Controller(gain_file), inputs, mechanism.rig.integrator, mass, gain_file)[0]
+        rows += _through(Controller(gain_file), inputs, integrator, mass, gain_file)[0]
     return rows
 
 
@@ -114,7 +116,7 @@ def make_vectors(loaded: LoadedGains, seed: int, draws: int = DRAWS) -> Recorded
     gain_file = check_gain_document(loaded.document)
     found = recorded(loaded, gain_file, seed, draws)
     nominal = [row for row in found.rows if row.run == 0]
-    damaged = hostile(nominal, loaded.mechanism, gain_file, seed)
+    damaged = hostile(nominal, loaded.mechanism.rig.integrator, found.mass, gain_file, seed)
     last = max((row.run for row in found.rows), default=-1) + 1
     return found._replace(rows=[*found.rows, *(row._replace(run=last + row.run) for row in damaged)])
 
@@ -194,7 +196,7 @@ def _through(
         if one.motion is None:
             acceleration = -(0.0 if one.zeroed else force) * inverse_mass
             position, velocity = move(one.position_desired, one.velocity_desired, acceleration, period)
-            motion = (position, velocity, acceleration)
+            motion = (float(position), float(velocity), acceleration)
         else:
             motion = one.motion
         command = controller.position_command(*motion)
