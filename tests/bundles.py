@@ -17,10 +17,13 @@ LIMITS = {"force_limit": 900.0, "held_readings": 3.0, "velocity_limit": None}
 
 
 def document(
-    mechanism_name: str = "rig-300kg", compensator: str = "phase_lead", **changes: Any
+    mechanism_name: str = "rig-300kg",
+    compensator: str = "phase_lead",
+    overrides: tuple[str, ...] = (),
+    **changes: Any,
 ) -> dict[str, Any]:
     """A gain document of a built-in mechanism, at the literature's gains."""
-    mechanism, sha256, _ = load(mechanism_name, ())
+    mechanism, sha256, _ = load(mechanism_name, overrides)
     gains = {gain.name: gain.nominal(mechanism) for gain in COMPENSATORS[compensator].gains}
     return build_document(compensator, {**gains, **changes}, mechanism, sha256, {}, {}, 0, {})
 

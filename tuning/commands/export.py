@@ -58,7 +58,9 @@ def _calibrated(loaded, options: Export) -> tuple[Any, Any]:
     """The limits for the rig, and what is known of the watchdog's alarms."""
     if find_spec("tuning.rig.calibration") is None:
         if options.sweep is not None:
-            raise InputError("--sweep: found a store, allowed none: limits cannot be worked out yet")
+            raise InputError(
+                f"--sweep: found {shown(options.sweep)}, allowed none: no limits are worked out yet"
+            )
         return None, None
     from tuning.rig.calibration import (  # pyright: ignore[reportMissingImports]
         WITHOUT_STORE,

@@ -32,7 +32,7 @@ def check_bundle(folder: Path) -> Checked:
     except subprocess.TimeoutExpired:
         return Checked([], [f"selftest.py: found no end within {LONGEST:g} s"])
     lines = [one_line(line) for line in (done.stdout + done.stderr).splitlines()]
-    failed = [line for line in lines if line.startswith("FAIL")]
-    if done.returncode and not failed:
-        failed = [f"selftest.py: ended with exit code {done.returncode}"]
-    return Checked(lines, failed if done.returncode else [])
+    if not done.returncode:
+        return Checked(lines, [])
+    failed = [line.removeprefix("FAIL").strip() for line in lines if line.startswith("FAIL ")]
+    return Checked(lines, failed or [f"selftest.py: ended with exit code {done.returncode}"])

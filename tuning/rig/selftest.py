@@ -350,7 +350,7 @@ def look_again():
     """This file against the manifest once more, apart from all the above: it may be what is damaged."""
     here = os.path.dirname(os.path.abspath(__file__))
     try:
-        own = json.loads(read(os.path.join(here, MANIFEST)))["files"]["selftest.py"]["sha256"]
+        own = json.loads(read(os.path.join(here, "manifest.json")))["files"]["selftest.py"]["sha256"]
     except (OSError, ValueError, KeyError, TypeError):
         return  # the checks above have told
     if hashlib.sha256(read(os.path.abspath(__file__))).hexdigest() != own:
