@@ -274,25 +274,23 @@ def test_words_it_does_not_know_are_refused(folder):
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 def test_c_controller_is_compiled_and_run(files, folder, monkeypatch):
     good, out = run_selftest(folder, "--c")
-    assert not good and "FAIL  c99: differs or is not here" in out
+    assert good and re.search(rf"ok    c99: vectors.csv: {TICKS + 60} ticks, the same bit for bit", out), out
     document = json.loads(files["gains.json"])
-    program = (
-        '#include <stdio.h>\nint main(int n, char **a) { printf("%s: same\\n", a[n - 1]); return %s; }\n'
-    )
-    for returned, reason in [
-        ("0", "ok    c99: vectors.csv: same"),
-        ("1", "FAIL  c99: "),
-        ("x", "FAIL  c99: "),
+    header = files["c99/jaxhil_gains.h"].decode()
+    value = re.search(r"[0-9]\.[0-9]+(e-[0-9]+)?", header)[0]
+    for old, new, reason in [
+        (value, str(2 * float(value)), r"FAIL  c99: vectors.csv:\d+: force_command: found"),
+        ("#define", "#defin", "FAIL  c99: .*error"),
     ]:
-        sources = {
-            "c99/test_vectors.c": program.replace("return %s", f"return {returned}").encode(),
-            "c99/jaxhil_controller.c": b"int jaxhil_nothing;\n",
-        }
-        for name, content in signed({**files, **sources}, document).items():
-            (folder / name).parent.mkdir(exist_ok=True)
+        wrong = signed({**files, "c99/jaxhil_gains.h": header.replace(old, new, 1).encode()}, document)
+        for name, content in wrong.items():
             (folder / name).write_bytes(content)
         good, out = run_selftest(folder, "--c")
-        assert good is (returned == "0") and reason in out, out
+        assert not good and re.search(reason, out), out
+    (folder / "c99" / "jaxhil_controller.h").write_bytes(b"")
+    assert "FAIL  c99: differs or is not here, so it is not compiled" in run_selftest(folder, "--c")[1]
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
     monkeypatch.setenv("PATH", "")
     good, out = run_selftest(folder, "--c")
     assert not good and "no C compiler is here" in out

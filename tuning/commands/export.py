@@ -14,9 +14,10 @@ from tuning.environment import prepare
 def run(options: Export) -> int:
     """0 if the runtime does what was simulated; 1 if not: nothing is written if the forces differ."""
     checks.at_least(0, seed=options.seed)
-    from tuning.rig.bundle import available_formats, build_bundle, check_target, write_bundle
+    from tuning.rig.bundle import build_bundle, check_target, write_bundle
+    from tuning.rig.writers import WRITERS
 
-    formats = _formats(options, available_formats())
+    formats = _formats(options, list(WRITERS))
     path = checks.gain_file(options.gains)
     folder = Path(options.output)
     check_target(folder)

@@ -1,1 +1,1 @@
-"""To the rig: the bundle that leaves the workstation, its writers, its test vectors and its self-test."""
+"""What goes to the rig: the bundle, its controller in Python and in C, and the loop in real time."""

@@ -8,7 +8,6 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -92,13 +91,6 @@ def with_limits(
     figures = {**document["figures"], **({"watchdog": rates} if rates else {})}
     changed = {**document, "limits": entries, "figures": figures}
     return {**changed, "sha256": digest(changed)}
-
-
-def available_formats() -> list[str]:
-    """What `--format` takes."""
-    from tuning.rig.writers import WRITERS
-
-    return [name for name in WRITERS if name != "c99" or find_spec("tuning.rig.c99")]
 
 
 def check_target(folder: Path) -> None:

@@ -125,9 +125,9 @@ def csv_table(document: Mapping[str, Any]) -> dict[str, bytes]:
 
 def c99(document: Mapping[str, Any]) -> dict[str, bytes]:
     """The controller in C99, in the folder `c99`. Raises `InputError` for a compensator without a C file."""
-    from tuning.rig.c99 import c99_files  # pyright: ignore[reportMissingImports]
+    from tuning.rig.c99 import c99_texts
 
-    return {f"c99/{name}": text.encode("ascii") for name, text in c99_files(document).items()}
+    return {f"c99/{name}": text.encode("ascii") for name, text in c99_texts(document).items()}
 
 
 WRITERS: dict[str, Callable[[Mapping[str, Any]], dict[str, bytes]]] = {
