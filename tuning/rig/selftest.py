@@ -309,12 +309,12 @@ def check_c(folder, damaged):
             vectors = os.path.join(os.path.abspath(folder), "vectors.csv")
             for command in ([compiler, *C_FLAGS, "-o", program, *sources, "-lm"], [program, vectors]):
                 done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+                lines = (done.stdout + done.stderr).replace(vectors, "vectors.csv").strip().split("\n")
                 if done.returncode:
-                    text = (done.stdout + done.stderr).strip().split("\n")[0]
-                    return fail("c99", plain(text) or f"exit code {done.returncode}")
+                    return fail("c99", plain(lines[0]) or f"exit code {done.returncode}")
     except Exception as error:
         return fail("c99", f"cannot be compiled and run: {describe(error)}")
-    return passed("c99", plain(done.stdout.strip().split("\n")[-1].replace(vectors, "vectors.csv")))
+    return passed("c99", plain(lines[-1]))
 
 
 def read(path):

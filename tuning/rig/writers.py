@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxhil.runtime.limits import LIMITS
 
 from jaxhil.errors import InputError, shown
+from jaxhil.runtime.limits import LIMITS
 
 NODE = "/jaxhil_controller"
 LONGEST_MATLAB_NAME = 63
