@@ -107,7 +107,7 @@ def test_says_what_for_how_good_and_how_sure(made, page):
             "numpy",
             "350 kg at 5 mm/s",
         ),
-        "false alarms 0 of 5000 good runs (95 %: 0 to 0.00073)",
+        "False alarms 0 of 5000 good runs (95 %: 0 to 0.00073)",
         "missed alarms 2 of 40 runs to be stopped",
     ):
         assert part in text, part

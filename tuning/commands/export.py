@@ -88,10 +88,14 @@ def _formats(options: Export, available: list[str]) -> list[str]:
 
 
 def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
+    from tuning.rig.summary import is_told, told_rates
+
     tables = []
     if document["limits"]:
         rows = [
-            (name, report.figure(one["value"], 6), one["unit"]) for name, one in document["limits"].items()
+            (name, report.figure(one["value"], 6), one["unit"])
+            for name, one in document["limits"].items()
+            if is_told(name)
         ]
         tables.append(report.table("Limits for the rig", ["limit", "value", "unit"], rows, texts=(0, 2)))
     lines = [
@@ -100,8 +104,6 @@ def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
         if end
     ]
     if document["rates"]:
-        from tuning.rig.summary import told_rates
-
         lines += [f"Watchdog: {text}" for text in told_rates(document["rates"])]
     if document["bundle"]:
         lines += [

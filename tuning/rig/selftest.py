@@ -311,7 +311,8 @@ def check_c(folder, damaged):
                 done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
                 lines = (done.stdout + done.stderr).replace(vectors, "vectors.csv").strip().split("\n")
                 if done.returncode:
-                    return fail("c99", plain(lines[0]) or f"exit code {done.returncode}")
+                    told = next((line for line in lines if "error" in line), lines[0])
+                    return fail("c99", plain(told) or f"exit code {done.returncode}")
     except Exception as error:
         return fail("c99", f"cannot be compiled and run: {describe(error)}")
     return passed("c99", plain(lines[-1]))

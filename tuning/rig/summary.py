@@ -70,6 +70,7 @@ def summary_html(document: Mapping[str, Any]) -> bytes:
         *_figures(document),
         '<div class="columns"><div>',
         *_gains(document),
+        *_watchdog(document),
         "</div><div>",
         *_limits(document),
         "</div></div>",
@@ -125,7 +126,7 @@ def _errors(axes: Axes, document: Mapping[str, Any]) -> None:
             centres, [value for _, value in shown], width * 0.92, color=COLOURS[name], hatch=HATCHES[name],
             edgecolor="white", linewidth=0.4, label=LABELS[name].partition(":")[0],
         )  # fmt: skip
-        axes.bar_label(bars, [f"{value:.2g}" for _, value in shown], fontsize=6.5, padding=1)
+        axes.bar_label(bars, [f"{value:.2g}" for _, value in shown], fontsize=6, padding=1)
     axes.set_xticks(range(len(groups)), [label for label, _ in groups], fontsize=8)
     axes.tick_params(axis="y", labelsize=8)
     axes.set_ylabel("|e - e*| [1]", fontsize=9)
@@ -199,23 +200,41 @@ def _gains(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _limits(document: Mapping[str, Any]) -> Iterator[str]:
-    entries: dict[str, Entry] = limit_entries(document)
-    given = [name for name, one in document.get("limits", {}).items() if one["value"] is not None]
+    given = _given(document)
     if not given:
-        yield "<h2>Limits and watchdog</h2><p>None: only what is not finite trips the controller.</p>"
+        yield "<h2>Limits</h2><p>None: only what is not finite trips the controller.</p>"
         return
-    listed = [name for name in given if not name.startswith(FITTED)]
-    rows = [(name, _number(entries[name].value, 5), entries[name].unit) for name in listed]
-    yield from _table("Limits and watchdog", ("limit", "value", "unit"), rows, (1,))
-    fitted = len(given) - len(listed)
-    if fitted:
-        yield f"<p>The watchdog's expected restitution: {fitted} fitted numbers in the gain file.</p>"
-    unset = [name for name in entries if name not in given]
-    if unset:
-        yield f'<p class="note">Not limited: {escape(", ".join(unset))}.</p>'
+    rows = [(name, _number(one.value, 5), one.unit) for name, one in given.items() if is_told(name)]
+    yield from _table("Limits", ("limit", "value", "unit"), rows, (1,))
+
+
+def _watchdog(document: Mapping[str, Any]) -> Iterator[str]:
+    """What there is to say of the limits beside their values."""
+    given = _given(document)
+    if not given:
+        return
+    yield "<h2>Watchdog</h2>"
     rates = document["figures"].get("watchdog")
     told = "; ".join(told_rates(rates)) if isinstance(rates, Mapping) else ""
-    yield f"<p>{escape(one_line(told, 600)) or 'Rates of false and missed alarms are not known'}.</p>"
+    told = one_line(told, 600) or "Rates of false and missed alarms are not known"
+    yield f"<p>{escape(told[0].upper() + told[1:])}.</p>"
+    fitted = sum(not is_told(name) for name in given)
+    if fitted:
+        yield f"<p>Its expected restitution: {fitted} fitted numbers in the gain file.</p>"
+    unset = [name for name in document["limits"] if name not in given]
+    if unset:
+        yield f'<p class="note">Not limited: {escape(", ".join(unset))}.</p>'
+
+
+def _given(document: Mapping[str, Any]) -> dict[str, Entry]:
+    """The limits that limit something."""
+    entries = limit_entries(document)
+    return {name: one for name, one in entries.items() if document["limits"][name]["value"] is not None}
+
+
+def is_told(limit: str) -> bool:
+    """Whether a limit says something to people: what the watchdog's expectation is made of does not."""
+    return not limit.startswith(FITTED)
 
 
 def told_rates(rates: Mapping[str, Any]) -> Iterator[str]:
