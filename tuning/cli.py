@@ -238,15 +238,51 @@ class Replay:
 
 
 @dataclass(frozen=True)
+class Export:
+    """A bundle for the rig: gains, controller, test vectors, self-test; nothing to install there.
+
+    Example: jaxhil export jaxhil-out/varying/gains.json -o bundle --sweep jaxhil-out/sweep
+
+    Exit code 1 if the controller on the rig does not do what was simulated.
+    """
+
+    gains: Annotated[Positional[str], arg(metavar="GAINS", help="Gain file, or its folder.")]
+    output: Annotated[str, arg(aliases=("-o",), metavar="DIR", help="Folder of the bundle.")] = (
+        "jaxhil-out/bundle"
+    )
+    sweep: Annotated[
+        str | None,
+        arg(
+            metavar="STORE",
+            help="Folder of a sweep of these gains: limits and the watchdog's rates come from it.",
+            help_behavior_hint="",
+        ),
+    ] = None
+    formats: Annotated[
+        UseAppendAction[tuple[str, ...]],
+        arg(
+            name="format",
+            metavar="NAME[,NAME]",
+            help="Also the gains for ros2, matlab, csv, c99; repeatable; by default all.",
+            help_behavior_hint="",
+        ),
+    ] = ()
+    seed: Annotated[int, _number("Seed of the test vectors.")] = 0
+    json: Json = False
+
+
+@dataclass(frozen=True)
 class Verify:
     """Replay recorded signals through the rig's runtime; the exit code is the verdict.
 
     Example: jaxhil verify jaxhil-out/varying/gains.json
 
-    Exit code 1 also for a gain file that is corrupt or was tampered with.
+    Of a bundle, its self-test first. Exit code 1 also for what is corrupt or was tampered with.
     """
 
-    path: Annotated[Positional[str], arg(metavar="BUNDLE_OR_GAINS", help="Gain file, or its folder.")]
+    path: Annotated[
+        Positional[str], arg(metavar="BUNDLE_OR_GAINS", help="Bundle, or gain file, or its folder.")
+    ]
     scenarios: Annotated[int, _number("Runs to replay: the nominal one, then draws.")] = 6
     seed: Annotated[int, _number("Seed of the draws.")] = 0
     json: Json = False
@@ -267,6 +303,7 @@ Command = (
     | Annotated[Tune, subcommand("tune")]
     | Annotated[Sweep, subcommand("sweep")]
     | Annotated[Replay, subcommand("replay")]
+    | Annotated[Export, subcommand("export")]
     | Annotated[Verify, subcommand("verify")]
     | Annotated[Mechanisms, subcommand("mechanisms")]
 )

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 import jax
 import msgspec
 import numpy as np
+from jaxhil.runtime.limits import NO_LIMITS
 
 from jaxhil.compensators import Signals
 from jaxhil.metrics import OK, STATUS_NAMES, Metrics
@@ -92,15 +93,16 @@ def verify(
     progress(f"recording {scenarios} runs")
     batch = nominal_and_draws(loaded.mechanism, scenarios, seed)
     metrics, lanes = record_lanes(loaded, batch)
-    # What a draw makes of period and clearance, the controller of that rig knows.
+    # What a draw makes of period and clearance, the controller of that rig knows. It is the law that is
+    # compared: some draw may well be what the limits are there to stop.
     gain_files = [
-        gain_file._replace(control_period=float(period), clearance=float(clearance))
+        gain_file._replace(control_period=float(period), clearance=float(clearance), limits=NO_LIMITS)
         for period, clearance in zip(batch.control_period, batch.clearance, strict=True)
     ]
     progress(f"replaying {sum(len(lane.command) for lane in lanes)} ticks through the runtime")
     replays = [replay(lane, file) for lane, file in zip(lanes, gain_files, strict=True)]
     progress("running the nominal contacts with the runtime in the loop")
-    closed = run_closed_loop(loaded, gain_files[0], batch)
+    closed = run_closed_loop(loaded, gain_file, batch)
     contacts = loaded.mechanism.approach.contacts
     comparisons = [_compare_contact(closed, metrics, contact) for contact in range(contacts)]
     reasons = (*_replay_reasons(replays), *_closed_loop_reasons(comparisons))

@@ -50,6 +50,14 @@ def gain_file(given: str) -> Path:
     return path
 
 
+def folder(given: str) -> Path | None:
+    """The folder at `given`; None if there is none, or it cannot be told."""
+    try:
+        return Path(given) if Path(given).is_dir() else None
+    except (OSError, ValueError):
+        return None
+
+
 def compensator(name: str) -> None:
     """The name is a compensator's."""
     # The runtime's table: the same names, without jax.

@@ -1,5 +1,10 @@
-"""`jaxhil verify`: does the runtime on the rig do what was simulated and tuned? The exit code says so."""
+"""`jaxhil verify`: does the runtime on the rig do what was simulated and tuned? The exit code says so.
 
+A bundle is checked against its manifest from here, then by its own self-test in a bare interpreter, and then
+as its gain file is.
+"""
+
+from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError
@@ -13,7 +18,24 @@ def run(options: Verify) -> int:
     """0 if the runtime agrees; 1 if not, or if the file is corrupt; 2 if there is nothing to read."""
     checks.at_least(1, scenarios=options.scenarios)
     checks.at_least(0, seed=options.seed)
-    path = checks.gain_file(options.path)
+    from tuning.rig.manifest import is_bundle
+
+    folder = checks.folder(options.path)
+    if folder is None or not is_bundle(folder):
+        return _finish(options, _verified(options, checks.gain_file(options.path)))
+    from tuning.rig.checking import check_bundle
+
+    checked = check_bundle(folder)
+    document: dict[str, Any] = {"bundle": str(folder), "self_test": checked.lines}
+    if checked.reasons:
+        document.update(verdict=False, reasons=checked.reasons)
+    else:
+        document.update(_verified(options, folder / "gains.json"))
+    return _finish(options, document)
+
+
+def _verified(options: Verify, path: Path) -> dict[str, Any]:
+    """What verification finds of a gain file."""
     prepare()
     import msgspec
 
@@ -29,6 +51,10 @@ def run(options: Verify) -> int:
         with report.stages(3) as stages:
             found = verify(loaded, options.scenarios, options.seed, stages.begin)
         document.update(mechanism=loaded.mechanism.name, **msgspec.to_builtins(found))
+    return document
+
+
+def _finish(options: Verify, document: dict[str, Any]) -> int:
     if options.json:
         report.emit_json(document)
     else:
@@ -42,9 +68,9 @@ def _exponential(value: float | None) -> str:
 
 
 def _print(document: dict[str, Any]) -> None:
-    tables = []
+    tables: list[Any] = list(document.get("self_test", ()))
     if "replay" in document:
-        tables = [
+        tables += [
             report.table(
                 f"{document['mechanism']}, {document['compensator']}: recorded runs through the runtime",
                 ["run", "ticks", "compared", "near a threshold", "command range [N]", "largest difference"],

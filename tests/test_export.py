@@ -1,0 +1,234 @@
+"""`jaxhil export` writes a bundle as a whole or not at all; `jaxhil verify` knows a corrupt one."""
+
+import json
+import os
+
+import pytest
+from bundles import document, signed, small_files
+
+from jaxhil.runtime.faults import FAULTS
+from tuning.files import TEMPORARY
+from tuning.gain_file import load_gain_file, write_gain_file
+from tuning.rig import bundle, vectors
+from tuning.rig.bundle import build_bundle, check_target, with_limits, write_bundle
+from tuning.rig.writers import WRITERS
+
+pytestmark = pytest.mark.usefixtures("no_cache")
+
+ALWAYS = {
+    *("gains.json", "jaxhil_runtime.py", "vectors.csv", "selftest.py", "manifest.json", "README.md"),
+    "summary.html",
+}
+
+
+@pytest.fixture
+def gains(tmp_path):
+    path = tmp_path / "gains.json"
+    write_gain_file(path, document())
+    return path
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Few vectors, and no limits worked out."""
+    monkeypatch.setattr(vectors, "HOSTILE_RUNS", 4)
+    monkeypatch.setattr("tuning.commands.export._calibrated", lambda loaded, options: (None, None))
+
+
+def refused(ran, *words):
+    assert ran.code == 2 and ran.out == ""
+    last = ran.err.splitlines()[-1]
+    assert last.startswith("jaxhil: ") and all(word in last for word in words), ran.err
+
+
+def placed(folder):
+    for name, content in small_files().items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+    return folder
+
+
+def files_of(folder):
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_bundle_is_exported_and_verified(jaxhil, gains, tmp_path, quick):
+    folder = tmp_path / "new" / "bundle"
+    ran = jaxhil("export", gains, "-o", folder, "--format", "csv,ros2", "--json")
+    assert ran.code == 0, ran
+    said = ran.document
+    assert said["verdict"] == "good" and said["bundle"] == str(folder) and said["formats"] == ["ros2", "csv"]
+    assert (
+        files_of(folder)
+        == {*said["files"]}
+        == ALWAYS | {"ros2.yaml", "gains.csv"} | ({"udp_controller.py"} & {*said["files"]})
+    )
+    assert load_gain_file(folder / "gains.json").document == load_gain_file(gains).document
+    assert os.listdir(tmp_path / "new") == ["bundle"]
+    ran = jaxhil("verify", folder, "--scenarios", "4")
+    assert ran.code == 0 and "Good: commands agree" in ran.out and "\nPASSED\n" in ran.out
+    # Once more onto itself.
+    ran = jaxhil("export", folder, "-o", folder, "--format", "matlab")
+    assert ran.code == 0 and "Good: " in ran.out and "selftest.py" in ran.out
+    assert "gains.mat" in files_of(folder) and "gains.csv" not in files_of(folder)
+
+
+def test_equal_gains_and_seed_make_equal_bundles(monkeypatch):
+    monkeypatch.setattr(vectors, "HOSTILE_RUNS", 4)
+    made = document()
+    first, second = (build_bundle(made, ["matlab", "csv"], {"force_limit": 900.0}).files for _ in range(2))
+    assert first == second
+    other = build_bundle(made, ["matlab", "csv"], {"force_limit": 900.0}, seed=1).files
+    assert {name for name in first if first[name] != other[name]} == {"vectors.csv", "manifest.json"}
+
+
+def test_limits_are_signed_and_rates_kept():
+    made = document()
+    changed = with_limits(made, {"force_limit": 900.0, "velocity_limit": None}, {"limit": 0.01})
+    assert changed["limits"] == {
+        "force_limit": {"value": 900.0, "unit": "N"},
+        "velocity_limit": {"value": None, "unit": "m/s"},
+    }
+    assert changed["figures"]["watchdog"] == {"limit": 0.01} and changed["sha256"] != made["sha256"]
+    assert with_limits(made, None) == made
+
+
+def test_what_differs_from_the_simulation_is_not_written(jaxhil, gains, tmp_path, quick, monkeypatch):
+    monkeypatch.setattr(vectors, "REPLAY_LIMIT", -1.0)
+    ran = jaxhil("export", gains, "-o", tmp_path / "bundle")
+    assert ran.code == 1 and "Bad: the nominal run, tick " in ran.out and "wrote" not in ran.out
+    assert not (tmp_path / "bundle").exists()
+
+
+def test_limits_that_stop_the_nominal_run_are_told(jaxhil, gains, tmp_path, quick, monkeypatch):
+    limits = {"force_limit": 1.0}
+    monkeypatch.setattr("tuning.commands.export._calibrated", lambda loaded, options: (limits, {}))
+    ran = jaxhil("export", gains, "-o", tmp_path / "bundle")
+    assert ran.code == 1 and "Bad: the nominal run, tick " in ran.out and "a guard acted" in ran.out
+    assert (tmp_path / "bundle" / "manifest.json").exists()
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["--format", "xml"], ["--format", "'xml'", "ros2, matlab, csv"]),
+        (["--format", "csv,"], ["--format", "''"]),
+        (["--seed", "-1"], ["--seed", "-1"]),
+        (["--sweep", "no-such-store"], ["no-such-store"]),
+    ],
+)
+def test_wrong_arguments_are_refused(jaxhil, gains, tmp_path, arguments, words):
+    refused(jaxhil("export", gains, "-o", tmp_path / "bundle", *arguments), *words)
+    assert not (tmp_path / "bundle").exists()
+
+
+def test_gains_that_cannot_be_read_are_refused(jaxhil, tmp_path):
+    refused(
+        jaxhil("export", tmp_path / "none.json", "-o", tmp_path / "bundle"), "none.json", "cannot be read"
+    )
+    (tmp_path / "gains.json").write_text("{}")
+    refused(jaxhil("export", tmp_path, "-o", tmp_path / "bundle"), "gains.json: schema: found nothing")
+
+
+def test_a_folder_that_is_no_bundle_is_left_alone(jaxhil, gains, tmp_path):
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "thesis.txt").write_text("years of work")
+    refused(jaxhil("export", gains, "-o", folder), "mine", "'thesis.txt' and no bundle")
+    refused(jaxhil("export", gains, "-o", folder / "thesis.txt"), "thesis.txt", "found a file")
+    placed(folder)
+    refused(jaxhil("export", gains, "-o", folder), "'thesis.txt' beside a bundle")
+    (folder / "thesis.txt").unlink()
+    check_target(folder)
+    (folder / "manifest.json").write_text("{")
+    refused(jaxhil("export", gains, "-o", folder), "no bundle")
+    assert (folder / "gains.json").exists()
+
+
+@pytest.mark.parametrize("before", [False, True])
+def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch, before):
+    folder = tmp_path / "bundle"
+    if before:
+        placed(folder)
+    there = {name: (folder / name).read_bytes() for name in files_of(folder)}
+    calls = []
+
+    def full(descriptor):
+        calls.append(descriptor)
+        if len(calls) == 3:
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(bundle.os, "fsync", full)
+    with pytest.raises(ValueError, match="bundle: cannot be written: No space left"):
+        write_bundle(folder, small_files())
+    assert {name: (folder / name).read_bytes() for name in files_of(folder)} == there
+    assert [name for name in os.listdir(tmp_path) if name.endswith(TEMPORARY)] == []
+    monkeypatch.undo()
+    monkeypatch.setattr(bundle, "_put", lambda *places: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        write_bundle(folder, small_files())
+    assert {name: (folder / name).read_bytes() for name in files_of(folder)} == there
+    assert {*os.listdir(tmp_path)} - {"file"} == ({"bundle"} if before else set())
+
+
+def test_a_link_to_a_folder_stays_one(tmp_path):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "there")
+    write_bundle(tmp_path / "link", small_files())
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "there" / "manifest.json").exists()
+
+
+@pytest.mark.parametrize(
+    "name", ["gains.json", "vectors.csv", "jaxhil_runtime.py", "selftest.py", "gains.mat"]
+)
+def test_a_corrupt_bundle_is_not_verified_and_not_run(jaxhil, tmp_path, name):
+    folder = placed(tmp_path / "bundle")
+    content = (folder / name).read_bytes()
+    trap = f"\nopen({str(tmp_path / 'ran')!r}, 'w')\n".encode()
+    (folder / name).write_bytes(content + trap)
+    ran = jaxhil("verify", folder, "--json")
+    assert ran.code == 1 and not ran.document["verdict"] and ran.document["self_test"] == []
+    assert any(reason.startswith(f"{name}: ") for reason in ran.document["reasons"])
+    assert f"Bad: {name}: " in jaxhil("verify", folder).out
+    assert not (tmp_path / "ran").exists()
+
+
+def test_what_is_left_of_a_bundle_is_corrupt_and_nothing_is_unusable(jaxhil, tmp_path):
+    folder = placed(tmp_path / "bundle")
+    (folder / "manifest.json").unlink()
+    ran = jaxhil("verify", folder)
+    assert ran.code == 1 and "Bad: manifest.json: cannot be read" in ran.out
+    (tmp_path / "empty").mkdir()
+    refused(jaxhil("verify", tmp_path / "empty"), "empty", "cannot be read")
+    refused(jaxhil("verify", tmp_path / "no such"), "cannot be read")
+    refused(jaxhil("verify", "a" * 5000), "cannot be read")
+
+
+def test_a_self_test_that_fails_is_told(jaxhil, tmp_path):
+    files = small_files()
+    lines = files["vectors.csv"].split(b"\n")
+    fields = lines[50].split(b",")
+    fields[10] = b"1.5"
+    lines[50] = b",".join(fields)
+    wrong = signed({**files, "vectors.csv": b"\n".join(lines)}, json.loads(files["gains.json"]))
+    folder = placed(tmp_path / "bundle")
+    for name, content in wrong.items():
+        (folder / name).write_bytes(content)
+    ran = jaxhil("verify", folder, "--json")
+    assert ran.code == 1
+    assert ran.document["reasons"][0].startswith("vectors.csv: line 51, run 0: force_command: found")
+
+
+def test_readme_has_the_runtime_s_faults_and_this_bundle_s_files():
+    text = small_files()["README.md"].decode()
+    for fault in FAULTS:
+        assert f"| `{fault.bit:#x}` | `{fault.name}` | {fault.condition} | {fault.reaction} |" in text
+    content = text.partition("## Before")[0]
+    assert "`gains.mat`" in content and "`ros2.yaml`" in content and "`c99`" in content
+    assert "$" not in text
+
+
+def test_export_has_help_with_an_example(jaxhil):
+    ran = jaxhil("export", "--help")
+    assert ran.code == 0 and "Example: jaxhil export" in ran.out and "--json" in ran.out
+    assert [*WRITERS] == ["ros2", "matlab", "csv", "c99"]

@@ -1,0 +1,296 @@
+"""The self-test passes what was exported, and names file, line and value of whatever was changed."""
+
+import json
+import os
+import random
+import re
+import shutil
+import string
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from bundles import TICKS, run_selftest, signed, small_files
+
+from tuning.rig import selftest
+from tuning.rig.manifest import is_text
+
+MUTATIONS = 200  # of each text file
+OWN_MUTATIONS = 60  # of the self-test itself, each in a process of its own
+
+
+@pytest.fixture(scope="module")
+def files():
+    return small_files()
+
+
+@pytest.fixture
+def folder(files, tmp_path):
+    """The small bundle, to be damaged."""
+    place = tmp_path / "bundle"
+    for name, content in files.items():
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        (place / name).write_bytes(content)
+    return place
+
+
+def in_a_bare_process(folder, *arguments, cwd="/", python=("-I", "-S")):
+    """The self-test as a rig engineer runs it, where no package can be imported."""
+    command = [sys.executable, *python, str(folder / "selftest.py"), *arguments]
+    ran = subprocess.run(command, capture_output=True, text=True, errors="replace", cwd=cwd, check=False)
+    return ran.returncode, ran.stdout, ran.stderr
+
+
+def test_passes_where_nothing_is_installed(folder):
+    code, out, err = in_a_bare_process(folder)
+    assert (code, err) == (0, "")
+    assert out.splitlines()[-1] == "PASSED" and "FAIL" not in out
+    assert re.search(rf"vectors.csv: {TICKS + 60} ticks of 2 runs, the same bit for bit", out)
+    code, out, err = in_a_bare_process(Path("."), cwd=folder, python=())
+    assert (code, err) == (0, "") and "PASSED" in out
+    assert not (folder / "__pycache__").exists()
+
+
+def test_uses_nothing_that_a_rig_lacks(folder):
+    program = (
+        "import runpy, sys\ntry: runpy.run_path(sys.argv.pop(1), run_name='__main__')\n"
+        "except SystemExit as stop: assert not stop.code, stop.code\n"
+        "assert not {'jax', 'numpy', 'jaxhil', 'tuning'} & {name.split('.')[0] for name in sys.modules}"
+    )
+    command = [sys.executable, "-c", program, str(folder / "selftest.py")]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stderr) == (0, ""), ran.stderr
+
+
+def mutated(source, content):
+    """One character changed into another one, or left out, and the line on which it stood."""
+    place = source.randrange(len(content))
+    old = chr(content[place])
+    choices = string.digits if old.isdigit() else string.printable
+    new = source.choice([one for one in choices if one != old] + ([""] if not old.isdigit() else []))
+    return content[:place] + new.encode() + content[place + 1 :], content.count(b"\n", 0, place) + 1
+
+
+def test_any_character_changed_is_named_by_file_and_line(files, folder):
+    source = random.Random(5)
+    names = [name for name, content in files.items() if is_text(content) and name != "selftest.py"]
+    assert {"gains.json", "vectors.csv", "jaxhil_runtime.py", "manifest.json", "README.md"} <= {*names}
+    for name in names:
+        for turn in range(MUTATIONS):
+            content, line = mutated(source, files[name])
+            (folder / name).write_bytes(content)
+            _, problems = selftest.differences(folder)
+            said = [text for other, text in problems if other == name]
+            assert len(problems) == len(said) > 0, (name, line)
+            if name != "manifest.json":
+                assert re.search(rf"line ({line}|{line + 1}): differs", said[0]) or "endings" in said[0], said
+            if turn < 2:
+                good, out = run_selftest(folder)
+                assert not good and out.splitlines()[-1].startswith("FAILED"), (name, line)
+                assert f"FAIL  {name}: {said[0]}" in out
+        (folder / name).write_bytes(files[name])
+    assert run_selftest(folder)[0]
+
+
+def test_the_manifest_names_its_own_line(files, folder):
+    lines = files["manifest.json"].split(b"\n")
+    for number in range(1, len(lines) - 4):
+        changed = [*lines]
+        changed[number] = lines[number][:-2] + b"~" + lines[number][-1:]
+        (folder / "manifest.json").write_bytes(b"\n".join(changed))
+        good, out = run_selftest(folder)
+        assert not good and f"FAIL  manifest.json: line {number + 1}: differs" in out, out
+
+
+def test_a_change_of_the_self_test_itself_never_passes(files, folder):
+    source = random.Random(6)
+    content = files["selftest.py"]
+    program = content.index(b"def main")
+    for turn in range(OWN_MUTATIONS):
+        # Of docstrings and constants too, but above all of what runs.
+        begin = program if turn % 4 else 0
+        changed, _ = mutated(source, content[begin:])
+        (folder / "selftest.py").write_bytes(content[:begin] + changed)
+        code, out, err = in_a_bare_process(folder)
+        # What is no Python any more is told by Python itself.
+        assert code != 0 and "selftest.py" in out + err, (changed, out, err)
+
+
+def test_the_guard_against_its_own_damage_holds_where_it_is_thin(files, folder):
+    content = files["selftest.py"].decode()
+    for old, new in [
+        ('if __name__ == "__main__":', 'if __name__ == "__main_":'),
+        ('    if not good:\n        sys.exit("FAIL  the self-test")\n', ""),
+        ('    look_again()\n    if not good:\n        sys.exit("FAIL  the self-test")\n', ""),
+        ("    look_again()\n    if not good", "    if not good"),
+        ("\nlook_again()\n", "\n"),
+        ("good = not damaged", "good = True"),
+        ("return good", "return True"),
+        ("!= own:", "== own:"),
+        ('["selftest.py"]["sha256"]', '["selftest.pi"]["sha256"]'),
+    ]:
+        assert old in content, old
+        (folder / "selftest.py").write_text(content.replace(old, new))
+        code, out, err = in_a_bare_process(folder)
+        assert code != 0 and "FAIL  selftest.py" in out + err, (old, out, err)
+
+
+def test_every_digit_of_every_gain_counts(files, folder):
+    document = json.loads(files["gains.json"])
+    text = files["gains.json"].decode()
+    values = {f"gains.{name}.value": one["value"] for name, one in document["gains"].items()}
+    values["limits.force_limit.value"] = 900.0
+    for key, value in values.items():
+        shown = json.dumps(value)
+        digits = [place for place, one in enumerate(shown) if one.isdigit()]
+        section = text.index(f'"{key.split(".")[1]}"', text.index(f'"{key.split(".")[0]}"'))
+        at = text.index(f'"value": {shown}', section) + len('"value": ')
+        for place in digits:
+            digit = int(shown[place])
+            new = shown[:place] + str(digit - 1 if digit == 9 else digit + 1) + shown[place + 1 :]
+            (folder / "gains.json").write_text(text[:at] + new + text[at + len(shown) :])
+            good, out = run_selftest(folder)
+            found = json.dumps(json.loads(new))
+            assert not good
+            assert f"FAIL  gains.json: {key}: found {found}, expected {shown}" in out, out
+            assert f"line {text.count(chr(10), 0, at) + 1}: differs" in out
+
+
+def test_a_changed_command_is_named_with_what_the_controller_commands(files, folder):
+    lines = files["vectors.csv"].decode().split("\n")
+    force = selftest.COLUMNS.split(",").index("force_command")
+    number = next(n for n, line in enumerate(lines[1:], start=1) if float(line.split(",")[force]) > 1)
+    fields = lines[number].split(",")
+    expected = fields[force]
+    fields[force] = expected[:-1] + str((int(expected[-1]) + 5) % 10)
+    lines[number] = ",".join(fields)
+    stated = repr(float(fields[force]))
+    assert stated != expected
+    (folder / "vectors.csv").write_text("\n".join(lines))
+    good, out = run_selftest(folder)
+    assert not good
+    assert f"line {number + 1}: differs from what was exported" in out
+    assert f"line {number + 1}, run 0: force_command: found {expected}, expected {stated}" in out
+
+
+def test_vectors_are_replayed_even_if_every_file_fits_the_manifest(files, folder):
+    """What a wrong port of the controller would look like."""
+    document = json.loads(files["gains.json"])
+    runtime = files["jaxhil_runtime.py"]
+    for old, new in [(b"2.0 * lag - period", b"2.0 * lag + period"), (b"held = 0", b"held = 1")]:
+        if old not in runtime:
+            continue
+        wrong = signed({**files, "jaxhil_runtime.py": runtime.replace(old, new)}, document)
+        for name in ("jaxhil_runtime.py", "manifest.json"):
+            (folder / name).write_bytes(wrong[name])
+        good, out = run_selftest(folder)
+        assert not good and "ok    manifest.json" in out
+        assert re.search(r"FAIL  vectors.csv: line \d+, run \d+: force_command: found", out), out
+        assert re.search(r"FAIL  vectors.csv: \d+ of \d+ ticks differ", out)
+
+
+@pytest.mark.parametrize("share, good", [(1e-12, True), (3e-11, False)])
+def test_simulated_forces_are_met_to_a_fraction_of_their_range(files, folder, share, good):
+    document = json.loads(files["gains.json"])
+    rows = [line.split(",") for line in files["vectors.csv"].decode().split("\n")[1:-1]]
+    forces = [float(row[-1]) for row in rows if row[-1] != "nan"]
+    span = max(forces) - min(0.0, *forces)
+    tick = max(range(len(forces)), key=lambda index: forces[index] < 0.9 * max(forces) and forces[index])
+    rows[tick][-1] = repr(float(rows[tick][-1]) + share * span)
+    text = "\n".join([selftest.COLUMNS, *(",".join(row) for row in rows), ""])
+    for name, content in signed({**files, "vectors.csv": text.encode()}, document).items():
+        (folder / name).write_bytes(content)
+    found, out = run_selftest(folder)
+    assert found is good, out
+    assert good or f"FAIL  vectors.csv: line {tick + 2}: run 0: force" in out
+
+
+def test_bits_are_bits():
+    assert selftest.same_bits(float("nan"), -float("nan"))
+    assert not selftest.same_bits(0.0, -0.0)
+    assert not selftest.same_bits(0.1 + 0.2, 0.3)
+    assert not selftest.same_bits(float("nan"), 0.0)
+
+
+@pytest.mark.parametrize(
+    "name", ["gains.json", "vectors.csv", "jaxhil_runtime.py", "manifest.json", "gains.mat"]
+)
+@pytest.mark.parametrize(
+    "garbage", [b"", b"\x00\xff\xfe" * 999, b"[" * 100_000, b"{}", b"raise SystemExit(0)\n", None, "folder"]
+)
+def test_garbage_ends_in_one_line_a_check(folder, name, garbage):
+    (folder / name).unlink()
+    if garbage == "folder":
+        (folder / name).mkdir()
+    elif garbage is not None:
+        (folder / name).write_bytes(garbage)
+    good, out = run_selftest(folder)
+    assert not good and f"FAIL  {name}: " in out and "Traceback" not in out
+    assert all(re.match("self-test of|ok    |FAIL  |FAILED", line) for line in out.splitlines()), out
+
+
+def test_garbage_that_the_manifest_fits_is_told_too(files, folder):
+    document = json.loads(files["gains.json"])
+    for name, text, reason in [
+        ("jaxhil_runtime.py", "raise SystemExit(0)", "cannot be run: SystemExit"),
+        ("jaxhil_runtime.py", "x = (", "cannot be run: SyntaxError"),
+        ("jaxhil_runtime.py", "Controller = 3", "cannot be run: NameError"),
+        ("gains.json", "[]", "found a list"),
+        ("vectors.csv", "a,b\n", "unknown columns"),
+        ("vectors.csv", selftest.COLUMNS + "\n1,2,3\n", "line 2: not a row of 14 numbers"),
+        ("vectors.csv", selftest.COLUMNS + "\n" + "0," * 13 + "0\n", "line 2: event 0.0"),
+        ("vectors.csv", selftest.COLUMNS + "\n", "has no tick"),
+    ]:
+        for other, content in signed({**files, name: text.encode()}, document).items():
+            (folder / other).write_bytes(content)
+        good, out = run_selftest(folder)
+        assert not good and f"FAIL  {name}: " in out and reason in out, out
+
+
+def test_files_too_many_and_too_few_are_named(files, folder):
+    (folder / "other").mkdir()
+    (folder / "other" / "notes.txt").write_text("mine")
+    (folder / "__pycache__").mkdir()
+    (folder / "__pycache__" / "jaxhil_runtime.cpython-311.pyc").write_bytes(b"")
+    os.unlink(folder / "summary.html")
+    good, out = run_selftest(folder)
+    assert not good and out.count("FAIL  ") == 2
+    assert "FAIL  other/notes.txt: is no file of this bundle" in out
+    assert "FAIL  summary.html: cannot be read: No such file or directory" in out
+
+
+def test_other_line_endings_are_told_as_such(files, folder):
+    (folder / "gains.csv").write_bytes(files["gains.csv"].replace(b"\n", b"\r\n"))
+    good, out = run_selftest(folder)
+    assert not good and "FAIL  gains.csv: its line endings differ from those exported" in out
+
+
+def test_words_it_does_not_know_are_refused(folder):
+    code, out, err = in_a_bare_process(folder, "--fast")
+    assert (code, out, err) == (1, "", "usage: python selftest.py [--c]\n")
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_c_controller_is_compiled_and_run(files, folder, monkeypatch):
+    good, out = run_selftest(folder, "--c")
+    assert good and re.search(rf"ok    c99: vectors.csv: {TICKS + 60} ticks, the same bit for bit", out), out
+    document = json.loads(files["gains.json"])
+    header = files["c99/jaxhil_gains.h"].decode()
+    value = re.search(r"[0-9]\.[0-9]+(e-[0-9]+)?", header)[0]
+    for old, new, reason in [
+        (value, str(2 * float(value)), r"FAIL  c99: vectors.csv:\d+: force_command: found"),
+        ("#define", "#defin", "FAIL  c99: .*error"),
+    ]:
+        wrong = signed({**files, "c99/jaxhil_gains.h": header.replace(old, new, 1).encode()}, document)
+        for name, content in wrong.items():
+            (folder / name).write_bytes(content)
+        good, out = run_selftest(folder, "--c")
+        assert not good and re.search(reason, out), out
+    (folder / "c99" / "jaxhil_controller.h").write_bytes(b"")
+    assert "FAIL  c99: differs or is not here, so it is not compiled" in run_selftest(folder, "--c")[1]
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    monkeypatch.setenv("PATH", "")
+    good, out = run_selftest(folder, "--c")
+    assert not good and "no C compiler is here" in out

@@ -1,0 +1,177 @@
+"""The runtime in one file does what the package does, whatever the package grows into."""
+
+import importlib
+import json
+import math
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from gain_documents import gain_document
+
+from jaxhil.runtime import COMPENSATORS, Controller
+from tuning.rig.single_file import runtime_source
+
+
+@pytest.fixture(scope="module", params=sorted(COMPENSATORS))
+def exported(request, tmp_path_factory):
+    """A folder with the runtime for one compensator in one file, beside a gain file of it."""
+    folder = tmp_path_factory.mktemp("single")
+    (folder / "jaxhil_runtime.py").write_text(runtime_source(request.param))
+    (folder / "gains.json").write_text(json.dumps(gain_document(request.param)))
+    return request.param, folder
+
+
+def loaded(folder):
+    namespace = {"__name__": "jaxhil_runtime"}
+    exec(compile((folder / "jaxhil_runtime.py").read_text(), "jaxhil_runtime.py", "exec"), namespace)
+    return namespace
+
+
+def test_holds_one_law_and_nothing_beside_the_standard_library(exported):
+    compensator, folder = exported
+    program = (
+        "import sys; sys.path.insert(0, sys.argv[1]); import jaxhil_runtime as runtime\n"
+        "print(*runtime.COMPENSATORS); runtime.Controller.from_file(sys.argv[1] + '/gains.json')\n"
+        "assert not {'jax', 'numpy', 'jaxhil', 'tuning'} & {name.split('.')[0] for name in sys.modules}"
+    )
+    command = [sys.executable, "-I", "-S", "-c", program, str(folder)]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stdout.split(), ran.stderr) == (0, [compensator], "")
+
+
+def test_has_no_name_too_many_or_too_few(exported):
+    _, folder = exported
+    command = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F,E9", str(folder)]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stdout
+
+
+def test_commands_are_the_package_s_to_the_bit(exported):
+    compensator, folder = exported
+    document = gain_document(compensator)
+    ours, other = Controller.from_dict(document), loaded(folder)["Controller"].from_dict(document)
+    source = random.Random(1)
+    for tick in range(400):
+        position = 2e-3 * math.sin(0.02 * tick)
+        inputs = (
+            max(0.0, 1e5 * position) + source.gauss(0, 1),
+            position,
+            0.04,
+            position + 1e-6 * source.random(),
+        )
+        assert other.step(*inputs) == ours.step(*inputs)
+        motion = position, 0.04, source.gauss(0, 1)
+        assert other.position_command(*motion) == ours.position_command(*motion)
+    assert other.identified == ours.identified
+
+
+def test_keeps_comments_and_says_what_each_part_is(exported):
+    _, folder = exported
+    text = (folder / "jaxhil_runtime.py").read_text()
+    assert "# ---- controller ---" in text
+    assert "# bool is an int to Python" in text
+    assert "from ." not in text and "\nimport jax" not in text
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """Make a package of the given modules, in which two laws are registered, and import it."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def make(**modules):
+        name = f"runtime_{tmp_path.name.replace('-', '_')}"
+        folder = tmp_path / name
+        folder.mkdir()
+        for module, text in {**MODULES, **modules}.items():
+            (folder / f"{module}.py").write_text(text)
+        return importlib.import_module(name)
+
+    yield make
+    for name in [name for name in sys.modules if name.startswith("runtime_")]:
+        del sys.modules[name]
+
+
+MODULES = {
+    "__init__": (
+        "from . import first, second\nfrom .controller import Controller\n"
+        "from .registry import COMPENSATORS\n__all__ = ['COMPENSATORS', 'Controller', 'first', 'second']\n"
+    ),
+    "registry": (
+        "COMPENSATORS = {}\n\ndef register(name):\n    def enter(law):\n        COMPENSATORS[name] = law\n"
+        "        return law\n    return enter\n"
+    ),
+    "first": "from .registry import register\n\n@register('first')\nclass First:\n    number = 1\n",
+    "second": "from .registry import register\n\n@register('second')\nclass Second:\n    number = 2\n",
+    "controller": "from .registry import COMPENSATORS\n\nclass Controller:\n    laws = COMPENSATORS\n",
+}
+
+
+def run_source(text):
+    namespace = {"__name__": "single"}
+    exec(compile(text, "single", "exec"), namespace)
+    return namespace
+
+
+def test_equal_names_of_two_modules_stay_apart(package):
+    made = package(
+        faults="import math as m\nfrom math import floor\nLIMIT = 3\n\ndef _number(value):\n"
+        "    # LIMIT stays in comments, and in 'LIMIT'.\n    return f'{LIMIT + floor(value)} {m.inf}'\n",
+        controller=(
+            "import cmath as m\nfrom . import faults\nfrom .faults import LIMIT as MOST, _number as other\n"
+            "from .registry import COMPENSATORS\n\nLIMIT = 5\n\ndef floor(value):\n    return LIMIT\n\n"
+            "def _number(LIMIT, floor=lambda LIMIT: LIMIT):\n    total = [LIMIT for LIMIT in range(LIMIT)]\n"
+            "    return total, floor(LIMIT)\n\nclass Controller:\n    LIMIT = 7\n    laws = COMPENSATORS\n\n"
+            "    def answers(self):\n        return (LIMIT, MOST, faults.LIMIT, faults._number(2.5), "
+            "other(1), _number(2), floor(1), f'{_number(LIMIT=1)} {LIMIT!r}', m.phase(1))\n"
+        ),
+    )
+    text = runtime_source("second", made)
+    made_of_it = run_source(text)
+    expected = (5, 3, 3, "5 inf", "4 inf", ([0, 1], 2), 5, "([0], 1) 5", 0.0)
+    assert made.Controller().answers() == expected
+    assert made_of_it["Controller"]().answers() == expected
+    assert made_of_it["Controller"].LIMIT == 7
+    assert [law.number for law in made_of_it["Controller"].laws.values()] == [2]
+    assert "# LIMIT stays in comments, and in 'LIMIT'." in text
+    assert "First" not in text and made_of_it["__all__"] == ["COMPENSATORS", "Controller"]
+
+
+def test_a_law_brings_along_what_it_imports(package):
+    made = package(
+        shared="SHARED = 4\n",
+        second="from .registry import register\nfrom .shared import SHARED\n\n@register('second')\n"
+        "class Second:\n    number = SHARED\n",
+    )
+    assert "SHARED" not in runtime_source("first", made)
+    assert run_source(runtime_source("second", made))["COMPENSATORS"]["second"].number == 4
+
+
+@pytest.mark.parametrize(
+    "controller, reason",
+    [
+        ("import scipy\n", "scipy"),
+        ("def f():\n    from .registry import COMPENSATORS\n", "within a block"),
+        ("from . import registry\nprint(registry)\n", "the module registry itself"),
+        ("from . import registry\nX = registry.NOTHING\n", "registry.NOTHING"),
+        ("from .circle import A\n", "import each other"),
+        (
+            "from .second import Second as enter\nSecond = 3\nclass A:\n    Second = Second\n",
+            "the class's own",
+        ),
+    ],
+)
+def test_what_cannot_be_in_one_file_is_refused(package, controller, reason):
+    made = package()
+    folder = Path(made.__file__).parent
+    (folder / "circle.py").write_text("from .controller import B\n")
+    (folder / "controller.py").write_text(controller + "class Controller: pass\n")
+    with pytest.raises(ValueError, match=reason):
+        runtime_source("first", made)
+
+
+def test_an_unknown_compensator_is_a_key_error():
+    with pytest.raises(KeyError):
+        runtime_source("no such law")

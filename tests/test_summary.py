@@ -1,0 +1,160 @@
+"""The summary holds every gain and limit, is one file, and says nothing that it does not know."""
+
+import base64
+import copy
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from bundles import document
+from matplotlib import image
+
+from jaxhil.runtime.limits import LIMITS
+from tuning.rig.bundle import with_limits
+from tuning.rig.summary import COLOURS, picture_png, summary_html
+
+FIGURES = {
+    "rms": 0.5, "p99": 1.25, "max": 1.5, "mean": 0.375, "diverging": 1.0, "peak_ratio": 1.75,
+    "chatter": 0.0, "failed": 3,
+}  # fmt: skip
+RATE = {"runs": 5000, "alarms": 0, "rate": 0.0, "low": 0.0, "high": 0.00073}
+RATES = {
+    "limit": 0.01,
+    "false_alarms": RATE,
+    "missed_alarms": {**RATE, "runs": 40, "alarms": 2, "high": 0.17},
+}
+
+
+def full_document():
+    made = copy.deepcopy(document("varying", "response_error"))
+    one = {name: {**FIGURES, "rms": 0.5 / 10**place} for place, name in enumerate(COLOURS)}
+    made["figures"] = {"nominal": one, "robust": one, "tuned_intervals": {}}
+    made["envelope"] = {
+        "contact_frequency": {"low": 1.625, "high": 6.5, "unit": "Hz"},
+        "delay": {"low": 0.0045, "high": 0.0056, "unit": "s"},
+        "approach_velocity": {"low": 0.005, "high": 0.005, "unit": "m/s"},
+        "force": {"low": 15.0, "high": 83.0, "unit": "N"},
+    }
+    # Values that stand for themselves, and some limits that are none.
+    limits = {name: None if place % 7 == 3 else 1.5 + place for place, name in enumerate(LIMITS)}
+    return with_limits(made, limits, RATES)
+
+
+class Page(HTMLParser):
+    """The page's text, its tags in balance, and what it refers to."""
+
+    def __init__(self, content):
+        super().__init__()
+        self.open, self.references, self.texts, self.rows = [], [], [], []
+        self.feed(content.decode("utf-8"))
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        self.references += [value for name, value in attributes if name in ("src", "href")]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open[-1:] in (["td"], ["th"]):
+            self.rows[-1].append(data)
+        self.texts.append(data)
+
+
+@pytest.fixture(scope="module")
+def made():
+    return full_document()
+
+
+@pytest.fixture(scope="module")
+def page(made):
+    return Page(summary_html(made))
+
+
+def test_every_gain_has_a_row_with_its_unit(made, page):
+    rows = {row[0]: row for row in page.rows if row}
+    for name, one in made["gains"].items():
+        assert float(rows[name][1]) == pytest.approx(one["value"], rel=1e-5) and rows[name][2] == one["unit"]
+
+
+def test_every_limit_is_there_or_said_not_to_be(made, page):
+    rows = {row[0]: row for row in page.rows if row}
+    text = " ".join(page.texts)
+    unset = re.search(r"Not limited: ([^.]*)\.", text)[1].split(", ")
+    for name, one in made["limits"].items():
+        if one["value"] is None:
+            assert name in unset
+        elif name in rows:
+            assert (float(rows[name][1]), rows[name][2]) == (one["value"], one["unit"])
+        else:
+            assert name.startswith(("expected_", "softness_", "speed_", "loss_", "reference_")), name
+    assert {"force_limit", "restitution_margin"} <= {*rows} | {*unset}
+
+
+def test_says_what_for_how_good_and_how_sure(made, page):
+    text = " ".join(page.texts)
+    for part in (
+        *(
+            "varying: compensator response_error",
+            made["sha256"],
+            made["created"],
+            "numpy",
+            "350 kg at 5 mm/s",
+        ),
+        "False alarms 0 of 5000 good runs (95 %: 0 to 0.00073)",
+        "missed alarms 2 of 40 runs to be stopped",
+    ):
+        assert part in text, part
+    rows = {row[0]: row for row in page.rows if row}
+    assert rows["tuned"][1:] == ["0.005", "1.25", "1.5", "0.375", "1.75", "3"]
+
+
+def test_stands_alone_and_is_the_same_twice(made, page):
+    assert len(page.references) == 1 and page.references[0].startswith("data:image/png;base64,")
+    assert summary_html(made) == summary_html(made)
+    content = summary_html(made).decode()
+    assert "http" not in content and "@page { size: A4" in content
+
+
+def test_the_picture_is_one(made, page, tmp_path):
+    content = base64.b64decode(page.references[0].partition(",")[2])
+    assert content == picture_png(made)
+    (tmp_path / "picture.png").write_bytes(content)
+    pixels = image.imread(tmp_path / "picture.png")[..., :3]
+    assert pixels.shape[1] > 1000 and pixels.shape[1] / pixels.shape[0] > 2.5
+    for colour in COLOURS.values():
+        wanted = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+        assert np.sum(np.all(np.abs(pixels - wanted) < 0.02, axis=-1)) > 100, colour
+    # Nothing touches the picture's edge.
+    edges = [pixels[:3], pixels[-3:], pixels[:, :3], pixels[:, -3:]]
+    assert all(np.all(edge == 1.0) for edge in edges)
+
+
+def test_rows_fit_on_one_sheet(page):
+    # A4 less margins is 275 mm: 3.7 mm a row in the longer column, 110 mm for heading, picture and figures.
+    limits = [row for row in page.rows if len(row) == 3]
+    gains = [row for row in page.rows if len(row) == 4]
+    assert 3.7 * max(len(limits), len(gains)) + 110 + 20 < 275
+
+
+def test_a_name_is_text_and_no_markup(made):
+    hostile = {**made, "mechanism": {**made["mechanism"], "name": "<script>alert('$x_1')</script>\n&"}}
+    content = summary_html(hostile)
+    assert b"<script" not in content and b"&lt;script&gt;" in content
+    Page(content)
+
+
+def test_what_is_not_known_is_not_made_up():
+    bare = document("rattling", "none")
+    text = " ".join(Page(summary_html(bare)).texts)
+    assert "None: the measured force is passed on." in text
+    assert "None: only what is not finite trips the controller." in text
+    assert "holds no figures" in text
+    unknown = with_limits(bare, {"force_limit": 1.0})
+    assert "Rates of false and missed alarms are not known." in " ".join(Page(summary_html(unknown)).texts)

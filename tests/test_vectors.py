@@ -1,0 +1,156 @@
+"""Test vectors: what the simulation read, as the runtime answers it; and hostile ticks of every kind."""
+
+import csv
+import io
+import itertools
+import math
+import struct
+
+import numpy as np
+import pytest
+from bundles import document
+
+from jaxhil.runtime import Controller
+from jaxhil.runtime.gain_file import check_gain_document
+from tuning.gain_file import check_document
+from tuning.recording import nominal_and_draws, record_lanes
+from tuning.rig import selftest
+from tuning.rig.bundle import with_limits
+from tuning.rig.vectors import BEGINS, NEXT_CONTACT, Row, as_csv, make_vectors, one_rig
+
+LIMITS = {"held_readings": 3.0, "missed_in_a_row": 3.0, "limited_in_a_row": 3.0, "force_limit": 500.0}
+
+
+@pytest.fixture(scope="module")
+def loaded():
+    made = document("varying", "response_error")
+    return check_document(with_limits(made, {**LIMITS, "velocity_limit": 0.1, "deceleration": 1.0}))
+
+
+@pytest.fixture(scope="module")
+def vectors(loaded):
+    return make_vectors(loaded, seed=3, draws=2)
+
+
+def runs_of(vectors):
+    runs = {}
+    for row in vectors.rows:
+        runs.setdefault(row.run, []).append(row)
+    return runs
+
+
+def test_columns_are_those_that_the_self_test_reads():
+    assert ",".join(Row._fields) == selftest.COLUMNS
+
+
+def test_recorded_runs_are_the_simulation_s_and_agree(loaded, vectors):
+    assert vectors.reasons == [] and vectors.ended == [None] * 3
+    _, lanes = record_lanes(loaded, nominal_and_draws(one_rig(loaded.mechanism), 3, 3))
+    runs = runs_of(vectors)
+    for number, lane in enumerate(lanes):
+        rows = runs[number]
+        assert len(rows) == len(lane.command) > 300
+        assert [row.force_measured for row in rows] == lane.signals.force_measured.tolist()
+        expected, found = lane.command, np.array([row.force_command for row in rows])
+        assert np.max(np.abs(found - expected)) <= 1e-13 * np.ptp(expected)
+        assert np.array([row.force_simulated for row in rows]) == pytest.approx(expected, rel=0, abs=0)
+        begins = np.flatnonzero(lane.signals.age == 0)
+        assert rows[0].event == BEGINS and [row.event for row in rows].count(BEGINS) == 1
+        assert [i for i, row in enumerate(rows) if row.event == NEXT_CONTACT] == begins[1:].tolist()
+        assert len(begins) == loaded.mechanism.approach.contacts == 3
+
+
+def test_the_model_moves_as_it_does_in_the_simulation(vectors):
+    """Position and velocity after a tick are what the next tick's are, but for rounding."""
+    for rows in list(runs_of(vectors).values())[:3]:
+        for row, following in itertools.pairwise(rows):
+            if following.event == 0:
+                assert row.position == pytest.approx(following.position_desired, rel=1e-9, abs=1e-13)
+                assert row.velocity == pytest.approx(following.velocity_desired, rel=1e-9, abs=1e-13)
+        assert [row.time for row in rows] == [tick * 0.001 for tick in range(len(rows))]
+
+
+def test_draws_differ_and_the_seed_decides(loaded, vectors):
+    runs = runs_of(vectors)
+    first = [rows[60].force_measured for rows in list(runs.values())[:3]]
+    assert len({*first}) == 3
+    again = make_vectors(loaded, seed=3, draws=2)
+    assert as_csv(again.rows) == as_csv(vectors.rows)
+    other = make_vectors(loaded, seed=4, draws=2)
+    assert as_csv(other.rows) != as_csv(vectors.rows)
+
+
+def test_hostile_runs_hold_every_kind_of_damage(vectors):
+    rows = [row for row in vectors.rows if row.run > 2]
+    inputs = [value for row in rows for value in row[2:10] if value is not None]
+    assert any(math.isnan(value) for value in inputs) and {math.inf, -math.inf} <= {*inputs}
+    assert {1e308, 5e-324} <= {abs(value) for value in inputs}
+    assert any(row.time is None for row in rows) and any(row.event == NEXT_CONTACT for row in rows)
+    seen = 0
+    for row in rows:
+        seen |= row.faults
+    # Not finite: force, position, model; missed tick, clock; limits of force and velocity.
+    for bit in (0x1, 0x2, 0x4, 0x200, 0x400, 0x800, 0x4000):
+        assert seen & bit, hex(bit)
+    assert all(math.isfinite(row.force_command) and math.isfinite(row.position_command) for row in rows)
+    assert all(math.isnan(row.force_simulated) for row in rows)
+
+
+def test_every_row_is_replayed_to_the_bit_by_a_fresh_controller(loaded, vectors):
+    gain_file = check_gain_document(loaded.document)
+    controller = None
+    for row in vectors.rows:
+        if row.event == BEGINS:
+            controller = Controller(gain_file)
+        elif row.event == NEXT_CONTACT:
+            controller.next_contact()
+        force = controller.step(*row[2:7])
+        position = controller.position_command(*row[7:10])
+        assert (force, position, controller.faults) == (row.force_command, row.position_command, row.faults)
+
+
+def test_the_text_gives_back_the_same_bits(vectors):
+    rows = list(csv.reader(io.StringIO(as_csv(vectors.rows))))[1:]
+    for row, fields in zip(vectors.rows, rows, strict=True):
+        for value, field in zip(row, fields, strict=True):
+            if value is None:
+                assert field == ""
+            elif value == value:
+                assert struct.pack("<d", float(field)) == struct.pack("<d", value)
+            else:
+                assert field == "nan"
+
+
+def test_where_a_guard_acts_nothing_is_compared(loaded):
+    tight = check_document(with_limits(loaded.document, {"force_limit": 20.0}))
+    found = make_vectors(tight, seed=3, draws=2)
+    assert found.reasons == []
+    end = next(i for i, row in enumerate(found.rows) if row.faults)
+    assert found.ended[0] == f"tick {end}: a guard acted (faults 0x800)"
+    nominal = [row for row in found.rows if row.run == 0]
+    assert all(math.isnan(row.force_simulated) for row in nominal[end:])
+    assert not any(math.isnan(row.force_simulated) for row in found.rows[:end])
+
+
+def test_a_runtime_that_differs_is_told(loaded, monkeypatch):
+    step = Controller.step
+    monkeypatch.setattr(Controller, "step", lambda self, *inputs: step(self, *inputs) * (1 + 1e-9))
+    found = make_vectors(loaded, seed=3, draws=2)
+    assert len(found.reasons) == 3 and found.reasons[0].startswith("the nominal run, tick ")
+    assert "allowed 1e-11" in found.reasons[1] and found.reasons[1].startswith("draw 1, ")
+
+
+def test_a_noisy_biased_rig_agrees_too():
+    """Its loop takes the first tick's force as none, whatever the sensor reads: that tick is not compared."""
+    rough = ("rig.force_sensor.noise_std=0.5", "rig.force_sensor.bias=0.3", "rig.command_latency=1")
+    found = make_vectors(check_document(document("claw-350kg", "phase_lead", rough)), seed=0, draws=1)
+    assert found.reasons == [] and found.ended == [None, None]
+    assert math.isnan(found.rows[0].force_simulated) and found.rows[0].force_command != 0
+    assert found.rows[0].acceleration == 0
+    assert not math.isnan(found.rows[1].force_simulated)
+
+
+def test_no_draw_changes_what_the_gain_file_says(loaded):
+    uncertain = one_rig(loaded.mechanism).uncertainty
+    assert "rig.control_period" not in uncertain and "contact.clearance" not in uncertain
+    assert uncertain.keys() <= loaded.mechanism.uncertainty.keys()

@@ -1,0 +1,194 @@
+"""What each writer writes is read back by an independent reader to the same bits."""
+
+import copy
+import csv
+import io
+import json
+import math
+import re
+import struct
+
+import pytest
+from gain_documents import gain_document, sign
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from ruamel.yaml import YAML
+from scipy.io import loadmat
+
+from jaxhil.errors import InputError
+from jaxhil.runtime import COMPENSATORS
+from jaxhil.runtime.limits import LIMITS
+from tuning.rig.writers import csv_table, gain_entries, limit_entries, matlab, ros2_yaml
+
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+AWKWARD = [5e-324, -0.0, 1e16, 1e22, 1e-5, 123456789012345680.0, 1.7976931348623157e308, 0.1 + 0.2]
+
+
+def bits(value):
+    assert type(value) is float
+    return struct.pack("<d", value)
+
+
+def document(values, limits):
+    """A document whose gains have these values, whatever a compensator would say of them."""
+    made = copy.deepcopy(gain_document("response_error"))
+    for name, value in zip(made["gains"], values, strict=True):
+        made["gains"][name]["value"] = value
+    made["limits"] = {
+        name: {"value": value, "unit": LIMITS[name].unit} for name, value in zip(LIMITS, limits, strict=False)
+    }
+    return sign(made)
+
+
+documents = st.builds(
+    document,
+    st.lists(FINITE | st.sampled_from(AWKWARD), min_size=12, max_size=12),
+    st.lists(st.none() | FINITE | st.sampled_from(AWKWARD), max_size=len(LIMITS)),
+)
+writer_test = settings(max_examples=40)
+
+
+@writer_test
+@given(documents)
+def test_ros2_parameters(made):
+    text = ros2_yaml(made)["ros2.yaml"].decode("ascii")
+    tree = YAML(typ="safe", pure=True).load(text)
+    assert list(tree) == ["/jaxhil_controller"] and list(tree["/jaxhil_controller"]) == ["ros__parameters"]
+    found = tree["/jaxhil_controller"]["ros__parameters"]
+    for section, entries in (("gains", gain_entries(made)), ("limits", limit_entries(made))):
+        assert list(found.get(section, {})) == list(entries)
+        for name, one in entries.items():
+            assert bits(found[section][name]) == bits(one.value)
+            assert found["units"][section][name] == one.unit
+    assert bits(found["control_period"]) == bits(0.001)
+    assert (found["compensator"], found["sha256"]) == ("response_error", made["sha256"])
+
+
+@writer_test
+@given(documents)
+def test_every_number_is_a_double_to_ros2_and_every_text_a_text(made):
+    """By the letter, as ROS 2's parser goes: a decimal point or .inf makes a double, quotes make a string."""
+    sections = []
+    for line in ros2_yaml(made)["ros2.yaml"].decode().splitlines()[3:]:
+        indent, name, value = re.fullmatch(r"( +)([A-Za-z_][A-Za-z0-9_]*):(?: (\S.*))?", line).groups()
+        sections[len(indent) // 2 - 2 :] = [name]
+        if value is None:
+            continue
+        is_text = sections[0] in ("compensator", "mechanism", "sha256", "units")
+        expected = r'"[^"]*"' if is_text else r"-?(\d+\.\d*([eE][-+]\d+)?|\.inf)"
+        assert re.fullmatch(expected, value), line
+
+
+def test_texts_that_look_like_numbers_stay_texts():
+    made = gain_document("none")
+    made["mechanism"]["name"] = "1e3"
+    made["sha256"] = "1234e5"
+    found = YAML(typ="safe", pure=True).load(ros2_yaml(made)["ros2.yaml"])["/jaxhil_controller"][
+        "ros__parameters"
+    ]
+    assert (found["mechanism"], found["sha256"]) == ("1e3", "1234e5")
+    # ROS 2 refuses an empty table.
+    assert "gains" not in found and "limits" not in found
+
+
+@writer_test
+@given(documents)
+def test_matlab_struct(made):
+    files = matlab(made)
+    assert files == matlab(made)
+    found = loadmat(io.BytesIO(files["gains.mat"]), simplify_cells=True)["jaxhil"]
+    for name, one in gain_entries(made).items():
+        entry = found["gains"][name]
+        for key in ("value", "lower", "upper"):
+            assert bits(float(entry[key])) == bits(getattr(one, key))
+        assert entry["unit"] == one.unit
+    for name, one in limit_entries(made).items():
+        assert bits(float(found["limits"][name]["value"])) == bits(one.value)
+        assert found["limits"][name]["unit"] == one.unit
+    assert (found["compensator"], found["sha256"]) == ("response_error", made["sha256"])
+    assert found["control_period"] == 0.001
+
+
+def mat_elements(content):
+    """(type, bytes) of the elements of MATLAB's level 5 format, as its published description has them."""
+    place = 0
+    while place < len(content):
+        kind, size = struct.unpack_from("<II", content, place)
+        if kind >> 16:  # a small element: size and type in one word
+            yield kind & 0xFFFF, content[place + 4 : place + 4 + (kind >> 16)]
+            place += 8
+        else:
+            yield kind, content[place + 8 : place + 8 + size]
+            place += 8 + size + (-size % 8)
+
+
+def mat_value(content):
+    """The value of a matrix element: a struct of one element, a text, or a matrix of doubles."""
+    parts = list(mat_elements(content))
+    kind = parts[0][1][0]
+    if kind == 2:
+        width = struct.unpack("<i", parts[3][1])[0]
+        names = [
+            parts[4][1][i : i + width].split(b"\0")[0].decode() for i in range(0, len(parts[4][1]), width)
+        ]
+        return dict(zip(names, (mat_value(inner) for _, inner in parts[5:]), strict=True))
+    if kind == 4:
+        return parts[3][1].decode({4: "utf-16-le", 16: "utf-8", 2: "utf-8"}[parts[3][0]])
+    assert (kind, parts[3][0] if parts[3][1] else 9) == (6, 9)
+    return struct.unpack(f"<{len(parts[3][1]) // 8}d", parts[3][1])
+
+
+def test_matlab_struct_by_the_format_s_description():
+    made = document([*AWKWARD, 1.0, 2.0, 3.0, 4.0], [None, 2.5])
+    content = matlab(made)["gains.mat"]
+    assert content[124:128] == b"\x00\x01IM"
+    ((kind, matrix),) = mat_elements(content[128:])
+    found = mat_value(matrix)
+    assert kind == 14
+    assert list(found) == ["compensator", "control_period", "mechanism", "sha256", "gains", "limits"]
+    for name, one in gain_entries(made).items():
+        assert [bits(x) for x in found["gains"][name]["value"]] == [bits(one.value)]
+        assert found["gains"][name]["unit"] == one.unit
+    assert [one["value"] for one in found["limits"].values()] == [(math.inf,), (2.5,)]
+
+
+@writer_test
+@given(documents)
+def test_csv_table(made):
+    rows = list(csv.DictReader(io.StringIO(csv_table(made)["gains.csv"].decode("ascii"))))
+    found = {row["name"]: row for row in rows}
+    assert len(found) == len(rows)
+    for name, one in gain_entries(made).items():
+        for key in ("value", "lower", "upper"):
+            assert bits(float(found[name][key])) == bits(getattr(one, key))
+        assert found[name]["unit"] == one.unit
+    for name, one in limit_entries(made).items():
+        row = found[f"limits.{name}"]
+        assert bits(float(row["value"])) == bits(one.value) and row["unit"] == one.unit
+        assert row["lower"] == row["upper"] == ""
+    assert bits(float(found["control_period"]["value"])) == bits(0.001)
+
+
+@pytest.mark.parametrize("compensator", sorted(COMPENSATORS))
+def test_every_compensator_is_written(compensator):
+    made = gain_document(compensator)
+    text = ros2_yaml(made)["ros2.yaml"]
+    found = YAML(typ="safe", pure=True).load(text)["/jaxhil_controller"]["ros__parameters"]
+    values = {name: one["value"] for name, one in made["gains"].items()}
+    assert found.get("gains", {}) == values
+    mat = loadmat(io.BytesIO(matlab(made)["gains.mat"]), simplify_cells=True)["jaxhil"]
+    assert {name: mat["gains"][name]["value"] for name in values} == values
+
+
+def test_no_limit_is_what_the_runtime_takes_it_for():
+    made = document([1.0] * 12, [None] * len(LIMITS))
+    assert {name: one.value for name, one in limit_entries(made).items()} == {
+        name: one.default for name, one in LIMITS.items()
+    }
+
+
+def test_a_name_too_long_for_matlab_is_refused():
+    made = json.loads(json.dumps(gain_document("phase_lead")))
+    made["gains"]["g" * 64] = made["gains"].pop("phase_lead")
+    with pytest.raises(InputError, match="found 64 characters, allowed 63"):
+        matlab(made)

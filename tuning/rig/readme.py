@@ -1,0 +1,54 @@
+"""A bundle's README: the text in `bundle_readme.md`, filled with what this bundle is and holds."""
+
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from jaxhil.runtime.faults import FAULTS
+
+from jaxhil.errors import one_line
+
+TEMPLATE = Path(__file__).parent / "bundle_readme.md"
+
+# What may be in a bundle, and for what.
+CONTENT = {
+    "gains.json": "the gains, their limits for the rig, and all that they were tuned for and over",
+    "jaxhil_runtime.py": "the controller, in Python without further packages",
+    "vectors.csv": "recorded and hostile ticks, and what the controller commands at each",
+    "selftest.py": "checks all files and replays the vectors",
+    "summary.html": "one page for people: gains, limits, what they reach, where they hold",
+    "udp_controller.py": "the controller as a process that answers a rig over UDP",
+    "c99": "the controller in C99, its gains, its test program",
+    "ros2.yaml": "the gains as ROS 2 parameters",
+    "gains.mat": "the gains for MATLAB",
+    "gains.csv": "the gains as a table",
+    "manifest.json": "what every file must be, line by line",
+}
+
+
+def readme_text(document: Mapping[str, Any], files: Collection[str]) -> str:
+    """The README of the bundle of a gain document that holds these files."""
+    present = {*(name.partition("/")[0] for name in files), "manifest.json"}
+    listed = [f"| `{name}` | {text} |" for name, text in CONTENT.items() if name in present]
+    return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
+        mechanism=_cell(one_line(document["mechanism"]["name"], 80)),
+        compensator=document["compensator"],
+        period=repr(document["control_period"]),
+        digest=document["sha256"],
+        content="\n".join(("| file | is |", "|---|---|", *listed)),
+        faults=fault_table(),
+    )
+
+
+def fault_table() -> str:
+    """The runtime's table of faults in Markdown: bit, name, when it is raised, what follows."""
+    rows = [
+        f"| `{fault.bit:#x}` | `{fault.name}` | {_cell(fault.condition)} | {_cell(fault.reaction)} |"
+        for fault in FAULTS
+    ]
+    return "\n".join(("| bit | fault | raised when | reaction |", "|---|---|---|---|", *rows))
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")
