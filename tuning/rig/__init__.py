@@ -1,0 +1,1 @@
+"""What leaves for the rig, and what stands in for a rig where there is none."""

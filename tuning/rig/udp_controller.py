@@ -1,0 +1,433 @@
+"""The controller as a process of its own: sensor packets in, position commands out, over UDP on loopback.
+
+    python -I udp_controller.py [--port 0] [--record ticks.json] [--empty] ...
+
+It runs from a bundle's folder with that bundle's `gains.json` and `jaxhil_runtime.py`; nothing else is needed.
+Standard output says `port NUMBER` once it listens. Whoever plays the rig sends
+
+    PREPARE  the mechanism is free: tare, then stand ready at the start of a run; repeated until READY
+    TICK     what the sensors read at tick n = 0, 1, ... of the run; answered by the command for tick n + 1
+    STOP     the session is over
+
+and a silent rig (`--silence`) ends it too. This process holds the numerical model: M x'' = -F_c, integrated
+once per period. Packets may be lost, late or out of order: one that is no newer than the last is dropped and
+counted, and periods that no packet came for are integrated under the last F_c, so that model time stays rig
+time. The controller sees the gap in the rig time that it is given.
+
+Its own time per tick (from the return of recv to that of send) and the CPU time in it are kept in arrays
+allocated beforehand and written at the end. With `--empty` it answers at once and computes nothing.
+"""
+
+import argparse
+import gc
+import json
+import math
+import select
+import socket
+import struct
+import sys
+import time
+from array import array
+from pathlib import Path
+from typing import Any, NamedTuple
+
+HERE = Path(__file__).resolve().parent
+# An isolated interpreter (-I) does not look beside the script.
+if (HERE / "jaxhil_runtime.py").is_file():
+    sys.path.insert(0, str(HERE))
+    from jaxhil_runtime import Controller  # pyright: ignore[reportMissingImports]
+else:
+    # Not in a bundle but in the source tree.
+    if not __package__:
+        sys.path.insert(0, str(HERE.parents[1]))
+    from jaxhil.runtime import Controller
+
+PREPARE, TICK, STOP = 1, 2, 3  # kinds of packets from the rig
+EVENTS = (PREPARE, TICK, STOP)
+READY, TRIPPED, TARING, EMPTY = 1, 2, 4, 8  # flags of an answer
+FLAGS = READY | TRIPPED | TARING | EMPTY
+
+# Little-endian: mark, version, kind, sequence, run, tick; time [s], force [N], position [m], start [m, m/s].
+READING = struct.Struct("<4sBBxxIIIxxxx5d")
+# Mark, version, flags, sequence, run, tick; positions, velocity, forces; faults; words on a trip.
+ANSWER = struct.Struct("<4sBBxxIII4xdddddQ96s")
+MARK_IN, MARK_OUT, VERSION = b"JHrd", b"JHan", 1
+
+APPROACH = 0.02  # s of free approach before a contact
+MOST_MADE_UP = 1000  # periods without a packet that the model is integrated through
+
+
+class PacketError(ValueError):
+    """Bytes that are no packet of this protocol."""
+
+
+class Reading(NamedTuple):
+    """From the rig: kind of packet, its number in the session, run, tick of the run; rig time [s]; measured
+    force [N] and position [m]; position [m] and velocity [m/s] of the numerical model at the run's tick 0."""
+
+    event: int
+    sequence: int
+    run: int
+    tick: int
+    time: float
+    force: float
+    position: float
+    start_position: float
+    start_velocity: float
+
+
+class Answer(NamedTuple):
+    """To the rig, about the reading of the same numbers: flags; position command [m] of the next tick (of
+    tick 0, while preparing) and its rate [m/s]; the model's position [m] and velocity [m/s] at this tick, and
+    the force F_c [N] it feels; the controller's faults; why it has tripped, if it has."""
+
+    flags: int
+    sequence: int
+    run: int
+    tick: int
+    position_command: float
+    command_rate: float
+    position: float
+    velocity: float
+    force_command: float
+    faults: int
+    words: str
+
+
+def encode_reading(reading: Reading) -> bytes:
+    """The packet of a reading."""
+    return READING.pack(MARK_IN, VERSION, *reading)
+
+
+def decode_reading(packet: bytes) -> Reading:
+    """The reading in a packet; sensor values may be anything, NaN included. Raises PacketError."""
+    if len(packet) != READING.size:
+        raise PacketError(f"{len(packet)} bytes, allowed {READING.size}")
+    mark, version, *fields = READING.unpack(packet)
+    reading = Reading(*fields)
+    if mark != MARK_IN or version != VERSION or reading.event not in EVENTS:
+        raise PacketError("not a packet from the rig of this version")
+    if not math.isfinite(reading.time):
+        raise PacketError("a time that is not finite")
+    return reading
+
+
+def encode_answer(answer: Answer) -> bytes:
+    """The packet of an answer; words are cut to 96 ASCII characters."""
+    words = answer.words.encode("ascii", "replace")
+    return ANSWER.pack(MARK_OUT, VERSION, *answer[:-1], words)
+
+
+def decode_answer(packet: bytes) -> Answer:
+    """The answer in a packet. Raises PacketError."""
+    if len(packet) != ANSWER.size:
+        raise PacketError(f"{len(packet)} bytes, allowed {ANSWER.size}")
+    mark, version, *fields, words = ANSWER.unpack(packet)
+    if mark != MARK_OUT or version != VERSION or fields[0] & ~FLAGS:
+        raise PacketError("not an answer of this version")
+    text = words.rstrip(b"\0")
+    if not all(32 <= byte < 127 for byte in text):
+        raise PacketError("words that are not printable")
+    return Answer(*fields, text.decode("ascii"))
+
+
+class NumericalModel:
+    """M x'' = -F_c of the relative motion of two free bodies, once per control period.
+
+    Mass [kg], period [s] and integrator are the mechanism's, which the gain file holds, and so is the first
+    start: in uniform motion at x(0) = -v (0.02 s + phase T).
+    """
+
+    __slots__ = ("_integrator", "_mass", "_period", "acceleration", "position", "start", "velocity")
+
+    def __init__(self, mechanism: dict[str, Any]) -> None:
+        bodies, rig, approach = mechanism["bodies"], mechanism["rig"], mechanism["approach"]
+        mass = bodies.get("equivalent_mass")
+        if mass is None:
+            chaser, target = bodies["chaser_mass"], bodies["target_mass"]
+            mass = chaser * (target / (chaser + target))
+        self._mass, self._period = float(mass), float(rig["control_period"])
+        self._integrator = rig.get("integrator", "semi_implicit_euler")
+        velocity = float(approach["velocity"])
+        phase = float(approach.get("phase", 1.0 / 3.0))
+        self.start = -velocity * (APPROACH + phase * self._period), velocity
+        self.place(*self.start)
+
+    def place(self, position: float, velocity: float) -> None:
+        """Uniform motion: position [m], velocity [m/s]."""
+        self.position, self.velocity, self.acceleration = position, velocity, 0.0
+
+    def integrate(self, force: float) -> None:
+        """One period under the force F_c [N]."""
+        period, velocity = self._period, self.velocity
+        acceleration = -force / self._mass
+        self.velocity = velocity + period * acceleration
+        self.acceleration = acceleration
+        if self._integrator == "zoh":
+            self.position += period * velocity + period * period * acceleration / 2.0
+        elif self._integrator == "explicit_euler":
+            self.position += period * velocity
+        else:
+            self.position += period * self.velocity
+
+
+class RuntimeGuards:
+    """What this process asks of the runtime's controller beside the law itself: tare, faults, trip."""
+
+    __slots__ = ("_controller", "_guarded", "_held")
+
+    def __init__(self, controller: Any) -> None:
+        self._controller = controller
+        self._guarded = hasattr(type(controller), "tare")
+        self._held: float | None = None
+
+    def tare(self, force: float) -> bool:
+        """Take in one reading of the free mechanism; whether that is enough."""
+        return bool(self._controller.tare(force)) if self._guarded else True
+
+    def faults(self) -> int:
+        """The faults of this tick, as bits."""
+        return int(self._controller.faults) if self._guarded else 0
+
+    def tripped(self) -> bool:
+        """Whether the controller has tripped."""
+        return bool(self._controller.tripped) if self._guarded else self._controller.status != "ok"
+
+    def position_command(self, model: NumericalModel) -> float:
+        """The position command [m]: after a trip, one that leaves contact and holds."""
+        command = self._controller.position_command(model.position, model.velocity, model.acceleration)
+        if self._guarded or not self.tripped():
+            self._held = command
+        # Without guards in the runtime, at least hold.
+        return command if self._held is None else self._held
+
+
+class Task:
+    """What is done with one packet, without a network: readings in, answers out."""
+
+    __slots__ = (
+        *("_answered", "_command", "_controller", "_force", "_guards", "_model", "_prepared", "_run"),
+        *("_sequence", "_tared", "_tick", "_words", "_zeroed", "made_up", "stale"),
+    )
+
+    def __init__(self, controller: Any, mechanism: dict[str, Any]) -> None:
+        self._controller, self._guards = controller, RuntimeGuards(controller)
+        self._model = NumericalModel(mechanism)
+        sensor = mechanism["rig"].get("force_sensor", {})
+        # Before tick 0 there is no force, though a noisy sensor reads some.
+        self._zeroed = sensor.get("noise_std", 0.0) != 0.0 or sensor.get("bias", 0.0) != 0.0
+        self._sequence, self._run, self._tick = -1, -1, -1
+        self._prepared, self._tared = -1, False
+        self._command = self._force = 0.0
+        self._answered: Answer | None = None
+        self._words = ""
+        self.stale = self.made_up = 0
+
+    @property
+    def status(self) -> str:
+        """What the controller says of itself."""
+        return str(self._controller.status)
+
+    def answer(self, reading: Reading) -> Answer | None:
+        """The answer to a reading, or None for one that comes too late to be of use."""
+        if reading.sequence <= self._sequence:
+            self.stale += 1
+            return None
+        self._sequence = reading.sequence
+        if reading.event == PREPARE:
+            return self._prepare(reading)
+        if reading.run != self._prepared:
+            # Ticks of a run that is over, or that was never prepared.
+            self.stale += 1
+            return None
+        return self._step(reading)
+
+    def _prepare(self, reading: Reading) -> Answer:
+        flags = 0
+        if reading.run != self._prepared:
+            if not self._tared:
+                self._tared = self._guards.tare(reading.force)
+            if not self._tared:
+                flags = TARING
+            else:
+                self._begin(reading)
+        if reading.run == self._prepared:
+            flags = READY
+        model = self._model
+        return self._reply(reading, flags, model.velocity, model.position, model.velocity)
+
+    def _begin(self, reading: Reading) -> None:
+        model, first = self._model, self._run < 0
+        if math.isfinite(reading.start_position) and math.isfinite(reading.start_velocity):
+            model.place(reading.start_position, reading.start_velocity)
+        else:
+            model.place(*model.start)
+        if not first:
+            self._controller.next_contact()
+        self._command = self._guards.position_command(model)
+        self._prepared = self._run = reading.run
+        self._tick, self._force = -1, 0.0
+
+    def _step(self, reading: Reading) -> Answer:
+        model = self._model
+        missed = reading.tick - self._tick - 1
+        if missed > 0:
+            # Model time is rig time: what was not commanded anew goes on as it was.
+            self.made_up += missed
+            for _ in range(min(missed, MOST_MADE_UP)):
+                model.integrate(self._force)
+        self._tick = reading.tick
+        position, velocity = model.position, model.velocity
+        force = self._controller.step(reading.force, position, velocity, reading.position, reading.time)
+        if self._zeroed and reading.tick == 0:
+            force = 0.0
+        self._force = force
+        model.integrate(force)
+        before = self._command
+        self._command = self._guards.position_command(model)
+        tripped = self._guards.tripped()
+        rate = 0.0 if tripped and self._command == before else model.velocity
+        return self._reply(reading, 0, rate, position, velocity, force)
+
+    def _reply(
+        self,
+        reading: Reading,
+        flags: int,
+        rate: float,
+        position: float = 0.0,
+        velocity: float = 0.0,
+        force: float = 0.0,
+    ) -> Answer:
+        if self._guards.tripped():
+            flags |= TRIPPED
+            self._words = self._words or self.status[:96]
+        _, sequence, run, tick, *_ = reading
+        faults = self._guards.faults()
+        return Answer(
+            *(flags, sequence, run, tick, self._command, rate, position, velocity, force, faults),
+            self._words,
+        )
+
+
+class Empty:
+    """An empty loop: every packet is answered, nothing is computed."""
+
+    stale = made_up = 0
+    status = "ok"
+
+    def answer(self, reading: Reading) -> Answer:
+        """Zeros, and the reading's own numbers."""
+        _, sequence, run, tick, *_ = reading
+        return Answer(EMPTY | READY, sequence, run, tick, 0.0, 0.0, 0.0, 0.0, 0.0, 0, "")
+
+
+class TickRecord:
+    """Sequence number, own time [ns] and CPU time [ns] of every tick, in arrays allocated beforehand."""
+
+    def __init__(self, capacity: int) -> None:
+        self.sequence, self.wall, self.cpu = (array("q", bytes(8 * capacity)) for _ in range(3))
+        self.count, self.capacity = 0, capacity
+
+    def add(self, sequence: int, wall: int, cpu: int) -> None:
+        """Keep one tick; what does not fit is not kept."""
+        count = self.count
+        if count < self.capacity:
+            self.sequence[count], self.wall[count], self.cpu[count] = sequence, wall, cpu
+            self.count = count + 1
+
+    def document(self) -> dict[str, list[int]]:
+        """As JSON can express it."""
+        return {name: list(getattr(self, name)[: self.count]) for name in ("sequence", "wall", "cpu")}
+
+
+def serve(receiver: socket.socket, task: Task | Empty, record: TickRecord, wait: float, silence: float) -> str:
+    """Answer packets until the rig stops or has been silent; returns which. Times in s.
+
+    Only the first peer that sends a packet of this protocol is answered.
+    """
+    packet = bytearray(READING.size + 1)
+    now, cpu_now, add = time.monotonic_ns, time.thread_time_ns, record.add
+    peer: Any = None
+    while True:
+        if not select.select([receiver], [], [], wait)[0]:
+            return "silent"
+        try:
+            size, sender = receiver.recvfrom_into(packet)
+        except OSError:
+            # A refusal that an earlier answer met: its addressee is gone.
+            continue
+        begun, cpu_begun = now(), cpu_now()
+        if peer is not None and sender != peer:
+            continue
+        try:
+            reading = decode_reading(packet[:size])
+        except PacketError:
+            continue
+        if peer is None:
+            peer, wait = sender, silence
+        if reading.event == STOP:
+            return "stopped"
+        answer = task.answer(reading)
+        if answer is None:
+            continue
+        try:
+            receiver.sendto(encode_answer(answer), peer)
+        except OSError:
+            continue
+        if reading.event == TICK:
+            add(reading.sequence, now() - begun, cpu_now() - cpu_begun)
+
+
+def parse(arguments: list[str] | None = None) -> argparse.Namespace:
+    """The process's options."""
+    parser = argparse.ArgumentParser(description="Answer a rig's sensor packets over UDP on loopback.")
+    parser.add_argument("--gains", default=str(HERE / "gains.json"), help="gain file; by default beside this")
+    parser.add_argument("--port", type=int, default=0, help="UDP port on 127.0.0.1; 0: any that is free")
+    parser.add_argument("--record", default=None, help="file for the time of every tick, as JSON")
+    parser.add_argument("--ticks", type=int, default=1_000_000, help="ticks to keep the time of")
+    parser.add_argument("--wait", type=float, default=30.0, help="s to wait for the first packet")
+    parser.add_argument("--silence", type=float, default=2.0, help="s without a packet that end the session")
+    parser.add_argument("--empty", action="store_true", help="answer at once, compute nothing")
+    return parser.parse_args(arguments)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Serve one session; 0 when it was ended by the rig, 1 by its silence, 2 for a file that does not fit."""
+    options = parse(arguments)
+    try:
+        if options.empty:
+            task: Task | Empty = Empty()
+        else:
+            controller = Controller.from_file(options.gains)
+            mechanism = json.loads(Path(options.gains).read_text(encoding="utf-8"))["mechanism"]
+            task = Task(controller, mechanism)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        print(f"udp_controller: {type(error).__name__}: {error}", file=sys.stderr)
+        return 2
+    record = TickRecord(max(options.ticks, 0))
+    # From here on nothing is made that a collector would have to look for.
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", options.port))
+        print(f"port {receiver.getsockname()[1]}", flush=True)
+        try:
+            ended = serve(receiver, task, record, options.wait, options.silence)
+        except KeyboardInterrupt:
+            ended = "interrupted"
+    document = {
+        "ended": ended,
+        "status": task.status,
+        "stale": task.stale,
+        "made_up": task.made_up,
+        "modules": sorted(name for name in ("jax", "numpy") if name in sys.modules),
+        "ticks": record.document(),
+    }
+    if options.record is not None:
+        Path(options.record).write_text(json.dumps(document), encoding="utf-8")
+    return 0 if ended == "stopped" else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
