@@ -11,8 +11,10 @@ Standard output says `port NUMBER` once it listens. Whoever plays the rig sends
 
 and a silent rig (`--silence`) ends it too. This process holds the numerical model: M x'' = -F_c, integrated
 once per period. Packets may be lost, late or out of order: one that is no newer than the last is dropped and
-counted, and periods that no packet came for are integrated under the last F_c, so that model time stays rig
-time. The controller sees the gap in the rig time that it is given.
+counted. Ticks that no packet came for are made up once the next one is there, from readings on the straight
+line between, and answered with the fault `missed_tick`. Where more are missing than the gain file's limit
+`missed_in_a_row` (without one, `MOST_MADE_UP`), the controller sees the gap in the rig's time and judges it,
+and the model goes on under the last F_c: its time stays the rig's.
 
 Its own time per tick (from the return of recv to that of send) and the CPU time in it are kept in arrays
 allocated beforehand and written at the end. With `--empty` it answers at once and computes nothing.
@@ -54,7 +56,9 @@ ANSWER = struct.Struct("<4sBBxxIII4xdddddQ96s")
 MARK_IN, MARK_OUT, VERSION = b"JHrd", b"JHan", 1
 
 APPROACH = 0.02  # s of free approach before a contact
-MOST_MADE_UP = 1000  # periods without a packet that the model is integrated through
+MOST_MADE_UP = 10  # ticks in a row, without a limit in the gain file
+MOST_PASSED = 10_000  # periods that the model goes on under the last force
+MISSED_TICK = 0x200  # the runtime's fault of this name
 
 
 class PacketError(ValueError):
@@ -203,23 +207,26 @@ class RuntimeGuards:
 
 
 class Task:
-    """What is done with one packet, without a network: readings in, answers out."""
+    """What is done with one packet, without a network: readings in, answers out.
+
+    `bridged`: how many missing ticks in a row are made up. Counts `made_up` and `stale`, packets of no use.
+    """
 
     __slots__ = (
-        *("_answered", "_command", "_controller", "_force", "_guards", "_model", "_prepared", "_run"),
-        *("_sequence", "_tared", "_tick", "_words", "_zeroed", "made_up", "stale"),
+        *("_bridged", "_command", "_controller", "_force", "_guards", "_last", "_model", "_period", "_run"),
+        *("_sequence", "_tared", "_words", "_zeroed", "made_up", "stale"),
     )
 
-    def __init__(self, controller: Any, mechanism: dict[str, Any]) -> None:
+    def __init__(self, controller: Any, mechanism: dict[str, Any], bridged: float = MOST_MADE_UP) -> None:
         self._controller, self._guards = controller, RuntimeGuards(controller)
-        self._model = NumericalModel(mechanism)
+        self._model, self._bridged = NumericalModel(mechanism), min(bridged, MOST_MADE_UP)
+        self._period = float(mechanism["rig"]["control_period"])
         sensor = mechanism["rig"].get("force_sensor", {})
         # Before tick 0 there is no force, though a noisy sensor reads some.
         self._zeroed = sensor.get("noise_std", 0.0) != 0.0 or sensor.get("bias", 0.0) != 0.0
-        self._sequence, self._run, self._tick = -1, -1, -1
-        self._prepared, self._tared = -1, False
+        self._sequence, self._run, self._tared = -1, -1, False
         self._command = self._force = 0.0
-        self._answered: Answer | None = None
+        self._last: Reading | None = None
         self._words = ""
         self.stale = self.made_up = 0
 
@@ -230,79 +237,88 @@ class Task:
 
     def answer(self, reading: Reading) -> Answer | None:
         """The answer to a reading, or None for one that comes too late to be of use."""
-        if reading.sequence <= self._sequence:
+        if reading.sequence <= self._sequence or (reading.event == TICK and reading.run != self._run):
             self.stale += 1
             return None
         self._sequence = reading.sequence
-        if reading.event == PREPARE:
-            return self._prepare(reading)
-        if reading.run != self._prepared:
-            # Ticks of a run that is over, or that was never prepared.
-            self.stale += 1
-            return None
-        return self._step(reading)
+        return self._prepare(reading) if reading.event == PREPARE else self._step(reading)
 
     def _prepare(self, reading: Reading) -> Answer:
-        flags = 0
-        if reading.run != self._prepared:
+        model = self._model
+        if reading.run != self._run:
             if not self._tared:
                 self._tared = self._guards.tare(reading.force)
             if not self._tared:
-                flags = TARING
-            else:
-                self._begin(reading)
-        if reading.run == self._prepared:
-            flags = READY
-        model = self._model
-        return self._reply(reading, flags, model.velocity, model.position, model.velocity)
+                return self._reply(reading, TARING, 0.0, model.position, model.velocity, 0.0, 0)
+            self._begin(reading)
+        return self._reply(reading, READY, model.velocity, model.position, model.velocity, 0.0, 0)
 
     def _begin(self, reading: Reading) -> None:
-        model, first = self._model, self._run < 0
+        model = self._model
         if math.isfinite(reading.start_position) and math.isfinite(reading.start_velocity):
             model.place(reading.start_position, reading.start_velocity)
         else:
             model.place(*model.start)
-        if not first:
+        if self._run >= 0:
             self._controller.next_contact()
         self._command = self._guards.position_command(model)
-        self._prepared = self._run = reading.run
-        self._tick, self._force = -1, 0.0
+        self._run, self._last, self._force = reading.run, None, 0.0
 
     def _step(self, reading: Reading) -> Answer:
-        model = self._model
-        missed = reading.tick - self._tick - 1
+        model, last = self._model, self._last
+        missed = reading.tick - (-1 if last is None else last.tick) - 1
+        faults = 0
         if missed > 0:
-            # Model time is rig time: what was not commanded anew goes on as it was.
-            self.made_up += missed
-            for _ in range(min(missed, MOST_MADE_UP)):
-                model.integrate(self._force)
-        self._tick = reading.tick
-        position, velocity = model.position, model.velocity
-        force = self._controller.step(reading.force, position, velocity, reading.position, reading.time)
-        if self._zeroed and reading.tick == 0:
-            force = 0.0
-        self._force = force
-        model.integrate(force)
-        before = self._command
+            faults = MISSED_TICK
+            if missed <= self._bridged:
+                self._make_up(missed, reading)
+            else:
+                for _ in range(min(missed, MOST_PASSED)):
+                    model.integrate(self._force)
+        position, velocity, before = model.position, model.velocity, self._command
+        faults |= self._tick(reading.tick, reading.force, reading.position, reading.time)
+        self._last = reading
+        # After a trip the command goes its own way.
+        rate = (self._command - before) / self._period if self._guards.tripped() else model.velocity
+        return self._reply(reading, 0, rate, position, velocity, self._force, faults)
+
+    def _make_up(self, missed: int, reading: Reading) -> None:
+        """The ticks between the last reading and this one, from readings on the line between them."""
+        self.made_up += missed
+        last = self._last
+        before = reading if last is None else last
+        for number in range(missed):
+            share = (number + 1) / (missed + 1)
+            force = before.force + share * (reading.force - before.force)
+            position = before.position + share * (reading.position - before.position)
+            tick = reading.tick - missed + number
+            self._tick(tick, force, position, reading.time - (missed - number) * self._period)
+
+    def _tick(self, tick: int, force: float, position: float, time: float) -> int:
+        """Controller and numerical model, one period further; the tick's faults."""
+        model = self._model
+        command = self._controller.step(force, model.position, model.velocity, position, time)
+        if self._zeroed and tick == 0:
+            command = 0.0
+        self._force = command
+        model.integrate(command)
         self._command = self._guards.position_command(model)
-        tripped = self._guards.tripped()
-        rate = 0.0 if tripped and self._command == before else model.velocity
-        return self._reply(reading, 0, rate, position, velocity, force)
+        return self._guards.faults()
 
     def _reply(
         self,
         reading: Reading,
         flags: int,
         rate: float,
-        position: float = 0.0,
-        velocity: float = 0.0,
-        force: float = 0.0,
+        position: float,
+        velocity: float,
+        force: float,
+        faults: int,
     ) -> Answer:
         if self._guards.tripped():
             flags |= TRIPPED
             self._words = self._words or self.status[:96]
         _, sequence, run, tick, *_ = reading
-        faults = self._guards.faults()
         return Answer(
             *(flags, sequence, run, tick, self._command, rate, position, velocity, force, faults),
             self._words,
@@ -399,8 +415,9 @@ def main(arguments: list[str] | None = None) -> int:
             task: Task | Empty = Empty()
         else:
             controller = Controller.from_file(options.gains)
-            mechanism = json.loads(Path(options.gains).read_text(encoding="utf-8"))["mechanism"]
-            task = Task(controller, mechanism)
+            document = json.loads(Path(options.gains).read_text(encoding="utf-8"))
+            limit = document.get("limits", {}).get("missed_in_a_row", {}).get("value")
+            task = Task(controller, document["mechanism"], MOST_MADE_UP if limit is None else limit)
     except (OSError, ValueError, KeyError, TypeError) as error:
         print(f"udp_controller: {type(error).__name__}: {error}", file=sys.stderr)
         return 2

@@ -19,12 +19,13 @@ PAUSE = 5  # ticks between two runs
 
 
 class Commanded(NamedTuple):
-    """Lowest and highest position command that reached the drives [m], and how many were not finite (and
-    never did); the largest |F_c| [N]."""
+    """Lowest and highest position command of the controller [m]; how many were not finite, and how many
+    beyond its limits (neither reach the drives); the largest |F_c| [N]."""
 
     lowest: float
     highest: float
     not_finite: int
+    beyond_limits: int
     largest_force: float
 
 
@@ -33,17 +34,22 @@ class RigTask:
 
     One-sided, every contact is a run of its own at the nominal approach speed; between two surfaces a run has
     as many contacts as the mechanism asks for. The lists of stiffness and damping are gone through again and
-    again; after the first round, each run meets its first surface at a phase of its own.
+    again; after the first round, each run meets its first surface at a phase of its own. `stroke`: the lowest
+    and highest position [m] that the drives take.
     """
 
-    def __init__(self, mechanism: Mechanism, seed: int = 0) -> None:
+    def __init__(
+        self, mechanism: Mechanism, seed: int = 0, stroke: tuple[float, float] = (-math.inf, math.inf)
+    ) -> None:
         self._mechanism, self._period = mechanism, mechanism.rig.control_period
         self._two_sided = math.isfinite(mechanism.contact.clearance)
         self._plant, self._watch = Plant(mechanism, seed), ContactWatch(mechanism)
         self._phases = Random(seed + 1)
         self._sequence, self._run = -1, 0
         self._contacts: list[ContactResult] = []
-        self._lowest, self._highest, self._largest, self._not_finite = math.inf, -math.inf, 0.0, 0
+        self._lowest, self._highest, self._largest = math.inf, -math.inf, 0.0
+        self._not_finite = self._beyond = 0
+        self._stroke = stroke
         self._newest: Answer | None = None
         self._words = ""
         self._next_run(0)
@@ -66,7 +72,7 @@ class RigTask:
     @property
     def commanded(self) -> Commanded:
         """What has been commanded so far."""
-        return Commanded(self._lowest, self._highest, self._not_finite, self._largest)
+        return Commanded(self._lowest, self._highest, self._not_finite, self._beyond, self._largest)
 
     def reading(self) -> Reading:
         """What to send at this tick; every call is another packet."""
@@ -90,10 +96,13 @@ class RigTask:
             return answer.sequence == self._sequence
         if answer.flags & READY:
             return False
-        if not (math.isfinite(answer.position_command) and math.isfinite(answer.command_rate)):
+        command, (low, high) = answer.position_command, self._stroke
+        if not all(map(math.isfinite, (command, answer.command_rate, answer.force_command))):
             self._not_finite += 1
         elif self._newest is None or answer.tick > self._newest.tick:
             self._newest = answer
+            self._beyond += not low <= command <= high
+            self._lowest, self._highest = min(self._lowest, command), max(self._highest, command)
             self._largest = max(self._largest, abs(answer.force_command))
         return answer.tick == self._tick
 
@@ -108,7 +117,7 @@ class RigTask:
         command = newest.position_command
         if late > 0:
             command += min(late, EXTRAPOLATED) * self._period * newest.command_rate
-        self._lowest, self._highest = min(self._lowest, command), max(self._highest, command)
+        command = min(max(command, self._stroke[0]), self._stroke[1])
         plant, watch = self._plant, self._watch
         if newest.tick >= 0:
             over = watch.observe(newest.position, newest.velocity, newest.force_command, plant.force)
