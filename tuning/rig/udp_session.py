@@ -1,16 +1,19 @@
 """A session: the controller's process, an empty loop for comparison, the run, and whose fault what was.
 
-A missed tick is the controller's if its process had more than `CPU_SHARE` of the period of CPU time for that
-tick, or if it follows such a tick without one in between that was met; else it is an injected fault's, if one
-hit its packets; else the machine's: the operating system ran something else.
+A missed tick is the controller's if its process took more than `CPU_SHARE` of the period of CPU time for that
+tick, live and when the same packets were gone through again, or if it follows such a tick without one in
+between that was met; else it is an injected fault's, if one hit its packets; else the machine's: the operating
+system, or another machine on the same processor, ran something else.
 """
 
 import json
 import math
+import os
 import select
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,14 +22,13 @@ import numpy as np
 from jaxhil.errors import InputError, one_line
 from jaxhil.mechanism import Mechanism
 from tuning.rig.contact_watch import ContactResult
-from tuning.rig.udp_controller import STOP, Reading, encode_reading
+from tuning.rig.udp_controller import CPU_SHARE, STOP, Reading, encode_reading, realtime
 from tuning.rig.udp_loop import ANSWER_SHARE, EmptyTask, Task, Timing, answered_by, play
 from tuning.rig.udp_network import Injection, Network
 from tuning.rig.udp_rig import Commanded, RigTask
 
-CPU_SHARE = 0.5  # of the period: the controller's
 STARTING = 30.0  # s in which the controller's process has to listen
-ENDING = 20.0  # s in which it has to end
+ENDING = 120.0  # s in which it has to end, going through its packets again included
 SILENCE = 2.0  # s without a packet, after which it ends by itself
 
 SOURCE = Path(__file__).parent
@@ -93,24 +95,29 @@ def run_session(
     seed: int,
     scratch: Path,
     say: Callable[[str], None],
+    real_time_priority: bool = False,
 ) -> SessionReport:
     """Play an empty loop, then the rig, against the controller of `folder` (a bundle, or `SOURCE`).
 
-    Durations in s; `scratch` is a folder for records; `stroke` [m] as in `RigTask`. Raises InputError when the
-    controller's process does not start.
+    Durations in s; `scratch` is a folder for records; `stroke` [m] as in `RigTask`; `real_time_priority` asks the system
+    for a real-time priority for both processes. Raises InputError when the controller's process does not
+    start.
     """
+    options = ("--realtime",) if real_time_priority else ()
     period, empty, run = mechanism.rig.control_period, None, None
     task = RigTask(mechanism, seed, stroke)
     interrupted = False
     try:
         if empty_duration >= period:
             say(f"empty loop, {empty_duration:g} s")
-            begun = _Loop(folder, gains, period, empty_duration, Injection(), seed, scratch, ("--empty",))
+            begun = _Loop(
+                folder, gains, period, empty_duration, Injection(), seed, scratch, ("--empty", *options)
+            )
             empty = begun.play(EmptyTask(), lambda: None)
             interrupted = begun.interrupted
         if not interrupted:
             say(f"{mechanism.name} at {1 / period:g} Hz, {duration:g} s")
-            begun = _Loop(folder, gains, period, duration, injection, seed, scratch, ())
+            begun = _Loop(folder, gains, period, duration, injection, seed, scratch, options)
             run = begun.play(task, lambda: None)
             interrupted = begun.interrupted
     except KeyboardInterrupt:
@@ -136,7 +143,7 @@ class _Loop:
         self._period, self._ticks = period, max(1, round(duration / period))
         self._record = scratch / f"ticks{''.join(options)}.json"
         self._injection, self._seed = injection, seed
-        self.interrupted = False
+        self.interrupted, self._realtime = False, "--realtime" in options
         silence = max(SILENCE, 100 * period)
         arguments = ["--gains", str(gains.resolve()), "--record", str(self._record)]
         arguments += ["--ticks", str(self._ticks), "--silence", str(silence), *options]
@@ -151,7 +158,8 @@ class _Loop:
             network = Network(("127.0.0.1", port), self._injection, self._seed, ticks, answered_by)
             timing = Timing(ticks)
             try:
-                play(task, network, period, timing, said)
+                with real_time(self._realtime):
+                    play(task, network, period, timing, said)
             except KeyboardInterrupt:
                 self.interrupted = True
             finally:
@@ -166,7 +174,9 @@ class _Loop:
         except (OSError, ValueError, subprocess.TimeoutExpired) as error:
             if isinstance(error, InputError):
                 raise
-            raise InputError(f"the controller's process did not end well: {one_line(str(error), 200)}") from None
+            raise InputError(
+                f"the controller's process did not end well: {one_line(str(error), 200)}"
+            ) from None
         finally:
             if process.poll() is None:
                 process.kill()
@@ -174,6 +184,20 @@ class _Loop:
             if process.stdout is not None:
                 process.stdout.close()
         return loop_report(timing, network, document, period)
+
+
+@contextmanager
+def real_time(wanted: bool) -> Iterator[None]:
+    """A real-time priority for this thread while it lasts. Raises OSError where that is not to be had."""
+    if not wanted:
+        yield
+        return
+    kind, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    realtime()
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, kind, parameters)
 
 
 def start_controller(folder: Path, arguments: Sequence[str]) -> subprocess.Popen:
@@ -204,13 +228,16 @@ def loop_report(timing: Timing, network: Network, controller: dict[str, Any], pe
     record = {name: np.array(values, np.int64) for name, values in controller.pop("ticks").items()}
     within = record["sequence"] < ticks
     wall, cpu = (1e-9 * record[name][within] for name in ("wall", "cpu"))
-    cpu_of = np.zeros(ticks)
-    cpu_of[record["sequence"][within]] = cpu
+    overspent = np.zeros(ticks, bool)
+    again = controller["replayed"]
+    for number, took in zip(again["sequence"], again["cpu"], strict=True):
+        if number < ticks and 1e-9 * took > CPU_SHARE * period:
+            overspent[number] = True
     met = np.array(timing.met[:ticks], bool)
     round_trip = 1e-9 * np.array(timing.round_trip[:ticks], float)
     held = 1e-9 * np.array(network.held_back[:ticks], float)
     lost = np.array(network.lost[:ticks], bool)
-    causes = attribute(met, cpu_of > CPU_SHARE * period, round_trip, held, lost, ANSWER_SHARE * period)
+    causes = attribute(met, overspent, round_trip, held, lost, ANSWER_SHARE * period)
     late = 1e-9 * np.array(timing.late[:ticks], float)
     trips = round_trip[round_trip > 0]
     figures = LoopFigures(
@@ -235,7 +262,7 @@ def attribute(
 ) -> np.ndarray:
     """Whose fault each missed tick is, (ticks,): `MET`, `CONTROLLER`, `INJECTED` or `MACHINE`.
 
-    `overspent`: the controller had more CPU time than its share; `round_trip` [s], 0 without an answer; `held`
+    `overspent`: the controller took more CPU time than its share; `round_trip` [s], 0 without an answer; `held`
     back by injection [s]; `lost` by it; `allowance` [s] for an answer. Injection is to blame for what was lost,
     for what would have come in time had it not been held back, and for what was held back and never answered
     (a newer packet overtook it).
@@ -256,5 +283,3 @@ def quantiles(values: np.ndarray) -> Quantiles:
     if not len(values):
         return Quantiles(math.nan, math.nan, math.nan)
     return Quantiles(*(float(value) for value in (*np.quantile(values, (0.5, 0.999)), np.max(values))))
-
-
