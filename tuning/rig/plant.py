@@ -1,9 +1,9 @@
 """A rig's hardware in plain floats: motion simulator, contact and sensors, one control period per call.
 
     plant = Plant(mechanism, seed=0)
-    plant.begin(position, velocity, command, number)      # a run of uniform motion, contact `number` ahead
-    force, position = plant.read()                        # what the sensors read at this tick
-    plant.move(command)                                   # the position command of the next tick; a period passes
+    plant.begin(position, velocity, command, number)  # a run of uniform motion, contact `number` ahead
+    force, position = plant.read()                    # what the sensors read at this tick
+    plant.move(command)                               # the position command of the next tick; a period passes
 
 The physics of `jaxhil.loop` stages 1, 4 and 5 without jax, fast enough for a loop in real time: linear parts
 are discretised exactly, once; delays are read at their places within a panel (`tuning.rig.propagation`), and

@@ -2,8 +2,8 @@
 
     python -I udp_controller.py [--port 0] [--record ticks.json] [--empty] ...
 
-It runs from a bundle's folder with that bundle's `gains.json` and `jaxhil_runtime.py`; nothing else is needed.
-Standard output says `port NUMBER` once it listens. Whoever plays the rig sends
+It runs from a bundle's folder with that bundle's `gains.json` and `jaxhil_runtime.py`; nothing else is
+needed. Standard output says `port NUMBER` once it listens. Whoever plays the rig sends
 
     PREPARE  the mechanism is free: tare, then stand ready at the start of a run; repeated until READY
     TICK     what the sensors read at tick n = 0, 1, ... of the run; answered by the command for tick n + 1
@@ -111,7 +111,7 @@ def encode_reading(reading: Reading) -> bytes:
     return READING.pack(MARK_IN, VERSION, *reading)
 
 
-def decode_reading(packet: bytes) -> Reading:
+def decode_reading(packet: bytes | bytearray) -> Reading:
     """The reading in a packet; sensor values may be anything, NaN included. Raises PacketError."""
     if len(packet) != READING.size:
         raise PacketError(f"{len(packet)} bytes, allowed {READING.size}")
@@ -360,7 +360,7 @@ class TickRecord:
         self.count = self.kept = 0
         self.capacity = capacity
 
-    def keep(self, packet: bytes) -> None:
+    def keep(self, packet: bytes | bytearray) -> None:
         """Keep a packet, of whatever kind."""
         kept = self.kept
         if kept < self.capacity:

@@ -2,8 +2,8 @@
 
 At t_n the sensors' packet leaves; its answer counts if it is there within `ANSWER_SHARE` of the period, the
 rest of which is the rig's own. A tick without an answer by then is a missed one: the rig goes on with what it
-has (`RigTask.advance`), and takes the answer in when it comes. A rig that was itself held up catches up: every
-tick whose time has passed is played at once, and missed.
+has (`RigTask.advance`), and takes the answer in when it comes. A rig that was itself held up catches up:
+every tick whose time has passed is played at once, and missed.
 """
 
 import gc
@@ -62,8 +62,10 @@ class Timing:
         self.ticks, self.began = 0, 0
 
 
-def play(task: Task, network: Network, period: float, timing: Timing, said: Callable[[], None]) -> None:
-    """Play `len(timing.met)` ticks of `period` [s], or until 1 s after a trip. `said` is called once a second.
+def play(task: Task, network: Network, period: float, timing: Timing, tell: Callable[[int], None]) -> None:
+    """Play `len(timing.met)` ticks of `period` [s], or until 1 s after a trip.
+
+    `tell` is told once a second how many are done.
 
     Interrupted, `timing` holds what was played until then.
     """
@@ -87,7 +89,7 @@ def play(task: Task, network: Network, period: float, timing: Timing, said: Call
             task.advance()
             timing.ticks = number + 1
             if number % second == 0:
-                said()
+                tell(number)
             if task.tripped and last == total:
                 last = number + round(AFTER_TRIP / period)
             if number >= last:

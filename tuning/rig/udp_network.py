@@ -31,8 +31,8 @@ class Injection(NamedTuple):
 
 
 class Network:
-    """Packets to one address and back. Times are those of `time.monotonic_ns`. `number_of(answer)` is the number
-    of the packet that bytes from there answer, None if they answer none.
+    """Packets to one address and back. Times are those of `time.monotonic_ns`. `number_of(answer)` is the
+    number of the packet that bytes from there answer, None if they answer none.
 
     `lost` and `held_back` say by the packet's number what was injected: 1 where the packet or its answer was
     lost; the time for which both together were held back [ns].

@@ -1,8 +1,8 @@
 """The rig's side of the loop: what it sends at every tick, and what it does with the answers.
 
-`RigTask` knows nothing of networks and clocks: `reading` is what to send at a tick, `take` an answer that came
-in time or late, `advance` ends the tick. Ticks that no answer came for go on at the rate of the newest command
-for up to `EXTRAPOLATED` periods, and hold it from then on.
+`RigTask` knows nothing of networks and clocks: `reading` is what to send at a tick, `take` an answer that
+came in time or late, `advance` ends the tick. Ticks that no answer came for go on at the rate of the newest
+command for up to `EXTRAPOLATED` periods, and hold it from then on.
 """
 
 import math

@@ -1,9 +1,9 @@
 """A session: the controller's process, an empty loop for comparison, the run, and whose fault what was.
 
-A missed tick is the controller's if its process took more than `CPU_SHARE` of the period of CPU time for that
-tick, live and when the same packets were gone through again, or if it follows such a tick without one in
-between that was met; else it is an injected fault's, if one hit its packets; else the machine's: the operating
-system, or another machine on the same processor, ran something else.
+A missed tick is the controller's if its process took more than `CPU_SHARE` of the period of CPU time for
+that tick, live and when the same packets were gone through again, or if it follows such a tick without one in
+between that was met; else it is an injected fault's, if one hit its packets; else the machine's: the
+operating system, or another machine on the same processor, ran something else.
 """
 
 import json
@@ -23,7 +23,7 @@ from jaxhil.errors import InputError, one_line
 from jaxhil.mechanism import Mechanism
 from tuning.rig.contact_watch import ContactResult
 from tuning.rig.udp_controller import CPU_SHARE, STOP, Reading, encode_reading, realtime
-from tuning.rig.udp_loop import ANSWER_SHARE, EmptyTask, Task, Timing, answered_by, play
+from tuning.rig.udp_loop import ANSWER_SHARE, EmptyTask, Timing, answered_by, play
 from tuning.rig.udp_network import Injection, Network
 from tuning.rig.udp_rig import Commanded, RigTask
 
@@ -32,6 +32,7 @@ ENDING = 120.0  # s in which it has to end, going through its packets again incl
 SILENCE = 2.0  # s without a packet, after which it ends by itself
 
 SOURCE = Path(__file__).parent
+LAST = Reading(STOP, 0xFFFFFFFF, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Quantiles(NamedTuple):
@@ -84,106 +85,88 @@ class SessionReport(NamedTuple):
     interrupted: bool
 
 
-def run_session(
-    folder: Path,
-    gains: Path,
-    mechanism: Mechanism,
-    stroke: tuple[float, float],
-    duration: float,
-    empty_duration: float,
-    injection: Injection,
-    seed: int,
-    scratch: Path,
-    say: Callable[[str], None],
-    real_time_priority: bool = False,
-) -> SessionReport:
-    """Play an empty loop, then the rig, against the controller of `folder` (a bundle, or `SOURCE`).
+class Setup(NamedTuple):
+    """A session: `folder` with the controller's process (a bundle, or `SOURCE`), its gain file and the
+    mechanism in that; what positions the drives take [m], as in `RigTask`; how long the run and the empty
+    loop before it last [s]; what is injected into the run; a seed of all draws; whether to ask the system for
+    a real-time priority for both processes."""
 
-    Durations in s; `scratch` is a folder for records; `stroke` [m] as in `RigTask`; `real_time_priority` asks the system
-    for a real-time priority for both processes. Raises InputError when the controller's process does not
-    start.
+    folder: Path
+    gains: Path
+    mechanism: Mechanism
+    stroke: tuple[float, float]
+    duration: float
+    empty_duration: float
+    injection: Injection
+    seed: int
+    priority: bool = False
+
+
+def run_session(
+    setup: Setup, scratch: Path, say: Callable[[str], None], progress: Callable[[int, int], None]
+) -> SessionReport:
+    """Play an empty loop, then the rig. Records go to the folder `scratch`; `say` is told what begins, and
+    `progress` once a second how many ticks of how many are done.
+
+    Raises InputError when the controller's process does not start.
     """
-    options = ("--realtime",) if real_time_priority else ()
-    period, empty, run = mechanism.rig.control_period, None, None
-    task = RigTask(mechanism, seed, stroke)
-    interrupted = False
+    task = RigTask(setup.mechanism, setup.seed, setup.stroke)
+    period, empty, run, interrupted = setup.mechanism.rig.control_period, None, None, False
     try:
-        if empty_duration >= period:
-            say(f"empty loop, {empty_duration:g} s")
-            begun = _Loop(
-                folder, gains, period, empty_duration, Injection(), seed, scratch, ("--empty", *options)
-            )
-            empty = begun.play(EmptyTask(), lambda: None)
-            interrupted = begun.interrupted
+        if setup.empty_duration >= period:
+            say(f"empty loop at {1 / period:g} Hz, {setup.empty_duration:g} s")
+            none = Injection()
+            empty, interrupted = _play(setup, EmptyTask(), setup.empty_duration, none, scratch, progress)
         if not interrupted:
-            say(f"{mechanism.name} at {1 / period:g} Hz, {duration:g} s")
-            begun = _Loop(folder, gains, period, duration, injection, seed, scratch, options)
-            run = begun.play(task, lambda: None)
-            interrupted = begun.interrupted
+            say(f"{setup.mechanism.name} at {1 / period:g} Hz, {setup.duration:g} s")
+            run, interrupted = _play(setup, task, setup.duration, setup.injection, scratch, progress)
     except KeyboardInterrupt:
         interrupted = True
     task.finish()
     return SessionReport(empty, run, task.contacts, task.commanded, task.tripped, interrupted)
 
 
-class _Loop:
-    """One loop against a process of its own."""
-
-    def __init__(
-        self,
-        folder: Path,
-        gains: Path,
-        period: float,
-        duration: float,
-        injection: Injection,
-        seed: int,
-        scratch: Path,
-        options: Sequence[str],
-    ) -> None:
-        self._period, self._ticks = period, max(1, round(duration / period))
-        self._record = scratch / f"ticks{''.join(options)}.json"
-        self._injection, self._seed = injection, seed
-        self.interrupted, self._realtime = False, "--realtime" in options
-        silence = max(SILENCE, 100 * period)
-        arguments = ["--gains", str(gains.resolve()), "--record", str(self._record)]
-        arguments += ["--ticks", str(self._ticks), "--silence", str(silence), *options]
-        self._process = start_controller(folder, arguments)
-
-    def play(self, task: Task, said: Callable[[], None]) -> LoopReport:
-        """Play until the end, an interruption included."""
-        process = self._process
+def _play(
+    setup: Setup,
+    task: RigTask | EmptyTask,
+    duration: float,
+    injection: Injection,
+    scratch: Path,
+    progress: Callable[[int, int], None],
+) -> tuple[LoopReport, bool]:
+    """One loop against a process of its own, and whether it was interrupted."""
+    period = setup.mechanism.rig.control_period
+    ticks, record = max(1, round(duration / period)), scratch / f"{type(task).__name__}.json"
+    options = ["--empty"] * isinstance(task, EmptyTask) + ["--realtime"] * setup.priority
+    options += ["--gains", str(setup.gains.resolve()), "--record", str(record), "--ticks", str(ticks)]
+    options += ["--silence", str(max(SILENCE, 100 * period))]
+    process, interrupted = start_controller(setup.folder, options), False
+    timing = Timing(ticks)
+    try:
+        port = listening_port(process)
+        network = Network(("127.0.0.1", port), injection, setup.seed, ticks, answered_by)
         try:
-            port = listening_port(process)
-            ticks, period = self._ticks, self._period
-            network = Network(("127.0.0.1", port), self._injection, self._seed, ticks, answered_by)
-            timing = Timing(ticks)
-            try:
-                with real_time(self._realtime):
-                    play(task, network, period, timing, said)
-            except KeyboardInterrupt:
-                self.interrupted = True
-            finally:
-                # The last packet is past all injection; twice, as the first may meet a full buffer.
-                for _ in range(2):
-                    network.send_plainly(
-                        encode_reading(Reading(STOP, 0xFFFFFFFF, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0))
-                    )
-                network.close()
-            process.wait(ENDING)
-            document = json.loads(self._record.read_text(encoding="utf-8"))
-        except (OSError, ValueError, subprocess.TimeoutExpired) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(
-                f"the controller's process did not end well: {one_line(str(error), 200)}"
-            ) from None
+            with real_time(setup.priority):
+                play(task, network, period, timing, lambda done: progress(done, ticks))
+        except KeyboardInterrupt:
+            interrupted = True
         finally:
-            if process.poll() is None:
-                process.kill()
-                process.wait()
-            if process.stdout is not None:
-                process.stdout.close()
-        return loop_report(timing, network, document, period)
+            # Past all injection; twice, as a full buffer may swallow one.
+            for _ in range(2):
+                network.send_plainly(encode_reading(LAST))
+            network.close()
+        process.wait(ENDING)
+        document = json.loads(record.read_text(encoding="utf-8"))
+    except (OSError, subprocess.TimeoutExpired, json.JSONDecodeError) as error:
+        reason = one_line(str(error), 200)
+        raise InputError(f"udp_controller.py: found no good end ({reason}), allowed a record of it") from None
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+    return loop_report(timing, network, document, period), interrupted
 
 
 @contextmanager
@@ -241,10 +224,15 @@ def loop_report(timing: Timing, network: Network, controller: dict[str, Any], pe
     late = 1e-9 * np.array(timing.late[:ticks], float)
     trips = round_trip[round_trip > 0]
     figures = LoopFigures(
-        ticks,
-        int(np.sum(~met)),
-        *(int(np.sum(causes == cause)) for cause in (CONTROLLER, INJECTED, MACHINE)),
-        *(quantiles(values) for values in (wall, cpu, trips, late)),
+        ticks=ticks,
+        missed=int(np.sum(~met)),
+        missed_by_controller=int(np.sum(causes == CONTROLLER)),
+        missed_by_injection=int(np.sum(causes == INJECTED)),
+        missed_by_machine=int(np.sum(causes == MACHINE)),
+        tick_time=quantiles(wall),
+        tick_cpu=quantiles(cpu),
+        round_trip=quantiles(trips),
+        lateness=quantiles(late),
     )
     return LoopReport(figures, LoopTimes(wall, trips), controller)
 
@@ -262,10 +250,10 @@ def attribute(
 ) -> np.ndarray:
     """Whose fault each missed tick is, (ticks,): `MET`, `CONTROLLER`, `INJECTED` or `MACHINE`.
 
-    `overspent`: the controller took more CPU time than its share; `round_trip` [s], 0 without an answer; `held`
-    back by injection [s]; `lost` by it; `allowance` [s] for an answer. Injection is to blame for what was lost,
-    for what would have come in time had it not been held back, and for what was held back and never answered
-    (a newer packet overtook it).
+    `overspent`: the controller took more CPU time than its share; `round_trip` [s], 0 without an answer;
+    `held` back by injection [s]; `lost` by it; `allowance` [s] for an answer. Injection is to blame for what
+    was lost, for what would have come in time had it not been held back, and for what was held back and never
+    answered (a newer packet overtook it).
     """
     in_time_but_for_it = np.where(round_trip > 0, round_trip - held <= allowance, True)
     injected = lost | ((held > 0) & in_time_but_for_it)
