@@ -140,7 +140,7 @@ def decode_answer(packet: bytes) -> Answer:
     text = words.rstrip(b"\0")
     if not all(32 <= byte < 127 for byte in text):
         raise PacketError("words that are not printable")
-    return Answer(*fields, text.decode("ascii"))
+    return Answer._make((*fields, text.decode("ascii")))
 
 
 class NumericalModel:
