@@ -111,7 +111,7 @@ class Failing(ON_THE_RIG["response_error"]):
         (Late, "the nominal run, tick "),
         (Loose, "the nominal run, tick "),
         (Leading, "closed loop, contact 1: restitution found "),
-        (Failing, "the nominal run: the runtime's controller tripped: the arithmetic overflowed"),
+        (Failing, "the nominal run: the runtime's controller tripped: command_not_finite"),
     ],
 )
 def test_a_wrong_runtime_is_told(varying, monkeypatch, runtime, start):

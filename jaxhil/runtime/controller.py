@@ -1,47 +1,76 @@
 """The controller that the rig calls once per control period.
 
-It checks what comes in and what goes out, watches the clock, and leaves the law to the compensator
-that its gain file names. Whatever is not finite trips it: from then on the force is 0 until
-`reset`.
+It checks what comes in (`inputs`), watches every contact's energy (`watchdog`), leaves the law to the
+compensator that its gain file names, and limits what goes out (`outputs`). What each of them may find, and
+what follows, is the table of `faults`. A trip is latched until `reset`: the force is led to 0, the position
+command to rest out of contact. No method raises once the controller is made; each takes bounded time.
 """
 
 import os
 from collections.abc import Mapping
-from math import isfinite
+from math import isfinite, nan
 from typing import Any
 
-from .errors import refusal
+from .errors import refusal, shown
+from .faults import (
+    CLOCK,
+    EMERGENCY_STOP,
+    FORCE_NOT_FINITE,
+    MODEL_NOT_FINITE,
+    POSITION_NOT_FINITE,
+    RESTITUTION,
+    TARE,
+    names,
+)
 from .gain_file import GainFile, check_gain_document, read_gain_document
+from .inputs import Clock, InputGuard, Tare
+from .outputs import ForceGuard, PositionGuard
 from .registry import COMPENSATORS
+from .watchdog import Watchdog
 
 
 class Controller:
-    """One compensator with its gains and its state.
+    """One compensator with its gains, its guards and its state.
 
-    Attributes: `missed_ticks`, the control periods since `reset` in which `step` was not called,
-    as far as the times passed to it tell.
+    Attributes: `faults`, the bits of the faults of this tick; `seen`, of all ticks since `reset`; `cause`,
+    the bits that tripped it, 0 if nothing has.
     """
 
     __slots__ = (
-        "_command",
+        "_clock",
         "_compensator",
-        "_late",
+        "_detail",
+        "_forces",
+        "_inputs",
         "_period",
-        "_status",
-        "_time",
-        "_tripped",
-        "missed_ticks",
+        "_positions",
+        "_stopped",
+        "_tare",
+        "_watchdog",
+        "cause",
+        "faults",
+        "seen",
     )
 
     def __init__(self, gain_file: GainFile, source: str = "gain document") -> None:
         compensator = COMPENSATORS[gain_file.compensator]
-        period = gain_file.control_period
+        period, clearance = gain_file.control_period, gain_file.clearance
         try:
-            self._compensator = compensator(gain_file.gains, period, gain_file.clearance)
+            self._compensator = compensator(gain_file.gains, period, clearance)
         except ValueError as error:
             raise refusal(source, "gains", str(error), "gains that fit the control period") from None
+        limits = gain_file.limits
         self._period = period
-        self._late = 1.5 * period
+        self._clock = Clock(limits, period)
+        self._tare = Tare(limits)
+        self._inputs = InputGuard(limits, period, clearance)
+        try:
+            self._watchdog = Watchdog(limits, period, clearance)
+        except ValueError as error:
+            raise refusal(source, "limits.alignment", str(error), "a delay that fits") from None
+        self._forces = ForceGuard(limits, period)
+        self._positions = PositionGuard(limits, period, clearance)
+        self._stopped = False
         self.reset()
 
     @classmethod
@@ -61,14 +90,54 @@ class Controller:
         return self._period
 
     @property
+    def tripped(self) -> bool:
+        """Whether a fault has tripped the controller since the last `reset`."""
+        return self.cause != 0
+
+    @property
     def status(self) -> str:
         """`ok`, or `tripped: ` and the reason."""
-        return self._status
+        if not self.cause:
+            return "ok"
+        return f"tripped: {', '.join(names(self.cause))}" + (f" ({self._detail})" if self._detail else "")
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether, after a trip, the position command has come to rest."""
+        return self.tripped and self._positions.at_rest
+
+    @property
+    def bias(self) -> float:
+        """The force sensor's bias [N] that the last good tare found."""
+        return self._tare.bias
+
+    @property
+    def missed_ticks(self) -> int:
+        """The control periods since `reset` without a tick, as far as the times passed to `step` tell."""
+        return self._clock.missed
+
+    @property
+    def late_ticks(self) -> int:
+        """The ticks since `reset` that came late, as far as the times passed to `step` tell."""
+        return self._clock.late
 
     @property
     def identified(self) -> tuple[float, float]:
         """Identified stiffness [N/m] and damping [N s/m]; (0, 0) if the law identifies none."""
         return self._compensator.identified
+
+    def tare(self, force_measured: float) -> bool:
+        """Take in one reading [N] of the force sensor out of contact; True once there are enough.
+
+        To be called once a tick before a run. Their mean is then taken from every reading, until the next
+        tare. Readings that will not do trip, with the fault `tare`.
+        """
+        if self.cause:
+            return True
+        over = self._tare.take(_float(force_measured))
+        if self._tare.fatal:
+            self._fail(TARE, f"reading {force_measured!r}")
+        return over
 
     def step(
         self,
@@ -80,87 +149,152 @@ class Controller:
     ) -> float:
         """The force F_c [N] that the numerical model is to feel this tick.
 
-        Force in N, positions in m, velocity in m/s. With `time` [s], a gap of more than 1.5
-        periods since the last tick adds to `missed_ticks` the periods left out. Once tripped, 0.0
-        until `reset`.
+        Force in N, positions in m, velocity in m/s. With `time` [s], ticks that come late or were missed
+        are seen. Once tripped, the force goes to 0 and stays there until `reset`.
         """
-        if self._tripped:
-            return 0.0
-        try:
-            force = float(force_measured)
-            position = float(position_desired)
-            velocity = float(velocity_desired)
-            measured = float(position_measured)
-            now = None if time is None else float(time)
-        except (TypeError, ValueError, OverflowError):
-            return self._trip("an input is not a number")
-        if not (isfinite(force) and isfinite(position) and isfinite(velocity) and isfinite(measured)):
-            return self._trip(
-                _not_finite(
-                    force_measured=force,
-                    position_desired=position,
-                    velocity_desired=velocity,
-                    position_measured=measured,
-                )
-            )
-        try:
-            if now is not None:
-                if not isfinite(now):
-                    return self._trip(_not_finite(time=now))
-                if self._time is not None and now - self._time > self._late:
-                    self.missed_ticks += int((now - self._time) / self._period + 0.5) - 1
-                self._time = now
-            command = self._compensator.step(force, position, velocity, measured)
-        except ArithmeticError:
-            return self._trip("the arithmetic overflowed")
-        if not isfinite(command):
-            return self._trip("the compensated force is not finite")
-        return command
+        forces = self._forces
+        self.faults = 0
+        if self.cause:
+            forces.fade()
+            return forces.output
+        faults = 0
+        fatal = 0
+        if time is not None:
+            faults = self._clock.tick(_float(time))
+            if self._clock.fatal:
+                fatal = faults
+        # Only what is no float yet takes time to be made one: the rig's numbers are.
+        reading = force_measured if type(force_measured) is float else _float(force_measured)
+        position = position_desired if type(position_desired) is float else _float(position_desired)
+        velocity = velocity_desired if type(velocity_desired) is float else _float(velocity_desired)
+        measured = position_measured if type(position_measured) is float else _float(position_measured)
+        inputs = self._inputs
+        faults |= inputs.check(reading, position, velocity, measured, self._tare.bias)
+        fatal |= inputs.fatal
+        watchdog = self._watchdog
+        if watchdog.on and not fatal:
+            fatal = watchdog.tick(forces.output, inputs.force, position, velocity, inputs.measured)
+            faults |= fatal
+        if not fatal:
+            try:
+                command = self._compensator.step(inputs.force, position, velocity, inputs.measured)
+            except ArithmeticError:
+                command = nan
+            faults |= forces.limit(command)
+            fatal = forces.fatal
+        self.faults = faults
+        self.seen |= faults
+        if fatal:
+            readings = {
+                "time": 0.0 if time is None else time,
+                "force_measured": force_measured,
+                "position_desired": position_desired,
+                "velocity_desired": velocity_desired,
+                "position_measured": position_measured,
+            }
+            self._fail(fatal, _detail(fatal, readings, watchdog))
+            forces.fade()
+        return forces.output
 
     def position_command(self, position: float, velocity: float, acceleration: float) -> float:
         """The position [m] to command, from the numerical model's motion after this tick's step.
 
-        An input that is not finite trips the controller and holds the last command.
+        Position in m, velocity in m/s, acceleration in m/s^2. Once tripped, the way to rest out of contact.
         """
-        try:
-            command = self._compensator.position_command(
-                float(position), float(velocity), float(acceleration)
-            )
-            finite = isfinite(command) and isfinite(velocity) and isfinite(acceleration)
-        except (TypeError, ValueError, ArithmeticError):
-            finite = False
-            command = 0.0
-        if not finite:
-            if not self._tripped:
-                self._trip("the numerical model's motion is not finite")
-            return self._command
-        self._command = command
-        return command
+        positions = self._positions
+        if not self.cause:
+            position, velocity, acceleration = _float(position), _float(velocity), _float(acceleration)
+            finite = isfinite(position) and isfinite(velocity) and isfinite(acceleration)
+            command = nan
+            if finite:
+                try:
+                    command = self._compensator.position_command(position, velocity, acceleration)
+                except ArithmeticError:
+                    command = nan
+            faults = positions.limit(command)
+            self.faults |= faults
+            self.seen |= faults
+            if not positions.fatal:
+                return positions.output
+            self._fail(positions.fatal, "the numerical model's motion" if not finite else "")
+        # Nothing was commanded yet: the drives are where the numerical model is, or else where they read.
+        start = _float(position)
+        positions.retreat(start if isfinite(start) else self._inputs.measured)
+        return positions.output
 
-    def reset(self) -> None:
-        """Restart everything: filters, identified parameters, a trip, the count of ticks."""
+    def emergency_stop(self, active: bool) -> None:
+        """Tell the controller the state of the rig's emergency stop; active, it trips.
+
+        Handshake: call with True for as long as the stop is active (once is enough); the force goes to 0 and
+        the position command to rest, then `at_rest` is True and the drives may be switched off; call with
+        False when the stop is released; the trip stays latched until `reset`, which is refused before.
+        """
+        self._stopped = bool(active)
+        if active:
+            self._fail(EMERGENCY_STOP, "")
+
+    def reset(self) -> bool:
+        """Restart everything but the tare: filters, identified parameters, a trip, the count of ticks.
+
+        Without a bump: force and position command go on from where they are, within their limits. Refused,
+        with False, while the emergency stop is active.
+        """
+        if self._stopped:
+            return False
         self._compensator.reset()
-        self._tripped = False
-        self._status = "ok"
-        self._time: float | None = None
-        self._command = 0.0
-        self.missed_ticks = 0
+        self._clock.reset()
+        self._tare.restart()
+        self._inputs.restart()
+        self._watchdog.restart()
+        self._forces.restart()
+        self._positions.restart()
+        self.cause = 0
+        self.faults = 0
+        self.seen = 0
+        self._detail = ""
+        return True
 
     def next_contact(self) -> None:
         """Begin a fresh run for the next contact: filters, delay lines and covariance restart.
 
-        Identified parameters carry over, a trip stays latched, and the time until the next tick
-        does not count as missed.
+        To be called when the rig has been brought to the start of the run: the first position command is
+        then where it begins. Identified parameters carry over, a trip stays latched, and the time until the
+        next tick does not count as missed.
         """
+        if self.cause:
+            return
+        fault = self._watchdog.conclude(self._forces.output)
+        if fault:
+            self._fail(fault, _detail(fault, {}, self._watchdog))
+            return
         self._compensator.next_contact()
-        self._time = None
+        self._clock.pause()
+        self._inputs.restart()
+        self._watchdog.restart()
+        self._positions.release()
 
-    def _trip(self, reason: str) -> float:
-        self._tripped = True
-        self._status = f"tripped: {reason}"
-        return 0.0
+    def _fail(self, cause: int, detail: str) -> None:
+        # The first cause is the one to look at: what follows a trip may follow from it.
+        if not self.cause:
+            self.cause = cause
+            self._detail = detail
+        self.faults |= cause
+        self.seen |= self.faults
 
 
-def _not_finite(**inputs: float) -> str:
-    name, value = next(item for item in inputs.items() if not isfinite(item[1]))
-    return f"{name} is {value!r}"
+def _float(value: Any) -> float:
+    """The value as a float; not a number if it is none."""
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return nan
+
+
+def _detail(fatal: int, readings: Mapping[str, Any], watchdog: Watchdog) -> str:
+    """What a cause looked like, in words."""
+    if fatal & RESTITUTION:
+        return watchdog.detail()
+    if fatal & (FORCE_NOT_FINITE | POSITION_NOT_FINITE | MODEL_NOT_FINITE | CLOCK):
+        bad = (item for item in readings.items() if not isfinite(_float(item[1])))
+        return ", ".join(f"{name} is {shown(value)}" for name, value in bad)
+    return ""

@@ -13,6 +13,7 @@ from math import inf, isfinite
 from typing import Any, NamedTuple
 
 from .errors import GainFileError, printable, refusal, shown
+from .limits import LIMITS, NO_LIMITS, complete
 from .registry import COMPENSATORS, GainSpecification
 
 SCHEMA = "jaxhil/gains/1"
@@ -22,12 +23,13 @@ UNSIGNED = ("created", "timings", "sha256")
 
 
 class GainFile(NamedTuple):
-    """What the controller needs of a gain file: gains (SI), period [s], clearance [m]."""
+    """What the controller needs of a gain file: gains (SI), period [s], clearance [m], limits (SI)."""
 
     compensator: str
     gains: Mapping[str, float]
     control_period: float
     clearance: float
+    limits: Mapping[str, float] = NO_LIMITS
 
 
 def digest(document: Mapping[str, Any]) -> str:
@@ -89,7 +91,7 @@ def check_gain_document(document: Mapping[str, Any], source: str = "gain documen
         clearance = _number(contact["clearance"], "mechanism.contact.clearance", source)
         if clearance < 0.0:
             raise refusal(source, "mechanism.contact.clearance", shown(clearance), ">= 0")
-    return GainFile(name, gains, period, clearance)
+    return GainFile(name, gains, period, clearance, _limits(document, source))
 
 
 def _check_form(document: Mapping[str, Any], source: str) -> None:
@@ -136,6 +138,32 @@ def _gains(
             raise refusal(source, f"{prefix}value", shown(value), specification.description())
         gains[name] = value
     return gains
+
+
+def _limits(document: Mapping[str, Any], source: str) -> dict[str, float]:
+    if "limits" not in document:
+        return dict(NO_LIMITS)
+    limits = {}
+    for name, entry in _object(document, "limits", source, "").items():
+        if name not in LIMITS:
+            raise refusal(source, "limits", f"an unknown limit {shown(name)}", ", ".join(LIMITS))
+        specification = LIMITS[name]
+        prefix = f"limits.{name}."
+        if not isinstance(entry, Mapping):
+            raise refusal(source, prefix[:-1], shown(entry), "an object")
+        unit = _entry(entry, "unit", source, prefix)
+        if unit != specification.unit:
+            raise refusal(source, f"{prefix}unit", shown(unit), f"'{specification.unit}'")
+        value = _entry(entry, "value", source, prefix)
+        if value is None:
+            continue
+        limits[name] = _number(value, f"{prefix}value", source)
+        if limits[name] < specification.lowest:
+            raise refusal(source, f"{prefix}value", shown(value), f">= {specification.lowest!r}")
+    try:
+        return complete(limits)
+    except ValueError as error:
+        raise refusal(source, "limits", str(error), "limits that fit one another") from None
 
 
 def _entry(mapping: Mapping[str, Any], key: str, source: str, prefix: str) -> Any:

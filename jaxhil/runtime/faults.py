@@ -1,0 +1,146 @@
+"""What can go wrong on the rig, and what the controller does about it.
+
+Every fault is one bit, raised in `Controller.faults` on the tick at which it happens. `FAULTS` is the table
+that documentation, exports and error texts are made from; the bits are the same in the C controller.
+
+A *trip* is latched: until `reset` the force is led to 0 and the position command to a halt out of contact.
+"""
+
+from typing import NamedTuple
+
+
+class Fault(NamedTuple):
+    """A fault: its bit, its name, when it is raised, what the controller does."""
+
+    bit: int
+    name: str
+    condition: str
+    reaction: str
+
+
+FORCE_NOT_FINITE = 0x1
+POSITION_NOT_FINITE = 0x2
+MODEL_NOT_FINITE = 0x4
+FORCE_OUT_OF_RANGE = 0x8
+POSITION_OUT_OF_RANGE = 0x10
+FORCE_STUCK = 0x20
+POSITION_STUCK = 0x40
+FORCE_IN_FLIGHT = 0x80
+LATE_TICK = 0x100
+MISSED_TICK = 0x200
+CLOCK = 0x400
+FORCE_LIMIT = 0x800
+FORCE_SLEW = 0x1000
+STROKE = 0x2000
+VELOCITY_LIMIT = 0x4000
+COMMAND_NOT_FINITE = 0x8000
+RESTITUTION = 0x10000
+ENERGY_BALANCE = 0x20000
+CONTACT_TOO_LONG = 0x40000
+EMERGENCY_STOP = 0x80000
+TARE = 0x100000
+
+_HELD = "the last good reading is used; more than `held_readings` in a row trip"
+_TRIPS = "trips"
+
+FAULTS = (
+    Fault(FORCE_NOT_FINITE, "force_not_finite", "the measured force is not a finite number", _HELD),
+    Fault(POSITION_NOT_FINITE, "position_not_finite", "the measured position is not a finite number", _HELD),
+    Fault(
+        MODEL_NOT_FINITE,
+        "model_not_finite",
+        "the numerical model's position, velocity or acceleration is not a finite number",
+        _TRIPS,
+    ),
+    Fault(
+        FORCE_OUT_OF_RANGE, "force_out_of_range", "the measured force is at or beyond `force_range`", _HELD
+    ),
+    Fault(
+        POSITION_OUT_OF_RANGE,
+        "position_out_of_range",
+        "the measured position is outside `measured_lowest` to `measured_highest`",
+        _HELD,
+    ),
+    Fault(
+        FORCE_STUCK,
+        "force_stuck",
+        "in contact, the force reading has stayed the same to the bit while the measured position moved "
+        "by more than `force_stuck_travel`",
+        _TRIPS,
+    ),
+    Fault(
+        POSITION_STUCK,
+        "position_stuck",
+        "the position reading has stayed the same to the bit while the numerical model moved by more than "
+        "`position_stuck_travel`",
+        _TRIPS,
+    ),
+    Fault(
+        FORCE_IN_FLIGHT,
+        "force_in_flight",
+        "a force beyond `free_force` is read though the mechanism has been out of contact by "
+        "`free_distance` for longer than `settling`: a bias, or a surface that is not where it should be",
+        "flagged; more than `held_readings` in a row trip",
+    ),
+    Fault(
+        LATE_TICK,
+        "late_tick",
+        "the tick comes later than the period by more than `late_fraction` of it",
+        "flagged and counted",
+    ),
+    Fault(
+        MISSED_TICK,
+        "missed_tick",
+        "more than one and a half periods have passed since the last tick",
+        "flagged and counted, the law is stepped once; more than `missed_in_a_row` trip",
+    ),
+    Fault(CLOCK, "clock", "the tick's time is not finite, or not after the last tick's", _TRIPS),
+    Fault(FORCE_LIMIT, "force_limit", "the compensated force is beyond `force_limit`", _TRIPS),
+    Fault(
+        FORCE_SLEW,
+        "force_slew",
+        "the compensated force changes faster than `force_slew`",
+        "the change is cut to the limit; more than `limited_in_a_row` ticks trip",
+    ),
+    Fault(STROKE, "stroke", "the position command is outside `command_lowest` to `command_highest`", _TRIPS),
+    Fault(
+        VELOCITY_LIMIT,
+        "velocity_limit",
+        "the position command changes faster than `velocity_limit`",
+        "the change is cut to the limit; more than `limited_in_a_row` ticks trip, but for the way back "
+        "to the numerical model after `reset`",
+    ),
+    Fault(COMMAND_NOT_FINITE, "command_not_finite", "the compensated force is not a finite number", _TRIPS),
+    Fault(
+        RESTITUTION,
+        "restitution",
+        "watchdog: a contact's restitution differs from the expected by more than `restitution_margin`",
+        _TRIPS,
+    ),
+    Fault(
+        ENERGY_BALANCE,
+        "energy_balance",
+        "watchdog: over a contact the numerical model's kinetic energy has not changed by the work of the "
+        "force it was given: it integrates something else",
+        _TRIPS,
+    ),
+    Fault(
+        CONTACT_TOO_LONG,
+        "contact_too_long",
+        "watchdog: a contact has lasted longer than `longest_contact`",
+        _TRIPS,
+    ),
+    Fault(EMERGENCY_STOP, "emergency_stop", "the rig has called `emergency_stop(True)`", _TRIPS),
+    Fault(
+        TARE,
+        "tare",
+        "the readings to tare are not finite, differ by more than `tare_spread`, or their mean is beyond "
+        "`bias_limit`",
+        _TRIPS,
+    ),
+)
+
+
+def names(bits: int) -> list[str]:
+    """The names of the faults whose bits are set."""
+    return [fault.name for fault in FAULTS if bits & fault.bit]

@@ -1,0 +1,275 @@
+"""What comes in, checked: clock, sensor readings, the numerical model's motion.
+
+A bad sensor reading is replaced by the last good one. `InputGuard.check` says which faults a tick has and
+which of them trip; `force` and `measured` are then what the law is to use.
+"""
+
+from collections.abc import Mapping
+from math import inf, isfinite
+
+from .faults import (
+    CLOCK,
+    FORCE_IN_FLIGHT,
+    FORCE_NOT_FINITE,
+    FORCE_OUT_OF_RANGE,
+    FORCE_STUCK,
+    LATE_TICK,
+    MISSED_TICK,
+    MODEL_NOT_FINITE,
+    POSITION_NOT_FINITE,
+    POSITION_OUT_OF_RANGE,
+    POSITION_STUCK,
+)
+
+MOST_MISSED = 1_000_000  # periods counted for one gap, so that a wild clock stays a small number
+
+
+class Clock:
+    """The times of the ticks: which came late, and how many were missed.
+
+    Attributes: `missed` and `late`, ticks counted; `fatal`, whether the last tick's fault trips.
+    """
+
+    __slots__ = ("_late", "_missing", "_period", "_time", "_tolerated", "fatal", "late", "missed")
+
+    def __init__(self, limits: Mapping[str, float], period: float) -> None:
+        self._period = period
+        self._missing = 1.5 * period
+        self._late = (1.0 + limits["late_fraction"]) * period
+        self._tolerated = limits["missed_in_a_row"]
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last tick and the counts."""
+        self.missed = 0
+        self.late = 0
+        self.pause()
+
+    def pause(self) -> None:
+        """Let the time until the next tick be any."""
+        self._time = -inf
+        self.fatal = False
+
+    def tick(self, time: float) -> int:
+        """The fault of a tick at `time` [s], 0 if it comes as it should."""
+        self.fatal = False
+        if not isfinite(time):
+            self.fatal = True
+            return CLOCK
+        if self._time == -inf:  # the first tick
+            self._time = time
+            return 0
+        gap = time - self._time
+        if not gap > 0.0:
+            self.fatal = True
+            return CLOCK
+        self._time = time
+        if gap > self._missing:
+            periods = gap / self._period + 0.5
+            left_out = (MOST_MISSED if periods > MOST_MISSED else int(periods)) - 1
+            self.missed += left_out
+            self.fatal = left_out > self._tolerated
+            return MISSED_TICK
+        if gap > self._late:
+            self.late += 1
+            return LATE_TICK
+        return 0
+
+
+class Tare:
+    """The bias of the force sensor [N], as the mean of `tare_ticks` readings out of contact.
+
+    Attributes: `bias`, what to take from every reading; `fatal`, whether the last tare failed.
+    """
+
+    __slots__ = (
+        "_count",
+        "_highest",
+        "_limit",
+        "_lowest",
+        "_range",
+        "_spread",
+        "_sum",
+        "_ticks",
+        "bias",
+        "fatal",
+    )
+
+    def __init__(self, limits: Mapping[str, float]) -> None:
+        self._ticks = limits["tare_ticks"]
+        self._spread = limits["tare_spread"]
+        self._limit = limits["bias_limit"]
+        self._range = limits["force_range"]
+        self.bias = 0.0
+        self._begin()
+
+    def _begin(self) -> None:
+        self._count = 0
+        self._sum = 0.0
+        self._lowest = inf
+        self._highest = -inf
+        self.fatal = False
+
+    def take(self, reading: float) -> bool:
+        """Take a reading in; whether the tare is over, well or, then `fatal`, badly."""
+        if not self._count < self._ticks:
+            return True
+        if self._count == 0:
+            self._begin()
+        self._count += 1
+        self._sum += reading
+        if reading < self._lowest:
+            self._lowest = reading
+        if reading > self._highest:
+            self._highest = reading
+        if not (isfinite(reading) and abs(reading) < self._range):
+            self.fatal = True
+        elif self._count < self._ticks:
+            return False
+        else:
+            mean = self._sum / self._count
+            spread = self._highest - self._lowest
+            self.fatal = not (spread <= self._spread and abs(mean) <= self._limit and isfinite(mean))
+            if not self.fatal:
+                self.bias = mean
+        return True
+
+    def restart(self) -> None:
+        """Let the next reading begin a new tare; the bias found holds until that is over."""
+        self._begin()
+
+
+class InputGuard:
+    """The readings of one tick, checked one by one; see `faults.FAULTS` for what each check means.
+
+    Attributes, of the last tick: `force` [N] without bias and `measured` [m], what the law is to use;
+    `fatal`, the faults that trip.
+    """
+
+    __slots__ = (
+        "_bad_forces",
+        "_bad_positions",
+        "_clearance",
+        "_desired",
+        "_flight",
+        "_force_limit",
+        "_force_reading",
+        "_force_stuck",
+        "_force_travel",
+        "_forces_in_flight",
+        "_free_distance",
+        "_free_force",
+        "_held",
+        "_highest",
+        "_known",
+        "_lowest",
+        "_position_stuck",
+        "_position_travel",
+        "_range",
+        "_settling",
+        "fatal",
+        "force",
+        "measured",
+    )
+
+    def __init__(self, limits: Mapping[str, float], period: float, clearance: float) -> None:
+        self._clearance = clearance
+        self._range = limits["force_range"]
+        self._lowest = limits["measured_lowest"]
+        self._highest = limits["measured_highest"]
+        self._held = limits["held_readings"]
+        self._force_stuck = limits["force_stuck_travel"]
+        self._position_stuck = limits["position_stuck_travel"]
+        self._free_distance = limits["free_distance"]
+        self._free_force = limits["free_force"]
+        self._settling = limits["settling"] / period
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the readings so far."""
+        self._known = False
+        self._bad_forces = 0
+        self._bad_positions = 0
+        self._forces_in_flight = 0
+        self._flight = 0
+        self._force_reading = 0.0
+        self._force_travel = 0.0
+        self._position_travel = 0.0
+        self._desired = 0.0
+        self.force = 0.0
+        self.measured = 0.0
+        self.fatal = 0
+
+    def check(self, reading: float, desired: float, velocity: float, position: float, bias: float) -> int:
+        """The faults of the readings of a tick: force [N], the model's motion [m, m/s], position [m]."""
+        if not (isfinite(desired) and isfinite(velocity)):
+            self.fatal = MODEL_NOT_FINITE
+            return MODEL_NOT_FINITE
+        faults = 0
+        fatal = 0
+        if not self._known:
+            # Before the first tick there is no good reading: no force, and the position as desired.
+            self._known = True
+            self._desired = desired
+            self.measured = desired
+            self._force_reading = inf
+
+        fault = 0
+        if not isfinite(position):
+            fault = POSITION_NOT_FINITE
+        elif position < self._lowest or position > self._highest:
+            fault = POSITION_OUT_OF_RANGE
+        before = self.measured
+        if fault:
+            faults |= fault
+            self._bad_positions += 1
+            if self._bad_positions > self._held:
+                fatal |= fault
+        else:
+            self._bad_positions = 0
+            if position == before:
+                self._position_travel += abs(desired - self._desired)
+                if self._position_travel > self._position_stuck:
+                    faults |= POSITION_STUCK
+                    fatal |= POSITION_STUCK
+            else:
+                self._position_travel = 0.0
+            self.measured = position
+        self._desired = desired
+        measured = self.measured
+
+        fault = 0
+        if not isfinite(reading):
+            fault = FORCE_NOT_FINITE
+        elif abs(reading) >= self._range:
+            fault = FORCE_OUT_OF_RANGE
+        if fault:
+            faults |= fault
+            self._bad_forces += 1
+            if self._bad_forces > self._held:
+                fatal |= fault
+        else:
+            self._bad_forces = 0
+            if reading == self._force_reading and (measured > 0.0 or measured < -self._clearance):
+                self._force_travel += abs(measured - before)
+                if self._force_travel > self._force_stuck:
+                    faults |= FORCE_STUCK
+                    fatal |= FORCE_STUCK
+            else:
+                self._force_travel = 0.0
+            self._force_reading = reading
+            self.force = reading - bias
+
+        if measured < -self._free_distance and measured > self._free_distance - self._clearance:
+            self._flight += 1
+        else:
+            self._flight = 0
+        if self._flight > self._settling and abs(self.force) > self._free_force:
+            faults |= FORCE_IN_FLIGHT
+            self._forces_in_flight += 1
+            if self._forces_in_flight > self._held:
+                fatal |= FORCE_IN_FLIGHT
+        else:
+            self._forces_in_flight = 0
+        self.fatal = fatal
+        return faults

@@ -1,0 +1,179 @@
+"""What goes out, limited: the force on the numerical model and the position command to the drives.
+
+Both guards hold the last value that they let out, so that nothing jumps: not on a trip, not on a reset.
+After a trip the force is led to 0; the position command brakes, and where it is in contact or nearer to a
+surface than `free_distance` it moves away at `retreat_velocity`, and comes to rest.
+"""
+
+from collections.abc import Mapping
+from math import isfinite
+
+from .faults import COMMAND_NOT_FINITE, FORCE_LIMIT, FORCE_SLEW, MODEL_NOT_FINITE, STROKE, VELOCITY_LIMIT
+
+
+class ForceGuard:
+    """The force on the numerical model within `force_limit`, its change within `force_slew`.
+
+    Attributes: `output` [N], the force let out last; `fatal`, the faults that trip.
+    """
+
+    __slots__ = ("_cut", "_cut_tolerated", "_limit", "_most", "fatal", "output")
+
+    def __init__(self, limits: Mapping[str, float], period: float) -> None:
+        self._limit = limits["force_limit"]
+        self._most = limits["force_slew"] * period
+        self._cut_tolerated = limits["limited_in_a_row"]
+        self.output = 0.0
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the faults; the output stays, for what follows to go on from."""
+        self._cut = 0
+        self.fatal = 0
+
+    def limit(self, command: float) -> int:
+        """Let the command [N] out as far as the limits allow; the faults of that."""
+        self.fatal = 0
+        if not isfinite(command):
+            self.fatal = COMMAND_NOT_FINITE
+            return COMMAND_NOT_FINITE
+        if abs(command) > self._limit:
+            self.fatal = FORCE_LIMIT
+            return FORCE_LIMIT
+        if abs(command - self.output) <= self._most:
+            self._cut = 0
+            self.output = command
+            return 0
+        self._cut += 1
+        if self._cut > self._cut_tolerated:
+            self.fatal = FORCE_SLEW
+        else:
+            self.output = _towards(self.output, command, self._most)
+        return FORCE_SLEW
+
+    def fade(self) -> None:
+        """Lead the output towards 0."""
+        self.output = _towards(self.output, 0.0, self._most)
+
+
+class PositionGuard:
+    """The position command within the stroke, its change within `velocity_limit`.
+
+    Attributes: `output` [m], the command let out last; `known`, whether there has been one; `at_rest`,
+    whether the last one after a trip did not move; `fatal`, the faults that trip.
+    """
+
+    __slots__ = (
+        "_braking",
+        "_clearance",
+        "_cut",
+        "_cut_tolerated",
+        "_distance",
+        "_engaged",
+        "_highest",
+        "_lowest",
+        "_most",
+        "_rate",
+        "_retreat",
+        "at_rest",
+        "fatal",
+        "known",
+        "output",
+    )
+
+    def __init__(self, limits: Mapping[str, float], period: float, clearance: float) -> None:
+        self._clearance = clearance
+        self._lowest = limits["command_lowest"]
+        self._highest = limits["command_highest"]
+        self._most = limits["velocity_limit"] * period
+        self._braking = limits["deceleration"] * period * period
+        self._retreat = limits["retreat_velocity"] * period
+        # In a narrow gap the safest place is its middle.
+        distance, middle = limits["free_distance"], 0.5 * clearance
+        self._distance = distance if distance < middle else middle
+        self._cut_tolerated = limits["limited_in_a_row"]
+        self.output = 0.0
+        self.known = False
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the faults; the way from the last output to the numerical model may take its time."""
+        self._cut = 0
+        self._engaged = False
+        self._rate = 0.0
+        self.at_rest = False
+        self.fatal = 0
+
+    def release(self) -> None:
+        """Forget the last output: the drives have been brought elsewhere."""
+        self.known = False
+        self.restart()
+
+    def limit(self, command: float) -> int:
+        """Let the command [m] out as far as the limits allow; the faults of that."""
+        self.fatal = 0
+        if not isfinite(command):
+            self.fatal = MODEL_NOT_FINITE
+            return MODEL_NOT_FINITE
+        if command < self._lowest or command > self._highest:
+            self.fatal = STROKE
+            return STROKE
+        if not self.known:
+            self.known = True
+            self._engaged = True
+            self.output = command
+            return 0
+        before = self.output
+        if abs(command - before) <= self._most:
+            self._engaged = True
+            self._cut = 0
+            self._rate = command - before
+            self.output = command
+            return 0
+        if self._engaged:
+            self._cut += 1
+            if self._cut > self._cut_tolerated:
+                self.fatal = VELOCITY_LIMIT
+                return VELOCITY_LIMIT
+        self.output = _towards(before, command, self._most)
+        self._rate = self.output - before
+        return VELOCITY_LIMIT
+
+    def retreat(self, start: float) -> None:
+        """One period of the way to rest out of contact; from `start` [m] if nothing was let out yet."""
+        if not self.known:
+            self.known = True
+            self.output = min(max(start, self._lowest), self._highest)
+        output = self.output
+        wanted = 0.0
+        if output > -self._distance:
+            wanted = -self._retreat
+        elif output < self._distance - self._clearance:
+            wanted = self._retreat
+        rate = self._rate
+        change = wanted - rate
+        if change > self._braking:
+            rate += self._braking
+        elif change < -self._braking:
+            rate -= self._braking
+        else:
+            rate = wanted
+        moved = output + rate
+        if moved < self._lowest:
+            moved = self._lowest
+            rate = 0.0
+        elif moved > self._highest:
+            moved = self._highest
+            rate = 0.0
+        self._rate = rate
+        self.output = moved
+        self.at_rest = rate == 0.0 and wanted == 0.0
+
+
+def _towards(start: float, target: float, most: float) -> float:
+    """The value nearest to the target that is at most `most` from the start."""
+    if target > start:
+        moved = start + most
+        return moved if moved < target else target
+    moved = start - most
+    return moved if moved > target else target

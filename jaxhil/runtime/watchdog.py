@@ -1,0 +1,261 @@
+"""The watchdog: an energy audit of every contact, from the motion of the numerical model.
+
+A contact begins on the tick on which the model's or the measured position is beyond a surface. It is audited
+once both have been outside for `settling`, the model moves away and the force on it has died out; at the
+latest in the middle of the gap or when the next contact is announced, so always before the next begins.
+With v_in the model's velocity on the tick before the contact and v now, the audit asks:
+
+- Is the energy balanced? M (v^2 - v_in^2)/2 must be the work -T sum F_c(n) (v(n) + v(n+1))/2 of the force
+  that the controller gave, an identity for every integrator with v(n+1) = v(n) - T F_c(n)/M.
+- Is the restitution |v|/|v_in| the expected one, within `restitution_margin`?
+
+The expected restitution is that of the contact's own stiffness: k and b are the least squares of the
+measured force on the measured position, delayed by `alignment`, and its rate, over the whole contact. An
+error delta of the delay moves k by a factor cos(omega delta) alone, whatever the compensator does; b it moves
+by -k delta, which nothing on the rig can tell from damping. So where the file knows the damping, the
+polynomial is one of k alone:
+
+    p = sqrt(reference_stiffness / k) - 1,  w = |v_in| / reference_velocity - 1,  z = b / (2 sqrt(k M)),
+    e* = c_1 + c_p p + c_pp p^2 + c_ppp p^3 + c_w w + c_ww w^2 + c_pw p w
+         + c_z z + c_zz z^2 + c_pz p z + c_wz w z,   within 0 and 1,
+
+each of p, w, z kept to the range that it was fitted over.
+"""
+
+from collections.abc import Mapping
+from math import sqrt
+
+from .faults import CONTACT_TOO_LONG, ENERGY_BALANCE, RESTITUTION
+from .filters import DelayLine
+
+FADED = 1e-3  # of the largest force of the contact
+PATIENCE = 0.02  # s, that the force is given to die out
+
+
+class Watchdog:
+    """One contact after another, audited.
+
+    Attributes: `on`, whether there is anything to watch; `contacts`, those audited since `restart`; of the
+    last of them `restitution`, the `expected` one and the energy out of `balance` [J].
+    """
+
+    __slots__ = (
+        "_aligned",
+        "_alignment",
+        "_clearance",
+        "_entry",
+        "_expectation",
+        "_faded",
+        "_force",
+        "_free_force",
+        "_known",
+        "_longest",
+        "_margin",
+        "_mass",
+        "_middle",
+        "_open",
+        "_peak",
+        "_period",
+        "_quiet",
+        "_quiet_ticks",
+        "_side",
+        "_svf",
+        "_svv",
+        "_sxf",
+        "_sxv",
+        "_sxx",
+        "_ticks",
+        "_tolerance",
+        "_velocity",
+        "_work",
+        "balance",
+        "contacts",
+        "expected",
+        "on",
+        "restitution",
+    )
+
+    def __init__(self, limits: Mapping[str, float], period: float, clearance: float) -> None:
+        self.on = limits["equivalent_mass"] > 0.0
+        self._clearance = clearance
+        self._middle = -0.5 * clearance
+        self._period = period
+        self._mass = limits["equivalent_mass"]
+        self._quiet_ticks = limits["settling"] / period
+        self._faded = (limits["settling"] + PATIENCE) / period
+        self._longest = limits["longest_contact"] / period
+        self._free_force = limits["free_force"]
+        self._margin = limits["restitution_margin"]
+        self._tolerance = limits["energy_balance"]
+        self._alignment = DelayLine(limits["alignment"], period)
+        self._expectation = Expectation(limits)
+        self.restart()
+        self.contacts = 0
+
+    def restart(self) -> None:
+        """Forget the contact under way and the motion so far, but not the count of contacts."""
+        self._known = False
+        self._open = False
+        self._entry = 0.0
+        self._side = 1.0
+        self._quiet = 0
+        self._ticks = 0
+        self._velocity = 0.0
+        self._force = 0.0
+        self._aligned = 0.0
+        self._peak = 0.0
+        self._work = 0.0
+        self._sxx = self._sxv = self._svv = self._sxf = self._svf = 0.0
+        self.balance = 0.0
+        self.expected = 0.0
+        self.restitution = 0.0
+
+    def tick(self, given: float, force: float, position: float, velocity: float, measured: float) -> int:
+        """The fault that this tick shows, 0 if none.
+
+        `given` [N] is the force that the controller gave on the tick before, `force` [N] and `measured` [m]
+        are this tick's readings, position [m] and velocity [m/s] the numerical model's.
+        """
+        if self._known:
+            before = self._velocity
+        else:
+            self._known = True
+            self._alignment.start(measured, velocity)
+            before, given = velocity, 0.0
+        deflection = self._deflection(self._alignment.step(measured))
+        touching = self._deflection(position) != 0.0 or self._deflection(measured) != 0.0
+        side = 1.0 if position > self._middle else -1.0
+        fault = 0
+        if not self._open and touching:
+            self._begin(before, side)
+        if self._open:
+            if touching:
+                self._quiet = 0
+            else:
+                self._quiet += 1
+            self._ticks += 1
+            self._work += self._period * given * 0.5 * (before + velocity)
+            size = abs(given)
+            if size > self._peak:
+                self._peak = size
+            self._regress(force, deflection)
+            faded = size <= FADED * self._peak or size <= self._free_force or self._quiet >= self._faded
+            leaving = self._quiet >= self._quiet_ticks and self._side * velocity < 0.0 and faded
+            if leaving or side != self._side:
+                fault = self._audit(velocity)
+            elif self._ticks > self._longest:
+                fault = CONTACT_TOO_LONG
+        self._velocity = velocity
+        self._force = force
+        self._aligned = deflection
+        return fault
+
+    def conclude(self, given: float) -> int:
+        """Audit the contact under way, if there is one, after the force `given` [N] on the last tick."""
+        if not self._open:
+            return 0
+        before = self._velocity
+        velocity = before - self._period * given / self._mass
+        self._work += self._period * given * 0.5 * (before + velocity)
+        return self._audit(velocity)
+
+    def detail(self) -> str:
+        """The last audit in words."""
+        return f"contact {self.contacts}: restitution {self.restitution:.4g}, expected {self.expected:.4g}"
+
+    def _begin(self, entry: float, side: float) -> None:
+        self._open = True
+        self._entry = entry
+        self._side = side
+        self._quiet = 0
+        self._ticks = 0
+        self._peak = 0.0
+        self._work = 0.0
+        self._sxx = self._sxv = self._svv = self._sxf = self._svf = 0.0
+
+    def _regress(self, force: float, deflection: float) -> None:
+        """Take in the interval between two ticks, if both its ends are in contact."""
+        side = self._side
+        least = self._free_force
+        before, force_before = self._aligned, self._force
+        if deflection * side > 0.0 and before * side > 0.0 and force * side > least:
+            if force_before * side > least:
+                middle = side * (deflection + before) * 0.5
+                rate = side * (deflection - before) / self._period
+                mean = side * (force + force_before) * 0.5
+                self._sxx += middle * middle
+                self._sxv += middle * rate
+                self._svv += rate * rate
+                self._sxf += middle * mean
+                self._svf += rate * mean
+
+    def _audit(self, velocity: float) -> int:
+        self._open = False
+        self.contacts += 1
+        entry, mass = self._entry, self._mass
+        energy = 0.5 * mass * entry * entry
+        self.balance = 0.5 * mass * velocity * velocity - energy + self._work
+        if not abs(self.balance) <= self._tolerance * energy:
+            return ENERGY_BALANCE
+        speed = abs(entry)
+        if speed == 0.0:
+            return 0
+        determinant = self._sxx * self._svv - self._sxv * self._sxv
+        stiffness = damping = 0.0
+        if determinant > 0.0:
+            stiffness = (self._sxf * self._svv - self._svf * self._sxv) / determinant
+            damping = (self._svf * self._sxx - self._sxf * self._sxv) / determinant
+        self.restitution = abs(velocity) / speed
+        self.expected = self._expectation.restitution(stiffness, damping, speed, mass)
+        if not abs(self.restitution - self.expected) <= self._margin:
+            return RESTITUTION
+        return 0
+
+    def _deflection(self, position: float) -> float:
+        if position > 0.0:
+            return position
+        far = position + self._clearance
+        return far if far < 0.0 else 0.0
+
+
+class Expectation:
+    """The restitution that a contact should have, by its stiffness [N/m], damping [N s/m], speed [m/s]."""
+
+    __slots__ = (
+        "_coefficients",
+        "_loss",
+        "_reference_stiffness",
+        "_reference_velocity",
+        "_softness",
+        "_speed",
+    )
+
+    def __init__(self, limits: Mapping[str, float]) -> None:
+        self._reference_stiffness = limits["reference_stiffness"]
+        self._reference_velocity = limits["reference_velocity"]
+        self._softness = limits["softness_lowest"], limits["softness_highest"]
+        self._speed = limits["speed_lowest"], limits["speed_highest"]
+        self._loss = limits["loss_lowest"], limits["loss_highest"]
+        self._coefficients = tuple(
+            limits[f"expected_{term}"]
+            for term in ("1", "p", "pp", "ppp", "w", "ww", "pw", "z", "zz", "pz", "wz")
+        )
+
+    def restitution(self, stiffness: float, damping: float, speed: float, mass: float) -> float:
+        """The polynomial of the module's text; a stiffness that is not above 0 counts as the softest."""
+        p, z = self._softness[1], self._loss[0]
+        root = sqrt(stiffness * mass) if stiffness > 0.0 else 0.0
+        if root > 0.0:
+            p = _within(sqrt(self._reference_stiffness / stiffness) - 1.0, self._softness)
+            z = _within(damping / (2.0 * root), self._loss)
+        w = _within(speed / self._reference_velocity - 1.0, self._speed)
+        c_1, c_p, c_pp, c_ppp, c_w, c_ww, c_pw, c_z, c_zz, c_pz, c_wz = self._coefficients
+        expected = c_1 + p * (c_p + p * (c_pp + p * c_ppp)) + w * (c_w + w * c_ww + p * c_pw)
+        return _within(expected + z * (c_z + z * c_zz + p * c_pz + w * c_wz), (0.0, 1.0))
+
+
+def _within(value: float, span: tuple[float, float]) -> float:
+    # Written so that what is not a number goes to an end as well.
+    if not value > span[0]:
+        return span[0]
+    return value if value < span[1] else span[1]

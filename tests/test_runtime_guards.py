@@ -1,0 +1,413 @@
+"""The runtime's guards: every fault on its tick, its reaction, and outputs that stay inside their limits."""
+
+import itertools
+import math
+import random
+import tracemalloc
+from typing import Any
+
+import pytest
+from gain_documents import gain_document, sign
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxhil.runtime import Controller, GainFileError
+from jaxhil.runtime.faults import (
+    CLOCK,
+    EMERGENCY_STOP,
+    FAULTS,
+    FORCE_IN_FLIGHT,
+    FORCE_LIMIT,
+    FORCE_NOT_FINITE,
+    FORCE_OUT_OF_RANGE,
+    FORCE_SLEW,
+    FORCE_STUCK,
+    LATE_TICK,
+    MISSED_TICK,
+    POSITION_NOT_FINITE,
+    POSITION_OUT_OF_RANGE,
+    POSITION_STUCK,
+    STROKE,
+    TARE,
+    VELOCITY_LIMIT,
+    names,
+)
+from jaxhil.runtime.limits import LIMITS
+
+PERIOD = 1e-3
+LIMITED = {
+    "force_range": 2000.0,
+    "measured_lowest": -0.05,
+    "measured_highest": 0.01,
+    "held_readings": 2.0,
+    "force_stuck_travel": 2e-4,
+    "position_stuck_travel": 1e-4,
+    "free_distance": 5e-4,
+    "settling": 0.01,
+    "free_force": 5.0,
+    "late_fraction": 0.25,
+    "missed_in_a_row": 3.0,
+    "tare_ticks": 50.0,
+    "tare_spread": 4.0,
+    "bias_limit": 20.0,
+    "force_limit": 1000.0,
+    "force_slew": 1e5,
+    "limited_in_a_row": 4.0,
+    "command_lowest": -0.04,
+    "command_highest": 0.008,
+    "velocity_limit": 0.02,
+    "deceleration": 0.5,
+    "retreat_velocity": 0.01,
+}
+
+
+def limited(name: str = "none", **changed: float | None) -> Controller:
+    document = gain_document(name)
+    limits = {**LIMITED, **changed}
+    document["limits"] = {name: {"value": value, "unit": LIMITS[name].unit} for name, value in limits.items()}
+    return Controller.from_dict(sign(document))
+
+
+def fly(controller: Controller, ticks: int, start: float = -0.02) -> float:
+    """Uniform motion out of contact; the time and position that come next."""
+    for n in range(ticks):
+        position = start + 5e-6 * n
+        assert controller.step(0.0, position, 5e-3, position - 1e-5, n * PERIOD) == 0.0
+        assert controller.position_command(position + 5e-6, 5e-3, 0.0) == position + 5e-6
+        assert controller.faults == 0, names(controller.faults)
+    return start + 5e-6 * ticks
+
+
+def test_the_table_of_faults_has_one_bit_and_one_name_each():
+    assert [fault.bit for fault in FAULTS] == [1 << n for n in range(len(FAULTS))]
+    assert len({fault.name for fault in FAULTS}) == len(FAULTS)
+    assert names(FORCE_SLEW | TARE) == ["force_slew", "tare"]
+
+
+BAD_READINGS = {
+    FORCE_NOT_FINITE: (math.nan, None),
+    FORCE_OUT_OF_RANGE: (2000.0, None),
+    POSITION_NOT_FINITE: (None, -math.inf),
+    POSITION_OUT_OF_RANGE: (None, 0.011),
+}
+
+
+@pytest.mark.parametrize("fault", BAD_READINGS)
+def test_bad_readings_are_bridged_then_trip(fault):
+    controller = limited()
+    controller.step(3.0, 1e-4, 5e-3, 1e-4)
+    force, measured = BAD_READINGS[fault]
+    for n in range(1, 4):
+        position = 1e-4 + 5e-6 * n
+        command = controller.step(
+            3.0 + n if force is None else force, position, 5e-3, position if measured is None else measured
+        )
+        assert controller.faults == fault
+        assert controller.tripped is (n > 2)
+        # Bridged, the last good force stands in; where the position is bad, the force is what is read.
+        assert command == (0.0 if n > 2 else 3.0 if measured is None else 3.0 + n)
+    assert controller.seen == controller.cause == fault
+
+
+def test_a_good_reading_ends_the_bridging():
+    controller = limited()
+    for n in range(30):
+        position = -1e-4 + 5e-6 * n
+        controller.step(math.nan if n % 3 else 1.0 + n, position, 5e-3, position)
+        assert bool(controller.faults) is bool(n % 3)
+    assert controller.status == "ok"
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_force_that_does_not_change_in_contact_is_stuck(side):
+    controller = limited()
+    document = gain_document("none")
+    assert "clearance" not in document["mechanism"]["contact"]
+    first = None
+    for n in range(60):
+        measured = side * (1e-4 + 5e-6 * n)
+        controller.step(7.0 if n else 6.0, measured, side * 5e-3, measured, n * PERIOD)
+        if controller.faults:
+            first = n
+            break
+    if side > 0:
+        # 7 N since tick 1: the travel from there is 5 um a tick.
+        assert controller.cause == FORCE_STUCK and first in (1 + 40, 1 + 41)
+    else:
+        assert first is None
+
+
+def test_position_that_does_not_change_while_the_model_moves_is_stuck():
+    controller = limited()
+    fly(controller, 30)
+    for n in range(30, 60):
+        controller.step(0.0, -0.02 + 5e-6 * n, 5e-3, -0.02, n * PERIOD)
+        if controller.faults:
+            break
+    assert controller.cause == POSITION_STUCK
+    assert n in (30 + 20, 30 + 21)
+
+
+def test_force_out_of_contact_is_flagged_once_contact_has_settled():
+    controller = limited()
+    for n in range(40):
+        controller.step(6.0, -0.02 + 5e-6 * n, 5e-3, -0.02 + 5e-6 * n, n * PERIOD)
+        assert bool(controller.faults & FORCE_IN_FLIGHT) is (n >= 10)
+        if controller.tripped:
+            break
+    assert (n, controller.cause) == (12, FORCE_IN_FLIGHT)
+    # Near the surface it is no fault.
+    controller = limited()
+    for n in range(40):
+        controller.step(6.0, -4e-4, 0.0, -4e-4, n * PERIOD)
+        assert controller.faults == 0
+
+
+def test_late_and_missed_ticks_and_a_clock_that_stands():
+    controller = limited()
+    seen = []
+    for time in (0.0, 1e-3, 2.3e-3, 3.3e-3, 5.3e-3, 9.3e-3):
+        controller.step(0.0, -0.02, 0.0, -0.02 + time * 1e-6, time)
+        seen.append(controller.faults)
+    assert seen == [0, 0, LATE_TICK, 0, MISSED_TICK, MISSED_TICK]
+    assert (controller.late_ticks, controller.missed_ticks) == (1, 1 + 3)
+    controller.step(0.0, -0.02, 0.0, -0.02, 14.4e-3)
+    assert controller.cause == MISSED_TICK
+    for late in (0.0, -1e-3, math.inf):
+        controller = limited()
+        controller.step(0.0, -0.02, 0.0, -0.02, 1.0)
+        controller.step(0.0, -0.02, 0.0, -0.03, 1.0 + late)
+        assert controller.cause == CLOCK
+
+
+def test_tare_takes_the_bias_from_every_reading_until_the_next():
+    controller = limited()
+    spread = [1.5 * math.sin(n) for n in range(50)]
+    assert [controller.tare(12.0 + value) for value in spread] == [False] * 49 + [True]
+    assert controller.bias == sum([12.0 + value for value in spread]) / 50
+    assert controller.step(112.0, 1e-4, 0.0, 1e-4) == 112.0 - controller.bias
+    assert controller.reset() and controller.bias != 0.0
+    for _ in range(50):
+        controller.tare(1.0)
+    assert controller.bias == 1.0
+
+
+@pytest.mark.parametrize("readings", [[25.0], [0.0, 9.0], [math.nan], [1999.0, 2001.0]])
+def test_tare_that_will_not_do_trips(readings):
+    controller = limited()
+    for n in range(50):
+        if controller.tare(readings[n % len(readings)]):
+            break
+    assert controller.cause == TARE and controller.bias == 0.0
+    assert controller.step(5.0, 0.0, 0.0, 0.0) == 0.0
+
+
+def test_force_limit_trips_and_the_force_fades():
+    controller = limited()
+    for n in range(10):
+        assert controller.step(100.0 * (n + 1), 1e-4 * n, 0.0, 1e-4 * n) == 100.0 * (n + 1)
+    # From 1000 N, 1001 N is beyond: the force goes to 0 by 100 N a tick.
+    forces = [controller.step(1001.0, 2e-3, 0.0, 2e-3) for _ in range(12)]
+    assert controller.cause == FORCE_LIMIT
+    assert forces == [*(1000.0 - 100.0 * (n + 1) for n in range(10)), 0.0, 0.0]
+
+
+def test_force_slew_is_cut_and_trips_if_it_goes_on():
+    controller = limited()
+    assert [controller.step(250.0, 1e-4 * n, 0.0, 1e-4 * n) for n in range(3)] == [100.0, 200.0, 250.0]
+    assert controller.seen == FORCE_SLEW and not controller.tripped
+    controller = limited()
+    forces = [controller.step(900.0, 1e-5 * n, 0.0, 1e-5 * n) for n in range(6)]
+    assert controller.cause == FORCE_SLEW
+    assert forces == [100.0, 200.0, 300.0, 400.0, 300.0, 200.0]
+
+
+def test_stroke_trips_and_the_command_stops_inside():
+    controller = limited()
+    sent = []
+    for n in range(30):
+        position = 7.9e-3 + 1e-5 * n
+        controller.step(0.0, position, 0.0, position + 1e-7 * n)
+        sent.append(controller.position_command(position, 1e-2, 0.0))
+        assert controller.tripped is (position > 8e-3)
+    assert controller.cause == STROKE
+    assert max(sent) <= 0.008 and sent[-1] < 0.008
+
+
+@pytest.mark.parametrize("start", [1e-3, -1e-5, -0.01])
+def test_after_a_trip_the_command_brakes_and_rests_out_of_contact(start):
+    controller = limited()
+    sent, resting = [], False
+    for n in range(3000):
+        position = start + 1e-5 * n
+        if n == 10:
+            controller.emergency_stop(True)
+        controller.step(0.0, position, 0.0, position)
+        sent.append(controller.position_command(position, 1e-2, 0.0))
+        resting = resting or controller.at_rest
+        assert controller.at_rest is resting and (not resting or sent[-1] == sent[-2])
+    changes = [b - a for a, b in itertools.pairwise(sent)]
+    braking = 0.5 * PERIOD**2
+    assert all(abs(b - a) <= braking * (1 + 1e-6) for a, b in itertools.pairwise(changes))
+    assert min(changes) > -1e-5 * (1 + 1e-6)
+    # The way that braking takes is v^2/2a.
+    length = 0.01**2 / (2 * 0.5) + 1e-5
+    assert max(sent) < start + 1e-4 + length
+    assert controller.at_rest and -0.01 < sent[-1] < (-5e-4 if start > -0.01 else -9e-3)
+    assert start < -5e-4 or sent[-1] > -5e-4 - length
+
+
+def test_velocity_limit_is_cut_and_trips_if_it_goes_on():
+    controller = limited()
+    controller.step(0.0, -0.02, 0.0, -0.02)
+    assert controller.position_command(-0.02, 0.0, 0.0) == -0.02
+    sent = [controller.position_command(-0.01, 0.0, 0.0) for _ in range(4)]
+    assert sent == pytest.approx([-0.02 + 2e-5 * (n + 1) for n in range(4)], rel=1e-12)
+    assert controller.faults == VELOCITY_LIMIT and not controller.tripped
+    controller.position_command(-0.01, 0.0, 0.0)
+    assert controller.cause == VELOCITY_LIMIT
+
+
+def test_reset_after_a_trip_is_without_a_bump():
+    controller = limited()
+    fly(controller, 20)
+    controller.emergency_stop(True)
+    held = [controller.position_command(-0.01, 0.0, 0.0) for _ in range(100)][-1]
+    assert controller.at_rest and not controller.reset()
+    controller.emergency_stop(False)
+    assert controller.tripped and controller.cause == EMERGENCY_STOP
+    assert controller.reset() and controller.status == "ok"
+    position, before = -0.0195, held
+    for n in range(2000):
+        controller.step(0.0, position, 5e-3, position + 1e-9 * n)
+        position += 5e-6
+        sent = controller.position_command(position, 5e-3, 0.0)
+        assert abs(sent - before) <= 2e-5 * (1 + 1e-9)
+        assert controller.faults == (VELOCITY_LIMIT if sent != position else 0)
+        before = sent
+        if sent == position:
+            break
+    assert sent == position and not controller.tripped
+    # Caught up, the limit is one again.
+    for _ in range(5):
+        controller.position_command(position + 1e-3, 5e-3, 0.0)
+    assert controller.cause == VELOCITY_LIMIT
+
+
+def test_next_contact_begins_where_the_model_begins_but_not_after_a_trip():
+    controller = limited()
+    fly(controller, 20)
+    controller.next_contact()
+    controller.step(0.0, -0.03, 5e-3, -0.03, 7.0)
+    assert controller.position_command(-0.03, 5e-3, 0.0) == -0.03
+    assert controller.seen == 0
+    controller.emergency_stop(True)
+    controller.next_contact()
+    assert abs(controller.position_command(-0.01, 5e-3, 0.0) + 0.03) < 1e-4
+
+
+def test_without_limits_a_gain_file_gives_the_bare_law():
+    controller = Controller.from_dict(gain_document("none"))
+    for n in range(200):
+        assert controller.step(1e9 * (-1) ** n, 1e3 * n, 5.0, 0.0, 10.0**n / 1e200) == 1e9 * (-1) ** n
+        assert controller.position_command(1e3 * n, 5.0, 0.0) == 1e3 * n
+    assert controller.status == "ok"
+
+
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        ({"force_limit": {"value": -1.0, "unit": "N"}}, ["limits.force_limit.value", "-1.0", ">= 0.0"]),
+        ({"force_limit": {"value": 1.0, "unit": "kN"}}, ["limits.force_limit.unit", "'kN'", "'N'"]),
+        ({"force_limit": {"value": math.inf, "unit": "N"}}, ["JSON"]),
+        ({"force_limit": {"unit": "N"}}, ["limits.force_limit.value", "nothing"]),
+        ({"strength": {"value": 1.0, "unit": "N"}}, ["unknown limit 'strength'"]),
+        ({"force_limit": 3.0}, ["limits.force_limit", "3.0", "an object"]),
+        ([], ["limits", "a list"]),
+        (
+            {"command_lowest": {"value": 1.0, "unit": "m"}, "command_highest": {"value": 0.5, "unit": "m"}},
+            ["limits", "command_lowest 1.0 is not below command_highest 0.5"],
+        ),
+        (
+            {
+                "velocity_limit": {"value": 0.1, "unit": "m/s"},
+                "retreat_velocity": {"value": 1, "unit": "m/s"},
+            },
+            ["limits", "retreat_velocity", "velocity_limit"],
+        ),
+    ],
+)
+def test_limits_that_do_not_fit_are_refused(limits, words):
+    document: dict[str, Any] = gain_document("none")
+    document["limits"] = limits
+    try:
+        signed = sign(document)
+    except ValueError:
+        signed = {**document, "sha256": "0"}
+    with pytest.raises(GainFileError) as caught:
+        Controller.from_dict(signed)
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+hostile = st.floats(allow_nan=True, allow_infinity=True) | st.sampled_from(
+    [0.0, -0.0, 1e308, 5e-324, math.nan]
+)
+calls = st.lists(
+    st.tuples(
+        st.sampled_from(["step", "timed", "position", "tare", "next", "reset", "stop", "release"]),
+        st.tuples(hostile, hostile, hostile, hostile, hostile),
+    ),
+    max_size=60,
+)
+
+
+@given(calls=calls, name=st.sampled_from(["none", "phase_lead", "response_error"]))
+def test_outputs_are_finite_and_inside_their_limits_whatever_comes(calls, name):
+    controller = limited(name)
+    force, sent = 0.0, None
+    for call, values in calls:
+        if call in ("step", "timed"):
+            new = controller.step(*values[:4], values[4] if call == "timed" else None)
+            assert abs(new) <= 1000.0 and abs(new - force) <= 100.0 * (1 + 1e-12)
+            force = new
+        elif call == "position":
+            new = controller.position_command(*values[:3])
+            if sent is not None:
+                assert -0.04 <= new <= 0.008 and abs(new - sent) <= 2e-5 * (1 + 1e-9)
+            sent = new
+        elif call == "tare":
+            controller.tare(values[0])
+        elif call == "next":
+            if not controller.tripped:
+                sent = None
+            controller.next_contact()
+        elif call == "reset":
+            controller.reset()
+        else:
+            controller.emergency_stop(call == "stop")
+        assert controller.tripped is (controller.status != "ok")
+        assert "\n" not in controller.status
+
+
+@pytest.mark.parametrize("name", ["none", "phase_lead", "response_error"])
+def test_memory_does_not_grow(name):
+    controller = limited(name)
+    rng = random.Random(1)
+    ticks = [(rng.gauss(0, 1), -0.02 + 1e-9 * n, 5e-3, -0.02 + 1e-9 * n) for n in range(1000)]
+
+    def run(first: int) -> None:
+        for n, tick in enumerate(ticks, start=first):
+            controller.step(*tick, n * PERIOD)
+            controller.position_command(*tick[1:3], 0.0)
+
+    run(0)
+    tracemalloc.start()
+    try:
+        run(1000)
+        before = tracemalloc.get_traced_memory()[0]
+        for n in range(2, 6):
+            run(1000 * n)
+        assert tracemalloc.get_traced_memory()[0] - before < 2000
+    finally:
+        tracemalloc.stop()
+    assert controller.status == "ok"
