@@ -183,37 +183,6 @@ class NumericalModel:
             self.position += period * self.velocity
 
 
-class RuntimeGuards:
-    """What this process asks of the runtime's controller beside the law itself: tare, faults, trip."""
-
-    __slots__ = ("_controller", "_guarded", "_held")
-
-    def __init__(self, controller: Any) -> None:
-        self._controller = controller
-        self._guarded = hasattr(type(controller), "tare")
-        self._held: float | None = None
-
-    def tare(self, force: float) -> bool:
-        """Take in one reading of the free mechanism; whether that is enough."""
-        return bool(self._controller.tare(force)) if self._guarded else True
-
-    def faults(self) -> int:
-        """The faults of this tick, as bits."""
-        return int(self._controller.faults) if self._guarded else 0
-
-    def tripped(self) -> bool:
-        """Whether the controller has tripped."""
-        return bool(self._controller.tripped) if self._guarded else self._controller.status != "ok"
-
-    def position_command(self, model: NumericalModel) -> float:
-        """The position command [m]: after a trip, one that leaves contact and holds."""
-        command = self._controller.position_command(model.position, model.velocity, model.acceleration)
-        if self._guarded or not self.tripped():
-            self._held = command
-        # Without guards in the runtime, at least hold.
-        return command if self._held is None else self._held
-
-
 class Task:
     """What is done with one packet, without a network: readings in, answers out.
 
@@ -221,12 +190,12 @@ class Task:
     """
 
     __slots__ = (
-        *("_bridged", "_command", "_controller", "_force", "_guards", "_last", "_model", "_period", "_run"),
+        *("_bridged", "_command", "_controller", "_force", "_last", "_model", "_period", "_run"),
         *("_sequence", "_tared", "_words", "_zeroed", "made_up", "stale"),
     )
 
     def __init__(self, controller: Any, mechanism: dict[str, Any], bridged: float = MOST_MADE_UP) -> None:
-        self._controller, self._guards = controller, RuntimeGuards(controller)
+        self._controller = controller
         self._model, self._bridged = NumericalModel(mechanism), min(bridged, MOST_MADE_UP)
         self._period = float(mechanism["rig"]["control_period"])
         sensor = mechanism["rig"].get("force_sensor", {})
@@ -260,7 +229,7 @@ class Task:
         model = self._model
         if reading.run != self._run:
             if not self._tared:
-                self._tared = self._guards.tare(reading.force)
+                self._tared = self._controller.tare(reading.force)
             if not self._tared:
                 return self._reply(reading, TARING, 0.0, model.position, model.velocity, 0.0, 0)
             self._begin(reading)
@@ -274,7 +243,7 @@ class Task:
             model.place(*model.start)
         if self._run >= 0:
             self._controller.next_contact()
-        self._command = self._guards.position_command(model)
+        self._command = self._controller.position_command(model.position, model.velocity, model.acceleration)
         self._run, self._last, self._force = reading.run, None, 0.0
 
     def _step(self, reading: Reading) -> Answer:
@@ -292,7 +261,7 @@ class Task:
         faults |= self._tick(reading.tick, reading.force, reading.position, reading.time)
         self._last = reading
         # After a trip the command goes its own way.
-        rate = (self._command - before) / self._period if self._guards.tripped() else model.velocity
+        rate = (self._command - before) / self._period if self._controller.tripped else model.velocity
         return self._reply(reading, 0, rate, position, velocity, self._force, faults)
 
     def _make_up(self, missed: int, reading: Reading) -> None:
@@ -309,14 +278,14 @@ class Task:
 
     def _tick(self, tick: int, force: float, position: float, time: float) -> int:
         """Controller and numerical model, one period further; the tick's faults."""
-        model = self._model
-        command = self._controller.step(force, model.position, model.velocity, position, time)
+        model, controller = self._model, self._controller
+        force = controller.step(force, model.position, model.velocity, position, time)
         if self._zeroed and tick == 0:
-            command = 0.0
-        self._force = command
-        model.integrate(command)
-        self._command = self._guards.position_command(model)
-        return self._guards.faults()
+            force = 0.0
+        self._force = force
+        model.integrate(force)
+        self._command = controller.position_command(model.position, model.velocity, model.acceleration)
+        return controller.faults
 
     def _reply(
         self,
@@ -328,7 +297,7 @@ class Task:
         force: float,
         faults: int,
     ) -> Answer:
-        if self._guards.tripped():
+        if self._controller.tripped:
             flags |= TRIPPED
             self._words = self._words or self.status[:96]
         _, sequence, run, tick, *_ = reading

@@ -129,8 +129,8 @@ class RigTask:
             self._over(over)
 
     def finish(self) -> None:
-        """No tick follows: a contact under way counts as tripped, or as not over."""
-        if self._tick >= 0 and self._words:
+        """No tick follows. A contact that a trip has cut short is one of the contacts."""
+        if self._tick >= 0 and self._words and all(one.status != "tripped" for one in self._contacts):
             cut = self._watch.cut("tripped")
             if cut is not None:
                 self._contacts.append(cut)
@@ -146,11 +146,13 @@ class RigTask:
         self._tick = 0
 
     def _over(self, over: ContactResult) -> None:
+        if self._words:
+            # Once tripped, the rig plays on, and what becomes of the contact says nothing.
+            if all(one.status != "tripped" for one in self._contacts):
+                self._contacts.append(over._replace(status="tripped", restitution=math.nan))
+            return
         self._contacts.append(over)
         following = over.number + 1
-        if self._words:
-            # Tripped: the rig plays on, and nothing more is asked of it.
-            return
         if self._two_sided and over.status == "ok" and following < self._mechanism.approach.contacts:
             self._plant.expect(following)
             return
