@@ -23,9 +23,13 @@ def controller(mechanism: Mechanism, compensator: str, gains: Mapping[str, float
 def closed_loop(
     mechanism: Mechanism, compensator: str, gains: Mapping[str, float], seed: int = 0
 ) -> tuple[list[ContactResult], dict[int, float]]:
-    """The mechanism's contacts as `jaxhil simulate` runs them, each entered at the speed of the rebound before;
-    the largest shortfall [m] of the position command in each."""
-    law, plant, watch = controller(mechanism, compensator, gains), Plant(mechanism, seed), ContactWatch(mechanism)
+    """The mechanism's contacts as `jaxhil simulate` runs them, each entered at the speed of the rebound
+    before; the largest shortfall [m] of the position command in each."""
+    law, plant, watch = (
+        controller(mechanism, compensator, gains),
+        Plant(mechanism, seed),
+        ContactWatch(mechanism),
+    )
     raw = to_builtins(mechanism)
     model, sensor = NumericalModel(raw), mechanism.rig.force_sensor
     zeroed = sensor.noise_std != 0 or sensor.bias != 0
@@ -65,8 +69,8 @@ def packets(
     delivered: Callable[[str, Any], list[Any]] = lambda way, packet: [packet],
     seed: int = 0,
 ) -> tuple[RigTask, Task, list[Answer]]:
-    """Rig and controller exchanging packets for so many ticks. `delivered(way, packet)` is what arrives at that
-    tick instead of a packet `"there"` or `"back"`."""
+    """Rig and controller exchanging packets for so many ticks. `delivered(way, packet)` is what arrives at
+    that tick instead of a packet `"there"` or `"back"`."""
     rig, task = RigTask(mechanism, seed), Task(law, to_builtins(mechanism))
     answers = []
     for _ in range(ticks):

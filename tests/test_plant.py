@@ -6,13 +6,15 @@ import time
 import numpy as np
 import pytest
 from cases import CASES, oracle_contacts, run_oracle
-from lanes import nominal_gains, validated
+from lanes import as_arrays, join, nominal_gains, run_rollout, validated
 from rig_lock_step import closed_loop
 
+from jaxhil.building import build_loop
 from jaxhil.compensators import literature_gains
 from jaxhil.mechanism_file import builtin_names, from_builtins, load
+from jaxhil.metrics import OK
 from jaxhil.runtime import COMPENSATORS
-from tuning.commands.simulate import simulate
+from jaxhil.scenario import build_scenarios
 from tuning.rig.plant import Plant
 from tuning.rig.propagation import split_delay
 
@@ -62,15 +64,19 @@ def test_every_built_in_mechanism_as_simulated(name):
         overrides += ("approach.contacts=3", "rig.command_latency=1")
     mechanism = load(name, overrides).mechanism
     gains = literature_gains(mechanism, "response_error")
-    expected, status = simulate(mechanism, "response_error", gains, 0)
-    assert status == "ok"
+    scenario = join([build_scenarios(mechanism)])
+    loop = build_loop(mechanism, "response_error", scenario)
+    expected = run_rollout(loop, as_arrays(gains), scenario)
     found, shortfalls = closed_loop(mechanism, "response_error", gains)
-    assert len(found) == len(expected) == mechanism.approach.contacts
-    for number, (mine, other) in enumerate(zip(found, expected, strict=True)):
-        assert mine.restitution == pytest.approx(other["restitution"], abs=1e-9)
-        assert mine.duration == pytest.approx(other["duration"], abs=1e-9)
-        assert mine.peak_force == pytest.approx(other["peak_force"], rel=1e-3)
-        assert shortfalls[number] == pytest.approx(other["position_shortfall"], rel=1e-6, abs=1e-17)
+    assert len(found) == mechanism.approach.contacts
+    for slot, mine in enumerate(found):
+        assert mine.status == "ok" and expected.status[slot, 0] == OK
+        assert mine.restitution == pytest.approx(float(expected.restitution[slot, 0]), abs=1e-9)
+        assert mine.duration == pytest.approx(float(expected.duration[slot, 0]), abs=1e-9)
+        assert mine.peak_force == pytest.approx(float(expected.peak_force[slot, 0]), rel=1e-3)
+        assert shortfalls[slot] == pytest.approx(
+            float(expected.position_shortfall[slot, 0]), rel=1e-6, abs=1e-17
+        )
     if overrides:
         assert max(shortfalls.values()) > 1e-7
 
