@@ -503,6 +503,19 @@ def test_unusable_input_of_rig(jaxhil, tmp_path, options, words):
     assert ran.err.strip().count("\n") == 0
 
 
+def test_help_of_rig_has_an_example(jaxhil):
+    ran = jaxhil("rig", "--help")
+    assert ran.code == 0 and "Example: jaxhil rig" in ran.out
+
+
+def test_the_loop_runs_without_jax():
+    program = (
+        "import sys, tuning.commands.rig as command, tuning.rig.udp_session, tuning.rig.udp_report\n"
+        "assert 'jax' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
+
+
 @pytest.mark.benchmark
 def test_ten_minutes_at_1_khz(jaxhil, tmp_path):
     mechanism, sha256, _ = load("varying")

@@ -275,8 +275,8 @@ class Rig:
         float, arg(metavar="SECONDS", help="Injected: constant delay of every packet, either way.")
     ] = 0.0
     realtime: Annotated[
-        bool,
-        arg(name="realtime", metavar="", help="Ask the system for a real-time priority for both processes."),
+        FlagCreatePairsOff[bool],
+        arg(help="Ask the system for a real-time priority for both processes.", help_behavior_hint=""),
     ] = False
     seed: Annotated[int, _number("Seed of sensor noise, contact phases and injected faults.")] = 0
     plot: Annotated[

@@ -253,7 +253,7 @@ class Task:
         if missed > 0:
             faults = MISSED_TICK
             if missed <= self._bridged:
-                self._make_up(missed, reading)
+                faults |= self._make_up(missed, reading)
             else:
                 for _ in range(min(missed, MOST_PASSED)):
                     model.integrate(self._force)
@@ -264,9 +264,10 @@ class Task:
         rate = (self._command - before) / self._period if self._controller.tripped else model.velocity
         return self._reply(reading, 0, rate, position, velocity, self._force, faults)
 
-    def _make_up(self, missed: int, reading: Reading) -> None:
-        """The ticks between the last reading and this one, from readings on the line between them."""
+    def _make_up(self, missed: int, reading: Reading) -> int:
+        """The ticks since the last reading, from readings on the line to this one; their faults."""
         self.made_up += missed
+        faults = 0
         last = self._last
         before = reading if last is None else last
         for number in range(missed):
@@ -274,7 +275,9 @@ class Task:
             force = before.force + share * (reading.force - before.force)
             position = before.position + share * (reading.position - before.position)
             tick = reading.tick - missed + number
-            self._tick(tick, force, position, reading.time - (missed - number) * self._period)
+            time_then = reading.time - (missed - number) * self._period
+            faults |= self._tick(tick, force, position, time_then)
+        return faults
 
     def _tick(self, tick: int, force: float, position: float, time: float) -> int:
         """Controller and numerical model, one period further; the tick's faults."""
