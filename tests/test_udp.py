@@ -393,6 +393,22 @@ def test_the_controllers_process_answers_its_rig_and_nobody_else(tmp_path):
     assert all(value > 0 for value in ticks["wall"] + ticks["cpu"])
 
 
+def test_the_controllers_process_of_a_bundle_runs_the_bundles_runtime(jaxhil, tmp_path):
+    gain_file(tmp_path)
+    (tmp_path / "udp_controller.py").write_bytes((SOURCE / "udp_controller.py").read_bytes())
+    stand_in = (
+        "import sys\n"
+        f"open({str(tmp_path / 'used')!r}, 'w').write(str(sys.flags.isolated))\n"
+        f"sys.path.insert(0, {str(ROOT)!r})\n"
+        "from jaxhil.runtime import Controller\n"
+    )
+    (tmp_path / "jaxhil_runtime.py").write_text(stand_in)
+    ran = jaxhil("rig", tmp_path, "--duration", 0.5, "--json", "--limit", "inf")
+    assert ran.document["run"]["ticks"] == 500
+    assert (tmp_path / "used").read_text() == "1"
+    assert not (tmp_path / "__pycache__").exists()
+
+
 @pytest.mark.parametrize("options", [("--wait", "0.1"), ("--wait", "20", "--silence", "0.1")])
 def test_a_silent_rig_ends_the_controllers_process(tmp_path, options):
     record = tmp_path / "ticks.json"
@@ -501,6 +517,15 @@ def test_unusable_input_of_rig(jaxhil, tmp_path, options, words):
     ran = jaxhil("rig", *(names.get(option, option) for option in options))
     assert ran.code == 2 and words in ran.err and ran.out == ""
     assert ran.err.strip().count("\n") == 0
+
+
+def test_a_priority_that_is_not_to_be_had(jaxhil, tmp_path, monkeypatch):
+    def refuse(*arguments):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse, raising=False)
+    ran = jaxhil("rig", gain_file(tmp_path), "--realtime")
+    assert ran.code == 2 and "--realtime: found no such priority (Operation not permitted)" in ran.err
 
 
 def test_help_of_rig_has_an_example(jaxhil):

@@ -1,8 +1,10 @@
 """`jaxhil rig`: the controller as a process of its own, against a rig played in real time over UDP."""
 
+import importlib
 import math
 import sys
 import tempfile
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from tuning.commands import checks
 LONGEST_EMPTY = 30.0  # s of empty loop at most
 EMPTY_SHARE = 0.2  # of the run's duration
 MOST_TICKS = 2_000_000
+PROCESS = "udp_controller.py"
 MOST_ROWS = 12  # contacts shown one by one
 
 
@@ -24,7 +27,7 @@ def run(options: Rig) -> int:
     _check_injection(options)
     if options.plot is not None:
         checks.picture(options.plot)
-    folder, gains = controller_folder(options.path)
+    gains = checks.gain_file(options.path)
     document, mechanism = load(gains)
     period = mechanism.rig.control_period
     if not period <= options.duration <= MOST_TICKS * period:
@@ -33,21 +36,29 @@ def run(options: Rig) -> int:
 
     from tuning.rig.udp_network import Injection
     from tuning.rig.udp_report import judge, reference_restitutions
-    from tuning.rig.udp_session import Setup, run_session
+    from tuning.rig.udp_session import Setup, real_time, run_session
 
-    setup = Setup(
-        folder=folder,
-        gains=gains,
-        mechanism=mechanism,
-        stroke=stroke(document),
-        duration=options.duration,
-        empty_duration=min(LONGEST_EMPTY, EMPTY_SHARE * options.duration),
-        injection=Injection(options.drops, options.jitter, options.delay),
-        seed=options.seed,
-        priority=options.realtime,
-    )
-    with tempfile.TemporaryDirectory(prefix="jaxhil-rig-") as scratch:
-        session = run_session(setup, Path(scratch), report.note, _Progress(period).tell)
+    try:
+        with real_time(options.realtime):
+            pass
+    except OSError as error:
+        reason = one_line(error.strerror or str(error), 100)
+        raise InputError(f"--realtime: found no such priority ({reason}), allowed without it") from None
+
+    with tempfile.TemporaryDirectory(prefix="jaxhil-rig-") as temporary:
+        scratch = Path(temporary)
+        setup = Setup(
+            folder=controller_folder(options.path, document["compensator"], scratch),
+            gains=gains,
+            mechanism=mechanism,
+            stroke=stroke(document),
+            duration=options.duration,
+            empty_duration=min(LONGEST_EMPTY, EMPTY_SHARE * options.duration),
+            injection=Injection(options.drops, options.jitter, options.delay),
+            seed=options.seed,
+            priority=options.realtime,
+        )
+        session = run_session(setup, scratch, report.note, _Progress(period).tell)
     # jax is imported here for the first time: none of it runs beside the loop.
     references = reference_restitutions(mechanism, session.contacts)
     found = judge(setup, session, references, options.limit, document["compensator"])
@@ -67,18 +78,20 @@ def run(options: Rig) -> int:
     return 0 if found["verdict"] == "good" else 1
 
 
-def controller_folder(given: str) -> tuple[Path, Path]:
-    """The folder in which the controller's process is to run, and its gain file.
-
-    A bundle has its own; beside a bare gain file, it is that of the source tree. Raises InputError for what
-    cannot be read.
-    """
+def controller_folder(given: str, compensator: str, scratch: Path) -> Path:
+    """The folder in which the controller's process is to run: the bundle itself or, for a bare gain file,
+    what such a process needs of a bundle, made in the folder `scratch`."""
     from tuning.rig.udp_session import SOURCE
 
-    gains = checks.gain_file(given)
     folder = Path(given)
-    bundle = folder.is_dir() and (folder / "udp_controller.py").is_file()
-    return (folder if bundle else SOURCE), gains
+    if folder.is_dir() and (folder / PROCESS).is_file():
+        return folder
+    if find_spec("tuning.rig.single_file") is None:
+        return SOURCE
+    runtime_source = importlib.import_module("tuning.rig.single_file").runtime_source
+    (scratch / "jaxhil_runtime.py").write_text(runtime_source(compensator), encoding="utf-8")
+    (scratch / PROCESS).write_bytes((SOURCE / PROCESS).read_bytes())
+    return scratch
 
 
 def load(gains: Path) -> tuple[dict[str, Any], Any]:
@@ -166,6 +179,12 @@ def _print(found: dict[str, Any]) -> None:
         lines.append(f"... and {len(found['contacts']) - len(shown)} more contacts.")
     if found["largest_error"] is not None:
         lines.append(f"Largest error of {found['judged']} contacts: {found['largest_error']:+.5f}.")
+    lines += [
+        f"{loop['replayed']} ticks of the controller took more than their share of CPU time, and at most "
+        f"{1e6 * loop['replayed_most']:.0f} µs when the same packets were gone through again."
+        for loop in reached.values()
+        if loop["replayed"]
+    ]
     if found["tripped"]:
         lines.append(f"The controller {found['tripped']}.")
     if found["interrupted"]:

@@ -41,6 +41,8 @@ HERE = Path(__file__).resolve().parent
 # An isolated interpreter (-I) does not look beside the script.
 if (HERE / "jaxhil_runtime.py").is_file():
     sys.path.insert(0, str(HERE))
+    # A bundle stays as it is.
+    sys.dont_write_bytecode = True
     from jaxhil_runtime import Controller  # pyright: ignore[reportMissingImports]
 else:
     # Not in a bundle but in the source tree.
