@@ -234,6 +234,29 @@ def test_stale_packets_are_dropped_and_counted(varying):
     assert task.answer(a_reading(4)) is not None
 
 
+SMALL = st.integers(0, 40)
+
+
+@given(
+    st.lists(
+        st.builds(
+            Reading, st.sampled_from([PREPARE, TICK]), SMALL, st.integers(0, 3), SMALL, FINITE, *[ANY] * 4
+        ),
+        max_size=30,
+    ),
+    st.sampled_from(["none", "response_error"]),
+)
+def test_whatever_a_rig_sends_is_answered_with_finite_commands(varying, readings, compensator):
+    mechanism, gains = varying
+    law = controller(mechanism, compensator, gains if compensator == "response_error" else {})
+    task = Task(law, to_builtins(mechanism))
+    for number, reading in enumerate(readings):
+        answer = task.answer(reading._replace(sequence=reading.sequence + 2 * number))
+        if answer is not None:
+            assert math.isfinite(answer.position_command) and math.isfinite(answer.force_command)
+            assert same(decode_answer(encode_answer(answer)), answer)
+
+
 def test_a_sensor_that_fails_trips_and_the_rig_is_safe(varying):
     mechanism, gains = varying
     limits = {"held_readings": 3.0, "retreat_velocity": 0.01, "deceleration": 0.5, "velocity_limit": 0.1}
