@@ -43,14 +43,18 @@ from tuning.rig.udp_controller import (
     encode_reading,
     replayed,
 )
+from tuning.rig.udp_loop import EmptyTask, Timing, answered_by, play
 from tuning.rig.udp_network import Injection, Network
-from tuning.rig.udp_report import reference_restitutions
+from tuning.rig.udp_report import reference_restitutions, stalled
+from tuning.rig.udp_rig import EXTRAPOLATED
 from tuning.rig.udp_session import (
     CONTROLLER,
     INJECTED,
     MACHINE,
     MET,
     SOURCE,
+    LoopReport,
+    Setup,
     attribute,
     listening_port,
     quantiles,
@@ -371,6 +375,45 @@ def test_references_are_those_of_the_lists():
         else:
             assert found == pytest.approx([0.91641, 0.93984, 0.96463, 0.93984], abs=1e-5)
     assert reference_restitutions(mechanism, []) == []
+
+
+def test_contacts_that_the_machine_left_without_commands_are_not_judged(varying):
+    causes = np.full(100, MET)
+    causes[20:40], causes[60] = MACHINE, CONTROLLER
+    figures, times = None, None
+    run = LoopReport(figures, times, causes, {})  # pyright: ignore[reportArgumentType]
+    contact = ContactResult(0, 0.005, 0.5, 1.0, 0.1, "ok", 3)
+    setup = Setup(SOURCE, SOURCE, varying[0], (-1, 1), 1.0, 0.0, Injection(), 0)
+    old = contact._replace(packets=(10, 50), oldest_command=EXTRAPOLATED + 1)
+    assert stalled(old, setup, run)
+    assert not stalled(old._replace(oldest_command=EXTRAPOLATED), setup, run)
+    assert not stalled(old._replace(packets=(10, 60)), setup, run)
+    assert not stalled(old, setup._replace(injection=Injection(drops=0.1)), run)
+
+
+class Sleepy(EmptyTask):
+    """A rig that is held up once."""
+
+    held = 0.03
+
+    def advance(self):
+        if self._sequence == 50:
+            time.sleep(self.held)
+
+
+def test_a_rig_that_was_held_up_goes_on_from_there():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as nobody:
+        nobody.bind(("127.0.0.1", 0))
+        timing = Timing(100)
+        network = Network(nobody.getsockname(), Injection(), 0, 100, answered_by)
+        begun = time.monotonic()
+        play(Sleepy(), network, 0.001, timing, lambda done: None)
+        took = time.monotonic() - begun
+        network.close()
+    assert timing.ticks == 100 and not any(timing.met)
+    assert timing.stood >= 0.9e9 * Sleepy.held
+    assert timing.late[51] >= 0.9e9 * Sleepy.held
+    assert took > 0.1 + Sleepy.held
 
 
 # Two processes

@@ -185,6 +185,16 @@ def _print(found: dict[str, Any]) -> None:
         for loop in reached.values()
         if loop["replayed"]
     ]
+    if found["stalled"]:
+        lines.append(
+            f"{found['stalled']} contacts are not judged: the machine left the controller without time for "
+            "more than ten periods."
+        )
+    lines += [
+        f"The machine held up the rig of the {name}: its clock stood still for {loop['stood_still']:.3g} s."
+        for name, loop in reached.items()
+        if loop["stood_still"] > 0
+    ]
     if found["tripped"]:
         lines.append(f"The controller {found['tripped']}.")
     if found["interrupted"]:

@@ -17,7 +17,8 @@ RUNAWAY = 1e3  # of the approach speed
 class ContactResult(NamedTuple):
     """One contact: its number in the mechanism's lists; approach_velocity [m/s]; restitution; peak_force, the
     largest sample of the real force [N]; duration, the time in touch [s]; status, as in `jaxhil.metrics`, or
-    "tripped"; begun, the tick of the run at which it began."""
+    "tripped"; begun, the tick of the run at which it began. Filled in by who exchanges packets: the numbers
+    of the first and the last packet about it, and the age of the oldest command used [periods]."""
 
     number: int
     approach_velocity: float
@@ -26,6 +27,8 @@ class ContactResult(NamedTuple):
     duration: float
     status: str
     begun: int
+    packets: tuple[int, int] = (0, 0)
+    oldest_command: int = 0
 
 
 class ContactWatch:

@@ -3,7 +3,8 @@
 At t_n the sensors' packet leaves; its answer counts if it is there within `ANSWER_SHARE` of the period, the
 rest of which is the rig's own. A tick without an answer by then is a missed one: the rig goes on with what it
 has (`RigTask.advance`), and takes the answer in when it comes. A rig that was itself held up catches up:
-every tick whose time has passed is played at once, and missed.
+every tick whose time has passed is played at once, and missed. Only where it was held up for more than
+`MOST_BEHIND` periods has its clock stood still: nothing of it went on meanwhile.
 """
 
 import gc
@@ -16,6 +17,7 @@ from tuning.rig.udp_controller import EMPTY, TICK, Answer, PacketError, Reading,
 from tuning.rig.udp_network import Network
 
 ANSWER_SHARE = 0.8  # of a period, within which the answer has to be there
+MOST_BEHIND = 10  # periods that the rig catches up with
 SPIN = 100_000  # ns before a tick from which the clock is watched without sleeping
 AHEAD = 50_000_000  # ns before the first tick
 AFTER_TRIP = 1.0  # s for which the rig plays on after a trip
@@ -54,12 +56,13 @@ class EmptyTask:
 
 class Timing:
     """By the number of the packet: how late it left [ns], when its answer arrived after it left [ns; 0 if it
-    never did], and whether that was in time. `ticks` were played; `began` on the monotonic clock [ns]."""
+    never did], and whether both were in time. `ticks` were played; `stood` is for how long the clock of the
+    rig has stood still [ns]."""
 
     def __init__(self, ticks: int) -> None:
         self.late, self.round_trip = (array("q", bytes(8 * ticks)) for _ in range(2))
         self.met = array("b", bytes(ticks))
-        self.ticks, self.began = 0, 0
+        self.ticks, self.stood = 0, 0
 
 
 def play(task: Task, network: Network, period: float, timing: Timing, tell: Callable[[int], None]) -> None:
@@ -76,16 +79,20 @@ def play(task: Task, network: Network, period: float, timing: Timing, tell: Call
     gc.freeze()
     gc.disable()
     try:
-        timing.began = time.monotonic_ns() + AHEAD
+        began = time.monotonic_ns() + AHEAD
         left = array("q", bytes(8 * total))
         for number in range(total):
-            due = timing.began + number * step
+            due = began + timing.stood + number * step
             _until(network, due)
             packet = encode_reading(task.reading())
             left[number] = time.monotonic_ns()
             network.send(number, packet)
-            timing.late[number] = left[number] - due
-            timing.met[number] = _answered(task, network, due + allowance, left, timing)
+            late = timing.late[number] = left[number] - due
+            if late > MOST_BEHIND * step:
+                timing.stood += late
+                due += late
+            met = _answered(task, network, due + allowance, left, timing)
+            timing.met[number] = met and late <= step
             task.advance()
             timing.ticks = number + 1
             if number % second == 0:

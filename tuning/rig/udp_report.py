@@ -8,7 +8,8 @@ import numpy as np
 
 from jaxhil.mechanism import Mechanism
 from tuning.rig.contact_watch import ContactResult
-from tuning.rig.udp_session import LoopReport, SessionReport, Setup
+from tuning.rig.udp_rig import EXTRAPOLATED
+from tuning.rig.udp_session import CONTROLLER, LoopReport, SessionReport, Setup
 
 
 def reference_restitutions(mechanism: Mechanism, contacts: Sequence[ContactResult]) -> list[float]:
@@ -38,6 +39,20 @@ def reference_restitutions(mechanism: Mechanism, contacts: Sequence[ContactResul
     return [float(value) for value in np.asarray(reference.restitution)[:, 0]]
 
 
+STALLED = "stalled"
+
+
+def stalled(contact: ContactResult, setup: Setup, run: LoopReport | None) -> bool:
+    """Whether the machine, and nobody else, left a contact with commands older than `EXTRAPOLATED` periods.
+
+    Such a contact says nothing of the controller. Where faults are injected there are none of the kind.
+    """
+    if run is None or setup.injection.any or contact.oldest_command <= EXTRAPOLATED:
+        return False
+    first, last = contact.packets
+    return not np.any(run.causes[first : last + 1] == CONTROLLER)
+
+
 def judge(
     setup: Setup, session: SessionReport, references: Sequence[float], limit: float, compensator: str
 ) -> dict[str, Any]:
@@ -45,13 +60,15 @@ def judge(
     contacts = [
         {
             **one._asdict(),
+            "status": STALLED if stalled(one, setup, session.run) else one.status,
             "reference_restitution": reference,
             "error": one.restitution - reference if one.status == "ok" else None,
         }
         for one, reference in zip(session.contacts, references, strict=True)
     ]
-    errors = [one["error"] for one in contacts if one["error"] is not None]
-    reasons = _reasons(setup, session, errors, limit)
+    ended = [one for one in contacts if one["status"] == "ok"]
+    errors = [one["error"] for one in ended]
+    reasons = _reasons(setup, session, [one["status"] for one in contacts], errors, limit)
     good = f"no missed tick is the controller's fault, every error is within {limit:g}."
     if session.tripped:
         good = "tripped with a cause under injected faults, every command finite and within its limits."
@@ -67,6 +84,7 @@ def judge(
         "run": _figures(session.run),
         "contacts": contacts,
         "judged": len(errors),
+        "stalled": sum(one["status"] == STALLED for one in contacts),
         "largest_error": max(errors, key=abs, default=None),
         "commanded": None if session.commanded is None else session.commanded._asdict(),
         "stroke": setup.stroke,
@@ -95,7 +113,9 @@ def _figures(loop: LoopReport | None) -> dict[str, Any] | None:
     }
 
 
-def _reasons(setup: Setup, session: SessionReport, errors: Sequence[float], limit: float) -> list[str]:
+def _reasons(
+    setup: Setup, session: SessionReport, statuses: Sequence[str], errors: Sequence[float], limit: float
+) -> list[str]:
     reasons = []
     run, commanded = session.run, session.commanded
     if run is not None:
@@ -112,7 +132,7 @@ def _reasons(setup: Setup, session: SessionReport, errors: Sequence[float], limi
             f"{len(wrong)} of {len(errors)} contacts have an error beyond {limit:g}, the largest "
             f"{worst:+.4f} ({kind})."
         )
-    failed = [one.status for one in session.contacts if one.status not in ("ok", "tripped")]
+    failed = [status for status in statuses if status not in ("ok", "tripped", STALLED)]
     if failed:
         reasons.append(f"{len(failed)} contacts did not end well: {', '.join(sorted(set(failed)))}.")
     if session.tripped and not setup.injection.any:
@@ -122,7 +142,7 @@ def _reasons(setup: Setup, session: SessionReport, errors: Sequence[float], limi
     if commanded is not None and commanded.beyond_limits:
         reasons.append(f"{commanded.beyond_limits} position commands were beyond their limits.")
     if not errors and not session.tripped and not session.interrupted:
-        reasons.append("no contact was over: the run was too short.")
+        reasons.append("no contact could be judged: the run was too short, or the machine too busy.")
     if math.isnan(sum(errors)):
         reasons.append("an error is not a number.")
     return reasons

@@ -51,7 +51,7 @@ class RigTask:
         self._not_finite = self._beyond = 0
         self._stroke = stroke
         self._newest: Answer | None = None
-        self._words = ""
+        self._words, self._first, self._oldest = "", 0, 0
         self._next_run(0)
 
     @property
@@ -114,6 +114,7 @@ class RigTask:
         newest = self._newest
         assert newest is not None
         late = self._tick - newest.tick
+        self._oldest = max(self._oldest, late)
         command = newest.position_command
         if late > 0:
             command += min(late, EXTRAPOLATED) * self._period * newest.command_rate
@@ -146,6 +147,8 @@ class RigTask:
         self._tick = 0
 
     def _over(self, over: ContactResult) -> None:
+        over = over._replace(packets=(self._first, self._sequence), oldest_command=self._oldest)
+        self._first, self._oldest = self._sequence + 1, 0
         if self._words:
             # Once tripped, the rig plays on, and what becomes of the contact says nothing.
             if all(one.status != "tripped" for one in self._contacts):
@@ -166,5 +169,6 @@ class RigTask:
         position = -approach.velocity * (APPROACH + phase * self._period)
         self._start, self._number = (position, approach.velocity), number
         self._tick, self._pause, self._newest = -1, PAUSE, None
+        self._oldest = 0
         # Until the run begins, the sensors see the mechanism free and at rest.
         self._plant.begin(position, 0.0, position, number)

@@ -44,14 +44,16 @@ class Quantiles(NamedTuple):
 
 
 class LoopFigures(NamedTuple):
-    """One loop: ticks played and missed, and whose fault the missed ones were; the controller's own time per
-    tick and the CPU time in it, the round trip, and by how much packets left late; all quantiles in s."""
+    """One loop: ticks played and missed, and whose fault the missed ones were; for how long the rig's clock
+    stood still [s]; the controller's own time per tick and the CPU time in it, the round trip, and by how
+    much packets left late; all quantiles in s."""
 
     ticks: int
     missed: int
     missed_by_controller: int
     missed_by_injection: int
     missed_by_machine: int
+    stood_still: float
     tick_time: Quantiles
     tick_cpu: Quantiles
     round_trip: Quantiles
@@ -66,10 +68,12 @@ class LoopTimes(NamedTuple):
 
 
 class LoopReport(NamedTuple):
-    """One loop: figures and times; what the controller's process said at its end."""
+    """One loop: figures and times; whose fault each tick was (`attribute`); what the controller's process
+    said at its end."""
 
     figures: LoopFigures
     times: LoopTimes
+    causes: np.ndarray
     controller: dict[str, Any]
 
 
@@ -229,12 +233,13 @@ def loop_report(timing: Timing, network: Network, controller: dict[str, Any], pe
         missed_by_controller=int(np.sum(causes == CONTROLLER)),
         missed_by_injection=int(np.sum(causes == INJECTED)),
         missed_by_machine=int(np.sum(causes == MACHINE)),
+        stood_still=1e-9 * timing.stood,
         tick_time=quantiles(wall),
         tick_cpu=quantiles(cpu),
         round_trip=quantiles(trips),
         lateness=quantiles(late),
     )
-    return LoopReport(figures, LoopTimes(wall, trips), controller)
+    return LoopReport(figures, LoopTimes(wall, trips), causes, controller)
 
 
 MET, CONTROLLER, INJECTED, MACHINE = 0, 1, 2, 3
