@@ -313,7 +313,10 @@ def test_injected_faults_of_the_network():
         for i in range(number + 1):
             if i < number:
                 network.send(i, b"%d" % i)
-            for _ in range(500 if i == number else 1):
+            until = time.monotonic() + (0.1 if i == number else 0.0)
+            going_on = True
+            while going_on:
+                going_on = time.monotonic() < until
                 network.wait(time.monotonic_ns() + 20_000)
                 while True:
                     try:
@@ -523,11 +526,11 @@ def test_rig_under_injected_faults_ends_safely(jaxhil, tmp_path):
     limits |= {"held_readings": 3.0, "missed_in_a_row": 5.0, "retreat_velocity": 0.01}
     limits |= {"limited_in_a_row": 5.0, "force_limit": 200.0}
     path = gain_file(tmp_path, limits=limits)
-    ran = jaxhil("rig", path, "--duration", 2, "--drops", 0.01, "--jitter", 0.002, "--limit", "inf")
+    ran = jaxhil("rig", path, "--duration", 1, "--drops", 0.01, "--jitter", 0.002, "--limit", "inf")
     assert "injected" in ran.out and "missed" in ran.out
-    ran = jaxhil("rig", path, "--duration", 2, "--drops", 0.2, "--delay", 0.003, "--limit", "inf", "--json")
+    ran = jaxhil("rig", path, "--duration", 1, "--drops", 0.2, "--delay", 0.003, "--limit", "inf", "--json")
     found = ran.document
-    assert found["run"]["missed_by_injection"] > 300
+    assert found["run"]["missed_by_injection"] > 100
     assert found["stroke"] == [-0.01, 0.01]
     assert -0.01 <= found["commanded"]["lowest"] <= found["commanded"]["highest"] <= 0.01
     assert found["commanded"]["not_finite"] == found["commanded"]["beyond_limits"] == 0
