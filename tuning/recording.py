@@ -63,19 +63,24 @@ def record_lanes(loaded: LoadedGains, batch: Scenario) -> tuple[Metrics, list[La
     first number that is not finite.
     """
     loop = build_loop(loaded.mechanism, loaded.compensator, batch)
-    gains = _arrays(loaded.gains)
-    program = _compiled(loop)
-    rig, run = program.begin(gains, batch)
-    chunks = []
-    while np.any(run.active):
-        run, ticks = program.record_chunk(rig, gains, run)
-        chunks.append(jax.device_get(ticks))
-    seen: Tick = jax.tree.map(lambda *parts: np.concatenate(parts), *chunks)
+    metrics, seen = record_ticks(loop, loaded.gains, batch)
     zeroed = loop.has_force_noise or loop.has_force_bias
-    return jax.device_get(run.metrics), [
+    return metrics, [
         _lane(jax.tree.map(lambda leaf, index=index: leaf[:, index], seen), zeroed)
         for index in range(seen.active.shape[1])
     ]
+
+
+def record_ticks(loop: Loop, gains: dict[str, float], batch: Scenario) -> tuple[Metrics, Tick]:
+    """Run the loop with jax until every lane is done: metrics (slots, lanes), every tick (ticks, lanes)."""
+    arrays = _arrays(gains)
+    program = _compiled(loop)
+    rig, run = program.begin(arrays, batch)
+    chunks = []
+    while np.any(run.active):
+        run, ticks = program.record_chunk(rig, arrays, run)
+        chunks.append(jax.device_get(ticks))
+    return jax.device_get(run.metrics), jax.tree.map(lambda *parts: np.concatenate(parts), *chunks)
 
 
 def prepare_recording(loaded: LoadedGains, batch: Scenario) -> None:

@@ -28,8 +28,8 @@ from math import sqrt
 from .faults import CONTACT_TOO_LONG, ENERGY_BALANCE, RESTITUTION
 from .filters import DelayLine
 
-FADED = 1e-3  # of the largest force of the contact
-PATIENCE = 0.02  # s, that the force is given to die out
+FADED = 1e-6  # of the largest force of the contact
+PATIENCE = 0.1  # s, that the force is given to die out
 
 
 class Watchdog:
@@ -46,8 +46,8 @@ class Watchdog:
         "_entry",
         "_expectation",
         "_faded",
+        "_fading",
         "_force",
-        "_free_force",
         "_known",
         "_longest",
         "_margin",
@@ -84,7 +84,7 @@ class Watchdog:
         self._quiet_ticks = limits["settling"] / period
         self._faded = (limits["settling"] + PATIENCE) / period
         self._longest = limits["longest_contact"] / period
-        self._free_force = limits["free_force"]
+        self._fading = limits["fading"]
         self._margin = limits["restitution_margin"]
         self._tolerance = limits["energy_balance"]
         self._alignment = DelayLine(limits["alignment"], period)
@@ -139,7 +139,7 @@ class Watchdog:
             if size > self._peak:
                 self._peak = size
             self._regress(force, deflection)
-            faded = size <= FADED * self._peak or size <= self._free_force or self._quiet >= self._faded
+            faded = size <= FADED * self._peak or size <= self._fading or self._quiet >= self._faded
             leaving = self._quiet >= self._quiet_ticks and self._side * velocity < 0.0 and faded
             if leaving or side != self._side:
                 fault = self._audit(velocity)
@@ -175,19 +175,18 @@ class Watchdog:
 
     def _regress(self, force: float, deflection: float) -> None:
         """Take in the interval between two ticks, if both its ends are in contact."""
+        # Not by the force as well: of noisy readings it would pick the larger ones, and bias the stiffness.
         side = self._side
-        least = self._free_force
-        before, force_before = self._aligned, self._force
-        if deflection * side > 0.0 and before * side > 0.0 and force * side > least:
-            if force_before * side > least:
-                middle = side * (deflection + before) * 0.5
-                rate = side * (deflection - before) / self._period
-                mean = side * (force + force_before) * 0.5
-                self._sxx += middle * middle
-                self._sxv += middle * rate
-                self._svv += rate * rate
-                self._sxf += middle * mean
-                self._svf += rate * mean
+        before = self._aligned
+        if deflection * side > 0.0 and before * side > 0.0:
+            middle = side * (deflection + before) * 0.5
+            rate = side * (deflection - before) / self._period
+            mean = side * (force + self._force) * 0.5
+            self._sxx += middle * middle
+            self._sxv += middle * rate
+            self._svv += rate * rate
+            self._sxf += middle * mean
+            self._svf += rate * mean
 
     def _audit(self, velocity: float) -> int:
         self._open = False

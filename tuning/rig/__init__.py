@@ -1,1 +1,1 @@
-"""What leaves for the rig, and what stands in for a rig where there is none."""
+"""What goes to the rig: bundles, the controller in C, limits and their calibration, the loop over UDP."""

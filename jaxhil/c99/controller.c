@@ -1,0 +1,259 @@
+/* The controller that the rig calls once per control period.
+ *
+ * It checks what comes in, watches every contact's energy, leaves the law to the compensator that its gain
+ * file names, and limits what goes out. A trip is latched until reset: the force is led to 0, the position
+ * command to rest out of contact. The faults are listed above. Every function takes bounded time.
+ */
+#include <math.h>
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "faults_table.c"
+#include "inputs.c"
+#include "law.c"
+#include "limits.c"
+#include "outputs.c"
+#include "watchdog.c"
+
+/* == Declarations == */
+
+/* One compensator with its gains, its guards and its state. To be read: `faults`, the bits of this tick;
+ * `seen`, of all ticks since reset; `cause`, the bits that tripped it, 0 if nothing has. */
+typedef struct {
+    uint32_t faults, seen, cause;
+    bool usable, stopped;
+    jaxhil_clock clock;
+    jaxhil_bias_tare tare;
+    jaxhil_input_guard inputs;
+    jaxhil_watchdog watchdog;
+    jaxhil_force_guard forces;
+    jaxhil_position_guard positions;
+    jaxhil_law law;
+} jaxhil_controller;
+
+/* Begin with these gains and limits. False if they are not admitted, or ask for a longer delay than this
+ * code holds: the controller then stays tripped, with the cause JAXHIL_UNUSABLE. */
+bool jaxhil_init(jaxhil_controller *controller, const jaxhil_gains *gains, const jaxhil_limits *limits);
+
+/* Take in one reading [N] of the force sensor out of contact; true once there are enough. To be called once
+ * a tick before a run: their mean is then taken from every reading, until the next tare. */
+bool jaxhil_tare(jaxhil_controller *controller, double force_measured);
+
+/* The force [N] that the numerical model is to feel this tick, from force [N], positions [m] and velocity
+ * [m/s]. With `time` [s], which may be NULL, ticks that come late or were missed are seen. */
+double jaxhil_step(jaxhil_controller *controller, double force_measured, double position_desired,
+                   double velocity_desired, double position_measured, const double *time);
+
+/* The position [m] to command, from the numerical model's motion [m, m/s, m/s^2] after this tick's step. */
+double jaxhil_position_command(jaxhil_controller *controller, double position, double velocity,
+                               double acceleration);
+
+/* Tell the controller the state of the rig's emergency stop: active, it trips, and the force and the position
+ * command come to rest; then `jaxhil_at_rest` and the drives may be switched off. Released, the trip stays
+ * latched until `jaxhil_reset`, which is refused before. */
+void jaxhil_emergency_stop(jaxhil_controller *controller, bool active);
+
+/* Restart everything but the tare: filters, identified parameters, a trip, the count of ticks. Without a
+ * bump. Refused, with false, while the emergency stop is active. */
+bool jaxhil_reset(jaxhil_controller *controller);
+
+/* Begin a fresh run for the next contact, the rig having been brought to its start. Identified parameters
+ * carry over, a trip stays latched. */
+void jaxhil_next_contact(jaxhil_controller *controller);
+
+/* Whether a fault has tripped the controller since the last reset. */
+bool jaxhil_tripped(const jaxhil_controller *controller);
+
+/* Whether, after a trip, the position command has come to rest. */
+bool jaxhil_at_rest(const jaxhil_controller *controller);
+
+/* The force sensor's bias [N] that the last good tare found. */
+double jaxhil_bias(const jaxhil_controller *controller);
+
+/* The control periods since reset without a tick, and the ticks that came late. */
+int64_t jaxhil_missed_ticks(const jaxhil_controller *controller);
+int64_t jaxhil_late_ticks(const jaxhil_controller *controller);
+
+/* Identified stiffness [N/m] and damping [N s/m]; 0 and 0 if the law identifies none. */
+void jaxhil_identified(const jaxhil_controller *controller, double *stiffness, double *damping);
+
+/* == Definitions == */
+
+static void jaxhil_fail(jaxhil_controller *controller, uint32_t cause) {
+    /* The first cause is the one to look at: what follows a trip may follow from it. */
+    if (!controller->cause) {
+        controller->cause = cause;
+    }
+    controller->faults |= cause;
+    controller->seen |= controller->faults;
+}
+
+static void jaxhil_restart(jaxhil_controller *controller) {
+    jaxhil_clock_reset(&controller->clock);
+    jaxhil_bias_tare_begin(&controller->tare);
+    jaxhil_input_guard_restart(&controller->inputs);
+    jaxhil_watchdog_restart(&controller->watchdog);
+    jaxhil_force_guard_restart(&controller->forces);
+    jaxhil_position_guard_restart(&controller->positions);
+    controller->cause = 0;
+    controller->faults = 0;
+    controller->seen = 0;
+}
+
+static bool jaxhil_guards_init(jaxhil_controller *controller, const jaxhil_limits *limits, double period,
+                               double clearance) {
+    jaxhil_clock_init(&controller->clock, limits, period);
+    jaxhil_bias_tare_init(&controller->tare, limits);
+    jaxhil_input_guard_init(&controller->inputs, limits, period, clearance);
+    jaxhil_force_guard_init(&controller->forces, limits, period);
+    jaxhil_position_guard_init(&controller->positions, limits, period, clearance);
+    return jaxhil_watchdog_init(&controller->watchdog, limits, period, clearance);
+}
+
+bool jaxhil_init(jaxhil_controller *controller, const jaxhil_gains *gains, const jaxhil_limits *limits) {
+    controller->usable = jaxhil_gains_admitted(gains) && jaxhil_limits_fit(limits) &&
+                         jaxhil_law_init(&controller->law, gains) &&
+                         jaxhil_guards_init(controller, limits, gains->control_period, gains->clearance);
+    controller->stopped = false;
+    if (controller->usable) {
+        jaxhil_law_reset(&controller->law);
+        jaxhil_restart(controller);
+    } else {
+        jaxhil_guards_init(controller, &jaxhil_no_limits, 1.0, INFINITY);
+        jaxhil_restart(controller);
+        jaxhil_fail(controller, JAXHIL_UNUSABLE);
+    }
+    return controller->usable;
+}
+
+bool jaxhil_tare(jaxhil_controller *controller, double force_measured) {
+    if (controller->cause) {
+        return true;
+    }
+    const bool over = jaxhil_bias_tare_take(&controller->tare, force_measured);
+    if (controller->tare.fatal) {
+        jaxhil_fail(controller, JAXHIL_TARE);
+    }
+    return over;
+}
+
+double jaxhil_step(jaxhil_controller *controller, double force_measured, double position_desired,
+                   double velocity_desired, double position_measured, const double *time) {
+    jaxhil_force_guard *forces = &controller->forces;
+    jaxhil_input_guard *inputs = &controller->inputs;
+    uint32_t faults = 0;
+    uint32_t fatal = 0;
+    controller->faults = 0;
+    if (controller->cause) {
+        jaxhil_force_guard_fade(forces);
+        return forces->output;
+    }
+    if (time != NULL) {
+        faults = jaxhil_clock_tick(&controller->clock, *time);
+        if (controller->clock.fatal) {
+            fatal = faults;
+        }
+    }
+    faults |= jaxhil_input_guard_check(inputs, force_measured, position_desired, velocity_desired,
+                                       position_measured, controller->tare.bias);
+    fatal |= inputs->fatal;
+    if (controller->watchdog.on && !fatal) {
+        fatal = jaxhil_watchdog_tick(&controller->watchdog, forces->output, inputs->force, position_desired,
+                                     velocity_desired, inputs->measured);
+        faults |= fatal;
+    }
+    if (!fatal) {
+        const double command = jaxhil_law_step(&controller->law, inputs->force, position_desired,
+                                               velocity_desired, inputs->measured);
+        faults |= jaxhil_force_guard_limit(forces, command);
+        fatal = forces->fatal;
+    }
+    controller->faults = faults;
+    controller->seen |= faults;
+    if (fatal) {
+        jaxhil_fail(controller, fatal);
+        jaxhil_force_guard_fade(forces);
+    }
+    return forces->output;
+}
+
+double jaxhil_position_command(jaxhil_controller *controller, double position, double velocity,
+                               double acceleration) {
+    jaxhil_position_guard *positions = &controller->positions;
+    if (!controller->cause) {
+        const bool finite = isfinite(position) && isfinite(velocity) && isfinite(acceleration);
+        const double command =
+            finite ? jaxhil_law_position_command(&controller->law, position, velocity, acceleration) : NAN;
+        const uint32_t faults = jaxhil_position_guard_limit(positions, command);
+        controller->faults |= faults;
+        controller->seen |= faults;
+        if (!positions->fatal) {
+            return positions->output;
+        }
+        jaxhil_fail(controller, positions->fatal);
+    }
+    /* Nothing was commanded yet: the drives are where the numerical model is, or else where they read. */
+    jaxhil_position_guard_retreat(positions, isfinite(position) ? position : controller->inputs.measured);
+    return positions->output;
+}
+
+void jaxhil_emergency_stop(jaxhil_controller *controller, bool active) {
+    controller->stopped = active;
+    if (active) {
+        jaxhil_fail(controller, JAXHIL_EMERGENCY_STOP);
+    }
+}
+
+bool jaxhil_reset(jaxhil_controller *controller) {
+    if (controller->stopped || !controller->usable) {
+        return false;
+    }
+    jaxhil_law_reset(&controller->law);
+    jaxhil_restart(controller);
+    return true;
+}
+
+void jaxhil_next_contact(jaxhil_controller *controller) {
+    if (controller->cause) {
+        return;
+    }
+    const uint32_t fault = jaxhil_watchdog_conclude(&controller->watchdog, controller->forces.output);
+    if (fault) {
+        jaxhil_fail(controller, fault);
+        return;
+    }
+    jaxhil_law_next_contact(&controller->law);
+    jaxhil_clock_pause(&controller->clock);
+    jaxhil_input_guard_restart(&controller->inputs);
+    jaxhil_watchdog_restart(&controller->watchdog);
+    jaxhil_position_guard_release(&controller->positions);
+}
+
+bool jaxhil_tripped(const jaxhil_controller *controller) {
+    return controller->cause != 0;
+}
+
+bool jaxhil_at_rest(const jaxhil_controller *controller) {
+    return controller->cause != 0 && controller->positions.at_rest;
+}
+
+double jaxhil_bias(const jaxhil_controller *controller) {
+    return controller->tare.bias;
+}
+
+int64_t jaxhil_missed_ticks(const jaxhil_controller *controller) {
+    return controller->clock.missed;
+}
+
+int64_t jaxhil_late_ticks(const jaxhil_controller *controller) {
+    return controller->clock.late;
+}
+
+void jaxhil_identified(const jaxhil_controller *controller, double *stiffness, double *damping) {
+    *stiffness = 0.0;
+    *damping = 0.0;
+    if (controller->usable) {
+        jaxhil_law_identified(&controller->law, stiffness, damping);
+    }
+}

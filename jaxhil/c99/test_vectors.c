@@ -1,0 +1,117 @@
+/* Replays recorded ticks (vectors.csv, argv[1]) through the controller and compares bit for bit.
+ *
+ * Exit code 0: all the same. 1: a line differs; its number, the column, what was found and what was expected
+ * are printed. 2: the vectors cannot be read.
+ */
+#include <errno.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "jaxhil_controller.h"
+#include "jaxhil_gains.h"
+
+enum {
+    RUN, EVENT, FORCE_MEASURED, POSITION_DESIRED, VELOCITY_DESIRED, POSITION_MEASURED, TIME,
+    POSITION, VELOCITY, ACCELERATION, FORCE_COMMAND, POSITION_COMMAND, FAULTS, FORCE_SIMULATED, COLUMNS
+};
+
+static const char header[] =
+    "run,event,force_measured,position_desired,velocity_desired,position_measured,time,position,velocity,"
+    "acceleration,force_command,position_command,faults,force_simulated";
+
+static jaxhil_controller controller;
+static char line[65536];
+
+static int is_same(double found, double expected) {
+    return (isnan(found) && isnan(expected)) || memcmp(&found, &expected, sizeof found) == 0;
+}
+
+static int unreadable(const char *file, long number, const char *what) {
+    fprintf(stderr, "%s:%ld: %s\n", file, number, what);
+    return 2;
+}
+
+static int differs(const char *file, long number, const char *column, double found, double expected) {
+    printf("%s:%ld: %s: found %.17g, expected %.17g\n", file, number, column, found, expected);
+    return 1;
+}
+
+/* The row's numbers; an empty field is NaN and `given` 0. False if the line is not COLUMNS numbers. */
+static int read_row(char *text, double *row, int *given) {
+    for (int column = 0; column < COLUMNS; column++) {
+        const char last = column + 1 < COLUMNS ? ',' : '\0';
+        given[column] = *text != last;
+        row[column] = NAN;
+        if (given[column]) {
+            char *end;
+            row[column] = strtod(text, &end);
+            if (end == text || *text == ' ' || *text == '\t') {
+                return 0;
+            }
+            text = end;
+        }
+        if (*text != last) {
+            return 0;
+        }
+        text += last == ',';
+    }
+    return 1;
+}
+
+int main(int count, char **arguments) {
+    const char *const name = count == 2 ? arguments[1] : "vectors.csv";
+    FILE *const file = fopen(name, "rb");
+    double row[COLUMNS];
+    int given[COLUMNS];
+    int begun = 0;
+    long number = 0;
+
+    if (file == NULL) {
+        return unreadable(name, 0, strerror(errno));
+    }
+    while (fgets(line, (int)sizeof line, file) != NULL) {
+        number++;
+        line[strcspn(line, "\r\n")] = '\0';
+        if (number == 1) {
+            if (strcmp(line, header) != 0) {
+                return unreadable(name, number, "unknown columns");
+            }
+            continue;
+        }
+        if (!read_row(line, row, given)) {
+            return unreadable(name, number, "not a row of numbers");
+        }
+        if (row[EVENT] == 1.0) {
+            if (!jaxhil_init(&controller, &jaxhil_exported_gains, &jaxhil_exported_limits)) {
+                return unreadable(name, number, "the controller refuses its own gains");
+            }
+            begun = 1;
+        } else if (row[EVENT] == 2.0 && begun) {
+            jaxhil_next_contact(&controller);
+        } else if (row[EVENT] != 0.0 || !begun) {
+            return unreadable(name, number, "an unknown event, or a tick before a run");
+        }
+        const double force =
+            jaxhil_step(&controller, row[FORCE_MEASURED], row[POSITION_DESIRED], row[VELOCITY_DESIRED],
+                        row[POSITION_MEASURED], given[TIME] ? &row[TIME] : NULL);
+        const double position =
+            jaxhil_position_command(&controller, row[POSITION], row[VELOCITY], row[ACCELERATION]);
+        if (!is_same(force, row[FORCE_COMMAND])) {
+            return differs(name, number, "force_command", force, row[FORCE_COMMAND]);
+        }
+        if (!is_same(position, row[POSITION_COMMAND])) {
+            return differs(name, number, "position_command", position, row[POSITION_COMMAND]);
+        }
+        if (!is_same((double)controller.faults, row[FAULTS])) {
+            return differs(name, number, "faults", (double)controller.faults, row[FAULTS]);
+        }
+    }
+    if (ferror(file) || number < 2) {
+        return unreadable(name, number, "no rows");
+    }
+    fclose(file);
+    printf("%s: %ld ticks, the same bit for bit\n", name, number - 1);
+    return 0;
+}

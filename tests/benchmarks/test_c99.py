@@ -1,0 +1,70 @@
+"""Time of a tick of the controller in C beside a loop that only reads what a tick reads.
+
+Every guard and the watchdog are on. The shortest of many repetitions counts: the machine is shared. Run with
+`pytest -m benchmark -s tests/benchmarks/test_c99.py`.
+"""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import c99_cases
+import numpy as np
+import pytest
+from gain_documents import gain_document, sign
+
+from jaxhil.runtime import COMPENSATORS
+from jaxhil.runtime.limits import LIMITS
+
+pytestmark = [
+    pytest.mark.benchmark,
+    pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine"),
+]
+BAR = 100.0  # ns
+ROWS = 200_000
+REPEATS = 40
+WIDE = {
+    "force_range": 1e5,
+    "measured_lowest": -1.0,
+    "measured_highest": 1.0,
+    "held_readings": 3.0,
+    "force_stuck_travel": 1.0,
+    "position_stuck_travel": 1.0,
+    "free_distance": 1e-4,
+    "settling": 0.02,
+    "free_force": 100.0,
+    "late_fraction": 0.25,
+    "missed_in_a_row": 3.0,
+    "force_limit": 1e5,
+    "force_slew": 1e9,
+    "limited_in_a_row": 3.0,
+    "command_lowest": -1.0,
+    "command_highest": 1.0,
+    "velocity_limit": 10.0,
+    "deceleration": 1.0,
+    "equivalent_mass": 350.0,
+    "restitution_margin": 1e12,
+    "energy_balance": 1e12,
+    "longest_contact": 10.0,
+    "alignment": 0.008,
+}
+
+
+@pytest.mark.parametrize("law", list(COMPENSATORS))
+def test_time_of_a_tick(law, tmp_path):
+    document = gain_document(law)
+    document["limits"] = {name: {"value": value, "unit": LIMITS[name].unit} for name, value in WIDE.items()}
+    folder = c99_cases.write_sources(tmp_path, sign(document))
+    shutil.copy(Path(__file__).with_name("c99_ticks.c"), folder)
+    program = c99_cases.compiled(folder, "c99_ticks.c", "c99_ticks", "-O2", "jaxhil_controller.c")
+    rows = c99_cases.drawn_rows("contact", ROWS, np.random.default_rng(0), c99_cases.PERIOD)
+    ran = subprocess.run(
+        [str(program), str(ROWS), str(REPEATS)], input=rows.tobytes(), capture_output=True, check=True
+    )
+    bare, tick, contact, cause = (float(number) for number in ran.stdout.split())
+    print(
+        f"\nC tick, {law}: {tick:.1f} ns (bar {BAR:.0f} ns); bare loop {bare:.1f} ns; "
+        f"{contact / ROWS:.0%} of the ticks in contact"
+    )
+    assert cause == 0 and contact > 0
+    assert tick <= BAR

@@ -1,0 +1,349 @@
+"""The controller in C beside the one in Python: compiled, loaded, and both run on the same rows.
+
+A row is what happens in one tick (see `c99_driver.c`), a result what either side makes of it.
+"""
+
+import ctypes
+import functools
+import math
+import re
+import shutil
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gain_documents import GAINS, gain_document, sign
+
+from jaxhil.runtime import COMPENSATORS, Controller
+from jaxhil.runtime.gain_file import GainFile
+from jaxhil.runtime.limits import LIMITS, NO_LIMITS, complete
+from tuning.rig.c99 import FLAGS, c99_texts
+
+COMPILER = shutil.which("cc")
+DRIVER = Path(__file__).with_name("c99_driver.c")
+ROW = ("event", "force", "desired", "velocity", "measured", "time", "timed", "x", "v", "a")
+RESULT = (
+    *("force", "position", "stiffness", "damping", "faults", "seen", "cause", "missed_ticks", "late_ticks"),
+    *("at_rest", "tripped", "bias", "answer", "contacts", "restitution", "expected", "balance"),
+)
+TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE = (float(code) for code in range(6))
+PERIOD = 0.001
+CAPACITY = 64  # periods of delay that the compiled laws hold
+SANITIZED = ("-fsanitize=undefined,address,float-cast-overflow", "-fno-sanitize-recover=all", "-g")
+SANE_LIMITS = {
+    "force_range": 2000.0,
+    "measured_lowest": -1e-3,
+    "measured_highest": 2e-3,
+    "held_readings": 3.0,
+    "force_stuck_travel": 2e-4,
+    "position_stuck_travel": 1e-4,
+    "free_distance": 1e-4,
+    "settling": 0.01,
+    "free_force": 1.0,
+    "late_fraction": 0.25,
+    "missed_in_a_row": 4.0,
+    "tare_ticks": 3.0,
+    "tare_spread": 4.0,
+    "bias_limit": 20.0,
+    "force_limit": 1000.0,
+    "force_slew": 1e5,
+    "limited_in_a_row": 3.0,
+    "command_lowest": -1e-3,
+    "command_highest": 1e-3,
+    "velocity_limit": 0.05,
+    "deceleration": 0.5,
+    "retreat_velocity": 0.01,
+    "equivalent_mass": 350.0,
+    "longest_contact": 0.2,
+    "energy_balance": 1e3,
+    "restitution_margin": 5.0,
+    "reference_stiffness": 1.2e5,
+    "reference_velocity": 0.005,
+    "softness_lowest": -0.5,
+    "speed_lowest": -0.5,
+}
+AUDIT = {"settling", *list(LIMITS)[list(LIMITS).index("equivalent_mass") :]}
+HOSTILE = np.array(
+    [
+        *(
+            0.0,
+            -0.0,
+            5e-324,
+            -5e-324,
+            1e-310,
+            2.3e-308,
+            1e-160,
+            1e-16,
+            1.0,
+            -1.0,
+            1e16,
+            -1e160,
+            1e300,
+            -1e308,
+        ),
+        *(1.7976931348623157e308, -1.7976931348623157e308, math.inf, -math.inf, math.nan),
+    ]
+)
+
+
+class Batch:
+    """The compiled controller of one law, which runs rows."""
+
+    def __init__(self, library: Path, law: str) -> None:
+        self._library = ctypes.CDLL(str(library))
+        self._library.driver_size.restype = ctypes.c_size_t
+        self._state = (ctypes.c_double * (self._library.driver_size() // 8 + 1))()
+        self.law = law
+
+    def exported(self) -> np.ndarray:
+        """The gains and limits compiled in."""
+        parameters = np.empty(2 + len(COMPENSATORS[self.law].gains) + len(LIMITS))
+        self._library.driver_exported.restype = ctypes.c_size_t
+        assert self._library.driver_exported(_pointer(parameters)) == parameters.size
+        return parameters
+
+    def fault_name(self, bit: int) -> str:
+        self._library.jaxhil_fault_name.restype = ctypes.c_char_p
+        return self._library.jaxhil_fault_name(ctypes.c_uint32(bit)).decode()
+
+    def begin(self, parameters: np.ndarray) -> bool:
+        return bool(self._library.driver_init(self._state, _pointer(parameters)))
+
+    def run(self, rows: np.ndarray, guarded: bool) -> np.ndarray:
+        results = np.empty((len(rows), len(RESULT)))
+        run = self._library.driver_run if guarded else self._library.driver_law
+        run(self._state, ctypes.c_size_t(len(rows)), _pointer(rows), _pointer(results))
+        return results
+
+
+def _pointer(values: np.ndarray):
+    assert values.dtype == np.float64 and values.flags.c_contiguous
+    return values.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
+
+
+def write_sources(folder: Path, document: Mapping[str, Any]) -> Path:
+    """The controller's files and the driver in `folder`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in c99_texts(document).items():
+        (folder / name).write_text(text)
+    shutil.copy(DRIVER, folder)
+    return folder
+
+
+def compiled(folder: Path, source: str, output: str, *options: str) -> Path:
+    """`source` in `folder`, compiled as the contract says."""
+    command = [str(COMPILER), *FLAGS, *options, source, "-o", output, "-lm"]
+    ran = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stderr == ""
+    return folder / output
+
+
+def long_document(law: str) -> dict[str, Any]:
+    """A document of `law` whose delays are as long as the tests need."""
+    document = gain_document(law)
+    document["limits"] = {}
+    for name in delays(law):
+        if name in document["gains"]:
+            document["gains"][name] |= {"value": CAPACITY * PERIOD, "upper": 1.0}
+        else:
+            document["limits"][name] = {"value": CAPACITY * PERIOD, "unit": LIMITS[name].unit}
+    return sign(document)
+
+
+@functools.cache
+def delays(law: str) -> frozenset[str]:
+    """The gains and limits that a line of the controller in C delays by."""
+    header = c99_texts(gain_document(law))["jaxhil_controller.h"]
+    return frozenset(name.lower() for name in re.findall(r"#define JAXHIL_(\w+)_SAMPLES", header))
+
+
+def packed(law: str, gain_file: GainFile) -> np.ndarray:
+    """The gains and limits as the structs in C hold them."""
+    gains = [gain_file.gains[name] for name in COMPENSATORS[law].gains]
+    limits = [gain_file.limits[name] for name in LIMITS]
+    return np.array([gain_file.control_period, gain_file.clearance, *gains, *limits])
+
+
+def drawn_gains(law: str, rng: np.random.Generator, hostile: bool) -> GainFile:
+    """Admissible gains: about the nominal ones, or from the whole range of doubles."""
+    gains = {}
+    period = PERIOD * float(rng.choice([0.25, 1.0, 1.7]))
+    for name, specification in COMPENSATORS[law].gains.items():
+        value = GAINS[law][name]["value"] * float(np.exp(0.5 * rng.standard_normal()))
+        if hostile and rng.random() < 0.5:
+            value = float(rng.choice(HOSTILE)) if rng.random() < 0.5 else float(10 ** rng.uniform(-320, 300))
+        if name in delays(law):
+            value = float(rng.choice([0.0, 1.0, 7.0, rng.uniform(0, CAPACITY)])) * period
+        value = min(max(value, specification.lowest), specification.highest)
+        if not (math.isfinite(value) and specification.admits(value)):
+            value = GAINS[law][name]["value"]
+        gains[name] = value
+    clearance = float(rng.choice([math.inf, 0.0, 1e-4, 0.02]))
+    return GainFile(law, gains, period, clearance, drawn_limits(law, rng, hostile, period))
+
+
+def drawn_limits(law: str, rng: np.random.Generator, hostile: bool, period: float) -> Mapping[str, float]:
+    """Limits that bind now and then on drawn rows, some of them left out; hostile, of any size."""
+    limits = {}
+    only_audited = rng.random() < 0.4  # so that contacts come to their end
+    for name, specification in LIMITS.items():
+        if (only_audited and name not in AUDIT) or (rng.random() < 0.3 and name != "equivalent_mass"):
+            continue
+        usual = 0.1 if name.startswith("expected_") else 1.0
+        value = SANE_LIMITS.get(name, usual) * float(np.exp(0.5 * rng.standard_normal()))
+        if hostile and rng.random() < 0.3:
+            value = float(rng.choice(HOSTILE)) if rng.random() < 0.5 else float(10 ** rng.uniform(-320, 300))
+        if name in delays(law):
+            value = float(rng.choice([0.0, 1.0, 7.0, rng.uniform(0, CAPACITY)])) * period
+        if math.isfinite(value) and value >= specification.lowest:
+            limits[name] = value
+    try:
+        return complete(limits)
+    except ValueError:
+        return NO_LIMITS
+
+
+def drawn_rows(kind: str, count: int, rng: np.random.Generator, period: float) -> np.ndarray:
+    """Ticks of a `contact`, of `random` size, or `hostile`; now and then a reset or the next contact."""
+    time = period * np.arange(count)
+    phase = rng.uniform(0, 2 * np.pi)
+    rate, amplitude = rng.uniform(10, 60), 10 ** rng.uniform(-5, -3)
+
+    def motion(late: float) -> np.ndarray:
+        return amplitude * (np.sin(rate * (time - late) + phase) - 0.3)
+
+    speed = amplitude * rate * np.cos(rate * time + phase)
+    force = 1.2e5 * np.maximum(motion(0.009), 0.0) + rng.standard_normal(count)
+    measured = motion(0.006) + 1e-7 * rng.standard_normal(count)
+    rows = np.zeros((count, len(ROW)))
+    rows[:, 1:] = np.stack(
+        [force, motion(0), speed, measured, time, np.ones(count), motion(0), speed, -force / 350], axis=1
+    )
+    if kind != "contact":
+        size = 10 ** rng.uniform(-12, 12, (count, 9))
+        rows[:, 1:] = np.where(
+            rng.random((count, 9)) < 0.5, rows[:, 1:], size * rng.standard_normal((count, 9))
+        )
+        rows[:, 6] = rng.random(count) < 0.7
+        rows[:, 5] = time + period * rng.choice([0.0, 0.4, -1.0, 3.0], count)
+    if kind == "hostile":
+        taken = rng.random((count, 9)) < rng.choice([0.001, 0.03, 0.5])
+        taken[:, 5] = False
+        rows[:, 1:] = np.where(taken, rng.choice(HOSTILE, (count, 9)), rows[:, 1:])
+    events = [TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE]
+    rows[:, 0] = rng.choice(events, count, p=[0.9, 0.03, 0.02, 0.002, 0.01, 0.038])
+    if rng.random() < 0.5:  # a rig that begins with a tare, and whose force sensor then resolves little
+        rows[:6, 0] = TARE
+        rows[:, 1] = np.where(np.abs(rows[:, 1]) < 1e6, 50.0 * np.round(rows[:, 1] / 50.0), rows[:, 1])
+        rows[:6, 1] = 3.0 * rng.standard_normal(6)
+    if rng.random() < 0.3:  # a position sensor that hangs
+        begin = int(rng.integers(count))
+        rows[begin : begin + count // 5, 4] = rows[begin, 4]
+    return rows
+
+
+def drawn_exactly(law: str, count: int, rng: np.random.Generator) -> tuple[GainFile, np.ndarray]:
+    """Gains, limits and rows of small whole numbers, so that much is equal which is compared."""
+    period = 2.0**-10
+    per_period = {"N/s": 1 / period, "m/s": 1 / period, "m/s^2": 1 / period**2, "s": period}
+    limits = {}
+    for name, specification in LIMITS.items():
+        if rng.random() < 0.4 and name != "equivalent_mass":
+            continue
+        value = float(rng.integers(1, 5)) * per_period.get(specification.unit, 1.0)
+        if name in ("late_fraction", "restitution_margin", "softness_lowest", "speed_lowest", "loss_lowest"):
+            value *= 0.25
+        if name.startswith("expected"):
+            value *= 0.125
+        limits[name] = -value if name in ("measured_lowest", "command_lowest") else value
+    try:
+        limits = complete(limits)
+    except ValueError:
+        limits = NO_LIMITS
+    clearance = float(rng.choice([math.inf, 1.0, 2.0, 4.0]))
+    gain_file = drawn_gains(law, rng, hostile=False)._replace(
+        control_period=period, clearance=clearance, limits=limits
+    )
+    if "forgetting" in gain_file.gains:
+        whole = {name: float(rng.integers(1, 4)) for name in gain_file.gains}
+        whole |= {"identification_delay": whole["identification_delay"] * period, "forgetting": 0.5}
+        gain_file = gain_file._replace(gains=whole)
+    rows = np.zeros((count, len(ROW)))
+    rows[:, 1:] = rng.integers(-3, 4, (count, 9))
+    smooth = rng.random() < 0.7
+    if smooth:  # walks, which stay on one side for a while
+        rows[:, 1:] = np.clip(np.cumsum(rng.integers(-1, 2, (count, 9)), axis=0), -4, 4)
+        rows[:, 4] = np.where(rng.random(count) < 0.5, rows[:, 2], rows[:, 4])
+    gaps = rng.choice([1.0, 1.25, 1.5, 2.0, 3.0, 5.0, 1e6 - 0.5], count, p=[0.9, 0.03, 0.03, *[0.01] * 4])
+    rows[:, 5] = period * np.cumsum(gaps)
+    rows[:, 6] = 1.0
+    events = [TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE]
+    rows[:, 0] = rng.choice(events, count, p=[0.8, 0.08, 0.02, 0.005, 0.045, 0.05])
+    return gain_file, rows
+
+
+def law_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
+    """What the Python runtime's law makes of the rows, without the controller's guards."""
+    law = COMPENSATORS[gain_file.compensator](gain_file.gains, gain_file.control_period, gain_file.clearance)
+    results = np.zeros((len(rows), len(RESULT)))
+    for row, result in zip(rows.tolist(), results, strict=True):
+        if row[0] == RESET:
+            law.reset()
+        elif row[0] == NEXT_CONTACT:
+            law.next_contact()
+        try:
+            force = law.step(*row[1:5])
+        except ArithmeticError:
+            force = math.nan
+        result[:4] = force, law.position_command(*row[7:]), *law.identified
+    return results
+
+
+def controller_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
+    """What the Python runtime's controller makes of the rows."""
+    controller = Controller(gain_file)
+    watchdog = controller._watchdog
+    results = np.zeros((len(rows), len(RESULT)))
+    for row, result in zip(rows.tolist(), results, strict=True):
+        answer = _event(controller, row[0], row[1])
+        result[0] = controller.step(*row[1:5], row[5] if row[6] else None)
+        result[1] = controller.position_command(*row[7:])
+        result[2:4] = controller.identified
+        result[4:7] = controller.faults, controller.seen, controller.cause
+        result[7:] = (
+            *(controller.missed_ticks, controller.late_ticks, controller.at_rest, controller.tripped),
+            *(controller.bias, answer),
+            *(watchdog.contacts, watchdog.restitution, watchdog.expected, watchdog.balance),
+        )
+    return results
+
+
+def _event(controller: Controller, code: float, force: float) -> bool:
+    if code == RESET:
+        return controller.reset()
+    if code == TARE:
+        return controller.tare(force)
+    if code == NEXT_CONTACT:
+        controller.next_contact()
+    elif code in (STOP, RELEASE):
+        controller.emergency_stop(code == STOP)
+    return False
+
+
+def same_bits(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Where two arrays of doubles are the same bits, or both not a number."""
+    return (found.view(np.uint64) == expected.view(np.uint64)) | (np.isnan(found) & np.isnan(expected))
+
+
+def assert_same(found: np.ndarray, expected: np.ndarray, rows: np.ndarray) -> None:
+    """Raises AssertionError with the first tick and column in which C and Python differ."""
+    same = same_bits(found, expected)
+    if not same.all():
+        tick, column = (int(index) for index in np.argwhere(~same)[0])
+        raise AssertionError(
+            f"tick {tick}: {RESULT[column]}: C {found[tick, column]!r}, Python {expected[tick, column]!r}, "
+            f"row {rows[tick].tolist()}"
+        )

@@ -1,0 +1,112 @@
+/* Ticks in batches, for the tests: the controller, and the law below it without its guards.
+ *
+ * With DRIVER_MAIN a program: from standard input the gains and the rows, to standard output the results.
+ */
+#include <stdio.h>
+#include <string.h>
+
+#include "jaxhil_controller.c"
+#include "jaxhil_gains.h"
+
+/* A row: event, force, desired position and velocity, measured position, time, whether it is given, the
+ * model's position, velocity and acceleration. A result: see `result`. */
+enum { ROW = 10, RESULT = 17 };
+enum { TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE };
+enum { GAINS = sizeof(jaxhil_gains) / sizeof(double), LIMITS = sizeof(jaxhil_limits) / sizeof(double) };
+
+size_t driver_size(void);
+size_t driver_exported(double *parameters);
+int driver_init(jaxhil_controller *controller, const double *parameters);
+void driver_law(jaxhil_controller *controller, size_t count, const double *rows, double *results);
+void driver_run(jaxhil_controller *controller, size_t count, const double *rows, double *results);
+
+size_t driver_size(void) {
+    return sizeof(jaxhil_controller);
+}
+
+size_t driver_exported(double *parameters) {
+    memcpy(parameters, &jaxhil_exported_gains, sizeof jaxhil_exported_gains);
+    memcpy(parameters + GAINS, &jaxhil_exported_limits, sizeof jaxhil_exported_limits);
+    return GAINS + LIMITS;
+}
+
+int driver_init(jaxhil_controller *controller, const double *parameters) {
+    jaxhil_gains gains;
+    jaxhil_limits limits;
+    memcpy(&gains, parameters, sizeof gains);
+    memcpy(&limits, parameters + GAINS, sizeof limits);
+    return jaxhil_init(controller, &gains, &limits);
+}
+
+void driver_law(jaxhil_controller *controller, size_t count, const double *rows, double *results) {
+    jaxhil_law *law = &controller->law;
+    for (size_t n = 0; n < count; n++, rows += ROW, results += RESULT) {
+        if (rows[0] == RESET) {
+            jaxhil_law_reset(law);
+        } else if (rows[0] == NEXT_CONTACT) {
+            jaxhil_law_next_contact(law);
+        }
+        memset(results, 0, RESULT * sizeof *results);
+        results[0] = jaxhil_law_step(law, rows[1], rows[2], rows[3], rows[4]);
+        results[1] = jaxhil_law_position_command(law, rows[7], rows[8], rows[9]);
+        jaxhil_law_identified(law, &results[2], &results[3]);
+    }
+}
+
+static double event(jaxhil_controller *controller, double code, double force) {
+    if (code == RESET) {
+        return jaxhil_reset(controller);
+    }
+    if (code == TARE) {
+        return jaxhil_tare(controller, force);
+    }
+    if (code == NEXT_CONTACT) {
+        jaxhil_next_contact(controller);
+    } else if (code == STOP || code == RELEASE) {
+        jaxhil_emergency_stop(controller, code == STOP);
+    }
+    return 0.0;
+}
+
+void driver_run(jaxhil_controller *controller, size_t count, const double *rows, double *results) {
+    for (size_t n = 0; n < count; n++, rows += ROW, results += RESULT) {
+        double *result = results;
+        const double answer = event(controller, rows[0], rows[1]);
+        const double *time = rows[6] != 0.0 ? &rows[5] : NULL;
+        *result++ = jaxhil_step(controller, rows[1], rows[2], rows[3], rows[4], time);
+        *result++ = jaxhil_position_command(controller, rows[7], rows[8], rows[9]);
+        jaxhil_identified(controller, result, result + 1);
+        result += 2;
+        *result++ = controller->faults;
+        *result++ = controller->seen;
+        *result++ = controller->cause;
+        *result++ = (double)jaxhil_missed_ticks(controller);
+        *result++ = (double)jaxhil_late_ticks(controller);
+        *result++ = jaxhil_at_rest(controller);
+        *result++ = jaxhil_tripped(controller);
+        *result++ = jaxhil_bias(controller);
+        *result++ = answer;
+        *result++ = (double)controller->watchdog.contacts;
+        *result++ = controller->watchdog.restitution;
+        *result++ = controller->watchdog.expected;
+        *result++ = controller->watchdog.balance;
+    }
+}
+
+#ifdef DRIVER_MAIN
+int main(int count, char **arguments) {
+    static jaxhil_controller controller;
+    double parameters[GAINS + LIMITS], row[ROW], result[RESULT];
+    (void)arguments;
+    if (fread(parameters, sizeof parameters, 1, stdin) != 1 || !driver_init(&controller, parameters)) {
+        return 2;
+    }
+    while (fread(row, sizeof row, 1, stdin) == 1) {
+        (count > 1 ? driver_law : driver_run)(&controller, 1, row, result);
+        if (fwrite(result, sizeof result, 1, stdout) != 1) {
+            return 2;
+        }
+    }
+    return 0;
+}
+#endif

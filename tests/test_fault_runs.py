@@ -1,0 +1,102 @@
+"""Faults injected tick by tick: each raised on its tick, nothing else, outputs finite and in their limits."""
+
+import c99_cases
+import numpy as np
+import pytest
+from c99_cases import RESULT, Batch, compiled, controller_in_python, packed, write_sources
+from fault_runs import LIMITED, PERIOD, FaultRun, document, fault_run
+
+from jaxhil.runtime import COMPENSATORS
+from jaxhil.runtime.faults import FAULTS, names
+from jaxhil.runtime.gain_file import check_gain_document
+
+BLOCK = 500_000
+# What needs a closed loop, a law gone wrong or a call: the tests of guards and watchdog have these.
+ELSEWHERE = (
+    "command_not_finite",
+    "restitution",
+    "energy_balance",
+    "contact_too_long",
+    "emergency_stop",
+    "tare",
+)
+needs_compiler = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
+
+
+def check(run: FaultRun, results: np.ndarray) -> None:
+    """Raises AssertionError for the first tick at which the controller did what it should not."""
+    force, position = results[:, RESULT.index("force")], results[:, RESULT.index("position")]
+    faults = results[:, RESULT.index("faults")].astype(np.int64)
+    wrong = run.wrong(faults, results[:, RESULT.index("tripped")] != 0)
+    if len(wrong):
+        tick = wrong[0]
+        raise AssertionError(
+            f"tick {tick}: raised {names(int(faults[tick]))}, expected {names(int(run.faults[tick]))}, "
+            f"row {run.rows[tick].tolist()}"
+        )
+    assert np.all(np.isfinite(force)) and np.all(np.isfinite(position))
+    assert np.all(np.abs(force) <= LIMITED["force_limit"])
+    assert np.all(np.abs(np.diff(force)) <= LIMITED["force_slew"] * PERIOD * (1 + 1e-12))
+    assert np.all((position >= LIMITED["command_lowest"]) & (position <= LIMITED["command_highest"]))
+    assert np.all(np.abs(np.diff(position)) <= LIMITED["velocity_limit"] * PERIOD * (1 + 1e-9))
+
+
+def counts(run: FaultRun) -> dict[str, int]:
+    """How many ticks raise each fault."""
+    return {fault.name: int(np.count_nonzero(run.faults & fault.bit)) for fault in FAULTS}
+
+
+def python_runs(ticks: int, law: str, seed: int) -> None:
+    gain_file = check_gain_document(document(law))
+    for part in range(max(1, ticks // BLOCK)):
+        run = fault_run(min(ticks, BLOCK), seed + part, law)
+        check(run, controller_in_python(gain_file, run.rows))
+
+
+def c_runs(folder, ticks: int, law: str, seed: int) -> None:
+    write_sources(folder, document(law))
+    batch = Batch(compiled(folder, "c99_driver.c", "driver.so", "-O2", "-shared", "-fPIC"), law)
+    gain_file = check_gain_document(document(law))
+    for part in range(max(1, ticks // BLOCK)):
+        run = fault_run(min(ticks, BLOCK), seed + part, law)
+        assert batch.begin(packed(law, gain_file))
+        check(run, batch.run(run.rows, guarded=True))
+
+
+def test_every_fault_of_a_rig_is_injected():
+    injected = counts(fault_run(60_000, 0, "none"))
+    assert [name for name, count in injected.items() if count == 0] == list(ELSEWHERE)
+
+
+def test_a_fault_that_is_not_raised_is_found():
+    run = fault_run(2000, 0, "none")
+    results = controller_in_python(check_gain_document(document("none")), run.rows)
+    check(run, results)
+    raised = np.nonzero(results[:, RESULT.index("faults")])[0]
+    results[raised[0], RESULT.index("faults")] = 0
+    with pytest.raises(AssertionError, match="raised"):
+        check(run, results)
+
+
+@pytest.mark.parametrize("law", COMPENSATORS)
+def test_python_raises_every_fault_on_its_tick(law):
+    python_runs(20_000, law, 10)
+
+
+@needs_compiler
+@pytest.mark.parametrize("law", COMPENSATORS)
+def test_c_raises_every_fault_on_its_tick(law, tmp_path):
+    c_runs(tmp_path, 200_000, law, 20)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", COMPENSATORS)
+def test_ten_million_ticks_in_python(law):
+    python_runs(10_000_000 if law == "response_error" else 1_000_000, law, 1000)
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("law", COMPENSATORS)
+def test_a_hundred_million_ticks_in_c(law, tmp_path):
+    c_runs(tmp_path, 100_000_000 if law == "response_error" else 10_000_000, law, 2000)

@@ -1,0 +1,307 @@
+"""Limits for the rig, calibrated: the watchdog's audit, what it expects, misses and stops in vain."""
+
+import functools
+import math
+
+import numpy as np
+import pytest
+from cases import SECOND_ORDER, mechanism, nominal_gains, validated
+from sweep_cases import NOISY, UNCERTAIN, case
+from sweep_cases import manifest as sweep_manifest
+
+from jaxhil.compensators import literature_gains
+from jaxhil.errors import InputError
+from jaxhil.mechanism_file import load
+from jaxhil.metrics import OK
+from jaxhil.runtime.limits import LIMITS, complete
+from jaxhil.runtime.watchdog import Watchdog
+from tuning.gain_file import build_document, check_document
+from tuning.rig.audited import audit_contacts, first_reached
+from tuning.rig.calibration import (
+    calibrate,
+    good_runs,
+    guard_limits,
+    judge_chunk,
+    limits_section,
+    watchdog_rules,
+)
+from tuning.rig.expectation import TERMS, Expectation, Features, expected_restitution, fit_expectation
+from tuning.rig.extent import extent_of
+from tuning.rig.recorded import Scenarios, Signals, recorded_chunks
+from tuning.rig.replayed import limited_controller, replay_lane
+from tuning.sweeps.run import run_sweep
+from tuning.sweeps.store import open_store, read_part
+
+DAMPING = {"contact.damping": {"distribution": "loguniform", "factor": [0.5, 2.0]}}
+LIMIT = 0.02
+
+
+def gains(contact=None, uncertainty=UNCERTAIN, compensator="response_error", contacts=2, **parts):
+    """Two damped contacts in coarse ticks, compensated so that some runs are good and some are not."""
+    contact = {"damping": [400.0], **(contact or {})}
+    raw = mechanism(contact, {**SECOND_ORDER, "natural_frequency": 20.0}, contacts=contacts, **parts)
+    parsed = validated({**raw, "uncertainty": uncertainty})
+    law = nominal_gains(parsed, compensator)
+    return check_document(build_document(compensator, law, parsed, "0" * 64, {}, {}, 0, {}))
+
+
+LANES = 128  # everywhere: one program
+ONE_SIDED = gains()
+NOISY_GAP = gains({"clearance": 0.001}, force_sensor=NOISY, contacts=3)
+
+
+@functools.cache
+def recorded(sided):
+    """Runs of either mechanism."""
+    (chunk,) = recorded_chunks({1: ONE_SIDED, 2: NOISY_GAP}[sided], Scenarios("random", 1, LANES))
+    return chunk
+
+
+@pytest.fixture(scope="module")
+def calibrated():
+    """The limits, and other runs."""
+    return calibrate(ONE_SIDED, scenarios=2 * LANES, limit=LIMIT, lanes=LANES), recorded(1)
+
+
+def watch(limits, signals, rules, lane):
+    """(restitution, expected, imbalance, fault) of every contact of a lane by the runtime's watchdog."""
+    watchdog = Watchdog(complete(limits), rules.period, rules.clearance)
+    found, given = [], 0.0
+
+    def note(fault):
+        if watchdog.contacts > len(found):
+            found.append((watchdog.restitution, watchdog.expected, watchdog.balance, fault))
+
+    for tick in range(int(np.sum(signals.live[:, lane]))):
+        force, position, velocity, measured, command = (float(leaf[tick, lane]) for leaf in signals[:5])
+        if tick and signals.begins[tick, lane]:
+            note(watchdog.conclude(given))
+            watchdog.restart()
+        note(watchdog.tick(given, force, position, velocity, measured))
+        given = command
+    note(watchdog.conclude(given))
+    return found
+
+
+@pytest.mark.parametrize("sided", [1, 2])
+def test_the_audit_is_the_watchdogs_to_the_bit(sided):
+    rules, _ = watchdog_rules({1: ONE_SIDED, 2: NOISY_GAP}[sided])
+    chunk, slots = recorded(sided), 8
+    audited = audit_contacts(chunk.signals, rules, slots)
+    limits = {
+        "equivalent_mass": rules.mass,
+        "settling": rules.settling,
+        "alignment": rules.alignment,
+        "fading": rules.fading,
+        "restitution_margin": 0.05,
+        "reference_stiffness": 1e5,
+        "reference_velocity": 0.004,
+        **{f"{name}_lowest": -0.5 for name in ("softness", "speed", "loss")},
+        **{f"{name}_highest": 0.5 for name in ("softness", "speed", "loss")},
+        **{f"expected_{term}": 0.9 / 3**place for place, term in enumerate(TERMS)},
+    }
+    expectation = Expectation(
+        {term: limits[f"expected_{term}"] for term in TERMS}, 1e5, 0.004, *[(-0.5, 0.5)] * 3
+    )
+    features = Features(audited.stiffness, audited.damping, audited.approach)
+    expected = expected_restitution(expectation, features, rules.mass)
+    contacts = 0
+    for lane in range(LANES):
+        for contact, one in enumerate(watch(limits, chunk.signals, rules, lane)[:slots]):
+            energy = 0.5 * rules.mass * audited.approach[contact, lane] * audited.approach[contact, lane]
+            assert one[0] == audited.restitution[contact, lane]
+            assert one[1] == expected[contact, lane]
+            assert abs(one[2]) / energy == audited.imbalance[contact, lane]
+            assert (one[3] != 0) == (not abs(one[0] - one[1]) <= 0.05)
+            contacts += 1
+    assert contacts == np.sum(np.isfinite(audited.restitution)) >= 2 * LANES
+
+
+def test_it_audits_the_restitution_that_the_loop_tells():
+    rules, distance = watchdog_rules(ONE_SIDED)
+    chunk = recorded(1)
+    judged = judge_chunk(chunk, rules, distance)
+    ended = (judged.status == OK) & (np.abs(judged.error) < 0.1)
+    ended = np.logical_and.accumulate(ended, axis=0)
+    apart = np.abs(judged.audited.restitution - chunk.contacts.restitution)[ended]
+    assert len(apart) >= LANES and np.max(apart) < 1e-6
+    assert np.max(judged.audited.imbalance[ended]) < 1e-11
+
+
+def test_every_limit_is_there_and_loads(calibrated):
+    limits = calibrated[0].limits
+    assert list(limits) == list(LIMITS)
+    controller = limited_controller(ONE_SIDED, limits_section(limits))
+    assert not controller.tripped
+    for name in (
+        "force_range",
+        "force_limit",
+        "force_slew",
+        "velocity_limit",
+        "longest_contact",
+        "free_force",
+    ):
+        assert limits[name] is not None and limits[name] > 0, name
+    assert limits["measured_lowest"] < 0 < limits["measured_highest"]
+
+
+def test_the_controller_stops_what_is_bad_and_nothing_that_is_good(calibrated):
+    (limits, rates), chunk = calibrated
+    rules, distance = watchdog_rules(ONE_SIDED)
+    judged = judge_chunk(chunk, rules, distance)
+    bad = (judged.status != OK) | ~(np.abs(judged.error) <= LIMIT)
+    first, good = first_reached(bad), good_runs(judged, LIMIT / 2)
+    controller = limited_controller(ONE_SIDED, limits_section(limits))
+    stopped = 0
+    for lane in range(len(good)):
+        tripped = replay_lane(controller, chunk.signals, lane, rules.mass)
+        if good[lane]:
+            assert tripped is None
+        if np.any(bad[:, lane]):
+            assert tripped is not None
+            following = judged.audited.tick[first[lane] + 1 :, lane]
+            assert not np.any(tripped.tick >= following[:1])
+            stopped += 1
+    assert stopped > 10 and np.sum(good) > 5
+    assert rates["false_alarms"]["alarms"] == rates["missed_alarms"]["alarms"] == 0
+    assert rates["missed_alarms"]["runs"] > 10 and 0 < rates["missed_alarms"]["high"] < 0.3
+
+
+def test_known_damping_needs_no_identified_one(calibrated):
+    rates = calibrated[0].rates
+    assert rates["terms"] == ["1", "p", "pp", "ppp"]
+    assert rates["expectation_largest"] < 2e-3 and rates["restitution_margin"] == 0.75 * LIMIT
+
+
+def test_unknown_damping_is_told_from_delay_by_nothing():
+    rates = calibrate(
+        gains(uncertainty={**UNCERTAIN, **DAMPING}), scenarios=2 * LANES, limit=LIMIT, lanes=LANES
+    ).rates
+    assert "z" in rates["terms"]
+    # pi omega sd(delay) / 2, of a delay of 0.5 ms more or less at 3 Hz.
+    assert rates["expectation_rms"] == pytest.approx(math.pi * 2 * math.pi * 3 * 0.0005 / 2, rel=0.3)
+    assert rates["restitution_margin"] < 0.75 * LIMIT
+
+
+def test_an_undamped_contact_is_to_return_all():
+    rng = np.random.default_rng(0)
+    features = Features(*rng.uniform(1.0, 2.0, (3, 100)))
+    fitted = fit_expectation(features, np.ones(100), np.arange(100), 350.0, 1e-4)
+    assert fitted.coefficients == {**dict.fromkeys(TERMS, 0.0), "1": pytest.approx(1.0)}
+
+
+def test_a_known_polynomial_is_found():
+    rng = np.random.default_rng(1)
+    features = Features(
+        1e5 * rng.uniform(0.5, 2, 400), 300 * rng.uniform(0.5, 2, 400), rng.uniform(4e-3, 6e-3, 400)
+    )
+    truth = fit_expectation(features, np.ones(400), np.arange(400), 350.0, 1.0)
+    truth = truth._replace(coefficients=dict(zip(TERMS, 0.8 / 2.0 ** np.arange(11), strict=True)))
+    truth = truth._replace(coefficients={**truth.coefficients, "1": 0.5, "p": -0.05, "z": -1.0})
+    expected = expected_restitution(truth, features, 350.0)
+    inside = (expected > 0) & (expected < 1)
+    chosen = Features(*(leaf[inside] for leaf in features))
+    fitted = fit_expectation(chosen, expected[inside], np.arange(np.sum(inside)), 350.0, 1e-6)
+    again = expected_restitution(fitted, chosen, 350.0)
+    assert np.sum(inside) > 300 and np.max(np.abs(again - expected[inside])) < 1e-9
+
+
+def test_a_store_is_run_again(tmp_path):
+    document = case(2, "response_error")
+    manifest = sweep_manifest(document, scenarios=LANES, limit=LIMIT)
+    store = open_store(tmp_path / "store", manifest, resume=False)
+    run_sweep(store, lambda *_: None, lambda *_: None)
+    loaded = check_document(document)
+    rows = read_part(store, 0)
+    assert rows is not None
+    (chunk,) = recorded_chunks(loaded, Scenarios(manifest.sampling, manifest.seed, LANES))
+    for contact in (1, 2):
+        assert chunk.contacts.restitution[contact - 1, :32] == pytest.approx(
+            rows[f"restitution_{contact}"], abs=1e-12
+        )
+    told = []
+    limits, rates = calibrate(loaded, store, progress=told.append)
+    assert sum(told) == LANES and rates["limit"] == LIMIT and rates["calibrated_on"]["scenarios"] == LANES
+    assert limits["equivalent_mass"] == loaded.mechanism.bodies.mass
+    with pytest.raises(InputError, match="--scenarios: found 129, allowed at most the store's 128"):
+        calibrate(loaded, store, scenarios=129)
+    with pytest.raises(InputError, match="gains_sha256"):
+        calibrate(ONE_SIDED, store)
+
+
+@pytest.mark.slow
+def test_of_a_hundred_thousand_scenarios_none_is_missed():
+    """The built-in claw, gains a little off the literature's, so that many runs are good and many are not."""
+    parsed = load("claw-350kg").mechanism
+    law = literature_gains(parsed, "response_error")
+    law |= {"response_error": 0.93 * law["response_error"], "phase_lead": 1.1 * law["phase_lead"]}
+    loaded = check_document(build_document("response_error", law, parsed, "0" * 64, {}, {}, 0, {}))
+    limit = 0.05
+    limits, rates = calibrate(loaded, scenarios=100_000, limit=limit)
+    print(rates)
+    false, missed = rates["false_alarms"], rates["missed_alarms"]
+    assert false["runs"] + missed["runs"] > 60_000 and missed["runs"] > 10_000
+    assert missed["alarms"] == 0 and missed["high"] < 5e-4
+    assert false["high"] < 1e-4
+    # The same verdicts by the controller itself, on other draws.
+    rules, distance = watchdog_rules(loaded)
+    controller = limited_controller(loaded, limits_section(limits))
+    (chunk,) = recorded_chunks(loaded, Scenarios("random", 1, 1024))
+    judged = judge_chunk(chunk, rules, distance)
+    error = np.abs(judged.error[0])
+    for lane in range(1024):
+        tripped = replay_lane(controller, chunk.signals, lane, rules.mass)
+        assert (tripped is not None) >= (not error[lane] <= limit)
+        assert (tripped is None) >= (error[lane] <= limit / 2)
+
+
+def signals(**columns):
+    """One lane."""
+    columns = {name: np.array(values, float)[:, None] for name, values in columns.items()}
+    shape = next(iter(columns.values())).shape
+    live, begins = np.ones(shape, bool), np.zeros(shape, bool)
+    begins[0] = True
+    every: dict = {name: columns.get(name, np.zeros(shape)) for name in Signals._fields[:5]}
+    return Signals(**every, live=live, begins=begins)
+
+
+def test_the_extent_of_a_run():
+    made = signals(
+        force=[0.0, 0.5, 0.5, 0.5, 7.0, -9.0],
+        measured=[-4.0, -3.0, 1.0, 3.0, 3.0, 4.0],
+        position=[-4.0, -3.0, 1.0, 3.0, 5.0, 6.0],
+        velocity=[1.0, 1.0, 1.0, 1.0, 1.0, -3.0],
+        command=[0.0, 1.0, -1.0, 2.0, 0.0, 0.0],
+    )
+    found = extent_of(made, period=0.5, clearance=math.inf, free_distance=2.0, settling=0.5)
+    expected = {
+        "reading": 9.0,
+        "measured_lowest": -4.0,
+        "measured_highest": 4.0,
+        "desired_lowest": -4.0,
+        "desired_highest": 6.0,
+        "command": 2.0,
+        "slew": 6.0,
+        "speed": 8.0,
+        "acceleration": 8.0,
+        "force_stuck": 6.0,
+        "position_stuck": 2.0,
+        "flight_force": 0.5,
+        "flight_spread": 0.0,
+    }
+    assert {name: float(values[0]) for name, values in found._asdict().items()} == expected
+
+
+def test_margins_are_on_good_runs_alone(calibrated):
+    _, chunk = calibrated
+    rules, distance = watchdog_rules(ONE_SIDED)
+    judged = judge_chunk(chunk, rules, distance)
+    one = np.arange(len(judged.index)) == 5
+    limits = guard_limits(ONE_SIDED, judged, one, rules, distance)
+    assert limits["force_limit"] == 1.5 * np.max(np.abs(chunk.signals.command[chunk.signals.live[:, 5], 5]))
+
+
+@pytest.mark.parametrize("keywords", [{"scenarios": 1}, {"limit": 0.0}, {"limit": math.nan}])
+def test_impossible_choices_are_refused(keywords):
+    with pytest.raises(InputError, match=r"found .*, allowed"):
+        calibrate(ONE_SIDED, **keywords)

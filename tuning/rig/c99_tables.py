@@ -1,0 +1,143 @@
+"""The parts of the controller in C99 that are tables of the runtime: gains, limits, faults.
+
+Each becomes a struct or a list of constants, with what its Python original says of every entry, and a check
+that admits just what the runtime admits. The struct of gains begins with control period and clearance, which
+the laws need too.
+"""
+
+import math
+import textwrap
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+from jaxhil.runtime.faults import FAULTS
+from jaxhil.runtime.gain_file import GainFile
+from jaxhil.runtime.limits import LIMITS
+from jaxhil.runtime.registry import COMPENSATORS
+
+UNUSABLE = 1 << 30
+WIDTH = 110
+
+
+class Table(NamedTuple):
+    """A fragment made of a table: opening comment, declarations, definitions."""
+
+    comment: str
+    declarations: str
+    definitions: str
+
+
+def decimal(value: float) -> str:
+    """A double as C writes it: 17 significant digits, which are read back as the same double."""
+    if math.isinf(value):
+        return "INFINITY" if value > 0.0 else "-INFINITY"
+    text = f"{value:.17g}"
+    return text if "." in text or "e" in text else f"{text}.0"
+
+
+def gains_table(law: str) -> Table:
+    """The struct `jaxhil_gains` of a law, and what is admitted in it."""
+    entries = [
+        ("control_period", "s, > 0"),
+        ("clearance", "m, of a contact with two sides; infinite with one"),
+    ]
+    checks = [
+        "isfinite(gains->control_period)",
+        "gains->control_period > 0.0",
+        "gains->clearance >= 0.0",
+    ]
+    for name, gain in COMPENSATORS[law].gains.items():
+        limited = gain.lowest > -math.inf or gain.highest < math.inf
+        entries.append((name, f"{gain.unit}, {gain.description()}" if limited else gain.unit))
+        checks.append(f"isfinite(gains->{name})")
+        if gain.lowest > -math.inf:
+            checks.append(f"gains->{name} {'>' if gain.exclusive else '>='} {decimal(gain.lowest)}")
+        if gain.highest < math.inf:
+            checks.append(f"gains->{name} <= {decimal(gain.highest)}")
+    return Table(
+        f"/* The gains of the compensator `{law}`. */\n",
+        _struct("jaxhil_gains", entries),
+        _check("jaxhil_gains_admitted", "jaxhil_gains", "gains", checks),
+    )
+
+
+def limits_table() -> Table:
+    """The struct `jaxhil_limits`, what is admitted in it, and the limits of a gain file without any."""
+    checks = []
+    for name, limit in LIMITS.items():
+        if math.isinf(limit.default):
+            checks.append(f"(isfinite(limits->{name}) || limits->{name} == {decimal(limit.default)})")
+        else:
+            checks.append(f"isfinite(limits->{name})")
+        if limit.lowest > -math.inf:
+            checks.append(f"limits->{name} >= {decimal(limit.lowest)}")
+    defaults = "".join(f"    .{name} = {decimal(limit.default)},\n" for name, limit in LIMITS.items())
+    return Table(
+        "/* The limits within which the controller works; infinite where there is none. */\n",
+        _struct(
+            "jaxhil_limits", [(name, f"{limit.unit}: {limit.meaning}") for name, limit in LIMITS.items()]
+        ),
+        f"static const jaxhil_limits jaxhil_no_limits = {{\n{defaults}}};\n\n"
+        + _check("jaxhil_limits_admitted", "jaxhil_limits", "limits", checks),
+    )
+
+
+def faults_table() -> Table:
+    """The bits of the faults, and their names."""
+    named = [(f"JAXHIL_{fault.name.upper()}", fault) for fault in FAULTS]
+    lines = []
+    for name, fault in named:
+        lines.append(_comment(f"{fault.condition}; reaction: {fault.reaction}", "    "))
+        lines.append(f"    {name} = 0x{fault.bit:X},\n")
+    lines.append(
+        "    /* the gains or limits given to jaxhil_init are not admitted; reaction: stays tripped */\n"
+    )
+    lines.append(f"    JAXHIL_UNUSABLE = 0x{UNUSABLE:X}\n")
+    cases = "".join(f'    case {name}:\n        return "{fault.name}";\n' for name, fault in named)
+    return Table(
+        "/* What can go wrong on the rig, and what the controller does about it: one bit each, raised on\n"
+        " * the tick at which it happens. A trip is latched. */\n",
+        f"enum {{\n{''.join(lines)}}};\n\n"
+        '/* The name of a fault, from its one bit; "" if it has none. */\n'
+        "const char *jaxhil_fault_name(uint32_t bit);\n",
+        "const char *jaxhil_fault_name(uint32_t bit) {\n    switch (bit) {\n"
+        f"{cases}"
+        '    case JAXHIL_UNUSABLE:\n        return "unusable";\n'
+        '    default:\n        return "";\n    }\n}\n',
+    )
+
+
+def constants(gain_file: GainFile) -> str:
+    """The gains and the limits of a gain file, as constants of those structs."""
+    units = {"control_period": "s", "clearance": "m"}
+    units |= {name: gain.unit for name, gain in COMPENSATORS[gain_file.compensator].gains.items()}
+    gains = {
+        "control_period": gain_file.control_period,
+        "clearance": gain_file.clearance,
+        **{name: gain_file.gains[name] for name in COMPENSATORS[gain_file.compensator].gains},
+    }
+    limit_units = {name: limit.unit for name, limit in LIMITS.items()}
+    limits = {name: gain_file.limits[name] for name in LIMITS}
+    return (
+        f"static const jaxhil_gains jaxhil_exported_gains = {{\n{_values(gains, units)}}};\n\n"
+        f"static const jaxhil_limits jaxhil_exported_limits = {{\n{_values(limits, limit_units)}}};\n"
+    )
+
+
+def _values(values: Mapping[str, float], units: Mapping[str, str]) -> str:
+    return "".join(f"    .{name} = {decimal(value)}, /* {units[name]} */\n" for name, value in values.items())
+
+
+def _struct(name: str, entries: Iterable[tuple[str, str]]) -> str:
+    lines = "".join(f"{_comment(meaning, '    ')}    double {entry};\n" for entry, meaning in entries)
+    return f"typedef struct {{\n{lines}}} {name};\n"
+
+
+def _check(function: str, struct: str, argument: str, checks: Iterable[str]) -> str:
+    joined = " &&\n           ".join(checks)
+    return f"static bool {function}(const {struct} *{argument}) {{\n    return {joined};\n}}\n"
+
+
+def _comment(text: str, indent: str) -> str:
+    lines = textwrap.wrap(text, WIDTH - len(indent) - 6, break_long_words=False)
+    return f"{indent}/* {f'{chr(10)}{indent} * '.join(lines)} */\n"
