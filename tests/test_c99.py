@@ -278,6 +278,26 @@ def test_limits_are_admitted_where_python_admits_them(batch):
     assert admitted > 100
 
 
+@pytest.mark.parametrize("low", [-1.0, 0.0, 1.0, 2.0])
+@pytest.mark.parametrize("high", [-1.0, 1.0, 2.0])
+def test_limits_that_clash_are_refused_as_in_python(low, high, batch):
+    made = batch("none")
+    plain = check_gain_document(gain_document("none"))
+    for names_of in (
+        ("measured_lowest", "measured_highest"),
+        ("command_lowest", "command_highest"),
+        ("retreat_velocity", "velocity_limit"),
+    ):
+        limits = dict(zip(names_of, (low, high), strict=True))
+        try:
+            complete(limits)
+            allowed = all(value >= LIMITS[name].lowest for name, value in limits.items())
+        except ValueError:
+            allowed = False
+        changed = plain._replace(limits={**plain.limits, **limits})
+        assert made.begin(packed("none", changed)) == allowed, limits
+
+
 # Bits
 
 
