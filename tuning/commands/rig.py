@@ -1,10 +1,8 @@
 """`jaxhil rig`: the controller as a process of its own, against a rig played in real time over UDP."""
 
-import importlib
 import math
 import sys
 import tempfile
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -81,14 +79,12 @@ def run(options: Rig) -> int:
 def controller_folder(given: str, compensator: str, scratch: Path) -> Path:
     """The folder in which the controller's process is to run: the bundle itself or, for a bare gain file,
     what such a process needs of a bundle, made in the folder `scratch`."""
+    from tuning.rig.single_file import runtime_source
     from tuning.rig.udp_session import SOURCE
 
     folder = Path(given)
     if folder.is_dir() and (folder / PROCESS).is_file():
         return folder
-    if find_spec("tuning.rig.single_file") is None:
-        return SOURCE
-    runtime_source = importlib.import_module("tuning.rig.single_file").runtime_source
     (scratch / "jaxhil_runtime.py").write_text(runtime_source(compensator), encoding="utf-8")
     (scratch / PROCESS).write_bytes((SOURCE / PROCESS).read_bytes())
     return scratch
