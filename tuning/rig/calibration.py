@@ -15,6 +15,8 @@ from jaxtyping import Bool, Float, Int
 from jaxhil.errors import InputError
 from jaxhil.metrics import OK
 from jaxhil.runtime.limits import LIMITS
+from jaxhil.scenario import build_scenarios
+from jaxhil.uncertainty import extremes
 from tuning.gain_file import LoadedGains
 from tuning.rig.audited import Audited, Rules, audit_contacts, first_reached
 from tuning.rig.expectation import Expectation, Features, expected_restitution, fit_expectation
@@ -32,7 +34,11 @@ BRIDGED = 3  # ticks: bad readings, missed ticks, cut rates in a row
 TARE = 0.1  # s
 RETREAT = 0.005  # s of free approach: what counts as out of contact besides what the sensor may err
 BALANCE = 1e-6  # of the approach's energy: what rounding leaves is far below, one wrong force far above
-PLACE = 0.75  # of the limit: where the margin of the restitution lies if the expectation is good enough
+BEYOND = 1.25  # times the expectation's largest error among the fitted runs: that among all others
+LEAST, PLACE = (
+    0.25,
+    0.75,
+)  # of the limit: the least margin of the restitution, and the one that a good expectation has
 ENOUGH = 0.01  # of the limit: rms error of an expectation that need not be better
 TOLD_ERRORS = (0.5, 1.0)  # of the limit: below the one a run is good, beyond the other it must be stopped
 
@@ -184,7 +190,7 @@ def restitution_margin(
     apart = runs.audited.restitution - expected - runs.error
     apart = np.abs(apart[use])
     largest = float(np.max(apart, initial=0.0))
-    return float(np.clip(limit - MARGIN * largest, 0.25 * limit, PLACE * limit))
+    return float(np.clip(limit - BEYOND * largest, LEAST * limit, PLACE * limit))
 
 
 def watchdog_rates(
@@ -343,9 +349,6 @@ def _rate(alarmed: Bool[np.ndarray, "runs"]) -> dict[str, Any]:
 
 def _largest(loaded: LoadedGains) -> dict[str, float]:
     """The largest that can be drawn of what the rules go by."""
-    from jaxhil.scenario import build_scenarios
-    from jaxhil.uncertainty import extremes
-
     scenarios = build_scenarios(loaded.mechanism, extremes(loaded.mechanism))
     force, position = scenarios.force_sensor, scenarios.position_sensor
     largest = {
