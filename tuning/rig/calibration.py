@@ -1,8 +1,8 @@
 """The limits of a gain file, from what good runs did: `calibrate`.
 
 The scenarios of a sweep's store are run again, recorded, and judged: a run is good if no contact's error
-exceeds the sweep's limit. Limits are margins on what the good ones of every fourth run needed, and the
-watchdog's expected restitution is fitted to those; what shares of the other runs are stopped for nothing, or
+exceeds the sweep's limit. To some of the runs the watchdog's expected restitution is fitted, and limits are
+margins on what the good ones among them needed; what shares of the other runs are stopped for nothing, or
 missed, is stated with exact intervals.
 """
 
@@ -15,6 +15,8 @@ from jaxtyping import Bool, Float, Int
 from jaxhil.errors import InputError
 from jaxhil.metrics import OK
 from jaxhil.runtime.limits import LIMITS
+from jaxhil.scenario import build_scenarios
+from jaxhil.uncertainty import extremes
 from tuning.gain_file import LoadedGains
 from tuning.rig.audited import Audited, Rules, audit_contacts, first_reached
 from tuning.rig.expectation import Expectation, Features, expected_restitution, fit_expectation
@@ -24,7 +26,7 @@ from tuning.sweeps.store import Store, read_part
 from tuning.verdict import binomial_interval
 
 MARGIN = 1.5  # on what good runs did
-FITTED = 4  # one run of so many is fitted to, the others judge
+FITTED = 2048  # runs that are enough to fit to: all others judge, at least 3 of 4 and at most 15 of 16
 SMALLEST = 0.02  # of the largest force reading: what a limit on forces leaves a sensor at least
 WITHOUT_STORE = 512  # draws
 LIMIT = 0.01  # of the restitution error, where no sweep states one
@@ -32,7 +34,11 @@ BRIDGED = 3  # ticks: bad readings, missed ticks, cut rates in a row
 TARE = 0.1  # s
 RETREAT = 0.005  # s of free approach: what counts as out of contact besides what the sensor may err
 BALANCE = 1e-6  # of the approach's energy: what rounding leaves is far below, one wrong force far above
-PLACE = 0.75  # of the limit: where the margin of the restitution lies if the expectation is good enough
+BEYOND = 1.25  # times the expectation's largest error among the fitted runs: what others may have
+LEAST, PLACE = (
+    0.25,
+    0.75,
+)  # of the limit: the least margin of the restitution, and the one that a good expectation has
 ENOUGH = 0.01  # of the limit: rms error of an expectation that need not be better
 TOLD_ERRORS = (0.5, 1.0)  # of the limit: below the one a run is good, beyond the other it must be stopped
 
@@ -85,7 +91,7 @@ def calibrate(
         parts.append(judge_chunk(chunk, rules, free_distance))
         progress(len(parts[-1].index))
     runs = _joined(parts)
-    fitted = runs.index % FITTED == 0
+    fitted = runs.index % int(np.clip(len(runs.index) // FITTED, 4, 16)) == 0
     good = good_runs(runs, limit) & fitted
     used = good if np.any(good) else np.all(runs.status == OK, axis=0) & fitted
     if not np.any(used):
@@ -165,9 +171,9 @@ def reached(runs: Judged, limit: float) -> Bool[np.ndarray, "slots lanes"]:
 def fit_reached(runs: Judged, limit: float, mass: float, chosen: Bool[np.ndarray, "lanes"]) -> Expectation:
     """The expectation, fitted to the contacts reached in the chosen runs."""
     use = reached(runs, limit) & (runs.status == OK) & chosen & (runs.audited.approach > 0)
-    index = np.broadcast_to(runs.index, use.shape)[use]
+    place = np.broadcast_to(np.cumsum(chosen), use.shape)[use]
     features = Features(*(leaf[use] for leaf in _features(runs.audited)))
-    return fit_expectation(features, runs.reference[use], index // FITTED, mass, ENOUGH * limit)
+    return fit_expectation(features, runs.reference[use], place, mass, ENOUGH * limit)
 
 
 def restitution_margin(
@@ -184,7 +190,7 @@ def restitution_margin(
     apart = runs.audited.restitution - expected - runs.error
     apart = np.abs(apart[use])
     largest = float(np.max(apart, initial=0.0))
-    return float(np.clip(limit - MARGIN * largest, 0.25 * limit, PLACE * limit))
+    return float(np.clip(limit - BEYOND * largest, LEAST * limit, PLACE * limit))
 
 
 def watchdog_rates(
@@ -343,9 +349,6 @@ def _rate(alarmed: Bool[np.ndarray, "runs"]) -> dict[str, Any]:
 
 def _largest(loaded: LoadedGains) -> dict[str, float]:
     """The largest that can be drawn of what the rules go by."""
-    from jaxhil.scenario import build_scenarios
-    from jaxhil.uncertainty import extremes
-
     scenarios = build_scenarios(loaded.mechanism, extremes(loaded.mechanism))
     force, position = scenarios.force_sensor, scenarios.position_sensor
     largest = {
