@@ -278,6 +278,26 @@ def test_limits_are_admitted_where_python_admits_them(batch):
     assert admitted > 100
 
 
+@pytest.mark.parametrize("low", [-1.0, 0.0, 1.0, 2.0])
+@pytest.mark.parametrize("high", [-1.0, 1.0, 2.0])
+def test_limits_that_clash_are_refused_as_in_python(low, high, batch):
+    made = batch("none")
+    plain = check_gain_document(gain_document("none"))
+    for names_of in (
+        ("measured_lowest", "measured_highest"),
+        ("command_lowest", "command_highest"),
+        ("retreat_velocity", "velocity_limit"),
+    ):
+        limits = dict(zip(names_of, (low, high), strict=True))
+        try:
+            complete(limits)
+            allowed = all(value >= LIMITS[name].lowest for name, value in limits.items())
+        except ValueError:
+            allowed = False
+        changed = plain._replace(limits={**plain.limits, **limits})
+        assert made.begin(packed("none", changed)) == allowed, limits
+
+
 # Bits
 
 
@@ -287,7 +307,17 @@ def compare(made: Batch, gain_file: GainFile, rows: np.ndarray) -> None:
     assert made.begin(gains)
     assert_same(made.run(rows, False), c99_cases.law_in_python(gain_file, rows), rows)
     assert made.begin(gains)
-    assert_same(made.run(rows, True), c99_cases.controller_in_python(gain_file, rows), rows)
+    results = made.run(rows, True)
+    assert_same(results, c99_cases.controller_in_python(gain_file, rows), rows)
+    assert np.all(np.isfinite(results[:, :2]))
+
+
+def test_retreat_of_a_command_from_one_end_of_the_range_to_the_other_is_finite(batch):
+    gain_file = GainFile("none", {}, PERIOD, math.inf, complete({"deceleration": 1.0}))
+    rows = np.zeros((6, len(c99_cases.ROW)))
+    rows[:2, 7] = 1e308, -1e308
+    rows[3, 0] = c99_cases.STOP
+    compare(batch("none"), gain_file, rows)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -15,6 +15,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg, subc
 PICTURES = (".png", ".pdf", ".svg")
 DEFAULT_PLOT = "jaxhil-out/simulate.png"
 DEFAULT_REPLAY_PLOT = "jaxhil-out/replay.png"
+DEFAULT_RIG_PLOT = "jaxhil-out/rig.png"
 DEFAULT_DRIVERS = 1024
 
 OptionalFile = Annotated[
@@ -289,6 +290,40 @@ class Verify:
 
 
 @dataclass(frozen=True)
+class Rig:
+    """A loop in real time: the controller as a process of its own, the rig played to it over UDP.
+
+    Example: jaxhil rig jaxhil-out/varying/gains.json --duration 600 --plot
+
+    An empty loop comes first, for comparison. Exit code 1 for a missed tick that is the controller's fault, a
+    restitution error beyond the limit, or a trip where no faults are injected.
+    """
+
+    path: Annotated[Positional[str], arg(metavar="BUNDLE_OR_GAINS", help="Bundle, gain file, or its folder.")]
+    duration: Annotated[float, arg(metavar="SECONDS", help="How long the run lasts.")] = 10.0
+    drops: Annotated[
+        float, arg(metavar="PROBABILITY", help="Injected: that a packet is lost, either way.")
+    ] = 0.0
+    jitter: Annotated[
+        float, arg(metavar="SECONDS", help="Injected: width of a random delay of every packet, either way.")
+    ] = 0.0
+    delay: Annotated[
+        float, arg(metavar="SECONDS", help="Injected: constant delay of every packet, either way.")
+    ] = 0.0
+    realtime: Annotated[
+        FlagCreatePairsOff[bool],
+        arg(help="Ask the system for a real-time priority for both processes.", help_behavior_hint=""),
+    ] = False
+    seed: Annotated[int, _number("Seed of sensor noise, contact phases and injected faults.")] = 0
+    plot: Annotated[
+        str | None,
+        arg(metavar="[PICTURE]", help=f"Latencies to a .png, .pdf or .svg file; bare: {DEFAULT_RIG_PLOT}."),
+    ] = None
+    limit: Limit = 0.01
+    json: Json = False
+
+
+@dataclass(frozen=True)
 class Mechanisms:
     """The built-in mechanism files, with their sources.
 
@@ -305,6 +340,7 @@ Command = (
     | Annotated[Replay, subcommand("replay")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Verify, subcommand("verify")]
+    | Annotated[Rig, subcommand("rig")]
     | Annotated[Mechanisms, subcommand("mechanisms")]
 )
 
@@ -329,7 +365,8 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
 def complete_bare(arguments: list[str]) -> list[str]:
     """A `--plot`, `--drivers` or `--rare` that no value follows gets the default one."""
     completed = []
-    plot = DEFAULT_REPLAY_PLOT if arguments[:1] == ["replay"] else DEFAULT_PLOT
+    own = {"replay": DEFAULT_REPLAY_PLOT, "rig": DEFAULT_RIG_PLOT}
+    plot = own.get(arguments[0], DEFAULT_PLOT) if arguments else DEFAULT_PLOT
     for place, word in enumerate(arguments):
         completed.append(word)
         following = arguments[place + 1] if place + 1 < len(arguments) else ""

@@ -16,12 +16,12 @@ from collections.abc import Callable, Iterator
 import jax
 import msgspec
 import numpy as np
-from jaxhil.runtime.limits import NO_LIMITS
 
 from jaxhil.compensators import Signals
 from jaxhil.metrics import OK, STATUS_NAMES, Metrics
 from jaxhil.runtime import Controller
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
+from jaxhil.runtime.limits import NO_LIMITS
 from tuning.gain_file import LoadedGains
 from tuning.recording import Lane, nominal_and_draws, record_lanes, run_closed_loop
 

@@ -176,6 +176,10 @@ static void jaxhil_position_guard_retreat(jaxhil_position_guard *guard, double s
         rate = wanted;
     }
     double moved = output + rate;
+    if (!isfinite(moved)) { /* after a step from one end of what a double can be to the other */
+        moved = output;
+        rate = 0.0;
+    }
     if (moved < guard->lowest) {
         moved = guard->lowest;
         rate = 0.0;

@@ -159,6 +159,9 @@ class PositionGuard:
         else:
             rate = wanted
         moved = output + rate
+        if not isfinite(moved):  # after a step from one end of what a float can be to the other
+            moved = output
+            rate = 0.0
         if moved < self._lowest:
             moved = self._lowest
             rate = 0.0

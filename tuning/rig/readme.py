@@ -5,9 +5,8 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from jaxhil.runtime.faults import FAULTS
-
 from jaxhil.errors import one_line
+from jaxhil.runtime.faults import FAULTS
 
 TEMPLATE = Path(__file__).parent / "bundle_readme.md"
 

@@ -1,0 +1,85 @@
+"""The rig's plant and the runtime's controller in lock-step: virtual time, no network, no jax."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from jaxhil.mechanism import Mechanism
+from jaxhil.mechanism_file import to_builtins
+from jaxhil.runtime import Controller
+from jaxhil.runtime.gain_file import GainFile
+from tuning.rig.contact_watch import ContactResult, ContactWatch
+from tuning.rig.plant import Plant
+from tuning.rig.udp_controller import APPROACH, Answer, NumericalModel, Reading, Task
+from tuning.rig.udp_rig import RigTask
+
+
+def controller(mechanism: Mechanism, compensator: str, gains: Mapping[str, float], **limits: float):
+    """The runtime's controller for a mechanism."""
+    made = GainFile(compensator, gains, mechanism.rig.control_period, mechanism.contact.clearance)
+    return Controller(made._replace(limits={**made.limits, **limits}))
+
+
+def closed_loop(
+    mechanism: Mechanism, compensator: str, gains: Mapping[str, float], seed: int = 0
+) -> tuple[list[ContactResult], dict[int, float]]:
+    """The mechanism's contacts as `jaxhil simulate` runs them, each entered at the speed of the rebound
+    before; the largest shortfall [m] of the position command in each."""
+    law, plant, watch = (
+        controller(mechanism, compensator, gains),
+        Plant(mechanism, seed),
+        ContactWatch(mechanism),
+    )
+    raw = to_builtins(mechanism)
+    model, sensor = NumericalModel(raw), mechanism.rig.force_sensor
+    zeroed = sensor.noise_std != 0 or sensor.bias != 0
+    (position, velocity), results, shortfalls = model.start, [], {}
+    while len(results) < mechanism.approach.contacts:
+        number, tick = len(results), 0
+        model.place(position, velocity)
+        plant.begin(position, velocity, law.position_command(position, velocity, 0.0), number)
+        watch.begin(number)
+        while len(results) < mechanism.approach.contacts:
+            force = law.step(plant.read()[0], model.position, model.velocity, plant.read()[1])
+            force = 0.0 if zeroed and tick == 0 else force
+            shortfalls.setdefault(len(results), 0.0)
+            over = watch.observe(model.position, model.velocity, force, plant.force)
+            if watch.in_contact or over:
+                shortfalls[len(results)] = max(shortfalls[len(results)], plant.shortfall)
+            model.integrate(force)
+            plant.move(law.position_command(model.position, model.velocity, model.acceleration))
+            tick += 1
+            if over is not None:
+                results.append(over)
+                if over.status != "ok" or math.isinf(mechanism.contact.clearance):
+                    break
+                plant.expect(len(results))
+        if results[-1].status != "ok":
+            break
+        velocity = results[-1].restitution * results[-1].approach_velocity
+        position = -velocity * (APPROACH + mechanism.approach.phase * mechanism.rig.control_period)
+        law.next_contact()
+    return results, shortfalls
+
+
+def packets(
+    mechanism: Mechanism,
+    law: Controller,
+    ticks: int,
+    delivered: Callable[[str, Any], list[Any]] = lambda way, packet: [packet],
+    seed: int = 0,
+) -> tuple[RigTask, Task, list[Answer]]:
+    """Rig and controller exchanging packets for so many ticks. `delivered(way, packet)` is what arrives at
+    that tick instead of a packet `"there"` or `"back"`."""
+    rig, task = RigTask(mechanism, seed), Task(law, to_builtins(mechanism))
+    answers = []
+    for _ in range(ticks):
+        packet: Reading = rig.reading()
+        for reading in delivered("there", packet):
+            answer = task.answer(reading)
+            if answer is not None:
+                answers.append(answer)
+                for arrived in delivered("back", answer):
+                    rig.take(arrived)
+        rig.advance()
+    return rig, task, answers

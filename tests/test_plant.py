@@ -1,0 +1,193 @@
+"""The rig's plant in plain floats: against the oracle, against jax's loop, against closed forms."""
+
+import math
+import time
+
+import numpy as np
+import pytest
+from cases import CASES, oracle_contacts, run_oracle
+from lanes import as_arrays, join, nominal_gains, run_rollout, validated
+from rig_lock_step import closed_loop
+
+from jaxhil.building import build_loop
+from jaxhil.compensators import literature_gains
+from jaxhil.mechanism_file import builtin_names, from_builtins, load
+from jaxhil.metrics import OK
+from jaxhil.runtime import COMPENSATORS
+from jaxhil.scenario import build_scenarios
+from tuning.rig.plant import Plant
+from tuning.rig.propagation import split_delay
+
+# One of each kind of motion simulator, hold, law and fault of a sensor, and several contacts.
+AGAINST_THE_ORACLE = (
+    *("delays of whole periods", "delays that make a whole period together", "overdamped", "tension"),
+    *("zoh hold and integrator", "transfer function with latency", "third order with latency"),
+    *("first order", "ideal with transport delay", "ideal with zoh hold", "hunt-crossley", "damped layers"),
+    *("response error, gains off nominal", "late position", "dead zone", "quantum", "range"),
+    *("velocity limit", "damped, lag", "rattling, lag", "rattling against layers"),
+    "rattling behind a long transport delay",
+)
+# Parabolas stand for the force that a lagging sensor follows.
+LAGGED = 1e-7
+
+
+@pytest.mark.parametrize("name", AGAINST_THE_ORACLE)
+def test_every_contact_against_the_oracle(name):
+    case = CASES[name]
+    mechanism = validated(case.mechanism)
+    gains = nominal_gains(mechanism, case.compensator, **case.gains)
+    found, shortfalls = closed_loop(mechanism, case.compensator, gains)
+    # The oracle is not told that a quantum is a level below which a command has died out.
+    expected = run_oracle(case, noise_level=0.5) if name == "quantum" else oracle_contacts(name)
+    assert len(found) == len(expected) == mechanism.approach.contacts
+    accuracy = LAGGED if "lag" in name else 1e-11
+    for number, (mine, other) in enumerate(zip(found, expected, strict=True)):
+        assert mine.status == "ok"
+        assert mine.restitution == pytest.approx(other["restitution"], abs=accuracy)
+        assert mine.approach_velocity == pytest.approx(other["approach_velocity"], rel=1e-7)
+        assert mine.peak_force == pytest.approx(other["peak_force"], rel=3e-3)
+        assert shortfalls[number] == pytest.approx(other["position_shortfall"], rel=1e-8, abs=1e-17)
+
+
+# Each form of loop is compiled for some seconds.
+BUILT_IN = [
+    name if name == "varying" else pytest.param(name, marks=pytest.mark.slow) for name in builtin_names()
+]
+
+
+@pytest.mark.parametrize("name", [*BUILT_IN, "limited"])
+def test_every_built_in_mechanism_as_simulated(name):
+    overrides = ()
+    if name == "limited":
+        name = "rattling"
+        overrides = ("rig.simulator.acceleration_limit=0.4", "rig.simulator.velocity_limit=0.0099")
+        overrides += ("approach.contacts=3", "rig.command_latency=1")
+    mechanism = load(name, overrides).mechanism
+    gains = literature_gains(mechanism, "response_error")
+    scenario = join([build_scenarios(mechanism)])
+    loop = build_loop(mechanism, "response_error", scenario)
+    expected = run_rollout(loop, as_arrays(gains), scenario)
+    found, shortfalls = closed_loop(mechanism, "response_error", gains)
+    assert len(found) == mechanism.approach.contacts
+    for slot, mine in enumerate(found):
+        assert mine.status == "ok" and expected.status[slot, 0] == OK
+        assert mine.restitution == pytest.approx(float(expected.restitution[slot, 0]), abs=1e-9)
+        assert mine.duration == pytest.approx(float(expected.duration[slot, 0]), abs=1e-9)
+        assert mine.peak_force == pytest.approx(float(expected.peak_force[slot, 0]), rel=1e-3)
+        assert shortfalls[slot] == pytest.approx(
+            float(expected.position_shortfall[slot, 0]), rel=1e-6, abs=1e-17
+        )
+    if overrides:
+        assert max(shortfalls.values()) > 1e-7
+
+
+SIMULATORS = {
+    "ideal": ({"model": "ideal"}, 0.0),
+    "first order": ({"model": "first_order", "time_constant": 0.009}, 0.009),
+    "second order": (
+        {"model": "second_order", "natural_frequency": 12.0, "damping_ratio": 0.8},
+        0.8 / (math.pi * 12.0),
+    ),
+    "third order": ({"model": "third_order", "coefficients": [0.02, 1.6e-4, 5e-7]}, 0.02),
+    "transfer function": (
+        {"model": "transfer_function", "numerator": [0.004, 1.0], "denominator": [1.5e-4, 0.02, 1.0]},
+        0.016,
+    ),
+}
+
+
+def on_rig(simulator, **rig):
+    return from_builtins(
+        {
+            "schema": "jaxhil/mechanism/1",
+            "name": "case",
+            "bodies": {"equivalent_mass": 350.0},
+            "approach": {"velocity": 0.005},
+            "contact": {"law": "linear", "stiffness": [1e5]},
+            "rig": {"control_period": 0.001, "simulator": simulator, **rig},
+        },
+        "case",
+    )
+
+
+@pytest.mark.parametrize("model", SIMULATORS)
+@pytest.mark.parametrize("latency", [0, 1])
+def test_uniform_motion_is_followed_by_a_constant_lag(model, latency):
+    simulator, lag = SIMULATORS[model]
+    mechanism = on_rig(
+        {**simulator, "delay": 0.0037}, command_latency=latency, position_sensor={"delay": 0.0009}
+    )
+    plant, velocity = Plant(mechanism), 0.005
+    plant.begin(-1.0, velocity, -1.0, 0)
+    lag += 0.0037 + 0.0009 + latency * 0.001
+    for tick in range(300):
+        position = -1.0 + tick * 0.001 * velocity
+        assert plant.read()[1] == pytest.approx(position - velocity * lag, abs=1e-12)
+        plant.move(position + 0.001 * velocity)
+
+
+def test_a_staircase_is_followed_in_its_steady_state():
+    mechanism = on_rig({**SIMULATORS["second order"][0], "delay": 0.0037}, command_hold="zoh")
+    plant, velocity = Plant(mechanism), 0.005
+    plant.begin(-1.0, velocity, -1.0, 0)
+    readings = []
+    for tick in range(200):
+        readings.append(plant.read()[1])
+        plant.move(-1.0 + (tick + 1) * 0.001 * velocity)
+    np.testing.assert_allclose(np.diff(readings), 0.001 * velocity, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("delay, panels, place", [(0.0, 0, 1.0), (0.003, 3, 1.0), (0.0032, 3, 0.8)])
+def test_delays_are_split_at_the_ticks(delay, panels, place):
+    assert split_delay(delay, 0.001) == (panels, pytest.approx(place, abs=1e-12))
+    assert split_delay(0.1 + 0.2, 0.1)[0] == 3
+
+
+def test_sensors_in_free_flight():
+    sensor = {"noise_std": 0.5, "bias": 2.0}
+    mechanism = on_rig({"model": "ideal"}, force_sensor=sensor, position_sensor={"noise_std": 1e-6})
+    plant = Plant(mechanism, seed=3)
+    plant.begin(-1.0, 0.0, -1.0, 0)
+    readings = np.array([plant.read() for _ in range(20_000)])
+    assert np.mean(readings[:, 0]) == pytest.approx(2.0, abs=5 * 0.5 / 20_000**0.5)
+    assert np.std(readings[:, 0]) == pytest.approx(0.5, rel=0.03)
+    assert np.std(readings[:, 1]) == pytest.approx(1e-6, rel=0.03)
+    again = Plant(mechanism, seed=3)
+    again.begin(-1.0, 0.0, -1.0, 0)
+    assert [again.read() for _ in range(3)] == [tuple(row) for row in readings[:3]]
+
+
+@pytest.mark.parametrize("name", ["rig-300kg", "rattling"])
+def test_noisy_contacts_as_good_as_without_noise_on_average(name):
+    mechanism = load(name, ("rig.force_sensor.noise_std=0.2", "approach.contacts=1")).mechanism
+    quiet = load(name, ("approach.contacts=1",)).mechanism
+    gains = literature_gains(mechanism, "phase_lead")
+    (expected,), _ = closed_loop(quiet, "phase_lead", gains)
+    found = [closed_loop(mechanism, "phase_lead", gains, seed)[0][0].restitution for seed in range(8)]
+    spread = np.std(found)
+    assert 1e-6 < spread < 0.02
+    assert np.mean(found) == pytest.approx(expected.restitution, abs=4 * spread / 8**0.5 + 1e-3)
+
+
+def test_the_runtime_has_every_law_that_is_played():
+    assert {case.compensator for case in CASES.values()} <= set(COMPENSATORS)
+
+
+@pytest.mark.benchmark
+@pytest.mark.parametrize("name", [*builtin_names(), "lag"])
+def test_time_of_a_tick(name):
+    overrides = ("rig.force_sensor.time_constant=0.002",) if name == "lag" else ()
+    mechanism = load("varying" if name == "lag" else name, overrides).mechanism
+    plant, velocity = Plant(mechanism), mechanism.approach.velocity
+    times = []
+    for _ in range(20):
+        plant.begin(-0.02 * velocity, velocity, -0.02 * velocity, 0)
+        for tick in range(300):
+            # In and out of contact.
+            phase = math.pi * (tick - 20) / 250
+            begun = time.thread_time_ns()
+            plant.read()
+            plant.move(velocity * 0.25 / math.pi * math.sin(phase))
+            times.append(1e-3 * (time.thread_time_ns() - begun))
+    print(f"\n{name}: plant's tick {np.median(times):.1f} us, 99 % {np.percentile(times, 99):.1f} us")
+    assert np.median(times) < 150

@@ -1,0 +1,89 @@
+"""Contact laws in plain floats: the force of one contact against penetration d > 0 and its rate d'.
+
+For loops that run tick by tick in real time; `jaxhil.contact` has the same laws for batches.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from jaxhil.mechanism import Contact
+
+Formula = Callable[[float, float], float]
+
+
+class ContactLaw(NamedTuple):
+    """One contact's law, functions of penetration d [m] and rate d' [m/s].
+
+    `hold` [N or 1] is positive as long as penetrated surfaces hold on to each other; `force` [N] is that of
+    d > 0, 0 where they let go; `edge` [N], of d' alone, is its limit as d goes to 0 from above.
+    """
+
+    force: Formula
+    hold: Formula
+    edge: Callable[[float], float]
+
+
+def contact_law(contact: Contact, number: int) -> ContactLaw:
+    """The law of successive contact `number` (from 0); the last entry of every list repeats."""
+    stiffness = contact.stiffness[min(number, len(contact.stiffness) - 1)]
+    damping = contact.damping[min(number, len(contact.damping) - 1)]
+    if isinstance(stiffness, list):
+        return _piecewise_linear(stiffness, contact.depths, damping)
+    if contact.law == "hunt_crossley":
+        return _hunt_crossley(stiffness, damping, contact.exponent)
+    if contact.law == "linear":
+        return _kelvin_voigt(stiffness, 0.0, False)
+    return _kelvin_voigt(stiffness, damping, contact.tension)
+
+
+def _kelvin_voigt(stiffness: float, damping: float, tension: bool) -> ContactLaw:
+    """F = k d + b d', clamped at 0 unless tension is allowed."""
+
+    def spring(depth: float, rate: float) -> float:
+        return stiffness * depth + damping * rate
+
+    if tension:
+        return ContactLaw(spring, lambda depth, rate: 1.0, lambda rate: damping * rate)
+    return _clamped(spring, lambda rate: damping * rate)
+
+
+def _hunt_crossley(stiffness: float, damping: float, exponent: float) -> ContactLaw:
+    """F = k d^n (1 + (3/2) chi d') >= 0."""
+
+    def hold(depth: float, rate: float) -> float:
+        return 1.0 + 1.5 * damping * rate
+
+    def force(depth: float, rate: float) -> float:
+        factor = 1.0 + 1.5 * damping * rate
+        return stiffness * depth**exponent * factor if factor > 0.0 else 0.0
+
+    return ContactLaw(force, hold, lambda rate: 0.0)
+
+
+def _piecewise_linear(slopes: list[float], depths: list[float], damping: float) -> ContactLaw:
+    """F = f(d) + b d' >= 0, f(0) = 0, of slope k_i between depths d_(i-1) and d_i; the last slope goes on."""
+    pieces, start, level = [], 0.0, 0.0
+    for slope, end in zip(slopes, [*depths, float("inf")], strict=True):
+        pieces.append((end, start, level, slope))
+        level += slope * (end - start)
+        start = end
+
+    def spring(depth: float, rate: float) -> float:
+        for end, start, level, slope in pieces:
+            if depth <= end:
+                return level + slope * (depth - start) + damping * rate
+        raise ValueError("the penetration is not a number")
+
+    return _clamped(spring, lambda rate: damping * rate)
+
+
+def _clamped(spring: Formula, edge: Callable[[float], float]) -> ContactLaw:
+    def force(depth: float, rate: float) -> float:
+        value = spring(depth, rate)
+        return value if value > 0.0 else 0.0
+
+    def limit(rate: float) -> float:
+        value = edge(rate)
+        return value if value > 0.0 else 0.0
+
+    return ContactLaw(force, spring, limit)

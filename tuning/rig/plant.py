@@ -1,0 +1,166 @@
+"""A rig's hardware in plain floats: motion simulator, contact and sensors, one control period per call.
+
+    plant = Plant(mechanism, seed=0)
+    plant.begin(position, velocity, command, number)  # a run of uniform motion, contact `number` ahead
+    force, position = plant.read()                    # what the sensors read at this tick
+    plant.move(command)                               # the position command of the next tick; a period passes
+
+The physics of `jaxhil.loop` stages 1, 4 and 5 without jax, fast enough for a loop in real time: linear parts
+are discretised exactly, once; delays are read at their places within a panel (`tuning.rig.propagation`), and
+nothing is rounded to ticks.
+"""
+
+import math
+from random import Random
+
+from jaxhil.mechanism import Mechanism
+from tuning.rig.contact_laws import contact_law
+from tuning.rig.propagation import WHOLE, Place, apply, propagation, split_delay
+from tuning.rig.sensor_lag import Motion, lagged
+
+Panel = tuple[Motion, Motion | None, Motion | None]  # where the force is sampled, at its start, at its end
+
+
+class Plant:
+    """Everything on the rig but the controller. `force` [N]: the newest sample of the real contact force that
+    has happened by this tick; `shortfall` [m]: how far limits keep the command from what was wanted."""
+
+    def __init__(self, mechanism: Mechanism, seed: int = 0) -> None:
+        rig = mechanism.rig
+        simulator, period = rig.simulator, rig.control_period
+        force_panels, force_place = split_delay(simulator.delay + rig.force_sensor.delay, period)
+        position_panels, position_place = split_delay(simulator.delay + rig.position_sensor.delay, period)
+        self._period, self._contact = period, mechanism.contact
+        self._clearance = mechanism.contact.clearance
+        self._hold, self._latency = rig.command_hold, rig.command_latency
+        self._force_sensor, self._position_sensor = rig.force_sensor, rig.position_sensor
+        self._place, self._noise = force_place * period, Random(seed)
+        self._limits = simulator.velocity_limit, simulator.acceleration_limit
+        self._limited = math.isfinite(min(self._limits))
+        self._rows = propagation(simulator, period, rig.command_hold, force_place, position_place)
+        # A sample happens `real` panels after its panel's command, and is read so many panels later.
+        self._real = math.ceil(simulator.delay / period + force_place - WHOLE) - 1
+        self._force_panels, self._position_panels = force_panels - self._real, position_panels
+        self._size = 1 << (max(self._force_panels, position_panels, self._real) + 2).bit_length()
+        self.begin(-1.0, 0.0, -1.0, 0)
+
+    def begin(self, position: float, velocity: float, command: float, number: int) -> None:
+        """A fresh run at its tick 0: contact `number` (from 0) ahead of a uniform motion.
+
+        The numerical model is at `position` [m] with `velocity` [m/s], the position command of this tick is
+        `command` [m]; before it, all have been in that motion for ever, and there was no force.
+        """
+        self._law, self._number, self._wanted_number = contact_law(self._contact, number), number, number
+        stride = self._period * velocity
+        self._commands = [command - back * stride for back in range(self._latency + 1)]
+        self._wanted, self._step, self.shortfall = command, stride, 0.0
+        rows, linear = self._rows, self._hold == "linear"
+        drive = self._commands[-1] if linear else self._commands[-1] + stride
+        before = [
+            c * (drive - stride) + s * stride
+            for c, s in zip(rows.steady_command, rows.steady_step, strict=True)
+        ]
+        first = apply(rows.measured, before, drive - stride, drive if linear else drive - stride)
+        self._state = [
+            c * drive + s * stride for c, s in zip(rows.steady_command, rows.steady_step, strict=True)
+        ]
+        size = self._size
+        self._forces = [0.0] * size
+        self._panels: list[Panel | None] = [None] * size
+        # Panel -1 is the newest before the run, and lies at the ring's end.
+        self._positions = [first + (place - size + 1) * stride for place in range(size)]
+        self._tick = 0
+        self._lag = self.force = 0.0
+        self._dented = False
+
+    def read(self) -> tuple[float, float]:
+        """Measured force [N] and position [m] at this tick, just before its command acts. Draws noise."""
+        last = self._size - 1
+        sensor, noise = self._force_sensor, self._noise
+        force = self._forces[(self._tick - 1 - self._force_panels) & last] + sensor.bias
+        if sensor.noise_std > 0.0:
+            force += sensor.noise_std * noise.gauss(0.0, 1.0)
+        force = _quantised(force, sensor.quantum)
+        if sensor.dead_zone > 0.0:
+            force = math.copysign(max(0.0, abs(force) - sensor.dead_zone), force)
+        force = min(max(force, -sensor.range), sensor.range)
+        position = self._positions[(self._tick - 1 - self._position_panels) & last]
+        if self._position_sensor.noise_std > 0.0:
+            position += self._position_sensor.noise_std * noise.gauss(0.0, 1.0)
+        return force, _quantised(position, self._position_sensor.quantum)
+
+    def move(self, command: float) -> None:
+        """One control period under the position command [m] of the tick at its end."""
+        if self._limited:
+            command = self._limit(command)
+        commands = self._commands
+        end = commands[self._latency - 1] if self._latency else command
+        start = commands[self._latency] if self._hold == "linear" else end
+        self._commands = [command, *commands[: self._latency]]
+        rows, state, tick, last = self._rows, self._state, self._tick, self._size - 1
+
+        def motion(place: Place) -> Motion:
+            return Motion(apply(place.position, state, start, end), apply(place.velocity, state, start, end))
+
+        if self._force_sensor.time_constant > 0.0:
+            panel = motion(rows.sample), motion(rows.start), motion(rows.end)
+        else:
+            panel = motion(rows.sample), None, None
+        self._panels[tick & last] = panel
+        self._positions[tick & last] = apply(rows.measured, state, start, end)
+        self._state = [apply(row, state, start, end) for row in rows.transition]
+        self._forces[tick & last] = self._touch(self._panels[(tick - self._real) & last])
+        self._tick = tick + 1
+        self.expect(self._wanted_number)
+
+    def expect(self, number: int) -> None:
+        """The next contact of the run is `number` (from 0): its law holds once the mechanism is free."""
+        self._wanted_number = number
+        if number != self._number and not self._dented:
+            self._law, self._number = contact_law(self._contact, number), number
+
+    def _touch(self, panel: Panel | None) -> float:
+        """What happens in the panel whose motion arrives now; what the sensor makes of its force [N]."""
+        if panel is None:
+            return 0.0
+        sample, start, end = panel
+        clearance = self._clearance
+        if sample.position > 0.0:
+            self._dented, self.force = True, self._law.force(sample.position, sample.velocity)
+        elif sample.position < -clearance:
+            self._dented = True
+            self.force = -self._law.force(-clearance - sample.position, -sample.velocity)
+        else:
+            self._dented, self.force = False, 0.0
+        if start is None or end is None:
+            return self.force
+        time_constant = self._force_sensor.time_constant
+        reading = lagged(self._lag, self._law, clearance, start, sample, self._place, time_constant)
+        rest = self._period - self._place
+        self._lag = lagged(reading, self._law, clearance, sample, end, rest, time_constant)
+        return reading
+
+    def _limit(self, wanted: float) -> float:
+        """Rate limits on the command: see `jaxhil.limits.limit_command`."""
+        velocity_limit, acceleration_limit = self._limits
+        previous, before = self._commands[0], self._wanted
+        largest, change = velocity_limit * self._period, acceleration_limit * self._period**2
+        step = unlimited = wanted - previous
+        own_step = wanted - before
+        if math.isfinite(change):
+            behind = before - previous
+            more = math.floor((math.sqrt(1 + 8 * abs(behind) / change) - 1) / 2)
+            step = own_step + behind / (more + 1) + math.copysign(change * more / 2, behind)
+            step = min(max(step, self._step - change), self._step + change)
+        step = min(max(step, -largest), largest)
+        rounding = 2 * math.ulp(1.0) * (abs(wanted) + abs(previous) + abs(own_step))
+        if abs(step - unlimited) <= rounding:
+            command, step = wanted, unlimited
+        else:
+            command = previous + step
+        self._wanted, self._step, self.shortfall = wanted, step, abs(wanted - command)
+        return command
+
+
+def _quantised(value: float, quantum: float) -> float:
+    return quantum * round(value / quantum) if quantum > 0.0 else value

@@ -1,0 +1,137 @@
+"""The motion simulator G(s) from tick to tick in plain floats, exact: one matrix exponential, then products.
+
+A transport delay commutes with a linear system: G is driven by the undelayed command, a straight line within
+each control period ("panel"), and every delay is how long ago its response is read. The response at the
+fraction s of a panel is a fixed row of numbers times (state, command at the panel's start, at its end).
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import expm
+
+from jaxhil.mechanism import Simulator
+
+Row = tuple[float, ...]
+WHOLE = 1e-9  # periods by which a delay may miss a whole number of them
+
+
+class Place(NamedTuple):
+    """Rows that give position [m] and velocity [m/s] at one place of a panel."""
+
+    position: Row
+    velocity: Row
+
+
+class Propagation(NamedTuple):
+    """Rows of the state one period later; `start` and `end` of a panel, from within; `sample`, where the
+    force is read, and `measured`, where the position is. `steady_command` and `steady_step`: the state of a
+    uniform motion, per command now [m] and per its growth in a period [m]."""
+
+    transition: tuple[Row, ...]
+    start: Place
+    sample: Place
+    end: Place
+    measured: Row
+    steady_command: Row
+    steady_step: Row
+
+
+def split_delay(delay: float, period: float) -> tuple[int, float]:
+    """Whole panels to look back from the newest one, and the place in (0, 1] within that panel."""
+    periods = delay / period
+    whole = math.floor(periods + WHOLE)
+    return whole, min(1.0, 1.0 - (periods - whole))
+
+
+def propagation(
+    simulator: Simulator, period: float, hold: str, force_place: float, position_place: float
+) -> Propagation:
+    """Exact discretisation of G(s): the exponential of the system augmented by its input (Van Loan 1978).
+
+    With z' = A z + B u, z(s T) = E(s) (z, u(0), u(1) - u(0)), E the exponential of s T [[A, B, 0],
+    [0, 0, 1/T], [0, 0, 0]]. `hold` is "linear" or "zoh"; places are fractions of the period [s].
+    """
+    numerator, denominator = transfer_function(simulator)
+    order = len(denominator) - 1
+    if order == 0:
+        return _ideal(period, hold, force_place, position_place)
+    # Time in periods: components of the state are then of like size.
+    powers = period ** np.arange(order + 1.0)
+    system = np.eye(order, k=1)
+    system[-1] = -(denominator[::-1] / denominator[0])[:order] * powers[:0:-1]
+    output = np.zeros(order)
+    output[: len(numerator)] = numerator[::-1] / denominator[0]
+    output *= powers[:0:-1]
+    drive = np.zeros(order)
+    drive[-1] = 1.0
+
+    def state_rows(place: float) -> np.ndarray:
+        generator = np.zeros((order + 2, order + 2))
+        generator[:order, :order] = system
+        generator[order - 1, order] = 1.0
+        generator[order, order + 1] = 1.0
+        rows = expm(place * generator)[: order + 1]
+        # Columns for (z, u(0), u(1)) instead of (z, u(0), u(1) - u(0)).
+        rows[:, order] -= rows[:, order + 1]
+        return rows
+
+    def motion(place: float) -> Place:
+        rows = state_rows(place)
+        rates = system @ rows[:order] + np.outer(drive, rows[order])
+        return Place(_row(output @ rows[:order]), _row(output @ rates / period))
+
+    transition = state_rows(1.0)[:order]
+    steady_command = -np.linalg.solve(system, drive)
+    if hold == "linear":
+        steady_step = np.linalg.solve(system, steady_command)
+    else:
+        # A staircase: z(k) = alpha u(k+1) + beta step and z(k+1) = Ad z(k) + Bd u(k+1).
+        steady_step = -np.linalg.solve(np.eye(order) - transition[:, :order], steady_command)
+    return Propagation(
+        transition=tuple(_row(row) for row in transition),
+        start=motion(0.0),
+        sample=motion(force_place),
+        end=motion(1.0),
+        measured=motion(position_place).position,
+        steady_command=_row(steady_command),
+        steady_step=_row(steady_step),
+    )
+
+
+def transfer_function(simulator: Simulator) -> tuple[np.ndarray, np.ndarray]:
+    """Numerator and denominator of G(s) in descending powers of s; order 0 is the ideal simulator."""
+    if simulator.model == "ideal":
+        return np.ones(1), np.ones(1)
+    if simulator.model == "transfer_function":
+        return np.array(simulator.numerator), np.array(simulator.denominator)
+    if simulator.model == "third_order":
+        return np.ones(1), np.array([*reversed(simulator.coefficients or ()), 1.0])
+    if simulator.model == "first_order":
+        return np.ones(1), np.array([simulator.time_constant, 1.0])
+    frequency = 2 * math.pi * (simulator.natural_frequency or math.nan)
+    damping = simulator.damping_ratio or math.nan
+    return np.array([frequency**2]), np.array([1.0, 2 * damping * frequency, frequency**2])
+
+
+def apply(row: Row, state: list[float], start: float, end: float) -> float:
+    """One row times (state, command at the panel's start, command at its end)."""
+    total = row[-2] * start + row[-1] * end
+    for weight, component in zip(row, state, strict=False):
+        total += weight * component
+    return total
+
+
+def _ideal(period: float, hold: str, force_place: float, position_place: float) -> Propagation:
+    slope = (-1.0 / period, 1.0 / period) if hold == "linear" else (0.0, 0.0)
+
+    def place(at: float) -> Place:
+        return Place((1.0 - at, at), slope)
+
+    measured = place(position_place).position
+    return Propagation((), place(0.0), place(force_place), place(1.0), measured, (), ())
+
+
+def _row(values: np.ndarray) -> Row:
+    return tuple(float(value) for value in values)

@@ -1,0 +1,147 @@
+"""What a force sensor with a first-order lag reads of a contact, stretch by stretch of smooth motion.
+
+T_s y' = F - y. Within a stretch the motion is the cubic through its exact ends (Hermite); the contact begins
+and ends at roots on that cubic, and the force in between is taken along parabolas, whose lag is exact.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+from tuning.rig.contact_laws import ContactLaw
+
+ARCS = 2  # parabolas that stand for the force of one stretch
+MOST_STEPS = 50  # of false position
+CLOSE = 1e-13  # of a stretch
+SHORT = 1e-2  # time constants below which the closed form of an arc cancels
+
+
+class Motion(NamedTuple):
+    """Position [m] and velocity [m/s]."""
+
+    position: float
+    velocity: float
+
+
+def lagged(
+    reading: float,
+    law: ContactLaw,
+    clearance: float,
+    start: Motion,
+    end: Motion,
+    duration: float,
+    time_constant: float,
+) -> float:
+    """The lag's output [N] at the end of a stretch of `duration` [s], `reading` [N] at its start.
+
+    Surfaces at 0 and, pushing the other way, at -clearance [m] (may be infinite).
+    """
+    if duration <= 0.0:
+        return reading
+    side, surface = _surface(start.position, end.position, clearance)
+    if side == 0.0:
+        return reading * math.exp(-duration / time_constant)
+    path = _Cubic(start, end, duration)
+
+    def depth(s: float) -> float:
+        return side * (path.position(s) - surface)
+
+    def hold(s: float) -> float:
+        return law.hold(depth(s), side * path.velocity(s))
+
+    enters, leaves = _span(depth)
+    catches, lets_go = _span(hold)
+    first, last = max(enters, catches), min(leaves, lets_go)
+    if not first < last:
+        return reading * math.exp(-duration / time_constant)
+    begins_at_surface = enters > 0.0 and enters >= catches
+    ends_at_surface = leaves < 1.0 and leaves <= lets_go
+    forces = []
+    for i in range(2 * ARCS + 1):
+        s = first + (last - first) * (i / (2 * ARCS))
+        rate = side * path.velocity(s)
+        if (i == 0 and begins_at_surface) or (i == 2 * ARCS and ends_at_surface):
+            # At the surface the force has a limit from inside.
+            force = law.edge(rate)
+        else:
+            penetration = depth(s)
+            force = law.force(penetration, rate) if penetration > 0.0 else 0.0
+        forces.append(side * force)
+    reading *= math.exp(-first * duration / time_constant)
+    span = (last - first) * duration / ARCS / time_constant
+    decay, straight, bow = _arc(span)
+    for i in range(0, 2 * ARCS, 2):
+        begin, middle, finish = forces[i : i + 3]
+        bend = middle - (begin + finish) / 2
+        reading = reading * decay + finish - begin * decay - (finish - begin) * straight + bend * bow
+    return reading * math.exp(-(1.0 - last) * duration / time_constant)
+
+
+def _surface(start: float, end: float, clearance: float) -> tuple[float, float]:
+    """Side (1, -1, or 0 for none) and position [m] of the surface that a stretch touches."""
+    for position in (start, end):
+        if position > 0.0:
+            return 1.0, 0.0
+        if position < -clearance:
+            return -1.0, -clearance
+    return 0.0, 0.0
+
+
+class _Cubic:
+    """The cubic through both ends of a stretch, over the fraction s of it."""
+
+    __slots__ = ("_bend", "_duration", "_rate", "_start", "_twist")
+
+    def __init__(self, start: Motion, end: Motion, duration: float) -> None:
+        rate, last = start.velocity * duration, end.velocity * duration
+        moved = end.position - start.position
+        self._start, self._rate, self._duration = start.position, rate, duration
+        self._bend, self._twist = 3 * moved - 2 * rate - last, rate + last - 2 * moved
+
+    def position(self, s: float) -> float:
+        return self._start + s * (self._rate + s * (self._bend + s * self._twist))
+
+    def velocity(self, s: float) -> float:
+        return (self._rate + s * (2 * self._bend + s * 3 * self._twist)) / self._duration
+
+
+def _span(function: Callable[[float], float]) -> tuple[float, float]:
+    """From which s in [0, 1] and until which a function is positive, if it changes its sign at most once."""
+    at_0, at_1 = function(0.0), function(1.0)
+    if at_0 <= 0.0 and at_1 <= 0.0:
+        return 1.0, 0.0
+    if at_0 > 0.0 and at_1 > 0.0:
+        return 0.0, 1.0
+    root = _root(function, at_0, at_1)
+    return (0.0, root) if at_0 > 0.0 else (root, 1.0)
+
+
+def _root(function: Callable[[float], float], at_0: float, at_1: float) -> float:
+    """Where a function changes its sign in [0, 1]: false position, the Illinois way."""
+    low, high, kept = 0.0, 1.0, 0
+    s = 1.0
+    for _ in range(MOST_STEPS):
+        before, s = s, low + (high - low) * at_0 / (at_0 - at_1)
+        value = function(s)
+        if value == 0.0 or abs(s - before) < CLOSE:
+            break
+        if (value > 0.0) == (at_1 > 0.0):
+            high, at_1 = s, value
+            at_0 = at_0 / 2 if kept == 1 else at_0
+            kept = 1
+        else:
+            low, at_0 = s, value
+            at_1 = at_1 / 2 if kept == -1 else at_1
+            kept = -1
+    return s
+
+
+def _arc(span: float) -> tuple[float, float, float]:
+    """What is left after `span` time constants of y, of an input s/span, and of 4 s/span (1 - s/span)."""
+    decay = math.exp(-span)
+    if span < SHORT:
+        mean = -math.expm1(-span) / span if span > 0.0 else 1.0
+        bow = 4 * span * (1 / 6 - span * (1 / 12 - span * (1 / 40 - span / 180)))
+        return decay, mean, bow
+    mean = -math.expm1(-span) / span
+    return decay, mean, 4 * (mean - 2 * (mean - decay) / span)
