@@ -337,7 +337,7 @@ def test_wrong_usage_is_2(jaxhil, arguments):
     assert ran.code == 2 and ran.out == "" and ran.err != ""
 
 
-@pytest.mark.parametrize("command", ["simulate", "tune", "verify", "mechanisms"])
+@pytest.mark.parametrize("command", ["simulate", "tune", "export", "verify", "mechanisms"])
 def test_help_has_an_example(jaxhil, command):
     ran = jaxhil(command, "--help")
     assert ran.code == 0
@@ -348,7 +348,8 @@ def test_help_has_an_example(jaxhil, command):
 def test_help_and_refusals_do_not_import_jax():
     program = (
         "import sys\nfrom tuning.__main__ import main\n"
-        "for words in (['tune', '--help'], ['mechanisms'], ['tune', '--compensator', 'x'], ['tune', 'x']):\n"
+        "for words in (['tune', '--help'], ['mechanisms'], ['tune', '--compensator', 'x'], ['tune', 'x'],\n"
+        "    ['export', 'x', '--format', 'y'], ['export', 'x']):\n"
         "    try: main(words)\n"
         "    except SystemExit: pass\n"
         "assert not {'jax', 'matplotlib'} & set(sys.modules), 'slow imports'"

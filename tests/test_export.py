@@ -2,6 +2,7 @@
 
 import json
 import os
+from types import SimpleNamespace
 
 import pytest
 from bundles import document, signed, small_files
@@ -104,8 +105,35 @@ def test_limits_that_stop_the_nominal_run_are_told(jaxhil, gains, tmp_path, quic
     limits = {"force_limit": 1.0}
     monkeypatch.setattr("tuning.commands.export._calibrated", lambda loaded, options: (limits, {}))
     ran = jaxhil("export", gains, "-o", tmp_path / "bundle")
-    assert ran.code == 1 and "Bad: the nominal run, tick " in ran.out and "a guard acted" in ran.out
+    assert (
+        ran.code == 1
+        and "Bad: the nominal run, tick " in ran.out
+        and "the controller acts on force_limit" in ran.out
+    )
     assert (tmp_path / "bundle" / "manifest.json").exists()
+
+
+def test_limits_come_from_the_sweep_that_is_named(jaxhil, gains, tmp_path, monkeypatch):
+    store = SimpleNamespace(manifest=SimpleNamespace(scenarios=8))
+    asked = []
+
+    def calibrate(loaded, given, progress):
+        asked.append((loaded.compensator, given))
+        progress(8)
+        return SimpleNamespace(limits={"force_limit": 900.0, "velocity_limit": None}, rates=RATES)
+
+    monkeypatch.setattr("tuning.sweeps.store.read_store", lambda folder: store)
+    monkeypatch.setattr("tuning.rig.calibration.calibrate", calibrate)
+    monkeypatch.setattr(vectors, "HOSTILE_RUNS", 4)
+    ran = jaxhil("export", gains, "-o", tmp_path / "bundle", "--sweep", "store", "--format", "csv")
+    assert ran.code == 0 and asked == [("phase_lead", store)], ran
+    assert "false alarms 1 of 50 good runs (95 %: 0.0005 to 0.1)" in ran.out and "force_limit" in ran.out
+    written = load_gain_file(tmp_path / "bundle" / "gains.json").document
+    assert written["limits"]["force_limit"] == {"value": 900.0, "unit": "N"}
+    assert written["figures"]["watchdog"] == RATES
+
+
+RATES = {"limit": 0.01, "false_alarms": {"runs": 50, "alarms": 1, "rate": 0.02, "low": 0.0005, "high": 0.1}}
 
 
 @pytest.mark.parametrize(
@@ -228,7 +256,16 @@ def test_readme_has_the_runtime_s_faults_and_this_bundle_s_files():
     assert "$" not in text
 
 
-def test_export_has_help_with_an_example(jaxhil):
-    ran = jaxhil("export", "--help")
-    assert ran.code == 0 and "Example: jaxhil export" in ran.out and "--json" in ran.out
-    assert [*WRITERS] == ["ros2", "matlab", "csv", "c99"]
+def test_every_format_has_its_files():
+    made = document()
+    for name, names in {
+        "ros2": {"ros2.yaml"},
+        "matlab": {"gains.mat"},
+        "csv": {"gains.csv"},
+        "c99": {f"c99/{one}" for one in C_FILES},
+    }.items():
+        assert {*WRITERS[name](made)} == names
+    assert len(WRITERS) == 4
+
+
+C_FILES = ("jaxhil_controller.h", "jaxhil_controller.c", "jaxhil_gains.h", "test_vectors.c")

@@ -126,7 +126,7 @@ def test_where_a_guard_acts_nothing_is_compared(loaded):
     found = make_vectors(tight, seed=3, draws=2)
     assert found.reasons == []
     end = next(i for i, row in enumerate(found.rows) if row.faults)
-    assert found.ended[0] == f"tick {end}: a guard acted (faults 0x800)"
+    assert found.ended[0] == f"tick {end}: the controller acts on force_limit"
     nominal = [row for row in found.rows if row.run == 0]
     assert all(math.isnan(row.force_simulated) for row in nominal[end:])
     assert not any(math.isnan(row.force_simulated) for row in found.rows[:end])

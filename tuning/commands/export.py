@@ -1,6 +1,5 @@
 """`jaxhil export`: gains as a bundle that a rig computer can check and run by itself."""
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -57,16 +56,7 @@ def run(options: Export) -> int:
 
 def _calibrated(loaded, options: Export) -> tuple[Any, Any]:
     """The limits for the rig, and what is known of the watchdog's alarms."""
-    if find_spec("tuning.rig.calibration") is None:
-        if options.sweep is not None:
-            raise InputError(
-                f"--sweep: found {shown(options.sweep)}, allowed none: no limits are worked out yet"
-            )
-        return None, None
-    from tuning.rig.calibration import (  # pyright: ignore[reportMissingImports]
-        WITHOUT_STORE,
-        calibrate,
-    )
+    from tuning.rig.calibration import WITHOUT_STORE, calibrate
     from tuning.sweeps.store import read_store
 
     store = None if options.sweep is None else read_store(Path(options.sweep))

@@ -19,6 +19,7 @@ import numpy as np
 from jaxhil.integrators import INTEGRATORS
 from jaxhil.mechanism import Mechanism
 from jaxhil.runtime import Controller
+from jaxhil.runtime.faults import names
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
 from tuning.gain_file import LoadedGains
 from tuning.recording import Lane, nominal_and_draws, record_lanes
@@ -234,10 +235,14 @@ def _compared(
             other = np.asarray(other)[:number]
             apart |= np.abs(mine - other) > PARTED * np.max(np.abs(other), initial=0.0)
     near = near_threshold(type(lane.signals)(*(leaf[:number] for leaf in lane.signals)), gain_file)
-    end, why = (int(faulty[0]), "a guard acted") if len(faulty) else (number, None)
+    end, why = number, None
+    if len(faulty):
+        end = int(faulty[0])
+        why = f"tick {end}: the controller acts on {', '.join(names(rows[end].faults))}"
     partings = np.flatnonzero(near & apart)
     if len(partings) and partings[0] < end and not np.any(apart[: partings[0]]):
-        end, why = int(partings[0]), "rounding decided at a threshold"
+        end = int(partings[0])
+        why = f"tick {end}: rounding decides at a threshold"
     wrong = np.flatnonzero(error[:end] > REPLAY_LIMIT)
     reason = None
     if len(wrong):
@@ -253,8 +258,6 @@ def _compared(
     if np.any(np.abs(found - kept) > REPLAY_LIMIT * _span(kept)):
         late = int(np.flatnonzero(np.abs(found - kept) > REPLAY_LIMIT * _span(kept))[0])
         kept[late:] = nan
-    if why:
-        why = f"tick {end}: {why} ({_status(rows, end)})"
     return (
         [row._replace(force_simulated=float(one)) for row, one in zip(rows, kept, strict=True)],
         why,
@@ -266,7 +269,3 @@ def _span(values: np.ndarray) -> float:
     """From least to greatest, 0 included."""
     finite = values[np.isfinite(values)]
     return float(np.max(finite, initial=0.0) - np.min(finite, initial=0.0))
-
-
-def _status(rows: Sequence[Row], tick: int) -> str:
-    return f"faults {rows[tick].faults:#x}" if tick < len(rows) else "no fault"
