@@ -16,8 +16,8 @@ from bundles import TICKS, run_selftest, signed, small_files
 from tuning.rig import selftest
 from tuning.rig.manifest import is_text
 
-MUTATIONS = 200  # of each text file
-OWN_MUTATIONS = 60  # of the self-test itself, each in a process of its own
+MUTATIONS = 80  # of each text file
+OWN_MUTATIONS = 40  # of the self-test itself, each in a process of its own
 
 
 @pytest.fixture(scope="module")

@@ -45,7 +45,7 @@ documents = st.builds(
     st.lists(FINITE | st.sampled_from(AWKWARD), min_size=12, max_size=12),
     st.lists(st.none() | FINITE | st.sampled_from(AWKWARD), max_size=len(LIMITS)),
 )
-writer_test = settings(max_examples=40)
+writer_test = settings(max_examples=25)
 
 
 @writer_test
