@@ -337,7 +337,7 @@ def test_wrong_usage_is_2(jaxhil, arguments):
     assert ran.code == 2 and ran.out == "" and ran.err != ""
 
 
-@pytest.mark.parametrize("command", ["simulate", "tune", "export", "verify", "mechanisms"])
+@pytest.mark.parametrize("command", ["simulate", "tune", "export", "verify", "rig", "mechanisms"])
 def test_help_has_an_example(jaxhil, command):
     ran = jaxhil(command, "--help")
     assert ran.code == 0
