@@ -11,8 +11,9 @@ from conftest import Ran
 from jaxhil.mechanism_file import builtin_names, builtin_path
 from tuning import environment
 from tuning.__main__ import main
-from tuning.cli import DEFAULT_DRIVERS, DEFAULT_PLOT, complete_bare
+from tuning.cli import complete_bare
 from tuning.commands.tune import folder_name, is_better
+from tuning.options import DEFAULT_DRIVERS, DEFAULT_PLOT
 from tuning.tune import Figures
 
 TINY = ["--scenarios", "4", "--starts", "2", "--steps", "2", "--validation", "16"]

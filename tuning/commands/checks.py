@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxhil.errors import InputError, one_line, shown
-from tuning.cli import PICTURES
+from tuning.options import PICTURES
 
 
 def at_least(least: int, **options: int) -> None:

@@ -5,9 +5,9 @@ from typing import Any
 
 from jaxhil.errors import InputError, shown
 from tuning import report
-from tuning.cli import Export
 from tuning.commands import checks
 from tuning.environment import prepare
+from tuning.options_rig import Export
 
 
 def run(options: Export) -> int:

@@ -6,7 +6,7 @@ from typing import Any
 from jaxhil.mechanism import Mechanism
 from jaxhil.mechanism_file import builtin_names, builtin_path, load
 from tuning import report
-from tuning.cli import Mechanisms
+from tuning.options import Mechanisms
 
 
 def run(options: Mechanisms) -> int:

@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Any
 
 from tuning import report
-from tuning.cli import Replay
 from tuning.commands import checks
 from tuning.environment import prepare
+from tuning.options import Replay
 
 KEYS = ("restitution", "reference_restitution", "error", "peak_force", "peak_command", "duration")
 KEYS = (*KEYS, "position_shortfall", "approach_velocity", "energy_in", "energy_out")

@@ -8,8 +8,8 @@ from typing import Any
 
 from jaxhil.errors import InputError, one_line
 from tuning import report
-from tuning.cli import Rig
 from tuning.commands import checks
+from tuning.options_rig import Rig
 
 LONGEST_EMPTY = 30.0  # s of empty loop at most
 EMPTY_SHARE = 0.2  # of the run's duration

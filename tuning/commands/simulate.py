@@ -8,9 +8,9 @@ from jaxhil.mechanism_file import from_builtins, load, to_builtins
 from jaxhil.mechanism_overrides import apply_override, parse_override
 from jaxhil.mechanism_types import KeyProblem
 from tuning import report
-from tuning.cli import Simulate
 from tuning.commands import checks
 from tuning.environment import prepare
+from tuning.options import Simulate
 
 
 def run(options: Simulate) -> int:

@@ -7,9 +7,9 @@ from typing import Any
 
 from jaxhil.errors import InputError
 from tuning import report
-from tuning.cli import Sweep
 from tuning.commands import checks, sweep_studies, sweep_tables
 from tuning.environment import prepare
+from tuning.options import Sweep
 from tuning.sweeps import LARGEST_CHUNK, LARGEST_SEED, MOST, PRECISIONS, SAMPLINGS
 
 MOST_DRIVERS = 2**20  # scenarios for each input

@@ -7,7 +7,7 @@ from typing import Any
 
 from jaxhil.errors import InputError, one_line
 from tuning import report
-from tuning.cli import Sweep
+from tuning.options import Sweep
 
 STAGE = 10_000  # scenarios between two lines of progress
 

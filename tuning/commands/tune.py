@@ -8,10 +8,10 @@ from typing import Any
 from jaxhil.errors import InputError, one_line
 from jaxhil.mechanism_file import LoadedMechanism, load
 from tuning import report
-from tuning.cli import Tune
 from tuning.commands import checks, tune_pareto
 from tuning.commands.tune_tables import print_one, print_overview
 from tuning.environment import prepare, program_folder
+from tuning.options import Tune
 
 MOST_DRAWN = 4  # mechanisms whose plots are drawn; of more there is one picture of all
 

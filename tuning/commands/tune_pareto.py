@@ -7,8 +7,8 @@ from typing import Any
 from jaxhil.errors import InputError
 from jaxhil.mechanism_file import LoadedMechanism
 from tuning import report
-from tuning.cli import Tune
 from tuning.environment import prepare
+from tuning.options import Tune
 
 FOLDER = "pareto"
 

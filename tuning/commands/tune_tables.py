@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 from tuning import report
-from tuning.cli import Tune
+from tuning.options import Tune
 
 
 def print_overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], drawn: bool) -> None:

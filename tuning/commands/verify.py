@@ -9,9 +9,9 @@ from typing import Any
 
 from jaxhil.errors import InputError
 from tuning import report
-from tuning.cli import Verify
 from tuning.commands import checks
 from tuning.environment import prepare
+from tuning.options_rig import Verify
 
 
 def run(options: Verify) -> int:

@@ -1,0 +1,240 @@
+"""The options of each command of `jaxhil`, as tyro reads them."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
+
+PICTURES = (".png", ".pdf", ".svg")
+DEFAULT_PLOT = "jaxhil-out/simulate.png"
+DEFAULT_REPLAY_PLOT = "jaxhil-out/replay.png"
+DEFAULT_DRIVERS = 1024
+
+OptionalFile = Annotated[
+    Positional[str | None],
+    arg(
+        metavar="[FILE]",
+        help="Mechanism file, or the name of a built-in one; by default 'varying'.",
+        help_behavior_hint="",
+    ),
+]
+Files = Annotated[
+    Positional[tuple[str, ...]],
+    arg(
+        metavar="[FILE ...]",
+        help="Mechanism files, or names of built-in ones; by default 'varying'.",
+        help_behavior_hint="",
+    ),
+]
+Overrides = Annotated[
+    UseAppendAction[tuple[str, ...]],
+    arg(
+        name="set",
+        metavar="PATH=VALUE",
+        help="Any key of the mechanism file by its dotted path, as approach.velocity=0.01; repeatable.",
+        help_behavior_hint="",
+    ),
+]
+Limit = Annotated[float, arg(metavar="NUMBER", help="Restitution error beyond which the verdict is bad.")]
+Json = Annotated[
+    FlagCreatePairsOff[bool],
+    arg(help="One JSON document on standard output, nothing else there.", help_behavior_hint=""),
+]
+
+
+def number(text: str):
+    return arg(metavar="NUMBER", help=text)
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """Run the contacts once; per contact restitution, reference, error, peak force, duration.
+
+    Example: jaxhil simulate rig-300kg --compensator phase_lead --set approach.velocity=0.01
+
+    Exit code 0 if every |e - e*| is within the limit, else 1.
+    """
+
+    file: OptionalFile = None
+    compensator: Annotated[
+        str | None,
+        arg(metavar="NAME", help="Compensator, at the literature's gains; 'none' by default."),
+    ] = None
+    gains: Annotated[
+        str | None,
+        arg(metavar="GAINS", help="Gain file: its compensator and gains and, without FILE, its mechanism."),
+    ] = None
+    overrides: Overrides = ()
+    plot: Annotated[
+        str | None,
+        arg(metavar="[PICTURE]", help=f"Plot to a .png, .pdf or .svg file; bare: {DEFAULT_PLOT}."),
+    ] = None
+    limit: Limit = 0.01
+    seed: Annotated[int, number("Seed of the sensor noise.")] = 0
+    json: Json = False
+
+
+@dataclass(frozen=True)
+class Tune:
+    """Tune a compensator's gains for every mechanism; judge them on scenarios that tuning never saw.
+
+    Example: jaxhil tune rig-300kg varying --output study --starts 16
+
+    Writes DIR/NAME/gains.json and plots. Exit code 1 if a tuned rms error exceeds the limit.
+    """
+
+    files: Files = ()
+    compensator: Annotated[str, arg(metavar="NAME", help="Compensator to tune.")] = "response_error"
+    output: Annotated[str, arg(aliases=("-o",), metavar="DIR", help="Folder for what is written.")] = (
+        "jaxhil-out"
+    )
+    scenarios: Annotated[
+        int | None,
+        arg(
+            metavar="NUMBER",
+            help="Scenarios to tune on; by default 32, or 128 where sensors are noisy.",
+            help_behavior_hint="",
+        ),
+    ] = None
+    starts: Annotated[int, number("Starts of the solver, and of each further lot where they disagree.")] = 4
+    start: Annotated[
+        tuple[str, ...],
+        arg(
+            metavar="GAINS [GAINS ...]",
+            help="Gain files of the same compensator: each mechanism is tuned from the gains of the nearest "
+            "of their mechanisms too.",
+            help_behavior_hint="",
+        ),
+    ] = ()
+    steps: Annotated[int, number("Most solver steps from each start.")] = 25
+    validation: Annotated[int, number("Fresh scenarios to judge on.")] = 511
+    objective: Annotated[
+        str,
+        arg(
+            metavar="NAME",
+            help="Of the errors e - e*: rms, cvar (mean of the worst 5 percent) or worst.",
+        ),
+    ] = "rms"
+    divergence_weight: Annotated[
+        float, number("How much more a squared divergence (e > e*) counts than a squared convergence.")
+    ] = 1.0
+    command_weight: Annotated[
+        float, number("Restitution error that weighs as much as a command one reference peak too high.")
+    ] = 0.0
+    noise_weight: Annotated[
+        float, number("Restitution error that weighs as much as one time the sensor noise more.")
+    ] = 0.0
+    chatter_weight: Annotated[
+        float, number("Restitution error that weighs as much as a command that swings once too often.")
+    ] = 0.0
+    pareto: Annotated[
+        int, number("Points of the trade-off of restitution error against sensor noise, each a gain file.")
+    ] = 0
+    certify: Annotated[
+        bool,
+        arg(
+            name="certify",
+            metavar="",
+            help="Also search all gains' whole ranges, with 50 times the evaluations: is there better?",
+        ),
+    ] = False
+    seed: Annotated[int, number("Seed of scenarios and starts.")] = 0
+    overrides: Overrides = ()
+    limit: Limit = 0.01
+    json: Json = False
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Monte Carlo robustness: how probable is a failure, how close do the worst scenarios come to one?
+
+    Example: jaxhil sweep jaxhil-out/varying/gains.json --scenarios 1000000 --output study/sweep
+
+    Exit code 0 if no scenario failed or, with --acceptable, if the interval ends below it; else 1.
+    """
+
+    gains: Annotated[Positional[str], arg(metavar="GAINS", help="Gain file, or its folder.")]
+    scenarios: Annotated[int, number("Scenarios to draw and run.")] = 100_000
+    seed: Annotated[int, number("Seed; scenario i depends on it and on i alone.")] = 0
+    sampling: Annotated[
+        str, arg(metavar="NAME", help="random, or sobol (scrambled, several replicates).")
+    ] = "random"
+    precision: Annotated[
+        str, arg(metavar="NAME", help="float64, or float32: faster, and compared with float64 on a subset.")
+    ] = "float64"
+    works: Annotated[
+        bool, arg(name="works", metavar="", help="Also the real contact force's works; 3 times the time.")
+    ] = False
+    limit: Limit = 0.01
+    until_width: Annotated[
+        float | None,
+        arg(
+            metavar="WIDTH",
+            help="Stop once the probability's interval is so narrow; --scenarios is then the most.",
+            help_behavior_hint="",
+        ),
+    ] = None
+    drivers: Annotated[
+        int | None,
+        arg(
+            metavar="[NUMBER]",
+            help=f"Also Sobol indices: what drives the error. A power of two; bare: {DEFAULT_DRIVERS}.",
+            help_behavior_hint="",
+        ),
+    ] = None
+    rare: Annotated[
+        float | None,
+        arg(
+            metavar="[LIMIT]",
+            help="Also subset simulation of an error beyond this, however rare; bare, or 0: --limit.",
+            help_behavior_hint="",
+        ),
+    ] = None
+    acceptable: Annotated[
+        float | None,
+        arg(
+            metavar="PROBABILITY",
+            help="Failure probability that the interval's upper end may reach; by default no run may fail.",
+            help_behavior_hint="",
+        ),
+    ] = None
+    output: Annotated[str, arg(aliases=("-o",), metavar="DIR", help="Folder of the store.")] = (
+        "jaxhil-out/sweep"
+    )
+    resume: Annotated[
+        bool, arg(name="resume", metavar="", help="Go on with a sweep that was interrupted.")
+    ] = False
+    chunk: Annotated[int, number("Scenarios computed at a time, and rows of each part.")] = 16384
+    scheduler: Annotated[
+        str | None,
+        arg(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster that computes the parts."),
+    ] = None
+    json: Json = False
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Run one scenario of a sweep again, and see whether it does the same, to the bit.
+
+    Example: jaxhil replay jaxhil-out/sweep 1234 --plot worst.png
+
+    Exit code 1 if any number differs from the stored one.
+    """
+
+    store: Annotated[Positional[str], arg(metavar="STORE", help="Folder that a sweep wrote.")]
+    index: Annotated[Positional[int], arg(metavar="INDEX", help="Number of the scenario.")]
+    plot: Annotated[
+        str | None,
+        arg(metavar="[PICTURE]", help=f"Plot to a .png, .pdf or .svg file; bare: {DEFAULT_REPLAY_PLOT}."),
+    ] = None
+    json: Json = False
+
+
+@dataclass(frozen=True)
+class Mechanisms:
+    """The built-in mechanism files, with their sources.
+
+    Example: jaxhil mechanisms --json
+    """
+
+    json: Json = False
