@@ -2,11 +2,13 @@
 
 import json
 import os
+import shutil
 from types import SimpleNamespace
 
 import pytest
-from bundles import document, signed, small_files
+from bundles import document, run_selftest, signed, small_files
 
+from jaxhil.compensators import COMPENSATORS
 from jaxhil.runtime.faults import FAULTS
 from tuning.files import TEMPORARY
 from tuning.gain_file import load_gain_file, write_gain_file
@@ -72,6 +74,14 @@ def test_a_bundle_is_exported_and_verified(jaxhil, gains, tmp_path, quick):
     ran = jaxhil("export", folder, "-o", folder, "--format", "matlab")
     assert ran.code == 0 and "Good: " in ran.out and "selftest.py" in ran.out
     assert "gains.mat" in files_of(folder) and "gains.csv" not in files_of(folder)
+
+
+@pytest.mark.parametrize("compensator", COMPENSATORS)
+def test_every_compensator_that_can_be_tuned_can_be_exported(compensator, tmp_path, quick):
+    made = build_bundle(document(compensator=compensator), list(WRITERS))
+    write_bundle(tmp_path / "bundle", made.files)
+    good, told = run_selftest(tmp_path / "bundle", *(["--c"] if shutil.which("cc") else []))
+    assert good and made.ticks > 300 and not made.reasons, told
 
 
 def test_equal_gains_and_seed_make_equal_bundles(monkeypatch):

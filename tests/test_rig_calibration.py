@@ -17,12 +17,12 @@ from jaxhil.runtime.limits import LIMITS, complete
 from jaxhil.runtime.watchdog import Watchdog
 from tuning.gain_file import build_document, check_document
 from tuning.rig.audited import audit_contacts, first_reached
+from tuning.rig.bundle import limits_section
 from tuning.rig.calibration import (
     calibrate,
     good_runs,
     guard_limits,
     judge_chunk,
-    limits_section,
     watchdog_rules,
 )
 from tuning.rig.expectation import TERMS, Expectation, Features, expected_restitution, fit_expectation

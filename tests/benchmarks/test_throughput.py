@@ -1,4 +1,4 @@
-"""Throughput of the loop beside the C++ baseline, cost of its gradient, and time per tick of the runtime.
+"""Throughput of the loop beside the C++ baseline, and cost of its gradient.
 
 Everything that is compared runs in this one process, in turn, and the best of many repetitions counts: the
 machine is shared. Run with `pytest -m benchmark -s tests/benchmarks`.
@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from baseline import compile_baseline
-from gain_documents import gain_document
 
 from jaxhil import evaluation
 from jaxhil.building import build_loop
@@ -20,7 +19,6 @@ from jaxhil.compensators import COMPENSATORS
 from jaxhil.loop import build_rig
 from jaxhil.mechanism_file import load
 from jaxhil.rollout import run_contacts
-from jaxhil.runtime import Controller
 from jaxhil.scenario import build_scenarios
 from jaxhil.uncertainty import draw
 
@@ -115,29 +113,3 @@ def test_gradient_costs_little_more_than_its_rollouts(compensator, capsys):
             f" {jacobian / one / (1 + len(names)):.2f} (1 + P)"
         )
     assert jacobian <= 1.5 * (1 + len(names)) * one
-
-
-@pytest.mark.parametrize("compensator", ["none", "phase_lead", "response_error"])
-def test_time_per_tick_of_the_runtime(compensator, capsys):
-    controller = Controller.from_dict(gain_document(compensator))
-    ticks = np.arange(200_000)
-    position = 5e-4 * np.sin(ticks * 0.02) + 1e-4
-    rows = list(
-        zip(*(a.tolist() for a in (1e5 * position, position, 5e-6 * position, position)), strict=True)
-    )
-    took, empty = [], []
-    clock = time.perf_counter_ns
-    for row in rows:
-        begin = clock()
-        controller.step(*row)
-        took.append(clock() - begin)
-        begin = clock()
-        empty.append(clock() - begin)
-    median, tail = np.percentile(took, [50, 99.9]) / 1e3
-    with capsys.disabled():
-        print(
-            f"\n{compensator}: runtime {median:.2f} us per tick (median), {tail:.2f} us (99.9th percentile);"
-            f" empty loop {np.median(empty) / 1e3:.2f} and {np.percentile(empty, 99.9) / 1e3:.2f} us"
-        )
-    assert controller.status == "ok"
-    assert median <= 10

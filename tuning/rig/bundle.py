@@ -87,10 +87,14 @@ def with_limits(
     """
     if limits is None:
         return dict(document)
-    entries = {name: {"value": value, "unit": LIMITS[name].unit} for name, value in limits.items()}
     figures = {**document["figures"], **({"watchdog": rates} if rates else {})}
-    changed = {**document, "limits": entries, "figures": figures}
+    changed = {**document, "limits": limits_section(limits), "figures": figures}
     return {**changed, "sha256": digest(changed)}
+
+
+def limits_section(limits: Mapping[str, float | None]) -> dict[str, dict[str, Any]]:
+    """The `limits` of a gain file: value and unit by name."""
+    return {name: {"value": value, "unit": LIMITS[name].unit} for name, value in limits.items()}
 
 
 def check_target(folder: Path) -> None:

@@ -117,11 +117,6 @@ def calibrate(
     return Calibration({name: _plain(value) for name, value in found.items()}, rates)
 
 
-def limits_section(limits: Mapping[str, float | None]) -> dict[str, dict[str, Any]]:
-    """The `limits` of a gain file: value and unit by name."""
-    return {name: {"value": value, "unit": LIMITS[name].unit} for name, value in limits.items()}
-
-
 def watchdog_rules(loaded: LoadedGains) -> tuple[Rules, float]:
     """By what rules the watchdog audits, worked out from the mechanism alone, and `free_distance` [m]."""
     mechanism = loaded.mechanism

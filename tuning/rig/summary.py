@@ -244,6 +244,9 @@ def told_rates(rates: Mapping[str, Any]) -> Iterator[str]:
         if isinstance(one, Mapping) and {"runs", "alarms", "low", "high"} <= one.keys():
             interval = f"95 %: {_number(one['low'], 2)} to {_number(one['high'], 2)}"
             yield f"{name.replace('_', ' ')} {one['alarms']} of {one['runs']} {runs} ({interval})"
+    calibrated = rates.get("calibrated_on")
+    if isinstance(calibrated, Mapping) and calibrated.get("runs") not in (None, "good"):
+        yield "no run was good: the limits come from runs with errors beyond the limit"
 
 
 def _table(

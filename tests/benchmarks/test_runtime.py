@@ -1,0 +1,49 @@
+"""Time of a tick of the rig's controller in Python beside an empty loop, bare and with all its guards.
+
+A tick is `step` with its time and `position_command`; the watchdog watches. Run with
+`pytest -m benchmark -s tests/benchmarks/test_runtime.py`.
+"""
+
+import time
+
+import numpy as np
+import pytest
+from c99_cases import drawn_rows
+from gain_documents import gain_document, sign
+from test_c99 import WIDE
+
+from jaxhil.runtime import COMPENSATORS, Controller
+from jaxhil.runtime.limits import LIMITS
+
+pytestmark = pytest.mark.benchmark
+TICKS = 200_000
+BAR = 10.0  # us
+
+
+@pytest.mark.parametrize("guarded", [False, True], ids=["bare", "guarded"])
+@pytest.mark.parametrize("law", COMPENSATORS)
+def test_time_of_a_tick(law, guarded, capsys):
+    document = gain_document(law)
+    if guarded:
+        document["limits"] = {
+            name: {"value": value, "unit": LIMITS[name].unit} for name, value in WIDE.items()
+        }
+    controller = Controller.from_dict(sign(document))
+    rows = drawn_rows("contact", TICKS, np.random.default_rng(0), controller.control_period).tolist()
+    took, empty = [], []
+    clock, step, position_command = time.perf_counter_ns, controller.step, controller.position_command
+    for _, force, desired, velocity, measured, now, _, x, v, a in rows:
+        begin = clock()
+        step(force, desired, velocity, measured, now)
+        position_command(x, v, a)
+        took.append(clock() - begin)
+        begin = clock()
+        empty.append(clock() - begin)
+    assert controller.status == "ok"
+    (median, tail), (bare, bare_tail) = (np.percentile(times, [50, 99.9]) / 1e3 for times in (took, empty))
+    with capsys.disabled():
+        print(
+            f"\n{law}, {'guarded' if guarded else 'bare'}: {median:.2f} us a tick (median), {tail:.2f} us "
+            f"(99.9th percentile); empty loop {bare:.2f} and {bare_tail:.2f} us"
+        )
+    assert median <= BAR
