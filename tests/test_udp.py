@@ -546,7 +546,12 @@ def test_rig_trips_without_injection_and_is_bad(jaxhil, tmp_path):
 
 def test_rig_interrupted_says_what_it_measured(tmp_path):
     path = gain_file(tmp_path)
-    command = [sys.executable, "-m", "tuning", "rig", str(path), "--duration", "60", "--json"]
+    # A shell's background jobs ignore interrupts, and hand that on.
+    heeding = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from tuning.__main__ import main; sys.exit(main(sys.argv[1:]))"
+    )
+    command = [sys.executable, "-c", heeding, "rig", str(path), "--duration", "60", "--json"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     process = subprocess.Popen(
         command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -1,7 +1,7 @@
 """Time of a tick of the controller in C beside a loop that only reads what a tick reads.
 
 Every guard and the watchdog are on. The shortest of many repetitions counts: the machine is shared. Run with
-`pytest -m benchmark -s tests/benchmarks/test_c99.py`.
+`pytest -m benchmark -s tests/benchmarks/test_c_tick.py`.
 """
 
 import shutil

@@ -1,7 +1,7 @@
 """Time of a tick of the rig's controller in Python beside an empty loop, bare and with all its guards.
 
 A tick is `step` with its time and `position_command`; the watchdog watches. Run with
-`pytest -m benchmark -s tests/benchmarks/test_runtime.py`.
+`pytest -m benchmark -s tests/benchmarks/test_python_tick.py`.
 """
 
 import time
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from c99_cases import drawn_rows
 from gain_documents import gain_document, sign
-from test_c99 import WIDE
+from test_c_tick import WIDE
 
 from jaxhil.runtime import COMPENSATORS, Controller
 from jaxhil.runtime.limits import LIMITS
