@@ -122,8 +122,9 @@ class Counts:
 
     def __str__(self) -> str:
         lines = [
-            f"  bad {self.bad}, missed {_share(len(self.missed), self.bad)}; "
-            f"stopped by {dict(self.causes)}, {self.early} of them before the first bad contact",
+            f"  bad {self.bad}, missed {_share(len(self.missed), self.bad)}; stopped by {dict(self.causes)}",
+            f"  bad and not stopped before the first bad contact {self.bad - self.early}, "
+            f"missed {_share(len(self.missed), self.bad - self.early)}",
             f"  good {self.good}, false alarms {_share(len(self.false), self.good)}",
             f"  between {self.between}, stopped {self.between_stopped}",
             *(f"  missed: lane {lane}, row {row}, {text}" for lane, row, text in self.missed[:10]),
