@@ -35,7 +35,7 @@ def gains(tmp_path):
 def quick(monkeypatch):
     """Few vectors, and no limits worked out."""
     monkeypatch.setattr(vectors, "HOSTILE_RUNS", 4)
-    monkeypatch.setattr("tuning.commands.export._calibrated", lambda loaded, options: (None, None))
+    monkeypatch.setattr("tuning.commands.export._calibrated", lambda *given: (None, None))
 
 
 def refused(ran, *words):
@@ -113,7 +113,7 @@ def test_what_differs_from_the_simulation_is_not_written(jaxhil, gains, tmp_path
 
 def test_limits_that_stop_the_nominal_run_are_told(jaxhil, gains, tmp_path, quick, monkeypatch):
     limits = {"force_limit": 1.0}
-    monkeypatch.setattr("tuning.commands.export._calibrated", lambda loaded, options: (limits, {}))
+    monkeypatch.setattr("tuning.commands.export._calibrated", lambda *given: (limits, {}))
     ran = jaxhil("export", gains, "-o", tmp_path / "bundle")
     assert (
         ran.code == 1
@@ -127,16 +127,30 @@ def test_limits_come_from_the_sweep_that_is_named(jaxhil, gains, tmp_path, monke
     store = SimpleNamespace(manifest=SimpleNamespace(scenarios=8))
     asked = []
 
-    def calibrate(loaded, given, progress):
-        asked.append((loaded.compensator, given))
+    def calibrate(loaded, given, replaced, progress):
+        asked.append((loaded.compensator, given, replaced))
         progress(8)
         return SimpleNamespace(limits={"force_limit": 900.0, "velocity_limit": None}, rates=RATES)
 
     monkeypatch.setattr("tuning.sweeps.store.read_store", lambda folder: store)
     monkeypatch.setattr("tuning.rig.calibration.calibrate", calibrate)
     monkeypatch.setattr(vectors, "HOSTILE_RUNS", 4)
-    ran = jaxhil("export", gains, "-o", tmp_path / "bundle", "--sweep", "store", "--format", "csv")
-    assert ran.code == 0 and asked == [("phase_lead", store)], ran
+    ran = jaxhil(
+        "export",
+        gains,
+        "-o",
+        tmp_path / "bundle",
+        "--sweep",
+        "store",
+        "--format",
+        "csv",
+        "--set",
+        "command_lowest=-0.05",
+        "--set",
+        "force_range=none",
+    )
+    replaced = {"command_lowest": -0.05, "force_range": None}
+    assert ran.code == 0 and asked == [("phase_lead", store, replaced)], ran
     assert "false alarms 1 of 50 good runs (95 %: 0.0005 to 0.1)" in ran.out and "force_limit" in ran.out
     written = load_gain_file(tmp_path / "bundle" / "gains.json").document
     assert written["limits"]["force_limit"] == {"value": 900.0, "unit": "N"}
@@ -153,6 +167,10 @@ RATES = {"limit": 0.01, "false_alarms": {"runs": 50, "alarms": 1, "rate": 0.02, 
         (["--format", "csv,"], ["--format", "''"]),
         (["--seed", "-1"], ["--seed", "-1"]),
         (["--sweep", "no-such-store"], ["no-such-store"]),
+        (["--set", "stroke=1"], ["--set", "'stroke=1'", "command_lowest"]),
+        (["--set", "force_limit=-1"], ["--set", "'force_limit=-1'", "at least 0"]),
+        (["--set", "command_lowest=inf"], ["--set", "'command_lowest=inf'", "finite"]),
+        (["--set", "command_lowest"], ["--set", "'command_lowest'", "none"]),
     ],
 )
 def test_wrong_arguments_are_refused(jaxhil, gains, tmp_path, arguments, words):

@@ -1,11 +1,8 @@
 """The runtime controller: gain files, laws against plain matrix equations, life cycle."""
 
-import ast
-import copy
 import json
 import math
 import random
-import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -18,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxhil.runtime
-from jaxhil.runtime import COMPENSATORS, Controller, GainFileError, digest
+from jaxhil.runtime import Controller, GainFileError, digest
 from jaxhil.runtime.filters import DelayLine, LeadFilter, VelocityFilter
 from jaxhil.runtime.identification import ContactIdentification
 
@@ -653,44 +650,3 @@ print(repr(controller.step(100.0, 1e-3, 0.0, 1e-3)))
     expected = Controller.from_dict(gain_document()).step(100.0, 1e-3, 0.0, 1e-3)
     assert float(shown.stdout) == expected
     assert shown.stderr == ""
-
-
-def bundle(law: str) -> str:
-    """The controller, one law and what they import, as one source file without relative imports."""
-    order: list[str] = []
-
-    def visit(module: str) -> None:
-        for node in ast.parse((RUNTIME / f"{module}.py").read_text()).body:
-            if isinstance(node, ast.ImportFrom) and node.level and node.module:
-                visit(node.module)
-        if module not in order:
-            order.append(module)
-
-    visit(law)
-    visit("controller")
-    return "\n".join(_without_relative_imports((RUNTIME / f"{module}.py").read_text()) for module in order)
-
-
-def _without_relative_imports(source: str) -> str:
-    lines = source.splitlines()
-    for node in ast.parse(source).body:
-        if isinstance(node, ast.ImportFrom) and node.level and node.end_lineno:
-            lines[node.lineno - 1 : node.end_lineno] = [""] * (node.end_lineno - node.lineno + 1)
-    return "\n".join(lines)
-
-
-@pytest.mark.parametrize("name", sorted(COMPENSATORS))
-def test_concatenated_files_are_the_same_controller(name, tmp_path):
-    source = bundle(name)
-    definitions = [node for node in ast.parse(source).body if hasattr(node, "name")]
-    names = [node.name for node in definitions]  # type: ignore[attr-defined]
-    assert len(names) == len(set(names))
-    path = tmp_path / "bundle.py"
-    path.write_text(source)
-    namespace = runpy.run_path(str(path))
-    assert list(namespace["COMPENSATORS"]) == [name]
-    ticks = readings(200)
-    document = copy.deepcopy(gain_document(name))
-    assert run(namespace["Controller"].from_dict(document), ticks) == run(
-        Controller.from_dict(document), ticks
-    )

@@ -38,7 +38,8 @@ from jaxhil.runtime import digest
 from jaxhil.runtime.faults import RESTITUTION, names
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
 from tuning.gain_file import LoadedGains, build_document, check_document
-from tuning.rig.calibration import LIMIT, WITHOUT_STORE, calibrate, limits_section
+from tuning.rig.bundle import limits_section
+from tuning.rig.calibration import LIMIT, WITHOUT_STORE, calibrate
 from tuning.rig.recorded import Chunk, Scenarios, recorded_chunks
 from tuning.verdict import binomial_interval
 

@@ -40,6 +40,15 @@ class Export:
             help_behavior_hint="",
         ),
     ] = ()
+    limits: Annotated[
+        UseAppendAction[tuple[str, ...]],
+        arg(
+            name="set",
+            metavar="LIMIT=VALUE",
+            help="A limit of the rig's own, as command_lowest=-0.05 (SI), or none; repeatable.",
+            help_behavior_hint="",
+        ),
+    ] = ()
     seed: Annotated[int, number("Seed of the test vectors.")] = 0
     json: Json = False
 

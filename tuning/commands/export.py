@@ -1,9 +1,11 @@
 """`jaxhil export`: gains as a bundle that a rig computer can check and run by itself."""
 
+import math
 from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError, shown
+from jaxhil.runtime.limits import LIMITS
 from tuning import report
 from tuning.commands import checks
 from tuning.environment import prepare
@@ -17,6 +19,7 @@ def run(options: Export) -> int:
     from tuning.rig.writers import WRITERS
 
     formats = _formats(options, list(WRITERS))
+    replaced = _replaced(options.limits)
     path = checks.gain_file(options.gains)
     folder = Path(options.output)
     check_target(folder)
@@ -24,7 +27,7 @@ def run(options: Export) -> int:
     from tuning.gain_file import load_gain_file
 
     loaded = load_gain_file(path)
-    limits, rates = _calibrated(loaded, options)
+    limits, rates = _calibrated(loaded, options, replaced)
     with report.stages(2) as stages:
         bundle = build_bundle(loaded.document, formats, limits, rates, options.seed, stages.begin)
         if not bundle.reasons:
@@ -54,7 +57,7 @@ def run(options: Export) -> int:
     return 1 if reasons else 0
 
 
-def _calibrated(loaded, options: Export) -> tuple[Any, Any]:
+def _calibrated(loaded, options: Export, replaced: dict[str, float | None]) -> tuple[Any, Any]:
     """The limits for the rig, and what is known of the watchdog's alarms."""
     from tuning.rig.calibration import WITHOUT_STORE, calibrate
     from tuning.sweeps.store import read_store
@@ -63,9 +66,33 @@ def _calibrated(loaded, options: Export) -> tuple[Any, Any]:
     runs = WITHOUT_STORE if store is None else store.manifest.scenarios
     with report.progress(runs, "runs") as progress:
         found = calibrate(
-            loaded, store, progress=lambda number: progress.advance(number, "working out the limits")
+            loaded,
+            store,
+            replaced=replaced,
+            progress=lambda number: progress.advance(number, "working out the limits"),
         )
     return found.limits, found.rates
+
+
+def _replaced(given: tuple[str, ...]) -> dict[str, float | None]:
+    """The limits that the user sets, None for no limit. Raises `InputError`."""
+    replaced: dict[str, float | None] = {}
+    for words in given:
+        name, _, text = words.partition("=")
+        if name not in LIMITS:
+            raise InputError(
+                f"--set: found {shown(words)}, allowed LIMIT=VALUE, LIMIT one of {', '.join(LIMITS)}"
+            )
+        try:
+            value = None if text == "none" else float(text)
+        except ValueError:
+            value = math.nan
+        lowest = LIMITS[name].lowest
+        if value is not None and not (math.isfinite(value) and value >= lowest):
+            at_least = "" if math.isinf(lowest) else f" of at least {lowest:g}"
+            raise InputError(f"--set: found {shown(words)}, allowed a finite number{at_least}, or none")
+        replaced[name] = value
+    return replaced
 
 
 def _formats(options: Export, available: list[str]) -> list[str]:

@@ -69,15 +69,17 @@ def calibrate(
     scenarios: int | None = None,
     limit: float | None = None,
     lanes: int = LANES,
+    replaced: Mapping[str, float | None] | None = None,
     progress: Callable[[int], None] = lambda runs: None,
 ) -> Calibration:
     """Limits for the rig, and the watchdog's rates of false and missed alarms.
 
     Args: `loaded`, the gain file; `store`, a sweep's of that gain file, whose scenarios are run again, all of
     them or the first so many `scenarios`; without a store so many draws of the file's own uncertainty (512).
-    `limit` of the restitution error: the store's own by default, else 0.01. So many `lanes` are run at a
-    time; `progress` is told how many more runs are done. Raises `InputError` for a store of another gain
-    file, or a number that it does not hold.
+    `limit` of the restitution error: the store's own by default, else 0.01. `replaced` limits are as given,
+    whatever the runs say, and the rates are under them. So many `lanes` are run at a time; `progress` is told
+    how many more runs are done. Raises `InputError` for a store of another gain file, or a number that it
+    does not hold.
     """
     chosen = _chosen(loaded, store, scenarios)
     if limit is None:
@@ -103,7 +105,7 @@ def calibrate(
         **expectation.limits(),
         "restitution_margin": margin,
     }
-    found = {name: limits.get(name) for name in LIMITS}
+    found = {name: limits.get(name) for name in LIMITS} | dict(replaced or {})
     rates = watchdog_rates(runs, expectation, found, limit, rules.mass, ~fitted)
     rates["calibrated_on"] = {
         "scenarios": chosen.number,
@@ -321,10 +323,14 @@ def _balance(runs: Judged, used) -> float:
     return max(BALANCE, MARGIN * float(np.nanmax(runs.audited.imbalance[:, used])))
 
 
-def _widened(low: float, high: float, clearance: float) -> tuple[float, float]:
-    """A stroke with half as much again on either side; the gap between two surfaces is part of it."""
-    if np.isfinite(clearance):
-        low, high = min(low, -clearance), max(high, 0.0)
+def _widened(low: float, high: float, clearance: float) -> tuple[float | None, float]:
+    """A stroke with half as much again on either side; the gap between two surfaces is part of it.
+
+    Of one surface the far side is free: from how far an approach comes, no run of the simulation says.
+    """
+    if np.isinf(clearance):
+        return None, high + (MARGIN - 1) * (high - low)
+    low, high = min(low, -clearance), max(high, 0.0)
     spare = (MARGIN - 1) * (high - low)
     return low - spare, high + spare
 
