@@ -68,10 +68,11 @@ def packets(
     ticks: int,
     delivered: Callable[[str, Any], list[Any]] = lambda way, packet: [packet],
     seed: int = 0,
+    resets: bool = False,
 ) -> tuple[RigTask, Task, list[Answer]]:
     """Rig and controller exchanging packets for so many ticks. `delivered(way, packet)` is what arrives at
     that tick instead of a packet `"there"` or `"back"`."""
-    rig, task = RigTask(mechanism, seed), Task(law, to_builtins(mechanism))
+    rig, task = RigTask(mechanism, seed, resets=resets), Task(law, to_builtins(mechanism))
     answers = []
     for _ in range(ticks):
         packet: Reading = rig.reading()

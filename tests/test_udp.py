@@ -30,6 +30,7 @@ from tuning.rig.udp_controller import (
     MOST_MADE_UP,
     PREPARE,
     READY,
+    RESET,
     STOP,
     TICK,
     Answer,
@@ -46,7 +47,7 @@ from tuning.rig.udp_controller import (
 from tuning.rig.udp_loop import EmptyTask, Timing, answered_by, play
 from tuning.rig.udp_network import Injection, Network
 from tuning.rig.udp_report import reference_restitutions, stalled
-from tuning.rig.udp_rig import EXTRAPOLATED
+from tuning.rig.udp_rig import BRIDGED
 from tuning.rig.udp_session import (
     CONTROLLER,
     INJECTED,
@@ -74,7 +75,9 @@ def same(one, other):
     return all(a == b or (a != a and b != b) for a, b in zip(one, other, strict=True))
 
 
-@given(st.builds(Reading, st.sampled_from([PREPARE, TICK, STOP]), WORD, WORD, WORD, FINITE, *[ANY] * 4))
+@given(
+    st.builds(Reading, st.sampled_from([PREPARE, TICK, STOP, RESET]), WORD, WORD, WORD, FINITE, *[ANY] * 4)
+)
 def test_readings_come_back(reading):
     assert same(decode_reading(encode_reading(reading)), reading)
 
@@ -244,7 +247,13 @@ SMALL = st.integers(0, 40)
 @given(
     st.lists(
         st.builds(
-            Reading, st.sampled_from([PREPARE, TICK]), SMALL, st.integers(0, 3), SMALL, FINITE, *[ANY] * 4
+            Reading,
+            st.sampled_from([PREPARE, TICK, RESET]),
+            SMALL,
+            st.integers(0, 3),
+            SMALL,
+            FINITE,
+            *[ANY] * 4,
         ),
         max_size=30,
     ),
@@ -259,6 +268,38 @@ def test_whatever_a_rig_sends_is_answered_with_finite_commands(varying, readings
         if answer is not None:
             assert math.isfinite(answer.position_command) and math.isfinite(answer.force_command)
             assert same(decode_answer(encode_answer(answer)), answer)
+
+
+@pytest.mark.parametrize("resets", [False, True])
+def test_a_trip_over_a_stall_of_the_machine_is_reset_and_told(varying, resets):
+    mechanism, gains = varying
+    law = controller(mechanism, "response_error", gains, missed_in_a_row=3.0)
+    count = 0
+
+    def stalled_twice(way, packet):
+        nonlocal count
+        count += way == "there"
+        return [] if 100 <= count < 130 or 900 <= count < 930 else [packet]
+
+    rig, task, _ = packets(mechanism, law, 3000, stalled_twice, resets=resets)
+    rig.finish()
+    if not resets:
+        assert "missed_tick" in rig.tripped and rig.forgiven == () and len(rig.contacts) == 1
+        return
+    assert not rig.tripped and task.status == "ok"
+    assert len(rig.forgiven) == 2 and all("missed_tick" in words for words in rig.forgiven)
+    statuses = [one.status for one in rig.contacts]
+    assert statuses.count("stalled") == 2 and statuses.count("ok") == len(statuses) - 2 > 6
+    assert all(one.oldest_command > 3 for one in rig.contacts if one.status == "stalled")
+    assert all(abs(one.restitution - 0.94) < 0.05 for one in rig.contacts if one.status == "ok")
+
+
+def test_a_trip_that_no_stall_explains_is_not_reset(varying):
+    mechanism, gains = varying
+    law = controller(mechanism, "response_error", gains, force_limit=20.0)
+    rig, _, _ = packets(mechanism, law, 1000, resets=True)
+    rig.finish()
+    assert "force_limit" in rig.tripped and rig.forgiven == ()
 
 
 def test_a_sensor_that_fails_trips_and_the_rig_is_safe(varying):
@@ -387,9 +428,9 @@ def test_contacts_that_the_machine_left_without_commands_are_not_judged(varying)
     run = LoopReport(figures, times, causes, {})  # pyright: ignore[reportArgumentType]
     contact = ContactResult(0, 0.005, 0.5, 1.0, 0.1, "ok", 3)
     setup = Setup(SOURCE, SOURCE, varying[0], (-1, 1), 1.0, 0.0, Injection(), 0)
-    old = contact._replace(packets=(10, 50), oldest_command=EXTRAPOLATED + 1)
+    old = contact._replace(packets=(10, 50), oldest_command=BRIDGED + 1)
     assert stalled(old, setup, run)
-    assert not stalled(old._replace(oldest_command=EXTRAPOLATED), setup, run)
+    assert not stalled(old._replace(oldest_command=BRIDGED), setup, run)
     assert not stalled(old._replace(packets=(10, 60)), setup, run)
     assert not stalled(old, setup._replace(injection=Injection(drops=0.1)), run)
 

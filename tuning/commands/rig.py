@@ -184,8 +184,10 @@ def _print(found: dict[str, Any]) -> None:
     if found["stalled"]:
         lines.append(
             f"{found['stalled']} contacts are not judged: the machine left the controller without time for "
-            "more than ten periods."
+            "more than three periods."
         )
+    if found["resets"]:
+        lines.append(f"{len(found['resets'])} times the controller tripped over that, and was reset.")
     lines += [
         f"The machine held up the rig of the {name}: its clock stood still for {loop['stood_still']:.3g} s."
         for name, loop in reached.items()

@@ -6,6 +6,7 @@ It runs from a bundle's folder with that bundle's `gains.json` and `jaxhil_runti
 needed. Standard output says `port NUMBER` once it listens. Whoever plays the rig sends
 
     PREPARE  the mechanism is free: tare, then stand ready at the start of a run; repeated until READY
+    RESET    as PREPARE, after a reset of a controller that has tripped
     TICK     what the sensors read at tick n = 0, 1, ... of the run; answered by the command for tick n + 1
     STOP     the session is over
 
@@ -50,8 +51,8 @@ else:
         sys.path.insert(0, str(HERE.parents[1]))
     from jaxhil.runtime import Controller
 
-PREPARE, TICK, STOP = 1, 2, 3  # kinds of packets from the rig
-EVENTS = (PREPARE, TICK, STOP)
+PREPARE, TICK, STOP, RESET = 1, 2, 3, 4  # kinds of packets from the rig
+EVENTS = (PREPARE, TICK, STOP, RESET)
 READY, TRIPPED, TARING, EMPTY = 1, 2, 4, 8  # flags of an answer
 FLAGS = READY | TRIPPED | TARING | EMPTY
 
@@ -225,7 +226,9 @@ class Task:
             self.stale += 1
             return None
         self._sequence = reading.sequence
-        return self._prepare(reading) if reading.event == PREPARE else self._step(reading)
+        if reading.event == RESET and reading.run != self._run and self._controller.reset():
+            self._words = ""
+        return self._step(reading) if reading.event == TICK else self._prepare(reading)
 
     def _prepare(self, reading: Reading) -> Answer:
         model = self._model

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxhil.mechanism import Mechanism
 from tuning.rig.contact_watch import ContactResult
-from tuning.rig.udp_rig import EXTRAPOLATED
+from tuning.rig.udp_rig import BRIDGED, STALLED
 from tuning.rig.udp_session import CONTROLLER, LoopReport, SessionReport, Setup
 
 
@@ -39,15 +39,12 @@ def reference_restitutions(mechanism: Mechanism, contacts: Sequence[ContactResul
     return [float(value) for value in np.asarray(reference.restitution)[:, 0]]
 
 
-STALLED = "stalled"
-
-
 def stalled(contact: ContactResult, setup: Setup, run: LoopReport | None) -> bool:
-    """Whether the machine, and nobody else, left a contact with commands older than `EXTRAPOLATED` periods.
+    """Whether the machine, and nobody else, left a contact with commands older than `BRIDGED` periods.
 
     Such a contact says nothing of the controller. Where faults are injected there are none of the kind.
     """
-    if run is None or setup.injection.any or contact.oldest_command <= EXTRAPOLATED:
+    if run is None or setup.injection.any or contact.oldest_command <= BRIDGED:
         return False
     first, last = contact.packets
     return not np.any(run.causes[first : last + 1] == CONTROLLER)
@@ -89,6 +86,7 @@ def judge(
         "commanded": None if session.commanded is None else session.commanded._asdict(),
         "stroke": setup.stroke,
         "tripped": session.tripped,
+        "resets": session.resets,
         "interrupted": session.interrupted,
         "limit": limit,
         "reasons": reasons,

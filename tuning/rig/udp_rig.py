@@ -12,10 +12,12 @@ from typing import NamedTuple
 from jaxhil.mechanism import Mechanism
 from tuning.rig.contact_watch import ContactResult, ContactWatch
 from tuning.rig.plant import Plant
-from tuning.rig.udp_controller import APPROACH, PREPARE, READY, TICK, TRIPPED, Answer, Reading
+from tuning.rig.udp_controller import APPROACH, PREPARE, READY, RESET, TICK, TRIPPED, Answer, Reading
 
 EXTRAPOLATED = 10  # periods for which a command goes on at its rate
+BRIDGED = 3  # periods: what follows from an older command is not the controller's doing
 PAUSE = 5  # ticks between two runs
+STALLED = "stalled"  # a contact that the machine left without new commands
 
 
 class Commanded(NamedTuple):
@@ -35,11 +37,16 @@ class RigTask:
     One-sided, every contact is a run of its own at the nominal approach speed; between two surfaces a run has
     as many contacts as the mechanism asks for. The lists of stiffness and damping are gone through again and
     again; after the first round, each run meets its first surface at a phase of its own. `stroke`: the lowest
-    and highest position [m] that the drives take.
+    and highest position [m] that the drives take. With `resets`, a controller that trips where a command was
+    older than `BRIDGED` periods is reset, and the session goes on.
     """
 
     def __init__(
-        self, mechanism: Mechanism, seed: int = 0, stroke: tuple[float, float] = (-math.inf, math.inf)
+        self,
+        mechanism: Mechanism,
+        seed: int = 0,
+        stroke: tuple[float, float] = (-math.inf, math.inf),
+        resets: bool = False,
     ) -> None:
         self._mechanism, self._period = mechanism, mechanism.rig.control_period
         self._two_sided = math.isfinite(mechanism.contact.clearance)
@@ -52,6 +59,7 @@ class RigTask:
         self._stroke = stroke
         self._newest: Answer | None = None
         self._words, self._first, self._oldest = "", 0, 0
+        self._resets, self._forgiven, self._resetting = resets, [], False
         self._next_run(0)
 
     @property
@@ -63,6 +71,11 @@ class RigTask:
     def tripped(self) -> str:
         """Why the controller has tripped; empty as long as it has not."""
         return self._words
+
+    @property
+    def forgiven(self) -> tuple[str, ...]:
+        """Why the controller has tripped where the machine had left the rig with old commands."""
+        return tuple(self._forgiven)
 
     @property
     def running(self) -> bool:
@@ -81,15 +94,16 @@ class RigTask:
         time = self._sequence * self._period
         if self._tick < 0:
             start = self._start
-            return Reading(PREPARE, self._sequence, self._run, 0, time, force, position, *start)
+            event = RESET if self._resetting else PREPARE
+            return Reading(event, self._sequence, self._run, 0, time, force, position, *start)
         return Reading(TICK, self._sequence, self._run, self._tick, time, force, position, *self._start)
 
     def take(self, answer: Answer) -> bool:
         """Take in an answer; whether it is the one to this tick."""
-        if answer.flags & TRIPPED:
-            self._words = answer.words or "tripped"
         if answer.run != self._run:
             return False
+        if answer.flags & TRIPPED:
+            self._words = answer.words or "tripped"
         if self._tick < 0:
             if answer.flags & READY and math.isfinite(answer.position_command):
                 self._newest = answer._replace(tick=-1)
@@ -108,6 +122,8 @@ class RigTask:
 
     def advance(self) -> None:
         """The tick is over: its command, or what stands for it, moves the rig one period."""
+        if self._words and self._resets and self._last_oldest() > BRIDGED:
+            self._reset()
         if self._tick < 0:
             self._wait()
             return
@@ -136,6 +152,25 @@ class RigTask:
             if cut is not None:
                 self._contacts.append(cut)
 
+    def _last_oldest(self) -> int:
+        """The age [periods] of the oldest command of the contact under way or, between runs, of the last."""
+        if self._tick < 0 and self._contacts:
+            return self._contacts[-1].oldest_command
+        return self._oldest
+
+    def _reset(self) -> None:
+        """Another run instead of this one, with a controller that starts anew."""
+        self._forgiven.append(self._words)
+        self._words = ""
+        number = self._number
+        if self._tick >= 0:
+            cut = self._watch.cut(STALLED)
+            if cut is not None:
+                self._keep(cut)
+                number = 0 if self._two_sided else (cut.number + 1) % self._mechanism.approach.contacts
+        self._next_run(number)
+        self._resetting = True
+
     def _wait(self) -> None:
         """Between runs the mechanism is held, free, at the start of the next one."""
         self._pause -= 1
@@ -147,19 +182,23 @@ class RigTask:
         self._tick = 0
 
     def _over(self, over: ContactResult) -> None:
-        over = over._replace(packets=(self._first, self._sequence), oldest_command=self._oldest)
-        self._first, self._oldest = self._sequence + 1, 0
         if self._words:
             # Once tripped, the rig plays on, and what becomes of the contact says nothing.
             if all(one.status != "tripped" for one in self._contacts):
-                self._contacts.append(over._replace(status="tripped", restitution=math.nan))
+                self._keep(over._replace(status="tripped", restitution=math.nan))
             return
-        self._contacts.append(over)
+        self._keep(over)
         following = over.number + 1
         if self._two_sided and over.status == "ok" and following < self._mechanism.approach.contacts:
             self._plant.expect(following)
             return
         self._next_run(0 if self._two_sided else following % self._mechanism.approach.contacts)
+
+    def _keep(self, over: ContactResult) -> None:
+        self._contacts.append(
+            over._replace(packets=(self._first, self._sequence), oldest_command=self._oldest)
+        )
+        self._first, self._oldest = self._sequence + 1, 0
 
     def _next_run(self, number: int) -> None:
         approach = self._mechanism.approach
@@ -169,6 +208,6 @@ class RigTask:
         position = -approach.velocity * (APPROACH + phase * self._period)
         self._start, self._number = (position, approach.velocity), number
         self._tick, self._pause, self._newest = -1, PAUSE, None
-        self._oldest = 0
+        self._oldest, self._resetting = 0, False
         # Until the run begins, the sensors see the mechanism free and at rest.
         self._plant.begin(position, 0.0, position, number)

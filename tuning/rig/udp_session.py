@@ -79,7 +79,8 @@ class LoopReport(NamedTuple):
 
 class SessionReport(NamedTuple):
     """The empty loop and the run (None where not reached); contacts that are over; what was commanded; why
-    the controller tripped, if it did; whether the session was interrupted."""
+    the controller tripped, if it did; whether the session was interrupted; why the controller tripped and was
+    reset, where the machine had left it without time."""
 
     empty: LoopReport | None
     run: LoopReport | None
@@ -87,6 +88,7 @@ class SessionReport(NamedTuple):
     commanded: Commanded | None
     tripped: str
     interrupted: bool
+    resets: tuple[str, ...] = ()
 
 
 class Setup(NamedTuple):
@@ -114,7 +116,7 @@ def run_session(
 
     Raises InputError when the controller's process does not start.
     """
-    task = RigTask(setup.mechanism, setup.seed, setup.stroke)
+    task = RigTask(setup.mechanism, setup.seed, setup.stroke, resets=not setup.injection.any)
     period, empty, run, interrupted = setup.mechanism.rig.control_period, None, None, False
     try:
         if setup.empty_duration >= period:
@@ -127,7 +129,7 @@ def run_session(
     except KeyboardInterrupt:
         interrupted = True
     task.finish()
-    return SessionReport(empty, run, task.contacts, task.commanded, task.tripped, interrupted)
+    return SessionReport(empty, run, task.contacts, task.commanded, task.tripped, interrupted, task.forgiven)
 
 
 def _play(
