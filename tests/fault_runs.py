@@ -181,26 +181,19 @@ def _clock(run: FaultRun, begin: int, rng: np.random.Generator) -> int:
     return begin
 
 
-def _stuck_position(run: FaultRun, begin: int, rng: np.random.Generator) -> int | None:
-    travel = 0.0
-    for tick in range(begin, begin + UNTIL_RESET):
-        run.rows[tick, MEASURED] = run.rows[begin - 1, MEASURED]
-        travel += abs(run.rows[tick, DESIRED] - run.rows[tick - 1, DESIRED])
-        if travel > LIMITED["position_stuck_travel"]:
-            run.faults[tick] |= POSITION_STUCK
-            return tick
-    return None
+def _stuck(column: int, moving: int, limit: str, fault: int):
+    def inject(run: FaultRun, begin: int, rng: np.random.Generator) -> int | None:
+        """One reading stays as it was, until what moves meanwhile has gone too far for that."""
+        travel = 0.0
+        for tick in range(begin, begin + UNTIL_RESET):
+            run.rows[tick, column] = run.rows[begin - 1, column]
+            travel += abs(run.rows[tick, moving] - run.rows[tick - 1, moving])
+            if travel > LIMITED[limit]:
+                run.faults[tick] |= fault
+                return tick
+        return None
 
-
-def _stuck_force(run: FaultRun, begin: int, rng: np.random.Generator) -> int | None:
-    travel = 0.0
-    for tick in range(begin, begin + UNTIL_RESET):
-        run.rows[tick, FORCE] = run.rows[begin - 1, FORCE]
-        travel += abs(run.rows[tick, MEASURED] - run.rows[tick - 1, MEASURED])
-        if travel > LIMITED["force_stuck_travel"]:
-            run.faults[tick] |= FORCE_STUCK
-            return tick
-    return None
+    return inject
 
 
 def _bias(run: FaultRun, begin: int, rng: np.random.Generator) -> int | None:
@@ -252,8 +245,9 @@ _EVERYWHERE = (
     _bad_reading(MEASURED, POSITION_NOT_FINITE, NOT_FINITE),
     _bad_reading(MEASURED, POSITION_OUT_OF_RANGE, (0.0101, -0.0101, 1e300)),
     *(_bad_model(column) for column in (DESIRED, VELOCITY, MODEL, MODEL + 1, MODEL + 2)),
-    *(_late, _missed, _clock, _stuck_position, _stroke, _fast_position),
+    _stuck(MEASURED, DESIRED, "position_stuck_travel", POSITION_STUCK),
+    *(_late, _missed, _clock, _stroke, _fast_position),
 )
-_IN_CONTACT = (_stuck_force,)
+_IN_CONTACT = (_stuck(FORCE, MEASURED, "force_stuck_travel", FORCE_STUCK),)
 _IN_FLIGHT = (_bias,)
 _OF_COMMAND = (_strong_force, _fast_force)
