@@ -296,8 +296,15 @@ def test_a_trip_over_a_stall_of_the_machine_is_reset_and_told(varying, resets):
 
 def test_a_trip_that_no_stall_explains_is_not_reset(varying):
     mechanism, gains = varying
-    law = controller(mechanism, "response_error", gains, force_limit=20.0)
-    rig, _, _ = packets(mechanism, law, 1000, resets=True)
+    law = controller(mechanism, "response_error", gains, force_limit=20.0, missed_in_a_row=1e9)
+    count = 0
+
+    def stalled_once(way, packet):
+        nonlocal count
+        count += way == "there"
+        return [] if 20 <= count < 25 else [packet]
+
+    rig, _, _ = packets(mechanism, law, 1000, stalled_once, resets=True)
     rig.finish()
     assert "force_limit" in rig.tripped and rig.forgiven == ()
 

@@ -16,6 +16,7 @@ from tuning.rig.udp_controller import APPROACH, PREPARE, READY, RESET, TICK, TRI
 
 EXTRAPOLATED = 10  # periods for which a command goes on at its rate
 BRIDGED = 3  # periods: what follows from an older command is not the controller's doing
+EXPLAINED = ("tripped: restitution", "tripped: missed_tick")  # what may follow from one
 PAUSE = 5  # ticks between two runs
 STALLED = "stalled"  # a contact that the machine left without new commands
 
@@ -37,8 +38,8 @@ class RigTask:
     One-sided, every contact is a run of its own at the nominal approach speed; between two surfaces a run has
     as many contacts as the mechanism asks for. The lists of stiffness and damping are gone through again and
     again; after the first round, each run meets its first surface at a phase of its own. `stroke`: the lowest
-    and highest position [m] that the drives take. With `resets`, a controller that trips where a command was
-    older than `BRIDGED` periods is reset, and the session goes on.
+    and highest position [m] that the drives take. With `resets`, a controller that trips by one of the
+    faults `EXPLAINED` where a command was older than `BRIDGED` periods is reset, and the session goes on.
     """
 
     def __init__(
@@ -122,7 +123,8 @@ class RigTask:
 
     def advance(self) -> None:
         """The tick is over: its command, or what stands for it, moves the rig one period."""
-        if self._words and self._resets and self._last_oldest() > BRIDGED:
+        explained = self._resets and self._words.startswith(EXPLAINED)
+        if explained and self._last_oldest() > BRIDGED:
             self._reset()
         if self._tick < 0:
             self._wait()
