@@ -11,7 +11,7 @@ decides. Such ticks are counted and compared separately; where the decisions fel
 of that lane ends.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import jax
 import msgspec
@@ -122,17 +122,8 @@ def replay(lane: Lane, gain_file: GainFile) -> LaneReplay:
     controller = Controller(gain_file)
     commands, stiffness, damping = replayed(controller, lane)
     near = near_threshold(lane.signals, gain_file)
-    span = float(np.max(lane.command, initial=0.0) - np.min(lane.command, initial=0.0))
-    error = np.abs(commands - lane.command)
-    # Of a command that is always 0 no fraction can be taken: there, only equality will do.
-    error = error / span if span > 0 else np.where(error == 0, 0.0, np.inf)
-    apart = error > REPLAY_LIMIT
-    if lane.identified is not None:
-        for mine, other in zip((stiffness, damping), lane.identified, strict=True):
-            apart |= np.abs(mine - other) > PARTED * np.max(np.abs(other), initial=0.0)
-    partings = np.nonzero(near & apart)[0]
-    # Differences grow before they show: a parting counts from the first time the two sides are apart.
-    parted = int(partings[0]) if len(partings) and not np.any(apart[: partings[0]]) else None
+    error, span = relative_difference(commands, np.asarray(lane.command))
+    parted = parting(error, (stiffness, damping), lane.identified, near)
     compared = len(commands) if parted is None else parted
     clear = np.where(near, 0.0, error)[:compared]
     worst = int(np.argmax(clear)) if compared else 0
@@ -163,6 +154,39 @@ def replayed(controller: Controller, lane: Lane) -> tuple[np.ndarray, np.ndarray
         results.append((0.0 if age == 0 and lane.zeroed else command, *controller.identified))
     commands, stiffness, damping = np.array(results, float).reshape(-1, 3).T
     return commands, stiffness, damping
+
+
+def command_range(commands: np.ndarray) -> float:
+    """From the least to the greatest command [N] that is finite, 0 included."""
+    finite = commands[np.isfinite(commands)]
+    return float(np.max(finite, initial=0.0) - np.min(finite, initial=0.0))
+
+
+def relative_difference(commands: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, float]:
+    """Differences as fractions of the expected commands' range, and that range; 0 where none (NaN) is expected."""
+    span = command_range(expected)
+    error = np.where(np.isnan(expected), 0.0, np.abs(commands - expected))
+    # Of a command that is always 0 no fraction can be taken: there, only equality will do.
+    return error / span if span > 0 else np.where(error == 0, 0.0, np.inf), span
+
+
+def parting(
+    error: np.ndarray,
+    identified: Sequence[np.ndarray],
+    expected: Sequence[np.ndarray | jax.Array] | None,
+    near: np.ndarray,
+) -> int | None:
+    """The first tick at which rounding decided at a threshold, and the two sides parted.
+
+    By `error` of the command, or by what either side identified, where it identifies anything.
+    """
+    apart = error > REPLAY_LIMIT
+    for mine, other in zip(identified, expected or (), strict=expected is not None):
+        other = np.asarray(other)[: len(error)]
+        apart |= np.abs(mine - other) > PARTED * np.max(np.abs(other), initial=0.0)
+    partings = np.nonzero(near & apart)[0]
+    # Differences grow before they show: a parting counts from the first time the two sides are apart.
+    return int(partings[0]) if len(partings) and not np.any(apart[: partings[0]]) else None
 
 
 def near_threshold(signals: Signals, gain_file: GainFile) -> np.ndarray:

@@ -11,6 +11,7 @@
 #include "gains_table.c"
 #include "gates.c"
 #include "identification.c"
+#include "surfaces.c"
 
 /* == Declarations == */
 
@@ -48,14 +49,6 @@ static bool jaxhil_law_init(jaxhil_law *law, const jaxhil_gains *gains) {
                                   gains->identification_delay, period);
 }
 
-static double jaxhil_deflection(const jaxhil_law *law, double position) {
-    if (position > 0.0) {
-        return position;
-    }
-    const double far = position + law->clearance;
-    return far < 0.0 ? far : 0.0;
-}
-
 /* Before the first tick the motion is uniform, so every filter begins in steady state. */
 static void jaxhil_law_start(jaxhil_law *law, double position, double velocity) {
     jaxhil_delay_line_start(&law->alignment, law->samples, position, velocity);
@@ -82,9 +75,9 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
     const double aligned_velocity = jaxhil_velocity_filter_step(&law->aligned_velocity, aligned);
 
     const double aligned_before = law->aligned;
-    const double deflection = jaxhil_deflection(law, aligned);
+    const double deflection = jaxhil_deflection(aligned, law->clearance);
     const double contact_share =
-        jaxhil_share_beyond(deflection, jaxhil_deflection(law, aligned_before), aligned - aligned_before);
+        jaxhil_share_beyond(deflection, jaxhil_deflection(aligned_before, law->clearance), aligned - aligned_before);
     const double contact_gate = jaxhil_gate(contact_share, law->contact_share);
     const double threshold = law->threshold;
     const double size = fabs(force_measured);

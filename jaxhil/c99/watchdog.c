@@ -12,6 +12,7 @@
 #include "faults_table.c"
 #include "filters.c"
 #include "limits_table.c"
+#include "surfaces.c"
 
 /* == Declarations == */
 
@@ -80,14 +81,6 @@ static bool jaxhil_watchdog_init(jaxhil_watchdog *watchdog, const jaxhil_limits 
     jaxhil_watchdog_restart(watchdog);
     return jaxhil_delay_line_init(&watchdog->alignment, watchdog->samples, JAXHIL_ALIGNMENT_SAMPLES,
                                   limits->alignment, period);
-}
-
-static double jaxhil_watchdog_deflection(const jaxhil_watchdog *watchdog, double position) {
-    if (position > 0.0) {
-        return position;
-    }
-    const double far = position + watchdog->clearance;
-    return far < 0.0 ? far : 0.0;
 }
 
 /* Written so that what is not a number goes to an end as well. */
@@ -188,9 +181,9 @@ static uint32_t jaxhil_watchdog_tick(jaxhil_watchdog *watchdog, double given, do
         given = 0.0;
     }
     const double aligned = jaxhil_delay_line_step(&watchdog->alignment, watchdog->samples, measured);
-    const double deflection = jaxhil_watchdog_deflection(watchdog, aligned);
-    const bool touching = jaxhil_watchdog_deflection(watchdog, position) != 0.0 ||
-                          jaxhil_watchdog_deflection(watchdog, measured) != 0.0;
+    const double deflection = jaxhil_deflection(aligned, watchdog->clearance);
+    const bool touching = jaxhil_deflection(position, watchdog->clearance) != 0.0 ||
+                          jaxhil_deflection(measured, watchdog->clearance) != 0.0;
     const double side = position > watchdog->middle ? 1.0 : -1.0;
     uint32_t fault = 0;
     if (!watchdog->open && touching) {

@@ -18,6 +18,7 @@ from .filters import DelayLine, LeadFilter, VelocityFilter
 from .gates import gate, share_beyond
 from .identification import ContactIdentification
 from .registry import GainSpecification, register
+from .surfaces import deflection
 
 
 @register("response_error")
@@ -108,8 +109,9 @@ class ResponseError:
         aligned_velocity = self._aligned_velocity.step(aligned)
 
         aligned_before = self._aligned
-        deflection = self._deflection(aligned)
-        contact_share = share_beyond(deflection, self._deflection(aligned_before), aligned - aligned_before)
+        clearance = self._clearance
+        depth = deflection(aligned, clearance)
+        contact_share = share_beyond(depth, deflection(aligned_before, clearance), aligned - aligned_before)
         contact_gate = gate(contact_share, self._contact_share)
         threshold = self._threshold
         size = abs(force_measured)
@@ -129,17 +131,11 @@ class ResponseError:
             return force
         identification = self._identification
         if force_gate != 0.0:
-            identification.update(force_measured, deflection, aligned_velocity, contact_gate * force_gate)
+            identification.update(force_measured, depth, aligned_velocity, contact_gate * force_gate)
         return force + contact_gate * (
             self._response_error * identification.stiffness * (position_desired - position_measured)
             + self._response_error_damping * identification.damping * (velocity_desired - velocity_measured)
         )
-
-    def _deflection(self, position: float) -> float:
-        if position > 0.0:
-            return position
-        far = position + self._clearance
-        return far if far < 0.0 else 0.0
 
     def _start(self, position: float, velocity: float) -> None:
         # Before the first tick the motion is uniform, so every filter begins in steady state.

@@ -27,6 +27,7 @@ from math import sqrt
 
 from .faults import CONTACT_TOO_LONG, ENERGY_BALANCE, RESTITUTION
 from .filters import DelayLine
+from .surfaces import deflection
 
 FADED = 1e-6  # of the largest force of the contact
 PATIENCE = 0.1  # s, that the force is given to die out
@@ -122,8 +123,9 @@ class Watchdog:
             self._known = True
             self._alignment.start(measured, velocity)
             before, given = velocity, 0.0
-        deflection = self._deflection(self._alignment.step(measured))
-        touching = self._deflection(position) != 0.0 or self._deflection(measured) != 0.0
+        clearance = self._clearance
+        aligned = deflection(self._alignment.step(measured), clearance)
+        touching = deflection(position, clearance) != 0.0 or deflection(measured, clearance) != 0.0
         side = 1.0 if position > self._middle else -1.0
         fault = 0
         if not self._open and touching:
@@ -138,7 +140,7 @@ class Watchdog:
             size = abs(given)
             if size > self._peak:
                 self._peak = size
-            self._regress(force, deflection)
+            self._regress(force, aligned)
             faded = size <= FADED * self._peak or size <= self._fading or self._quiet >= self._faded
             leaving = self._quiet >= self._quiet_ticks and self._side * velocity < 0.0 and faded
             if leaving or side != self._side:
@@ -147,7 +149,7 @@ class Watchdog:
                 fault = CONTACT_TOO_LONG
         self._velocity = velocity
         self._force = force
-        self._aligned = deflection
+        self._aligned = aligned
         return fault
 
     def conclude(self, given: float) -> int:
@@ -173,14 +175,14 @@ class Watchdog:
         self._work = 0.0
         self._sxx = self._sxv = self._svv = self._sxf = self._svf = 0.0
 
-    def _regress(self, force: float, deflection: float) -> None:
+    def _regress(self, force: float, aligned: float) -> None:
         """Take in the interval between two ticks, if both its ends are in contact."""
         # Not by the force as well: of noisy readings it would pick the larger ones, and bias the stiffness.
         side = self._side
         before = self._aligned
-        if deflection * side > 0.0 and before * side > 0.0:
-            middle = side * (deflection + before) * 0.5
-            rate = side * (deflection - before) / self._period
+        if aligned * side > 0.0 and before * side > 0.0:
+            middle = side * (aligned + before) * 0.5
+            rate = side * (aligned - before) / self._period
             mean = side * (force + self._force) * 0.5
             self._sxx += middle * middle
             self._sxv += middle * rate
@@ -209,12 +211,6 @@ class Watchdog:
         if not abs(self.restitution - self.expected) <= self._margin:
             return RESTITUTION
         return 0
-
-    def _deflection(self, position: float) -> float:
-        if position > 0.0:
-            return position
-        far = position + self._clearance
-        return far if far < 0.0 else 0.0
 
 
 class Expectation:

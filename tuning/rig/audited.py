@@ -164,8 +164,7 @@ class _Alignment:
     """`DelayLine` of every lane."""
 
     def __init__(self, delay: float, period: float):
-        line = DelayLine(delay, period)  # refuses a delay that spans too many periods
-        del line
+        DelayLine(delay, period)  # refuses a delay that spans too many periods
         ratio = delay / period
         self._whole = int(np.floor(ratio + 1e-9))
         self._fraction = ratio - self._whole

@@ -23,7 +23,13 @@ from jaxhil.runtime.faults import names
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
 from tuning.gain_file import LoadedGains
 from tuning.recording import Lane, nominal_and_draws, record_lanes
-from tuning.verification import PARTED, REPLAY_LIMIT, near_threshold
+from tuning.verification import (
+    REPLAY_LIMIT,
+    command_range,
+    near_threshold,
+    parting,
+    relative_difference,
+)
 
 BEGINS, NEXT_CONTACT = 1, 2  # events of a tick; 0 for none
 DRAWS = 3
@@ -226,22 +232,15 @@ def _compared(
     faulty = np.flatnonzero([row.faults for row in rows])
     found = np.array([row.force_command for row in rows])
     expected = np.array([one.force_simulated for one in inputs])
-    span = _span(expected)
-    error = np.where(np.isnan(expected), 0.0, np.abs(found - expected))
-    error = error / span if span > 0 else np.where(error == 0, 0.0, np.inf)
-    apart = error > REPLAY_LIMIT
-    if lane.identified is not None:
-        for mine, other in zip(np.array(identified).T, lane.identified, strict=True):
-            other = np.asarray(other)[:number]
-            apart |= np.abs(mine - other) > PARTED * np.max(np.abs(other), initial=0.0)
+    error, span = relative_difference(found, expected)
     near = near_threshold(type(lane.signals)(*(leaf[:number] for leaf in lane.signals)), gain_file)
     end, why = number, None
     if len(faulty):
         end = int(faulty[0])
         why = f"tick {end}: the controller acts on {', '.join(names(rows[end].faults))}"
-    partings = np.flatnonzero(near & apart)
-    if len(partings) and partings[0] < end and not np.any(apart[: partings[0]]):
-        end = int(partings[0])
+    parted = parting(error, list(np.array(identified).T), lane.identified, near)
+    if parted is not None and parted < end:
+        end = parted
         why = f"tick {end}: rounding decides at a threshold"
     wrong = np.flatnonzero(error[:end] > REPLAY_LIMIT)
     reason = None
@@ -255,17 +254,11 @@ def _compared(
     # A fraction of what is left to compare has to do, for who reads the file sees no more.
     kept = expected.copy()
     kept[end:] = nan
-    if np.any(np.abs(found - kept) > REPLAY_LIMIT * _span(kept)):
-        late = int(np.flatnonzero(np.abs(found - kept) > REPLAY_LIMIT * _span(kept))[0])
-        kept[late:] = nan
+    late = np.flatnonzero(np.abs(found - kept) > REPLAY_LIMIT * command_range(kept))
+    if len(late):
+        kept[int(late[0]) :] = nan
     return (
         [row._replace(force_simulated=float(one)) for row, one in zip(rows, kept, strict=True)],
         why,
         reason,
     )
-
-
-def _span(values: np.ndarray) -> float:
-    """From least to greatest, 0 included."""
-    finite = values[np.isfinite(values)]
-    return float(np.max(finite, initial=0.0) - np.min(finite, initial=0.0))
