@@ -206,6 +206,7 @@ class Clamped(Compensator):
     """max(0, F_c) of another law; the measured force alone for the first `blind` ticks of contact."""
 
     name: ClassVar[str] = "clamped"
+    knows: ClassVar[tuple] = ()
     gains: ClassVar[tuple] = ()
     inner: Compensator
     blind: int = 0

@@ -134,6 +134,7 @@ class OnTheRig(Compensator):
 
     law: Compensator
     name: ClassVar[str] = "on_the_rig"
+    knows: ClassVar[tuple[str, ...]] = ()
     gains: ClassVar[tuple[Gain, ...]] = ()
 
     def init(self, gains, constants, ring):

@@ -163,7 +163,7 @@ def command_range(commands: np.ndarray) -> float:
 
 
 def relative_difference(commands: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, float]:
-    """Differences as fractions of the expected commands' range, and that range; 0 where none (NaN) is expected."""
+    """Differences as fractions of the expected range, 0 where nothing (NaN) is expected; that range [N]."""
     span = command_range(expected)
     error = np.where(np.isnan(expected), 0.0, np.abs(commands - expected))
     # Of a command that is always 0 no fraction can be taken: there, only equality will do.

@@ -62,6 +62,8 @@ class Compensator(eqx.Module):
     """Interface; see the module's text."""
 
     name: eqx.AbstractClassVar[str]
+    # What it must be told of mechanism and rig beforehand, in the words of `estimates`.
+    knows: eqx.AbstractClassVar[tuple[str, ...]]
     gains: eqx.AbstractClassVar[tuple[Gain, ...]]
 
     def prepare(self, gains: Gains, constants: Constants) -> Any:

@@ -9,6 +9,7 @@ class NoCompensator(Compensator):
     """F_c = F."""
 
     name: ClassVar[str] = "none"
+    knows: ClassVar[tuple[str, ...]] = ()
     gains: ClassVar[tuple[Gain, ...]] = ()
 
     def init(self, gains, constants, ring):

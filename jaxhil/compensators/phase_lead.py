@@ -10,13 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxhil.compensators.base import Compensator, Constants, Gain, Gains
-
-
-def force_delay(mechanism) -> float:
-    """The known delay [s] of the force measurement: transport plus first-order lag."""
-    sensor = mechanism.rig.force_sensor
-    return sensor.delay + sensor.time_constant
-
+from jaxhil.compensators.estimates import FORCE_DELAY, force_delay
 
 PHASE_LEAD = Gain(
     name="phase_lead",
@@ -80,6 +74,7 @@ class PhaseLead(Compensator):
     """F_c = F + T_lead dF/dt, filtered."""
 
     name: ClassVar[str] = "phase_lead"
+    knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY,)
     gains: ClassVar[tuple[Gain, ...]] = (PHASE_LEAD, LEAD_FILTER)
 
     def prepare(self, gains, constants):

@@ -13,7 +13,6 @@ where between two ticks the surface was met (see `gates`). A reading's weight in
 gate times another, of the measured force above `contact_threshold`: nothing jumps as a delay crosses a tick.
 """
 
-import math
 from typing import ClassVar, NamedTuple
 
 import jax
@@ -21,6 +20,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxhil.compensators.base import Compensator, Gain, Gains
+from jaxhil.compensators.estimates import (
+    FORCE_DELAY,
+    critical_damping,
+    force_delay,
+    is_damped,
+    noise_level,
+    peak_force,
+    typical_stiffness,
+)
 from jaxhil.compensators.gates import gate, share_beyond
 from jaxhil.compensators.identification import Identified, update
 from jaxhil.compensators.phase_lead import (
@@ -28,46 +36,12 @@ from jaxhil.compensators.phase_lead import (
     PHASE_LEAD,
     LeadFilter,
     LeadState,
-    force_delay,
     lead,
     lead_amplification,
     lead_filter,
 )
 from jaxhil.contact import deflection
 from jaxhil.ring import look_back, write
-
-
-def is_damped(mechanism) -> bool:
-    """Whether the mechanism's contact law dissipates, so that damping is worth identifying."""
-    return mechanism.contact.law != "linear" and any(b > 0 for b in mechanism.contact.damping)
-
-
-def peak_force(mechanism) -> float:
-    """Order of the contact force [N]: v sqrt(k M) with the stiffest entry, as of a linear contact."""
-    contact = mechanism.contact
-    stiffness = [max(k) if isinstance(k, list | tuple) else k for k in contact.stiffness]
-    mass, velocity = mechanism.bodies.mass, mechanism.approach.velocity
-    if contact.law == "hunt_crossley":
-        order = contact.exponent + 1
-        deepest = (order * mass * velocity**2 / (2 * min(stiffness))) ** (1 / order)
-        return max(stiffness) * deepest**contact.exponent
-    return velocity * math.sqrt(max(stiffness) * mass)
-
-
-def typical_stiffness(mechanism) -> float:
-    """Order of the contact stiffness [N/m]: M omega^2 of the stiffest entry."""
-    return (peak_force(mechanism) / mechanism.approach.velocity) ** 2 / mechanism.bodies.mass
-
-
-def _noise_level(mechanism) -> float:
-    """What noise hardly ever exceeds [N]. A single reading that does, while penetration is next to nothing,
-    is a wild stiffness identified: beyond 3 standard deviations that happens in one contact of hundreds."""
-    sensor = mechanism.rig.force_sensor
-    return 4 * sensor.noise_std + abs(sensor.bias) + sensor.quantum
-
-
-def _critical_damping(mechanism) -> float:
-    return 2 * math.sqrt(typical_stiffness(mechanism) * mechanism.bodies.mass)
 
 
 def _stiffness_covariance(mechanism) -> float:
@@ -121,6 +95,7 @@ class ResponseError(Compensator):
     """Phase lead + response error + identification; see the module's text."""
 
     name: ClassVar[str] = "response_error"
+    knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY,)
     gains: ClassVar[tuple[Gain, ...]] = (
         PHASE_LEAD,
         LEAD_FILTER._replace(tuned=_never),
@@ -134,7 +109,7 @@ class ResponseError(Compensator):
             lambda m: 0.0, tuned=_never,
         ),
         Gain(
-            "initial_damping", "N s/m", lambda m: 0.0, _critical_damping, lambda m: 0.0,
+            "initial_damping", "N s/m", lambda m: 0.0, critical_damping, lambda m: 0.0,
             tuned=_never,
         ),
         Gain(
@@ -147,8 +122,8 @@ class ResponseError(Compensator):
         ),
         Gain("forgetting", "1", lambda m: 0.8, lambda m: 1.0, lambda m: 0.98, tuned=_never),
         Gain(
-            "contact_threshold", "N", lambda m: 0.0, lambda m: max(peak_force(m), _noise_level(m)),
-            lambda m: max(0.01 * peak_force(m), _noise_level(m)), tuned=_never,
+            "contact_threshold", "N", lambda m: 0.0, lambda m: max(peak_force(m), noise_level(m)),
+            lambda m: max(0.01 * peak_force(m), noise_level(m)), tuned=_never,
         ),
         Gain(
             "identification_delay", "s", lambda m: 0.0, lambda m: 2 * force_delay(m) + 0.02,
