@@ -192,13 +192,13 @@ def parting(
 def near_threshold(signals: Signals, gain_file: GainFile) -> np.ndarray:
     """The ticks, (ticks,) of bool, at which a decision of the law is within `NEAR` of its threshold.
 
-    Two decisions: on which side of a surface the delay-aligned position is, relative to the size of the
-    measured positions; and, in contact, whether |F| exceeds the contact threshold, relative to either. A
+    Two decisions, of laws that identify: on which side of a surface the delay-aligned position is, relative
+    to the size of the measured positions; and, in contact, whether |F| exceeds the contact threshold, relative to either. A
     force and a threshold that are both 0 are equal on both sides, whatever the rounding.
     """
     gains, clearance = gain_file.gains, gain_file.clearance
     near = np.zeros(len(signals.age), bool)
-    if "identification_delay" not in gains or not len(near):
+    if "contact_threshold" not in gains or not len(near):
         return near
     aligned = _aligned(signals, gains["identification_delay"], gain_file.control_period)
     margin = NEAR * np.max(np.abs(signals.position_measured))

@@ -1,0 +1,75 @@
+"""What a dead zone does to a contact by its closed form, and that the observer undoes it."""
+
+import math
+
+import numpy as np
+import pytest
+from lanes import IDEAL, STIFFNESS, first_contact, mechanism, nominal_gains, spread, validated
+
+from jaxhil.mechanism_file import load
+from jaxhil.runtime import COMPENSATORS
+
+DEAD_ZONE, DELAY, PERIOD = 12.0, 0.008, 1e-3
+MECHANISM = validated(mechanism({}, IDEAL, DELAY, period=PERIOD, force_sensor={"dead_zone": DEAD_ZONE}))
+GAINS = nominal_gains(MECHANISM, "dead_zone_observer")
+
+
+@pytest.fixture(scope="module")
+def led():
+    """Phase lead alone: next to no dead zone, and the dead zone."""
+    scenario = spread(MECHANISM, 2, force_sensor__dead_zone=np.array([1e-9, DEAD_ZONE]))
+    return first_contact(MECHANISM, scenario, "phase_lead", nominal_gains(MECHANISM, "phase_lead"))
+
+
+def test_a_dead_zone_moves_the_surface(led):
+    """By dz/k: the hardware is pressed by dz more, and leaves as fast as without."""
+    assert led["restitution"][1] == pytest.approx(led["restitution"][0], abs=1e-4)
+    assert led["peak_force"][1] - led["peak_force"][0] == pytest.approx(DEAD_ZONE, rel=1e-3)
+
+
+def test_the_observer_removes_the_dead_zone_s_error(led):
+    """Right stiffness: to a hundredth. Wrong by 30 %: a tenth is left. As late as F: divergence."""
+    lag = 1 / (2 * math.pi * GAINS["observer_bandwidth"])
+    assert GAINS["identification_delay"] == pytest.approx(DELAY - lag, rel=1e-12)
+    stiffness = STIFFNESS * np.array([1.0, 0.7, 1.3, 0.0, 1.0])
+    alignment = np.array([*[GAINS["identification_delay"]] * 4, DELAY])
+    changed = {"observer_stiffness": stiffness, "identification_delay": alignment}
+    found = first_contact(MECHANISM, spread(MECHANISM, 5), "dead_zone_observer", GAINS | changed)
+    left = (found["peak_force"] - led["peak_force"][0]) / DEAD_ZONE
+    moved = found["restitution"] - led["restitution"][0]
+    print(left, moved)
+    assert abs(left[0]) < 0.01 and np.all(np.abs(left[1:3]) < 0.1) and left[3] == pytest.approx(1, rel=1e-3)
+    assert np.all(np.abs(moved[:4]) < 1e-3) and moved[4] > 0.05
+
+
+def test_without_a_dead_zone_it_is_phase_lead_exactly():
+    rng = np.random.default_rng(0)
+    without = nominal_gains(load("rig-300kg").mechanism, "dead_zone_observer")
+    gains = GAINS | {"observer_limit": without["observer_limit"]}
+    assert gains["observer_limit"] == 0.0
+    ours = COMPENSATORS["dead_zone_observer"](gains, PERIOD, 0.002)
+    other = COMPENSATORS["phase_lead"](gains, PERIOD, 0.002)
+    for row in (rng.standard_normal((2000, 4)) * [100, 1e-3, 1e-2, 1e-3]).tolist():
+        assert ours.step(*row) == other.step(*row)
+
+
+@pytest.mark.parametrize("overrides", [[], ["rig.force_sensor.delay=0.002"], ["rig.control_period=0.004"]])
+def test_the_observer_is_near_1_below_15_hz(overrides):
+    """|Q| >= 0.9 of the filter at its control period, and its lag no longer than the force's delay."""
+    parsed = load("rig-300kg", [*overrides, "rig.force_sensor.dead_zone=12"]).mechanism
+    gains, period = nominal_gains(parsed, "dead_zone_observer"), parsed.rig.control_period
+    still = gains | {"phase_lead": 0.0, "identification_delay": 0.0, "observer_stiffness": 1.0}
+    for frequency in (1.0, 5.0, 15.0):
+        law = COMPENSATORS["dead_zone_observer"](still | {"observer_limit": 10.0}, period, math.inf)
+        turn = 2 * math.pi * frequency * period
+        positions = [2 + math.cos(turn * tick) for tick in range(3000)]
+        output = np.array([law.step(0.0, 0.0, 0.0, position) for position in positions])[1000:]
+        waves = np.exp(-1j * turn * np.arange(1000, 3000))
+        basis = np.stack([waves.real, waves.imag, np.ones(2000)], axis=1)
+        cosine, sine, mean = np.linalg.lstsq(basis, output, rcond=None)[0]
+        corner = math.pi * gains["observer_bandwidth"] * period
+        tangent = 1j * math.tan(turn / 2)
+        assert abs(cosine + 1j * sine) == pytest.approx(abs(corner / (corner + tangent)), rel=1e-6)
+        assert abs(cosine + 1j * sine) >= 0.9 and mean == pytest.approx(2.0, rel=1e-6)
+    lag = 1 / (2 * math.pi * gains["observer_bandwidth"])
+    assert lag <= max(parsed.rig.force_sensor.delay, period / 2) * (1 + 1e-12)
