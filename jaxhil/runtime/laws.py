@@ -1,0 +1,7 @@
+"""The compensation laws by name: the one entry that a law has anywhere.
+
+The law `<name>` is `jaxhil/compensators/<name>.py` in JAX, `jaxhil/runtime/<name>.py` in plain Python and
+`jaxhil/c99/<name>.c` in C99. Simulation, tuning, command line, export and tests go by this list.
+"""
+
+LAWS = ("none", "phase_lead", "virtual_contact", "passivity", "response_error")
