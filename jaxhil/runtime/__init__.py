@@ -6,7 +6,7 @@ called once per control period. Each compensator is one file and enters itself i
 the two import, and nothing else.
 """
 
-from . import none, phase_lead, response_error
+from . import multi_parameter_lead, none, phase_lead, response_error
 from .controller import Controller
 from .errors import GainFileError
 from .gain_file import digest
@@ -17,6 +17,7 @@ __all__ = [
     "Controller",
     "GainFileError",
     "digest",
+    "multi_parameter_lead",
     "none",
     "phase_lead",
     "response_error",
