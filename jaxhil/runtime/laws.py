@@ -4,4 +4,11 @@ The law `<name>` is `jaxhil/compensators/<name>.py` in JAX, `jaxhil/runtime/<nam
 `jaxhil/c99/<name>.c` in C99. Simulation, tuning, command line, export and tests go by this list.
 """
 
-LAWS = ("none", "phase_lead", "virtual_contact", "passivity", "response_error")
+LAWS = (
+    "none",
+    "phase_lead",
+    "multi_parameter_lead",
+    "virtual_contact",
+    "passivity",
+    "response_error",
+)
