@@ -269,10 +269,10 @@ def drawn_exactly(law: str, count: int, rng: np.random.Generator) -> tuple[GainF
     gain_file = drawn_gains(law, rng, hostile=False)._replace(
         control_period=period, clearance=clearance, limits=limits
     )
-    if "forgetting" in gain_file.gains:
-        whole = {name: float(rng.integers(1, 4)) for name in gain_file.gains}
-        whole |= {"identification_delay": whole["identification_delay"] * period, "forgetting": 0.5}
-        gain_file = gain_file._replace(gains=whole)
+    whole = {name: float(rng.integers(1, 4)) for name in gain_file.gains}
+    whole |= {name: whole[name] * period for name in delays(law) & whole.keys()}
+    whole |= {"forgetting": 0.5} if "forgetting" in whole else {}
+    gain_file = gain_file._replace(gains=whole)
     rows = np.zeros((count, len(ROW)))
     rows[:, 1:] = rng.integers(-3, 4, (count, 9))
     if rng.random() < 0.7:  # walks, which stay on one side for a while

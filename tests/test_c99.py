@@ -130,28 +130,6 @@ def test_law_without_a_c_file_is_named(monkeypatch):
         c99_texts(document)
 
 
-def test_one_c_file_adds_a_law(monkeypatch, tmp_path):
-    class Doubled(COMPENSATORS["none"]):
-        def step(self, force_measured, position_desired, velocity_desired, position_measured):
-            return 2.0 * force_measured
-
-    fragments = tmp_path / "c99"
-    shutil.copytree(Path(str(c99.FOLDER)), fragments)
-    text = (fragments / "none.c").read_text()
-    (fragments / "doubled.c").write_text(
-        text.replace("return force_measured;", "return 2.0 * force_measured;")
-    )
-    monkeypatch.setattr(c99, "FOLDER", fragments)
-    monkeypatch.setitem(COMPENSATORS, "doubled", Doubled)
-    document = sign(gain_document("none") | {"compensator": "doubled"})
-    folder = c99_cases.write_sources(tmp_path / "made", document)
-    doubled = Batch(compiled(folder, "c99_driver.c", "driver.so", "-shared", "-fPIC"), "doubled")
-    gain_file = check_gain_document(document)
-    assert doubled.begin(packed("doubled", gain_file))
-    rows = drawn_rows("contact", 100, np.random.default_rng(0), PERIOD)
-    assert_same(doubled.run(rows, False), c99_cases.law_in_python(gain_file, rows), rows)
-
-
 def test_document_that_the_runtime_refuses_is_refused():
     document = gain_document()
     document["gains"]["forgetting"]["value"] = 0.99

@@ -1,13 +1,14 @@
 """The compensators against the closed forms of model.md, section 6, items 4, 5, 6 and 8."""
 
 import dataclasses
+import functools
 from math import pi
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from endless import OMEGA, STIFFNESS, characteristic_root, decay, growth, persistent, spring, without_period
 from lanes import (
     IDEAL,
     MASS,
@@ -17,7 +18,6 @@ from lanes import (
     mechanism,
     nominal_gains,
     per_lane,
-    run_record,
     run_rollout,
     spread,
     validated,
@@ -28,8 +28,6 @@ from jaxhil.compensators.base import Compensator
 from jaxhil.compensators.phase_lead import PhaseLead
 from jaxhil.compensators.response_error import ResponseError
 
-OMEGA = 2 * pi * 3.0
-STIFFNESS = MASS * OMEGA**2
 PHASES = (np.arange(8) + 0.5) / 8
 
 # Item 4.
@@ -100,35 +98,7 @@ def test_net_delay_with_response_error_compensation(model):
     assert np.ptp(expected) > 0.007
 
 
-# Items 5 and 6: with both surfaces at x = 0 and tension allowed the contact is a spring and damper that never
-# lets go, so that its oscillation grows or decays for as long as one likes.
-
-
-def persistent(parsed, compensator, seconds, gains, **leaves):
-    """Record of an endless contact; `leaves` as for `spread`."""
-    lanes = next(iter(leaves.values())).shape[-1]
-    scenario = spread(parsed, lanes, clearance=np.zeros(lanes), **leaves)
-    loop = build_loop(parsed, compensator, scenario)
-    period = parsed.rig.control_period
-    ticks = run_record(loop, per_lane(gains, lanes), scenario, round(seconds / period))[1]
-    return jax.tree.map(np.asarray, ticks)
-
-
-def growth(ticks):
-    """Logarithm of the ratio of successive extrema of x_d, from the later half of a record."""
-    rates = []
-    for x in np.abs(ticks.signals.position_desired).T:
-        top = np.flatnonzero((x[1:-1] > x[:-2]) & (x[1:-1] >= x[2:])) + 1
-        bend = 2 * x[top] - x[top - 1] - x[top + 1]
-        heights = x[top] + (x[top + 1] - x[top - 1]) ** 2 / (8 * bend)
-        half = len(heights) // 2
-        rates.append(np.log(heights[-1] / heights[half]) / (len(heights) - 1 - half))
-    return np.array(rates)
-
-
-def spring(simulator=IDEAL, period=5e-4):
-    return validated(mechanism({"stiffness": [STIFFNESS], "tension": True}, simulator, 0.0, period=period))
-
+# Items 5 and 6, on a contact that never ends.
 
 DAMPING = 2 * 0.05 * MASS * OMEGA
 MARGIN = np.array([0.8, 0.95, 1.0, 1.05, 1.2])
@@ -167,16 +137,46 @@ def test_stable_or_divergent_by_the_critical_lag():
     assert np.all(found[:2] < -0.007) and abs(found[2]) < 1e-6 and np.all(found[3:] > 0.007)
 
 
+# First-order lead: omega tau, and the damping as a multiple of the critical one.
+LEADS = np.array([[0.1, 0], [0.2, 0], [0.3, 0], *([a, m] for a in (0.4, 0.6) for m in (0.8, 1.0, 1.2))]).T
+
+
+@functools.cache
+def first_order_leads():
+    """Growth in the limit T -> 0 of endless contacts under phase lead, and their dominant roots."""
+    angle, multiple = LEADS
+    # At the threshold (k + j omega b)(1 + j theta) e^(-j theta) is real and M omega^2, theta = omega tau:
+    # b omega/k = tan(theta - atan theta), about theta^3/3, twice the damping ratio.
+    short = angle - np.arctan(angle)
+    there = OMEGA * np.sqrt(np.sqrt(1 + angle**2) / np.cos(short))
+    omega = np.where(multiple > 0, there, OMEGA)
+    damping, delay = multiple * STIFFNESS * np.tan(short) / omega, angle / omega
+    leaves = {"contact__damping": damping, "force_sensor__delay": delay}
+    found = without_period("phase_lead", 2.5, {"phase_lead": delay}, **leaves)
+
+    def root(b, tau):
+        return characteristic_root(
+            lambda s: MASS * s**2 + (b * s + STIFFNESS) * (1 + tau * s) * np.exp(-s * tau)
+        )
+
+    return found, np.array([decay(root(b, tau)) for b, tau in zip(damping, delay, strict=True)])
+
+
+def test_first_order_lead_grows_as_its_root():
+    found, expected = first_order_leads()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)
+
+
 def test_first_order_lead_stays_divergent():
-    phase = np.array([0.1, 0.2, 0.3])
-    rates = []
-    for period in (5e-4, 2.5e-4):
-        gains = {"phase_lead": phase / OMEGA, "lead_filter": period / 2}
-        leaves = {"force_sensor__delay": phase / OMEGA}
-        rates.append(growth(persistent(spring(period=period), "phase_lead", 2.5, gains, **leaves)))
-    # The filter that realises the lead is of first order in T.
-    ratio = (2 * rates[1] - rates[0]) / (pi / 6 * phase**3)
-    assert np.all(np.abs(ratio - 1) < 0.01 + 0.7 * phase**2)
+    angle = LEADS[0, :3]
+    ratio = first_order_leads()[0][:3] / (pi / 6 * angle**3)
+    assert np.all(np.abs(ratio - 1) < 0.01 + 0.7 * angle**2)
+
+
+def test_first_order_lead_is_stable_or_divergent_by_the_critical_damping():
+    found = first_order_leads()[0][3:].reshape(2, 3)
+    assert np.all(np.abs(found[:, 1]) < 1e-4)
+    assert np.all(found[:, 0] > 4e-3) and np.all(found[:, 2] < -4e-3)
 
 
 def test_identification_of_delayed_force_on_undelayed_motion_is_biased():

@@ -5,18 +5,14 @@ import math
 
 import numpy as np
 import pytest
+from endless import OMEGA, STIFFNESS, characteristic_root, decay, growth, persistent, spring
 from hypothesis import given
 from hypothesis import strategies as st
-from lanes import IDEAL, MASS, per_lane, run_record, spread, validated
-from lanes import mechanism as plain
+from lanes import MASS
 
-from jaxhil.building import build_loop
 from jaxhil.compensators import literature_gains
 from jaxhil.compensators.virtual_contact import damping_at_the_limit
 from jaxhil.mechanism_file import load
-
-OMEGA = 2 * math.pi * 3.0
-STIFFNESS = MASS * OMEGA**2
 
 
 @given(
@@ -47,41 +43,23 @@ def test_nominal_damping_is_the_limit_of_all_delay():
     assert gains["virtual_stiffness"] == 0.0
 
 
-def growth(period, delay, damping, stiffness):
-    """Logarithm of the ratio of successive extrema of x_d in a contact that never lets go, per lane."""
-    parsed = validated(plain({"stiffness": [STIFFNESS], "tension": True}, IDEAL, 0.0))
-    lanes = len(delay)
-    leaves = {"clearance": np.zeros(lanes), "force_sensor__delay": delay, "control_period": period}
-    scenario = spread(parsed, lanes, **leaves)
-    gains = per_lane({"virtual_damping": damping, "virtual_stiffness": stiffness}, lanes)
-    loop = build_loop(parsed, "virtual_contact", scenario)
-    ticks = run_record(loop, gains, scenario, 3000)[1]
-    rates = []
-    for x in np.abs(np.asarray(ticks.signals.position_desired)).T:
-        top = np.flatnonzero((x[1:-1] > x[:-2]) & (x[1:-1] >= x[2:])) + 1
-        bend = 2 * x[top] - x[top - 1] - x[top + 1]
-        heights = x[top] + (x[top + 1] - x[top - 1]) ** 2 / (8 * bend)
-        half = len(heights) // 2
-        rates.append(np.log(heights[-1] / heights[half]) / (len(heights) - 1 - half))
-    return np.array(rates)
-
-
 def test_the_simulated_loop_is_marginal_at_the_limit():
     """Growth per half-cycle of an endless contact, pi Re s/Im s of the characteristic root: 0 at the limit.
 
     Semi-implicit Euler has the velocity half a period late: what is of first order in T is extrapolated.
     """
-    angle = np.repeat([0.1, 0.2, 0.4], 3)
-    delay = angle / OMEGA
-    share, stiffness = np.tile([0.9, 1.0, 1.1], 3), np.tile([0.0, 0.0, 0.2 * STIFFNESS], 3)
-    limit = np.array([damping_at_the_limit(STIFFNESS, OMEGA, one)[0] for one in delay])
-    root = np.full(9, 1j * OMEGA)
-    for _ in range(60):
-        shifted = STIFFNESS * np.exp(-root * delay)
-        value = MASS * root**2 + share * limit * root + stiffness + shifted
-        root = root - value / (2 * MASS * root + share * limit - delay * shifted)
-    period = np.repeat([1e-3, 5e-4], 9)
-    coarse, fine = np.split(growth(period, *np.tile([delay, share * limit, stiffness], 2)), 2)
+    delay = np.repeat([0.1, 0.2, 0.4], 3) / OMEGA
+    share, added = np.tile([0.9, 1.0, 1.1], 3), np.tile([0.0, 0.0, 0.2 * STIFFNESS], 3)
+    damping = share * np.array([damping_at_the_limit(STIFFNESS, OMEGA, one)[0] for one in delay])
+    gains = {"virtual_damping": np.tile(damping, 2), "virtual_stiffness": np.tile(added, 2)}
+    leaves = {"force_sensor__delay": np.tile(delay, 2), "control_period": np.repeat([1e-3, 5e-4], 9)}
+    coarse, fine = np.split(growth(persistent(spring(), "virtual_contact", 1.5, gains, **leaves)), 2)
     found = 2 * fine - coarse
-    np.testing.assert_allclose(found, np.pi * root.real / root.imag, rtol=0, atol=2e-4)
-    assert np.all(np.abs(found[1::3]) < 2e-4) and np.all(found[0::3] > 0.01) and np.all(found[2::3] < -0.01)
+    roots = [
+        characteristic_root(lambda s, b=b, k=k, t=t: MASS * s**2 + b * s + k + STIFFNESS * cmath.exp(-s * t))
+        for b, k, t in zip(damping, added, delay, strict=True)
+    ]
+    expected = [decay(root) for root in roots]
+    print(np.max(np.abs(found - expected)), found)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=3e-5)
+    assert np.all(np.abs(found[1::3]) < 3e-5) and np.all(found[0::3] > 0.01) and np.all(found[2::3] < -0.01)

@@ -21,7 +21,8 @@ double jaxhil_lead_filter_step(jaxhil_lead_filter *filter, double value);
 
 /* Filtered derivative s/(1 + T_v s) by Tustin's rule at period T:
  * w = ((2 T_v - T) w_prev + 2 (x - x_prev)) / (2 T_v + T). Position in m, velocity in m/s, times in s.
- * `start` makes the past a uniform motion that reaches `position` at the next step. */
+ * Its past is 0; `start` makes it a uniform motion that reaches `position` at the next step. Of a force as
+ * well. */
 typedef struct {
     double period, of_velocity, denominator;
     double position, velocity;

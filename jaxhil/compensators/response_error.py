@@ -15,11 +15,11 @@ gate times another, of the measured force above `contact_threshold`: nothing jum
 
 from typing import ClassVar, NamedTuple
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxhil.compensators.base import Compensator, Gain, Gains
+from jaxhil.compensators.delay_line import Delay, DelayLine, delayed, empty, split
 from jaxhil.compensators.estimates import (
     FORCE_DELAY,
     critical_damping,
@@ -41,7 +41,6 @@ from jaxhil.compensators.phase_lead import (
     lead_filter,
 )
 from jaxhil.contact import deflection
-from jaxhil.ring import look_back, write
 
 
 def _stiffness_covariance(mechanism) -> float:
@@ -61,25 +60,23 @@ def _never(mechanism) -> bool:
 
 class ResponseErrorState(NamedTuple):
     """lead filter; measured and aligned positions [m] and their filtered rates [m/s], of the tick before;
-    the run's first reading [m] and speed [m/s]; shares [1] of the last period in contact and with a force
-    above the threshold; what is identified; ring of interpolated readings [m]."""
+    shares [1] of the last period in contact and with a force above the threshold; what is identified; the
+    readings that are delayed."""
 
     lead: LeadState
     position: Float[Array, "*batch"]
     velocity: Float[Array, "*batch"]
     aligned: Float[Array, "*batch"]
     aligned_velocity: Float[Array, "*batch"]
-    first_position: Float[Array, "*batch"]
-    first_velocity: Float[Array, "*batch"]
     contact_share: Float[Array, "*batch"]
     force_share: Float[Array, "*batch"]
     identified: Identified
-    ring: Float[Array, "samples *batch"]
+    line: DelayLine
 
 
 class Prepared(NamedTuple):
     """Gains, control period [s], clearance [m], lead filter, coefficients of the velocity filter
-    v(n) = rate_pole v(n-1) + rate_gain (x(n) - x(n-1)), alignment delay as whole periods and a rest."""
+    v(n) = rate_pole v(n-1) + rate_gain (x(n) - x(n-1)), alignment delay."""
 
     gains: Gains
     period: Float[Array, "*batch"]
@@ -87,8 +84,7 @@ class Prepared(NamedTuple):
     lead: LeadFilter
     rate_pole: Float[Array, "*batch"]
     rate_gain: Float[Array, "*batch"]
-    lookback: Int[Array, "*batch"]
-    fraction: Float[Array, "*batch"]
+    delay: Delay
 
 
 class ResponseError(Compensator):
@@ -138,8 +134,6 @@ class ResponseError(Compensator):
 
     def prepare(self, gains, constants):
         period = constants.control_period
-        periods = gains["identification_delay"] / period
-        whole = jax.lax.stop_gradient(jnp.floor(periods + 1e-9))
         smoothing = 2 * gains["velocity_filter"]
         scale = 1 / (smoothing + period)
         return Prepared(
@@ -149,8 +143,7 @@ class ResponseError(Compensator):
             lead_filter(gains, constants),
             (smoothing - period) * scale,
             2 * scale,
-            whole.astype(jnp.int32),
-            periods - whole,
+            split(gains["identification_delay"], period),
         )
 
     def init(self, gains, constants, ring):
@@ -161,8 +154,6 @@ class ResponseError(Compensator):
             velocity=zeros,
             aligned=zeros,
             aligned_velocity=zeros,
-            first_position=zeros,
-            first_velocity=zeros,
             contact_share=zeros,
             force_share=zeros,
             identified=Identified(
@@ -172,7 +163,7 @@ class ResponseError(Compensator):
                 zeros + gains["stiffness_covariance"],
                 zeros + gains["damping_covariance"],
             ),
-            ring=jnp.zeros((ring, *zeros.shape), zeros.dtype),
+            line=empty(ring, zeros),
         )
 
     def restart(self, gains, state, begins, fresh):
@@ -191,20 +182,12 @@ class ResponseError(Compensator):
 
     def step(self, prepared, state, signals, tick):
         gains, period = prepared.gains, prepared.period
-        force, measured, age = signals.force_measured, signals.position_measured, signals.age
+        force, measured = signals.force_measured, signals.position_measured
         # Before its first tick a run is in uniform motion: that is what every filter starts from.
-        begins = age == 0
-        first_position = jnp.where(begins, measured, state.first_position)
-        first_velocity = jnp.where(begins, signals.velocity_desired, state.first_velocity)
-        stride = period * first_velocity
+        begins = signals.age == 0
+        stride = period * signals.velocity_desired
         before = jnp.where(begins, measured - stride, state.position)
-
-        lookback, fraction = prepared.lookback, prepared.fraction
-        ring = write(state.ring, tick, measured)
-        newer, older = look_back(ring, tick, lookback), look_back(ring, tick, lookback + 1)
-        recalled = newer - fraction * (newer - older)
-        uniform = first_position + ((age - lookback).astype(measured.dtype) - fraction) * stride
-        aligned = jnp.where(age <= lookback, uniform, recalled)
+        aligned, line = delayed(prepared.delay, state.line, signals, tick)
         aligned_before = jnp.where(begins, aligned - stride, state.aligned)
 
         def rate(position, position_before, velocity_before):
@@ -242,12 +225,10 @@ class ResponseError(Compensator):
             velocity,
             aligned,
             aligned_velocity,
-            first_position,
-            first_velocity,
             contact_share,
             force_share,
             identified,
-            ring,
+            line,
         )
 
     def noise_amplification(self, gains, constants):

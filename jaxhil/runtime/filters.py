@@ -45,7 +45,8 @@ class VelocityFilter:
 
     w = ((2 T_v - T) w_prev + 2 (x - x_prev)) / (2 T_v + T).
 
-    `start` must come before the first `step`. Position in m, velocity in m/s, times in s.
+    Its past is 0 unless `start` says otherwise. Position in m, velocity in m/s, times in s; it serves a
+    force as well.
     """
 
     __slots__ = ("_denominator", "_of_velocity", "_period", "_position", "_velocity")

@@ -7,6 +7,7 @@ The law `<name>` is `jaxhil/compensators/<name>.py` in JAX, `jaxhil/runtime/<nam
 LAWS = (
     "none",
     "phase_lead",
+    "multi_parameter_lead",
     "virtual_contact",
     "dead_zone_observer",
     "passivity",

@@ -1,0 +1,124 @@
+"""Multi-parameter phase lead (Osaki, Konno): a F + b dF/dt, by pole placement at the contact frequency.
+
+Realised as a + b s/(1 + T_2 s) by Tustin's rule at the control period; phase lead is a = 1, b = T_lead.
+
+The literature's rule takes the contact for M x'' = -k (a + b d/dt) x(t - tau), undamped, omega^2 = k/M, and
+puts a root of its characteristic equation s^2 + omega^2 (a + b s) e^(-s tau) = 0 where the damped
+oscillation of the desired restitution has its own:
+
+    s_d = omega (-zeta + j sqrt(1 - zeta^2)),  e = exp(-pi zeta/sqrt(1 - zeta^2)).
+
+That is one complex equation, a + b s_d = R with R = -(s_d^2/omega^2) e^(s_d tau), for two real gains:
+b = Im R/Im s_d, a = Re R - b Re s_d. For e = 1 they are a = cos(omega tau), b = sin(omega tau)/omega, and the
+loop passes the force on at omega with neither delay nor gain: (a + j omega b) e^(-j omega tau) = 1.
+
+Nominal is that one, tau the delay of the force measurement and the lag of the motion simulator together: what
+the loop adds is undone, and the mechanism's own damping, of which the model has none, is left to act.
+"""
+
+import cmath
+import math
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from jaxhil.compensators.base import Compensator, Constants, Gain, Gains
+from jaxhil.compensators.estimates import (
+    CONTACT_FREQUENCY,
+    FORCE_DELAY,
+    SIMULATOR_LAG,
+    contact_frequency,
+    force_delay,
+    simulator_lag,
+)
+from jaxhil.compensators.phase_lead import (
+    LEAD_FILTER,
+    LeadFilter,
+    LeadState,
+    lead,
+    lead_amplification,
+)
+from jaxhil.errors import InputError
+from jaxhil.mechanism import Mechanism
+
+
+def pole_placement(frequency: float, delay: float, restitution: float) -> tuple[float, float]:
+    """Gains a [1] and b [s] that give a contact of angular frequency omega [rad/s] behind a delay tau [s] the
+    desired restitution [1]: see the module's text.
+
+    Raises InputError unless omega and e are above 0 and all are finite.
+    """
+    for name, value, least in (
+        ("frequency", frequency, 0.0),
+        ("delay", delay, -math.inf),
+        ("restitution", restitution, 0.0),
+    ):
+        if not least < value < math.inf:
+            raise InputError(f"pole_placement: {name}: found {value!r}, allowed finite numbers > {least!r}")
+    decrement = -math.log(restitution)
+    ratio = decrement / math.hypot(math.pi, decrement)
+    root = frequency * complex(-ratio, math.sqrt(1 - ratio**2))
+    wanted = -((root / frequency) ** 2) * cmath.exp(root * delay)
+    rate = wanted.imag / root.imag
+    return wanted.real - rate * root.real, rate
+
+
+def _nominal(mechanism: Mechanism) -> tuple[float, float]:
+    delay = force_delay(mechanism) + simulator_lag(mechanism)
+    return pole_placement(contact_frequency(mechanism), delay, 1.0)
+
+
+def multi_parameter_filter(gains: Gains, constants: Constants) -> LeadFilter:
+    """a + b s/(1 + T_2 s), T_2 = lead_filter, by Tustin's rule."""
+    period = constants.control_period
+    slow = 2 * gains["lead_filter"]
+    scale = 1 / (slow + period)
+    constant, rate = gains["force_gain"], 2 * gains["force_rate_gain"]
+    return LeadFilter(
+        (slow - period) * scale,
+        (constant * (slow + period) + rate) * scale,
+        (constant * (period - slow) - rate) * scale,
+    )
+
+
+class MultiParameterLead(Compensator):
+    """F_c = a F + b dF/dt, filtered."""
+
+    name: ClassVar[str] = "multi_parameter_lead"
+    knows: ClassVar[tuple[str, ...]] = (CONTACT_FREQUENCY, FORCE_DELAY, SIMULATOR_LAG)
+    # Beyond a quarter of an oscillation of delay a is negative, beyond half of one b is.
+    gains: ClassVar[tuple[Gain, ...]] = (
+        Gain(
+            name="force_gain",
+            unit="1",
+            lower=lambda mechanism: min(0.0, 2 * _nominal(mechanism)[0]),
+            upper=lambda mechanism: 2.0,
+            nominal=lambda mechanism: _nominal(mechanism)[0],
+            neutral=1.0,
+        ),
+        Gain(
+            name="force_rate_gain",
+            unit="s",
+            lower=lambda mechanism: min(0.0, 2 * _nominal(mechanism)[1]),
+            upper=lambda mechanism: 2 * max(0.0, _nominal(mechanism)[1]) + 0.02,
+            nominal=lambda mechanism: _nominal(mechanism)[1],
+            neutral=0.0,
+        ),
+        LEAD_FILTER,
+    )
+
+    def prepare(self, gains, constants):
+        return multi_parameter_filter(gains, constants)
+
+    def noise_amplification(self, gains, constants):
+        return lead_amplification(multi_parameter_filter(gains, constants))
+
+    def init(self, gains, constants, ring):
+        zeros = jnp.zeros_like(constants.control_period)
+        return LeadState(zeros, zeros)
+
+    def restart(self, gains, state, begins, fresh):
+        return LeadState(*(jnp.where(begins, 0, leaf) for leaf in state))
+
+    def step(self, prepared, state, signals, tick):
+        return lead(prepared, state, signals.force_measured)

@@ -1,0 +1,84 @@
+"""A contact that never ends: what the loop does to a spring and damper for as long as one likes.
+
+With both surfaces at x = 0 and tension allowed the contact never lets go, and its oscillation grows or decays
+as the dominant root of the loop's characteristic equation says.
+"""
+
+from collections.abc import Callable, Mapping
+from math import pi
+from typing import Any
+
+import jax
+import numpy as np
+from lanes import IDEAL, MASS, mechanism, per_lane, run_record, spread, validated
+
+from jaxhil.building import build_loop
+from jaxhil.mechanism import Mechanism
+from jaxhil.rollout import Tick
+
+OMEGA = 2 * pi * 3.0
+STIFFNESS = MASS * OMEGA**2
+
+
+def persistent(
+    parsed: Mechanism, compensator: str, seconds: float, gains: Mapping[str, Any], **leaves: Any
+) -> Tick:
+    """Record of an endless contact; `leaves` as for `spread`."""
+    lanes = next(iter(leaves.values())).shape[-1]
+    scenario = spread(parsed, lanes, clearance=np.zeros(lanes), **leaves)
+    loop = build_loop(parsed, compensator, scenario)
+    period = float(np.min(scenario.control_period))
+    ticks = run_record(loop, per_lane(gains, lanes), scenario, round(seconds / period))[1]
+    return jax.tree.map(np.asarray, ticks)
+
+
+def without_period(
+    compensator: str,
+    seconds: float,
+    gains: Mapping[str, Any],
+    periods: tuple[float, float] = (5e-4, 2.5e-4),
+    **leaves: Any,
+) -> np.ndarray:
+    """Growth in the limit T -> 0 of a loop whose error is of first order in T, from two periods, one half
+    of the other; `lead_filter` is half the period. Behind an ideal simulator."""
+    lanes = next(iter(leaves.values())).shape[-1]
+    period = np.repeat(periods, lanes)
+    both = {name: np.tile(value, 2) for name, value in leaves.items()}
+    gains = {name: np.tile(value, 2) for name, value in gains.items()} | {"lead_filter": period / 2}
+    ticks = persistent(spring(), compensator, seconds, gains, control_period=period, **both)
+    coarse, fine = growth(ticks).reshape(2, lanes)
+    return 2 * fine - coarse
+
+
+def growth(ticks: Tick) -> np.ndarray:
+    """Logarithm of the ratio of successive extrema of x_d, from the later half of a record."""
+    rates = []
+    for x in np.abs(ticks.signals.position_desired).T:
+        top = np.flatnonzero((x[1:-1] > x[:-2]) & (x[1:-1] >= x[2:])) + 1
+        bend = 2 * x[top] - x[top - 1] - x[top + 1]
+        heights = x[top] + (x[top + 1] - x[top - 1]) ** 2 / (8 * bend)
+        half = len(heights) // 2
+        rates.append(np.log(heights[-1] / heights[half]) / (len(heights) - 1 - half))
+    return np.array(rates)
+
+
+def spring(simulator: Mapping[str, Any] = IDEAL, period: float = 5e-4) -> Mechanism:
+    """An undamped contact of 3 Hz that never ends, behind a simulator, without delays."""
+    return validated(mechanism({"stiffness": [STIFFNESS], "tension": True}, simulator, 0.0, period=period))
+
+
+def characteristic_root(equation: Callable[[complex], complex], start: complex = 1j * OMEGA) -> complex:
+    """The root [1/s] of a loop's characteristic equation next to `start`, by the secant method."""
+    before, root = start * (1 + 1e-3), start
+    value_before = equation(before)
+    for _ in range(50):
+        value = equation(root)
+        if value == value_before:
+            break
+        before, root, value_before = root, root - value * (root - before) / (value - value_before), value
+    return root
+
+
+def decay(root: complex) -> float:
+    """Logarithm of the ratio of successive extrema of an oscillation of this root."""
+    return pi * root.real / abs(root.imag)

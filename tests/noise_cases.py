@@ -1,0 +1,53 @@
+"""What a law makes of white noise: its closed form against the rig's own controller, tick by tick."""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from lanes import QUICK
+
+from jaxhil.compensators import COMPENSATORS, Constants
+from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
+
+LONG = 4000  # ticks: every filter has died out
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICK)
+def _amplified(name, gains, period):
+    def value(gains):
+        return COMPENSATORS[name].noise_amplification(gains, Constants(period, jnp.asarray(jnp.inf)))
+
+    return value(gains), jax.jacfwd(value)(gains)
+
+
+def runtime_commands(name: str, gains: Mapping[str, float], forces: np.ndarray, period: float) -> np.ndarray:
+    """F_c [N] of the runtime for these force readings [N], out of contact."""
+    law = ON_THE_RIG[name](gains, period, np.inf)
+    return np.array([law.step(force, -1.0, 0.0, -1.0) for force in forces.tolist()])
+
+
+def check_amplification(name: str, cases: Sequence[Mapping[str, float]], period: float = 1e-3) -> None:
+    """`noise_amplification` of a law that filters the force alone is the root of the sum of the squares of
+    the runtime's answer to an impulse, and what noise through it deviates by; its derivatives are those of
+    differences."""
+    noise = np.random.default_rng(2).normal(size=60_000)
+    impulse = np.zeros(LONG)
+    impulse[0] = 1.0
+    for number, case in enumerate(cases):
+        arrays = {gain: jnp.asarray(value, float) for gain, value in case.items()}
+        ours, slopes = _amplified(name, arrays, jnp.asarray(period))
+        response = runtime_commands(name, case, impulse, period)
+        assert abs(response[-1]) < 1e-12
+        np.testing.assert_allclose(ours, np.sqrt(np.sum(response**2)), rtol=1e-10)
+        if number == 0:
+            made = runtime_commands(name, case, noise, period)
+            np.testing.assert_allclose(np.std(made), ours, rtol=0.02)
+        for gain, value in case.items():
+            step = 1e-5 * abs(value) or 1e-8
+            low, high = (
+                _amplified(name, {**arrays, gain: jnp.asarray(value + h)}, jnp.asarray(period))[0]
+                for h in (-step, step)
+            )
+            np.testing.assert_allclose(slopes[gain], (high - low) / (2 * step), rtol=1e-6, atol=1e-6)

@@ -1,0 +1,128 @@
+"""Adding a law takes a file each in JAX, Python and C, and one entry in the list of laws."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+FILES = {
+    "jaxhil/compensators/toy.py": '''
+"""A toy: F_c = F + toy_share (F - F of the tick before)."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from jaxhil.compensators.base import Compensator, Gain
+
+
+class Toy(Compensator):
+    """F_c = F + toy_share (F - F_before)."""
+
+    name: ClassVar[str] = "toy"
+    knows: ClassVar[tuple[str, ...]] = ()
+    gains: ClassVar[tuple[Gain, ...]] = (
+        Gain("toy_share", "1", lambda m: 0.0, lambda m: 4.0, lambda m: 1.0, neutral=0.0),
+    )
+
+    def init(self, gains, constants, ring):
+        return jnp.zeros_like(constants.control_period)
+
+    def restart(self, gains, state, begins, fresh):
+        return jnp.where(begins, 0, state)
+
+    def step(self, prepared, state, signals, tick):
+        force = signals.force_measured
+        return force + prepared["toy_share"] * (force - state), force
+
+    def noise_amplification(self, gains, constants):
+        share = gains["toy_share"]
+        return jnp.sqrt((1 + share) ** 2 + share**2)
+''',
+    "jaxhil/runtime/toy.py": '''
+"""A toy: F_c = F + toy_share (F - F of the tick before)."""
+
+from .registry import GainSpecification, register
+
+
+@register("toy")
+class Toy:
+    """F_c = F + toy_share (F - F_before)."""
+
+    gains = {"toy_share": GainSpecification("1")}
+    identified = (0.0, 0.0)
+
+    def __init__(self, gains, period, clearance):
+        self._share = gains["toy_share"]
+        self._before = 0.0
+
+    def step(self, force_measured, position_desired, velocity_desired, position_measured):
+        command = force_measured + self._share * (force_measured - self._before)
+        self._before = force_measured
+        return command
+
+    def position_command(self, position, velocity, acceleration):
+        return position
+
+    def reset(self):
+        self._before = 0.0
+
+    def next_contact(self):
+        self._before = 0.0
+''',
+}
+# What the law alone is in C: the rest is that of a law without a gain.
+IN_C = {
+    "char stateless; /* C has no empty structs */": "double share, before;",
+    "(void)gains;\n    law->stateless = 0;": "law->share = gains->toy_share;\n    law->before = 0.0;",
+    "(void)law, (void)position_desired": "(void)position_desired",
+    "return force_measured;": "const double command = force_measured + law->share * (force_measured - "
+    "law->before);\n    law->before = force_measured;\n    return command;",
+    "reset(jaxhil_law *law) {\n    (void)law;": "reset(jaxhil_law *law) {\n    law->before = 0.0;",
+    "next_contact(jaxhil_law *law) {\n    (void)law;": "next_contact(jaxhil_law *law) {\n"
+    "    law->before = 0.0;",
+}
+# Agreement with the runtime; export with the bundle's self-test, of its C, too; all of `test_compensators`.
+RUN = (
+    "test_compensators.py",
+    "test_agreement.py::test_random_ticks",
+    "test_export.py::test_every_compensator_that_can_be_tuned_can_be_exported",
+)
+
+
+@pytest.fixture
+def copied(tmp_path):
+    """The repository with a toy law in it."""
+    folder = tmp_path / "copy"
+    for part in ("jaxhil", "tuning", "tests"):
+        shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", folder)
+    for name, text in FILES.items():
+        (folder / name).write_text(text.lstrip())
+    text = (folder / "jaxhil/c99/none.c").read_text()
+    for before, after in IN_C.items():
+        assert text.count(before) == 1, before
+        text = text.replace(before, after)
+    (folder / "jaxhil/c99/toy.c").write_text(text)
+    laws = folder / "jaxhil/runtime/laws.py"
+    text, entries = re.subn(r'\n    "none",\n', r'\n    "none",\n    "toy",\n', laws.read_text())
+    assert entries == 1
+    laws.write_text(text)
+    return folder
+
+
+def test_a_law_of_three_files_and_one_entry_is_tested_and_exported(copied):
+    """By the tests named `...[toy...]`, in a process that sees the copy alone."""
+    command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "-k", "toy", *RUN]
+    environment = {**os.environ, "PYTHONPATH": str(copied), "JAXHIL_CACHE": str(copied / "cache")}
+    folder = copied / "tests"
+    ran = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    told = ran.stdout + ran.stderr
+    assert ran.returncode == 0, told
+    passed = int(re.search(r"(\d+) passed", told)[1])
+    assert passed >= 19 and "skipped" not in told, told
