@@ -1,7 +1,7 @@
 """What holds for every compensation law of the registry.
 
-Agreement with the runtime on random and recorded readings is in `test_agreement`, that of C with Python in
-`test_c99`, the bundle and its self-test in `test_export`: all of them go by the registry, too.
+Agreement with the runtime on many random and recorded readings is in `test_agreement`, that of C with Python
+in `test_c99`, the bundle and its self-test in `test_export`: all of them go by the registry, too.
 """
 
 import functools
@@ -90,11 +90,15 @@ def some_gains(name, shape=()):
 
 
 def on_the_rig(name, signals):
-    """The runtime's commands on readings of one lane, as one run."""
+    """The runtime's commands on readings of one lane."""
     gains = {gain: entry["value"] for gain, entry in GAINS[name].items()}
     controller = ON_THE_RIG[name](gains, PERIOD, GAP)
-    rows = zip(*(np.asarray(leaf).tolist() for leaf in signals[:4]), strict=True)
-    return np.array([controller.step(*row) for row in rows])
+    found = []
+    for *row, age in zip(*(np.asarray(leaf).tolist() for leaf in signals), strict=True):
+        if age == 0:
+            controller.next_contact()
+        found.append(controller.step(*row))
+    return np.array(found)
 
 
 def test_every_law_is_there_in_three_languages():
@@ -115,6 +119,17 @@ def test_nominal_gains_are_within_bounds_that_the_runtime_admits(name, hostile):
         assert all(ON_THE_RIG[name].gains[gain.name].admits(bound) for bound in (lower, nominal, upper))
         assert lower > 0 or not gain.logarithmic
         assert gain.neutral is None or lower <= gain.neutral <= upper
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_jax_and_runtime_agree_on_contacts_and_on_noise(name):
+    signals, constants = readings((), GAP)
+    rng = np.random.default_rng(1)
+    noise = Signals(*(leaf * rng.standard_normal(TICKS) for leaf in signals[:4]), signals.age)
+    for given in (signals, noise):
+        found = on_the_rig(name, given)
+        expected = commands(name, given, some_gains(name), constants)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11 * np.ptp(found))
 
 
 @pytest.mark.parametrize("name", WITH_GAINS)
