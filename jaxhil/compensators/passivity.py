@@ -8,8 +8,9 @@ between 0 and F however small v_d is, and at v_d = 0 nothing is to be corrected.
 the rig: but what a damped contact has truly dissipated is a reserve that later contacts of the run may spend.
 
 With M v' = -F_c over one period the model's kinetic energy rises by -T F_c v_d + (T F_c)^2/(2 M): the second
-term, the sampling's, is not observed. It lets a linear contact of frequency omega leave at up to about
-1 + pi omega T/4 of its approach speed.
+term, the sampling's, is not observed. With E back at 0 a contact leaves at
+sqrt(1 + sum (T F_c/(M v))^2) of its approach speed v: 1 + pi omega T/4 for the arc of a linear contact of
+frequency omega, somewhat more for a delayed one, which is longer.
 """
 
 from typing import ClassVar
