@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.reference import Reference, hunt_crossley, kelvin_voigt, piecewise_linear
 
@@ -20,7 +20,8 @@ class ContactParameters(NamedTuple):
     """What a law needs of one contact; a leading axis of contacts, where there is one, comes first.
 
     stiffness [N/m, or N/m^n for Hunt-Crossley; (segments, ...) for piecewise-linear], damping [N s/m,
-    or chi in s/m for Hunt-Crossley], exponent [1], depths [m, (segments - 1, ...)], tension [bool].
+    or chi in s/m for Hunt-Crossley], exponent [1], depths [m, (segments - 1, ...)], tension [bool]; of
+    `jaxhil.contact_mixture` the law's number, else None.
     """
 
     stiffness: Float[Array, "..."]
@@ -28,6 +29,7 @@ class ContactParameters(NamedTuple):
     exponent: Float[Array, "..."]
     depths: Float[Array, "..."]
     tension: Bool[Array, "..."]
+    kind: Int[Array, "..."] | None = None
 
 
 class ContactLaw(eqx.Module):

@@ -20,6 +20,7 @@ from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import quasi_random
 from tuning.box import Bounds, to_gains
+from tuning.forms import Form
 
 # In training a contact that takes longer than this many times its undelayed duration, and so many
 # seconds more, has failed.
@@ -31,13 +32,15 @@ SCENARIOS, NOISY_SCENARIOS = 32, 128  # to tune on, without and with sensor nois
 
 @dataclass(frozen=True)
 class Task:
-    """A mechanism to tune: the compensator's literature gains, the scenarios to tune on and their loop."""
+    """A mechanism to tune: the compensator's literature gains, the scenarios to tune on and their loop; the
+    form that scenarios and loop are brought to, if it shares a program with unlike mechanisms."""
 
     mechanism: Mechanism
     compensator: str
     literature: dict[str, float]
     scenarios: Scenario
     loop: Loop
+    form: Form | None = None
 
     @property
     def tuned(self) -> tuple[Gain, ...]:
@@ -45,7 +48,9 @@ class Task:
         return tuple(gain for gain in COMPENSATORS[self.compensator].gains if gain.tuned(self.mechanism))
 
 
-def build_task(mechanism: Mechanism, compensator: str, scenarios: int | None, seed: int) -> Task:
+def build_task(
+    mechanism: Mechanism, compensator: str, scenarios: int | None, seed: int, form: Form | None = None
+) -> Task:
     """Training scenarios are quasi-random: they fill the range evenly. Their contacts must end in time.
 
     Each comes with a realisation of the sensors' noise of its own. Gains can be fitted to a few of them, so
@@ -54,8 +59,10 @@ def build_task(mechanism: Mechanism, compensator: str, scenarios: int | None, se
     number = scenarios or (NOISY_SCENARIOS if has_sensor_noise(mechanism) else SCENARIOS)
     batch = build_scenarios(mechanism, quasi_random(mechanism, number, seed), seed)
     loop = build_loop(mechanism, compensator, batch)
+    if form is not None:
+        batch, loop = form.scenarios(mechanism, batch), form.loop(loop)
     batch = batch._replace(time_limit=np.asarray(_patience(loop.law, batch)))
-    return Task(mechanism, compensator, literature_gains(mechanism, compensator), batch, loop)
+    return Task(mechanism, compensator, literature_gains(mechanism, compensator), batch, loop, form)
 
 
 def has_sensor_noise(mechanism: Mechanism) -> bool:

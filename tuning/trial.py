@@ -39,9 +39,15 @@ class Trial:
         for task in tasks:
             drawn = draw(task.mechanism, validation, seed)
             self.fresh.append(build_scenarios(task.mechanism, drawn, seed))
-            every.append(_join([self.fresh[-1], build_scenarios(task.mechanism)]))
-            both = _join([every[-1], task.scenarios])
-            loops.append(build_loop(task.mechanism, task.compensator, both, chatter=True))
+            own = _join([self.fresh[-1], build_scenarios(task.mechanism)])
+            if task.form is None:
+                both = _join([own, task.scenarios])
+                loop = build_loop(task.mechanism, task.compensator, both, chatter=True)
+            else:
+                loop = task.form.loop(build_loop(task.mechanism, task.compensator, own, chatter=True))
+                own = task.form.scenarios(task.mechanism, own)
+            every.append(own)
+            loops.append(loop)
         self.loop: Loop = common_loop(loops)
         self.names = tuned_names(tasks)
         self.bounds: list[Bounds] = [gain_bounds(task, self.names) for task in tasks]

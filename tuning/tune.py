@@ -14,6 +14,7 @@ from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario
 from tuning.certificate import Certified, certified
 from tuning.finding import Found, find
+from tuning.forms import Form
 from tuning.objective import RMS, SCALE, Objective
 from tuning.problems import Task, alike, build_task
 from tuning.rounds import Start
@@ -109,14 +110,15 @@ def tune_all(
     settings: Settings,
     report: Callable[[str], None] = lambda text: None,
     tuned: Sequence[Tuned] = (),
+    form: Form | None = None,
 ) -> Iterator[tuple[int, Result]]:
     """(index, result) of every mechanism, as they are done: like ones together, in one program.
 
     The gains of the nearest of those `tuned` before, with the same compensator, are a start for each, and so
     are those of the nearest that an earlier block found: in the places of the last other starts, never of the
-    literature's.
+    literature's. Unlike mechanisms of one `form` are tuned together in it.
     """
-    tasks = [build_task(m, compensator, settings.scenarios, settings.seed) for m in mechanisms]
+    tasks = [build_task(m, compensator, settings.scenarios, settings.seed, form) for m in mechanisms]
     found: list[Tuned] = []
     for group in alike([task.loop for task in tasks], [task.scenarios for task in tasks]):
         for begin in range(0, len(group), BLOCK):

@@ -58,15 +58,15 @@ def in_space(
     def each(parameters, mass, velocity, size, centre):
         """Lane by lane, `LANES` at a time."""
         leaves = parameters, mass, velocity, size, centre
-        flat = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-2], -1), leaves)
-        lanes = flat[1].shape[-1]
+        lanes = mass.size
+        flat = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-2], lanes), leaves)
         parts = []
         for begin in range(0, lanes, LANES):
             some = np.minimum(np.arange(begin, begin + LANES), lanes - 1)
             part = _move(law, *jax.tree.map(lambda leaf, some=some: leaf[..., some], flat))
             parts.append(jax.tree.map(lambda leaf, lanes=lanes - begin: leaf[..., :lanes], jax.device_get(part)))
         joined = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *parts)
-        return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], -1, number), joined)
+        return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], lanes // number, number), joined)
 
     entered = np.asarray(velocity[:contacts])
     none = np.zeros_like(entered)
