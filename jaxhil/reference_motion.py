@@ -22,7 +22,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 if TYPE_CHECKING:
-    from jaxhil.contact import ContactLaw, ContactParameters
+    from jaxhil.contacts.base import ContactLaw, ContactParameters
 
 TOLERANCE = 1e-10  # of a step, against approach velocity and deepest penetration
 FIRST_STEP = 1e-4  # s, tried first

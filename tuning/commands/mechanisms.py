@@ -48,7 +48,7 @@ def _entry(name: str, mechanism: Mechanism) -> dict[str, Any]:
 
 def _frequencies(mechanism: Mechanism) -> list[float]:
     """sqrt(k/M)/(2 pi) [Hz] of every stiffness in the file, each once; none for a power law."""
-    if mechanism.contact.law == "hunt_crossley":
+    if mechanism.contact.law in ("hunt_crossley", "depth_damped"):
         return []
     stiffness: list[float] = []
     for entry in mechanism.contact.stiffness:
