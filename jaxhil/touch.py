@@ -60,22 +60,15 @@ class Surfaces(NamedTuple):
             self.law, self.parameters, self.state, motion.position, motion.velocity, self.clearance
         )
 
-    def after(self, start: Motion, end: Motion, duration: Array) -> "Surfaces":
-        """The same after a smooth stretch of motion from `start` to `end`, of a `duration` [s]."""
+    def after(self, start: Motion, end: Motion, duration: Array, s: Any = 1) -> "Surfaces":
+        """The same at the fraction s of a smooth stretch of motion of a `duration` [s]; these are those at its
+        start."""
         if not self.law.remembers:
             return self
         side, surface = self.side(start, end)
-        # On the stretch's cubic, where it turns round, if it does.
-        inward, outward = side * start.velocity, side * end.velocity
-        turns = (inward > 0) & (outward < 0)
-        s = jnp.where(turns, inward / jnp.where(turns, inward - outward, 1), 0)
-        for _ in range(ROOT_STEPS):
-            rate, slope = jax.jvp(
-                lambda s: side * along(start, end, duration, s).velocity, (s,), (jnp.ones_like(s),)
-            )
-            s = jnp.where(turns & (slope < 0), jnp.clip(s - rate / jnp.where(slope < 0, slope, -1), 0, 1), s)
+        turn = jnp.minimum(_turn(start, end, duration, side), s)
         state = self.state
-        for motion in (along(start, end, duration, s), end):
+        for motion in (along(start, end, duration, turn), along(start, end, duration, s)):
             depth = side * (motion.position - surface)
             _, state = self.law.step(self.parameters, state, depth, side * motion.velocity)
         return self._replace(state=state)
@@ -150,7 +143,7 @@ def crest(surfaces: Surfaces, start: Motion, end: Motion, duration: Array) -> Fl
     """Largest |force| [N] within a panel: at an end, or near the vertex of a parabola through its middle."""
 
     def magnitude(motion, s):
-        return jnp.abs(surfaces.after(start, motion, s * duration).force(motion)[0])
+        return jnp.abs(surfaces.after(start, end, duration, s).force(motion)[0])
 
     first, last = magnitude(start, 0), magnitude(end, 1)
     half = magnitude(along(start, end, duration, 0.5), 0.5)
@@ -199,10 +192,22 @@ def along(start: Motion, end: Motion, duration: Array, s: Any) -> Motion:
     return Motion(position, jnp.where(duration > 0, velocity / safe, start.velocity))
 
 
+def _turn(start, end, duration, side):
+    """The fraction of a stretch at which it turns round on its way in; 1 where it does not."""
+    first, last = side * start.velocity, side * end.velocity
+    turns = (first > 0) & (last < 0)
+    # The velocity first + slope s + bend s^2 of the stretch's cubic, times the duration.
+    moved = side * (end.position - start.position)
+    first, last = first * duration, last * duration
+    slope, bend = 6 * moved - 4 * first - 2 * last, 3 * (first + last - 2 * moved)
+    square = jnp.where(turns, slope**2 - 4 * bend * first, 1)
+    return jnp.where(turns, 2 * first / jnp.where(turns, jnp.sqrt(square) - slope, 1), 1)
+
+
 def _force_along(surfaces, start, end, duration, s):
     """Motion at the fraction s of a stretch, and the force there [N]; `surfaces` are those at its start."""
     motion = along(start, end, duration, s)
-    force, _ = surfaces.after(start, motion, s * duration).force(motion)
+    force, _ = surfaces.after(start, end, duration, s).force(motion)
     return motion, force
 
 
@@ -226,7 +231,7 @@ def _contact(surfaces, start, end, duration):
 
     def hold(s):
         motion = along(start, end, duration, s)
-        state = surfaces.after(start, motion, s * duration).state
+        state = surfaces.after(start, end, duration, s).state
         return surfaces.law.hold(surfaces.parameters, state, depth(s), side * motion.velocity)
 
     enters, leaves = _crossing(depth, duration)
