@@ -201,7 +201,9 @@ CASES: dict[str, Case] = {
         mechanism({**LAYERS, "damping": [400.0]}, TRANSFER, command_hold="zoh"), "response_error"
     ),
     "hardening": Case(mechanism(HARDENING, contacts=2), "phase_lead"),
-    "damped hardening": Case(mechanism({**HARDENING, "damping": [700.0]}, **LAGGED), "phase_lead"),
+    "damped hardening": Case(
+        mechanism({**HARDENING, "stiffness": [0.3 * STIFFNESS], "damping": [700.0]}, **LAGGED), "phase_lead"
+    ),
     "depth-damped": Case(mechanism({**DEPTH_DAMPED, "damping": [900.0]}, contacts=2), "phase_lead"),
     "depth-damped, linear spring, lag": Case(
         mechanism(

@@ -1,4 +1,4 @@
-"""The motion in space by integration: closed forms, order of convergence, pushes, trajectories, derivatives."""
+"""The motion in space by integration: closed forms, order of convergence, pushes, paths, derivatives."""
 
 import jax
 import jax.numpy as jnp
@@ -66,7 +66,7 @@ def test_closed_forms(case):
 
 @pytest.mark.parametrize("case", CASES)
 def test_error_falls_with_the_tolerance(case):
-    """A step of order 5 whose error is E has a length of E^(1/5): the sum of their errors falls as E^(4/5)."""
+    """A step of order 5 whose error is E is as long as E^(1/5): the sum of their errors falls as E^(4/5)."""
     tolerances = np.array([1e-5, 1e-7, 1e-9, 1e-11])
     errors = []
     for tolerance in tolerances:
@@ -156,7 +156,7 @@ def test_trajectory_of_linear_contact():
 # Of each quantity over itself, by stiffness, damping (of a tenth of the critical one), mass and velocity.
 @pytest.mark.parametrize("case, tolerance", [("kelvin_voigt", 1e-6), ("piecewise_linear", 1e-3)])
 def test_derivatives_of_the_closed_forms(case, tolerance):
-    """Where a step has a kink inside, its derivative is that of a force a little off: short as the step is."""
+    """Where a step has a kink inside, its derivative is that of a force a bit off: short as it is."""
     name, values = CASES[case]
     law, parameters = LAWS[name](), contact(**values)
     mass, velocity = (jnp.full((LANES,), value) for value in (MASS, VELOCITY))

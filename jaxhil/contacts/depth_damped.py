@@ -28,11 +28,11 @@ class DepthDamped(ContactLaw):
         return jnp.zeros_like(rate)
 
     def hold(self, parameters, state, penetration, rate):
-        """F/d, odd in the depth."""
-        size = jnp.abs(penetration)
-        power = jnp.where(size > 0, size, 1) ** (parameters.exponent - 1)
-        spring = parameters.stiffness * jnp.sign(penetration) * jnp.where(size > 0, power, 0)
-        return spring + parameters.damping * rate / parameters.reference_depth
+        """F/d; outside, its damping's part alone, but for a linear spring, which has no end there."""
+        touching = penetration > 0
+        power = jnp.where(touching, penetration, 1) ** (parameters.exponent - 1)
+        power = jnp.where(touching | (parameters.exponent == 1), power, 0)
+        return parameters.stiffness * power + parameters.damping * rate / parameters.reference_depth
 
     def reference(self, parameters, mass, velocity):
         return Reference(*integrate_contact(self, parameters, mass, velocity)[:3])

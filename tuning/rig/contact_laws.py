@@ -3,7 +3,6 @@
 For loops that run tick by tick in real time; `jaxhil.contact` has the same laws for batches.
 """
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -99,9 +98,8 @@ def _depth_damped(stiffness: float, damping: float, exponent: float, reference_d
     """F = k d^n + b d' d/d_0 >= 0."""
 
     def hold(depth: float, rate: float) -> float:
-        """F/d, odd in the depth."""
-        spring = math.copysign(stiffness * abs(depth) ** (exponent - 1.0), depth) if depth else 0.0
-        return spring + damping * rate / reference_depth
+        """F/d; outside, its damping's part alone, but for a linear spring, which has no end there."""
+        return stiffness * max(depth, 0.0) ** (exponent - 1.0) + damping * rate / reference_depth
 
     def force(depth: float, rate: float) -> float:
         value = stiffness * depth**exponent + damping * rate * (depth / reference_depth)
