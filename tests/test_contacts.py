@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from lanes import IDEAL, MASS, QUICK, VELOCITY, first_contact, grid, join, mechanism, spread, validated
+from lanes import IDEAL, MASS, QUICK, VELOCITY, first_contact, grid, mechanism, spread, validated
 
 from jaxhil.contact import LAWS, ContactParameters
 from jaxhil.reference import hunt_crossley
@@ -131,7 +131,7 @@ def limit(name):
     return continuous.contact(MASS, VELOCITY, laws[values["law"]])
 
 
-@pytest.mark.parametrize("name, order", zip(LAWS_ALONE, [2, 1, 2, 2], strict=True))
+@pytest.mark.parametrize("name, order", list(zip(LAWS_ALONE, [2, 1, 1, 2], strict=True)))
 def test_contact_without_delay_converges_to_the_reference(name, order):
     """Restitution to that of SciPy's or the closed form, which is also the law's own; W_out/W_in to e^2."""
     expected, expected_peak = limit(name)
@@ -147,11 +147,7 @@ def test_contact_without_delay_converges_to_the_reference(name, order):
     assert found["peak_force"][-16:] == pytest.approx(expected_peak, rel=1e-3)
     balance = found["work_out"] / found["work_in"] - found["restitution"] ** 2
     assert np.abs(balance[-16:]).max() < (5e-4 if order == 2 else 2e-3)
-    values = join([spread(parsed, LANES)]).contact
-    one = jax.tree.map(lambda leaf: leaf[0], values._replace(depths=values.depths[:, 0]))
-    one = one._replace(depths=jnp.zeros((0, LANES)))
-    own = jax.jit(LAWS[parsed.contact.law]().reference, compiler_options=QUICK)(
-        one, jnp.full((LANES,), MASS), jnp.full((LANES,), VELOCITY)
-    )
+    values = {key: np.squeeze(value) for key, value in LAWS_ALONE[name].items() if key != "law"}
+    own = reference(parsed.contact.law, **values)
     np.testing.assert_allclose(own.restitution, expected, rtol=0, atol=2e-8)
     np.testing.assert_allclose(own.peak_force, expected_peak, rtol=1e-4)
