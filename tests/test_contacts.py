@@ -1,4 +1,4 @@
-"""Contact laws whose reference is integrated or which remember: closed forms, SciPy, energies, derivatives."""
+"""Contact laws whose reference is integrated or which remember: closed forms, SciPy, works, derivatives."""
 
 import continuous
 import jax
@@ -150,4 +150,5 @@ def test_contact_without_delay_converges_to_the_reference(name, order):
     values = {key: np.squeeze(value) for key, value in LAWS_ALONE[name].items() if key != "law"}
     own = reference(parsed.contact.law, **values)
     np.testing.assert_allclose(own.restitution, expected, rtol=0, atol=2e-8)
-    np.testing.assert_allclose(own.peak_force, expected_peak, rtol=1e-4)
+    # SciPy's is the largest of samples a millisecond apart.
+    np.testing.assert_allclose(own.peak_force, expected_peak, rtol=2e-4)
