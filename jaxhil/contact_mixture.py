@@ -24,6 +24,10 @@ class AnyOf(ContactLaw):
 
     laws: tuple[ContactLaw, ...] = eqx.field(static=True)
 
+    @property
+    def remembers(self):
+        return any(law.remembers for law in self.laws)
+
     def init(self, penetration):
         return tuple(law.init(penetration) for law in self.laws)
 

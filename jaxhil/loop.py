@@ -100,7 +100,7 @@ class Loop(eqx.Module):
     @property
     def follows_panels(self) -> bool:
         """Whether the motion is needed between samples."""
-        return self.has_lag or self.has_corners or self.energies
+        return self.has_lag or self.has_corners or self.energies or self.law.remembers
 
 
 class Rig(NamedTuple):
@@ -263,12 +263,17 @@ def drive(
         panels = write_in_turn(panels, tick, panel)
         panel = _arrived(rig, panels, tick, tick - state.entry_tick)
     surfaces = Surfaces(loop.law, state.parameters, state.law, scenario.clearance)
-    real, law = surfaces.force(panel.sample)
+    until = rig.delays.force.fraction * period
+    if loop.law.remembers:
+        dented = surfaces.after(panel.start, panel.sample, until)
+        real, _ = dented.force(panel.sample)
+        law = dented.after(panel.sample, panel.end, period - until).state
+    else:
+        real, law = surfaces.force(panel.sample)
     now, lagged, reading = sensed.last, sensed.lagged, None
     if loop.is_two_sided or loop.energies:
         now = surfaces.touch(panel.sample, real)
     if loop.has_lag:
-        until = rig.delays.force.fraction * period
         time_constant = scenario.force_sensor.time_constant
         reading, lagged = sensed_lag(surfaces, lagged, panel, until, period, time_constant)
     touched = state.touched

@@ -40,7 +40,15 @@ __all__ = [
 SCHEMA = "jaxhil/mechanism/1"
 MAX_CONTACTS = 1000
 
-Law = Literal["linear", "kelvin_voigt", "hunt_crossley", "piecewise_linear"]
+Law = Literal[
+    "linear",
+    "kelvin_voigt",
+    "hunt_crossley",
+    "piecewise_linear",
+    "hardening",
+    "depth_damped",
+    "elastoplastic",
+]
 SimulatorModel = Literal["ideal", "first_order", "second_order", "third_order", "transfer_function"]
 Integrator = Literal["semi_implicit_euler", "zoh", "explicit_euler"]
 CommandHold = Literal["linear", "zoh"]
@@ -89,9 +97,10 @@ class Approach(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 class Contact(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The contact law and its parameters, one entry per successive contact; the last repeats.
 
-    `stiffness` in N/m (N/m^exponent for hunt_crossley); for piecewise_linear one list of slopes per
-    contact, one slope more than there are `depths` [m]. `damping` in N s/m (s/m for hunt_crossley).
-    `clearance` [m] between two surfaces; infinite when there is one surface.
+    `stiffness` in N/m (N/m^exponent for hunt_crossley and depth_damped); for piecewise_linear one list of
+    slopes per contact, one slope more than there are `depths` [m]. `damping` in N s/m (s/m for
+    hunt_crossley; none for elastoplastic). `clearance` [m] between two surfaces; infinite when there is one
+    surface. `reference_depth` [m] of hardening and depth_damped, `unloading_ratio` [1] of elastoplastic.
     """
 
     law: Law
@@ -103,6 +112,8 @@ class Contact(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     clearance: PositiveOrInfinite = math.inf
     exponent: Annotated[float, Meta(ge=1.0)] = 1.5
     depths: Annotated[list[Positive], Meta(max_length=20)] = field(default_factory=list)
+    reference_depth: Positive | None = None
+    unloading_ratio: Annotated[float, Meta(ge=1.0)] | None = None
 
 
 class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -1,6 +1,6 @@
 """Reading a mechanism file: bytes, TOML, overrides, validation.
 
-`load` turns a file (or the name of a built-in one) and the ``PATH=VALUE`` overrides of ``--set``
+`load` turns a file (or the name of a built-in one or suite) and the ``PATH=VALUE`` overrides of ``--set``
 into a validated `Mechanism`. Whatever is wrong with them raises `InputError` with one line.
 """
 
@@ -29,12 +29,15 @@ __all__ = [
     "builtin_path",
     "from_builtins",
     "load",
+    "suite_names",
     "to_builtins",
 ]
 
 DEFAULT = "varying"
 MAX_BYTES = 1 << 20
 MAX_KEY_PARTS = 64
+
+SUITE = "suite-"  # begins the names of the standard suites
 
 _FOLDER = Path(__file__).parent / "mechanisms"
 # The pieces of a TOML text that matter for where a dotted key begins and ends. An unclosed string
@@ -65,7 +68,7 @@ def load(path_or_name: str | Path | None = None, overrides: Sequence[str] = ()) 
     Raises `InputError`, one line, for whatever is wrong.
     """
     name = DEFAULT if path_or_name is None else path_or_name
-    if isinstance(name, str) and name in builtin_names():
+    if isinstance(name, str) and name in (*builtin_names(), *suite_names()):
         path, label = builtin_path(name), name
     else:
         path, label = Path(name), one_line(str(name)) or "''"
@@ -92,13 +95,19 @@ def to_builtins(mechanism: Mechanism) -> dict[str, Any]:
 
 
 def builtin_names() -> list[str]:
-    """The names of the built-in mechanism files."""
-    return sorted(path.stem for path in _FOLDER.glob("*.toml"))
+    """The names of the built-in mechanism files, the standard suites apart."""
+    return [name for name in _names() if not name.startswith(SUITE)]
+
+
+def suite_names() -> list[str]:
+    """The names of the standard suites: built-in mechanism files on which compensators are compared, each
+    with one difficulty, drawn from the same rig."""
+    return [name for name in _names() if name.startswith(SUITE)]
 
 
 def builtin_path(name: str) -> Path:
-    """The file of a built-in mechanism. Raises `InputError` for an unknown name."""
-    names = builtin_names()
+    """The file of a built-in mechanism or suite. Raises `InputError` for an unknown name."""
+    names = [*builtin_names(), *suite_names()]
     if name not in names:
         raise InputError(
             f"{one_line(name)}: found no built-in mechanism of this name, "
@@ -107,13 +116,17 @@ def builtin_path(name: str) -> Path:
     return _FOLDER / f"{name}.toml"
 
 
+def _names() -> list[str]:
+    return sorted(path.stem for path in _FOLDER.glob("*.toml"))
+
+
 def _read(path: Path, label: str) -> bytes:
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
         names = builtin_names()
-        hint = close_match(label, names) or f" (built-in: {', '.join(names)})"
+        hint = close_match(label, [*names, *suite_names()]) or f" (built-in: {', '.join(names)})"
         raise InputError(f"{label}: found no such file, allowed a mechanism file{hint}") from None
     except IsADirectoryError:
         raise InputError(f"{label}: found a directory, allowed a mechanism file") from None

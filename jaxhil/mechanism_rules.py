@@ -2,7 +2,8 @@
 
 Each rule raises a `KeyProblem` that names the key to change. Types and single ranges are checked
 before, in `jaxhil.mechanism_types`. A key that the chosen law or model does not use need not fit
-any rule, so that one file serves a study over laws and models.
+any rule, so that one file serves a study over laws and models; but for `reference_depth` and
+`unloading_ratio`, which say nothing beside another law.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ _NEEDED = {
     "third_order": ("coefficients",),
     "transfer_function": ("numerator", "denominator"),
 }
+# Keys of some contact laws alone.
+_LAWS_OF = {"reference_depth": ("hardening", "depth_damped"), "unloading_ratio": ("elastoplastic",)}
 _Span = tuple[np.ndarray, np.ndarray]
 _FIXED = ("rig.simulator.numerator", "rig.simulator.denominator")
 
@@ -36,6 +39,7 @@ def check(mechanism: Mechanism) -> None:
     _check_texts(mechanism)
     _check_bodies(mechanism)
     _check_contact(mechanism.contact)
+    _check_dissipation(mechanism)
     _check_simulator(mechanism.rig.simulator)
     _check_hold(mechanism)
     spans = {
@@ -107,6 +111,25 @@ def _check_contact(contact: Contact) -> None:
             raise KeyProblem(path, shown(entry), f"a number > 0 (law {contact.law})")
 
 
+def _check_dissipation(mechanism: Mechanism) -> None:
+    contact = mechanism.contact
+    for key, laws in _LAWS_OF.items():
+        value = getattr(contact, key)
+        if contact.law in laws and value is None:
+            allowed = f"{numeric_keys()[f'contact.{key}']} (law {contact.law} needs it)"
+            raise KeyProblem(("contact", key), "nothing", allowed)
+        if contact.law not in laws and value is not None:
+            raise KeyProblem(("contact", key), shown(value), f"nothing (only for law {' or '.join(laws)})")
+    if contact.law == "elastoplastic" and _is_damped(mechanism):
+        damping = shown(contact.damping) if any(contact.damping) else "an uncertain damping"
+        raise KeyProblem(("contact", "damping"), damping, "0 (law elastoplastic dissipates by yielding)")
+
+
+def _is_damped(mechanism: Mechanism) -> bool:
+    uncertain = mechanism.uncertainty.get("contact.damping")
+    return any(mechanism.contact.damping) or (uncertain is not None and uncertain.factor is None)
+
+
 def _check_simulator(simulator: Simulator) -> None:
     path = ("rig", "simulator")
     for key in _NEEDED[simulator.model]:
@@ -143,8 +166,7 @@ def _check_transfer_function(numerator: list[float], denominator: list[float]) -
 def _check_hold(mechanism: Mechanism) -> None:
     # The ideal simulator jumps between ticks and rests otherwise: damping would see no velocity.
     rig, contact = mechanism.rig, mechanism.contact
-    uncertain = mechanism.uncertainty.get("contact.damping")
-    damped = any(contact.damping) or (uncertain is not None and uncertain.factor is None)
+    damped = _is_damped(mechanism)
     if rig.simulator.model == "ideal" and rig.command_hold == "zoh" and damped and contact.law != "linear":
         allowed = '"linear" for an ideal simulator with contact damping (or another model)'
         raise KeyProblem(("rig", "command_hold"), shown(rig.command_hold), allowed)

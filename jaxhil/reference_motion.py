@@ -22,7 +22,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 if TYPE_CHECKING:
-    from jaxhil.contact import ContactLaw, ContactParameters
+    from jaxhil.contacts.base import ContactLaw, ContactParameters
 
 TOLERANCE = 1e-10  # of a step, against approach velocity and deepest penetration
 FIRST_STEP = 1e-4  # s, tried first
@@ -50,7 +50,7 @@ class ReferenceMotion(NamedTuple):
 
     `restitution` is the speed |d'| after contact and push are over / v, `peak_force` [N] the largest contact
     force (without the push), `duration` [s] the time from first touch to separation (infinite if there is
-    none within 10 s; `restitution` is then that of the speed by that time). `position` [m] and `velocity`
+    none within 10 s, or they come to rest; `restitution` is then that of the speed by that time). `position` [m] and `velocity`
     [m/s], (samples, *batch), belong to the times asked for, else are None.
     """
 
@@ -94,10 +94,12 @@ def integrate_contact(
     position = rate = None
     if nodes is not None:
         position, rate = _at_times(nodes, end, velocity, times)
+    # What comes to rest at the surface crosses it by rounding alone.
+    moving = jnp.abs(end.velocity) > tolerance * velocity
     return ReferenceMotion(
         restitution=jnp.abs(end.velocity) / velocity,
         peak_force=end.peak,
-        duration=jnp.where(end.phase >= FREE, end.separated, jnp.inf),
+        duration=jnp.where((end.phase >= FREE) & moving, end.separated, jnp.inf),
         position=position,
         velocity=rate,
     )
@@ -167,7 +169,8 @@ def _event(problem, state, time, depth, rate):
     # Both of order 1, or the root of their lesser one would be hard to find.
     hold = hold / jnp.where(state.grip > 0, state.grip, 1)
     share = depth / jnp.where(state.deepest > 0, state.deepest, 1)
-    event = jnp.where(state.phase == INWARD, rate, jnp.where(hold < share, hold, share))
+    parting = jnp.where(hold < share, hold, share)
+    event = jnp.where(state.phase == INWARD, rate, parting)
     return jnp.where(state.phase == FREE, problem.until - time, event)
 
 

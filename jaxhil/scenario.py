@@ -128,6 +128,8 @@ def build_scenarios(
             exponent=every(scalar("contact.exponent", contact.exponent)),
             depths=every(table("contact.depths", contact.depths)),
             tension=every(np.full(number, contact.tension and contact.law == "kelvin_voigt")),
+            reference_depth=every(scalar("contact.reference_depth", contact.reference_depth or 1.0)),
+            unloading_ratio=every(scalar("contact.unloading_ratio", contact.unloading_ratio or 1.0)),
         ),
         control_period=scalar("rig.control_period", rig.control_period),
         simulator=simulator,

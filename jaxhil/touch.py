@@ -60,6 +60,25 @@ class Surfaces(NamedTuple):
             self.law, self.parameters, self.state, motion.position, motion.velocity, self.clearance
         )
 
+    def after(self, start: Motion, end: Motion, duration: Array, s: Any = 1) -> "Surfaces":
+        """The same at the fraction s of a smooth stretch of motion of a `duration` [s]; these are those at its
+        start."""
+        if not self.law.remembers:
+            return self
+        side, surface = self.side(start, end)
+        turn = jnp.minimum(_turn(start, end, duration, side), s)
+        state = self.state
+        for motion in (along(start, end, duration, turn), along(start, end, duration, s)):
+            depth = side * (motion.position - surface)
+            _, state = self.law.step(self.parameters, state, depth, side * motion.velocity)
+        return self._replace(state=state)
+
+    def side(self, start: Motion, end: Motion) -> tuple[Array, Array]:
+        """Side (1, -1, or 0 for none) and position [m] of the surface that a stretch touches."""
+        signed = deflection(start.position, self.clearance)
+        side = jnp.sign(jnp.where(signed == 0, deflection(end.position, self.clearance), signed))
+        return side, jnp.where(side < 0, -self.clearance, 0)
+
     def touch(self, motion: Motion, force: Array) -> "Touch":
         """A sample of the contact, whose force is known."""
         far = -self.clearance - motion.position
@@ -112,8 +131,7 @@ def works_along(surfaces: Surfaces, start: Motion, end: Motion, duration: Array)
     done = returned = jnp.zeros_like(duration)
     for a, b in ((contact.first, turn), (turn, contact.last)):
         for node, weight in GAUSS:
-            motion = along(start, end, duration, a + (b - a) * node)
-            force, _ = surfaces.force(motion)
+            motion, force = _force_along(surfaces, start, end, duration, a + (b - a) * node)
             work = force * motion.velocity * (weight * (b - a) * duration)
             deeper = contact.side * motion.velocity > 0
             done = done + jnp.where(deeper, work, 0)
@@ -124,14 +142,14 @@ def works_along(surfaces: Surfaces, start: Motion, end: Motion, duration: Array)
 def crest(surfaces: Surfaces, start: Motion, end: Motion, duration: Array) -> Float[Array, "*batch"]:
     """Largest |force| [N] within a panel: at an end, or near the vertex of a parabola through its middle."""
 
-    def magnitude(motion):
-        return jnp.abs(surfaces.force(motion)[0])
+    def magnitude(motion, s):
+        return jnp.abs(surfaces.after(start, end, duration, s).force(motion)[0])
 
-    first, last = magnitude(start), magnitude(end)
-    half = magnitude(along(start, end, duration, 0.5))
+    first, last = magnitude(start, 0), magnitude(end, 1)
+    half = magnitude(along(start, end, duration, 0.5), 0.5)
     slope, bend = last - first, first + last - 2 * half
     vertex = jnp.clip(0.5 - slope / (4 * jnp.where(bend < 0, bend, -1)), 0, 1)
-    top = magnitude(along(start, end, duration, vertex))
+    top = magnitude(along(start, end, duration, vertex), vertex)
     highest = jnp.where(first > last, first, last)
     return jnp.where((bend < 0) & (top > highest), top, highest)
 
@@ -150,7 +168,8 @@ def sensed_lag(
     def follow(reading, panel):
         sample = _lag_along(surfaces, reading, panel.start, panel.sample, until, time_constant)
         rest = duration - until
-        return sample, _lag_along(surfaces, sample, panel.sample, panel.end, rest, time_constant)
+        dented = surfaces.after(panel.start, panel.sample, until)
+        return sample, _lag_along(dented, sample, panel.sample, panel.end, rest, time_constant)
 
     def fade(reading, panel):
         # In the same steps as `follow`: to the bit, no lane depends on whether others touch.
@@ -173,6 +192,25 @@ def along(start: Motion, end: Motion, duration: Array, s: Any) -> Motion:
     return Motion(position, jnp.where(duration > 0, velocity / safe, start.velocity))
 
 
+def _turn(start, end, duration, side):
+    """The fraction of a stretch at which it turns round on its way in; 1 where it does not."""
+    first, last = side * start.velocity, side * end.velocity
+    turns = (first > 0) & (last < 0)
+    # The velocity first + slope s + bend s^2 of the stretch's cubic, times the duration.
+    moved = side * (end.position - start.position)
+    first, last = first * duration, last * duration
+    slope, bend = 6 * moved - 4 * first - 2 * last, 3 * (first + last - 2 * moved)
+    square = jnp.where(turns, slope**2 - 4 * bend * first, 1)
+    return jnp.where(turns, 2 * first / jnp.where(turns, jnp.sqrt(square) - slope, 1), 1)
+
+
+def _force_along(surfaces, start, end, duration, s):
+    """Motion at the fraction s of a stretch, and the force there [N]; `surfaces` are those at its start."""
+    motion = along(start, end, duration, s)
+    force, _ = surfaces.after(start, end, duration, s).force(motion)
+    return motion, force
+
+
 class _Contact(NamedTuple):
     """Contact during a stretch of motion: whether there is any, with which side, from which fraction of the
     stretch until which, and whether it begins and ends there at the surface."""
@@ -186,17 +224,15 @@ class _Contact(NamedTuple):
 
 def _contact(surfaces, start, end, duration):
     """Both instants are roots on the stretch's cubic: of the depth, or of the force that lets go before."""
-    clearance = surfaces.clearance
-    signed = deflection(start.position, clearance)
-    side = jnp.sign(jnp.where(signed == 0, deflection(end.position, clearance), signed))
-    surface = jnp.where(side < 0, -clearance, 0)
+    side, surface = surfaces.side(start, end)
 
     def depth(s):
         return side * (along(start, end, duration, s).position - surface)
 
     def hold(s):
-        rate = side * along(start, end, duration, s).velocity
-        return surfaces.law.hold(surfaces.parameters, surfaces.state, depth(s), rate)
+        motion = along(start, end, duration, s)
+        state = surfaces.after(start, end, duration, s).state
+        return surfaces.law.hold(surfaces.parameters, state, depth(s), side * motion.velocity)
 
     enters, leaves = _crossing(depth, duration)
     catches, lets_go = _crossing(hold, duration)
@@ -237,8 +273,8 @@ def _lag_along(surfaces, reading, start, end, duration, time_constant):
     span = contact.last - contact.first
     forces = []
     for i in range(2 * ARCS + 1):
-        motion = along(start, end, duration, contact.first + span * (i / (2 * ARCS)))
-        force, _ = surfaces.force(motion)
+        s = contact.first + span * (i / (2 * ARCS))
+        motion, force = _force_along(surfaces, start, end, duration, s)
         if i in (0, 2 * ARCS):
             # At the surface the force has a limit from inside.
             edge = surfaces.law.edge(surfaces.parameters, contact.side * motion.velocity)

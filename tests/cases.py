@@ -141,6 +141,9 @@ LAYERS = {
     "stiffness": [[8e4, 1.6e5, 3.2e5], [6e4, 1.2e5, 4e5]],
 }
 HERTZ = {"law": "hunt_crossley", "stiffness": [1e7, 2e7]}
+HARDENING = {"law": "hardening", "stiffness": [STIFFNESS, 0.4 * STIFFNESS], "reference_depth": 2e-4}
+DEPTH_DAMPED = {"law": "depth_damped", "stiffness": [1e7, 2e7], "reference_depth": 2e-4}
+ELASTOPLASTIC = {"law": "elastoplastic", "stiffness": [STIFFNESS, 2 * STIFFNESS], "unloading_ratio": 1.6}
 FIRST_ORDER = {"model": "first_order", "time_constant": 0.009, "delay": 0.0013}
 THIRD_ORDER = {"model": "third_order", "coefficients": [0.02, 1.6e-4, 5e-7], "delay": 0.0029}
 TRANSFER = {"model": "transfer_function", "numerator": [0.004, 1.0], "denominator": [4e-7, 1.5e-4, 0.02, 1.0]}
@@ -196,6 +199,22 @@ CASES: dict[str, Case] = {
     "layers": Case(mechanism(LAYERS, THIRD_ORDER, contacts=2, command_hold="zoh"), "response_error"),
     "damped layers": Case(
         mechanism({**LAYERS, "damping": [400.0]}, TRANSFER, command_hold="zoh"), "response_error"
+    ),
+    "hardening": Case(mechanism(HARDENING, contacts=2), "phase_lead"),
+    "damped hardening": Case(
+        mechanism({**HARDENING, "stiffness": [0.3 * STIFFNESS], "damping": [700.0]}, **LAGGED), "phase_lead"
+    ),
+    "depth-damped": Case(mechanism({**DEPTH_DAMPED, "damping": [900.0]}, contacts=2), "phase_lead"),
+    "depth-damped, linear spring, lag": Case(
+        mechanism(
+            {**DEPTH_DAMPED, "stiffness": [STIFFNESS], "exponent": 1.0, "damping": [600.0]}, **LAGGED
+        ),
+        "phase_lead",
+    ),
+    "elastoplastic": Case(mechanism(ELASTOPLASTIC, contacts=2), "phase_lead"),
+    "elastoplastic, lag": Case(mechanism({**ELASTOPLASTIC, "unloading_ratio": 3.0}, **LAGGED), "phase_lead"),
+    "rattling, elastoplastic": Case(
+        mechanism({**ELASTOPLASTIC, "clearance": 0.002}, RATTLING, 0.003, 3, velocity=0.01), "phase_lead"
     ),
     # The paper's compensation, with the sensors' faults and the simulator's limit.
     "response error": Case(mechanism(LIST, contacts=3), "response_error"),

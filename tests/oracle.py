@@ -260,13 +260,16 @@ class _Law:
 
     def __init__(self, contact):
         self.kind = contact["law"]
-        if self.kind not in ("linear", "kelvin_voigt", "hunt_crossley", "piecewise_linear"):
+        kinds = ("linear", "kelvin_voigt", "hunt_crossley", "piecewise_linear")
+        if self.kind not in (*kinds, "hardening", "depth_damped", "elastoplastic"):
             raise ValueError(f"unknown contact law {self.kind!r}")
         self.stiffness = _as_list(contact["stiffness"])
         self.damping = [0.0] if self.kind == "linear" else _as_list(contact.get("damping", 0.0))
+        self.scale, self.ratio = contact.get("reference_depth"), contact.get("unloading_ratio")
+        self.deepest = 0.0  # of the surface in touch, so far; elastoplastic remembers it
         self.exponent = contact.get("exponent", 1.5)
         self.depths = _as_list(contact.get("depths", [])) if self.kind == "piecewise_linear" else []
-        self.tension = bool(contact.get("tension", False)) and self.kind != "piecewise_linear"
+        self.tension = bool(contact.get("tension", False)) and self.kind == "kelvin_voigt"
         clearance = contact.get("clearance")
         self.clearance = inf if clearance is None else clearance
 
@@ -277,6 +280,8 @@ class _Law:
         )
 
     def clamped(self, index):
+        if self.kind == "elastoplastic":
+            return True
         return self.parameters(index)[1] != 0.0 and not self.tension
 
     def damped(self):
@@ -293,7 +298,7 @@ class _Law:
     def penetration(self, position, side):
         return position if side > 0 else -self.clearance - position
 
-    def raw(self, depth, rate, index):
+    def raw(self, depth, rate, index, deepest=0.0):
         stiffness, damping = self.parameters(index)
         depth = np.maximum(depth, 0.0)
         if self.kind == "hunt_crossley":
@@ -304,13 +309,24 @@ class _Law:
             for slope, low, high in zip(stiffness, edges[:-1], edges[1:], strict=True):
                 force = force + slope * np.clip(depth - low, 0.0, high - low)
             return force
+        if self.kind == "hardening":
+            return stiffness * (depth + depth**3 / self.scale**2) + damping * rate
+        if self.kind == "depth_damped":
+            return depth * self.sign_of(depth, rate, index)
+        if self.kind == "elastoplastic":
+            # Two lines through the point at the deepest penetration; the virgin one is met by way of max.
+            peak = np.maximum(depth, deepest)
+            return stiffness * (peak - self.ratio * (peak - depth))
         return stiffness * depth + damping * rate
 
-    def sign_of(self, depth, rate, index):
+    def sign_of(self, depth, rate, index, deepest=0.0):
         """A function with the sign of the unclamped force, without its d^n (which hides the root)."""
         if self.kind == "hunt_crossley":
             return 1.0 + 1.5 * self.parameters(index)[1] * rate + 0.0 * depth
-        return self.raw(depth, rate, index)
+        if self.kind == "depth_damped":
+            stiffness, damping = self.parameters(index)
+            return stiffness * np.maximum(depth, 0.0) ** (self.exponent - 1.0) + damping * rate / self.scale
+        return self.raw(depth, rate, index, deepest)
 
 
 @dataclass
@@ -324,6 +340,7 @@ class _Piece:
     velocity: np.ndarray  # m/s, coefficients in theta
     side: int
     index: int
+    deepest: float  # when it begins
     law: _Law = field(repr=False)
 
     @property
@@ -343,7 +360,7 @@ class _Piece:
             return np.zeros_like(np.asarray(theta, float))
         x, v = self.motion(theta)
         depth = self.law.penetration(x, self.side)
-        return self.side * self.law.raw(depth, self.side * v, self.index)
+        return self.side * self.law.raw(depth, self.side * v, self.index, self.deepest)
 
     def force_at(self, time):
         theta = (time - self.origin) / self.length
@@ -539,9 +556,11 @@ class _Run:
             if self.ideal_zoh:
                 self._jump(position[0])
             velocity = polyder(position) * self.motion.substeps / self.period
-            for theta, side, reached in _cut(position, velocity, a, b, self.law, self.law_index):
+            for theta, side, reached, deepest in _cut(position, velocity, a, b, self.law, self.law_index):
                 length = 1.0 / self.motion.substeps
-                piece = _Piece(origin, length, theta, position, velocity, side, self.law_index, self.law)
+                piece = _Piece(
+                    origin, length, theta, position, velocity, side, self.law_index, deepest, self.law
+                )
                 self.pieces.append(piece)
                 self.reached |= reached
                 if side:
@@ -647,7 +666,10 @@ class _Run:
 
 
 def _cut(position, velocity, a, b, law, index):
-    """Cut theta in [a, b] where the force's formula changes: [((start, end), side, reached)]."""
+    """Cut theta in [a, b] where the force's formula changes: [((start, end), side, reached, deepest)].
+
+    `deepest` is the law's when the piece begins; by the end of the pieces the law has that of the last.
+    """
 
     def x(s):
         return float(polyval(s, position))
@@ -658,7 +680,11 @@ def _cut(position, velocity, a, b, law, index):
     turning = [a, *_roots(v, a, b), b]
     cuts = {a, b, *turning}
     for low, high in pairwise(turning):
-        for level in law.levels():  # x is monotone here: one root at most
+        dent = [law.deepest, -law.clearance - law.deepest] if law.kind == "elastoplastic" else []
+        for level in [
+            *law.levels(),
+            *(d for d in dent if isfinite(d)),
+        ]:  # x is monotone here: one root at most
             cuts.update(_roots(lambda s, level=level: x(s) - level, low, high, samples=1))
     cuts = sorted(cuts)
     pieces = []
@@ -668,15 +694,19 @@ def _cut(position, velocity, a, b, law, index):
         clamped = side != 0 and law.clamped(index)
 
         def sign(s, side=side):
-            return float(law.sign_of(law.penetration(x(s), side), side * v(s), index))
+            return float(law.sign_of(law.penetration(x(s), side), side * v(s), index, law.deepest))
 
+        if side == 0:
+            law.deepest = 0.0
         if clamped:
             edges = [low, *_roots(sign, low, high), high]
         for start, end in pairwise(edges):
             if end - start <= 1e-14:
                 continue
             active = side if not clamped or sign((start + end) / 2.0) > 0.0 else 0
-            pieces.append(((start, end), active, side != 0))
+            pieces.append(((start, end), active, side != 0, law.deepest))
+        if side != 0:
+            law.deepest = max(law.deepest, law.penetration(x(high), side))
     return pieces
 
 

@@ -8,7 +8,7 @@ import sys
 import pytest
 from conftest import Ran
 
-from jaxhil.mechanism_file import builtin_names, builtin_path
+from jaxhil.mechanism_file import builtin_names, builtin_path, suite_names
 from tuning import environment
 from tuning.__main__ import main
 from tuning.cli import complete_bare
@@ -369,12 +369,15 @@ def test_module_runs_like_the_command_and_a_closed_pipe_is_quiet():
 
 
 def test_mechanisms_lists_the_built_in_files(jaxhil):
-    entries = jaxhil("mechanisms", "--json").document["mechanisms"]
+    document = jaxhil("mechanisms", "--json").document
+    entries = document["mechanisms"]
     assert [entry["name"] for entry in entries] == builtin_names()
+    assert [entry["name"] for entry in document["suites"]] == suite_names()
     assert all(entry["source"] for entry in entries)
     rig = next(entry for entry in entries if entry["name"] == "rig-300kg")
     assert rig["contact_frequencies"] == [pytest.approx(3.0, rel=1e-5)]
-    assert all(entry["source"][:20] in jaxhil("mechanisms").out for entry in entries)
+    listed = jaxhil("mechanisms").out
+    assert all(entry["source"][:20] in listed for entry in [*entries, *document["suites"]])
 
 
 def test_plot_without_a_name_gets_one():

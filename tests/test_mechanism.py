@@ -102,6 +102,10 @@ MAY_BE_INFINITE = [
 ]
 
 
+# Refused beside the law of the full table.
+OF_ONE_LAW = ("contact.reference_depth", "contact.unloading_ratio")
+
+
 def changed(changes=(), base=FULL):
     """A copy of the full table with the values at dotted paths replaced; `...` removes a key."""
     raw = copy.deepcopy(base)
@@ -150,7 +154,7 @@ def test_full_table_is_read_value_by_value():
                 node = node[part]
             assert value_at(mechanism, path) == node
     for path in numeric_keys():
-        if not path.startswith("bodies."):
+        if not path.startswith("bodies.") and path not in OF_ONE_LAW:
             assert path in set(leaves())
     assert mechanism.uncertainty["contact.stiffness"].factor == [0.3, 3.0]
     assert mechanism.uncertainty["rig.force_sensor.delay"].independent
@@ -288,6 +292,42 @@ def test_edges_of_ranges(path, inside, outside):
     assert isinstance(from_builtins(changed({path: inside}), "f"), Mechanism)
     message = refusal(changed({path: outside}))
     assert f": {path}" in message and ", allowed " in message
+
+
+HARDENING = {"contact.law": "hardening", "contact.reference_depth": 2e-4}
+DEPTH_DAMPED = {"contact.law": "depth_damped", "contact.reference_depth": 2e-4}
+ELASTOPLASTIC = {
+    "contact.law": "elastoplastic",
+    "contact.unloading_ratio": 1.0,
+    "contact.damping": [0.0, 0.0],
+}
+
+
+@pytest.mark.parametrize("contact", [HARDENING, DEPTH_DAMPED, ELASTOPLASTIC], ids=lambda c: c["contact.law"])
+def test_keys_of_one_law(contact):
+    name, key = contact["contact.law"], list(contact)[1]
+    drawn = {"uncertainty": {key: {"distribution": "uniform", "factor": [1.0, 1.5]}}}
+    mechanism = from_builtins(changed({**contact, **drawn}), "f")
+    assert value_at(mechanism, key) == contact[key]
+    message = refusal(changed({**contact, key: ...}))
+    assert f": {key}: found nothing, allowed a number >" in message and f"(law {name} needs it)" in message
+    for value in (0.99 if "ratio" in key else 0.0, math.inf, "1", [1.0]):
+        assert f": {key}: found " in refusal(changed({**contact, key: value}))
+    message = refusal(changed({key: contact[key]}))
+    assert f": {key}: found {contact[key]}, allowed nothing (only for law " in message and name in message
+    other = OF_ONE_LAW[key == OF_ONE_LAW[0]]
+    assert f": {other}: found 2.0, allowed nothing" in refusal(changed({**contact, other: 2.0}))
+    low = {key: {"distribution": "uniform", "low": 0.0, "high": 2.0}}
+    assert f': uncertainty."{key}": found values as far as 0' in refusal(
+        changed({**contact, "uncertainty": low})
+    )
+
+
+def test_elastoplastic_contact_has_no_damping():
+    message = refusal(changed({**ELASTOPLASTIC, "contact.damping": [0.0, 3.0]}))
+    assert ": contact.damping: found [0.0, 3.0], allowed 0 (law elastoplastic" in message
+    drawn = {"contact.damping": {"distribution": "uniform", "low": 0.0, "high": 2.0}}
+    assert "found an uncertain damping" in refusal(changed({**ELASTOPLASTIC, "uncertainty": drawn}))
 
 
 @pytest.mark.parametrize(

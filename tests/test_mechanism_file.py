@@ -22,6 +22,7 @@ from jaxhil.mechanism_file import (
     builtin_path,
     from_builtins,
     load,
+    suite_names,
     to_builtins,
 )
 
@@ -53,6 +54,19 @@ def test_builtins_are_those_promised():
     names = "claw-350kg layered rattling rig-300kg rod-100n-mm varying"
     assert builtin_names() == names.split()
     assert load() == load(DEFAULT) == load("varying")
+
+
+SUITES = "damped dead-zone depth-damped elastoplastic fast hardening hertz layered"
+SUITES += " noise-free noisy rattling repeated"
+
+
+def test_suites_are_those_promised():
+    assert suite_names() == [f"suite-{name}" for name in SUITES.split()]
+    for name in suite_names():
+        mechanism, _, label = load(name)
+        assert label == mechanism.name == name
+        assert mechanism.source.startswith("assumed: ") and "\n" not in mechanism.source
+        assert mechanism == from_builtins(to_builtins(mechanism), name)
 
 
 @pytest.mark.parametrize("name", builtin_names())

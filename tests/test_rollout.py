@@ -36,6 +36,8 @@ from jaxhil.sensors import draw_noise
 ACCURACY = {
     name: 1e-7 for name, case in CASES.items() if "time_constant" in case.mechanism["rig"]["force_sensor"]
 }
+# A cubic stands for the motion on which the deepest point is found.
+ACCURACY |= {name: 1e-7 for name in CASES if "elastoplastic" in name}
 # Corners of layers, and the panel in which a contact is over, are not split.
 WORK_ACCURACY = {
     "layers": 1e-4,

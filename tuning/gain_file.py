@@ -178,7 +178,12 @@ def _peak_forces(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
     stiffness = np.asarray(contact.stiffness)
     energy = np.asarray(scenarios.equivalent_mass) * np.asarray(scenarios.velocity) ** 2 / 2
     law = mechanism.contact.law
-    if law == "hunt_crossley":
+    if law == "hardening":
+        # M v^2/2 = k d^2/2 + k d^4/(4 d_0^2), in units of d_0
+        unit = np.asarray(contact.reference_depth)
+        square = np.sqrt(1 + 4 * energy / (stiffness * unit**2)) - 1
+        return stiffness * unit * np.sqrt(square) * (1 + square)
+    if law in ("hunt_crossley", "depth_damped"):
         # M v^2/2 = k d^(n+1)/(n+1)
         exponent = np.asarray(contact.exponent)
         depth = ((exponent + 1) * energy / stiffness) ** (1 / (exponent + 1))

@@ -51,7 +51,13 @@ def peak_force(mechanism: Mechanism) -> float:
     contact = mechanism.contact
     stiffness = [max(k) if isinstance(k, list | tuple) else k for k in contact.stiffness]
     mass, velocity = mechanism.bodies.mass, mechanism.approach.velocity
-    if contact.law == "hunt_crossley":
+    if contact.law == "hardening" and contact.reference_depth is not None:
+        # k d^2/2 + k d^4/(4 d_0^2) = M v^2/2, of every entry.
+        energies = [mass * velocity**2 / (k * contact.reference_depth**2) for k in stiffness]
+        depths = [math.sqrt(math.sqrt(1 + 2 * energy) - 1) for energy in energies]
+        forces = [k * depth * (1 + depth**2) for k, depth in zip(stiffness, depths, strict=True)]
+        return contact.reference_depth * max(forces)
+    if contact.law in ("hunt_crossley", "depth_damped"):
         order = contact.exponent + 1
         deepest = (order * mass * velocity**2 / (2 * min(stiffness))) ** (1 / order)
         return max(stiffness) * deepest**contact.exponent

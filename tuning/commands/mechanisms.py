@@ -1,36 +1,36 @@
-"""`jaxhil mechanisms`: the built-in mechanism files, with their sources."""
+"""`jaxhil mechanisms`: the built-in mechanism files and the standard suites, with their sources."""
 
 import math
 from typing import Any
 
 from jaxhil.mechanism import Mechanism
-from jaxhil.mechanism_file import builtin_names, builtin_path, load
+from jaxhil.mechanism_file import builtin_names, builtin_path, load, suite_names
 from tuning import report
 from tuning.options import Mechanisms
 
 
 def run(options: Mechanisms) -> int:
     """List them; always 0."""
-    entries = [_entry(name, load(name).mechanism) for name in builtin_names()]
+    titles = {"Built-in mechanisms": builtin_names(), "Standard suites": suite_names()}
+    tables = {
+        title: [_entry(name, load(name).mechanism) for name in names] for title, names in titles.items()
+    }
     if options.json:
-        report.emit_json({"mechanisms": entries})
+        mechanisms, suites = tables.values()
+        report.emit_json({"mechanisms": mechanisms, "suites": suites})
         return 0
-    rows = [
-        [
-            entry["name"],
-            entry["law"],
-            entry["contacts"],
-            entry["mass"],
-            " ".join(f"{value:.3g}" for value in entry["contact_frequencies"]) or "-",
-        ]
-        for entry in entries
-    ]
     headings = ["name", "law", "contacts", "mass [kg]", "contact frequencies [Hz]"]
-    report.emit(
-        report.table("Built-in mechanisms", headings, rows, texts=(0, 1, 4)),
-        *(f"{entry['name']}: {entry['source']}\n" for entry in entries),
-    )
+    for title, entries in tables.items():
+        report.emit(
+            report.table(title, headings, [_row(entry) for entry in entries], texts=(0, 1, 4)),
+            *(f"{entry['name']}: {entry['source']}\n" for entry in entries),
+        )
     return 0
+
+
+def _row(entry: dict[str, Any]) -> list[Any]:
+    frequencies = " ".join(f"{value:.3g}" for value in entry["contact_frequencies"]) or "-"
+    return [entry["name"], entry["law"], entry["contacts"], entry["mass"], frequencies]
 
 
 def _entry(name: str, mechanism: Mechanism) -> dict[str, Any]:
@@ -48,7 +48,7 @@ def _entry(name: str, mechanism: Mechanism) -> dict[str, Any]:
 
 def _frequencies(mechanism: Mechanism) -> list[float]:
     """sqrt(k/M)/(2 pi) [Hz] of every stiffness in the file, each once; none for a power law."""
-    if mechanism.contact.law == "hunt_crossley":
+    if mechanism.contact.law in ("hunt_crossley", "depth_damped"):
         return []
     stiffness: list[float] = []
     for entry in mechanism.contact.stiffness:

@@ -15,12 +15,14 @@ class ContactLaw(NamedTuple):
     """One contact's law, functions of penetration d [m] and rate d' [m/s].
 
     `hold` [N or 1] is positive as long as penetrated surfaces hold on to each other; `force` [N] is that of
-    d > 0, 0 where they let go; `edge` [N], of d' alone, is its limit as d goes to 0 from above.
+    d > 0, 0 where they let go; `edge` [N], of d' alone, is its limit as d goes to 0 from above. `dented`, of
+    a law that remembers, is the law after the deepest penetration given [m]; that of 0 is the law as new.
     """
 
     force: Formula
     hold: Formula
     edge: Callable[[float], float]
+    dented: "Callable[[float], ContactLaw] | None" = None
 
 
 def contact_law(contact: Contact, number: int) -> ContactLaw:
@@ -31,6 +33,12 @@ def contact_law(contact: Contact, number: int) -> ContactLaw:
         return _piecewise_linear(stiffness, contact.depths, damping)
     if contact.law == "hunt_crossley":
         return _hunt_crossley(stiffness, damping, contact.exponent)
+    if contact.law == "hardening" and contact.reference_depth is not None:
+        return _hardening(stiffness, damping, contact.reference_depth)
+    if contact.law == "depth_damped" and contact.reference_depth is not None:
+        return _depth_damped(stiffness, damping, contact.exponent, contact.reference_depth)
+    if contact.law == "elastoplastic" and contact.unloading_ratio is not None:
+        return _elastoplastic(stiffness, contact.unloading_ratio, 0.0)
     if contact.law == "linear":
         return _kelvin_voigt(stiffness, 0.0, False)
     return _kelvin_voigt(stiffness, damping, contact.tension)
@@ -75,6 +83,43 @@ def _piecewise_linear(slopes: list[float], depths: list[float], damping: float) 
         raise ValueError("the penetration is not a number")
 
     return _clamped(spring, lambda rate: damping * rate)
+
+
+def _hardening(stiffness: float, damping: float, reference_depth: float) -> ContactLaw:
+    """F = k d (1 + (d/d_0)^2) + b d' >= 0."""
+
+    def spring(depth: float, rate: float) -> float:
+        return stiffness * depth * (1.0 + (depth / reference_depth) ** 2) + damping * rate
+
+    return _clamped(spring, lambda rate: damping * rate)
+
+
+def _depth_damped(stiffness: float, damping: float, exponent: float, reference_depth: float) -> ContactLaw:
+    """F = k d^n + b d' d/d_0 >= 0."""
+
+    def hold(depth: float, rate: float) -> float:
+        """F/d; outside, its damping's part alone, but for a linear spring, which has no end there."""
+        return stiffness * max(depth, 0.0) ** (exponent - 1.0) + damping * rate / reference_depth
+
+    def force(depth: float, rate: float) -> float:
+        value = stiffness * depth**exponent + damping * rate * (depth / reference_depth)
+        return value if value > 0.0 else 0.0
+
+    return ContactLaw(force, hold, lambda rate: 0.0)
+
+
+def _elastoplastic(stiffness: float, unloading_ratio: float, deepest: float) -> ContactLaw:
+    """F = k d_max - k_u (d_max - d) >= 0, k_u = r k, after the penetration d_max; k d beyond it."""
+
+    def spring(depth: float, rate: float) -> float:
+        if depth >= deepest:
+            return stiffness * depth
+        return stiffness * deepest - stiffness * unloading_ratio * (deepest - depth)
+
+    def dented(depth: float) -> ContactLaw:
+        return _elastoplastic(stiffness, unloading_ratio, depth)
+
+    return _clamped(spring, lambda rate: 0.0)._replace(dented=dented)
 
 
 def _clamped(spring: Formula, edge: Callable[[float], float]) -> ContactLaw:

@@ -16,7 +16,7 @@ from random import Random
 from jaxhil.mechanism import Mechanism
 from tuning.rig.contact_laws import contact_law
 from tuning.rig.propagation import WHOLE, Place, apply, propagation, split_delay
-from tuning.rig.sensor_lag import Motion, lagged
+from tuning.rig.sensor_lag import Motion, deepest_within, lagged
 
 Panel = tuple[Motion, Motion | None, Motion | None]  # where the force is sampled, at its start, at its end
 
@@ -71,7 +71,7 @@ class Plant:
         self._positions = [first + (place - size + 1) * stride for place in range(size)]
         self._tick = 0
         self._lag = self.force = 0.0
-        self._dented = False
+        self._dented, self._deepest = False, 0.0
 
     def read(self) -> tuple[float, float]:
         """Measured force [N] and position [m] at this tick, just before its command acts. Draws noise."""
@@ -102,7 +102,7 @@ class Plant:
         def motion(place: Place) -> Motion:
             return Motion(apply(place.position, state, start, end), apply(place.velocity, state, start, end))
 
-        if self._force_sensor.time_constant > 0.0:
+        if self._force_sensor.time_constant > 0.0 or self._law.dented is not None:
             panel = motion(rows.sample), motion(rows.start), motion(rows.end)
         else:
             panel = motion(rows.sample), None, None
@@ -124,21 +124,33 @@ class Plant:
         if panel is None:
             return 0.0
         sample, start, end = panel
-        clearance = self._clearance
+        clearance, rest = self._clearance, self._period - self._place
+        law, deepest = self._law, self._deepest
+        if law.dented is not None and start is not None and end is not None:
+            at_sample = self._deeper(deepest, start, sample, self._place)
+            law = law.dented(at_sample)
+            self._deepest = self._deeper(at_sample, sample, end, rest)
+        else:
+            at_sample = 0.0
         if sample.position > 0.0:
-            self._dented, self.force = True, self._law.force(sample.position, sample.velocity)
+            self._dented, self.force = True, law.force(sample.position, sample.velocity)
         elif sample.position < -clearance:
             self._dented = True
-            self.force = -self._law.force(-clearance - sample.position, -sample.velocity)
+            self.force = -law.force(-clearance - sample.position, -sample.velocity)
         else:
             self._dented, self.force = False, 0.0
-        if start is None or end is None:
-            return self.force
         time_constant = self._force_sensor.time_constant
-        reading = lagged(self._lag, self._law, clearance, start, sample, self._place, time_constant)
-        rest = self._period - self._place
-        self._lag = lagged(reading, self._law, clearance, sample, end, rest, time_constant)
+        if start is None or end is None or time_constant == 0.0:
+            return self.force
+        reading = lagged(self._lag, self._law, clearance, start, sample, self._place, time_constant, deepest)
+        self._lag = lagged(reading, self._law, clearance, sample, end, rest, time_constant, at_sample)
         return reading
+
+    def _deeper(self, deepest: float, start: Motion, end: Motion, duration: float) -> float:
+        """Deepest penetration [m] by the end of a stretch; a surface that has been left is as new."""
+        if -self._clearance <= end.position <= 0.0:
+            return 0.0
+        return max(deepest, deepest_within(start, end, duration, self._clearance))
 
     def _limit(self, wanted: float) -> float:
         """Rate limits on the command: see `jaxhil.limits.limit_command`."""

@@ -31,10 +31,12 @@ def lagged(
     end: Motion,
     duration: float,
     time_constant: float,
+    deepest: float = 0.0,
 ) -> float:
     """The lag's output [N] at the end of a stretch of `duration` [s], `reading` [N] at its start.
 
-    Surfaces at 0 and, pushing the other way, at -clearance [m] (may be infinite).
+    Surfaces at 0 and, pushing the other way, at -clearance [m] (may be infinite). `deepest` [m]: what a law
+    that remembers does at the start of the stretch.
     """
     if duration <= 0.0:
         return reading
@@ -46,8 +48,15 @@ def lagged(
     def depth(s: float) -> float:
         return side * (path.position(s) - surface)
 
+    turn, bottom = _turn(path, depth, side) if law.dented else (1.0, 0.0)
+
+    def law_at(s: float) -> ContactLaw:
+        if law.dented is None:
+            return law
+        return law.dented(max(deepest, depth(0.0), bottom if s > turn else depth(s)))
+
     def hold(s: float) -> float:
-        return law.hold(depth(s), side * path.velocity(s))
+        return law_at(s).hold(depth(s), side * path.velocity(s))
 
     enters, leaves = _span(depth)
     catches, lets_go = _span(hold)
@@ -65,7 +74,7 @@ def lagged(
             force = law.edge(rate)
         else:
             penetration = depth(s)
-            force = law.force(penetration, rate) if penetration > 0.0 else 0.0
+            force = law_at(s).force(penetration, rate) if penetration > 0.0 else 0.0
         forces.append(side * force)
     reading *= math.exp(-first * duration / time_constant)
     span = (last - first) * duration / ARCS / time_constant
@@ -77,6 +86,19 @@ def lagged(
     return reading * math.exp(-(1.0 - last) * duration / time_constant)
 
 
+def deepest_within(start: Motion, end: Motion, duration: float, clearance: float) -> float:
+    """Deepest penetration [m] of either surface along a smooth stretch of motion; 0 where there is none."""
+    side, surface = _surface(start.position, end.position, clearance)
+    if side == 0.0:
+        return 0.0
+    path = _Cubic(start, end, duration)
+
+    def depth(s: float) -> float:
+        return side * (path.position(s) - surface)
+
+    return max(depth(0.0), depth(1.0), _turn(path, depth, side)[1], 0.0)
+
+
 def _surface(start: float, end: float, clearance: float) -> tuple[float, float]:
     """Side (1, -1, or 0 for none) and position [m] of the surface that a stretch touches."""
     for position in (start, end):
@@ -85,6 +107,17 @@ def _surface(start: float, end: float, clearance: float) -> tuple[float, float]:
         if position < -clearance:
             return -1.0, -clearance
     return 0.0, 0.0
+
+
+def _turn(path: "_Cubic", depth: Callable[[float], float], side: float) -> tuple[float, float]:
+    """The fraction of a stretch at which it turns round on its way in, and how deep; else its end."""
+
+    def inward(s: float) -> float:
+        return side * path.velocity(s)
+
+    at_0, at_1 = inward(0.0), inward(1.0)
+    turn = _root(inward, at_0, at_1) if at_0 > 0.0 > at_1 else 1.0
+    return turn, depth(turn)
 
 
 class _Cubic:

@@ -79,8 +79,8 @@ _UNITS = {
     "natural_frequency": "Hz",
     **dict.fromkeys(("control_period", "delay", "time_constant"), "s"),
     **dict.fromkeys(("dead_zone", "bias", "range"), "N"),
-    **dict.fromkeys(("depths", "clearance"), "m"),
-    **dict.fromkeys(("phase", "damping_ratio", "exponent"), "1"),
+    **dict.fromkeys(("depths", "clearance", "reference_depth"), "m"),
+    **dict.fromkeys(("phase", "damping_ratio", "exponent", "unloading_ratio"), "1"),
 }
 
 
@@ -116,11 +116,11 @@ def texts_of(column: str) -> tuple[str, ...]:
 def unit_of(mechanism: Mechanism, path: str) -> str:
     """SI unit of the mechanism file's key."""
     key = path.rpartition(".")[2]
-    hertzian = mechanism.contact.law == "hunt_crossley"
+    law = mechanism.contact.law
     if path == "contact.stiffness":
-        return "N/m^n" if hertzian else "N/m"
+        return "N/m^n" if law in ("hunt_crossley", "depth_damped") else "N/m"
     if path == "contact.damping":
-        return "s/m" if hertzian else "N s/m"
+        return "s/m" if law == "hunt_crossley" else "N s/m"
     if key in ("noise_std", "quantum"):
         return "N" if "force" in path else "m"
     return _UNITS.get(key, "")

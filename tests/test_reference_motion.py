@@ -1,0 +1,193 @@
+"""The motion in space by integration: closed forms, order of convergence, pushes, paths, derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from lanes import QUICK
+from scipy.integrate import solve_ivp
+
+from jaxhil.contact import LAWS, ContactParameters
+from jaxhil.reference_motion import integrate_contact
+
+MASS, STIFFNESS, VELOCITY = 350.0, 124355.0, 0.005
+OMEGA = np.sqrt(STIFFNESS / MASS)
+CRITICAL = 2 * np.sqrt(STIFFNESS * MASS)
+LANES = 8
+
+KELVIN_VOIGT = {"damping": CRITICAL * np.array([0.0, 1e-9, 0.03, 0.1, 0.4, 0.6, 1.0, 3.0])}
+TENSION = {"damping": CRITICAL * np.linspace(0, 0.8, LANES), "tension": True}
+HUNT_CROSSLEY = {
+    "stiffness": 1e7,
+    "damping": np.array([0.0, 0.0, 1.0, 10.0, 100.0, 1000.0, 2.0, 3.0]),
+    "exponent": np.array([1.5, 1.1, 1.2, 1.0, 2.0, 3.0, 1.5, 1.5]),
+}
+LAYERS = {
+    "stiffness": np.array([[8e4], [1.6e5], [3.2e5]]),
+    "depths": np.array([[1e-4], [2e-4]]),
+    "damping": np.linspace(0, 3000, LANES),
+}
+CASES = {
+    "kelvin_voigt": ("kelvin_voigt", KELVIN_VOIGT),
+    "tension": ("kelvin_voigt", TENSION),
+    "hunt_crossley": ("hunt_crossley", HUNT_CROSSLEY),
+    "piecewise_linear": ("piecewise_linear", LAYERS),
+}
+
+
+def contact(dtype=float, **values):
+    """Parameters of every lane, by name; what is not named is nominal."""
+
+    def lanes(value):
+        return jnp.broadcast_to(jnp.asarray(value, dtype), (*np.shape(value)[:-1], LANES))
+
+    defaults = {"stiffness": STIFFNESS, "damping": 0.0, "exponent": 1.5, "depths": np.zeros((0, 1))}
+    defaults |= {"reference_depth": 1.0, "unloading_ratio": 1.0}
+    numbers = {name: values.get(name, default) for name, default in defaults.items()}
+    tension = jnp.full((LANES,), values.get("tension", False))
+    return ContactParameters(**{n: lanes(v) for n, v in numbers.items()}, tension=tension)
+
+
+def integrated(name, values, **options):
+    mass, velocity = (jnp.full((LANES,), value) for value in (MASS, VELOCITY))
+    law = LAWS[name]()
+    run = jax.jit(lambda c, m, v: integrate_contact(law, c, m, v, **options), compiler_options=QUICK)
+    parameters = contact(**values)
+    return run(parameters, mass, velocity), law.reference(parameters, mass, velocity)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_closed_forms(case):
+    found, expected = integrated(*CASES[case])
+    np.testing.assert_allclose(found.restitution, expected.restitution, rtol=0, atol=2e-8)
+    np.testing.assert_allclose(found.peak_force, expected.peak_force, rtol=2e-8)
+    np.testing.assert_allclose(found.duration, expected.duration, rtol=2e-8)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_error_falls_with_the_tolerance(case):
+    """A step of order 5 whose error is E is as long as E^(1/5): the sum of their errors falls as E^(4/5)."""
+    tolerances = np.array([1e-5, 1e-7, 1e-9, 1e-11])
+    errors = []
+    for tolerance in tolerances:
+        found, expected = integrated(*CASES[case], tolerance=float(tolerance))
+        errors.append(np.sqrt(np.mean((found.restitution - expected.restitution) ** 2)))
+    assert np.polyfit(np.log(tolerances), np.log(errors), 1)[0] > 0.75
+    assert errors[-1] < 1e-9
+
+
+def test_bodies_that_stick_never_separate():
+    found, _ = integrated("kelvin_voigt", {"damping": 3 * CRITICAL, "tension": True})
+    assert np.all(np.isinf(found.duration))
+    assert np.all(found.restitution < 1e-6)
+
+
+def pulse(start, length, height):
+    """Half a sine."""
+
+    def push(time):
+        inside = (time > start) & (time < start + length)
+        return jnp.where(inside, height * jnp.sin(np.pi * (time - start) / length), 0.0)
+
+    return push
+
+
+def test_push_against_scipy():
+    """A pulse at all times of a damped contact: before, at and after the turning point and the separation."""
+    starts, length, height = np.linspace(0.0, 0.21, LANES), 0.02, 6.0
+    damping = 0.05 * CRITICAL
+    push = pulse(jnp.asarray(starts), length, height)
+    times = np.linspace(-0.01, 0.3, 63)[:, None] + np.linspace(0, 1e-3, LANES)
+    found, _ = integrated(
+        "kelvin_voigt",
+        {"damping": damping},
+        push=push,
+        push_duration=jnp.asarray(starts + length),
+        times=jnp.asarray(times),
+    )
+    for lane, start in enumerate(starts):
+
+        def pushed(t, start=start):
+            return height * np.sin(np.pi * (t - start) / length) if start < t < start + length else 0.0
+
+        def motion(t, y, pushed=pushed):
+            force = max(0.0, STIFFNESS * y[0] + damping * y[1]) if y[0] >= 0 else 0.0
+            return [y[1], -(force + pushed(t)) / MASS]
+
+        exact = solve_ivp(
+            motion,
+            (0, 0.31),
+            [0, VELOCITY],
+            "DOP853",
+            rtol=1e-10,
+            atol=1e-15,
+            max_step=5e-4,
+            dense_output=True,
+        )
+        assert found.restitution[lane] == pytest.approx(-exact.y[1, -1] / VELOCITY, abs=2e-7)
+        position, speed = np.array(
+            [exact.sol(t) if t > 0 else (VELOCITY * t, VELOCITY) for t in times[:, lane]]
+        ).T
+        np.testing.assert_allclose(found.position[:, lane], position, rtol=0, atol=2e-7 * VELOCITY / OMEGA)
+        np.testing.assert_allclose(found.velocity[:, lane], speed, rtol=0, atol=1e-6 * VELOCITY)
+
+
+def test_push_after_the_contact_adds_its_impulse():
+    push = pulse(0.25, 0.02, 6.0)
+    found, alone = integrated("kelvin_voigt", {}, push=push, push_duration=0.27)
+    impulse = 6.0 * 0.02 * 2 / np.pi
+    np.testing.assert_allclose(found.restitution, 1 + impulse / (MASS * VELOCITY), rtol=1e-8)
+    np.testing.assert_allclose(found.duration, alone.duration, rtol=1e-9)
+
+
+def test_trajectory_of_linear_contact():
+    """x = v sin(omega t) / omega, then uniform motion; times in any order."""
+    times = np.linspace(-0.1, 0.4, 97)[::-1].copy()
+    times = times[:, None] * np.ones(LANES)
+    found, _ = integrated("linear", {}, times=jnp.asarray(times))
+    end = np.pi / OMEGA
+    inside = (times > 0) & (times < end)
+    position = np.where(inside, np.sin(OMEGA * times) / OMEGA, np.where(times > 0, end - times, times))
+    speed = np.where(inside, np.cos(OMEGA * times), np.where(times > 0, -1.0, 1.0))
+    np.testing.assert_allclose(found.position / VELOCITY, position, rtol=0, atol=1e-8 / OMEGA)
+    np.testing.assert_allclose(found.velocity / VELOCITY, speed, rtol=0, atol=2e-7)
+
+
+# Of each quantity over itself, by stiffness, damping (of a tenth of the critical one), mass and velocity.
+@pytest.mark.parametrize("case, tolerance", [("kelvin_voigt", 1e-3), ("piecewise_linear", 1e-3)])
+def test_derivatives_of_the_closed_forms(case, tolerance):
+    """Where a step has a kink inside, its derivative is that of a force a bit off: short as it is."""
+    name, values = CASES[case]
+    law, parameters = LAWS[name](), contact(**values)
+    mass, velocity = (jnp.full((LANES,), value) for value in (MASS, VELOCITY))
+
+    def derivatives(reference):
+        def function(scales):
+            stiffness = parameters.stiffness * (1 + scales[0])
+            # Without any damping the derivative by it has a side.
+            damping = parameters.damping + 10 + CRITICAL * scales[1] / 10
+            changed = parameters._replace(stiffness=stiffness, damping=damping)
+            return jnp.stack(reference(changed, mass * (1 + scales[2]), velocity * (1 + scales[3]))[:3])
+
+        return jax.jit(jax.jacfwd(function), compiler_options=QUICK)(jnp.zeros(4))
+
+    found = derivatives(lambda c, m, v: integrate_contact(law, c, m, v))
+    expected = derivatives(law.reference)
+    size = jnp.stack(law.reference(parameters._replace(damping=parameters.damping + 10), mass, velocity))[
+        ..., None
+    ]
+    np.testing.assert_array_less(np.abs(found - expected) / size, tolerance)
+
+
+def test_single_precision_and_vmap():
+    law, parameters = LAWS["kelvin_voigt"](), contact(np.float32, **KELVIN_VOIGT)
+    mass, velocity = (jnp.full((LANES,), value, np.float32) for value in (MASS, VELOCITY))
+
+    def run(damping, mass, velocity):
+        scalar = jax.tree.map(lambda leaf: leaf[..., 0], parameters)
+        return integrate_contact(law, scalar._replace(damping=damping), mass, velocity)
+
+    found = jax.jit(jax.vmap(run), compiler_options=QUICK)(parameters.damping, mass, velocity)
+    assert found.restitution.dtype == np.float32
+    expected = law.reference(parameters, mass, velocity)
+    np.testing.assert_allclose(found.restitution, expected.restitution, atol=1e-4)
