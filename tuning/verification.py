@@ -193,8 +193,8 @@ def near_threshold(signals: Signals, gain_file: GainFile) -> np.ndarray:
     """The ticks, (ticks,) of bool, at which a decision of the law is within `NEAR` of its threshold.
 
     Two decisions, of laws that identify: on which side of a surface the delay-aligned position is, relative
-    to the size of the measured positions; and, in contact, whether |F| exceeds the contact threshold, relative
-    to either. A force and a threshold that are both 0 are equal on both sides, whatever the rounding.
+    to the size of the measured positions; and, in contact, whether |F| exceeds the contact threshold,
+    relative to either. A force and a threshold that are both 0 are equal on both sides, however it rounds.
     """
     gains, clearance = gain_file.gains, gain_file.clearance
     near = np.zeros(len(signals.age), bool)
