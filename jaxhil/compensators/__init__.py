@@ -5,6 +5,8 @@ from jaxhil.compensators.multi_parameter_lead import MultiParameterLead
 from jaxhil.compensators.none import NoCompensator
 from jaxhil.compensators.phase_lead import PhaseLead
 from jaxhil.compensators.response_error import ResponseError
+from jaxhil.compensators.smith_hybrid import SmithHybrid
+from jaxhil.compensators.smith_predictor import SmithPredictor
 from jaxhil.mechanism import Mechanism
 
 COMPENSATORS: dict[str, Compensator] = {
@@ -13,6 +15,8 @@ COMPENSATORS: dict[str, Compensator] = {
         NoCompensator(),
         PhaseLead(),
         MultiParameterLead(),
+        SmithPredictor(),
+        SmithHybrid(),
         ResponseError(),
     )
 }

@@ -6,7 +6,7 @@ called once per control period. Each compensator is one file and enters itself i
 the two import, and nothing else.
 """
 
-from . import multi_parameter_lead, none, phase_lead, response_error
+from . import multi_parameter_lead, none, phase_lead, response_error, smith_hybrid, smith_predictor
 from .controller import Controller
 from .errors import GainFileError
 from .gain_file import digest
@@ -21,4 +21,6 @@ __all__ = [
     "none",
     "phase_lead",
     "response_error",
+    "smith_hybrid",
+    "smith_predictor",
 ]
