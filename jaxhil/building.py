@@ -62,6 +62,7 @@ def build_loop(
         ring=samples(sensed),
         controller_ring=samples(max(aligned, default=0.0)),
         energies=energies,
+        probed=scenarios.probe is not None,
         chatter=chatter,
     )
 

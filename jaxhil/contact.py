@@ -52,7 +52,9 @@ class ContactLaw(eqx.Module):
         """Limit of the force [N] as the penetration goes to 0 from above: the jump of a damped touch."""
 
     @abc.abstractmethod
-    def hold(self, parameters: ContactParameters, penetration: Array, rate: Array) -> Array:
+    def hold(
+        self, parameters: ContactParameters, state: tuple[Array, ...], penetration: Array, rate: Array
+    ) -> Array:
         """Smooth and positive as long as penetrated surfaces hold on to each other, else not: they let go
         where it goes through 0. The force before its clamp, or anything of its sign."""
 
@@ -73,7 +75,7 @@ class KelvinVoigt(ContactLaw):
         force = parameters.damping * rate
         return jnp.where(parameters.tension | (force > 0), force, 0)
 
-    def hold(self, parameters, penetration, rate):
+    def hold(self, parameters, state, penetration, rate):
         force = parameters.stiffness * penetration + parameters.damping * rate
         return jnp.where(parameters.tension, 1, force)
 
@@ -95,7 +97,7 @@ class HuntCrossley(ContactLaw):
     def edge(self, parameters, rate):
         return jnp.zeros_like(rate)
 
-    def hold(self, parameters, penetration, rate):
+    def hold(self, parameters, state, penetration, rate):
         return 1 + 1.5 * parameters.damping * rate
 
     def reference(self, parameters, mass, velocity):
@@ -109,10 +111,10 @@ class PiecewiseLinear(ContactLaw):
     """
 
     def step(self, parameters, state, penetration, rate):
-        force = self.hold(parameters, penetration, rate)
+        force = self.hold(parameters, state, penetration, rate)
         return jnp.where((penetration > 0) & (force > 0), force, 0), state
 
-    def hold(self, parameters, penetration, rate):
+    def hold(self, parameters, state, penetration, rate):
         segments = parameters.stiffness.shape[0]
         force = parameters.damping * rate
         for i in range(segments):

@@ -18,10 +18,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxhil.compensators.base import Compensator, Constants, Gains, Signals
-from jaxhil.contact import ContactLaw
+from jaxhil.contact import ContactLaw, deflection
 from jaxhil.integrators import INTEGRATORS
 from jaxhil.limits import limit_command
 from jaxhil.loop_state import LoopState, Plant, Rings, Sensed
+from jaxhil.probe import Push, touch, untouched
 from jaxhil.ring import look_back, tie, write_in_turn
 from jaxhil.scenario import Scenario
 from jaxhil.sensors import Noise, quantise, sample_force
@@ -69,7 +70,7 @@ class Loop(eqx.Module):
     are present: force lag, force noise or bias, position noise, sample effects (quantum, dead zone, range),
     command limits, a second surface; which derivative of the mechanism's position is the first to break at
     the ticks (0: it jumps itself; 3 stands for all higher ones); samples in the delay lines of the sensors
-    and of the controller; whether energies are audited and the command's swings followed.
+    and of the controller; whether energies are audited, the run is probed and the command's swings followed.
     """
 
     law: ContactLaw = eqx.field(static=True)
@@ -88,6 +89,7 @@ class Loop(eqx.Module):
     ring: int = eqx.field(static=True)
     controller_ring: int = eqx.field(static=True)
     energies: bool = eqx.field(static=True)
+    probed: bool = eqx.field(static=True)
     chatter: bool = eqx.field(static=True)
 
     @property
@@ -189,6 +191,7 @@ def enter(
         law=loop.law.init(position),
         entry_velocity=velocity,
         entry_tick=jnp.broadcast_to(tick, position.shape),
+        touched=untouched(position) if loop.probed else None,
     )
 
 
@@ -229,8 +232,12 @@ def drive(
     truth: Truth,
     force: Array,
     controller: Any,
+    push: Push | None = None,
 ) -> LoopState:
-    """Stages 3 to 5: integrate the numerical model under F_c, move the rig, touch the mechanism."""
+    """Stages 3 to 5: integrate the numerical model under F_c, move the rig, touch the mechanism.
+
+    A push acts on the hardware beside the contact, where the run is probed.
+    """
     scenario, sensed = rig.scenario, state.sensed
     period = rig.constants.control_period
     acceleration = -force * rig.inverse_mass
@@ -264,6 +271,19 @@ def drive(
         until = rig.delays.force.fraction * period
         time_constant = scenario.force_sensor.time_constant
         reading, lagged = sensed_lag(surfaces, lagged, panel, until, period, time_constant)
+    touched = state.touched
+    if touched is not None and push is not None:
+        signed = deflection(panel.sample.position, scenario.clearance)
+        side = jnp.sign(signed)
+        now_in_run = (tick - state.entry_tick).astype(period.dtype)
+        touched = touch(touched, side * signed, side * panel.sample.velocity, side, now_in_run, period)
+        since = jnp.where(touched.yet, now_in_run - touched.time, -1e9) * period
+        pushed = real + touched.side * push.force(since)
+        if reading is not None:
+            time_constant = scenario.force_sensor.time_constant
+            reading = reading + touched.side * push.lagged(since, time_constant)
+    else:
+        pushed = real
     works = peak = None
     if loop.energies and loop.first_break == 0:
         works = works_between(sensed.last, now)
@@ -271,7 +291,7 @@ def drive(
         works = works_along(surfaces, panel.start, panel.end, period)
     if loop.has_corners:
         peak = crest(surfaces, panel.start, panel.end, period)
-    happened = jax.tree.map(tie, Truth(real, works, peak), truth)
+    happened = jax.tree.map(tie, Truth(pushed, works, peak), truth)
     samples = Rings(happened, reading, read(plant.measured_position, x_now, start, end), None)
     rings = write_in_turn(rings._replace(panel=None), tick, samples)._replace(panel=panels)
     return state._replace(
@@ -281,6 +301,7 @@ def drive(
         sensed=Sensed(rings, now, lagged, sensed.first_position),
         law=law,
         controller=controller,
+        touched=touched,
     )
 
 

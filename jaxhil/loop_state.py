@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 from jaxtyping import Array, Float, Int
 
 from jaxhil.contact import ContactParameters
+from jaxhil.probe import Touched
 from jaxhil.touch import Panel, Touch, Truth
 
 
@@ -45,7 +46,8 @@ class Sensed(NamedTuple):
 
 class LoopState(NamedTuple):
     """All that evolves: the model's position [m] and velocity [m/s], and the rest. The run under way was
-    entered at `entry_tick`, in uniform motion of `entry_velocity` [m/s]."""
+    entered at `entry_tick`, in uniform motion of `entry_velocity` [m/s]. Where the run is probed, the
+    hardware's first touch (else None)."""
 
     position: Float[Array, "*batch"]
     velocity: Float[Array, "*batch"]
@@ -56,3 +58,4 @@ class LoopState(NamedTuple):
     parameters: ContactParameters
     entry_velocity: Float[Array, "*batch"]
     entry_tick: Int[Array, "*batch"]
+    touched: Touched | None

@@ -9,9 +9,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxhil.compensators.base import Signals
+from jaxhil.compensators.base import Constants, Signals
 from jaxhil.contact import deflection
 from jaxhil.loop import Loop
+from jaxhil.probe import Deviation, Probe, follow, no_deviation, root_mean_square
 from jaxhil.scenario import Scenario
 from jaxhil.touch import Truth
 
@@ -32,7 +33,9 @@ class Metrics(NamedTuple):
     """Per contact, (slots, *batch): restitution [1]; approach_velocity [m/s]; peak_force, the real contact
     force's, and peak_command, |F_c|'s [N]; excess_variation of F_c [N] (0 unless followed);
     position_shortfall, how far the motion simulator's limits bound [m]; duration, the time in touch [s];
-    work_in and work_out, by the real force along x_a [J] (0 unless audited); status, one of `STATUS_NAMES`;
+    work_in and work_out, by the real force along x_a [J] (0 unless audited); trajectory_error, the root mean
+    square of x_d's depth off that of the same contact in space, as long as that lasts, each since it touched
+    [m] (0 unless probed); status, one of `STATUS_NAMES`;
     ticks run by then.
 
     excess_variation is V / 2 - (max F_c - min F_c), V the total variation sum |F_c(n+1) - F_c(n)| of the
@@ -54,6 +57,7 @@ class Metrics(NamedTuple):
     duration: Float[Array, "slots *batch"]
     work_in: Float[Array, "slots *batch"]
     work_out: Float[Array, "slots *batch"]
+    trajectory_error: Float[Array, "slots *batch"]
     status: Int[Array, "slots *batch"]
     ticks: Int[Array, "slots *batch"]
 
@@ -73,7 +77,7 @@ class Watch(NamedTuple):
     rebound speed [m/s]; peaks [N]; the real force at the last two ticks [N]; ticks with and since a touch;
     works [J] and the command's swings, where followed; the largest shortfall of the position command [m],
     where it has limits; between two surfaces also the side (1 or -1), |F_c| of the last tick and what was
-    left of it when the last contact was over [N]."""
+    left of it when the last contact was over [N]; where the run is probed, x_d beside the reference."""
 
     elapsed: Float[Array, "*batch"]
     over: Bool[Array, "*batch"]
@@ -90,6 +94,7 @@ class Watch(NamedTuple):
     side: Float[Array, "*batch"] | None
     command: Float[Array, "*batch"] | None
     left: Float[Array, "*batch"] | None
+    deviation: Deviation | None
 
 
 class Rules(NamedTuple):
@@ -123,6 +128,7 @@ def empty_metrics(loop: Loop, slots: int, like: Array) -> Metrics:
         duration=numbers,
         work_in=numbers,
         work_out=numbers,
+        trajectory_error=numbers if loop.probed else jnp.zeros_like(numbers),
         status=counts + NOT_REACHED,
         ticks=counts,
     )
@@ -147,20 +153,24 @@ def fresh_watch(loop: Loop, like: Array) -> Watch:
         side=zeros + 1 if loop.is_two_sided else None,
         command=zeros if loop.is_two_sided else None,
         left=zeros if loop.is_two_sided else None,
+        deviation=no_deviation(like) if loop.probed else None,
     )
 
 
 def observe(
     loop: Loop,
-    clearance: Array,
+    constants: Constants,
     rules: Rules,
     watch: Watch,
     signals: Signals,
     truth: Truth,
     command: Array,
     shortfall: Array | None,
+    probe: Probe | None = None,
 ) -> Watch:
-    """Follow the contact through one tick; `command` is F_c, `shortfall` that of `Plant`."""
+    """Follow the contact through one tick; `command` is F_c, `shortfall` that of `Plant`, `probe` that of
+    this contact."""
+    clearance = constants.clearance
     velocity, position = signals.velocity_desired, signals.position_desired
     speed, force, magnitude = jnp.abs(velocity), jnp.abs(truth.force), jnp.abs(command)
     touching = force > 0
@@ -196,6 +206,15 @@ def observe(
     largest = watch.shortfall
     if largest is not None and shortfall is not None:
         largest = jnp.where(lasts, jnp.maximum(largest, shortfall), largest)
+    deviation = watch.deviation
+    if deviation is not None and probe is not None:
+        depth, rate = position, velocity
+        if side is not None:
+            depth, rate = jnp.where(side > 0, position, -clearance - position), side * velocity
+        now = signals.age.astype(velocity.dtype)
+        deviation = follow(
+            deviation, probe.depth, probe.span, depth, rate, now, constants.control_period, ~watch.over
+        )
     return Watch(
         elapsed=jnp.where(begun, watch.elapsed + 1, watch.elapsed),
         over=watch.over | ends,
@@ -213,6 +232,7 @@ def observe(
         side=side,
         command=magnitude if loop.is_two_sided else None,
         left=watch.left,
+        deviation=deviation,
     )
 
 
@@ -255,6 +275,7 @@ def collect(
         duration=watch.touched * period,
         work_in=work_in,
         work_out=work_out,
+        trajectory_error=none if watch.deviation is None else root_mean_square(watch.deviation),
         status=status,
         ticks=ticks,
     )
@@ -262,9 +283,11 @@ def collect(
     slot = jnp.arange(slots, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
     here = (slot == index[None]) & over[None]
     entered = Metrics(*(jnp.where(here, v[None], m) for v, m in zip(values, metrics, strict=True)))
+    # What is not followed still is what it was before any contact: no work in every turn-over.
     if watch.shortfall is None:
-        # Still what it was before any contact: no work in every turn-over.
-        return entered._replace(position_shortfall=metrics.position_shortfall)
+        entered = entered._replace(position_shortfall=metrics.position_shortfall)
+    if watch.deviation is None:
+        entered = entered._replace(trajectory_error=metrics.trajectory_error)
     return entered
 
 

@@ -34,6 +34,7 @@ from jaxhil.metrics import (
     judge,
     observe,
 )
+from jaxhil.probe import Probe, untouched
 from jaxhil.scenario import Scenario
 from jaxhil.sensors import Noise, draw_noise
 from jaxhil.touch import Motion, Panel, Truth, no_touch
@@ -133,6 +134,7 @@ def start(loop: Loop, rig: Rig, gains: Gains) -> Run:
         parameters=_entry(scenario.contact, index),
         entry_velocity=zeros,
         entry_tick=index,
+        touched=untouched(zeros) if loop.probed else None,
     )
     # Rings are read up to one ring behind: start there, so that no index is negative.
     tick = jnp.array(_first_tick(loop), jnp.int32)
@@ -153,7 +155,7 @@ def stretch(loop: Loop, rig: Rig, gains: Gains, run: Run, record: bool) -> tuple
 
     rules = build_rules(rig.scenario)
     prepared = loop.compensator.prepare(gains, rig.constants)
-    clearance = rig.scenario.clearance
+    probe: Probe | None = _entry(rig.scenario.probe, _slot(rig, run.index)) if loop.probed else None
 
     def tick(carry, noise):
         state, watch, now = carry
@@ -161,8 +163,11 @@ def stretch(loop: Loop, rig: Rig, gains: Gains, run: Run, record: bool) -> tuple
         command, controller = loop.compensator.step(prepared, state.controller, signals, now)
         if loop.has_force_noise or loop.has_force_bias:
             command = jnp.where(signals.age == 0, 0, command)
-        watch = observe(loop, clearance, rules, watch, signals, truth, command, state.plant.shortfall)
-        state = drive(loop, rig, gains, state, now, truth, command, controller)
+        watch = observe(
+            loop, rig.constants, rules, watch, signals, truth, command, state.plant.shortfall, probe
+        )
+        push = None if probe is None else probe.push
+        state = drive(loop, rig, gains, state, now, truth, command, controller, push)
         seen = None
         if record:
             identified = loop.compensator.identified(controller)
@@ -192,7 +197,7 @@ def turn_over(loop: Loop, rig: Rig, gains: Gains, run: Run, skip_flight: bool = 
     index = run.index + over.astype(jnp.int32)
     active = run.active & ~(over & ((status != OK) | (index >= scenario.contacts)))
     blank = fresh_watch(loop, watch.approach)
-    entry = _entry(scenario.contact, jnp.minimum(index, scenario.phase.shape[0] - 1))
+    entry = _entry(scenario.contact, _slot(rig, index))
     if watch.command is not None:
         left = jnp.maximum(FADED * watch.peak_command, watch.command)
         # A touch before the turn-over begins the next contact at once, at the speed of the rebound.
@@ -206,6 +211,8 @@ def turn_over(loop: Loop, rig: Rig, gains: Gains, run: Run, skip_flight: bool = 
         # A damped contact is over while the mechanism is still dented: its law holds until it is free.
         free = state.sensed.last.distance <= 0
         state = state._replace(parameters=_choose(free, entry, state.parameters))
+        if state.touched is not None:
+            state = state._replace(touched=_choose(over, untouched(watch.approach), state.touched))
         if skip_flight:
             state = _skip_flight(loop, rig, gains, state, watch, run.tick)
     else:
@@ -240,7 +247,7 @@ def _first_tick(loop):
 
 def _approach(rig, index, velocity):
     """Where a run of the schedule starts: x_d(0) = -v (0.02 s + phi T)."""
-    phase = _entry(rig.scenario.phase, jnp.minimum(index, rig.scenario.phase.shape[0] - 1))
+    phase = _entry(rig.scenario.phase, _slot(rig, index))
     return -velocity * (APPROACH + phase * rig.constants.control_period), velocity
 
 
@@ -289,6 +296,11 @@ def _restart(loop, gains, state, entered, begins, fresh):
         controller=loop.compensator.restart(gains, state.controller, begins, fresh),
         parameters=state.parameters,
     )
+
+
+def _slot(rig, index):
+    """The slot of a contact; of one beyond them all, the last."""
+    return jnp.minimum(index, rig.scenario.phase.shape[0] - 1)
 
 
 def _entry(table, index):

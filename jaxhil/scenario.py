@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int, UInt32
 
 from jaxhil.contact import ContactParameters
 from jaxhil.mechanism import Mechanism
+from jaxhil.probe import Probe
 
 LONGEST_CONTACT = 10.0  # s
 
@@ -50,7 +51,7 @@ class PositionSensor(NamedTuple):
 class Scenario(NamedTuple):
     """One run per lane: equivalent_mass [kg], velocity [m/s] of the first approach, number of contacts,
     phase of each contact [1], clearance [m] (inf if one-sided), the contacts' parameters, the rig, the
-    time_limit [s] of a contact, and a random key (seed, index) for sensor noise."""
+    time_limit [s] of a contact, a random key (seed, index) for sensor noise, and what it is probed with."""
 
     equivalent_mass: Float[Array, "*batch"]
     velocity: Float[Array, "*batch"]
@@ -64,6 +65,7 @@ class Scenario(NamedTuple):
     position_sensor: PositionSensor
     time_limit: Float[Array, "*batch"]
     key: UInt32[Array, "2 *batch"]
+    probe: Probe | None = None
 
 
 def contact_slots(contacts: int) -> int:

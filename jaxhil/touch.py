@@ -196,7 +196,7 @@ def _contact(surfaces, start, end, duration):
 
     def hold(s):
         rate = side * along(start, end, duration, s).velocity
-        return surfaces.law.hold(surfaces.parameters, depth(s), rate)
+        return surfaces.law.hold(surfaces.parameters, surfaces.state, depth(s), rate)
 
     enters, leaves = _crossing(depth, duration)
     catches, lets_go = _crossing(hold, duration)

@@ -28,7 +28,7 @@ from lanes import (
 from oracle import simulate
 
 from jaxhil.building import build_loop
-from jaxhil.compensators.phase_lead import force_delay
+from jaxhil.compensators.estimates import force_delay
 from jaxhil.contact import LAWS
 from jaxhil.loop import Loop
 from jaxhil.metrics import Metrics

@@ -3,6 +3,8 @@
 import copy
 from typing import Any
 
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.mechanism_file import from_builtins
 from jaxhil.runtime import digest
 
 MECHANISM: dict[str, Any] = {
@@ -38,8 +40,20 @@ _LEAD = {
     "lead_filter": {"value": 0.001, "unit": "s", "lower": 1e-4, "upper": 0.02},
 }
 
+
+def _entries(compensator: str) -> dict[str, dict[str, Any]]:
+    """Gains at the literature's values, and where that is 0 well within their bounds."""
+    mechanism = from_builtins(copy.deepcopy(MECHANISM), "documents")
+    entries = {}
+    for gain in COMPENSATORS[compensator].gains:
+        lower, upper = gain.lower(mechanism), gain.upper(mechanism)
+        value = gain.nominal(mechanism) or 0.7 * lower + 0.3 * upper
+        entries[gain.name] = {"value": value, "unit": gain.unit, "lower": lower, "upper": upper}
+    return entries
+
+
 GAINS: dict[str, dict[str, dict[str, Any]]] = {
-    "none": {},
+    **{compensator: _entries(compensator) for compensator in COMPENSATORS},
     "phase_lead": _LEAD,
     "response_error": {
         **_LEAD,

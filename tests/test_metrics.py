@@ -13,13 +13,14 @@ import pytest
 from lanes import QUICK, first_contact, join, mechanism, nominal_gains, spread, validated
 
 from jaxhil.building import build_loop
-from jaxhil.compensators import Signals
+from jaxhil.compensators import Constants, Signals
 from jaxhil.metrics import build_rules, collect, empty_metrics, fresh_watch, observe
 from jaxhil.scenario import build_scenarios
 from jaxhil.touch import Truth
 
 PARSED = validated(mechanism({}))
 SCENARIO = join([build_scenarios(PARSED)])
+CONSTANTS = Constants(SCENARIO.control_period, SCENARIO.clearance)
 LOOP = build_loop(PARSED, "none", SCENARIO, chatter=True)
 BEFORE, AFTER = 5, 40  # ticks without force
 
@@ -35,7 +36,7 @@ def excess(commands, touching):
         # It turns round at once, so that what ends the contact is the quiet after it.
         signals = Signals(zeros, zeros, zeros - 1, zeros, jnp.zeros(1, jnp.int32))
         truth = Truth(jnp.where(touches, 10.0, 0.0)[None], None, None)
-        return observe(LOOP, SCENARIO.clearance, rules, watch, signals, truth, command[None], None), None
+        return observe(LOOP, CONSTANTS, rules, watch, signals, truth, command[None], None), None
 
     watch, _ = jax.lax.scan(tick, fresh_watch(LOOP, zeros), (commands, touching))
     index = jnp.zeros(1, jnp.int32)

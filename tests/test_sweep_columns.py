@@ -33,7 +33,9 @@ def rows(errors, status, peak_force=10.0, force_range=np.inf, shortfall=0.0):
         approach_velocity=2 * like,
         peak_force=peak_force * like,
         position_shortfall=shortfall * like,
-        **dict.fromkeys(("peak_command", "excess_variation", "duration", "work_in", "work_out"), like),
+        **dict.fromkeys(
+            ("peak_command", "excess_variation", "duration", "work_in", "work_out", "trajectory_error"), like
+        ),
         status=status,
         ticks=status,
     )

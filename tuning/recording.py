@@ -226,9 +226,9 @@ def _advance(
     loop: Loop, rig: Rig, gains: Gains, run: Run, signals: Signals, truth: Truth, command: Array, sent: Array
 ) -> Run:
     """The tick's bookkeeping, then stages 3 to 5 under the command and the position sent to the drives."""
-    scenario, rules = rig.scenario, build_rules(rig.scenario)
+    rules = build_rules(rig.scenario)
     shortfall = run.state.plant.shortfall
-    watch = observe(loop, scenario.clearance, rules, run.watch, signals, truth, command, shortfall)
+    watch = observe(loop, rig.constants, rules, run.watch, signals, truth, command, shortfall)
     controller = Sent(sent, run.state.controller)
     state = drive(loop, rig, gains, run.state, run.tick, truth, command, controller)
     return run._replace(state=state, watch=watch, tick=run.tick + 1)

@@ -1,6 +1,6 @@
 """The runtime as one source file, with the exported law and what it imports, and no other.
 
-The package's `__init__` says what the runtime offers; from there relative imports are followed, and each
+What the package's `__init__` offers in `__all__`, the law, and what their relative imports lead to: each
 module's text follows those that it imports, comments and all. Imports from outside come first, once each.
 Where two modules use one name for different things, the later module's is renamed, wherever it is
 not a local one that is meant; the text so edited must parse to what renaming in the syntax tree gives.
@@ -10,7 +10,7 @@ import ast
 import importlib
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -57,8 +57,11 @@ def runtime_source(compensator: str, package: ModuleType = jaxhil.runtime) -> st
     left_out = {one.__module__.rpartition(".")[2] for one in laws.values()} - {law}
     folder = Path(str(package.__file__)).parent
     offered = read_source(folder / "__init__.py", package.__name__)
-    sources = _in_order(folder, package.__name__, offered, left_out)
-    public = {name: origin for name in _public(offered) if (origin := _kept(offered, name, sources))}
+    public = {name: origin for name in _public(offered) if (origin := _origin(offered, name))}
+    wanted = [law, *(module for module, _ in public.values() if module not in left_out)]
+    sources = _in_order(folder, package.__name__, wanted)
+    there = {source.name for source in sources}
+    public = {name: origin for name, origin in public.items() if origin[0] in there}
     bodies, external = _joined(sources, public)
     lines = [
         f'"""The controller for the rig, compensator {compensator}: its whole source in this one file.',
@@ -135,25 +138,25 @@ def _is_inside(statement: ast.Import | ast.ImportFrom, package: str) -> bool:
     return any(alias.name.startswith(package) for alias in statement.names)
 
 
-def _in_order(folder: Path, package: str, offered: Source, left_out: set[str]) -> list[Source]:
-    """The modules that `offered` imports, directly or not, each after those that it imports itself."""
+def _in_order(folder: Path, package: str, wanted: Iterable[str]) -> list[Source]:
+    """The modules wanted and what they import, directly or not, each after those that it imports itself."""
     ordered: dict[str, Source] = {}
     begun: list[str] = []
 
-    def visit(name: str, top: bool) -> None:
-        if name in ordered or (top and name in left_out):
+    def visit(name: str) -> None:
+        if name in ordered:
             return
         if name in begun:
             raise ValueError(f"{package}: modules that import each other: {' -> '.join([*begun, name])}")
         begun.append(name)
         source = read_source(folder / f"{name}.py", package)
         for needed in _needed(source):
-            visit(needed, False)
+            visit(needed)
         begun.pop()
         ordered[name] = source
 
-    for name in _needed(offered):
-        visit(name, True)
+    for name in wanted:
+        visit(name)
     return list(ordered.values())
 
 
@@ -254,12 +257,12 @@ def _public(offered: Source) -> list[str]:
     raise ValueError("the runtime's __init__ says nothing in __all__")
 
 
-def _kept(offered: Source, name: str, sources: list[Source]) -> tuple[str, str] | None:
-    """Module and name there of what is offered as `name`, if that module is among the sources."""
+def _origin(offered: Source, name: str) -> tuple[str, str] | None:
+    """Module and name there of what is offered as `name`; None for a module."""
     origin = offered.imports.get(name)
     if not isinstance(origin, Internal) or origin.name is None:
         return None
-    return (origin.module, origin.name) if origin.module in {one.name for one in sources} else None
+    return origin.module, origin.name
 
 
 def _is_docstring(statement: ast.stmt) -> bool:

@@ -1,0 +1,145 @@
+"""What a run is probed with, beside its contact: a push on the hardware, and the motion it should have had.
+
+A push that no model knows of shows whether a law is transparent: whether what happens to the hardware reaches
+the numerical model. The motion of the same contact in space shows how far the model is led off it. Both count
+from the first touch, of the hardware the one, of the numerical model the other.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+
+class Push(NamedTuple):
+    """A force p(t) = size sin(pi (t - centre + width/2)/width) for as long as the sine is positive, else 0.
+
+    size [N] against the penetration, centre and width [s]; t counts from the hardware's first touch.
+    """
+
+    size: Float[Array, "*batch"]
+    centre: Float[Array, "*batch"]
+    width: Float[Array, "*batch"]
+
+    def force(self, time: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """p [N] at a time [s] since the first touch."""
+        since = time - self.centre + self.width / 2
+        inside = (since > 0) & (since < self.width)
+        phase = jnp.where(inside, since, 0) * (jnp.pi / self.width)
+        return self.size * jnp.where(inside, jnp.sin(phase), 0)
+
+    def lagged(
+        self, time: Float[Array, "*batch"], time_constant: Float[Array, "*batch"]
+    ) -> Float[Array, "*batch"]:
+        """What a sensor with a first-order lag [s] reads of it: 1/(1 + s tau_s) applied to p, in closed form.
+
+        With w = pi/width and s since the push began: size/(1 + (w tau)^2) (sin ws - w tau cos ws
+        + w tau exp(-s/tau)) until it ends, then exponential decay.
+        """
+        lags = time_constant > 0
+        lag = jnp.where(lags, time_constant, 1)
+        since = time - self.centre + self.width / 2
+        begun = since > 0
+        within = jnp.clip(jnp.where(begun, since, 0), 0, self.width)
+        rate = jnp.pi / self.width
+        late = rate * lag
+        swing = jnp.sin(rate * within) - late * jnp.cos(rate * within) + late * jnp.exp(-within / lag)
+        left = jnp.exp(-jnp.where(since > self.width, since - self.width, 0) / lag)
+        reading = self.size / (1 + late**2) * jnp.where(begun, swing * left, 0)
+        return jnp.where(lags, reading, self.force(time))
+
+
+class Probe(NamedTuple):
+    """Of each contact: the push, leaves (slots, *batch), and the penetration [m] of the same contact in
+    space, (slots, samples, *batch), at as many times evenly spaced from its first touch to `span` [s]."""
+
+    push: Push
+    depth: Float[Array, "slots samples *batch"]
+    span: Float[Array, "slots *batch"]
+
+
+class Touched(NamedTuple):
+    """The hardware's first touch of the contact under way: whether there was one, its time in periods of the
+    run, the side of the surface (1 or -1)."""
+
+    yet: Bool[Array, "*batch"]
+    time: Float[Array, "*batch"]
+    side: Float[Array, "*batch"]
+
+
+class Deviation(NamedTuple):
+    """The numerical model beside the reference: whether it has entered, when, in periods of the run, sum of
+    the squares [m^2] of x_d's depth off the reference's, and how many there are."""
+
+    entered: Bool[Array, "*batch"]
+    time: Float[Array, "*batch"]
+    squares: Float[Array, "*batch"]
+    count: Float[Array, "*batch"]
+
+
+def untouched(like: Float[Array, "*batch"]) -> Touched:
+    """Before the first touch."""
+    zeros = jnp.zeros_like(like)
+    return Touched(jnp.zeros(like.shape, bool), zeros, zeros + 1)
+
+
+def touch(touched: Touched, depth: Array, rate: Array, side: Array, now: Array, period: Array) -> Touched:
+    """Follow the hardware to a sample: at `now` [periods] it is `depth` [m] beyond the surface on `side`,
+    going deeper at `rate` [m/s]. The first touch lies where uniform motion met the surface."""
+    first = ~touched.yet & (depth > 0)
+    return Touched(
+        touched.yet | first,
+        jnp.where(first, now - _since(depth, rate, period), touched.time),
+        jnp.where(first, side, touched.side),
+    )
+
+
+def no_deviation(like: Float[Array, "*batch"]) -> Deviation:
+    """Before the numerical model has entered."""
+    zeros = jnp.zeros_like(like)
+    return Deviation(jnp.zeros(like.shape, bool), zeros, zeros, zeros)
+
+
+def follow(
+    deviation: Deviation,
+    reference: Float[Array, "samples *batch"],
+    span: Array,
+    depth: Array,
+    rate: Array,
+    now: Array,
+    period: Array,
+    lasts: Array,
+) -> Deviation:
+    """Compare the numerical model with the reference, at `now` [periods], as long as the contact `lasts`."""
+    first = ~deviation.entered & (depth > 0)
+    entered = deviation.entered | first
+    begin = jnp.where(first, now - _since(depth, rate, period), deviation.time)
+    since = jnp.where(entered, now - begin, 0) * period
+    samples = len(reference)
+    place = jnp.clip(since / span, 0, 1) * (samples - 1)
+    before = jnp.clip(jnp.floor(place), 0, samples - 2)
+    share = place - before
+    index = before.astype(jnp.int32)[None]
+    left = jnp.take_along_axis(reference, index, axis=0, mode="promise_in_bounds")[0]
+    right = jnp.take_along_axis(reference, index + 1, axis=0, mode="promise_in_bounds")[0]
+    off = depth - (left + share * (right - left))
+    counts = entered & lasts & (since <= span)
+    return Deviation(
+        entered,
+        begin,
+        deviation.squares + jnp.where(counts, off**2, 0),
+        deviation.count + jnp.where(counts, 1, 0).astype(off.dtype),
+    )
+
+
+def root_mean_square(deviation: Deviation) -> Float[Array, "*batch"]:
+    """Of x_d's depth off the reference's [m]; 0 where nothing was compared."""
+    mean = deviation.squares / jnp.maximum(deviation.count, 1)
+    return jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1)), 0)
+
+
+def _since(depth, rate, period):
+    """Periods since a uniform motion met the surface, one at most."""
+    stride = rate * period
+    inward = stride > 0
+    return jnp.where(inward, jnp.clip(depth / jnp.where(inward, stride, 1), 0, 1), 0)

@@ -1,0 +1,16 @@
+"""The compensation laws by name: the one entry that a law has anywhere.
+
+The law `<name>` is `jaxhil/compensators/<name>.py` in JAX, `jaxhil/runtime/<name>.py` in plain Python and
+`jaxhil/c99/<name>.c` in C99. Simulation, tuning, command line, export and tests go by this list.
+"""
+
+LAWS = (
+    "none",
+    "phase_lead",
+    "multi_parameter_lead",
+    "smith_predictor",
+    "smith_hybrid",
+    "virtual_contact",
+    "passivity",
+    "response_error",
+)

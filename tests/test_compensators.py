@@ -1,0 +1,247 @@
+"""What holds for every compensation law of the registry.
+
+Agreement with the runtime on random and recorded readings is in `test_agreement`, that of C with Python in
+`test_c99`, the bundle and its self-test in `test_export`: all of them go by the registry, too.
+"""
+
+import functools
+import math
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gain_documents import GAINS, gain_document, sign
+from lanes import QUICK
+
+from jaxhil.compensators import COMPENSATORS, Constants, Signals
+from jaxhil.compensators import estimates as known
+from jaxhil.mechanism_file import load
+from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
+from jaxhil.runtime import Controller, GainFileError
+from tuning.rig.c99 import FOLDER
+
+LAWS = tuple(COMPENSATORS)
+WITH_GAINS = tuple(name for name, law in COMPENSATORS.items() if law.gains)
+PERIOD, TICKS, RING, GAP = 1e-3, 200, 64, 2e-4
+HOSTILE = {
+    "no delay, ideal": ["rig.force_sensor.delay=0", "rig.simulator.model=ideal", "rig.simulator.delay=0"],
+    "long delay": ["rig.force_sensor.delay=0.09", "rig.simulator.delay=0.05"],
+    "lagging sensor": ["rig.force_sensor.delay=0", "rig.force_sensor.time_constant=0.02"],
+    "dead zone": ["rig.force_sensor.dead_zone=12", "rig.force_sensor.noise_std=2.7"],
+    "fast": ["rig.control_period=0.00025", "contact.stiffness=[1e7]"],
+    "slow": ["rig.control_period=0.02", "contact.stiffness=[10]", "approach.velocity=0.0001"],
+    "late in jumps": ["rig.command_hold=zoh", "rig.command_latency=1"],
+    "at once": ["rig.command_hold=zoh", "rig.simulator.model=ideal", "rig.force_sensor.delay=0"],
+    "light": ["bodies.equivalent_mass=0.01", "approach.velocity=3"],
+}
+WORDS = {value for name, value in vars(known).items() if name.isupper()}
+
+
+@functools.partial(jax.jit, static_argnums=0, compiler_options=QUICK)
+def commands(name, signals, gains, constants):
+    """Force commands, (ticks, *batch); runs begin where `age` is 0."""
+    law = COMPENSATORS[name]
+    prepared = law.prepare(gains, constants)
+
+    def tick(state, now):
+        index, signals = now
+        begins = (signals.age == 0) & (index > RING)
+        state = law.restart(gains, state, begins, begins)
+        command, state = law.step(prepared, state, signals, index)
+        return state, command
+
+    ticks = jnp.arange(signals.age.shape[0], dtype=jnp.int32) + RING
+    return jax.lax.scan(tick, law.init(gains, constants, RING), (ticks, signals))[1]
+
+
+@functools.partial(jax.jit, static_argnums=0, compiler_options=QUICK)
+def derivative(name, signals, gains, constants, along_signals, along_gains):
+    """Of the commands, along a direction of the four readings and of the gains."""
+
+    def of(moved, gains):
+        return commands.__wrapped__(name, Signals(*moved, signals.age), gains, constants)
+
+    return jax.jvp(of, (signals[:4], gains), (along_signals, along_gains))[1]
+
+
+def readings(shape=(), clearance=math.inf):
+    """Contacts at either surface, force and measured position late, (ticks, *shape), two runs of them."""
+    size = 1 + 0.1 * np.arange(math.prod(shape)).reshape(shape)
+    time = PERIOD * np.arange(TICKS).reshape(-1, *(1 for _ in shape))
+
+    def motion(late):
+        return 3e-4 * size * np.sin(40 * (time - late) - 0.3)
+
+    late = motion(0.0091)
+    far = np.minimum(late + clearance, 0.0)
+    force = 1.2e5 * np.where(late > 0, late, far)
+    velocity = 40 * 3e-4 * size * np.cos(40 * time - 0.3)
+    age = np.broadcast_to((np.arange(TICKS) % 120).reshape(time.shape), velocity.shape)
+    signals = Signals(force, motion(0.0), velocity, motion(0.0063), age.astype(np.int32))
+    constants = Constants(np.full(shape, PERIOD), np.full(shape, clearance))
+    return jax.tree.map(jnp.asarray, (signals, constants))
+
+
+def some_gains(name, shape=()):
+    """Gains with none of them 0, the same in every lane."""
+    return {gain: jnp.full(shape, entry["value"]) for gain, entry in GAINS[name].items()}
+
+
+def on_the_rig(name, signals):
+    """The runtime's commands on readings of one lane, as one run."""
+    gains = {gain: entry["value"] for gain, entry in GAINS[name].items()}
+    controller = ON_THE_RIG[name](gains, PERIOD, GAP)
+    rows = zip(*(np.asarray(leaf).tolist() for leaf in signals[:4]), strict=True)
+    return np.array([controller.step(*row) for row in rows])
+
+
+def test_every_law_is_there_in_three_languages():
+    assert set(ON_THE_RIG) == set(LAWS)
+    for name, law in COMPENSATORS.items():
+        assert law.name == name and (Path(str(FOLDER)) / f"{name}.c").exists()
+        assert {g.name: g.unit for g in law.gains} == {g: s.unit for g, s in ON_THE_RIG[name].gains.items()}
+        assert set(law.knows) <= WORDS
+
+
+@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("hostile", HOSTILE)
+def test_nominal_gains_are_within_bounds_that_the_runtime_admits(name, hostile):
+    mechanism = load("rig-300kg", HOSTILE[hostile]).mechanism
+    for gain in COMPENSATORS[name].gains:
+        lower, nominal, upper = (bound(mechanism) for bound in (gain.lower, gain.nominal, gain.upper))
+        assert lower <= nominal <= upper and lower < upper and math.isfinite(upper), (gain.name, nominal)
+        assert all(ON_THE_RIG[name].gains[gain.name].admits(bound) for bound in (lower, nominal, upper))
+        assert lower > 0 or not gain.logarithmic
+        assert gain.neutral is None or lower <= gain.neutral <= upper
+
+
+@pytest.mark.parametrize("name", WITH_GAINS)
+def test_bad_gains_are_refused_with_one_line(name):
+    for gain, specification in ON_THE_RIG[name].gains.items():
+        bad = [10**400, None, "1", True]
+        bad += [specification.lowest] * specification.exclusive
+        bad += [specification.lowest - 1.0] * (specification.lowest > -math.inf)
+        bad += [specification.highest + 1.0] * (specification.highest < math.inf)
+        for value in bad:
+            document = gain_document(name)
+            document["gains"][gain] |= {"value": value, "lower": -1e300, "upper": 1e300}
+            with pytest.raises(GainFileError) as caught:
+                Controller.from_dict(sign(document))
+            assert f"gains.{gain}" in str(caught.value) and "\n" not in str(caught.value)
+    document = gain_document(name)
+    document["gains"].popitem()
+    with pytest.raises(GainFileError, match=r"^[^\n]*gains[^\n]*$"):
+        Controller.from_dict(sign(document))
+
+
+@pytest.mark.parametrize("name", WITH_GAINS)
+def test_derivatives_by_every_gain_are_those_of_differences(name):
+    signals, constants = readings((), GAP)
+    gains = some_gains(name)
+    still = tuple(jnp.zeros_like(leaf) for leaf in signals[:4])
+    for gain, value in gains.items():
+        along = {other: jnp.asarray(float(other == gain)) for other in gains}
+        found = derivative(name, signals, gains, constants, still, along)
+        step = 1e-4 * value
+        moved = [
+            commands(name, signals, {**gains, gain: value + times * step}, constants)
+            for times in (-2, -1, 1, 2)
+        ]
+        expected = (moved[0] - 8 * moved[1] + 8 * moved[2] - moved[3]) / (12 * step)
+        scale = float(jnp.max(jnp.abs(expected)))
+        assert scale > 0, f"{gain} does nothing"
+        np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * scale, err_msg=gain)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_derivatives_are_finite_at_rest_at_the_surface_and_without_force(name):
+    signals, constants = readings((), GAP)
+    gains = some_gains(name)
+    nothing = signals._replace(**{leaf: jnp.zeros(TICKS) for leaf in signals._fields[:4]})
+    for given in (signals, nothing, nothing._replace(force_measured=signals.force_measured)):
+        ones = jax.tree.map(jnp.ones_like, (given[:4], gains))
+        assert jnp.all(jnp.isfinite(derivative(name, given, gains, constants, *ones)))
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_lanes_of_any_batch_shape_are_alone(name):
+    """Shapes (), (n,) and (m, n)."""
+    signals, constants = readings((2, 3), GAP)
+    together = commands(name, signals, some_gains(name, (2, 3)), constants)
+    row = jax.tree.map(lambda leaf: leaf[..., 1, :], (signals, constants))
+    in_a_row = commands(name, row[0], some_gains(name), row[1])
+    lane = jax.tree.map(lambda leaf: leaf[..., 2], row)
+    alone = commands(name, lane[0], some_gains(name), lane[1])
+    assert together.shape == (TICKS, 2, 3) and in_a_row.shape == (TICKS, 3) and alone.shape == (TICKS,)
+    scale = float(jnp.max(jnp.abs(alone)))
+    np.testing.assert_allclose(together[:, 1, 2], alone, rtol=0, atol=1e-12 * scale)
+    np.testing.assert_allclose(in_a_row[:, 2], alone, rtol=0, atol=1e-12 * scale)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_law_takes_its_type_from_its_arrays(name):
+    lowered = jax.tree.map(
+        lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf,
+        (*readings((), GAP), some_gains(name)),
+    )
+    signals, constants, gains = lowered
+    of_law = functools.partial(commands.__wrapped__, name)
+    assert jax.eval_shape(of_law, signals, gains, constants).dtype == jnp.float32
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_either_surface_is_the_other_s_mirror_image(name):
+    signals, _ = readings((), GAP)
+    mirrored = Signals(
+        -signals.force_measured,
+        -GAP - signals.position_desired,
+        -signals.velocity_desired,
+        -GAP - signals.position_measured,
+        signals.age,
+    )
+    found, expected = on_the_rig(name, mirrored), -on_the_rig(name, signals)
+    assert np.min(expected) < 0 < np.max(expected)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected)))
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_runs_begin_anew(name):
+    """Where none begins nothing changes; the next contact knows nothing but what was identified; after a
+    reset nothing is left."""
+    law, gains = COMPENSATORS[name], some_gains(name)
+    signals, constants = readings((), GAP)
+    first = jax.tree.map(lambda leaf: leaf[60], signals)
+    fresh = law.init(gains, constants, RING)
+    used = fresh
+    for tick in range(4):
+        used = law.step(law.prepare(gains, constants), used, first, jnp.asarray(tick))[1]
+    no, yes = jnp.asarray(False), jnp.asarray(True)
+    for goes_on in (law.restart(gains, used, no, no), law.restart(gains, used, no, yes)):
+        jax.tree.map(np.testing.assert_array_equal, goes_on, used)
+    rows = [row for row in zip(*(np.asarray(leaf).tolist() for leaf in signals[:4]), strict=True)]
+    values = {gain: entry["value"] for gain, entry in GAINS[name].items()}
+    controllers = [ON_THE_RIG[name](values, PERIOD, GAP) for _ in range(3)]
+    for row in rows:
+        controllers[0].step(*row)
+        controllers[1].step(*row)
+    controllers[0].reset()
+    controllers[1].next_contact()
+    if law.identified(used) is not None:
+        del controllers[1]
+    for row in rows:
+        assert len({controller.step(*row) for controller in controllers}) == 1
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_noise_is_passed_on_as_predicted(name):
+    """White noise on the force readings in a contact held still."""
+    ticks, gains = 40_000, {gain: entry["value"] for gain, entry in GAINS[name].items()}
+    law = COMPENSATORS[name]
+    constants = Constants(jnp.asarray(PERIOD), jnp.asarray(math.inf))
+    predicted = float(law.noise_amplification(some_gains(name), constants))
+    controller = ON_THE_RIG[name](gains, PERIOD, math.inf)
+    noise = np.random.default_rng(5).standard_normal(ticks)
+    found = [controller.step(120.0 + one, 1e-3, 0.0, 1e-3) for one in noise.tolist()]
+    assert np.std(found[1000:]) == pytest.approx(predicted * np.std(noise[1000:]), rel=0.02)

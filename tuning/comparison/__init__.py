@@ -1,0 +1,1 @@
+"""Every compensator, each tuned to its own best, on the same scenarios."""

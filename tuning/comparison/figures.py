@@ -1,0 +1,146 @@
+"""What is said of a law on one mechanism's scenarios, each figure with its 95 % interval.
+
+    rms, p99, worst      restitution error |e - e*| over all contacts
+    failures             share of scenarios with a contact that does not end, or errs beyond the limit
+    early, late          transparency to a push at a quarter and at three quarters of the contact; 1 is perfect
+    slope                of e against e* over damped twins; 1 is perfect
+    peak                 99th percentile of the command's peak over the reference's
+    trajectory           rms of x_d off the reference within the contact, over the reference's depth
+    noise                amplification of white noise on the force, from the gains alone: no interval
+
+Scenarios are resampled (bootstrap), each with all its contacts; a share has its Clopper-Pearson interval.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.stats import binomtest
+
+from jaxhil.evaluation import Outcome
+from tuning.trust import interval
+
+RESAMPLES = 999
+LEVEL = 0.95
+# Figures by how good they are: the less the better, or the closer to 1.
+LESS = ("rms", "p99", "failures", "peak", "trajectory")
+CLOSER_TO_1 = ("early", "late", "slope")
+
+
+class Figure(NamedTuple):
+    """A figure and the ends of its interval; the ends are NaN where it has none."""
+
+    value: float
+    low: float
+    high: float
+
+
+class Judged(NamedTuple):
+    """What runs of one law with one set of gains say: outcome (slots, scenarios) of the plain runs, e of the
+    first contact under an early and a late push, outcome of the damped twins."""
+
+    plain: Outcome
+    early: Outcome
+    late: Outcome
+    twins: Outcome
+
+
+def judge(
+    judged: Judged,
+    pushed: tuple[Float[np.ndarray, "scenarios"], Float[np.ndarray, "scenarios"]],
+    in_space: Float[np.ndarray, "scenarios"],
+    depth: Float[np.ndarray, "slots scenarios"],
+    amplification: float,
+    limit: float,
+    seed: int,
+) -> dict[str, Figure]:
+    """All figures. `pushed`: e* under the early and the late push; `in_space`: e* without, integrated alike;
+    `depth` [m]: the deepest point of each contact in space."""
+    plain, good = judged.plain, judged.plain.good
+    ends = interval(plain.error, good, seed=seed)
+    size = np.abs(plain.error[good])
+    wrong = np.any((plain.wanted & ~good) | (good & (np.abs(plain.error) > limit)), axis=0)
+    found = {
+        "rms": Figure(_rms(size), *ends.rms),
+        "p99": Figure(_percentile(size, 99), *ends.p99),
+        "worst": Figure(float(np.max(size, initial=np.nan)) if len(size) else np.nan, np.nan, np.nan),
+        "failures": share(wrong),
+    }
+    for name, runs, e in zip(("early", "late"), (judged.early, judged.late), pushed, strict=True):
+        both = good[0] & runs.good[0]
+        change = runs.metrics.restitution[0] - plain.metrics.restitution[0]
+        found[name] = resampled(transmitted, seed, change[both], (e - in_space)[both])
+    twins = judged.twins.good
+    found["slope"] = resampled(
+        slope, seed, judged.twins.metrics.restitution[twins], judged.twins.reference_restitution[twins]
+    )
+    found["peak"] = resampled(lambda ratio: np.percentile(ratio, 99, axis=-1), seed, plain.peak_ratio[good])
+    apart = plain.metrics.trajectory_error[good] / depth[good]
+    found["trajectory"] = resampled(lambda off: np.sqrt(np.mean(off**2, axis=-1)), seed, apart)
+    found["noise"] = Figure(amplification, np.nan, np.nan)
+    return found
+
+
+def transmitted(
+    change: Float[np.ndarray, "*resamples scenarios"], true: Float[np.ndarray, "*resamples scenarios"]
+) -> Float[np.ndarray, "*resamples"]:
+    """Least squares of the change of e on the true one, through 0: sum(change true)/sum(true^2)."""
+    return np.sum(change * true, axis=-1) / np.sum(true**2, axis=-1)
+
+
+def slope(
+    restitution: Float[np.ndarray, "*resamples scenarios"], reference: Float[np.ndarray, "*resamples scenarios"]
+) -> Float[np.ndarray, "*resamples"]:
+    """Least squares of e on e*, with an intercept."""
+    centred = reference - np.mean(reference, axis=-1, keepdims=True)
+    return np.sum(centred * restitution, axis=-1) / np.sum(centred**2, axis=-1)
+
+
+def share(yes: Bool[np.ndarray, "scenarios"]) -> Figure:
+    """How often, with the Clopper-Pearson interval."""
+    ends = binomtest(int(np.sum(yes)), len(yes)).proportion_ci(LEVEL, method="exact")
+    return Figure(float(np.mean(yes)), float(ends.low), float(ends.high))
+
+
+def resampled(function: Callable[..., np.ndarray], seed: int, *data: Float[np.ndarray, "scenarios"]) -> Figure:
+    """A function of paired data, along their last axis, with its percentile bootstrap interval.
+
+    Source: Efron and Tibshirani, "An Introduction to the Bootstrap" (1993), chapter 13.
+    """
+    number = len(data[0])
+    if number < 2:
+        return Figure(np.nan, np.nan, np.nan)
+    chosen = np.random.default_rng(seed).integers(number, size=(RESAMPLES, number))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        spread = function(*(values[chosen] for values in data))
+        ends = np.quantile(spread, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+        return Figure(float(function(*data)), float(ends[0]), float(ends[1]))
+
+
+def distance(name: str, figure: Figure) -> Figure:
+    """How far a figure is from its best: itself, or its distance from 1; NaN ends where it has no interval."""
+    if name not in CLOSER_TO_1:
+        return figure
+    ends = sorted((abs(figure.low - 1), abs(figure.high - 1)))
+    straddles = figure.low <= 1 <= figure.high
+    return Figure(abs(figure.value - 1), 0.0 if straddles else ends[0], ends[1])
+
+
+def winner(name: str, figures: dict[str, Figure]) -> str | None:
+    """Of several laws the one whose interval lies below all others'; None where there is no such one."""
+    apart = {law: distance(name, figure) for law, figure in figures.items()}
+    known = {law: one for law, one in apart.items() if np.isfinite(one.value) and np.isfinite(one.high)}
+    if len(known) < 2:
+        return None
+    first = min(known, key=lambda law: known[law].high)
+    others = (one.low for law, one in known.items() if law != first)
+    return first if all(known[first].high < low for low in others) else None
+
+
+def _rms(values):
+    return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan
+
+
+def _percentile(values, percent):
+    return float(np.percentile(values, percent)) if len(values) else np.nan
