@@ -147,7 +147,7 @@ def lane_of(measured, force, gain_file):
         np.arange(ticks, dtype=np.int32),
     )
     lane = Lane(signals, np.zeros(ticks), None, False)
-    command, stiffness, damping = replayed(Controller(gain_file), lane)
+    command, _, stiffness, damping = replayed(Controller(gain_file), lane)
     return lane._replace(command=command, identified=(stiffness, damping))
 
 

@@ -10,6 +10,7 @@ LAWS = (
     "multi_parameter_lead",
     "smith_predictor",
     "smith_hybrid",
+    "position_lead",
     "virtual_contact",
     "passivity",
     "response_error",
