@@ -42,8 +42,8 @@ DELAY = 0.005
 
 @functools.cache
 def restitutions():
-    """Means over the contact phase, (3, periods): with the exact inverse, without any lead, with the inverse and
-    a force delay."""
+    """Means over the contact phase, (3, periods): with the exact inverse, without any lead, with the inverse
+    and a force delay."""
     parsed = validated(mechanism({"stiffness": [STIFFNESS]}, EXACT, 0.0, period=PERIODS[-1]))
     gains = nominal_gains(parsed, "position_lead")
     frequency = 2 * pi * 12.0
