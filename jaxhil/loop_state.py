@@ -19,6 +19,11 @@ class Plant(NamedTuple):
     wanted: Float[Array, "*batch"] | None
 
     @property
+    def sent(self) -> Float[Array, "*batch"]:
+        """c(n) as the controller commanded it [m]: before the limits, where there are any."""
+        return self.commands[0] if self.wanted is None else self.wanted
+
+    @property
     def shortfall(self) -> Float[Array, "*batch"] | None:
         """How far the limits keep c(n) from what was wanted [m], where there are any."""
         return None if self.wanted is None else abs(self.wanted - self.commands[0])

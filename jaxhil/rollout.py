@@ -57,7 +57,8 @@ class Run(NamedTuple):
 
 class Tick(NamedTuple):
     """What is recorded of a tick: what the controller read and what it made of it, the truth, whether the
-    lane was still running, the number of the contact, what was identified [N/m, N s/m]."""
+    lane was still running, the number of the contact, what was identified [N/m, N s/m], and the position
+    command [m] sent to the drives at its end, before any limits of theirs."""
 
     signals: Signals
     command: Float[Array, "*batch"]
@@ -65,6 +66,7 @@ class Tick(NamedTuple):
     active: Bool[Array, "*batch"]
     contact: Int[Array, "*batch"]
     identified: tuple[Array, Array] | None
+    sent: Float[Array, "*batch"]
 
 
 def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Metrics:
@@ -172,7 +174,7 @@ def stretch(loop: Loop, rig: Rig, gains: Gains, run: Run, record: bool) -> tuple
         if record:
             identified = loop.compensator.identified(controller)
             going = run.active & ~watch.over
-            seen = Tick(signals, command, truth, going, run.index, identified)
+            seen = Tick(signals, command, truth, going, run.index, identified, state.plant.sent)
         return (state, watch, now + 1), seen
 
     carry, length = (run.state, run.watch, run.tick), stretch_length(loop)

@@ -237,6 +237,11 @@ CASES: dict[str, Case] = {
     "velocity limit": Case(
         mechanism(LIST, {**SECOND_ORDER, "velocity_limit": 0.00505}, 0.011, contacts=2), "response_error"
     ),
+    "position lead": Case(mechanism(LIST, contacts=2), "position_lead"),
+    "position lead, late drives with a limit": Case(
+        mechanism(LIST, {**SECOND_ORDER, "velocity_limit": 0.007}, command_latency=1),
+        "position_lead",
+    ),
     # A force sensor with a lag.
     "lag": Case(mechanism({}, **LAGGED), "phase_lead"),
     "damped, lag": Case(mechanism({"damping": [500.0]}, **LAGGED), "phase_lead"),

@@ -4,20 +4,25 @@ With both surfaces at x = 0 and tension allowed the contact never lets go, and i
 as the dominant root of the loop's characteristic equation says.
 """
 
+import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from math import pi
 from typing import Any
 
 import jax
 import numpy as np
-from lanes import IDEAL, MASS, mechanism, per_lane, run_record, spread, validated
+from jax import lax
+from lanes import IDEAL, MASS, QUICK, mechanism, per_lane, spread, validated
 
 from jaxhil.building import build_loop
+from jaxhil.loop import build_rig
 from jaxhil.mechanism import Mechanism
-from jaxhil.rollout import Tick
+from jaxhil.rollout import Tick, start, stretch, stretch_length
 
 OMEGA = 2 * pi * 3.0
 STIFFNESS = MASS * OMEGA**2
+CHUNK = 256  # ticks
 
 
 def persistent(
@@ -27,9 +32,30 @@ def persistent(
     lanes = next(iter(leaves.values())).shape[-1]
     scenario = spread(parsed, lanes, clearance=np.zeros(lanes), **leaves)
     loop = build_loop(parsed, compensator, scenario)
-    period = float(np.min(scenario.control_period))
-    ticks = run_record(loop, per_lane(gains, lanes), scenario, round(seconds / period))[1]
-    return jax.tree.map(np.asarray, ticks)
+    gains = per_lane(gains, lanes)
+    rig, run = _begin(loop, gains, scenario)
+    recorded = []
+    for _ in range(math.ceil(seconds / float(np.min(scenario.control_period)) / CHUNK)):
+        run, seen = _go_on(loop, gains, rig, run)
+        recorded.append(jax.device_get(seen))
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *recorded)
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICK)
+def _begin(loop, gains, scenario):
+    rig = build_rig(loop, scenario)
+    return rig, start(loop, rig, gains)
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICK)
+def _go_on(loop, gains, rig, run):
+    """One chunk: longer ones take the more time a tick, the more they record."""
+
+    def body(run, _):
+        return stretch(loop, rig, gains, run, record=True)
+
+    run, seen = lax.scan(body, run, None, length=CHUNK // stretch_length(loop))
+    return run, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), seen)
 
 
 def without_period(
@@ -39,8 +65,10 @@ def without_period(
     periods: tuple[float, float] = (5e-4, 2.5e-4),
     **leaves: Any,
 ) -> np.ndarray:
-    """Growth in the limit T -> 0 of a loop whose error is of first order in T, from two periods, one half
-    of the other; `lead_filter` is half the period. Behind an ideal simulator."""
+    """Growth in the limit T -> 0 of a loop whose error is of first order in T, from two periods.
+
+    The second is half the first, `lead_filter` half the period, the simulator ideal.
+    """
     lanes = next(iter(leaves.values())).shape[-1]
     period = np.repeat(periods, lanes)
     both = {name: np.tile(value, 2) for name, value in leaves.items()}

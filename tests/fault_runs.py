@@ -60,6 +60,11 @@ LIMITED: dict[str, float] = {
 FORCE, DESIRED, VELOCITY, MEASURED, TIME, MODEL = 1, 2, 3, 4, 5, 7
 BETWEEN, UNTIL_RESET = 60, 20
 NOT_FINITE = (math.nan, math.inf, -math.inf)
+# Leads short enough that what is injected, and nothing else, takes a command to its limits.
+GENTLE = {
+    "multi_parameter_lead": {"force_rate_gain": 0.008},
+    "position_lead": {"position_lead": 1e-3, "acceleration_lead": 1e-5},
+}
 
 
 class FaultRun(NamedTuple):
@@ -82,7 +87,7 @@ class FaultRun(NamedTuple):
 
 def document(law: str) -> dict[str, Any]:
     """A gain document of the law with the limits of these runs."""
-    made = gain_document(law)
+    made = gain_document(law, **GENTLE.get(law, {}))
     made["limits"] = {
         name: {"value": float(value), "unit": LIMITS[name].unit} for name, value in LIMITED.items()
     }

@@ -282,7 +282,7 @@ def signals(**columns):
     shape = next(iter(columns.values())).shape
     live, begins = np.ones(shape, bool), np.zeros(shape, bool)
     begins[0] = True
-    every: dict = {name: columns.get(name, np.zeros(shape)) for name in Signals._fields[:5]}
+    every: dict = {name: columns.get(name, np.zeros(shape)) for name in Signals._fields[:6]}
     return Signals(**every, live=live, begins=begins)
 
 
@@ -293,16 +293,18 @@ def test_the_extent_of_a_run():
         position=[-4.0, -3.0, 1.0, 3.0, 5.0, 6.0],
         velocity=[1.0, 1.0, 1.0, 1.0, 1.0, -3.0],
         command=[0.0, 1.0, -1.0, 2.0, 0.0, 0.0],
+        sent=[-3.0, -2.5, 2.0, 7.0, 6.0, 5.5],
     )
     found = extent_of(made, period=0.5, clearance=math.inf, free_distance=2.0, settling=0.5)
     expected = {
         "reading": 9.0,
         "measured_lowest": -4.0,
         "measured_highest": 4.0,
-        "desired_lowest": -4.0,
-        "desired_highest": 6.0,
+        "sent_lowest": -3.0,
+        "sent_highest": 7.0,
         "command": 2.0,
         "slew": 6.0,
+        "sent_speed": 10.0,
         "speed": 8.0,
         "acceleration": 8.0,
         "force_stuck": 6.0,

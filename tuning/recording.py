@@ -36,6 +36,7 @@ CHUNK = 512  # ticks recorded by one call of the compiled program
 class Lane(NamedTuple):
     """What the controller read and commanded [N] in one lane, (ticks,), up to the end of its last contact.
 
+    `sent` is the position command [m] that it made of the numerical model's motion after each tick.
     `identified` is what it made of stiffness [N/m] and damping [N s/m], where it identifies them. With
     `zeroed`, the loop takes F_c = 0 at the first tick of a run, whatever the controller says: before t = 0
     there is no force, though a noisy or biased sensor reads some.
@@ -45,6 +46,7 @@ class Lane(NamedTuple):
     command: np.ndarray | Array
     identified: tuple[np.ndarray | Array, np.ndarray | Array] | None
     zeroed: bool
+    sent: np.ndarray | Array | None = None
 
 
 def nominal_and_draws(mechanism: Mechanism, number: int, seed: int) -> Scenario:
@@ -166,11 +168,11 @@ def _arrays(gains: dict[str, float]) -> Gains:
 def _lane(seen: Tick, zeroed: bool) -> Lane:
     # A pause between two contacts still is the controller's; what follows the last active tick is not.
     end = int(np.max(np.nonzero(seen.active)[0], initial=-1)) + 1
-    numbers = [*seen.signals, seen.command, *(seen.identified or ())]
+    numbers = [*seen.signals, seen.command, seen.sent, *(seen.identified or ())]
     finite = np.all(np.isfinite(np.stack(numbers)[:, :end]), axis=0)
     end = end if np.all(finite) else int(np.argmin(finite))
     seen = jax.tree.map(lambda leaf: leaf[:end], seen)
-    return Lane(seen.signals, seen.command, seen.identified, zeroed)
+    return Lane(seen.signals, seen.command, seen.identified, zeroed, seen.sent)
 
 
 @jax.jit

@@ -2,8 +2,8 @@
 
 Two comparisons under the gains of a gain file. *Replay*: the loop is recorded with jax, for the nominal
 mechanism and some draws of its uncertainty, and what its controller read goes tick by tick through the
-runtime's; their force commands are compared. *Closed loop*: the nominal contacts are run once more with the
-runtime in the place of the jax controller, and each contact's restitution is compared.
+runtime's; their force and position commands are compared. *Closed loop*: the nominal contacts are run once
+more with the runtime in the place of the jax controller, and each contact's restitution is compared.
 
 Each side rounds in its own order, so they agree to a fraction of the command's range, but for one thing: a
 decision (touching or not, force above the contact threshold or not) so close to its threshold that rounding
@@ -11,6 +11,7 @@ decides. Such ticks are counted and compared separately; where the decisions fel
 of that lane ends.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 
 import jax
@@ -39,7 +40,8 @@ class LaneReplay(msgspec.Struct, frozen=True):
     Ticks recorded, compared, and of those `near` a threshold; the command's range, 0 included [N]; the
     largest difference away from thresholds and near them, as fractions of that range; the tick of the former,
     and what either side commanded there [N]; the tick at which a decision at a threshold fell differently,
-    which ended the comparison; the runtime's status.
+    which ended the comparison; the runtime's status; the largest difference of the position commands, as a
+    fraction of their range.
     """
 
     ticks: int
@@ -53,6 +55,7 @@ class LaneReplay(msgspec.Struct, frozen=True):
     expected: float
     parted: int | None
     status: str
+    position_difference: float = 0.0
 
 
 class ContactComparison(msgspec.Struct, frozen=True):
@@ -120,7 +123,7 @@ def verify(
 def replay(lane: Lane, gain_file: GainFile) -> LaneReplay:
     """The lane's signals tick by tick through the runtime, and how its commands compare."""
     controller = Controller(gain_file)
-    commands, stiffness, damping = replayed(controller, lane)
+    commands, positions, stiffness, damping = replayed(controller, lane)
     near = near_threshold(lane.signals, gain_file)
     error, span = relative_difference(commands, np.asarray(lane.command))
     parted = parting(error, (stiffness, damping), lane.identified, near)
@@ -139,21 +142,39 @@ def replay(lane: Lane, gain_file: GainFile) -> LaneReplay:
         expected=float(lane.command[worst]) if compared else 0.0,
         parted=parted,
         status=controller.status,
+        position_difference=position_difference(positions[:compared], lane),
     )
 
 
-def replayed(controller: Controller, lane: Lane) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The runtime's commands [N] and identified stiffness and damping, (ticks,), for the lane's signals."""
+def replayed(controller: Controller, lane: Lane) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The runtime's commands [N] and [m] and identified stiffness and damping, (ticks,), for the lane's
+    signals; NaN for a position command after which no motion of the numerical model is recorded."""
     controller.reset()
-    readings = zip(*(leaf.tolist() for leaf in lane.signals), strict=True)
+    readings = list(zip(*(leaf.tolist() for leaf in lane.signals), strict=True))
     results = []
     for tick, (force, position, velocity, measured, age) in enumerate(readings):
         if age == 0 and tick > 0:
             controller.next_contact()
         command = controller.step(force, position, velocity, measured)
-        results.append((0.0 if age == 0 and lane.zeroed else command, *controller.identified))
-    commands, stiffness, damping = np.array(results, float).reshape(-1, 3).T
-    return commands, stiffness, damping
+        identified, sent = controller.identified, math.nan
+        if lane.sent is not None and tick + 1 < len(readings) and readings[tick + 1][4] == age + 1:
+            # Every integrator has v(n+1) = v(n) + T a.
+            moved_to, moved_at = readings[tick + 1][1:3]
+            acceleration = (moved_at - velocity) / controller.control_period
+            sent = controller.position_command(moved_to, moved_at, acceleration)
+        results.append((0.0 if age == 0 and lane.zeroed else command, sent, *identified))
+    commands, positions, stiffness, damping = np.array(results, float).reshape(-1, 4).T
+    return commands, positions, stiffness, damping
+
+
+def position_difference(positions: np.ndarray, lane: Lane) -> float:
+    """Largest difference of the position commands, those that are not NaN, from the lane's: a fraction of the
+    range of these."""
+    if lane.sent is None:
+        return 0.0
+    expected = np.asarray(lane.sent)[: len(positions)]
+    error, _ = relative_difference(positions, np.where(np.isnan(positions), np.nan, expected))
+    return float(np.max(error, initial=0.0))
 
 
 def command_range(commands: np.ndarray) -> float:
@@ -244,6 +265,11 @@ def _replay_reasons(replays: list[LaneReplay]) -> Iterator[str]:
                 f"{run}, tick {lane.worst_tick}: force command found {lane.found!r} N, expected "
                 f"{lane.expected!r} N: they differ by {lane.difference:.1e} of the command's range "
                 f"{lane.command_range:.4g} N, allowed {REPLAY_LIMIT:.0e}"
+            )
+        if lane.position_difference > REPLAY_LIMIT:
+            yield (
+                f"{run}: position commands differ by {lane.position_difference:.1e} of their range, allowed "
+                f"{REPLAY_LIMIT:.0e}"
             )
     ticks, compared = sum(lane.ticks for lane in replays), sum(lane.compared for lane in replays)
     if compared < LEAST_COMPARED * ticks:

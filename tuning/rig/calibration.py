@@ -260,14 +260,14 @@ def guard_trips(extent: Extent, limits: Mapping[str, float | None]) -> Bool[np.n
         (extent.reading >= most("force_range"))
         | (extent.measured_lowest < least("measured_lowest"))
         | (extent.measured_highest > most("measured_highest"))
-        | (extent.desired_lowest < least("command_lowest"))
-        | (extent.desired_highest > most("command_highest"))
+        | (extent.sent_lowest < least("command_lowest"))
+        | (extent.sent_highest > most("command_highest"))
         | (extent.force_stuck > most("force_stuck_travel"))
         | (extent.position_stuck > most("position_stuck_travel"))
         | (extent.flight_force > most("free_force"))
         | (extent.command > most("force_limit"))
         | (extent.slew > most("force_slew"))
-        | (extent.speed > most("velocity_limit"))
+        | (extent.sent_speed > most("velocity_limit"))
     )
 
 
@@ -281,8 +281,8 @@ def guard_limits(
     smallest = SMALLEST * most["reading"]
     drawn = _largest(loaded)
     measured = _widened(float(np.min(extent.measured_lowest)), most["measured_highest"], rules.clearance)
-    desired = _widened(float(np.min(extent.desired_lowest)), most["desired_highest"], rules.clearance)
-    speed = MARGIN * most["speed"]
+    sent = _widened(float(np.min(extent.sent_lowest)), most["sent_highest"], rules.clearance)
+    speed = MARGIN * most["sent_speed"]
     acceleration = most["acceleration"]
     limited = rig.simulator.acceleration_limit
     duration = runs.audited.duration[:, used]
@@ -305,8 +305,8 @@ def guard_limits(
         "force_limit": MARGIN * most["command"],
         "force_slew": MARGIN * max(most["slew"], smallest / period),
         "limited_in_a_row": float(BRIDGED),
-        "command_lowest": desired[0],
-        "command_highest": desired[1],
+        "command_lowest": sent[0],
+        "command_highest": sent[1],
         "velocity_limit": speed,
         "deceleration": min(acceleration, limited),
         "retreat_velocity": min(loaded.mechanism.approach.velocity, speed),

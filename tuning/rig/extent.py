@@ -10,18 +10,20 @@ from tuning.rig.recorded import Signals
 
 class Extent(NamedTuple):
     """Of every run, (lanes,), all at least 0 but the positions: largest |force reading| [N]; least and
-    largest measured and desired position [m]; largest |F_c| [N] and its fastest change [N/s]; fastest change
-    of the desired position [m/s] and of its velocity [m/s^2]; longest travel [m] of the measured position in
-    contact under one force reading, and of the desired one under one position reading; largest |force
-    reading| in flight [N], and the most by which two of them differ [N]."""
+    largest measured position and position command [m]; largest |F_c| [N] and its fastest change [N/s];
+    fastest change of the position command [m/s], of the desired position [m/s] and of its velocity [m/s^2];
+    longest travel [m] of the measured position in contact under one force reading, and of the desired one
+    under one position reading; largest |force reading| in flight [N], and the most by which two of them
+    differ [N]."""
 
     reading: Float[np.ndarray, "lanes"]
     measured_lowest: Float[np.ndarray, "lanes"]
     measured_highest: Float[np.ndarray, "lanes"]
-    desired_lowest: Float[np.ndarray, "lanes"]
-    desired_highest: Float[np.ndarray, "lanes"]
+    sent_lowest: Float[np.ndarray, "lanes"]
+    sent_highest: Float[np.ndarray, "lanes"]
     command: Float[np.ndarray, "lanes"]
     slew: Float[np.ndarray, "lanes"]
+    sent_speed: Float[np.ndarray, "lanes"]
     speed: Float[np.ndarray, "lanes"]
     acceleration: Float[np.ndarray, "lanes"]
     force_stuck: Float[np.ndarray, "lanes"]
@@ -35,7 +37,7 @@ def extent_of(
 ) -> Extent:
     """The extent of every lane's runs; flight is what `jaxhil.runtime.inputs` calls so."""
     live, begins = signals.live, signals.begins
-    force, position, velocity, measured, command = (np.where(live, leaf, 0.0) for leaf in signals[:5])
+    force, position, velocity, measured, command, sent = (np.where(live, leaf, 0.0) for leaf in signals[:6])
     goes_on = live[1:] & ~begins[1:]
 
     def largest(values, where):
@@ -55,10 +57,11 @@ def extent_of(
         reading=largest(np.abs(force), live),
         measured_lowest=least(measured),
         measured_highest=-least(-measured),
-        desired_lowest=least(position),
-        desired_highest=-least(-position),
+        sent_lowest=least(sent),
+        sent_highest=-least(-sent),
         command=largest(np.abs(command), live),
         slew=largest(step, live) / period,
+        sent_speed=largest(np.abs(np.diff(sent, axis=0)), goes_on) / period,
         speed=largest(np.abs(np.diff(position, axis=0)), goes_on) / period,
         acceleration=largest(np.abs(np.diff(velocity, axis=0)), goes_on) / period,
         force_stuck=force_stuck,

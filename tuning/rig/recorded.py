@@ -35,14 +35,16 @@ class Scenarios(NamedTuple):
 
 class Signals(NamedTuple):
     """Ticks of many runs, (ticks, lanes): measured force [N], the numerical model's position [m] and velocity
-    [m/s], measured position [m], force command F_c [N]; on which ticks a run of the lane is under way, and on
-    which a run begins. Between two surfaces all contacts are one run."""
+    [m/s], measured position [m], force command F_c [N], position command sent to the drives [m]; on which
+    ticks a run of the lane is under way, and on which a run begins. Between two surfaces all contacts are one
+    run."""
 
     force: Float[np.ndarray, "ticks lanes"]
     position: Float[np.ndarray, "ticks lanes"]
     velocity: Float[np.ndarray, "ticks lanes"]
     measured: Float[np.ndarray, "ticks lanes"]
     command: Float[np.ndarray, "ticks lanes"]
+    sent: Float[np.ndarray, "ticks lanes"]
     live: Bool[np.ndarray, "ticks lanes"]
     begins: Bool[np.ndarray, "ticks lanes"]
 
@@ -99,14 +101,13 @@ def record_chunk(loop: Loop, loaded: LoadedGains, scenarios: Scenario, first: in
     live = ticks <= np.max(np.where(seen.active, ticks, -1), axis=0)
     force, position, velocity, measured, age = (np.asarray(leaf) for leaf in seen.signals)
     begins = live & (age == 0)
-    command = np.asarray(seen.command)
+    command, sent = np.asarray(seen.command), np.asarray(seen.sent)
     if loop.has_force_noise or loop.has_force_bias:
         command = np.where(begins, 0.0, command)
-    finite = np.all([np.isfinite(one) for one in (force, position, velocity, measured, command)], axis=0)
+    columns = force, position, velocity, measured, command, sent
+    finite = np.all([np.isfinite(one) for one in columns], axis=0)
     live &= np.logical_and.accumulate(finite | ~live, axis=0)
-    return Chunk(
-        first, scenarios, Signals(force, position, velocity, measured, command, live, begins), contacts
-    )
+    return Chunk(first, scenarios, Signals(*columns, live, begins), contacts)
 
 
 def _first_lanes(chunk: Chunk, number: int) -> Chunk:

@@ -231,6 +231,7 @@ def _compared(
         return rows, None, None
     faulty = np.flatnonzero([row.faults for row in rows])
     found = np.array([row.force_command for row in rows])
+    sent = np.array([row.position_command for row in rows])
     expected = np.array([one.force_simulated for one in inputs])
     error, span = relative_difference(found, expected)
     near = near_threshold(type(lane.signals)(*(leaf[:number] for leaf in lane.signals)), gain_file)
@@ -251,6 +252,16 @@ def _compared(
             f"{expected[tick].item()!r} N: they differ by {error[tick]:.1e} of the command's range "
             f"{span:.4g} N, allowed {REPLAY_LIMIT:.0e}"
         )
+    elif lane.sent is not None:
+        simulated = np.asarray(lane.sent)[:end]
+        apart, span = relative_difference(sent[:end], simulated)
+        if np.any(apart > REPLAY_LIMIT):
+            tick = int(np.argmax(apart > REPLAY_LIMIT))
+            reason = (
+                f"tick {tick}: position command found {sent[tick].item()!r} m, simulated "
+                f"{simulated[tick].item()!r} m: they differ by {apart[tick]:.1e} of the command's range "
+                f"{span:.4g} m, allowed {REPLAY_LIMIT:.0e}"
+            )
     # A fraction of what is left to compare has to do, for who reads the file sees no more.
     kept = expected.copy()
     kept[end:] = nan
