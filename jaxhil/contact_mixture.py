@@ -5,6 +5,7 @@ program to compile for each law.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,9 +21,17 @@ class AnyOf(ContactLaw):
     Stiffness and depths have a leading axis of segments, as for the piecewise-linear law; the other laws take
     the first. A lane's numbers mean to its own law what they always mean; the others see them without
     damping.
+
+    `beforehand` says that references without a closed form come with the scenarios (`Scenario.reference`):
+    here they are then NaN.
     """
 
     laws: tuple[ContactLaw, ...] = eqx.field(static=True)
+    beforehand: bool = eqx.field(static=True, default=False)
+
+    @property
+    def closed_form(self):
+        return self.beforehand or all(law.closed_form for law in self.laws)
 
     @property
     def remembers(self):
@@ -31,7 +40,7 @@ class AnyOf(ContactLaw):
     def init(self, penetration):
         return tuple(law.init(penetration) for law in self.laws)
 
-    def step(self, parameters, state, penetration, rate):
+    def step(self, parameters, state: Any, penetration, rate):
         found = [
             law.step(own, memory, penetration, rate)
             for law, own, memory in zip(self.laws, self._own(parameters), state, strict=True)
@@ -42,13 +51,18 @@ class AnyOf(ContactLaw):
         own = zip(self.laws, self._own(parameters), strict=True)
         return self._choose(parameters, [law.edge(one, rate) for law, one in own])
 
-    def hold(self, parameters, state, penetration, rate):
+    def hold(self, parameters, state: Any, penetration, rate):
         own = zip(self.laws, self._own(parameters), state, strict=True)
-        return self._choose(parameters, [law.hold(one, memory, penetration, rate) for law, one, memory in own])
+        return self._choose(
+            parameters, [law.hold(one, memory, penetration, rate) for law, one, memory in own]
+        )
 
     def reference(self, parameters, mass, velocity):
-        own = zip(self.laws, self._own(parameters), strict=True)
-        found = [law.reference(one, mass, velocity) for law, one in own]
+        unknown = Reference(*[jnp.full_like(velocity, jnp.nan)] * 3)
+        found = [
+            law.reference(own, mass, velocity) if law.closed_form or not self.beforehand else unknown
+            for law, own in zip(self.laws, self._own(parameters), strict=True)
+        ]
         return Reference(*(self._choose(parameters, list(leaves)) for leaves in zip(*found, strict=True)))
 
     def _own(self, parameters: ContactParameters) -> list[ContactParameters]:

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 from jaxhil.contact import ContactParameters
 from jaxhil.loop import Loop
 from jaxhil.metrics import OK, Metrics
+from jaxhil.reference import Reference
 from jaxhil.rollout import rollout
 from jaxhil.scenario import Scenario
 
@@ -53,6 +54,10 @@ def compare_with_reference(loop: Loop, scenario: Scenario, metrics: Metrics) -> 
     contact = parameters_by_slot(scenario.contact)
     mass = jnp.broadcast_to(scenario.equivalent_mass, velocity.shape)
     reference = loop.law.reference(contact, mass, velocity)
+    known = scenario.reference
+    if known is not None:
+        given = ~jnp.isnan(known.restitution)
+        reference = Reference(*(jnp.where(given, a, b) for a, b in zip(known, reference, strict=True)))
     return Outcome(
         metrics=metrics,
         reference_restitution=reference.restitution,

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int, UInt32
 from jaxhil.contact import ContactParameters
 from jaxhil.mechanism import Mechanism
 from jaxhil.probe import Probe
+from jaxhil.reference import Reference
 
 LONGEST_CONTACT = 10.0  # s
 
@@ -51,7 +52,8 @@ class PositionSensor(NamedTuple):
 class Scenario(NamedTuple):
     """One run per lane: equivalent_mass [kg], velocity [m/s] of the first approach, number of contacts,
     phase of each contact [1], clearance [m] (inf if one-sided), the contacts' parameters, the rig, the
-    time_limit [s] of a contact, a random key (seed, index) for sensor noise, and what it is probed with."""
+    time_limit [s] of a contact, a random key (seed, index) for sensor noise; what it is probed with; the
+    contacts in space, where they are known beforehand (else NaN)."""
 
     equivalent_mass: Float[Array, "*batch"]
     velocity: Float[Array, "*batch"]
@@ -66,6 +68,7 @@ class Scenario(NamedTuple):
     time_limit: Float[Array, "*batch"]
     key: UInt32[Array, "2 *batch"]
     probe: Probe | None = None
+    reference: Reference | None = None
 
 
 def contact_slots(contacts: int) -> int:

@@ -16,6 +16,7 @@ from tuning.options import (
     DEFAULT_PLOT,
     DEFAULT_REPLAY_PLOT,
     PICTURES,
+    Compare,
     Mechanisms,
     Replay,
     Simulate,
@@ -32,6 +33,7 @@ Command = (
     | Annotated[Export, subcommand("export")]
     | Annotated[Verify, subcommand("verify")]
     | Annotated[Rig, subcommand("rig")]
+    | Annotated[Compare, subcommand("compare")]
     | Annotated[Mechanisms, subcommand("mechanisms")]
 )
 

@@ -26,7 +26,7 @@ from tuning.rounds import Start, inverse_hessian, prepare_solver, solve_tasks
 from tuning.search import apart, polish
 from tuning.trial import Trial
 
-SCANNED, SCAN_SCENARIOS = 256, 32  # points looked at before a lot, and on how many scenarios
+SCANNED, SCAN_SCENARIOS = 256, 32  # points looked at before a lot, by default; on how many scenarios
 LOTS = 4  # of starts, at most
 SURE = 3  # starts that have to agree: two may have met in a poor basin
 AGREED = 0.005  # relative difference of values that count as the same minimum
@@ -60,23 +60,28 @@ def find(
     objective: Objective | Sequence[Objective] = RMS,
     first: Sequence[Sequence[Mapping[str, float]]] | None = None,
     report: Callable[[str], None] = lambda text: None,
+    scanned: int = SCANNED,
 ) -> list[Found]:
-    """Best gains of every task, from lots of so many starts of so many steps, and a polish of so many
-    evaluations for each gain. `first` has, of each task, gains to start at, in the places of the last starts
-    of its first lot, never of the literature's. One start alone is the literature's, and the only lot."""
+    """Best gains of every task, from lots of so many starts of so many steps, the best of so many points
+    `scanned`, and a polish of so many evaluations for each gain.
+
+    `first` has, of each task, gains to start at, in the places of the last starts of its first lot, never of
+    the literature's. One start alone is the literature's, and the only lot."""
     tasks, objectives = trial.tasks, one_each(objective, len(trial.tasks))
     told = [list(own) for own in first] if first else [[] for _ in tasks]
     number = max(starts, 1 + max(map(len, told)))
     searches = [_Search() for _ in tasks]
     chosen = _while_compiling(
-        trial, number, objectives, lambda: choose_starts(trial, number, seed, objectives, told)
+        trial, number, objectives, lambda: choose_starts(trial, number, seed, objectives, told, scanned)
     )
     going = list(range(len(tasks)))
     for lot in range(LOTS if number > 1 else 1):
         if lot > 0:
             report(f"lot {lot + 1} of starts, {len(going)} of {len(tasks)} mechanisms")
             chosen = [np.empty((0, len(trial.names)))] * len(tasks)
-            for i, points in zip(going, _scan(trial, going, number, (seed, lot), objectives), strict=True):
+            for i, points in zip(
+                going, _scan(trial, going, number, (seed, lot), objectives, scanned), strict=True
+            ):
                 chosen[i] = points
         ended = solve_tasks(tasks, chosen, steps, objectives, report)
         for i in going:
@@ -84,7 +89,7 @@ def find(
             own.starts += _exactly(trial, i, ended[i], objectives)
             own.evaluations += (1 + len(trial.names)) * sum(start.steps for start in ended[i])
             if lot > 0 or number > 1 + len(told[i]):
-                own.evaluations += _scan_evaluations(trial, number)
+                own.evaluations += _scan_evaluations(trial, number, scanned)
         going = [i for i in going if not _agree(searches[i].starts)]
         if not going:
             break
@@ -123,6 +128,7 @@ def choose_starts(
     seed: int,
     objective: Objective | Sequence[Objective] = RMS,
     first: Sequence[Sequence[Mapping[str, float]]] | None = None,
+    scanned: int = SCANNED,
 ) -> list[Float[np.ndarray, "starts gains"]]:
     """Shares to start from, of every task: the literature's gains, then the best of a scan that lie apart
     from each other. `first` has, of each task, gains that take the places of the last of these, never of the
@@ -132,7 +138,7 @@ def choose_starts(
     usual = [max(starts - len(own), 1) for own in told]
     literature = [_shares(trial, i, [trial.tasks[i].literature]) for i in tasks]
     if max(usual) > 1:
-        scanned = _scan(trial, list(tasks), max(usual) - 1, seed, objective, literature)
+        scanned = _scan(trial, list(tasks), max(usual) - 1, seed, objective, scanned, literature)
         literature = [np.concatenate(both) for both in zip(literature, scanned, strict=True)]
     return [np.concatenate([literature[i][: usual[i]], told[i]]) for i in tasks]
 
@@ -143,11 +149,12 @@ def _scan(
     number: int,
     seed: int | tuple[int, ...],
     objective: Objective | Sequence[Objective],
+    scanned: int,
     beside: list[np.ndarray] | None = None,
 ) -> list[Float[np.ndarray, "number gains"]]:
     """The best points of a scan of the tasks `which`, so many that lie apart, and from those `beside`."""
     around = [_shares(trial, i, [trial.tasks[i].literature])[0] for i in which]
-    points = np.stack([spread_points(own, _scanned(number), seed)[1:] for own in around])
+    points = np.stack([spread_points(own, max(scanned, 2 * number), seed)[1:] for own in around])
     values = trial.losses(objective, which, points, SCAN_SCENARIOS)
     order = np.argsort(np.where(np.isfinite(values), values, np.inf), axis=1, kind="stable")
     best = []
@@ -157,13 +164,9 @@ def _scan(
     return best
 
 
-def _scanned(number: int) -> int:
-    return max(SCANNED, 2 * number)
-
-
-def _scan_evaluations(trial: Trial, number: int) -> int:
+def _scan_evaluations(trial: Trial, number: int, scanned: int) -> int:
     scenarios = len(trial.tasks[0].scenarios.velocity)
-    return -(-_scanned(number) * min(SCAN_SCENARIOS, scenarios) // scenarios)
+    return -(-max(scanned, 2 * number) * min(SCAN_SCENARIOS, scenarios) // scenarios)
 
 
 def _shares(

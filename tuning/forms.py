@@ -1,4 +1,4 @@
-"""One form for unlike mechanisms: which contact law a lane has, how many segments and contacts, become numbers.
+"""One form for unlike mechanisms: contact law, number of segments and of contacts become a lane's numbers.
 
 What shapes a compiled program is then common to all, and optional parts of the loop that one of them has are
 inert where a lane's numbers say so. A second surface, which costs every lane time, stays apart.
@@ -7,16 +7,19 @@ inert where a lane's numbers say so. A second surface, which costs every lane ti
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array
 
 from jaxhil.building import build_loop
-from jaxhil.contact import LAWS
+from jaxhil.contact import LAWS, ContactLaw, ContactParameters
 from jaxhil.contact_mixture import AnyOf
 from jaxhil.loop import Loop
 from jaxhil.mechanism import Mechanism
+from jaxhil.reference import Reference
 from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import extremes
 
@@ -34,7 +37,8 @@ _APART = ("integrator", "hold", "latency", "is_two_sided")
 @dataclass(frozen=True)
 class Form:
     """Contact laws by name; numbers of segments and of result slots; names of the optional parts of the loop
-    that some mechanism has; the first derivative that breaks at a tick; samples in the delay lines."""
+    that some mechanism has; the first derivative that breaks at a tick; samples in the delay lines; whether
+    references that have to be integrated are worked out beforehand, as every first contact's can be."""
 
     laws: tuple[str, ...]
     segments: int
@@ -42,14 +46,19 @@ class Form:
     parts: tuple[str, ...]
     first_break: int
     ring: int
+    beforehand: bool
+
+    def law(self, beforehand: bool | None = None) -> AnyOf:
+        """The laws' mixture; with references that are integrated, unless they come `beforehand`."""
+        kinds = dict.fromkeys(LAWS[name] for name in self.laws)
+        return AnyOf(tuple(kind() for kind in kinds), self.beforehand if beforehand is None else beforehand)
 
     def loop(self, loop: Loop) -> Loop:
         """The loop of one mechanism, in this form."""
-        kinds = tuple(dict.fromkeys(LAWS[name] for name in self.laws))
         parts = {name: name in self.parts for name in _PARTS}
         return dataclasses.replace(
             loop,
-            law=AnyOf(tuple(kind() for kind in kinds)),
+            law=self.law(),
             first_break=self.first_break,
             ring=max(self.ring, loop.ring),
             **parts,
@@ -76,10 +85,26 @@ class Form:
         depths = np.concatenate([depths, further], axis=1)[:, : self.segments - 1]
         kind: Any = np.full((self.slots, number), kinds.index(LAWS[mechanism.contact.law]), np.int32)
         contact = contact._replace(stiffness=stiffness, depths=depths, kind=kind)
-        return batch._replace(contact=contact, phase=by_slot(batch.phase))
+        reference: Any = None
+        if self.beforehand:
+            law = LAWS[mechanism.contact.law]()
+            unknown: Any = np.full((self.slots, number), np.nan)
+            reference = Reference(*[unknown] * 3) if law.closed_form else self._first(law, batch)
+        return batch._replace(contact=contact, phase=by_slot(batch.phase), reference=reference)
+
+    def _first(self, law: ContactLaw, batch: Scenario) -> Any:
+        """The first contact of every scenario in space, in every slot."""
+        contact: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[0], batch.contact)
+        found = jax.device_get(_reference(law, contact, batch.equivalent_mass, batch.velocity))
+        return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (self.slots, *leaf.shape)), found)
 
 
 UNREACHED = 1.0  # m: no mechanism is that deep
+
+
+@partial(jax.jit, static_argnums=0)
+def _reference(law: ContactLaw, contact: ContactParameters, mass: Array, velocity: Array) -> Reference:
+    return law.reference(contact, mass, velocity)
 
 
 def forms(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], Form]]:
@@ -89,9 +114,20 @@ def forms(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], Form]]:
     loops = [build_loop(m, "none", batch) for m, batch in zip(mechanisms, batches, strict=True)]
     groups: dict[Any, list[int]] = {}
     for index, (loop, batch) in enumerate(zip(loops, batches, strict=True)):
-        key = (*(getattr(loop, name) for name in _APART), len(batch.simulator.denominator))
+        key = (
+            *(getattr(loop, name) for name in _APART),
+            len(batch.simulator.denominator),
+            _later(mechanisms[index]),
+        )
         groups.setdefault(key, []).append(index)
-    return [(group, _form([mechanisms[i] for i in group], group, loops, batches)) for group in groups.values()]
+    return [
+        (group, _form([mechanisms[i] for i in group], group, loops, batches)) for group in groups.values()
+    ]
+
+
+def _later(mechanism: Mechanism) -> bool:
+    """Whether there are contacts whose reference has to be integrated at a speed not known beforehand."""
+    return mechanism.approach.contacts > 1 and not LAWS[mechanism.contact.law]().closed_form
 
 
 def _form(mechanisms, group, loops, batches) -> Form:
@@ -103,4 +139,5 @@ def _form(mechanisms, group, loops, batches) -> Form:
         parts=tuple(name for name in _PARTS if any(getattr(loops[i], name) for i in group)),
         first_break=min(loops[i].first_break for i in group),
         ring=max(loops[i].ring for i in group),
+        beforehand=not _later(mechanisms[0]) and not all(loops[i].law.closed_form for i in group),
     )

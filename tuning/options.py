@@ -231,6 +231,37 @@ class Replay:
 
 
 @dataclass(frozen=True)
+class Compare:
+    """Every compensator, each tuned to its own best, on the same fresh scenarios, with 95 % intervals.
+
+    Example: jaxhil compare rig-300kg varying --compensators phase_lead response_error
+
+    Writes DIR/compare.json, with every figure and all gains, and pictures.
+    """
+
+    files: Files = ()
+    suites: Annotated[
+        FlagCreatePairsOff[bool],
+        arg(help="The standard suites, besides what files are given.", help_behavior_hint=""),
+    ] = False
+    compensators: Annotated[
+        tuple[str, ...],
+        arg(
+            metavar="NAME [NAME ...]", help="Compensators to compare; by default all.", help_behavior_hint=""
+        ),
+    ] = ()
+    output: Annotated[str, arg(aliases=("-o",), metavar="DIR", help="Folder for what is written.")] = (
+        "jaxhil-out/compare"
+    )
+    scenarios: Annotated[int, number("Scenarios to tune on.")] = 32
+    judged: Annotated[int, number("Fresh scenarios to judge on.")] = 256
+    overrides: Overrides = ()
+    limit: Annotated[float, arg(metavar="NUMBER", help="Restitution error that counts as a failure.")] = 0.01
+    seed: Annotated[int, number("Seed of scenarios, starts and resampling.")] = 0
+    json: Json = False
+
+
+@dataclass(frozen=True)
 class Mechanisms:
     """The built-in mechanism files, with their sources.
 

@@ -59,9 +59,9 @@ def build_task(
     number = scenarios or (NOISY_SCENARIOS if has_sensor_noise(mechanism) else SCENARIOS)
     batch = build_scenarios(mechanism, quasi_random(mechanism, number, seed), seed)
     loop = build_loop(mechanism, compensator, batch)
+    batch = batch._replace(time_limit=np.asarray(_patience(loop.law, batch)))
     if form is not None:
         batch, loop = form.scenarios(mechanism, batch), form.loop(loop)
-    batch = batch._replace(time_limit=np.asarray(_patience(loop.law, batch)))
     return Task(mechanism, compensator, literature_gains(mechanism, compensator), batch, loop, form)
 
 

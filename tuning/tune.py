@@ -13,7 +13,7 @@ from jaxhil.evaluation import Outcome
 from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario
 from tuning.certificate import Certified, certified
-from tuning.finding import Found, find
+from tuning.finding import SCANNED, Found, find
 from tuning.forms import Form
 from tuning.objective import RMS, SCALE, Objective
 from tuning.problems import Task, alike, build_task
@@ -29,7 +29,8 @@ BLOCK = 16  # mechanisms tuned and judged together: what is done when work is in
 class Settings:
     """Numbers of scenarios to tune on (None: `tuning.problems` knows), of starts of a lot
     (`tuning.finding`), of solver steps, of scenarios to judge on; the seed; what to minimise; evaluations
-    without derivatives at the end, for each gain; whether to search the whole box for something better."""
+    without derivatives at the end, for each gain; whether to search the whole box for something better;
+    points looked at before a lot of starts."""
 
     scenarios: int | None = None
     starts: int = 4
@@ -39,6 +40,7 @@ class Settings:
     objective: Objective = RMS
     polish: int = 160
     certify: bool = False
+    scanned: int = SCANNED
 
 
 class Figures(NamedTuple):
@@ -162,6 +164,7 @@ def _tune_block(
             settings.objective,
             first,
             lambda text: report(f"{name}: {text}"),
+            settings.scanned,
         )
     best = [one.best.gains if one.best else task.literature for one, task in zip(found, tasks, strict=True)]
     clock.lap("tune")

@@ -42,6 +42,11 @@ class ContactLaw(eqx.Module):
         surface that has been left is as new. Of the way between two penetrations only the deepest counts."""
         return False
 
+    @property
+    def closed_form(self) -> bool:
+        """Whether the reference is quick enough to be worked out with every run; else it is integrated."""
+        return True
+
     def init(self, penetration: Array) -> tuple[Array, ...]:
         """State before the first touch, for a batch shaped like `penetration`."""
         return ()

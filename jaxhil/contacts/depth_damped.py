@@ -16,6 +16,10 @@ class DepthDamped(ContactLaw):
     with chi = 2 b/(3 k d_0), whose reference has a closed form.
     """
 
+    @property
+    def closed_form(self):
+        return False
+
     def step(self, parameters, state, penetration, rate):
         # The inner `where` keeps the derivative of d^n finite at d <= 0.
         touching = penetration > 0

@@ -26,11 +26,13 @@ def damped_twins(
     point. elastoplastic: unloading_ratio exp(2 pi zeta), as e* = unloading_ratio^(-1/2).
     """
     number = len(next(iter(draws.values())))
-    # Neighbouring draws get ratios far apart: whatever else the draws follow in their order is not confounded.
+    # Neighbouring draws get ratios far apart, so that nothing that goes with their order goes with the ratio.
     ratio = MOST * ((np.arange(number) * 0.6180339887498949) % 1)[:, None]
     contact = mechanism.contact
     mass = _mass(mechanism, draws)[:, None]
-    velocity = np.broadcast_to(draws.get("approach.velocity", mechanism.approach.velocity), (number,))[:, None]
+    velocity = np.broadcast_to(draws.get("approach.velocity", mechanism.approach.velocity), (number,))[
+        :, None
+    ]
 
     def drawn(path: str, nominal) -> np.ndarray:
         nominal = np.asarray(nominal, float)
@@ -57,7 +59,9 @@ def damped_twins(
     before = _entries(drawn("contact.damping", contact.damping), entries) * (contact.law != "linear")
     # Entries as many as there are draws for.
     listed = list(contact.damping) + [contact.damping[-1]] * (entries - len(contact.damping))
-    twin = msgspec.structs.replace(mechanism, contact=msgspec.structs.replace(contact, law=law, damping=listed))
+    twin = msgspec.structs.replace(
+        mechanism, contact=msgspec.structs.replace(contact, law=law, damping=listed)
+    )
     return twin, {**draws, "contact.damping": before + added}
 
 

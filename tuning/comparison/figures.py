@@ -2,7 +2,7 @@
 
     rms, p99, worst      restitution error |e - e*| over all contacts
     failures             share of scenarios with a contact that does not end, or errs beyond the limit
-    early, late          transparency to a push at a quarter and at three quarters of the contact; 1 is perfect
+    early, late          transparency to a push at a quarter and three quarters of the contact; 1 is perfect
     slope                of e against e* over damped twins; 1 is perfect
     peak                 99th percentile of the command's peak over the reference's
     trajectory           rms of x_d off the reference within the contact, over the reference's depth
@@ -12,17 +12,18 @@ Scenarios are resampled (bootstrap), each with all its contacts; a share has its
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import binomtest
 
 from jaxhil.evaluation import Outcome
-from tuning.trust import interval
+from tuning.trust import Interval, Intervals, interval
 
 RESAMPLES = 999
 LEVEL = 0.95
+NOWHERE = Interval(np.nan, np.nan)
 # Figures by how good they are: the less the better, or the closer to 1.
 LESS = ("rms", "p99", "failures", "peak", "trajectory")
 CLOSER_TO_1 = ("early", "late", "slope")
@@ -57,24 +58,27 @@ def judge(
 ) -> dict[str, Figure]:
     """All figures. `pushed`: e* under the early and the late push; `in_space`: e* without, integrated alike;
     `depth` [m]: the deepest point of each contact in space."""
-    plain, good = judged.plain, judged.plain.good
-    ends = interval(plain.error, good, seed=seed)
+    plain: Any = judged.plain
+    twin: Any = judged.twins
+    good = plain.good
     size = np.abs(plain.error[good])
+    ends = interval(plain.error, good, seed=seed)
+    if np.any(plain.wanted & ~good):
+        # What is said of the contacts that ended is no match for a law under which all of them do.
+        ends = Intervals(NOWHERE, NOWHERE)
     wrong = np.any((plain.wanted & ~good) | (good & (np.abs(plain.error) > limit)), axis=0)
     found = {
         "rms": Figure(_rms(size), *ends.rms),
         "p99": Figure(_percentile(size, 99), *ends.p99),
-        "worst": Figure(float(np.max(size, initial=np.nan)) if len(size) else np.nan, np.nan, np.nan),
+        "worst": Figure(float(np.max(size)) if len(size) else np.nan, np.nan, np.nan),
         "failures": share(wrong),
     }
     for name, runs, e in zip(("early", "late"), (judged.early, judged.late), pushed, strict=True):
         both = good[0] & runs.good[0]
         change = runs.metrics.restitution[0] - plain.metrics.restitution[0]
         found[name] = resampled(transmitted, seed, change[both], (e - in_space)[both])
-    twins = judged.twins.good
-    found["slope"] = resampled(
-        slope, seed, judged.twins.metrics.restitution[twins], judged.twins.reference_restitution[twins]
-    )
+    met = twin.good
+    found["slope"] = resampled(slope, seed, twin.metrics.restitution[met], twin.reference_restitution[met])
     found["peak"] = resampled(lambda ratio: np.percentile(ratio, 99, axis=-1), seed, plain.peak_ratio[good])
     apart = plain.metrics.trajectory_error[good] / depth[good]
     found["trajectory"] = resampled(lambda off: np.sqrt(np.mean(off**2, axis=-1)), seed, apart)
@@ -90,7 +94,8 @@ def transmitted(
 
 
 def slope(
-    restitution: Float[np.ndarray, "*resamples scenarios"], reference: Float[np.ndarray, "*resamples scenarios"]
+    restitution: Float[np.ndarray, "*resamples scenarios"],
+    reference: Float[np.ndarray, "*resamples scenarios"],
 ) -> Float[np.ndarray, "*resamples"]:
     """Least squares of e on e*, with an intercept."""
     centred = reference - np.mean(reference, axis=-1, keepdims=True)
@@ -103,7 +108,9 @@ def share(yes: Bool[np.ndarray, "scenarios"]) -> Figure:
     return Figure(float(np.mean(yes)), float(ends.low), float(ends.high))
 
 
-def resampled(function: Callable[..., np.ndarray], seed: int, *data: Float[np.ndarray, "scenarios"]) -> Figure:
+def resampled(
+    function: Callable[..., np.ndarray], seed: int, *data: Float[np.ndarray, "scenarios"]
+) -> Figure:
     """A function of paired data, along their last axis, with its percentile bootstrap interval.
 
     Source: Efron and Tibshirani, "An Introduction to the Bootstrap" (1993), chapter 13.
@@ -119,7 +126,7 @@ def resampled(function: Callable[..., np.ndarray], seed: int, *data: Float[np.nd
 
 
 def distance(name: str, figure: Figure) -> Figure:
-    """How far a figure is from its best: itself, or its distance from 1; NaN ends where it has no interval."""
+    """How far a figure is from its best: itself, or its distance from 1; NaN ends if it has no interval."""
     if name not in CLOSER_TO_1:
         return figure
     ends = sorted((abs(figure.low - 1), abs(figure.high - 1)))

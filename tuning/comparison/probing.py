@@ -55,7 +55,7 @@ def in_space(
     contact = jax.device_get(parameters_by_slot(contact))
     mass = np.broadcast_to(scenarios.equivalent_mass, (contacts, number))
 
-    def each(parameters, mass, velocity, size, centre):
+    def each(parameters, mass, velocity, size, centre) -> Any:
         """Lane by lane, `LANES` at a time."""
         leaves = parameters, mass, velocity, size, centre
         lanes = mass.size
@@ -64,17 +64,19 @@ def in_space(
         for begin in range(0, lanes, LANES):
             some = np.minimum(np.arange(begin, begin + LANES), lanes - 1)
             part = _move(law, *jax.tree.map(lambda leaf, some=some: leaf[..., some], flat))
-            parts.append(jax.tree.map(lambda leaf, lanes=lanes - begin: leaf[..., :lanes], jax.device_get(part)))
+            parts.append(
+                jax.tree.map(lambda leaf, lanes=lanes - begin: leaf[..., :lanes], jax.device_get(part))
+            )
         joined = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *parts)
         return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], lanes // number, number), joined)
 
     entered = np.asarray(velocity[:contacts])
     none = np.zeros_like(entered)
     plain = each(contact, mass, entered, none, none)
-    first = jax.tree.map(lambda leaf: leaf[..., :1, :], (contact, mass, entered))
+    first = jax.tree.map(lambda leaf: leaf[..., :1, :], contact), mass[:1], entered[:1]
     size = SIZE * plain.peak_force[:1]
     # Both by the same integration: what is left of its error cancels in the difference.
-    pushed = [each(*first, size, share * plain.duration[:1]).restitution[0] for share in (EARLY, LATE)]
+    early, late = (each(*first, size, share * plain.duration[:1]).restitution[0] for share in (EARLY, LATE))
 
     def by_slot(leaf):
         return leaf[np.minimum(np.arange(slots), contacts - 1)]
@@ -84,22 +86,21 @@ def in_space(
         by_slot(plain.peak_force),
         by_slot(plain.duration),
         by_slot(np.moveaxis(plain.position, 1, 0)),
-        *pushed,
+        early,
+        late,
     )
 
 
-def probed(
-    scenarios: Scenario, space: Space, share: float | None = None, duration: Any = None
-) -> Scenario:
+def probed(scenarios: Scenario, space: Any, share: float | None = None, duration: Any = None) -> Scenario:
     """The scenarios with the reference beside each contact; with a push at a `share` of the first contact's
     `duration` [s, (scenarios,)], if one is given."""
-    size, centre = np.zeros_like(space.peak_force), np.zeros_like(space.peak_force)
+    size: Any = np.zeros_like(space.peak_force)
+    centre: Any = np.zeros_like(space.peak_force)
+    width: Any = np.full_like(size, WIDTH)
     if share is not None:
         size[0] = SIZE * space.peak_force[0]
         centre[0] = share * duration
-    push: Any = Push(size, centre, np.full_like(size, WIDTH))
-    probe: Any = Probe(push, space.depth, space.duration)
-    return scenarios._replace(probe=probe)
+    return scenarios._replace(probe=Probe(Push(size, centre, width), space.depth, space.duration))
 
 
 class _Motion(NamedTuple):

@@ -1,7 +1,8 @@
 """The comparison itself: each law tuned to its own best, all judged on the same scenarios and probes.
 
-Laws are dealt out to as many processes as there are cores, each with one device: compiling takes most of the
-time, and one process compiles on one core. A figure depends on neither.
+Laws, and groups of mechanisms that share a form, are dealt out to as many processes as there are cores, each
+with one device: compiling takes most of the time, and one process compiles on one core. No figure depends on
+how they are dealt.
 """
 
 import multiprocessing
@@ -9,8 +10,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from jaxhil.mechanism import Mechanism
 from tuning.comparison.figures import Figure
@@ -21,14 +20,15 @@ SEED = 0xFA1  # of the scenarios to judge on: tuning and its own validation neve
 
 @dataclass(frozen=True)
 class Settings:
-    """Numbers of scenarios to tune on (None: `tuning.problems` knows), of starts and steps of the solver, of
-    evaluations without derivatives for each gain; of scenarios to judge on; the error beyond which a contact
+    """Numbers of scenarios to tune on, of starts and steps of the solver, of evaluations without derivatives
+    for each gain, of points scanned for starts; of scenarios to judge on; the error beyond which a contact
     counts as a failure; the seed."""
 
-    scenarios: int | None = None
-    starts: int = 2
+    scenarios: int = 32
+    starts: int = 3
     steps: int = 16
     polish: int = 20
+    scanned: int = 64
     judged: int = 256
     limit: float = 0.01
     seed: int = 0
@@ -36,7 +36,7 @@ class Settings:
 
 class LawFigures(NamedTuple):
     """Of one law on one mechanism: gains by "literature" and "tuned", and what is said of each. A law that
-    has no gains is only there with the literature's."""
+    has no gains to tune is only there with the literature's."""
 
     law: str
     mechanism: str
@@ -50,35 +50,66 @@ def compare(
     settings: Settings,
     processes: int,
     report: Callable[[str], None] = lambda text: None,
-) -> Iterator[list[LawFigures]]:
-    """What is found of each law on every mechanism, a law at a time, as they are done."""
-    if processes < 2 or len(laws) < 2:
-        for law in laws:
-            report(law)
-            yield judge_law(list(mechanisms), law, settings)
-        return
+) -> Iterator[LawFigures]:
+    """What is found of each law on every mechanism, as it is done."""
     # A fresh interpreter each: jax does not survive a fork.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(processes, len(laws)), context, _begin) as pool:
+    with ProcessPoolExecutor(processes, context, _begin) as pool:
         try:
-            running = {pool.submit(judge_law, list(mechanisms), law, settings): law for law in laws}
+            report("contacts in space")
+            scenes = pool.submit(build_scenes, list(mechanisms), settings).result()
+            tasks = [(group, law) for group in scenes for law in laws]
+            # Those with the most to compile first, so that no process is left with one of them at the end.
+            running = {pool.submit(judge_law, group, law, settings): (group, law) for group, law in tasks}
             for done in as_completed(running):
-                report(running[done])
-                yield done.result()
+                group, law = running[done]
+                report(f"{law}, {len(group)} mechanism{'s' if len(group) > 1 else ''}")
+                yield from done.result()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
 
 
-def judge_law(mechanisms: list[Mechanism], law: str, settings: Settings) -> list[LawFigures]:
-    """All figures of one law on every mechanism."""
+def build_scenes(mechanisms: list[Mechanism], settings: Settings) -> list[list[Any]]:
+    """What the laws are judged on (`tuning.comparison.runs.Scene`), grouped by form."""
+    from tuning.comparison.runs import build_scene
     from tuning.forms import forms
 
-    found: dict[int, LawFigures] = {}
-    for group, form in forms(mechanisms):
-        own = _judge_group([mechanisms[i] for i in group], law, form, settings)
-        found.update(zip(group, own, strict=True))
-    return [found[i] for i in range(len(mechanisms))]
+    seed = settings.seed + SEED
+    return [
+        [build_scene(mechanisms[i], form, settings.judged, seed) for i in group]
+        for group, form in forms(mechanisms)
+    ]
+
+
+def judge_law(scenes: list[Any], law: str, settings: Settings) -> list[LawFigures]:
+    """All figures of one law on mechanisms of one form, tuned together."""
+    from jaxhil.compensators import COMPENSATORS, literature_gains
+    from tuning.comparison.runs import judge_gains
+    from tuning.tune import Settings as Tuning
+    from tuning.tune import tune_all
+
+    mechanisms = [scene.mechanism for scene in scenes]
+    gains = [{LITERATURE: literature_gains(mechanism, law)} for mechanism in mechanisms]
+    if any(gain.tuned(mechanism) for gain in COMPENSATORS[law].gains for mechanism in mechanisms):
+        tuning = Tuning(
+            settings.scenarios,
+            settings.starts,
+            settings.steps,
+            validation=31,
+            seed=settings.seed,
+            polish=settings.polish,
+            scanned=settings.scanned,
+        )
+        for index, result in tune_all(mechanisms, law, tuning, form=scenes[0].form):
+            gains[index][TUNED] = result.gains
+    found = []
+    for scene, own in zip(scenes, gains, strict=True):
+        figures = {
+            which: judge_gains(scene, law, one, settings.limit, settings.seed) for which, one in own.items()
+        }
+        found.append(LawFigures(law, scene.mechanism.name, own, figures))
+    return found
 
 
 def _begin() -> None:
@@ -93,37 +124,3 @@ def _begin() -> None:
     from tuning.environment import prepare
 
     prepare()
-
-
-def _judge_group(mechanisms: list[Mechanism], law: str, form: Any, settings: Settings) -> list[LawFigures]:
-    """Of the mechanisms of one form."""
-    from jaxhil.compensators import literature_gains
-    from tuning.comparison.runs import Judge
-    from tuning.tune import Settings as Tuning
-    from tuning.tune import tune_all
-
-    gains = [{LITERATURE: literature_gains(mechanism, law)} for mechanism in mechanisms]
-    if gains[0][LITERATURE]:
-        tuning = Tuning(
-            settings.scenarios,
-            settings.starts,
-            settings.steps,
-            validation=31,
-            seed=settings.seed,
-            polish=settings.polish,
-        )
-        for index, result in tune_all(mechanisms, law, tuning, form=form):
-            gains[index][TUNED] = result.gains
-    found = []
-    for mechanism, own in zip(mechanisms, gains, strict=True):
-        judge = Judge(mechanism, law, form, settings.judged, settings.seed + SEED)
-        figures = {
-            which: judge.figures(one, settings.limit, settings.seed) for which, one in own.items()
-        }
-        found.append(LawFigures(law, mechanism.name, own, figures))
-    return found
-
-
-def finite(figure: Figure) -> bool:
-    """Whether there is such a figure."""
-    return bool(np.isfinite(figure.value))

@@ -1,0 +1,160 @@
+"""`jaxhil compare`: every compensator, each tuned to its own best, on the same scenarios."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxhil.errors import InputError
+from jaxhil.mechanism_file import LoadedMechanism, load, suite_names
+from jaxhil.runtime.laws import LAWS
+from tuning import report
+from tuning.commands import checks
+from tuning.environment import prepare, usable_cores
+from tuning.options import Compare
+
+
+def run(options: Compare) -> int:
+    """Compare; what is finished is told and written, also when interrupted. 0, or 130."""
+    checks.limit(options.limit)
+    checks.at_least(1, scenarios=options.scenarios)
+    checks.at_least(2, judged=options.judged)
+    checks.at_least(0, seed=options.seed)
+    laws = options.compensators or LAWS
+    for law in laws:
+        checks.one_of(LAWS, compensators=law)
+    loaded = _load(options)
+    Path(options.output).mkdir(parents=True, exist_ok=True)
+    prepare()
+    from tuning.comparison.study import Settings, compare
+
+    settings = Settings(options.scenarios, judged=options.judged, limit=options.limit, seed=options.seed)
+    names = [one.mechanism.name for one in loaded]
+    found: dict[str, dict[str, Any]] = {name: {} for name in names}
+    interrupted = False
+    with report.stages(0) as stages:
+        try:
+            mechanisms = [one.mechanism for one in loaded]
+            for one in compare(mechanisms, tuple(dict.fromkeys(laws)), settings, usable_cores(), stages.say):
+                found[one.mechanism][one.law] = one
+        except KeyboardInterrupt:
+            interrupted = True
+    ordered = {
+        name: [found[name][law] for law in dict.fromkeys(laws) if law in found[name]] for name in names
+    }
+    done = [name for name in names if ordered[name]]
+    document = _document(options, loaded, ordered, interrupted)
+    (Path(options.output) / "compare.json").write_text(report.as_json(document), encoding="utf-8")
+    if done and not interrupted:
+        _draw(options, done, ordered)
+    if options.json:
+        report.emit_json(document)
+    else:
+        _print(options, done, ordered, document)
+    if interrupted:
+        finished = sum(len(own) for own in ordered.values())
+        report.note(f"jaxhil: interrupted, {finished} of {len(names) * len(laws)} results finished and kept")
+        return 130
+    return 0
+
+
+def _load(options: Compare) -> list[LoadedMechanism]:
+    files: list[str | None] = [*options.files, *(suite_names() if options.suites else [])]
+    loaded = [load(file, options.overrides) for file in files or [None]]
+    known: dict[str, str] = {}
+    for one in loaded:
+        name = one.mechanism.name
+        if name in known:
+            raise InputError(
+                f"{one.label}: name: found {name}, allowed a name other than that of {known[name]}"
+            )
+        known[name] = one.label
+    return loaded
+
+
+def _document(
+    options: Compare,
+    loaded: Sequence[LoadedMechanism],
+    ordered: Mapping[str, Sequence[Any]],
+    interrupted: bool,
+) -> dict[str, Any]:
+    from jaxhil.compensators import COMPENSATORS
+    from tuning.comparison.tables import winners
+
+    return {
+        "limit": options.limit,
+        "seed": options.seed,
+        "scenarios": options.scenarios,
+        "judged": options.judged,
+        "mechanisms": [
+            {
+                "mechanism": one.mechanism.name,
+                "file": one.label,
+                "laws": [
+                    {
+                        "law": own.law,
+                        "knows": list(COMPENSATORS[own.law].knows),
+                        "gains": own.gains,
+                        "figures": own.figures,
+                    }
+                    for own in ordered[one.mechanism.name]
+                ],
+                "winners": winners(ordered[one.mechanism.name]) if ordered[one.mechanism.name] else {},
+            }
+            for one in loaded
+        ],
+        "timings": {"microseconds_per_tick": _costs(loaded[0], ordered)},
+        "interrupted": interrupted,
+    }
+
+
+def _costs(loaded: LoadedMechanism, ordered: Mapping[str, Sequence[Any]]) -> dict[str, float]:
+    """Of every law with the first mechanism's gains."""
+    from tuning.comparison.cost import microseconds_per_tick
+    from tuning.comparison.study import LITERATURE
+
+    mechanism = loaded.mechanism
+    period, clearance = mechanism.rig.control_period, mechanism.contact.clearance
+    return {
+        own.law: microseconds_per_tick(
+            own.law, own.gains[LITERATURE], period, clearance, mechanism.approach.velocity
+        )
+        for own in ordered[mechanism.name]
+    }
+
+
+def _draw(options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence[Any]]) -> None:
+    from tuning.comparison.plots import errors_plot, honesty_plot
+    from tuning.plots import save
+
+    save(errors_plot(names, ordered, options.limit), Path(options.output) / "errors.png")
+    save(honesty_plot(names, ordered), Path(options.output) / "honesty.png")
+
+
+def _print(
+    options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence[Any]], document: dict[str, Any]
+) -> None:
+    from jaxhil.compensators import COMPENSATORS
+    from tuning.comparison.tables import leaderboard, mechanism_table
+
+    for name in names:
+        report.emit(mechanism_table(name, ordered[name]))
+    if len(names) > 1:
+        report.emit(leaderboard(names, ordered))
+    costs = document["timings"]["microseconds_per_tick"]
+    rows = [[law, ", ".join(COMPENSATORS[law].knows) or "nothing", cost] for law, cost in costs.items()]
+    report.emit(
+        report.table(
+            "What a law must be told, and what it costs",
+            ["law", "told beforehand", "Python [us per tick]"],
+            rows,
+            texts=(0, 1),
+        ),
+        "rms, p99, worst: |e - e*|; failing: scenarios that do not end or err by more than "
+        f"{100 * options.limit:g} %; early, late: transparency",
+        "to a push on the hardware; slope: of e against e*; peak: 99th percentile of the command's peak over "
+        "the reference's;",
+        "path: x_d off the reference; noise: amplification. * better than every other law, tuned, by more "
+        "than the 95 % intervals",
+        f"wrote {options.output}/compare.json" + (" and pictures" if names else ""),
+        "",
+    )

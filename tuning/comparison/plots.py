@@ -1,0 +1,76 @@
+"""Pictures of a comparison: errors with their intervals, and how honest the laws are."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure as Picture
+
+from tuning.comparison.study import TUNED, LawFigures
+from tuning.comparison.tables import best
+from tuning.plots import LABELS, MARKERS, STYLES, new_figure
+
+COLUMNS = 4  # of panels
+HONESTY = {
+    "early": "transparency, push at 25 %",
+    "late": "transparency, push at 75 %",
+    "slope": "slope of e against e*",
+    "peak": "peak command / reference's peak",
+}
+
+
+def errors_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]], limit: float) -> Picture:
+    """The rms error of every law with its interval, a panel for every mechanism."""
+    laws = list(dict.fromkeys(one.law for name in names for one in found[name]))
+    across = min(COLUMNS, len(names))
+    down = -(-len(names) // across)
+    height = 0.9 + 0.26 * len(laws)
+    size = (2.2 + 2.6 * across, 1.2 + height * down)
+    picture = new_figure(size, "Restitution error on fresh scenarios", above=0.9, below=0.75)
+    panels = picture.subplots(down, across, sharex=True, sharey=True, squeeze=False)
+    for panel, name in zip(panels.flat, names, strict=False):
+        by_law = {one.law: one for one in found[name]}
+        for key in ("literature", TUNED):
+            places = [i for i, law in enumerate(laws) if law in by_law and key in by_law[law].figures]
+            figures = [by_law[laws[i]].figures[key]["rms"] for i in places]
+            colour = STYLES[key][0]
+            heights = np.array(places) + (0.15 if key == TUNED else -0.15)
+            for height_, one in zip(heights, figures, strict=True):
+                panel.plot([100 * one.low, 100 * one.high], [height_, height_], color=colour, linewidth=1.5)
+            values = [100 * one.value for one in figures]
+            panel.plot(values, heights, MARKERS[key], color=colour, markersize=4, label=LABELS[key])
+        panel.axvline(100 * limit, color="0.5", linewidth=1, linestyle=":", label="limit")
+        panel.set_xscale("log")
+        panel.set_title(name.removeprefix("suite-"), fontsize=9)
+        panel.grid(axis="x", alpha=0.3)
+    for panel in list(panels.flat)[len(names) :]:
+        panel.set_visible(False)
+    first = panels[0, 0]
+    first.set_yticks(range(len(laws)), [law.replace("_", " ") for law in laws], fontsize=8)
+    first.set_ylim(len(laws) - 0.5, -0.5)
+    for panel in list(panels.flat)[max(0, len(names) - across) : len(names)]:
+        panel.set_xlabel("rms of |e - e*| [%]")
+        panel.tick_params(labelbottom=True)
+    handles, labels = first.get_legend_handles_labels()
+    picture.legend(handles, labels, loc="lower center", ncols=3, frameon=False, fontsize=9)
+    return picture
+
+
+def honesty_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> Picture:
+    """Transparency, slope and peak force of every law, tuned: a point for every mechanism."""
+    laws = list(dict.fromkeys(one.law for name in names for one in found[name]))
+    size = (12.0, 1.7 + 0.34 * len(laws))
+    picture = new_figure(size, "Is it still a test of the hardware? Tuned gains, 1 is perfect", above=0.8)
+    panels = picture.subplots(1, len(HONESTY), sharey=True)
+    for panel, (key, title) in zip(panels, HONESTY.items(), strict=True):
+        for place, law in enumerate(laws):
+            values = [best(one)[key].value for name in names for one in found[name] if one.law == law]
+            spread = place + np.linspace(-0.25, 0.25, max(len(values), 2))[: len(values)]
+            panel.plot(values, spread, "o", color=STYLES[TUNED][0], markersize=4, alpha=0.6)
+        panel.axvline(1, color="0.3", linewidth=1, linestyle="--")
+        low, high = (0.5, 4.0) if key == "peak" else (-0.75, 2.25)
+        panel.set_xlim(low, high)
+        panel.set_xlabel(title, fontsize=9)
+        panel.grid(axis="x", alpha=0.3)
+    panels[0].set_yticks(range(len(laws)), [law.replace("_", " ") for law in laws], fontsize=8)
+    panels[0].set_ylim(len(laws) - 0.5, -0.5)
+    return picture
