@@ -25,7 +25,17 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 # Shapes are checked where there are shapes: the modules that compute with arrays.
 ARRAY_MODULES = (
     *("building", "contact", "contacts", "integrators", "limits", "loop", "metrics", "reference"),
-    *("reference_laws", "reference_motion", "ring", "rollout", "scenario", "sensors", "simulator"),
+    *(
+        "contact_mixture",
+        "probe",
+        "reference_laws",
+        "reference_motion",
+        "ring",
+        "rollout",
+        "scenario",
+        "sensors",
+        "simulator",
+    ),
     "compensators",
 )
 install_import_hook([f"jaxhil.{name}" for name in ARRAY_MODULES], "beartype.beartype")

@@ -138,8 +138,8 @@ def choose_starts(
     usual = [max(starts - len(own), 1) for own in told]
     literature = [_shares(trial, i, [trial.tasks[i].literature]) for i in tasks]
     if max(usual) > 1:
-        scanned = _scan(trial, list(tasks), max(usual) - 1, seed, objective, scanned, literature)
-        literature = [np.concatenate(both) for both in zip(literature, scanned, strict=True)]
+        further = _scan(trial, list(tasks), max(usual) - 1, seed, objective, scanned, literature)
+        literature = [np.concatenate(both) for both in zip(literature, further, strict=True)]
     return [np.concatenate([literature[i][: usual[i]], told[i]]) for i in tasks]
 
 

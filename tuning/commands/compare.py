@@ -149,12 +149,12 @@ def _print(
             rows,
             texts=(0, 1),
         ),
-        "rms, p99, worst: |e - e*|; failing: scenarios that do not end or err by more than "
-        f"{100 * options.limit:g} %; early, late: transparency",
-        "to a push on the hardware; slope: of e against e*; peak: 99th percentile of the command's peak over "
-        "the reference's;",
-        "path: x_d off the reference; noise: amplification. * better than every other law, tuned, by more "
-        "than the 95 % intervals",
+        f"rms, p99, worst: |e - e*|. fail: scenarios beyond {100 * options.limit:g} %, or that do not end.",
+        "early, late: transparency to a push on the hardware at 25 and 75 % of the contact (1: perfect, 0: "
+        "blind).",
+        "slope: of e against e* over damped twins. peak: command over the reference, 99th percentile.",
+        "path: x_d off the reference. noise: amplification. *: better than every other law, tuned, by more",
+        "than the 95 % intervals.",
         f"wrote {options.output}/compare.json" + (" and pictures" if names else ""),
         "",
     )

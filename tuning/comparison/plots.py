@@ -45,8 +45,10 @@ def errors_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]],
     for panel in list(panels.flat)[len(names) :]:
         panel.set_visible(False)
     first = panels[0, 0]
-    first.set_yticks(range(len(laws)), [law.replace("_", " ") for law in laws], fontsize=8)
     first.set_ylim(len(laws) - 0.5, -0.5)
+    for panel in panels[:, 0]:
+        panel.set_yticks(range(len(laws)), [law.replace("_", " ") for law in laws], fontsize=8)
+    picture.subplots_adjust(left=1.6 / size[0], hspace=0.2, wspace=0.08)
     for panel in list(panels.flat)[max(0, len(names) - across) : len(names)]:
         panel.set_xlabel("rms of |e - e*| [%]")
         panel.tick_params(labelbottom=True)
@@ -61,14 +63,19 @@ def honesty_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]
     size = (12.0, 1.7 + 0.34 * len(laws))
     picture = new_figure(size, "Is it still a test of the hardware? Tuned gains, 1 is perfect", above=0.8)
     panels = picture.subplots(1, len(HONESTY), sharey=True)
+    picture.subplots_adjust(left=1.6 / size[0], wspace=0.08)
     for panel, (key, title) in zip(panels, HONESTY.items(), strict=True):
+        low, high = (0.3, 100.0) if key == "peak" else (-1.0, 2.5)
         for place, law in enumerate(laws):
             values = [best(one)[key].value for name in names for one in found[name] if one.law == law]
             spread = place + np.linspace(-0.25, 0.25, max(len(values), 2))[: len(values)]
-            panel.plot(values, spread, "o", color=STYLES[TUNED][0], markersize=4, alpha=0.6)
+            # What lies beyond is drawn at the edge.
+            values = np.clip(values, low, high)
+            panel.plot(values, spread, "o", color=STYLES[TUNED][0], markersize=4, alpha=0.6, clip_on=False)
         panel.axvline(1, color="0.3", linewidth=1, linestyle="--")
-        low, high = (0.5, 4.0) if key == "peak" else (-0.75, 2.25)
         panel.set_xlim(low, high)
+        if key == "peak":
+            panel.set_xscale("log")
         panel.set_xlabel(title, fontsize=9)
         panel.grid(axis="x", alpha=0.3)
     panels[0].set_yticks(range(len(laws)), [law.replace("_", " ") for law in laws], fontsize=8)

@@ -58,7 +58,7 @@ def compare(
         try:
             report("contacts in space")
             scenes = pool.submit(build_scenes, list(mechanisms), settings).result()
-            tasks = [(group, law) for group in scenes for law in laws]
+            tasks = [(group, law) for group in scenes for law in sorted(laws, key=_gains, reverse=True)]
             # Those with the most to compile first, so that no process is left with one of them at the end.
             running = {pool.submit(judge_law, group, law, settings): (group, law) for group, law in tasks}
             for done in as_completed(running):
@@ -68,6 +68,13 @@ def compare(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def _gains(law: str) -> int:
+    """How many there are: the more, the longer it takes."""
+    from jaxhil.runtime import COMPENSATORS
+
+    return len(COMPENSATORS[law].gains)
 
 
 def build_scenes(mechanisms: list[Mechanism], settings: Settings) -> list[list[Any]]:

@@ -10,15 +10,15 @@ from tuning.comparison.study import LITERATURE, TUNED, LawFigures
 
 PERCENT = ("rms", "p99", "worst", "failures", "trajectory")
 HEADINGS = {
-    "rms": "rms [%]",
-    "p99": "p99 [%]",
-    "worst": "worst [%]",
-    "failures": "failing [%]",
+    "rms": "rms %",
+    "p99": "p99 %",
+    "worst": "worst %",
+    "failures": "fail %",
     "early": "early",
     "late": "late",
     "slope": "slope",
     "peak": "peak",
-    "trajectory": "path [%]",
+    "trajectory": "path %",
     "noise": "noise",
 }
 MARK = "*"  # of what is better than all others by more than its interval
@@ -44,11 +44,12 @@ def mechanism_table(name: str, found: Sequence[LawFigures]) -> Table:
             own = figures is best(one)
             rows.append(
                 [
-                    f"{one.law}, {which}" if one.gains[LITERATURE] else one.law,
+                    one.law if which == LITERATURE else "  tuned",
                     *(shown(key, figures[key], own and won[key] == one.law) for key in HEADINGS),
                 ]
             )
-    return report.table(f"{name}: restitution error and honesty", ["law", *HEADINGS.values()], rows)
+    title = f"{name}: each law with the literature's gains, then tuned"
+    return _unfolded(report.table(title, ["law", *HEADINGS.values()], rows))
 
 
 def leaderboard(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> Table:
@@ -60,8 +61,15 @@ def leaderboard(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]])
         by_law = {one.law: best(one)["rms"] for one in found[name]}
         cells = [shown("rms", by_law[law], won[name] == law) if law in by_law else "-" for law in laws]
         rows.append([name.removeprefix("suite-"), *cells])
-    headings = ["tuned, rms [%]", *(law.replace("_", " ") for law in laws)]
-    return report.table("Leaderboard", headings, rows)
+    headings = ["", *(law.replace("_", "\n") for law in laws)]
+    return _unfolded(report.table("Leaderboard: restitution error, rms [%], each law tuned", headings, rows))
+
+
+def _unfolded(made: Table) -> Table:
+    """Names in one piece, columns close together."""
+    made.columns[0].no_wrap = True
+    made.padding = (0, 1, 0, 0)
+    return made
 
 
 def shown(key: str, figure: Figure, wins: bool = False) -> str:

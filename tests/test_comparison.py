@@ -1,0 +1,168 @@
+"""The figures of a comparison, tested themselves: laws whose honesty is known beforehand."""
+
+from typing import ClassVar, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from continuous import delayed_restitution
+from jaxtyping import Array
+from lanes import IDEAL, mechanism, validated
+
+from jaxhil import compensators
+from jaxhil.building import build_loop
+from jaxhil.compensators.base import Compensator, Gain
+from jaxhil.contact import LAWS
+from jaxhil.evaluation import evaluate
+from jaxhil.mechanism_file import load
+from jaxhil.scenario import build_scenarios
+from jaxhil.uncertainty import draw
+from tuning.comparison.damped import MOST, damped_twins
+from tuning.comparison.figures import (
+    CLOSER_TO_1,
+    Figure,
+    distance,
+    resampled,
+    share,
+    slope,
+    transmitted,
+    winner,
+)
+from tuning.comparison.runs import build_scene, judge_gains
+from tuning.forms import forms
+
+LIMIT, SEED, LANES = 0.01, 3, 16
+SPREAD = {"contact.stiffness": {"distribution": "loguniform", "factor": [0.5, 2.0]}}
+
+
+def judged(raw, law, gains=None, number=LANES):
+    parsed = validated({**raw, "uncertainty": SPREAD})
+    [(_, form)] = forms([parsed])
+    scene = build_scene(parsed, form, number, SEED)
+    return judge_gains(scene, law, gains or {}, LIMIT, SEED)
+
+
+def test_an_ideal_rig_is_honest():
+    """No delay, T -> 0: error 0, transparency 1, slope 1, peak ratio 1."""
+    figures = judged(mechanism({}, IDEAL, 0.0, period=2.5e-5), "none")
+    assert figures["rms"].value < 1e-3 and figures["worst"].value < 1e-3
+    for name in ("early", "late", "slope", "peak"):
+        assert figures[name].value == pytest.approx(1, abs=1e-3), name
+    assert figures["trajectory"].value < 1e-3
+    assert figures["failures"].value == 0 and figures["noise"].value == 1
+
+
+class PlayedBack(Compensator):
+    """Blind to the hardware: the force of the contact as it should be, at the model's own depth."""
+
+    name: ClassVar[str] = "played_back"
+    knows: ClassVar[tuple[str, ...]] = ()
+    gains: ClassVar[tuple[Gain, ...]] = ()
+
+    def init(self, gains, constants, ring):
+        return ()
+
+    def restart(self, gains, state, begins, fresh):
+        return ()
+
+    def step(self, prepared, state, signals, tick):
+        depth, rate = signals.position_desired, signals.velocity_desired
+        force = prepared["stiffness"] * depth + prepared["damping"] * rate
+        return jnp.where((depth > 0) & (force > 0), force, 0), state
+
+
+class Told(NamedTuple):
+    """The truth of every lane, which no law on a rig is told."""
+
+    stiffness: Array
+    damping: Array
+
+
+def test_a_law_that_plays_back_the_reference_is_blind(monkeypatch):
+    """Error 0 and slope 1, although the simulator is slow and the force late; transparency 0."""
+    monkeypatch.setitem(compensators.COMPENSATORS, "played_back", PlayedBack())
+
+    def told(loop, gains, scenarios):
+        contact = scenarios.contact
+        stiffness = contact.stiffness[0].reshape(-1, contact.damping.shape[-1])[0]
+        truth = Told(stiffness, contact.damping[0])
+        return evaluate(loop, truth._asdict(), scenarios)
+
+    monkeypatch.setattr("tuning.comparison.runs.evaluate", told)
+    figures = judged(mechanism({}, period=2.5e-4), "played_back")
+    assert figures["rms"].value < 1e-3
+    assert figures["slope"].value == pytest.approx(1, abs=1e-3)
+    assert abs(figures["early"].value) < 1e-6 and abs(figures["late"].value) < 1e-6
+
+
+def test_without_compensation_the_error_is_the_closed_form():
+    """A pure force delay before an ideal simulator: e = |S'(t_s + tau)| (model.md, section 6, item 1)."""
+    tau = 0.004
+    raw = mechanism({}, IDEAL, tau, period=2.5e-4)
+    parsed = validated({**raw, "uncertainty": SPREAD})
+    stiffness = draw(parsed, LANES, SEED)["contact.stiffness"][:, 0]
+    omega = np.sqrt(stiffness / parsed.bodies.mass)
+    expected = np.array([delayed_restitution(value * tau) for value in omega]) - 1
+    figures = judged(raw, "none")
+    assert figures["rms"].value == pytest.approx(np.sqrt(np.mean(expected**2)), abs=2e-3)
+    assert figures["worst"].value == pytest.approx(np.max(expected), abs=2e-3)
+    # Delay makes the loop livelier than the contact: whatever disturbs it disturbs it more.
+    assert figures["early"].value > 1 and figures["late"].value > 1
+
+
+@pytest.mark.parametrize(
+    "name", ["suite-damped", "suite-hertz", "suite-depth-damped", "suite-elastoplastic", "suite-repeated"]
+)
+def test_damped_twins_span_a_third_of_the_speed(name):
+    parsed = load(name).mechanism
+    draws = draw(parsed, 24, 0)
+    twin, twin_draws = damped_twins(parsed, draws)
+    lossy = []
+    for one, values in ((parsed, draws), (twin, twin_draws)):
+        batch = build_scenarios(one, values)
+        assert build_loop(one, "none", batch).law == LAWS[one.contact.law]()
+        contact = type(batch.contact)(
+            *(jnp.asarray(leaf)[0] if leaf is not None else None for leaf in batch.contact)
+        )
+        mass, velocity = jnp.asarray(batch.equivalent_mass), jnp.asarray(batch.velocity)
+        lossy.append(np.asarray(LAWS[one.contact.law]().reference(contact, mass, velocity).restitution))
+    before, after = lossy
+    lost = 1 - after / before
+    assert np.all(lost >= -1e-9) and np.min(lost) < 0.02
+    assert 0.2 < np.max(lost) < 1.3 * (1 - np.exp(-np.pi * MOST))
+
+
+def test_transparency_and_slope_are_least_squares():
+    true = np.array([0.01, -0.02, 0.03])
+    assert transmitted(0.4 * true, true) == pytest.approx(0.4)
+    reference = np.array([0.5, 0.7, 0.9])
+    assert slope(0.2 + 0.8 * reference, reference) == pytest.approx(0.8)
+
+
+def test_intervals_cover_as_often_as_they_say():
+    rng = np.random.default_rng(0)
+    hits = 0
+    for seed in range(200):
+        sample = rng.normal(1.0, 1.0, 60)
+        found = resampled(lambda values: np.mean(values, axis=-1), seed, sample)
+        hits += found.low <= 1.0 <= found.high
+    # Binomial(200, 0.95) is below 181 with probability 0.3 %.
+    assert 181 <= hits <= 200
+    none = share(np.zeros(100, bool))
+    assert none.value == 0 and none.low == 0 and none.high == pytest.approx(1 - 0.025 ** (1 / 100))
+
+
+def test_a_winner_is_better_by_more_than_the_intervals():
+    figures = {"a": Figure(0.1, 0.09, 0.11), "b": Figure(0.2, 0.12, 0.3), "c": Figure(0.15, 0.105, 0.2)}
+    assert winner("rms", figures) is None
+    assert winner("rms", {name: figures[name] for name in "ab"}) == "a"
+    assert winner("rms", {"a": figures["a"]}) is None
+    # A law of which contacts did not end has no interval, and neither wins nor stands in the way.
+    assert winner("rms", {"a": figures["a"], "b": figures["b"], "d": Figure(0.01, np.nan, np.nan)}) == "a"
+
+
+def test_honesty_is_measured_from_1():
+    assert set(CLOSER_TO_1) == {"early", "late", "slope"}
+    assert distance("early", Figure(0.7, 0.6, 0.8)) == pytest.approx((0.3, 0.2, 0.4))
+    assert distance("slope", Figure(1.1, 0.9, 1.3)) == pytest.approx((0.1, 0.0, 0.3))
+    assert distance("rms", Figure(0.7, 0.6, 0.8)) == (0.7, 0.6, 0.8)

@@ -1,0 +1,85 @@
+"""Forms: a mechanism does the same in a common form as alone."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from lanes import IDEAL, SECOND_ORDER, as_arrays, mechanism, run_rollout, validated
+
+from jaxhil.building import build_loop
+from jaxhil.contact import LAWS
+from jaxhil.evaluation import compare_with_reference, evaluate
+from jaxhil.scenario import build_scenarios
+from jaxhil.uncertainty import draw
+from tuning.forms import forms
+
+SPREAD = {"contact.stiffness": {"distribution": "uniform", "factor": [0.5, 2.0]}}
+CONTACTS = {
+    "linear": {"law": "linear"},
+    "kelvin_voigt": {"damping": [900.0, 300.0]},
+    "tension": {"damping": [900.0], "tension": True},
+    "hunt_crossley": {"law": "hunt_crossley", "stiffness": [3e6], "damping": [2.0]},
+    "piecewise_linear": {
+        "law": "piecewise_linear", "stiffness": [[1e5, 3e5, 1e5]], "depths": [1e-4, 2e-4], "damping": [100.0],
+    },
+    "hardening": {"law": "hardening", "reference_depth": 2e-4, "damping": [200.0]},
+    "depth_damped": {
+        "law": "depth_damped", "stiffness": [3e6], "damping": [900.0], "reference_depth": 2e-4,
+    },
+    "elastoplastic": {"law": "elastoplastic", "unloading_ratio": 1.5},
+}  # fmt: skip
+
+
+def members():
+    found = {}
+    for name, contact in CONTACTS.items():
+        several = 3 if "depth" not in str(contact) and name != "hardening" else 1
+        raw = mechanism(contact, contacts=several)
+        found[name] = validated({**raw, "uncertainty": SPREAD})
+    noisy = mechanism({}, force_sensor={"noise_std": 0.1, "dead_zone": 0.3, "time_constant": 0.001})
+    return {**found, "noisy": validated({**noisy, "name": "noisy", "uncertainty": SPREAD})}
+
+
+MEMBERS = members()
+ALONE = ("kelvin_voigt", "piecewise_linear", "hardening", "elastoplastic", "noisy")
+GAINS, LANES = {"phase_lead": 0.005, "lead_filter": 0.001}, 4
+
+
+def test_one_form_has_every_contact_law():
+    groups = forms(list(MEMBERS.values()))
+    assert [len(group) for group, _ in groups] == [len(MEMBERS)]
+    assert set(groups[0][1].laws) == set(LAWS)
+
+
+def test_two_surfaces_and_other_orders_stay_apart():
+    others = [
+        mechanism({}),
+        mechanism({"clearance": 0.02}),
+        mechanism({}, IDEAL),
+        mechanism({}, SECOND_ORDER, command_hold="zoh"),
+        mechanism(CONTACTS["hardening"], contacts=2),
+    ]
+    groups = [group for group, _ in forms([validated(raw) for raw in others])]
+    assert groups == [[0], [1], [2], [3], [4]]
+
+
+def test_the_same_as_alone():
+    some = [MEMBERS[name] for name in ALONE]
+    [(_, form)] = forms(some)
+    scenarios = [build_scenarios(one, draw(one, LANES, 1), 1) for one in some]
+    in_form = [form.scenarios(one, batch) for one, batch in zip(some, scenarios, strict=True)]
+    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *in_form)
+    together = evaluate(form.loop(build_loop(MEMBERS["noisy"], "phase_lead", joined)), GAINS, joined)
+    for place, (name, one, batch) in enumerate(zip(ALONE, some, scenarios, strict=True)):
+        loop = build_loop(one, "phase_lead", batch)
+        batch = jax.tree.map(jnp.asarray, batch)
+        metrics = run_rollout(loop, as_arrays(GAINS), batch)
+        expected = compare_with_reference(loop, batch, metrics)
+        own = slice(place * LANES, (place + 1) * LANES)
+        good = np.asarray(expected.good)
+        assert np.all(good == expected.wanted) and np.any(good)
+        np.testing.assert_array_equal(together.good[:, own], good, err_msg=name)
+        for figure in ("error", "reference_restitution", "peak_ratio"):
+            found, wanted = getattr(together, figure)[:, own], np.asarray(getattr(expected, figure))
+            np.testing.assert_allclose(
+                found[good], wanted[good], rtol=0, atol=1e-9, err_msg=f"{name}: {figure}"
+            )

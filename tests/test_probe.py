@@ -1,0 +1,79 @@
+"""The probe: a push on the hardware against its closed form, and what it leaves alone."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from lanes import IDEAL, SECOND_ORDER, mechanism, nominal_gains, run_rollout, validated
+from scipy.integrate import quad
+
+from jaxhil.building import build_loop
+from jaxhil.probe import Probe, Push
+from jaxhil.scenario import build_scenarios
+
+PUSH = Push(jnp.array(3.0), jnp.array(0.05), jnp.array(0.02))
+TIMES = np.array([-0.01, 0.0, 0.04, 0.0433, 0.05, 0.0571, 0.06, 0.065, 0.2])
+
+
+def test_push_is_a_half_sine():
+    expected = 3 * np.maximum(0, np.sin(np.pi * np.clip(TIMES - 0.04, 0, 0.02) / 0.02))
+    np.testing.assert_allclose([PUSH.force(jnp.array(t)) for t in TIMES], expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("lag", [1e-3, 0.01, 0.1])
+def test_lagged_push_is_the_convolution_with_the_lag(lag):
+    for time in TIMES:
+        expected, _ = quad(
+            lambda s, time=time: float(PUSH.force(jnp.array(s))) * np.exp(-(time - s) / lag) / lag,
+            0.04,
+            max(0.04, min(time, 0.06)),
+        )
+        assert float(PUSH.lagged(jnp.array(time), jnp.array(lag))) == pytest.approx(expected, abs=1e-9)
+
+
+def test_without_lag_the_sensor_reads_the_push():
+    for time in TIMES:
+        reading = PUSH.lagged(jnp.array(time), jnp.array(0.0))
+        assert float(reading) == float(PUSH.force(jnp.array(time)))
+
+
+def run(parsed, size=0.0, share=0.25, depth=None, span=0.1):
+    """Metrics of a run with a push of so many newtons at 0.06 s of the contact."""
+    scenarios = build_scenarios(parsed)
+    shape = scenarios.phase.shape
+    full = np.full(shape, 1.0)
+    push = Push(size * full, share * 0.16 * full, 0.02 * full)
+    table = np.zeros((shape[0], 5, shape[1])) if depth is None else depth
+    probed = scenarios._replace(probe=Probe(push, table, span * full))
+    loop = build_loop(parsed, "none", probed)
+    return run_rollout(loop, nominal_gains(parsed, "none"), probed)
+
+
+@pytest.mark.parametrize("simulator", [IDEAL, SECOND_ORDER], ids=["ideal", "second order"])
+def test_a_push_of_nothing_changes_nothing(simulator):
+    parsed = validated(mechanism({}, simulator, 0.004))
+    scenarios = build_scenarios(parsed)
+    plain = run_rollout(build_loop(parsed, "none", scenarios), nominal_gains(parsed, "none"), scenarios)
+    probed = run(parsed)
+    for name in ("restitution", "peak_force", "peak_command", "duration", "approach_velocity"):
+        np.testing.assert_array_equal(getattr(probed, name), getattr(plain, name), err_msg=name)
+
+
+def test_an_early_push_takes_and_a_late_one_gives():
+    parsed = validated(mechanism({}, IDEAL, 0.0))
+    plain, early, late = (run(parsed, *push).restitution[0, 0] for push in ((0.0,), (5.0, 0.25), (5.0, 0.75)))
+    assert early < plain - 1e-3 and late > plain + 1e-3
+
+
+def test_trajectory_error_is_the_root_mean_square_off_the_table():
+    # Ideal, no delay, linear: x_d is the sine itself, and the table lies 1 mm deeper.
+    parsed = validated(mechanism({}, IDEAL, 0.0))
+    shape = build_scenarios(parsed).phase.shape
+    omega = np.sqrt(parsed.contact.stiffness[0] / parsed.bodies.mass)
+    span = np.pi / omega
+    sine = parsed.approach.velocity / omega * np.sin(np.linspace(0, np.pi, 513))
+    table = np.broadcast_to(sine[None, :, None], (shape[0], 513, shape[1]))
+    on = run(parsed, depth=table, span=span).trajectory_error[0, 0]
+    off = run(parsed, depth=table + 1e-3, span=span).trajectory_error[0, 0]
+    # The sampled loop itself is off by the semi-implicit rule's half stride.
+    assert on < 1e-2 * np.max(sine)
+    assert off == pytest.approx(1e-3, rel=0.02)
