@@ -1,0 +1,137 @@
+"""`jaxhil compare` as a user calls it; what runs the comparison itself is slow."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from math import inf, nan
+
+import pytest
+
+from tuning import report
+from tuning.comparison.cost import microseconds_per_tick
+from tuning.comparison.figures import Figure
+from tuning.comparison.plots import errors_plot, honesty_plot
+from tuning.comparison.study import LawFigures
+from tuning.comparison.tables import HEADINGS, leaderboard, mechanism_table, winners
+from tuning.plots import save
+
+COMMAND = [sys.executable, "-m", "tuning", "compare"]
+SMALL = ["rig-300kg", "--set", "approach.contacts=1", "--compensators", "none", "passivity", "--judged", "8"]
+
+
+def run(arguments, folder, **options):
+    environment = {**os.environ, "JAXHIL_CACHE": str(folder / "cache"), "XLA_FLAGS": ""}
+    return subprocess.run(
+        [*COMMAND, *arguments], capture_output=True, text=True, env=environment, cwd=folder, **options
+    )
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_document(tmp_path):
+    first, second = (run([*SMALL, "--json", "-o", name], tmp_path) for name in ("a", "b"))
+    assert (first.returncode, second.returncode) == (0, 0), first.stderr
+    documents = [json.loads(one.stdout) for one in (first, second)]
+    for name, document in zip("ab", documents, strict=True):
+        assert json.loads((tmp_path / name / "compare.json").read_text()) == document
+        assert (tmp_path / name / "errors.png").exists() and (tmp_path / name / "honesty.png").exists()
+        costs = document.pop("timings")["microseconds_per_tick"]
+        assert set(costs) == {"none", "passivity"} and all(cost > 0 for cost in costs.values())
+    assert documents[0] == documents[1]
+    [mechanism] = documents[0]["mechanisms"]
+    none, passivity = mechanism["laws"]
+    assert none["knows"] == [] and set(none["figures"]) == {"literature"}
+    rms = none["figures"]["literature"]["rms"]
+    assert rms["low"] <= rms["value"] <= rms["high"]
+    # A law that gives back what was taken: a small error, and blind.
+    assert passivity["figures"]["literature"]["rms"]["high"] < 0.2 * rms["low"]
+    assert abs(passivity["figures"]["literature"]["late"]["value"]) < 0.1
+    assert mechanism["winners"]["rms"] == "passivity"
+    table = run([*SMALL, "-o", "c"], tmp_path).stdout
+    assert "* " in table and "passivity" in table and "wrote c/compare.json" in table
+
+
+def figures(rms, **others):
+    own = dict.fromkeys(HEADINGS, Figure(1.0, 0.9, 1.1))
+    return {**own, "rms": Figure(rms, 0.9 * rms, 1.1 * rms), **others}
+
+
+FOUND = [
+    LawFigures("none", "m", {"literature": {}}, {"literature": figures(0.5)}),
+    LawFigures(
+        "phase_lead",
+        "m",
+        {"literature": {"phase_lead": 0.1}, "tuned": {"phase_lead": 0.2}},
+        {"literature": figures(0.4), "tuned": figures(0.1, worst=Figure(nan, nan, nan))},
+    ),
+]
+
+
+def test_tables_mark_what_wins(capsys):
+    report.emit(mechanism_table("m", FOUND), leaderboard(["m", "n"], {"m": FOUND, "n": FOUND[:1]}))
+    out = capsys.readouterr().out
+    rows = [line.split() for line in out.splitlines() if line.strip()]
+    assert ["none", "50"] in [row[:2] for row in rows] and ["phase_lead", "40"] in [row[:2] for row in rows]
+    # Tuned, by more than the intervals; what there is not is a dash.
+    assert ["tuned", "10*", "100", "-"] in [row[:4] for row in rows]
+    assert ["m", "50", "10*"] in rows and ["n", "50", "-"] in rows
+    assert winners(FOUND)["rms"] == "phase_lead" and winners(FOUND)["late"] is None
+
+
+def test_pictures_are_drawn(tmp_path):
+    both = {"m": FOUND, "n": FOUND}
+    save(errors_plot(["m", "n"], both, 0.01), tmp_path / "errors.png")
+    save(honesty_plot(["m", "n"], both), tmp_path / "honesty.png")
+    assert all((tmp_path / name).stat().st_size > 10_000 for name in ("errors.png", "honesty.png"))
+
+
+def test_cost_is_a_time():
+    assert 0 < microseconds_per_tick("phase_lead", literature("phase_lead"), 1e-3, inf, 0.005) < 1e3
+
+
+def literature(law):
+    from jaxhil.compensators import literature_gains
+    from jaxhil.mechanism_file import load
+
+    return literature_gains(load("rig-300kg").mechanism, law)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--compensators", "magic"], "--compensators: found 'magic', allowed none, phase_lead"),
+        (["no-such-file"], "no-such-file"),
+        (["varying", "varying"], "name: found varying, allowed a name other than that of varying"),
+        (["--judged", "1"], "--judged: found 1, allowed an integer >= 2"),
+        (["--scenarios", "0"], "--scenarios: found 0, allowed an integer >= 1"),
+        (["--limit", "nan"], "--limit: found nan, allowed a number >= 0"),
+    ],
+)
+def test_unusable_input_is_one_line(jaxhil, arguments, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ran = jaxhil("compare", *arguments)
+    assert ran.code == 2 and said in ran.err and ran.err.count("\n") == 1
+    assert not ran.out and not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_interrupted_it_keeps_what_is_finished(tmp_path):
+    environment = {**os.environ, "JAXHIL_CACHE": str(tmp_path / "cache"), "XLA_FLAGS": ""}
+    process = subprocess.Popen(
+        [*COMMAND, *SMALL, "--json", "-o", "out"], text=True, env=environment, cwd=tmp_path,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=_heed_interrupts,
+    )  # fmt: skip
+    time.sleep(6)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 130, err
+    document = json.loads(out)
+    assert document["interrupted"] and document == json.loads((tmp_path / "out" / "compare.json").read_text())
+    assert "interrupted" in err and "Traceback" not in err
+
+
+def _heed_interrupts():
+    # A job in the background of a shell that is not interactive is started deaf to them.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
