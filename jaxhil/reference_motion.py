@@ -50,8 +50,8 @@ class ReferenceMotion(NamedTuple):
 
     `restitution` is the speed |d'| after contact and push are over / v, `peak_force` [N] the largest contact
     force (without the push), `duration` [s] the time from first touch to separation (infinite if there is
-    none within 10 s, or they come to rest; `restitution` is then that of the speed by that time). `position` [m] and `velocity`
-    [m/s], (samples, *batch), belong to the times asked for, else are None.
+    none within 10 s, or they come to rest; `restitution` is then that of the speed by that time).
+    `position` [m] and `velocity` [m/s], (samples, *batch), belong to the times asked for, else are None.
     """
 
     restitution: Float[Array, "*batch"]

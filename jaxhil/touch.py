@@ -61,8 +61,8 @@ class Surfaces(NamedTuple):
         )
 
     def after(self, start: Motion, end: Motion, duration: Array, s: Any = 1) -> "Surfaces":
-        """The same at the fraction s of a smooth stretch of motion of a `duration` [s]; these are those at its
-        start."""
+        """The same at the fraction s of a smooth stretch of motion of a `duration` [s], at whose start these
+        are."""
         if not self.law.remembers:
             return self
         side, surface = self.side(start, end)

@@ -141,7 +141,7 @@ LAYERS = {
     "stiffness": [[8e4, 1.6e5, 3.2e5], [6e4, 1.2e5, 4e5]],
 }
 HERTZ = {"law": "hunt_crossley", "stiffness": [1e7, 2e7]}
-HARDENING = {"law": "hardening", "stiffness": [STIFFNESS, 0.4 * STIFFNESS], "reference_depth": 2e-4}
+HARDENING = {"law": "hardening", "stiffness": [STIFFNESS, 0.4 * STIFFNESS], "reference_depth": 5e-4}
 DEPTH_DAMPED = {"law": "depth_damped", "stiffness": [1e7, 2e7], "reference_depth": 2e-4}
 ELASTOPLASTIC = {"law": "elastoplastic", "stiffness": [STIFFNESS, 2 * STIFFNESS], "unloading_ratio": 1.6}
 FIRST_ORDER = {"model": "first_order", "time_constant": 0.009, "delay": 0.0013}

@@ -309,7 +309,7 @@ def test_keys_of_one_law(contact):
     drawn = {"uncertainty": {key: {"distribution": "uniform", "factor": [1.0, 1.5]}}}
     mechanism = from_builtins(changed({**contact, **drawn}), "f")
     assert value_at(mechanism, key) == contact[key]
-    message = refusal(changed({**contact, key: ...}))
+    message = refusal(changed({k: value for k, value in contact.items() if k != key}))
     assert f": {key}: found nothing, allowed a number >" in message and f"(law {name} needs it)" in message
     for value in (0.99 if "ratio" in key else 0.0, math.inf, "1", [1.0]):
         assert f": {key}: found " in refusal(changed({**contact, key: value}))

@@ -199,6 +199,9 @@ def test_normal_draws_are_allowed_values(path, nominal, std):
     raw = copy.deepcopy(BASE)
     if path.startswith("bodies.") and "equivalent" not in path:
         raw["bodies"] = {"chaser_mass": 1.0, "target_mass": 1.0}
+    of_one_law = {"contact.reference_depth": "hardening", "contact.unloading_ratio": "elastoplastic"}
+    if path in of_one_law:
+        raw["contact"] |= {"law": of_one_law[path], "damping": [0.0]}
     node = raw
     *tables, key = path.split(".")
     for table in tables:

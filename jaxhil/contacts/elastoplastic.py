@@ -1,4 +1,4 @@
-"""A mechanism that yields: it loads along one slope and unloads from its deepest point along a steeper one."""
+"""A mechanism that yields: it loads along one slope and unloads from its deepest point along a steeper."""
 
 import jax.numpy as jnp
 
