@@ -88,9 +88,7 @@ def update(old: Map, phi: Array, force: Array, variance: Array, enabled: Array) 
     g = jnp.sum(old.covariance * phi[None], axis=1)
     share = jnp.where(used, 1 / (variance + jnp.sum(phi * g, axis=0)), 0)
     scaled = share * g
-    return Map(
-        old.mean + scaled * (force - expected), old.covariance - scaled[:, None] * g[None]
-    )
+    return Map(old.mean + scaled * (force - expected), old.covariance - scaled[:, None] * g[None])
 
 
 def positive_damping(old: Map) -> Float[Array, "*batch"]:

@@ -2,17 +2,18 @@
 
 Scaled as in `force_depth_map`: the reference enters at depth 0 with speed 1 and obeys
 
-    x' = v,    v' = -f_i,    f_i = F(x, v) + rho [y_i - F(X_i, V_i)]
+    x' = v,    v' = -f,    f = F(x, v) + rho [y - F(X, V)]
 
 with the bracket only as far as the hardware has been measured, until it separates: x <= 0, or v < 0 and
-f <= 0. It is stepped on the ticks, counted from its entry, by the velocity Verlet scheme with the damping
-implicit in the first half of a step and explicit in the second (order 2). Measured samples are moved to that
-grid by straight lines, such that the hardware's own entry falls on the reference's.
+f <= 0. It is stepped by the velocity Verlet scheme, the damping implicit in the first half of a step and
+explicit in the second (order 2), the bracket constant within a step: the mean of y less that of F at its ends.
+Samples are counted in ticks from the reference's entry; measured ones are moved to that grid by straight
+lines, such that the hardware's own entry falls on the reference's.
 
-A pass from the entry takes up to `STRIDE` samples per tick under the map that it started with. When it has
-caught up with the present it becomes the live reference, which goes on sample by sample under the newest map,
-and the next pass starts: a bounded effort per tick, and a reference that is at most 1/(STRIDE - 1) of the
-contact's duration behind what has been identified.
+A pass from the entry makes up to `STRIDE` steps of up to `COARSE` per tick, under the map that it started
+with. When it has caught up with the present it becomes the live reference, which goes on tick by tick under
+the newest map, and the next pass starts. So the effort per tick is bounded, and the live reference rests on a
+map that at 1 ms is at most 1/23 of the contact's duration old.
 """
 
 from typing import NamedTuple
@@ -25,22 +26,26 @@ from jaxtyping import Array, Float, Int
 from jaxhil.compensators.force_depth_map import elastic
 from jaxhil.ring import write
 
-STRIDE = 16  # samples per tick of the pass from the entry
-HISTORY = 1024  # ticks of measured samples kept; a longer contact is not integrated over again
+STRIDE = 24  # steps per tick of the pass from the entry
+COARSE = 0.002  # s, the longest step of that pass, at least a tick
+HISTORY = 512
 
 
 class Motion(NamedTuple):
-    """Depth [s], speed [1], force [1/s] and whether (1) it has separated, as one array (4, *batch)."""
+    """Depth [s], speed [1] and elastic force [1/s]; of the measured sample there, the force's integral since
+    the entry [ticks/s] and the map's force [1/s]; whether (1) it has separated."""
 
     depth: Float[Array, "*batch"]
     speed: Float[Array, "*batch"]
     force: Float[Array, "*batch"]
+    impulse: Float[Array, "*batch"]
+    expected: Float[Array, "*batch"]
     free: Float[Array, "*batch"]
 
 
 class History(NamedTuple):
-    """Ring of measured samples y, X, V on the reference's grid, (HISTORY, 3, *batch), by the tick at which each
-    came; the tick at which sample 0 came, and how many have come."""
+    """Ring of measured samples on the reference's grid, by the tick at which each came: integral of y since the
+    entry [ticks/s], depth X [s], speed V [1]; the tick at which sample 0 came, and how many have come."""
 
     ring: Float[Array, "samples 3 *batch"]
     origin: Int[Array, "*batch"]
@@ -59,7 +64,7 @@ class Reference(NamedTuple):
 def entry(like: Array) -> Motion:
     """Depth 0, speed 1, no force."""
     zeros = jnp.zeros_like(like)
-    return Motion(zeros, zeros + 1, zeros, zeros)
+    return Motion(zeros, zeros + 1, zeros, zeros, zeros, zeros)
 
 
 def no_history(like: Array) -> History:
@@ -90,37 +95,45 @@ def follow(
     theta_behind = jnp.where(starts, theta, old.theta)
     may_start = history.number <= HISTORY
 
-    def force_of(theta, index, depth):
-        """Elastic force of the motion plus what was measured in excess of the map, [1/s]."""
+    def recall(index):
+        """A measured sample, and whether it has come."""
         slot = (history.origin + index) & (HISTORY - 1)
         taken = jnp.take_along_axis(history.ring, slot[None, None], axis=0, mode="promise_in_bounds")[0]
-        measured, hardware_depth, hardware_speed = taken
-        both = elastic(theta[:-1, None], jnp.stack([depth, hardware_depth]))
-        expected = both[1] + jnp.where(hardware_depth > 0, theta[-1] * hardware_speed, 0)
-        known = (index >= 0) & (index < history.number)
-        return both[0] + jnp.where(known, replay * (measured - expected), 0)
+        return taken, (index >= 0) & (index < history.number)
 
-    def advance(theta, motion, index, duration):
+    def advance(theta, motion, index, ticks):
+        (impulse, hardware_depth, hardware_speed), known = recall(index)
+        expected = elastic(theta[:-1], hardware_depth)
+        expected = expected + jnp.where(hardware_depth > 0, theta[-1] * hardware_speed, 0)
+        missing = (impulse - motion.impulse) / ticks - 0.5 * (motion.expected + expected)
+        missing = jnp.where(known, replay * missing, 0)
+        duration = ticks * period
         half = 0.5 * duration
         push = jnp.where(motion.free > 0, 0, 1)
         drag = theta[-1] * half * push
-        middle = (motion.speed - half * push * motion.force) / (1 + drag)
+        middle = (motion.speed - half * push * (motion.force + missing)) / (1 + drag)
         depth = motion.depth + duration * middle
-        force = force_of(theta, index, depth)
-        speed = middle - push * half * force - drag * middle
-        free = (motion.free > 0) | (depth <= 0) | ((speed < 0) & (force + theta[-1] * speed <= 0))
-        return Motion(depth, speed, force, free.astype(depth.dtype))
+        force = elastic(theta[:-1], depth)
+        speed = middle - push * half * (force + missing) - drag * middle
+        free = (depth <= 0) | ((speed < 0) & (force + missing + theta[-1] * speed <= 0))
+        free = (motion.free > 0) | free
+        kept = (jnp.where(known, impulse, motion.impulse), jnp.where(known, expected, motion.expected))
+        return Motion(depth, speed, force, *kept, free.astype(depth.dtype))
+
+    coarse = jnp.maximum(jnp.floor(COARSE / period + 1e-9), 1).astype(jnp.int32)
 
     def one(_, carry):
         motion, reached = carry
         ahead = reached < present
-        index = reached + 1
-        moved = advance(theta_behind, motion, index, jnp.where(reached < 0, first, period))
+        jump = jnp.where((reached >= 0) & (present - reached >= coarse), coarse, 1)
+        index = reached + jump
+        ticks = jnp.where(reached < 0, first / period, jump.astype(period.dtype))
+        moved = advance(theta_behind, motion, index, ticks)
         chosen = jax.tree.map(lambda a, b: jnp.where(ahead, a, b), moved, motion)
         return Motion(*chosen), jnp.where(ahead, index, reached)
 
     behind, reached = lax.fori_loop(0, STRIDE, one, (old.behind, old.reached))
-    live = advance(theta, old.live, present, period)
+    live = advance(theta, old.live, present, jnp.ones_like(period))
     held = starts & ~may_start
     behind = _choose(held, old.behind, behind)
     reached = jnp.where(held, old.reached, reached)

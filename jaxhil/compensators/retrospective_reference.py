@@ -46,7 +46,7 @@ from jaxhil.compensators.reference_motion import (
 from jaxhil.contact import deflection
 from jaxhil.ring import tie
 
-FAREWELL = 0.006  # s for which it goes on after the hardware has left the surface
+FAREWELL = 0.006
 LONGEST_LAG = 0.1  # s for which it waits for hardware that has not touched yet
 
 
@@ -64,8 +64,9 @@ class Aligned(NamedTuple):
 
 class Episode(NamedTuple):
     """One contact: side (1 or -1; 0: none), approach speed [m/s] (0: unusable), time [s] from the entry to the
-    first tick, ticks since that one, whether the hardware has touched, ticks since it left, where between two
-    ticks its samples fall on the reference's grid, what it was measured by at the tick before (3, *batch)."""
+    first tick, ticks since that one, whether (1) the hardware has touched, ticks since it left, where between
+    two ticks its samples fall on the reference's grid; of the tick before, what was measured (y, X, V), y moved
+    to that grid and its integral [ticks/s]."""
 
     side: Float[Array, "*batch"]
     velocity: Float[Array, "*batch"]
@@ -75,6 +76,8 @@ class Episode(NamedTuple):
     gone: Float[Array, "*batch"]
     fraction: Float[Array, "*batch"]
     sample: Float[Array, "3 *batch"]
+    moved: Float[Array, "*batch"]
+    impulse: Float[Array, "*batch"]
 
 
 class RetrospectiveState(NamedTuple):
@@ -171,7 +174,16 @@ class RetrospectiveReference(Compensator):
             aligned=Aligned(zeros, zeros),
             noise=(zeros, zeros),
             episode=Episode(
-                zeros, zeros, zeros, counts, zeros, zeros, zeros, jnp.stack([zeros, zeros, zeros])
+                zeros,
+                zeros,
+                zeros,
+                counts,
+                zeros,
+                zeros,
+                zeros,
+                jnp.stack([zeros, zeros, zeros]),
+                zeros,
+                zeros,
             ),
             map=Map(theta, theta[:, None] + theta[None]),
             reference=Reference(entry(zeros), entry(zeros), counts - 1, theta),
@@ -283,8 +295,11 @@ class RetrospectiveReference(Compensator):
         kept = jnp.where(enters[None], jnp.stack([force, depth - period * rate, rate]), old.sample)
         moved = kept + fraction * (sample - kept)
         read = history.ring[0, 0]
-        ring = remember(history, tick, tie(moved, read))
         arrived = tick - origin + 1
+        begun = 0.5 * moved[0] * first / period
+        impulse = jnp.where(arrived == 1, begun, old.impulse + 0.5 * (old.moved + moved[0]))
+        stored = jnp.concatenate([impulse[None], moved[1:]])
+        ring = remember(history, tick, tie(stored, read))
         number = jnp.where(touched, jnp.where(arrived > 0, arrived, 0), 0)
         return command, RetrospectiveState(
             line=line,
@@ -299,6 +314,8 @@ class RetrospectiveReference(Compensator):
                 gone=gone,
                 fraction=fraction,
                 sample=sample,
+                moved=moved[0],
+                impulse=impulse,
             ),
             map=now,
             reference=reference,
