@@ -8,6 +8,7 @@ first, the batch trails. They start from a Gaussian prior whose slopes wander wi
 recursive least squares (Kalman's update for constant parameters).
 """
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -51,21 +52,21 @@ def prior(
     """
     common, wandering = (common_spread * stiffness) ** 2, (wandering_spread * stiffness) ** 2
     shared = _column(np.minimum.outer(KNOTS, KNOTS) / WANDERING, stiffness)
-    slopes = common + wandering * shared
+    slopes = common[None, None] + wandering[None, None] * shared
     zeros = jnp.zeros_like(slopes[0])
     covariance = jnp.concatenate(
         [
             jnp.concatenate([slopes, zeros[:, None]], axis=1),
-            jnp.concatenate([zeros, zeros[:1] + damping_spread**2], axis=0)[None],
+            jnp.concatenate([zeros, zeros[:1] + damping_spread[None] ** 2], axis=0)[None],
         ]
     )
-    mean = jnp.concatenate([zeros + stiffness, zeros[:1] + damping])
+    mean = jnp.concatenate([zeros + stiffness[None], zeros[:1] + damping[None]])
     return Prior(mean, covariance, common, wandering, damping_spread**2)
 
 
 def ramps(depth: Float[Array, "*batch"]) -> Float[Array, "segments *batch"]:
     """How far [s] each segment is pressed in."""
-    beyond = depth - _column(KNOTS, depth)
+    beyond = depth[None] - _column(KNOTS, depth)
     return jnp.where(beyond > 0, jnp.minimum(beyond, _column(WIDTHS, depth)), 0)
 
 
@@ -74,7 +75,7 @@ def features(depth: Array, speed: Array) -> Float[Array, "parameters *batch"]:
     return jnp.concatenate([ramps(depth), speed[None]])
 
 
-def elastic(slopes: Float[Array, "segments *batch"], depth: Array) -> Float[Array, "*batch"]:
+def elastic(slopes: Float[Array, "segments *batch"], depth: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Force [1/s] without damping, 0 out of contact."""
     return jnp.sum(slopes * ramps(depth), axis=0)
 
@@ -87,8 +88,8 @@ def update(old: Map, phi: Array, force: Array, variance: Array, enabled: Array) 
     used = enabled & ((expected > 0) | (force**2 > OUTLYING * variance))
     g = jnp.sum(old.covariance * phi[None], axis=1)
     share = jnp.where(used, 1 / (variance + jnp.sum(phi * g, axis=0)), 0)
-    scaled = share * g
-    return Map(old.mean + scaled * (force - expected), old.covariance - scaled[:, None] * g[None])
+    scaled = share[None] * g
+    return Map(old.mean + scaled * (force - expected)[None], old.covariance - scaled[:, None] * g[None])
 
 
 def positive_damping(old: Map) -> Float[Array, "*batch"]:
@@ -101,11 +102,11 @@ def positive_damping(old: Map) -> Float[Array, "*batch"]:
     mean, variance = old.mean[-1], old.covariance[-1, -1]
     spread = jnp.sqrt(jnp.where(variance > 0, variance, 1))
     ratio = mean / spread
-    root = jnp.sqrt(ratio**2 + 2 * jnp.pi)
-    below = (ratio + root) / jnp.pi
+    root = jnp.sqrt(ratio**2 + 2 * math.pi)
+    below = (ratio + root) / math.pi
     positive = jnp.where(ratio > 0, ratio, 0)
-    mills = jnp.pi / ((jnp.pi - 1) * positive + root)
-    density = jnp.exp(-0.5 * positive**2) / np.sqrt(2 * np.pi)
+    mills = math.pi / ((math.pi - 1) * positive + root)
+    density = jnp.exp(-0.5 * positive**2) / math.sqrt(2 * math.pi)
     above = positive + density / (1 - density * mills)
     return jnp.where(variance > 0, spread * jnp.where(ratio > 0, above, below), jnp.where(mean > 0, mean, 0))
 
@@ -114,7 +115,7 @@ def learnt(old: Map, prior: Prior, depth: Array, speed: Array) -> Float[Array, "
     """By which share [1] the variance of the force at a depth, 10 ms or deeper, is less than the prior's."""
     phi = features(jnp.where(depth > SHALLOWEST, depth, SHALLOWEST), speed)
     left = jnp.sum(phi * jnp.sum(old.covariance * phi[None], axis=1), axis=0)
-    beyond = jnp.where(depth > SHALLOWEST, depth, SHALLOWEST) - _column(KNOTS, depth)
+    beyond = jnp.where(depth > SHALLOWEST, depth, SHALLOWEST)[None] - _column(KNOTS, depth)
     beyond = jnp.where(beyond > 0, beyond, 0)
     steps = _column(np.append(0, np.diff(KNOTS)) / WANDERING, depth)
     before = (

@@ -92,7 +92,7 @@ def follow(
     theta ends with the damping that counts; `first` [s] is the time from the entry to sample 0.
     """
     starts = old.reached < 0
-    theta_behind = jnp.where(starts, theta, old.theta)
+    theta_behind = jnp.where(starts[None], theta, old.theta)
     may_start = history.number <= HISTORY
 
     def recall(index):

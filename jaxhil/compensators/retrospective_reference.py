@@ -254,8 +254,8 @@ class RetrospectiveReference(Compensator):
         variance = gains["force_noise_floor"] ** 2 + floor
 
         before = Map(
-            jnp.where(enters, prepared.prior.mean, state.map.mean),
-            jnp.where(enters, prepared.prior.covariance, state.map.covariance),
+            jnp.where(enters[None], prepared.prior.mean, state.map.mean),
+            jnp.where(enters[None, None], prepared.prior.covariance, state.map.covariance),
         )
         now = update(before, features(depth, rate), force, variance, usable & (depth > 0))
         damping = positive_damping(now)
@@ -271,10 +271,9 @@ class RetrospectiveReference(Compensator):
         )
         live = reference.live
 
-        both = elastic(theta[:-1, None], jnp.stack([x, depth]))
-        own = jnp.where(x > 0, both[0] + damping * v, 0)
-        expected = jnp.where(depth > 0, both[1] + damping * rate, 0)
-        separated = (x <= 0) | ((v < 0) & (own <= 0))
+        own = jnp.where(x > 0, elastic(now.mean[:-1], x) + damping * v, 0)
+        expected = jnp.where(depth > 0, elastic(now.mean[:-1], depth) + damping * rate, 0)
+        separated = (x <= 0) | (usable & (v < 0) & (own <= 0))
         own = jnp.where(own > 0, own, 0)
         frequency, limit = gains["reference_frequency"], gains["correction_limit"]
         gate = learnt(now, prepared.prior, x, v)
@@ -293,13 +292,14 @@ class RetrospectiveReference(Compensator):
 
         sample = jnp.stack([force, depth, rate])
         kept = jnp.where(enters[None], jnp.stack([force, depth - period * rate, rate]), old.sample)
-        moved = kept + fraction * (sample - kept)
-        read = history.ring[0, 0]
+        moved = kept + fraction[None] * (sample - kept)
         arrived = tick - origin + 1
         begun = 0.5 * moved[0] * first / period
         impulse = jnp.where(arrived == 1, begun, old.impulse + 0.5 * (old.moved + moved[0]))
+        # Written after it is read: only then the ring is updated in place.
+        impulse = tie(impulse, jnp.where(jnp.isfinite(live.depth), live.depth, 0))
         stored = jnp.concatenate([impulse[None], moved[1:]])
-        ring = remember(history, tick, tie(stored, read))
+        ring = remember(history, tick, stored)
         number = jnp.where(touched, jnp.where(arrived > 0, arrived, 0), 0)
         return command, RetrospectiveState(
             line=line,
