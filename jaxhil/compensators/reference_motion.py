@@ -103,9 +103,10 @@ def follow(
 
     def advance(theta, motion, index, ticks):
         (impulse, hardware_depth, hardware_speed), known = recall(index)
+        known = known & (ticks > 0)
         expected = elastic(theta[:-1], hardware_depth)
         expected = expected + jnp.where(hardware_depth > 0, theta[-1] * hardware_speed, 0)
-        missing = (impulse - motion.impulse) / ticks - 0.5 * (motion.expected + expected)
+        missing = (impulse - motion.impulse) / jnp.where(known, ticks, 1) - 0.5 * (motion.expected + expected)
         missing = jnp.where(known, replay * missing, 0)
         duration = ticks * period
         half = 0.5 * duration
@@ -120,7 +121,7 @@ def follow(
         kept = (jnp.where(known, impulse, motion.impulse), jnp.where(known, expected, motion.expected))
         return Motion(depth, speed, force, *kept, free.astype(depth.dtype))
 
-    coarse = jnp.maximum(jnp.floor(COARSE / period + 1e-9), 1).astype(jnp.int32)
+    coarse = jnp.clip(jnp.floor(COARSE / period + 1e-9), 1, HISTORY).astype(jnp.int32)
 
     def one(_, carry):
         motion, reached = carry

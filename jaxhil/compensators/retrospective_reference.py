@@ -118,13 +118,13 @@ class RetrospectiveReference(Compensator):
             force_delay, tuned=_fact,
         ),
         Gain(
-            "prior_stiffness", "1/s^2", lambda m: 10.0, lambda m: 1e4, lambda m: 254.0, logarithmic=True,
+            "prior_stiffness", "1/s^2", lambda m: 10.0, lambda m: 5e3, lambda m: 254.0, logarithmic=True,
         ),
         Gain(
-            "prior_stiffness_spread", "1", lambda m: 0.05, lambda m: 10.0, lambda m: 2.63, logarithmic=True,
+            "prior_stiffness_spread", "1", lambda m: 0.05, lambda m: 5.0, lambda m: 2.63, logarithmic=True,
         ),
         Gain(
-            "prior_slope_spread", "1", lambda m: 0.01, lambda m: 10.0, lambda m: 0.979, logarithmic=True,
+            "prior_slope_spread", "1", lambda m: 0.01, lambda m: 5.0, lambda m: 0.979, logarithmic=True,
         ),
         Gain("prior_damping", "1/s", lambda m: 0.0, lambda m: 10.0, lambda m: 0.063, tuned=_fact),
         Gain(

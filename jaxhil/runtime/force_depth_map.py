@@ -7,7 +7,7 @@ that are pressed in enter the sums.
 """
 
 from bisect import bisect_left
-from math import exp, pi, sqrt
+from math import pi, sqrt
 
 KNOTS = (0.0, 0.002, 0.005, 0.01, 0.016, 0.024, 0.032, 0.04, 0.05, 0.062, 0.076, 0.092)
 SEGMENTS = 12
@@ -94,6 +94,8 @@ class ForceDepthMap:
         for j, ramp in enumerate(pressed):
             s += ramp * g[j]
         s += speed * g[SEGMENTS]
+        if not s > 0.0:
+            return
         share = 1.0 / s
         innovation = force - expected
         for i, row in enumerate(covariance):
@@ -165,7 +167,8 @@ def positive_mean(mean: float, variance: float) -> float:
     """The mean of N(mean, variance) given that it is not negative.
 
     That is s (t + phi(t)/Phi(t)), t = mean/s, phi and Phi the normal density and distribution, with Boyd's
-    bound of Mills' ratio, (1 - Phi(u))/phi(u) = pi/((pi - 1) u + sqrt(u^2 + 2 pi)), exact at 0 and far out.
+    bound of Mills' ratio, (1 - Phi(u))/phi(u) = pi/((pi - 1) u + sqrt(u^2 + 2 pi)), exact at 0 and far out,
+    and (1 + u^2/512)^-256 for the density's exponential.
     """
     if not variance > 0.0:
         return mean if mean > 0.0 else 0.0
@@ -175,5 +178,8 @@ def positive_mean(mean: float, variance: float) -> float:
     if not ratio > 0.0:
         return spread * ((ratio + root) / pi)
     mills = pi / ((pi - 1.0) * ratio + root)
-    density = exp(-0.5 * (ratio * ratio)) / sqrt(2.0 * pi)
+    tail = 1.0 / (1.0 + ratio * ratio / 512.0)
+    for _ in range(8):
+        tail *= tail
+    density = tail / sqrt(2.0 * pi)
     return spread * (ratio + density / (1.0 - density * mills))

@@ -76,8 +76,8 @@ class ReferenceMotion:
     def __init__(self, replay: float, period: float) -> None:
         self._replay = replay
         self._period = period
-        steps = floor(COARSE / period + 1e-9)
-        self._coarse = steps if steps > 1 else 1
+        steps = COARSE / period
+        self._coarse = floor(steps + 1e-9) if 1.0 < steps < HISTORY else (1 if steps <= 1.0 else HISTORY)
         self._impulses = [0.0] * HISTORY
         self._depths = [0.0] * HISTORY
         self._speeds = [0.0] * HISTORY
@@ -152,7 +152,7 @@ class ReferenceMotion:
         at_knots = path.at_knots
         damping = path.damping
         missing = 0.0
-        if index < self._number:
+        if index < self._number and ticks > 0.0:
             slot = index & (HISTORY - 1)
             impulse = self._impulses[slot]
             depth = self._depths[slot]

@@ -82,7 +82,7 @@ class RetrospectiveReference:
         "reference_frequency": GainSpecification("rad/s", lowest=0.0),
         "reference_damping_ratio": GainSpecification("1", lowest=0.0),
         "correction_limit": GainSpecification("1/s", lowest=0.0),
-        "force_replay": GainSpecification("1", lowest=0.0, highest=1.0),
+        "force_replay": GainSpecification("1", lowest=0.0),
     }
 
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
@@ -92,7 +92,7 @@ class RetrospectiveReference:
         self._mass = gains["equivalent_mass"]
         # The line delays by a tick less, so that the speed can be a difference about the middle.
         whole = delay > period
-        self._line = DelayLine(delay - period if whole else 0.0, period)
+        self._line = DelayLine(delay - period, period) if whole else None
         self._share = 1.0 if whole else delay / period
         self._map = ForceDepthMap(
             gains["prior_stiffness"],
@@ -132,7 +132,7 @@ class RetrospectiveReference:
         enters = now != 0.0 and now != self._side
         if enters:
             approach = now * velocity_desired
-            sound = approach > 0.0 and abs(touching) <= 2.0 * period * approach
+            sound = self._mass * approach > 0.0 and abs(touching) <= 2.0 * period * approach
             self._side = now
             self._speed = approach if sound else 0.0
             self._touched = False
@@ -187,7 +187,8 @@ class RetrospectiveReference:
         if depth > 0.0:
             if not self._touched:
                 self._touch(depth, rate)
-            mean = self._squares / ((self._count if self._count > 0.0 else 1.0) * (weight * weight))
+            scale = (self._count if self._count > 0.0 else 1.0) * (weight * weight)
+            mean = self._squares / scale if scale > 0.0 else 0.0
             contact.update(depth, rate, force, self._floor * self._floor + mean)
         reference.tick(contact)
 
@@ -225,7 +226,7 @@ class RetrospectiveReference:
         since = 0.5 * period
         if rate > 0.0:
             since = depth / rate
-            if since > period:
+            if not since <= period:
                 since = period
         shift = (self._first - since) / period
         whole = floor(shift)
@@ -260,9 +261,12 @@ class RetrospectiveReference:
         """The measured position [m] a tick less than the delay ago; position and velocity [m/s] as old as
         the force."""
         period = self._period
-        if not self._started:
-            self._line.start(position, velocity)
-        newest = self._line.step(position)
+        line = self._line
+        newest = position
+        if line is not None:
+            if not self._started:
+                line.start(position, velocity)
+            newest = line.step(position)
         if not self._started:
             stride = period * velocity
             self._middle = newest - stride
