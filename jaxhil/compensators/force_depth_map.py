@@ -4,8 +4,8 @@
 
 Everything is scaled by the approach speed v0 and the mass M: depth x / v0 [s], speed v / v0 [1],
 force F / (M v0) [1/s], slope k / M [1/s^2], damping b / M [1/s]. Parameters theta (slopes, then damping) come
-first, the batch trails. They start from a Gaussian prior whose slopes wander with depth, and are identified by
-recursive least squares (Kalman's update for constant parameters).
+first, the batch trails. They start from a Gaussian prior whose slopes wander with depth, and are identified
+by recursive least squares (Kalman's update for constant parameters).
 """
 
 import math

@@ -6,9 +6,9 @@ Scaled as in `force_depth_map`: the reference enters at depth 0 with speed 1 and
 
 with the bracket only as far as the hardware has been measured, until it separates: x <= 0, or v < 0 and
 f <= 0. It is stepped by the velocity Verlet scheme, the damping implicit in the first half of a step and
-explicit in the second (order 2), the bracket constant within a step: the mean of y less that of F at its ends.
-Samples are counted in ticks from the reference's entry; measured ones are moved to that grid by straight
-lines, such that the hardware's own entry falls on the reference's.
+explicit in the second (order 2), the bracket constant within a step: the mean of y less that of F at its
+ends. Samples are counted in ticks from the reference's entry; measured ones are moved to that grid by
+straight lines, such that the hardware's own entry falls on the reference's.
 
 A pass from the entry makes up to `STRIDE` steps of up to `COARSE` per tick, under the map that it started
 with. When it has caught up with the present it becomes the live reference, which goes on tick by tick under
@@ -44,8 +44,8 @@ class Motion(NamedTuple):
 
 
 class History(NamedTuple):
-    """Ring of measured samples on the reference's grid, by the tick at which each came: integral of y since the
-    entry [ticks/s], depth X [s], speed V [1]; the tick at which sample 0 came, and how many have come."""
+    """Ring of measured samples on the reference's grid, by the tick at which each came: integral of y since
+    the entry [ticks/s], depth X [s], speed V [1]; the tick at which sample 0 came, how many have come."""
 
     ring: Float[Array, "samples 3 *batch"]
     origin: Int[Array, "*batch"]

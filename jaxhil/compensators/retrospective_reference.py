@@ -11,9 +11,9 @@ equivalent mass M, F_theta the map, (X, V) the measured motion aligned with the 
     in contact:  F_c = f_0 + (y - F_theta(X, V)) + f_e
     separated:   F_c = f_e  until the hardware has left the surface for 6 ms, then 0
 
-`gate` is the share of the prior's variance that has been learnt. Every contact starts afresh; so does one with
-the other surface. A run that begins in contact has no approach speed to scale by: there F_c is the measured
-force, as it is.
+`gate` is the share of the prior's variance that has been learnt. Every contact starts afresh; so does one
+with the other surface. Without f_e it is the published law with the map in the place of k_hat and b_hat; a
+run that begins in contact has no approach speed to scale by: there F_c is the measured force, as it is.
 """
 
 from typing import ClassVar, NamedTuple
@@ -63,10 +63,10 @@ class Aligned(NamedTuple):
 
 
 class Episode(NamedTuple):
-    """One contact: side (1 or -1; 0: none), approach speed [m/s] (0: unusable), time [s] from the entry to the
-    first tick, ticks since that one, whether (1) the hardware has touched, ticks since it left, where between
-    two ticks its samples fall on the reference's grid; of the tick before, what was measured (y, X, V), y moved
-    to that grid and its integral [ticks/s]."""
+    """One contact: side (1 or -1; 0: none), approach speed [m/s] (0: unusable), time [s] from the entry to
+    the first tick, ticks since that one, whether (1) the hardware has touched, ticks since it left, where
+    between two ticks its samples fall on the reference's grid; of the tick before, what was measured
+    (y, X, V), y moved to that grid and its integral [ticks/s]."""
 
     side: Float[Array, "*batch"]
     velocity: Float[Array, "*batch"]

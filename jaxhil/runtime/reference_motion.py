@@ -21,9 +21,9 @@ HISTORY = 1024  # samples kept; a longer contact is not integrated over again
 
 
 class Path:
-    """A motion under a map that it holds, at one sample: depth [s], speed, elastic force [1/s]; of the measured
-    sample there, the force's integral since the entry [ticks/s] and the map's force [1/s]; whether it has
-    separated."""
+    """A motion under a map that it holds, at one sample: depth [s], speed, elastic force [1/s]; of the
+    measured sample there, the force's integral since the entry [ticks/s] and the map's force [1/s]; whether
+    it has separated."""
 
     __slots__ = ("at_knots", "damping", "depth", "expected", "force", "free", "impulse", "slopes", "speed")
 

@@ -33,8 +33,8 @@ class RetrospectiveReference:
 
     Every contact starts afresh, also with the other surface. A run that begins in contact has no approach
     speed to scale by: there F_c is the measured force. `status` is what stands behind the last command:
-    `OUT_OF_CONTACT`, `IDENTIFIED`, `UNSURE` (less than half is learnt: what is steered by is the measured force
-    and what the prior says of the contact), or `SATURATED` (the correction is at its limit).
+    `OUT_OF_CONTACT`, `IDENTIFIED`, `UNSURE` (less than half is learnt: it goes by the measured force and what
+    the prior says of the contact), or `SATURATED` (the correction is at its limit).
     """
 
     __slots__ = (
