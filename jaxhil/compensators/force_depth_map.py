@@ -109,7 +109,8 @@ def positive_damping(old: Map) -> Float[Array, "*batch"]:
     below = (ratio + root) / math.pi
     positive = jnp.where(ratio > 0, ratio, 0)
     mills = math.pi / ((math.pi - 1) * positive + root)
-    density = 1 / (1 + positive**2 / 512) ** 256 / math.sqrt(2 * math.pi)
+    # The power of what is at most 1: the other way round it overflows, and so does its derivative.
+    density = (1 / (1 + positive**2 / 512)) ** 256 / math.sqrt(2 * math.pi)
     above = positive + density / (1 - density * mills)
     return jnp.where(variance > 0, spread * jnp.where(ratio > 0, above, below), jnp.where(mean > 0, mean, 0))
 
