@@ -55,6 +55,11 @@ def _entries(compensator: str) -> dict[str, dict[str, Any]]:
 GAINS: dict[str, dict[str, dict[str, Any]]] = {
     **{compensator: _entries(compensator) for compensator in COMPENSATORS},
     "phase_lead": _LEAD,
+    "retrospective_reference": {
+        **_entries("retrospective_reference"),
+        # Off the ticks, where it may be differentiated.
+        "identification_delay": {"value": 0.0083, "unit": "s", "lower": 0.0, "upper": 0.05},
+    },
     "response_error": {
         **_LEAD,
         "response_error": {"value": 0.9, "unit": "1", "lower": 0.0, "upper": 2.0},

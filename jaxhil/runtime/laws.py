@@ -15,4 +15,5 @@ LAWS = (
     "dead_zone_observer",
     "passivity",
     "response_error",
+    "retrospective_reference",
 )

@@ -21,6 +21,7 @@ pytestmark = [
     pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine"),
 ]
 BAR = 100.0  # ns
+BARS = {"retrospective_reference": 20_000.0}  # it integrates a whole contact over again
 ROWS = 200_000
 REPEATS = 40
 WIDE = {
@@ -62,9 +63,10 @@ def test_time_of_a_tick(law, tmp_path):
         [str(program), str(ROWS), str(REPEATS)], input=rows.tobytes(), capture_output=True, check=True
     )
     bare, tick, contact, cause = (float(number) for number in ran.stdout.split())
+    bar = BARS.get(law, BAR)
     print(
-        f"\nC tick, {law}: {tick:.1f} ns (bar {BAR:.0f} ns); bare loop {bare:.1f} ns; "
+        f"\nC tick, {law}: {tick:.1f} ns (bar {bar:.0f} ns); bare loop {bare:.1f} ns; "
         f"{contact / ROWS:.0%} of the ticks in contact"
     )
     assert cause == 0 and contact > 0
-    assert tick <= BAR
+    assert tick <= bar

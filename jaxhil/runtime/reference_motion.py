@@ -1,0 +1,183 @@
+"""The motion that a contact should have had, integrated over again from its entry while the map improves.
+
+From depth 0 at speed 1: x' = v, v' = -f, f = F(x, v) + rho [y - F(X, V)], the bracket only as far as the
+hardware has been measured, until it separates: x <= 0, or v < 0 and f <= 0. Velocity Verlet with the damping
+implicit in the first half of a step and explicit in the second; the bracket is constant within a step: the
+mean of y less that of F at its ends. Samples are counted in ticks from the entry.
+
+A pass from the entry makes up to `STRIDE` steps of up to `COARSE` per tick under the map that it started
+with. When it has caught up with the present it becomes the live motion, which goes on tick by tick under the
+newest map, and the next pass starts.
+"""
+
+from bisect import bisect_left
+from math import floor
+
+from .force_depth_map import KNOTS, ForceDepthMap
+
+STRIDE = 24  # steps per tick of the pass from the entry
+COARSE = 0.002  # s, the longest step of that pass, at least a tick
+HISTORY = 1024  # samples kept; a longer contact is not integrated over again
+
+
+class Path:
+    """A motion under a map that it holds, at one sample: depth [s], speed, elastic force [1/s]; of the
+    measured sample there, the force's integral since the entry [ticks/s] and the map's force [1/s]; whether
+    it has separated."""
+
+    __slots__ = ("at_knots", "damping", "depth", "expected", "force", "free", "impulse", "slopes", "speed")
+
+    def __init__(self) -> None:
+        self.enter()
+
+    def enter(self) -> None:
+        """Begin at depth 0 with speed 1."""
+        self.depth = 0.0
+        self.speed = 1.0
+        self.force = 0.0
+        self.impulse = 0.0
+        self.expected = 0.0
+        self.free = False
+
+    def under(self, contact: ForceDepthMap) -> None:
+        """Take over a map as it is now."""
+        self.slopes = contact.slopes
+        self.at_knots = contact.at_knots
+        self.damping = contact.damping
+
+    def take(self, other: "Path") -> None:
+        """Go on from where the other is."""
+        self.depth = other.depth
+        self.speed = other.speed
+        self.force = other.force
+        self.impulse = other.impulse
+        self.expected = other.expected
+        self.free = other.free
+
+
+class ReferenceMotion:
+    """The live motion, `depth` [s] and `speed`, and the pass behind it."""
+
+    __slots__ = (
+        "_behind",
+        "_coarse",
+        "_depths",
+        "_first",
+        "_impulses",
+        "_live",
+        "_number",
+        "_period",
+        "_present",
+        "_reached",
+        "_replay",
+        "_speeds",
+    )
+
+    def __init__(self, replay: float, period: float) -> None:
+        self._replay = replay
+        self._period = period
+        steps = COARSE / period
+        self._coarse = floor(steps + 1e-9) if 1.0 < steps < HISTORY else (1 if steps <= 1.0 else HISTORY)
+        self._impulses = [0.0] * HISTORY
+        self._depths = [0.0] * HISTORY
+        self._speeds = [0.0] * HISTORY
+        self._live = Path()
+        self._behind = Path()
+        self.restart(0.0)
+
+    @property
+    def depth(self) -> float:
+        """Where the numerical model should be [s]."""
+        return self._live.depth
+
+    @property
+    def speed(self) -> float:
+        """How fast it should move, as a fraction of the approach speed."""
+        return self._live.speed
+
+    def restart(self, first: float) -> None:
+        """A contact whose sample 0, the next tick's, comes `first` [s] after its entry."""
+        self._first = first
+        self._number = 0
+        self._present = -1
+        self._reached = -1
+        self._behind.enter()
+
+    def remember(self, index: int, impulse: float, depth: float, speed: float) -> None:
+        """A measured sample: the force's integral since the entry [ticks/s], depth [s], speed."""
+        slot = index & (HISTORY - 1)
+        self._impulses[slot] = impulse
+        self._depths[slot] = depth
+        self._speeds[slot] = speed
+        self._number = index + 1
+
+    def tick(self, contact: ForceDepthMap) -> None:
+        """One tick of the live motion and of the pass."""
+        present = self._present + 1
+        self._present = present
+        live = self._live
+        behind = self._behind
+        reached = self._reached
+        if reached >= 0 or self._number <= HISTORY:
+            if reached < 0:
+                behind.under(contact)
+            reached = self._pass(behind, reached, present)
+        if reached == present:
+            live.take(behind)
+            behind.enter()
+            reached = -1
+        else:
+            live.under(contact)
+            self._advance(live, present, 1.0)
+        self._reached = reached
+
+    def _pass(self, behind: Path, reached: int, present: int) -> int:
+        """Up to `STRIDE` steps from the sample `reached`; the one reached then."""
+        coarse = self._coarse
+        for _ in range(STRIDE):
+            if reached >= present:
+                break
+            if reached < 0:
+                reached = 0
+                self._advance(behind, 0, self._first / self._period)
+            else:
+                jump = coarse if present - reached >= coarse else 1
+                reached += jump
+                self._advance(behind, reached, float(jump))
+        return reached
+
+    def _advance(self, path: Path, index: int, ticks: float) -> None:
+        """The path to the sample `index`, over so many ticks."""
+        slopes = path.slopes
+        at_knots = path.at_knots
+        damping = path.damping
+        missing = 0.0
+        if index < self._number and ticks > 0.0:
+            slot = index & (HISTORY - 1)
+            impulse = self._impulses[slot]
+            depth = self._depths[slot]
+            expected = 0.0
+            if depth > 0.0:
+                segment = bisect_left(KNOTS, depth) - 1
+                expected = at_knots[segment] + slopes[segment] * (depth - KNOTS[segment])
+                expected += damping * self._speeds[slot]
+            missing = self._replay * ((impulse - path.impulse) / ticks - 0.5 * (path.expected + expected))
+            path.impulse = impulse
+            path.expected = expected
+        duration = ticks * self._period
+        if path.free:
+            path.depth += duration * path.speed
+            return
+        half = 0.5 * duration
+        drag = damping * half
+        middle = (path.speed - half * (path.force + missing)) / (1.0 + drag)
+        depth = path.depth + duration * middle
+        force = 0.0
+        if depth > 0.0:
+            segment = bisect_left(KNOTS, depth) - 1
+            force = at_knots[segment] + slopes[segment] * (depth - KNOTS[segment])
+        speed = middle - half * (force + missing) - drag * middle
+        path.depth = depth
+        path.speed = speed
+        path.force = force
+        path.free = depth <= 0.0 or (speed < 0.0 and force + missing + damping * speed <= 0.0)
