@@ -232,7 +232,7 @@ class Replay:
 
 @dataclass(frozen=True)
 class Compare:
-    """Every compensator, each tuned to its own best, on the same fresh scenarios, with 95 % intervals.
+    """Every published compensator, each tuned to its best, on the same fresh scenarios, with intervals.
 
     Example: jaxhil compare rig-300kg varying --compensators phase_lead response_error
 
@@ -247,7 +247,9 @@ class Compare:
     compensators: Annotated[
         tuple[str, ...],
         arg(
-            metavar="NAME [NAME ...]", help="Compensators to compare; by default all.", help_behavior_hint=""
+            metavar="NAME [NAME ...]",
+            help="Compensators to compare; by default all that are published.",
+            help_behavior_hint="",
         ),
     ] = ()
     output: Annotated[str, arg(aliases=("-o",), metavar="DIR", help="Folder for what is written.")] = (

@@ -120,6 +120,8 @@ def inverse_hessian(
 ) -> Float[np.ndarray, "gains gains"]:
     """That of the value of the objective, over it, from J^T J of the loss; widths at most a quarter of the
     box: the shape of the region in which the value rises by little."""
+    # Where derivatives overflow, nothing is known of the shape.
+    curvature = np.where(np.all(np.isfinite(curvature)), curvature, 0.0)
     loss = (value / SCALE) ** 2 / 2
     return np.linalg.inv(curvature / (2 * max(loss, 1e-12)) + 16 * np.eye(len(curvature)))
 

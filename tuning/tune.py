@@ -214,7 +214,7 @@ def _certify(trial: Trial, settings: Settings, found: list[Found], report) -> li
 def _freedom(task: Task, names: tuple[str, ...], found: Start | None) -> dict[str, Freedom]:
     """Of the gains tuned for the task, from the solver's last J^T J."""
     moved = [i for i, name in enumerate(names) if name in {gain.name for gain in task.tuned}]
-    if found is None or not moved:
+    if found is None or not moved or not np.all(np.isfinite(found.curvature)):
         return {}
     values, vectors = np.linalg.eigh(found.curvature[np.ix_(moved, moved)])
     root = np.sqrt(np.maximum(values, 0))[:, None] * vectors.T

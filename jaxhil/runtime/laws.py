@@ -1,10 +1,11 @@
 """The compensation laws by name: the one entry that a law has anywhere.
 
 The law `<name>` is `jaxhil/compensators/<name>.py` in JAX, `jaxhil/runtime/<name>.py` in plain Python and
-`jaxhil/c99/<name>.c` in C99. Simulation, tuning, command line, export and tests go by this list.
+`jaxhil/c99/<name>.c` in C99. Simulation, tuning, command line, export and tests go by this list;
+`PUBLISHED` are those of the literature, the rest is ours.
 """
 
-LAWS = (
+PUBLISHED = (
     "none",
     "phase_lead",
     "multi_parameter_lead",
@@ -15,5 +16,5 @@ LAWS = (
     "dead_zone_observer",
     "passivity",
     "response_error",
-    "retrospective_reference",
 )
+LAWS = (*PUBLISHED, "retrospective_reference")

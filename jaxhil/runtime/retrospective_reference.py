@@ -125,7 +125,7 @@ class RetrospectiveReference:
         """The force F_c [N]."""
         period = self._period
         clearance = self._clearance
-        newest, position, velocity = self._align(position_measured, velocity_desired)
+        _, position, velocity = self._align(position_measured, velocity_desired)
         bent = deflection(position, clearance)
         touching = deflection(position_desired, clearance)
         now = 1.0 if touching > 0.0 else (-1.0 if touching < 0.0 else 0.0)

@@ -6,7 +6,7 @@ from typing import Any
 
 from jaxhil.errors import InputError
 from jaxhil.mechanism_file import LoadedMechanism, load, suite_names
-from jaxhil.runtime.laws import LAWS
+from jaxhil.runtime.laws import LAWS, PUBLISHED
 from tuning import report
 from tuning.commands import checks
 from tuning.environment import prepare, usable_cores
@@ -14,35 +14,39 @@ from tuning.options import Compare
 
 
 def run(options: Compare) -> int:
-    """Compare; what is finished is told and written, also when interrupted. 0, or 130."""
+    """Compare; what is finished is told and written, also when interrupted. 0, 1 if a law failed, or 130."""
     checks.limit(options.limit)
     checks.at_least(1, scenarios=options.scenarios)
     checks.at_least(2, judged=options.judged)
     checks.at_least(0, seed=options.seed)
-    laws = options.compensators or LAWS
+    laws = options.compensators or PUBLISHED
     for law in laws:
         checks.one_of(LAWS, compensators=law)
     loaded = _load(options)
     Path(options.output).mkdir(parents=True, exist_ok=True)
     prepare()
-    from tuning.comparison.study import Settings, compare
+    from tuning.comparison.study import Failed, Settings, compare
 
     settings = Settings(options.scenarios, judged=options.judged, limit=options.limit, seed=options.seed)
     names = [one.mechanism.name for one in loaded]
     found: dict[str, dict[str, Any]] = {name: {} for name in names}
-    interrupted = False
+    interrupted, problems = False, []
     with report.stages(0) as stages:
         try:
             mechanisms = [one.mechanism for one in loaded]
             for one in compare(mechanisms, tuple(dict.fromkeys(laws)), settings, usable_cores(), stages.say):
-                found[one.mechanism][one.law] = one
+                if isinstance(one, Failed):
+                    problems.append(f"{one.law}: {one.reason}")
+                    report.note(f"jaxhil: {problems[-1]}")
+                else:
+                    found[one.mechanism][one.law] = one
         except KeyboardInterrupt:
             interrupted = True
     ordered = {
         name: [found[name][law] for law in dict.fromkeys(laws) if law in found[name]] for name in names
     }
     done = [name for name in names if ordered[name]]
-    document = _document(options, loaded, ordered, interrupted)
+    document = {**_document(options, loaded, ordered), "problems": problems, "interrupted": interrupted}
     (Path(options.output) / "compare.json").write_text(report.as_json(document), encoding="utf-8")
     if done and not interrupted:
         _draw(options, done, ordered)
@@ -54,7 +58,7 @@ def run(options: Compare) -> int:
         finished = sum(len(own) for own in ordered.values())
         report.note(f"jaxhil: interrupted, {finished} of {len(names) * len(laws)} results finished and kept")
         return 130
-    return 0
+    return 1 if problems else 0
 
 
 def _load(options: Compare) -> list[LoadedMechanism]:
@@ -75,7 +79,6 @@ def _document(
     options: Compare,
     loaded: Sequence[LoadedMechanism],
     ordered: Mapping[str, Sequence[Any]],
-    interrupted: bool,
 ) -> dict[str, Any]:
     from jaxhil.compensators import COMPENSATORS
     from tuning.comparison.tables import winners
@@ -103,7 +106,6 @@ def _document(
             for one in loaded
         ],
         "timings": {"microseconds_per_tick": _costs(loaded[0], ordered)},
-        "interrupted": interrupted,
     }
 
 

@@ -11,6 +11,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from jaxhil.errors import one_line
 from jaxhil.mechanism import Mechanism
 from tuning.comparison.figures import Figure
 
@@ -44,13 +45,20 @@ class LawFigures(NamedTuple):
     figures: dict[str, dict[str, Figure]]
 
 
+class Failed(NamedTuple):
+    """A law that could not be judged on some mechanisms, and why; the others are none the worse for it."""
+
+    law: str
+    reason: str
+
+
 def compare(
     mechanisms: Sequence[Mechanism],
     laws: Sequence[str],
     settings: Settings,
     processes: int,
     report: Callable[[str], None] = lambda text: None,
-) -> Iterator[LawFigures]:
+) -> Iterator[LawFigures | Failed]:
     """What is found of each law on every mechanism, as it is done."""
     # A fresh interpreter each: jax does not survive a fork.
     context = multiprocessing.get_context("spawn")
@@ -64,7 +72,11 @@ def compare(
             for done in as_completed(running):
                 group, law = running[done]
                 report(f"{law}, {len(group)} mechanism{'s' if len(group) > 1 else ''}")
-                yield from done.result()
+                error = done.exception()
+                if error is None:
+                    yield from done.result()
+                else:
+                    yield Failed(law, one_line(f"{type(error).__name__}: {error}", 200))
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
