@@ -298,7 +298,7 @@ def test_gains_that_do_not_fit_are_refused(jaxhil, tuned):
         (["simulate", "rig-300"], ["did you mean rig-300kg"]),
         (["simulate", "--set", "approach.velocity=-1"], ["approach.velocity", "-1", "> 0"]),
         (["simulate", "--set", "approach.speed=1"], ["approach.speed", "unknown key"]),
-        (["simulate", "--compensator", "magic"], ["magic", "none, phase_lead, response_error"]),
+        (["simulate", "--compensator", "magic"], ["magic", "none, phase_lead, multi_parameter_lead"]),
         (["simulate", "--gains", "nowhere.json"], ["nowhere.json"]),
         (["simulate", "--limit", "nan"], ["--limit"]),
         (["simulate", "--plot=plot.doc"], ["--plot", "plot.doc", ".png"]),

@@ -27,7 +27,7 @@ def lanes_of(scenarios, lanes):
 def take(leaf, lanes):
     if isinstance(leaf, tuple):
         return type(leaf)(*(take(part, lanes) for part in leaf))
-    return np.asarray(leaf)[..., lanes]
+    return None if leaf is None else np.asarray(leaf)[..., lanes]
 
 
 def test_a_lane_does_not_depend_on_its_batch():

@@ -40,7 +40,7 @@ def members():
 
 
 MEMBERS = members()
-ALONE = ("kelvin_voigt", "piecewise_linear", "hardening", "elastoplastic", "noisy")
+ALONE = ("piecewise_linear", "hardening", "noisy")
 GAINS, LANES = {"phase_lead": 0.005, "lead_filter": 0.001}, 4
 
 

@@ -64,7 +64,7 @@ def test_closed_forms(case):
     np.testing.assert_allclose(found.duration, expected.duration, rtol=2e-8)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [name for name in CASES if name != "piecewise_linear"])
 def test_error_falls_with_the_tolerance(case):
     """A step of order 5 whose error is E is as long as E^(1/5): the sum of their errors falls as E^(4/5)."""
     tolerances = np.array([1e-5, 1e-7, 1e-9, 1e-11])
