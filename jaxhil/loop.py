@@ -276,7 +276,7 @@ def drive(
     if loop.has_lag:
         time_constant = scenario.force_sensor.time_constant
         reading, lagged = sensed_lag(surfaces, lagged, panel, until, period, time_constant)
-    touched = state.touched
+    touched, pushed = state.touched, real
     if touched is not None and push is not None:
         signed = deflection(panel.sample.position, scenario.clearance)
         side = jnp.sign(signed)
@@ -287,8 +287,6 @@ def drive(
         if reading is not None:
             time_constant = scenario.force_sensor.time_constant
             reading = reading + touched.side * push.lagged(since, time_constant)
-    else:
-        pushed = real
     works = peak = None
     if loop.energies and loop.first_break == 0:
         works = works_between(sensed.last, now)

@@ -141,10 +141,10 @@ def test_transparency_and_slope_are_least_squares():
 
 def test_intervals_cover_as_often_as_they_say():
     rng = np.random.default_rng(0)
-    hits = 0
+    hits, every = 0, np.ones((1, 60), bool)
     for seed in range(200):
         sample = rng.normal(1.0, 1.0, 60)
-        found = resampled(lambda values: np.mean(values, axis=-1), seed, sample)
+        found = resampled(lambda values: np.mean(values, axis=-1), seed, every, sample[None])
         hits += found.low <= 1.0 <= found.high
     # Binomial(200, 0.95) is below 181 with probability 0.3 %.
     assert 181 <= hits <= 200
@@ -166,3 +166,17 @@ def test_honesty_is_measured_from_1():
     assert distance("early", Figure(0.7, 0.6, 0.8)) == pytest.approx((0.3, 0.2, 0.4))
     assert distance("slope", Figure(1.1, 0.9, 1.3)) == pytest.approx((0.1, 0.0, 0.3))
     assert distance("rms", Figure(0.7, 0.6, 0.8)) == (0.7, 0.6, 0.8)
+
+
+def test_scenarios_are_resampled_with_all_their_contacts():
+    """Four equal contacts say no more than one, and one that is not good says nothing."""
+    sample = np.random.default_rng(0).normal(1.0, 1.0, 40)
+    good = np.ones((4, 40), bool)
+
+    def mean(values):
+        return np.nanmean(values, axis=-1)
+
+    once = resampled(mean, 0, good[:1], sample[None])
+    assert resampled(mean, 0, good, np.tile(sample, (4, 1))) == pytest.approx(once, rel=1e-12)
+    good[1:] = False
+    assert resampled(mean, 0, good, np.tile(1e3 * sample, (4, 1)) * [[1e-3], [1], [1], [1]]) == once

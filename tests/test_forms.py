@@ -10,6 +10,7 @@ from jaxhil.contact import LAWS
 from jaxhil.evaluation import compare_with_reference, evaluate
 from jaxhil.scenario import build_scenarios
 from jaxhil.uncertainty import draw
+from tuning.batches import join
 from tuning.forms import forms
 
 SPREAD = {"contact.stiffness": {"distribution": "uniform", "factor": [0.5, 2.0]}}
@@ -67,7 +68,7 @@ def test_the_same_as_alone():
     [(_, form)] = forms(some)
     scenarios = [build_scenarios(one, draw(one, LANES, 1), 1) for one in some]
     in_form = [form.scenarios(one, batch) for one, batch in zip(some, scenarios, strict=True)]
-    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *in_form)
+    joined = join(in_form)
     together = evaluate(form.loop(build_loop(MEMBERS["noisy"], "phase_lead", joined)), GAINS, joined)
     for place, (name, one, batch) in enumerate(zip(ALONE, some, scenarios, strict=True)):
         loop = build_loop(one, "phase_lead", batch)

@@ -50,8 +50,13 @@ class Form:
 
     def law(self, beforehand: bool | None = None) -> AnyOf:
         """The laws' mixture; with references that are integrated, unless they come `beforehand`."""
-        kinds = dict.fromkeys(LAWS[name] for name in self.laws)
-        return AnyOf(tuple(kind() for kind in kinds), self.beforehand if beforehand is None else beforehand)
+        kinds = tuple(kind() for kind in self._kinds)
+        return AnyOf(kinds, self.beforehand if beforehand is None else beforehand)
+
+    @property
+    def _kinds(self) -> list[type[ContactLaw]]:
+        """Laws of two names may be of one kind."""
+        return list(dict.fromkeys(LAWS[name] for name in self.laws))
 
     def loop(self, loop: Loop) -> Loop:
         """The loop of one mechanism, in this form."""
@@ -66,7 +71,6 @@ class Form:
 
     def scenarios(self, mechanism: Mechanism, batch: Scenario) -> Scenario:
         """The scenarios of one mechanism, in this form."""
-        kinds = list(dict.fromkeys(LAWS[name] for name in self.laws))
         slots, number = batch.phase.shape
         chosen = np.minimum(np.arange(self.slots), slots - 1)
 
@@ -83,7 +87,7 @@ class Form:
         deepest = depths[:, -1:] if depths.shape[1] else np.full((self.slots, 1, number), UNREACHED)
         further = deepest * (1 + np.arange(1, self.segments))[None, :, None]
         depths = np.concatenate([depths, further], axis=1)[:, : self.segments - 1]
-        kind: Any = np.full((self.slots, number), kinds.index(LAWS[mechanism.contact.law]), np.int32)
+        kind: Any = np.full((self.slots, number), self._kinds.index(LAWS[mechanism.contact.law]), np.int32)
         contact = contact._replace(stiffness=stiffness, depths=depths, kind=kind)
         reference: Any = None
         if self.beforehand:

@@ -17,6 +17,7 @@ from jaxhil.evaluation import Outcome, begin_evaluation, evaluate
 from jaxhil.loop import Loop
 from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import draw
+from tuning.batches import cut, join
 from tuning.box import Bounds
 from tuning.objective import Objective, contact_terms, objective_value, one_each
 from tuning.problems import Task, common_loop, gain_bounds, gains_at, tuned_names
@@ -39,9 +40,9 @@ class Trial:
         for task in tasks:
             drawn = draw(task.mechanism, validation, seed)
             self.fresh.append(build_scenarios(task.mechanism, drawn, seed))
-            own = _join([self.fresh[-1], build_scenarios(task.mechanism)])
+            own = join([self.fresh[-1], build_scenarios(task.mechanism)])
             if task.form is None:
-                both = _join([own, task.scenarios])
+                both = join([own, task.scenarios])
                 loop = build_loop(task.mechanism, task.compensator, both, chatter=True)
             else:
                 loop = task.form.loop(build_loop(task.mechanism, task.compensator, own, chatter=True))
@@ -51,7 +52,7 @@ class Trial:
         self.loop: Loop = common_loop(loops)
         self.names = tuned_names(tasks)
         self.bounds: list[Bounds] = [gain_bounds(task, self.names) for task in tasks]
-        self._scenarios: Scenario = _join(every)
+        self._scenarios: Scenario = join(every)
         self._training: Any = jax.tree.map(
             lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]),
             *[task.scenarios for task in tasks],
@@ -61,9 +62,7 @@ class Trial:
 
     def judge(self, gains: list[dict[str, float]]) -> list[Outcome]:
         """Outcome on the fresh scenarios of every task under its gains, the nominal run last."""
-        outcome = evaluate(self.loop, self._values(gains), self._scenarios)
-        cuts = [slice(i * self._each, (i + 1) * self._each) for i in range(len(gains))]
-        return [jax.tree.map(lambda leaf, cut=cut: leaf[..., cut], outcome) for cut in cuts]
+        return cut(evaluate(self.loop, self._values(gains), self._scenarios), self._each)
 
     def losses(
         self,
@@ -125,7 +124,3 @@ class Trial:
 
     def _values(self, gains: list[dict[str, float]]) -> dict[str, Any]:
         return {name: np.repeat([one[name] for one in gains], self._each) for name in gains[0]}
-
-
-def _join(batches: list[Scenario]) -> Any:
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *batches)

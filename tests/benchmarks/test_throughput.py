@@ -21,6 +21,7 @@ from jaxhil.mechanism_file import load
 from jaxhil.rollout import run_contacts
 from jaxhil.scenario import build_scenarios
 from jaxhil.uncertainty import draw
+from tuning.batches import join
 
 pytestmark = pytest.mark.benchmark
 LANES = 8192
@@ -37,7 +38,7 @@ def case(compensator, lanes, names=("varying",)):
     for name in names:
         mechanism = load(name).mechanism
         batches.append(build_scenarios(mechanism, draw(mechanism, lanes // len(names), 1)))
-    scenarios = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *batches)
+    scenarios = join(batches)
     mechanism = load(names[-1]).mechanism
     gains = {g.name: float(g.nominal(mechanism)) for g in COMPENSATORS[compensator].gains}
     return build_loop(mechanism, compensator, scenarios), gains, scenarios

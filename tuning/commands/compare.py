@@ -19,7 +19,7 @@ def run(options: Compare) -> int:
     checks.at_least(1, scenarios=options.scenarios)
     checks.at_least(2, judged=options.judged)
     checks.at_least(0, seed=options.seed)
-    laws = options.compensators or PUBLISHED
+    laws = tuple(dict.fromkeys(options.compensators or PUBLISHED))
     for law in laws:
         checks.one_of(LAWS, compensators=law)
     loaded = _load(options)
@@ -31,20 +31,19 @@ def run(options: Compare) -> int:
     names = [one.mechanism.name for one in loaded]
     found: dict[str, dict[str, Any]] = {name: {} for name in names}
     interrupted, problems = False, []
-    with report.stages(0) as stages:
+    with report.stages(len(names) * len(laws)) as stages:
         try:
             mechanisms = [one.mechanism for one in loaded]
-            for one in compare(mechanisms, tuple(dict.fromkeys(laws)), settings, usable_cores(), stages.say):
+            for one in compare(mechanisms, laws, settings, usable_cores(), stages.say):
                 if isinstance(one, Failed):
                     problems.append(f"{one.law}: {one.reason}")
                     report.note(f"jaxhil: {problems[-1]}")
                 else:
                     found[one.mechanism][one.law] = one
+                    stages.finish()
         except KeyboardInterrupt:
             interrupted = True
-    ordered = {
-        name: [found[name][law] for law in dict.fromkeys(laws) if law in found[name]] for name in names
-    }
+    ordered = {name: [found[name][law] for law in laws if law in found[name]] for name in names}
     done = [name for name in names if ordered[name]]
     document = {**_document(options, loaded, ordered), "problems": problems, "interrupted": interrupted}
     (Path(options.output) / "compare.json").write_text(report.as_json(document), encoding="utf-8")

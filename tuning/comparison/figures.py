@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import binomtest
+from scipy.stats import binomtest, bootstrap
 
 from jaxhil.evaluation import Outcome
 from tuning.trust import Interval, Intervals, interval
@@ -24,8 +24,7 @@ from tuning.trust import Interval, Intervals, interval
 RESAMPLES = 999
 LEVEL = 0.95
 NOWHERE = Interval(np.nan, np.nan)
-# Figures by how good they are: the less the better, or the closer to 1.
-LESS = ("rms", "p99", "failures", "peak", "trajectory")
+# Of these figures 1 is the best; of the others, less is better.
 CLOSER_TO_1 = ("early", "late", "slope")
 
 
@@ -76,30 +75,31 @@ def judge(
     for name, runs, e in zip(("early", "late"), (judged.early, judged.late), pushed, strict=True):
         both = good[0] & runs.good[0]
         change = runs.metrics.restitution[0] - plain.metrics.restitution[0]
-        found[name] = resampled(transmitted, seed, change[both], (e - in_space)[both])
-    met = twin.good
-    found["slope"] = resampled(slope, seed, twin.metrics.restitution[met], twin.reference_restitution[met])
-    found["peak"] = resampled(lambda ratio: np.percentile(ratio, 99, axis=-1), seed, plain.peak_ratio[good])
-    apart = plain.metrics.trajectory_error[good] / depth[good]
-    found["trajectory"] = resampled(lambda off: np.sqrt(np.mean(off**2, axis=-1)), seed, apart)
+        found[name] = resampled(transmitted, seed, both[None], change[None], (e - in_space)[None])
+    found["slope"] = resampled(slope, seed, twin.good, twin.metrics.restitution, twin.reference_restitution)
+    found["peak"] = resampled(_highest, seed, good, plain.peak_ratio)
+    found["trajectory"] = resampled(_root_mean_square, seed, good, plain.metrics.trajectory_error / depth)
     found["noise"] = Figure(amplification, np.nan, np.nan)
     return found
 
 
 def transmitted(
-    change: Float[np.ndarray, "*resamples scenarios"], true: Float[np.ndarray, "*resamples scenarios"]
+    change: Float[np.ndarray, "*resamples contacts"], true: Float[np.ndarray, "*resamples contacts"]
 ) -> Float[np.ndarray, "*resamples"]:
-    """Least squares of the change of e on the true one, through 0: sum(change true)/sum(true^2)."""
-    return np.sum(change * true, axis=-1) / np.sum(true**2, axis=-1)
+    """Least squares of the change of e on the true one, through 0: sum(change true)/sum(true^2).
+
+    NaN stands for a contact that does not count.
+    """
+    return np.nansum(change * true, axis=-1) / np.nansum(true**2, axis=-1)
 
 
 def slope(
-    restitution: Float[np.ndarray, "*resamples scenarios"],
-    reference: Float[np.ndarray, "*resamples scenarios"],
+    restitution: Float[np.ndarray, "*resamples contacts"],
+    reference: Float[np.ndarray, "*resamples contacts"],
 ) -> Float[np.ndarray, "*resamples"]:
-    """Least squares of e on e*, with an intercept."""
-    centred = reference - np.mean(reference, axis=-1, keepdims=True)
-    return np.sum(centred * restitution, axis=-1) / np.sum(centred**2, axis=-1)
+    """Least squares of e on e*, with an intercept; NaN stands for a contact that does not count."""
+    centred = reference - np.nanmean(reference, axis=-1, keepdims=True)
+    return np.nansum(centred * restitution, axis=-1) / np.nansum(centred**2, axis=-1)
 
 
 def share(yes: Bool[np.ndarray, "scenarios"]) -> Figure:
@@ -109,20 +109,41 @@ def share(yes: Bool[np.ndarray, "scenarios"]) -> Figure:
 
 
 def resampled(
-    function: Callable[..., np.ndarray], seed: int, *data: Float[np.ndarray, "scenarios"]
+    function: Callable[..., np.ndarray],
+    seed: int,
+    good: Bool[np.ndarray, "slots scenarios"],
+    *data: Float[np.ndarray, "slots scenarios"],
 ) -> Figure:
     """A function of paired data, along their last axis, with its percentile bootstrap interval.
 
+    It gets the `good` contacts of all scenarios side by side, and NaN for the others. Scenarios are
+    resampled, each with all its contacts: those of one scenario depend on each other.
+
     Source: Efron and Tibshirani, "An Introduction to the Bootstrap" (1993), chapter 13.
     """
-    number = len(data[0])
-    if number < 2:
+    slots, met = np.any(good, axis=1), np.any(good, axis=0)
+    if np.sum(met) < 2:
         return Figure(np.nan, np.nan, np.nan)
-    chosen = np.random.default_rng(seed).integers(number, size=(RESAMPLES, number))
+    kept = [np.where(good, values, np.nan)[slots][:, met] for values in data]
+
+    def of_contacts(*chosen: np.ndarray, axis: int) -> np.ndarray:
+        rows = (np.moveaxis(values, 0, -2) for values in chosen)
+        return function(*(row.reshape(*row.shape[:-2], -1) for row in rows))
+
     with np.errstate(invalid="ignore", divide="ignore"):
-        spread = function(*(values[chosen] for values in data))
-        ends = np.quantile(spread, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-        return Figure(float(function(*data)), float(ends[0]), float(ends[1]))
+        value = of_contacts(*kept, axis=-1)
+        ends = bootstrap(
+            kept,
+            of_contacts,
+            paired=True,
+            vectorized=True,
+            axis=-1,
+            n_resamples=RESAMPLES,
+            confidence_level=LEVEL,
+            method="percentile",
+            rng=np.random.default_rng(seed),
+        ).confidence_interval
+    return Figure(float(value), float(ends.low), float(ends.high))
 
 
 def distance(name: str, figure: Figure) -> Figure:
@@ -143,6 +164,14 @@ def winner(name: str, figures: dict[str, Figure]) -> str | None:
     first = min(known, key=lambda law: known[law].high)
     others = (one.low for law, one in known.items() if law != first)
     return first if all(known[first].high < low for low in others) else None
+
+
+def _highest(values):
+    return np.nanpercentile(values, 99, axis=-1)
+
+
+def _root_mean_square(values):
+    return np.sqrt(np.nanmean(values**2, axis=-1))
 
 
 def _rms(values):

@@ -21,6 +21,7 @@ from jaxhil.evaluation import parameters_by_slot
 from jaxhil.probe import Probe, Push
 from jaxhil.reference_motion import integrate_contact
 from jaxhil.scenario import Scenario
+from tuning.batches import join
 
 SIZE, WIDTH = 0.2, 0.02  # of the peak force; s
 EARLY, LATE = 0.25, 0.75  # of the contact's duration
@@ -67,8 +68,7 @@ def in_space(
             parts.append(
                 jax.tree.map(lambda leaf, lanes=lanes - begin: leaf[..., :lanes], jax.device_get(part))
             )
-        joined = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *parts)
-        return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], lanes // number, number), joined)
+        return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], lanes // number, number), join(parts))
 
     entered = np.asarray(velocity[:contacts])
     none = np.zeros_like(entered)

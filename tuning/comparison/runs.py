@@ -6,7 +6,6 @@ Of a law, all mechanisms of a form go through one compiled program.
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -17,6 +16,7 @@ from jaxhil.evaluation import Outcome, evaluate
 from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import draw
+from tuning.batches import cut, join
 from tuning.comparison.damped import damped_twins
 from tuning.comparison.figures import Figure, Judged, judge
 from tuning.comparison.probing import EARLY, LATE, Space, in_space, probed
@@ -54,9 +54,7 @@ def judge_gains(
     space = scene.space
 
     def run(batches: list[Scenario]) -> list[Any]:
-        outcome = _run(scene, law, gains, _join(batches))
-        cuts = [slice(i * number, (i + 1) * number) for i in range(len(batches))]
-        return [jax.tree.map(lambda leaf, cut=cut: leaf[..., cut], outcome) for cut in cuts]
+        return cut(_run(scene, law, gains, join(batches)), number)
 
     # As many batches as in the second call, so that one program serves.
     plain, twins, _ = run([probed(batch, space) for batch in (scene.plain, scene.twins, scene.plain)])
@@ -93,7 +91,3 @@ def _amplification(scene: Scene, law: str, gains: Mapping[str, float]) -> float:
     period, clearance = jnp.asarray(scene.plain.control_period), jnp.asarray(scene.plain.clearance)
     own = {name: jnp.full_like(period, value) for name, value in gains.items()}
     return float(jnp.mean(COMPENSATORS[law].noise_amplification(own, Constants(period, clearance))))
-
-
-def _join(batches: list[Any]) -> Any:
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *batches)
