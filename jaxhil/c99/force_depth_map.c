@@ -1,47 +1,50 @@
-/* A force-depth map of unknown contact, identified while it is met: slopes between knots, and damping. */
+/* A force-depth map of unknown contact, identified while it is met: slopes between knots, and dissipation. */
 #include <math.h>
 #include <stdbool.h>
 
 /* == Declarations == */
 
-enum { JAXHIL_SEGMENTS = 12, JAXHIL_PARAMETERS = 13 };
+enum { JAXHIL_SEGMENTS = 12, JAXHIL_PARAMETERS = 15 };
 
-/* What of a map a motion needs: slopes [1/s^2], force at the knots [1/s], damping [1/s]. Depth in s (over the
- * approach speed), speed as a fraction of that speed, force in 1/s (over mass and approach speed). */
+/* What counts of a map: slopes [1/s^2], force at the knots [1/s], damping and depth damping [1/s], unloading
+ * [1/s^2]. Depth in s (over the approach speed), speed as a fraction of that speed, force in 1/s (over mass and
+ * approach speed). */
 typedef struct {
-    double slopes[JAXHIL_SEGMENTS], at_knots[JAXHIL_SEGMENTS], damping;
-} jaxhil_map;
+    double slopes[JAXHIL_SEGMENTS], at_knots[JAXHIL_SEGMENTS], damping, depth_damping, unloading;
+} jaxhil_curve;
 
-/* f(x, v) = sum_j slope_j clip(x - kappa_j, 0, kappa_{j+1} - kappa_j) + damping v at x > 0, else 0, from a
- * Gaussian prior by recursive least squares; the damping of `now` is the mean given that it is not negative. */
+/* f(x, v, x_m) = sum_j slope_j clip(x - kappa_j, 0, kappa_{j+1} - kappa_j) + (damping + depth_damping x/reach) v
+ * - unloading (x_m - x) at x > 0, else 0, x_m the deepest point so far; from a Gaussian prior by recursive least
+ * squares. What dissipates counts in `curve` with its mean given that it is not negative. */
 typedef struct {
-    double stiffness, prior_damping, common, wandering, damping_variance;
+    double stiffness, common, wandering, damping, depth_damping, unloading;
     double estimate[JAXHIL_PARAMETERS], covariance[JAXHIL_PARAMETERS][JAXHIL_PARAMETERS];
-    jaxhil_map now;
+    jaxhil_curve curve;
 } jaxhil_force_depth_map;
 
-void jaxhil_force_depth_map_init(jaxhil_force_depth_map *map, double stiffness, double common_spread,
-                                 double wandering_spread, double damping, double damping_spread);
+/* The spreads of the slopes' common value and of their wandering, of damping, depth damping and unloading. */
+void jaxhil_force_depth_map_init(jaxhil_force_depth_map *map, double stiffness, double common,
+                                 double wandering, double damping, double depth_damping, double unloading);
 void jaxhil_force_depth_map_restart(jaxhil_force_depth_map *map);
 
 /* One reading in contact, with noise of a `variance` [1/s^2]. */
-void jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, double speed, double force,
-                                   double variance);
+void jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, double speed, double deepest,
+                                   double force, double variance);
 
-/* By which share the variance of the force at a depth, 10 ms or deeper, is less than the prior's. */
-double jaxhil_force_depth_map_learnt(const jaxhil_force_depth_map *map, double depth, double speed);
+/* Force [1/s] that does not depend on how the contact came there, and all of it; 0 out of contact. */
+double jaxhil_curve_elastic(const jaxhil_curve *curve, double depth);
+double jaxhil_curve_force(const jaxhil_curve *curve, double depth, double speed, double deepest);
 
-/* Force [1/s] without damping, and with it; 0 out of contact. */
-double jaxhil_map_elastic(const jaxhil_map *map, double depth);
-double jaxhil_map_force(const jaxhil_map *map, double depth, double speed);
+/* Force [1/s] where a contact entered at speed 1 comes to rest without dissipation. */
+double jaxhil_curve_peak_force(const jaxhil_curve *curve);
 
 /* == Definitions == */
 
 static const double jaxhil_knots[JAXHIL_SEGMENTS] = {0.0,  0.002, 0.005, 0.01,  0.016, 0.024,
                                                      0.032, 0.04,  0.05,  0.062, 0.076, 0.092};
-static const double jaxhil_map_wandering = 0.03;  /* s of depth over which a slope wanders by its spread */
-static const double jaxhil_map_shallowest = 0.01; /* s of depth by which it is judged what has been learnt */
-static const double jaxhil_map_outlying = 4.0;    /* times the noise's variance: hardly noise */
+static const double jaxhil_map_wandering = 0.03; /* s of depth over which a slope wanders by its spread */
+static const double jaxhil_map_reach = 0.03;     /* s of depth at which the depth damping is as strong as named */
+static const double jaxhil_map_outlying = 4.0;   /* times the noise's variance: hardly noise */
 static const double jaxhil_map_pi = 3.141592653589793;
 
 /* The mean of N(mean, variance) given that it is not negative, with Boyd's bound of Mills' ratio. */
@@ -53,7 +56,8 @@ static double jaxhil_positive_mean(double mean, double variance) {
     const double ratio = mean / spread;
     const double root = sqrt(ratio * ratio + 2.0 * jaxhil_map_pi);
     if (!(ratio > 0.0)) {
-        return spread * ((ratio + root) / jaxhil_map_pi);
+        /* (ratio + root)/pi, without the cancellation far below 0. */
+        return spread * (2.0 / (root - ratio));
     }
     const double mills = jaxhil_map_pi / ((jaxhil_map_pi - 1.0) * ratio + root);
     double tail = 1.0 / (1.0 + ratio * ratio / 512.0);
@@ -83,69 +87,82 @@ static int jaxhil_pressed(double depth, double *pressed) {
 }
 
 static void jaxhil_force_depth_map_conclude(jaxhil_force_depth_map *map) {
+    jaxhil_curve *curve = &map->curve;
     double reached = 0.0;
     for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
-        map->now.slopes[j] = map->estimate[j];
+        curve->slopes[j] = map->estimate[j];
         if (j > 0) {
             reached += map->estimate[j - 1] * (jaxhil_knots[j] - jaxhil_knots[j - 1]);
         }
-        map->now.at_knots[j] = reached;
+        curve->at_knots[j] = reached;
     }
-    map->now.damping = jaxhil_positive_mean(map->estimate[JAXHIL_SEGMENTS],
-                                            map->covariance[JAXHIL_SEGMENTS][JAXHIL_SEGMENTS]);
+    curve->damping = jaxhil_positive_mean(map->estimate[12], map->covariance[12][12]);
+    curve->depth_damping = jaxhil_positive_mean(map->estimate[13], map->covariance[13][13]);
+    curve->unloading = jaxhil_positive_mean(map->estimate[14], map->covariance[14][14]);
 }
 
-void jaxhil_force_depth_map_init(jaxhil_force_depth_map *map, double stiffness, double common_spread,
-                                 double wandering_spread, double damping, double damping_spread) {
-    const double common = common_spread * stiffness;
-    const double wandering = wandering_spread * stiffness;
+void jaxhil_force_depth_map_init(jaxhil_force_depth_map *map, double stiffness, double common,
+                                 double wandering, double damping, double depth_damping, double unloading) {
     map->stiffness = stiffness;
-    map->prior_damping = damping;
     map->common = common * common;
     map->wandering = wandering * wandering;
-    map->damping_variance = damping_spread * damping_spread;
+    map->damping = damping * damping;
+    map->depth_damping = depth_damping * depth_damping;
+    map->unloading = unloading * unloading;
     jaxhil_force_depth_map_restart(map);
 }
 
 void jaxhil_force_depth_map_restart(jaxhil_force_depth_map *map) {
+    for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
+        for (int j = 0; j < JAXHIL_PARAMETERS; j++) {
+            map->covariance[i][j] = 0.0;
+        }
+        map->estimate[i] = 0.0;
+    }
     for (int i = 0; i < JAXHIL_SEGMENTS; i++) {
         for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
             const double shared = i < j ? jaxhil_knots[i] : jaxhil_knots[j];
             map->covariance[i][j] = map->common + map->wandering * (shared / jaxhil_map_wandering);
         }
-        map->covariance[i][JAXHIL_SEGMENTS] = 0.0;
-        map->covariance[JAXHIL_SEGMENTS][i] = 0.0;
         map->estimate[i] = map->stiffness;
     }
-    map->covariance[JAXHIL_SEGMENTS][JAXHIL_SEGMENTS] = map->damping_variance;
-    map->estimate[JAXHIL_SEGMENTS] = map->prior_damping;
+    map->covariance[12][12] = map->damping;
+    map->covariance[13][13] = map->depth_damping;
+    map->covariance[14][14] = map->unloading;
     jaxhil_force_depth_map_conclude(map);
 }
 
-void jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, double speed, double force,
-                                   double variance) {
+void jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, double speed, double deepest,
+                                   double force, double variance) {
     double pressed[JAXHIL_SEGMENTS], g[JAXHIL_PARAMETERS];
     const int number = jaxhil_pressed(depth, pressed);
+    const double deeply = depth * speed / jaxhil_map_reach;
+    const double back = depth - deepest;
     double expected = 0.0;
     for (int j = 0; j < number; j++) {
         expected += pressed[j] * map->estimate[j];
     }
-    expected += speed * map->estimate[JAXHIL_SEGMENTS];
+    expected += speed * map->estimate[12];
+    expected += deeply * map->estimate[13];
+    expected += back * map->estimate[14];
     if (!(expected > 0.0 || force * force > jaxhil_map_outlying * variance)) {
         return;
     }
     for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
+        const double *row = map->covariance[i];
         double product = 0.0;
         for (int j = 0; j < number; j++) {
-            product += map->covariance[i][j] * pressed[j];
+            product += row[j] * pressed[j];
         }
-        g[i] = product + map->covariance[i][JAXHIL_SEGMENTS] * speed;
+        g[i] = product + row[12] * speed + row[13] * deeply + row[14] * back;
     }
     double s = variance;
     for (int j = 0; j < number; j++) {
         s += pressed[j] * g[j];
     }
-    s += speed * g[JAXHIL_SEGMENTS];
+    s += speed * g[12];
+    s += deeply * g[13];
+    s += back * g[14];
     if (!(s > 0.0)) {
         return;
     }
@@ -161,43 +178,43 @@ void jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, do
     jaxhil_force_depth_map_conclude(map);
 }
 
-double jaxhil_force_depth_map_learnt(const jaxhil_force_depth_map *map, double depth, double speed) {
-    double pressed[JAXHIL_SEGMENTS];
-    if (!(depth > jaxhil_map_shallowest)) {
-        depth = jaxhil_map_shallowest;
-    }
-    const int number = jaxhil_pressed(depth, pressed);
-    const double *last = map->covariance[JAXHIL_SEGMENTS];
-    double left = 0.0;
-    double crossed = 0.0;
-    for (int i = 0; i < number; i++) {
-        const double *row = map->covariance[i];
-        double product = 0.0;
-        for (int j = 0; j < number; j++) {
-            product += row[j] * pressed[j];
-        }
-        left += pressed[i] * product;
-        crossed += pressed[i] * (row[JAXHIL_SEGMENTS] + last[i]);
-    }
-    left += speed * crossed + speed * last[JAXHIL_SEGMENTS] * speed;
-    double wandered = 0.0;
-    for (int j = 1; j < number; j++) {
-        const double beyond = depth - jaxhil_knots[j];
-        wandered += (jaxhil_knots[j] - jaxhil_knots[j - 1]) / jaxhil_map_wandering * (beyond * beyond);
-    }
-    const double before = map->common * (depth * depth) + map->wandering * wandered +
-                          map->damping_variance * (speed * speed);
-    return before > 0.0 ? 1.0 - left / before : 0.0;
-}
-
-double jaxhil_map_elastic(const jaxhil_map *map, double depth) {
+double jaxhil_curve_elastic(const jaxhil_curve *curve, double depth) {
     const int segment = jaxhil_segment_of(depth);
     if (segment < 0) {
         return 0.0;
     }
-    return map->at_knots[segment] + map->slopes[segment] * (depth - jaxhil_knots[segment]);
+    return curve->at_knots[segment] + curve->slopes[segment] * (depth - jaxhil_knots[segment]);
 }
 
-double jaxhil_map_force(const jaxhil_map *map, double depth, double speed) {
-    return depth > 0.0 ? jaxhil_map_elastic(map, depth) + map->damping * speed : 0.0;
+double jaxhil_curve_force(const jaxhil_curve *curve, double depth, double speed, double deepest) {
+    if (!(depth > 0.0)) {
+        return 0.0;
+    }
+    const double drag = (curve->damping + curve->depth_damping * depth / jaxhil_map_reach) * speed;
+    const double back = deepest > depth ? deepest - depth : 0.0;
+    return jaxhil_curve_elastic(curve, depth) + (drag - curve->unloading * back);
+}
+
+double jaxhil_curve_peak_force(const jaxhil_curve *curve) {
+    double energy = 0.0;
+    int segment = 0;
+    while (segment < JAXHIL_SEGMENTS - 1) {
+        const double width = jaxhil_knots[segment + 1] - jaxhil_knots[segment];
+        const double more =
+            energy + (curve->at_knots[segment] + 0.5 * (curve->slopes[segment] * width)) * width;
+        if (!(more < 0.5 && curve->at_knots[segment + 1] >= 0.0)) {
+            break;
+        }
+        energy = more;
+        segment++;
+    }
+    double reached = curve->at_knots[segment];
+    if (!(reached > 0.0)) {
+        reached = 0.0;
+    }
+    const double rise = curve->slopes[segment] * (0.5 - energy);
+    if (rise > 0.0) {
+        return sqrt(reached * reached + 2.0 * rise);
+    }
+    return reached > 1.0 ? reached : 1.0;
 }

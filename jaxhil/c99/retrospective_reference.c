@@ -1,8 +1,8 @@
 /* The retrospective reference: identify the contact, work out what should have happened, and pay it back.
  * In contact F_c = f_0 + (y - F(X, V)) + f_e, f_0 = max(F(x_d, v_d), 0), F the force-depth map identified on
  * delay-aligned readings (X, V, y); separated F_c = f_e until the hardware has left the surface for 6 ms, then
- * 0. f_e = clip(gate [w^2 (x_d - x_r) + 2 z w (v_d - T f_0/2 - v_r)], -limit, limit), (x_r, v_r) the motion
- * that the contact should have had since its entry. Scaled by approach speed and equivalent mass.
+ * 0. f_e = clip(c (v_d - T f_0/2 - v_r), -limit p, limit p), v_r the speed of the motion that the contact should
+ * have had since its entry, p the peak force that the map predicts. Scaled by approach speed and equivalent mass.
  */
 #include <math.h>
 #include <stdbool.h>
@@ -10,23 +10,24 @@
 #include "filters.c"
 #include "force_depth_map.c"
 #include "gains_table.c"
-#include "reference_motion.c"
+#include "reintegration.c"
 #include "surfaces.c"
 
 /* == Declarations == */
 
-/* What stands behind the last command; unsure: less than half of what the prior leaves open is learnt;
- * saturated: the correction is at its limit. */
-enum { JAXHIL_OUT_OF_CONTACT, JAXHIL_IDENTIFIED, JAXHIL_UNSURE, JAXHIL_SATURATED };
+/* What stands behind the last command; unsure: nothing is identified yet, or there is nothing to scale by;
+ * saturated: the correction is at its limit; too short: the hardware touched when half of the contact was over. */
+enum { JAXHIL_OUT_OF_CONTACT, JAXHIL_IDENTIFIED, JAXHIL_UNSURE, JAXHIL_SATURATED, JAXHIL_TOO_SHORT };
 
 typedef struct {
-    double period, clearance, mass, share, floor, frequency, ratio, limit;
+    double period, clearance, mass, share, force_noise, dead_zone, floor;
+    double velocity_gain, limit, replay, replay_noise;
     jaxhil_delay_line line;
     jaxhil_force_depth_map map;
     jaxhil_reference_motion reference;
     double middle, last, side, speed, gone, squares, count, first, fraction, impulse, moved;
-    double sample, sample_depth, sample_speed;
-    long offset, ticks;
+    double sample, sample_depth, sample_speed, sample_deepest, deepest, hardware_deepest, late;
+    long offset, ticks, elapsed, readings;
     bool whole, touched, started;
     int status;
     double samples[JAXHIL_IDENTIFICATION_DELAY_SAMPLES];
@@ -36,7 +37,8 @@ typedef struct {
 
 static const double jaxhil_farewell = 0.006;   /* s for which it goes on after the hardware has left */
 static const double jaxhil_longest_lag = 0.1;  /* s for which it waits for hardware that has not touched yet */
-static const double jaxhil_sure = 0.5;         /* of the prior's variance that has to be learnt */
+static const double jaxhil_too_late = 0.5;     /* of the predicted duration, that the hardware may touch late by */
+static const long jaxhil_few = 5;              /* readings on which no contact is identified */
 
 static void jaxhil_law_reset(jaxhil_law *law) {
     law->side = 0.0;
@@ -54,6 +56,12 @@ static void jaxhil_law_reset(jaxhil_law *law) {
     law->sample = 0.0;
     law->sample_depth = 0.0;
     law->sample_speed = 0.0;
+    law->sample_deepest = 0.0;
+    law->deepest = 0.0;
+    law->hardware_deepest = 0.0;
+    law->late = 0.0;
+    law->elapsed = 0;
+    law->readings = 0;
     law->started = false;
     law->status = JAXHIL_OUT_OF_CONTACT;
 }
@@ -67,16 +75,19 @@ static bool jaxhil_law_init(jaxhil_law *law, const jaxhil_gains *gains) {
     law->clearance = gains->clearance;
     law->mass = gains->equivalent_mass;
     law->share = whole ? 1.0 : delay / period;
+    law->force_noise = gains->force_noise;
+    law->dead_zone = gains->dead_zone;
     law->floor = gains->force_noise_floor;
-    law->frequency = gains->reference_frequency;
-    law->ratio = gains->reference_damping_ratio;
+    law->velocity_gain = gains->velocity_gain;
     law->limit = gains->correction_limit;
+    law->replay = gains->force_replay;
+    law->replay_noise = gains->replay_noise;
     law->middle = 0.0;
     law->last = 0.0;
     jaxhil_force_depth_map_init(&law->map, gains->prior_stiffness, gains->prior_stiffness_spread,
-                                gains->prior_slope_spread, gains->prior_damping,
-                                gains->prior_damping_spread);
-    jaxhil_reference_motion_init(&law->reference, gains->force_replay, period);
+                                gains->prior_slope_spread, gains->prior_damping_spread,
+                                gains->prior_depth_damping_spread, gains->prior_unloading_spread);
+    jaxhil_reference_motion_init(&law->reference, period);
     jaxhil_law_reset(law);
     law->whole = whole;
     /* The line delays by less than the capacity allows: a delay is refused like that of the other laws. */
@@ -134,10 +145,11 @@ static void jaxhil_law_touch(jaxhil_law *law, double depth, double rate) {
     law->offset = -1 - (long)whole;
     law->ticks = 0;
     law->touched = true;
+    law->late = law->first + (double)law->elapsed * period;
 }
 
 /* This tick's sample, moved to the reference's grid, into its history. */
-static void jaxhil_law_remember(jaxhil_law *law, double force, double depth, double rate) {
+static void jaxhil_law_remember(jaxhil_law *law, double force, double depth, double rate, double deepest) {
     const double fraction = law->fraction;
     const double moved = law->sample + fraction * (force - law->sample);
     const long index = law->ticks + law->offset;
@@ -151,62 +163,100 @@ static void jaxhil_law_remember(jaxhil_law *law, double force, double depth, dou
     if (index >= 0) {
         jaxhil_reference_motion_remember(&law->reference, index, law->impulse,
                                          law->sample_depth + fraction * (depth - law->sample_depth),
-                                         law->sample_speed + fraction * (rate - law->sample_speed));
+                                         law->sample_speed + fraction * (rate - law->sample_speed),
+                                         law->sample_deepest + fraction * (deepest - law->sample_deepest));
     }
+}
+
+/* The force's variance [N^2]: what it is told, or what readings out of contact show if that is more. */
+static double jaxhil_law_noise(const jaxhil_law *law) {
+    const double told = law->force_noise * law->force_noise;
+    const double seen = law->squares / (law->count > 0.0 ? law->count : 1.0);
+    return seen > told ? seen : told;
 }
 
 /* The command over M v0 [1/s]; whether the numerical model has separated. */
 static double jaxhil_law_follow(jaxhil_law *law, bool enters, double x, double v, double depth, double rate,
-                                double force, double weight, bool *separated) {
+                                double force, bool hidden, double weight, bool *separated) {
     const double period = law->period;
-    const jaxhil_map *map = &law->map.now;
+    const jaxhil_curve *curve = &law->map.curve;
+    law->elapsed++;
     if (enters) {
         jaxhil_force_depth_map_restart(&law->map);
-        law->first = x;
         jaxhil_reference_motion_restart(&law->reference, x);
+        law->first = x;
+        law->elapsed = 0;
+        law->readings = 0;
+        law->late = 0.0;
+        law->deepest = 0.0;
+        law->hardware_deepest = 0.0;
         law->sample = force;
         law->sample_depth = depth - period * rate;
         law->sample_speed = rate;
+        law->sample_deepest = 0.0;
     }
+    if (x > law->deepest) {
+        law->deepest = x;
+    }
+    if (depth > law->hardware_deepest) {
+        law->hardware_deepest = depth;
+    }
+    const double deepest = law->hardware_deepest;
+
+    const double zone = law->dead_zone / weight;
+    const double square = weight * weight;
+    const double noise = square > 0.0 ? jaxhil_law_noise(law) / square : 0.0;
     if (depth > 0.0) {
         if (!law->touched) {
             jaxhil_law_touch(law, depth, rate);
         }
-        const double scale = (law->count > 0.0 ? law->count : 1.0) * (weight * weight);
-        const double mean = scale > 0.0 ? law->squares / scale : 0.0;
-        jaxhil_force_depth_map_update(&law->map, depth, rate, force, law->floor * law->floor + mean);
+        const double variance = law->floor * law->floor + noise;
+        if (!hidden) {
+            jaxhil_force_depth_map_update(&law->map, depth, rate, deepest, force, variance);
+            law->readings++;
+        } else if (jaxhil_curve_force(curve, depth, rate, deepest) > zone) {
+            jaxhil_force_depth_map_update(&law->map, depth, rate, deepest, 0.5 * zone,
+                                          variance + zone * zone / 12.0);
+        }
     }
-    jaxhil_reference_motion_tick(&law->reference, map);
+    const double expected = jaxhil_curve_force(curve, depth, rate, deepest);
+    if (hidden) {
+        force = expected > zone ? zone : (expected > 0.0 ? expected : 0.0);
+    }
+    const double strength = law->replay_noise * law->replay_noise;
+    const double whole = strength + noise;
+    law->reference.replay = whole > 0.0 ? law->replay * strength / whole : 0.0;
+    jaxhil_reference_motion_tick(&law->reference, curve);
 
-    double own = jaxhil_map_force(map, x, v);
+    double own = jaxhil_curve_force(curve, x, v, law->deepest);
     *separated = x <= 0.0 || (v < 0.0 && own <= 0.0);
     if (!(own > 0.0)) {
         own = 0.0;
     }
-    const double frequency = law->frequency;
-    const double limit = law->limit;
-    const double gate = jaxhil_force_depth_map_learnt(&law->map, x, v);
-    double correction = gate * (frequency * frequency * (x - law->reference.live.depth) +
-                                2.0 * law->ratio * frequency *
-                                    (v - 0.5 * period * own - law->reference.live.speed));
-    law->status = gate >= jaxhil_sure ? JAXHIL_IDENTIFIED : JAXHIL_UNSURE;
-    if (correction > limit) {
-        correction = limit;
-        law->status = JAXHIL_SATURATED;
-    } else if (correction < -limit) {
-        correction = -limit;
-        law->status = JAXHIL_SATURATED;
+    const double peak = jaxhil_curve_peak_force(curve);
+    const double limit = law->limit * peak;
+    double correction = law->velocity_gain * (v - 0.5 * period * own - law->reference.live.speed);
+    law->status = JAXHIL_IDENTIFIED;
+    if (law->readings < jaxhil_few) {
+        law->status = JAXHIL_UNSURE;
+    } else if (law->late * peak > jaxhil_too_late * jaxhil_map_pi) {
+        law->status = JAXHIL_TOO_SHORT;
+    }
+    if (correction > limit || correction < -limit) {
+        correction = correction > limit ? limit : -limit;
+        law->status = law->status == JAXHIL_IDENTIFIED ? JAXHIL_SATURATED : law->status;
     }
     double command = correction;
     if (!*separated) {
-        command = own + (force - jaxhil_map_force(map, depth, rate)) + correction;
+        command = own + (force - expected) + correction;
     }
     if (law->touched) {
-        jaxhil_law_remember(law, force, depth, rate);
+        jaxhil_law_remember(law, force, depth, rate, deepest);
     }
     law->sample = force;
     law->sample_depth = depth;
     law->sample_speed = rate;
+    law->sample_deepest = deepest;
     return command;
 }
 
@@ -241,7 +291,17 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
     const double v = side * velocity_desired / scale;
     const double depth = (side < 0.0 ? -clearance - position : position) / scale;
     const double rate = side * velocity / scale;
-    const double force = bent * side < 0.0 ? 0.0 : side * force_measured / weight;
+    const double zone = law->dead_zone;
+    bool hidden = false;
+    double force = 0.0;
+    if (!(bent * side < 0.0)) {
+        hidden = zone > 0.0 && force_measured == 0.0;
+        if (force_measured > 0.0) {
+            force = side * (force_measured + zone) / weight;
+        } else if (force_measured < 0.0) {
+            force = side * (force_measured - zone) / weight;
+        }
+    }
     if (!law->touched && !(speed > 0.0 && depth > 0.0)) {
         jaxhil_law_take_noise(law, force_measured, bent);
     }
@@ -254,7 +314,7 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
     bool separated = x <= 0.0;
     double command = separated ? 0.0 : force;
     if (speed > 0.0) {
-        command = jaxhil_law_follow(law, enters, x, v, depth, rate, force, weight, &separated);
+        command = jaxhil_law_follow(law, enters, x, v, depth, rate, force, hidden, weight, &separated);
     } else {
         law->status = JAXHIL_UNSURE;
     }

@@ -14,6 +14,7 @@ CONTACT_FREQUENCY = "contact frequency"
 SIMULATOR_LAG = "simulator lag"
 SIMULATOR_DYNAMICS = "simulator dynamics"
 DEAD_ZONE = "dead zone"
+FORCE_NOISE = "force noise"
 EQUIVALENT_MASS = "equivalent mass"
 
 

@@ -1,11 +1,13 @@
-"""A force-depth map of unknown contact, identified while it is met: slopes between knots, and damping.
+"""A force-depth map of unknown contact, identified while it is met: slopes between knots, and dissipation.
 
-    f(x, v) = sum_j slope_j clip(x - kappa_j, 0, kappa_{j+1} - kappa_j) + damping v      at x > 0, else 0
+    f(x, v, x_m) = sum_j slope_j clip(x - kappa_j, 0, kappa_{j+1} - kappa_j)
+                   + (damping + depth_damping x/REACH) v - unloading (x_m - x)    at x > 0, else 0
 
-Everything is scaled by the approach speed v0 and the mass M: depth x / v0 [s], speed v / v0 [1],
-force F / (M v0) [1/s], slope k / M [1/s^2], damping b / M [1/s]. Parameters theta (slopes, then damping) come
-first, the batch trails. They start from a Gaussian prior whose slopes wander with depth, and are identified
-by recursive least squares (Kalman's update for constant parameters).
+x_m >= x is the deepest point so far. Everything is scaled by the approach speed v0 and the mass M: depth
+x / v0 [s], speed v / v0 [1], force F / (M v0) [1/s], slope k / M [1/s^2], damping b / M [1/s]. Parameters
+theta (slopes, damping, depth damping, unloading) come first, the batch trails. They start from a Gaussian
+prior whose slopes wander with depth, and are identified by recursive least squares (Kalman's update for
+constant parameters). What dissipates counts with its mean given that it is not negative.
 """
 
 import math
@@ -13,27 +15,17 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax import lax
+from jaxtyping import Array, Bool, Float
 
 # Depth over approach speed [s] at which a segment begins; the last goes on.
 KNOTS = np.array([0, 2, 5, 10, 16, 24, 32, 40, 50, 62, 76, 92]) * 1e-3
 SEGMENTS = len(KNOTS)
-PARAMETERS = SEGMENTS + 1
+PARAMETERS = SEGMENTS + 3
 WIDTHS = np.append(np.diff(KNOTS), np.inf)
 WANDERING = 0.03  # s of depth over which a slope wanders by its spread
-SHALLOWEST = 0.01  # s of depth by which it is judged how much has been learnt
+REACH = 0.03  # s of depth at which the depth damping is as strong as its name says
 OUTLYING = 4.0  # times the noise's variance: a force that hardly is noise
-
-
-class Prior(NamedTuple):
-    """Mean (13, *batch) and covariance (13, 13, *batch) of theta; variances [1/s^4, 1/s^4, 1/s^2] of the
-    slopes' common value, of their wandering and of the damping."""
-
-    mean: Float[Array, "parameters *batch"]
-    covariance: Float[Array, "parameters parameters *batch"]
-    common: Float[Array, "*batch"]
-    wandering: Float[Array, "*batch"]
-    damping: Float[Array, "*batch"]
 
 
 class Map(NamedTuple):
@@ -43,25 +35,33 @@ class Map(NamedTuple):
     covariance: Float[Array, "parameters parameters *batch"]
 
 
-def prior(
-    stiffness: Array, common_spread: Array, wandering_spread: Array, damping: Array, damping_spread: Array
-) -> Prior:
-    """Slopes N(K0, (s_K K0)^2 + (s_S K0)^2 min(kappa_i, kappa_j)/30 ms), damping N(B0, s_B^2).
+class Curve(NamedTuple):
+    """What counts of a map: slopes [1/s^2], damping and depth damping [1/s], unloading [1/s^2]."""
 
-    stiffness K0 [1/s^2], its spreads s_K, s_S [1], damping B0 and its spread s_B [1/s], of one shape.
+    slopes: Float[Array, "segments *batch"]
+    damping: Float[Array, "*batch"]
+    depth_damping: Float[Array, "*batch"]
+    unloading: Float[Array, "*batch"]
+
+
+def prior(
+    stiffness: Array, common: Array, wandering: Array, damping: Array, depth_damping: Array, unloading: Array
+) -> Map:
+    """Slopes N(K0, s_K^2 + s_S^2 min(kappa_i, kappa_j)/30 ms), what dissipates N(0, s^2).
+
+    stiffness K0, spreads s_K (`common`), s_S (`wandering`) and of `unloading` [1/s^2], of `damping` and
+    `depth_damping` [1/s], of one shape.
     """
-    common, wandering = (common_spread * stiffness) ** 2, (wandering_spread * stiffness) ** 2
     shared = _column(np.minimum.outer(KNOTS, KNOTS) / WANDERING, stiffness)
-    slopes = common[None, None] + wandering[None, None] * shared
-    zeros = jnp.zeros_like(slopes[0])
-    covariance = jnp.concatenate(
-        [
-            jnp.concatenate([slopes, zeros[:, None]], axis=1),
-            jnp.concatenate([zeros, zeros[:1] + damping_spread[None] ** 2], axis=0)[None],
-        ]
-    )
-    mean = jnp.concatenate([zeros + stiffness[None], zeros[:1] + damping[None]])
-    return Prior(mean, covariance, common, wandering, damping_spread**2)
+    slopes = common[None, None] ** 2 + wandering[None, None] ** 2 * shared
+    zeros = jnp.zeros_like(slopes[:, :1])
+    rows = [jnp.concatenate([slopes, zeros, zeros, zeros], axis=1)]
+    for place, spread in enumerate((damping, depth_damping, unloading)):
+        row = [zeros[:1]] * (SEGMENTS + 3)
+        row[SEGMENTS + place] = zeros[:1] + spread[None, None] ** 2
+        rows.append(jnp.concatenate(row, axis=1))
+    mean = jnp.concatenate([zeros[:, 0] + stiffness[None], *[zeros[:1, 0]] * 3])
+    return Map(mean, jnp.concatenate(rows))
 
 
 def ramps(depth: Float[Array, "*batch"]) -> Float[Array, "segments *batch"]:
@@ -70,17 +70,12 @@ def ramps(depth: Float[Array, "*batch"]) -> Float[Array, "segments *batch"]:
     return jnp.where(beyond > 0, jnp.minimum(beyond, _column(WIDTHS, depth)), 0)
 
 
-def features(depth: Array, speed: Array) -> Float[Array, "parameters *batch"]:
+def features(depth: Array, speed: Array, deepest: Array) -> Float[Array, "parameters *batch"]:
     """phi, of which the force is phi.theta."""
-    return jnp.concatenate([ramps(depth), speed[None]])
+    return jnp.concatenate([ramps(depth), jnp.stack([speed, depth * speed / REACH, depth - deepest])])
 
 
-def elastic(slopes: Float[Array, "segments *batch"], depth: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Force [1/s] without damping, 0 out of contact."""
-    return jnp.sum(slopes * ramps(depth), axis=0)
-
-
-def update(old: Map, phi: Array, force: Array, variance: Array, enabled: Array) -> Map:
+def update(old: Map, phi: Array, force: Array, variance: Array, enabled: Bool[Array, "*batch"]) -> Map:
     """One reading of `force` [1/s] with noise of a `variance` [1/s^2], where `enabled` and either the map or
     the reading itself tells of contact: g = P phi, s = variance + phi.g, theta += g (f - phi.theta)/s,
     P -= g g'/s."""
@@ -91,43 +86,70 @@ def update(old: Map, phi: Array, force: Array, variance: Array, enabled: Array) 
     used = used & (s > 0)
     share = jnp.where(used, 1 / jnp.where(used, s, 1), 0)
     scaled = share[None] * g
-    return Map(old.mean + scaled * (force - expected)[None], old.covariance - scaled[:, None] * g[None])
+    mean = old.mean + scaled * (force - expected)[None]
+    return Map(mean, old.covariance - scaled[:, None] * g[None])
 
 
-def positive_damping(old: Map) -> Float[Array, "*batch"]:
-    """Mean [1/s] of the damping, given that it is not negative.
+def curve(old: Map) -> Curve:
+    """What counts of the map."""
+    places = range(SEGMENTS, PARAMETERS)
+    return Curve(old.mean[:SEGMENTS], *(positive_mean(old.mean[i], old.covariance[i, i]) for i in places))
+
+
+def elastic(slopes: Float[Array, "segments *batch"], depth: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Force [1/s] that does not depend on how the contact came there, 0 out of contact."""
+    return jnp.sum(slopes * ramps(depth), axis=0)
+
+
+def force(now: Curve, depth: Array, speed: Array, deepest: Array) -> Float[Array, "*batch"]:
+    """f [1/s], 0 out of contact; the deepest point so far may be short of the depth."""
+    pressed = jnp.where(depth > 0, depth, 0)
+    drag = (now.damping + now.depth_damping * pressed / REACH) * speed
+    back = jnp.where(deepest > pressed, deepest - pressed, 0)
+    return elastic(now.slopes, depth) + jnp.where(depth > 0, drag - now.unloading * back, 0)
+
+
+def peak_force(slopes: Float[Array, "segments *batch"]) -> Float[Array, "*batch"]:
+    """Force [1/s] where a contact entered at speed 1 comes to rest without dissipation: that up to which
+    int f dx = 1/2. Where the map pulls instead, the force before it does, at least 1."""
+    widths = _column(WIDTHS[:-1], slopes[0])
+    gained = slopes[:-1] * widths
+    forces = jnp.concatenate([jnp.zeros_like(slopes[:1]), jnp.cumsum(gained, axis=0)])
+    energies = jnp.cumsum((forces[:-1] + 0.5 * gained) * widths, axis=0)
+    passed = lax.cummin(((energies < 0.5) & (forces[1:] >= 0)).astype(jnp.int32), axis=0)
+    energies = jnp.concatenate([jnp.zeros_like(slopes[:1]), energies])
+    place = jnp.sum(passed, axis=0)[None]
+
+    def there(values):
+        return jnp.take_along_axis(values, place, axis=0)[0]
+
+    reached, slope, left = there(forces), there(slopes), 0.5 - there(energies)
+    reached = jnp.where(reached > 0, reached, 0)
+    more = slope * left > 0
+    further = jnp.sqrt(jnp.where(more, reached**2 + 2 * slope * left, 1))
+    return jnp.where(more, further, jnp.where(reached > 1, reached, 1))
+
+
+def positive_mean(mean: Float[Array, "*batch"], variance: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Mean of N(mean, variance), given that it is not negative.
 
     Of N(m, s^2) truncated at 0: s (t + phi(t)/Phi(t)), t = m/s, phi and Phi the normal density and
     distribution, with Boyd's bound of Mills' ratio, (1 - Phi(u))/phi(u) = pi/((pi - 1) u + sqrt(u^2 + 2 pi)),
     which is exact at 0 and far out, and (1 + u^2/512)^-256 for the density's exponential: algebraic, the same
     on every machine.
     """
-    mean, variance = old.mean[-1], old.covariance[-1, -1]
     spread = jnp.sqrt(jnp.where(variance > 0, variance, 1))
     ratio = mean / spread
     root = jnp.sqrt(ratio**2 + 2 * math.pi)
-    below = (ratio + root) / math.pi
+    # (ratio + root)/pi, without the cancellation far below 0.
+    negative = jnp.where(ratio > 0, 0, ratio)
+    below = 2 / (jnp.sqrt(negative**2 + 2 * math.pi) - negative)
     positive = jnp.where(ratio > 0, ratio, 0)
     mills = math.pi / ((math.pi - 1) * positive + root)
     # The power of what is at most 1: the other way round it overflows, and so does its derivative.
     density = (1 / (1 + positive**2 / 512)) ** 256 / math.sqrt(2 * math.pi)
     above = positive + density / (1 - density * mills)
     return jnp.where(variance > 0, spread * jnp.where(ratio > 0, above, below), jnp.where(mean > 0, mean, 0))
-
-
-def learnt(old: Map, prior: Prior, depth: Array, speed: Array) -> Float[Array, "*batch"]:
-    """By which share [1] the variance of the force at a depth, 10 ms or deeper, is less than the prior's."""
-    phi = features(jnp.where(depth > SHALLOWEST, depth, SHALLOWEST), speed)
-    left = jnp.sum(phi * jnp.sum(old.covariance * phi[None], axis=1), axis=0)
-    beyond = jnp.where(depth > SHALLOWEST, depth, SHALLOWEST)[None] - _column(KNOTS, depth)
-    beyond = jnp.where(beyond > 0, beyond, 0)
-    steps = _column(np.append(0, np.diff(KNOTS)) / WANDERING, depth)
-    before = (
-        prior.common * beyond[0] ** 2
-        + prior.wandering * jnp.sum(steps * beyond**2, axis=0)
-        + prior.damping * speed**2
-    )
-    return jnp.where(before > 0, 1 - left / jnp.where(before > 0, before, 1), 0)
 
 
 def _column(values: np.ndarray, like: Array) -> Array:

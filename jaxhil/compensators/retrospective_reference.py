@@ -2,18 +2,26 @@
 
 A map from depth to force is identified on delay-aligned readings (`force_depth_map`). From it the motion that
 the contact should have had since its entry is integrated over again while the map improves
-(`reference_motion`), and the numerical model (x_d, v_d) is steered onto that motion (x_r, v_r) until the
-hardware itself has separated. No model of the motion simulator is used. Scaled by approach speed v0 and
-equivalent mass M, F_theta the map, (X, V) the measured motion aligned with the measured force y:
+(`reintegration`), and the numerical model's speed v_d is led to that motion's, v_r, until the hardware itself
+has separated. No model of the motion simulator is used. Scaled by approach speed v0 and equivalent mass M,
+F the map, (X, V) the measured motion aligned with the measured force y, p the peak force that the map
+predicts:
 
-    f_0 = max(F_theta(x_d, v_d), 0)
-    f_e = clip(gate [w^2 (x_d - x_r) + 2 z w (v_d - T f_0/2 - v_r)], -limit, limit)
-    in contact:  F_c = f_0 + (y - F_theta(X, V)) + f_e
+    f_0 = max(F(x_d, v_d), 0)
+    f_e = clip(c (v_d - T f_0/2 - v_r), -limit p, limit p)
+    in contact:  F_c = f_0 + (y - F(X, V)) + f_e
     separated:   F_c = f_e  until the hardware has left the surface for 6 ms, then 0
 
-`gate` is the share of the prior's variance that has been learnt. Every contact starts afresh; so does one
-with the other surface. Without f_e it is the published law with the map in the place of k_hat and b_hat; a
-run that begins in contact has no approach speed to scale by: there F_c is the measured force, as it is.
+It is the momentum that is paid back: what the numerical model was late by stays as an offset of its position,
+which no force has to make up for. Every contact starts afresh; so does one with the other surface. Without
+f_e it is the published law with the map in the place of k_hat and b_hat: that is what remains while nothing
+is identified. A run that begins in contact has no approach speed to scale by: there F_c is the measured
+force, as it is.
+
+A sensor's known dead zone is added to what it reads. What it hides (a reading of 0 in contact) counts as
+half of it, with the variance of a uniform distribution, and only where the map expects more. Where the
+noise's standard deviation s is not small, less of the bracket of `reintegration` is replayed:
+rho = force_replay/(1 + (s/replay_noise)^2).
 """
 
 from typing import ClassVar, NamedTuple
@@ -23,19 +31,26 @@ from jaxtyping import Array, Float, Int
 
 from jaxhil.compensators.base import Compensator, Constants, Gain, Gains
 from jaxhil.compensators.delay_line import Delay, DelayLine, delayed, empty, split
-from jaxhil.compensators.estimates import EQUIVALENT_MASS, FORCE_DELAY, force_delay
+from jaxhil.compensators.estimates import (
+    DEAD_ZONE,
+    EQUIVALENT_MASS,
+    FORCE_DELAY,
+    FORCE_NOISE,
+    force_delay,
+)
+from jaxhil.compensators.estimates import (
+    peak_force as typical_peak,
+)
 from jaxhil.compensators.force_depth_map import (
-    PARAMETERS,
     Map,
-    Prior,
-    elastic,
+    curve,
     features,
-    learnt,
-    positive_damping,
+    force,
+    peak_force,
     prior,
     update,
 )
-from jaxhil.compensators.reference_motion import (
+from jaxhil.compensators.reintegration import (
     History,
     Reference,
     entry,
@@ -55,6 +70,11 @@ def _fact(mechanism) -> bool:
     return False
 
 
+def _prior(name: str, unit: str, lower: float, upper: float, nominal: float) -> Gain:
+    """A gain that no mechanism's numbers enter: what it scales is scaled by approach speed and mass."""
+    return Gain(name, unit, lambda m: lower, lambda m: upper, lambda m: nominal, logarithmic=True)
+
+
 class Aligned(NamedTuple):
     """Measured position [m] delayed by tau and by tau + T, of the tick before."""
 
@@ -65,8 +85,9 @@ class Aligned(NamedTuple):
 class Episode(NamedTuple):
     """One contact: side (1 or -1; 0: none), approach speed [m/s] (0: unusable), time [s] from the entry to
     the first tick, ticks since that one, whether (1) the hardware has touched, ticks since it left, where
-    between two ticks its samples fall on the reference's grid; of the tick before, what was measured
-    (y, X, V), y moved to that grid and its integral [ticks/s]."""
+    between two ticks its samples fall on the reference's grid; deepest points so far [s] of the numerical
+    model and of the hardware; of the tick before, what was measured (y, X, V, X_m), y moved to that grid and
+    its integral [ticks/s]."""
 
     side: Float[Array, "*batch"]
     velocity: Float[Array, "*batch"]
@@ -75,7 +96,9 @@ class Episode(NamedTuple):
     touched: Float[Array, "*batch"]
     gone: Float[Array, "*batch"]
     fraction: Float[Array, "*batch"]
-    sample: Float[Array, "3 *batch"]
+    deepest: Float[Array, "*batch"]
+    hardware_deepest: Float[Array, "*batch"]
+    sample: Float[Array, "4 *batch"]
     moved: Float[Array, "*batch"]
     impulse: Float[Array, "*batch"]
 
@@ -98,7 +121,7 @@ class Prepared(NamedTuple):
 
     gains: Gains
     constants: Constants
-    prior: Prior
+    prior: Map
     delay: Delay
     share: Float[Array, "*batch"]
 
@@ -107,7 +130,7 @@ class RetrospectiveReference(Compensator):
     """Force-depth map, reference and repayment; see the module's text."""
 
     name: ClassVar[str] = "retrospective_reference"
-    knows: ClassVar[tuple[str, ...]] = (EQUIVALENT_MASS, FORCE_DELAY)
+    knows: ClassVar[tuple[str, ...]] = (EQUIVALENT_MASS, FORCE_DELAY, FORCE_NOISE, DEAD_ZONE)
     gains: ClassVar[tuple[Gain, ...]] = (
         Gain(
             "equivalent_mass", "kg", lambda m: 0.1 * m.bodies.mass, lambda m: 10 * m.bodies.mass,
@@ -118,32 +141,27 @@ class RetrospectiveReference(Compensator):
             force_delay, tuned=_fact,
         ),
         Gain(
-            "prior_stiffness", "1/s^2", lambda m: 10.0, lambda m: 5e3, lambda m: 254.0, logarithmic=True,
+            "force_noise", "N", lambda m: 0.0, lambda m: m.rig.force_sensor.noise_std + typical_peak(m),
+            lambda m: m.rig.force_sensor.noise_std, tuned=_fact,
         ),
         Gain(
-            "prior_stiffness_spread", "1", lambda m: 0.05, lambda m: 5.0, lambda m: 2.63, logarithmic=True,
+            "dead_zone", "N", lambda m: 0.0, lambda m: 2 * m.rig.force_sensor.dead_zone + typical_peak(m),
+            lambda m: m.rig.force_sensor.dead_zone, tuned=_fact,
         ),
+        _prior("prior_stiffness", "1/s^2", 0.1, 1e3, 9.563),
+        _prior("prior_stiffness_spread", "1/s^2", 1.0, 5e3, 35.8),
+        _prior("prior_slope_spread", "1/s^2", 0.1, 5e3, 29.17),
+        _prior("prior_damping_spread", "1/s", 0.01, 50.0, 1.912),
+        _prior("prior_depth_damping_spread", "1/s", 1e-4, 50.0, 0.03103),
+        _prior("prior_unloading_spread", "1/s^2", 1e-4, 5e3, 0.1607),
+        _prior("force_noise_floor", "1/s", 1e-4, 10.0, 0.01091),
         Gain(
-            "prior_slope_spread", "1", lambda m: 0.01, lambda m: 5.0, lambda m: 0.979, logarithmic=True,
+            "velocity_gain", "1/s", lambda m: 1.0, lambda m: 1 / m.rig.control_period,
+            lambda m: min(174.6, 0.7 / m.rig.control_period), logarithmic=True,
         ),
-        Gain("prior_damping", "1/s", lambda m: 0.0, lambda m: 10.0, lambda m: 0.063, tuned=_fact),
-        Gain(
-            "prior_damping_spread", "1/s", lambda m: 0.01, lambda m: 20.0, lambda m: 0.879,
-            logarithmic=True,
-        ),
-        Gain(
-            "force_noise_floor", "1/s", lambda m: 1e-3, lambda m: 10.0, lambda m: 0.139, logarithmic=True,
-        ),
-        Gain(
-            "reference_frequency", "rad/s", lambda m: 10.0, lambda m: 500.0, lambda m: 225.0,
-            logarithmic=True,
-        ),
-        Gain(
-            "reference_damping_ratio", "1", lambda m: 0.1, lambda m: 5.0, lambda m: 0.76,
-            logarithmic=True,
-        ),
-        Gain("correction_limit", "1/s", lambda m: 1.0, lambda m: 200.0, lambda m: 40.0, tuned=_fact),
+        _prior("correction_limit", "1", 0.01, 20.0, 0.6394),
         Gain("force_replay", "1", lambda m: 0.0, lambda m: 1.0, lambda m: 1.0, tuned=_fact),
+        _prior("replay_noise", "1/s", 0.01, 100.0, 0.7679),
     )  # fmt: skip
 
     def prepare(self, gains, constants):
@@ -158,8 +176,9 @@ class RetrospectiveReference(Compensator):
                 full["prior_stiffness"],
                 full["prior_stiffness_spread"],
                 full["prior_slope_spread"],
-                full["prior_damping"],
                 full["prior_damping_spread"],
+                full["prior_depth_damping_spread"],
+                full["prior_unloading_spread"],
             ),
             split(jnp.where(whole, delay - period, 0), period),
             jnp.where(whole, 1, delay / period),
@@ -168,25 +187,27 @@ class RetrospectiveReference(Compensator):
     def init(self, gains, constants, ring):
         zeros = jnp.zeros_like(constants.control_period)
         counts = jnp.zeros(zeros.shape, jnp.int32)
-        theta = jnp.zeros((PARAMETERS, *zeros.shape), zeros.dtype)
+        unknown = prior(*[zeros] * 6)
         return RetrospectiveState(
             line=empty(ring, zeros),
             aligned=Aligned(zeros, zeros),
             noise=(zeros, zeros),
             episode=Episode(
-                zeros,
-                zeros,
-                zeros,
-                counts,
-                zeros,
-                zeros,
-                zeros,
-                jnp.stack([zeros, zeros, zeros]),
-                zeros,
-                zeros,
+                side=zeros,
+                velocity=zeros,
+                first=zeros,
+                elapsed=counts,
+                touched=zeros,
+                gone=zeros,
+                fraction=zeros,
+                deepest=zeros,
+                hardware_deepest=zeros,
+                sample=jnp.stack([zeros] * 4),
+                moved=zeros,
+                impulse=zeros,
             ),
-            map=Map(theta, theta[:, None] + theta[None]),
-            reference=Reference(entry(zeros), entry(zeros), counts - 1, theta),
+            map=unknown,
+            reference=Reference(entry(zeros), entry(zeros), counts - 1, curve(unknown)),
             history=no_history(zeros),
         )
 
@@ -230,7 +251,10 @@ class RetrospectiveReference(Compensator):
         depth, rate = depth_of(position), side * velocity / scale
         elsewhere = jnp.sign(deflection(position, clearance)) == -side
         weight = mass * scale
-        force = jnp.where(elsewhere, 0, side * signals.force_measured / weight)
+        hides = gains["dead_zone"] > 0
+        reading = signals.force_measured + jnp.sign(signals.force_measured) * gains["dead_zone"]
+        hidden = hides & (signals.force_measured == 0) & ~elsewhere
+        read = jnp.where(elsewhere, 0, side * reading / weight)
         first = jnp.where(enters, jnp.where(usable, x, 0), old.first)
         elapsed = jnp.where(enters, 0, old.elapsed + 1)
 
@@ -250,48 +274,64 @@ class RetrospectiveReference(Compensator):
         free_readings = (~under_way | ~touched) & (deflection(position, clearance) == 0)
         squares = state.noise[0] + jnp.where(free_readings, signals.force_measured**2, 0)
         count = state.noise[1] + jnp.where(free_readings, 1, 0)
-        floor = squares / (jnp.where(count > 0, count, 1) * weight**2)
-        variance = gains["force_noise_floor"] ** 2 + floor
+        told = gains["force_noise"] ** 2
+        seen = squares / jnp.where(count > 0, count, 1)
+        noise = jnp.where(seen > told, seen, told) / weight**2
+        variance = gains["force_noise_floor"] ** 2 + noise
+        strength = gains["replay_noise"] ** 2
+        replay = gains["force_replay"] * strength / (strength + noise)
 
+        deepest = jnp.where(enters, 0, old.deepest)
+        deepest = jnp.where(x > deepest, x, deepest)
+        hardware_deepest = jnp.where(enters, 0, old.hardware_deepest)
+        hardware_deepest = jnp.where(depth > hardware_deepest, depth, hardware_deepest)
         before = Map(
             jnp.where(enters[None], prepared.prior.mean, state.map.mean),
             jnp.where(enters[None, None], prepared.prior.covariance, state.map.covariance),
         )
-        now = update(before, features(depth, rate), force, variance, usable & (depth > 0))
-        damping = positive_damping(now)
-        theta = jnp.concatenate([now.mean[:-1], damping[None]])
+        hardware = depth, rate, hardware_deepest
+        zone = gains["dead_zone"] / weight
+        known = curve(before)
+        more = force(known, *hardware) > zone
+        now = update(
+            before,
+            features(*hardware),
+            jnp.where(hidden, 0.5 * zone, read),
+            variance + jnp.where(hidden, zone**2 / 12, 0),
+            usable & (depth > 0) & (~hidden | more),
+        )
+        known = curve(now)
+        expected = force(known, *hardware)
+        guess = jnp.where(expected > zone, zone, jnp.where(expected > 0, expected, 0))
+        measured = jnp.where(hidden & usable, guess, read)
         reference = follow(
-            state.reference._replace(reached=jnp.where(enters, -1, state.reference.reached)),
-            theta,
+            state.reference,
+            known,
             history,
-            gains["force_replay"],
+            replay,
             first,
             period,
             elapsed,
         )
         live = reference.live
 
-        own = jnp.where(x > 0, elastic(now.mean[:-1], x) + damping * v, 0)
-        expected = jnp.where(depth > 0, elastic(now.mean[:-1], depth) + damping * rate, 0)
+        own = force(known, x, v, deepest)
         separated = (x <= 0) | (usable & (v < 0) & (own <= 0))
         own = jnp.where(own > 0, own, 0)
-        frequency, limit = gains["reference_frequency"], gains["correction_limit"]
-        gate = learnt(now, prepared.prior, x, v)
-        wanted = gate * (
-            frequency**2 * (x - live.depth)
-            + 2 * gains["reference_damping_ratio"] * frequency * (v - 0.5 * period * own - live.speed)
-        )
+        limit = gains["correction_limit"] * peak_force(known.slopes)
+        wanted = gains["velocity_gain"] * (v - 0.5 * period * own - live.speed)
         correction = jnp.where(wanted > limit, limit, jnp.where(wanted < -limit, -limit, wanted))
-        command = jnp.where(separated, correction, own + (force - expected) + correction)
-        command = jnp.where(usable, command, jnp.where(separated, 0, force))
+        command = jnp.where(separated, correction, own + (measured - expected) + correction)
+        command = jnp.where(usable, command, jnp.where(separated, 0, measured))
 
         gone = jnp.where(enters | (depth > 0), 0, old.gone + 1)
         patience = jnp.where(touched | ~usable, FAREWELL, LONGEST_LAG)
         over = separated & (gone * period > patience * (1 + 1e-9))
         command = jnp.where(under_way & ~over, side * weight * command, 0)
 
-        sample = jnp.stack([force, depth, rate])
-        kept = jnp.where(enters[None], jnp.stack([force, depth - period * rate, rate]), old.sample)
+        sample = jnp.stack([measured, *hardware])
+        kept = jnp.stack([measured, depth - period * rate, rate, jnp.zeros_like(rate)])
+        kept = jnp.where(enters[None], kept, old.sample)
         moved = kept + fraction[None] * (sample - kept)
         arrived = tick - origin + 1
         begun = 0.5 * moved[0] * first / period
@@ -313,6 +353,8 @@ class RetrospectiveReference(Compensator):
                 touched=touched.astype(side.dtype),
                 gone=gone,
                 fraction=fraction,
+                deepest=deepest,
+                hardware_deepest=hardware_deepest,
                 sample=sample,
                 moved=moved[0],
                 impulse=impulse,

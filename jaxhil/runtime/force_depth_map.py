@@ -1,9 +1,10 @@
-"""A force-depth map of unknown contact, identified while it is met: slopes between knots, and damping.
+"""A force-depth map of unknown contact, identified while it is met: slopes between knots, and dissipation.
 
-f(x, v) = sum_j slope_j clip(x - kappa_j, 0, kappa_{j+1} - kappa_j) + damping v at x > 0, else 0. Depth in s
-(over the approach speed), speed as a fraction of that speed, force in 1/s (over mass and approach speed).
-Slopes and damping start from a Gaussian prior and are identified by recursive least squares. Only segments
-that are pressed in enter the sums.
+f(x, v, x_m) = sum_j slope_j clip(x - kappa_j, 0, kappa_{j+1} - kappa_j) + (damping + depth_damping x/REACH) v
+- unloading (x_m - x) at x > 0, else 0; x_m is the deepest point so far. Depth in s (over the approach speed),
+speed as a fraction of that speed, force in 1/s (over mass and approach speed). All parameters start from a
+Gaussian prior and are identified by recursive least squares; what dissipates counts with its mean given that
+it is not negative. Only segments that are pressed in enter the sums.
 """
 
 from bisect import bisect_left
@@ -11,59 +12,102 @@ from math import pi, sqrt
 
 KNOTS = (0.0, 0.002, 0.005, 0.01, 0.016, 0.024, 0.032, 0.04, 0.05, 0.062, 0.076, 0.092)
 SEGMENTS = 12
+PARAMETERS = 15
 WANDERING = 0.03  # s of depth over which a slope wanders by its spread
-SHALLOWEST = 0.01  # s of depth by which it is judged how much has been learnt
+REACH = 0.03  # s of depth at which the depth damping is as strong as its name says
 OUTLYING = 4.0  # times the noise's variance: a force that hardly is noise
 
 
-def segment_of(depth: float) -> int:
-    """The segment that a depth [s] lies in; -1 out of contact."""
-    return bisect_left(KNOTS, depth) - 1
+class Curve:
+    """What counts of a map: `slopes` [1/s^2], the force `at_knots` [1/s], `damping`, `depth_damping` [1/s],
+    `unloading` [1/s^2]."""
+
+    __slots__ = ("at_knots", "damping", "depth_damping", "slopes", "unloading")
+
+    def __init__(self) -> None:
+        self.slopes = [0.0] * SEGMENTS
+        self.at_knots = [0.0] * SEGMENTS
+        self.damping = 0.0
+        self.depth_damping = 0.0
+        self.unloading = 0.0
+
+    def take(self, other: "Curve") -> None:
+        """Become equal to the other, whose lists are never changed."""
+        self.slopes = other.slopes
+        self.at_knots = other.at_knots
+        self.damping = other.damping
+        self.depth_damping = other.depth_damping
+        self.unloading = other.unloading
+
+    def elastic(self, depth: float) -> float:
+        """Force [1/s] that does not depend on how the contact came there, 0 out of contact."""
+        segment = bisect_left(KNOTS, depth) - 1
+        if segment < 0:
+            return 0.0
+        return self.at_knots[segment] + self.slopes[segment] * (depth - KNOTS[segment])
+
+    def force(self, depth: float, speed: float, deepest: float) -> float:
+        """Force [1/s], 0 out of contact; the deepest point may be short of the depth."""
+        if not depth > 0.0:
+            return 0.0
+        drag = (self.damping + self.depth_damping * depth / REACH) * speed
+        back = deepest - depth if deepest > depth else 0.0
+        return self.elastic(depth) + (drag - self.unloading * back)
+
+    def peak_force(self) -> float:
+        """Force [1/s] where a contact entered at speed 1 comes to rest without dissipation: that up to which
+        int f dx = 1/2. Where the map pulls instead, the force before it does, at least 1."""
+        slopes = self.slopes
+        forces = self.at_knots
+        energy = 0.0
+        segment = 0
+        while segment < SEGMENTS - 1:
+            width = KNOTS[segment + 1] - KNOTS[segment]
+            more = energy + (forces[segment] + 0.5 * (slopes[segment] * width)) * width
+            if not (more < 0.5 and forces[segment + 1] >= 0.0):
+                break
+            energy = more
+            segment += 1
+        reached = forces[segment]
+        if not reached > 0.0:
+            reached = 0.0
+        rise = slopes[segment] * (0.5 - energy)
+        if rise > 0.0:
+            return sqrt(reached * reached + 2.0 * rise)
+        return reached if reached > 1.0 else 1.0
 
 
 class ForceDepthMap:
-    """Mean and covariance of the slopes [1/s^2] and, last, the damping [1/s].
+    """Mean and covariance of the slopes [1/s^2], damping and depth damping [1/s] and unloading [1/s^2]; the
+    `curve` that counts."""
 
-    Attributes of use outside: `slopes`, the force `at_knots` [1/s], and the `damping` [1/s] that counts, the
-    mean given that it is not negative.
-    """
-
-    __slots__ = (
-        "_common",
-        "_covariance",
-        "_damping_variance",
-        "_estimate",
-        "_prior_covariance",
-        "_prior_estimate",
-        "_wandering",
-        "at_knots",
-        "damping",
-        "slopes",
-    )
+    __slots__ = ("_covariance", "_estimate", "_prior_covariance", "_prior_estimate", "curve")
 
     def __init__(
         self,
         stiffness: float,
-        common_spread: float,
-        wandering_spread: float,
+        common: float,
+        wandering: float,
         damping: float,
-        damping_spread: float,
+        depth_damping: float,
+        unloading: float,
     ) -> None:
-        common = common_spread * stiffness
-        wandering = wandering_spread * stiffness
-        self._common = common * common
-        self._wandering = wandering * wandering
-        self._damping_variance = damping_spread * damping_spread
-        self._prior_estimate = [stiffness] * SEGMENTS + [damping]
+        common = common * common
+        wandering = wandering * wandering
+        self._prior_estimate = [stiffness] * SEGMENTS + [0.0, 0.0, 0.0]
         rows = []
         for i in range(SEGMENTS):
             row = []
             for j in range(SEGMENTS):
                 shared = KNOTS[i] if i < j else KNOTS[j]
-                row.append(self._common + self._wandering * (shared / WANDERING))
-            rows.append([*row, 0.0])
-        self._prior_covariance = [*rows, [0.0] * SEGMENTS + [self._damping_variance]]
-        self.at_knots = [0.0] * SEGMENTS
+                row.append(common + wandering * (shared / WANDERING))
+            rows.append([*row, 0.0, 0.0, 0.0])
+        for place, spread in enumerate((damping, depth_damping, unloading)):
+            row = [0.0] * PARAMETERS
+            row[SEGMENTS + place] = spread * spread
+            rows.append(row)
+        self._prior_covariance = rows
+        self.curve = Curve()
         self.restart()
 
     def restart(self) -> None:
@@ -72,16 +116,20 @@ class ForceDepthMap:
         self._covariance = [list(row) for row in self._prior_covariance]
         self._conclude()
 
-    def update(self, depth: float, speed: float, force: float, variance: float) -> None:
+    def update(self, depth: float, speed: float, deepest: float, force: float, variance: float) -> None:
         """One reading in contact, its noise of a `variance` [1/s^2], if the map or the reading tells of
         contact: g = P phi, s = variance + phi.g, theta += g (f - phi.theta)/s, P -= g g'/s."""
         estimate = self._estimate
         covariance = self._covariance
-        pressed = self._pressed(depth)
+        pressed = _pressed(depth)
+        deeply = depth * speed / REACH
+        back = depth - deepest
         expected = 0.0
-        for j, ramp in enumerate(pressed):
-            expected += ramp * estimate[j]
-        expected += speed * estimate[SEGMENTS]
+        for ramp, value in zip(pressed, estimate, strict=False):
+            expected += ramp * value
+        expected += speed * estimate[12]
+        expected += deeply * estimate[13]
+        expected += back * estimate[14]
         if not (expected > 0.0 or force * force > OUTLYING * variance):
             return
         g = []
@@ -89,11 +137,13 @@ class ForceDepthMap:
             product = 0.0
             for entry, ramp in zip(row, pressed, strict=False):
                 product += entry * ramp
-            g.append(product + row[SEGMENTS] * speed)
+            g.append(product + row[12] * speed + row[13] * deeply + row[14] * back)
         s = variance
-        for j, ramp in enumerate(pressed):
-            s += ramp * g[j]
-        s += speed * g[SEGMENTS]
+        for ramp, value in zip(pressed, g, strict=False):
+            s += ramp * value
+        s += speed * g[12]
+        s += deeply * g[13]
+        s += back * g[14]
         if not s > 0.0:
             return
         share = 1.0 / s
@@ -104,63 +154,21 @@ class ForceDepthMap:
             covariance[i] = [entry - scaled * other for entry, other in zip(row, g, strict=True)]
         self._conclude()
 
-    def elastic(self, depth: float) -> float:
-        """Force [1/s] without damping, 0 out of contact."""
-        segment = bisect_left(KNOTS, depth) - 1
-        if segment < 0:
-            return 0.0
-        return self.at_knots[segment] + self.slopes[segment] * (depth - KNOTS[segment])
-
-    def force(self, depth: float, speed: float) -> float:
-        """Force [1/s], 0 out of contact."""
-        return self.elastic(depth) + self.damping * speed if depth > 0.0 else 0.0
-
-    def learnt(self, depth: float, speed: float) -> float:
-        """By which share the variance of the force at a depth, 10 ms or deeper, is less than the prior's."""
-        if not depth > SHALLOWEST:
-            depth = SHALLOWEST
-        covariance = self._covariance
-        pressed = self._pressed(depth)
-        last = covariance[SEGMENTS]
-        left = 0.0
-        crossed = 0.0
-        for i, ramp in enumerate(pressed):
-            row = covariance[i]
-            product = 0.0
-            for entry, other in zip(row, pressed, strict=False):
-                product += entry * other
-            left += ramp * product
-            crossed += ramp * (row[SEGMENTS] + last[i])
-        left += speed * crossed + speed * last[SEGMENTS] * speed
-        wandered = 0.0
-        for j in range(1, len(pressed)):
-            beyond = depth - KNOTS[j]
-            wandered += (KNOTS[j] - KNOTS[j - 1]) / WANDERING * (beyond * beyond)
-        before = (
-            self._common * (depth * depth)
-            + self._wandering * wandered
-            + self._damping_variance * (speed * speed)
-        )
-        return 1.0 - left / before if before > 0.0 else 0.0
-
-    def _pressed(self, depth: float) -> list[float]:
-        """How far [s] each segment is pressed in, of those that are."""
-        last = bisect_left(KNOTS, depth) - 1
-        pressed = [KNOTS[j + 1] - KNOTS[j] for j in range(last)]
-        pressed.append(depth - KNOTS[last])
-        return pressed
-
     def _conclude(self) -> None:
         estimate = self._estimate
+        covariance = self._covariance
         slopes = estimate[:SEGMENTS]
         at_knots = [0.0] * SEGMENTS
         reached = 0.0
         for j in range(1, SEGMENTS):
             reached += slopes[j - 1] * (KNOTS[j] - KNOTS[j - 1])
             at_knots[j] = reached
-        self.slopes = slopes
-        self.at_knots = at_knots
-        self.damping = positive_mean(estimate[SEGMENTS], self._covariance[SEGMENTS][SEGMENTS])
+        curve = self.curve
+        curve.slopes = slopes
+        curve.at_knots = at_knots
+        curve.damping = positive_mean(estimate[12], covariance[12][12])
+        curve.depth_damping = positive_mean(estimate[13], covariance[13][13])
+        curve.unloading = positive_mean(estimate[14], covariance[14][14])
 
 
 def positive_mean(mean: float, variance: float) -> float:
@@ -176,10 +184,19 @@ def positive_mean(mean: float, variance: float) -> float:
     ratio = mean / spread
     root = sqrt(ratio * ratio + 2.0 * pi)
     if not ratio > 0.0:
-        return spread * ((ratio + root) / pi)
+        # (ratio + root)/pi, without the cancellation far below 0.
+        return spread * (2.0 / (root - ratio))
     mills = pi / ((pi - 1.0) * ratio + root)
     tail = 1.0 / (1.0 + ratio * ratio / 512.0)
     for _ in range(8):
         tail *= tail
     density = tail / sqrt(2.0 * pi)
     return spread * (ratio + density / (1.0 - density * mills))
+
+
+def _pressed(depth: float) -> list[float]:
+    """How far [s] each segment is pressed in, of those that are."""
+    last = bisect_left(KNOTS, depth) - 1
+    pressed = [KNOTS[j + 1] - KNOTS[j] for j in range(last)]
+    pressed.append(depth - KNOTS[last])
+    return pressed

@@ -1,30 +1,35 @@
 """The retrospective reference: identify the contact, work out what should have happened, and pay it back.
 
 Scaled by approach speed v0 and equivalent mass M, F the force-depth map identified on delay-aligned readings
-(X, V, y), (x_r, v_r) the motion that the contact should have had since its entry:
+(X, V, y), p the peak force that it predicts, v_r the speed of the motion that the contact should have had
+since its entry:
 
     f_0 = max(F(x_d, v_d), 0)
-    f_e = clip(gate [w^2 (x_d - x_r) + 2 z w (v_d - T f_0/2 - v_r)], -limit, limit)
+    f_e = clip(c (v_d - T f_0/2 - v_r), -limit p, limit p)
     in contact:  F_c = f_0 + (y - F(X, V)) + f_e
     separated:   F_c = f_e  until the hardware has left the surface for 6 ms, then 0
 
-No model of the motion simulator is used.
+No model of the motion simulator is used. Without f_e it is the published law with the map in the place of
+k_hat and b_hat: that is what remains while nothing is identified. A known dead zone is added to what the
+sensor reads; what it hides counts as half of it, where the map expects more than the dead zone. The noisier
+the force, the less of what the map does not explain is replayed in the motion.
 """
 
 from collections.abc import Mapping
-from math import floor
+from math import floor, pi
 from typing import ClassVar
 
 from .filters import DelayLine
 from .force_depth_map import ForceDepthMap
-from .reference_motion import ReferenceMotion
 from .registry import GainSpecification, register
+from .reintegration import ReferenceMotion
 from .surfaces import deflection
 
 FAREWELL = 0.006  # s for which it goes on after the hardware has left the surface
 LONGEST_LAG = 0.1  # s for which it waits for hardware that has not touched yet
-SURE = 0.5  # of the prior's variance that has to be learnt
-OUT_OF_CONTACT, IDENTIFIED, UNSURE, SATURATED = 0, 1, 2, 3
+FEW = 5  # readings on which no contact is identified
+LATE = 0.5  # of the predicted contact's duration, that the hardware may touch late by
+OUT_OF_CONTACT, IDENTIFIED, UNSURE, SATURATED, TOO_SHORT = range(5)
 
 
 @register("retrospective_reference")
@@ -33,20 +38,27 @@ class RetrospectiveReference:
 
     Every contact starts afresh, also with the other surface. A run that begins in contact has no approach
     speed to scale by: there F_c is the measured force. `status` is what stands behind the last command:
-    `OUT_OF_CONTACT`, `IDENTIFIED`, `UNSURE` (less than half is learnt: it goes by the measured force and what
-    the prior says of the contact), or `SATURATED` (the correction is at its limit).
+    `OUT_OF_CONTACT`; `UNSURE`: nothing is identified yet, or there is nothing to scale by, and it goes by the
+    measured force and what the prior says of the contact; `IDENTIFIED`; `SATURATED`: the correction is at its
+    limit; `TOO_SHORT`: the hardware touched when half of the contact was over by what is known of it now, so
+    that little time is left to pay back.
     """
 
     __slots__ = (
         "_clearance",
         "_count",
+        "_dead_zone",
+        "_deepest",
+        "_elapsed",
         "_first",
         "_floor",
+        "_force_noise",
         "_fraction",
-        "_frequency",
         "_gone",
+        "_hardware_deepest",
         "_impulse",
         "_last",
+        "_late",
         "_limit",
         "_line",
         "_map",
@@ -55,9 +67,12 @@ class RetrospectiveReference:
         "_moved",
         "_offset",
         "_period",
-        "_ratio",
+        "_readings",
         "_reference",
+        "_replay",
+        "_replay_noise",
         "_sample",
+        "_sample_deepest",
         "_sample_depth",
         "_sample_speed",
         "_share",
@@ -67,22 +82,26 @@ class RetrospectiveReference:
         "_started",
         "_ticks",
         "_touched",
+        "_velocity_gain",
         "status",
     )
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
         "equivalent_mass": GainSpecification("kg", lowest=0.0, exclusive=True),
         "identification_delay": GainSpecification("s", lowest=0.0),
+        "force_noise": GainSpecification("N", lowest=0.0),
+        "dead_zone": GainSpecification("N", lowest=0.0),
         "prior_stiffness": GainSpecification("1/s^2", lowest=0.0),
-        "prior_stiffness_spread": GainSpecification("1", lowest=0.0),
-        "prior_slope_spread": GainSpecification("1", lowest=0.0),
-        "prior_damping": GainSpecification("1/s", lowest=0.0),
+        "prior_stiffness_spread": GainSpecification("1/s^2", lowest=0.0),
+        "prior_slope_spread": GainSpecification("1/s^2", lowest=0.0),
         "prior_damping_spread": GainSpecification("1/s", lowest=0.0),
+        "prior_depth_damping_spread": GainSpecification("1/s", lowest=0.0),
+        "prior_unloading_spread": GainSpecification("1/s^2", lowest=0.0),
         "force_noise_floor": GainSpecification("1/s", lowest=0.0, exclusive=True),
-        "reference_frequency": GainSpecification("rad/s", lowest=0.0),
-        "reference_damping_ratio": GainSpecification("1", lowest=0.0),
-        "correction_limit": GainSpecification("1/s", lowest=0.0),
+        "velocity_gain": GainSpecification("1/s", lowest=0.0),
+        "correction_limit": GainSpecification("1", lowest=0.0),
         "force_replay": GainSpecification("1", lowest=0.0),
+        "replay_noise": GainSpecification("1/s", lowest=0.0, exclusive=True),
     }
 
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
@@ -98,14 +117,18 @@ class RetrospectiveReference:
             gains["prior_stiffness"],
             gains["prior_stiffness_spread"],
             gains["prior_slope_spread"],
-            gains["prior_damping"],
             gains["prior_damping_spread"],
+            gains["prior_depth_damping_spread"],
+            gains["prior_unloading_spread"],
         )
-        self._reference = ReferenceMotion(gains["force_replay"], period)
+        self._reference = ReferenceMotion(period)
+        self._force_noise = gains["force_noise"]
+        self._dead_zone = gains["dead_zone"]
         self._floor = gains["force_noise_floor"]
-        self._frequency = gains["reference_frequency"]
-        self._ratio = gains["reference_damping_ratio"]
+        self._velocity_gain = gains["velocity_gain"]
         self._limit = gains["correction_limit"]
+        self._replay = gains["force_replay"]
+        self._replay_noise = gains["replay_noise"]
         self._middle = 0.0
         self._last = 0.0
         self.reset()
@@ -149,7 +172,15 @@ class RetrospectiveReference:
         v = side * velocity_desired / scale
         depth = (-clearance - position if side < 0.0 else position) / scale
         rate = side * velocity / scale
-        force = 0.0 if bent * side < 0.0 else side * force_measured / weight
+        zone = self._dead_zone
+        hidden = False
+        force = 0.0
+        if not bent * side < 0.0:
+            hidden = zone > 0.0 and force_measured == 0.0
+            if force_measured > 0.0:
+                force = side * (force_measured + zone) / weight
+            elif force_measured < 0.0:
+                force = side * (force_measured - zone) / weight
         touched_before = self._touched
         if not touched_before and not (speed > 0.0 and depth > 0.0):
             self._take_noise(force_measured, bent)
@@ -158,7 +189,7 @@ class RetrospectiveReference:
         if depth > 0.0:
             self._gone = 0.0
         if speed > 0.0:
-            command, separated = self._follow(enters, x, v, depth, rate, force, weight)
+            command, separated = self._follow(enters, x, v, depth, rate, force, hidden, weight)
         else:
             separated = x <= 0.0
             command = 0.0 if separated else force
@@ -171,54 +202,96 @@ class RetrospectiveReference:
         return side * weight * command
 
     def _follow(
-        self, enters: bool, x: float, v: float, depth: float, rate: float, force: float, weight: float
+        self,
+        enters: bool,
+        x: float,
+        v: float,
+        depth: float,
+        rate: float,
+        force: float,
+        hidden: bool,
+        weight: float,
     ) -> tuple[float, bool]:
         """The command over M v0 [1/s], and whether the numerical model has separated."""
         period = self._period
         contact = self._map
+        curve = contact.curve
         reference = self._reference
+        self._elapsed += 1
         if enters:
             contact.restart()
-            self._first = x
             reference.restart(x)
+            self._first = x
+            self._elapsed = 0
+            self._readings = 0
+            self._late = 0.0
+            self._deepest = 0.0
+            self._hardware_deepest = 0.0
             self._sample = force
             self._sample_depth = depth - period * rate
             self._sample_speed = rate
+            self._sample_deepest = 0.0
+        if x > self._deepest:
+            self._deepest = x
+        if depth > self._hardware_deepest:
+            self._hardware_deepest = depth
+        deepest = self._hardware_deepest
+
+        zone = self._dead_zone / weight
+        square = weight * weight
+        noise = self._noise() / square if square > 0.0 else 0.0
         if depth > 0.0:
             if not self._touched:
                 self._touch(depth, rate)
-            scale = (self._count if self._count > 0.0 else 1.0) * (weight * weight)
-            mean = self._squares / scale if scale > 0.0 else 0.0
-            contact.update(depth, rate, force, self._floor * self._floor + mean)
-        reference.tick(contact)
+            variance = self._floor * self._floor + noise
+            if not hidden:
+                contact.update(depth, rate, deepest, force, variance)
+                self._readings += 1
+            elif curve.force(depth, rate, deepest) > zone:
+                contact.update(depth, rate, deepest, 0.5 * zone, variance + zone * zone / 12.0)
+        expected = curve.force(depth, rate, deepest)
+        if hidden:
+            force = zone if expected > zone else (expected if expected > 0.0 else 0.0)
+        strength = self._replay_noise * self._replay_noise
+        whole = strength + noise
+        reference.replay = self._replay * strength / whole if whole > 0.0 else 0.0
+        reference.tick(curve)
 
-        own = contact.force(x, v)
+        own = curve.force(x, v, self._deepest)
         separated = x <= 0.0 or (v < 0.0 and own <= 0.0)
         if not own > 0.0:
             own = 0.0
-        frequency = self._frequency
-        limit = self._limit
-        gate = contact.learnt(x, v)
-        correction = gate * (
-            frequency * frequency * (x - reference.depth)
-            + 2.0 * self._ratio * frequency * (v - 0.5 * period * own - reference.speed)
-        )
-        self.status = IDENTIFIED if gate >= SURE else UNSURE
+        peak = curve.peak_force()
+        limit = self._limit * peak
+        correction = self._velocity_gain * (v - 0.5 * period * own - reference.speed)
+        self.status = IDENTIFIED
+        if self._readings < FEW:
+            self.status = UNSURE
+        elif self._late * peak > LATE * pi:
+            self.status = TOO_SHORT
         if correction > limit:
             correction = limit
-            self.status = SATURATED
+            self.status = SATURATED if self.status == IDENTIFIED else self.status
         elif correction < -limit:
             correction = -limit
-            self.status = SATURATED
+            self.status = SATURATED if self.status == IDENTIFIED else self.status
         command = correction
         if not separated:
-            command = own + (force - contact.force(depth, rate)) + correction
+            command = own + (force - expected) + correction
         if self._touched:
-            self._remember(force, depth, rate)
+            self._remember(force, depth, rate, deepest)
         self._sample = force
         self._sample_depth = depth
         self._sample_speed = rate
+        self._sample_deepest = deepest
         return command, separated
+
+    def _noise(self) -> float:
+        """The force's variance [N^2]: what it is told, or what readings out of contact show if that is
+        more."""
+        told = self._force_noise * self._force_noise
+        seen = self._squares / (self._count if self._count > 0.0 else 1.0)
+        return seen if seen > told else told
 
     def _touch(self, depth: float, rate: float) -> None:
         """The hardware's entry: where its samples fall on the reference's grid."""
@@ -234,8 +307,9 @@ class RetrospectiveReference:
         self._offset = -1 - whole
         self._ticks = 0
         self._touched = True
+        self._late = self._first + self._elapsed * period
 
-    def _remember(self, force: float, depth: float, rate: float) -> None:
+    def _remember(self, force: float, depth: float, rate: float, deepest: float) -> None:
         """This tick's sample, moved to the reference's grid, into its history."""
         fraction = self._fraction
         before = self._sample
@@ -250,11 +324,13 @@ class RetrospectiveReference:
         if index >= 0:
             before_depth = self._sample_depth
             before_rate = self._sample_speed
+            before_deepest = self._sample_deepest
             self._reference.remember(
                 index,
                 self._impulse,
                 before_depth + fraction * (depth - before_depth),
                 before_rate + fraction * (rate - before_rate),
+                before_deepest + fraction * (deepest - before_deepest),
             )
 
     def _align(self, position: float, velocity: float) -> tuple[float, float, float]:
@@ -305,6 +381,12 @@ class RetrospectiveReference:
         self._sample = 0.0
         self._sample_depth = 0.0
         self._sample_speed = 0.0
+        self._sample_deepest = 0.0
+        self._deepest = 0.0
+        self._hardware_deepest = 0.0
+        self._elapsed = 0
+        self._readings = 0
+        self._late = 0.0
         self._started = False
         self.status = OUT_OF_CONTACT
 

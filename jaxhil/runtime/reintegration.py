@@ -1,19 +1,19 @@
 """The motion that a contact should have had, integrated over again from its entry while the map improves.
 
-From depth 0 at speed 1: x' = v, v' = -f, f = F(x, v) + rho [y - F(X, V)], the bracket only as far as the
-hardware has been measured, until it separates: x <= 0, or v < 0 and f <= 0. Velocity Verlet with the damping
-implicit in the first half of a step and explicit in the second; the bracket is constant within a step: the
-mean of y less that of F at its ends. Samples are counted in ticks from the entry.
+From depth 0 at speed 1: x' = v, v' = -f, f = F(x, v, x_m) + rho [y - F(X, V, X_m)], the bracket only as far
+as the hardware has been measured, until it separates: x <= 0, or v < 0 and f <= 0; x_m and X_m are the
+deepest points so far. Velocity Verlet with the damping implicit in the first half of a step and explicit in
+the second; the bracket is constant within a step: the mean of y less that of F at its ends. Samples are
+counted in ticks from the entry.
 
 A pass from the entry makes up to `STRIDE` steps of up to `COARSE` per tick under the map that it started
 with. When it has caught up with the present it becomes the live motion, which goes on tick by tick under the
 newest map, and the next pass starts.
 """
 
-from bisect import bisect_left
 from math import floor
 
-from .force_depth_map import KNOTS, ForceDepthMap
+from .force_depth_map import REACH, Curve
 
 STRIDE = 24  # steps per tick of the pass from the entry
 COARSE = 0.002  # s, the longest step of that pass, at least a tick
@@ -21,34 +21,31 @@ HISTORY = 1024  # samples kept; a longer contact is not integrated over again
 
 
 class Path:
-    """A motion under a map that it holds, at one sample: depth [s], speed, elastic force [1/s]; of the
-    measured sample there, the force's integral since the entry [ticks/s] and the map's force [1/s]; whether
-    it has separated."""
+    """A motion under a `curve` of its own, at one sample: depth [s], speed, deepest point so far [s], force
+    without damping [1/s]; of the measured sample there, the force's integral since the entry [ticks/s] and
+    the map's force [1/s]; whether it has separated."""
 
-    __slots__ = ("at_knots", "damping", "depth", "expected", "force", "free", "impulse", "slopes", "speed")
+    __slots__ = ("curve", "deepest", "depth", "expected", "force", "free", "impulse", "speed")
 
     def __init__(self) -> None:
+        self.curve = Curve()
         self.enter()
 
     def enter(self) -> None:
         """Begin at depth 0 with speed 1."""
         self.depth = 0.0
         self.speed = 1.0
+        self.deepest = 0.0
         self.force = 0.0
         self.impulse = 0.0
         self.expected = 0.0
         self.free = False
 
-    def under(self, contact: ForceDepthMap) -> None:
-        """Take over a map as it is now."""
-        self.slopes = contact.slopes
-        self.at_knots = contact.at_knots
-        self.damping = contact.damping
-
     def take(self, other: "Path") -> None:
         """Go on from where the other is."""
         self.depth = other.depth
         self.speed = other.speed
+        self.deepest = other.deepest
         self.force = other.force
         self.impulse = other.impulse
         self.expected = other.expected
@@ -56,11 +53,12 @@ class Path:
 
 
 class ReferenceMotion:
-    """The live motion, `depth` [s] and `speed`, and the pass behind it."""
+    """The live motion, `depth` [s] and `speed`, and the pass behind it; `replay`: rho."""
 
     __slots__ = (
         "_behind",
         "_coarse",
+        "_deepest",
         "_depths",
         "_first",
         "_impulses",
@@ -69,18 +67,19 @@ class ReferenceMotion:
         "_period",
         "_present",
         "_reached",
-        "_replay",
         "_speeds",
+        "replay",
     )
 
-    def __init__(self, replay: float, period: float) -> None:
-        self._replay = replay
+    def __init__(self, period: float) -> None:
+        self.replay = 0.0
         self._period = period
         steps = COARSE / period
         self._coarse = floor(steps + 1e-9) if 1.0 < steps < HISTORY else (1 if steps <= 1.0 else HISTORY)
         self._impulses = [0.0] * HISTORY
         self._depths = [0.0] * HISTORY
         self._speeds = [0.0] * HISTORY
+        self._deepest = [0.0] * HISTORY
         self._live = Path()
         self._behind = Path()
         self.restart(0.0)
@@ -103,15 +102,17 @@ class ReferenceMotion:
         self._reached = -1
         self._behind.enter()
 
-    def remember(self, index: int, impulse: float, depth: float, speed: float) -> None:
-        """A measured sample: the force's integral since the entry [ticks/s], depth [s], speed."""
+    def remember(self, index: int, impulse: float, depth: float, speed: float, deepest: float) -> None:
+        """A measured sample: the force's integral since the entry [ticks/s], depth [s], speed, deepest
+        point so far [s]."""
         slot = index & (HISTORY - 1)
         self._impulses[slot] = impulse
         self._depths[slot] = depth
         self._speeds[slot] = speed
+        self._deepest[slot] = deepest
         self._number = index + 1
 
-    def tick(self, contact: ForceDepthMap) -> None:
+    def tick(self, curve: Curve) -> None:
         """One tick of the live motion and of the pass."""
         present = self._present + 1
         self._present = present
@@ -120,14 +121,14 @@ class ReferenceMotion:
         reached = self._reached
         if reached >= 0 or self._number <= HISTORY:
             if reached < 0:
-                behind.under(contact)
+                behind.curve.take(curve)
             reached = self._pass(behind, reached, present)
         if reached == present:
             live.take(behind)
             behind.enter()
             reached = -1
         else:
-            live.under(contact)
+            live.curve.take(curve)
             self._advance(live, present, 1.0)
         self._reached = reached
 
@@ -148,36 +149,33 @@ class ReferenceMotion:
 
     def _advance(self, path: Path, index: int, ticks: float) -> None:
         """The path to the sample `index`, over so many ticks."""
-        slopes = path.slopes
-        at_knots = path.at_knots
-        damping = path.damping
+        curve = path.curve
         missing = 0.0
         if index < self._number and ticks > 0.0:
             slot = index & (HISTORY - 1)
             impulse = self._impulses[slot]
-            depth = self._depths[slot]
-            expected = 0.0
-            if depth > 0.0:
-                segment = bisect_left(KNOTS, depth) - 1
-                expected = at_knots[segment] + slopes[segment] * (depth - KNOTS[segment])
-                expected += damping * self._speeds[slot]
-            missing = self._replay * ((impulse - path.impulse) / ticks - 0.5 * (path.expected + expected))
+            expected = curve.force(self._depths[slot], self._speeds[slot], self._deepest[slot])
+            missing = self.replay * ((impulse - path.impulse) / ticks - 0.5 * (path.expected + expected))
             path.impulse = impulse
             path.expected = expected
         duration = ticks * self._period
+        depth = path.depth
         if path.free:
-            path.depth += duration * path.speed
+            path.depth = depth + duration * path.speed
             return
         half = 0.5 * duration
-        drag = damping * half
-        middle = (path.speed - half * (path.force + missing)) / (1.0 + drag)
-        depth = path.depth + duration * middle
+        drag = curve.damping + curve.depth_damping * depth / REACH
+        middle = (path.speed - half * (path.force + missing)) / (1.0 + drag * half)
+        depth += duration * middle
+        drag = curve.damping
         force = 0.0
+        if depth > path.deepest:
+            path.deepest = depth
         if depth > 0.0:
-            segment = bisect_left(KNOTS, depth) - 1
-            force = at_knots[segment] + slopes[segment] * (depth - KNOTS[segment])
-        speed = middle - half * (force + missing) - drag * middle
+            drag += curve.depth_damping * depth / REACH
+            force = curve.elastic(depth) - curve.unloading * (path.deepest - depth)
+        speed = middle - half * (force + missing + drag * middle)
         path.depth = depth
         path.speed = speed
         path.force = force
-        path.free = depth <= 0.0 or (speed < 0.0 and force + missing + damping * speed <= 0.0)
+        path.free = depth <= 0.0 or (speed < 0.0 and force + missing + drag * speed <= 0.0)

@@ -11,33 +11,35 @@ enum {
     JAXHIL_STRIDE = 24     /* steps per tick of the pass from the entry */
 };
 
-/* A motion under a map at one sample: depth [s], speed, elastic force [1/s]; of the measured sample there, the
- * force's integral since the entry [ticks/s] and the map's force [1/s]; whether it has separated. */
+/* A motion under a curve of its own, at one sample: depth [s], speed, deepest point so far [s], force without
+ * damping [1/s]; of the measured sample there, the force's integral since the entry [ticks/s] and the map's force
+ * [1/s]; whether it has separated. */
 typedef struct {
-    double depth, speed, force, impulse, expected;
+    double depth, speed, deepest, force, impulse, expected;
     bool free;
-    jaxhil_map map;
+    jaxhil_curve curve;
 } jaxhil_path;
 
-/* From depth 0 at speed 1: x' = v, v' = -f, f = F(x, v) + rho [y - F(X, V)], the bracket only as far as the
- * hardware has been measured, until it separates. A pass from the entry makes up to JAXHIL_STRIDE steps of up to
+/* From depth 0 at speed 1: x' = v, v' = -f, f = F(x, v, x_m) + rho [y - F(X, V, X_m)], rho = `replay`, the bracket
+ * only as far as the hardware has been measured, until it separates. A pass from the entry makes up to JAXHIL_STRIDE steps of up to
  * 2 ms per tick; when it has caught up with the present it becomes the `live` motion. */
 typedef struct {
     double replay, period, first;
     long coarse, number, present, reached;
     jaxhil_path live, behind;
     double impulses[JAXHIL_HISTORY], depths[JAXHIL_HISTORY], speeds[JAXHIL_HISTORY];
+    double deepest[JAXHIL_HISTORY];
 } jaxhil_reference_motion;
 
-void jaxhil_reference_motion_init(jaxhil_reference_motion *reference, double replay, double period);
+void jaxhil_reference_motion_init(jaxhil_reference_motion *reference, double period);
 
 /* A contact whose sample 0, the next tick's, comes `first` [s] after its entry. */
 void jaxhil_reference_motion_restart(jaxhil_reference_motion *reference, double first);
 
-/* A measured sample: the force's integral since the entry [ticks/s], depth [s], speed. */
+/* A measured sample: the force's integral since the entry [ticks/s], depth [s], speed, deepest point [s]. */
 void jaxhil_reference_motion_remember(jaxhil_reference_motion *reference, long index, double impulse,
-                                      double depth, double speed);
-void jaxhil_reference_motion_tick(jaxhil_reference_motion *reference, const jaxhil_map *map);
+                                      double depth, double speed, double deepest);
+void jaxhil_reference_motion_tick(jaxhil_reference_motion *reference, const jaxhil_curve *curve);
 
 /* == Definitions == */
 
@@ -46,15 +48,16 @@ static const double jaxhil_reference_coarse = 0.002; /* s, the longest step of a
 static void jaxhil_path_enter(jaxhil_path *path) {
     path->depth = 0.0;
     path->speed = 1.0;
+    path->deepest = 0.0;
     path->force = 0.0;
     path->impulse = 0.0;
     path->expected = 0.0;
     path->free = false;
 }
 
-void jaxhil_reference_motion_init(jaxhil_reference_motion *reference, double replay, double period) {
+void jaxhil_reference_motion_init(jaxhil_reference_motion *reference, double period) {
     const double steps = jaxhil_reference_coarse / period;
-    reference->replay = replay;
+    reference->replay = 0.0;
     reference->period = period;
     /* A pass takes no longer steps than the history is long. */
     reference->coarse = JAXHIL_HISTORY;
@@ -65,6 +68,7 @@ void jaxhil_reference_motion_init(jaxhil_reference_motion *reference, double rep
         reference->impulses[slot] = 0.0;
         reference->depths[slot] = 0.0;
         reference->speeds[slot] = 0.0;
+        reference->deepest[slot] = 0.0;
     }
     jaxhil_path_enter(&reference->live);
     jaxhil_reference_motion_restart(reference, 0.0);
@@ -79,28 +83,25 @@ void jaxhil_reference_motion_restart(jaxhil_reference_motion *reference, double 
 }
 
 void jaxhil_reference_motion_remember(jaxhil_reference_motion *reference, long index, double impulse,
-                                      double depth, double speed) {
+                                      double depth, double speed, double deepest) {
     const long slot = index % JAXHIL_HISTORY;
     reference->impulses[slot] = impulse;
     reference->depths[slot] = depth;
     reference->speeds[slot] = speed;
+    reference->deepest[slot] = deepest;
     reference->number = index + 1;
 }
 
 /* The path to the sample `index`, over so many ticks. */
 static void jaxhil_reference_advance(const jaxhil_reference_motion *reference, jaxhil_path *path, long index,
                                      double ticks) {
-    const double damping = path->map.damping;
+    const jaxhil_curve *curve = &path->curve;
     double missing = 0.0;
     if (index < reference->number && ticks > 0.0) {
         const long slot = index % JAXHIL_HISTORY;
         const double impulse = reference->impulses[slot];
-        const double depth = reference->depths[slot];
-        double expected = 0.0;
-        if (depth > 0.0) {
-            expected = jaxhil_map_elastic(&path->map, depth);
-            expected += damping * reference->speeds[slot];
-        }
+        const double expected = jaxhil_curve_force(curve, reference->depths[slot], reference->speeds[slot],
+                                                   reference->deepest[slot]);
         missing =
             reference->replay * ((impulse - path->impulse) / ticks - 0.5 * (path->expected + expected));
         path->impulse = impulse;
@@ -112,15 +113,23 @@ static void jaxhil_reference_advance(const jaxhil_reference_motion *reference, j
         return;
     }
     const double half = 0.5 * duration;
-    const double drag = damping * half;
-    const double middle = (path->speed - half * (path->force + missing)) / (1.0 + drag);
+    const double before = curve->damping + curve->depth_damping * path->depth / jaxhil_map_reach;
+    const double middle = (path->speed - half * (path->force + missing)) / (1.0 + before * half);
     const double depth = path->depth + duration * middle;
-    const double force = depth > 0.0 ? jaxhil_map_elastic(&path->map, depth) : 0.0;
-    const double speed = middle - half * (force + missing) - drag * middle;
+    double drag = curve->damping;
+    double force = 0.0;
+    if (depth > path->deepest) {
+        path->deepest = depth;
+    }
+    if (depth > 0.0) {
+        drag += curve->depth_damping * depth / jaxhil_map_reach;
+        force = jaxhil_curve_elastic(curve, depth) - curve->unloading * (path->deepest - depth);
+    }
+    const double speed = middle - half * (force + missing + drag * middle);
     path->depth = depth;
     path->speed = speed;
     path->force = force;
-    path->free = depth <= 0.0 || (speed < 0.0 && force + missing + damping * speed <= 0.0);
+    path->free = depth <= 0.0 || (speed < 0.0 && force + missing + drag * speed <= 0.0);
 }
 
 static void jaxhil_reference_pass(jaxhil_reference_motion *reference) {
@@ -138,12 +147,12 @@ static void jaxhil_reference_pass(jaxhil_reference_motion *reference) {
     }
 }
 
-void jaxhil_reference_motion_tick(jaxhil_reference_motion *reference, const jaxhil_map *map) {
+void jaxhil_reference_motion_tick(jaxhil_reference_motion *reference, const jaxhil_curve *curve) {
     jaxhil_path *live = &reference->live;
     reference->present++;
     if (reference->reached >= 0 || reference->number <= JAXHIL_HISTORY) {
         if (reference->reached < 0) {
-            reference->behind.map = *map;
+            reference->behind.curve = *curve;
         }
         jaxhil_reference_pass(reference);
     }
@@ -152,7 +161,7 @@ void jaxhil_reference_motion_tick(jaxhil_reference_motion *reference, const jaxh
         jaxhil_path_enter(&reference->behind);
         reference->reached = -1;
     } else {
-        live->map = *map;
+        live->curve = *curve;
         jaxhil_reference_advance(reference, live, reference->present, 1.0);
     }
 }

@@ -2,13 +2,13 @@
 
 Scaled as in `force_depth_map`: the reference enters at depth 0 with speed 1 and obeys
 
-    x' = v,    v' = -f,    f = F(x, v) + rho [y - F(X, V)]
+    x' = v,    v' = -f,    f = F(x, v, x_m) + rho [y - F(X, V, X_m)]
 
 with the bracket only as far as the hardware has been measured, until it separates: x <= 0, or v < 0 and
-f <= 0. It is stepped by the velocity Verlet scheme, the damping implicit in the first half of a step and
-explicit in the second (order 2), the bracket constant within a step: the mean of y less that of F at its
-ends. Samples are counted in ticks from the reference's entry; measured ones are moved to that grid by
-straight lines, such that the hardware's own entry falls on the reference's.
+f <= 0; x_m and X_m are the deepest points so far. It is stepped by the velocity Verlet scheme, the damping
+implicit in the first half of a step and explicit in the second (order 2), the bracket constant within a step:
+the mean of y less that of F at its ends. Samples are counted in ticks from the reference's entry; measured
+ones are moved to that grid by straight lines, such that the hardware's own entry falls on the reference's.
 
 A pass from the entry makes up to `STRIDE` steps of up to `COARSE` per tick, under the map that it started
 with. When it has caught up with the present it becomes the live reference, which goes on tick by tick under
@@ -23,20 +23,23 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxhil.compensators.force_depth_map import elastic
+from jaxhil.compensators.force_depth_map import REACH, Curve, elastic
+from jaxhil.compensators.force_depth_map import force as force_of
 from jaxhil.ring import write
 
 STRIDE = 24  # steps per tick of the pass from the entry
 COARSE = 0.002  # s, the longest step of that pass, at least a tick
-HISTORY = 512
+HISTORY = 1024  # samples kept; a longer contact is not integrated over again
 
 
 class Motion(NamedTuple):
-    """Depth [s], speed [1] and elastic force [1/s]; of the measured sample there, the force's integral since
-    the entry [ticks/s] and the map's force [1/s]; whether (1) it has separated."""
+    """Depth [s], speed [1], deepest point so far [s], force without damping [1/s]; of the measured sample
+    there, the force's integral since the entry [ticks/s] and the map's force [1/s]; whether (1) it has
+    separated."""
 
     depth: Float[Array, "*batch"]
     speed: Float[Array, "*batch"]
+    deepest: Float[Array, "*batch"]
     force: Float[Array, "*batch"]
     impulse: Float[Array, "*batch"]
     expected: Float[Array, "*batch"]
@@ -45,54 +48,59 @@ class Motion(NamedTuple):
 
 class History(NamedTuple):
     """Ring of measured samples on the reference's grid, by the tick at which each came: integral of y since
-    the entry [ticks/s], depth X [s], speed V [1]; the tick at which sample 0 came, how many have come."""
+    the entry [ticks/s], depth X [s], speed V [1], deepest point X_m [s]; the tick at which sample 0 came, how
+    many have come."""
 
-    ring: Float[Array, "samples 3 *batch"]
+    ring: Float[Array, "samples 4 *batch"]
     origin: Int[Array, "*batch"]
     number: Int[Array, "*batch"]
 
 
 class Reference(NamedTuple):
-    """The live motion; the pass under way, the sample that it has reached (-1: the entry) and its map."""
+    """The live motion; the pass under way, the sample that it has reached (-1: the entry), its map."""
 
     live: Motion
     behind: Motion
     reached: Int[Array, "*batch"]
-    theta: Float[Array, "parameters *batch"]
+    curve: Curve
 
 
 def entry(like: Array) -> Motion:
     """Depth 0, speed 1, no force."""
     zeros = jnp.zeros_like(like)
-    return Motion(zeros, zeros + 1, zeros, zeros, zeros, zeros)
+    return Motion(zeros, zeros + 1, zeros, zeros, zeros, zeros, zeros)
 
 
 def no_history(like: Array) -> History:
     """Nothing measured yet."""
     counts = jnp.zeros(like.shape, jnp.int32)
-    return History(jnp.zeros((HISTORY, 3, *like.shape), like.dtype), counts, counts)
+    return History(jnp.zeros((HISTORY, 4, *like.shape), like.dtype), counts, counts)
 
 
-def remember(history: History, tick: Array, sample: Array) -> Float[Array, "samples 3 *batch"]:
-    """The ring with the sample (3, *batch) of this tick in it."""
+def remember(history: History, tick: Array, sample: Array) -> Float[Array, "samples 4 *batch"]:
+    """The ring with the sample (4, *batch) of this tick in it."""
     return write(history.ring, tick, sample)
 
 
 def follow(
     old: Reference,
-    theta: Array,
+    curve: Curve,
     history: History,
     replay: Array,
     first: Array,
     period: Array,
     present: Int[Array, "*batch"],
 ) -> Reference:
-    """One tick of the live motion, to the sample `present` (0 at the first tick in contact), and of the pass.
+    """One tick of the live motion, to the sample `present` (0 at the first tick in contact, where all starts
+    afresh), and of the pass.
 
-    theta ends with the damping that counts; `first` [s] is the time from the entry to sample 0.
+    `replay` is rho, `first` [s] the time from the entry to sample 0.
     """
-    starts = old.reached < 0
-    theta_behind = jnp.where(starts[None], theta, old.theta)
+    starts = (old.reached < 0) | (present == 0)
+    old = old._replace(
+        behind=_choose(starts, entry(period), old.behind), reached=jnp.where(starts, -1, old.reached)
+    )
+    curve_behind = _choose(starts, curve, old.curve)
     may_start = history.number <= HISTORY
 
     def recall(index):
@@ -101,25 +109,31 @@ def follow(
         taken = jnp.take_along_axis(history.ring, slot[None, None], axis=0, mode="promise_in_bounds")[0]
         return taken, (index >= 0) & (index < history.number)
 
-    def advance(theta, motion, index, ticks):
-        (impulse, hardware_depth, hardware_speed), known = recall(index)
+    def advance(curve, motion, index, ticks):
+        (impulse, *hardware), known = recall(index)
         known = known & (ticks > 0)
-        expected = elastic(theta[:-1], hardware_depth)
-        expected = expected + jnp.where(hardware_depth > 0, theta[-1] * hardware_speed, 0)
+        expected = force_of(curve, *hardware)
         missing = (impulse - motion.impulse) / jnp.where(known, ticks, 1) - 0.5 * (motion.expected + expected)
         missing = jnp.where(known, replay * missing, 0)
         duration = ticks * period
         half = 0.5 * duration
         push = jnp.where(motion.free > 0, 0, 1)
-        drag = theta[-1] * half * push
+
+        def damping(depth):
+            return curve.damping + curve.depth_damping * jnp.where(depth > 0, depth, 0) / REACH
+
+        drag = damping(motion.depth) * half * push
         middle = (motion.speed - half * push * (motion.force + missing)) / (1 + drag)
         depth = motion.depth + duration * middle
-        force = elastic(theta[:-1], depth)
-        speed = middle - push * half * (force + missing) - drag * middle
-        free = (depth <= 0) | ((speed < 0) & (force + missing + theta[-1] * speed <= 0))
+        deeper = (depth > motion.deepest) & (push > 0)
+        deepest = jnp.where(deeper, depth, motion.deepest)
+        force = jnp.where(depth > 0, elastic(curve.slopes, depth) - curve.unloading * (deepest - depth), 0)
+        dragging = damping(depth)
+        speed = middle - push * half * (force + missing + dragging * middle)
+        free = (depth <= 0) | ((speed < 0) & (force + missing + dragging * speed <= 0))
         free = (motion.free > 0) | free
         kept = (jnp.where(known, impulse, motion.impulse), jnp.where(known, expected, motion.expected))
-        return Motion(depth, speed, force, *kept, free.astype(depth.dtype))
+        return Motion(depth, speed, deepest, force, *kept, free.astype(depth.dtype))
 
     coarse = jnp.clip(jnp.floor(COARSE / period + 1e-9), 1, HISTORY).astype(jnp.int32)
 
@@ -129,23 +143,28 @@ def follow(
         jump = jnp.where((reached >= 0) & (present - reached >= coarse), coarse, 1)
         index = reached + jump
         ticks = jnp.where(reached < 0, first / period, jump.astype(period.dtype))
-        moved = advance(theta_behind, motion, index, ticks)
+        moved = advance(curve_behind, motion, index, ticks)
         chosen = jax.tree.map(lambda a, b: jnp.where(ahead, a, b), moved, motion)
         return Motion(*chosen), jnp.where(ahead, index, reached)
 
     behind, reached = lax.fori_loop(0, STRIDE, one, (old.behind, old.reached))
-    live = advance(theta, old.live, present, jnp.ones_like(period))
+    live = advance(curve, old.live, present, jnp.ones_like(period))
     held = starts & ~may_start
     behind = _choose(held, old.behind, behind)
     reached = jnp.where(held, old.reached, reached)
     done = reached == present
     return Reference(
         _choose(done, behind, live),
-        _choose(done, entry(period), behind),
+        behind,
         jnp.where(done, -1, reached),
-        theta_behind,
+        curve_behind,
     )
 
 
 def _choose(condition, when_true, when_false):
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), when_true, when_false)
+    """Lane by lane; leaves may have a leading axis."""
+
+    def choose(a, b):
+        return jnp.where(condition if a.ndim == condition.ndim else condition[None], a, b)
+
+    return jax.tree.map(choose, when_true, when_false)
