@@ -12,6 +12,8 @@ from jax.sharding import AxisType, PartitionSpec
 from jaxhil.contact import LAWS, HuntCrossley, KelvinVoigt
 from tuning import programs
 
+pytestmark = pytest.mark.users_options
+
 
 class Sums(NamedTuple):
     total: jax.Array
