@@ -37,3 +37,8 @@ def compile_quickly(quick: bool) -> None:
     if quick != _quick:
         jax.clear_caches()
         _quick = quick
+
+
+def overridden() -> dict[str, object]:
+    """Of the users' options, those that a program compiled now would have otherwise."""
+    return dict(compiler.get_compile_options(1, 1).env_option_overrides)

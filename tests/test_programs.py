@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import overridden
 from jax.sharding import AxisType, PartitionSpec
 
 from jaxhil.contact import LAWS, HuntCrossley, KelvinVoigt
@@ -51,6 +52,10 @@ def run(folder, static=STATIC, arguments=VALUES):
     programs._program.cache_clear()
     result = programs.run(sums, static, arguments, folder)
     return float(result.total), np.asarray(result.parts)
+
+
+def test_these_are_the_programs_that_users_run():
+    assert overridden() == {}
 
 
 def test_a_program_is_traced_once_and_gives_the_same_numbers(tmp_path):
