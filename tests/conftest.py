@@ -1,13 +1,14 @@
-"""What every test runs under: float64, strict promotion, two host devices, checked shapes. The command line,
-as tests call it."""
+"""What every test runs under: float64, strict promotion, two host devices, checked shapes, quick compilation.
+The command line, as tests call it."""
 
+import gc
 import json
 import os
 from typing import NamedTuple
 
 from tuning.environment import settings
 
-# The programs tested are those that users run, on two devices wherever the tests run.
+# Two devices wherever the tests run, and otherwise what users have.
 os.environ["XLA_FLAGS"] = settings(
     {"XLA_FLAGS": os.environ.get("XLA_FLAGS", "--xla_force_host_platform_device_count=2")}
 )["XLA_FLAGS"]
@@ -16,6 +17,7 @@ os.environ["NPROC"] = settings(os.environ)["NPROC"]
 import hypothesis
 import jax
 import pytest
+from compiling import compile_quickly
 from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
@@ -43,6 +45,20 @@ install_import_hook([f"jaxhil.{name}" for name in ARRAY_MODULES], "beartype.bear
 # A shared machine has no deadlines to keep, and a test that fails must fail again.
 hypothesis.settings.register_profile("jaxhil", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("jaxhil")
+
+# As in a command: tracing makes objects by the million, few of them in cycles.
+gc.set_threshold(100_000, 50, 50)
+
+
+def pytest_collection_modifyitems(items):
+    """Modules of a kind side by side, so that they share the programs of single operations."""
+    items.sort(key=lambda item: item.get_closest_marker("users_options") is None)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compiled(request):
+    everyday = "not slow" in request.config.option.markexpr
+    compile_quickly(everyday and request.node.get_closest_marker("users_options") is None)
 
 
 class Ran(NamedTuple):

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from compiling import QUICK
 
 from jaxhil.building import build_loop
 from jaxhil.compensators import COMPENSATORS
@@ -20,13 +21,6 @@ PERIOD = 2e-3  # coarse: errors of arithmetic show, and the oracle is quick
 MASS, VELOCITY, STIFFNESS = 350.0, 0.005, 124355.0
 IDEAL = {"model": "ideal"}
 SECOND_ORDER = {"model": "second_order", "natural_frequency": 12.0, "damping_ratio": 0.8, "delay": 0.0037}
-
-# A test's program runs once: less optimisation, a quarter of the time to compile.
-QUICK = {
-    "xla_backend_optimization_level": 0,
-    "xla_llvm_disable_expensive_passes": True,
-    "xla_cpu_use_fusion_emitters": False,
-}
 
 run_rollout = jax.jit(rollout, static_argnums=0, compiler_options=QUICK)
 run_record = jax.jit(record, static_argnums=(0, 3), compiler_options=QUICK)

@@ -31,6 +31,8 @@ from tuning.gain_file import build_document, check_document
 from tuning.recording import Lane, nominal_and_draws, record_lanes
 from tuning.verification import REPLAY_LIMIT, LaneReplay, replay
 
+pytestmark = pytest.mark.users_options
+
 RING = 256  # samples, more than any identification delay at the shortest period
 MECHANISMS = [
     load(name, [f"rig.control_period={period}"]).mechanism

@@ -12,6 +12,8 @@ from jaxhil.scenario import build_scenarios
 from jaxhil.uncertainty import draw
 from tuning.tune import neutral_gains
 
+pytestmark = pytest.mark.users_options
+
 
 def setting(compensator="response_error", lanes=40, name="varying", seed=1, overrides=()):
     mechanism = load(name, overrides).mechanism

@@ -16,7 +16,7 @@ from tuning.rig import bundle, vectors
 from tuning.rig.bundle import build_bundle, check_target, with_limits, write_bundle
 from tuning.rig.writers import WRITERS
 
-pytestmark = pytest.mark.usefixtures("no_cache")
+pytestmark = [pytest.mark.usefixtures("no_cache"), pytest.mark.users_options]
 
 ALWAYS = {
     *("gains.json", "jaxhil_runtime.py", "vectors.csv", "selftest.py", "manifest.json", "README.md"),

@@ -7,10 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import overridden
 from jax.sharding import AxisType, PartitionSpec
 
 from jaxhil.contact import LAWS, HuntCrossley, KelvinVoigt
 from tuning import programs
+
+pytestmark = pytest.mark.users_options
 
 
 class Sums(NamedTuple):
@@ -49,6 +52,10 @@ def run(folder, static=STATIC, arguments=VALUES):
     programs._program.cache_clear()
     result = programs.run(sums, static, arguments, folder)
     return float(result.total), np.asarray(result.parts)
+
+
+def test_these_are_the_programs_that_users_run():
+    assert overridden() == {}
 
 
 def test_a_program_is_traced_once_and_gives_the_same_numbers(tmp_path):

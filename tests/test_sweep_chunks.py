@@ -9,6 +9,8 @@ from tuning.sweeps.columns import OUTCOMES
 from tuning.sweeps.replay import replay
 from tuning.sweeps.store import open_store, same_rows, write_part
 
+pytestmark = pytest.mark.users_options
+
 
 def joined(pieces):
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}

@@ -21,6 +21,8 @@ from tuning.sweeps.run import compare_precisions, describe_outcomes, run_sweep
 from tuning.sweeps.store import open_store, read_part, read_store, same_rows
 from tuning.verdict import Running, enough, updated
 
+pytestmark = pytest.mark.users_options
+
 MANIFEST = manifest(case(), scenarios=300, limit=1.5)
 HERE = Path(__file__).parent
 

@@ -18,6 +18,8 @@ from tuning.rig import selftest
 from tuning.rig.bundle import with_limits
 from tuning.rig.vectors import BEGINS, NEXT_CONTACT, Row, as_csv, make_vectors, one_rig
 
+pytestmark = pytest.mark.users_options
+
 LIMITS = {"held_readings": 3.0, "missed_in_a_row": 3.0, "limited_in_a_row": 3.0, "force_limit": 500.0}
 
 

@@ -15,6 +15,8 @@ from tuning.gain_file import build_document, check_document
 from tuning.recording import Lane, nominal_and_draws, record_lanes
 from tuning.verification import near_threshold, replay, replayed, verify
 
+pytestmark = pytest.mark.users_options
+
 
 def loaded_gains(mechanism_name, compensator, overrides=(), **changes):
     mechanism, sha256, _ = load(mechanism_name, overrides)
