@@ -12,7 +12,7 @@ from lanes import mechanism as plain_mechanism
 from scipy import stats
 
 from jaxhil.building import build_loop
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.compensators import COMPENSATORS, literature_gains
 from jaxhil.compensators import force_depth_map as in_jax
 from jaxhil.compensators.reintegration import HISTORY
 from jaxhil.evaluation import compare_with_reference
@@ -251,6 +251,28 @@ def test_errors_of_the_standard_suites(suite):
     error = 100 * np.asarray(outcome.error)[0]
     print(suite, np.sqrt(np.mean(error**2)), np.max(np.abs(error)))
     assert np.sqrt(np.mean(error**2)) < rms and np.max(np.abs(error)) < worst
+
+
+def test_settings_are_gains_within_bounds_and_gentle_commands_less():
+    mechanism = load("suite-layered").mechanism
+    law = COMPENSATORS[NAME]
+    assert list(law.settings) == ["sharp", "gentle"]
+    assert literature_gains(mechanism, NAME, "sharp") == literature_gains(mechanism, NAME)
+    peaks = {}
+    scenario = join([build_scenarios(mechanism, draw(mechanism, 64, 3), 3)])
+    loop = build_loop(mechanism, NAME, scenario)
+    for name, chosen in law.settings.items():
+        gains = literature_gains(mechanism, NAME, name)
+        assert gains.items() >= chosen.items() and set(gains) == {gain.name for gain in law.gains}
+        outcome = compare_with_reference(loop, scenario, run_rollout(loop, as_arrays(gains), scenario))
+        peaks[name] = np.percentile(np.asarray(outcome.peak_ratio)[0], 99)
+        assert np.sqrt(np.mean(np.asarray(outcome.error)[0] ** 2)) < 0.005
+    assert peaks["gentle"] < 2.0 < peaks["sharp"] < 3.5
+    # A slow rig gets no more than its period allows.
+    slow = load("suite-layered", ["rig.control_period=0.008"]).mechanism
+    assert literature_gains(slow, NAME, "gentle")["velocity_gain"] == pytest.approx(125.0)
+    with pytest.raises(KeyError):
+        literature_gains(mechanism, "phase_lead", "gentle")
 
 
 def test_derivatives_against_differences():

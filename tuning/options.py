@@ -46,6 +46,16 @@ def number(text: str):
     return arg(metavar="NUMBER", help=text)
 
 
+Setting = Annotated[
+    str | None,
+    arg(
+        metavar="NAME",
+        help="Take the compensator's gains for any mechanism: gentle or sharp, of retrospective_reference.",
+        help_behavior_hint="",
+    ),
+]
+
+
 @dataclass(frozen=True)
 class Simulate:
     """Run the contacts once; per contact restitution, reference, error, peak force, duration.
@@ -60,6 +70,7 @@ class Simulate:
         str | None,
         arg(metavar="NAME", help="Compensator, at the literature's gains; 'none' by default."),
     ] = None
+    setting: Setting = None
     gains: Annotated[
         str | None,
         arg(metavar="GAINS", help="Gain file: its compensator and gains and, without FILE, its mechanism."),
@@ -85,6 +96,7 @@ class Tune:
 
     files: Files = ()
     compensator: Annotated[str, arg(metavar="NAME", help="Compensator to tune.")] = "response_error"
+    setting: Setting = None
     output: Annotated[str, arg(aliases=("-o",), metavar="DIR", help="Folder for what is written.")] = (
         "jaxhil-out"
     )

@@ -32,8 +32,9 @@ SCENARIOS, NOISY_SCENARIOS = 32, 128  # to tune on, without and with sensor nois
 
 @dataclass(frozen=True)
 class Task:
-    """A mechanism to tune: the compensator's literature gains, the scenarios to tune on and their loop; the
-    form that scenarios and loop are brought to, if it shares a program with unlike mechanisms."""
+    """A mechanism to tune: the compensator's literature gains, or those of a setting, the scenarios to tune
+    on and their loop; the form that scenarios and loop are brought to, if it shares a program with unlike
+    mechanisms."""
 
     mechanism: Mechanism
     compensator: str
@@ -49,7 +50,12 @@ class Task:
 
 
 def build_task(
-    mechanism: Mechanism, compensator: str, scenarios: int | None, seed: int, form: Form | None = None
+    mechanism: Mechanism,
+    compensator: str,
+    scenarios: int | None,
+    seed: int,
+    form: Form | None = None,
+    setting: str | None = None,
 ) -> Task:
     """Training scenarios are quasi-random: they fill the range evenly. Their contacts must end in time.
 
@@ -62,7 +68,8 @@ def build_task(
     batch = batch._replace(time_limit=np.asarray(_patience(loop.law, batch)))
     if form is not None:
         batch, loop = form.scenarios(mechanism, batch), form.loop(loop)
-    return Task(mechanism, compensator, literature_gains(mechanism, compensator), batch, loop, form)
+    gains = literature_gains(mechanism, compensator, setting)
+    return Task(mechanism, compensator, gains, batch, loop, form)
 
 
 def has_sensor_noise(mechanism: Mechanism) -> bool:

@@ -30,7 +30,7 @@ class Settings:
     """Numbers of scenarios to tune on (None: `tuning.problems` knows), of starts of a lot
     (`tuning.finding`), of solver steps, of scenarios to judge on; the seed; what to minimise; evaluations
     without derivatives at the end, for each gain; whether to search the whole box for something better;
-    points looked at before a lot of starts."""
+    points looked at before a lot of starts; a setting of the compensator that is only judged, as it is."""
 
     scenarios: int | None = None
     starts: int = 4
@@ -41,6 +41,7 @@ class Settings:
     polish: int = 160
     certify: bool = False
     scanned: int = SCANNED
+    setting: str | None = None
 
 
 class Figures(NamedTuple):
@@ -120,7 +121,10 @@ def tune_all(
     are those of the nearest that an earlier block found: in the places of the last other starts, never of the
     literature's. Unlike mechanisms of one `form` are tuned together in it.
     """
-    tasks = [build_task(m, compensator, settings.scenarios, settings.seed, form) for m in mechanisms]
+    tasks = [
+        build_task(m, compensator, settings.scenarios, settings.seed, form, settings.setting)
+        for m in mechanisms
+    ]
     found: list[Tuned] = []
     for group in alike([task.loop for task in tasks], [task.scenarios for task in tasks]):
         for begin in range(0, len(group), BLOCK):
@@ -148,7 +152,7 @@ def _tune_block(
         "literature": [task.literature for task in tasks],
     }
     found = [Found(None, [], 0) for _ in tasks]
-    if any(task.tuned for task in tasks):
+    if settings.setting is None and any(task.tuned for task in tasks):
         number = len(tasks[0].scenarios.velocity)
         report(f"{name}: tuning {compensator} on {number} scenarios each")
         first = [
@@ -173,7 +177,7 @@ def _tune_block(
     outcomes["tuned"] = trial.judge(best)
     clock.lap("judge")
     certificates: list[Certified | None] = [None for _ in tasks]
-    if settings.certify:
+    if settings.certify and settings.setting is None:
         certificates = _certify(trial, settings, found, lambda text: report(f"{name}: {text}"))
         clock.lap("certify")
     results = []

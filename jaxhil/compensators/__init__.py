@@ -23,9 +23,21 @@ def _law(name: str) -> Compensator:
 COMPENSATORS: dict[str, Compensator] = {name: _law(name) for name in LAWS}
 
 
-def literature_gains(mechanism: Mechanism, compensator: str) -> dict[str, float]:
-    """What the literature's rules set the gains of a compensator to, for a mechanism."""
-    return {gain.name: float(gain.nominal(mechanism)) for gain in COMPENSATORS[compensator].gains}
+def literature_gains(mechanism: Mechanism, compensator: str, setting: str | None = None) -> dict[str, float]:
+    """What the literature's rules set the gains of a compensator to, for a mechanism; or one of its settings,
+    within the bounds that the mechanism has for it.
+
+    Raises KeyError for a setting that the compensator does not have.
+    """
+    law = COMPENSATORS[compensator]
+    chosen = law.settings[setting] if setting is not None else {}
+    found = {}
+    for gain in law.gains:
+        value = float(gain.nominal(mechanism))
+        if gain.name in chosen:
+            value = min(max(float(gain.lower(mechanism)), chosen[gain.name]), float(gain.upper(mechanism)))
+        found[gain.name] = value
+    return found
 
 
 __all__ = ["COMPENSATORS", "Compensator", "Constants", "Gain", "Gains", "Signals", "literature_gains"]

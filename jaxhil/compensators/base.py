@@ -6,8 +6,9 @@ unit, bounds and the literature's rule: that list is what tuning, gain files and
 """
 
 import abc
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -65,6 +66,8 @@ class Compensator(eqx.Module):
     # What it must be told of mechanism and rig beforehand, in the words of `estimates`.
     knows: eqx.AbstractClassVar[tuple[str, ...]]
     gains: eqx.AbstractClassVar[tuple[Gain, ...]]
+    # Sets of gains that serve any mechanism, by name: those that differ from the nominal ones.
+    settings: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType({})
 
     def prepare(self, gains: Gains, constants: Constants) -> Any:
         """What `step` needs of the gains, worked out once per run; the gains themselves by default."""

@@ -24,6 +24,7 @@ noise's standard deviation s is not small, less of the bracket of `reintegration
 rho = force_replay/(1 + (s/replay_noise)^2).
 """
 
+from collections.abc import Mapping
 from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
@@ -64,15 +65,46 @@ from jaxhil.ring import tie
 FAREWELL = 0.006
 LONGEST_LAG = 0.1  # s for which it waits for hardware that has not touched yet
 
+# Two sets of gains for any mechanism, each judged on linear, damped, Hertzian, hardening and layered contact
+# of 1.5 to 5 Hz at once. Sharp, the nominal one, was found by CMA-ES with errors under other dissipation, of
+# contact of 5 to 10 Hz and with the published rig's noise and dead zone in its objective. Gentle, by hand from
+# there, commands less, at the price of twice the error with that noise.
+SHARP = {
+    "prior_stiffness": 9.563,
+    "prior_stiffness_spread": 35.8,
+    "prior_slope_spread": 29.17,
+    "prior_damping_spread": 1.912,
+    "prior_depth_damping_spread": 0.03103,
+    "prior_unloading_spread": 0.1607,
+    "force_noise_floor": 0.01091,
+    "velocity_gain": 174.6,
+    "correction_limit": 0.9,
+    "replay_noise": 0.7679,
+}
+GENTLE = {
+    "prior_stiffness": 9.563,
+    "prior_stiffness_spread": 28.69,
+    "prior_slope_spread": 29.17,
+    "prior_damping_spread": 6.5,
+    "prior_depth_damping_spread": 0.05,
+    "prior_unloading_spread": 0.1607,
+    "force_noise_floor": 0.05,
+    "velocity_gain": 200.0,
+    "correction_limit": 0.46,
+    "replay_noise": 0.6,
+}
+
 
 def _fact(mechanism) -> bool:
     """Of gains that are known beforehand or chosen, not tuned."""
     return False
 
 
-def _prior(name: str, unit: str, lower: float, upper: float, nominal: float) -> Gain:
+def _prior(name: str, unit: str, lower: float, upper: float, tuned: bool = True) -> Gain:
     """A gain that no mechanism's numbers enter: what it scales is scaled by approach speed and mass."""
-    return Gain(name, unit, lambda m: lower, lambda m: upper, lambda m: nominal, logarithmic=True)
+    return Gain(
+        name, unit, lambda m: lower, lambda m: upper, lambda m: SHARP[name], True, tuned=lambda m: tuned
+    )
 
 
 class Aligned(NamedTuple):
@@ -131,6 +163,7 @@ class RetrospectiveReference(Compensator):
 
     name: ClassVar[str] = "retrospective_reference"
     knows: ClassVar[tuple[str, ...]] = (EQUIVALENT_MASS, FORCE_DELAY, FORCE_NOISE, DEAD_ZONE)
+    settings: ClassVar[Mapping[str, Mapping[str, float]]] = {"sharp": SHARP, "gentle": GENTLE}
     gains: ClassVar[tuple[Gain, ...]] = (
         Gain(
             "equivalent_mass", "kg", lambda m: 0.1 * m.bodies.mass, lambda m: 10 * m.bodies.mass,
@@ -148,20 +181,21 @@ class RetrospectiveReference(Compensator):
             "dead_zone", "N", lambda m: 0.0, lambda m: 2 * m.rig.force_sensor.dead_zone + typical_peak(m),
             lambda m: m.rig.force_sensor.dead_zone, tuned=_fact,
         ),
-        _prior("prior_stiffness", "1/s^2", 0.1, 1e3, 9.563),
-        _prior("prior_stiffness_spread", "1/s^2", 1.0, 5e3, 35.8),
-        _prior("prior_slope_spread", "1/s^2", 0.1, 5e3, 29.17),
-        _prior("prior_damping_spread", "1/s", 0.01, 50.0, 1.912),
-        _prior("prior_depth_damping_spread", "1/s", 1e-4, 50.0, 0.03103),
-        _prior("prior_unloading_spread", "1/s^2", 1e-4, 5e3, 0.1607),
-        _prior("force_noise_floor", "1/s", 1e-4, 10.0, 0.01091),
+        _prior("prior_stiffness", "1/s^2", 0.1, 1e3),
+        _prior("prior_stiffness_spread", "1/s^2", 1.0, 5e3),
+        _prior("prior_slope_spread", "1/s^2", 0.1, 5e3),
+        _prior("prior_damping_spread", "1/s", 0.01, 50.0),
+        _prior("prior_depth_damping_spread", "1/s", 1e-4, 50.0),
+        _prior("prior_unloading_spread", "1/s^2", 1e-4, 5e3),
+        _prior("force_noise_floor", "1/s", 1e-4, 10.0),
         Gain(
             "velocity_gain", "1/s", lambda m: 1.0, lambda m: 1 / m.rig.control_period,
-            lambda m: min(174.6, 0.7 / m.rig.control_period), logarithmic=True,
+            lambda m: min(SHARP["velocity_gain"], 0.7 / m.rig.control_period), logarithmic=True,
         ),
-        _prior("correction_limit", "1", 0.01, 20.0, 0.6394),
+        _prior("correction_limit", "1", 0.01, 20.0),
+        # Neither is tuned: what is replayed is what makes it a test of the hardware, whatever that errs by.
         Gain("force_replay", "1", lambda m: 0.0, lambda m: 1.0, lambda m: 1.0, tuned=_fact),
-        _prior("replay_noise", "1/s", 0.01, 100.0, 0.7679),
+        _prior("replay_noise", "1/s", 0.01, 100.0, tuned=False),
     )  # fmt: skip
 
     def prepare(self, gains, constants):

@@ -22,6 +22,18 @@ def one_of(allowed: Sequence[str], **options: str) -> None:
             raise InputError(f"--{name}: found {shown(value)}, allowed {', '.join(allowed)}")
 
 
+def setting(compensator: str, value: str | None) -> None:
+    """The compensator has a setting of that name. Starts jax."""
+    if value is None:
+        return
+    from jaxhil.compensators import COMPENSATORS
+
+    names = COMPENSATORS[compensator].settings
+    if value not in names:
+        allowed = ", ".join(names) or f"none, {compensator} has no settings"
+        raise InputError(f"--setting: found {shown(value)}, allowed {allowed}")
+
+
 def limit(value: float) -> None:
     """A limit is a number >= 0."""
     if math.isnan(value) or value < 0:

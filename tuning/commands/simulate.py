@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from jaxhil.errors import InputError, one_line
+from jaxhil.errors import InputError, one_line, shown
 from jaxhil.mechanism import Mechanism
 from jaxhil.mechanism_file import from_builtins, load, to_builtins
 from jaxhil.mechanism_overrides import apply_override, parse_override
@@ -107,10 +107,13 @@ def _gains(options: Simulate, mechanism: Mechanism | None) -> tuple[Mechanism, s
     if options.gains is None:
         assert mechanism is not None
         compensator = options.compensator or "none"
-        return mechanism, compensator, literature_gains(mechanism, compensator)
+        checks.setting(compensator, options.setting)
+        return mechanism, compensator, literature_gains(mechanism, compensator, options.setting)
 
     from tuning.gain_file import load_gain_file
 
+    if options.setting is not None:
+        raise InputError(f"--setting: found {shown(options.setting)}, allowed none beside a gain file")
     loaded = load_gain_file(options.gains)
     label = one_line(options.gains)
     if options.compensator not in (None, loaded.compensator):

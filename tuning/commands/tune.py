@@ -26,6 +26,9 @@ def run(options: Tune) -> int:
     checks.compensator(options.compensator)
     tune_pareto.check(options)
     known = _known(options)
+    if options.setting is not None:
+        prepare()
+        checks.setting(options.compensator, options.setting)
     loaded, problems = _load(options)
     entries, interrupted = [], False
     if loaded:
@@ -134,6 +137,7 @@ def _tune_all(
         options.seed,
         _objective(options),
         certify=options.certify,
+        setting=options.setting,
     )
     mechanisms = [one.mechanism for one in loaded]
     entries, done, traded = {}, {}, {}

@@ -36,8 +36,8 @@ class Settings:
 
 
 class LawFigures(NamedTuple):
-    """Of one law on one mechanism: gains by "literature" and "tuned", and what is said of each. A law that
-    has no gains to tune is only there with the literature's."""
+    """Of one law on one mechanism: gains by "literature", names of settings and "tuned", and what is said of
+    each. A law that has no gains to tune is only there with the literature's."""
 
     law: str
     mechanism: str
@@ -109,7 +109,15 @@ def judge_law(scenes: list[Any], law: str, settings: Settings) -> list[LawFigure
     from tuning.tune import tune_all
 
     mechanisms = [scene.mechanism for scene in scenes]
-    gains = [{LITERATURE: literature_gains(mechanism, law)} for mechanism in mechanisms]
+    others = [
+        name
+        for name in COMPENSATORS[law].settings
+        if any(literature_gains(one, law, name) != literature_gains(one, law) for one in mechanisms)
+    ]
+    gains = [
+        {which or LITERATURE: literature_gains(mechanism, law, which) for which in (None, *others)}
+        for mechanism in mechanisms
+    ]
     if any(gain.tuned(mechanism) for gain in COMPENSATORS[law].gains for mechanism in mechanisms):
         tuning = Tuning(
             settings.scenarios,

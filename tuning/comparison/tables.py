@@ -44,7 +44,7 @@ def mechanism_table(name: str, found: Sequence[LawFigures]) -> Table:
             own = figures is best(one)
             rows.append(
                 [
-                    one.law if which == LITERATURE else "  tuned",
+                    one.law if which == LITERATURE else f"  {which}",
                     *(shown(key, figures[key], own and won[key] == one.law) for key in HEADINGS),
                 ]
             )
