@@ -10,6 +10,8 @@ from tuning.sweeps.chunks import build_sweep, run_chunk
 from tuning.sweeps.studies import NOISE, error_drivers, rare_failure, run_points, spread_beyond_formula
 from tuning.sweeps.tally import add_rows, empty_tally, error_sizes, failure_probability
 
+pytestmark = pytest.mark.users_options
+
 # Of a linear contact the error does not depend on how fast it is entered.
 IDLE = {"approach.velocity": {"distribution": "uniform", "factor": [0.5, 2.0]}}
 
