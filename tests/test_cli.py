@@ -300,6 +300,13 @@ def test_gains_that_do_not_fit_are_refused(jaxhil, tuned):
         (["simulate", "--set", "approach.speed=1"], ["approach.speed", "unknown key"]),
         (["simulate", "--compensator", "magic"], ["magic", "none, phase_lead, multi_parameter_lead"]),
         (["simulate", "--gains", "nowhere.json"], ["nowhere.json"]),
+        (
+            ["simulate", "--compensator", "phase_lead", "--setting", "sharp"],
+            ["sharp", "none, phase_lead has"],
+        ),
+        (["simulate", "--compensator", "retrospective_reference", "--setting", "x"], ["x", "sharp, gentle"]),
+        (["simulate", "--gains", "x.json", "--setting", "sharp"], ["--setting", "none beside a gain file"]),
+        (["tune", "--setting", "sharp"], ["--setting", "sharp", "none, response_error has"]),
         (["simulate", "--limit", "nan"], ["--limit"]),
         (["simulate", "--plot=plot.doc"], ["--plot", "plot.doc", ".png"]),
         (["simulate", "--seed", "-1"], ["--seed", "-1"]),

@@ -1,5 +1,7 @@
 """Tuning end to end on small settings: better than the literature on scenarios it never saw."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -90,6 +92,15 @@ def test_a_compensator_without_gains_is_judged_only():
     result = tune(load().mechanism, "none", SMALL)
     assert result.starts == [] and result.gains == {}
     assert result.figures["before"] == result.figures["tuned"]
+
+
+def test_a_setting_is_judged_as_it_is(monkeypatch):
+    law = COMPENSATORS["phase_lead"]
+    monkeypatch.setattr(type(law), "settings", {"mild": {"phase_lead": 0.0015}})
+    result = tune(load().mechanism, "phase_lead", dataclasses.replace(SMALL, setting="mild", certify=True))
+    assert result.starts == [] and result.certified is None
+    assert result.gains["phase_lead"] == 0.0015
+    assert result.figures["literature"] == result.figures["tuned"] != result.figures["before"]
 
 
 def test_starts_begin_with_the_literature_and_stay_inside():

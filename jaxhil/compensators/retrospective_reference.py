@@ -67,8 +67,8 @@ LONGEST_LAG = 0.1  # s for which it waits for hardware that has not touched yet
 
 # Two sets of gains for any mechanism, each judged on linear, damped, Hertzian, hardening and layered contact
 # of 1.5 to 5 Hz at once. Sharp, the nominal one, was found by CMA-ES with errors under other dissipation, of
-# contact of 5 to 10 Hz and with the published rig's noise and dead zone in its objective. Gentle, by hand from
-# there, commands less, at the price of twice the error with that noise.
+# contact of 5 to 10 Hz and with the published rig's noise and dead zone in its objective. Gentle, by hand
+# from there, commands less, at the price of twice the error with that noise.
 SHARP = {
     "prior_stiffness": 9.563,
     "prior_stiffness_spread": 35.8,
