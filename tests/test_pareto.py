@@ -22,7 +22,15 @@ from tuning.trial import VALIDATION_SEED, Trial
 from tuning.tune import Settings, tune_all
 
 POINTS = 5
-SETTINGS = Settings(scenarios=8, starts=2, steps=10, validation=16, objective=Objective(noise_weight=2e-3))
+SETTINGS = Settings(
+    scenarios=8,
+    starts=2,
+    steps=10,
+    validation=16,
+    objective=Objective(noise_weight=2e-3),
+    polish=0,
+    scanned=32,
+)
 MECHANISMS = [
     load("varying", [f"contact.stiffness=[{k}]", "approach.contacts=1", f"name='{k}'"]).mechanism
     for k in ("5e4", "9e4")

@@ -108,15 +108,14 @@ def test_killed_and_resumed_is_the_same(whole, tmp_path):
     path = os.pathsep.join([str(HERE.parent), str(HERE)])
     environment = {**os.environ, "PYTHONPATH": path, "JAXHIL_CACHE": str(tmp_path / "cache")}
     silent = {"env": environment, "cwd": HERE, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    for parts in (1, 4):
-        with subprocess.Popen(command, **silent) as process:
-            while process.poll() is None and len(list(folder.glob("parts/part-*"))) < parts:
-                time.sleep(0.002)
-            process.send_signal(signal.SIGKILL)
-    assert 4 <= len(list(folder.glob("parts/part-*"))) < 10
+    with subprocess.Popen(command, **silent) as process:
+        while process.poll() is None and not list(folder.glob("parts/part-*")):
+            time.sleep(0.002)
+        process.send_signal(signal.SIGKILL)
+    assert 1 <= len(list(folder.glob("parts/part-*"))) < 10
     log = Log()
     store, _, _ = log.sweep(folder)
-    assert log.found >= 4 * 32
+    assert log.found >= 32 and log.computed > 0
     assert same_rows(all_rows(store), rows) == []
 
 
