@@ -49,7 +49,7 @@ def test_the_same_seed_gives_the_same_document(tmp_path):
     assert passivity["figures"]["literature"]["rms"]["high"] < 0.2 * rms["low"]
     assert abs(passivity["figures"]["literature"]["late"]["value"]) < 0.1
     assert mechanism["winners"]["rms"] == "passivity"
-    table = run([*SMALL, "-o", "c"], tmp_path).stdout
+    table = run([*SMALL, "-o", "c", "--untuned"], tmp_path).stdout
     assert "* " in table and "passivity" in table and "wrote c/compare.json" in table
 
 
@@ -78,6 +78,15 @@ def test_tables_mark_what_wins(capsys):
     assert ["tuned", "10*", "100", "-"] in [row[:4] for row in rows]
     assert ["m", "50", "10*"] in rows and ["n", "50", "-"] in rows
     assert winners(FOUND)["rms"] == "phase_lead" and winners(FOUND)["late"] is None
+
+
+def test_tables_of_what_is_not_tuned_do_not_say_so(capsys):
+    both = {"literature": figures(0.4), "gentle": figures(0.3)}
+    found = [FOUND[0], LawFigures("retrospective_reference", "m", {}, both)]
+    report.emit(mechanism_table("m", found), leaderboard(["m"], {"m": found}))
+    out = capsys.readouterr().out
+    assert "tuned" not in out and "  gentle  " in out
+    assert out.count("with the literature's gains") == 2
 
 
 def test_pictures_are_drawn(tmp_path):

@@ -267,6 +267,13 @@ class Compare:
     output: Annotated[str, arg(aliases=("-o",), metavar="DIR", help="Folder for what is written.")] = (
         "jaxhil-out/compare"
     )
+    untuned: Annotated[
+        FlagCreatePairsOff[bool],
+        arg(
+            help="Tune nothing: judge the literature's gains, and a compensator's settings, as they are.",
+            help_behavior_hint="",
+        ),
+    ] = False
     scenarios: Annotated[int, number("Scenarios to tune on.")] = 32
     judged: Annotated[int, number("Fresh scenarios to judge on.")] = 256
     overrides: Overrides = ()

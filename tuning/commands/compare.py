@@ -27,7 +27,13 @@ def run(options: Compare) -> int:
     prepare()
     from tuning.comparison.study import Failed, Settings, compare
 
-    settings = Settings(options.scenarios, judged=options.judged, limit=options.limit, seed=options.seed)
+    settings = Settings(
+        options.scenarios,
+        judged=options.judged,
+        limit=options.limit,
+        seed=options.seed,
+        tuned=not options.untuned,
+    )
     names = [one.mechanism.name for one in loaded]
     found: dict[str, dict[str, Any]] = {name: {} for name in names}
     interrupted, problems = False, []
@@ -87,6 +93,7 @@ def _document(
         "seed": options.seed,
         "scenarios": options.scenarios,
         "judged": options.judged,
+        "tuned": not options.untuned,
         "mechanisms": [
             {
                 "mechanism": one.mechanism.name,

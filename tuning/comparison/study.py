@@ -23,7 +23,7 @@ SEED = 0xFA1  # of the scenarios to judge on: tuning and its own validation neve
 class Settings:
     """Numbers of scenarios to tune on, of starts and steps of the solver, of evaluations without derivatives
     for each gain, of points scanned for starts; of scenarios to judge on; the error beyond which a contact
-    counts as a failure; the seed."""
+    counts as a failure; the seed; whether to tune at all."""
 
     scenarios: int = 32
     starts: int = 3
@@ -33,6 +33,7 @@ class Settings:
     judged: int = 256
     limit: float = 0.01
     seed: int = 0
+    tuned: bool = True
 
 
 class LawFigures(NamedTuple):
@@ -118,7 +119,8 @@ def judge_law(scenes: list[Any], law: str, settings: Settings) -> list[LawFigure
         {which or LITERATURE: literature_gains(mechanism, law, which) for which in (None, *others)}
         for mechanism in mechanisms
     ]
-    if any(gain.tuned(mechanism) for gain in COMPENSATORS[law].gains for mechanism in mechanisms):
+    moved = any(gain.tuned(mechanism) for gain in COMPENSATORS[law].gains for mechanism in mechanisms)
+    if settings.tuned and moved:
         tuning = Tuning(
             settings.scenarios,
             settings.starts,

@@ -48,12 +48,12 @@ def mechanism_table(name: str, found: Sequence[LawFigures]) -> Table:
                     *(shown(key, figures[key], own and won[key] == one.law) for key in HEADINGS),
                 ]
             )
-    title = f"{name}: each law with the literature's gains, then tuned"
+    title = f"{name}: each law with the literature's gains{', then tuned' if _tuned(found) else ''}"
     return _unfolded(report.table(title, ["law", *HEADINGS.values()], rows))
 
 
 def leaderboard(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> Table:
-    """rms error [%] of every law, tuned, on every mechanism."""
+    """rms error [%] of every law, tuned if any is, on every mechanism."""
     laws = list(dict.fromkeys(one.law for name in names for one in found[name]))
     won = {name: winners(found[name])["rms"] for name in names}
     rows = []
@@ -62,7 +62,13 @@ def leaderboard(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]])
         cells = [shown("rms", by_law[law], won[name] == law) if law in by_law else "-" for law in laws]
         rows.append([name.removeprefix("suite-"), *cells])
     headings = ["", *(law.replace("_", "\n") for law in laws)]
-    return _unfolded(report.table("Leaderboard: restitution error, rms [%], each law tuned", headings, rows))
+    tuned = any(_tuned(found[name]) for name in names)
+    how = "each law tuned" if tuned else "each law with the literature's gains"
+    return _unfolded(report.table(f"Leaderboard: restitution error, rms [%], {how}", headings, rows))
+
+
+def _tuned(found: Sequence[LawFigures]) -> bool:
+    return any(TUNED in one.figures for one in found)
 
 
 def _unfolded(made: Table) -> Table:
