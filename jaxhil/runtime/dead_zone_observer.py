@@ -10,12 +10,12 @@ from math import pi
 from typing import ClassVar
 
 from .filters import DelayLine, LeadFilter
-from .registry import GainSpecification, register
+from .registry import Compensator, GainSpecification, register
 from .surfaces import deflection
 
 
 @register("dead_zone_observer")
-class DeadZoneObserver:
+class DeadZoneObserver(Compensator):
     """F_c = lead(F + w), w = Q clip(k_n d, -limit, limit), Q = 1/(1 + s/(2 pi f)) by Tustin's rule:
 
     w = ((2 - c) w_prev + c (u + u_prev)) / (2 + c), c = 2 pi f T.
@@ -58,11 +58,6 @@ class DeadZoneObserver:
         self._observed = 0.0
         self._started = False
 
-    @property
-    def identified(self) -> tuple[float, float]:
-        """(0, 0): this law identifies nothing."""
-        return 0.0, 0.0
-
     def step(
         self,
         force_measured: float,
@@ -85,17 +80,9 @@ class DeadZoneObserver:
         self._observed = observed
         return self._lead.step(force_measured + observed)
 
-    def position_command(self, position: float, velocity: float, acceleration: float) -> float:
-        """The numerical model's position [m] itself."""
-        return position
-
     def reset(self) -> None:
         """Restart filters and delay line."""
         self._lead.reset()
         self._withheld = 0.0
         self._observed = 0.0
         self._started = False
-
-    def next_contact(self) -> None:
-        """Restart filters and delay line."""
-        self.reset()

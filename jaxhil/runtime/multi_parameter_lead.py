@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from .filters import VelocityFilter
-from .registry import GainSpecification, register
+from .registry import Compensator, GainSpecification, register
 
 
 @register("multi_parameter_lead")
-class MultiParameterLead:
+class MultiParameterLead(Compensator):
     """F_c = a F + b w, w = s/(1 + T_2 s) F by Tustin's rule.
 
     a = force_gain, b = force_rate_gain, T_2 = lead_filter; the literature places a root of the delayed
@@ -28,11 +28,6 @@ class MultiParameterLead:
         self._force_rate_gain = gains["force_rate_gain"]
         self._rate = VelocityFilter(gains["lead_filter"], period)
 
-    @property
-    def identified(self) -> tuple[float, float]:
-        """(0, 0): this law identifies nothing."""
-        return 0.0, 0.0
-
     def step(
         self,
         force_measured: float,
@@ -44,14 +39,6 @@ class MultiParameterLead:
         rate = self._rate.step(force_measured)
         return self._force_gain * force_measured + self._force_rate_gain * rate
 
-    def position_command(self, position: float, velocity: float, acceleration: float) -> float:
-        """The numerical model's position [m] itself."""
-        return position
-
     def reset(self) -> None:
         """Restart the filter: no force so far."""
-        self._rate.start(0.0, 0.0)
-
-    def next_contact(self) -> None:
-        """Restart the filter."""
         self._rate.start(0.0, 0.0)

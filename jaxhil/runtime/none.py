@@ -3,11 +3,11 @@
 from collections.abc import Mapping
 from typing import ClassVar
 
-from .registry import GainSpecification, register
+from .registry import Compensator, GainSpecification, register
 
 
 @register("none")
-class NoCompensation:
+class NoCompensation(Compensator):
     """F_c = F. The baseline, whose contacts diverge with the loop's delay."""
 
     __slots__ = ()
@@ -16,11 +16,6 @@ class NoCompensation:
 
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
         pass
-
-    @property
-    def identified(self) -> tuple[float, float]:
-        """(0, 0): this law identifies nothing."""
-        return 0.0, 0.0
 
     def step(
         self,
@@ -31,13 +26,3 @@ class NoCompensation:
     ) -> float:
         """The measured force [N]."""
         return force_measured
-
-    def position_command(self, position: float, velocity: float, acceleration: float) -> float:
-        """The numerical model's position [m] itself."""
-        return position
-
-    def reset(self) -> None:
-        """Nothing to restart."""
-
-    def next_contact(self) -> None:
-        """Nothing to restart."""

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from math import inf
 from typing import ClassVar
 
-from .registry import GainSpecification, register
+from .registry import Compensator, GainSpecification, register
 
 
 @register("passivity")
-class Passivity:
+class Passivity(Compensator):
     """F_c = F, but where E = E_before + T F v_d < 0 such that E becomes 0: F_c = -E_before/(T v_d).
 
     That is virtual damping alpha = -E/(T v_d^2). E_before >= 0, so that T v_d is not 0 there and F_c lies
@@ -22,11 +22,6 @@ class Passivity:
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
         self._period = period
         self._energy = 0.0
-
-    @property
-    def identified(self) -> tuple[float, float]:
-        """(0, 0): this law identifies nothing."""
-        return 0.0, 0.0
 
     def step(
         self,
@@ -47,14 +42,6 @@ class Passivity:
             self._energy = energy
         return force_measured
 
-    def position_command(self, position: float, velocity: float, acceleration: float) -> float:
-        """The numerical model's position [m] itself."""
-        return position
-
     def reset(self) -> None:
-        """Forget the energy."""
-        self._energy = 0.0
-
-    def next_contact(self) -> None:
         """Forget the energy."""
         self._energy = 0.0

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from .filters import LeadFilter
-from .registry import GainSpecification, register
+from .registry import Compensator, GainSpecification, register
 
 
 @register("phase_lead")
-class PhaseLead:
+class PhaseLead(Compensator):
     """F_c = (1 + T_1 s)/(1 + T_2 s) F by Tustin's rule.
 
     T_1 = phase_lead + lead_filter, T_2 = lead_filter: the net lead is `phase_lead`; the literature
@@ -25,11 +25,6 @@ class PhaseLead:
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
         self._lead = LeadFilter(gains["phase_lead"], gains["lead_filter"], period)
 
-    @property
-    def identified(self) -> tuple[float, float]:
-        """(0, 0): this law identifies nothing."""
-        return 0.0, 0.0
-
     def step(
         self,
         force_measured: float,
@@ -40,14 +35,6 @@ class PhaseLead:
         """The measured force [N], led."""
         return self._lead.step(force_measured)
 
-    def position_command(self, position: float, velocity: float, acceleration: float) -> float:
-        """The numerical model's position [m] itself."""
-        return position
-
     def reset(self) -> None:
-        """Restart the filter."""
-        self._lead.reset()
-
-    def next_contact(self) -> None:
         """Restart the filter."""
         self._lead.reset()

@@ -3,11 +3,11 @@
 from collections.abc import Mapping
 from typing import ClassVar
 
-from .registry import GainSpecification, register
+from .registry import Compensator, GainSpecification, register
 
 
 @register("position_lead")
-class PositionLead:
+class PositionLead(Compensator):
     """F_c = F; position command x + a_1 v + a_2 a, a_1 = position_lead, a_2 = acceleration_lead.
 
     With a_1 and a_2 of the motion simulator's inverse 1 + a_1 s + a_2 s^2 + ... its lag is made up for.
@@ -24,11 +24,6 @@ class PositionLead:
         self._of_velocity = gains["position_lead"]
         self._of_acceleration = gains["acceleration_lead"]
 
-    @property
-    def identified(self) -> tuple[float, float]:
-        """(0, 0): this law identifies nothing."""
-        return 0.0, 0.0
-
     def step(
         self,
         force_measured: float,
@@ -42,9 +37,3 @@ class PositionLead:
     def position_command(self, position: float, velocity: float, acceleration: float) -> float:
         """The numerical model's position [m], led."""
         return position + self._of_velocity * velocity + self._of_acceleration * acceleration
-
-    def reset(self) -> None:
-        """Nothing to restart."""
-
-    def next_contact(self) -> None:
-        """Nothing to restart."""

@@ -1,7 +1,7 @@
 """What a compensator of the runtime is, and the table of those known.
 
-A compensator is a class with the methods of `Compensator`; `@register(name)` enters it under the
-name that gain files use.
+A compensator is a class with the methods of `Compensator`, from which it may take those that do nothing of
+their own; `@register(name)` enters it under the name that gain files use.
 """
 
 from collections.abc import Callable, Mapping
@@ -43,6 +43,8 @@ class Compensator(Protocol):
     two-sided contact (infinite when the contact is one-sided).
     """
 
+    __slots__ = ()
+
     gains: ClassVar[Mapping[str, GainSpecification]]
 
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None: ...
@@ -50,7 +52,7 @@ class Compensator(Protocol):
     @property
     def identified(self) -> tuple[float, float]:
         """Identified stiffness [N/m] and damping [N s/m]; (0, 0) if the law identifies none."""
-        ...
+        return 0.0, 0.0
 
     def step(
         self,
@@ -63,16 +65,16 @@ class Compensator(Protocol):
         ...
 
     def position_command(self, position: float, velocity: float, acceleration: float) -> float:
-        """The position [m] to command, from the numerical model's new motion."""
-        ...
+        """The position [m] to command, from the numerical model's new motion; its position itself unless the
+        law says otherwise."""
+        return position
 
     def reset(self) -> None:
-        """Restart everything, identified parameters included."""
-        ...
+        """Restart everything, identified parameters included; nothing, where a law has no state."""
 
     def next_contact(self) -> None:
-        """Restart filters, delay lines and covariance; keep the identified parameters."""
-        ...
+        """Restart filters, delay lines and covariance; keep the identified parameters, if there are any."""
+        self.reset()
 
 
 AnyCompensator = TypeVar("AnyCompensator", bound=type[Compensator])

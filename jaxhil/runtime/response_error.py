@@ -17,12 +17,12 @@ from typing import ClassVar
 from .filters import DelayLine, LeadFilter, VelocityFilter
 from .gates import gate, share_beyond
 from .identification import ContactIdentification
-from .registry import GainSpecification, register
+from .registry import Compensator, GainSpecification, register
 from .surfaces import deflection
 
 
 @register("response_error")
-class ResponseError:
+class ResponseError(Compensator):
     """Phase lead, plus the force that the motion simulator's response error leaves out.
 
     The measured force is late against the measured position, so the identification regresses it on
@@ -151,10 +151,6 @@ class ResponseError:
         self._contact_share = 0.0
         self._force_share = 0.0
         self._started = True
-
-    def position_command(self, position: float, velocity: float, acceleration: float) -> float:
-        """The numerical model's position [m] itself."""
-        return position
 
     def reset(self) -> None:
         """Restart filters, delay line and identification."""

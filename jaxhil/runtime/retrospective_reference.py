@@ -21,7 +21,7 @@ from typing import ClassVar
 
 from .filters import DelayLine
 from .force_depth_map import ForceDepthMap
-from .registry import GainSpecification, register
+from .registry import Compensator, GainSpecification, register
 from .reintegration import ReferenceMotion
 from .surfaces import deflection
 
@@ -33,7 +33,7 @@ OUT_OF_CONTACT, IDENTIFIED, UNSURE, SATURATED, TOO_SHORT = range(5)
 
 
 @register("retrospective_reference")
-class RetrospectiveReference:
+class RetrospectiveReference(Compensator):
     """Force-depth map, reference and repayment.
 
     Every contact starts afresh, also with the other surface. A run that begins in contact has no approach
@@ -132,11 +132,6 @@ class RetrospectiveReference:
         self._middle = 0.0
         self._last = 0.0
         self.reset()
-
-    @property
-    def identified(self) -> tuple[float, float]:
-        """(0, 0): what it identifies is more than a stiffness, and forgotten with the contact."""
-        return 0.0, 0.0
 
     def step(
         self,
@@ -360,10 +355,6 @@ class RetrospectiveReference:
             self._squares += force * force
             self._count += 1.0
 
-    def position_command(self, position: float, velocity: float, acceleration: float) -> float:
-        """The numerical model's position [m] itself."""
-        return position
-
     def reset(self) -> None:
         """Forget everything."""
         self._side = 0.0
@@ -389,7 +380,3 @@ class RetrospectiveReference:
         self._late = 0.0
         self._started = False
         self.status = OUT_OF_CONTACT
-
-    def next_contact(self) -> None:
-        """Forget everything: every contact starts afresh."""
-        self.reset()

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from .filters import LeadFilter
-from .registry import GainSpecification, register
+from .registry import Compensator, GainSpecification, register
 
 
 @register("smith_hybrid")
-class SmithHybrid:
+class SmithHybrid(Compensator):
     """F_c = (F_smith + F_lead)/2, the forces of `smith_predictor` and `phase_lead` with these gains."""
 
     __slots__ = ("_lead", "_predictor")
@@ -24,11 +24,6 @@ class SmithHybrid:
         self._lead = LeadFilter(gains["phase_lead"], gains["lead_filter"], period)
         self._predictor = LeadFilter(lag, 0.5 * lag, period)
 
-    @property
-    def identified(self) -> tuple[float, float]:
-        """(0, 0): this law identifies nothing."""
-        return 0.0, 0.0
-
     def step(
         self,
         force_measured: float,
@@ -40,15 +35,7 @@ class SmithHybrid:
         led = self._lead.step(force_measured)
         return 0.5 * (self._predictor.step(led) + led)
 
-    def position_command(self, position: float, velocity: float, acceleration: float) -> float:
-        """The numerical model's position [m] itself."""
-        return position
-
     def reset(self) -> None:
         """Restart the filters."""
         self._lead.reset()
         self._predictor.reset()
-
-    def next_contact(self) -> None:
-        """Restart the filters."""
-        self.reset()

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from .filters import LeadFilter
-from .registry import GainSpecification, register
+from .registry import Compensator, GainSpecification, register
 
 
 @register("smith_predictor")
-class SmithPredictor:
+class SmithPredictor(Compensator):
     """F_c = (1 + T_s s/(1 + T_s s/2)) (1 + T_l s) F, each factor by Tustin's rule.
 
     T_l = phase_lead, filtered with lead_filter as in phase lead; T_s = simulator_lag.
@@ -27,11 +27,6 @@ class SmithPredictor:
         self._lead = LeadFilter(gains["phase_lead"], gains["lead_filter"], period)
         self._predictor = LeadFilter(lag, 0.5 * lag, period)
 
-    @property
-    def identified(self) -> tuple[float, float]:
-        """(0, 0): this law identifies nothing."""
-        return 0.0, 0.0
-
     def step(
         self,
         force_measured: float,
@@ -42,15 +37,7 @@ class SmithPredictor:
         """The measured force [N], led and predicted."""
         return self._predictor.step(self._lead.step(force_measured))
 
-    def position_command(self, position: float, velocity: float, acceleration: float) -> float:
-        """The numerical model's position [m] itself."""
-        return position
-
     def reset(self) -> None:
         """Restart the filters."""
         self._lead.reset()
         self._predictor.reset()
-
-    def next_contact(self) -> None:
-        """Restart the filters."""
-        self.reset()

@@ -3,12 +3,12 @@
 from collections.abc import Mapping
 from typing import ClassVar
 
-from .registry import GainSpecification, register
+from .registry import Compensator, GainSpecification, register
 from .surfaces import deflection
 
 
 @register("virtual_contact")
-class VirtualContact:
+class VirtualContact(Compensator):
     """F_c = F + k_v d + b_v v_d while the numerical model's position is beyond a surface, by d; else F."""
 
     __slots__ = ("_clearance", "_damping", "_stiffness")
@@ -23,11 +23,6 @@ class VirtualContact:
         self._damping = gains["virtual_damping"]
         self._clearance = clearance
 
-    @property
-    def identified(self) -> tuple[float, float]:
-        """(0, 0): this law identifies nothing."""
-        return 0.0, 0.0
-
     def step(
         self,
         force_measured: float,
@@ -40,13 +35,3 @@ class VirtualContact:
         if depth == 0.0:
             return force_measured
         return force_measured + (self._stiffness * depth + self._damping * velocity_desired)
-
-    def position_command(self, position: float, velocity: float, acceleration: float) -> float:
-        """The numerical model's position [m] itself."""
-        return position
-
-    def reset(self) -> None:
-        """Nothing to restart."""
-
-    def next_contact(self) -> None:
-        """Nothing to restart."""
