@@ -18,6 +18,7 @@ from gain_documents import GAINS, gain_document, sign
 
 from jaxhil.runtime import COMPENSATORS, Controller
 from jaxhil.runtime.gain_file import GainFile
+from jaxhil.runtime.law_status import STATUSES
 from jaxhil.runtime.limits import LIMITS, NO_LIMITS, complete
 from tuning.rig.c99 import FLAGS, c99_texts
 
@@ -25,9 +26,12 @@ COMPILER = shutil.which("cc")
 DRIVER = Path(__file__).with_name("c99_driver.c")
 ROW = ("event", "force", "desired", "velocity", "measured", "time", "timed", "x", "v", "a")
 RESULT = (
-    *("force", "position", "stiffness", "damping", "faults", "seen", "cause", "missed_ticks", "late_ticks"),
-    *("at_rest", "tripped", "bias", "answer", "contacts", "restitution", "expected", "balance"),
+    *("force", "position", "stiffness", "damping", "law_status", "faults", "seen", "cause"),
+    *("missed_ticks", "late_ticks", "at_rest", "tripped", "bias", "answer"),
+    *("contacts", "restitution", "expected", "balance"),
+    *("last_contact", "contact_status", "contact_ticks", "unsure", "saturated", "too_short"),
 )
+STATUS_NAMES = tuple(status.name for status in STATUSES)
 TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE = (float(code) for code in range(6))
 PERIOD = 0.001
 CAPACITY = 64  # periods of delay that the compiled laws hold
@@ -107,6 +111,10 @@ class Batch:
     def fault_name(self, bit: int) -> str:
         self._library.jaxhil_fault_name.restype = ctypes.c_char_p
         return self._library.jaxhil_fault_name(ctypes.c_uint32(bit)).decode()
+
+    def status_name(self, status: int) -> str:
+        self._library.jaxhil_law_status_name.restype = ctypes.c_char_p
+        return self._library.jaxhil_law_status_name(status).decode()
 
     def begin(self, parameters: np.ndarray) -> bool:
         return bool(self._library.driver_init(self._state, _pointer(parameters)))
@@ -302,7 +310,7 @@ def law_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
             force = law.step(*row[1:5])
         except ArithmeticError:
             force = math.nan
-        result[:4] = force, law.position_command(*row[7:]), *law.identified
+        result[:5] = force, law.position_command(*row[7:]), *law.identified, law.status
     return results
 
 
@@ -316,11 +324,14 @@ def controller_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
         result[0] = controller.step(*row[1:5], row[5] if row[6] else None)
         result[1] = controller.position_command(*row[7:])
         result[2:4] = controller.identified
-        result[4:7] = controller.faults, controller.seen, controller.cause
-        result[7:] = (
+        result[4] = STATUS_NAMES.index(controller.law_status)
+        result[5:8] = controller.faults, controller.seen, controller.cause
+        number, status, *counts = controller.last_contact
+        result[8:] = (
             *(controller.missed_ticks, controller.late_ticks, controller.at_rest, controller.tripped),
             *(controller.bias, answer),
             *(watchdog.contacts, watchdog.restitution, watchdog.expected, watchdog.balance),
+            *(number, STATUS_NAMES.index(status), *counts),
         )
     return results
 

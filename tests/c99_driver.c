@@ -10,7 +10,7 @@
 
 /* A row: event, force, desired position and velocity, measured position, time, whether it is given, the
  * model's position, velocity and acceleration. A result: see `result`. */
-enum { ROW = 10, RESULT = 17 };
+enum { ROW = 10, RESULT = 24 };
 enum { TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE };
 enum { GAINS = sizeof(jaxhil_gains) / sizeof(double), LIMITS = sizeof(jaxhil_limits) / sizeof(double) };
 
@@ -50,6 +50,7 @@ void driver_law(jaxhil_controller *controller, size_t count, const double *rows,
         results[0] = jaxhil_law_step(law, rows[1], rows[2], rows[3], rows[4]);
         results[1] = jaxhil_law_position_command(law, rows[7], rows[8], rows[9]);
         jaxhil_law_identified(law, &results[2], &results[3]);
+        results[4] = jaxhil_law_own_status(law);
     }
 }
 
@@ -77,6 +78,7 @@ void driver_run(jaxhil_controller *controller, size_t count, const double *rows,
         *result++ = jaxhil_position_command(controller, rows[7], rows[8], rows[9]);
         jaxhil_identified(controller, result, result + 1);
         result += 2;
+        *result++ = jaxhil_law_status(controller);
         *result++ = controller->faults;
         *result++ = controller->seen;
         *result++ = controller->cause;
@@ -90,6 +92,13 @@ void driver_run(jaxhil_controller *controller, size_t count, const double *rows,
         *result++ = controller->watchdog.restitution;
         *result++ = controller->watchdog.expected;
         *result++ = controller->watchdog.balance;
+        const jaxhil_contact_record record = jaxhil_last_contact(controller);
+        *result++ = (double)record.number;
+        *result++ = record.status;
+        *result++ = (double)record.ticks;
+        *result++ = (double)record.unsure;
+        *result++ = (double)record.saturated;
+        *result++ = (double)record.too_short;
     }
 }
 

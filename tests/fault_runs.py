@@ -21,6 +21,7 @@ from jaxhil.runtime.faults import (
     FORCE_SLEW,
     FORCE_STUCK,
     LATE_TICK,
+    LAW_IN_DOUBT,
     MISSED_TICK,
     MODEL_NOT_FINITE,
     POSITION_NOT_FINITE,
@@ -71,17 +72,19 @@ class FaultRun(NamedTuple):
     """Ticks and what they must raise, (ticks,); `tripped` says on which ticks the latch must hold.
 
     `catching_up` are ticks after a reset on which the command, which had been led elsewhere, comes back
-    within the velocity limit, and says so.
+    within the velocity limit, and says so; `entered` those of a contact in which a reset fell, and a
+    while after: a law with a status does not know such a contact, and may say so.
     """
 
     rows: np.ndarray
     faults: np.ndarray
     tripped: np.ndarray
     catching_up: np.ndarray
+    entered: np.ndarray
 
     def wrong(self, faults: np.ndarray, tripped: np.ndarray) -> np.ndarray:
         """The ticks on which a controller raised, or held, something else."""
-        excused = np.where(self.catching_up, VELOCITY_LIMIT, 0)
+        excused = np.where(self.catching_up, VELOCITY_LIMIT, 0) | np.where(self.entered, LAW_IN_DOUBT, 0)
         return np.nonzero(((faults ^ self.faults) & ~excused != 0) | (tripped != self.tripped))[0]
 
 
@@ -100,7 +103,7 @@ def fault_run(ticks: int, seed: int, law: str) -> FaultRun:
     rows = _healthy(ticks, rng)
     faults = np.zeros(ticks, np.int64)
     tripped = np.zeros(ticks, bool)
-    run = FaultRun(rows, faults, tripped, np.zeros(ticks, bool))
+    run = FaultRun(rows, faults, tripped, np.zeros(ticks, bool), np.zeros(ticks, bool))
     in_contact = _IN_CONTACT + (_OF_COMMAND if law == "none" else ())
     # The first tick after a reset has no past: nothing is injected before all is settled.
     for begin in range(BETWEEN, ticks - BETWEEN, BETWEEN):
@@ -119,6 +122,8 @@ def fault_run(ticks: int, seed: int, law: str) -> FaultRun:
             tripped[tick:end] = True
             rows[end, 0] = RESET
             run.catching_up[end : end + 10] = kind is _fast_position
+            if rows[end, DESIRED] > 0 or rows[end, MEASURED] > 0:
+                run.entered[end : end + CYCLE // 2] = True
     return run
 
 

@@ -19,6 +19,7 @@ ELSEWHERE = (
     "contact_too_long",
     "emergency_stop",
     "tare",
+    "law_in_doubt",
 )
 needs_compiler = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
 

@@ -13,6 +13,7 @@ from jaxhil.compensators import literature_gains
 from jaxhil.errors import InputError
 from jaxhil.mechanism_file import load
 from jaxhil.metrics import OK
+from jaxhil.runtime.law_status import UNSTATED
 from jaxhil.runtime.limits import LIMITS, complete
 from jaxhil.runtime.watchdog import Watchdog
 from tuning.gain_file import build_document, check_document
@@ -75,11 +76,11 @@ def watch(limits, signals, rules, lane):
     for tick in range(int(np.sum(signals.live[:, lane]))):
         force, position, velocity, measured, command = (float(leaf[tick, lane]) for leaf in signals[:5])
         if tick and signals.begins[tick, lane]:
-            note(watchdog.conclude(given))
+            note(watchdog.conclude(given, UNSTATED))
             watchdog.restart()
-        note(watchdog.tick(given, force, position, velocity, measured))
+        note(watchdog.tick(given, UNSTATED, force, position, velocity, measured))
         given = command
-    note(watchdog.conclude(given))
+    note(watchdog.conclude(given, UNSTATED))
     return found
 
 

@@ -171,3 +171,17 @@ def test_expectation_is_its_polynomial_within_its_ranges():
     end = sum(0.01 * (n + 1) * value for n, value in enumerate(values))
     for stiffness in (-1.0, 0.0, math.nan, 5e-324):
         assert Expectation(limits).restitution(stiffness, -1e9, 1.0, 300.0) == pytest.approx(end, rel=1e-12)
+
+
+def test_no_contact_is_over_while_it_is_touched():
+    """Without a time to settle in: not where the force crosses 0 on the way back either."""
+    controller = watched(settling=0.0, energy_balance=1e9, restitution_margin=1e9)
+    position, velocity, audited = -1e-4, SPEED, []
+    for n in range(300):
+        force = 0.0 if velocity < 0 else STIFFNESS * max(position, 0.0)
+        force = controller.step(force, position, velocity, position, n * PERIOD)
+        audited.append((controller._watchdog.contacts, position))
+        velocity -= PERIOD * force / MASS
+        velocity = -SPEED if velocity < 1e-4 else velocity
+        position += PERIOD * velocity
+    assert audited[-1][0] == 1 and all(position <= 0 for contacts, position in audited if contacts)

@@ -47,15 +47,14 @@ class Toy(Compensator):
     "jaxhil/runtime/toy.py": '''
 """A toy: F_c = F + toy_share (F - F of the tick before)."""
 
-from .registry import GainSpecification, register
+from .registry import Compensator, GainSpecification, register
 
 
 @register("toy")
-class Toy:
+class Toy(Compensator):
     """F_c = F + toy_share (F - F_before)."""
 
     gains = {"toy_share": GainSpecification("1")}
-    identified = (0.0, 0.0)
 
     def __init__(self, gains, period, clearance):
         self._share = gains["toy_share"]
@@ -66,13 +65,7 @@ class Toy:
         self._before = force_measured
         return command
 
-    def position_command(self, position, velocity, acceleration):
-        return position
-
     def reset(self):
-        self._before = 0.0
-
-    def next_contact(self):
         self._before = 0.0
 ''',
 }

@@ -21,6 +21,7 @@ from rig_lock_step import closed_loop, controller, packets
 
 from jaxhil.compensators import literature_gains
 from jaxhil.mechanism_file import load, to_builtins
+from jaxhil.runtime import faults
 from tuning.gain_file import build_document, write_gain_file
 from tuning.rig import udp_controller
 from tuning.rig.contact_watch import ContactResult
@@ -191,6 +192,17 @@ def test_lost_and_late_packets_are_made_up_for(varying, drops, ticks):
         assert found.status == "ok"
         assert found.restitution == pytest.approx(expected.restitution, abs=0.006)
     assert rig.commanded.not_finite == rig.commanded.beyond_limits == 0
+
+
+def test_contacts_that_the_law_did_not_know_are_counted():
+    """Too short ones, each told once by an answer; the process says how many."""
+    mechanism = load("suite-fast", ["contact.stiffness=[884316.0]"]).mechanism
+    gains = literature_gains(mechanism, "retrospective_reference")
+    rig, task, answers = packets(mechanism, controller(mechanism, "retrospective_reference", gains), 900)
+    assert udp_controller.LAW_IN_DOUBT == faults.LAW_IN_DOUBT and MISSED_TICK == faults.MISSED_TICK
+    told = [answer for answer in answers if answer.faults & faults.LAW_IN_DOUBT]
+    assert len(rig.contacts) >= 3 and not rig.tripped
+    assert task.doubts == {"too_short": len(told)} and len(told) in (len(rig.contacts), len(rig.contacts) + 1)
 
 
 def a_reading(tick, sequence=None, force=0.0, position=-1.0, event=TICK, run=1):

@@ -12,6 +12,7 @@
 #include "faults_table.c"
 #include "inputs.c"
 #include "law.c"
+#include "law_status.c"
 #include "limits.c"
 #include "outputs.c"
 #include "watchdog.c"
@@ -59,7 +60,8 @@ void jaxhil_emergency_stop(jaxhil_controller *controller, bool active);
 bool jaxhil_reset(jaxhil_controller *controller);
 
 /* Begin a fresh run for the next contact, the rig having been brought to its start. Identified parameters
- * carry over, a trip stays latched. */
+ * carry over, a trip stays latched. A contact still under way is audited first: what that finds is in `faults`
+ * until the next step. */
 void jaxhil_next_contact(jaxhil_controller *controller);
 
 /* Whether a fault has tripped the controller since the last reset. */
@@ -77,6 +79,12 @@ int64_t jaxhil_late_ticks(const jaxhil_controller *controller);
 
 /* Identified stiffness [N/m] and damping [N s/m]; 0 and 0 if the law identifies none. */
 void jaxhil_identified(const jaxhil_controller *controller, double *stiffness, double *damping);
+
+/* What the law says of the last command; JAXHIL_UNSTATED if it says nothing. */
+int jaxhil_law_status(const jaxhil_controller *controller);
+
+/* What the law said of the contact audited last, whatever follows, reset included, until the next one is. */
+jaxhil_contact_record jaxhil_last_contact(const jaxhil_controller *controller);
 
 /* == Definitions == */
 
@@ -102,25 +110,26 @@ static void jaxhil_restart(jaxhil_controller *controller) {
 }
 
 static bool jaxhil_guards_init(jaxhil_controller *controller, const jaxhil_limits *limits, double period,
-                               double clearance) {
+                               double clearance, bool stated) {
     jaxhil_clock_init(&controller->clock, limits, period);
     jaxhil_bias_tare_init(&controller->tare, limits);
     jaxhil_input_guard_init(&controller->inputs, limits, period, clearance);
     jaxhil_force_guard_init(&controller->forces, limits, period);
     jaxhil_position_guard_init(&controller->positions, limits, period, clearance);
-    return jaxhil_watchdog_init(&controller->watchdog, limits, period, clearance);
+    return jaxhil_watchdog_init(&controller->watchdog, limits, period, clearance, stated);
 }
 
 bool jaxhil_init(jaxhil_controller *controller, const jaxhil_gains *gains, const jaxhil_limits *limits) {
     controller->usable = jaxhil_gains_admitted(gains) && jaxhil_limits_fit(limits) &&
                          jaxhil_law_init(&controller->law, gains) &&
-                         jaxhil_guards_init(controller, limits, gains->control_period, gains->clearance);
+                         jaxhil_guards_init(controller, limits, gains->control_period, gains->clearance,
+                                            jaxhil_law_own_status(&controller->law) != JAXHIL_UNSTATED);
     controller->stopped = false;
     if (controller->usable) {
         jaxhil_law_reset(&controller->law);
         jaxhil_restart(controller);
     } else {
-        jaxhil_guards_init(controller, &jaxhil_no_limits, 1.0, INFINITY);
+        jaxhil_guards_init(controller, &jaxhil_no_limits, 1.0, INFINITY, false);
         jaxhil_restart(controller);
         jaxhil_fail(controller, JAXHIL_UNUSABLE);
     }
@@ -159,9 +168,11 @@ double jaxhil_step(jaxhil_controller *controller, double force_measured, double 
                                        position_measured, controller->tare.bias);
     fatal |= inputs->fatal;
     if (controller->watchdog.on && !fatal) {
-        fatal = jaxhil_watchdog_tick(&controller->watchdog, forces->output, inputs->force, position_desired,
-                                     velocity_desired, inputs->measured);
-        faults |= fatal;
+        const uint32_t found = jaxhil_watchdog_tick(
+            &controller->watchdog, forces->output, jaxhil_law_own_status(&controller->law), inputs->force,
+            position_desired, velocity_desired, inputs->measured);
+        faults |= found;
+        fatal = found & ~(uint32_t)JAXHIL_LAW_IN_DOUBT;
     }
     if (!fatal) {
         const double command = jaxhil_law_step(&controller->law, inputs->force, position_desired,
@@ -218,9 +229,13 @@ void jaxhil_next_contact(jaxhil_controller *controller) {
     if (controller->cause) {
         return;
     }
-    const uint32_t fault = jaxhil_watchdog_conclude(&controller->watchdog, controller->forces.output);
-    if (fault) {
-        jaxhil_fail(controller, fault);
+    const uint32_t faults = jaxhil_watchdog_conclude(&controller->watchdog, controller->forces.output,
+                                                     jaxhil_law_own_status(&controller->law));
+    const uint32_t fatal = faults & ~(uint32_t)JAXHIL_LAW_IN_DOUBT;
+    controller->faults = faults;
+    controller->seen |= faults;
+    if (fatal) {
+        jaxhil_fail(controller, fatal);
         return;
     }
     jaxhil_law_next_contact(&controller->law);
@@ -256,4 +271,12 @@ void jaxhil_identified(const jaxhil_controller *controller, double *stiffness, d
     if (controller->usable) {
         jaxhil_law_identified(&controller->law, stiffness, damping);
     }
+}
+
+int jaxhil_law_status(const jaxhil_controller *controller) {
+    return controller->usable ? jaxhil_law_own_status(&controller->law) : JAXHIL_UNSTATED;
+}
+
+jaxhil_contact_record jaxhil_last_contact(const jaxhil_controller *controller) {
+    return controller->watchdog.record;
 }

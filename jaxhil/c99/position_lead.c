@@ -4,6 +4,7 @@
 #include <stdbool.h>
 
 #include "gains_table.c"
+#include "law_status_table.c"
 
 /* == Declarations == */
 
@@ -34,6 +35,11 @@ static void jaxhil_law_identified(const jaxhil_law *law, double *stiffness, doub
     (void)law;
     *stiffness = 0.0;
     *damping = 0.0;
+}
+
+static int jaxhil_law_own_status(const jaxhil_law *law) {
+    (void)law;
+    return JAXHIL_UNSTATED;
 }
 
 static void jaxhil_law_reset(jaxhil_law *law) {

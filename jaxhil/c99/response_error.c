@@ -11,6 +11,7 @@
 #include "gains_table.c"
 #include "gates.c"
 #include "identification.c"
+#include "law_status_table.c"
 #include "surfaces.c"
 
 /* == Declarations == */
@@ -115,6 +116,11 @@ static double jaxhil_law_position_command(jaxhil_law *law, double position, doub
 static void jaxhil_law_identified(const jaxhil_law *law, double *stiffness, double *damping) {
     *stiffness = law->identification.stiffness;
     *damping = law->identification.damping;
+}
+
+static int jaxhil_law_own_status(const jaxhil_law *law) {
+    (void)law;
+    return JAXHIL_UNSTATED;
 }
 
 static void jaxhil_law_reset(jaxhil_law *law) {

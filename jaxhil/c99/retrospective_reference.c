@@ -10,14 +10,11 @@
 #include "filters.c"
 #include "force_depth_map.c"
 #include "gains_table.c"
+#include "law_status_table.c"
 #include "reintegration.c"
 #include "surfaces.c"
 
 /* == Declarations == */
-
-/* What stands behind the last command; unsure: nothing is identified yet, or there is nothing to scale by;
- * saturated: the correction is at its limit; too short: the hardware touched when half of the contact was over. */
-enum { JAXHIL_OUT_OF_CONTACT, JAXHIL_IDENTIFIED, JAXHIL_UNSURE, JAXHIL_SATURATED, JAXHIL_TOO_SHORT };
 
 typedef struct {
     double period, clearance, mass, share, force_noise, dead_zone, floor;
@@ -337,6 +334,10 @@ static void jaxhil_law_identified(const jaxhil_law *law, double *stiffness, doub
     (void)law;
     *stiffness = 0.0;
     *damping = 0.0;
+}
+
+static int jaxhil_law_own_status(const jaxhil_law *law) {
+    return law->status;
 }
 
 static void jaxhil_law_next_contact(jaxhil_law *law) {

@@ -3,7 +3,8 @@
  * A contact is audited once both positions have been outside for `settling`, the model moves away and the
  * force on it has died out; at the latest in the middle of the gap or when the next contact is announced.
  * The model's kinetic energy must have changed by the work of the force that the controller gave, and the
- * restitution must be the one expected of a contact of the identified stiffness.
+ * restitution must be the one expected of a contact of the identified stiffness. A law that has a status says
+ * whether it knew the contact; this is asked without the equivalent mass too.
  */
 #include <math.h>
 #include <stdbool.h>
@@ -11,21 +12,25 @@
 
 #include "faults_table.c"
 #include "filters.c"
+#include "law_status.c"
 #include "limits_table.c"
 #include "surfaces.c"
 
 /* == Declarations == */
 
 /* One contact after another, audited. To be read: `contacts`, those audited since init; of the last of them
- * `restitution`, the `expected` one and the energy out of `balance` [J]. */
+ * `record`, what the law said of it, and until a restart its `restitution`, the `expected` one and the energy out
+ * of `balance` [J]. */
 typedef struct {
     double restitution, expected, balance;
     int64_t contacts;
-    bool on, known, open;
+    jaxhil_contact_record record;
+    bool on, stated, known, open;
     double clearance, middle, period, mass, quiet_ticks, faded, longest, fading, margin, tolerance;
     double entry, side, velocity, force, aligned, peak, work;
     double sxx, sxv, svv, sxf, svf;
     int64_t quiet, ticks;
+    jaxhil_contact_record statuses;
     jaxhil_limits limits;
     jaxhil_delay_line alignment;
     double samples[JAXHIL_ALIGNMENT_SAMPLES];
@@ -41,6 +46,7 @@ static void jaxhil_watchdog_clear(jaxhil_watchdog *watchdog) {
     watchdog->ticks = 0;
     watchdog->peak = 0.0;
     watchdog->work = 0.0;
+    watchdog->statuses = jaxhil_contact_record_begin(0, JAXHIL_UNSTATED);
     watchdog->sxx = 0.0;
     watchdog->sxv = 0.0;
     watchdog->svv = 0.0;
@@ -62,22 +68,24 @@ static void jaxhil_watchdog_restart(jaxhil_watchdog *watchdog) {
     watchdog->restitution = 0.0;
 }
 
-/* False if the alignment is longer than its line. */
+/* False if the alignment is longer than its line. `stated`: whether the law has a status. */
 static bool jaxhil_watchdog_init(jaxhil_watchdog *watchdog, const jaxhil_limits *limits, double period,
-                                 double clearance) {
-    watchdog->on = limits->equivalent_mass > 0.0;
+                                 double clearance, bool stated) {
+    watchdog->on = stated || limits->equivalent_mass > 0.0;
+    watchdog->stated = stated;
     watchdog->clearance = clearance;
     watchdog->middle = -0.5 * clearance;
     watchdog->period = period;
     watchdog->mass = limits->equivalent_mass;
     watchdog->quiet_ticks = limits->settling / period;
     watchdog->faded = (limits->settling + JAXHIL_PATIENCE) / period;
-    watchdog->longest = limits->longest_contact / period;
+    watchdog->longest = limits->equivalent_mass > 0.0 ? limits->longest_contact / period : INFINITY;
     watchdog->fading = limits->fading;
     watchdog->margin = limits->restitution_margin;
     watchdog->tolerance = limits->energy_balance;
     watchdog->limits = *limits;
     watchdog->contacts = 0;
+    watchdog->record = jaxhil_contact_record_begin(0, JAXHIL_UNSTATED);
     jaxhil_watchdog_restart(watchdog);
     return jaxhil_delay_line_init(&watchdog->alignment, watchdog->samples, JAXHIL_ALIGNMENT_SAMPLES,
                                   limits->alignment, period);
@@ -112,12 +120,10 @@ static double jaxhil_expected(const jaxhil_limits *c, double stiffness, double d
                          0.0, 1.0);
 }
 
-static uint32_t jaxhil_watchdog_audit(jaxhil_watchdog *watchdog, double velocity) {
+static uint32_t jaxhil_watchdog_energies(jaxhil_watchdog *watchdog, double velocity) {
     const double entry = watchdog->entry;
     const double mass = watchdog->mass;
     const double energy = 0.5 * mass * entry * entry;
-    watchdog->open = false;
-    watchdog->contacts++;
     watchdog->balance = 0.5 * mass * velocity * velocity - energy + watchdog->work;
     if (!(fabs(watchdog->balance) <= watchdog->tolerance * energy)) {
         return JAXHIL_ENERGY_BALANCE;
@@ -141,12 +147,29 @@ static uint32_t jaxhil_watchdog_audit(jaxhil_watchdog *watchdog, double velocity
     return 0;
 }
 
-/* Audit the contact under way, if there is one, after the force `given` [N] on the last tick. */
-static uint32_t jaxhil_watchdog_conclude(jaxhil_watchdog *watchdog, double given) {
+static uint32_t jaxhil_watchdog_audit(jaxhil_watchdog *watchdog, double velocity) {
+    uint32_t doubt = 0;
+    watchdog->open = false;
+    watchdog->contacts++;
+    if (watchdog->stated) {
+        watchdog->statuses.number = watchdog->contacts;
+        doubt = jaxhil_contact_record_end(&watchdog->statuses) ? JAXHIL_LAW_IN_DOUBT : 0;
+        watchdog->record = watchdog->statuses;
+    }
+    return doubt | (watchdog->mass > 0.0 ? jaxhil_watchdog_energies(watchdog, velocity) : 0);
+}
+
+/* Audit the contact under way, if there is one, after the force `given` [N] on the last tick and the law's
+ * `status` then. */
+static uint32_t jaxhil_watchdog_conclude(jaxhil_watchdog *watchdog, double given, int status) {
     if (!watchdog->open) {
         return 0;
     }
+    jaxhil_contact_record_take(&watchdog->statuses, status);
     const double before = watchdog->velocity;
+    if (!(watchdog->mass > 0.0)) {
+        return jaxhil_watchdog_audit(watchdog, before);
+    }
     const double velocity = before - watchdog->period * given / watchdog->mass;
     watchdog->work += watchdog->period * given * 0.5 * (before + velocity);
     return jaxhil_watchdog_audit(watchdog, velocity);
@@ -169,10 +192,11 @@ static void jaxhil_watchdog_regress(jaxhil_watchdog *watchdog, double force, dou
     }
 }
 
-/* The fault that this tick shows, 0 if none. `given` [N] is the force that the controller gave on the tick
- * before, `force` [N] and `measured` [m] are this tick's readings, the rest the numerical model's. */
-static uint32_t jaxhil_watchdog_tick(jaxhil_watchdog *watchdog, double given, double force, double position,
-                                     double velocity, double measured) {
+/* The faults that this tick shows, 0 if none. `given` [N] is the force that the controller gave on the tick
+ * before, `status` what the law said of it, `force` [N] and `measured` [m] are this tick's readings, the rest the
+ * numerical model's. */
+static uint32_t jaxhil_watchdog_tick(jaxhil_watchdog *watchdog, double given, int status, double force,
+                                     double position, double velocity, double measured) {
     double before = watchdog->velocity;
     if (!watchdog->known) {
         watchdog->known = true;
@@ -196,6 +220,7 @@ static uint32_t jaxhil_watchdog_tick(jaxhil_watchdog *watchdog, double given, do
         const double size = fabs(given);
         watchdog->quiet = touching ? 0 : watchdog->quiet + 1;
         watchdog->ticks++;
+        jaxhil_contact_record_take(&watchdog->statuses, status);
         watchdog->work += watchdog->period * given * 0.5 * (before + velocity);
         if (size > watchdog->peak) {
             watchdog->peak = size;
@@ -203,8 +228,8 @@ static uint32_t jaxhil_watchdog_tick(jaxhil_watchdog *watchdog, double given, do
         jaxhil_watchdog_regress(watchdog, force, deflection);
         const bool faded = size <= JAXHIL_FADED * watchdog->peak || size <= watchdog->fading ||
                            (double)watchdog->quiet >= watchdog->faded;
-        const bool leaving = (double)watchdog->quiet >= watchdog->quiet_ticks &&
-                             watchdog->side * velocity < 0.0 && faded;
+        const bool outside = !touching && (double)watchdog->quiet >= watchdog->quiet_ticks;
+        const bool leaving = outside && watchdog->side * velocity < 0.0 && faded;
         if (leaving || side != watchdog->side) {
             fault = jaxhil_watchdog_audit(watchdog, velocity);
         } else if ((double)watchdog->ticks > watchdog->longest) {

@@ -16,6 +16,7 @@ from .faults import (
     CLOCK,
     EMERGENCY_STOP,
     FORCE_NOT_FINITE,
+    LAW_IN_DOUBT,
     MODEL_NOT_FINITE,
     POSITION_NOT_FINITE,
     RESTITUTION,
@@ -24,6 +25,7 @@ from .faults import (
 )
 from .gain_file import GainFile, check_gain_document, read_gain_document
 from .inputs import Clock, InputGuard, Tare
+from .law_status import STATUSES, UNSTATED, ContactRecord
 from .outputs import ForceGuard, PositionGuard
 from .registry import COMPENSATORS
 from .watchdog import Watchdog
@@ -65,7 +67,8 @@ class Controller:
         self._tare = Tare(limits)
         self._inputs = InputGuard(limits, period, clearance)
         try:
-            self._watchdog = Watchdog(limits, period, clearance)
+            stated = self._compensator.status != UNSTATED
+            self._watchdog = Watchdog(limits, period, clearance, stated)
         except ValueError as error:
             raise refusal(source, "limits.alignment", str(error), "a delay that fits") from None
         self._forces = ForceGuard(limits, period)
@@ -126,6 +129,17 @@ class Controller:
         """Identified stiffness [N/m] and damping [N s/m]; (0, 0) if the law identifies none."""
         return self._compensator.identified
 
+    @property
+    def law_status(self) -> str:
+        """What the law says of the last command (`law_status.STATUSES`); `unstated` if it says nothing."""
+        return STATUSES[self._compensator.status].name
+
+    @property
+    def last_contact(self) -> ContactRecord:
+        """What the law said of the contact audited last, whatever follows, `reset` included, until the next
+        one is; contact 0 before the first."""
+        return self._watchdog.record
+
     def tare(self, force_measured: float) -> bool:
         """Take in one reading [N] of the force sensor out of contact; True once there are enough.
 
@@ -171,13 +185,16 @@ class Controller:
         inputs = self._inputs
         faults |= inputs.check(reading, position, velocity, measured, self._tare.bias)
         fatal |= inputs.fatal
+        compensator = self._compensator
         watchdog = self._watchdog
         if watchdog.on and not fatal:
-            fatal = watchdog.tick(forces.output, inputs.force, position, velocity, inputs.measured)
-            faults |= fatal
+            status = compensator.status
+            found = watchdog.tick(forces.output, status, inputs.force, position, velocity, inputs.measured)
+            faults |= found
+            fatal = found & ~LAW_IN_DOUBT
         if not fatal:
             try:
-                command = self._compensator.step(inputs.force, position, velocity, inputs.measured)
+                command = compensator.step(inputs.force, position, velocity, inputs.measured)
             except ArithmeticError:
                 command = nan
             faults |= forces.limit(command)
@@ -259,13 +276,17 @@ class Controller:
 
         To be called when the rig has been brought to the start of the run: the first position command is
         then where it begins. Identified parameters carry over, a trip stays latched, and the time until the
-        next tick does not count as missed.
+        next tick does not count as missed. A contact still under way is audited first: what that finds is in
+        `faults` until the next `step`.
         """
         if self.cause:
             return
-        fault = self._watchdog.conclude(self._forces.output)
-        if fault:
-            self._fail(fault, _detail(fault, {}, self._watchdog))
+        faults = self._watchdog.conclude(self._forces.output, self._compensator.status)
+        self.faults = faults
+        self.seen |= faults
+        fatal = faults & ~LAW_IN_DOUBT
+        if fatal:
+            self._fail(fatal, _detail(fatal, {}, self._watchdog))
             return
         self._compensator.next_contact()
         self._clock.pause()

@@ -39,6 +39,7 @@ ENERGY_BALANCE = 0x20000
 CONTACT_TOO_LONG = 0x40000
 EMERGENCY_STOP = 0x80000
 TARE = 0x100000
+LAW_IN_DOUBT = 0x200000
 
 _HELD = "the last good reading is used; more than `held_readings` in a row trip"
 _TRIPS = "trips"
@@ -137,6 +138,13 @@ FAULTS = (
         "the readings to tare are not finite, differ by more than `tare_spread`, or their mean is beyond "
         "`bias_limit`",
         _TRIPS,
+    ),
+    Fault(
+        LAW_IN_DOUBT,
+        "law_in_doubt",
+        "watchdog: a contact is over of which the law says that it was unsure, or the contact too short, on "
+        "more than two fifths of its ticks, or the correction at its limit on more than half",
+        "flagged; `last_contact` says which",
     ),
 )
 

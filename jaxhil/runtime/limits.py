@@ -50,7 +50,7 @@ LIMITS: dict[str, LimitSpecification] = {
     "velocity_limit": LimitSpecification("m/s", inf, 0.0, "fastest change of the position command"),
     "deceleration": LimitSpecification("m/s^2", inf, 0.0, "braking and starting after a trip"),
     "retreat_velocity": LimitSpecification("m/s", 0.0, 0.0, "speed of the way out of contact after a trip"),
-    "equivalent_mass": LimitSpecification("kg", 0.0, 0.0, "of the numerical model; 0: the watchdog is off"),
+    "equivalent_mass": LimitSpecification("kg", 0.0, 0.0, "the model's; 0: no energies are audited"),
     "fading": LimitSpecification("N", 0.0, 0.0, "force on the numerical model that counts as died out"),
     "longest_contact": LimitSpecification("s", inf, 0.0, "longest contact"),
     "energy_balance": LimitSpecification("1", inf, 0.0, "energy out of balance, of the approach's"),

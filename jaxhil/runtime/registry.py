@@ -8,6 +8,8 @@ from collections.abc import Callable, Mapping
 from math import inf
 from typing import ClassVar, NamedTuple, Protocol, TypeVar
 
+from .law_status import UNSTATED
+
 
 class GainSpecification(NamedTuple):
     """One gain of a compensator: its unit, and the values for which the law is defined.
@@ -46,6 +48,8 @@ class Compensator(Protocol):
     __slots__ = ()
 
     gains: ClassVar[Mapping[str, GainSpecification]]
+    # What stands behind the last command, one of `law_status`; a law says so always or never.
+    status: int = UNSTATED
 
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None: ...
 

@@ -21,6 +21,7 @@ from typing import ClassVar
 
 from .filters import DelayLine
 from .force_depth_map import ForceDepthMap
+from .law_status import IDENTIFIED, OUT_OF_CONTACT, SATURATED, TOO_SHORT, UNSURE
 from .registry import Compensator, GainSpecification, register
 from .reintegration import ReferenceMotion
 from .surfaces import deflection
@@ -29,7 +30,6 @@ FAREWELL = 0.006  # s for which it goes on after the hardware has left the surfa
 LONGEST_LAG = 0.1  # s for which it waits for hardware that has not touched yet
 FEW = 5  # readings on which no contact is identified
 LATE = 0.5  # of the predicted contact's duration, that the hardware may touch late by
-OUT_OF_CONTACT, IDENTIFIED, UNSURE, SATURATED, TOO_SHORT = range(5)
 
 
 @register("retrospective_reference")

@@ -8,6 +8,7 @@ With v_in the model's velocity on the tick before the contact and v now, the aud
 - Is the energy balanced? M (v^2 - v_in^2)/2 must be the work -T sum F_c(n) (v(n) + v(n+1))/2 of the force
   that the controller gave, an identity for every integrator with v(n+1) = v(n) - T F_c(n)/M.
 - Is the restitution |v|/|v_in| the expected one, within `restitution_margin`?
+- Did the law, by its own word, know the contact (`law_status`)? This alone it asks without `equivalent_mass`.
 
 The expected restitution is that of the contact's own stiffness: k and b are the least squares of the
 measured force on the measured position, delayed by `alignment`, and its rate, over the whole contact. An
@@ -23,10 +24,11 @@ each of p, w, z kept to the range that it was fitted over.
 """
 
 from collections.abc import Mapping
-from math import sqrt
+from math import inf, sqrt
 
-from .faults import CONTACT_TOO_LONG, ENERGY_BALANCE, RESTITUTION
+from .faults import CONTACT_TOO_LONG, ENERGY_BALANCE, LAW_IN_DOUBT, RESTITUTION
 from .filters import DelayLine
+from .law_status import STATUSES, UNSTATED, ContactRecord, StatusCount
 from .surfaces import deflection
 
 FADED = 1e-6  # of the largest force of the contact
@@ -36,8 +38,9 @@ PATIENCE = 0.1  # s, that the force is given to die out
 class Watchdog:
     """One contact after another, audited.
 
-    Attributes: `on`, whether there is anything to watch; `contacts`, those audited since `restart`; of the
-    last of them `restitution`, the `expected` one and the energy out of `balance` [J].
+    `stated`: whether the law has a status. Attributes: `on`, whether there is anything to watch; `contacts`,
+    those audited; of the last of them `record`, what the law said of it, and, until `restart`, `restitution`,
+    the `expected` one and the energy out of `balance` [J].
     """
 
     __slots__ = (
@@ -60,6 +63,8 @@ class Watchdog:
         "_quiet",
         "_quiet_ticks",
         "_side",
+        "_stated",
+        "_statuses",
         "_svf",
         "_svv",
         "_sxf",
@@ -73,18 +78,23 @@ class Watchdog:
         "contacts",
         "expected",
         "on",
+        "record",
         "restitution",
     )
 
-    def __init__(self, limits: Mapping[str, float], period: float, clearance: float) -> None:
-        self.on = limits["equivalent_mass"] > 0.0
+    def __init__(
+        self, limits: Mapping[str, float], period: float, clearance: float, stated: bool = False
+    ) -> None:
+        self.on = stated or limits["equivalent_mass"] > 0.0
+        self._stated = stated
+        self._statuses = StatusCount()
         self._clearance = clearance
         self._middle = -0.5 * clearance
         self._period = period
         self._mass = limits["equivalent_mass"]
         self._quiet_ticks = limits["settling"] / period
         self._faded = (limits["settling"] + PATIENCE) / period
-        self._longest = limits["longest_contact"] / period
+        self._longest = limits["longest_contact"] / period if self._mass > 0.0 else inf
         self._fading = limits["fading"]
         self._margin = limits["restitution_margin"]
         self._tolerance = limits["energy_balance"]
@@ -92,9 +102,10 @@ class Watchdog:
         self._expectation = Expectation(limits)
         self.restart()
         self.contacts = 0
+        self.record = ContactRecord(0, STATUSES[UNSTATED].name, 0, 0, 0, 0)
 
     def restart(self) -> None:
-        """Forget the contact under way and the motion so far, but not the count of contacts."""
+        """Forget the contact under way and the motion so far, but not `contacts` and `record`."""
         self._known = False
         self._open = False
         self._entry = 0.0
@@ -106,16 +117,20 @@ class Watchdog:
         self._aligned = 0.0
         self._peak = 0.0
         self._work = 0.0
+        self._statuses.restart()
         self._sxx = self._sxv = self._svv = self._sxf = self._svf = 0.0
         self.balance = 0.0
         self.expected = 0.0
         self.restitution = 0.0
 
-    def tick(self, given: float, force: float, position: float, velocity: float, measured: float) -> int:
-        """The fault that this tick shows, 0 if none.
+    def tick(
+        self, given: float, status: int, force: float, position: float, velocity: float, measured: float
+    ) -> int:
+        """The faults that this tick shows, 0 if none.
 
-        `given` [N] is the force that the controller gave on the tick before, `force` [N] and `measured` [m]
-        are this tick's readings, position [m] and velocity [m/s] the numerical model's.
+        `given` [N] is the force that the controller gave on the tick before, `status` what the law said of
+        it, `force` [N] and `measured` [m] are this tick's readings, position [m] and velocity [m/s] the
+        numerical model's.
         """
         if self._known:
             before = self._velocity
@@ -136,13 +151,15 @@ class Watchdog:
             else:
                 self._quiet += 1
             self._ticks += 1
+            self._statuses.take(status)
             self._work += self._period * given * 0.5 * (before + velocity)
             size = abs(given)
             if size > self._peak:
                 self._peak = size
             self._regress(force, aligned)
             faded = size <= FADED * self._peak or size <= self._fading or self._quiet >= self._faded
-            leaving = self._quiet >= self._quiet_ticks and self._side * velocity < 0.0 and faded
+            outside = not touching and self._quiet >= self._quiet_ticks
+            leaving = outside and self._side * velocity < 0.0 and faded
             if leaving or side != self._side:
                 fault = self._audit(velocity)
             elif self._ticks > self._longest:
@@ -152,18 +169,23 @@ class Watchdog:
         self._aligned = aligned
         return fault
 
-    def conclude(self, given: float) -> int:
-        """Audit the contact under way, if there is one, after the force `given` [N] on the last tick."""
+    def conclude(self, given: float, status: int) -> int:
+        """Audit the contact under way, if there is one, after the force `given` [N] on the last tick and the
+        law's `status` then."""
         if not self._open:
             return 0
+        self._statuses.take(status)
         before = self._velocity
+        if not self._mass > 0.0:
+            return self._audit(before)
         velocity = before - self._period * given / self._mass
         self._work += self._period * given * 0.5 * (before + velocity)
         return self._audit(velocity)
 
     def detail(self) -> str:
         """The last audit in words."""
-        return f"contact {self.contacts}: restitution {self.restitution:.4g}, expected {self.expected:.4g}"
+        found = f"contact {self.contacts}: restitution {self.restitution:.4g}, expected {self.expected:.4g}"
+        return f"{found}, law {self.record.status.replace('_', ' ')}" if self._stated else found
 
     def _begin(self, entry: float, side: float) -> None:
         self._open = True
@@ -173,6 +195,7 @@ class Watchdog:
         self._ticks = 0
         self._peak = 0.0
         self._work = 0.0
+        self._statuses.restart()
         self._sxx = self._sxv = self._svv = self._sxf = self._svf = 0.0
 
     def _regress(self, force: float, aligned: float) -> None:
@@ -193,6 +216,13 @@ class Watchdog:
     def _audit(self, velocity: float) -> int:
         self._open = False
         self.contacts += 1
+        doubt = 0
+        if self._stated:
+            self.record = self._statuses.record(self.contacts)
+            doubt = LAW_IN_DOUBT if self.record.in_doubt else 0
+        return doubt | (self._energies(velocity) if self._mass > 0.0 else 0)
+
+    def _energies(self, velocity: float) -> int:
         entry, mass = self._entry, self._mass
         energy = 0.5 * mass * entry * entry
         self.balance = 0.5 * mass * velocity * velocity - energy + self._work

@@ -193,6 +193,10 @@ def _print(found: dict[str, Any]) -> None:
         for name, loop in reached.items()
         if loop["stood_still"] > 0
     ]
+    doubts = found["run"]["controller"]["doubts"] if found["run"] is not None else {}
+    if doubts:
+        said = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in doubts.items())
+        lines.append(f"Of {sum(doubts.values())} contacts the law says that it did not know them: {said}.")
     if found["tripped"]:
         lines.append(f"The controller {found['tripped']}.")
     if found["interrupted"]:

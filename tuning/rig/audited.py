@@ -150,7 +150,7 @@ def audit_contacts(signals: Signals, rules: Rules, slots: int) -> Audited:
                 for name, product in zip(SUMS, (x * x, x * v, v * v, x * f, v * f), strict=True):
                     state.sums[name] += product
                 faded = (size <= FADED * state.peak) | (size <= rules.fading) | (state.quiet >= patience)
-                leaves = (state.quiet >= quiet_ticks) & (own * velocity < 0) & faded
+                leaves = ~touching & (state.quiet >= quiet_ticks) & (own * velocity < 0) & faded
                 over = going & (leaves | (side != own))
                 if np.any(over):
                     state.audit(over, velocity, np.zeros(lanes))

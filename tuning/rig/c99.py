@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from jaxhil.errors import InputError, one_line
 from jaxhil.runtime.controller import Controller
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
-from tuning.rig.c99_tables import Table, constants, faults_table, gains_table, limits_table
+from tuning.rig.c99_tables import Table, constants, faults_table, gains_table, limits_table, statuses_table
 
 HEADER, SOURCE, GAINS, TEST = (
     "jaxhil_controller.h",
@@ -103,6 +103,7 @@ _TABLES: Mapping[str, Callable[[str], Table]] = {
     "gains_table.c": gains_table,
     "limits_table.c": lambda law: limits_table(),
     "faults_table.c": lambda law: faults_table(),
+    "law_status_table.c": lambda law: statuses_table(),
 }
 
 

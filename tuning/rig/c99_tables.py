@@ -1,4 +1,4 @@
-"""The parts of the controller in C99 that are tables of the runtime: gains, limits, faults.
+"""The parts of the controller in C99 that are tables of the runtime: gains, limits, faults, statuses.
 
 Each becomes a struct or a list of constants, with what its Python original says of every entry, and a check
 that admits just what the runtime admits. The struct of gains begins with control period and clearance, which
@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from jaxhil.runtime.faults import FAULTS
 from jaxhil.runtime.gain_file import GainFile
+from jaxhil.runtime.law_status import STATUSES
 from jaxhil.runtime.limits import LIMITS
 from jaxhil.runtime.registry import COMPENSATORS
 
@@ -104,6 +105,22 @@ def faults_table() -> Table:
         f"{cases}"
         '    case JAXHIL_UNUSABLE:\n        return "unusable";\n'
         '    default:\n        return "";\n    }\n}\n',
+    )
+
+
+def statuses_table() -> Table:
+    """The statuses of a law, and their names."""
+    named = [(f"JAXHIL_{status.name.upper()}", status) for status in STATUSES]
+    lines = [f"{_comment(status.meaning, '    ')}    {name}" for name, status in named]
+    joined = ",\n".join(lines)
+    cases = "".join(f'    case {name}:\n        return "{status.name}";\n' for name, status in named)
+    return Table(
+        "/* What a law may say of its last command. */\n",
+        f"enum {{\n{joined}\n}};\n\n"
+        '/* The name of a status; "" if there is none of the number. */\n'
+        "const char *jaxhil_law_status_name(int status);\n",
+        "const char *jaxhil_law_status_name(int status) {\n    switch (status) {\n"
+        f'{cases}    default:\n        return "";\n    }}\n}}\n',
     )
 
 

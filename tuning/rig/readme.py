@@ -7,6 +7,7 @@ from typing import Any
 
 from jaxhil.errors import one_line
 from jaxhil.runtime.faults import FAULTS
+from jaxhil.runtime.law_status import STATUSES
 
 TEMPLATE = Path(__file__).parent / "bundle_readme.md"
 
@@ -36,8 +37,15 @@ def readme_text(document: Mapping[str, Any], files: Collection[str]) -> str:
         period=repr(document["control_period"]),
         digest=document["sha256"],
         content="\n".join(("| file | is |", "|---|---|", *listed)),
+        statuses=status_table(),
         faults=fault_table(),
     )
+
+
+def status_table() -> str:
+    """The runtime's table of a law's statuses in Markdown."""
+    rows = [f"| `{status.name}` | {_cell(status.meaning)} |" for status in STATUSES]
+    return "\n".join(("| status | says |", "|---|---|", *rows))
 
 
 def fault_table() -> str:

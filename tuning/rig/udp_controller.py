@@ -36,7 +36,7 @@ import time
 from array import array
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 HERE = Path(__file__).resolve().parent
 # An isolated interpreter (-I) does not look beside the script.
@@ -65,7 +65,7 @@ MARK_IN, MARK_OUT, VERSION = b"JHrd", b"JHan", 1
 APPROACH = 0.02  # s of free approach before a contact
 MOST_MADE_UP = 10  # ticks in a row, without a limit in the gain file
 MOST_PASSED = 10_000  # periods that the model goes on under the last force
-MISSED_TICK = 0x200  # the runtime's fault of this name
+MISSED_TICK, LAW_IN_DOUBT = 0x200, 0x200000  # the runtime's faults of these names
 
 CPU_SHARE = 0.5  # of the period, that is the controller's
 REPLAYS = 3
@@ -189,12 +189,13 @@ class NumericalModel:
 class Task:
     """What is done with one packet, without a network: readings in, answers out.
 
-    `bridged`: how many missing ticks in a row are made up. Counts `made_up` and `stale`, packets of no use.
+    `bridged`: how many missing ticks in a row are made up. Counts `made_up` and `stale`, packets of no
+    use, and in `doubts` the contacts of which the law said that it did not know them, by what it said.
     """
 
     __slots__ = (
         *("_bridged", "_command", "_controller", "_force", "_last", "_model", "_period", "_run"),
-        *("_sequence", "_tared", "_words", "_zeroed", "made_up", "stale"),
+        *("_sequence", "_tared", "_words", "_zeroed", "doubts", "made_up", "stale"),
     )
 
     def __init__(self, controller: Any, mechanism: dict[str, Any], bridged: float = MOST_MADE_UP) -> None:
@@ -209,6 +210,7 @@ class Task:
         self._last: Reading | None = None
         self._words = ""
         self.stale = self.made_up = 0
+        self.doubts: dict[str, int] = {}
 
     @property
     def period(self) -> float:
@@ -231,25 +233,36 @@ class Task:
         return self._step(reading) if reading.event == TICK else self._prepare(reading)
 
     def _prepare(self, reading: Reading) -> Answer:
-        model = self._model
+        model, faults = self._model, 0
         if reading.run != self._run:
             if not self._tared:
                 self._tared = self._controller.tare(reading.force)
             if not self._tared:
                 return self._reply(reading, TARING, 0.0, model.position, model.velocity, 0.0, 0)
-            self._begin(reading)
-        return self._reply(reading, READY, model.velocity, model.position, model.velocity, 0.0, 0)
+            faults = self._begin(reading)
+        return self._reply(reading, READY, model.velocity, model.position, model.velocity, 0.0, faults)
 
-    def _begin(self, reading: Reading) -> None:
-        model = self._model
+    def _begin(self, reading: Reading) -> int:
+        """A fresh run; the faults of the last one's end."""
+        model, faults = self._model, 0
         if math.isfinite(reading.start_position) and math.isfinite(reading.start_velocity):
             model.place(reading.start_position, reading.start_velocity)
         else:
             model.place(*model.start)
-        if self._run >= 0:
+        if self._run >= 0 and not self._controller.tripped:
             self._controller.next_contact()
+            faults = self._told()
         self._command = self._controller.position_command(model.position, model.velocity, model.acceleration)
         self._run, self._last, self._force = reading.run, None, 0.0
+        return faults
+
+    def _told(self) -> int:
+        """The controller's faults now, a contact of which the law says that it did not know it counted."""
+        controller = self._controller
+        if controller.faults & LAW_IN_DOUBT:
+            status = controller.last_contact.status
+            self.doubts[status] = self.doubts.get(status, 0) + 1
+        return controller.faults
 
     def _step(self, reading: Reading) -> Answer:
         model, last = self._model, self._last
@@ -293,7 +306,7 @@ class Task:
         self._force = force
         model.integrate(force)
         self._command = controller.position_command(model.position, model.velocity, model.acceleration)
-        return controller.faults
+        return self._told()
 
     def _reply(
         self,
@@ -320,6 +333,7 @@ class Empty:
 
     stale = made_up = 0
     status = "ok"
+    doubts: ClassVar[dict[str, int]] = {}
 
     def answer(self, reading: Reading) -> Answer:
         """Zeros, and the reading's own numbers."""
@@ -468,6 +482,7 @@ def main(arguments: list[str] | None = None) -> int:
         "status": task.status,
         "stale": task.stale,
         "made_up": task.made_up,
+        "doubts": task.doubts,
         "jax": "jax" in sys.modules,
         "ticks": record.document(),
         "replayed": {"sequence": list(again), "cpu": list(again.values())},

@@ -1,0 +1,272 @@
+"""What the law says of itself, tick by tick and over a contact, and what the watchdog makes of it: in Python
+and in C bit for bit.
+
+`pytest -m slow -s tests/test_law_status.py` prints what the shares in `jaxhil.runtime.law_status` rest on.
+"""
+
+from collections.abc import Mapping
+from functools import cache
+from typing import NamedTuple
+
+import c99_cases
+import numpy as np
+import pytest
+from c99_cases import RESULT, ROW, Batch, assert_same, compiled, controller_in_python, packed
+from rig_lock_step import controller
+
+from jaxhil.compensators import literature_gains
+from jaxhil.mechanism import Mechanism
+from jaxhil.mechanism_file import load, to_builtins
+from jaxhil.runtime import COMPENSATORS, Controller
+from jaxhil.runtime.faults import LAW_IN_DOUBT, RESTITUTION, names
+from jaxhil.runtime.gain_file import GainFile
+from jaxhil.runtime.law_status import (
+    DOUBTFUL,
+    IDENTIFIED,
+    OUT_OF_CONTACT,
+    SATURATED,
+    SATURATING,
+    STATUSES,
+    TOO_SHORT,
+    UNSURE,
+    StatusCount,
+)
+from jaxhil.runtime.limits import NO_LIMITS
+from jaxhil.uncertainty import draw
+from tuning.rig.plant import Plant
+from tuning.rig.udp_controller import NumericalModel
+
+LAW = "retrospective_reference"
+AFTER = 60  # ticks that are run on once both have left the surface
+LONGEST = 2000
+
+
+class Kind(NamedTuple):
+    """A contact: its suite, what is set, the gains that differ, and what the law is to say of it."""
+
+    suite: str
+    changes: tuple[str, ...]
+    gains: Mapping[str, float]
+    status: str
+
+
+KINDS = {
+    "ordinary": Kind("noisy", (), {}, "identified"),
+    "8 Hz": Kind("fast", ("contact.stiffness=[884316.0]",), {}, "too_short"),
+    "hidden by the dead zone": Kind(
+        "dead-zone", ("contact.stiffness=[51000.0]", "rig.force_sensor.dead_zone=40.0"), {}, "unsure"
+    ),
+    "repelled before the hardware touches": Kind("noisy", (), {"prior_stiffness": 1e5}, "unsure"),
+    "hardly corrected": Kind("noisy", (), {"correction_limit": 1e-3}, "saturated"),
+}
+WATCHED = {"settling": 0.02, "free_force": 20.0}
+LIMITS = {
+    "none": {},
+    "no energies": WATCHED,
+    "energies": {**WATCHED, "equivalent_mass": 350.0, "energy_balance": 1e-6},
+}
+
+
+class Ran(NamedTuple):
+    """A contact tick by tick: rows of `c99_cases.ROW`, the controller's faults and what the law said."""
+
+    rows: np.ndarray
+    faults: np.ndarray
+    said: list[str]
+
+
+def run(mechanism: Mechanism, law: Controller, seed: int = 0) -> Ran:
+    """One contact in lock-step with the rig's plant, until both have been outside for a while."""
+    plant, model = Plant(mechanism, seed), NumericalModel(to_builtins(mechanism))
+    period, quiet, entered = law.control_period, 0, False
+    position, velocity = model.start
+    model.place(position, velocity)
+    plant.begin(position, velocity, law.position_command(position, velocity, 0.0), 0)
+    rows, faults, said = [], [], []
+    for tick in range(LONGEST):
+        force, measured = plant.read()
+        readings = [force, model.position, model.velocity, measured, tick * period]
+        command = law.step(*readings)
+        model.integrate(0.0 if tick == 0 else command)
+        motion = [model.position, model.velocity, model.acceleration]
+        plant.move(law.position_command(*motion))
+        rows.append([c99_cases.TICK, *readings, 1.0, *motion])
+        faults.append(law.faults)
+        said.append(law.law_status)
+        touching = readings[1] > 0.0 or measured > 0.0
+        entered, quiet = entered or touching, 0 if touching else quiet + 1
+        if entered and quiet > AFTER:
+            break
+    return Ran(np.array(rows), np.array(faults), said)
+
+
+def gain_file(kind: Kind, limits: Mapping[str, float]) -> tuple[Mechanism, GainFile]:
+    mechanism = load(f"suite-{kind.suite}", list(kind.changes)).mechanism
+    gains = literature_gains(mechanism, LAW) | dict(kind.gains)
+    made = GainFile(LAW, gains, mechanism.rig.control_period, mechanism.contact.clearance)
+    return mechanism, made._replace(limits={**NO_LIMITS, **limits})
+
+
+@cache
+def ran(name: str, limits: str) -> tuple[Controller, Ran]:
+    """One of the kinds under these limits, and its controller after it."""
+    mechanism, made = gain_file(KINDS[name], LIMITS[limits])
+    law = Controller(made)
+    return law, run(mechanism, law)
+
+
+@pytest.mark.parametrize("limits", LIMITS)
+@pytest.mark.parametrize("name", KINDS)
+def test_a_contact_is_what_the_law_said_of_most_of_it(name, limits):
+    """Once it is over, on one tick, and without a trip; with the audit of energies and without."""
+    law, found = ran(name, limits)
+    record, wanted = law.last_contact, KINDS[name].status
+    assert (record.number, record.status) == (1, wanted)
+    assert law.status == "ok" and names(law.seen) == ([] if wanted == "identified" else ["law_in_doubt"])
+    (raised,) = np.nonzero(found.faults) if wanted != "identified" else ([len(found.faults)],)
+    assert len(raised) == 1
+    said = found.said[: raised[0]]
+    assert record.ticks == len(said) - said.count("out_of_contact") > 50
+    for status in ("unsure", "saturated", "too_short"):
+        assert getattr(record, status) == said.count(status)
+
+
+@pytest.fixture(scope="module")
+def in_c(tmp_path_factory):
+    """The law, compiled and loaded."""
+    if c99_cases.COMPILER is None:
+        pytest.skip("no C compiler (cc) on this machine")
+    folder = c99_cases.write_sources(tmp_path_factory.mktemp(LAW), c99_cases.long_document(LAW))
+    return Batch(compiled(folder, "c99_driver.c", "driver.so", "-O2", "-shared", "-fPIC"), LAW)
+
+
+def test_c_says_the_same_of_every_kind_of_contact(in_c):
+    """To the bit, with resets and new contacts in between; the kinds show every status that there is."""
+    column = {name: place for place, name in enumerate(RESULT)}
+    rows = np.concatenate([ran(name, "no energies")[1].rows for name in KINDS])
+    rows[:, ROW.index("timed")] = 0.0
+    rng = np.random.default_rng(0)
+    said, contacts = set(), set()
+    for name in KINDS:
+        _, made = gain_file(KINDS[name], LIMITS["energies"])
+        for share in (0.0, 0.01):
+            events = [c99_cases.TICK, c99_cases.RESET, c99_cases.NEXT_CONTACT]
+            rows[:, 0] = rng.choice(events, len(rows), p=[1 - 2 * share, share, share])
+            expected = controller_in_python(made, rows)
+            assert in_c.begin(packed(LAW, made))
+            assert_same(in_c.run(rows, True), expected, rows)
+            said |= set(expected[:, column["law_status"]])
+            contacts |= set(expected[:, column["contact_status"]])
+    assert said == {OUT_OF_CONTACT, IDENTIFIED, UNSURE, SATURATED, TOO_SHORT}
+    assert contacts == {*range(len(STATUSES))}
+
+
+def test_the_record_stays_until_the_next_contact_is_audited():
+    mechanism, made = gain_file(KINDS["8 Hz"], {})
+    law = Controller(made)
+    assert law.law_status == "out_of_contact" and law.last_contact == (0, "unstated", 0, 0, 0, 0)
+    run(mechanism, law)
+    first = law.last_contact
+    assert first.number == 1
+    law.next_contact()
+    assert law.last_contact == first and law.faults == 0
+    assert law.reset() and law.last_contact == first and law.seen == 0
+    run(*gain_file(KINDS["ordinary"], {})[:1], law)
+    assert law.last_contact[:2] == (2, "identified")
+
+
+def test_a_contact_under_way_is_judged_when_the_next_is_announced():
+    for limits in LIMITS.values():
+        mechanism, made = gain_file(KINDS["8 Hz"], {**limits, "settling": 5.0})
+        law = Controller(made)
+        found = run(mechanism, law)
+        assert not np.any(found.faults) and law.last_contact.number == 0
+        law.next_contact()
+        assert law.faults == law.seen == LAW_IN_DOUBT and not law.tripped
+        assert law.last_contact[:2] == (1, "too_short")
+        law.step(0.0, -1e-3, 5e-3, -1e-3)
+        assert law.faults == 0 and law.seen == LAW_IN_DOUBT
+
+
+def test_a_restitution_that_trips_comes_with_what_the_law_said():
+    """Both faults on one tick; the one that does not trip is no cause."""
+    mechanism, made = gain_file(KINDS["8 Hz"], {**LIMITS["energies"], "restitution_margin": 1e-6})
+    law = Controller(made)
+    found = run(mechanism, law)
+    assert RESTITUTION | LAW_IN_DOUBT in found.faults and law.cause == RESTITUTION
+    assert law.status.startswith("tripped: restitution (contact 1: restitution ")
+    assert law.status.endswith(", law too short)")
+
+
+@pytest.mark.parametrize("name", [name for name in COMPENSATORS if name != LAW])
+def test_laws_without_a_status_say_nothing(name):
+    mechanism = load("suite-noisy").mechanism
+    law = controller(mechanism, name, literature_gains(mechanism, name), **LIMITS["energies"])
+    found = run(mechanism, law)
+    assert set(found.said) == {"unstated"} and law.last_contact == (0, "unstated", 0, 0, 0, 0)
+    law.next_contact()
+    assert not law.seen & LAW_IN_DOUBT and law._watchdog.contacts == 1
+    assert law.last_contact.number == 0
+    law = controller(mechanism, name, literature_gains(mechanism, name), **WATCHED)
+    assert not law._watchdog.on
+
+
+@pytest.mark.parametrize(
+    ("counts", "status"),
+    [
+        ({}, OUT_OF_CONTACT),
+        ({OUT_OF_CONTACT: 50}, OUT_OF_CONTACT),
+        ({OUT_OF_CONTACT: 500, IDENTIFIED: 6, UNSURE: 4}, IDENTIFIED),
+        ({IDENTIFIED: 59, UNSURE: 41}, UNSURE),
+        ({IDENTIFIED: 59, UNSURE: 21, TOO_SHORT: 20}, UNSURE),
+        ({IDENTIFIED: 59, UNSURE: 20, TOO_SHORT: 21}, TOO_SHORT),
+        ({IDENTIFIED: 50, SATURATED: 50}, IDENTIFIED),
+        ({IDENTIFIED: 9, SATURATED: 51, UNSURE: 40}, SATURATED),
+        ({SATURATED: 59, UNSURE: 41}, UNSURE),
+    ],
+)
+def test_the_status_that_counts(counts, status):
+    made = StatusCount()
+    for one, number in counts.items():
+        for _ in range(number):
+            made.take(one)
+    record = made.record(7)
+    assert (record.number, record.status) == (7, STATUSES[status].name)
+    assert record.ticks == sum(counts.values()) - counts.get(OUT_OF_CONTACT, 0)
+    assert record.in_doubt == (status in (UNSURE, SATURATED, TOO_SHORT))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", ["sharp", "gentle"])
+@pytest.mark.parametrize("suite", ["noisy", "hertz", "layered", "dead-zone", "fast"])
+def test_what_the_shares_rest_on(suite, setting):
+    """Of many contacts: the shares of ticks in doubt and saturated, and the gap that `DOUBTFUL` lies in.
+
+    Too short are those that the law calls so on any tick.
+    """
+    parsed = load(f"suite-{suite}").mechanism
+    contacts = 200
+    drawn = draw(parsed, contacts, 5)
+    doubt, saturated, short = np.empty((3, contacts))
+    for place in range(contacts):
+        one = {path: values[place].tolist() for path, values in drawn.items()}
+        one["approach.phase"] = one["approach.phase"][0]
+        changes = [f"{path}={value}" for path, value in one.items()]
+        mechanism = load(f"suite-{suite}", changes).mechanism
+        law = controller(mechanism, LAW, literature_gains(mechanism, LAW, setting))
+        run(mechanism, law, place)
+        record = law.last_contact
+        assert record.number == 1
+        doubt[place] = (record.unsure + record.too_short) / record.ticks
+        saturated[place] = record.saturated / record.ticks
+        short[place] = record.too_short > 0
+    known = doubt[short == 0]
+    print(
+        f"{suite}, {setting}: {len(known)} contacts that are not too short, in doubt on up to "
+        f"{np.max(known):.2f} of their ticks; saturated on up to {np.max(saturated):.2f}"
+    )
+    assert np.max(known) < DOUBTFUL and np.max(saturated) < SATURATING
+    if np.any(short):
+        least, most = np.quantile(doubt[short > 0], [0.0, 0.05])
+        print(f"{int(np.sum(short))} that are, on {least:.2f} and more, all but a twentieth on {most:.2f}")
+        assert most > DOUBTFUL
