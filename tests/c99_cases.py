@@ -9,6 +9,7 @@ import math
 import re
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -124,6 +125,16 @@ class Batch:
         run = self._library.driver_run if guarded else self._library.driver_law
         run(self._state, ctypes.c_size_t(len(rows)), _pointer(rows), _pointer(results))
         return results
+
+
+@functools.cache
+def loaded(law: str) -> Batch:
+    """The law, compiled for delays as long as the tests need and loaded: once for all modules."""
+    folder = write_sources(Path(_BUILT.name) / law, long_document(law))
+    return Batch(compiled(folder, "c99_driver.c", "driver.so", "-O2", "-shared", "-fPIC"), law)
+
+
+_BUILT = tempfile.TemporaryDirectory(prefix="jaxhil-c99-")
 
 
 def _pointer(values: np.ndarray):

@@ -1,6 +1,7 @@
 """The controller in C99 is the runtime in Python, bit for bit, and compiles without a warning."""
 
 import ctypes
+import functools
 import math
 import re
 import shutil
@@ -43,17 +44,9 @@ KINDS = ("contact", "random", "hostile")
 
 
 @pytest.fixture(scope="module")
-def batch(tmp_path_factory):
-    """`batch(law)`: the law, compiled and loaded, once per session."""
-    made = {}
-
-    def get(law):
-        if law not in made:
-            folder = c99_cases.write_sources(tmp_path_factory.mktemp(law), c99_cases.long_document(law))
-            made[law] = Batch(compiled(folder, "c99_driver.c", "driver.so", "-O2", "-shared", "-fPIC"), law)
-        return made[law]
-
-    return get
+def batch():
+    """`batch(law)`: the law, compiled and loaded."""
+    return c99_cases.loaded
 
 
 def sanitized(tmp_path: Path, law: str) -> Path:
@@ -70,20 +63,30 @@ def sanitized(tmp_path: Path, law: str) -> Path:
 # Sources
 
 
-@pytest.mark.parametrize("law", LAWS)
-def test_every_law_compiles_without_a_warning(law, tmp_path):
-    folder = c99_cases.write_sources(tmp_path, gain_document(law))
-    strict = ("-Wconversion", "-Wshadow", "-Wstrict-prototypes", "-Wfloat-conversion")
-    compiled(folder, "jaxhil_controller.c", "controller.o", "-c", "-O2", *strict)
-    compiled(folder, "test_vectors.c", "test.o", "-c", "-O0")
+@pytest.fixture(scope="module")
+def controller_object(tmp_path_factory):
+    """`controller_object(law)`: the folder with the law's sources and its controller.o."""
+
+    @functools.cache
+    def made(law):
+        folder = c99_cases.write_sources(tmp_path_factory.mktemp(law), gain_document(law))
+        strict = ("-Wconversion", "-Wshadow", "-Wstrict-prototypes", "-Wfloat-conversion")
+        compiled(folder, "jaxhil_controller.c", "controller.o", "-c", "-O2", *strict)
+        return folder
+
+    return made
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_controller_keeps_no_memory_of_its_own_and_calls_nothing_but_math(law, tmp_path):
+def test_every_law_compiles_without_a_warning(law, controller_object):
+    compiled(controller_object(law), "test_vectors.c", "test.o", "-c", "-O0")
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_controller_keeps_no_memory_of_its_own_and_calls_nothing_but_math(law, controller_object):
     if shutil.which("nm") is None:
         pytest.skip("no nm on this machine")
-    folder = c99_cases.write_sources(tmp_path, gain_document(law))
-    compiled(folder, "jaxhil_controller.c", "controller.o", "-c", "-O1")
+    folder = controller_object(law)
     listed = subprocess.run(["nm", "-P", "controller.o"], cwd=folder, capture_output=True, text=True).stdout
     symbols = [line.split()[:2] for line in listed.splitlines()]
     # memset and memcpy are what a compiler makes of loops and assignments, also for a free-standing program.

@@ -3,7 +3,7 @@
 import c99_cases
 import numpy as np
 import pytest
-from c99_cases import RESULT, Batch, compiled, controller_in_python, packed, write_sources
+from c99_cases import RESULT, controller_in_python, loaded, packed
 from fault_runs import LIMITED, PERIOD, FaultRun, document, fault_run
 
 from jaxhil.runtime import COMPENSATORS
@@ -54,9 +54,8 @@ def python_runs(ticks: int, law: str, seed: int) -> None:
         check(run, controller_in_python(gain_file, run.rows))
 
 
-def c_runs(folder, ticks: int, law: str, seed: int) -> None:
-    write_sources(folder, document(law))
-    batch = Batch(compiled(folder, "c99_driver.c", "driver.so", "-O2", "-shared", "-fPIC"), law)
+def c_runs(ticks: int, law: str, seed: int) -> None:
+    batch = loaded(law)
     gain_file = check_gain_document(document(law))
     for part in range(max(1, ticks // BLOCK)):
         run = fault_run(min(ticks, BLOCK), seed + part, law)
@@ -86,8 +85,8 @@ def test_python_raises_every_fault_on_its_tick(law):
 
 @needs_compiler
 @pytest.mark.parametrize("law", COMPENSATORS)
-def test_c_raises_every_fault_on_its_tick(law, tmp_path):
-    c_runs(tmp_path, 200_000, law, 20)
+def test_c_raises_every_fault_on_its_tick(law):
+    c_runs(200_000, law, 20)
 
 
 @pytest.mark.slow
@@ -99,5 +98,5 @@ def test_ten_million_ticks_in_python(law):
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize("law", COMPENSATORS)
-def test_a_hundred_million_ticks_in_c(law, tmp_path):
-    c_runs(tmp_path, 100_000_000 if law == "response_error" else 10_000_000, law, 2000)
+def test_a_hundred_million_ticks_in_c(law):
+    c_runs(100_000_000 if law == "response_error" else 10_000_000, law, 2000)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import c99_cases
 import numpy as np
 import pytest
-from c99_cases import RESULT, ROW, Batch, assert_same, compiled, controller_in_python, packed
+from c99_cases import RESULT, ROW, assert_same, controller_in_python, packed
 from rig_lock_step import controller
 
 from jaxhil.compensators import literature_gains
@@ -132,12 +132,11 @@ def test_a_contact_is_what_the_law_said_of_most_of_it(name, limits):
 
 
 @pytest.fixture(scope="module")
-def in_c(tmp_path_factory):
+def in_c():
     """The law, compiled and loaded."""
     if c99_cases.COMPILER is None:
         pytest.skip("no C compiler (cc) on this machine")
-    folder = c99_cases.write_sources(tmp_path_factory.mktemp(LAW), c99_cases.long_document(LAW))
-    return Batch(compiled(folder, "c99_driver.c", "driver.so", "-O2", "-shared", "-fPIC"), LAW)
+    return c99_cases.loaded(LAW)
 
 
 def test_c_says_the_same_of_every_kind_of_contact(in_c):
