@@ -34,6 +34,7 @@ from tuning.verification import REPLAY_LIMIT, LaneReplay, replay
 pytestmark = pytest.mark.users_options
 
 RING = 256  # samples, more than any identification delay at the shortest period
+RECORD = 3072  # ticks, more than any record has: its programs serve every mechanism
 MECHANISMS = [
     load(name, [f"rig.control_period={period}"]).mechanism
     for name, period in (("varying", 0.00025), ("rattling", 0.001), ("claw-350kg", 0.004))
@@ -234,10 +235,10 @@ def test_recorded_ticks(mechanism_name):
         assert max(seen.difference, seen.near_difference) <= REPLAY_LIMIT, (index, seen)
     # The same readings, padded to a common length, serve every compensator with gains of any kind.
     ticks = [len(lane.command) for lane in lanes]
-    length = 1024 * math.ceil(max(ticks) / 1024)
+    assert max(ticks) <= RECORD
     signals = Signals(
         *(
-            np.stack([np.pad(leaf, (0, length - len(leaf)), mode="edge") for leaf in leaves], axis=1)
+            np.stack([np.pad(leaf, (0, RECORD - len(leaf)), mode="edge") for leaf in leaves], axis=1)
             for leaves in zip(*(lane.signals for lane in lanes), strict=True)
         )
     )
