@@ -35,8 +35,8 @@ class Metrics(NamedTuple):
     position_shortfall, how far the motion simulator's limits bound [m]; duration, the time in touch [s];
     work_in and work_out, by the real force along x_a [J] (0 unless audited); trajectory_error, the root mean
     square of x_d's depth off that of the same contact in space, as long as that lasts, each since it touched
-    [m] (0 unless probed); status, one of `STATUS_NAMES`;
-    ticks run by then.
+    [m] (0 unless probed); force_delay, the delay of the force measurement as the law estimates it by then
+    [s] (0 unless it does); status, one of `STATUS_NAMES`; ticks run by then.
 
     excess_variation is V / 2 - (max F_c - min F_c), V the total variation sum |F_c(n+1) - F_c(n)| of the
     command, which counts as 0 before the contact and after it. The least V / 2 there is, max - min, is that
@@ -58,6 +58,7 @@ class Metrics(NamedTuple):
     work_in: Float[Array, "slots *batch"]
     work_out: Float[Array, "slots *batch"]
     trajectory_error: Float[Array, "slots *batch"]
+    force_delay: Float[Array, "slots *batch"]
     status: Int[Array, "slots *batch"]
     ticks: Int[Array, "slots *batch"]
 
@@ -129,6 +130,7 @@ def empty_metrics(loop: Loop, slots: int, like: Array) -> Metrics:
         work_in=numbers,
         work_out=numbers,
         trajectory_error=numbers if loop.probed else jnp.zeros_like(numbers),
+        force_delay=numbers if loop.compensator.estimates_delay else jnp.zeros_like(numbers),
         status=counts + NOT_REACHED,
         ticks=counts,
     )
@@ -257,8 +259,10 @@ def collect(
     over: Array,
     status: Array,
     ticks: Array,
+    force_delay: Array | None = None,
 ) -> Metrics:
-    """Enter the contacts that are `over` at their `index`; `ticks` have run by now."""
+    """Enter the contacts that are `over` at their `index`; `ticks` have run by now, and the law estimates a
+    `force_delay` [s], or none."""
     period = scenario.control_period
     none = jnp.zeros_like(period)
     work_in, work_out = watch.works or (none, none)
@@ -276,6 +280,7 @@ def collect(
         work_in=work_in,
         work_out=work_out,
         trajectory_error=none if watch.deviation is None else root_mean_square(watch.deviation),
+        force_delay=none if force_delay is None else force_delay,
         status=status,
         ticks=ticks,
     )
@@ -288,6 +293,8 @@ def collect(
         entered = entered._replace(position_shortfall=metrics.position_shortfall)
     if watch.deviation is None:
         entered = entered._replace(trajectory_error=metrics.trajectory_error)
+    if force_delay is None:
+        entered = entered._replace(force_delay=metrics.force_delay)
     return entered
 
 

@@ -195,7 +195,10 @@ def turn_over(loop: Loop, rig: Rig, gains: Gains, run: Run, skip_flight: bool = 
     status = judge(scenario, watch, run.tick - state.entry_tick)
     over = _pending(rig, run)
     ticks = jnp.broadcast_to(run.tick - _first_tick(loop), run.index.shape)
-    metrics = collect(scenario, run.metrics, watch, run.index, over, status, ticks)
+    delay = None
+    if loop.compensator.estimates_delay:
+        delay = loop.compensator.force_delay(gains, state.controller)
+    metrics = collect(scenario, run.metrics, watch, run.index, over, status, ticks, delay)
     index = run.index + over.astype(jnp.int32)
     active = run.active & ~(over & ((status != OK) | (index >= scenario.contacts)))
     blank = fresh_watch(loop, watch.approach)

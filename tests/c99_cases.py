@@ -31,6 +31,7 @@ RESULT = (
     *("missed_ticks", "late_ticks", "at_rest", "tripped", "bias", "answer"),
     *("contacts", "restitution", "expected", "balance"),
     *("last_contact", "contact_status", "contact_ticks", "unsure", "saturated", "too_short"),
+    "force_delay",
 )
 STATUS_NAMES = tuple(status.name for status in STATUSES)
 TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE = (float(code) for code in range(6))
@@ -343,6 +344,7 @@ def controller_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
             *(controller.bias, answer),
             *(watchdog.contacts, watchdog.restitution, watchdog.expected, watchdog.balance),
             *(number, STATUS_NAMES.index(status), *counts),
+            controller.force_delay,
         )
     return results
 

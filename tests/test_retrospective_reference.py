@@ -20,15 +20,9 @@ from jaxhil.mechanism_file import load
 from jaxhil.rollout import rollout
 from jaxhil.runtime import reintegration
 from jaxhil.runtime.force_depth_map import KNOTS, Curve, ForceDepthMap, positive_mean
+from jaxhil.runtime.law_status import IDENTIFIED, OUT_OF_CONTACT, SATURATED, TOO_SHORT, UNSURE
 from jaxhil.runtime.reintegration import ReferenceMotion
-from jaxhil.runtime.retrospective_reference import (
-    IDENTIFIED,
-    OUT_OF_CONTACT,
-    SATURATED,
-    TOO_SHORT,
-    UNSURE,
-    RetrospectiveReference,
-)
+from jaxhil.runtime.retrospective_reference import RetrospectiveReference
 from jaxhil.scenario import build_scenarios
 from jaxhil.uncertainty import draw
 

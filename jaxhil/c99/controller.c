@@ -80,6 +80,9 @@ int64_t jaxhil_late_ticks(const jaxhil_controller *controller);
 /* Identified stiffness [N/m] and damping [N s/m]; 0 and 0 if the law identifies none. */
 void jaxhil_identified(const jaxhil_controller *controller, double *stiffness, double *damping);
 
+/* Estimated delay [s] of the force measurement; 0 if the law estimates none. */
+double jaxhil_force_delay(const jaxhil_controller *controller);
+
 /* What the law says of the last command; JAXHIL_UNSTATED if it says nothing. */
 int jaxhil_law_status(const jaxhil_controller *controller);
 
@@ -279,4 +282,14 @@ int jaxhil_law_status(const jaxhil_controller *controller) {
 
 jaxhil_contact_record jaxhil_last_contact(const jaxhil_controller *controller) {
     return controller->watchdog.record;
+}
+
+double jaxhil_force_delay(const jaxhil_controller *controller) {
+#ifdef JAXHIL_LAW_ESTIMATES_DELAY
+    if (controller->usable) {
+        return jaxhil_law_force_delay(&controller->law);
+    }
+#endif
+    (void)controller;
+    return 0.0;
 }

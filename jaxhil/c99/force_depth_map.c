@@ -44,6 +44,7 @@ static const double jaxhil_knots[JAXHIL_SEGMENTS] = {0.0,  0.002, 0.005, 0.01,  
                                                      0.032, 0.04,  0.05,  0.062, 0.076, 0.092};
 static const double jaxhil_map_wandering = 0.03; /* s of depth over which a slope wanders by its spread */
 static const double jaxhil_map_reach = 0.03;     /* s of depth at which the depth damping is as strong as named */
+static const double jaxhil_map_surface = 1e-12;  /* s of depth: nearer is on the surface, whatever the rounding */
 static const double jaxhil_map_outlying = 4.0;   /* times the noise's variance: hardly noise */
 static const double jaxhil_map_pi = 3.141592653589793;
 

@@ -22,9 +22,10 @@ typedef struct {
 
 /* From depth 0 at speed 1: x' = v, v' = -f, f = F(x, v, x_m) + rho [y - F(X, V, X_m)], rho = `replay`, the bracket
  * only as far as the hardware has been measured, until it separates. A pass from the entry makes up to JAXHIL_STRIDE steps of up to
- * 2 ms per tick; when it has caught up with the present it becomes the `live` motion. */
+ * 2 ms per tick; when it has caught up with the present it becomes the `live` motion. The force is older by `shift`
+ * [s] than it was taken for when samples were remembered: it belongs to X - shift V. */
 typedef struct {
-    double replay, period, first;
+    double replay, shift, period, first;
     long coarse, number, present, reached;
     jaxhil_path live, behind;
     double impulses[JAXHIL_HISTORY], depths[JAXHIL_HISTORY], speeds[JAXHIL_HISTORY];
@@ -58,6 +59,7 @@ static void jaxhil_path_enter(jaxhil_path *path) {
 void jaxhil_reference_motion_init(jaxhil_reference_motion *reference, double period) {
     const double steps = jaxhil_reference_coarse / period;
     reference->replay = 0.0;
+    reference->shift = 0.0;
     reference->period = period;
     /* A pass takes no longer steps than the history is long. */
     reference->coarse = JAXHIL_HISTORY;
@@ -100,8 +102,9 @@ static void jaxhil_reference_advance(const jaxhil_reference_motion *reference, j
     if (index < reference->number && ticks > 0.0) {
         const long slot = index % JAXHIL_HISTORY;
         const double impulse = reference->impulses[slot];
-        const double expected = jaxhil_curve_force(curve, reference->depths[slot], reference->speeds[slot],
-                                                   reference->deepest[slot]);
+        const double rate = reference->speeds[slot];
+        const double expected = jaxhil_curve_force(curve, reference->depths[slot] - reference->shift * rate,
+                                                   rate, reference->deepest[slot]);
         missing =
             reference->replay * ((impulse - path->impulse) / ticks - 0.5 * (path->expected + expected));
         path->impulse = impulse;

@@ -68,6 +68,8 @@ class Compensator(eqx.Module):
     gains: eqx.AbstractClassVar[tuple[Gain, ...]]
     # Sets of gains that serve any mechanism, by name: those that differ from the nominal ones.
     settings: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType({})
+    # Whether it estimates the delay of the force measurement: `force_delay`.
+    estimates_delay: ClassVar[bool] = False
 
     def prepare(self, gains: Gains, constants: Constants) -> Any:
         """What `step` needs of the gains, worked out once per run; the gains themselves by default."""
@@ -103,3 +105,7 @@ class Compensator(eqx.Module):
     def identified(self, state: Any) -> tuple[Array, Array] | None:
         """Identified stiffness [N/m] and damping [N s/m], where the law identifies them."""
         return None
+
+    def force_delay(self, gains: Gains, state: Any) -> Float[Array, "*batch"]:
+        """Estimated delay [s] of the force measurement; of a law that `estimates_delay`."""
+        raise NotImplementedError(f"{self.name} estimates no delay")

@@ -9,6 +9,7 @@ import math
 from jaxhil.mechanism import Mechanism
 
 FORCE_DELAY = "force delay"
+ROUGH_FORCE_DELAY = "force delay, roughly"
 STIFFNESS = "contact stiffness"
 CONTACT_FREQUENCY = "contact frequency"
 SIMULATOR_LAG = "simulator lag"
@@ -17,11 +18,29 @@ DEAD_ZONE = "dead zone"
 FORCE_NOISE = "force noise"
 EQUIVALENT_MASS = "equivalent mass"
 
+UNTOLD_DELAY_SPREAD = 0.001  # s
+
 
 def force_delay(mechanism: Mechanism) -> float:
     """The known delay [s] of the force measurement: transport plus first-order lag."""
     sensor = mechanism.rig.force_sensor
     return sensor.delay + sensor.time_constant
+
+
+def force_delay_spread(mechanism: Mechanism) -> float:
+    """How far [s] the force delay may lie from what is known of it: half of the range that the file gives it,
+    or two standard deviations; 1 ms where it says nothing of that."""
+    found = mechanism.uncertainty.get("rig.force_sensor.delay")
+    if found is None:
+        return UNTOLD_DELAY_SPREAD
+    nominal = mechanism.rig.force_sensor.delay
+    if found.std is not None:
+        return 2 * found.std
+    if found.factor is not None:
+        ends = [factor * nominal for factor in found.factor]
+    else:
+        ends = [end for end in (found.low, found.high) if end is not None]
+    return max(abs(end - nominal) for end in ends)
 
 
 def simulator_inverse(mechanism: Mechanism) -> tuple[float, float]:

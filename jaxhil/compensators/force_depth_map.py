@@ -25,6 +25,7 @@ PARAMETERS = SEGMENTS + 3
 WIDTHS = np.append(np.diff(KNOTS), np.inf)
 WANDERING = 0.03  # s of depth over which a slope wanders by its spread
 REACH = 0.03  # s of depth at which the depth damping is as strong as its name says
+SURFACE = 1e-12  # s of depth: nearer than that is on the surface, which rounding does not decide
 OUTLYING = 4.0  # times the noise's variance: a force that hardly is noise
 
 
@@ -33,6 +34,27 @@ class Map(NamedTuple):
 
     mean: Float[Array, "parameters *batch"]
     covariance: Float[Array, "parameters parameters *batch"]
+
+
+class Reading(NamedTuple):
+    """Of a tick: depth X [s] and speed V [1] as old as the force is told to be, the force y [1/s], its
+    variance r [1/s^2], whether the sensor's dead zone hides it, that zone [1/s], whether to learn from it."""
+
+    depth: Float[Array, "*batch"]
+    rate: Float[Array, "*batch"]
+    force: Float[Array, "*batch"]
+    variance: Float[Array, "*batch"]
+    hidden: Bool[Array, "*batch"]
+    zone: Float[Array, "*batch"]
+    counts: Bool[Array, "*batch"]
+
+
+class Prediction(NamedTuple):
+    """Of a reading: phi.theta [1/s], g = P phi, variance s = phi.g + that of the reading's noise [1/s^2]."""
+
+    force: Float[Array, "*batch"]
+    gain: Float[Array, "parameters *batch"]
+    variance: Float[Array, "*batch"]
 
 
 class Curve(NamedTuple):
@@ -75,19 +97,31 @@ def features(depth: Array, speed: Array, deepest: Array) -> Float[Array, "parame
     return jnp.concatenate([ramps(depth), jnp.stack([speed, depth * speed / REACH, depth - deepest])])
 
 
-def update(old: Map, phi: Array, force: Array, variance: Array, enabled: Bool[Array, "*batch"]) -> Map:
-    """One reading of `force` [1/s] with noise of a `variance` [1/s^2], where `enabled` and either the map or
-    the reading itself tells of contact: g = P phi, s = variance + phi.g, theta += g (f - phi.theta)/s,
-    P -= g g'/s."""
-    expected = jnp.sum(phi * old.mean, axis=0)
-    used = enabled & ((expected > 0) | (force**2 > OUTLYING * variance))
+def predict(old: Map, phi: Array, variance: Array) -> Prediction:
+    """What a reading with noise of a `variance` [1/s^2] will be by the map."""
     g = jnp.sum(old.covariance * phi[None], axis=1)
-    s = variance + jnp.sum(phi * g, axis=0)
-    used = used & (s > 0)
-    share = jnp.where(used, 1 / jnp.where(used, s, 1), 0)
-    scaled = share[None] * g
-    mean = old.mean + scaled * (force - expected)[None]
-    return Map(mean, old.covariance - scaled[:, None] * g[None])
+    return Prediction(jnp.sum(phi * old.mean, axis=0), g, variance + jnp.sum(phi * g, axis=0))
+
+
+def correct(old: Map, predicted: Prediction, force: Array, used: Bool[Array, "*batch"]) -> Map:
+    """The map once the reading is known to be `force` [1/s], where `used`: g = P phi, s = variance + phi.g,
+    theta += g (f - phi.theta)/s, P -= g g'/s."""
+    used = used & (predicted.variance > 0)
+    share = jnp.where(used, 1 / jnp.where(used, predicted.variance, 1), 0)
+    scaled = share[None] * predicted.gain
+    mean = old.mean + scaled * (force - predicted.force)[None]
+    return Map(mean, old.covariance - scaled[:, None] * predicted.gain[None])
+
+
+def tells(predicted: Prediction, force: Array, variance: Array) -> Bool[Array, "*batch"]:
+    """Whether either the map or the reading itself tells of contact."""
+    return (predicted.force > 0) | (force**2 > OUTLYING * variance)
+
+
+def update(old: Map, phi: Array, force: Array, variance: Array, enabled: Bool[Array, "*batch"]) -> Map:
+    """One reading of `force` [1/s] with noise of a `variance` [1/s^2], where `enabled` and it `tells`."""
+    predicted = predict(old, phi, variance)
+    return correct(old, predicted, force, enabled & tells(predicted, force, variance))
 
 
 def curve(old: Map) -> Curve:

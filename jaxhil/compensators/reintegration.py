@@ -90,11 +90,13 @@ def follow(
     first: Array,
     period: Array,
     present: Int[Array, "*batch"],
+    shift: Array | None = None,
 ) -> Reference:
     """One tick of the live motion, to the sample `present` (0 at the first tick in contact, where all starts
     afresh), and of the pass.
 
-    `replay` is rho, `first` [s] the time from the entry to sample 0.
+    `replay` is rho, `first` [s] the time from the entry to sample 0. With a `shift` [s] the force is that
+    much older than it was taken for when the samples were remembered: it belongs to X - shift V.
     """
     starts = (old.reached < 0) | (present == 0)
     old = old._replace(
@@ -111,6 +113,8 @@ def follow(
 
     def advance(curve, motion, index, ticks):
         (impulse, *hardware), known = recall(index)
+        if shift is not None:
+            hardware[0] = hardware[0] - shift * hardware[1]
         known = known & (ticks > 0)
         expected = force_of(curve, *hardware)
         missing = (impulse - motion.impulse) / jnp.where(known, ticks, 1) - 0.5 * (motion.expected + expected)

@@ -25,7 +25,7 @@ rho = force_replay/(1 + (s/replay_noise)^2).
 """
 
 from collections.abc import Mapping
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -43,7 +43,10 @@ from jaxhil.compensators.estimates import (
     peak_force as typical_peak,
 )
 from jaxhil.compensators.force_depth_map import (
+    SURFACE,
+    Curve,
     Map,
+    Reading,
     curve,
     features,
     force,
@@ -137,13 +140,13 @@ class Episode(NamedTuple):
 
 class RetrospectiveState(NamedTuple):
     """Delay line and aligned readings; sum of squares [N^2] and number of forces before contact; the contact
-    under way, its map, reference and history."""
+    under way, what was learnt of it (its map), its reference and history."""
 
     line: DelayLine
     aligned: Aligned
     noise: tuple[Array, Array]
     episode: Episode
-    map: Map
+    learnt: Any
     reference: Reference
     history: History
 
@@ -240,10 +243,38 @@ class RetrospectiveReference(Compensator):
                 moved=zeros,
                 impulse=zeros,
             ),
-            map=unknown,
+            learnt=self.unlearnt(unknown),
             reference=Reference(entry(zeros), entry(zeros), counts - 1, curve(unknown)),
             history=no_history(zeros),
         )
+
+    def unlearnt(self, prior: Map) -> Any:
+        """What is known before the first contact: the map's prior."""
+        return prior
+
+    def delay_shift(self, learnt: Any) -> Float[Array, "*batch"] | None:
+        """By how much [s] the force is older than the law was told; None: as old as that."""
+        return None
+
+    def learn(
+        self, prepared: Prepared, learnt: Any, enters: Array, reading: Reading, deepest: Array
+    ) -> tuple[Any, Curve]:
+        """What is known with one reading more, and what counts of it; from the prior on where a contact
+        `enters`."""
+        before = Map(
+            jnp.where(enters[None], prepared.prior.mean, learnt.mean),
+            jnp.where(enters[None, None], prepared.prior.covariance, learnt.covariance),
+        )
+        hardware = reading.depth, reading.rate, deepest
+        more = force(curve(before), *hardware) > reading.zone
+        now = update(
+            before,
+            features(*hardware),
+            jnp.where(reading.hidden, 0.5 * reading.zone, reading.force),
+            reading.variance + jnp.where(reading.hidden, reading.zone**2 / 12, 0),
+            reading.counts & (reading.depth > 0) & (~reading.hidden | more),
+        )
+        return now, curve(now)
 
     def restart(self, gains, state, begins, fresh):
         episode = state.episode
@@ -282,7 +313,10 @@ class RetrospectiveReference(Compensator):
             return jnp.where(side < 0, -clearance - measured, measured) / scale
 
         x, v = depth_of(signals.position_desired), side * signals.velocity_desired / scale
-        depth, rate = depth_of(position), side * velocity / scale
+        aligned, rate = depth_of(position), side * velocity / scale
+        older = self.delay_shift(state.learnt)
+        depth = aligned if older is None else aligned - older * rate
+        depth = jnp.where((depth > SURFACE) | (depth < -SURFACE), depth, 0)
         elsewhere = jnp.sign(deflection(position, clearance)) == -side
         weight = mass * scale
         hides = gains["dead_zone"] > 0
@@ -319,22 +353,10 @@ class RetrospectiveReference(Compensator):
         deepest = jnp.where(x > deepest, x, deepest)
         hardware_deepest = jnp.where(enters, 0, old.hardware_deepest)
         hardware_deepest = jnp.where(depth > hardware_deepest, depth, hardware_deepest)
-        before = Map(
-            jnp.where(enters[None], prepared.prior.mean, state.map.mean),
-            jnp.where(enters[None, None], prepared.prior.covariance, state.map.covariance),
-        )
         hardware = depth, rate, hardware_deepest
         zone = gains["dead_zone"] / weight
-        known = curve(before)
-        more = force(known, *hardware) > zone
-        now = update(
-            before,
-            features(*hardware),
-            jnp.where(hidden, 0.5 * zone, read),
-            variance + jnp.where(hidden, zone**2 / 12, 0),
-            usable & (depth > 0) & (~hidden | more),
-        )
-        known = curve(now)
+        reading = Reading(aligned, rate, read, variance, hidden, zone, usable)
+        learnt, known = self.learn(prepared, state.learnt, enters, reading, hardware_deepest)
         expected = force(known, *hardware)
         guess = jnp.where(expected > zone, zone, jnp.where(expected > 0, expected, 0))
         measured = jnp.where(hidden & usable, guess, read)
@@ -346,6 +368,7 @@ class RetrospectiveReference(Compensator):
             first,
             period,
             elapsed,
+            older,
         )
         live = reference.live
 
@@ -363,8 +386,8 @@ class RetrospectiveReference(Compensator):
         over = separated & (gone * period > patience * (1 + 1e-9))
         command = jnp.where(under_way & ~over, side * weight * command, 0)
 
-        sample = jnp.stack([measured, *hardware])
-        kept = jnp.stack([measured, depth - period * rate, rate, jnp.zeros_like(rate)])
+        sample = jnp.stack([measured, aligned, rate, hardware_deepest])
+        kept = jnp.stack([measured, aligned - period * rate, rate, jnp.zeros_like(rate)])
         kept = jnp.where(enters[None], kept, old.sample)
         moved = kept + fraction[None] * (sample - kept)
         arrived = tick - origin + 1
@@ -393,7 +416,7 @@ class RetrospectiveReference(Compensator):
                 moved=moved[0],
                 impulse=impulse,
             ),
-            map=now,
+            learnt=learnt,
             reference=reference,
             history=History(ring, origin, number),
         )

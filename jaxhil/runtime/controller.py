@@ -130,6 +130,11 @@ class Controller:
         return self._compensator.identified
 
     @property
+    def force_delay(self) -> float:
+        """Estimated delay [s] of the force measurement; 0 if the law estimates none."""
+        return self._compensator.force_delay
+
+    @property
     def law_status(self) -> str:
         """What the law says of the last command (`law_status.STATUSES`); `unstated` if it says nothing."""
         return STATUSES[self._compensator.status].name

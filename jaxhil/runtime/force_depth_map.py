@@ -15,6 +15,7 @@ SEGMENTS = 12
 PARAMETERS = 15
 WANDERING = 0.03  # s of depth over which a slope wanders by its spread
 REACH = 0.03  # s of depth at which the depth damping is as strong as its name says
+SURFACE = 1e-12  # s of depth: nearer than that is on the surface, which rounding does not decide
 OUTLYING = 4.0  # times the noise's variance: a force that hardly is noise
 
 

@@ -17,4 +17,4 @@ PUBLISHED = (
     "passivity",
     "response_error",
 )
-LAWS = (*PUBLISHED, "retrospective_reference")
+LAWS = (*PUBLISHED, "retrospective_reference", "retrospective_delay_bank")

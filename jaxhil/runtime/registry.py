@@ -58,6 +58,11 @@ class Compensator(Protocol):
         """Identified stiffness [N/m] and damping [N s/m]; (0, 0) if the law identifies none."""
         return 0.0, 0.0
 
+    @property
+    def force_delay(self) -> float:
+        """Estimated delay [s] of the force measurement; 0 if the law estimates none."""
+        return 0.0
+
     def step(
         self,
         force_measured: float,

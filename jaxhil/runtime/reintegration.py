@@ -53,7 +53,8 @@ class Path:
 
 
 class ReferenceMotion:
-    """The live motion, `depth` [s] and `speed`, and the pass behind it; `replay`: rho."""
+    """The live motion, `depth` [s] and `speed`, and the pass behind it; `replay`: rho; `shift` [s]: by how
+    much older the force is than it was taken for when samples were remembered: it belongs to X - shift V."""
 
     __slots__ = (
         "_behind",
@@ -69,10 +70,12 @@ class ReferenceMotion:
         "_reached",
         "_speeds",
         "replay",
+        "shift",
     )
 
     def __init__(self, period: float) -> None:
         self.replay = 0.0
+        self.shift = 0.0
         self._period = period
         steps = COARSE / period
         self._coarse = floor(steps + 1e-9) if 1.0 < steps < HISTORY else (1 if steps <= 1.0 else HISTORY)
@@ -154,7 +157,8 @@ class ReferenceMotion:
         if index < self._number and ticks > 0.0:
             slot = index & (HISTORY - 1)
             impulse = self._impulses[slot]
-            expected = curve.force(self._depths[slot], self._speeds[slot], self._deepest[slot])
+            speed = self._speeds[slot]
+            expected = curve.force(self._depths[slot] - self.shift * speed, speed, self._deepest[slot])
             missing = self.replay * ((impulse - path.impulse) / ticks - 0.5 * (path.expected + expected))
             path.impulse = impulse
             path.expected = expected

@@ -21,7 +21,8 @@ pytestmark = [
     pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine"),
 ]
 BAR = 100.0  # ns
-BARS = {"retrospective_reference": 20_000.0}  # it integrates a whole contact over again
+# They integrate a whole contact over again.
+BARS = {"retrospective_reference": 20_000.0, "retrospective_delay_bank": 20_000.0}
 ROWS = 200_000
 REPEATS = 40
 WIDE = {

@@ -18,7 +18,8 @@ from jaxhil.runtime.limits import LIMITS
 pytestmark = pytest.mark.benchmark
 TICKS = 200_000
 BAR = 10.0  # us
-BARS = {"retrospective_reference": 300.0}  # it integrates a whole contact over again
+# They integrate a whole contact over again.
+BARS = {"retrospective_reference": 300.0, "retrospective_delay_bank": 300.0}
 
 
 @pytest.mark.parametrize("guarded", [False, True], ids=["bare", "guarded"])

@@ -61,6 +61,7 @@ def simulate(
     A contact that did not end has no restitution and no error.
     """
     from jaxhil.building import build_loop
+    from jaxhil.compensators import COMPENSATORS
     from jaxhil.evaluation import evaluate
     from jaxhil.metrics import NOT_REACHED, OK, STATUS_NAMES
     from jaxhil.scenario import build_scenarios
@@ -68,6 +69,7 @@ def simulate(
     scenarios = build_scenarios(mechanism, seed=seed)
     outcome = evaluate(build_loop(mechanism, compensator, scenarios), gains, scenarios)
     metrics = outcome.metrics
+    estimates = COMPENSATORS[compensator].estimates_delay
     contacts, overall = [], "ok"
     for slot in range(mechanism.approach.contacts):
         status = int(metrics.status[slot, 0])
@@ -89,6 +91,7 @@ def simulate(
                 "position_shortfall": value(metrics.position_shortfall),
                 "duration": value(metrics.duration),
                 "approach_velocity": value(metrics.approach_velocity),
+                **({"force_delay": value(metrics.force_delay)} if estimates else {}),
                 "status": STATUS_NAMES[status],
             }
         )
@@ -154,6 +157,7 @@ def _check_fit(mechanism: Mechanism, loaded, label: str) -> None:
 
 
 def _print(options, mechanism, compensator, contacts, status, good) -> None:
+    estimates = any("force_delay" in contact for contact in contacts)
     rows = [
         [
             number,
@@ -163,11 +167,13 @@ def _print(options, mechanism, compensator, contacts, status, good) -> None:
             contact["peak_force"],
             1e3 * contact["duration"],
             1e3 * contact["approach_velocity"],
+            *([f"{1e3 * contact['force_delay']:.2f}"] if estimates else []),
             contact["status"],
         ]
         for number, contact in enumerate(contacts, start=1)
     ]
-    headings = ["contact", "e", "e*", "error", "peak force [N]", "duration [ms]", "approach [mm/s]", "status"]
+    headings = ["contact", "e", "e*", "error", "peak force [N]", "duration [ms]", "approach [mm/s]"]
+    headings += ["force delay [ms]"] * estimates + ["status"]
     rule = "the gain file's gains" if options.gains is not None else "gains by the literature's rule"
     title = f"{mechanism.name}, compensation: {compensator}"
     title += f", {rule}" if compensator != "none" else ""
@@ -183,4 +189,4 @@ def _print(options, mechanism, compensator, contacts, status, good) -> None:
         worst = max((contact["error"] for contact in contacts), key=abs)
         kind = "divergence" if worst > 0 else "convergence"
         lines.append(f"Bad: the largest error is {worst:+.4f} ({kind}), allowed {options.limit:g}.")
-    report.emit(report.table(title, headings, rows, texts=(7,)), *lines)
+    report.emit(report.table(title, headings, rows, texts=(len(headings) - 1,)), *lines)

@@ -63,10 +63,12 @@ def runtime_source(compensator: str, package: ModuleType = jaxhil.runtime) -> st
     there = {source.name for source in sources}
     public = {name: origin for name, origin in public.items() if origin[0] in there}
     bodies, external = _joined(sources, public)
+    numpy = any(origin.module.partition(".")[0] == "numpy" for origin in external.values())
+    needed = "NumPy beside it" if numpy else "nothing else to install"
     lines = [
         f'"""The controller for the rig, compensator {compensator}: its whole source in this one file.',
         "",
-        "Made of the package's modules by `jaxhil export`; Python 3.11 or later, nothing else to install.",
+        f"Made of the package's modules by `jaxhil export`; Python 3.11 or later, {needed}.",
         "",
         "    controller = Controller.from_file('gains.json')",
         '"""',

@@ -1,0 +1,51 @@
+/* What is learnt of a contact where the delay of the force is known: a force-depth map. */
+#include <stdbool.h>
+
+#include "force_depth_map.c"
+#include "gains_table.c"
+
+/* == Declarations == */
+
+typedef struct {
+    jaxhil_force_depth_map map;
+} jaxhil_learnt;
+
+/* == Definitions == */
+
+static void jaxhil_learnt_init(jaxhil_learnt *learnt, const jaxhil_gains *gains) {
+    jaxhil_force_depth_map_init(&learnt->map, gains->prior_stiffness, gains->prior_stiffness_spread,
+                                gains->prior_slope_spread, gains->prior_damping_spread,
+                                gains->prior_depth_damping_spread, gains->prior_unloading_spread);
+}
+
+static void jaxhil_learnt_reset(jaxhil_learnt *learnt) {
+    (void)learnt;
+}
+
+static void jaxhil_learnt_begin(jaxhil_learnt *learnt) {
+    jaxhil_force_depth_map_restart(&learnt->map);
+}
+
+static const jaxhil_curve *jaxhil_learnt_curve(const jaxhil_learnt *learnt) {
+    return &learnt->map.curve;
+}
+
+static double jaxhil_learnt_shift(const jaxhil_learnt *learnt) {
+    (void)learnt;
+    return 0.0;
+}
+
+/* One reading: depth [s], speed, deepest point [s], force [1/s], its variance [1/s^2], whether the sensor's dead
+ * zone hides it, that zone [1/s]. */
+static void jaxhil_learnt_read(jaxhil_learnt *learnt, double depth, double rate, double deepest, double force,
+                               double variance, bool hidden, double zone) {
+    jaxhil_force_depth_map *map = &learnt->map;
+    if (depth > 0.0) {
+        if (!hidden) {
+            jaxhil_force_depth_map_update(map, depth, rate, deepest, force, variance);
+        } else if (jaxhil_curve_force(&map->curve, depth, rate, deepest) > zone) {
+            jaxhil_force_depth_map_update(map, depth, rate, deepest, 0.5 * zone,
+                                          variance + zone * zone / 12.0);
+        }
+    }
+}

@@ -1,0 +1,15 @@
+/* The retrospective reference where the force delay is hardly known: a bank of delays, weighed as one goes. */
+#include <stdbool.h>
+
+#include "delay_bank.c"
+#include "retrospective_law.c"
+
+/* == Declarations == */
+
+#define JAXHIL_LAW_ESTIMATES_DELAY
+
+/* == Definitions == */
+
+static double jaxhil_law_force_delay(const jaxhil_law *law) {
+    return law->learnt.told + law->learnt.shift;
+}

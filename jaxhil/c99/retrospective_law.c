@@ -1,0 +1,346 @@
+/* What the retrospective references share: identify the contact, work out what should have happened, pay it back.
+ * In contact F_c = f_0 + (y - F(X, V)) + f_e, f_0 = max(F(x_d, v_d), 0), F the force-depth map identified on
+ * delay-aligned readings (X, V, y); separated F_c = f_e until the hardware has left the surface for 6 ms, then
+ * 0. f_e = clip(c (v_d - T f_0/2 - v_r), -limit p, limit p), v_r the speed of the motion that the contact should
+ * have had since its entry, p the peak force that the map predicts. Scaled by approach speed and equivalent mass.
+ */
+#include <math.h>
+#include <stdbool.h>
+
+#include "filters.c"
+#include "gains_table.c"
+#include "law_status_table.c"
+#include "reintegration.c"
+#include "surfaces.c"
+
+/* == Declarations == */
+
+typedef struct {
+    double period, clearance, mass, share, force_noise, dead_zone, floor;
+    double velocity_gain, limit, replay, replay_noise;
+    jaxhil_delay_line line;
+    jaxhil_learnt learnt;
+    jaxhil_reference_motion reference;
+    double middle, last, side, speed, gone, squares, count, first, fraction, impulse, moved;
+    double sample, sample_depth, sample_speed, sample_deepest, deepest, hardware_deepest, late;
+    long offset, ticks, elapsed, readings;
+    bool whole, touched, started;
+    int status;
+    double samples[JAXHIL_IDENTIFICATION_DELAY_SAMPLES];
+} jaxhil_law;
+
+/* == Definitions == */
+
+static const double jaxhil_farewell = 0.006;   /* s for which it goes on after the hardware has left */
+static const double jaxhil_longest_lag = 0.1;  /* s for which it waits for hardware that has not touched yet */
+static const double jaxhil_too_late = 0.5;     /* of the predicted duration, that the hardware may touch late by */
+static const long jaxhil_few = 5;              /* readings on which no contact is identified */
+
+/* All but what was learnt of earlier contacts. */
+static void jaxhil_law_restart(jaxhil_law *law) {
+    law->side = 0.0;
+    law->speed = 0.0;
+    law->touched = false;
+    law->gone = 0.0;
+    law->squares = 0.0;
+    law->count = 0.0;
+    law->first = 0.0;
+    law->fraction = 0.0;
+    law->offset = 0;
+    law->ticks = 0;
+    law->impulse = 0.0;
+    law->moved = 0.0;
+    law->sample = 0.0;
+    law->sample_depth = 0.0;
+    law->sample_speed = 0.0;
+    law->sample_deepest = 0.0;
+    law->deepest = 0.0;
+    law->hardware_deepest = 0.0;
+    law->late = 0.0;
+    law->elapsed = 0;
+    law->readings = 0;
+    law->started = false;
+    law->status = JAXHIL_OUT_OF_CONTACT;
+}
+
+static bool jaxhil_law_init(jaxhil_law *law, const jaxhil_gains *gains) {
+    const double period = gains->control_period;
+    const double delay = gains->identification_delay;
+    /* The line delays by a tick less, so that the speed can be a difference about the middle. */
+    const bool whole = delay > period;
+    law->period = period;
+    law->clearance = gains->clearance;
+    law->mass = gains->equivalent_mass;
+    law->share = whole ? 1.0 : delay / period;
+    law->force_noise = gains->force_noise;
+    law->dead_zone = gains->dead_zone;
+    law->floor = gains->force_noise_floor;
+    law->velocity_gain = gains->velocity_gain;
+    law->limit = gains->correction_limit;
+    law->replay = gains->force_replay;
+    law->replay_noise = gains->replay_noise;
+    law->middle = 0.0;
+    law->last = 0.0;
+    jaxhil_learnt_init(&law->learnt, gains);
+    jaxhil_reference_motion_init(&law->reference, period);
+    jaxhil_law_restart(law);
+    law->whole = whole;
+    /* The line delays by less than the capacity allows: a delay is refused like that of the other laws. */
+    if (!(floor(delay / period + 1e-9) <= (double)(JAXHIL_IDENTIFICATION_DELAY_SAMPLES - 2))) {
+        return false;
+    }
+    return jaxhil_delay_line_init(&law->line, law->samples, JAXHIL_IDENTIFICATION_DELAY_SAMPLES,
+                                  whole ? delay - period : 0.0, period);
+}
+
+/* Position [m] and velocity [m/s] of the hardware, as old as the force. */
+static void jaxhil_law_align(jaxhil_law *law, double measured, double velocity_desired, double *position,
+                             double *velocity) {
+    const double period = law->period;
+    double newest = measured;
+    if (law->whole) {
+        if (!law->started) {
+            jaxhil_delay_line_start(&law->line, law->samples, measured, velocity_desired);
+        }
+        newest = jaxhil_delay_line_step(&law->line, law->samples, measured);
+    }
+    if (!law->started) {
+        const double stride = period * velocity_desired;
+        law->middle = newest - stride;
+        law->last = newest - 2.0 * stride;
+        law->started = true;
+    }
+    *position = newest + law->share * (law->middle - newest);
+    *velocity = (newest - law->last) / (2.0 * period);
+    law->last = law->middle;
+    law->middle = newest;
+}
+
+/* A reading out of contact, if it is one: it tells how noisy the force is. */
+static void jaxhil_law_take_noise(jaxhil_law *law, double force, double bent) {
+    if (bent == 0.0) {
+        law->squares += force * force;
+        law->count += 1.0;
+    }
+}
+
+/* The hardware's entry: where its samples fall on the reference's grid. */
+static void jaxhil_law_touch(jaxhil_law *law, double depth, double rate) {
+    const double period = law->period;
+    double since = 0.5 * period;
+    if (rate > 0.0) {
+        since = depth / rate;
+        if (!(since <= period)) {
+            since = period;
+        }
+    }
+    const double shift = (law->first - since) / period;
+    const double whole = floor(shift);
+    law->fraction = shift - whole;
+    law->offset = -1 - (long)whole;
+    law->ticks = 0;
+    law->touched = true;
+    law->late = law->first + (double)law->elapsed * period;
+}
+
+/* This tick's sample, moved to the reference's grid, into its history. */
+static void jaxhil_law_remember(jaxhil_law *law, double force, double depth, double rate, double deepest) {
+    const double fraction = law->fraction;
+    const double moved = law->sample + fraction * (force - law->sample);
+    const long index = law->ticks + law->offset;
+    law->ticks++;
+    if (index == 0) {
+        law->impulse = 0.5 * moved * law->first / law->period;
+    } else if (index > 0) {
+        law->impulse += 0.5 * (law->moved + moved);
+    }
+    law->moved = moved;
+    if (index >= 0) {
+        jaxhil_reference_motion_remember(&law->reference, index, law->impulse,
+                                         law->sample_depth + fraction * (depth - law->sample_depth),
+                                         law->sample_speed + fraction * (rate - law->sample_speed),
+                                         law->sample_deepest + fraction * (deepest - law->sample_deepest));
+    }
+}
+
+/* The force's variance [N^2]: what it is told, or what readings out of contact show if that is more. */
+static double jaxhil_law_noise(const jaxhil_law *law) {
+    const double told = law->force_noise * law->force_noise;
+    const double seen = law->squares / (law->count > 0.0 ? law->count : 1.0);
+    return seen > told ? seen : told;
+}
+
+/* The command over M v0 [1/s]; whether the numerical model has separated. */
+static double jaxhil_law_follow(jaxhil_law *law, bool enters, double x, double v, double told, double depth,
+                                double rate, double force, bool hidden, double weight, bool *separated) {
+    const double period = law->period;
+    const jaxhil_curve *curve = jaxhil_learnt_curve(&law->learnt);
+    law->elapsed++;
+    if (enters) {
+        jaxhil_learnt_begin(&law->learnt);
+        jaxhil_reference_motion_restart(&law->reference, x);
+        law->first = x;
+        law->elapsed = 0;
+        law->readings = 0;
+        law->late = 0.0;
+        law->deepest = 0.0;
+        law->hardware_deepest = 0.0;
+        law->sample = force;
+        law->sample_depth = told - period * rate;
+        law->sample_speed = rate;
+        law->sample_deepest = 0.0;
+    }
+    if (x > law->deepest) {
+        law->deepest = x;
+    }
+    if (depth > law->hardware_deepest) {
+        law->hardware_deepest = depth;
+    }
+    const double deepest = law->hardware_deepest;
+
+    const double zone = law->dead_zone / weight;
+    const double square = weight * weight;
+    const double noise = square > 0.0 ? jaxhil_law_noise(law) / square : 0.0;
+    if (depth > 0.0) {
+        if (!law->touched) {
+            jaxhil_law_touch(law, depth, rate);
+        }
+        law->readings += !hidden;
+    }
+    law->reference.shift = jaxhil_learnt_shift(&law->learnt);
+    jaxhil_learnt_read(&law->learnt, told, rate, deepest, force, law->floor * law->floor + noise, hidden, zone);
+    const double expected = jaxhil_curve_force(curve, depth, rate, deepest);
+    if (hidden) {
+        force = expected > zone ? zone : (expected > 0.0 ? expected : 0.0);
+    }
+    const double strength = law->replay_noise * law->replay_noise;
+    const double whole = strength + noise;
+    law->reference.replay = whole > 0.0 ? law->replay * strength / whole : 0.0;
+    jaxhil_reference_motion_tick(&law->reference, curve);
+
+    double own = jaxhil_curve_force(curve, x, v, law->deepest);
+    *separated = x <= 0.0 || (v < 0.0 && own <= 0.0);
+    if (!(own > 0.0)) {
+        own = 0.0;
+    }
+    const double peak = jaxhil_curve_peak_force(curve);
+    const double limit = law->limit * peak;
+    double correction = law->velocity_gain * (v - 0.5 * period * own - law->reference.live.speed);
+    law->status = JAXHIL_IDENTIFIED;
+    if (law->readings < jaxhil_few) {
+        law->status = JAXHIL_UNSURE;
+    } else if (law->late * peak > jaxhil_too_late * jaxhil_map_pi) {
+        law->status = JAXHIL_TOO_SHORT;
+    }
+    if (correction > limit || correction < -limit) {
+        correction = correction > limit ? limit : -limit;
+        law->status = law->status == JAXHIL_IDENTIFIED ? JAXHIL_SATURATED : law->status;
+    }
+    double command = correction;
+    if (!*separated) {
+        command = own + (force - expected) + correction;
+    }
+    if (law->touched) {
+        jaxhil_law_remember(law, force, told, rate, deepest);
+    }
+    law->sample = force;
+    law->sample_depth = told;
+    law->sample_speed = rate;
+    law->sample_deepest = deepest;
+    return command;
+}
+
+static double jaxhil_law_step(jaxhil_law *law, double force_measured, double position_desired,
+                              double velocity_desired, double position_measured) {
+    const double period = law->period;
+    const double clearance = law->clearance;
+    double position, velocity;
+    jaxhil_law_align(law, position_measured, velocity_desired, &position, &velocity);
+    const double bent = jaxhil_deflection(position, clearance);
+    const double touching = jaxhil_deflection(position_desired, clearance);
+    const double now = touching > 0.0 ? 1.0 : (touching < 0.0 ? -1.0 : 0.0);
+    const bool enters = now != 0.0 && now != law->side;
+    if (enters) {
+        const double approach = now * velocity_desired;
+        const bool sound = law->mass * approach > 0.0 && fabs(touching) <= 2.0 * period * approach;
+        law->side = now;
+        law->speed = sound ? approach : 0.0;
+        law->touched = false;
+        law->gone = 0.0;
+    }
+    const double side = law->side;
+    if (side == 0.0) {
+        jaxhil_law_take_noise(law, force_measured, bent);
+        law->status = JAXHIL_OUT_OF_CONTACT;
+        return 0.0;
+    }
+    const double speed = law->speed;
+    const double scale = speed > 0.0 ? speed : 1.0;
+    const double weight = law->mass * scale;
+    const double x = (side < 0.0 ? -clearance - position_desired : position_desired) / scale;
+    const double v = side * velocity_desired / scale;
+    const double told = (side < 0.0 ? -clearance - position : position) / scale;
+    const double rate = side * velocity / scale;
+    const double shifted = told - jaxhil_learnt_shift(&law->learnt) * rate;
+    const double depth = shifted >= -jaxhil_map_surface && shifted <= jaxhil_map_surface ? 0.0 : shifted;
+    const double zone = law->dead_zone;
+    bool hidden = false;
+    double force = 0.0;
+    if (!(bent * side < 0.0)) {
+        hidden = zone > 0.0 && force_measured == 0.0;
+        if (force_measured > 0.0) {
+            force = side * (force_measured + zone) / weight;
+        } else if (force_measured < 0.0) {
+            force = side * (force_measured - zone) / weight;
+        }
+    }
+    if (!law->touched && !(speed > 0.0 && depth > 0.0)) {
+        jaxhil_law_take_noise(law, force_measured, bent);
+    }
+    if (!enters) {
+        law->gone += 1.0;
+    }
+    if (depth > 0.0) {
+        law->gone = 0.0;
+    }
+    bool separated = x <= 0.0;
+    double command = separated ? 0.0 : force;
+    if (speed > 0.0) {
+        command = jaxhil_law_follow(law, enters, x, v, told, depth, rate, force, hidden, weight,
+                                    &separated);
+    } else {
+        law->status = JAXHIL_UNSURE;
+    }
+    const double patience = law->touched || !(speed > 0.0) ? jaxhil_farewell : jaxhil_longest_lag;
+    if (separated && law->gone * period > patience * (1.0 + 1e-9)) {
+        law->side = 0.0;
+        law->status = JAXHIL_OUT_OF_CONTACT;
+        return 0.0;
+    }
+    return side * weight * command;
+}
+
+static double jaxhil_law_position_command(jaxhil_law *law, double position, double velocity,
+                                          double acceleration) {
+    (void)law, (void)velocity, (void)acceleration;
+    return position;
+}
+
+static void jaxhil_law_identified(const jaxhil_law *law, double *stiffness, double *damping) {
+    (void)law;
+    *stiffness = 0.0;
+    *damping = 0.0;
+}
+
+static int jaxhil_law_own_status(const jaxhil_law *law) {
+    return law->status;
+}
+
+static void jaxhil_law_reset(jaxhil_law *law) {
+    jaxhil_law_restart(law);
+    jaxhil_learnt_reset(&law->learnt);
+}
+
+static void jaxhil_law_next_contact(jaxhil_law *law) {
+    jaxhil_law_restart(law);
+}

@@ -1,0 +1,199 @@
+"""Hypotheses of the force delay side by side, each with a map of its own, weighed by what they explain.
+
+Hypothesis h takes the force to be d_h [s] older than it is told: it belongs to the depth X - d_h V, to first
+order. Each identifies a `force_depth_map` of its own and says beforehand what it expects to read, f_h with a
+variance s_h (0 with the noise's own variance r out of contact, and where what it expects while the contact
+opens is not positive). Its weight is the product of
+
+- the likelihood of the readings of this contact and of those before it, in every one
+  (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), the root of the normal density, as no map is quite the contact;
+- how well the damping that it identified goes with what is known of contacts: either there is none, with
+  probability `ELASTIC`, or it is not negative. With its mean B and variance s^2, of prior variance s_0^2:
+  ELASTIC (s_0/s) exp(-t^2/2) + (1 - ELASTIC) 2 Phi(t), t = B/s. To be wrong by d means to see a damping that
+  is wrong by the stiffness times d, so that this is what tells a delay from damping; what else does are the
+  few readings between the two entries. Several contacts are one and the same device: their B are averaged.
+  s^2 counts five times, as the delay lies between two hypotheses.
+
+The exponentials are (1 + u/n)^-n: algebraic, the same on every machine. What counts is the mean over all
+hypotheses, of their maps and of their delays.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxhil.compensators.force_depth_map import (
+    PARAMETERS,
+    SEGMENTS,
+    SURFACE,
+    Curve,
+    Map,
+    Reading,
+    correct,
+    features,
+    positive_mean,
+    predict,
+    tells,
+)
+
+HYPOTHESES = 9
+OFFSETS = np.linspace(-1, 1, HYPOTHESES)  # of their delays, in terms of the farthest
+ELASTIC = 0.25
+BROADENING = 5.0  # of the variance of the damping
+# The least share of a likelihood, within a contact and of those before: what they rule out can come back.
+LEAST, LEAST_CARRIED = 1e-200, 1e-12
+SQUARINGS, DENSITY_SQUARINGS = 10, 8  # n = 2^10 of the likelihood, 2^8 of what is known of damping
+LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
+DAMPING = SEGMENTS
+
+
+class Bank(NamedTuple):
+    """Of each hypothesis its map, the deepest point [s] of this contact, the likelihoods of this contact's
+    readings and of those before; sum over the contacts before of the damping's precision 1/s^2 [s^2] and of
+    B/s^2 [s], their number; whether (1) this contact is to be added to them; the mean of d_h [s]."""
+
+    maps: Map
+    deepest: Float[Array, "hypotheses *batch"]
+    likelihood: Float[Array, "hypotheses *batch"]
+    carried: Float[Array, "hypotheses *batch"]
+    precision: Float[Array, "hypotheses *batch"]
+    weighted: Float[Array, "hypotheses *batch"]
+    met: Float[Array, "*batch"]
+    learning: Float[Array, "*batch"]
+    shift: Float[Array, "*batch"]
+
+
+def no_bank(prior: Map) -> Bank:
+    """Nothing met yet."""
+    zero = jnp.zeros_like(prior.mean[0])
+    each = jnp.stack([zero] * HYPOTHESES)
+    return Bank(_repeated(prior), each, each + 1, each + 1, each, each, zero, zero, zero)
+
+
+def begin(old: Bank, prior: Map, begins: Bool[Array, "*batch"]) -> Bank:
+    """Where a contact `begins`: the one before is added to what is carried, and the maps are the prior."""
+    ends = begins & (old.learning > 0)
+    mean, variance = old.maps.mean[DAMPING], old.maps.covariance[DAMPING, DAMPING]
+    precision = 1 / jnp.where(variance > 0, variance, 1)
+    fresh = _repeated(prior)
+    return old._replace(
+        maps=Map(
+            jnp.where(begins[None, None], fresh.mean, old.maps.mean),
+            jnp.where(begins[None, None, None], fresh.covariance, old.maps.covariance),
+        ),
+        deepest=jnp.where(begins[None], 0, old.deepest),
+        likelihood=jnp.where(begins[None], 1, old.likelihood),
+        carried=jnp.where(ends[None], _shares(old.carried * old.likelihood, LEAST_CARRIED), old.carried),
+        precision=old.precision + jnp.where(ends[None], precision, 0),
+        weighted=old.weighted + jnp.where(ends[None], precision * mean, 0),
+        met=old.met + jnp.where(ends, 1, 0),
+        learning=jnp.where(begins, 0, old.learning),
+    )
+
+
+def learn(old: Bank, reading: Reading, farthest: Array, damping: Array) -> tuple[Bank, Curve]:
+    """The bank with one reading more, and the mean of its maps.
+
+    `farthest` [s] is the largest d_h, `damping` [1/s^2] the prior variance s_0^2 of the damping.
+    """
+    offsets = _offsets(reading.depth) * farthest[None]
+    rate = reading.rate[None] + jnp.zeros_like(offsets)
+    depth = reading.depth[None] - offsets * rate
+    counts, hidden, zone = reading.counts[None], reading.hidden[None], reading.zone[None]
+    deepest = jnp.where(counts & (depth > old.deepest), depth, old.deepest)
+    noise = (reading.variance + jnp.where(reading.hidden, reading.zone**2 / 12, 0))[None]
+    inside = depth > SURFACE
+    phi = features(depth, rate, deepest)
+    predicted = predict(old.maps, phi, noise)
+    # Hidden, a force is known to be small: half of the zone, where the map expects more than all of it.
+    tight = hidden & (predicted.force <= zone)
+    force = jnp.where(reading.hidden, 0.5 * reading.zone, reading.force)[None]
+    force = force + jnp.zeros_like(depth)
+    # While a contact closes its force is not negative. Opening, nothing may be left of it before depth 0.
+    closes = rate > 0
+    used = counts & inside & ~tight & (closes | tells(predicted, force, noise))
+    maps = correct(old.maps, predicted, force, used)
+
+    nothing = ~inside | tight | (~closes & (predicted.force <= 0))
+    wide = jnp.where(nothing, noise, predicted.variance)
+    wide = jnp.where(wide > 0, wide, 1)
+    read = jnp.where(reading.hidden, 0, reading.force)[None]
+    missed = jnp.where(nothing, read, force - predicted.force)
+    surprise = 0.25 * missed**2 / wide
+    surprise = surprise - jnp.min(surprise, axis=0, keepdims=True)
+    sharpness = jnp.sqrt(jnp.sqrt(jnp.where(wide > noise, noise / wide, 1)))
+    likelihood = _shares(old.likelihood * sharpness * exponential(surprise, SQUARINGS), LEAST)
+    now = old._replace(
+        maps=maps,
+        deepest=deepest,
+        likelihood=jnp.where(counts, likelihood, old.likelihood),
+        learning=jnp.where(reading.counts, 1, old.learning),
+    )
+    weights = weigh(now, damping)
+    shift = jnp.sum(weights * offsets, axis=0)
+    shift = jnp.where((shift > LEAST_SHIFT) | (shift < -LEAST_SHIFT), shift, 0)
+    return now._replace(shift=shift), average(maps, weights)
+
+
+def weigh(bank: Bank, damping: Array) -> Float[Array, "hypotheses *batch"]:
+    """Weights of the hypotheses; their sum is 1."""
+    own = bank.maps.covariance[DAMPING, DAMPING]
+    precision = 1 / jnp.where(own > 0, own, 1)
+    total = bank.precision + precision
+    mean = (bank.weighted + precision * bank.maps.mean[DAMPING]) / total
+    variance = BROADENING * (bank.met[None] + 1) / total
+    plausible = plausibility(mean, variance, damping[None])
+    plausible = jnp.where(own > 0, jnp.where(plausible > LEAST_CARRIED, plausible, LEAST_CARRIED), 1)
+    weights = bank.likelihood * bank.carried * plausible
+    return weights / jnp.sum(weights, axis=0, keepdims=True)
+
+
+def plausibility(mean: Array, variance: Array, prior: Array) -> Float[Array, "*batch"]:
+    """How much better a damping N(mean, variance) [1/s] goes with one that is 0 or not negative than one
+    N(0, prior) does; Phi as in `positive_mean`."""
+    spread = jnp.sqrt(variance)
+    ratio = mean / spread
+    density = exponential(0.5 * ratio**2, DENSITY_SQUARINGS)
+    size = jnp.where(ratio > 0, ratio, -ratio)
+    mills = math.pi / ((math.pi - 1) * size + jnp.sqrt(size**2 + 2 * math.pi))
+    beyond = density * mills * (2 / math.sqrt(2 * math.pi))
+    at_least_0 = jnp.where(ratio > 0, 2 - beyond, beyond)
+    prior = jnp.where(prior > 0, prior, 1)
+    return ELASTIC * (jnp.sqrt(prior) / spread) * density + (1 - ELASTIC) * at_least_0
+
+
+def average(maps: Map, weights: Float[Array, "hypotheses *batch"]) -> Curve:
+    """What counts of the maps, by their weights."""
+    slopes = jnp.sum(maps.mean[:SEGMENTS] * weights[None], axis=1)
+    lost = (
+        jnp.sum(positive_mean(maps.mean[i], maps.covariance[i, i]) * weights, axis=0)
+        for i in range(SEGMENTS, PARAMETERS)
+    )
+    return Curve(slopes, *lost)
+
+
+def exponential(u: Array, squarings: int) -> Array:
+    """(1 + u/n)^-n at u >= 0, n = 2^squarings: exp(-u), and less steep far out."""
+    value = 1 / (1 + u / 2**squarings)
+    for _ in range(squarings):
+        value = value * value
+    return value
+
+
+def _shares(values: Array, least: float) -> Array:
+    """Of their sum, at least so much."""
+    shares = values / jnp.sum(values, axis=0, keepdims=True)
+    return jnp.where(shares > least, shares, least)
+
+
+def _repeated(prior: Map) -> Map:
+    return Map(
+        jnp.stack([prior.mean] * HYPOTHESES, axis=1), jnp.stack([prior.covariance] * HYPOTHESES, axis=2)
+    )
+
+
+def _offsets(like: Array) -> Array:
+    return jnp.asarray(OFFSETS.reshape(-1, *[1] * like.ndim), like.dtype)

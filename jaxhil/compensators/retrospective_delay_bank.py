@@ -1,0 +1,62 @@
+"""The retrospective reference where the force delay is hardly known: a bank of delays, weighed as one goes.
+
+`retrospective_reference` with `delay_bank` in the place of its one map. Hypotheses lie evenly within
+`delay_spread` of `identification_delay`; with 0 it is the retrospective reference, but for readings of no
+force while a contact closes, from which the bank learns as well. What was learnt of the delay, and of whether
+there is any damping, is carried from contact to contact; maps are not. With d the mean of the hypotheses'
+delays on the tick before, the depth as old as the force is X - d V, and the measured samples that the
+reference is integrated over again with are moved alike.
+"""
+
+from typing import ClassVar
+
+from jaxhil.compensators.base import Gain
+from jaxhil.compensators.delay_bank import begin, learn, no_bank
+from jaxhil.compensators.estimates import (
+    DEAD_ZONE,
+    EQUIVALENT_MASS,
+    FORCE_NOISE,
+    ROUGH_FORCE_DELAY,
+    force_delay_spread,
+)
+from jaxhil.compensators.retrospective_reference import RetrospectiveReference
+
+MOST = 0.004  # s: beyond it hypotheses are too far apart, and too far off for the first order in d
+LEAST_FLOOR = 0.005  # 1/s
+
+
+class RetrospectiveDelayBank(RetrospectiveReference):
+    """Bank of delays, reference and repayment; see the module's text."""
+
+    name: ClassVar[str] = "retrospective_delay_bank"
+    estimates_delay: ClassVar[bool] = True
+    knows: ClassVar[tuple[str, ...]] = (EQUIVALENT_MASS, ROUGH_FORCE_DELAY, FORCE_NOISE, DEAD_ZONE)
+    gains: ClassVar[tuple[Gain, ...]] = (
+        *(
+            # Next to no noise, a delay that is a little wrong is all that a hypothesis sees.
+            gain._replace(lower=lambda m: LEAST_FLOOR) if gain.name == "force_noise_floor" else gain
+            for gain in RetrospectiveReference.gains
+        ),
+        Gain(
+            "delay_spread",
+            "s",
+            lambda m: 0.0,
+            lambda m: MOST,
+            lambda m: min(force_delay_spread(m), MOST),
+            tuned=lambda m: False,
+        ),
+    )
+
+    def unlearnt(self, prior):
+        return no_bank(prior)
+
+    def delay_shift(self, learnt):
+        return learnt.shift
+
+    def learn(self, prepared, learnt, enters, reading, deepest):
+        gains = prepared.gains
+        begun = begin(learnt, prepared.prior, enters & reading.counts)
+        return learn(begun, reading, gains["delay_spread"], gains["prior_damping_spread"] ** 2)
+
+    def force_delay(self, gains, state):
+        return gains["identification_delay"] + state.learnt.shift

@@ -1,0 +1,254 @@
+"""Hypotheses of the force delay side by side, each with a map of its own, weighed by what they explain.
+
+Hypothesis h takes the force to be d_h [s] older than it is told: it belongs to the depth X - d_h V. Each
+identifies a force-depth map (`force_depth_map`) and says beforehand what it expects to read, f_h with a
+variance s_h (0 with the noise's own variance r out of contact, and where what it expects while the contact
+opens is not positive). Its weight is the product of the likelihoods of all readings of this contact and of
+those before, (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), and of how well its damping, of mean B and variance
+s^2, goes with what is known of contacts: ELASTIC (s_0/s) exp(-t^2/2) + (1 - ELASTIC) 2 Phi(t), t = B/s. The
+exponentials are (1 + u/n)^-n. What counts is the mean over all hypotheses, of their maps and of their delays.
+
+In NumPy, all hypotheses at a time; sums are taken one term after another.
+"""
+
+from math import pi, sqrt
+
+import numpy as np
+
+from .force_depth_map import KNOTS, OUTLYING, PARAMETERS, REACH, SEGMENTS, SURFACE, WANDERING, Curve
+
+HYPOTHESES = 9
+ELASTIC = 0.25  # probability that a contact has no damping
+BROADENING = 5.0  # of the variance of the damping, as the delay lies between two hypotheses
+# The least share of a likelihood, within a contact and of those before: what they rule out can come back.
+LEAST, LEAST_CARRIED = 1e-200, 1e-12
+SQUARINGS, DENSITY_SQUARINGS = 10, 8
+LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
+DAMPING = SEGMENTS
+
+_KNOTS = np.array(KNOTS)[:, None]
+_WIDTHS = np.append(np.diff(KNOTS), np.inf)[:, None]
+
+
+class DelayBank:
+    """The bank. `curve`: the mean of the maps; `shift` [s]: the mean of the hypotheses' delays.
+
+    `spread` [s] is how far the farthest hypotheses lie from the delay that is told; the rest is the map's
+    prior, as of `ForceDepthMap`.
+    """
+
+    __slots__ = (
+        "_carried",
+        "_covariance",
+        "_damping",
+        "_deepest",
+        "_estimate",
+        "_learning",
+        "_likelihood",
+        "_met",
+        "_offsets",
+        "_precision",
+        "_prior_covariance",
+        "_prior_estimate",
+        "_weighted",
+        "curve",
+        "shift",
+    )
+
+    def __init__(
+        self,
+        spread: float,
+        stiffness: float,
+        common: float,
+        wandering: float,
+        damping: float,
+        depth_damping: float,
+        unloading: float,
+    ) -> None:
+        self._offsets = np.array([0.25 * step - 1.0 for step in range(HYPOTHESES)]) * spread
+        self._damping = damping * damping
+        estimate = np.zeros((PARAMETERS, 1))
+        estimate[:SEGMENTS] = stiffness
+        covariance = np.zeros((PARAMETERS, PARAMETERS, 1))
+        common = common * common
+        wandering = wandering * wandering
+        for i in range(SEGMENTS):
+            for j in range(SEGMENTS):
+                covariance[i, j] = common + wandering * (KNOTS[min(i, j)] / WANDERING)
+        for place, one in enumerate((damping, depth_damping, unloading), start=SEGMENTS):
+            covariance[place, place] = one * one
+        self._prior_estimate = np.repeat(estimate, HYPOTHESES, axis=1)
+        self._prior_covariance = np.repeat(covariance, HYPOTHESES, axis=2)
+        self.curve = Curve()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all contacts."""
+        self._estimate = self._prior_estimate.copy()
+        self._covariance = self._prior_covariance.copy()
+        self._deepest = np.zeros(HYPOTHESES)
+        self._likelihood = np.ones(HYPOTHESES)
+        self._carried = np.ones(HYPOTHESES)
+        self._precision = np.zeros(HYPOTHESES)
+        self._weighted = np.zeros(HYPOTHESES)
+        self._met = 0.0
+        self._learning = False
+        self.shift = 0.0
+
+    @np.errstate(all="ignore")
+    def begin(self) -> None:
+        """A contact begins: the one before is added to what is carried, and the maps are the prior."""
+        if self._learning:
+            variance = self._covariance[DAMPING, DAMPING]
+            precision = 1.0 / np.where(variance > 0.0, variance, 1.0)
+            self._carried = _shares(self._carried * self._likelihood, LEAST_CARRIED)
+            self._precision = self._precision + precision
+            self._weighted = self._weighted + precision * self._estimate[DAMPING]
+            self._met += 1.0
+        self._learning = False
+        self._estimate = self._prior_estimate.copy()
+        self._covariance = self._prior_covariance.copy()
+        self._deepest = np.zeros(HYPOTHESES)
+        self._likelihood = np.ones(HYPOTHESES)
+
+    @np.errstate(all="ignore")
+    def learn(
+        self, depth: float, rate: float, force: float, variance: float, hidden: bool, zone: float
+    ) -> None:
+        """One reading: depth [s] and speed as old as the force is told to be, the force [1/s], its variance
+        [1/s^2], whether the sensor's dead zone hides it, that zone [1/s]."""
+        self._read(depth, rate, force, variance, hidden, zone)
+        weights = self._weigh()
+        shift = float(_total(weights * self._offsets))
+        self.shift = shift if shift > LEAST_SHIFT or shift < -LEAST_SHIFT else 0.0
+        self._conclude(weights)
+
+    def _read(
+        self, depth: float, rate: float, force: float, variance: float, hidden: bool, zone: float
+    ) -> None:
+        estimate = self._estimate
+        depths = depth - self._offsets * rate
+        deepest = np.where(depths > self._deepest, depths, self._deepest)
+        beyond = depths - _KNOTS
+        phi = np.empty((PARAMETERS, HYPOTHESES))
+        phi[:SEGMENTS] = np.where(beyond > 0.0, np.minimum(beyond, _WIDTHS), 0.0)
+        phi[12] = rate
+        phi[13] = depths * rate / REACH
+        phi[14] = depths - deepest
+        read = force
+        noise = variance
+        if hidden:
+            force = 0.5 * zone
+            read = 0.0
+            noise = variance + zone * zone / 12.0
+        # Rows and columns are exchanged in memory: only so are sums over rows both quick and in order.
+        g = np.add.reduce(self._covariance * phi[:, None], axis=0)
+        expected = np.add.reduce(phi * estimate, axis=0)
+        s = noise + np.add.reduce(phi * g, axis=0)
+        inside = depths > SURFACE
+        if hidden:
+            inside &= expected > zone
+        positive = expected > 0.0
+        closes = rate > 0.0
+        used = inside & (s > 0.0)
+        if not closes and not force * force > OUTLYING * noise:
+            used &= positive
+        nothing = ~inside
+        if not closes:
+            nothing |= ~positive
+        innovation = force - expected
+        wide = np.where(nothing, noise, s)
+        wide = np.where(wide > 0.0, wide, 1.0)
+        missed = np.where(nothing, read, innovation)
+        surprise = 0.25 * (missed * missed) / wide
+        surprise -= np.minimum.reduce(surprise)
+        sharpness = np.sqrt(np.sqrt(np.where(wide > noise, noise / wide, 1.0)))
+        likelihood = self._likelihood * sharpness * _exponential(surprise, SQUARINGS)
+        self._likelihood = _shares(likelihood, LEAST)
+        self._deepest = deepest
+        self._learning = True
+        scaled = 1.0 / np.where(used, s, 1.0) * g
+        correction = scaled * innovation
+        less = g[:, None] * scaled
+        if not used.all():
+            correction = np.where(used, correction, 0.0)
+            less = np.where(used, less, 0.0)
+        self._estimate = estimate + correction
+        self._covariance -= less
+
+    def _weigh(self) -> np.ndarray:
+        """Weights of the hypotheses; their sum is 1."""
+        own = self._covariance[DAMPING, DAMPING]
+        precision = 1.0 / np.where(own > 0.0, own, 1.0)
+        total = self._precision + precision
+        mean = (self._weighted + precision * self._estimate[DAMPING]) / total
+        variance = BROADENING * (self._met + 1.0) / total
+        plausible = _plausibility(mean, variance, self._damping)
+        plausible = np.where(own > 0.0, np.where(plausible > LEAST_CARRIED, plausible, LEAST_CARRIED), 1.0)
+        weights = self._likelihood * self._carried * plausible
+        return weights / _total(weights)
+
+    def _conclude(self, weights: np.ndarray) -> None:
+        estimate = self._estimate
+        slopes = np.add.accumulate(estimate[:SEGMENTS] * weights, axis=1)[:, -1].tolist()
+        at_knots = [0.0] * SEGMENTS
+        reached = 0.0
+        for j in range(1, SEGMENTS):
+            reached += slopes[j - 1] * (KNOTS[j] - KNOTS[j - 1])
+            at_knots[j] = reached
+        variances = self._covariance[(12, 13, 14), (12, 13, 14)]
+        lost = _positive_mean(estimate[SEGMENTS:], variances) * weights
+        curve = self.curve
+        curve.slopes = slopes
+        curve.at_knots = at_knots
+        curve.damping, curve.depth_damping, curve.unloading = np.add.accumulate(lost, axis=1)[:, -1].tolist()
+
+
+def _plausibility(mean: np.ndarray, variance: np.ndarray, prior: float) -> np.ndarray:
+    """How much better a damping N(mean, variance) goes with one that is 0 or not negative than one
+    N(0, prior) does; Phi as in `force_depth_map.positive_mean`."""
+    spread = np.sqrt(variance)
+    ratio = mean / spread
+    density = _exponential(0.5 * (ratio * ratio), DENSITY_SQUARINGS)
+    size = np.abs(ratio)
+    mills = pi / ((pi - 1.0) * size + np.sqrt(size * size + 2.0 * pi))
+    beyond = density * mills * (2.0 / sqrt(2.0 * pi))
+    at_least_0 = np.where(ratio > 0.0, 2.0 - beyond, beyond)
+    known = sqrt(prior if prior > 0.0 else 1.0)
+    return ELASTIC * (known / spread) * density + (1.0 - ELASTIC) * at_least_0
+
+
+def _positive_mean(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """`force_depth_map.positive_mean` of many."""
+    spread = np.sqrt(np.where(variance > 0.0, variance, 1.0))
+    ratio = mean / spread
+    root = np.sqrt(ratio * ratio + 2.0 * pi)
+    below = 2.0 / (root - ratio)
+    positive = np.where(ratio > 0.0, ratio, 0.0)
+    mills = pi / ((pi - 1.0) * positive + root)
+    tail = 1.0 / (1.0 + positive * positive / 512.0)
+    for _ in range(8):
+        tail = tail * tail
+    density = tail / sqrt(2.0 * pi)
+    above = positive + density / (1.0 - density * mills)
+    known = spread * np.where(ratio > 0.0, above, below)
+    return np.where(variance > 0.0, known, np.where(mean > 0.0, mean, 0.0))
+
+
+def _exponential(u: np.ndarray, squarings: int) -> np.ndarray:
+    """(1 + u/n)^-n, n = 2^squarings."""
+    value = 1.0 / (1.0 + u / float(1 << squarings))
+    for _ in range(squarings):
+        value = value * value
+    return value
+
+
+def _shares(values: np.ndarray, least: float) -> np.ndarray:
+    """Of their sum, at least so much."""
+    shares = values / _total(values)
+    return np.where(shares > least, shares, least)
+
+
+def _total(values: np.ndarray) -> float:
+    """The sum, one term after another."""
+    return np.add.accumulate(values)[-1]

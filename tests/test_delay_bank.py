@@ -1,0 +1,180 @@
+"""The bank of delays: its weights against exact densities, both recursions, and what it finds of a delay."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gain_documents import gain_document
+from scipy import stats
+
+from jaxhil.building import build_loop
+from jaxhil.compensators import delay_bank as in_jax
+from jaxhil.compensators import force_depth_map, literature_gains
+from jaxhil.evaluation import evaluate
+from jaxhil.mechanism_file import load
+from jaxhil.runtime import Controller
+from jaxhil.runtime.delay_bank import HYPOTHESES, DelayBank
+from jaxhil.runtime.force_depth_map import KNOTS, ForceDepthMap
+from jaxhil.scenario import build_scenarios
+from jaxhil.uncertainty import draw
+
+LAW, PERIOD, SPREAD, VARIANCE = "retrospective_delay_bank", 1e-3, 1e-3, 0.1**2
+PRIOR = {
+    "stiffness": 200.0,
+    "common": 100.0,
+    "wandering": 50.0,
+    "damping": 1.9,
+    "depth_damping": 0.4,
+    "unloading": 6.0,
+}
+OFFSETS = SPREAD * np.linspace(-1, 1, HYPOTHESES)
+DELAYS = 'uncertainty."rig.force_sensor.delay"={distribution="uniform",low=0.007,high=0.009}'
+
+
+def contact(rng, ticks=170, begins=-0.02, lasts=0.13, delay=0.0, hides=0.0):
+    """Depths, speeds and forces of a contact that is damped, its force `delay` [s] older than the depths, and
+    what a dead zone hides."""
+    phase = (begins + PERIOD * np.arange(ticks)) * math.pi / lasts
+    depths, speeds = lasts / math.pi * np.sin(phase), np.cos(phase)
+    x = depths - delay * speeds
+    forces = np.where(x > 0, np.maximum(500 * x + 1.2 * speeds, 0), 0)
+    forces = forces + math.sqrt(VARIANCE) * rng.standard_normal(ticks)
+    hidden = np.abs(forces) < hides
+    return depths, speeds, np.where(hidden, 0, forces), hidden
+
+
+def plain(spread=SPREAD):
+    return DelayBank(spread, *PRIOR.values())
+
+
+def weights_of(bank):
+    return bank._weigh()
+
+
+def test_exponential_and_plausibility_are_nearly_those_of_the_normal_distribution():
+    u = np.linspace(0, 20, 41)
+    np.testing.assert_allclose(in_jax.exponential(jnp.asarray(u), in_jax.SQUARINGS), np.exp(-u), rtol=0.25)
+    mean, spread, prior = np.linspace(-2, 4, 25), 0.7, 1.9
+    found = in_jax.plausibility(jnp.asarray(mean), jnp.asarray(spread**2), jnp.asarray(prior**2))
+    # The posterior's density at 0 over the prior's, and its share from 0 on over the prior's half.
+    elastic = stats.norm.pdf(0, mean, spread) / stats.norm.pdf(0, 0, prior)
+    exact = in_jax.ELASTIC * elastic + (1 - in_jax.ELASTIC) * 2 * stats.norm.cdf(mean / spread)
+    np.testing.assert_allclose(found, exact, rtol=0.06, atol=1e-5)
+
+
+def test_likelihood_is_the_root_of_the_density_of_all_readings():
+    """Of a contact that closes: one multivariate normal density per hypothesis, no recursion."""
+    rng = np.random.default_rng(0)
+    depths, speeds, forces, _ = contact(rng, ticks=60, begins=0.002)
+    bank = plain()
+    bank.begin()
+    for depth, speed, force in zip(depths.tolist(), speeds.tolist(), forces.tolist(), strict=True):
+        bank.learn(depth, speed, force, VARIANCE, False, 0.0)
+    knots = np.array(KNOTS)
+    covariance = np.zeros((15, 15))
+    covariance[:12, :12] = PRIOR["common"] ** 2
+    covariance[:12, :12] += PRIOR["wandering"] ** 2 * np.minimum.outer(knots, knots) / 0.03
+    for place, name in enumerate(("damping", "depth_damping", "unloading"), start=12):
+        covariance[place, place] = PRIOR[name] ** 2
+    mean = np.r_[np.full(12, PRIOR["stiffness"]), 0, 0, 0]
+    exact = []
+    for offset in OFFSETS:
+        x = depths - offset * speeds
+        assert np.all(x > 0)
+        widths = np.append(np.diff(KNOTS), np.inf)
+        ramps = np.clip(x[:, None] - knots, 0, widths)
+        phi = np.column_stack([ramps, speeds, x * speeds / 0.03, x - np.maximum.accumulate(x)])
+        spread = phi @ covariance @ phi.T + VARIANCE * np.eye(len(x))
+        exact.append(0.5 * stats.multivariate_normal.logpdf(forces, phi @ mean, spread))
+    found = np.log(bank._likelihood)
+    np.testing.assert_allclose(found - found[4], np.array(exact) - exact[4], atol=0.02)
+    assert np.ptp(exact) > 0.1
+
+
+def test_both_recursions_agree():
+    """Three contacts, the last in part hidden by a dead zone; what is carried as well."""
+    rng = np.random.default_rng(1)
+    bank, zero = plain(), jnp.zeros(())
+    prior = force_depth_map.prior(*(zero + value for value in PRIOR.values()))
+    ours = in_jax.no_bank(prior)
+    for delay, zone in ((0.0004, 0.0), (0.0004, 0.0), (-0.0007, 1.0)):
+        bank.begin()
+        ours = in_jax.begin(ours, prior, jnp.asarray(True))
+        for depth, speed, force, hidden in zip(*contact(rng, delay=delay, hides=zone), strict=True):
+            bank.learn(float(depth), float(speed), float(force), VARIANCE, bool(hidden), zone)
+            reading = force_depth_map.Reading(
+                zero + depth, zero + speed, zero + force, zero + VARIANCE, jnp.asarray(bool(hidden)),
+                zero + zone, jnp.asarray(True),
+            )  # fmt: skip
+            ours, curve = in_jax.learn(ours, reading, zero + SPREAD, zero + PRIOR["damping"] ** 2)
+        assert float(ours.shift) == pytest.approx(bank.shift, rel=1e-9, abs=1e-14)
+        np.testing.assert_allclose(curve.slopes, bank.curve.slopes, rtol=1e-8)
+        for name in ("damping", "depth_damping", "unloading"):
+            assert float(getattr(curve, name)) == pytest.approx(getattr(bank.curve, name), rel=1e-7)
+    assert bank._met == float(ours.met) == 2
+    np.testing.assert_allclose(ours.weighted, bank._weighted, rtol=1e-8)
+
+
+def test_where_all_delays_are_the_same_it_is_one_map():
+    depths, speeds, forces, _ = contact(np.random.default_rng(2), begins=0.002, lasts=0.2)
+    bank, alone = plain(0.0), ForceDepthMap(*PRIOR.values())
+    bank.begin()
+    deepest = 0.0
+    for depth, speed, force in zip(depths.tolist(), speeds.tolist(), forces.tolist(), strict=True):
+        deepest = max(deepest, depth)
+        bank.learn(depth, speed, force, VARIANCE, False, 0.0)
+        alone.update(depth, speed, deepest, force, VARIANCE)
+    np.testing.assert_allclose(weights_of(bank), 1 / HYPOTHESES, rtol=1e-12)
+    np.testing.assert_allclose(bank.curve.slopes, alone.curve.slopes, rtol=1e-9)
+    assert bank.curve.damping == pytest.approx(alone.curve.damping, rel=1e-9) and bank.shift == 0
+
+
+def test_contacts_narrow_the_delay_and_a_reset_forgets_it():
+    rng, bank, delay = np.random.default_rng(3), plain(), 0.0006
+    spreads = []
+    for _ in range(8):
+        # The ticks fall elsewhere on every contact: of damped contact that is what tells a delay.
+        depths, speeds, forces, _ = contact(rng, begins=-0.02 + PERIOD * rng.random(), delay=delay)
+        bank.begin()
+        for depth, speed, force in zip(depths.tolist(), speeds.tolist(), forces.tolist(), strict=True):
+            bank.learn(depth, speed, force, VARIANCE, False, 0.0)
+        weights = weights_of(bank)
+        spreads.append(math.sqrt(np.sum(weights * (OFFSETS - bank.shift) ** 2)))
+    assert abs(bank.shift - delay) < 1.5e-4 and spreads[-1] < 0.6 * spreads[0]
+    bank.reset()
+    np.testing.assert_array_equal(weights_of(bank), weights_of(plain()))
+
+
+@pytest.fixture(scope="module")
+def repeated():
+    """Four contacts of the layered suite whose force delay is unknown to +-1 ms, under the law."""
+    mechanism = load("suite-layered", ["approach.contacts=4", DELAYS]).mechanism
+    drawn = draw(mechanism, 64, 9)
+    scenarios = build_scenarios(mechanism, drawn, 9)
+    gains = literature_gains(mechanism, LAW)
+    assert gains["delay_spread"] == pytest.approx(0.001)
+    loop = build_loop(mechanism, LAW, scenarios)
+    return drawn["rig.force_sensor.delay"], evaluate(loop, gains, scenarios)
+
+
+def test_an_unknown_delay_is_found_and_leaves_little(repeated):
+    delays, outcome = repeated
+    assert np.all(outcome.good)
+    rms = np.sqrt(np.mean(np.asarray(outcome.error) ** 2, axis=1))
+    found = np.asarray(outcome.metrics.force_delay) - delays
+    assert rms[0] < 0.006 and rms[-1] < 0.004
+    assert np.sqrt(np.mean(found[-1] ** 2)) < 1.5e-4 < 3 * np.sqrt(np.mean(found[0] ** 2))
+
+
+def test_simulate_and_the_controller_report_the_delay(jaxhil):
+    told = ["--set", "rig.force_sensor.delay=0.0085"]
+    answer = jaxhil("simulate", "suite-layered", "--compensator", LAW, *told, "--json")
+    [one] = answer.document["contacts"]
+    assert one["force_delay"] == pytest.approx(0.0085, abs=3e-4)
+    table = jaxhil("simulate", "suite-layered", "--compensator", LAW, *told).out
+    assert "force delay [ms]" in table and f"{1e3 * one['force_delay']:.2f}" in table
+    document = gain_document(LAW)
+    value = document["gains"]["identification_delay"]["value"]
+    assert Controller.from_dict(document).force_delay == value
+    assert Controller.from_dict(gain_document("phase_lead")).force_delay == 0
