@@ -69,7 +69,7 @@ def integrate_contact(
     push: Callable[[Array], Array] | None = None,
     push_duration: Float[Array, "*batch"] | float = 0.0,
     times: Float[Array, "samples *batch"] | None = None,
-    tolerance: float = TOLERANCE,
+    tolerance: Float[Array, ""] | float = TOLERANCE,
 ) -> ReferenceMotion:
     """The motion of one contact, entered at `velocity` v [m/s] with equivalent `mass` M [kg].
 
@@ -112,7 +112,7 @@ class _Problem(NamedTuple):
     approach: Array
     push: Any
     until: Array
-    tolerance: float
+    tolerance: Float[Array, ""] | float
 
 
 class _State(NamedTuple):
@@ -210,7 +210,7 @@ def _follow(problem, records):
     like = problem.approach
     dtype, zeros = like.dtype, jnp.zeros_like(like)
     rounding = float(np.finfo(dtype).eps)
-    tolerance = max(problem.tolerance, 32 * rounding)
+    tolerance = jnp.maximum(problem.tolerance, 32 * rounding)
     none = jnp.zeros(like.shape, jnp.int32)
     start = _State(zeros, zeros, like, problem.law.init(zeros), none, zeros, zeros, zeros, zeros)
     search = _Search(zeros + FIRST_STEP, none, *[zeros] * 5)

@@ -1,5 +1,7 @@
 """The motion in space by integration: closed forms, order of convergence, pushes, paths, derivatives."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ from lanes import QUICK
 from scipy.integrate import solve_ivp
 
 from jaxhil.contact import LAWS, ContactParameters
-from jaxhil.reference_motion import integrate_contact
+from jaxhil.reference_motion import TOLERANCE, integrate_contact
 
 MASS, STIFFNESS, VELOCITY = 350.0, 124355.0, 0.005
 OMEGA = np.sqrt(STIFFNESS / MASS)
@@ -48,12 +50,22 @@ def contact(dtype=float, **values):
     return ContactParameters(**{n: lanes(v) for n, v in numbers.items()}, tension=tension)
 
 
-def integrated(name, values, **options):
+@functools.partial(jax.jit, static_argnums=0, compiler_options=QUICK)
+def within(law, parameters, mass, velocity, tolerance):
+    """One program for a law, whatever the tolerance."""
+    return integrate_contact(law, parameters, mass, velocity, tolerance=tolerance)
+
+
+def integrated(name, values, tolerance=TOLERANCE, **options):
     mass, velocity = (jnp.full((LANES,), value) for value in (MASS, VELOCITY))
     law = LAWS[name]()
-    run = jax.jit(lambda c, m, v: integrate_contact(law, c, m, v, **options), compiler_options=QUICK)
     parameters = contact(**values)
-    return run(parameters, mass, velocity), law.reference(parameters, mass, velocity)
+    if options:
+        run = jax.jit(lambda c, m, v: integrate_contact(law, c, m, v, **options), compiler_options=QUICK)
+        found = run(parameters, mass, velocity)
+    else:
+        found = within(law, parameters, mass, velocity, jnp.asarray(tolerance, float))
+    return found, law.reference(parameters, mass, velocity)
 
 
 @pytest.mark.parametrize("case", CASES)
