@@ -139,6 +139,15 @@ class Tune:
     chatter_weight: Annotated[
         float, number("Restitution error that weighs as much as a command that swings once too often.")
     ] = 0.0
+    honesty_weight: Annotated[
+        float | None,
+        arg(
+            metavar="NUMBER",
+            help="How much the errors of the same scenarios count with a push on the hardware, and damped; by "
+            "default 1 for retrospective_reference, 0 for others.",
+            help_behavior_hint="",
+        ),
+    ] = None
     pareto: Annotated[
         int, number("Points of the trade-off of restitution error against sensor noise, each a gain file.")
     ] = 0

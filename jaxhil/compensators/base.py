@@ -68,6 +68,8 @@ class Compensator(eqx.Module):
     gains: eqx.AbstractClassVar[tuple[Gain, ...]]
     # Sets of gains that serve any mechanism, by name: those that differ from the nominal ones.
     settings: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType({})
+    # Whether it works out a motion of its own that it could follow whatever the hardware does.
+    anticipates: ClassVar[bool] = False
 
     def prepare(self, gains: Gains, constants: Constants) -> Any:
         """What `step` needs of the gains, worked out once per run; the gains themselves by default."""

@@ -183,6 +183,7 @@ def _tune_all(
 
 
 def _objective(options: Tune):
+    from tuning.honesty import default_weight
     from tuning.objective import Objective
 
     return Objective(
@@ -191,6 +192,7 @@ def _objective(options: Tune):
         options.command_weight,
         options.noise_weight,
         options.chatter_weight,
+        default_weight(options.compensator) if options.honesty_weight is None else options.honesty_weight,
     )
 
 
