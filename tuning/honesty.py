@@ -34,7 +34,8 @@ from tuning.comparison.figures import Figure, Judged, honesty
 from tuning.comparison.probing import EARLY, LATE, SIZE, WIDTH, in_space
 
 COPIES = 4  # lanes of a scenario: plain, early, late, damped
-ANTICIPATING = 1.0  # honesty weight of a law that anticipates, unless one is given
+# Weights of the objective of a law that anticipates, unless others are given.
+ANTICIPATING = {"honesty_weight": 1.0, "command_weight": 0.003}
 
 
 class Probed(NamedTuple):
@@ -47,11 +48,19 @@ class Probed(NamedTuple):
     late: Any
 
 
-def default_weight(compensator: str) -> float:
-    """Honesty weight [1] of a compensator that none is given for: the errors of the copies count as much as
-    those of the scenarios where the law anticipates, and for nothing where it can but pass on what it
-    measures."""
-    return ANTICIPATING if COMPENSATORS[compensator].anticipates else 0.0
+def default_weights(compensator: str) -> dict[str, float]:
+    """Weights of `tuning.objective.Objective` that a compensator has unless others are given, by name.
+
+    Where the law anticipates, the errors of the copies count as much as those of the scenarios, and force is
+    dear: what such a law is late by it can pay back by a kick, which the error alone rewards. Where a law can
+    but pass on what it measures, neither counts.
+    """
+    return dict(ANTICIPATING) if COMPENSATORS[compensator].anticipates else {}
+
+
+def are_copies(lanes: int) -> np.ndarray:
+    """Which of so many lanes, with those of the copies, are of copies."""
+    return np.arange(lanes) % COPIES > 0
 
 
 def probed_scenarios(

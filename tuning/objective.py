@@ -35,7 +35,7 @@ from jaxhil.errors import InputError, shown
 from jaxhil.evaluation import Outcome, compare_with_reference
 from jaxhil.loop import Loop, Rig
 from jaxhil.rollout import run_contacts
-from tuning.honesty import COPIES
+from tuning.honesty import are_copies
 
 SCALE = 0.01  # an error of one: the solver's first steps are damped as for residuals of order one
 FAILED = 3.0  # error of a contact that does not end, or is not reached: as bad as a wild divergence
@@ -55,11 +55,12 @@ class Objective:
 
     E: per contact the restitution error e - e* [1], times sqrt(divergence_weight) where it is positive:
     divergence_weight [1] is how much more a squared divergence (e > e*) counts than a squared convergence.
-    H: per contact of the scenarios' copies (`tuning.honesty`) the restitution error e - e* [1], e* their own;
-    they count nowhere else. With a weight of 1 those of a copy count as much as those of a scenario.
-    C: per contact max(0, peak |F_c| / the reference's peak force - 1) [1].
-    S: per contact the chatter [1]: how far F_c goes up and down beyond a single swing (`jaxhil.metrics`),
-    over the reference's peak force. Where the sensors are noisy it holds what the noise does to F_c.
+    H: per contact of the scenarios' copies (`tuning.honesty`) the restitution error e - e* [1], e* their own.
+    With a weight of 1 the errors of the copies count as much as those of the scenarios, E.
+    C: per contact, of copies too, max(0, peak |F_c| / the reference's peak force - 1) [1].
+    S: per contact, of copies too, the chatter [1]: how far F_c goes up and down beyond a single swing
+    (`jaxhil.metrics`), over the reference's peak force. Where the sensors are noisy it holds what the noise
+    does to F_c.
     N: max(0, A - 1) [1], A the amplification of the force sensor's white noise, from the gains alone
     (`Compensator.noise_amplification`); a quieter command than the measured force earns nothing.
 
@@ -178,17 +179,12 @@ def residuals(
     def by_problem(leaf):
         return jnp.moveaxis(leaf.reshape(-1, number, lanes), 1, 0).reshape(number, -1)
 
-    contacts = [*map(by_problem, contact_terms(outcome)), by_problem(outcome.wanted)]
+    error, excess, chatter = map(by_problem, contact_terms(outcome))
     amplification = jnp.mean(by_problem(loop.compensator.noise_amplification(values, rig.constants)), axis=1)
-    probed = None
-    if terms.honesty:
-        # Contact slots by scenarios, the copies of each side by side.
-        folded = [leaf.reshape(number, -1, COPIES) for leaf in contacts]
-        contacts = [leaf[..., 0] for leaf in folded]
-        errors, asked = (folded[i][..., 1:].reshape(number, -1) for i in (0, 3))
-        probed = errors, asked
-    error, excess, chatter, wanted = contacts
-    return weigh(terms, problems.weights, error, excess, chatter, wanted, amplification, probed)
+    copies = by_problem(jnp.broadcast_to(are_copies(number * lanes), outcome.wanted.shape))
+    return weigh(
+        terms, problems.weights, error, excess, chatter, by_problem(outcome.wanted), amplification, copies
+    )
 
 
 def weigh(
@@ -199,15 +195,24 @@ def weigh(
     chatter: Float[Array, "problems contacts"],
     wanted: Bool[Array, "problems contacts"],
     amplification: Float[Array, "problems"],
-    probed: tuple[Array, Array] | None = None,
+    copies: Bool[Array, "problems contacts"] | None = None,
 ) -> Float[Array, "problems residuals"]:
-    """The residuals of `contact_terms`, of the noise's amplification, and of the copies: their errors, and
-    which contacts of theirs were asked for."""
+    """The residuals of `contact_terms` and of the noise's amplification; `copies`: which contacts are of
+    copies, where the terms have honesty."""
+
     # A problem that asks for no contact, which fills up a call, has errors of 0.
-    count = jnp.maximum(jnp.sum(wanted, axis=1, dtype=jnp.int32), 1)[:, None]
+    def counted(asked):
+        return jnp.maximum(jnp.sum(asked, axis=1, dtype=jnp.int32), 1)[:, None]
+
+    count = plain = counted(wanted)
+    blindness = []
+    if terms.honesty and copies is not None:
+        blind = _norm(jnp.where(copies, error, 0), counted(wanted & copies), 2)
+        blindness = [weights.honesty[:, None] * blind]
+        error, plain = jnp.where(copies, 0, error), counted(wanted & ~copies)
     diverging = jnp.sqrt(weights.divergence)[:, None] * error
-    number = {"rms": count, "cvar": _tail(count), "worst": jnp.ones_like(count)}[terms.name]
-    parts = [_norm(jnp.where(error > 0, diverging, error), number, POWERS[terms.name])]
+    number = {"rms": plain, "cvar": _tail(plain), "worst": jnp.ones_like(plain)}[terms.name]
+    parts = [_norm(jnp.where(error > 0, diverging, error), number, POWERS[terms.name]), *blindness]
     if terms.command:
         parts.append(weights.command[:, None] * _norm(excess, count, 2))
     if terms.chatter:
@@ -215,10 +220,6 @@ def weigh(
     if terms.noise:
         beyond = amplification - 1
         parts.append((weights.noise * jnp.where(beyond > 0, beyond, 0))[:, None])
-    if probed is not None:
-        errors, asked = probed
-        several = jnp.maximum(jnp.sum(asked, axis=1, dtype=jnp.int32), 1)[:, None]
-        parts.append(weights.honesty[:, None] * _norm(errors, several, 2))
     return jnp.concatenate(parts, axis=1) / SCALE
 
 
@@ -249,7 +250,8 @@ def objective_value(
     """J [1] of `Objective`, exactly, for all three names: what a table of results is made of.
 
     `errors`, `excesses` and `chatter` (none: no part in it) are those of `contact_terms`, of the contacts
-    asked for, `honesty` the errors of the copies'; what is not finite counts as `FAILED`.
+    asked for; `honesty` are the errors of the copies, which are not among `errors` then. What is not finite
+    counts as `FAILED`.
     """
     given = errors, excesses, chatter, honesty
     error, excess, swings, blindness = (

@@ -131,8 +131,14 @@ class Tune:
         float, number("How much more a squared divergence (e > e*) counts than a squared convergence.")
     ] = 1.0
     command_weight: Annotated[
-        float, number("Restitution error that weighs as much as a command one reference peak too high.")
-    ] = 0.0
+        float | None,
+        arg(
+            metavar="NUMBER",
+            help="Restitution error that weighs as much as a command one reference peak too high; by default "
+            "0.003 for retrospective_reference, 0 for others.",
+            help_behavior_hint="",
+        ),
+    ] = None
     noise_weight: Annotated[
         float, number("Restitution error that weighs as much as one time the sensor noise more.")
     ] = 0.0
@@ -143,7 +149,7 @@ class Tune:
         float | None,
         arg(
             metavar="NUMBER",
-            help="How much the errors of the same scenarios count with a push on the hardware, and damped; by "
+            help="How much errors of the same scenarios count with a push on the hardware, and damped; by "
             "default 1 for retrospective_reference, 0 for others.",
             help_behavior_hint="",
         ),

@@ -31,6 +31,7 @@ TILE = 128  # lanes computed side by side on a device: more leave the cache
 FIRST_ROUND = 8  # steps
 PROMISING = 3  # starts of a task that go on after the first round
 LONGEST = 32  # steps of one call
+ENOUGH = 0.005  # by which a start with copies gets better in a round that is not its last
 STEP_LIMIT = STATUSES.index("step limit")
 GIVEN_UP = "given up"
 
@@ -96,14 +97,24 @@ def solve_tasks(
         several = honest or (done == 0 and max(map(len, starts)) > PROMISING)
         limit = min(steps - done, FIRST_ROUND if several else LONGEST)
         report(f"{len(going)} of {len(problems)} starts, {limit} steps")
+        before = [problem.loss for problem in going]
         advance(going, limit)
         done += limit
+        if honest and done > FIRST_ROUND:
+            _settle(going, before)
         if done < steps and not honest:
             _give_up(problems)
     return [
         [_finished(p, names, bounds[index], tasks[index]) for p in problems if p.task == index]
         for index in range(len(tasks))
     ]
+
+
+def _settle(problems: list[_Problem], before: list[float]) -> None:
+    """Those whose value hardly fell in the round have converged: the scenarios decide about the rest."""
+    for problem, loss in zip(problems, before, strict=True):
+        if problem.status == STEP_LIMIT and problem.loss > (1 - ENOUGH) ** 2 * loss:
+            problem.status = STATUSES.index("converged")
 
 
 def _give_up(problems: list[_Problem]) -> None:

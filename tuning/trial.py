@@ -19,7 +19,7 @@ from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import draw
 from tuning.batches import cut, join
 from tuning.box import Bounds
-from tuning.honesty import COPIES, Probed, probed_scenarios
+from tuning.honesty import COPIES, Probed, are_copies, probed_scenarios
 from tuning.objective import Objective, contact_terms, objective_value, one_each
 from tuning.problems import Task, common_loop, gain_bounds, gains_at, tuned_names
 
@@ -117,13 +117,14 @@ class Trial:
             # (slots, pairs, scenarios)
             terms = [np.asarray(term).reshape(-1, len(some), number) for term in contact_terms(outcome)]
             wanted = outcome.wanted.reshape(terms[0].shape)
-            plain = np.arange(number) % (COPIES if self._honest else 1) == 0
+            copies = are_copies(number) & self._honest
             for k, (i, point) in enumerate(some):
                 asked = wanted[:, k]
-                error, excess, chatter = (term[:, k][asked & plain] for term in terms)
-                copies = terms[0][:, k][asked & ~plain] if self._honest else None
+                excess, chatter = (term[:, k][asked] for term in terms[1:])
+                error, honesty = (terms[0][:, k][asked & some] for some in (~copies, copies))
                 own = objectives[which[i]]
-                found[i, point] = objective_value(own, error, excess, amplification[k], chatter, copies)
+                honesty = honesty if self._honest else None
+                found[i, point] = objective_value(own, error, excess, amplification[k], chatter, honesty)
         return found
 
     def _begin(self, noise, which, shares, some, number, lanes) -> Callable[[], tuple[Outcome, np.ndarray]]:

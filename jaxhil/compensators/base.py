@@ -36,6 +36,7 @@ class Gain(NamedTuple):
     logarithmic: bool = False
     neutral: float | None = None
     tuned: Callable[[Mechanism], bool] = lambda mechanism: True
+    begins: Callable[[Mechanism], float] | None = None
 
 
 class Signals(NamedTuple):

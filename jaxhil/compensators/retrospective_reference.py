@@ -109,7 +109,7 @@ def _prior(
 
 
 def _shows(*laws: str) -> Callable[[Mechanism], bool]:
-    """Whether the mechanism's contacts show what a gain is about: others would tune away what is not theirs."""
+    """Of what only such contacts show: on others it would be tuned away."""
     return lambda m: m.contact.law in laws
 
 
@@ -201,7 +201,11 @@ class RetrospectiveReference(Compensator):
             "velocity_gain", "1/s", lambda m: 1.0, lambda m: 1 / m.rig.control_period,
             lambda m: min(SHARP["velocity_gain"], 0.7 / m.rig.control_period), logarithmic=True,
         ),
-        _prior("correction_limit", "1", 0.01, 20.0),
+        # Where the limit binds, it hides from the solver what the other gains do.
+        Gain(
+            "correction_limit", "1", lambda m: 0.01, lambda m: 20.0, lambda m: SHARP["correction_limit"],
+            logarithmic=True, begins=lambda m: 3.0,
+        ),
         # Neither is tuned: what is replayed is what makes it a test of the hardware, whatever that errs by.
         Gain("force_replay", "1", lambda m: 0.0, lambda m: 1.0, lambda m: 1.0, tuned=_fact),
         _prior("replay_noise", "1/s", 0.01, 100.0, _fact),

@@ -183,17 +183,13 @@ def _tune_all(
 
 
 def _objective(options: Tune):
-    from tuning.honesty import default_weight
-    from tuning.objective import Objective
+    """What is asked for and, where nothing is, what the compensator's kind calls for."""
+    from tuning.honesty import default_weights
+    from tuning.objective import WEIGHTS, Objective
 
-    return Objective(
-        options.objective,
-        options.divergence_weight,
-        options.command_weight,
-        options.noise_weight,
-        options.chatter_weight,
-        default_weight(options.compensator) if options.honesty_weight is None else options.honesty_weight,
-    )
+    given = {name: getattr(options, name) for name in WEIGHTS}
+    stated = {name: weight for name, weight in given.items() if weight is not None}
+    return Objective(options.objective, **{**default_weights(options.compensator), **stated})
 
 
 def _in_order(by_index: dict[int, Any]) -> list[Any]:
@@ -213,7 +209,12 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) ->
         loaded.mechanism,
         loaded.sha256,
         validity_envelope(loaded.mechanism, result.scenarios),
-        {"nominal": result.nominal, "robust": result.figures, "tuned_intervals": result.intervals.plain()},
+        {
+            "nominal": result.nominal,
+            "robust": result.figures,
+            "tuned_intervals": result.intervals.plain(),
+            **({"honesty": result.honesty} if result.honesty else {}),
+        },
         options.seed,
         result.timings,
     )
@@ -235,6 +236,7 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) ->
         "figures": result.figures,
         "nominal": result.nominal,
         "tuned_intervals": result.intervals.plain(),
+        "honesty": result.honesty,
         "starts": [_start(start) for start in result.starts],
         "carried_over": _carried_over(result),
         "freedom": {name: one._asdict() for name, one in result.freedom.items()},
