@@ -77,7 +77,7 @@ def probed_scenarios(
     pushes = [_pushed(plain, space, share, e) for share, e in ((EARLY, space.early), (LATE, space.late))]
     batches = [_pushed(plain, space), *pushes, _pushed(own, space)]
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves, axis=-1), *batches)
-    side_by_side = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-2], -1), stacked)
+    side_by_side = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-2], COPIES * number), stacked)
     return Probed(side_by_side, space.restitution[0], space.early, space.late)
 
 

@@ -293,7 +293,7 @@ def _in_chunks(function: Callable[[Any], Outcome], arguments: Any) -> Outcome:
     lanes = jax.tree.leaves(arguments)[0].shape[-1]
     size = math.gcd(lanes, CHUNK)
     chunks = jax.tree.map(
-        lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], -1, size), -2, 0), arguments
+        lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes // size, size), -2, 0), arguments
     )
     done = lax.map(function, chunks)
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], lanes), done)

@@ -154,9 +154,16 @@ class Tune:
             help_behavior_hint="",
         ),
     ] = None
-    pareto: Annotated[
-        int, number("Points of the trade-off of restitution error against sensor noise, each a gain file.")
-    ] = 0
+    pareto: Annotated[int, number("Points of a trade-off of restitution error, each a gain file.")] = 0
+    pareto_against: Annotated[
+        str | None,
+        arg(
+            metavar="NAME",
+            help="What --pareto trades the error against: noise, peak (of the command) or honesty; by "
+            "default noise, or peak for retrospective_reference.",
+            help_behavior_hint="",
+        ),
+    ] = None
     certify: Annotated[
         bool,
         arg(

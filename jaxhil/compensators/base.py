@@ -25,7 +25,8 @@ class Gain(NamedTuple):
     unit ("1" if none), lower and upper bounds and the literature's own rule, each a function of the
     mechanism; `logarithmic` says that the gain is searched on a logarithmic scale; `neutral` is the value
     at which it does nothing, where it has one (with all of them neutral the law passes the force on);
-    `tuned` whether tuning moves it for this mechanism; if not, it stays at the literature's value.
+    `tuned` whether tuning moves it for this mechanism; if not, it stays at the literature's value; `begins`
+    where all starts of tuning but the literature's have it, if not anywhere.
     """
 
     name: str

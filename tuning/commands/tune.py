@@ -138,6 +138,7 @@ def _tune_all(
         _objective(options),
         certify=options.certify,
         setting=options.setting,
+        probed=options.pareto_against == "honesty",
     )
     mechanisms = [one.mechanism for one in loaded]
     entries, done, traded = {}, {}, {}
