@@ -57,7 +57,7 @@ def test_builtins_are_those_promised():
 
 
 SUITES = "damped dead-zone depth-damped elastoplastic fast hardening hertz layered"
-SUITES += " noise-free noisy rattling repeated"
+SUITES += " mixed noise-free noisy rattling repeated"
 
 
 def test_suites_are_those_promised():

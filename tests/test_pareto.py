@@ -122,7 +122,7 @@ def test_every_point_s_figures_are_those_of_an_evaluation(results, made):
             assert point.figures.rms == pytest.approx(rms, rel=1e-9)
             low, high = point.intervals.rms
             assert low < rms < high
-            assert point.amplification == amplification(mechanism, "phase_lead", point.gains)
+            assert point.cost == amplification(mechanism, "phase_lead", point.gains)
         assert front.literature.gains == result.literature and front.tuned.gains == result.gains
         assert front.literature.figures == result.figures["literature"]
         assert front.tuned.figures == result.figures["tuned"]
@@ -139,16 +139,16 @@ def test_no_point_is_better_under_another_s_weight(results, made):
         every = [*front.points, front.tuned, front.literature]
         errors = [errors_of(task.loop, task.scenarios, point.gains) for point in every]
         for own, point in zip(errors[:POINTS], front.points, strict=True):
-            objective = Objective(noise_weight=point.noise_weight)
+            objective = Objective(noise_weight=point.weight)
             values = [
-                objective_value(objective, error, None, other.amplification)
+                objective_value(objective, error, None, other.cost)
                 for error, other in zip(errors, every, strict=True)
             ]
             # As exact as what a start tells of itself: its last step is not in its history.
-            assert objective_value(objective, own, None, point.amplification) <= min(values) * (1 + 2e-4)
-        weights = [point.noise_weight for point in front.points]
+            assert objective_value(objective, own, None, point.cost) <= min(values) * (1 + 2e-4)
+        weights = [point.weight for point in front.points]
         assert weights[0] == 0 and weights == sorted(weights) and len(weights) == POINTS
-        noise = [point.amplification for point in front.points]
+        noise = [point.cost for point in front.points]
         assert (np.diff(noise) <= 1e-9).all() and noise[0] > 1.1 * noise[-1]
         rms = [np.sqrt(np.mean(error**2)) for error in errors[:POINTS]]
         assert (np.diff(rms) >= -2e-4 * rms[0]).all() and rms[-1] > 1.2 * rms[0]

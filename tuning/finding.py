@@ -30,6 +30,8 @@ SCANNED, SCAN_SCENARIOS = 256, 32  # points looked at before a lot, by default; 
 LOTS = 4  # of starts, at most
 SURE = 3  # starts that have to agree: two may have met in a poor basin
 AGREED = 0.005  # relative difference of values that count as the same minimum
+# The same where scenarios have copies: another draw of the scenarios would change the value by more.
+HONESTLY_AGREED = 0.02
 REACH, CANDIDATES = 0.1, 16  # of the search without derivatives: first standard deviation in the box, lot
 
 
@@ -70,6 +72,7 @@ def find(
     tasks, objectives = trial.tasks, one_each(objective, len(trial.tasks))
     told = [list(own) for own in first] if first else [[] for _ in tasks]
     number = max(starts, 1 + max(map(len, told)))
+    agreed = HONESTLY_AGREED if tasks[0].honest else AGREED
     searches = [_Search() for _ in tasks]
     chosen = _while_compiling(
         trial, number, objectives, lambda: choose_starts(trial, number, seed, objectives, told, scanned)
@@ -90,11 +93,13 @@ def find(
             own.evaluations += (1 + len(trial.names)) * sum(start.steps for start in ended[i])
             if lot > 0 or number > 1 + len(told[i]):
                 own.evaluations += _scan_evaluations(trial, number, scanned)
-        going = [i for i in going if not _agree(searches[i].starts)]
+        going = [i for i in going if not _agree(searches[i].starts, agreed)]
         if not going:
             break
-    report("searching on without derivatives")
-    polishing *= len(trial.names)
+    # Where starts agree to that, the rest of the way down is within what scenarios decide.
+    polishing = 0 if tasks[0].honest and not going else polishing * len(trial.names)
+    if polishing:
+        report("searching on without derivatives")
     best = finish(trial, [own.starts for own in searches], polishing, seed, objectives)
     return [
         Found(top, own.starts, own.evaluations + (polishing if top else 0))
@@ -155,6 +160,12 @@ def _scan(
     """The best points of a scan of the tasks `which`, so many that lie apart, and from those `beside`."""
     around = [_shares(trial, i, [trial.tasks[i].literature])[0] for i in which]
     points = np.stack([spread_points(own, max(scanned, 2 * number), seed)[1:] for own in around])
+    for own, i in zip(points, which, strict=True):
+        task = trial.tasks[i]
+        for gain in task.tuned:
+            if gain.begins is not None:
+                place, begins = trial.names.index(gain.name), {gain.name: gain.begins(task.mechanism)}
+                own[:, place] = _shares(trial, i, [{**task.literature, **begins}])[0, place]
     values = trial.losses(objective, which, points, SCAN_SCENARIOS)
     order = np.argsort(np.where(np.isfinite(values), values, np.inf), axis=1, kind="stable")
     best = []
@@ -213,7 +224,7 @@ def _ranked(starts: list[Start]) -> list[Start]:
     return sorted((start for start in starts if np.isfinite(start.rms)), key=lambda start: start.rms)
 
 
-def _agree(starts: list[Start]) -> bool:
+def _agree(starts: list[Start], agreed: float) -> bool:
     """Whether enough of the best starts do."""
     ranked = _ranked(starts)
-    return len(ranked) >= SURE and ranked[SURE - 1].rms <= (1 + AGREED) * ranked[0].rms
+    return len(ranked) >= SURE and ranked[SURE - 1].rms <= (1 + agreed) * ranked[0].rms

@@ -21,7 +21,7 @@ and a step that spoils one of them is not foreseen. By this norm the tail ends l
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -35,25 +35,32 @@ from jaxhil.errors import InputError, shown
 from jaxhil.evaluation import Outcome, compare_with_reference
 from jaxhil.loop import Loop, Rig
 from jaxhil.rollout import run_contacts
+from tuning.honesty import are_copies
 
 SCALE = 0.01  # an error of one: the solver's first steps are damped as for residuals of order one
 FAILED = 3.0  # error of a contact that does not end, or is not reached: as bad as a wild divergence
+CHUNK = 32  # lanes with copies that are computed side by side
 TAIL = 20  # cvar: the worst one in so many contacts, at least one
 POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # of the norms in the residuals; even
 OBJECTIVES = tuple(POWERS)
+WEIGHTS = tuple(f"{name}_weight" for name in ("divergence", "command", "noise", "chatter", "honesty"))
 
 
 @dataclass(frozen=True)
 class Objective:
     """What to minimise, J with
 
-        J^2 = figure(E)^2 + (command_weight rms(C))^2 + (chatter_weight rms(S))^2 + (noise_weight N)^2
+        J^2 = figure(E)^2 + (honesty_weight rms(H))^2
+          + (command_weight rms(C))^2 + (chatter_weight rms(S))^2 + (noise_weight N)^2
 
     E: per contact the restitution error e - e* [1], times sqrt(divergence_weight) where it is positive:
     divergence_weight [1] is how much more a squared divergence (e > e*) counts than a squared convergence.
-    C: per contact max(0, peak |F_c| / the reference's peak force - 1) [1].
-    S: per contact the chatter [1]: how far F_c goes up and down beyond a single swing (`jaxhil.metrics`),
-    over the reference's peak force. Where the sensors are noisy it holds what the noise does to F_c.
+    H: per contact of the scenarios' copies (`tuning.honesty`) the restitution error e - e* [1], e* their own.
+    With a weight of 1 the errors of the copies count as much as those of the scenarios, E.
+    C: per contact, of copies too, max(0, peak |F_c| / the reference's peak force - 1) [1].
+    S: per contact, of copies too, the chatter [1]: how far F_c goes up and down beyond a single swing
+    (`jaxhil.metrics`), over the reference's peak force. Where the sensors are noisy it holds what the noise
+    does to F_c.
     N: max(0, A - 1) [1], A the amplification of the force sensor's white noise, from the gains alone
     (`Compensator.noise_amplification`); a quieter command than the measured force earns nothing.
 
@@ -69,11 +76,12 @@ class Objective:
     command_weight: float = 0.0
     noise_weight: float = 0.0
     chatter_weight: float = 0.0
+    honesty_weight: float = 0.0
 
     def __post_init__(self):
         if self.name not in OBJECTIVES:
             raise InputError(f"objective: found {shown(self.name)}, allowed {', '.join(OBJECTIVES)}")
-        for name in ("divergence_weight", "command_weight", "noise_weight", "chatter_weight"):
+        for name in WEIGHTS:
             weight, may_be_0 = getattr(self, name), name != "divergence_weight"
             if not (0 < weight < math.inf or (may_be_0 and weight == 0)):
                 allowed = f"allowed finite numbers {'>=' if may_be_0 else '>'} 0"
@@ -82,21 +90,21 @@ class Objective:
     @property
     def weights(self) -> "Weights":
         """The numbers in it, each a scalar array."""
-        numbers = self.divergence_weight, self.command_weight, self.noise_weight, self.chatter_weight
-        return Weights(*(jnp.asarray(float(number)) for number in numbers))
+        return Weights(*(jnp.asarray(float(getattr(self, name))) for name in WEIGHTS))
 
 
 RMS = Objective()
 
 
 class Terms(NamedTuple):
-    """What of an objective shapes the program: its figure, and whether command, noise and chatter have a
-    part."""
+    """What of an objective shapes the program: its figure, whether command, noise and chatter have a part,
+    and whether the scenarios come with copies."""
 
     name: str
     command: bool
     noise: bool
     chatter: bool
+    honesty: bool = False
 
 
 class Weights(NamedTuple):
@@ -106,6 +114,7 @@ class Weights(NamedTuple):
     command: Float[Array, "*problems"]
     noise: Float[Array, "*problems"]
     chatter: Float[Array, "*problems"]
+    honesty: Float[Array, "*problems"]
 
 
 class Problem(NamedTuple):
@@ -122,8 +131,9 @@ def one_each(objective: Objective | Sequence[Objective], number: int) -> list[Ob
     return [objective] * number if isinstance(objective, Objective) else list(objective)
 
 
-def common_terms(objectives: Sequence[Objective]) -> Terms:
+def common_terms(objectives: Sequence[Objective], honest: bool = False) -> Terms:
     """The terms of objectives of one name: a part that one of them has, all have, some with a weight of 0.
+    `honest` scenarios come with copies.
 
     Raises ValueError for objectives of several names.
     """
@@ -133,6 +143,7 @@ def common_terms(objectives: Sequence[Objective]) -> Terms:
         any(objective.command_weight > 0 for objective in objectives),
         any(objective.noise_weight > 0 for objective in objectives),
         any(objective.chatter_weight > 0 for objective in objectives),
+        honest,
     )
 
 
@@ -144,8 +155,9 @@ def residuals(
     """(J / `SCALE`)^2 of every problem as a sum of squares, J as of `Objective`; the loss is half of it.
 
     One residual per contact slot of every scenario for the figure, or the norm that stands for it, as many
-    for the command, as many for its chatter and one for the noise, where they are among the terms. Contacts
-    that fail count with the constant error, excess and chatter `FAILED`.
+    for the command, as many for its chatter, one for the noise, and one for every contact slot of the copies,
+    where they are among the terms. Contacts that fail count with the constant error, excess and chatter
+    `FAILED`.
 
     `static` is the loop, the names of the gains that are tuned and the objective's terms. The scenarios of
     all problems run side by side, as the lanes of one batch.
@@ -157,14 +169,22 @@ def residuals(
     rig = jax.tree.map(_side_by_side, problems.rig)
     values: dict[str, Any] = {name: gains[:, i] for i, name in enumerate(names)}
     values = {name: jnp.repeat(value, lanes) for name, value in {**problems.fixed, **values}.items()}
-    outcome = compare_with_reference(loop, rig.scenario, run_contacts(loop, values, rig))
+
+    def run(arguments):
+        values, rig = arguments
+        return compare_with_reference(loop, rig.scenario, run_contacts(loop, values, rig))
+
+    outcome = _in_chunks(run, (values, rig)) if terms.honesty else run((values, rig))
 
     def by_problem(leaf):
         return jnp.moveaxis(leaf.reshape(-1, number, lanes), 1, 0).reshape(number, -1)
 
     error, excess, chatter = map(by_problem, contact_terms(outcome))
     amplification = jnp.mean(by_problem(loop.compensator.noise_amplification(values, rig.constants)), axis=1)
-    return weigh(terms, problems.weights, error, excess, chatter, by_problem(outcome.wanted), amplification)
+    copies = by_problem(jnp.broadcast_to(are_copies(number * lanes), outcome.wanted.shape))
+    return weigh(
+        terms, problems.weights, error, excess, chatter, by_problem(outcome.wanted), amplification, copies
+    )
 
 
 def weigh(
@@ -175,13 +195,24 @@ def weigh(
     chatter: Float[Array, "problems contacts"],
     wanted: Bool[Array, "problems contacts"],
     amplification: Float[Array, "problems"],
+    copies: Bool[Array, "problems contacts"] | None = None,
 ) -> Float[Array, "problems residuals"]:
-    """The residuals of `contact_terms` and of the noise's amplification."""
+    """The residuals of `contact_terms` and of the noise's amplification; `copies`: which contacts are of
+    copies, where the terms have honesty."""
+
     # A problem that asks for no contact, which fills up a call, has errors of 0.
-    count = jnp.maximum(jnp.sum(wanted, axis=1, dtype=jnp.int32), 1)[:, None]
+    def counted(asked):
+        return jnp.maximum(jnp.sum(asked, axis=1, dtype=jnp.int32), 1)[:, None]
+
+    count = plain = counted(wanted)
+    blindness = []
+    if terms.honesty and copies is not None:
+        blind = _norm(jnp.where(copies, error, 0), counted(wanted & copies), 2)
+        blindness = [weights.honesty[:, None] * blind]
+        error, plain = jnp.where(copies, 0, error), counted(wanted & ~copies)
     diverging = jnp.sqrt(weights.divergence)[:, None] * error
-    number = {"rms": count, "cvar": _tail(count), "worst": jnp.ones_like(count)}[terms.name]
-    parts = [_norm(jnp.where(error > 0, diverging, error), number, POWERS[terms.name])]
+    number = {"rms": plain, "cvar": _tail(plain), "worst": jnp.ones_like(plain)}[terms.name]
+    parts = [_norm(jnp.where(error > 0, diverging, error), number, POWERS[terms.name]), *blindness]
     if terms.command:
         parts.append(weights.command[:, None] * _norm(excess, count, 2))
     if terms.chatter:
@@ -214,15 +245,18 @@ def objective_value(
     excesses: Float[np.ndarray, "contacts"] | None = None,
     amplification: float = 1.0,
     chatter: Float[np.ndarray, "contacts"] | None = None,
+    honesty: Float[np.ndarray, "contacts"] | None = None,
 ) -> float:
     """J [1] of `Objective`, exactly, for all three names: what a table of results is made of.
 
     `errors`, `excesses` and `chatter` (none: no part in it) are those of `contact_terms`, of the contacts
-    asked for; what is not finite counts as `FAILED`.
+    asked for; `honesty` are the errors of the copies, which are not among `errors` then. What is not finite
+    counts as `FAILED`.
     """
-    error, excess, swings = (
+    given = errors, excesses, chatter, honesty
+    error, excess, swings, blindness = (
         np.where(np.isfinite(term), term, FAILED)
-        for term in (np.zeros(1) if term is None else np.ravel(term) for term in (errors, excesses, chatter))
+        for term in (np.zeros(1) if term is None else np.ravel(term) for term in given)
     )
     size = np.sort(np.abs(np.where(error > 0, math.sqrt(objective.divergence_weight) * error, error)))
     figure = {
@@ -233,7 +267,8 @@ def objective_value(
     command = objective.command_weight * np.sqrt(np.mean(excess**2))
     restless = objective.chatter_weight * np.sqrt(np.mean(swings**2))
     noise = objective.noise_weight * max(0.0, float(amplification) - 1)
-    return math.hypot(figure, command, restless, noise)
+    blind = objective.honesty_weight * np.sqrt(np.mean(blindness**2))
+    return math.hypot(figure, command, restless, noise, blind)
 
 
 def _tail(count):
@@ -251,6 +286,17 @@ def _norm(error: Float[Array, "problems contacts"], number: Int[Array, "problems
     total = jnp.sum((size / unit) ** power, axis=1, keepdims=True)
     norm = unit * jnp.where(largest > 0, total, 1) ** (1 / power)
     return error * (size / norm) ** (power // 2 - 1) / number.astype(error.dtype) ** (1 / power)
+
+
+def _in_chunks(function: Callable[[Any], Outcome], arguments: Any) -> Outcome:
+    """Lanes, the last axis of every leaf, `CHUNK` at a time: each chunk ends with its own slowest lane."""
+    lanes = jax.tree.leaves(arguments)[0].shape[-1]
+    size = math.gcd(lanes, CHUNK)
+    chunks = jax.tree.map(
+        lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes // size, size), -2, 0), arguments
+    )
+    done = lax.map(function, chunks)
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], lanes), done)
 
 
 def _side_by_side(leaf: Array) -> Array:

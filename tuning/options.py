@@ -131,17 +131,39 @@ class Tune:
         float, number("How much more a squared divergence (e > e*) counts than a squared convergence.")
     ] = 1.0
     command_weight: Annotated[
-        float, number("Restitution error that weighs as much as a command one reference peak too high.")
-    ] = 0.0
+        float | None,
+        arg(
+            metavar="NUMBER",
+            help="Restitution error that weighs as much as a command one reference peak too high; by default "
+            "0.003 for retrospective_reference, 0 for others.",
+            help_behavior_hint="",
+        ),
+    ] = None
     noise_weight: Annotated[
         float, number("Restitution error that weighs as much as one time the sensor noise more.")
     ] = 0.0
     chatter_weight: Annotated[
         float, number("Restitution error that weighs as much as a command that swings once too often.")
     ] = 0.0
-    pareto: Annotated[
-        int, number("Points of the trade-off of restitution error against sensor noise, each a gain file.")
-    ] = 0
+    honesty_weight: Annotated[
+        float | None,
+        arg(
+            metavar="NUMBER",
+            help="How much errors of the same scenarios count with a push on the hardware, and damped; by "
+            "default 1 for retrospective_reference, 0 for others.",
+            help_behavior_hint="",
+        ),
+    ] = None
+    pareto: Annotated[int, number("Points of a trade-off of restitution error, each a gain file.")] = 0
+    pareto_against: Annotated[
+        str | None,
+        arg(
+            metavar="NAME",
+            help="What --pareto trades the error against: noise, peak (of the command) or honesty; by "
+            "default noise, or peak for retrospective_reference.",
+            help_behavior_hint="",
+        ),
+    ] = None
     certify: Annotated[
         bool,
         arg(

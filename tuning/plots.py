@@ -160,14 +160,14 @@ def overview_plot(results: Sequence[Result], limit: float) -> Figure:
 
 
 def front_plot(front: Front, result: Result, limit: float) -> Figure:
-    """Restitution error against amplification of sensor noise: numbered points, the front as a line of what
+    """Restitution error against what it is traded for: numbered points, the front as a line of what
     is reached, the literature's gains and those tuned beside."""
     figure = new_figure(
-        (7, 5), f"{result.mechanism.name}: restitution error against sensor noise, fresh scenarios"
+        (7, 5), f"{result.mechanism.name}: restitution error against {front.axis.name}, fresh scenarios"
     )
     axes = figure.subplots()
-    kept = sorted((one for one in front.points if one.on_front), key=lambda one: one.amplification)
-    axes.step([p.amplification for p in kept], [p.error for p in kept], where="post", color=BLUE)
+    kept = sorted((one for one in front.points if one.on_front), key=lambda one: one.cost)
+    axes.step([p.cost for p in kept], [p.error for p in kept], where="post", color=BLUE)
     for points, label, marker, size, edge, face in (
         (kept, "front", "o", 7, BLUE, BLUE),
         ([one for one in front.points if not one.on_front], "beaten by another", "o", 7, BLUE, "white"),
@@ -176,7 +176,7 @@ def front_plot(front: Front, result: Result, limit: float) -> Figure:
         ([front.tuned], LABELS["tuned"], "D", 10, BLACK, "none"),
     ):
         if points:
-            places = [one.amplification for one in points], [one.error for one in points]
+            places = [one.cost for one in points], [one.error for one in points]
             style: dict[str, Any] = {"linestyle": "none", "marker": marker, "markersize": size}
             axes.plot(*places, color=edge, markerfacecolor=face, label=label, zorder=3, **style)
     if 0 < limit < np.inf:
@@ -187,11 +187,11 @@ def front_plot(front: Front, result: Result, limit: float) -> Figure:
     for turn, (error, noise) in enumerate(sorted(numbers)):
         where = {"xytext": (6, -14 if turn % 2 else 6), "textcoords": "offset points"}  # one above, one below
         axes.annotate(", ".join(numbers[error, noise]), (noise, error), fontsize=8, **where)
-    _scale(axes, "x", [one.amplification for one in (*front.points, front.literature, front.tuned)])
+    _scale(axes, "x", [one.cost for one in (*front.points, front.literature, front.tuned)])
     _scale(axes, "y", [one.error for one in (*front.points, front.literature, front.tuned)])
     axes.margins(0.08, 0.12)
     name = result.settings.objective.name
-    axes.set(xlabel="noise of the command over noise of the force sensor [1]", ylabel=f"{name} of e - e* [1]")
+    axes.set(xlabel=f"{front.axis.words} [1]", ylabel=f"{name} of e - e* [1]")
     finish(axes, "best")
     return figure
 

@@ -21,20 +21,21 @@ from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import quasi_random
 from tuning.box import Bounds, to_gains
 from tuning.forms import Form
+from tuning.honesty import COPIES, probed_scenarios
 
 # In training a contact that takes longer than this many times its undelayed duration, and so many
 # seconds more, has failed.
 PATIENCE = 2.0
 SHORTEST_PATIENCE = 0.15  # s
 
-SCENARIOS, NOISY_SCENARIOS = 32, 128  # to tune on, without and with sensor noise
+SCENARIOS, NOISY_SCENARIOS = 32, 128  # to tune on, without and with sensor noise, copies included
 
 
 @dataclass(frozen=True)
 class Task:
     """A mechanism to tune: the compensator's literature gains, or those of a setting, the scenarios to tune
     on and their loop; the form that scenarios and loop are brought to, if it shares a program with unlike
-    mechanisms."""
+    mechanisms; whether each scenario comes with its copies (`tuning.honesty`)."""
 
     mechanism: Mechanism
     compensator: str
@@ -42,6 +43,12 @@ class Task:
     scenarios: Scenario
     loop: Loop
     form: Form | None = None
+    honest: bool = False
+
+    @property
+    def number(self) -> int:
+        """Scenarios, copies not counted."""
+        return len(self.scenarios.velocity) // (COPIES if self.honest else 1)
 
     @property
     def tuned(self) -> tuple[Gain, ...]:
@@ -56,20 +63,31 @@ def build_task(
     seed: int,
     form: Form | None = None,
     setting: str | None = None,
+    honest: bool = False,
 ) -> Task:
     """Training scenarios are quasi-random: they fill the range evenly. Their contacts must end in time.
 
     Each comes with a realisation of the sensors' noise of its own. Gains can be fitted to a few of them, so
-    that there are more, unless a number is given, where there is noise.
+    that there are more, unless a number is given, where there is noise. The copies of `honest` ones are as
+    good for that: there are fewer scenarios then.
+
+    Raises ValueError for honest tasks in a form.
     """
-    number = scenarios or (NOISY_SCENARIOS if has_sensor_noise(mechanism) else SCENARIOS)
-    batch = build_scenarios(mechanism, quasi_random(mechanism, number, seed), seed)
+    if honest and form is not None:
+        raise ValueError("honest: found True, allowed False for mechanisms of one form")
+    noisy = has_sensor_noise(mechanism)
+    number = scenarios or (NOISY_SCENARIOS // (COPIES if honest else 1) if noisy else SCENARIOS)
+    draws = quasi_random(mechanism, number, seed)
+    if honest:
+        batch = probed_scenarios(mechanism, draws, seed).scenarios
+    else:
+        batch = build_scenarios(mechanism, draws, seed)
     loop = build_loop(mechanism, compensator, batch)
     batch = batch._replace(time_limit=np.asarray(_patience(loop.law, batch)))
     if form is not None:
         batch, loop = form.scenarios(mechanism, batch), form.loop(loop)
     gains = literature_gains(mechanism, compensator, setting)
-    return Task(mechanism, compensator, gains, batch, loop, form)
+    return Task(mechanism, compensator, gains, batch, loop, form, honest)
 
 
 def has_sensor_noise(mechanism: Mechanism) -> bool:

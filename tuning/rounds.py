@@ -17,9 +17,11 @@ from jaxtyping import Float
 
 from jaxhil.evaluation import expected_duration
 from jaxhil.loop import build_rig
+from jaxhil.scenario import Scenario
 from tuning import programs
 from tuning.box import Bounds
 from tuning.environment import program_folder
+from tuning.honesty import COPIES
 from tuning.objective import RMS, SCALE, Objective, Problem, common_terms, one_each, residuals
 from tuning.optimiser import STATUSES, Solution, solve
 from tuning.problems import Task, common_loop, gain_bounds, gains_at, tuned_names
@@ -29,6 +31,7 @@ TILE = 128  # lanes computed side by side on a device: more leave the cache
 FIRST_ROUND = 8  # steps
 PROMISING = 3  # starts of a task that go on after the first round
 LONGEST = 32  # steps of one call
+ENOUGH = 0.005  # by which a start with copies gets better in a round that is not its last
 STEP_LIMIT = STATUSES.index("step limit")
 GIVEN_UP = "given up"
 
@@ -86,22 +89,32 @@ def solve_tasks(
     order = np.argsort([-float(np.max(expected_duration(task.scenarios))) for task in tasks], kind="stable")
     rank = {int(task): place for place, task in enumerate(order)}
     problems.sort(key=lambda problem: rank[problem.task])
-    done = 0
+    done, honest = 0, tasks[0].honest
     while done < steps:
         going = [problem for problem in problems if problem.status == STEP_LIMIT]
         if not going:
             break
-        several = done == 0 and max(map(len, starts)) > PROMISING
+        several = honest or (done == 0 and max(map(len, starts)) > PROMISING)
         limit = min(steps - done, FIRST_ROUND if several else LONGEST)
         report(f"{len(going)} of {len(problems)} starts, {limit} steps")
+        before = [problem.loss for problem in going]
         advance(going, limit)
         done += limit
-        if done < steps:
+        if honest and done > FIRST_ROUND:
+            _settle(going, before)
+        if done < steps and not honest:
             _give_up(problems)
     return [
         [_finished(p, names, bounds[index], tasks[index]) for p in problems if p.task == index]
         for index in range(len(tasks))
     ]
+
+
+def _settle(problems: list[_Problem], before: list[float]) -> None:
+    """Those whose value hardly fell in the round have converged: the scenarios decide about the rest."""
+    for problem, loss in zip(problems, before, strict=True):
+        if problem.status == STEP_LIMIT and problem.loss > (1 - ENOUGH) ** 2 * loss:
+            problem.status = STATUSES.index("converged")
 
 
 def _give_up(problems: list[_Problem]) -> None:
@@ -177,11 +190,11 @@ def _calls(tasks, names, bounds, objectives, number):
     loop = common_loop([task.loop for task in tasks])
     fixed = [{k: v for k, v in task.literature.items() if k not in names} for task in tasks]
     weights = [one.weights for one in objectives]
-    each = [(t.scenarios, f, w, b) for t, f, w, b in zip(tasks, fixed, weights, bounds, strict=True)]
+    each = [(_in_order(t), f, w, b) for t, f, w, b in zip(tasks, fixed, weights, bounds, strict=True)]
     table = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *each)
     size = _size(number)
     lanes = len(tasks[0].scenarios.velocity)
-    static = (loop, names, common_terms(objectives)), LONGEST, max(1, TILE // lanes)
+    static = (loop, names, common_terms(objectives, tasks[0].honest)), LONGEST, max(1, TILE // lanes)
 
     def call(some: list[_Problem], limit: int):
         dealt = _dealt(size)
@@ -195,6 +208,17 @@ def _calls(tasks, names, bounds, objectives, number):
         return scenarios._replace(contacts=contacts), others, weighed, limits, starts, np.array(limit)
 
     return static, call
+
+
+def _in_order(task: Task) -> Scenario:
+    """The task's scenarios. Where each has its copies, those that take as long are neighbours."""
+    if not task.honest:
+        return task.scenarios
+    # That is made of how long the contacts take.
+    longest = np.asarray(task.scenarios.time_limit)[::COPIES]
+    order = np.argsort(-longest, kind="stable")
+    lanes = (COPIES * order[:, None] + np.arange(COPIES)).ravel()
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[..., lanes], task.scenarios)
 
 
 def _take(problem: _Problem, solution: Solution, i: int) -> None:

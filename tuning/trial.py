@@ -19,6 +19,7 @@ from jaxhil.scenario import Scenario, build_scenarios
 from jaxhil.uncertainty import draw
 from tuning.batches import cut, join
 from tuning.box import Bounds
+from tuning.honesty import COPIES, Probed, are_copies, probed_scenarios
 from tuning.objective import Objective, contact_terms, objective_value, one_each
 from tuning.problems import Task, common_loop, gain_bounds, gains_at, tuned_names
 
@@ -29,18 +30,26 @@ VALIDATION_SEED = 0x5EED
 class Trial:
     """Like tasks with fresh scenarios, and the nominal run of each as one more lane of its own.
 
-    fresh: (tasks) scenarios of each; names, bounds: of the gains that are tuned for any of the tasks.
+    fresh: (tasks) scenarios of each; probed: the same with their copies, where the tasks are honest, as all
+    are or none; names, bounds: of the gains that are tuned for any of the tasks.
     """
 
     def __init__(self, tasks: list[Task], validation: int, seed: int):
         seed = seed + VALIDATION_SEED
         self.tasks = tasks
         self.fresh: list[Scenario] = []
+        self.probed: list[Probed | None] = []
         every, loops = [], []
         for task in tasks:
             drawn = draw(task.mechanism, validation, seed)
             self.fresh.append(build_scenarios(task.mechanism, drawn, seed))
-            own = join([self.fresh[-1], build_scenarios(task.mechanism)])
+            if task.honest:
+                probed = probed_scenarios(task.mechanism, drawn, seed)
+                nominal = probed_scenarios(task.mechanism).scenarios
+                own = join([probed.scenarios, jax.tree.map(lambda leaf: leaf[..., :1], nominal)])
+            else:
+                probed, own = None, join([self.fresh[-1], build_scenarios(task.mechanism)])
+            self.probed.append(probed)
             if task.form is None:
                 both = join([own, task.scenarios])
                 loop = build_loop(task.mechanism, task.compensator, both, chatter=True)
@@ -57,12 +66,28 @@ class Trial:
             lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]),
             *[task.scenarios for task in tasks],
         )
-        self._each = validation + 1
+        self._honest = tasks[0].honest
+        self._each = validation * (COPIES if self._honest else 1) + 1
         self._lanes = self._each * len(tasks)
 
     def judge(self, gains: list[dict[str, float]]) -> list[Outcome]:
         """Outcome on the fresh scenarios of every task under its gains, the nominal run last."""
-        return cut(evaluate(self.loop, self._values(gains), self._scenarios), self._each)
+        return [plain for plain, _ in self.judge_copies(gains)]
+
+    def judge_copies(self, gains: list[dict[str, float]]) -> list[tuple[Outcome, Outcome | None]]:
+        """What `judge` returns and, where the tasks are honest, the outcome of the fresh scenarios with their
+        copies, (slots, scenarios, `COPIES`)."""
+        every = cut(evaluate(self.loop, self._values(gains), self._scenarios), self._each)
+        if not self._honest:
+            return [(own, None) for own in every]
+
+        def plain(leaf):
+            return np.concatenate([leaf[..., :-1:COPIES], leaf[..., -1:]], axis=-1)
+
+        def copies(leaf):
+            return leaf[..., :-1].reshape(*leaf.shape[:-1], -1, COPIES)
+
+        return [(jax.tree.map(plain, own), jax.tree.map(copies, own)) for own in every]
 
     def losses(
         self,
@@ -73,8 +98,8 @@ class Trial:
         lanes: int = 0,
     ) -> Float[np.ndarray, "which points"]:
         """`objective_value` of points of the unit box on the training scenarios of the tasks `which`, or on
-        the first so many `scenarios` of each; the objective is that of all tasks, or one of each. At least so
-        many `lanes` are computed at a time."""
+        the first so many `scenarios` of each, copies counted; the objective is that of all tasks, or one of
+        each. At least so many `lanes` are computed at a time."""
         objectives = one_each(objective, len(self.tasks))
         noise = any(objectives[task].noise_weight > 0 for task in which)
         number = self._training.velocity.shape[-1]
@@ -92,10 +117,14 @@ class Trial:
             # (slots, pairs, scenarios)
             terms = [np.asarray(term).reshape(-1, len(some), number) for term in contact_terms(outcome)]
             wanted = outcome.wanted.reshape(terms[0].shape)
+            copies = are_copies(number) & self._honest
             for k, (i, point) in enumerate(some):
-                error, excess, chatter = (term[:, k][wanted[:, k]] for term in terms)
+                asked = wanted[:, k]
+                excess, chatter = (term[:, k][asked] for term in terms[1:])
+                error, honesty = (terms[0][:, k][asked & some] for some in (~copies, copies))
                 own = objectives[which[i]]
-                found[i, point] = objective_value(own, error, excess, amplification[k], chatter)
+                honesty = honesty if self._honest else None
+                found[i, point] = objective_value(own, error, excess, amplification[k], chatter, honesty)
         return found
 
     def _begin(self, noise, which, shares, some, number, lanes) -> Callable[[], tuple[Outcome, np.ndarray]]:

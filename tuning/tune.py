@@ -1,7 +1,7 @@
 """Tuning of mechanisms: scenarios, starts, solve, and judgement on scenarios that tuning never saw."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -13,8 +13,10 @@ from jaxhil.evaluation import Outcome
 from jaxhil.mechanism import Mechanism
 from jaxhil.scenario import Scenario
 from tuning.certificate import Certified, certified
+from tuning.comparison.figures import Figure
 from tuning.finding import SCANNED, Found, find
 from tuning.forms import Form
+from tuning.honesty import honesty_figures
 from tuning.objective import RMS, SCALE, Objective
 from tuning.problems import Task, alike, build_task
 from tuning.rounds import Start
@@ -30,7 +32,8 @@ class Settings:
     """Numbers of scenarios to tune on (None: `tuning.problems` knows), of starts of a lot
     (`tuning.finding`), of solver steps, of scenarios to judge on; the seed; what to minimise; evaluations
     without derivatives at the end, for each gain; whether to search the whole box for something better;
-    points looked at before a lot of starts; a setting of the compensator that is only judged, as it is."""
+    points looked at before a lot of starts; a setting of the compensator that is only judged, as it is;
+    whether honesty is judged also where the objective does not weigh it."""
 
     scenarios: int | None = None
     starts: int = 4
@@ -42,6 +45,12 @@ class Settings:
     certify: bool = False
     scanned: int = SCANNED
     setting: str | None = None
+    probed: bool = False
+
+    @property
+    def honest(self) -> bool:
+        """Whether scenarios come with the copies of `tuning.honesty`."""
+        return self.probed or self.objective.honesty_weight > 0
 
 
 class Figures(NamedTuple):
@@ -73,7 +82,8 @@ class Result:
     compensation), "literature" and "tuned" on the same fresh scenarios, and of their nominal run; every
     start; outcomes and scenarios for plots; seconds spent; 95 % confidence
     intervals of the tuned figures; of each tuned gain how far it may move (`tuning.trust.sensitivity`); how
-    far from the best anywhere, if asked for; what the last of the starts took their gains from."""
+    far from the best anywhere, if asked for; what the last of the starts took their gains from; where honesty
+    counts, transparency, slope and peak of each on the fresh scenarios (`tuning.honesty`)."""
 
     compensator: str
     mechanism: Mechanism
@@ -90,6 +100,7 @@ class Result:
     first: tuple[Tuned, ...] = ()
     freedom: dict[str, Freedom] = field(default_factory=dict)
     certified: Certified | None = None
+    honesty: dict[str, dict[str, Figure]] = field(default_factory=dict)
 
     @property
     def usual_starts(self) -> int:
@@ -122,7 +133,7 @@ def tune_all(
     literature's. Unlike mechanisms of one `form` are tuned together in it.
     """
     tasks = [
-        build_task(m, compensator, settings.scenarios, settings.seed, form, settings.setting)
+        build_task(m, compensator, settings.scenarios, settings.seed, form, settings.setting, settings.honest)
         for m in mechanisms
     ]
     found: list[Tuned] = []
@@ -153,7 +164,7 @@ def _tune_block(
     }
     found = [Found(None, [], 0) for _ in tasks]
     if settings.setting is None and any(task.tuned for task in tasks):
-        number = len(tasks[0].scenarios.velocity)
+        number = tasks[0].number
         report(f"{name}: tuning {compensator} on {number} scenarios each")
         first = [
             [carry_over(compensator, one.gains, one.mechanism, task.mechanism) for one in own]
@@ -173,8 +184,8 @@ def _tune_block(
     best = [one.best.gains if one.best else task.literature for one, task in zip(found, tasks, strict=True)]
     clock.lap("tune")
     report(f"{name}: judging on {settings.validation} fresh scenarios")
-    outcomes = {key: trial.judge(gains) for key, gains in known.items()}
-    outcomes["tuned"] = trial.judge(best)
+    judged = {key: trial.judge_copies(gains) for key, gains in {**known, "tuned": best}.items()}
+    outcomes = {key: [own for own, _ in every] for key, every in judged.items()}
     clock.lap("judge")
     certificates: list[Certified | None] = [None for _ in tasks]
     if settings.certify and settings.setting is None:
@@ -202,6 +213,7 @@ def _tune_block(
                 first=tuple(near[i]),
                 freedom=_freedom(task, trial.names, found[i].best),
                 certified=certificates[i],
+                honesty=_honesty(trial, i, {key: every[i][1] for key, every in judged.items()}),
             )
         )
     return results
@@ -213,6 +225,14 @@ def _certify(trial: Trial, settings: Settings, found: list[Found], report) -> li
         report(f"searching everywhere, {i + 1} of {len(found)}")
         certificates.append(certified(trial, i, one, settings.objective, settings.seed))
     return certificates
+
+
+def _honesty(trial: Trial, task: int, copies: Mapping[str, Outcome | None]) -> dict[str, dict[str, Figure]]:
+    """Of a task under several gains, where its scenarios have copies."""
+    probed = trial.probed[task]
+    if probed is None:
+        return {}
+    return {key: honesty_figures(probed, own) for key, own in copies.items() if own is not None}
 
 
 def _freedom(task: Task, names: tuple[str, ...], found: Start | None) -> dict[str, Freedom]:

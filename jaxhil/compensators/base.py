@@ -25,7 +25,8 @@ class Gain(NamedTuple):
     unit ("1" if none), lower and upper bounds and the literature's own rule, each a function of the
     mechanism; `logarithmic` says that the gain is searched on a logarithmic scale; `neutral` is the value
     at which it does nothing, where it has one (with all of them neutral the law passes the force on);
-    `tuned` whether tuning moves it for this mechanism; if not, it stays at the literature's value.
+    `tuned` whether tuning moves it for this mechanism; if not, it stays at the literature's value; `begins`
+    where all starts of tuning but the literature's have it, if not anywhere.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Gain(NamedTuple):
     logarithmic: bool = False
     neutral: float | None = None
     tuned: Callable[[Mechanism], bool] = lambda mechanism: True
+    begins: Callable[[Mechanism], float] | None = None
 
 
 class Signals(NamedTuple):
@@ -70,6 +72,8 @@ class Compensator(eqx.Module):
     settings: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType({})
     # Whether it estimates the delay of the force measurement: `force_delay`.
     estimates_delay: ClassVar[bool] = False
+    # Whether it works out a motion of its own that it could follow whatever the hardware does.
+    anticipates: ClassVar[bool] = False
 
     def prepare(self, gains: Gains, constants: Constants) -> Any:
         """What `step` needs of the gains, worked out once per run; the gains themselves by default."""

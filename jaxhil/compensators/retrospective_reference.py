@@ -24,7 +24,7 @@ noise's standard deviation s is not small, less of the bracket of `reintegration
 rho = force_replay/(1 + (s/replay_noise)^2).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
@@ -63,6 +63,7 @@ from jaxhil.compensators.reintegration import (
     remember,
 )
 from jaxhil.contact import deflection
+from jaxhil.mechanism import Mechanism
 from jaxhil.ring import tie
 
 FAREWELL = 0.006
@@ -103,11 +104,16 @@ def _fact(mechanism) -> bool:
     return False
 
 
-def _prior(name: str, unit: str, lower: float, upper: float, tuned: bool = True) -> Gain:
+def _prior(
+    name: str, unit: str, lower: float, upper: float, tuned: Callable[[Mechanism], bool] = lambda m: True
+) -> Gain:
     """A gain that no mechanism's numbers enter: what it scales is scaled by approach speed and mass."""
-    return Gain(
-        name, unit, lambda m: lower, lambda m: upper, lambda m: SHARP[name], True, tuned=lambda m: tuned
-    )
+    return Gain(name, unit, lambda m: lower, lambda m: upper, lambda m: SHARP[name], True, tuned=tuned)
+
+
+def _shows(*laws: str) -> Callable[[Mechanism], bool]:
+    """Of what only such contacts show: on others it would be tuned away."""
+    return lambda m: m.contact.law in laws
 
 
 class Aligned(NamedTuple):
@@ -167,6 +173,7 @@ class RetrospectiveReference(Compensator):
     name: ClassVar[str] = "retrospective_reference"
     knows: ClassVar[tuple[str, ...]] = (EQUIVALENT_MASS, FORCE_DELAY, FORCE_NOISE, DEAD_ZONE)
     settings: ClassVar[Mapping[str, Mapping[str, float]]] = {"sharp": SHARP, "gentle": GENTLE}
+    anticipates: ClassVar[bool] = True
     gains: ClassVar[tuple[Gain, ...]] = (
         Gain(
             "equivalent_mass", "kg", lambda m: 0.1 * m.bodies.mass, lambda m: 10 * m.bodies.mass,
@@ -184,21 +191,27 @@ class RetrospectiveReference(Compensator):
             "dead_zone", "N", lambda m: 0.0, lambda m: 2 * m.rig.force_sensor.dead_zone + typical_peak(m),
             lambda m: m.rig.force_sensor.dead_zone, tuned=_fact,
         ),
-        _prior("prior_stiffness", "1/s^2", 0.1, 1e3),
+        # Next to its spread it hardly matters.
+        _prior("prior_stiffness", "1/s^2", 0.1, 1e3, _fact),
         _prior("prior_stiffness_spread", "1/s^2", 1.0, 5e3),
         _prior("prior_slope_spread", "1/s^2", 0.1, 5e3),
         _prior("prior_damping_spread", "1/s", 0.01, 50.0),
-        _prior("prior_depth_damping_spread", "1/s", 1e-4, 50.0),
-        _prior("prior_unloading_spread", "1/s^2", 1e-4, 5e3),
-        _prior("force_noise_floor", "1/s", 1e-4, 10.0),
+        _prior("prior_depth_damping_spread", "1/s", 1e-4, 50.0, _shows("hunt_crossley", "depth_damped")),
+        _prior("prior_unloading_spread", "1/s^2", 1e-4, 5e3, _shows("elastoplastic")),
+        # Where there is noise, which it is told and sees, it hardly matters.
+        _prior("force_noise_floor", "1/s", 1e-4, 10.0, lambda m: not m.rig.force_sensor.noise_std),
         Gain(
             "velocity_gain", "1/s", lambda m: 1.0, lambda m: 1 / m.rig.control_period,
             lambda m: min(SHARP["velocity_gain"], 0.7 / m.rig.control_period), logarithmic=True,
         ),
-        _prior("correction_limit", "1", 0.01, 20.0),
+        # Where the limit binds, it hides from the solver what the other gains do.
+        Gain(
+            "correction_limit", "1", lambda m: 0.01, lambda m: 20.0, lambda m: SHARP["correction_limit"],
+            logarithmic=True, begins=lambda m: 3.0,
+        ),
         # Neither is tuned: what is replayed is what makes it a test of the hardware, whatever that errs by.
         Gain("force_replay", "1", lambda m: 0.0, lambda m: 1.0, lambda m: 1.0, tuned=_fact),
-        _prior("replay_noise", "1/s", 0.01, 100.0, tuned=False),
+        _prior("replay_noise", "1/s", 0.01, 100.0, _fact),
     )  # fmt: skip
 
     def prepare(self, gains, constants):

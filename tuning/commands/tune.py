@@ -138,6 +138,7 @@ def _tune_all(
         _objective(options),
         certify=options.certify,
         setting=options.setting,
+        probed=options.pareto_against == "honesty",
     )
     mechanisms = [one.mechanism for one in loaded]
     entries, done, traded = {}, {}, {}
@@ -183,15 +184,13 @@ def _tune_all(
 
 
 def _objective(options: Tune):
-    from tuning.objective import Objective
+    """What is asked for and, where nothing is, what the compensator's kind calls for."""
+    from tuning.honesty import default_weights
+    from tuning.objective import WEIGHTS, Objective
 
-    return Objective(
-        options.objective,
-        options.divergence_weight,
-        options.command_weight,
-        options.noise_weight,
-        options.chatter_weight,
-    )
+    given = {name: getattr(options, name) for name in WEIGHTS}
+    stated = {name: weight for name, weight in given.items() if weight is not None}
+    return Objective(options.objective, **{**default_weights(options.compensator), **stated})
 
 
 def _in_order(by_index: dict[int, Any]) -> list[Any]:
@@ -211,7 +210,12 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) ->
         loaded.mechanism,
         loaded.sha256,
         validity_envelope(loaded.mechanism, result.scenarios),
-        {"nominal": result.nominal, "robust": result.figures, "tuned_intervals": result.intervals.plain()},
+        {
+            "nominal": result.nominal,
+            "robust": result.figures,
+            "tuned_intervals": result.intervals.plain(),
+            **({"honesty": result.honesty} if result.honesty else {}),
+        },
         options.seed,
         result.timings,
     )
@@ -233,6 +237,7 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) ->
         "figures": result.figures,
         "nominal": result.nominal,
         "tuned_intervals": result.intervals.plain(),
+        "honesty": result.honesty,
         "starts": [_start(start) for start in result.starts],
         "carried_over": _carried_over(result),
         "freedom": {name: one._asdict() for name, one in result.freedom.items()},

@@ -1,4 +1,4 @@
-"""`jaxhil tune --pareto N`: gains that trade accuracy for quiet, a gain file for each point of the front."""
+"""`jaxhil tune --pareto N`: gains that trade accuracy for something else, a gain file for each point."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -7,6 +7,7 @@ from typing import Any
 from jaxhil.errors import InputError
 from jaxhil.mechanism_file import LoadedMechanism
 from tuning import report
+from tuning.commands import checks
 from tuning.environment import prepare
 from tuning.options import Tune
 
@@ -21,13 +22,25 @@ def check(options: Tune) -> None:
     if number < 2:
         raise InputError(f"--pareto: found {number}, allowed 0 or an integer >= 2")
     prepare()
-    from tuning.pareto import has_trade_off
+    from tuning.pareto import AXES
 
-    if not has_trade_off(options.compensator):
+    if options.pareto_against is not None:
+        checks.one_of(tuple(AXES), **{"pareto-against": options.pareto_against})
+    if axis_of(options) is None:
         raise InputError(
             f"--pareto: found {number}, allowed 0 for {options.compensator}: there is no trade-off, it "
             "passes sensor noise on as it is whatever its gains"
         )
+
+
+def axis_of(options: Tune) -> Any:
+    """What the error is traded against (`tuning.pareto.Axis`); None: nothing."""
+    from tuning.pareto import AXES, NOISE, default_axis, has_trade_off
+
+    if options.pareto_against is None:
+        return default_axis(options.compensator)
+    axis = AXES[options.pareto_against]
+    return None if axis == NOISE and not has_trade_off(options.compensator) else axis
 
 
 def trade(
@@ -42,7 +55,9 @@ def trade(
     from tuning.pareto import fronts
 
     order, made = sorted(done), {}
-    for place, front in fronts([done[index] for index in order], options.pareto, stages.say):
+    for place, front in fronts(
+        [done[index] for index in order], options.pareto, stages.say, axis_of(options)
+    ):
         index = order[place]
         folder = Path(entries[index]["gain_file"]).parent
         try:
@@ -59,16 +74,18 @@ def trade(
 def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -> None:
     """Every point, and the quietest that is accurate enough."""
     rows: list[list[Any]] = [
-        ["literature's rule", None, *_numbers(options, front.literature), ""],
-        ["tuned", None, *_numbers(options, front.tuned), ""],
+        ["literature's rule", None, *_numbers(result, front.literature), ""],
+        ["tuned", None, *_numbers(result, front.tuned), ""],
     ]
     for number, point in enumerate(front.points, start=1):
         like = next(n for n, other in enumerate(front.points, start=1) if other.place == point.place)
         place = f"as point {like}" if like < number else "front" if point.on_front else "dominated"
-        rows.append([str(number), point.noise_weight, *_numbers(options, point), place])
-    headings = ["point", "noise weight", "noise", *([] if _is_rms(options) else ["objective"])]
+        rows.append([str(number), point.weight, *_numbers(result, point), place])
+    axis = front.axis
+    weight = axis.weight.replace("_", " ")
+    headings = ["point", weight, axis.name, *([] if _is_rms(result) else ["objective"])]
     table = report.table(
-        f"{result.mechanism.name}: restitution error against amplification of sensor noise, "
+        f"{result.mechanism.name}: restitution error against {axis.words}, "
         f"{options.validation} fresh scenarios",
         [*headings, "rms", "99th pct", "max", "not ended", ""],
         rows,
@@ -82,10 +99,13 @@ def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -
         if point.figures.failed == 0 and point.figures.rms <= options.limit
     ]
     if enough:
-        noise, number, rms = min(enough)
-        lines.append(
-            f"Quietest within {options.limit:g}: point {number}, sensor noise x {noise:.4g}, rms {rms:.2g}."
-        )
+        cost, number, rms = min(enough)
+        words = {
+            "noise": f"Quietest within {options.limit:g}: point {number}, sensor noise x {cost:.4g}",
+            "peak": f"Gentlest within {options.limit:g}: point {number}, peak x {cost:.4g}",
+            "honesty": f"Most honest within {options.limit:g}: point {number}, error {cost:.2g}",
+        }
+        lines.append(f"{words[axis.name]}, rms {rms:.2g}.")
     else:
         lines.append(f"No point's rms error is within {options.limit:g}.")
     report.emit(table, *lines, "")
@@ -97,13 +117,13 @@ def _write(options: Tune, sha256: str, result: Any, front: Any, folder: Path) ->
     from tuning.plots import front_plot, save
 
     envelope = validity_envelope(result.mechanism, result.scenarios)
-    entries = []
+    axis, entries = front.axis, []
     for number, point in enumerate(front.points, start=1):
         place = folder / FOLDER / f"{number:02d}"
         place.mkdir(parents=True, exist_ok=True)
         traded = {
-            "noise_weight": point.noise_weight,
-            "noise_amplification": point.amplification,
+            axis.weight: point.weight,
+            axis.cost: point.cost,
             "error": point.error,
             "on_front": point.on_front,
         }
@@ -112,6 +132,8 @@ def _write(options: Tune, sha256: str, result: Any, front: Any, folder: Path) ->
             "robust": {**result.figures, "tuned": point.figures},
             "tuned_intervals": point.intervals.plain(),
         }
+        if point.honesty is not None:
+            figures["honesty"] = {**result.honesty, "tuned": point.honesty}
         document = build_document(
             options.compensator,
             point.gains,
@@ -129,10 +151,10 @@ def _write(options: Tune, sha256: str, result: Any, front: Any, folder: Path) ->
     plot = folder / "pareto.png"
     save(front_plot(front, result, options.limit), plot)
     beside = {
-        name: {"noise_amplification": one.amplification, "error": one.error, "figures": one.figures}
+        name: {axis.cost: one.cost, "error": one.error, "figures": one.figures}
         for name, one in (("literature", front.literature), ("tuned", front.tuned))
     }
-    return {"points": entries, **beside, "plot": str(plot)}
+    return {"against": axis.name, "points": entries, **beside, "plot": str(plot)}
 
 
 def _remove_others(folder: Path, number: int) -> None:
@@ -145,13 +167,16 @@ def _remove_others(folder: Path, number: int) -> None:
                 path.parent.rmdir()
 
 
-def _is_rms(options: Tune) -> bool:
-    """Whether the objective without noise is the rms error itself."""
-    weights = options.divergence_weight, options.command_weight, options.chatter_weight
-    return (options.objective, *weights) == ("rms", 1.0, 0.0, 0.0)
+def _is_rms(result: Any) -> bool:
+    """Whether the objective without what is traded is the rms error itself."""
+    one = result.settings.objective
+    weights = one.divergence_weight, one.command_weight, one.chatter_weight, one.honesty_weight
+    return (one.name, *weights) == ("rms", 1.0, 0.0, 0.0, 0.0)
 
 
-def _numbers(options: Tune, point: Any) -> list[Any]:
+def _numbers(result: Any, point: Any) -> list[Any]:
     one = point.figures
-    errors = [one.rms] if _is_rms(options) else [point.error, one.rms]
-    return [f"x {point.amplification:.3f}", *errors, one.p99, one.max, one.failed]
+    errors = [one.rms] if _is_rms(result) else [point.error, one.rms]
+    # An error is no factor.
+    cost = f"x {point.cost:.3f}" if point.cost >= 0.1 else f"{point.cost:.4g}"
+    return [cost, *errors, one.p99, one.max, one.failed]

@@ -94,19 +94,45 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
             "Free: the share of its range by which a gain may move, alone or with the others moved along, "
             "before the loss rises by 1 %."
         )
+    ends = sorted(start.rms for start in result.starts if math.isfinite(start.rms))
+    if result.settings.honest and len(ends) > 1:
+        above = 100 * (ends[-1] / ends[0] - 1)
+        sure_of.append(
+            f"Starts: {len(ends)} of {len(result.starts)} ended, the worst {above:.1f} % above the best."
+        )
     if result.certified:
         one = result.certified
         sure_of.append(
             f"Best of {one.evaluations} evaluations anywhere: {one.best:.4g}; tuned, with {one.spent}: "
             f"{one.tuned:.4g}, {100 * abs(one.above):.1f} % {'above' if one.above > 0 else 'below'} it."
         )
-    tables = [errors] + ([gains] if law else []) + ([starts] if result.starts else [])
+    tables = [errors] + ([_honesty(result)] if result.honesty else [])
+    tables += ([gains] if law else []) + ([starts] if result.starts else [])
     report.emit(*tables, *sure_of, *(f"wrote {path}" for path in written), *told, "")
+
+
+def _honesty(result: Any) -> Any:
+    """Whether it still is a test of the hardware, with the literature's and with tuned gains."""
+    labels = {"literature": "literature's rule", "tuned": "tuned"}
+    rows = [
+        [label, *(_with_ends(one) for one in result.honesty[key].values())] for key, label in labels.items()
+    ]
+    return report.table(
+        "Honesty: transparency to an early and a late push, slope of e against e*, peak command (95 %)",
+        ["gains", *result.honesty["tuned"]],
+        rows,
+    )
+
+
+def _with_ends(figure: Any) -> str:
+    value, low, high = (report.figure(float(number), 3) for number in figure)
+    return f"{value} ({low} to {high})"
 
 
 def _starts(options: Tune, result: Any) -> Any:
     """Every start; a column of where they began, where one did not begin as usual."""
-    headings = ["start", "status", "steps", f"{options.objective} on training scenarios"]
+    figure = "objective" if result.settings.honest else options.objective
+    headings = ["start", "status", "steps", f"{figure} on training scenarios"]
     rows: list[list[Any]] = [[n, s.status, s.steps, s.rms] for n, s in enumerate(result.starts, start=1)]
     if not result.first:
         return report.table("Starts", headings, rows, texts=(1,))

@@ -58,7 +58,6 @@ def judge(
     """All figures. `pushed`: e* under the early and the late push; `in_space`: e* without, integrated alike;
     `depth` [m]: the deepest point of each contact in space."""
     plain: Any = judged.plain
-    twin: Any = judged.twins
     good = plain.good
     size = np.abs(plain.error[good])
     ends = interval(plain.error, good, seed=seed)
@@ -72,14 +71,28 @@ def judge(
         "worst": Figure(float(np.max(size)) if len(size) else np.nan, np.nan, np.nan),
         "failures": share(wrong),
     }
+    found |= honesty(judged, pushed, in_space, seed)
+    found["trajectory"] = resampled(_root_mean_square, seed, good, plain.metrics.trajectory_error / depth)
+    found["noise"] = Figure(amplification, np.nan, np.nan)
+    return found
+
+
+def honesty(
+    judged: Judged,
+    pushed: tuple[Float[np.ndarray, "scenarios"], Float[np.ndarray, "scenarios"]],
+    in_space: Float[np.ndarray, "scenarios"],
+    seed: int,
+) -> dict[str, Figure]:
+    """Whether it still is a test of the hardware: early, late, slope and peak; arguments as of `judge`."""
+    plain: Any = judged.plain
+    twin: Any = judged.twins
+    found = {}
     for name, runs, e in zip(("early", "late"), (judged.early, judged.late), pushed, strict=True):
-        both = good[0] & runs.good[0]
+        both = plain.good[0] & runs.good[0]
         change = runs.metrics.restitution[0] - plain.metrics.restitution[0]
         found[name] = resampled(transmitted, seed, both[None], change[None], (e - in_space)[None])
     found["slope"] = resampled(slope, seed, twin.good, twin.metrics.restitution, twin.reference_restitution)
-    found["peak"] = resampled(_highest, seed, good, plain.peak_ratio)
-    found["trajectory"] = resampled(_root_mean_square, seed, good, plain.metrics.trajectory_error / depth)
-    found["noise"] = Figure(amplification, np.nan, np.nan)
+    found["peak"] = resampled(_highest, seed, plain.good, plain.peak_ratio)
     return found
 
 

@@ -1,0 +1,161 @@
+"""Honest tuning: copies of every scenario whose restitution is that of space, and what they weigh."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from lanes import IDEAL, mechanism, validated
+from scipy.integrate import solve_ivp
+
+from jaxhil.building import build_loop
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.evaluation import evaluate
+from jaxhil.mechanism_file import load
+from jaxhil.uncertainty import draw
+from tuning import pareto
+from tuning.comparison.probing import SIZE, WIDTH
+from tuning.honesty import COPIES, are_copies, default_weights, honesty_figures, probed_scenarios
+from tuning.objective import Objective, contact_terms, objective_value
+from tuning.pareto import HONESTY, PEAK, default_axis, fronts
+from tuning.problems import build_task
+from tuning.rounds import solve_tasks
+from tuning.trial import Trial
+from tuning.tune import Settings, tune
+
+DAMPED = load("varying", ["contact.stiffness=[1e5]", "approach.contacts=1"]).mechanism
+HONEST = Objective(command_weight=0.02, honesty_weight=0.7)
+SMALL = Settings(scenarios=4, starts=2, steps=4, validation=15, objective=HONEST, polish=0, scanned=8)
+
+
+def kind(scenarios, number):
+    """One lane of each scenario: 0 plain, 1 early, 2 late, 3 damped."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[..., number::COPIES], scenarios)
+
+
+def test_a_pushed_contact_s_restitution_is_that_of_the_same_push_in_space():
+    """Against SciPy, event by event, with the very push that the scenario's hardware gets."""
+    probed = probed_scenarios(DAMPED, draw(DAMPED, 3, 0))
+    for number, known in ((1, probed.early), (2, probed.late)):
+        own = kind(probed.scenarios, number)
+        assert (own.contacts == 1).all()
+        for lane in range(3):
+            stiffness, damping = own.contact.stiffness[0, lane], own.contact.damping[0, lane]
+            mass, velocity = own.equivalent_mass[lane], own.velocity[lane]
+            size, centre = own.probe.push.size[0, lane], own.probe.push.centre[0, lane]
+            assert size == pytest.approx(SIZE * own.reference.peak_force[0, lane])
+
+            def motion(t, y, k=stiffness, b=damping, m=mass, size=size, begin=centre - WIDTH / 2):
+                inside = 0 < t - begin < WIDTH
+                push = size * np.sin(np.pi * (t - begin) / WIDTH) if inside else 0.0
+                return [y[1], -(max(0.0, k * y[0] + b * y[1]) * (y[0] > 0) + push) / m]
+
+            end = solve_ivp(motion, (0, 0.5), [0, velocity], rtol=1e-9, atol=1e-13, max_step=1e-4).y[1, -1]
+            assert known[lane] == pytest.approx(-end / velocity, abs=2e-5)
+            assert own.reference.restitution[0, lane] == known[lane]
+            # It tells a law that hears the push from one that does not.
+            assert abs(known[lane] - probed.plain[lane]) > 0.01
+
+
+def test_on_an_ideal_rig_no_copy_errs():
+    spread = {"contact.stiffness": {"distribution": "loguniform", "factor": [0.5, 2.0]}}
+    made = validated({**mechanism({}, IDEAL, 0.0, period=2.5e-5), "uncertainty": spread})
+    probed = probed_scenarios(made, draw(made, 16, 0))
+    outcome = evaluate(build_loop(made, "none", probed.scenarios), {}, probed.scenarios)
+    assert outcome.good[0].all() and np.max(np.abs(outcome.error[0])) < 1e-3
+    copies = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], -1, COPIES), outcome)
+    figures = honesty_figures(probed, copies)
+    assert list(figures) == ["early", "late", "slope", "peak"]
+    assert [one.value for one in figures.values()] == pytest.approx([1] * 4, abs=2e-3)
+
+
+def test_the_first_lanes_have_some_of_each():
+    assert list(are_copies(8)) == [False, True, True, True] * 2
+    probed = probed_scenarios(DAMPED, draw(DAMPED, 5, 1)).scenarios
+    damping = np.asarray(probed.contact.damping)[0]
+    assert (damping[3::COPIES] >= damping[::COPIES]).all() and (damping[3:] > damping[:-3]).any()
+    np.testing.assert_array_equal(damping[1::COPIES], damping[::COPIES])
+    pushed = probed.probe.push.size[0] > 0
+    np.testing.assert_array_equal(pushed, np.arange(20) % COPIES % 3 > 0)
+
+
+def test_only_what_anticipates_is_weighed_unless_asked():
+    weighed = [name for name in COMPENSATORS if default_weights(name)]
+    assert weighed == ["retrospective_reference"] == [n for n in COMPENSATORS if default_axis(n) == PEAK]
+    assert Objective(**default_weights(weighed[0])).honesty_weight > 0
+
+
+@pytest.fixture(scope="module")
+def task():
+    return build_task(DAMPED, "phase_lead", 4, 0, honest=True)
+
+
+def of_training(task, gains):
+    """Restitution errors of scenarios and of copies, and all peaks' excesses, on the training scenarios."""
+    outcome = evaluate(task.loop, gains, task.scenarios)
+    assert outcome.good[outcome.wanted].all()
+    error, excess, _ = (np.asarray(term)[0] for term in contact_terms(outcome))
+    copies = are_copies(len(error))
+    return error[~copies], error[copies], excess
+
+
+def test_solver_and_search_minimise_the_stated_objective(task):
+    assert task.number == 4 and len(task.scenarios.velocity) == 4 * COPIES
+    trial = Trial([task], 3, 0)
+    points = np.array([[0.3, 0.4], [0.6, 0.2]])[:, : len(trial.names)]
+    (starts,) = solve_tasks([task], [points], 1, HONEST)
+    for point, start, loss in zip(points, starts, trial.losses(HONEST, [0], points[None])[0], strict=True):
+        error, honesty, excess = of_training(task, trial.gains(0, point))
+        stated = np.sqrt(np.mean(error**2) + 0.7**2 * np.mean(honesty**2) + 0.02**2 * np.mean(excess**2))
+        assert loss == pytest.approx(stated, rel=1e-9)
+        assert objective_value(HONEST, error, excess, honesty=honesty) == pytest.approx(stated, rel=1e-12)
+        assert start.history[0] <= stated * (1 + 1e-9)
+        ended = of_training(task, start.gains)
+        value = objective_value(HONEST, ended[0], ended[2], honesty=ended[1])
+        assert start.rms >= value * (1 - 1e-9)
+
+
+def test_scenarios_of_a_form_have_no_copies():
+    with pytest.raises(ValueError):
+        build_task(DAMPED, "phase_lead", 4, 0, form=object(), honest=True)  # pyright: ignore
+
+
+@pytest.fixture(scope="module")
+def result():
+    return tune(DAMPED, "phase_lead", SMALL)
+
+
+def test_honesty_is_judged_of_literature_and_tuned_gains(result):
+    assert list(result.honesty) == ["before", "literature", "tuned"]
+    for key, own in result.honesty.items():
+        peaks = result.outcomes[key].peak_ratio[result.outcomes[key].good]
+        assert own["peak"].value == pytest.approx(np.percentile(peaks, 99), rel=1e-12)
+        assert own["peak"].low <= own["peak"].value <= own["peak"].high
+    assert len(result.scenarios.velocity) == SMALL.validation == result.outcomes["tuned"].error.shape[-1]
+    assert result.nominal["tuned"] != result.figures["tuned"]
+
+
+def test_without_the_weight_there_are_no_copies():
+    plain = dataclasses.replace(SMALL, objective=Objective())
+    assert not plain.honest and dataclasses.replace(plain, probed=True).honest
+    assert len(build_task(DAMPED, "phase_lead", 4, 0).scenarios.velocity) == 4
+
+
+@pytest.mark.parametrize("axis", [PEAK, HONESTY])
+def test_the_error_is_traded_against_peak_or_honesty(result, axis):
+    ((_, front),) = fronts([result], 2, axis=axis)
+    assert front.axis == axis and front.points[0].weight == 0 < front.points[1].weight
+    for point in (*front.points, front.tuned):
+        assert point.honesty is not None
+        if axis == PEAK:
+            assert point.cost == pytest.approx(point.honesty["peak"].value, rel=1e-12)
+    assert front.tuned.honesty == result.honesty["tuned"]
+    # On the training scenarios the heavier weight is no worse in what it weighs.
+    task = build_task(DAMPED, "phase_lead", SMALL.scenarios, SMALL.seed, honest=True)
+    trial = Trial([task], 3, 0)
+    starts = [pareto.Start("made up", 1, 1.0, [1.0], point.gains) for point in front.points]
+    light, heavy = pareto._reached(trial, 0, axis, HONEST, 0.0, starts)
+    assert heavy.excess <= light.excess * (1 + 1e-6) and light.error <= heavy.error * (1 + 1e-6)
+    _, honesty, excess = of_training(task, front.points[1].gains)
+    traded = excess if axis == PEAK else honesty
+    assert heavy.excess == pytest.approx(np.sqrt(np.mean(traded**2)), rel=1e-6)
