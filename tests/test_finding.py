@@ -10,7 +10,7 @@ from tuning import finding
 from tuning.finding import SCANNED, choose_starts, find, finish
 from tuning.objective import RMS, Objective
 from tuning.problems import spread_points
-from tuning.rounds import solve_tasks
+from tuning.rounds import Start, solve_tasks
 from tuning.trial import Trial
 
 
@@ -125,3 +125,29 @@ def test_a_task_that_fails_leaves_the_others_their_best(tasks, trial):
     (alone,) = find(Trial([tasks[0]], 15, 0), 3, 6, 16, 0)
     assert found[0].best is not None and alone.best is not None
     assert found[0].best.rms == pytest.approx(alone.best.rms, rel=1e-6)
+
+
+class Kinked:
+    """A task whose objective has a kink that leads along an edge, in the place of a trial's."""
+
+    def losses(self, objective, which, points):
+        x, y = points[..., 0], points[..., 1]
+        return 1 + 20 * np.abs(y - x) + (x - 0.8) ** 2
+
+    def gains(self, task, shares):
+        return {"x": float(shares[0]), "y": float(shares[1])}
+
+
+def test_a_start_that_is_stuck_is_searched_on_and_the_others_are_left():
+    corner, best = np.array([0.3, 0.3]), np.array([0.8, 0.8])
+    starts = [
+        Start("converged", 3, 1.0, [1.0], {"x": 0.8, "y": 0.8}, best),
+        Start("converged", 3, 1.25, [1.25], {"x": 0.3, "y": 0.3}, corner),
+        Start("failed", 3, np.nan, [], {}, corner),
+    ]
+    freed, evaluations = finding._freed(Kinked(), 0, starts, 0.02, 0, [RMS])  # pyright: ignore[reportArgumentType]
+    assert freed[0] is starts[0] and freed[2] is starts[2]
+    assert freed[1].rms < 1.02 and freed[1].history == [1.25, freed[1].rms]
+    assert freed[1].gains == {"x": freed[1].shares[0], "y": freed[1].shares[1]}
+    assert evaluations == finding.CANDIDATES * finding.FREEING
+    assert finding._freed(Kinked(), 0, starts[:1], 0.02, 0, [RMS]) == (starts[:1], 0)  # pyright: ignore[reportArgumentType]

@@ -32,6 +32,7 @@ SURE = 3  # starts that have to agree: two may have met in a poor basin
 AGREED = 0.005  # relative difference of values that count as the same minimum
 # The same where scenarios have copies: another draw of the scenarios would change the value by more.
 HONESTLY_AGREED = 0.02
+FREEING, FREEING_REACH = 24, 0.2  # generations of the search from a start that is stuck, its first reach
 REACH, CANDIDATES = 0.1, 16  # of the search without derivatives: first standard deviation in the box, lot
 
 
@@ -96,6 +97,10 @@ def find(
         going = [i for i in going if not _agree(searches[i].starts, agreed)]
         if not going:
             break
+    if tasks[0].honest:
+        for i, own in enumerate(searches):
+            own.starts, more = _freed(trial, i, own.starts, agreed, seed, objectives)
+            own.evaluations += more
     # Where starts agree to that, the rest of the way down is within what scenarios decide.
     polishing = 0 if tasks[0].honest and not going else polishing * len(trial.names)
     if polishing:
@@ -105,6 +110,39 @@ def find(
         Found(top, own.starts, own.evaluations + (polishing if top else 0))
         for top, own in zip(best, searches, strict=True)
     ]
+
+
+def _freed(
+    trial: Trial, task: int, starts: list[Start], agreed: float, seed: int, objectives: list[Objective]
+) -> tuple[list[Start], int]:
+    """The starts, those that ended further above the best searched on from there without derivatives, and the
+    evaluations that took.
+
+    Where the correction's limit begins to bind the objective has a kink, and the solver stays there.
+    """
+    ranked = _ranked(starts)
+    stuck = (
+        [i for i, start in enumerate(starts) if start.rms > (1 + agreed) * ranked[0].rms] if ranked else []
+    )
+    if not stuck:
+        return starts, 0
+    number = CANDIDATES * FREEING
+
+    def losses(points):
+        flat = points.reshape(1, -1, points.shape[-1])
+        return trial.losses(objectives, [task], flat)[0].reshape(points.shape[:-1])
+
+    at = np.stack([starts[i].shares for i in stuck])
+    found = polish(losses, at, number, candidates=CANDIDATES, reach=FREEING_REACH, seed=seed)
+    freed = list(starts)
+    for i, shares, loss in zip(stuck, found.free, found.loss, strict=True):
+        freed[i] = starts[i]._replace(
+            rms=float(loss),
+            gains=trial.gains(task, shares),
+            shares=shares,
+            history=[*starts[i].history, float(loss)],
+        )
+    return freed, number * len(stuck)
 
 
 def _exactly(trial: Trial, task: int, starts: list[Start], objectives: list[Objective]) -> list[Start]:
