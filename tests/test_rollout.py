@@ -243,8 +243,9 @@ def test_padding_is_inert(mixed):
     for name, values in metrics._asdict().items():
         if name == "status":
             continue
-        # There are no limits that a command could fall short by, and nothing to probe with.
-        expected = 0 if name in ("ticks", "position_shortfall", "trajectory_error") else np.nan
+        # There are no limits that a command could fall short by, nothing to probe with, no delay estimated.
+        nothing = "ticks", "position_shortfall", "trajectory_error", "force_delay"
+        expected = 0 if name in nothing else np.nan
         np.testing.assert_array_equal(values[:, lane], expected, err_msg=name)
     # With nothing but padding the program does not even start.
     idle = batch.scenario._replace(contacts=jnp.zeros_like(batch.scenario.contacts))

@@ -12,6 +12,7 @@ import pytest
 from gain_documents import gain_document
 
 from jaxhil.runtime import COMPENSATORS, Controller
+from jaxhil.runtime.laws import NEED_NUMPY
 from tuning.rig.single_file import runtime_source
 
 
@@ -32,7 +33,7 @@ def loaded(folder):
 
 def test_holds_one_law_and_nothing_beside_what_it_says_it_needs(exported):
     compensator, folder = exported
-    needs_numpy = compensator == "retrospective_delay_bank"
+    needs_numpy = compensator in NEED_NUMPY
     head = (folder / "jaxhil_runtime.py").read_text().partition("# ---- ")[0]
     assert ("NumPy beside it" in head) == ("nothing else to install" not in head) == needs_numpy
     foreign = {"jax", "jaxhil", "tuning"} | (set() if needs_numpy else {"numpy"})

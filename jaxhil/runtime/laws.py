@@ -18,3 +18,4 @@ PUBLISHED = (
     "response_error",
 )
 LAWS = (*PUBLISHED, "retrospective_reference", "retrospective_delay_bank")
+NEED_NUMPY = ("retrospective_delay_bank",)  # on the rig, in Python
