@@ -136,12 +136,7 @@ def _freed(
     found = polish(losses, at, number, candidates=CANDIDATES, reach=FREEING_REACH, seed=seed)
     freed = list(starts)
     for i, shares, loss in zip(stuck, found.free, found.loss, strict=True):
-        freed[i] = starts[i]._replace(
-            rms=float(loss),
-            gains=trial.gains(task, shares),
-            shares=shares,
-            history=[*starts[i].history, float(loss)],
-        )
+        freed[i] = _moved(trial, task, starts[i], shares, loss)
     return freed, number * len(stuck)
 
 
@@ -249,13 +244,16 @@ def finish(
         losses, starts, evaluations, candidates=CANDIDATES, reach=REACH, covariance=shapes, seed=seed
     )
     for i, top, shares, loss in zip(some, tops, found.free, found.loss, strict=True):
-        # It keeps the start itself where nothing is better.
-        if (shares != top.shares).any():
-            history = [*top.history, float(loss)]
-            best[i] = top._replace(
-                rms=float(loss), gains=trial.gains(i, shares), shares=shares, history=history
-            )
+        best[i] = _moved(trial, i, top, shares, loss)
     return best
+
+
+def _moved(trial: Trial, task: int, start: Start, shares: np.ndarray, loss: float) -> Start:
+    """The start where a search from it ended; itself where that found nothing better."""
+    if (shares == start.shares).all():
+        return start
+    history = [*start.history, float(loss)]
+    return start._replace(rms=float(loss), gains=trial.gains(task, shares), shares=shares, history=history)
 
 
 def _ranked(starts: list[Start]) -> list[Start]:

@@ -121,7 +121,7 @@ class Trial:
             for k, (i, point) in enumerate(some):
                 asked = wanted[:, k]
                 excess, chatter = (term[:, k][asked] for term in terms[1:])
-                error, honesty = (terms[0][:, k][asked & some] for some in (~copies, copies))
+                error, honesty = (terms[0][:, k][asked & ones] for ones in (~copies, copies))
                 own = objectives[which[i]]
                 honesty = honesty if self._honest else None
                 found[i, point] = objective_value(own, error, excess, amplification[k], chatter, honesty)
