@@ -256,7 +256,7 @@ def drive(
     end = commands[loop.latency]
     start = commands[loop.latency + 1] if loop.hold == "linear" else end
     plant, x_now = rig.propagation, state.plant.state
-    panel = _panel(plant, x_now, start, end)
+    panel = _panel(plant, x_now, start, end, scenario.contact_plane)
     rings = sensed.rings
     panels = rings.panel
     if panels is not None:
@@ -313,11 +313,11 @@ def _recall(ring, tick, age, panels):
     return jnp.where(age > panels, look_back(ring, tick - 1, panels), 0)
 
 
-def _panel(plant, state, start, end):
-    """Motion of the real mechanism over the panel under way."""
+def _panel(plant, state, start, end, plane):
+    """Motion of the real mechanism over the panel under way, from the plane in which it touches."""
 
     def motion(position, velocity):
-        return Motion(read(position, state, start, end), read(velocity, state, start, end))
+        return Motion(read(position, state, start, end) - plane, read(velocity, state, start, end))
 
     sample = motion(plant.position, plant.velocity)
     if plant.start is None:

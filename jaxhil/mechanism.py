@@ -156,12 +156,16 @@ class PositionSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class Rig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The controller: period [s], integrator, command; the motion simulator, the sensors."""
+    """The controller: period [s], integrator, command; the motion simulator, the sensors.
+
+    `contact_plane` [m] is where the hardware touches; the controller takes it to be at 0.
+    """
 
     control_period: ControlPeriod
     integrator: Integrator = "semi_implicit_euler"
     command_latency: Annotated[int, Meta(ge=0, le=1)] = 0
     command_hold: CommandHold = "linear"
+    contact_plane: float = 0.0
     simulator: Simulator
     force_sensor: ForceSensor = ForceSensor()
     position_sensor: PositionSensor = PositionSensor()

@@ -189,6 +189,13 @@ def _check_gap(mechanism: Mechanism, spans: Mapping[str, _Span]) -> None:
     if clearance <= start:
         allowed = f"a clearance > {start:g}, v (0.02 s + T + the motion simulator's delay and lag): "
         raise KeyProblem(("contact", "clearance"), shown(clearance), allowed + "the start lies within it")
+    low, high = -0.02 * float(extreme("approach.velocity", 0)), clearance - start
+    for plane in (float(extreme("rig.contact_plane", end)) for end in (0, 1)):
+        if not low < plane < high:
+            allowed = f"a number > {low:g}, -0.02 s v"
+            allowed += f", and < {high:g}, the clearance less what the start needs" if high < math.inf else ""
+            where = ("rig", "contact_plane")
+            raise KeyProblem(where, shown(plane), allowed + ": the start lies outside contact")
 
 
 def _greatest_lag(simulator: Simulator, extreme: Callable[[str, int], Any]) -> float:

@@ -51,9 +51,10 @@ class PositionSensor(NamedTuple):
 
 class Scenario(NamedTuple):
     """One run per lane: equivalent_mass [kg], velocity [m/s] of the first approach, number of contacts,
-    phase of each contact [1], clearance [m] (inf if one-sided), the contacts' parameters, the rig, the
-    time_limit [s] of a contact, a random key (seed, index) for sensor noise; what it is probed with; the
-    contacts in space, where they are known beforehand (else NaN)."""
+    phase of each contact [1], clearance [m] (inf if one-sided), the contacts' parameters, the rig with the
+    contact_plane [m] in which it touches, the time_limit [s] of a contact, a random key (seed, index) for
+    sensor noise; what it is probed with; the contacts in space, where they are known beforehand (else NaN).
+    """
 
     equivalent_mass: Float[Array, "*batch"]
     velocity: Float[Array, "*batch"]
@@ -62,6 +63,7 @@ class Scenario(NamedTuple):
     clearance: Float[Array, "*batch"]
     contact: ContactParameters
     control_period: Float[Array, "*batch"]
+    contact_plane: Float[Array, "*batch"]
     simulator: MotionSimulator
     force_sensor: ForceSensor
     position_sensor: PositionSensor
@@ -135,6 +137,7 @@ def build_scenarios(
             unloading_ratio=every(scalar("contact.unloading_ratio", contact.unloading_ratio or 1.0)),
         ),
         control_period=scalar("rig.control_period", rig.control_period),
+        contact_plane=scalar("rig.contact_plane", rig.contact_plane),
         simulator=simulator,
         force_sensor=ForceSensor(
             *(

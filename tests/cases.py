@@ -229,6 +229,9 @@ CASES: dict[str, Case] = {
     ),
     "late position": Case(mechanism(LIST, position_sensor={"delay": 0.0037}), "response_error"),
     "position a whole period late": Case(mechanism(LIST, position_sensor={"delay": 0.002}), "response_error"),
+    "contact plane deeper": Case(
+        mechanism({**LIST, "damping": [300.0]}, contacts=2, contact_plane=4.3e-5), "response_error"
+    ),
     "dead zone": Case(mechanism(LIST, contacts=2, force_sensor={"dead_zone": 4.0}), "response_error"),
     "quantum": Case(
         mechanism(LIST, force_sensor={"quantum": 0.5}, position_sensor={"quantum": 1e-7}), "response_error"
@@ -256,6 +259,16 @@ CASES: dict[str, Case] = {
             {**LIST, "damping": [120.0], "clearance": 0.002}, RATTLING, 0.003, 3, velocity=0.01, **LAGGED
         ),
         "response_error",
+    ),
+    "rattling, contact plane nearer": Case(
+        mechanism(
+            {**LIST, "damping": [120.0], "clearance": 0.002}, RATTLING, 0.003, 3, velocity=0.01,
+            contact_plane=-7.7e-5, **LAGGED,
+        ),
+        "response_error",
+    ),
+    "elastoplastic, contact plane nearer": Case(
+        mechanism({"law": "elastoplastic", "unloading_ratio": 1.5}, contact_plane=-3.1e-5), "phase_lead"
     ),
     "rattling": Case(
         mechanism({**LIST, "damping": [120.0], "clearance": 0.002}, RATTLING, 0.003, 3, velocity=0.01),

@@ -258,8 +258,8 @@ class _Motion:
 class _Law:
     """Contact law: force(d, d') without the clamp, and where the formula changes."""
 
-    def __init__(self, contact):
-        self.kind = contact["law"]
+    def __init__(self, contact, plane=0.0):
+        self.kind, self.plane = contact["law"], plane
         kinds = ("linear", "kelvin_voigt", "hunt_crossley", "piecewise_linear")
         if self.kind not in (*kinds, "hardening", "depth_damped", "elastoplastic"):
             raise ValueError(f"unknown contact law {self.kind!r}")
@@ -290,13 +290,16 @@ class _Law:
     def levels(self):
         """Positions at which the formula may change."""
         levels = [0.0, *self.depths]
-        return levels + ([-self.clearance - depth for depth in levels] if isfinite(self.clearance) else [])
+        far = [-self.clearance - depth for depth in levels] if isfinite(self.clearance) else []
+        return [self.plane + level for level in (*levels, *far)]
 
     def side(self, position):
-        return 1 if position > 0.0 else (-1 if position < -self.clearance else 0)
+        depth = position - self.plane
+        return 1 if depth > 0.0 else (-1 if depth < -self.clearance else 0)
 
     def penetration(self, position, side):
-        return position if side > 0 else -self.clearance - position
+        depth = position - self.plane
+        return depth if side > 0 else -self.clearance - depth
 
     def raw(self, depth, rate, index, deepest=0.0):
         stiffness, damping = self.parameters(index)
@@ -393,7 +396,8 @@ class _Run:
         self.integrator = rig.get("integrator", "semi_implicit_euler")
         if self.integrator not in ("semi_implicit_euler", "zoh", "explicit_euler"):
             raise ValueError(f"unknown integrator {self.integrator!r}")
-        self.law, self.index, self.law_index = _Law(mechanism["contact"]), index, index
+        self.law = _Law(mechanism["contact"], rig.get("contact_plane", 0.0))
+        self.index, self.law_index = index, index
         self.index_waits_for_exit = index_waits_for_exit
         self.compensator = compensator
         self.first_force_zero, self.time_limit = first_force_zero, time_limit
@@ -680,7 +684,8 @@ def _cut(position, velocity, a, b, law, index):
     turning = [a, *_roots(v, a, b), b]
     cuts = {a, b, *turning}
     for low, high in pairwise(turning):
-        dent = [law.deepest, -law.clearance - law.deepest] if law.kind == "elastoplastic" else []
+        dent = [law.plane + law.deepest, law.plane - law.clearance - law.deepest]
+        dent = dent if law.kind == "elastoplastic" else []
         for level in [
             *law.levels(),
             *(d for d in dent if isfinite(d)),

@@ -56,6 +56,7 @@ FULL = {
             "range": 1000.0,
         },
         "position_sensor": {"delay": 0.001, "noise_std": 1e-6, "quantum": 1e-6},
+        "contact_plane": 2e-5,
     },
     "uncertainty": {
         "contact.stiffness": {"distribution": "loguniform", "factor": [0.3, 3.0]},
@@ -171,7 +172,7 @@ def test_defaults():
     assert (contact.stiffness, contact.damping, contact.depths) == ([5.0], [0.0], [])
     assert (contact.tension, contact.clearance, contact.exponent) == (False, math.inf, 1.5)
     assert (rig.integrator, rig.command_latency) == ("semi_implicit_euler", 0)
-    assert (rig.command_hold, rig.simulator.delay) == ("linear", 0.0)
+    assert (rig.command_hold, rig.simulator.delay, rig.contact_plane) == ("linear", 0.0, 0.0)
     assert rig.simulator.velocity_limit == rig.simulator.acceleration_limit == math.inf
     assert rig.force_sensor.range == math.inf
     for name in ("delay", "time_constant", "noise_std", "quantum", "dead_zone", "bias"):
@@ -252,6 +253,7 @@ def flat(node, path=""):
 def test_zero_and_negative(path):
     nominal = dict(flat(FULL))[path]
     signed = ("rig.force_sensor.bias", "rig.simulator.numerator", "rig.simulator.denominator")
+    signed = (*signed, "rig.contact_plane")
     for value in (0.0, -1e-9):
         listed = [value, *nominal[1:]] if isinstance(nominal, list) else value
         raw = changed({path: listed})
@@ -408,9 +410,26 @@ def test_other_laws_and_models(changes):
 def test_both_positions_start_inside_the_gap(changes, lag):
     # Free approach and phase, then latency, transport delay and lag of x_a.
     start = 0.005 * (0.02 + 0.001 + 0.001 + 0.004 + lag)
+    changes = changes | {"rig.contact_plane": ...}
     assert from_builtins(changed(changes | {"contact.clearance": start * (1 + 1e-9)}), "f")
     message = refusal(changed(changes | {"contact.clearance": start * (1 - 1e-9)}))
     assert ": contact.clearance: found " in message and f"allowed a clearance > {start:g}" in message
+
+
+@pytest.mark.parametrize(
+    ("clearance", "plane", "allowed"),
+    [
+        (math.inf, -1.001e-4, "a number > -0.0001, -0.02 s v: the start"),
+        (0.02, -1.001e-4, "a number > -0.0001, -0.02 s v, and < 0.0197427"),
+        # Free approach and phase, then latency, transport delay and lag of x_a.
+        (0.02, 0.02 - 0.99 * 0.005 * (0.026 + 2 * 0.8 / (2 * math.pi * 10.0)), "and < 0.0197427, the clear"),
+    ],
+)
+def test_the_start_is_free_of_the_contact_plane(clearance, plane, allowed):
+    changes = {"contact.clearance": clearance}
+    assert from_builtins(changed(changes | {"rig.contact_plane": 0.99 * plane}), "f")
+    message = refusal(changed(changes | {"rig.contact_plane": plane}))
+    assert ": rig.contact_plane: found " in message and allowed in message
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ AGAINST_THE_ORACLE = (
     *("velocity limit", "damped, lag", "rattling, lag", "rattling against layers"),
     *("rattling behind a long transport delay", "damped hardening", "depth-damped", "elastoplastic"),
     *("depth-damped, linear spring, lag", "elastoplastic, lag", "rattling, elastoplastic"),
+    *("contact plane deeper", "rattling, contact plane nearer", "elastoplastic, contact plane nearer"),
 )
 # Parabolas stand for the force that a lagging sensor follows.
 LAGGED = 1e-7

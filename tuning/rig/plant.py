@@ -31,7 +31,7 @@ class Plant:
         force_panels, force_place = split_delay(simulator.delay + rig.force_sensor.delay, period)
         position_panels, position_place = split_delay(simulator.delay + rig.position_sensor.delay, period)
         self._period, self._contact = period, mechanism.contact
-        self._clearance = mechanism.contact.clearance
+        self._clearance, self._plane = mechanism.contact.clearance, rig.contact_plane
         self._hold, self._latency = rig.command_hold, rig.command_latency
         self._force_sensor, self._position_sensor = rig.force_sensor, rig.position_sensor
         self._place, self._noise = force_place * period, Random(seed)
@@ -100,7 +100,8 @@ class Plant:
         rows, state, tick, last = self._rows, self._state, self._tick, self._size - 1
 
         def motion(place: Place) -> Motion:
-            return Motion(apply(place.position, state, start, end), apply(place.velocity, state, start, end))
+            position = apply(place.position, state, start, end) - self._plane
+            return Motion(position, apply(place.velocity, state, start, end))
 
         if self._force_sensor.time_constant > 0.0 or self._law.dented is not None:
             panel = motion(rows.sample), motion(rows.start), motion(rows.end)

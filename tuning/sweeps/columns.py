@@ -79,7 +79,7 @@ _UNITS = {
     "natural_frequency": "Hz",
     **dict.fromkeys(("control_period", "delay", "time_constant"), "s"),
     **dict.fromkeys(("dead_zone", "bias", "range"), "N"),
-    **dict.fromkeys(("depths", "clearance", "reference_depth"), "m"),
+    **dict.fromkeys(("depths", "clearance", "reference_depth", "contact_plane"), "m"),
     **dict.fromkeys(("phase", "damping_ratio", "exponent", "unloading_ratio"), "1"),
 }
 
