@@ -31,6 +31,7 @@ RESULT = (
     *("missed_ticks", "late_ticks", "at_rest", "tripped", "bias", "answer"),
     *("contacts", "restitution", "expected", "balance"),
     *("last_contact", "contact_status", "contact_ticks", "unsure", "saturated", "too_short"),
+    *("displaced", "noisy"),
     "force_delay",
 )
 STATUS_NAMES = tuple(status.name for status in STATUSES)

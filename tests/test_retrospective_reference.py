@@ -185,13 +185,38 @@ def test_replayed_force_makes_up_for_a_wrong_map():
         time = (0.5 + np.arange(last)) * PERIOD
         impulse = (1 - np.cos(rate * time)) * rate / rate / PERIOD
         depths, speeds = np.sin(rate * time) / rate, np.cos(rate * time)
-        samples = zip(impulse, depths, speeds, np.maximum.accumulate(depths), strict=True)
+        samples = zip(impulse, time / PERIOD, depths, speeds, np.maximum.accumulate(depths), strict=True)
         for index, sample in enumerate(samples):
             reference.remember(index, *(float(value) for value in sample))
         for _ in range(last):
             reference.tick(wrong)
         found[replay] = abs(reference.depth - depths[-1]) * rate
     assert found[1.0] < 2e-3 and found[0.0] > 0.1
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_what_a_dead_zone_hides_is_left_to_the_map(shown):
+    """With rho = 1 and the true map, the way in, on which no force is read at first, does no harm; taken for
+    no force, it does."""
+    rate = 20.0
+    right, last = curve_of(np.full(12, rate**2)), math.floor(math.pi / rate / PERIOD)
+    time = (0.5 + np.arange(last)) * PERIOD
+    forces, depths, speeds = rate * np.sin(rate * time), np.sin(rate * time) / rate, np.cos(rate * time)
+    seen = (forces > 0.7 * rate) | (speeds < 0.0)
+    intervals = np.append(0.0, seen[1:] & seen[:-1])
+    impulse = np.cumsum(intervals * (forces + np.append(0.0, forces[:-1])) / 2)
+    read = np.cumsum(intervals) if shown else time / PERIOD
+    reference = ReferenceMotion(PERIOD)
+    reference.replay = 1.0
+    reference.restart(0.5 * PERIOD)
+    for index, sample in enumerate(
+        zip(impulse, read, depths, speeds, np.maximum.accumulate(depths), strict=True)
+    ):
+        reference.remember(index, *(float(value) for value in sample))
+    for _ in range(last):
+        reference.tick(right)
+    error = abs(reference.speed - speeds[-1])
+    assert error < 2e-3 if shown else error > 0.1
 
 
 def test_both_sides_keep_as_much():

@@ -20,7 +20,9 @@ enum { JAXHIL_HYPOTHESES = 9 };
  * these of the damping's precision and of precision times mean, their number `met`; whether this contact is to be
  * added to them. The mean of the maps and, `shift` [s], of the delays; the delay that was `told`. */
 typedef struct {
-    double told, shift, stiffness, common, wandering, spreads[3], met;
+    double told, shift, met, variance;
+    double known[JAXHIL_HYPOTHESES];
+    jaxhil_force_depth_map prior;
     double offsets[JAXHIL_HYPOTHESES], deepest[JAXHIL_HYPOTHESES];
     double likelihood[JAXHIL_HYPOTHESES], carried[JAXHIL_HYPOTHESES];
     double precision[JAXHIL_HYPOTHESES], weighted[JAXHIL_HYPOTHESES];
@@ -35,6 +37,7 @@ typedef struct {
 static const double jaxhil_bank_elastic = 0.25;
 static const double jaxhil_bank_broadening = 5.0;
 static const double jaxhil_bank_least = 1e-200;
+static const double jaxhil_bank_nothing = 1e-300; /* a smaller product is none: some machines keep such numbers */
 static const double jaxhil_bank_least_carried = 1e-12;
 static const double jaxhil_bank_least_shift = 1e-12; /* s: where nothing tells delays apart, rounding does not */
 enum { JAXHIL_SQUARINGS = 10, JAXHIL_DENSITY_SQUARINGS = 8, JAXHIL_DAMPING = JAXHIL_SEGMENTS };
@@ -50,9 +53,10 @@ static double jaxhil_bank_exponential(double u, int squarings) {
 
 /* Of their sum, at least so much. */
 static void jaxhil_bank_shares(double *values, double least) {
-    double total = values[0];
-    for (int h = 1; h < JAXHIL_HYPOTHESES; h++) {
-        total += values[h];
+    double total = 0.0;
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        values[h] = values[h] < jaxhil_bank_nothing ? 0.0 : values[h];
+        total = h > 0 ? total + values[h] : values[h];
     }
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         const double share = values[h] / total;
@@ -60,31 +64,24 @@ static void jaxhil_bank_shares(double *values, double least) {
     }
 }
 
-static void jaxhil_bank_prior(jaxhil_learnt *bank) {
+static void jaxhil_bank_restart(jaxhil_learnt *bank) {
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
             for (int j = 0; j < JAXHIL_PARAMETERS; j++) {
-                bank->covariance[h][i][j] = 0.0;
+                bank->covariance[h][i][j] = bank->prior.covariance[i][j];
             }
-            bank->estimate[h][i] = i < JAXHIL_SEGMENTS ? bank->stiffness : 0.0;
-        }
-        for (int i = 0; i < JAXHIL_SEGMENTS; i++) {
-            for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
-                const double shared = i < j ? jaxhil_knots[i] : jaxhil_knots[j];
-                bank->covariance[h][i][j] = bank->common + bank->wandering * (shared / jaxhil_map_wandering);
-            }
-        }
-        for (int k = 0; k < 3; k++) {
-            bank->covariance[h][JAXHIL_SEGMENTS + k][JAXHIL_SEGMENTS + k] = bank->spreads[k];
+            bank->estimate[h][i] = bank->prior.estimate[i];
         }
         bank->deepest[h] = 0.0;
+        bank->known[h] = 0.0;
         bank->likelihood[h] = 1.0;
     }
     bank->learning = false;
+    bank->variance = 0.0;
 }
 
 static void jaxhil_learnt_reset(jaxhil_learnt *bank) {
-    jaxhil_bank_prior(bank);
+    jaxhil_bank_restart(bank);
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         bank->carried[h] = 1.0;
         bank->precision[h] = 0.0;
@@ -96,12 +93,7 @@ static void jaxhil_learnt_reset(jaxhil_learnt *bank) {
 
 static void jaxhil_learnt_init(jaxhil_learnt *bank, const jaxhil_gains *gains) {
     bank->told = gains->identification_delay;
-    bank->stiffness = gains->prior_stiffness;
-    bank->common = gains->prior_stiffness_spread * gains->prior_stiffness_spread;
-    bank->wandering = gains->prior_slope_spread * gains->prior_slope_spread;
-    bank->spreads[0] = gains->prior_damping_spread * gains->prior_damping_spread;
-    bank->spreads[1] = gains->prior_depth_damping_spread * gains->prior_depth_damping_spread;
-    bank->spreads[2] = gains->prior_unloading_spread * gains->prior_unloading_spread;
+    jaxhil_force_depth_map_init(&bank->prior, gains);
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         bank->offsets[h] = (0.25 * (double)h - 1.0) * gains->delay_spread;
     }
@@ -128,7 +120,12 @@ static void jaxhil_learnt_begin(jaxhil_learnt *bank) {
         jaxhil_bank_shares(bank->carried, jaxhil_bank_least_carried);
         bank->met += 1.0;
     }
-    jaxhil_bank_prior(bank);
+    jaxhil_bank_restart(bank);
+}
+
+/* Variance [1/s^2] of the force that is expected where it was read last. */
+static double jaxhil_learnt_variance(const jaxhil_learnt *bank) {
+    return bank->variance;
 }
 
 static const jaxhil_curve *jaxhil_learnt_curve(const jaxhil_learnt *bank) {
@@ -164,7 +161,7 @@ static void jaxhil_bank_weigh(const jaxhil_learnt *bank, double *weights) {
         const double variance = jaxhil_bank_broadening * (bank->met + 1.0) / sum;
         double plausible = 1.0;
         if (own > 0.0) {
-            plausible = jaxhil_bank_plausibility(mean, variance, bank->spreads[0]);
+            plausible = jaxhil_bank_plausibility(mean, variance, bank->prior.damping);
             plausible = plausible > jaxhil_bank_least_carried ? plausible : jaxhil_bank_least_carried;
         }
         weights[h] = bank->likelihood[h] * bank->carried[h] * plausible;
@@ -200,7 +197,9 @@ static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
             lost[k] = h > 0 ? lost[k] + mean : mean;
         }
         const double delay = weights[h] * bank->offsets[h];
+        const double known = weights[h] * bank->known[h];
         shift = h > 0 ? shift + delay : delay;
+        bank->variance = h > 0 ? bank->variance + known : known;
     }
     bank->shift = shift > jaxhil_bank_least_shift || shift < -jaxhil_bank_least_shift ? shift : 0.0;
     curve->damping = lost[0];
@@ -254,6 +253,7 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
     if (inside && s > 0.0 &&
         (closes || expected > 0.0 || seen * seen > jaxhil_map_outlying * noise)) {
         const double share = 1.0 / s;
+        bank->known[h] = noise * ((s - noise) * share);
         for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
             const double scaled = share * g[i];
             estimate[i] += scaled * innovation;

@@ -2,6 +2,8 @@
 #include <math.h>
 #include <stdbool.h>
 
+#include "gains_table.c"
+
 /* == Declarations == */
 
 enum { JAXHIL_SEGMENTS = 12, JAXHIL_PARAMETERS = 15 };
@@ -20,11 +22,11 @@ typedef struct {
     double stiffness, common, wandering, damping, depth_damping, unloading;
     double estimate[JAXHIL_PARAMETERS], covariance[JAXHIL_PARAMETERS][JAXHIL_PARAMETERS];
     jaxhil_curve curve;
+    double variance; /* [1/s^2] of the force that it expects where it was read last */
 } jaxhil_force_depth_map;
 
-/* The spreads of the slopes' common value and of their wandering, of damping, depth damping and unloading. */
-void jaxhil_force_depth_map_init(jaxhil_force_depth_map *map, double stiffness, double common,
-                                 double wandering, double damping, double depth_damping, double unloading);
+/* With the gains' prior. */
+void jaxhil_force_depth_map_init(jaxhil_force_depth_map *map, const jaxhil_gains *gains);
 void jaxhil_force_depth_map_restart(jaxhil_force_depth_map *map);
 
 /* One reading in contact, with noise of a `variance` [1/s^2]. */
@@ -102,14 +104,13 @@ static void jaxhil_force_depth_map_conclude(jaxhil_force_depth_map *map) {
     curve->unloading = jaxhil_positive_mean(map->estimate[14], map->covariance[14][14]);
 }
 
-void jaxhil_force_depth_map_init(jaxhil_force_depth_map *map, double stiffness, double common,
-                                 double wandering, double damping, double depth_damping, double unloading) {
-    map->stiffness = stiffness;
-    map->common = common * common;
-    map->wandering = wandering * wandering;
-    map->damping = damping * damping;
-    map->depth_damping = depth_damping * depth_damping;
-    map->unloading = unloading * unloading;
+void jaxhil_force_depth_map_init(jaxhil_force_depth_map *map, const jaxhil_gains *gains) {
+    map->stiffness = gains->prior_stiffness;
+    map->common = gains->prior_stiffness_spread * gains->prior_stiffness_spread;
+    map->wandering = gains->prior_slope_spread * gains->prior_slope_spread;
+    map->damping = gains->prior_damping_spread * gains->prior_damping_spread;
+    map->depth_damping = gains->prior_depth_damping_spread * gains->prior_depth_damping_spread;
+    map->unloading = gains->prior_unloading_spread * gains->prior_unloading_spread;
     jaxhil_force_depth_map_restart(map);
 }
 
@@ -120,6 +121,7 @@ void jaxhil_force_depth_map_restart(jaxhil_force_depth_map *map) {
         }
         map->estimate[i] = 0.0;
     }
+    map->variance = 0.0;
     for (int i = 0; i < JAXHIL_SEGMENTS; i++) {
         for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
             const double shared = i < j ? jaxhil_knots[i] : jaxhil_knots[j];
@@ -168,6 +170,7 @@ void jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, do
         return;
     }
     const double share = 1.0 / s;
+    map->variance = variance * ((s - variance) * share);
     const double innovation = force - expected;
     for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
         const double scaled = share * g[i];

@@ -13,9 +13,7 @@ typedef struct {
 /* == Definitions == */
 
 static void jaxhil_learnt_init(jaxhil_learnt *learnt, const jaxhil_gains *gains) {
-    jaxhil_force_depth_map_init(&learnt->map, gains->prior_stiffness, gains->prior_stiffness_spread,
-                                gains->prior_slope_spread, gains->prior_damping_spread,
-                                gains->prior_depth_damping_spread, gains->prior_unloading_spread);
+    jaxhil_force_depth_map_init(&learnt->map, gains);
 }
 
 static void jaxhil_learnt_reset(jaxhil_learnt *learnt) {
@@ -28,6 +26,11 @@ static void jaxhil_learnt_begin(jaxhil_learnt *learnt) {
 
 static const jaxhil_curve *jaxhil_learnt_curve(const jaxhil_learnt *learnt) {
     return &learnt->map.curve;
+}
+
+/* Variance [1/s^2] of the force that is expected where it was read last. */
+static double jaxhil_learnt_variance(const jaxhil_learnt *learnt) {
+    return learnt->map.variance;
 }
 
 static double jaxhil_learnt_shift(const jaxhil_learnt *learnt) {

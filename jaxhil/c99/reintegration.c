@@ -12,23 +12,23 @@ enum {
 };
 
 /* A motion under a curve of its own, at one sample: depth [s], speed, deepest point so far [s], force without
- * damping [1/s]; of the measured sample there, the force's integral since the entry [ticks/s] and the map's force
- * [1/s]; whether it has separated. */
+ * damping [1/s]; of the measured sample there, the force's integral since the entry [ticks/s], over how many ticks
+ * that is, and the map's force [1/s]; whether it has separated. */
 typedef struct {
-    double depth, speed, deepest, force, impulse, expected;
+    double depth, speed, deepest, force, impulse, read, expected;
     bool free;
     jaxhil_curve curve;
 } jaxhil_path;
 
 /* From depth 0 at speed 1: x' = v, v' = -f, f = F(x, v, x_m) + rho [y - F(X, V, X_m)], rho = `replay`, the bracket
- * only as far as the hardware has been measured, until it separates. A pass from the entry makes up to JAXHIL_STRIDE steps of up to
- * 2 ms per tick; when it has caught up with the present it becomes the `live` motion. The force is older by `shift`
+ * only as far as the hardware has been measured and y could be read, until it separates. A pass from the entry makes
+ * up to JAXHIL_STRIDE steps of up to 2 ms per tick; when it has caught up with the present it becomes the `live` motion. The force is older by `shift`
  * [s] than it was taken for when samples were remembered: it belongs to X - shift V. */
 typedef struct {
     double replay, shift, period, first;
     long coarse, number, present, reached;
     jaxhil_path live, behind;
-    double impulses[JAXHIL_HISTORY], depths[JAXHIL_HISTORY], speeds[JAXHIL_HISTORY];
+    double impulses[JAXHIL_HISTORY], reads[JAXHIL_HISTORY], depths[JAXHIL_HISTORY], speeds[JAXHIL_HISTORY];
     double deepest[JAXHIL_HISTORY];
 } jaxhil_reference_motion;
 
@@ -37,8 +37,9 @@ void jaxhil_reference_motion_init(jaxhil_reference_motion *reference, double per
 /* A contact whose sample 0, the next tick's, comes `first` [s] after its entry. */
 void jaxhil_reference_motion_restart(jaxhil_reference_motion *reference, double first);
 
-/* A measured sample: the force's integral since the entry [ticks/s], depth [s], speed, deepest point [s]. */
-void jaxhil_reference_motion_remember(jaxhil_reference_motion *reference, long index, double impulse,
+/* A measured sample: the integral since the entry [ticks/s] of the force that could be read, over how many ticks that
+ * is, depth [s], speed, deepest point [s]. */
+void jaxhil_reference_motion_remember(jaxhil_reference_motion *reference, long index, double impulse, double read,
                                       double depth, double speed, double deepest);
 void jaxhil_reference_motion_tick(jaxhil_reference_motion *reference, const jaxhil_curve *curve);
 
@@ -52,6 +53,7 @@ static void jaxhil_path_enter(jaxhil_path *path) {
     path->deepest = 0.0;
     path->force = 0.0;
     path->impulse = 0.0;
+    path->read = 0.0;
     path->expected = 0.0;
     path->free = false;
 }
@@ -68,6 +70,7 @@ void jaxhil_reference_motion_init(jaxhil_reference_motion *reference, double per
     }
     for (int slot = 0; slot < JAXHIL_HISTORY; slot++) {
         reference->impulses[slot] = 0.0;
+        reference->reads[slot] = 0.0;
         reference->depths[slot] = 0.0;
         reference->speeds[slot] = 0.0;
         reference->deepest[slot] = 0.0;
@@ -84,10 +87,11 @@ void jaxhil_reference_motion_restart(jaxhil_reference_motion *reference, double 
     jaxhil_path_enter(&reference->behind);
 }
 
-void jaxhil_reference_motion_remember(jaxhil_reference_motion *reference, long index, double impulse,
+void jaxhil_reference_motion_remember(jaxhil_reference_motion *reference, long index, double impulse, double read,
                                       double depth, double speed, double deepest) {
     const long slot = index % JAXHIL_HISTORY;
     reference->impulses[slot] = impulse;
+    reference->reads[slot] = read;
     reference->depths[slot] = depth;
     reference->speeds[slot] = speed;
     reference->deepest[slot] = deepest;
@@ -102,12 +106,15 @@ static void jaxhil_reference_advance(const jaxhil_reference_motion *reference, j
     if (index < reference->number && ticks > 0.0) {
         const long slot = index % JAXHIL_HISTORY;
         const double impulse = reference->impulses[slot];
+        const double read = reference->reads[slot];
         const double rate = reference->speeds[slot];
         const double expected = jaxhil_curve_force(curve, reference->depths[slot] - reference->shift * rate,
                                                    rate, reference->deepest[slot]);
-        missing =
-            reference->replay * ((impulse - path->impulse) / ticks - 0.5 * (path->expected + expected));
+        const double modelled = 0.5 * (path->expected + expected);
+        const double gap = (impulse - path->impulse) - (read - path->read) * modelled;
+        missing = reference->replay * (gap / ticks);
         path->impulse = impulse;
+        path->read = read;
         path->expected = expected;
     }
     const double duration = ticks * reference->period;

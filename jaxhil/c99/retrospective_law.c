@@ -7,9 +7,9 @@
 #include <math.h>
 #include <stdbool.h>
 
+#include "doubts.c"
 #include "filters.c"
 #include "gains_table.c"
-#include "law_status_table.c"
 #include "reintegration.c"
 #include "surfaces.c"
 
@@ -21,10 +21,11 @@ typedef struct {
     jaxhil_delay_line line;
     jaxhil_learnt learnt;
     jaxhil_reference_motion reference;
-    double middle, last, side, speed, gone, squares, count, first, fraction, impulse, moved;
-    double sample, sample_depth, sample_speed, sample_deepest, deepest, hardware_deepest, late;
-    long offset, ticks, elapsed, readings;
-    bool whole, touched, started;
+    double middle, last, side, speed, gone, squares, count, first, fraction, impulse, read, moved, plane, surface;
+    double sample, sample_depth, sample_speed, sample_deepest, deepest, hardware_deepest;
+    jaxhil_doubts doubts;
+    long offset, ticks, elapsed;
+    bool whole, touched, started, moved_shown, sample_shown;
     int status;
     double samples[JAXHIL_IDENTIFICATION_DELAY_SAMPLES];
 } jaxhil_law;
@@ -33,8 +34,8 @@ typedef struct {
 
 static const double jaxhil_farewell = 0.006;   /* s for which it goes on after the hardware has left */
 static const double jaxhil_longest_lag = 0.1;  /* s for which it waits for hardware that has not touched yet */
-static const double jaxhil_too_late = 0.5;     /* of the predicted duration, that the hardware may touch late by */
-static const long jaxhil_few = 5;              /* readings on which no contact is identified */
+static const double jaxhil_seen = 8.0;         /* readings out of contact that show how noisy the force is */
+static const double jaxhil_outstanding = 16.0; /* times the noise's variance: what hardly is noise */
 
 /* All but what was learnt of earlier contacts. */
 static void jaxhil_law_restart(jaxhil_law *law) {
@@ -49,16 +50,20 @@ static void jaxhil_law_restart(jaxhil_law *law) {
     law->offset = 0;
     law->ticks = 0;
     law->impulse = 0.0;
+    law->read = 0.0;
     law->moved = 0.0;
+    law->moved_shown = true;
     law->sample = 0.0;
+    law->sample_shown = true;
     law->sample_depth = 0.0;
     law->sample_speed = 0.0;
     law->sample_deepest = 0.0;
     law->deepest = 0.0;
     law->hardware_deepest = 0.0;
-    law->late = 0.0;
     law->elapsed = 0;
-    law->readings = 0;
+    law->plane = 0.0;
+    law->surface = 0.0;
+    jaxhil_doubts_restart(&law->doubts);
     law->started = false;
     law->status = JAXHIL_OUT_OF_CONTACT;
 }
@@ -81,6 +86,7 @@ static bool jaxhil_law_init(jaxhil_law *law, const jaxhil_gains *gains) {
     law->replay_noise = gains->replay_noise;
     law->middle = 0.0;
     law->last = 0.0;
+    jaxhil_doubts_start(&law->doubts, 0.0, 0.0);
     jaxhil_learnt_init(&law->learnt, gains);
     jaxhil_reference_motion_init(&law->reference, period);
     jaxhil_law_restart(law);
@@ -108,20 +114,20 @@ static void jaxhil_law_align(jaxhil_law *law, double measured, double velocity_d
         const double stride = period * velocity_desired;
         law->middle = newest - stride;
         law->last = newest - 2.0 * stride;
+        jaxhil_doubts_start(&law->doubts, measured - stride, stride);
         law->started = true;
     }
+    jaxhil_doubts_move(&law->doubts, measured);
     *position = newest + law->share * (law->middle - newest);
     *velocity = (newest - law->last) / (2.0 * period);
     law->last = law->middle;
     law->middle = newest;
 }
 
-/* A reading out of contact, if it is one: it tells how noisy the force is. */
-static void jaxhil_law_take_noise(jaxhil_law *law, double force, double bent) {
-    if (bent == 0.0) {
-        law->squares += force * force;
-        law->count += 1.0;
-    }
+/* A reading out of contact: it tells how noisy the force is. */
+static void jaxhil_law_take_noise(jaxhil_law *law, double force) {
+    law->squares += force * force;
+    law->count += 1.0;
 }
 
 /* The hardware's entry: where its samples fall on the reference's grid. */
@@ -140,23 +146,29 @@ static void jaxhil_law_touch(jaxhil_law *law, double depth, double rate) {
     law->offset = -1 - (long)whole;
     law->ticks = 0;
     law->touched = true;
-    law->late = law->first + (double)law->elapsed * period;
+    law->doubts.late = law->first + (double)law->elapsed * period;
 }
 
 /* This tick's sample, moved to the reference's grid, into its history. */
-static void jaxhil_law_remember(jaxhil_law *law, double force, double depth, double rate, double deepest) {
+static void jaxhil_law_remember(jaxhil_law *law, double force, bool hidden, double depth, double rate,
+                                double deepest) {
     const double fraction = law->fraction;
     const double moved = law->sample + fraction * (force - law->sample);
+    const bool shown = !hidden && law->sample_shown;
     const long index = law->ticks + law->offset;
     law->ticks++;
     if (index == 0) {
-        law->impulse = 0.5 * moved * law->first / law->period;
-    } else if (index > 0) {
+        const double ticks = shown ? law->first / law->period : 0.0;
+        law->impulse = 0.5 * moved * ticks;
+        law->read = ticks;
+    } else if (index > 0 && shown && law->moved_shown) {
         law->impulse += 0.5 * (law->moved + moved);
+        law->read += 1.0;
     }
     law->moved = moved;
+    law->moved_shown = shown;
     if (index >= 0) {
-        jaxhil_reference_motion_remember(&law->reference, index, law->impulse,
+        jaxhil_reference_motion_remember(&law->reference, index, law->impulse, law->read,
                                          law->sample_depth + fraction * (depth - law->sample_depth),
                                          law->sample_speed + fraction * (rate - law->sample_speed),
                                          law->sample_deepest + fraction * (deepest - law->sample_deepest));
@@ -181,11 +193,10 @@ static double jaxhil_law_follow(jaxhil_law *law, bool enters, double x, double v
         jaxhil_reference_motion_restart(&law->reference, x);
         law->first = x;
         law->elapsed = 0;
-        law->readings = 0;
-        law->late = 0.0;
         law->deepest = 0.0;
         law->hardware_deepest = 0.0;
         law->sample = force;
+        law->sample_shown = !hidden;
         law->sample_depth = told - period * rate;
         law->sample_speed = rate;
         law->sample_deepest = 0.0;
@@ -201,14 +212,17 @@ static double jaxhil_law_follow(jaxhil_law *law, bool enters, double x, double v
     const double zone = law->dead_zone / weight;
     const double square = weight * weight;
     const double noise = square > 0.0 ? jaxhil_law_noise(law) / square : 0.0;
+    const double variance = law->floor * law->floor + noise;
     if (depth > 0.0) {
         if (!law->touched) {
             jaxhil_law_touch(law, depth, rate);
         }
-        law->readings += !hidden;
+        if (!hidden) {
+            jaxhil_doubts_read(&law->doubts, depth, deepest, force, variance);
+        }
     }
     law->reference.shift = jaxhil_learnt_shift(&law->learnt);
-    jaxhil_learnt_read(&law->learnt, told, rate, deepest, force, law->floor * law->floor + noise, hidden, zone);
+    jaxhil_learnt_read(&law->learnt, told, rate, deepest, force, variance, hidden, zone);
     const double expected = jaxhil_curve_force(curve, depth, rate, deepest);
     if (hidden) {
         force = expected > zone ? zone : (expected > 0.0 ? expected : 0.0);
@@ -226,12 +240,8 @@ static double jaxhil_law_follow(jaxhil_law *law, bool enters, double x, double v
     const double peak = jaxhil_curve_peak_force(curve);
     const double limit = law->limit * peak;
     double correction = law->velocity_gain * (v - 0.5 * period * own - law->reference.live.speed);
-    law->status = JAXHIL_IDENTIFIED;
-    if (law->readings < jaxhil_few) {
-        law->status = JAXHIL_UNSURE;
-    } else if (law->late * peak > jaxhil_too_late * jaxhil_map_pi) {
-        law->status = JAXHIL_TOO_SHORT;
-    }
+    law->status = jaxhil_doubts_status(&law->doubts, curve, peak, deepest, jaxhil_learnt_variance(&law->learnt),
+                                       zone, law->speed);
     if (correction > limit || correction < -limit) {
         correction = correction > limit ? limit : -limit;
         law->status = law->status == JAXHIL_IDENTIFIED ? JAXHIL_SATURATED : law->status;
@@ -241,9 +251,10 @@ static double jaxhil_law_follow(jaxhil_law *law, bool enters, double x, double v
         command = own + (force - expected) + correction;
     }
     if (law->touched) {
-        jaxhil_law_remember(law, force, told, rate, deepest);
+        jaxhil_law_remember(law, force, hidden, told, rate, deepest);
     }
     law->sample = force;
+    law->sample_shown = !hidden;
     law->sample_depth = told;
     law->sample_speed = rate;
     law->sample_deepest = deepest;
@@ -267,10 +278,14 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
         law->speed = sound ? approach : 0.0;
         law->touched = false;
         law->gone = 0.0;
+        law->plane = 0.0;
+        jaxhil_doubts_restart(&law->doubts);
     }
     const double side = law->side;
     if (side == 0.0) {
-        jaxhil_law_take_noise(law, force_measured, bent);
+        if (bent == 0.0) {
+            jaxhil_law_take_noise(law, force_measured);
+        }
         law->status = JAXHIL_OUT_OF_CONTACT;
         return 0.0;
     }
@@ -279,7 +294,7 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
     const double weight = law->mass * scale;
     const double x = (side < 0.0 ? -clearance - position_desired : position_desired) / scale;
     const double v = side * velocity_desired / scale;
-    const double told = (side < 0.0 ? -clearance - position : position) / scale;
+    const double told = (side < 0.0 ? -clearance - position : position) / scale + law->plane;
     const double rate = side * velocity / scale;
     const double shifted = told - jaxhil_learnt_shift(&law->learnt) * rate;
     const double depth = shifted >= -jaxhil_map_surface && shifted <= jaxhil_map_surface ? 0.0 : shifted;
@@ -294,8 +309,20 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
             force = side * (force_measured - zone) / weight;
         }
     }
-    if (!law->touched && !(speed > 0.0 && depth > 0.0)) {
-        jaxhil_law_take_noise(law, force_measured, bent);
+    if (!law->touched && !(speed > 0.0 && depth > 0.0) && bent == 0.0) {
+        const double floor_force = law->floor * weight;
+        const double usual = jaxhil_outstanding * (jaxhil_law_noise(law) + floor_force * floor_force);
+        if (law->count >= jaxhil_seen && force_measured * force_measured > usual) {
+            law->doubts.early++;
+            if (law->doubts.early == 1) {
+                law->surface = -told;
+            }
+            if (law->doubts.early > jaxhil_early) {
+                law->plane = law->surface;
+            }
+        } else {
+            jaxhil_law_take_noise(law, force_measured);
+        }
     }
     if (!enters) {
         law->gone += 1.0;

@@ -45,6 +45,7 @@ ELASTIC = 0.25
 BROADENING = 5.0  # of the variance of the damping
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
 LEAST, LEAST_CARRIED = 1e-200, 1e-12
+NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, some do not
 SQUARINGS, DENSITY_SQUARINGS = 10, 8  # n = 2^10 of the likelihood, 2^8 of what is known of damping
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
 DAMPING = SEGMENTS
@@ -185,6 +186,7 @@ def exponential(u: Array, squarings: int) -> Array:
 
 def _shares(values: Array, least: float) -> Array:
     """Of their sum, at least so much."""
+    values = jnp.where(values < NOTHING, 0, values)
     shares = values / jnp.sum(values, axis=0, keepdims=True)
     return jnp.where(shares > least, shares, least)
 

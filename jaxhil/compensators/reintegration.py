@@ -7,8 +7,9 @@ Scaled as in `force_depth_map`: the reference enters at depth 0 with speed 1 and
 with the bracket only as far as the hardware has been measured, until it separates: x <= 0, or v < 0 and
 f <= 0; x_m and X_m are the deepest points so far. It is stepped by the velocity Verlet scheme, the damping
 implicit in the first half of a step and explicit in the second (order 2), the bracket constant within a step:
-the mean of y less that of F at its ends. Samples are counted in ticks from the reference's entry; measured
-ones are moved to that grid by straight lines, such that the hardware's own entry falls on the reference's.
+the mean of y less that of F at its ends, over as much of the step as y could be read. Samples are counted in
+ticks from the reference's entry; measured ones are moved to that grid by straight lines, such that the
+hardware's own entry falls on the reference's.
 
 A pass from the entry makes up to `STRIDE` steps of up to `COARSE` per tick, under the map that it started
 with. When it has caught up with the present it becomes the live reference, which goes on tick by tick under
@@ -34,24 +35,25 @@ HISTORY = 1024  # samples kept; a longer contact is not integrated over again
 
 class Motion(NamedTuple):
     """Depth [s], speed [1], deepest point so far [s], force without damping [1/s]; of the measured sample
-    there, the force's integral since the entry [ticks/s] and the map's force [1/s]; whether (1) it has
-    separated."""
+    there, the force's integral since the entry [ticks/s], over how many ticks that is, and the map's force
+    [1/s]; whether (1) it has separated."""
 
     depth: Float[Array, "*batch"]
     speed: Float[Array, "*batch"]
     deepest: Float[Array, "*batch"]
     force: Float[Array, "*batch"]
     impulse: Float[Array, "*batch"]
+    read: Float[Array, "*batch"]
     expected: Float[Array, "*batch"]
     free: Float[Array, "*batch"]
 
 
 class History(NamedTuple):
-    """Ring of measured samples on the reference's grid, by the tick at which each came: integral of y since
-    the entry [ticks/s], depth X [s], speed V [1], deepest point X_m [s]; the tick at which sample 0 came, how
-    many have come."""
+    """Ring of measured samples on the reference's grid, by the tick at which each came: integral since the
+    entry [ticks/s] of the y that could be read, over how many ticks that is, depth X [s], speed V [1],
+    deepest point X_m [s]; the tick at which sample 0 came, how many have come."""
 
-    ring: Float[Array, "samples 4 *batch"]
+    ring: Float[Array, "samples 5 *batch"]
     origin: Int[Array, "*batch"]
     number: Int[Array, "*batch"]
 
@@ -68,17 +70,17 @@ class Reference(NamedTuple):
 def entry(like: Array) -> Motion:
     """Depth 0, speed 1, no force."""
     zeros = jnp.zeros_like(like)
-    return Motion(zeros, zeros + 1, zeros, zeros, zeros, zeros, zeros)
+    return Motion(zeros, zeros + 1, zeros, zeros, zeros, zeros, zeros, zeros)
 
 
 def no_history(like: Array) -> History:
     """Nothing measured yet."""
     counts = jnp.zeros(like.shape, jnp.int32)
-    return History(jnp.zeros((HISTORY, 4, *like.shape), like.dtype), counts, counts)
+    return History(jnp.zeros((HISTORY, 5, *like.shape), like.dtype), counts, counts)
 
 
-def remember(history: History, tick: Array, sample: Array) -> Float[Array, "samples 4 *batch"]:
-    """The ring with the sample (4, *batch) of this tick in it."""
+def remember(history: History, tick: Array, sample: Array) -> Float[Array, "samples 5 *batch"]:
+    """The ring with the sample (5, *batch) of this tick in it."""
     return write(history.ring, tick, sample)
 
 
@@ -112,13 +114,14 @@ def follow(
         return taken, (index >= 0) & (index < history.number)
 
     def advance(curve, motion, index, ticks):
-        (impulse, *hardware), known = recall(index)
+        (impulse, read, *hardware), known = recall(index)
         if shift is not None:
             hardware[0] = hardware[0] - shift * hardware[1]
         known = known & (ticks > 0)
         expected = force_of(curve, *hardware)
-        missing = (impulse - motion.impulse) / jnp.where(known, ticks, 1) - 0.5 * (motion.expected + expected)
-        missing = jnp.where(known, replay * missing, 0)
+        modelled = 0.5 * (motion.expected + expected)
+        gap = (impulse - motion.impulse) - (read - motion.read) * modelled
+        missing = jnp.where(known, replay * (gap / jnp.where(known, ticks, 1)), 0)
         duration = ticks * period
         half = 0.5 * duration
         push = jnp.where(motion.free > 0, 0, 1)
@@ -136,8 +139,16 @@ def follow(
         speed = middle - push * half * (force + missing + dragging * middle)
         free = (depth <= 0) | ((speed < 0) & (force + missing + dragging * speed <= 0))
         free = (motion.free > 0) | free
-        kept = (jnp.where(known, impulse, motion.impulse), jnp.where(known, expected, motion.expected))
-        return Motion(depth, speed, deepest, force, *kept, free.astype(depth.dtype))
+        return Motion(
+            depth,
+            speed,
+            deepest,
+            force,
+            impulse=jnp.where(known, impulse, motion.impulse),
+            read=jnp.where(known, read, motion.read),
+            expected=jnp.where(known, expected, motion.expected),
+            free=free.astype(depth.dtype),
+        )
 
     coarse = jnp.clip(jnp.floor(COARSE / period + 1e-9), 1, HISTORY).astype(jnp.int32)
 

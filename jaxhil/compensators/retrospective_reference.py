@@ -19,9 +19,10 @@ is identified. A run that begins in contact has no approach speed to scale by: t
 force, as it is.
 
 A sensor's known dead zone is added to what it reads. What it hides (a reading of 0 in contact) counts as
-half of it, with the variance of a uniform distribution, and only where the map expects more. Where the
-noise's standard deviation s is not small, less of the bracket of `reintegration` is replayed:
-rho = force_replay/(1 + (s/replay_noise)^2).
+half of it, with the variance of a uniform distribution, and only where the map expects more; nothing of it
+is replayed. Where forces stand out of the noise before the hardware was to touch, its surface is nearer than
+told: it is taken to be where the first of them was read. Where the noise's standard deviation s is not
+small, less of the bracket of `reintegration` is replayed: rho = force_replay/(1 + (s/replay_noise)^2).
 """
 
 from collections.abc import Callable, Mapping
@@ -66,6 +67,9 @@ from jaxhil.contact import deflection
 from jaxhil.mechanism import Mechanism
 from jaxhil.ring import tie
 
+SEEN = 8  # readings out of contact that show how noisy the force is
+OUTSTANDING = 16.0  # times the noise's variance: what hardly is noise
+EARLY = 2  # such readings before the hardware is to touch, that its surface is nearer than told
 FAREWELL = 0.006
 LONGEST_LAG = 0.1  # s for which it waits for hardware that has not touched yet
 
@@ -127,8 +131,10 @@ class Episode(NamedTuple):
     """One contact: side (1 or -1; 0: none), approach speed [m/s] (0: unusable), time [s] from the entry to
     the first tick, ticks since that one, whether (1) the hardware has touched, ticks since it left, where
     between two ticks its samples fall on the reference's grid; deepest points so far [s] of the numerical
-    model and of the hardware; of the tick before, what was measured (y, X, V, X_m), y moved to that grid and
-    its integral [ticks/s]."""
+    model and of the hardware; of the tick before, what was measured (y, X, V, X_m), y moved to that grid, its
+    integral [ticks/s] over those that could be read and how many ticks that is, whether (1) the tick's own
+    force and that moved one could; readings that stood out of the noise too early, how much nearer [s] the
+    surface was at the first of them, and is taken to be."""
 
     side: Float[Array, "*batch"]
     velocity: Float[Array, "*batch"]
@@ -142,6 +148,11 @@ class Episode(NamedTuple):
     sample: Float[Array, "4 *batch"]
     moved: Float[Array, "*batch"]
     impulse: Float[Array, "*batch"]
+    read: Float[Array, "*batch"]
+    shown: Float[Array, "2 *batch"]
+    early: Int[Array, "*batch"]
+    surface: Float[Array, "*batch"]
+    plane: Float[Array, "*batch"]
 
 
 class RetrospectiveState(NamedTuple):
@@ -255,6 +266,11 @@ class RetrospectiveReference(Compensator):
                 sample=jnp.stack([zeros] * 4),
                 moved=zeros,
                 impulse=zeros,
+                read=zeros,
+                shown=jnp.stack([zeros + 1] * 2),
+                early=counts,
+                surface=zeros,
+                plane=zeros,
             ),
             learnt=self.unlearnt(unknown),
             reference=Reference(entry(zeros), entry(zeros), counts - 1, curve(unknown)),
@@ -326,7 +342,8 @@ class RetrospectiveReference(Compensator):
             return jnp.where(side < 0, -clearance - measured, measured) / scale
 
         x, v = depth_of(signals.position_desired), side * signals.velocity_desired / scale
-        aligned, rate = depth_of(position), side * velocity / scale
+        plane = jnp.where(enters, 0, old.plane)
+        aligned, rate = depth_of(position) + plane, side * velocity / scale
         older = self.delay_shift(state.learnt)
         depth = aligned if older is None else aligned - older * rate
         depth = jnp.where((depth > SURFACE) | (depth < -SURFACE), depth, 0)
@@ -352,12 +369,18 @@ class RetrospectiveReference(Compensator):
         number = jnp.where(touched_before, state.history.number, 0)
         history = state.history._replace(origin=origin, number=number)
 
+        # A force that stands out of the noise once a contact is under way is the hardware, met too early.
+        square = signals.force_measured**2
+        usual = _force_noise(gains, state.noise) + (gains["force_noise_floor"] * weight) ** 2
         free_readings = (~under_way | ~touched) & (deflection(position, clearance) == 0)
-        squares = state.noise[0] + jnp.where(free_readings, signals.force_measured**2, 0)
+        stands = free_readings & under_way & (state.noise[1] >= SEEN) & (square > OUTSTANDING * usual)
+        early = jnp.where(enters, 0, old.early) + jnp.where(stands, 1, 0)
+        surface = jnp.where(stands & (early == 1), -aligned, old.surface)
+        plane = jnp.where(stands & (early > EARLY), surface, plane)
+        free_readings = free_readings & ~stands
+        squares = state.noise[0] + jnp.where(free_readings, square, 0)
         count = state.noise[1] + jnp.where(free_readings, 1, 0)
-        told = gains["force_noise"] ** 2
-        seen = squares / jnp.where(count > 0, count, 1)
-        noise = jnp.where(seen > told, seen, told) / weight**2
+        noise = _force_noise(gains, (squares, count)) / weight**2
         variance = gains["force_noise_floor"] ** 2 + noise
         strength = gains["replay_noise"] ** 2
         replay = gains["force_replay"] * strength / (strength + noise)
@@ -404,11 +427,15 @@ class RetrospectiveReference(Compensator):
         kept = jnp.where(enters[None], kept, old.sample)
         moved = kept + fraction[None] * (sample - kept)
         arrived = tick - origin + 1
-        begun = 0.5 * moved[0] * first / period
-        impulse = jnp.where(arrived == 1, begun, old.impulse + 0.5 * (old.moved + moved[0]))
+        shown_now = jnp.where(hidden, 0.0, 1.0)
+        shown_moved = shown_now * jnp.where(enters, shown_now, old.shown[0])
+        ticks = jnp.where(arrived == 1, shown_moved * (first / period), shown_moved * old.shown[1])
+        mean = jnp.where(arrived == 1, 0.5 * moved[0], 0.5 * (old.moved + moved[0]))
+        impulse = jnp.where(arrived == 1, 0, old.impulse) + ticks * mean
+        read = jnp.where(arrived == 1, 0, old.read) + ticks
         # Written after it is read: only then the ring is updated in place.
         impulse = tie(impulse, jnp.where(jnp.isfinite(live.depth), live.depth, 0))
-        stored = jnp.concatenate([impulse[None], moved[1:]])
+        stored = jnp.concatenate([jnp.stack([impulse, read]), moved[1:]])
         ring = remember(history, tick, stored)
         number = jnp.where(touched, jnp.where(arrived > 0, arrived, 0), 0)
         return command, RetrospectiveState(
@@ -428,8 +455,20 @@ class RetrospectiveReference(Compensator):
                 sample=sample,
                 moved=moved[0],
                 impulse=impulse,
+                read=read,
+                shown=jnp.stack([shown_now, shown_moved]),
+                early=early,
+                surface=surface,
+                plane=plane,
             ),
             learnt=learnt,
             reference=reference,
             history=History(ring, origin, number),
         )
+
+
+def _force_noise(gains: Gains, seen: tuple[Array, Array]) -> Float[Array, "*batch"]:
+    """The force's variance [N^2]: what it is told, or what readings out of contact show if that is more."""
+    squares, count = seen
+    told, shown = gains["force_noise"] ** 2, squares / jnp.where(count > 0, count, 1)
+    return jnp.where(shown > told, shown, told)

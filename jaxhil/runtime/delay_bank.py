@@ -15,13 +15,14 @@ from math import pi, sqrt
 
 import numpy as np
 
-from .force_depth_map import KNOTS, OUTLYING, PARAMETERS, REACH, SEGMENTS, SURFACE, WANDERING, Curve
+from .force_depth_map import KNOTS, OUTLYING, PARAMETERS, REACH, SEGMENTS, SURFACE, Curve, prior
 
 HYPOTHESES = 9
 ELASTIC = 0.25  # probability that a contact has no damping
 BROADENING = 5.0  # of the variance of the damping, as the delay lies between two hypotheses
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
 LEAST, LEAST_CARRIED = 1e-200, 1e-12
+NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, some do not
 SQUARINGS, DENSITY_SQUARINGS = 10, 8
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
 DAMPING = SEGMENTS
@@ -31,7 +32,8 @@ _WIDTHS = np.append(np.diff(KNOTS), np.inf)[:, None]
 
 
 class DelayBank:
-    """The bank. `curve`: the mean of the maps; `shift` [s]: the mean of the hypotheses' delays.
+    """The bank. `curve`: the mean of the maps; `shift` [s]: the mean of the hypotheses' delays; `variance`
+    [1/s^2]: that of the force that each expects where it was read last.
 
     `spread` [s] is how far the farthest hypotheses lie from the delay that is told; the rest is the map's
     prior, as of `ForceDepthMap`.
@@ -43,6 +45,7 @@ class DelayBank:
         "_damping",
         "_deepest",
         "_estimate",
+        "_known",
         "_learning",
         "_likelihood",
         "_met",
@@ -53,6 +56,7 @@ class DelayBank:
         "_weighted",
         "curve",
         "shift",
+        "variance",
     )
 
     def __init__(
@@ -67,18 +71,9 @@ class DelayBank:
     ) -> None:
         self._offsets = np.array([0.25 * step - 1.0 for step in range(HYPOTHESES)]) * spread
         self._damping = damping * damping
-        estimate = np.zeros((PARAMETERS, 1))
-        estimate[:SEGMENTS] = stiffness
-        covariance = np.zeros((PARAMETERS, PARAMETERS, 1))
-        common = common * common
-        wandering = wandering * wandering
-        for i in range(SEGMENTS):
-            for j in range(SEGMENTS):
-                covariance[i, j] = common + wandering * (KNOTS[min(i, j)] / WANDERING)
-        for place, one in enumerate((damping, depth_damping, unloading), start=SEGMENTS):
-            covariance[place, place] = one * one
-        self._prior_estimate = np.repeat(estimate, HYPOTHESES, axis=1)
-        self._prior_covariance = np.repeat(covariance, HYPOTHESES, axis=2)
+        estimate, covariance = prior(stiffness, common, wandering, damping, depth_damping, unloading)
+        self._prior_estimate = np.repeat(np.array(estimate)[:, None], HYPOTHESES, axis=1)
+        self._prior_covariance = np.repeat(np.array(covariance)[:, :, None], HYPOTHESES, axis=2)
         self.curve = Curve()
         self.reset()
 
@@ -87,6 +82,8 @@ class DelayBank:
         self._estimate = self._prior_estimate.copy()
         self._covariance = self._prior_covariance.copy()
         self._deepest = np.zeros(HYPOTHESES)
+        self._known = np.zeros(HYPOTHESES)
+        self.variance = 0.0
         self._likelihood = np.ones(HYPOTHESES)
         self._carried = np.ones(HYPOTHESES)
         self._precision = np.zeros(HYPOTHESES)
@@ -109,6 +106,8 @@ class DelayBank:
         self._estimate = self._prior_estimate.copy()
         self._covariance = self._prior_covariance.copy()
         self._deepest = np.zeros(HYPOTHESES)
+        self._known = np.zeros(HYPOTHESES)
+        self.variance = 0.0
         self._likelihood = np.ones(HYPOTHESES)
 
     @np.errstate(all="ignore")
@@ -121,6 +120,7 @@ class DelayBank:
         weights = self._weigh()
         shift = float(_total(weights * self._offsets))
         self.shift = shift if shift > LEAST_SHIFT or shift < -LEAST_SHIFT else 0.0
+        self.variance = float(_total(weights * self._known))
         self._conclude(weights)
 
     def _read(
@@ -167,7 +167,9 @@ class DelayBank:
         self._likelihood = _shares(likelihood, LEAST)
         self._deepest = deepest
         self._learning = True
-        scaled = 1.0 / np.where(used, s, 1.0) * g
+        share = 1.0 / np.where(used, s, 1.0)
+        self._known = np.where(used, noise * ((s - noise) * share), self._known)
+        scaled = share * g
         correction = scaled * innovation
         less = g[:, None] * scaled
         if not used.all():
@@ -245,6 +247,7 @@ def _exponential(u: np.ndarray, squarings: int) -> np.ndarray:
 
 def _shares(values: np.ndarray, least: float) -> np.ndarray:
     """Of their sum, at least so much."""
+    values = np.where(values < NOTHING, 0.0, values)
     shares = values / _total(values)
     return np.where(shares > least, shares, least)
 

@@ -80,9 +80,9 @@ class Curve:
 
 class ForceDepthMap:
     """Mean and covariance of the slopes [1/s^2], damping and depth damping [1/s] and unloading [1/s^2]; the
-    `curve` that counts."""
+    `curve` that counts; the `variance` [1/s^2] of the force that it expects where it was read last."""
 
-    __slots__ = ("_covariance", "_estimate", "_prior_covariance", "_prior_estimate", "curve")
+    __slots__ = ("_covariance", "_estimate", "_prior_covariance", "_prior_estimate", "curve", "variance")
 
     def __init__(
         self,
@@ -93,21 +93,9 @@ class ForceDepthMap:
         depth_damping: float,
         unloading: float,
     ) -> None:
-        common = common * common
-        wandering = wandering * wandering
-        self._prior_estimate = [stiffness] * SEGMENTS + [0.0, 0.0, 0.0]
-        rows = []
-        for i in range(SEGMENTS):
-            row = []
-            for j in range(SEGMENTS):
-                shared = KNOTS[i] if i < j else KNOTS[j]
-                row.append(common + wandering * (shared / WANDERING))
-            rows.append([*row, 0.0, 0.0, 0.0])
-        for place, spread in enumerate((damping, depth_damping, unloading)):
-            row = [0.0] * PARAMETERS
-            row[SEGMENTS + place] = spread * spread
-            rows.append(row)
-        self._prior_covariance = rows
+        self._prior_estimate, self._prior_covariance = prior(
+            stiffness, common, wandering, damping, depth_damping, unloading
+        )
         self.curve = Curve()
         self.restart()
 
@@ -115,6 +103,7 @@ class ForceDepthMap:
         """Return to the prior."""
         self._estimate = list(self._prior_estimate)
         self._covariance = [list(row) for row in self._prior_covariance]
+        self.variance = 0.0
         self._conclude()
 
     def update(self, depth: float, speed: float, deepest: float, force: float, variance: float) -> None:
@@ -148,6 +137,7 @@ class ForceDepthMap:
         if not s > 0.0:
             return
         share = 1.0 / s
+        self.variance = variance * ((s - variance) * share)
         innovation = force - expected
         for i, row in enumerate(covariance):
             scaled = share * g[i]
@@ -170,6 +160,32 @@ class ForceDepthMap:
         curve.damping = positive_mean(estimate[12], covariance[12][12])
         curve.depth_damping = positive_mean(estimate[13], covariance[13][13])
         curve.unloading = positive_mean(estimate[14], covariance[14][14])
+
+
+def prior(
+    stiffness: float,
+    common: float,
+    wandering: float,
+    damping: float,
+    depth_damping: float,
+    unloading: float,
+) -> tuple[list[float], list[list[float]]]:
+    """Mean and covariance of all parameters before any reading: slopes N(stiffness, common^2 + wandering^2
+    min(kappa_i, kappa_j)/30 ms), what dissipates N(0, spread^2)."""
+    common = common * common
+    wandering = wandering * wandering
+    rows = []
+    for i in range(SEGMENTS):
+        row = []
+        for j in range(SEGMENTS):
+            shared = KNOTS[i] if i < j else KNOTS[j]
+            row.append(common + wandering * (shared / WANDERING))
+        rows.append([*row, 0.0, 0.0, 0.0])
+    for place, spread in enumerate((damping, depth_damping, unloading)):
+        row = [0.0] * PARAMETERS
+        row[SEGMENTS + place] = spread * spread
+        rows.append(row)
+    return [stiffness] * SEGMENTS + [0.0, 0.0, 0.0], rows
 
 
 def positive_mean(mean: float, variance: float) -> float:

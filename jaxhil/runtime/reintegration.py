@@ -3,8 +3,8 @@
 From depth 0 at speed 1: x' = v, v' = -f, f = F(x, v, x_m) + rho [y - F(X, V, X_m)], the bracket only as far
 as the hardware has been measured, until it separates: x <= 0, or v < 0 and f <= 0; x_m and X_m are the
 deepest points so far. Velocity Verlet with the damping implicit in the first half of a step and explicit in
-the second; the bracket is constant within a step: the mean of y less that of F at its ends. Samples are
-counted in ticks from the entry.
+the second; the bracket is constant within a step: the mean of y less that of F at its ends, over as much of
+the step as y could be read. Samples are counted in ticks from the entry.
 
 A pass from the entry makes up to `STRIDE` steps of up to `COARSE` per tick under the map that it started
 with. When it has caught up with the present it becomes the live motion, which goes on tick by tick under the
@@ -22,10 +22,10 @@ HISTORY = 1024  # samples kept; a longer contact is not integrated over again
 
 class Path:
     """A motion under a `curve` of its own, at one sample: depth [s], speed, deepest point so far [s], force
-    without damping [1/s]; of the measured sample there, the force's integral since the entry [ticks/s] and
-    the map's force [1/s]; whether it has separated."""
+    without damping [1/s]; of the measured sample there, the force's integral since the entry [ticks/s], over
+    how many ticks that is, and the map's force [1/s]; whether it has separated."""
 
-    __slots__ = ("curve", "deepest", "depth", "expected", "force", "free", "impulse", "speed")
+    __slots__ = ("curve", "deepest", "depth", "expected", "force", "free", "impulse", "read", "speed")
 
     def __init__(self) -> None:
         self.curve = Curve()
@@ -38,6 +38,7 @@ class Path:
         self.deepest = 0.0
         self.force = 0.0
         self.impulse = 0.0
+        self.read = 0.0
         self.expected = 0.0
         self.free = False
 
@@ -48,6 +49,7 @@ class Path:
         self.deepest = other.deepest
         self.force = other.force
         self.impulse = other.impulse
+        self.read = other.read
         self.expected = other.expected
         self.free = other.free
 
@@ -68,6 +70,7 @@ class ReferenceMotion:
         "_period",
         "_present",
         "_reached",
+        "_reads",
         "_speeds",
         "replay",
         "shift",
@@ -80,6 +83,7 @@ class ReferenceMotion:
         steps = COARSE / period
         self._coarse = floor(steps + 1e-9) if 1.0 < steps < HISTORY else (1 if steps <= 1.0 else HISTORY)
         self._impulses = [0.0] * HISTORY
+        self._reads = [0.0] * HISTORY
         self._depths = [0.0] * HISTORY
         self._speeds = [0.0] * HISTORY
         self._deepest = [0.0] * HISTORY
@@ -105,11 +109,14 @@ class ReferenceMotion:
         self._reached = -1
         self._behind.enter()
 
-    def remember(self, index: int, impulse: float, depth: float, speed: float, deepest: float) -> None:
-        """A measured sample: the force's integral since the entry [ticks/s], depth [s], speed, deepest
-        point so far [s]."""
+    def remember(
+        self, index: int, impulse: float, read: float, depth: float, speed: float, deepest: float
+    ) -> None:
+        """A measured sample: the integral since the entry [ticks/s] of the force that could be read, over how
+        many ticks that is, depth [s], speed, deepest point so far [s]."""
         slot = index & (HISTORY - 1)
         self._impulses[slot] = impulse
+        self._reads[slot] = read
         self._depths[slot] = depth
         self._speeds[slot] = speed
         self._deepest[slot] = deepest
@@ -157,10 +164,14 @@ class ReferenceMotion:
         if index < self._number and ticks > 0.0:
             slot = index & (HISTORY - 1)
             impulse = self._impulses[slot]
+            read = self._reads[slot]
             speed = self._speeds[slot]
             expected = curve.force(self._depths[slot] - self.shift * speed, speed, self._deepest[slot])
-            missing = self.replay * ((impulse - path.impulse) / ticks - 0.5 * (path.expected + expected))
+            modelled = 0.5 * (path.expected + expected)
+            gap = (impulse - path.impulse) - (read - path.read) * modelled
+            missing = self.replay * (gap / ticks)
             path.impulse = impulse
+            path.read = read
             path.expected = expected
         duration = ticks * self._period
         depth = path.depth

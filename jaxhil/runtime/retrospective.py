@@ -11,25 +11,28 @@ since its entry:
 
 No model of the motion simulator is used. Without f_e it is the published law with the map in the place of
 k_hat and b_hat: that is what remains while nothing is identified. A known dead zone is added to what the
-sensor reads; what it hides counts as half of it, where the map expects more than the dead zone. The noisier
-the force, the less of what the map does not explain is replayed in the motion.
+sensor reads; what it hides counts as half of it, where the map expects more than the dead zone, and nothing
+of it is replayed. The noisier the force, the less of what the map does not explain is replayed in the
+motion. Where forces stand out of the noise before the hardware was to touch, its surface is nearer than
+told: it is taken to be where the first of them was read.
 """
 
 from collections.abc import Mapping
-from math import floor, pi
+from math import floor
 from typing import ClassVar
 
+from .doubts import EARLY, Doubts
 from .filters import DelayLine
 from .force_depth_map import SURFACE
-from .law_status import IDENTIFIED, OUT_OF_CONTACT, SATURATED, TOO_SHORT, UNSURE
+from .law_status import IDENTIFIED, OUT_OF_CONTACT, SATURATED, UNSURE
 from .registry import Compensator, GainSpecification
 from .reintegration import ReferenceMotion
 from .surfaces import deflection
 
+SEEN = 8  # readings out of contact that show how noisy the force is
+OUTSTANDING = 16.0  # times the noise's variance: what hardly is noise
 FAREWELL = 0.006  # s for which it goes on after the hardware has left the surface
 LONGEST_LAG = 0.1  # s for which it waits for hardware that has not touched yet
-FEW = 5  # readings on which no contact is identified
-LATE = 0.5  # of the predicted contact's duration, that the hardware may touch late by
 PRIOR = (
     "prior_stiffness",
     "prior_stiffness_spread",
@@ -47,9 +50,7 @@ class Retrospective(Compensator):
     with the other surface. A run that begins in contact has no approach speed to scale by: there F_c is the
     measured force. `status` is what stands behind the last command: `OUT_OF_CONTACT`; `UNSURE`: nothing is
     identified yet, or there is nothing to scale by, and it goes by the measured force and what the prior says
-    of the contact; `IDENTIFIED`; `SATURATED`: the correction is at its limit; `TOO_SHORT`: the hardware
-    touched when half of the contact was over by what is known of it now, so that little time is left to pay
-    back.
+    of the contact; `SATURATED`: identified, and the correction is at its limit; else what `doubts` says.
     """
 
     __slots__ = (
@@ -58,6 +59,7 @@ class Retrospective(Compensator):
         "_curve",
         "_dead_zone",
         "_deepest",
+        "_doubts",
         "_elapsed",
         "_first",
         "_floor",
@@ -67,21 +69,23 @@ class Retrospective(Compensator):
         "_hardware_deepest",
         "_impulse",
         "_last",
-        "_late",
         "_limit",
         "_line",
         "_mass",
         "_middle",
         "_moved",
+        "_moved_shown",
         "_offset",
         "_period",
-        "_readings",
+        "_plane",
+        "_read",
         "_reference",
         "_replay",
         "_replay_noise",
         "_sample",
         "_sample_deepest",
         "_sample_depth",
+        "_sample_shown",
         "_sample_speed",
         "_share",
         "_shift",
@@ -89,6 +93,7 @@ class Retrospective(Compensator):
         "_speed",
         "_squares",
         "_started",
+        "_surface",
         "_ticks",
         "_touched",
         "_velocity_gain",
@@ -132,6 +137,7 @@ class Retrospective(Compensator):
         self._replay_noise = gains["replay_noise"]
         self._middle = 0.0
         self._last = 0.0
+        self._doubts = Doubts()
         self._shift = 0.0
         self._prepare(gains)
         self.reset()
@@ -158,9 +164,12 @@ class Retrospective(Compensator):
             self._speed = approach if sound else 0.0
             self._touched = False
             self._gone = 0.0
+            self._plane = 0.0
+            self._doubts.restart()
         side = self._side
         if side == 0.0:
-            self._take_noise(force_measured, bent)
+            if bent == 0.0:
+                self._take_noise(force_measured)
             self.status = OUT_OF_CONTACT
             return 0.0
         speed = self._speed
@@ -168,7 +177,7 @@ class Retrospective(Compensator):
         weight = self._mass * scale
         x = (-clearance - position_desired if side < 0.0 else position_desired) / scale
         v = side * velocity_desired / scale
-        told = (-clearance - position if side < 0.0 else position) / scale
+        told = (-clearance - position if side < 0.0 else position) / scale + self._plane
         rate = side * velocity / scale
         shift = self._shift
         depth = told - shift * rate
@@ -184,8 +193,17 @@ class Retrospective(Compensator):
             elif force_measured < 0.0:
                 force = side * (force_measured - zone) / weight
         touched_before = self._touched
-        if not touched_before and not (speed > 0.0 and depth > 0.0):
-            self._take_noise(force_measured, bent)
+        if not touched_before and not (speed > 0.0 and depth > 0.0) and bent == 0.0:
+            least = self._floor * weight
+            usual = OUTSTANDING * (self._noise() + least * least)
+            if self._count >= SEEN and force_measured * force_measured > usual:
+                self._doubts.early += 1
+                if self._doubts.early == 1:
+                    self._surface = -told
+                if self._doubts.early > EARLY:
+                    self._plane = self._surface
+            else:
+                self._take_noise(force_measured)
         if not enters:
             self._gone += 1.0
         if depth > 0.0:
@@ -225,11 +243,10 @@ class Retrospective(Compensator):
             reference.restart(x)
             self._first = x
             self._elapsed = 0
-            self._readings = 0
-            self._late = 0.0
             self._deepest = 0.0
             self._hardware_deepest = 0.0
             self._sample = force
+            self._sample_shown = not hidden
             self._sample_depth = told - period * rate
             self._sample_speed = rate
             self._sample_deepest = 0.0
@@ -242,13 +259,14 @@ class Retrospective(Compensator):
         zone = self._dead_zone / weight
         square = weight * weight
         noise = self._noise() / square if square > 0.0 else 0.0
+        variance = self._floor * self._floor + noise
         if depth > 0.0:
             if not self._touched:
                 self._touch(depth, rate)
             if not hidden:
-                self._readings += 1
+                self._doubts.read(depth, deepest, force, variance)
         reference.shift = self._shift
-        self._learn(told, rate, deepest, force, self._floor * self._floor + noise, hidden, zone)
+        self._learn(told, rate, deepest, force, variance, hidden, zone)
         expected = curve.force(depth, rate, deepest)
         if hidden:
             force = zone if expected > zone else (expected if expected > 0.0 else 0.0)
@@ -264,11 +282,7 @@ class Retrospective(Compensator):
         peak = curve.peak_force()
         limit = self._limit * peak
         correction = self._velocity_gain * (v - 0.5 * period * own - reference.speed)
-        self.status = IDENTIFIED
-        if self._readings < FEW:
-            self.status = UNSURE
-        elif self._late * peak > LATE * pi:
-            self.status = TOO_SHORT
+        self.status = self._doubts.status(curve, peak, deepest, self._variance(), zone, self._speed)
         if correction > limit:
             correction = limit
             self.status = SATURATED if self.status == IDENTIFIED else self.status
@@ -279,8 +293,9 @@ class Retrospective(Compensator):
         if not separated:
             command = own + (force - expected) + correction
         if self._touched:
-            self._remember(force, told, rate, deepest)
+            self._remember(force, hidden, told, rate, deepest)
         self._sample = force
+        self._sample_shown = not hidden
         self._sample_depth = told
         self._sample_speed = rate
         self._sample_deepest = deepest
@@ -308,6 +323,10 @@ class Retrospective(Compensator):
         force [1/s], its variance [1/s^2], whether the sensor's dead zone hides it, that zone [1/s]."""
         raise NotImplementedError
 
+    def _variance(self) -> float:
+        """Of the force that is expected where it was read last [1/s^2]."""
+        raise NotImplementedError
+
     def _noise(self) -> float:
         """The force's variance [N^2]: what it is told, or what readings out of contact show if that is
         more."""
@@ -329,20 +348,25 @@ class Retrospective(Compensator):
         self._offset = -1 - whole
         self._ticks = 0
         self._touched = True
-        self._late = self._first + self._elapsed * period
+        self._doubts.late = self._first + self._elapsed * period
 
-    def _remember(self, force: float, depth: float, rate: float, deepest: float) -> None:
+    def _remember(self, force: float, hidden: bool, depth: float, rate: float, deepest: float) -> None:
         """This tick's sample, moved to the reference's grid, into its history."""
         fraction = self._fraction
         before = self._sample
         moved = before + fraction * (force - before)
+        shown = not hidden and self._sample_shown
         index = self._ticks + self._offset
         self._ticks += 1
         if index == 0:
-            self._impulse = 0.5 * moved * self._first / self._period
-        elif index > 0:
+            ticks = self._first / self._period if shown else 0.0
+            self._impulse = 0.5 * moved * ticks
+            self._read = ticks
+        elif index > 0 and shown and self._moved_shown:
             self._impulse += 0.5 * (self._moved + moved)
+            self._read += 1.0
         self._moved = moved
+        self._moved_shown = shown
         if index >= 0:
             before_depth = self._sample_depth
             before_rate = self._sample_speed
@@ -350,6 +374,7 @@ class Retrospective(Compensator):
             self._reference.remember(
                 index,
                 self._impulse,
+                self._read,
                 before_depth + fraction * (depth - before_depth),
                 before_rate + fraction * (rate - before_rate),
                 before_deepest + fraction * (deepest - before_deepest),
@@ -369,18 +394,19 @@ class Retrospective(Compensator):
             stride = period * velocity
             self._middle = newest - stride
             self._last = newest - 2.0 * stride
+            self._doubts.start(position - stride, stride)
             self._started = True
+        self._doubts.move(position)
         aligned = newest + self._share * (self._middle - newest)
         rate = (newest - self._last) / (2.0 * period)
         self._last = self._middle
         self._middle = newest
         return newest, aligned, rate
 
-    def _take_noise(self, force: float, bent: float) -> None:
-        """A reading out of contact, if it is one: it tells how noisy the force is."""
-        if bent == 0.0:
-            self._squares += force * force
-            self._count += 1.0
+    def _take_noise(self, force: float) -> None:
+        """A reading out of contact: it tells how noisy the force is."""
+        self._squares += force * force
+        self._count += 1.0
 
     def reset(self) -> None:
         """Forget everything."""
@@ -395,15 +421,19 @@ class Retrospective(Compensator):
         self._offset = 0
         self._ticks = 0
         self._impulse = 0.0
+        self._read = 0.0
         self._moved = 0.0
+        self._moved_shown = True
         self._sample = 0.0
+        self._sample_shown = True
         self._sample_depth = 0.0
         self._sample_speed = 0.0
         self._sample_deepest = 0.0
         self._deepest = 0.0
         self._hardware_deepest = 0.0
         self._elapsed = 0
-        self._readings = 0
-        self._late = 0.0
+        self._plane = 0.0
+        self._surface = 0.0
+        self._doubts.restart()
         self._started = False
         self.status = OUT_OF_CONTACT

@@ -60,3 +60,6 @@ class RetrospectiveDelayBank(Retrospective):
     ) -> None:
         self._bank.learn(depth, rate, force, variance, hidden, zone)
         self._shift = self._bank.shift
+
+    def _variance(self) -> float:
+        return self._bank.variance

@@ -41,3 +41,6 @@ class RetrospectiveReference(Retrospective):
                 self._map.update(depth, rate, deepest, force, variance)
             elif self._curve.force(depth, rate, deepest) > zone:
                 self._map.update(depth, rate, deepest, 0.5 * zone, variance + zone * zone / 12.0)
+
+    def _variance(self) -> float:
+        return self._map.variance

@@ -28,7 +28,7 @@ from math import inf, sqrt
 
 from .faults import CONTACT_TOO_LONG, ENERGY_BALANCE, LAW_IN_DOUBT, RESTITUTION
 from .filters import DelayLine
-from .law_status import STATUSES, UNSTATED, ContactRecord, StatusCount
+from .law_status import ContactRecord, StatusCount
 from .surfaces import deflection
 
 FADED = 1e-6  # of the largest force of the contact
@@ -102,7 +102,7 @@ class Watchdog:
         self._expectation = Expectation(limits)
         self.restart()
         self.contacts = 0
-        self.record = ContactRecord(0, STATUSES[UNSTATED].name, 0, 0, 0, 0)
+        self.record = ContactRecord()
 
     def restart(self) -> None:
         """Forget the contact under way and the motion so far, but not `contacts` and `record`."""
