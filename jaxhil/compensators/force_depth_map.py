@@ -11,6 +11,8 @@ constant parameters). What dissipates counts with its mean given that it is not 
 """
 
 import math
+from functools import reduce
+from operator import add
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -99,8 +101,8 @@ def features(depth: Array, speed: Array, deepest: Array) -> Float[Array, "parame
 
 def predict(old: Map, phi: Array, variance: Array) -> Prediction:
     """What a reading with noise of a `variance` [1/s^2] will be by the map."""
-    g = jnp.sum(old.covariance * phi[None], axis=1)
-    return Prediction(jnp.sum(phi * old.mean, axis=0), g, variance + jnp.sum(phi * g, axis=0))
+    g = _product(jnp.swapaxes(old.covariance, 0, 1), phi[:, None])
+    return Prediction(_product(old.mean, phi), g, variance + _product(g, phi))
 
 
 def correct(old: Map, predicted: Prediction, force: Array, used: Bool[Array, "*batch"]) -> Map:
@@ -132,7 +134,7 @@ def curve(old: Map) -> Curve:
 
 def elastic(slopes: Float[Array, "segments *batch"], depth: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Force [1/s] that does not depend on how the contact came there, 0 out of contact."""
-    return jnp.sum(slopes * ramps(depth), axis=0)
+    return _product(slopes, ramps(depth))
 
 
 def force(now: Curve, depth: Array, speed: Array, deepest: Array) -> Float[Array, "*batch"]:
@@ -184,6 +186,15 @@ def positive_mean(mean: Float[Array, "*batch"], variance: Float[Array, "*batch"]
     density = (1 / (1 + positive**2 / 512)) ** 256 / math.sqrt(2 * math.pi)
     above = positive + density / (1 - density * mills)
     return jnp.where(variance > 0, spread * jnp.where(ratio > 0, above, below), jnp.where(mean > 0, mean, 0))
+
+
+def _product(a: Float[Array, "terms *shape"], b: Float[Array, "terms *other"]) -> Float[Array, "*shape"]:
+    """sum_j a_j b_j, where b has 1 or as many along each other axis.
+
+    Term by term: what the compiler takes for a reduction it computes lane by lane, or by a library's call
+    that breaks up the loop around it.
+    """
+    return reduce(add, (a[j] * b[j] for j in range(len(a))))
 
 
 def _column(values: np.ndarray, like: Array) -> Array:
