@@ -15,7 +15,7 @@ from jaxhil.evaluation import evaluate
 from jaxhil.mechanism_file import load
 from jaxhil.runtime import Controller
 from jaxhil.runtime.delay_bank import HYPOTHESES, DelayBank
-from jaxhil.runtime.force_depth_map import KNOTS, ForceDepthMap
+from jaxhil.runtime.force_depth_map import KNOTS, ForceDepthMap, Prior
 from jaxhil.scenario import build_scenarios
 from jaxhil.uncertainty import draw
 
@@ -45,7 +45,7 @@ def contact(rng, ticks=170, begins=-0.02, lasts=0.13, delay=0.0, hides=0.0):
 
 
 def plain(spread=SPREAD):
-    return DelayBank(spread, *PRIOR.values())
+    return DelayBank(spread, Prior(**PRIOR))
 
 
 def weights_of(bank):
@@ -118,7 +118,7 @@ def test_both_recursions_agree():
 
 def test_where_all_delays_are_the_same_it_is_one_map():
     depths, speeds, forces, _ = contact(np.random.default_rng(2), begins=0.002, lasts=0.2)
-    bank, alone = plain(0.0), ForceDepthMap(*PRIOR.values())
+    bank, alone = plain(0.0), ForceDepthMap(Prior(**PRIOR))
     bank.begin()
     deepest = 0.0
     for depth, speed, force in zip(depths.tolist(), speeds.tolist(), forces.tolist(), strict=True):

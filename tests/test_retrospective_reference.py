@@ -19,7 +19,7 @@ from jaxhil.evaluation import compare_with_reference
 from jaxhil.mechanism_file import load
 from jaxhil.rollout import rollout
 from jaxhil.runtime import reintegration
-from jaxhil.runtime.force_depth_map import KNOTS, Curve, ForceDepthMap, positive_mean
+from jaxhil.runtime.force_depth_map import KNOTS, Curve, ForceDepthMap, Prior, positive_mean
 from jaxhil.runtime.law_status import IDENTIFIED, OUT_OF_CONTACT, SATURATED, TOO_SHORT, UNSURE
 from jaxhil.runtime.reintegration import ReferenceMotion
 from jaxhil.runtime.retrospective_reference import RetrospectiveReference
@@ -86,7 +86,7 @@ def test_map_is_the_posterior_of_all_readings():
     share = np.linalg.solve(spread, phi @ covariance).T
     expected, left = mean + share @ (forces - phi @ mean), covariance - share @ phi @ covariance
 
-    contact = ForceDepthMap(*PRIOR.values())
+    contact = ForceDepthMap(Prior(**PRIOR))
     like = jnp.zeros(())
     ours = in_jax.prior(*(like + value for value in PRIOR.values()))
     np.testing.assert_allclose(ours.mean, mean, rtol=1e-14)

@@ -182,6 +182,23 @@ static double jaxhil_law_noise(const jaxhil_law *law) {
     return seen > told ? seen : told;
 }
 
+/* A reading [N] out of contact while one is under way: noise, or the hardware, met too early. */
+static void jaxhil_law_sort_out(jaxhil_law *law, double force, double depth, double weight) {
+    const double least = law->floor * weight;
+    const double usual = jaxhil_law_noise(law) + least * least;
+    if (!(law->count >= jaxhil_seen && force * force > jaxhil_outstanding * usual)) {
+        jaxhil_law_take_noise(law, force);
+        return;
+    }
+    law->doubts.early++;
+    if (law->doubts.early == 1) {
+        law->surface = -depth;
+    }
+    if (law->doubts.early > jaxhil_early) {
+        law->plane = law->surface;
+    }
+}
+
 /* The command over M v0 [1/s]; whether the numerical model has separated. */
 static double jaxhil_law_follow(jaxhil_law *law, bool enters, double x, double v, double told, double depth,
                                 double rate, double force, bool hidden, double weight, bool *separated) {
@@ -310,19 +327,7 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
         }
     }
     if (!law->touched && !(speed > 0.0 && depth > 0.0) && bent == 0.0) {
-        const double floor_force = law->floor * weight;
-        const double usual = jaxhil_outstanding * (jaxhil_law_noise(law) + floor_force * floor_force);
-        if (law->count >= jaxhil_seen && force_measured * force_measured > usual) {
-            law->doubts.early++;
-            if (law->doubts.early == 1) {
-                law->surface = -told;
-            }
-            if (law->doubts.early > jaxhil_early) {
-                law->plane = law->surface;
-            }
-        } else {
-            jaxhil_law_take_noise(law, force_measured);
-        }
+        jaxhil_law_sort_out(law, force_measured, told, weight);
     }
     if (!enters) {
         law->gone += 1.0;

@@ -15,7 +15,7 @@ from math import pi, sqrt
 
 import numpy as np
 
-from .force_depth_map import KNOTS, OUTLYING, PARAMETERS, REACH, SEGMENTS, SURFACE, Curve, prior
+from .force_depth_map import KNOTS, OUTLYING, PARAMETERS, REACH, SEGMENTS, SURFACE, Curve, Prior
 
 HYPOTHESES = 9
 ELASTIC = 0.25  # probability that a contact has no damping
@@ -59,19 +59,10 @@ class DelayBank:
         "variance",
     )
 
-    def __init__(
-        self,
-        spread: float,
-        stiffness: float,
-        common: float,
-        wandering: float,
-        damping: float,
-        depth_damping: float,
-        unloading: float,
-    ) -> None:
+    def __init__(self, spread: float, prior: Prior) -> None:
         self._offsets = np.array([0.25 * step - 1.0 for step in range(HYPOTHESES)]) * spread
-        self._damping = damping * damping
-        estimate, covariance = prior(stiffness, common, wandering, damping, depth_damping, unloading)
+        self._damping = prior.damping * prior.damping
+        estimate, covariance = prior.moments()
         self._prior_estimate = np.repeat(np.array(estimate)[:, None], HYPOTHESES, axis=1)
         self._prior_covariance = np.repeat(np.array(covariance)[:, :, None], HYPOTHESES, axis=2)
         self.curve = Curve()

@@ -9,6 +9,7 @@ it is not negative. Only segments that are pressed in enter the sums.
 
 from bisect import bisect_left
 from math import pi, sqrt
+from typing import NamedTuple
 
 KNOTS = (0.0, 0.002, 0.005, 0.01, 0.016, 0.024, 0.032, 0.04, 0.05, 0.062, 0.076, 0.092)
 SEGMENTS = 12
@@ -17,6 +18,36 @@ WANDERING = 0.03  # s of depth over which a slope wanders by its spread
 REACH = 0.03  # s of depth at which the depth damping is as strong as its name says
 SURFACE = 1e-12  # s of depth: nearer than that is on the surface, which rounding does not decide
 OUTLYING = 4.0  # times the noise's variance: a force that hardly is noise
+
+
+class Prior(NamedTuple):
+    """What is known before any reading: slopes N(stiffness, common^2 + wandering^2 min(kappa_i, kappa_j) /
+    30 ms) [1/s^2], what dissipates N(0, spread^2): `damping` and `depth_damping` [1/s], `unloading` [1/s^2].
+    """
+
+    stiffness: float
+    common: float
+    wandering: float
+    damping: float
+    depth_damping: float
+    unloading: float
+
+    def moments(self) -> tuple[list[float], list[list[float]]]:
+        """Mean and covariance of all parameters."""
+        common = self.common * self.common
+        wandering = self.wandering * self.wandering
+        rows = []
+        for i in range(SEGMENTS):
+            row = []
+            for j in range(SEGMENTS):
+                shared = KNOTS[i] if i < j else KNOTS[j]
+                row.append(common + wandering * (shared / WANDERING))
+            rows.append([*row, 0.0, 0.0, 0.0])
+        for place, spread in enumerate((self.damping, self.depth_damping, self.unloading)):
+            row = [0.0] * PARAMETERS
+            row[SEGMENTS + place] = spread * spread
+            rows.append(row)
+        return [self.stiffness] * SEGMENTS + [0.0, 0.0, 0.0], rows
 
 
 class Curve:
@@ -84,18 +115,8 @@ class ForceDepthMap:
 
     __slots__ = ("_covariance", "_estimate", "_prior_covariance", "_prior_estimate", "curve", "variance")
 
-    def __init__(
-        self,
-        stiffness: float,
-        common: float,
-        wandering: float,
-        damping: float,
-        depth_damping: float,
-        unloading: float,
-    ) -> None:
-        self._prior_estimate, self._prior_covariance = prior(
-            stiffness, common, wandering, damping, depth_damping, unloading
-        )
+    def __init__(self, prior: Prior) -> None:
+        self._prior_estimate, self._prior_covariance = prior.moments()
         self.curve = Curve()
         self.restart()
 
@@ -160,32 +181,6 @@ class ForceDepthMap:
         curve.damping = positive_mean(estimate[12], covariance[12][12])
         curve.depth_damping = positive_mean(estimate[13], covariance[13][13])
         curve.unloading = positive_mean(estimate[14], covariance[14][14])
-
-
-def prior(
-    stiffness: float,
-    common: float,
-    wandering: float,
-    damping: float,
-    depth_damping: float,
-    unloading: float,
-) -> tuple[list[float], list[list[float]]]:
-    """Mean and covariance of all parameters before any reading: slopes N(stiffness, common^2 + wandering^2
-    min(kappa_i, kappa_j)/30 ms), what dissipates N(0, spread^2)."""
-    common = common * common
-    wandering = wandering * wandering
-    rows = []
-    for i in range(SEGMENTS):
-        row = []
-        for j in range(SEGMENTS):
-            shared = KNOTS[i] if i < j else KNOTS[j]
-            row.append(common + wandering * (shared / WANDERING))
-        rows.append([*row, 0.0, 0.0, 0.0])
-    for place, spread in enumerate((damping, depth_damping, unloading)):
-        row = [0.0] * PARAMETERS
-        row[SEGMENTS + place] = spread * spread
-        rows.append(row)
-    return [stiffness] * SEGMENTS + [0.0, 0.0, 0.0], rows
 
 
 def positive_mean(mean: float, variance: float) -> float:

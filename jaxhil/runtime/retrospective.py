@@ -23,7 +23,7 @@ from typing import ClassVar
 
 from .doubts import EARLY, Doubts
 from .filters import DelayLine
-from .force_depth_map import SURFACE
+from .force_depth_map import SURFACE, Prior
 from .law_status import IDENTIFIED, OUT_OF_CONTACT, SATURATED, UNSURE
 from .registry import Compensator, GainSpecification
 from .reintegration import ReferenceMotion
@@ -139,7 +139,7 @@ class Retrospective(Compensator):
         self._last = 0.0
         self._doubts = Doubts()
         self._shift = 0.0
-        self._prepare(gains)
+        self._prepare(gains, Prior(*(gains[name] for name in PRIOR)))
         self.reset()
 
     def step(
@@ -152,7 +152,7 @@ class Retrospective(Compensator):
         """The force F_c [N]."""
         period = self._period
         clearance = self._clearance
-        _, position, velocity = self._align(position_measured, velocity_desired)
+        position, velocity = self._align(position_measured, velocity_desired)
         bent = deflection(position, clearance)
         touching = deflection(position_desired, clearance)
         now = 1.0 if touching > 0.0 else (-1.0 if touching < 0.0 else 0.0)
@@ -192,18 +192,8 @@ class Retrospective(Compensator):
                 force = side * (force_measured + zone) / weight
             elif force_measured < 0.0:
                 force = side * (force_measured - zone) / weight
-        touched_before = self._touched
-        if not touched_before and not (speed > 0.0 and depth > 0.0) and bent == 0.0:
-            least = self._floor * weight
-            usual = OUTSTANDING * (self._noise() + least * least)
-            if self._count >= SEEN and force_measured * force_measured > usual:
-                self._doubts.early += 1
-                if self._doubts.early == 1:
-                    self._surface = -told
-                if self._doubts.early > EARLY:
-                    self._plane = self._surface
-            else:
-                self._take_noise(force_measured)
+        if not self._touched and not (speed > 0.0 and depth > 0.0) and bent == 0.0:
+            self._sort_out(force_measured, told, weight)
         if not enters:
             self._gone += 1.0
         if depth > 0.0:
@@ -301,7 +291,7 @@ class Retrospective(Compensator):
         self._sample_deepest = deepest
         return command, separated
 
-    def _prepare(self, gains: Mapping[str, float]) -> None:
+    def _prepare(self, gains: Mapping[str, float], prior: Prior) -> None:
         """What identifies the contact, and the curve that it makes of it, `_curve`."""
         raise NotImplementedError
 
@@ -380,9 +370,8 @@ class Retrospective(Compensator):
                 before_deepest + fraction * (deepest - before_deepest),
             )
 
-    def _align(self, position: float, velocity: float) -> tuple[float, float, float]:
-        """The measured position [m] a tick less than the delay ago; position and velocity [m/s] as old as
-        the force."""
+    def _align(self, position: float, velocity: float) -> tuple[float, float]:
+        """The measured position [m] and velocity [m/s] as old as the force."""
         period = self._period
         line = self._line
         newest = position
@@ -401,7 +390,21 @@ class Retrospective(Compensator):
         rate = (newest - self._last) / (2.0 * period)
         self._last = self._middle
         self._middle = newest
-        return newest, aligned, rate
+        return aligned, rate
+
+    def _sort_out(self, force: float, depth: float, weight: float) -> None:
+        """A reading [N] out of contact while one is under way: noise, or the hardware, met too early."""
+        least = self._floor * weight
+        usual = self._noise() + least * least
+        if not (self._count >= SEEN and force * force > OUTSTANDING * usual):
+            self._take_noise(force)
+            return
+        doubts = self._doubts
+        doubts.early += 1
+        if doubts.early == 1:
+            self._surface = -depth
+        if doubts.early > EARLY:
+            self._plane = self._surface
 
     def _take_noise(self, force: float) -> None:
         """A reading out of contact: it tells how noisy the force is."""

@@ -10,8 +10,9 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from .delay_bank import DelayBank
+from .force_depth_map import Prior
 from .registry import GainSpecification, register
-from .retrospective import PRIOR, Retrospective
+from .retrospective import Retrospective
 
 
 @register("retrospective_delay_bank")
@@ -40,9 +41,9 @@ class RetrospectiveDelayBank(Retrospective):
         """Restart all but what was learnt of the delay."""
         super().reset()
 
-    def _prepare(self, gains: Mapping[str, float]) -> None:
+    def _prepare(self, gains: Mapping[str, float], prior: Prior) -> None:
         self._told_delay = gains["identification_delay"]
-        self._bank = DelayBank(gains["delay_spread"], *(gains[name] for name in PRIOR))
+        self._bank = DelayBank(gains["delay_spread"], prior)
         self._curve = self._bank.curve
 
     def _begin(self) -> None:

@@ -8,9 +8,9 @@ See `retrospective`. With F the map, (X, V, y) the delay-aligned readings, f_0 =
 
 from collections.abc import Mapping
 
-from .force_depth_map import ForceDepthMap
+from .force_depth_map import ForceDepthMap, Prior
 from .registry import register
-from .retrospective import PRIOR, Retrospective
+from .retrospective import Retrospective
 
 
 @register("retrospective_reference")
@@ -19,8 +19,8 @@ class RetrospectiveReference(Retrospective):
 
     __slots__ = ("_map",)
 
-    def _prepare(self, gains: Mapping[str, float]) -> None:
-        self._map = ForceDepthMap(*(gains[name] for name in PRIOR))
+    def _prepare(self, gains: Mapping[str, float], prior: Prior) -> None:
+        self._map = ForceDepthMap(prior)
         self._curve = self._map.curve
 
     def _begin(self) -> None:

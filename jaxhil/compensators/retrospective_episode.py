@@ -1,0 +1,257 @@
+"""A tick of a contact as the retrospective references see it: which contact, on what scale, how far it is.
+
+Signals are aligned with the force that is read, and scaled by the contact's approach speed v0 and the mass M.
+What was measured is moved to the grid of the reference's samples, such that the hardware's own entry falls on
+the reference's. A force that stands out of the noise before the hardware was to touch is the hardware, met
+too early: its surface is nearer than told, and is taken to be where the first of them was read.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxhil.compensators.base import Constants, Gains, Signals
+from jaxhil.compensators.force_depth_map import SURFACE
+from jaxhil.compensators.reintegration import History
+from jaxhil.contact import deflection
+
+SEEN = 8  # readings out of contact that show how noisy the force is
+OUTSTANDING = 16.0  # times the noise's variance: what hardly is noise
+EARLY = 2  # such readings before the hardware is to touch, that its surface is nearer than told
+
+
+class Aligned(NamedTuple):
+    """Measured position [m] delayed by tau and by tau + T, of the tick before."""
+
+    middle: Float[Array, "*batch"]
+    last: Float[Array, "*batch"]
+
+
+class Noise(NamedTuple):
+    """Of the forces read out of contact: sum of squares [N^2], number."""
+
+    squares: Float[Array, "*batch"]
+    number: Float[Array, "*batch"]
+
+
+class Sample(NamedTuple):
+    """What was measured at a tick: force y [1/s], depth X [s], speed V [1], deepest point X_m [s]; whether
+    (1) the force could be read."""
+
+    measured: Float[Array, "4 *batch"]
+    shown: Float[Array, "*batch"]
+
+
+class Early(NamedTuple):
+    """Readings that stood out of the noise before the hardware was to touch; how much nearer [s] the surface
+    was at the first of them, and is taken to be."""
+
+    number: Int[Array, "*batch"]
+    surface: Float[Array, "*batch"]
+    plane: Float[Array, "*batch"]
+
+
+class Moved(NamedTuple):
+    """A sample on the reference's grid: the force y [1/s] there, whether (1) it could be read; integral
+    [ticks/s] of those that could since the entry, over how many ticks that is."""
+
+    force: Float[Array, "*batch"]
+    shown: Float[Array, "*batch"]
+    impulse: Float[Array, "*batch"]
+    read: Float[Array, "*batch"]
+
+
+class Episode(NamedTuple):
+    """One contact: side (1 or -1; 0: none), approach speed [m/s] (0: unusable), time [s] from the entry to
+    the first tick, ticks since that one, whether (1) the hardware has touched, ticks since it left, where
+    between two ticks its samples fall on the reference's grid; deepest points so far [s] of the numerical
+    model and of the hardware; what was measured at the tick before, and what that made on the grid; what was
+    read too early."""
+
+    side: Float[Array, "*batch"]
+    velocity: Float[Array, "*batch"]
+    first: Float[Array, "*batch"]
+    elapsed: Int[Array, "*batch"]
+    touched: Float[Array, "*batch"]
+    gone: Float[Array, "*batch"]
+    fraction: Float[Array, "*batch"]
+    deepest: Float[Array, "*batch"]
+    hardware_deepest: Float[Array, "*batch"]
+    sample: Sample
+    moved: Moved
+    early: Early
+
+
+class Now(NamedTuple):
+    """A tick on the scales of its contact: whether that `enters`, its side, approach speed [m/s], whether it
+    is `usable`, M v0 [kg m/s]; depth x [s] and speed v of the numerical model; of the hardware, as old as the
+    force: depth by the delay that is told, depth, speed, whether it is away from both surfaces; the force
+    [1/s], whether the dead zone hides it; time [s] from the entry to the first tick, ticks since that one."""
+
+    enters: Bool[Array, "*batch"]
+    side: Float[Array, "*batch"]
+    speed: Float[Array, "*batch"]
+    usable: Bool[Array, "*batch"]
+    weight: Float[Array, "*batch"]
+    x: Float[Array, "*batch"]
+    v: Float[Array, "*batch"]
+    told: Float[Array, "*batch"]
+    depth: Float[Array, "*batch"]
+    rate: Float[Array, "*batch"]
+    away: Bool[Array, "*batch"]
+    force: Float[Array, "*batch"]
+    hidden: Bool[Array, "*batch"]
+    first: Float[Array, "*batch"]
+    elapsed: Int[Array, "*batch"]
+
+
+class Entry(NamedTuple):
+    """Whether the hardware has touched, where between two ticks its samples fall on the reference's grid, and
+    the history that begins there."""
+
+    touched: Bool[Array, "*batch"]
+    fraction: Float[Array, "*batch"]
+    history: History
+
+
+def no_episode(like: Float[Array, "*batch"]) -> Episode:
+    """No contact yet."""
+    zeros, counts = jnp.zeros_like(like), jnp.zeros(like.shape, jnp.int32)
+    return Episode(
+        side=zeros,
+        velocity=zeros,
+        first=zeros,
+        elapsed=counts,
+        touched=zeros,
+        gone=zeros,
+        fraction=zeros,
+        deepest=zeros,
+        hardware_deepest=zeros,
+        sample=Sample(jnp.stack([zeros] * 4), zeros + 1),
+        moved=Moved(zeros, zeros + 1, zeros, zeros),
+        early=Early(counts, zeros, zeros),
+    )
+
+
+def align(
+    old: Aligned, newest: Array, share: Array, signals: Signals, period: Array
+) -> tuple[Array, Array, Aligned]:
+    """Measured position [m] and velocity [m/s] as old as the force that is read, `newest` being the position
+    a tick less than the delay ago; what is kept."""
+    begins = signals.age == 0
+    stride = period * signals.velocity_desired
+    middle = jnp.where(begins, newest - stride, old.middle)
+    last = jnp.where(begins, newest - 2 * stride, old.last)
+    position = newest + share * (middle - newest)
+    return position, (newest - last) / (2 * period), Aligned(newest, middle)
+
+
+def scaled(
+    gains: Gains,
+    constants: Constants,
+    old: Episode,
+    signals: Signals,
+    position: Array,
+    velocity: Array,
+    older: Array | None,
+) -> Now:
+    """Which contact it is, and its numbers on that contact's scales; the force is `older` [s] than told."""
+    period, clearance = constants.control_period, constants.clearance
+    touching = deflection(signals.position_desired, clearance)
+    side_now = jnp.sign(touching)
+    enters = (side_now != 0) & (side_now != old.side)
+    side = jnp.where(enters, side_now, old.side)
+    approach = side_now * signals.velocity_desired
+    sound = (approach > 0) & (jnp.abs(touching) <= 2 * period * approach)
+    speed = jnp.where(enters, jnp.where(sound, approach, 0), old.velocity)
+    usable = (side != 0) & (speed > 0)
+    scale = jnp.where(usable, speed, 1)
+
+    def depth_of(measured):
+        return jnp.where(side < 0, -clearance - measured, measured) / scale
+
+    x, v = depth_of(signals.position_desired), side * signals.velocity_desired / scale
+    told = depth_of(position) + jnp.where(enters, 0, old.early.plane)
+    rate = side * velocity / scale
+    depth = told if older is None else told - older * rate
+    bent = deflection(position, clearance)
+    elsewhere = jnp.sign(bent) == -side
+    weight = gains["equivalent_mass"] * scale
+    reading = signals.force_measured + jnp.sign(signals.force_measured) * gains["dead_zone"]
+    return Now(
+        enters=enters,
+        side=side,
+        speed=speed,
+        usable=usable,
+        weight=weight,
+        x=x,
+        v=v,
+        told=told,
+        depth=jnp.where((depth > SURFACE) | (depth < -SURFACE), depth, 0),
+        rate=rate,
+        away=bent == 0,
+        force=jnp.where(elsewhere, 0, side * reading / weight),
+        hidden=(gains["dead_zone"] > 0) & (signals.force_measured == 0) & ~elsewhere,
+        first=jnp.where(enters, jnp.where(usable, x, 0), old.first),
+        elapsed=jnp.where(enters, 0, old.elapsed + 1),
+    )
+
+
+def enter_grid(old: Episode, history: History, now: Now, period: Array, tick: Array) -> Entry:
+    """The hardware's entry: sample 0 of the history is the first one after the reference's."""
+    touched_before = jnp.where(now.enters, 0, old.touched) > 0
+    onset = now.usable & ~touched_before & (now.depth > 0)
+    since = now.depth / jnp.where(onset & (now.rate > 0), now.rate, 1)
+    since = jnp.where(now.rate > 0, jnp.minimum(since, period), 0.5 * period)
+    shift = (now.first - since) / period
+    whole = jnp.floor(shift)
+    origin = jnp.where(onset, tick + 1 + whole.astype(jnp.int32), history.origin)
+    number = jnp.where(touched_before, history.number, 0)
+    fraction = jnp.where(onset, shift - whole, old.fraction)
+    return Entry(touched_before | onset, fraction, history._replace(origin=origin, number=number))
+
+
+def sort_out(
+    gains: Gains, noise: Noise, old: Early, now: Now, force: Array, touched: Array
+) -> tuple[Noise, Early]:
+    """A force [N] that is read out of contact is noise, or one that came too early."""
+    square = force**2
+    usual = force_noise(gains, noise) + (gains["force_noise_floor"] * now.weight) ** 2
+    under_way = now.side != 0
+    free = (~under_way | ~touched) & now.away
+    stands = free & under_way & (noise.number >= SEEN) & (square > OUTSTANDING * usual)
+    number = jnp.where(now.enters, 0, old.number) + jnp.where(stands, 1, 0)
+    surface = jnp.where(stands & (number == 1), -now.told, old.surface)
+    plane = jnp.where(now.enters, 0, old.plane)
+    plane = jnp.where(stands & (number > EARLY), surface, plane)
+    free = free & ~stands
+    more = Noise(noise.squares + jnp.where(free, square, 0), noise.number + jnp.where(free, 1, 0))
+    return more, Early(number, surface, plane)
+
+
+def force_noise(gains: Gains, seen: Noise) -> Float[Array, "*batch"]:
+    """The force's variance [N^2]: what it is told, or what readings out of contact show if that is more."""
+    told = gains["force_noise"] ** 2
+    shown = seen.squares / jnp.where(seen.number > 0, seen.number, 1)
+    return jnp.where(shown > told, shown, told)
+
+
+def move(
+    old: Episode, sample: Sample, now: Now, entry: Entry, period: Array, tick: Array
+) -> tuple[Moved, Float[Array, "3 *batch"], Int[Array, "*batch"]]:
+    """The tick's sample on the reference's grid; depth, speed and deepest point there; samples in the history
+    with it."""
+    force, told, rate, _ = sample.measured
+    before = jnp.stack([force, told - period * rate, rate, jnp.zeros_like(rate)])
+    before = jnp.where(now.enters[None], before, old.sample.measured)
+    moved = before + entry.fraction[None] * (sample.measured - before)
+    arrived = tick - entry.history.origin + 1
+    begins = arrived == 1
+    shown = sample.shown * jnp.where(now.enters, sample.shown, old.sample.shown)
+    ticks = jnp.where(begins, shown * (now.first / period), shown * old.moved.shown)
+    mean = jnp.where(begins, 0.5 * moved[0], 0.5 * (old.moved.force + moved[0]))
+    impulse = jnp.where(begins, 0, old.moved.impulse) + ticks * mean
+    read = jnp.where(begins, 0, old.moved.read) + ticks
+    number = jnp.where(entry.touched, jnp.where(arrived > 0, arrived, 0), 0)
+    return Moved(moved[0], shown, impulse, read), moved[1:], number
