@@ -247,28 +247,31 @@ def test_economical_reference_costs_little(monkeypatch, stiffness):
     assert abs(plain - 1) < 1.5e-3 and abs(economical - plain) < 5e-4
 
 
-# What is left, root mean square and worst [%]; the published law, tuned to each suite, leaves 2 to 6 rms.
+# What is set, what is left, root mean square and worst [%]; the published law, tuned to each suite, leaves 2
+# to 6 rms.
 SUITES = {
-    "noisy": (0.5, 1.5),
-    "damped": (0.5, 1.5),
-    "hertz": (0.6, 2.0),
-    "elastoplastic": (1.5, 5.0),
-    "fast": (1.5, 5.0),
-    "dead-zone": (2.5, 8.0),
+    "noisy": ("noisy", [], 0.5, 1.5),
+    "damped": ("damped", [], 0.5, 1.5),
+    "hertz": ("hertz", [], 0.6, 2.0),
+    "elastoplastic": ("elastoplastic", [], 1.5, 5.0),
+    "fast": ("fast", [], 1.5, 5.0),
+    "dead zone": ("dead-zone", [], 2.5, 8.0),
+    "dead zone, little noise": ("noisy", ["rig.force_sensor.dead_zone=12.0"], 0.8, 2.5),
+    "surface 10 ms x v0 nearer": ("noisy", ["rig.contact_plane=-5e-5"], 0.8, 2.5),
 }
 
 
-@pytest.mark.parametrize("suite", SUITES)
-def test_errors_of_the_standard_suites(suite):
-    mechanism = load(f"suite-{suite}").mechanism
-    rms, worst = SUITES[suite]
+@pytest.mark.parametrize("case", SUITES)
+def test_errors_of_the_standard_suites(case):
+    suite, changes, rms, worst = SUITES[case]
+    mechanism = load(f"suite-{suite}", changes).mechanism
     scenario = join([build_scenarios(mechanism, draw(mechanism, 64, 3), 3)])
     loop = build_loop(mechanism, NAME, scenario)
     metrics = run_rollout(loop, as_arrays(nominal_gains(mechanism, NAME)), scenario)
     outcome = compare_with_reference(loop, scenario, metrics)
     assert np.all(np.asarray(outcome.good)[0])
     error = 100 * np.asarray(outcome.error)[0]
-    print(suite, np.sqrt(np.mean(error**2)), np.max(np.abs(error)))
+    print(case, np.sqrt(np.mean(error**2)), np.max(np.abs(error)))
     assert np.sqrt(np.mean(error**2)) < rms and np.max(np.abs(error)) < worst
 
 
