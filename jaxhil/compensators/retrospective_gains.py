@@ -34,15 +34,6 @@ GENTLE = {
     "correction_limit": 0.48,
     "replay_noise": 0.6,
 }
-# What the map's prior is made of, in `force_depth_map.prior`'s order.
-PRIOR = (
-    "prior_stiffness",
-    "prior_stiffness_spread",
-    "prior_slope_spread",
-    "prior_damping_spread",
-    "prior_depth_damping_spread",
-    "prior_unloading_spread",
-)
 
 
 def _fact(mechanism) -> bool:

@@ -33,7 +33,7 @@ SEEN = 8  # readings out of contact that show how noisy the force is
 OUTSTANDING = 16.0  # times the noise's variance: what hardly is noise
 FAREWELL = 0.006  # s for which it goes on after the hardware has left the surface
 LONGEST_LAG = 0.1  # s for which it waits for hardware that has not touched yet
-PRIOR = (
+PRIOR = (  # the gains that `Prior` is made of, in its order
     "prior_stiffness",
     "prior_stiffness_spread",
     "prior_slope_spread",
