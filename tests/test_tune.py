@@ -24,7 +24,7 @@ from tuning.problems import (
 )
 from tuning.rounds import solve_tasks
 from tuning.trial import Trial
-from tuning.tune import Settings, figures, tune
+from tuning.tune import Settings, figures, tune, uncompensated
 
 SMALL = Settings(scenarios=16, starts=2, steps=12, validation=63)
 
@@ -101,6 +101,16 @@ def test_a_setting_is_judged_as_it_is(monkeypatch):
     assert result.starts == [] and result.certified is None
     assert result.gains["phase_lead"] == 0.0015
     assert result.figures["literature"] == result.figures["tuned"] != result.figures["before"]
+
+
+def test_before_is_no_compensation_of_any_law():
+    mechanism, quiet = load().mechanism, dataclasses.replace(SMALL, setting="sharp")
+    without = tune(mechanism, "none", SMALL).outcomes["tuned"]
+    assert uncompensated("retrospective_reference", {}) == ("none", {})
+    assert uncompensated("phase_lead", {"phase_lead": 1.0}) == ("phase_lead", {"phase_lead": 0.0})
+    before = tune(mechanism, "retrospective_reference", quiet).outcomes["before"]
+    np.testing.assert_allclose(before.error, without.error, rtol=1e-12)
+    assert np.sqrt(np.nanmean(before.error**2)) > 0.1
 
 
 def test_starts_begin_with_the_literature_and_stay_inside():

@@ -1,6 +1,6 @@
 """The nominal run tick by tick, and the same contacts in space: what plots are drawn from."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -19,6 +19,8 @@ from tuning.recording import Lane, prepare_recording, record_lanes
 
 STEPS = 8000  # of the integration in space
 POINTS = 800  # of them kept
+
+Laws = Mapping[str, tuple[str, Mapping[str, float]]]  # by name, a compensator and its gains
 
 
 class Curve(NamedTuple):
@@ -43,38 +45,43 @@ class Piece(NamedTuple):
     curves: dict[str, Curve]
 
 
-def nominal_motion(
-    mechanism: Mechanism, compensator: str, gains: Mapping[str, Mapping[str, float]], seed: int = 0
-) -> list[Piece]:
-    """The pieces of the nominal run under each of `gains`; the run in space enters as the last of them."""
-    loaded, scenarios = _lanes(mechanism, compensator, gains, seed)
-    return _pieces(loaded, scenarios, list(gains))
+def nominal_motion(mechanism: Mechanism, laws: Laws, seed: int = 0) -> list[Piece]:
+    """The pieces of the nominal run under each of the `laws`; the run in space enters as the last of them."""
+    runs: dict[str, list[Curve]] = {}
+    for names, loaded, scenarios in _lanes(mechanism, laws, seed):
+        runs |= _runs(loaded, scenarios, names)
+    return _pieces(mechanism, build_scenarios(mechanism, seed=seed), {name: runs[name] for name in laws})
 
 
 def scenario_motion(loaded: LoadedGains, scenarios: Scenario, name: str = "rig") -> list[Piece]:
     """The pieces of one scenario's run, a batch of one lane, which the plots call `name`."""
-    return _pieces(loaded, scenarios, [name])
+    return _pieces(loaded.mechanism, scenarios, _runs(loaded, scenarios, [name]))
 
 
-def prepare_motion(mechanism: Mechanism, compensator: str, gains: Mapping[str, Mapping[str, float]]) -> None:
-    """Compile what `nominal_motion` will run under so many gains."""
-    prepare_recording(*_lanes(mechanism, compensator, gains, 0))
+def prepare_motion(mechanism: Mechanism, laws: Laws) -> None:
+    """Compile what `nominal_motion` will run under such laws."""
+    for _, loaded, scenarios in _lanes(mechanism, laws, 0):
+        prepare_recording(loaded, scenarios)
 
 
-def _lanes(mechanism, compensator, gains, seed) -> tuple[LoadedGains, Scenario]:
-    """The nominal scenario in as many lanes as there are gains."""
-    phase = np.full(len(gains), mechanism.approach.phase)
-    scenarios = build_scenarios(mechanism, {"approach.phase": phase}, seed)
-    names = next(iter(gains.values()))
-    lanes: Any = {name: np.array([one[name] for one in gains.values()]) for name in names}
-    return LoadedGains({}, compensator, lanes, mechanism), scenarios
+def _lanes(mechanism: Mechanism, laws: Laws, seed: int) -> Iterator[tuple[list[str], LoadedGains, Scenario]]:
+    """Of each compensator the names of its gains and the nominal scenario in as many lanes."""
+    for compensator in dict.fromkeys(compensator for compensator, _ in laws.values()):
+        own = {name: gains for name, (one, gains) in laws.items() if one == compensator}
+        phase = np.full(len(own), mechanism.approach.phase)
+        scenarios = build_scenarios(mechanism, {"approach.phase": phase}, seed)
+        every = list(own.values())
+        lanes: Any = {name: np.array([gains[name] for gains in every]) for name in every[0]}
+        yield list(own), LoadedGains({}, compensator, lanes, mechanism), scenarios
 
 
-def _pieces(loaded: LoadedGains, scenarios: Scenario, names: list[str]) -> list[Piece]:
+def _runs(loaded: LoadedGains, scenarios: Scenario, names: list[str]) -> dict[str, list[Curve]]:
     """A lane for each of the names; the lanes differ by their gains alone."""
     _, recorded = record_lanes(loaded, scenarios)
-    lanes = zip(names, recorded, strict=True)
-    runs = {name: _split(lane, scenarios) for name, lane in lanes}
+    return {name: _split(lane, scenarios) for name, lane in zip(names, recorded, strict=True)}
+
+
+def _pieces(mechanism: Mechanism, scenarios: Scenario, runs: dict[str, list[Curve]]) -> list[Piece]:
     leading = list(runs.values())[-1]
     clearance = float(scenarios.clearance[0])
     two = bool(np.isfinite(clearance))
@@ -82,8 +89,8 @@ def _pieces(loaded: LoadedGains, scenarios: Scenario, names: list[str]) -> list[
     pieces = []
     for number, curve in enumerate(leading):
         others = {name: run[number] for name, run in runs.items() if number < len(run)}
-        space = _space(loaded.mechanism, scenarios, number, curve.velocity, float(curve.time[-1]))
-        name = f"{loaded.mechanism.approach.contacts} contacts" if two else f"contact {number + 1}"
+        space = _space(mechanism, scenarios, number, curve.velocity, float(curve.time[-1]))
+        name = f"{mechanism.approach.contacts} contacts" if two else f"contact {number + 1}"
         pieces.append(Piece(name, surfaces, {"in space": space, **others}))
     return pieces
 

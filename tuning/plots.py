@@ -17,6 +17,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 
 from jaxhil.errors import one_line
 from tuning.motion import Curve, Piece
+from tuning.objective import Objective
 from tuning.pareto import Front
 from tuning.tune import Result
 
@@ -130,7 +131,9 @@ def loss_plot(result: Result) -> Figure:
         axes.plot(steps, start.history, color=colour, linewidth=width, label=label, zorder=order)
         axes.plot(steps[-1:], start.history[-1:], color=colour, marker="o", markersize=4, zorder=order)
     axes.set_yscale("log")
-    axes.set(xlabel="solver step", ylabel=f"{result.settings.objective.name} on training scenarios [1]")
+    objective = result.settings.objective
+    what = objective.name if objective == Objective(objective.name) else "objective"
+    axes.set(xlabel="solver step", ylabel=f"{what} on training scenarios [1]")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     finish(axes, "best")
     return figure

@@ -3,6 +3,7 @@
 Both go through one compiled program, that of `jaxhil.evaluation`, with as many lanes at every call.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxhil.building import build_loop
+from jaxhil.compensators import COMPENSATORS
 from jaxhil.compensators.base import Constants
 from jaxhil.evaluation import Outcome, begin_evaluation, evaluate
 from jaxhil.loop import Loop
@@ -74,10 +76,16 @@ class Trial:
         """Outcome on the fresh scenarios of every task under its gains, the nominal run last."""
         return [plain for plain, _ in self.judge_copies(gains)]
 
-    def judge_copies(self, gains: list[dict[str, float]]) -> list[tuple[Outcome, Outcome | None]]:
+    def judge_copies(
+        self, gains: list[dict[str, float]], compensator: str | None = None
+    ) -> list[tuple[Outcome, Outcome | None]]:
         """What `judge` returns and, where the tasks are honest, the outcome of the fresh scenarios with their
-        copies, (slots, scenarios, `COPIES`)."""
-        every = cut(evaluate(self.loop, self._values(gains), self._scenarios), self._each)
+        copies, (slots, scenarios, `COPIES`); of another `compensator` than that of the tasks, if one is
+        given."""
+        loop = self.loop
+        if compensator is not None:
+            loop = dataclasses.replace(loop, compensator=COMPENSATORS[compensator])
+        every = cut(evaluate(loop, self._values(gains), self._scenarios), self._each)
         if not self._honest:
             return [(own, None) for own in every]
 

@@ -158,10 +158,6 @@ def _tune_block(
     name = tasks[0].mechanism.name if len(tasks) == 1 else f"{len(tasks)} mechanisms"
     compensator = tasks[0].compensator
     trial = Trial(tasks, settings.validation, settings.seed)
-    known = {
-        "before": [neutral_gains(compensator, task.literature) for task in tasks],
-        "literature": [task.literature for task in tasks],
-    }
     found = [Found(None, [], 0) for _ in tasks]
     if settings.setting is None and any(task.tuned for task in tasks):
         number = tasks[0].number
@@ -184,7 +180,12 @@ def _tune_block(
     best = [one.best.gains if one.best else task.literature for one, task in zip(found, tasks, strict=True)]
     clock.lap("tune")
     report(f"{name}: judging on {settings.validation} fresh scenarios")
-    judged = {key: trial.judge_copies(gains) for key, gains in {**known, "tuned": best}.items()}
+    plain = [uncompensated(compensator, task.literature) for task in tasks]
+    judged = {
+        "before": trial.judge_copies([gains for _, gains in plain], plain[0][0]),
+        "literature": trial.judge_copies([task.literature for task in tasks]),
+        "tuned": trial.judge_copies(best),
+    }
     outcomes = {key: [own for own, _ in every] for key, every in judged.items()}
     clock.lap("judge")
     certificates: list[Certified | None] = [None for _ in tasks]
@@ -267,11 +268,18 @@ def figures(outcome: Outcome) -> Figures:
     )
 
 
-def neutral_gains(compensator: str, gains: dict[str, float]) -> dict[str, float]:
-    """Gains at which the compensator passes the measured force on unchanged: what "before" is judged with.
+def uncompensated(compensator: str, gains: dict[str, float]) -> tuple[str, dict[str, float]]:
+    """Compensator and gains that pass the measured force on unchanged: what "before" is judged with.
 
-    It is the same compiled program as for any other gains.
+    Neutral gains need no program of their own. In the place of a law that has none stands no compensation.
     """
+    if all(gain.neutral is None for gain in COMPENSATORS[compensator].gains):
+        return "none", {}
+    return compensator, neutral_gains(compensator, gains)
+
+
+def neutral_gains(compensator: str, gains: dict[str, float]) -> dict[str, float]:
+    """The gains, neutral where they can be."""
     neutral = {
         gain.name: gain.neutral for gain in COMPENSATORS[compensator].gains if gain.neutral is not None
     }

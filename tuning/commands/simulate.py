@@ -32,7 +32,7 @@ def run(options: Simulate) -> int:
         from tuning.motion import nominal_motion
         from tuning.plots import contact_plot, save
 
-        motion = nominal_motion(mechanism, compensator, {"rig": gains}, options.seed)
+        motion = nominal_motion(mechanism, {"rig": (compensator, gains)}, options.seed)
         title = f"{mechanism.name}, compensation: {compensator}"
         save(contact_plot(motion, title, sensors="rig"), options.plot)
         report.note(f"wrote {options.plot}")

@@ -273,9 +273,10 @@ def _prepare_drawing(mechanism, compensator: str) -> None:
     from jaxhil.compensators import literature_gains
     from tuning import plots  # noqa: F401
     from tuning.motion import prepare_motion
+    from tuning.tune import uncompensated
 
     gains = literature_gains(mechanism, compensator)
-    prepare_motion(mechanism, compensator, {"before": gains, "tuned": gains})
+    prepare_motion(mechanism, {"before": uncompensated(compensator, gains), "tuned": (compensator, gains)})
 
 
 def is_better(figures, other) -> bool:
@@ -286,11 +287,11 @@ def is_better(figures, other) -> bool:
 def _draw(result, options: Tune, folder: Path) -> list[str]:
     from tuning.motion import nominal_motion
     from tuning.plots import contact_plot, errors_plot, loss_plot, save
-    from tuning.tune import neutral_gains
+    from tuning.tune import uncompensated
 
     name, compensator = result.mechanism.name, options.compensator
-    gains = {"before": neutral_gains(compensator, result.literature), "tuned": result.gains}
-    motion = nominal_motion(result.mechanism, compensator, gains)
+    before, tuned = uncompensated(compensator, result.literature), (compensator, result.gains)
+    motion = nominal_motion(result.mechanism, {"before": before, "tuned": tuned})
     figures = {
         "errors.png": errors_plot(result, options.limit),
         "contact.png": contact_plot(motion, f"{name}: nominal run, {compensator}"),

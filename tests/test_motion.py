@@ -1,0 +1,42 @@
+"""The nominal run tick by tick: laws side by side, and the same contact in space."""
+
+import math
+
+import numpy as np
+import pytest
+
+from jaxhil.compensators import literature_gains
+from jaxhil.mechanism_file import load
+from tuning.motion import nominal_motion
+
+MECHANISM = load("varying", ["approach.contacts=2", "contact.damping=[0.0]"]).mechanism
+LAWS = {
+    "before": ("none", {}),
+    "literature": ("response_error", literature_gains(MECHANISM, "response_error")),
+    "tuned": ("none", {}),
+}
+
+
+@pytest.fixture(scope="module")
+def pieces():
+    return nominal_motion(MECHANISM, LAWS)
+
+
+def test_laws_side_by_side_are_each_as_alone(pieces):
+    assert [list(piece.curves) for piece in pieces] == [["in space", *LAWS]] * 2
+    for name in ("before", "literature"):
+        for piece, alone in zip(pieces, nominal_motion(MECHANISM, {name: LAWS[name]}), strict=True):
+            np.testing.assert_allclose(
+                piece.curves[name].position, alone.curves[name].position, rtol=1e-9, atol=1e-12
+            )
+    first = pieces[0].curves
+    np.testing.assert_array_equal(first["before"].force, first["tuned"].force)
+    assert np.max(first["before"].force) != pytest.approx(np.max(first["literature"].force), rel=0.01)
+
+
+def test_in_space_the_first_contact_is_the_closed_form(pieces):
+    stiffness, mass = MECHANISM.contact.stiffness[0], MECHANISM.bodies.mass
+    space, velocity = pieces[0].curves["in space"], MECHANISM.approach.velocity
+    assert np.max(space.force) == pytest.approx(velocity * math.sqrt(stiffness * mass), rel=1e-3)
+    assert np.max(space.position) == pytest.approx(velocity * math.sqrt(mass / stiffness), rel=1e-3)
+    assert space.velocity == velocity
