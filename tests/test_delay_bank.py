@@ -2,6 +2,7 @@
 
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -97,7 +98,7 @@ def test_both_recursions_agree():
     rng = np.random.default_rng(1)
     bank, zero = plain(), jnp.zeros(())
     prior = force_depth_map.prior(*(zero + value for value in PRIOR.values()))
-    ours = in_jax.no_bank(prior)
+    ours, learn = in_jax.no_bank(prior), jax.jit(in_jax.learn)
     for delay, zone in ((0.0004, 0.0), (0.0004, 0.0), (-0.0007, 1.0)):
         bank.begin()
         ours = in_jax.begin(ours, prior, jnp.asarray(True))
@@ -107,7 +108,7 @@ def test_both_recursions_agree():
                 zero + depth, zero + speed, zero + force, zero + VARIANCE, jnp.asarray(bool(hidden)),
                 zero + zone, jnp.asarray(True),
             )  # fmt: skip
-            ours, curve = in_jax.learn(ours, reading, zero + SPREAD, zero + PRIOR["damping"] ** 2)
+            ours, curve = learn(ours, reading, zero + SPREAD, zero + PRIOR["damping"] ** 2)
         assert float(ours.shift) == pytest.approx(bank.shift, rel=1e-9, abs=1e-14)
         np.testing.assert_allclose(curve.slopes, bank.curve.slopes, rtol=1e-8)
         for name in ("damping", "depth_damping", "unloading"):

@@ -88,13 +88,13 @@ def test_map_is_the_posterior_of_all_readings():
 
     contact = ForceDepthMap(Prior(**PRIOR))
     like = jnp.zeros(())
-    ours = in_jax.prior(*(like + value for value in PRIOR.values()))
+    ours, update = in_jax.prior(*(like + value for value in PRIOR.values())), jax.jit(in_jax.update)
     np.testing.assert_allclose(ours.mean, mean, rtol=1e-14)
     np.testing.assert_allclose(ours.covariance, covariance, rtol=1e-13)
     for depth, speed, deepest, force in zip(*readings, strict=True):
         contact.update(float(depth), float(speed), float(deepest), float(force), variance)
         regressor = in_jax.features(like + depth, like + speed, like + deepest)
-        ours = in_jax.update(ours, regressor, like + force, like + variance, jnp.asarray(True))
+        ours = update(ours, regressor, like + force, like + variance, jnp.asarray(True))
     scale = np.max(np.abs(expected))
     np.testing.assert_allclose(ours.mean, expected, rtol=0, atol=1e-9 * scale)
     np.testing.assert_allclose(contact.curve.slopes, expected[:12], rtol=0, atol=1e-9 * scale)
