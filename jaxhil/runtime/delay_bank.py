@@ -29,6 +29,8 @@ DAMPING = SEGMENTS
 
 _KNOTS = np.array(KNOTS)[:, None]
 _WIDTHS = np.append(np.diff(KNOTS), np.inf)[:, None]
+# Beside an array, a number takes longer than an array does.
+_0, _1 = np.zeros(HYPOTHESES), np.ones(HYPOTHESES)
 
 
 class DelayBank:
@@ -119,10 +121,10 @@ class DelayBank:
     ) -> None:
         estimate = self._estimate
         depths = depth - self._offsets * rate
-        deepest = np.where(depths > self._deepest, depths, self._deepest)
+        deepest = np.fmax(self._deepest, depths)
         beyond = depths - _KNOTS
         phi = np.empty((PARAMETERS, HYPOTHESES))
-        phi[:SEGMENTS] = np.where(beyond > 0.0, np.minimum(beyond, _WIDTHS), 0.0)
+        phi[:SEGMENTS] = np.fmax(np.minimum(beyond, _WIDTHS), _0)
         phi[12] = rate
         phi[13] = depths * rate / REACH
         phi[14] = depths - deepest
@@ -139,9 +141,9 @@ class DelayBank:
         inside = depths > SURFACE
         if hidden:
             inside &= expected > zone
-        positive = expected > 0.0
+        positive = expected > _0
         closes = rate > 0.0
-        used = inside & (s > 0.0)
+        used = inside & (s > _0)
         if not closes and not force * force > OUTLYING * noise:
             used &= positive
         nothing = ~inside
@@ -149,21 +151,21 @@ class DelayBank:
             nothing |= ~positive
         innovation = force - expected
         wide = np.where(nothing, noise, s)
-        wide = np.where(wide > 0.0, wide, 1.0)
+        wide = np.where(wide > _0, wide, _1)
         missed = np.where(nothing, read, innovation)
         surprise = 0.25 * (missed * missed) / wide
         surprise -= np.minimum.reduce(surprise)
-        sharpness = np.sqrt(np.sqrt(np.where(wide > noise, noise / wide, 1.0)))
+        sharpness = np.sqrt(np.sqrt(np.fmin(noise / wide, _1)))
         likelihood = self._likelihood * sharpness * _exponential(surprise, SQUARINGS)
         self._likelihood = _shares(likelihood, LEAST)
         self._deepest = deepest
         self._learning = True
-        share = 1.0 / np.where(used, s, 1.0)
+        share = _1 / np.where(used, s, _1)
         self._known = np.where(used, noise * ((s - noise) * share), self._known)
         scaled = share * g
         correction = scaled * innovation
         less = g[:, None] * scaled
-        if not used.all():
+        if not np.logical_and.reduce(used):
             correction = np.where(used, correction, 0.0)
             less = np.where(used, less, 0.0)
         self._estimate = estimate + correction
@@ -172,12 +174,12 @@ class DelayBank:
     def _weigh(self) -> np.ndarray:
         """Weights of the hypotheses; their sum is 1."""
         own = self._covariance[DAMPING, DAMPING]
-        precision = 1.0 / np.where(own > 0.0, own, 1.0)
+        precision = _1 / np.where(own > _0, own, _1)
         total = self._precision + precision
         mean = (self._weighted + precision * self._estimate[DAMPING]) / total
         variance = BROADENING * (self._met + 1.0) / total
         plausible = _plausibility(mean, variance, self._damping)
-        plausible = np.where(own > 0.0, np.where(plausible > LEAST_CARRIED, plausible, LEAST_CARRIED), 1.0)
+        plausible = np.where(own > _0, np.fmax(plausible, LEAST_CARRIED), _1)
         weights = self._likelihood * self._carried * plausible
         return weights / _total(weights)
 
@@ -189,7 +191,8 @@ class DelayBank:
         for j in range(1, SEGMENTS):
             reached += slopes[j - 1] * (KNOTS[j] - KNOTS[j - 1])
             at_knots[j] = reached
-        variances = self._covariance[(12, 13, 14), (12, 13, 14)]
+        # The last of the diagonal, without a copy.
+        variances = self._covariance.reshape(-1, HYPOTHESES)[DAMPING * (PARAMETERS + 1) :: PARAMETERS + 1]
         lost = _positive_mean(estimate[SEGMENTS:], variances) * weights
         curve = self.curve
         curve.slopes = slopes
@@ -206,33 +209,34 @@ def _plausibility(mean: np.ndarray, variance: np.ndarray, prior: float) -> np.nd
     size = np.abs(ratio)
     mills = pi / ((pi - 1.0) * size + np.sqrt(size * size + 2.0 * pi))
     beyond = density * mills * (2.0 / sqrt(2.0 * pi))
-    at_least_0 = np.where(ratio > 0.0, 2.0 - beyond, beyond)
+    at_least_0 = np.where(ratio > _0, 2.0 - beyond, beyond)
     known = sqrt(prior if prior > 0.0 else 1.0)
     return ELASTIC * (known / spread) * density + (1.0 - ELASTIC) * at_least_0
 
 
 def _positive_mean(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """`force_depth_map.positive_mean` of many."""
-    spread = np.sqrt(np.where(variance > 0.0, variance, 1.0))
+    known = variance > _0
+    spread = np.sqrt(np.where(known, variance, _1))
     ratio = mean / spread
     root = np.sqrt(ratio * ratio + 2.0 * pi)
     below = 2.0 / (root - ratio)
-    positive = np.where(ratio > 0.0, ratio, 0.0)
+    above_0 = ratio > _0
+    positive = np.where(above_0, ratio, _0)
     mills = pi / ((pi - 1.0) * positive + root)
     tail = 1.0 / (1.0 + positive * positive / 512.0)
     for _ in range(8):
-        tail = tail * tail
+        tail *= tail
     density = tail / sqrt(2.0 * pi)
     above = positive + density / (1.0 - density * mills)
-    known = spread * np.where(ratio > 0.0, above, below)
-    return np.where(variance > 0.0, known, np.where(mean > 0.0, mean, 0.0))
+    return np.where(known, spread * np.where(above_0, above, below), np.fmax(mean, _0))
 
 
 def _exponential(u: np.ndarray, squarings: int) -> np.ndarray:
     """(1 + u/n)^-n, n = 2^squarings."""
     value = 1.0 / (1.0 + u / float(1 << squarings))
     for _ in range(squarings):
-        value = value * value
+        value *= value
     return value
 
 
@@ -240,7 +244,7 @@ def _shares(values: np.ndarray, least: float) -> np.ndarray:
     """Of their sum, at least so much."""
     values = np.where(values < NOTHING, 0.0, values)
     shares = values / _total(values)
-    return np.where(shares > least, shares, least)
+    return np.fmax(shares, least)
 
 
 def _total(values: np.ndarray) -> float:
