@@ -48,9 +48,10 @@ class Piece(NamedTuple):
 def nominal_motion(mechanism: Mechanism, laws: Laws, seed: int = 0) -> list[Piece]:
     """The pieces of the nominal run under each of the `laws`; the run in space enters as the last of them."""
     runs: dict[str, list[Curve]] = {}
-    for names, loaded, scenarios in _lanes(mechanism, laws, seed):
+    lanes = list(_lanes(mechanism, laws, seed))
+    for names, loaded, scenarios in lanes:
         runs |= _runs(loaded, scenarios, names)
-    return _pieces(mechanism, build_scenarios(mechanism, seed=seed), {name: runs[name] for name in laws})
+    return _pieces(mechanism, lanes[0][-1], {name: runs[name] for name in laws})
 
 
 def scenario_motion(loaded: LoadedGains, scenarios: Scenario, name: str = "rig") -> list[Piece]:

@@ -21,9 +21,10 @@ typedef struct {
 } jaxhil_path;
 
 /* From depth 0 at speed 1: x' = v, v' = -f, f = F(x, v, x_m) + rho [y - F(X, V, X_m)], rho = `replay`, the bracket
- * only as far as the hardware has been measured and y could be read, until it separates. A pass from the entry makes
- * up to JAXHIL_STRIDE steps of up to 2 ms per tick; when it has caught up with the present it becomes the `live` motion. The force is older by `shift`
- * [s] than it was taken for when samples were remembered: it belongs to X - shift V. */
+ * only as far as the hardware has been measured and y could be read, until it separates. A pass from the entry
+ * makes up to JAXHIL_STRIDE steps of up to 2 ms per tick; when it has caught up with the present it becomes the
+ * `live` motion. The force is older by `shift` [s] than it was taken for when samples were remembered: it belongs
+ * to X - shift V. */
 typedef struct {
     double replay, shift, period, first;
     long coarse, number, present, reached;

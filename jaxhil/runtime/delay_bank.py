@@ -72,17 +72,11 @@ class DelayBank:
 
     def reset(self) -> None:
         """Forget all contacts."""
-        self._estimate = self._prior_estimate.copy()
-        self._covariance = self._prior_covariance.copy()
-        self._deepest = np.zeros(HYPOTHESES)
-        self._known = np.zeros(HYPOTHESES)
-        self.variance = 0.0
-        self._likelihood = np.ones(HYPOTHESES)
+        self._restart()
         self._carried = np.ones(HYPOTHESES)
         self._precision = np.zeros(HYPOTHESES)
         self._weighted = np.zeros(HYPOTHESES)
         self._met = 0.0
-        self._learning = False
         self.shift = 0.0
 
     @np.errstate(all="ignore")
@@ -95,13 +89,7 @@ class DelayBank:
             self._precision = self._precision + precision
             self._weighted = self._weighted + precision * self._estimate[DAMPING]
             self._met += 1.0
-        self._learning = False
-        self._estimate = self._prior_estimate.copy()
-        self._covariance = self._prior_covariance.copy()
-        self._deepest = np.zeros(HYPOTHESES)
-        self._known = np.zeros(HYPOTHESES)
-        self.variance = 0.0
-        self._likelihood = np.ones(HYPOTHESES)
+        self._restart()
 
     @np.errstate(all="ignore")
     def learn(
@@ -115,6 +103,16 @@ class DelayBank:
         self.shift = shift if shift > LEAST_SHIFT or shift < -LEAST_SHIFT else 0.0
         self.variance = float(_total(weights * self._known))
         self._conclude(weights)
+
+    def _restart(self) -> None:
+        """Another contact: the maps are the prior, nothing has been read."""
+        self._learning = False
+        self._estimate = self._prior_estimate.copy()
+        self._covariance = self._prior_covariance.copy()
+        self._deepest = np.zeros(HYPOTHESES)
+        self._known = np.zeros(HYPOTHESES)
+        self.variance = 0.0
+        self._likelihood = np.ones(HYPOTHESES)
 
     def _read(
         self, depth: float, rate: float, force: float, variance: float, hidden: bool, zone: float
