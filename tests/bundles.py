@@ -6,11 +6,11 @@ import io
 from typing import Any
 
 from jaxhil.compensators import COMPENSATORS
-from jaxhil.mechanism_file import load
+from jaxhil.mechanism.file import load
+from tuning.bundle import selftest
+from tuning.bundle.bundle import build_bundle
+from tuning.bundle.manifest import manifest_text
 from tuning.gain_file import build_document
-from tuning.rig import selftest
-from tuning.rig.bundle import build_bundle
-from tuning.rig.manifest import manifest_text
 
 TICKS = 240  # of the small bundle: the nominal run
 LIMITS = {"force_limit": 900.0, "held_readings": 3.0, "velocity_limit": None}

@@ -21,7 +21,7 @@ from jaxhil.runtime import COMPENSATORS, Controller
 from jaxhil.runtime.gain_file import GainFile
 from jaxhil.runtime.law_status import STATUSES
 from jaxhil.runtime.limits import LIMITS, NO_LIMITS, complete
-from tuning.rig.c99 import FLAGS, c99_texts
+from tuning.bundle.c99 import FLAGS, c99_texts
 
 COMPILER = shutil.which("cc")
 DRIVER = Path(__file__).with_name("c99_driver.c")

@@ -27,13 +27,13 @@ from lanes import (
 )
 from oracle import simulate
 
-from jaxhil.building import build_loop
 from jaxhil.compensators.estimates import force_delay
-from jaxhil.contact import LAWS
-from jaxhil.loop import Loop
-from jaxhil.metrics import Metrics
+from jaxhil.contact.laws import LAWS
 from jaxhil.runtime import COMPENSATORS as RIG_COMPENSATORS
-from jaxhil.scenario import Scenario, build_scenarios
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop import Loop
+from jaxhil.simulation.metrics import Metrics
+from jaxhil.simulation.scenario import Scenario, build_scenarios
 
 
 class Case(NamedTuple):

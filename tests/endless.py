@@ -15,10 +15,10 @@ import numpy as np
 from jax import lax
 from lanes import IDEAL, MASS, QUICK, mechanism, per_lane, spread, validated
 
-from jaxhil.building import build_loop
-from jaxhil.loop import build_rig
-from jaxhil.mechanism import Mechanism
-from jaxhil.rollout import Tick, start, stretch, stretch_length
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop import build_rig
+from jaxhil.simulation.rollout import Tick, start, stretch, stretch_length
 
 OMEGA = 2 * pi * 3.0
 STIFFNESS = MASS * OMEGA**2

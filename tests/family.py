@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import qmc
 
-from jaxhil.mechanism import Mechanism
-from jaxhil.mechanism_file import from_builtins
+from jaxhil.mechanism.file import from_builtins
+from jaxhil.mechanism.structs import Mechanism
 
 NUMBER = 64
 EXPONENT = 1.5  # Hertz

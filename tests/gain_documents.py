@@ -4,7 +4,7 @@ import copy
 from typing import Any
 
 from jaxhil.compensators import COMPENSATORS
-from jaxhil.mechanism_file import from_builtins
+from jaxhil.mechanism.file import from_builtins
 from jaxhil.runtime import digest
 
 MECHANISM: dict[str, Any] = {

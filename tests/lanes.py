@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from compiling import QUICK
 
-from jaxhil.building import build_loop
 from jaxhil.compensators import COMPENSATORS
-from jaxhil.mechanism import Mechanism
-from jaxhil.mechanism_file import from_builtins
-from jaxhil.metrics import OK
-from jaxhil.rollout import record, rollout
-from jaxhil.scenario import Scenario, build_scenarios
+from jaxhil.mechanism.file import from_builtins
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.metrics import OK
+from jaxhil.simulation.rollout import record, rollout
+from jaxhil.simulation.scenario import Scenario, build_scenarios
 
 PERIOD = 2e-3  # coarse: errors of arithmetic show, and the oracle is quick
 MASS, VELOCITY, STIFFNESS = 350.0, 0.005, 124355.0

@@ -1,7 +1,7 @@
 """Small tasks for tests of the search: phase lead on a motion simulator that it can make up for."""
 
-from jaxhil.mechanism_file import load
-from tuning.problems import Task, build_task
+from jaxhil.mechanism.file import load
+from tuning.gains.tasks import Task, build_task
 
 SCENARIOS = 8
 FAST = ["rig.simulator.natural_frequency=60", "rig.simulator.delay=0.001"]

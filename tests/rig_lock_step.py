@@ -4,14 +4,14 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from jaxhil.mechanism import Mechanism
-from jaxhil.mechanism_file import to_builtins
+from jaxhil.mechanism.file import to_builtins
+from jaxhil.mechanism.structs import Mechanism
 from jaxhil.runtime import Controller
 from jaxhil.runtime.gain_file import GainFile
 from tuning.rig.contact_watch import ContactResult, ContactWatch
+from tuning.rig.hardware import RigTask
 from tuning.rig.plant import Plant
 from tuning.rig.udp_controller import APPROACH, Answer, NumericalModel, Reading, Task
-from tuning.rig.udp_rig import RigTask
 
 
 def controller(mechanism: Mechanism, compensator: str, gains: Mapping[str, float], **limits: float):

@@ -4,7 +4,7 @@ On every built-in mechanism's recorded ticks and on a million random ones the fo
 the command's range, those of the retrospective reference, whose recursion is long, to 1e-9. Counted and
 compared separately are
 
-- ticks whose decisions lie within 1e-9 of a threshold (see `tuning.verification`), and
+- ticks whose decisions lie within 1e-9 of a threshold (see `tuning.verification.replay`), and
 - lanes that magnify rounding: where successive regressors of the identification are nearly parallel, one unit
   in the last place of every operation moves the runtime's own command by as much as the two sides differ
   (Monte Carlo arithmetic: Parker, Pierce and Eggert 2000).
@@ -24,12 +24,12 @@ from hypothesis.extra import numpy as hnp
 from jax import lax
 
 from jaxhil.compensators import COMPENSATORS, Constants, Signals
-from jaxhil.mechanism_file import builtin_names, load
+from jaxhil.mechanism.file import builtin_names, load
 from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
 from jaxhil.runtime.gain_file import GainFile
 from tuning.gain_file import build_document, check_document
-from tuning.recording import Lane, nominal_and_draws, record_lanes
-from tuning.verification import REPLAY_LIMIT, LaneReplay, replay
+from tuning.verification.recording import Lane, nominal_and_draws, record_lanes
+from tuning.verification.replay import REPLAY_LIMIT, LaneReplay, replay
 
 pytestmark = pytest.mark.users_options
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tuning.box import Bounds, to_gains, to_shares
+from tuning.optimisation.unit_box import Bounds, to_gains, to_shares
 
 BOUNDS = Bounds(np.array([0.0, 1e-3, 0.4]), np.array([2.0, 10.0, 0.4]), np.array([0.0, 1.0, 0.0]))
 

@@ -34,9 +34,9 @@ from jaxhil.runtime.faults import FAULTS, LAW_IN_DOUBT, names
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
 from jaxhil.runtime.law_status import STATUSES
 from jaxhil.runtime.limits import LIMITS, complete
-from tuning.rig import c99
-from tuning.rig.c99 import c99_texts
-from tuning.rig.c99_tables import UNUSABLE, decimal
+from tuning.bundle import c99
+from tuning.bundle.c99 import c99_texts
+from tuning.bundle.c99_tables import UNUSABLE, decimal
 
 pytestmark = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
 LAWS = tuple(COMPENSATORS)

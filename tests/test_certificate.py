@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from lead_cases import lead_task
 
-from tuning.certificate import certified
-from tuning.finding import Found, find
-from tuning.objective import RMS
-from tuning.trial import Trial
+from tuning.gains.global_search import certified
+from tuning.gains.multistart import Found, find
+from tuning.gains.objective import RMS
+from tuning.gains.validation import Trial
 
 
 @pytest.fixture(scope="module")

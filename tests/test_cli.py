@@ -8,13 +8,13 @@ import sys
 import pytest
 from conftest import Ran
 
-from jaxhil.mechanism_file import builtin_names, builtin_path, suite_names
+from jaxhil.mechanism.file import builtin_names, builtin_path, suite_names
 from tuning import environment
 from tuning.__main__ import main
-from tuning.cli import complete_bare
-from tuning.commands.tune import folder_name, is_better
-from tuning.options import DEFAULT_DRIVERS, DEFAULT_PLOT
-from tuning.tune import Figures
+from tuning.cli.commands.tune import folder_name, is_better
+from tuning.cli.options import DEFAULT_DRIVERS, DEFAULT_PLOT
+from tuning.cli.parser import complete_bare
+from tuning.gains.tune import Figures
 
 TINY = ["--scenarios", "4", "--starts", "2", "--steps", "2", "--validation", "16"]
 CONTACT_KEYS = {
@@ -137,13 +137,13 @@ def test_bad_files_do_not_stop_the_others(jaxhil, tuned, tmp_path):
 
 
 def test_interrupted_keeps_what_was_finished(jaxhil, tuned, tmp_path, monkeypatch):
-    from tuning.tune import tune_all
+    from tuning.gains.tune import tune_all
 
     def stopped_after_the_first(*arguments):
         yield next(tune_all(*arguments))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tuning.tune.tune_all", stopped_after_the_first)
+    monkeypatch.setattr("tuning.gains.tune.tune_all", stopped_after_the_first)
     files = ["rig-300kg", "rod-100n-mm", "--compensator", "phase_lead"]
     ran = jaxhil("tune", *files, "-o", tmp_path, "--json", *TINY)
     assert ran.code == 130
@@ -245,7 +245,7 @@ def test_interrupt_anywhere_is_130(jaxhil, monkeypatch):
     def interrupted(arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tuning.cli.parse", interrupted)
+    monkeypatch.setattr("tuning.cli.parser.parse", interrupted)
     assert jaxhil("mechanisms") == Ran(130, "", "jaxhil: interrupted\n")
 
 
@@ -335,7 +335,7 @@ def test_what_goes_wrong_inside_is_one_line(jaxhil, monkeypatch):
     def broken(*arguments):
         raise ZeroDivisionError("inside")
 
-    monkeypatch.setattr("tuning.commands.mechanisms.load", broken)
+    monkeypatch.setattr("tuning.cli.commands.mechanisms.load", broken)
     refused(jaxhil("mechanisms"), "internal error", "ZeroDivisionError: inside")
 
 

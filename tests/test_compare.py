@@ -10,13 +10,13 @@ from math import inf, nan
 
 import pytest
 
-from tuning import report
-from tuning.comparison.cost import microseconds_per_tick
-from tuning.comparison.figures import Figure
-from tuning.comparison.plots import errors_plot, honesty_plot
-from tuning.comparison.study import LawFigures
-from tuning.comparison.tables import HEADINGS, leaderboard, mechanism_table, winners
-from tuning.plots import save
+from tuning import terminal as report
+from tuning.benchmark.cost import microseconds_per_tick
+from tuning.benchmark.plots import errors_plot, honesty_plot
+from tuning.benchmark.study import LawFigures
+from tuning.benchmark.tables import HEADINGS, leaderboard, mechanism_table, winners
+from tuning.pictures.plots import save
+from tuning.transparency.figures import Figure
 
 COMMAND = [sys.executable, "-m", "tuning", "compare"]
 SMALL = ["rig-300kg", "--set", "approach.contacts=1", "--compensators", "none", "passivity", "--judged", "8"]
@@ -102,7 +102,7 @@ def test_cost_is_a_time():
 
 def literature(law):
     from jaxhil.compensators import literature_gains
-    from jaxhil.mechanism_file import load
+    from jaxhil.mechanism.file import load
 
     return literature_gains(load("rig-300kg").mechanism, law)
 

@@ -10,15 +10,17 @@ from jaxtyping import Array
 from lanes import IDEAL, mechanism, validated
 
 from jaxhil import compensators
-from jaxhil.building import build_loop
 from jaxhil.compensators.base import Compensator, Gain
-from jaxhil.contact import LAWS
-from jaxhil.evaluation import evaluate
-from jaxhil.mechanism_file import load
-from jaxhil.scenario import build_scenarios
-from jaxhil.uncertainty import draw
-from tuning.comparison.damped import MOST, damped_twins
-from tuning.comparison.figures import (
+from jaxhil.contact.laws import LAWS
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.scenario import build_scenarios
+from tuning.benchmark.runs import build_scene, judge_gains
+from tuning.gains.common_program import forms
+from tuning.transparency.damped_twins import MOST, damped_twins
+from tuning.transparency.figures import (
     CLOSER_TO_1,
     Figure,
     distance,
@@ -28,8 +30,6 @@ from tuning.comparison.figures import (
     transmitted,
     winner,
 )
-from tuning.comparison.runs import build_scene, judge_gains
-from tuning.forms import forms
 
 LIMIT, SEED, LANES = 0.01, 3, 16
 SPREAD = {"contact.stiffness": {"distribution": "loguniform", "factor": [0.5, 2.0]}}
@@ -88,7 +88,7 @@ def test_a_law_that_plays_back_the_reference_is_blind(monkeypatch):
         truth = Told(stiffness, contact.damping[0])
         return evaluate(loop, truth._asdict(), scenarios)
 
-    monkeypatch.setattr("tuning.comparison.runs.evaluate", told)
+    monkeypatch.setattr("tuning.benchmark.runs.evaluate", told)
     figures = judged(mechanism({}, period=2.5e-4), "played_back")
     assert figures["rms"].value < 1e-3
     assert figures["slope"].value == pytest.approx(1, abs=1e-3)

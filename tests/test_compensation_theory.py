@@ -23,10 +23,10 @@ from lanes import (
     validated,
 )
 
-from jaxhil.building import build_loop
 from jaxhil.compensators.base import Compensator
 from jaxhil.compensators.phase_lead import PhaseLead
 from jaxhil.compensators.response_error import ResponseError
+from jaxhil.simulation.building import build_loop
 
 PHASES = (np.arange(8) + 0.5) / 8
 

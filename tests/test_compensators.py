@@ -17,10 +17,10 @@ from lanes import QUICK
 
 from jaxhil.compensators import COMPENSATORS, Compensator, Constants, Signals
 from jaxhil.compensators import estimates as known
-from jaxhil.mechanism_file import load
+from jaxhil.mechanism.file import load
 from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
 from jaxhil.runtime import Controller, GainFileError
-from tuning.rig.c99 import FOLDER
+from tuning.bundle.c99 import FOLDER
 
 LAWS = tuple(COMPENSATORS)
 WITH_GAINS = tuple(name for name, law in COMPENSATORS.items() if law.gains)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from lanes import IDEAL, MASS, QUICK, VELOCITY, first_contact, grid, mechanism, spread, validated
 
-from jaxhil.contact import LAWS, ContactParameters
-from jaxhil.reference import hunt_crossley
-from jaxhil.reference_motion import integrate_contact
+from jaxhil.contact.laws import LAWS, ContactParameters
+from jaxhil.contact.reference import hunt_crossley
+from jaxhil.contact.reference_motion import integrate_contact
 
 STIFFNESS, LANES = 124355.0, 6
 PERIODS = np.array([4e-3, 2e-3, 1e-3, 5e-4])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from lanes import IDEAL, STIFFNESS, first_contact, mechanism, nominal_gains, spread, validated
 
-from jaxhil.mechanism_file import load
+from jaxhil.mechanism.file import load
 from jaxhil.runtime import COMPENSATORS
 
 DEAD_ZONE, DELAY, PERIOD = 12.0, 0.008, 1e-3

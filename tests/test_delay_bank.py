@@ -9,16 +9,16 @@ import pytest
 from gain_documents import gain_document
 from scipy import stats
 
-from jaxhil.building import build_loop
 from jaxhil.compensators import delay_bank as in_jax
 from jaxhil.compensators import force_depth_map, literature_gains
-from jaxhil.evaluation import evaluate
-from jaxhil.mechanism_file import load
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.uncertainty import draw
 from jaxhil.runtime import Controller
-from jaxhil.runtime.delay_bank import HYPOTHESES, DelayBank
-from jaxhil.runtime.force_depth_map import KNOTS, ForceDepthMap, Prior
-from jaxhil.scenario import build_scenarios
-from jaxhil.uncertainty import draw
+from jaxhil.runtime.laws.delay_bank import HYPOTHESES, DelayBank
+from jaxhil.runtime.laws.force_depth_map import KNOTS, ForceDepthMap, Prior
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.scenario import build_scenarios
 
 LAW, PERIOD, SPREAD, VARIANCE = "retrospective_delay_bank", 1e-3, 1e-3, 0.1**2
 PRIOR = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tuning.drivers import evaluations, saltelli_design, sobol_indices
+from tuning.statistics.sobol_indices import evaluations, saltelli_design, sobol_indices
 
 
 def ishigami(uniform):

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from jaxhil import evaluation
-from jaxhil.building import build_loop
 from jaxhil.compensators import COMPENSATORS
-from jaxhil.evaluation import evaluate
-from jaxhil.mechanism_file import load
-from jaxhil.scenario import build_scenarios
-from jaxhil.uncertainty import draw
-from tuning.tune import neutral_gains
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation import evaluation
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.scenario import build_scenarios
+from tuning.gains.tune import neutral_gains
 
 pytestmark = pytest.mark.users_options
 

@@ -10,11 +10,11 @@ from bundles import document, run_selftest, signed, small_files
 
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.runtime.faults import FAULTS
+from tuning.bundle import bundle, vectors
+from tuning.bundle.bundle import build_bundle, check_target, with_limits, write_bundle
+from tuning.bundle.writers import WRITERS
 from tuning.files import TEMPORARY
 from tuning.gain_file import load_gain_file, write_gain_file
-from tuning.rig import bundle, vectors
-from tuning.rig.bundle import build_bundle, check_target, with_limits, write_bundle
-from tuning.rig.writers import WRITERS
 
 pytestmark = [pytest.mark.usefixtures("no_cache"), pytest.mark.users_options]
 
@@ -35,7 +35,7 @@ def gains(tmp_path):
 def quick(monkeypatch):
     """Few vectors, and no limits worked out."""
     monkeypatch.setattr(vectors, "HOSTILE_RUNS", 4)
-    monkeypatch.setattr("tuning.commands.export._calibrated", lambda *given: (None, None))
+    monkeypatch.setattr("tuning.cli.commands.export._calibrated", lambda *given: (None, None))
 
 
 def refused(ran, *words):
@@ -113,7 +113,7 @@ def test_what_differs_from_the_simulation_is_not_written(jaxhil, gains, tmp_path
 
 def test_limits_that_stop_the_nominal_run_are_told(jaxhil, gains, tmp_path, quick, monkeypatch):
     limits = {"force_limit": 1.0}
-    monkeypatch.setattr("tuning.commands.export._calibrated", lambda *given: (limits, {}))
+    monkeypatch.setattr("tuning.cli.commands.export._calibrated", lambda *given: (limits, {}))
     ran = jaxhil("export", gains, "-o", tmp_path / "bundle")
     assert (
         ran.code == 1
@@ -133,7 +133,7 @@ def test_limits_come_from_the_sweep_that_is_named(jaxhil, gains, tmp_path, monke
         return SimpleNamespace(limits={"force_limit": 900.0, "velocity_limit": None}, rates=RATES)
 
     monkeypatch.setattr("tuning.sweeps.store.read_store", lambda folder: store)
-    monkeypatch.setattr("tuning.rig.calibration.calibrate", calibrate)
+    monkeypatch.setattr("tuning.watchdog.calibration.calibrate", calibrate)
     monkeypatch.setattr(vectors, "HOSTILE_RUNS", 4)
     ran = jaxhil(
         "export",

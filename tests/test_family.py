@@ -14,10 +14,10 @@ from family import LAWS, NUMBER, RANGES, family, texts, write
 from lanes import QUICK
 
 from jaxhil.compensators import COMPENSATORS
-from jaxhil.contact import LAWS as CONTACT_LAWS
-from jaxhil.contact import ContactParameters
-from jaxhil.mechanism_file import load
-from jaxhil.reference import Reference
+from jaxhil.contact.laws import LAWS as CONTACT_LAWS
+from jaxhil.contact.laws import ContactParameters
+from jaxhil.contact.reference import Reference
+from jaxhil.mechanism.file import load
 
 
 @pytest.fixture(scope="module")

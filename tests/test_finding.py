@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from lead_cases import lead_tasks
 
-from tuning import finding
-from tuning.finding import SCANNED, choose_starts, find, finish
-from tuning.objective import RMS, Objective
-from tuning.problems import spread_points
-from tuning.rounds import Start, solve_tasks
-from tuning.trial import Trial
+from tuning.gains import multistart as finding
+from tuning.gains.multistart import SCANNED, choose_starts, find, finish
+from tuning.gains.objective import RMS, Objective
+from tuning.gains.rounds import Start, solve_tasks
+from tuning.gains.tasks import spread_points
+from tuning.gains.validation import Trial
 
 
 @pytest.fixture(scope="module")

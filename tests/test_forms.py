@@ -5,13 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 from lanes import IDEAL, SECOND_ORDER, as_arrays, mechanism, run_rollout, validated
 
-from jaxhil.building import build_loop
-from jaxhil.contact import LAWS
-from jaxhil.evaluation import compare_with_reference, evaluate
-from jaxhil.scenario import build_scenarios
-from jaxhil.uncertainty import draw
+from jaxhil.contact.laws import LAWS
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.evaluation import compare_with_reference, evaluate
+from jaxhil.simulation.scenario import build_scenarios
 from tuning.batches import join
-from tuning.forms import forms
+from tuning.gains.common_program import forms
 
 SPREAD = {"contact.stiffness": {"distribution": "uniform", "factor": [0.5, 2.0]}}
 CONTACTS = {

@@ -16,9 +16,9 @@ from scipy import optimize
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.compensators.response_error import typical_stiffness
 from jaxhil.errors import InputError
-from jaxhil.mechanism_file import builtin_names, load
+from jaxhil.mechanism.file import builtin_names, load
 from jaxhil.runtime import Controller, digest
-from jaxhil.scenario import build_scenarios
+from jaxhil.simulation.scenario import build_scenarios
 from tuning.gain_file import (
     build_document,
     check_document,

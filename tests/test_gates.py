@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxhil.compensators.gates import gate, share_beyond
-from jaxhil.contact import deflection
-from jaxhil.runtime import gates as on_the_rig
+from jaxhil.contact.laws import deflection
+from jaxhil.runtime.laws import gates as on_the_rig
 
 CLEARANCE = 3.0
 TICKS = np.arange(-4, 40)

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from lanes import QUICK, join, run_record
 
-from jaxhil.building import build_loop
 from jaxhil.compensators import COMPENSATORS
-from jaxhil.mechanism_file import load
-from jaxhil.metrics import OK
-from jaxhil.rollout import rollout
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.uncertainty import draw
 from jaxhil.runtime.filters import DelayLine
-from jaxhil.scenario import build_scenarios
-from jaxhil.uncertainty import draw
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.metrics import OK
+from jaxhil.simulation.rollout import rollout
+from jaxhil.simulation.scenario import build_scenarios
 
 SCENARIOS = 200
 SPARE = 16  # scenarios drawn beyond, for those whose contact ends late or never under their gains

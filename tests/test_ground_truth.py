@@ -25,7 +25,7 @@ from lanes import (
 )
 from scipy.special import lambertw
 
-from jaxhil.building import build_loop
+from jaxhil.simulation.building import build_loop
 
 OMEGA = 2 * pi * 3.0
 STIFFNESS = MASS * OMEGA**2

@@ -8,20 +8,20 @@ import pytest
 from lanes import IDEAL, mechanism, validated
 from scipy.integrate import solve_ivp
 
-from jaxhil.building import build_loop
 from jaxhil.compensators import COMPENSATORS
-from jaxhil.evaluation import evaluate
-from jaxhil.mechanism_file import load
-from jaxhil.uncertainty import draw
-from tuning import pareto
-from tuning.comparison.probing import SIZE, WIDTH
-from tuning.honesty import COPIES, are_copies, default_weights, honesty_figures, probed_scenarios
-from tuning.objective import Objective, contact_terms, objective_value
-from tuning.pareto import HONESTY, PEAK, default_axis, fronts
-from tuning.problems import build_task
-from tuning.rounds import solve_tasks
-from tuning.trial import Trial
-from tuning.tune import Settings, tune
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.evaluation import evaluate
+from tuning.gains import pareto
+from tuning.gains.objective import Objective, contact_terms, objective_value
+from tuning.gains.pareto import HONESTY, PEAK, default_axis, fronts
+from tuning.gains.rounds import solve_tasks
+from tuning.gains.tasks import build_task
+from tuning.gains.tune import Settings, tune
+from tuning.gains.validation import Trial
+from tuning.transparency.probes import COPIES, are_copies, default_weights, honesty_figures, probed_scenarios
+from tuning.transparency.pushes import SIZE, WIDTH
 
 DAMPED = load("varying", ["contact.stiffness=[1e5]", "approach.contacts=1"]).mechanism
 HONEST = Objective(command_weight=0.02, honesty_weight=0.7)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxhil.compensators.identification import Identified, update
-from jaxhil.runtime.identification import ContactIdentification
+from jaxhil.runtime.laws.identification import ContactIdentification
 
 INITIAL = (2.0, -1.0)
 VARIANCES = (5.0, 0.5)

@@ -15,8 +15,9 @@ from c99_cases import RESULT, ROW, assert_same, controller_in_python, packed
 from rig_lock_step import controller
 
 from jaxhil.compensators import literature_gains
-from jaxhil.mechanism import Mechanism
-from jaxhil.mechanism_file import load, to_builtins
+from jaxhil.mechanism.file import load, to_builtins
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.uncertainty import draw
 from jaxhil.runtime import COMPENSATORS, Controller
 from jaxhil.runtime.faults import LAW_IN_DOUBT, RESTITUTION, names
 from jaxhil.runtime.gain_file import GainFile
@@ -35,7 +36,6 @@ from jaxhil.runtime.law_status import (
     StatusCount,
 )
 from jaxhil.runtime.limits import NO_LIMITS
-from jaxhil.uncertainty import draw
 from tuning.rig.plant import Plant
 from tuning.rig.udp_controller import NumericalModel
 

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lanes import mechanism, run_record
 
-from jaxhil.limits import limit_command
-from jaxhil.metrics import OK
+from jaxhil.simulation.metrics import OK
+from jaxhil.simulation.rate_limits import limit_command
 
 PERIOD, VELOCITY_LIMIT, ACCELERATION_LIMIT = 1e-3, 0.02, 0.5
 

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxhil.errors import InputError, one_line, shown
-from jaxhil.mechanism import Bodies, Mechanism, numeric_keys, value_at
-from jaxhil.mechanism_file import from_builtins, to_builtins
-from jaxhil.mechanism_rules import is_hurwitz
+from jaxhil.mechanism.file import from_builtins, to_builtins
+from jaxhil.mechanism.rules import is_hurwitz
+from jaxhil.mechanism.structs import Bodies, Mechanism, numeric_keys, value_at
 
 # Every key of the schema, apart from those that exclude each other.
 FULL = {

@@ -14,8 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from jaxhil.errors import InputError
-from jaxhil.mechanism import numeric_keys
-from jaxhil.mechanism_file import (
+from jaxhil.mechanism.file import (
     DEFAULT,
     MAX_BYTES,
     builtin_names,
@@ -25,6 +24,7 @@ from jaxhil.mechanism_file import (
     suite_names,
     to_builtins,
 )
+from jaxhil.mechanism.structs import numeric_keys
 
 TEXT = builtin_path("claw-350kg").read_text()
 
@@ -331,6 +331,6 @@ def test_every_numeric_key_can_be_overridden_or_says_why(path):
 
 
 def test_reading_needs_no_jax():
-    code = "import sys, jaxhil.mechanism_file, jaxhil.uncertainty; sys.exit('jax' in sys.modules)"
+    code = "import sys, jaxhil.mechanism.file, jaxhil.mechanism.uncertainty; sys.exit('jax' in sys.modules)"
     root = Path(__file__).parent.parent
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0

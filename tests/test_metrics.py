@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from lanes import QUICK, first_contact, join, mechanism, nominal_gains, spread, validated
 
-from jaxhil.building import build_loop
 from jaxhil.compensators import Constants, Signals
-from jaxhil.metrics import build_rules, collect, empty_metrics, fresh_watch, observe
-from jaxhil.scenario import build_scenarios
-from jaxhil.touch import Truth
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.contact_force import Truth
+from jaxhil.simulation.metrics import build_rules, collect, empty_metrics, fresh_watch, observe
+from jaxhil.simulation.scenario import build_scenarios
 
 PARSED = validated(mechanism({}))
 SCENARIO = join([build_scenarios(PARSED)])

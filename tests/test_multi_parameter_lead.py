@@ -14,7 +14,7 @@ from noise_cases import check_amplification
 from jaxhil.compensators import COMPENSATORS, Constants, literature_gains
 from jaxhil.compensators.multi_parameter_lead import pole_placement
 from jaxhil.errors import InputError
-from jaxhil.mechanism_file import builtin_names, load
+from jaxhil.mechanism.file import builtin_names, load
 
 FREQUENCIES = [0.5, 6.0, 18.8, 300.0]
 DELAYS = [0.0, 1e-4, 0.008, 0.05]

@@ -10,15 +10,15 @@ import pytest
 from lanes import QUICK, join, mechanism, nominal_gains, per_lane, run_record, spread, validated
 from scipy.signal import bilinear, lfilter
 
-from jaxhil.building import build_loop
 from jaxhil.compensators import COMPENSATORS, Constants
 from jaxhil.errors import InputError
-from jaxhil.evaluation import evaluate
-from jaxhil.loop import build_rig
-from jaxhil.mechanism_file import load
-from jaxhil.scenario import build_scenarios
-from jaxhil.uncertainty import draw
-from tuning.objective import (
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.loop import build_rig
+from jaxhil.simulation.scenario import build_scenarios
+from tuning.gains.objective import (
     FAILED,
     OBJECTIVES,
     POWERS,

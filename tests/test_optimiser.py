@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from tuning.box import Bounds, to_gains, to_shares
-from tuning.optimiser import STATUSES, _with_jacobian, solve
+from tuning.optimisation.levenberg_marquardt import STATUSES, _with_jacobian, solve
+from tuning.optimisation.unit_box import Bounds, to_gains, to_shares
 
 BOUNDS = Bounds(np.array([0.0, 1e-3]), np.array([2.0, 10.0]), np.array([0.0, 1.0]))
 

@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 from scipy.signal import bilinear, lfilter
 
-from jaxhil.building import build_loop
 from jaxhil.compensators import COMPENSATORS, literature_gains
-from jaxhil.evaluation import evaluate
-from jaxhil.mechanism_file import load
-from jaxhil.scenario import build_scenarios
-from jaxhil.uncertainty import draw
-from tuning import pareto, programs
-from tuning.objective import Objective, objective_value
-from tuning.pareto import ENDS, amplification, dominated, fronts, has_trade_off, ladder
-from tuning.problems import build_task
-from tuning.trial import VALIDATION_SEED, Trial
-from tuning.tune import Settings, tune_all
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.scenario import build_scenarios
+from tuning import program_cache as programs
+from tuning.gains import pareto
+from tuning.gains.objective import Objective, objective_value
+from tuning.gains.pareto import ENDS, amplification, dominated, fronts, has_trade_off, ladder
+from tuning.gains.tasks import build_task
+from tuning.gains.tune import Settings, tune_all
+from tuning.gains.validation import VALIDATION_SEED, Trial
 
 POINTS = 5
 SETTINGS = Settings(

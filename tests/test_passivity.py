@@ -21,9 +21,9 @@ from lanes import (
     validated,
 )
 
-from jaxhil.building import build_loop
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
+from jaxhil.simulation.building import build_loop
 
 LAW = COMPENSATORS["passivity"]
 EPSILON = 2.0**-52

@@ -9,12 +9,12 @@ from cases import CASES, oracle_contacts, run_oracle
 from lanes import as_arrays, join, nominal_gains, run_rollout, validated
 from rig_lock_step import closed_loop
 
-from jaxhil.building import build_loop
 from jaxhil.compensators import literature_gains
-from jaxhil.mechanism_file import builtin_names, from_builtins, load
-from jaxhil.metrics import OK
+from jaxhil.mechanism.file import builtin_names, from_builtins, load
 from jaxhil.runtime import COMPENSATORS
-from jaxhil.scenario import build_scenarios
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.metrics import OK
+from jaxhil.simulation.scenario import build_scenarios
 from tuning.rig.plant import Plant
 from tuning.rig.propagation import split_delay
 

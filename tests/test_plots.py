@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-from jaxhil.contact import LAWS
-from jaxhil.evaluation import Outcome, parameters_by_slot
-from jaxhil.mechanism_file import load
-from jaxhil.metrics import Metrics
-from jaxhil.scenario import build_scenarios
-from jaxhil.uncertainty import draw
-from tuning.motion import Curve, Piece, _space
-from tuning.pareto import Front, Point
-from tuning.plots import STYLES, contact_plot, errors_plot, front_plot, loss_plot, save
-from tuning.tune import Result, Settings, Start, figures
+from jaxhil.contact.laws import LAWS
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation.evaluation import Outcome, parameters_by_slot
+from jaxhil.simulation.metrics import Metrics
+from jaxhil.simulation.scenario import build_scenarios
+from tuning.gains.pareto import Front, Point
+from tuning.gains.tune import Result, Settings, Start, figures
+from tuning.pictures.motion import Curve, Piece, _space
+from tuning.pictures.plots import STYLES, contact_plot, errors_plot, front_plot, loss_plot, save
 
 LANES = 40
 

@@ -23,16 +23,16 @@ from lanes import (
     validated,
 )
 
-from jaxhil.building import build_loop
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.compensators.estimates import simulator_inverse
-from jaxhil.mechanism_file import builtin_names, load
+from jaxhil.mechanism.file import builtin_names, load
+from jaxhil.simulation.building import build_loop
+from tuning.bundle.vectors import make_vectors
 from tuning.gain_file import build_document, check_document
-from tuning.recording import nominal_and_draws, record_lanes
-from tuning.rig.calibration import calibrate
-from tuning.rig.recorded import Scenarios, recorded_chunks
-from tuning.rig.vectors import make_vectors
-from tuning.verification import verify
+from tuning.verification.recording import nominal_and_draws, record_lanes
+from tuning.verification.replay import verify
+from tuning.watchdog.calibration import calibrate
+from tuning.watchdog.recorded import Scenarios, recorded_chunks
 
 EXACT = {"model": "second_order", "natural_frequency": 12.0, "damping_ratio": 0.8}
 PERIODS = np.array([2e-3, 1e-3, 5e-4, 2.5e-4])
@@ -150,7 +150,7 @@ def test_verification_sees_a_position_command_that_is_wrong(monkeypatch):
     assert good.replay[0].position_difference < 1e-11
     vectors = make_vectors(loaded, seed=1, draws=0)
     assert not vectors.reasons
-    from jaxhil.runtime.position_lead import PositionLead
+    from jaxhil.runtime.laws.position_lead import PositionLead
 
     right = PositionLead.position_command
     monkeypatch.setattr(PositionLead, "position_command", lambda *args: right(*args) + 1e-12)

@@ -6,9 +6,9 @@ import pytest
 from lanes import IDEAL, SECOND_ORDER, mechanism, nominal_gains, run_rollout, validated
 from scipy.integrate import quad
 
-from jaxhil.building import build_loop
-from jaxhil.probe import Probe, Push
-from jaxhil.scenario import build_scenarios
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.probe import Probe, Push
+from jaxhil.simulation.scenario import build_scenarios
 
 PUSH = Push(jnp.array(3.0), jnp.array(0.05), jnp.array(0.02))
 TIMES = np.array([-0.01, 0.0, 0.04, 0.0433, 0.05, 0.0571, 0.06, 0.065, 0.2])

@@ -10,8 +10,8 @@ import pytest
 from compiling import overridden
 from jax.sharding import AxisType, PartitionSpec
 
-from jaxhil.contact import LAWS, HuntCrossley, KelvinVoigt
-from tuning import programs
+from jaxhil.contact.laws import LAWS, HuntCrossley, KelvinVoigt
+from tuning import program_cache as programs
 
 pytestmark = pytest.mark.users_options
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tuning.quantiles import (
+from tuning.statistics.quantiles import (
     BINS,
     EDGES,
     RESOLUTION,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tuning.rare import subset_simulation, to_uniform
-from tuning.verdict import binomial_interval
+from tuning.statistics.intervals import binomial_interval
+from tuning.statistics.subset_simulation import subset_simulation, to_uniform
 
 
 def plane(inputs):

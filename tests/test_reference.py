@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.special import beta
 
-from jaxhil.reference import Reference, hunt_crossley, kelvin_voigt, piecewise_linear
+from jaxhil.contact.reference import Reference, hunt_crossley, kelvin_voigt, piecewise_linear
 
 MASS, STIFFNESS, VELOCITY = 325.0, 124355.0, 0.01
 PERIOD = np.sqrt(MASS / STIFFNESS)

@@ -9,8 +9,8 @@ import pytest
 from lanes import QUICK
 from scipy.integrate import solve_ivp
 
-from jaxhil.contact import LAWS, ContactParameters
-from jaxhil.reference_motion import TOLERANCE, integrate_contact
+from jaxhil.contact.laws import LAWS, ContactParameters
+from jaxhil.contact.reference_motion import TOLERANCE, integrate_contact
 
 MASS, STIFFNESS, VELOCITY = 350.0, 124355.0, 0.005
 OMEGA = np.sqrt(STIFFNESS / MASS)

@@ -11,20 +11,20 @@ from lanes import as_arrays, join, nominal_gains, run_rollout
 from lanes import mechanism as plain_mechanism
 from scipy import stats
 
-from jaxhil.building import build_loop
 from jaxhil.compensators import COMPENSATORS, literature_gains
 from jaxhil.compensators import force_depth_map as in_jax
 from jaxhil.compensators.reintegration import HISTORY
-from jaxhil.evaluation import compare_with_reference
-from jaxhil.mechanism_file import load
-from jaxhil.rollout import rollout
-from jaxhil.runtime import reintegration
-from jaxhil.runtime.force_depth_map import KNOTS, Curve, ForceDepthMap, Prior, positive_mean
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.uncertainty import draw
 from jaxhil.runtime.law_status import IDENTIFIED, OUT_OF_CONTACT, SATURATED, TOO_SHORT, UNSURE
-from jaxhil.runtime.reintegration import ReferenceMotion
-from jaxhil.runtime.retrospective_reference import RetrospectiveReference
-from jaxhil.scenario import build_scenarios
-from jaxhil.uncertainty import draw
+from jaxhil.runtime.laws import reintegration
+from jaxhil.runtime.laws.force_depth_map import KNOTS, Curve, ForceDepthMap, Prior, positive_mean
+from jaxhil.runtime.laws.reintegration import ReferenceMotion
+from jaxhil.runtime.laws.retrospective_reference import RetrospectiveReference
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.evaluation import compare_with_reference
+from jaxhil.simulation.rollout import rollout
+from jaxhil.simulation.scenario import build_scenarios
 
 NAME, PERIOD = "retrospective_reference", 1e-3
 PRIOR = {

@@ -11,27 +11,27 @@ from sweep_cases import manifest as sweep_manifest
 
 from jaxhil.compensators import literature_gains
 from jaxhil.errors import InputError
-from jaxhil.mechanism_file import load
-from jaxhil.metrics import OK
+from jaxhil.mechanism.file import load
 from jaxhil.runtime.law_status import UNSTATED
 from jaxhil.runtime.limits import LIMITS, complete
 from jaxhil.runtime.watchdog import Watchdog
+from jaxhil.simulation.metrics import OK
+from tuning.bundle.bundle import limits_section
 from tuning.gain_file import build_document, check_document
-from tuning.rig.audited import audit_contacts, first_reached
-from tuning.rig.bundle import limits_section
-from tuning.rig.calibration import (
+from tuning.sweeps.run import run_sweep
+from tuning.sweeps.store import open_store, read_part
+from tuning.watchdog.audited import audit_contacts, first_reached
+from tuning.watchdog.calibration import (
     calibrate,
     good_runs,
     guard_limits,
     judge_chunk,
     watchdog_rules,
 )
-from tuning.rig.expectation import TERMS, Expectation, Features, expected_restitution, fit_expectation
-from tuning.rig.extent import extent_of
-from tuning.rig.recorded import Scenarios, Signals, recorded_chunks
-from tuning.rig.replayed import limited_controller, replay_lane
-from tuning.sweeps.run import run_sweep
-from tuning.sweeps.store import open_store, read_part
+from tuning.watchdog.expectation import TERMS, Expectation, Features, expected_restitution, fit_expectation
+from tuning.watchdog.extent import extent_of
+from tuning.watchdog.recorded import Scenarios, Signals, recorded_chunks
+from tuning.watchdog.replayed import limited_controller, replay_lane
 
 DAMPING = {"contact.damping": {"distribution": "loguniform", "factor": [0.5, 2.0]}}
 LIMIT = 0.02

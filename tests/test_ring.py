@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxhil.ring import look_back, tie, write, write_in_turn
+from jaxhil.ring_buffer import look_back, tie, write, write_in_turn
 
 SAMPLES, LANES = 8, 3
 

@@ -26,11 +26,11 @@ from lanes import (
     validated,
 )
 
-from jaxhil.building import build_loop
-from jaxhil.metrics import DIVERGED, NON_FINITE, NOT_REACHED, OK, TIMEOUT
-from jaxhil.rollout import rollout, stretch_length
-from jaxhil.scenario import build_scenarios
-from jaxhil.sensors import draw_noise
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.metrics import DIVERGED, NON_FINITE, NOT_REACHED, OK, TIMEOUT
+from jaxhil.simulation.rollout import rollout, stretch_length
+from jaxhil.simulation.scenario import build_scenarios
+from jaxhil.simulation.sensors import draw_noise
 
 # Parabolas stand for the force that a lagging sensor follows; of restitution.
 ACCURACY = {

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from lead_cases import lead_tasks
 
-from jaxhil.evaluation import evaluate
-from tuning import rounds
-from tuning.box import to_shares
-from tuning.objective import RMS, Objective, objective_value
-from tuning.problems import alike, gain_bounds, spread_points, tuned_names
-from tuning.rounds import GIVEN_UP, solve_tasks
-from tuning.trial import Trial
+from jaxhil.simulation.evaluation import evaluate
+from tuning.gains import rounds
+from tuning.gains.objective import RMS, Objective, objective_value
+from tuning.gains.rounds import GIVEN_UP, solve_tasks
+from tuning.gains.tasks import alike, gain_bounds, spread_points, tuned_names
+from tuning.gains.validation import Trial
+from tuning.optimisation.unit_box import to_shares
 
 STARTS, STEPS = 5, 14
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import jaxhil.runtime
 from jaxhil.runtime import Controller, GainFileError, digest
 from jaxhil.runtime.filters import DelayLine, LeadFilter, VelocityFilter
-from jaxhil.runtime.identification import ContactIdentification
+from jaxhil.runtime.laws.identification import ContactIdentification
 
 RUNTIME = Path(jaxhil.runtime.__file__).parent
 Reading = tuple[float, float, float, float]

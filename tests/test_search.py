@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tuning.search import certify, mirror, polish
+from tuning.optimisation.derivative_free import certify, mirror, polish
 
 
 def rosenbrock(points):

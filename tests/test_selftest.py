@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from bundles import TICKS, run_selftest, signed, small_files
 
-from tuning.rig import selftest
-from tuning.rig.manifest import is_text
+from tuning.bundle import selftest
+from tuning.bundle.manifest import is_text
 
 MUTATIONS = 80  # of each text file
 OWN_MUTATIONS = 40  # of the self-test itself, each in a process of its own

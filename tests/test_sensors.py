@@ -6,7 +6,7 @@ import pytest
 from jax.extend.random import threefry_2x32
 from scipy.stats import kstest
 
-from jaxhil.sensors import threefry, white_noise
+from jaxhil.simulation.sensors import threefry, white_noise
 
 
 # Of the authors' library, Random123: key, counter, result.

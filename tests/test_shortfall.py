@@ -15,9 +15,9 @@ from cases import Case
 from lanes import SECOND_ORDER, VELOCITY, mechanism, run_rollout
 
 from jaxhil.compensators.none import NoCompensator
-from jaxhil.loop import build_rig
-from jaxhil.metrics import OK
-from jaxhil.rollout import start
+from jaxhil.simulation.loop import build_rig
+from jaxhil.simulation.metrics import OK
+from jaxhil.simulation.rollout import start
 
 LATE = 0.011  # s of force delay: uncompensated, a contact ends faster than it begins
 LIMITS = {  # m/s, and whether it binds

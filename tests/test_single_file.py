@@ -13,7 +13,7 @@ from gain_documents import gain_document
 
 from jaxhil.runtime import COMPENSATORS, Controller
 from jaxhil.runtime.laws import NEED_NUMPY
-from tuning.rig.single_file import runtime_source
+from tuning.bundle.single_file import runtime_source
 
 
 @pytest.fixture(scope="module", params=sorted(COMPENSATORS))
@@ -101,8 +101,8 @@ def package(tmp_path, monkeypatch):
 
 MODULES = {
     "__init__": (
-        "from . import first, second\nfrom .controller import Controller\n"
-        "from .registry import COMPENSATORS\n__all__ = ['COMPENSATORS', 'Controller', 'first', 'second']\n"
+        "from .first import First\nfrom .second import Second\nfrom .controller import Controller\n"
+        "from .registry import COMPENSATORS\n__all__ = ['COMPENSATORS', 'Controller']\n"
     ),
     "registry": (
         "COMPENSATORS = {}\n\ndef register(name):\n    def enter(law):\n        COMPENSATORS[name] = law\n"
@@ -120,38 +120,18 @@ def run_source(text):
     return namespace
 
 
-def test_equal_names_of_two_modules_stay_apart(package):
+def test_a_law_brings_along_what_it_imports_and_no_other_law(package):
     made = package(
-        faults="import math as m\nfrom math import floor\nLIMIT = 3\n\ndef _number(value):\n"
-        "    # LIMIT stays in comments, and in 'LIMIT'.\n    return f'{LIMIT + floor(value)} {m.inf}'\n",
-        controller=(
-            "import cmath as m\nfrom . import faults\nfrom .faults import LIMIT as MOST, _number as other\n"
-            "from .registry import COMPENSATORS\n\nLIMIT = 5\n\ndef floor(value):\n    return LIMIT\n\n"
-            "def _number(LIMIT, floor=lambda LIMIT: LIMIT):\n    total = [LIMIT for LIMIT in range(LIMIT)]\n"
-            "    return total, floor(LIMIT)\n\nclass Controller:\n    LIMIT = 7\n    laws = COMPENSATORS\n\n"
-            "    def answers(self):\n        return (LIMIT, MOST, faults.LIMIT, faults._number(2.5), "
-            "other(1), _number(2), floor(1), f'{_number(LIMIT=1)} {LIMIT!r}', m.phase(1))\n"
-        ),
-    )
-    text = runtime_source("second", made)
-    made_of_it = run_source(text)
-    expected = (5, 3, 3, "5 inf", "4 inf", ([0, 1], 2), 5, "([0], 1) 5", 0.0)
-    assert made.Controller().answers() == expected
-    assert made_of_it["Controller"]().answers() == expected
-    assert made_of_it["Controller"].LIMIT == 7
-    assert [law.number for law in made_of_it["Controller"].laws.values()] == [2]
-    assert "# LIMIT stays in comments, and in 'LIMIT'." in text
-    assert "First" not in text and made_of_it["__all__"] == ["COMPENSATORS", "Controller"]
-
-
-def test_a_law_brings_along_what_it_imports(package):
-    made = package(
-        shared="SHARED = 4\n",
+        shared="import math as m\nSHARED = 4 * m.floor(1.5)  # a comment stays\n",
         second="from .registry import register\nfrom .shared import SHARED\n\n@register('second')\n"
         "class Second:\n    number = SHARED\n",
     )
     assert "SHARED" not in runtime_source("first", made)
-    assert run_source(runtime_source("second", made))["COMPENSATORS"]["second"].number == 4
+    text = runtime_source("second", made)
+    in_one_file = run_source(text)
+    assert in_one_file["COMPENSATORS"]["second"].number == 4
+    assert "First" not in text and in_one_file["__all__"] == ["COMPENSATORS", "Controller"]
+    assert "# a comment stays" in text
 
 
 @pytest.mark.parametrize(
@@ -159,19 +139,20 @@ def test_a_law_brings_along_what_it_imports(package):
     [
         ("import scipy\n", "scipy"),
         ("def f():\n    from .registry import COMPENSATORS\n", "within a block"),
-        ("from . import registry\nprint(registry)\n", "the module registry itself"),
-        ("from . import registry\nX = registry.NOTHING\n", "registry.NOTHING"),
+        ("from . import registry\n", "allowed names of a module"),
+        ("from .registry import register as enter\n", "under no other name"),
         ("from .circle import A\n", "import each other"),
-        (
-            "from .second import Second as enter\nSecond = 3\nclass A:\n    Second = Second\n",
-            "the class's own",
-        ),
+        ("def register():\n    pass\n", "register: found in registry and in controller, allowed once"),
+        ("import re as register\n", "register: found in registry and in import re as register"),
+        ("from .same import X\nimport cmath as m\n", "m: found in import math as m and in import cmath as m"),
+        ("for register in (): pass\n", "register: found in registry and in controller"),
     ],
 )
 def test_what_cannot_be_in_one_file_is_refused(package, controller, reason):
     made = package()
     folder = Path(made.__file__).parent
     (folder / "circle.py").write_text("from .controller import B\n")
+    (folder / "same.py").write_text("import math as m\nX = m.inf\n")
     (folder / "controller.py").write_text(controller + "class Controller: pass\n")
     with pytest.raises(ValueError, match=reason):
         runtime_source("first", made)

@@ -11,8 +11,8 @@ from bundles import document
 from matplotlib import image
 
 from jaxhil.runtime.limits import LIMITS
-from tuning.rig.bundle import with_limits
-from tuning.rig.summary import COLOURS, picture_png, summary_html
+from tuning.bundle.bundle import with_limits
+from tuning.bundle.summary import COLOURS, picture_png, summary_html
 
 FIGURES = {
     "rms": 0.5, "p99": 1.25, "max": 1.5, "mean": 0.375, "diverging": 1.0, "peak_ratio": 1.75,

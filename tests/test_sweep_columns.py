@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from sweep_cases import case
 
-from jaxhil.evaluation import Outcome
-from jaxhil.mechanism_file import load
-from jaxhil.metrics import DIVERGED, NON_FINITE, NOT_REACHED, OK, TIMEOUT, Metrics
-from jaxhil.scenario import build_scenarios
+from jaxhil.mechanism.file import load
+from jaxhil.simulation.evaluation import Outcome
+from jaxhil.simulation.metrics import DIVERGED, NON_FINITE, NOT_REACHED, OK, TIMEOUT, Metrics
+from jaxhil.simulation.scenario import build_scenarios
 from tuning.gain_file import check_document
 from tuning.sweeps.columns import OUTCOMES, STATUSES, rows_of, sweep_columns, unit_of
 

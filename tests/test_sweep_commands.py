@@ -309,5 +309,7 @@ def test_what_cannot_be_is_refused(jaxhil, gains, store, tmp_path):
 
 def test_jax_is_not_imported_before_it_is_configured():
     # Its flags, and with them the last bits of every row, are read when it starts.
-    program = "import sys, tuning.commands.sweep, tuning.commands.replay; sys.exit('jax' in sys.modules)"
+    program = (
+        "import sys, tuning.cli.commands.sweep, tuning.cli.commands.replay; sys.exit('jax' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", program]).returncode == 0

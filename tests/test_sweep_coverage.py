@@ -15,9 +15,9 @@ from cases import IDEAL, MASS, STIFFNESS, mechanism, nominal_gains, validated
 from sweep_cases import manifest
 
 from tuning.gain_file import build_document
+from tuning.statistics.intervals import enough
 from tuning.sweeps.chunks import build_sweep, run_chunk
 from tuning.sweeps.tally import Probability, add_rows, empty_tally, failure_probability
-from tuning.verdict import enough
 
 pytestmark = pytest.mark.slow
 

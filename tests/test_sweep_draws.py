@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxhil.mechanism_file import load
+from jaxhil.mechanism.file import load
 from tuning.sweeps import SAMPLINGS
 from tuning.sweeps.draws import REPLICATES, drawn_scenarios, sobol_points
 

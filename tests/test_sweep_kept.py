@@ -14,7 +14,7 @@ from sweep_cases import case, manifest
 
 from jaxhil.errors import InputError
 from jaxhil.runtime import digest
-from tuning.rare import Rare
+from tuning.statistics.subset_simulation import Rare
 from tuning.sweeps.chunks import build_sweep
 from tuning.sweeps.kept import (
     DriversStudy,

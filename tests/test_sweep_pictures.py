@@ -10,13 +10,13 @@ from sweep_cases import case, manifest
 
 from tuning.__main__ import main
 from tuning.gain_file import check_document, write_gain_file
-from tuning.quantiles import EDGES
+from tuning.statistics.intervals import binomial_interval, replicate_interval
+from tuning.statistics.quantiles import EDGES
 from tuning.sweeps import pictures, regions
 from tuning.sweeps.chunks import build_sweep, run_chunk
 from tuning.sweeps.columns import OUTCOMES, STATUSES
 from tuning.sweeps.regions import add_rows, empty_regions, make_plan, quantile
 from tuning.sweeps.store import PICTURES
-from tuning.verdict import binomial_interval, replicate_interval
 
 NUMBER = 96
 LOST = {

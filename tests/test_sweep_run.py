@@ -15,11 +15,11 @@ from sweep_cases import case, manifest
 
 from jaxhil.errors import InputError
 from tuning.gain_file import write_gain_file
+from tuning.statistics.intervals import Running, enough, updated
 from tuning.sweeps.chunks import run_chunk
 from tuning.sweeps.replay import motion_of, replay
 from tuning.sweeps.run import compare_precisions, describe_outcomes, run_sweep
 from tuning.sweeps.store import open_store, read_part, read_store, same_rows
-from tuning.verdict import Running, enough, updated
 
 pytestmark = pytest.mark.users_options
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from sweep_cases import NOISY, UNCERTAIN, case, manifest
 
-from jaxhil.uncertainty import dimensions
-from tuning.drivers import evaluations
+from jaxhil.mechanism.uncertainty import dimensions
+from tuning.statistics.sobol_indices import evaluations
 from tuning.sweeps.chunks import build_sweep, run_chunk
 from tuning.sweeps.studies import NOISE, error_drivers, rare_failure, run_points, spread_beyond_formula
 from tuning.sweeps.tally import add_rows, empty_tally, error_sizes, failure_probability

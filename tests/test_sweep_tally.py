@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from tuning.quantiles import quantile
+from tuning.statistics.intervals import Running, confidence_sequence, replicate_interval, updated
+from tuning.statistics.quantiles import quantile
 from tuning.sweeps.columns import GOOD, OUTCOMES
 from tuning.sweeps.tally import (
     ORDERS,
@@ -14,7 +15,6 @@ from tuning.sweeps.tally import (
     error_sizes,
     failure_probability,
 )
-from tuning.verdict import Running, confidence_sequence, replicate_interval, updated
 
 
 def made_up(number, seed=0, share=0.3):

@@ -44,10 +44,10 @@ class Toy(Compensator):
         share = gains["toy_share"]
         return jnp.sqrt((1 + share) ** 2 + share**2)
 ''',
-    "jaxhil/runtime/toy.py": '''
+    "jaxhil/runtime/laws/toy.py": '''
 """A toy: F_c = F + toy_share (F - F of the tick before)."""
 
-from .registry import Compensator, GainSpecification, register
+from ..registry import Compensator, GainSpecification, register
 
 
 @register("toy")
@@ -97,12 +97,12 @@ def copied(tmp_path):
     shutil.copy(ROOT / "pyproject.toml", folder)
     for name, text in FILES.items():
         (folder / name).write_text(text.lstrip())
-    text = (folder / "jaxhil/c99/none.c").read_text()
+    text = (folder / "jaxhil/c99/laws/none.c").read_text()
     for before, after in IN_C.items():
         assert text.count(before) == 1, before
         text = text.replace(before, after)
-    (folder / "jaxhil/c99/toy.c").write_text(text)
-    laws = folder / "jaxhil/runtime/laws.py"
+    (folder / "jaxhil/c99/laws/toy.c").write_text(text)
+    laws = folder / "jaxhil/runtime/laws/__init__.py"
     text, entries = re.subn(r'\n    "none",\n', r'\n    "none",\n    "toy",\n', laws.read_text())
     assert entries == 1
     laws.write_text(text)

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from jaxhil.compensators import COMPENSATORS, literature_gains
-from jaxhil.evaluation import evaluate
-from jaxhil.mechanism_file import builtin_names, load
-from tuning import tune
-from tuning.finding import choose_starts
-from tuning.objective import RMS, objective_value
-from tuning.problems import build_task
-from tuning.rounds import solve_tasks
-from tuning.transfer import Tuned, carry_over, distance, nearest, traits
-from tuning.trial import Trial
+from jaxhil.mechanism.file import builtin_names, load
+from jaxhil.simulation.evaluation import evaluate
+from tuning.gains import tune
+from tuning.gains.multistart import choose_starts
+from tuning.gains.objective import RMS, objective_value
+from tuning.gains.rounds import solve_tasks
+from tuning.gains.tasks import build_task
+from tuning.gains.transfer import Tuned, carry_over, distance, nearest, traits
+from tuning.gains.validation import Trial
 
 MASS, STIFFNESS = 350.0, 124355.0
 OMEGA = math.sqrt(STIFFNESS / MASS)

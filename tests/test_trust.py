@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from tuning.trust import RISE, freedom, interval, sensitivity
+from tuning.optimisation.sensitivity import RISE, freedom, sensitivity
+from tuning.statistics.bootstrap import interval
 
 STIFF_ENOUGH = 0.05  # the box adds its square to the region, relatively
 

@@ -5,16 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxhil.building import build_loop
 from jaxhil.compensators import COMPENSATORS
-from jaxhil.evaluation import evaluate
-from jaxhil.mechanism_file import load
-from jaxhil.scenario import build_scenarios
-from jaxhil.uncertainty import draw
-from tuning.box import to_gains, to_shares
-from tuning.finding import LOTS, choose_starts
-from tuning.optimiser import STATUSES
-from tuning.problems import (
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.scenario import build_scenarios
+from tuning.gains.multistart import LOTS, choose_starts
+from tuning.gains.rounds import solve_tasks
+from tuning.gains.tasks import (
     NOISY_SCENARIOS,
     SCENARIOS,
     build_task,
@@ -22,9 +21,10 @@ from tuning.problems import (
     spread_points,
     tuned_names,
 )
-from tuning.rounds import solve_tasks
-from tuning.trial import Trial
-from tuning.tune import Settings, figures, tune, uncompensated
+from tuning.gains.tune import Settings, figures, tune, uncompensated
+from tuning.gains.validation import Trial
+from tuning.optimisation.levenberg_marquardt import STATUSES
+from tuning.optimisation.unit_box import to_gains, to_shares
 
 SMALL = Settings(scenarios=16, starts=2, steps=12, validation=63)
 

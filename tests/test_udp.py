@@ -20,11 +20,28 @@ from hypothesis import strategies as st
 from rig_lock_step import closed_loop, controller, packets
 
 from jaxhil.compensators import literature_gains
-from jaxhil.mechanism_file import load, to_builtins
+from jaxhil.mechanism.file import load, to_builtins
 from jaxhil.runtime import faults
 from tuning.gain_file import build_document, write_gain_file
 from tuning.rig import udp_controller
 from tuning.rig.contact_watch import ContactResult
+from tuning.rig.hardware import BRIDGED
+from tuning.rig.loop import EmptyTask, Timing, answered_by, play
+from tuning.rig.network import Injection, Network
+from tuning.rig.report import reference_restitutions, stalled
+from tuning.rig.session import (
+    CONTROLLER,
+    INJECTED,
+    MACHINE,
+    MET,
+    SOURCE,
+    LoopReport,
+    Setup,
+    attribute,
+    listening_port,
+    quantiles,
+    start_controller,
+)
 from tuning.rig.udp_controller import (
     FLAGS,
     MISSED_TICK,
@@ -44,23 +61,6 @@ from tuning.rig.udp_controller import (
     encode_answer,
     encode_reading,
     replayed,
-)
-from tuning.rig.udp_loop import EmptyTask, Timing, answered_by, play
-from tuning.rig.udp_network import Injection, Network
-from tuning.rig.udp_report import reference_restitutions, stalled
-from tuning.rig.udp_rig import BRIDGED
-from tuning.rig.udp_session import (
-    CONTROLLER,
-    INJECTED,
-    MACHINE,
-    MET,
-    SOURCE,
-    LoopReport,
-    Setup,
-    attribute,
-    listening_port,
-    quantiles,
-    start_controller,
 )
 
 ROOT = Path(__file__).parents[1]
@@ -669,7 +669,7 @@ def test_help_of_rig_has_an_example(jaxhil):
 
 def test_the_loop_runs_without_jax():
     program = (
-        "import sys, tuning.commands.rig as command, tuning.rig.udp_session, tuning.rig.udp_report\n"
+        "import sys, tuning.cli.commands.rig as command, tuning.rig.session, tuning.rig.report\n"
         "assert 'jax' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from jaxhil.errors import InputError
-from jaxhil.mechanism import numeric_keys
-from jaxhil.mechanism_file import builtin_names, from_builtins, load, to_builtins
-from jaxhil.uncertainty import PHASE, at_points, dimensions, draw, extremes, quasi_random
+from jaxhil.mechanism.file import builtin_names, from_builtins, load, to_builtins
+from jaxhil.mechanism.structs import numeric_keys
+from jaxhil.mechanism.uncertainty import PHASE, at_points, dimensions, draw, extremes, quasi_random
 
 CERTAIN = ["uncertainty={}", "contact.damping=[1.0, 2.0]"]
 BASE = to_builtins(load("varying", CERTAIN).mechanism)

@@ -6,7 +6,7 @@ from scipy import integrate, stats
 from scipy.special import ndtri
 from scipy.stats import qmc
 
-from tuning.verdict import (
+from tuning.statistics.intervals import (
     Interval,
     Running,
     binomial_interval,

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from jaxhil.compensators import COMPENSATORS, Signals
-from jaxhil.mechanism_file import load
-from jaxhil.metrics import OK
+from jaxhil.mechanism.file import load
 from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
 from jaxhil.runtime import Controller
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
+from jaxhil.simulation.metrics import OK
 from tuning.gain_file import build_document, check_document
-from tuning.recording import Lane, nominal_and_draws, record_lanes
-from tuning.verification import near_threshold, replay, replayed, verify
+from tuning.verification.recording import Lane, nominal_and_draws, record_lanes
+from tuning.verification.replay import near_threshold, replay, replayed, verify
 
 pytestmark = pytest.mark.users_options
 

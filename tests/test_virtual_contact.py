@@ -12,7 +12,7 @@ from lanes import MASS
 
 from jaxhil.compensators import literature_gains
 from jaxhil.compensators.virtual_contact import damping_at_the_limit
-from jaxhil.mechanism_file import load
+from jaxhil.mechanism.file import load
 
 
 @given(

@@ -30,18 +30,18 @@ from cases import SECOND_ORDER, mechanism, nominal_gains, validated
 from sweep_cases import NOISY, UNCERTAIN
 
 from jaxhil.compensators import literature_gains
-from jaxhil.integrators import INTEGRATORS
-from jaxhil.mechanism import Mechanism
-from jaxhil.mechanism_file import DEFAULT, load
-from jaxhil.metrics import OK
+from jaxhil.mechanism.file import DEFAULT, load
+from jaxhil.mechanism.structs import Mechanism
 from jaxhil.runtime import digest
 from jaxhil.runtime.faults import RESTITUTION, names
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
+from jaxhil.simulation.integrators import INTEGRATORS
+from jaxhil.simulation.metrics import OK
+from tuning.bundle.bundle import limits_section
 from tuning.gain_file import LoadedGains, build_document, check_document
-from tuning.rig.bundle import limits_section
-from tuning.rig.calibration import LIMIT, WITHOUT_STORE, calibrate
-from tuning.rig.recorded import Chunk, Scenarios, recorded_chunks
-from tuning.verdict import binomial_interval
+from tuning.statistics.intervals import binomial_interval
+from tuning.watchdog.calibration import LIMIT, WITHOUT_STORE, calibrate
+from tuning.watchdog.recorded import Chunk, Scenarios, recorded_chunks
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler (cc) on this machine")
 FRESH = 20_000  # seed; limits are calibrated on draws of seed 0

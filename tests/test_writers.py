@@ -18,7 +18,7 @@ from scipy.io import loadmat
 from jaxhil.errors import InputError
 from jaxhil.runtime import COMPENSATORS
 from jaxhil.runtime.limits import LIMITS
-from tuning.rig.writers import csv_table, gain_entries, limit_entries, matlab, ros2_yaml
+from tuning.bundle.writers import csv_table, gain_entries, limit_entries, matlab, ros2_yaml
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 AWKWARD = [5e-324, -0.0, 1e16, 1e22, 1e-5, 123456789012345680.0, 1.7976931348623157e308, 0.1 + 0.2]

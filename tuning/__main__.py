@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
-        from tuning.cli import parse
+        from tuning.cli.parser import parse
 
         code = parse(arguments)()
         sys.stdout.flush()

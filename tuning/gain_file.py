@@ -21,11 +21,11 @@ import numpy as np
 
 from jaxhil.compensators import COMPENSATORS, Gain
 from jaxhil.errors import InputError, one_line, shown
-from jaxhil.mechanism import Mechanism
-from jaxhil.mechanism_file import from_builtins, to_builtins
+from jaxhil.mechanism.file import from_builtins, to_builtins
+from jaxhil.mechanism.structs import Mechanism
 from jaxhil.runtime import GainFileError, digest
 from jaxhil.runtime.gain_file import SCHEMA, check_gain_document, read_gain_document
-from jaxhil.scenario import Scenario
+from jaxhil.simulation.scenario import Scenario
 from tuning.files import write_whole, writing
 
 VERSIONED = ("jaxhil", "jax", "numpy", "optimistix")

@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import cast
 
 from jaxhil.compensators.base import Compensator, Constants, Gain, Gains, Signals
-from jaxhil.mechanism import Mechanism
+from jaxhil.mechanism.structs import Mechanism
 from jaxhil.runtime.laws import LAWS
 
 

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxhil.mechanism import Mechanism
+from jaxhil.mechanism.structs import Mechanism
 
 Gains = dict[str, Array]
 

@@ -41,8 +41,8 @@ from jaxhil.compensators.phase_lead import (
     lead_amplification,
     lead_filter,
 )
-from jaxhil.contact import deflection
-from jaxhil.mechanism import Mechanism
+from jaxhil.contact.laws import deflection
+from jaxhil.mechanism.structs import Mechanism
 
 NEAR_1 = 15.0, 0.9  # up to this frequency [Hz] |Q| is at least this
 

@@ -6,7 +6,7 @@ estimate is wrong by. A law names what it must be told in `Compensator.knows`.
 
 import math
 
-from jaxhil.mechanism import Mechanism
+from jaxhil.mechanism.structs import Mechanism
 
 FORCE_DELAY = "force delay"
 ROUGH_FORCE_DELAY = "force delay, roughly"

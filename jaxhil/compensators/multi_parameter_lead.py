@@ -39,7 +39,7 @@ from jaxhil.compensators.phase_lead import (
     lead_amplification,
 )
 from jaxhil.errors import InputError
-from jaxhil.mechanism import Mechanism
+from jaxhil.mechanism.structs import Mechanism
 
 
 def pole_placement(frequency: float, delay: float, restitution: float) -> tuple[float, float]:

@@ -40,7 +40,7 @@ from jaxhil.compensators.phase_lead import (
     lead_amplification,
     lead_filter,
 )
-from jaxhil.contact import deflection
+from jaxhil.contact.laws import deflection
 
 
 def _stiffness_covariance(mechanism) -> float:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxhil.compensators.base import Constants, Gains, Signals
 from jaxhil.compensators.force_depth_map import SURFACE
 from jaxhil.compensators.reintegration import History
-from jaxhil.contact import deflection
+from jaxhil.contact.laws import deflection
 
 SEEN = 8  # readings out of contact that show how noisy the force is
 OUTSTANDING = 16.0  # times the noise's variance: what hardly is noise

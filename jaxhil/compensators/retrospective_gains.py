@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from jaxhil.compensators.base import Gain
 from jaxhil.compensators.estimates import force_delay, peak_force
-from jaxhil.mechanism import Mechanism
+from jaxhil.mechanism.structs import Mechanism
 
 # Two sets of gains for any mechanism, each judged on linear, damped, Hertzian, hardening and layered contact
 # of 1.5 to 5 Hz at once. Sharp, the nominal one, was found by CMA-ES with errors under other dissipation, of

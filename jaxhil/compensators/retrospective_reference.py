@@ -60,8 +60,8 @@ from jaxhil.compensators.retrospective_episode import (
     sort_out,
 )
 from jaxhil.compensators.retrospective_gains import GAINS, GENTLE, SHARP
-from jaxhil.ring import tie
-from jaxhil.runtime.retrospective import PRIOR
+from jaxhil.ring_buffer import tie
+from jaxhil.runtime.laws.retrospective import PRIOR
 
 FAREWELL = 0.006  # s for which it goes on after the hardware has left the surface
 LONGEST_LAG = 0.1  # s for which it waits for hardware that has not touched yet

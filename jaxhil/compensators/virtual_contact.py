@@ -28,8 +28,8 @@ from jaxhil.compensators.estimates import (
     simulator_lag,
     typical_stiffness,
 )
-from jaxhil.contact import deflection
-from jaxhil.mechanism import Mechanism
+from jaxhil.contact.laws import deflection
+from jaxhil.mechanism.structs import Mechanism
 
 
 def damping_at_the_limit(stiffness: float, frequency: float, delay: float) -> tuple[float, float]:

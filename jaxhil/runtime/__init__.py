@@ -1,7 +1,7 @@
 """The controller as it runs on the rig: plain Python floats, a fixed order of operations, no jax.
 
 `Controller.from_file(path)` reads a gain file and refuses one that does not fit; `step` is then
-called once per control period. Each compensator is one file, named in `laws`, and enters itself in
+called once per control period. Each compensator is one file of `laws`, and enters itself in
 `registry.COMPENSATORS`, so that a bundle may concatenate `controller`, one compensator and what
 the two import, and nothing else.
 """
@@ -16,7 +16,7 @@ from .registry import COMPENSATORS
 
 for _law in LAWS:
     try:
-        import_module(f".{_law}", __name__)
+        import_module(f".laws.{_law}", __name__)
     except ImportError:
         # A rig without NumPy has all other laws.
         if _law not in NEED_NUMPY:

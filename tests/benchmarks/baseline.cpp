@@ -2,7 +2,7 @@
 //
 // Kelvin-Voigt contact without tension, a motion simulator of order 2, linear hold, latency 0, semi-implicit
 // Euler, ideal sensors with fractional delays, one surface, successive contacts as fresh runs; compensators none,
-// phase lead, response error. The discretised simulator and the delays are input: jaxhil.loop.build_rig makes them.
+// phase lead, response error. The discretised simulator and the delays are input: jaxhil.simulation.loop.build_rig makes them.
 //
 // Lanes (scenarios) run in blocks of LANES, tick by tick; each variable of a block is an array over its lanes, so
 // that the compiler turns the loops over lanes into vector instructions. Blocks are dealt out to the threads in turn.

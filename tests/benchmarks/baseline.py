@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxhil.compensators.response_error import ResponseError
-from jaxhil.contact import KelvinVoigt
-from jaxhil.loop import Loop, Rig
-from jaxhil.metrics import NOT_REACHED, build_rules
-from jaxhil.scenario import Scenario
+from jaxhil.contact.laws import KelvinVoigt
+from jaxhil.simulation.loop import Loop, Rig
+from jaxhil.simulation.metrics import NOT_REACHED, build_rules
+from jaxhil.simulation.scenario import Scenario
 
 SOURCE = Path(__file__).with_name("baseline.cpp")
 FLAGS = ("-O3", "-march=native", "-std=c++17", "-pthread")
@@ -58,7 +58,7 @@ class Baseline(NamedTuple):
         """All contacts of every lane, and on to `horizon_ticks`: every lane runs that many ticks.
 
         `scenario` is the one `rig` was built from, its batch one axis of lanes; `gains` are scalars or
-        (lanes,). Returns arrays (slots, lanes) named as in `jaxhil.metrics.Metrics`: restitution,
+        (lanes,). Returns arrays (slots, lanes) named as in `jaxhil.simulation.metrics.Metrics`: restitution,
         approach_velocity, peak_force, peak_command, duration, status (`NOT_REACHED` where the horizon
         came first) and ticks; and "seconds" spent inside C++. Raises ValueError out of scope.
         """

@@ -1,8 +1,8 @@
 """What every method of the comparison is given: a mechanism to tune and one compiled loss, whoever calls it.
 
 A point is a vector of shares, in [0, 1], of each tuned gain's range on its own scale; its loss is half the
-sum of squares of `tuning.objective.residuals` over all scenarios. The scenarios, not the points, are dealt
-out to the devices: one point alone keeps all of them busy, and so does a generation of any size.
+sum of squares of `tuning.gains.objective.residuals` over all scenarios. The scenarios, not the points, are
+dealt out to the devices: one point alone keeps all of them busy, and so does a generation of any size.
 """
 
 import math
@@ -17,13 +17,13 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
-from jaxhil.evaluation import expected_duration
-from jaxhil.loop import Loop, Rig, build_rig
-from jaxhil.mechanism import Mechanism
-from jaxhil.scenario import Scenario
-from tuning.box import Bounds, to_gains, to_shares
-from tuning.objective import RMS, Problem, common_terms, residuals
-from tuning.problems import Task, alike, build_task, common_loop, gain_bounds, spread_points, tuned_names
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.evaluation import expected_duration
+from jaxhil.simulation.loop import Loop, Rig, build_rig
+from jaxhil.simulation.scenario import Scenario
+from tuning.gains.objective import RMS, Problem, common_terms, residuals
+from tuning.gains.tasks import Task, alike, build_task, common_loop, gain_bounds, spread_points, tuned_names
+from tuning.optimisation.unit_box import Bounds, to_gains, to_shares
 
 COMPENSATOR = "response_error"
 SCENARIOS = 128

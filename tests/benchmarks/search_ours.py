@@ -13,12 +13,12 @@ from jaxtyping import Float
 from search_case import Case, several
 from search_methods import Trace
 
-from tuning.finding import AGREED, CANDIDATES, LOTS, REACH, SURE
-from tuning.objective import RMS, SCALE, common_terms, residuals
-from tuning.optimiser import Solution, solve
-from tuning.problems import spread_points
-from tuning.rounds import FIRST_ROUND, inverse_hessian
-from tuning.search import apart, polish
+from tuning.gains.multistart import AGREED, CANDIDATES, LOTS, REACH, SURE
+from tuning.gains.objective import RMS, SCALE, common_terms, residuals
+from tuning.gains.rounds import FIRST_ROUND, inverse_hessian
+from tuning.gains.tasks import spread_points
+from tuning.optimisation.derivative_free import apart, polish
+from tuning.optimisation.levenberg_marquardt import Solution, solve
 
 SCANNED, DESCENTS, GO_ON = 64, 6, 3  # points looked at, those descended from, those that go on; of a lot
 STEPS = 25  # of Levenberg-Marquardt

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 from baseline import RESULTS, compile_baseline
 
-from jaxhil.building import build_loop
 from jaxhil.compensators import COMPENSATORS
-from jaxhil.loop import build_rig
-from jaxhil.mechanism_file import load
-from jaxhil.metrics import NOT_REACHED, OK
-from jaxhil.rollout import rollout
-from jaxhil.scenario import build_scenarios
-from jaxhil.uncertainty import draw
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop import build_rig
+from jaxhil.simulation.metrics import NOT_REACHED, OK
+from jaxhil.simulation.rollout import rollout
+from jaxhil.simulation.scenario import build_scenarios
 
 pytestmark = pytest.mark.benchmark
 

@@ -18,7 +18,7 @@ from search_methods import OTHERS, Recorder, TimeIsUp, Trace, record
 from search_ours import ours, warm_up
 from search_table import Results, judge, medians, ratios, table
 
-from tuning.objective import RMS, SCALE, common_terms, residuals
+from tuning.gains.objective import RMS, SCALE, common_terms, residuals
 
 pytestmark = pytest.mark.benchmark
 

@@ -15,8 +15,8 @@ import pytest
 from baseline import compile_baseline
 
 from jaxhil.compensators import literature_gains
-from jaxhil.loop import build_rig
-from jaxhil.mechanism_file import load
+from jaxhil.mechanism.file import load
+from jaxhil.simulation.loop import build_rig
 from tuning.gain_file import build_document, check_document, write_gain_file
 from tuning.sweeps.chunks import build_sweep, run_parts
 from tuning.sweeps.draws import drawn_scenarios

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from baseline import compile_baseline
 
-from jaxhil import evaluation
-from jaxhil.building import build_loop
 from jaxhil.compensators import COMPENSATORS
-from jaxhil.loop import build_rig
-from jaxhil.mechanism_file import load
-from jaxhil.rollout import run_contacts
-from jaxhil.scenario import build_scenarios
-from jaxhil.uncertainty import draw
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation import evaluation
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop import build_rig
+from jaxhil.simulation.rollout import run_contacts
+from jaxhil.simulation.scenario import build_scenarios
 from tuning.batches import join
 
 pytestmark = pytest.mark.benchmark

@@ -1,1 +1,1 @@
-"""What goes to the rig: bundles, the controller in C, limits and their calibration, the loop over UDP."""
+"""The rig's loop over UDP: the controller as a process of its own, against a plant in plain floats."""

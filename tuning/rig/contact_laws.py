@@ -1,12 +1,12 @@
 """Contact laws in plain floats: the force of one contact against penetration d > 0 and its rate d'.
 
-For loops that run tick by tick in real time; `jaxhil.contact` has the same laws for batches.
+For loops that run tick by tick in real time; `jaxhil.contact.laws` has the same laws for batches.
 """
 
 from collections.abc import Callable
 from typing import NamedTuple
 
-from jaxhil.mechanism import Contact
+from jaxhil.mechanism.structs import Contact
 
 Formula = Callable[[float, float], float]
 

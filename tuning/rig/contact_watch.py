@@ -1,12 +1,12 @@
 """Where contacts begin and end, tick by tick, and their restitution (model.md, conventions), in plain floats.
 
-`jaxhil.metrics` follows batches by the same rules; a loop in real time cannot wait for it.
+`jaxhil.simulation.metrics` follows batches by the same rules; a loop in real time cannot wait for it.
 """
 
 import math
 from typing import NamedTuple
 
-from jaxhil.mechanism import Mechanism
+from jaxhil.mechanism.structs import Mechanism
 
 FADED = 1e-6  # of the command's peak: it has died out
 LONGEST_FADING = 0.1  # s, waited for that
@@ -16,9 +16,10 @@ RUNAWAY = 1e3  # of the approach speed
 
 class ContactResult(NamedTuple):
     """One contact: its number in the mechanism's lists; approach_velocity [m/s]; restitution; peak_force, the
-    largest sample of the real force [N]; duration, the time in touch [s]; status, as in `jaxhil.metrics`, or
-    "tripped"; begun, the tick of the run at which it began. Filled in by who exchanges packets: the numbers
-    of the first and the last packet about it, and the age of the oldest command used [periods]."""
+    largest sample of the real force [N]; duration, the time in touch [s]; status, as in
+    `jaxhil.simulation.metrics`, or "tripped"; begun, the tick of the run at which it began. Filled in by who
+    exchanges packets: the numbers of the first and the last packet about it, and the age of the oldest
+    command used [periods]."""
 
     number: int
     approach_velocity: float

@@ -5,15 +5,15 @@
     force, position = plant.read()                    # what the sensors read at this tick
     plant.move(command)                               # the position command of the next tick; a period passes
 
-The physics of `jaxhil.loop` stages 1, 4 and 5 without jax, fast enough for a loop in real time: linear parts
-are discretised exactly, once; delays are read at their places within a panel (`tuning.rig.propagation`), and
-nothing is rounded to ticks.
+The physics of `jaxhil.simulation.loop` stages 1, 4 and 5 without jax, fast enough for a loop in real time:
+linear parts are discretised exactly, once; delays are read at their places within a panel
+(`tuning.rig.propagation`), and nothing is rounded to ticks.
 """
 
 import math
 from random import Random
 
-from jaxhil.mechanism import Mechanism
+from jaxhil.mechanism.structs import Mechanism
 from tuning.rig.contact_laws import contact_law
 from tuning.rig.propagation import WHOLE, Place, apply, propagation, split_delay
 from tuning.rig.sensor_lag import Motion, deepest_within, lagged
@@ -154,7 +154,7 @@ class Plant:
         return max(deepest, deepest_within(start, end, duration, self._clearance))
 
     def _limit(self, wanted: float) -> float:
-        """Rate limits on the command: see `jaxhil.limits.limit_command`."""
+        """Rate limits on the command: see `jaxhil.simulation.rate_limits.limit_command`."""
         velocity_limit, acceleration_limit = self._limits
         previous, before = self._commands[0], self._wanted
         largest, change = velocity_limit * self._period, acceleration_limit * self._period**2

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import expm
 
-from jaxhil.mechanism import Simulator
+from jaxhil.mechanism.structs import Simulator
 
 Row = tuple[float, ...]
 WHOLE = 1e-9  # periods by which a delay may miss a whole number of them

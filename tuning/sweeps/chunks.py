@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxhil.building import build_loop
-from jaxhil.evaluation import begin_evaluation
-from jaxhil.loop import Loop
-from jaxhil.mechanism import Mechanism
-from jaxhil.scenario import Scenario, build_scenarios
-from jaxhil.uncertainty import extremes
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.uncertainty import extremes
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.evaluation import begin_evaluation
+from jaxhil.simulation.loop import Loop
+from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.gain_file import LoadedGains
 from tuning.sweeps.columns import rows_of
 from tuning.sweeps.draws import drawn_scenarios

@@ -10,11 +10,11 @@ from typing import Literal, NamedTuple
 import msgspec
 import numpy as np
 
-from jaxhil.evaluation import Outcome
-from jaxhil.mechanism import Mechanism, value_at
-from jaxhil.metrics import DIVERGED, NON_FINITE, NOT_REACHED, OK, STATUS_NAMES, TIMEOUT
-from jaxhil.scenario import Scenario
-from jaxhil.uncertainty import PHASE, dimensions
+from jaxhil.mechanism.structs import Mechanism, value_at
+from jaxhil.mechanism.uncertainty import PHASE, dimensions
+from jaxhil.simulation.evaluation import Outcome
+from jaxhil.simulation.metrics import DIVERGED, NON_FINITE, NOT_REACHED, OK, STATUS_NAMES, TIMEOUT
+from jaxhil.simulation.scenario import Scenario
 
 GOOD, BEYOND, SATURATED = "good", "error beyond limit", "saturated"
 SATURATION = "a force beyond the sensor's range, or a limit of the motion simulator that bound"

@@ -3,7 +3,7 @@
 Whatever the chunks, the devices, the number of scenarios or the interruptions, scenario i is the same, its
 sensors' noise included.
 
-- `random`: independent draws, from counter-based generators (`jaxhil.uncertainty.draw`).
+- `random`: independent draws, from counter-based generators (`jaxhil.mechanism.uncertainty.draw`).
 - `sobol`: R = `REPLICATES` scrambled Sobol sequences, each scrambled by itself; scenario i is point i // R of
   sequence i % R. The means of the R sequences are independent and alike, so that an interval can be stated
   (Owen, "Monte Carlo theory, methods and examples", ch. 17: randomised quasi-Monte Carlo).
@@ -13,9 +13,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from jaxhil.mechanism import Mechanism
-from jaxhil.scenario import Scenario, build_scenarios
-from jaxhil.uncertainty import at_points, dimensions, draw
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.uncertainty import at_points, dimensions, draw
+from jaxhil.simulation.scenario import Scenario, build_scenarios
 
 REPLICATES = 16
 BITS = 30  # of a Sobol point's coordinate

@@ -21,7 +21,7 @@ from msgspec import Meta
 
 from jaxhil.runtime import digest
 from tuning.files import write_whole, writing
-from tuning.rare import Rare
+from tuning.statistics.subset_simulation import Rare
 from tuning.sweeps import LARGEST_SEED
 from tuning.sweeps.manifest import LARGEST, Digest, Manifest
 from tuning.sweeps.store import STUDIES, VERDICT, Store

@@ -16,11 +16,11 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from tuning.files import writing
-from tuning.plots import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION, finish, new_figure, save
+from tuning.pictures.plots import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION, finish, new_figure, save
+from tuning.statistics.intervals import binomial_interval, confidence_sequence, replicate_interval
 from tuning.sweeps.manifest import Manifest, loaded_gains
 from tuning.sweeps.regions import Input, Plan, Points, Regions, add_rows, empty_regions, make_plan, quantile
 from tuning.sweeps.store import PICTURES, Store, read_part
-from tuning.verdict import binomial_interval, confidence_sequence, replicate_interval
 
 FEW = 20  # contacts of a cell below which it has no quantile: a 95th percentile needs as many
 FAILED, UNENDED = "failed", "failed, a contact did not end: drawn at the top"

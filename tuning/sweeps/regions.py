@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxhil.mechanism import Mechanism, value_at
-from jaxhil.metrics import OK, STATUS_NAMES
-from jaxhil.uncertainty import PHASE, at_points, dimensions
-from tuning.quantiles import BINS, EDGES, binned_estimate
+from jaxhil.mechanism.structs import Mechanism, value_at
+from jaxhil.mechanism.uncertainty import PHASE, at_points, dimensions
+from jaxhil.simulation.metrics import OK, STATUS_NAMES
+from tuning.statistics.quantiles import BINS, EDGES, binned_estimate
 from tuning.sweeps.columns import STATUSES, input_names, unit_of
 from tuning.sweeps.manifest import Manifest
 from tuning.sweeps.tally import error_sizes

@@ -17,12 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxhil.errors import InputError, one_line, shown
+from tuning.statistics.intervals import enough
 from tuning.sweeps.chunks import Rows, Sweep, build_sweep, run_chunk, run_parts
 from tuning.sweeps.columns import OUTCOMES
 from tuning.sweeps.manifest import Manifest, decode, encode, unlike_here
 from tuning.sweeps.store import Store, read_part, remove_parts, write_part
 from tuning.sweeps.tally import Tally, add_rows, empty_tally
-from tuning.verdict import enough
 
 COMPARED = 4096  # scenarios that a float32 sweep runs in float64 too
 

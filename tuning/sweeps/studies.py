@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxhil.evaluation import evaluate
-from jaxhil.scenario import build_scenarios
-from jaxhil.uncertainty import at_points, dimensions
-from tuning.drivers import saltelli_design, sobol_indices
-from tuning.rare import Rare, subset_simulation, to_uniform
+from jaxhil.mechanism.uncertainty import at_points, dimensions
+from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.scenario import build_scenarios
+from tuning.statistics.sobol_indices import saltelli_design, sobol_indices
+from tuning.statistics.subset_simulation import Rare, subset_simulation, to_uniform
 from tuning.sweeps.chunks import Rows, Sweep, in_precision
 from tuning.sweeps.columns import OUTCOMES, SATURATED, rows_of
 from tuning.sweeps.tally import error_sizes

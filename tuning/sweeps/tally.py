@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tuning.quantiles import BINS, binned_estimate, binned_quantile, counts, replicate_quantile
+from tuning.statistics.intervals import Running, binomial_interval, replicate_interval, updated
+from tuning.statistics.quantiles import BINS, binned_estimate, binned_quantile, counts, replicate_quantile
 from tuning.sweeps import MOST
 from tuning.sweeps.columns import BEYOND, GOOD, OUTCOMES, SATURATED
-from tuning.verdict import Running, binomial_interval, replicate_interval, updated
 
 WORST = 10
 ORDERS = (0.5, 0.95, 0.99, 0.999)
@@ -26,9 +26,9 @@ ORDERS = (0.5, 0.95, 0.99, 0.999)
 
 class Tally(NamedTuple):
     """Scenarios of each of `OUTCOMES`; number of scenarios, counted from 0, that make whole replicates; per
-    replicate of those scenarios, failures, and bins of the errors (`tuning.quantiles.counts`); the worst
-    scenarios, the worst first: how bad the outcome is, |error|, index; the looks taken, if it is looked at
-    part by part."""
+    replicate of those scenarios, failures, and bins of the errors (`tuning.statistics.quantiles.counts`); the
+    worst scenarios, the worst first: how bad the outcome is, |error|, index; the looks taken, if it is looked
+    at part by part."""
 
     outcomes: tuple[int, ...]
     whole: int
@@ -111,7 +111,8 @@ def error_sizes(rows: Mapping[str, np.ndarray]) -> np.ndarray:
 
 def failure_probability(tally: Tally) -> Probability:
     """The probability that a scenario fails: `binomial_interval` of independent draws, `replicate_interval`
-    of Sobol replicates, `confidence_sequence` where the tally was looked at; see `tuning.verdict`.
+    of Sobol replicates, `confidence_sequence` where the tally was looked at; see
+    `tuning.statistics.intervals`.
 
     While replicates are of unequal size, the interval is 0 to 1.
     """

@@ -1,0 +1,77 @@
+"""What a contact law is: the force of a docking mechanism against penetration d > 0 and its rate d'.
+
+A law is a pure function of the motion and of a state of its own (`init`, `step`); that of a memoryless law is
+empty. All forces are zero for d <= 0 and, unless tension is allowed, never negative. Shapes: every argument
+broadcasts to the batch shape; slopes and depths of the piecewise-linear law carry a leading axis of segments.
+"""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxhil.contact.reference import Reference
+
+
+class ContactParameters(NamedTuple):
+    """What a law needs of one contact; a leading axis of contacts, where there is one, comes first.
+
+    stiffness [N/m, or N/m^n for Hunt-Crossley; (segments, ...) for piecewise-linear], damping [N s/m,
+    or chi in s/m for Hunt-Crossley], exponent [1], depths [m, (segments - 1, ...)], tension [bool],
+    reference_depth [m], unloading_ratio [1]; for `jaxhil.contact.mixture` the law's number, else None.
+    """
+
+    stiffness: Float[Array, "..."]
+    damping: Float[Array, "..."]
+    exponent: Float[Array, "..."]
+    depths: Float[Array, "..."]
+    tension: Bool[Array, "..."]
+    reference_depth: Float[Array, "..."]
+    unloading_ratio: Float[Array, "..."]
+    kind: Int[Array, "..."] | None = None
+
+
+class ContactLaw(eqx.Module):
+    """Interface of all contact laws."""
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the force depends on how deep the mechanism has been: state and motion are then followed
+        between samples too. Where there is no penetration the state is that before the first touch: a
+        surface that has been left is as new. Of the way between two penetrations only the deepest counts."""
+        return False
+
+    @property
+    def closed_form(self) -> bool:
+        """Whether the reference is quick enough to be worked out with every run; else it is integrated."""
+        return True
+
+    def init(self, penetration: Array) -> tuple[Array, ...]:
+        """State before the first touch, for a batch shaped like `penetration`."""
+        return ()
+
+    @abc.abstractmethod
+    def step(
+        self,
+        parameters: ContactParameters,
+        state: tuple[Array, ...],
+        penetration: Array,
+        rate: Array,
+    ) -> tuple[Array, tuple[Array, ...]]:
+        """Force [N] at `penetration` [m] and `rate` [m/s], and the next state."""
+
+    @abc.abstractmethod
+    def edge(self, parameters: ContactParameters, rate: Array) -> Array:
+        """Limit of the force [N] as the penetration goes to 0 from above: the jump of a damped touch."""
+
+    @abc.abstractmethod
+    def hold(
+        self, parameters: ContactParameters, state: tuple[Array, ...], penetration: Array, rate: Array
+    ) -> Array:
+        """Smooth and positive as long as penetrated surfaces hold on to each other, else not: they let go
+        where it goes through 0. The force before its clamp, or anything of its sign."""
+
+    @abc.abstractmethod
+    def reference(self, parameters: ContactParameters, mass: Array, velocity: Array) -> Reference:
+        """The same contact in space, entered at `velocity` [m/s]: see `jaxhil.contact.reference`."""

@@ -1,0 +1,27 @@
+"""A power of the penetration, damped in proportion to itself."""
+
+import jax.numpy as jnp
+
+from jaxhil.contact.base import ContactLaw
+from jaxhil.contact.reference import hunt_crossley
+
+
+class HuntCrossley(ContactLaw):
+    """F = k d^n (1 + (3/2) chi d'), n = 1.5 for Hertz (Hunt and Crossley 1975)."""
+
+    def step(self, parameters, state, penetration, rate):
+        # The inner `where` keeps the derivative of d^n finite at d <= 0.
+        touching = penetration > 0
+        depth = jnp.where(touching, penetration, 1)
+        force = parameters.stiffness * depth**parameters.exponent
+        force = force * (1 + 1.5 * parameters.damping * rate)
+        return jnp.where(touching & (force > 0), force, 0), state
+
+    def edge(self, parameters, rate):
+        return jnp.zeros_like(rate)
+
+    def hold(self, parameters, state, penetration, rate):
+        return 1 + 1.5 * parameters.damping * rate
+
+    def reference(self, parameters, mass, velocity):
+        return hunt_crossley(mass, parameters.stiffness, parameters.exponent, parameters.damping, velocity)

@@ -1,0 +1,53 @@
+"""All contact laws by their names, and contact with one surface or two.
+
+A law is one file of `jaxhil.contact` and an entry here; `jaxhil.contact.base` says what it has to offer.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxhil.contact.base import ContactLaw, ContactParameters
+from jaxhil.contact.depth_damped import DepthDamped
+from jaxhil.contact.elastoplastic import Elastoplastic
+from jaxhil.contact.hardening import Hardening
+from jaxhil.contact.hunt_crossley import HuntCrossley
+from jaxhil.contact.kelvin_voigt import KelvinVoigt
+from jaxhil.contact.piecewise_linear import PiecewiseLinear
+
+__all__ = [
+    "LAWS",
+    "ContactLaw",
+    "ContactParameters",
+    "DepthDamped",
+    "Elastoplastic",
+    "Hardening",
+    "HuntCrossley",
+    "KelvinVoigt",
+    "PiecewiseLinear",
+    "deflection",
+    "two_sided",
+]
+
+LAWS: dict[str, type[ContactLaw]] = {
+    "linear": KelvinVoigt,
+    "kelvin_voigt": KelvinVoigt,
+    "hunt_crossley": HuntCrossley,
+    "piecewise_linear": PiecewiseLinear,
+    "hardening": Hardening,
+    "depth_damped": DepthDamped,
+    "elastoplastic": Elastoplastic,
+}
+
+
+def deflection(position: Array, clearance: Array) -> Array:
+    """Signed deflection [m] of the mechanism: x at x > 0, x + c at x < -c, else 0 (c may be inf)."""
+    far = position + clearance
+    return jnp.where(position > 0, position, jnp.where(far < 0, far, 0))
+
+
+def two_sided(law, parameters, state, position, velocity, clearance):
+    """Signed force [N] at either surface: law(d, d') with d = x, or -law(d, d') with d = -c - x."""
+    signed = deflection(position, clearance)
+    side = jnp.sign(signed)
+    force, state = law.step(parameters, state, side * signed, side * velocity)
+    return side * force, state

@@ -1,1 +1,0 @@
-"""Contact laws, one file each; `jaxhil.contact` has them by name."""

@@ -1,0 +1,212 @@
+"""From a raw table to a `Mechanism`, key by key.
+
+Walks the table along the struct types of `jaxhil.mechanism.structs`, so that each wrong key is told with
+its path, what was found and what is allowed. Rules that join several keys are in
+`jaxhil.mechanism.rules`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import msgspec
+from msgspec import inspect
+
+from jaxhil.errors import one_line, shown
+from jaxhil.mechanism.structs import Mechanism, range_of, schema_type
+
+__all__ = [
+    "KeyProblem",
+    "Path",
+    "close_match",
+    "dotted",
+    "entry_count",
+    "step_into",
+    "to_mechanism",
+]
+
+Path = tuple[str | int, ...]
+
+# Lists for which a bare number stands for a list of one entry.
+_NUMBER_FOR_LIST = {("contact", "stiffness"), ("contact", "damping")}
+# Polynomials, whose leading zeros say nothing.
+_POLYNOMIALS = {("rig", "simulator", "numerator"), ("rig", "simulator", "denominator")}
+
+
+class KeyProblem(Exception):
+    """A key with an unusable value: its path, what was found, what is allowed."""
+
+    def __init__(self, path: Path, found: str, allowed: str):
+        super().__init__(path, found, allowed)
+        self.path = path
+        self.found = found
+        self.allowed = allowed
+
+    def __str__(self) -> str:
+        where = f"{dotted(self.path)}: " if self.path else ""
+        return f"{where}found {self.found}, allowed {self.allowed}"
+
+
+def dotted(path: Path) -> str:
+    """A path as TOML writes it, printable: ``uncertainty."contact.stiffness".factor[0]``."""
+    text = ""
+    for part in path:
+        if isinstance(part, int):
+            text += f"[{part}]"
+            continue
+        bare = re.fullmatch(r"[A-Za-z0-9_-]+", part) and len(part) <= 60
+        quoted = one_line(part[:61].replace("\\", "\\\\").replace('"', '\\"'), 60)
+        text += "." * bool(text) + (part if bare else f'"{quoted}"')
+    return text
+
+
+def close_match(word: str, known: Iterable[str]) -> str:
+    """` (did you mean X?)` for the known words closest to `word`, or nothing."""
+    matches = difflib.get_close_matches(word[:200], list(known), n=3, cutoff=0.6)
+    return f" (did you mean {' or '.join(matches)}?)" if matches else ""
+
+
+def entry_count(entries: Sequence[object]) -> str:
+    """`a list of N entries`."""
+    return f"a list of {len(entries)} entr{'y' if len(entries) == 1 else 'ies'}"
+
+
+def to_mechanism(raw: Mapping[str, Any]) -> Mechanism:
+    """The raw table as a `Mechanism`: every key known, of its type and in its range.
+
+    Integers are accepted where a number is wanted, a bare number for `contact.stiffness` and
+    `contact.damping`; leading zeros of a transfer function's polynomials are dropped. Raises
+    `KeyProblem` for the first key that is not usable.
+    """
+    return msgspec.convert(_clean(schema_type(), raw, (), False), Mechanism)
+
+
+def step_into(kind: inspect.Type, part: str | int, path: Path) -> inspect.Type:
+    """The type of what `part` names inside a value of type `kind`, or raises `KeyProblem`."""
+    match kind:
+        case inspect.Metadata(type=inner):
+            return step_into(inner, part, path)
+        case inspect.UnionType(types=members):
+            inner = [m for m in members if isinstance(m, (inspect.ListType, inspect.Metadata))]
+            if isinstance(part, int) and inner:
+                return step_into(inner[0], part, path)
+        case inspect.StructType(fields=fields) if isinstance(part, str):
+            for entry in fields:
+                if entry.name == part:
+                    return entry.type
+            raise _unknown_key(kind, part, path)
+        case inspect.DictType(value_type=value) if isinstance(part, str):
+            return value
+        case inspect.ListType(item_type=item) if isinstance(part, int):
+            return item
+        case _:
+            pass
+    raise KeyProblem((*path, part), "no such key", _allowed(kind, False) + f" at {dotted(path)}")
+
+
+def _unknown_key(kind: inspect.StructType, key: str, path: Path) -> KeyProblem:
+    names = [entry.name for entry in kind.fields]
+    allowed = f"one of {', '.join(names)}{close_match(key, names)}"
+    return KeyProblem((*path, key), "an unknown key", allowed)
+
+
+def _clean(kind: inspect.Type, value: Any, path: Path, infinite: bool) -> Any:
+    """`value` as plain data of type `kind`, numbers as floats; raises `KeyProblem`."""
+    if path in _NUMBER_FOR_LIST and isinstance(value, (int, float)) and not isinstance(value, bool):
+        value = [value]
+    match kind:
+        case inspect.Metadata(type=inner, extra=extra):
+            return _clean(inner, value, path, bool(extra))
+        case inspect.UnionType(types=members):
+            return _clean(_member(members, value), value, path, infinite)
+        case inspect.NoneType():
+            return None
+        case inspect.StructType() if isinstance(value, Mapping):
+            return _clean_struct(kind, value, path)
+        case inspect.DictType(value_type=inner) if isinstance(value, Mapping):
+            return {key: _clean(inner, entry, (*path, key), False) for key, entry in value.items()}
+        case inspect.ListType(item_type=item) if isinstance(value, (list, tuple)):
+            shortest, longest = kind.min_length or 0, kind.max_length
+            if len(value) < shortest or (longest is not None and len(value) > longest):
+                raise KeyProblem(path, entry_count(value), _allowed(kind, False))
+            cleaned = [_clean(item, entry, (*path, i), False) for i, entry in enumerate(value)]
+            while path in _POLYNOMIALS and len(cleaned) > 1 and cleaned[0] == 0.0:
+                del cleaned[0]
+            return cleaned
+        case inspect.FloatType() if isinstance(value, (int, float)) and not isinstance(value, bool):
+            try:
+                number = float(value)
+            except OverflowError:
+                number = math.nan
+            if range_of(kind, infinite).allows(number):
+                return number
+        case inspect.IntType() if isinstance(value, int) and not isinstance(value, bool):
+            if range_of(kind, False).allows(value):
+                return value
+        case inspect.BoolType() if isinstance(value, bool):
+            return value
+        case inspect.StrType() if isinstance(value, str):
+            shortest, longest = kind.min_length or 0, kind.max_length or math.inf
+            if shortest <= len(value) <= longest:
+                return value
+        case inspect.LiteralType(values=values) if isinstance(value, str) and value in values:
+            return value
+        case _:
+            pass
+    raise KeyProblem(path, shown(value), _allowed(kind, infinite))
+
+
+def _clean_struct(kind: inspect.StructType, value: Mapping[Any, Any], path: Path) -> dict[str, Any]:
+    names = {entry.name for entry in kind.fields}
+    for key in value:
+        # Unknown keys come first: a misspelt key is also a missing one.
+        if key not in names:
+            raise _unknown_key(kind, str(key), path)
+    cleaned = {}
+    for entry in kind.fields:
+        if entry.name in value:
+            cleaned[entry.name] = _clean(entry.type, value[entry.name], (*path, entry.name), False)
+        elif entry.required:
+            raise KeyProblem((*path, entry.name), "nothing", _allowed(entry.type, False))
+    return cleaned
+
+
+def _member(members: Iterable[inspect.Type], value: Any) -> inspect.Type:
+    """Which of the types of a union a value is meant to be: nothing, a list, or the scalar."""
+    kinds = list(members)
+    nothing = [kind for kind in kinds if isinstance(kind, inspect.NoneType)]
+    if value is None and nothing:
+        return nothing[0]
+    lists = [kind for kind in kinds if isinstance(kind, inspect.ListType)]
+    others = [kind for kind in kinds if kind not in nothing and kind not in lists]
+    wanted = lists or others if isinstance(value, (list, tuple)) else others or lists
+    return wanted[0]
+
+
+def _allowed(kind: inspect.Type, infinite: bool) -> str:
+    match kind:
+        case inspect.Metadata(type=inner, extra=extra):
+            return _allowed(inner, bool(extra))
+        case inspect.UnionType(types=members):
+            kinds = [_allowed(m, infinite) for m in members if not isinstance(m, inspect.NoneType)]
+            return " or ".join(kinds)
+        case inspect.FloatType():
+            return str(range_of(kind, infinite))
+        case inspect.IntType():
+            return f"an integer from {kind.ge} to {kind.le}"
+        case inspect.BoolType():
+            return "true or false"
+        case inspect.StrType():
+            return f"a text of {kind.min_length or 0} to {kind.max_length} characters"
+        case inspect.LiteralType(values=values):
+            return "one of " * (len(values) > 1) + ", ".join(map(str, values))
+        case inspect.ListType(item_type=item):
+            shortest, longest = kind.min_length or 0, kind.max_length
+            length = f"{shortest}" if shortest == longest else f"{shortest} to {longest}"
+            return f"a list of {length} entries, each {_allowed(item, False)}"
+        case _:
+            return "a table"

@@ -1,0 +1,105 @@
+"""Overrides of a mechanism file: ``PATH=VALUE``, as given to ``--set``.
+
+PATH is a dotted key as TOML writes it, possibly with indices into lists; VALUE is a TOML value, and
+a bare word is a string, so that ``contact.law=linear`` needs no quotes within a shell's quotes.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from typing import Any
+
+from jaxhil.errors import shown
+from jaxhil.mechanism.conversion import KeyProblem, Path, close_match, dotted, entry_count, step_into
+from jaxhil.mechanism.structs import numeric_keys, schema_type
+
+__all__ = ["apply_override", "parse_override"]
+
+_EXAMPLE = "PATH=VALUE, such as approach.velocity=0.01"
+_PART = re.compile(r"""\s*("(?:[^"\\]|\\.)*"|'[^']*'|[A-Za-z0-9_-]+)\s*""")
+_INDEX = re.compile(r"\[\s*([0-9]{1,6})\s*\]\s*")
+_WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")
+_MAX_LENGTH = 100_000
+
+
+def parse_override(text: str) -> tuple[Path, Any]:
+    """The path and the value of a ``PATH=VALUE`` text. Raises `KeyProblem`."""
+    path, position = _parse_path(text)
+    written = text[position:].strip()
+    if len(written) > _MAX_LENGTH:
+        raise KeyProblem(path, f"{len(written)} characters", f"at most {_MAX_LENGTH}")
+    try:
+        table = tomllib.loads(f"value = {written}")
+    except RecursionError:
+        raise KeyProblem(path, "values nested too deeply", "a TOML value") from None
+    except ValueError:
+        if _WORD.fullmatch(written):
+            return path, written
+        found = shown(written) if written else "nothing after ="
+        raise KeyProblem(
+            path, found, 'a TOML value, such as 0.5, [1.0, 2.0], "text" or a bare word'
+        ) from None
+    if list(table) != ["value"]:
+        raise KeyProblem(path, shown(written), "one TOML value")
+    return path, table["value"]
+
+
+def apply_override(raw: Mapping[str, Any], path: Path, value: Any) -> dict[str, Any]:
+    """A copy of a raw table with the value at `path` replaced; tables on the way are made.
+
+    Raises `KeyProblem` when the schema has no such path, or a list no such entry.
+    """
+    kind = schema_type()
+    for depth, part in enumerate(path):
+        try:
+            kind = step_into(kind, part, path[:depth])
+        except KeyProblem as problem:
+            hint = close_match(dotted(path), numeric_keys())
+            if hint and "did you mean" not in problem.allowed:
+                problem = KeyProblem(problem.path, problem.found, problem.allowed + hint)
+            raise problem from None
+    return _replaced(raw, path, 0, value)
+
+
+def _parse_path(text: str) -> tuple[Path, int]:
+    """The path in front of ``=`` and the position behind it."""
+    path: list[str | int] = []
+    position = 0
+    while True:
+        part = _PART.match(text, position)
+        if part is None or len(path) > 16:
+            raise KeyProblem((), shown(text), _EXAMPLE)
+        word = part.group(1)
+        try:
+            path.append(next(iter(tomllib.loads(f"{word} = 0"))))
+        except ValueError:
+            raise KeyProblem((), shown(text), _EXAMPLE) from None
+        position = part.end()
+        while index := _INDEX.match(text, position):
+            path.append(int(index.group(1)))
+            position = index.end()
+        if text[position : position + 1] == "=":
+            return tuple(path), position + 1
+        if text[position : position + 1] != ".":
+            raise KeyProblem((), shown(text), _EXAMPLE)
+        position += 1
+
+
+def _replaced(node: Any, path: Path, depth: int, value: Any) -> Any:
+    if depth == len(path):
+        return value
+    part = path[depth]
+    if isinstance(part, int):
+        # A bare number stands for a list of one entry.
+        entries = list(node) if isinstance(node, (list, tuple)) else [node]
+        if node is None or part >= len(entries):
+            found = "no list to change" if node is None else entry_count(entries)
+            raise KeyProblem(path[: depth + 1], found, "an index into the list, or a whole list")
+        entries[part] = _replaced(entries[part], path, depth + 1, value)
+        return entries
+    if not isinstance(node, Mapping):
+        raise KeyProblem(path[:depth], shown(node), "a table")
+    missing = {} if depth + 1 < len(path) and isinstance(path[depth + 1], str) else None
+    return {**node, part: _replaced(node.get(part, missing), path, depth + 1, value)}

@@ -1,0 +1,21 @@
+"""The compensation laws by name: the one entry that a law has anywhere.
+
+The law `<name>` is `jaxhil/compensators/<name>.py` in JAX, `jaxhil/runtime/laws/<name>.py` in plain Python
+and `jaxhil/c99/laws/<name>.c` in C99. Simulation, tuning, command line, export and tests go by this list;
+`PUBLISHED` are those of the literature, the rest is ours.
+"""
+
+PUBLISHED = (
+    "none",
+    "phase_lead",
+    "multi_parameter_lead",
+    "smith_predictor",
+    "smith_hybrid",
+    "position_lead",
+    "virtual_contact",
+    "dead_zone_observer",
+    "passivity",
+    "response_error",
+)
+LAWS = (*PUBLISHED, "retrospective_reference", "retrospective_delay_bank")
+NEED_NUMPY = ("retrospective_delay_bank",)  # on the rig, in Python

@@ -1,0 +1,66 @@
+"""The retrospective reference where the force delay is hardly known: a bank of delays, weighed as one goes.
+
+`retrospective_reference` with a `delay_bank` in the place of its one map: hypotheses lie evenly within
+`delay_spread` of `identification_delay`. What was learnt of the delay, and of whether there is any damping,
+is carried from contact to contact; maps are not. With d the mean of the hypotheses' delays on the tick
+before, the depth as old as the force is X - d V.
+"""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+from ..registry import GainSpecification, register
+from .delay_bank import DelayBank
+from .force_depth_map import Prior
+from .retrospective import Retrospective
+
+
+@register("retrospective_delay_bank")
+class RetrospectiveDelayBank(Retrospective):
+    """Bank of delays, reference and repayment."""
+
+    __slots__ = ("_bank", "_told_delay")
+
+    gains: ClassVar[Mapping[str, GainSpecification]] = {
+        **Retrospective.gains,
+        "delay_spread": GainSpecification("s", lowest=0.0),
+    }
+
+    @property
+    def force_delay(self) -> float:
+        """The estimated delay [s] of the force measurement."""
+        return self._told_delay + self._shift
+
+    def reset(self) -> None:
+        """Forget everything, what was learnt of the delay as well."""
+        super().reset()
+        self._bank.reset()
+        self._shift = 0.0
+
+    def next_contact(self) -> None:
+        """Restart all but what was learnt of the delay."""
+        super().reset()
+
+    def _prepare(self, gains: Mapping[str, float], prior: Prior) -> None:
+        self._told_delay = gains["identification_delay"]
+        self._bank = DelayBank(gains["delay_spread"], prior)
+        self._curve = self._bank.curve
+
+    def _begin(self) -> None:
+        self._bank.begin()
+
+    def _learn(
+        self,
+        depth: float,
+        rate: float,
+        deepest: float,
+        force: float,
+        variance: float,
+        hidden: bool,
+        zone: float,
+    ) -> None:
+        self._bank.learn(depth, rate, force, variance, hidden, zone)
+        self._shift = self._bank.shift
+
+    def _variance(self) -> float:
+        return self._bank.variance

@@ -1,0 +1,46 @@
+"""The retrospective reference with one force-depth map: the force is as old as it is told to be.
+
+See `retrospective`. With F the map, (X, V, y) the delay-aligned readings, f_0 = max(F(x_d, v_d), 0):
+
+    in contact:  F_c = f_0 + (y - F(X, V)) + f_e
+    separated:   F_c = f_e  until the hardware has left the surface for 6 ms, then 0
+"""
+
+from collections.abc import Mapping
+
+from ..registry import register
+from .force_depth_map import ForceDepthMap, Prior
+from .retrospective import Retrospective
+
+
+@register("retrospective_reference")
+class RetrospectiveReference(Retrospective):
+    """Force-depth map, reference and repayment."""
+
+    __slots__ = ("_map",)
+
+    def _prepare(self, gains: Mapping[str, float], prior: Prior) -> None:
+        self._map = ForceDepthMap(prior)
+        self._curve = self._map.curve
+
+    def _begin(self) -> None:
+        self._map.restart()
+
+    def _learn(
+        self,
+        depth: float,
+        rate: float,
+        deepest: float,
+        force: float,
+        variance: float,
+        hidden: bool,
+        zone: float,
+    ) -> None:
+        if depth > 0.0:
+            if not hidden:
+                self._map.update(depth, rate, deepest, force, variance)
+            elif self._curve.force(depth, rate, deepest) > zone:
+                self._map.update(depth, rate, deepest, 0.5 * zone, variance + zone * zone / 12.0)
+
+    def _variance(self) -> float:
+        return self._map.variance

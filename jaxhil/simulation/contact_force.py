@@ -1,0 +1,284 @@
+"""The real contact, panel by panel: its force, peak and work, and what a lagging force sensor makes of it.
+
+The motion simulator moves smoothly within a panel (`jaxhil.simulation.motion_simulator`); its corners are the
+panel's ends. The force is read where the sensor will sample it, once per panel. What depends on the force in
+between follows it along the cubic through the exact position and velocity at the ends of each smooth stretch.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxhil.contact.laws import ContactLaw, ContactParameters, deflection, two_sided
+from jaxhil.simulation.sensors import lag, lag_decay
+
+ROOT_STEPS = 3  # of Newton's method, from a straight line's root
+ARCS = 2  # parabolas that stand for the force of one stretch, for the sensor's lag
+GAUSS = ((0.5 - 0.15**0.5, 5 / 18), (0.5, 4 / 9), (0.5 + 0.15**0.5, 5 / 18))  # node, weight
+
+
+class Motion(NamedTuple):
+    """Position [m] and velocity [m/s] somewhere in a panel."""
+
+    position: Float[Array, "*batch"]
+    velocity: Float[Array, "*batch"]
+
+
+class Panel(NamedTuple):
+    """Motion of the real mechanism over one panel: where the force is sampled and, for loops that look
+    between the samples, at its start and its end (limits from within; else None)."""
+
+    sample: Motion
+    start: Any
+    end: Any
+
+
+class Truth(NamedTuple):
+    """What really happens in a panel: contact force [N] where it is sampled; where energies are audited, work
+    done on the mechanism and work returned by it [J]; where the force has corners between samples, its peak
+    in the panel [N]."""
+
+    force: Float[Array, "*batch"]
+    works: tuple[Array, Array] | None
+    crest: Float[Array, "*batch"] | None
+
+
+class Surfaces(NamedTuple):
+    """A contact law with its parameters and state, at one surface or (finite clearance [m]) two."""
+
+    law: ContactLaw
+    parameters: ContactParameters
+    state: tuple[Array, ...]
+    clearance: Array
+
+    def force(self, motion: Motion) -> tuple[Array, tuple[Array, ...]]:
+        """Signed force [N] and the law's next state."""
+        return two_sided(
+            self.law, self.parameters, self.state, motion.position, motion.velocity, self.clearance
+        )
+
+    def after(self, start: Motion, end: Motion, duration: Array, s: Any = 1) -> "Surfaces":
+        """The same at the fraction s of a smooth stretch of motion of a `duration` [s], at whose start these
+        are."""
+        if not self.law.remembers:
+            return self
+        side, surface = self.side(start, end)
+        turn = jnp.minimum(_turn(start, end, duration, side), s)
+        state = self.state
+        for motion in (along(start, end, duration, turn), along(start, end, duration, s)):
+            depth = side * (motion.position - surface)
+            _, state = self.law.step(self.parameters, state, depth, side * motion.velocity)
+        return self._replace(state=state)
+
+    def side(self, start: Motion, end: Motion) -> tuple[Array, Array]:
+        """Side (1, -1, or 0 for none) and position [m] of the surface that a stretch touches."""
+        signed = deflection(start.position, self.clearance)
+        side = jnp.sign(jnp.where(signed == 0, deflection(end.position, self.clearance), signed))
+        return side, jnp.where(side < 0, -self.clearance, 0)
+
+    def touch(self, motion: Motion, force: Array) -> "Touch":
+        """A sample of the contact, whose force is known."""
+        far = -self.clearance - motion.position
+        beyond = jnp.where(far > motion.position, far, motion.position)
+        side = jnp.where(far > motion.position, -1, 1).astype(far.dtype)
+        edge = side * self.law.edge(self.parameters, side * motion.velocity)
+        return Touch(beyond, force, edge, side)
+
+
+class Touch(NamedTuple):
+    """A sample of the contact: distance into the nearer surface [m], negative outside; force [N]; its limit
+    at the surface [N]; side of that surface (1 or -1)."""
+
+    distance: Float[Array, "*batch"]
+    force: Float[Array, "*batch"]
+    edge: Float[Array, "*batch"]
+    side: Float[Array, "*batch"]
+
+
+def no_touch(like: Array) -> Touch:
+    """Far from any surface."""
+    zeros = jnp.zeros_like(like)
+    return Touch(zeros - 1, zeros, zeros, zeros + 1)
+
+
+def works_between(before: Touch, now: Touch) -> tuple[Array, Array]:
+    """Work [J] done on the mechanism and returned by it from one sample to the next, exact for a force
+    straight in the penetration."""
+    depth_0 = jnp.where(before.distance > 0, before.distance, 0)
+    depth_1 = jnp.where(now.distance > 0, now.distance, 0)
+    force_0 = jnp.where(before.distance > 0, before.force, now.edge)
+    force_1 = jnp.where(now.distance > 0, now.force, before.edge)
+    side = jnp.where(now.distance > 0, now.side, before.side)
+    work = side * (force_0 + force_1) / 2 * (depth_1 - depth_0)
+    return jnp.where(work > 0, work, 0), jnp.where(work > 0, 0, -work)
+
+
+def works_along(surfaces: Surfaces, start: Motion, end: Motion, duration: Array) -> tuple[Array, Array]:
+    """Work [J] done on the mechanism and returned by it along a smooth stretch of motion.
+
+    A pulling force acts while the penetration recedes: it takes from the work returned.
+    """
+    contact = _contact(surfaces, start, end, duration)
+
+    def inward(s):
+        return contact.side * along(start, end, duration, s).velocity
+
+    since, until = _crossing(inward, duration)
+    turn = jnp.clip(jnp.where(until < 1, until, since), contact.first, contact.last)
+    done = returned = jnp.zeros_like(duration)
+    for a, b in ((contact.first, turn), (turn, contact.last)):
+        for node, weight in GAUSS:
+            motion, force = _force_along(surfaces, start, end, duration, a + (b - a) * node)
+            work = force * motion.velocity * (weight * (b - a) * duration)
+            deeper = contact.side * motion.velocity > 0
+            done = done + jnp.where(deeper, work, 0)
+            returned = returned - jnp.where(deeper, 0, work)
+    return done, returned
+
+
+def crest(surfaces: Surfaces, start: Motion, end: Motion, duration: Array) -> Float[Array, "*batch"]:
+    """Largest |force| [N] within a panel: at an end, or near the vertex of a parabola through its middle."""
+
+    def magnitude(motion, s):
+        return jnp.abs(surfaces.after(start, end, duration, s).force(motion)[0])
+
+    first, last = magnitude(start, 0), magnitude(end, 1)
+    half = magnitude(along(start, end, duration, 0.5), 0.5)
+    slope, bend = last - first, first + last - 2 * half
+    vertex = jnp.clip(0.5 - slope / (4 * jnp.where(bend < 0, bend, -1)), 0, 1)
+    top = magnitude(along(start, end, duration, vertex), vertex)
+    highest = jnp.where(first > last, first, last)
+    return jnp.where((bend < 0) & (top > highest), top, highest)
+
+
+def sensed_lag(
+    surfaces: Surfaces,
+    reading: Float[Array, "*batch"],
+    panel: Panel,
+    until: Array,
+    duration: Array,
+    time_constant: Array,
+) -> tuple[Array, Array]:
+    """A lagging sensor's readings [N] at a panel's sample, `until` [s] after its start, and at its end, after
+    `duration` [s]; `reading` was that at its start."""
+
+    def follow(reading, panel):
+        sample = _lag_along(surfaces, reading, panel.start, panel.sample, until, time_constant)
+        rest = duration - until
+        dented = surfaces.after(panel.start, panel.sample, until)
+        return sample, _lag_along(dented, sample, panel.sample, panel.end, rest, time_constant)
+
+    def fade(reading, panel):
+        # In the same steps as `follow`: to the bit, no lane depends on whether others touch.
+        sample = reading * lag_decay(until, time_constant)
+        return sample, sample * lag_decay(duration - until, time_constant)
+
+    # Most of the time no lane touches.
+    outside = [deflection(motion.position, surfaces.clearance) == 0 for motion in panel]
+    return lax.cond(jnp.all(outside[0] & outside[1] & outside[2]), fade, follow, reading, panel)
+
+
+def along(start: Motion, end: Motion, duration: Array, s: Any) -> Motion:
+    """Position and velocity at the fraction s of a stretch, by its cubic (Hermite)."""
+    v_0, v_1 = start.velocity * duration, end.velocity * duration
+    moved = end.position - start.position
+    bend, twist = 3 * moved - 2 * v_0 - v_1, v_0 + v_1 - 2 * moved
+    position = start.position + s * (v_0 + s * (bend + s * twist))
+    velocity = v_0 + s * (2 * bend + s * 3 * twist)
+    safe = jnp.where(duration > 0, duration, 1)
+    return Motion(position, jnp.where(duration > 0, velocity / safe, start.velocity))
+
+
+def _turn(start, end, duration, side):
+    """The fraction of a stretch at which it turns round on its way in; 1 where it does not."""
+    first, last = side * start.velocity, side * end.velocity
+    turns = (first > 0) & (last < 0)
+    # The velocity first + slope s + bend s^2 of the stretch's cubic, times the duration.
+    moved = side * (end.position - start.position)
+    first, last = first * duration, last * duration
+    slope, bend = 6 * moved - 4 * first - 2 * last, 3 * (first + last - 2 * moved)
+    square = jnp.where(turns, slope**2 - 4 * bend * first, 1)
+    return jnp.where(turns, 2 * first / jnp.where(turns, jnp.sqrt(square) - slope, 1), 1)
+
+
+def _force_along(surfaces, start, end, duration, s):
+    """Motion at the fraction s of a stretch, and the force there [N]; `surfaces` are those at its start."""
+    motion = along(start, end, duration, s)
+    force, _ = surfaces.after(start, end, duration, s).force(motion)
+    return motion, force
+
+
+class _Contact(NamedTuple):
+    """Contact during a stretch of motion: whether there is any, with which side, from which fraction of the
+    stretch until which, and whether it begins and ends there at the surface."""
+
+    touches: Array
+    side: Array
+    first: Array
+    last: Array
+    at_surface: tuple[Array, Array]
+
+
+def _contact(surfaces, start, end, duration):
+    """Both instants are roots on the stretch's cubic: of the depth, or of the force that lets go before."""
+    side, surface = surfaces.side(start, end)
+
+    def depth(s):
+        return side * (along(start, end, duration, s).position - surface)
+
+    def hold(s):
+        motion = along(start, end, duration, s)
+        state = surfaces.after(start, end, duration, s).state
+        return surfaces.law.hold(surfaces.parameters, state, depth(s), side * motion.velocity)
+
+    enters, leaves = _crossing(depth, duration)
+    catches, lets_go = _crossing(hold, duration)
+    first = jnp.where(enters >= catches, enters, catches)
+    last = jnp.where(leaves <= lets_go, leaves, lets_go)
+    touches = (side != 0) & (first < last)
+    begins_at_surface = (enters > 0) & (enters >= catches)
+    ends_at_surface = (leaves < 1) & (leaves <= lets_go)
+    return _Contact(
+        touches,
+        side,
+        jnp.where(touches, first, 0),
+        jnp.where(touches, last, 0),
+        (begins_at_surface, ends_at_surface),
+    )
+
+
+def _crossing(function, like):
+    """From which s in [0, 1] and until which a function of s is positive, if it changes its sign once."""
+    zeros, ones = jnp.zeros_like(like), jnp.ones_like(like)
+    at_0, at_1 = function(zeros), function(ones)
+    rises, falls = (at_0 <= 0) & (at_1 > 0), (at_0 > 0) & (at_1 <= 0)
+    chord = jnp.where(rises | falls, at_1 - at_0, 1)
+    root = jnp.where(rises | falls, -at_0 / chord, 0)
+    for _ in range(ROOT_STEPS):
+        value, slope = jax.jvp(function, (root,), (ones,))
+        # Towards the other end, at any rate.
+        slope = jnp.where(slope * chord > 0, slope, chord)
+        root = jnp.clip(root - value / slope, 0, 1)
+    never = (at_0 <= 0) & (at_1 <= 0)
+    return jnp.where(rises, root, jnp.where(never, 1, 0)), jnp.where(falls, root, jnp.where(never, 0, 1))
+
+
+def _lag_along(surfaces, reading, start, end, duration, time_constant):
+    """The lagging reading after a smooth stretch of motion: the force is taken along parabolas, whose lag is
+    exact, from where contact begins to where it ends."""
+    contact = _contact(surfaces, start, end, duration)
+    span = contact.last - contact.first
+    forces = []
+    for i in range(2 * ARCS + 1):
+        s = contact.first + span * (i / (2 * ARCS))
+        motion, force = _force_along(surfaces, start, end, duration, s)
+        if i in (0, 2 * ARCS):
+            # At the surface the force has a limit from inside.
+            edge = surfaces.law.edge(surfaces.parameters, contact.side * motion.velocity)
+            force = jnp.where(contact.at_surface[i > 0], contact.side * edge, force)
+        forces.append(jnp.where(contact.touches, force, 0))
+    idle, touching, free = (part * duration for part in (contact.first, span, 1 - contact.last))
+    return lag(reading, idle, touching, free, forces, time_constant)

@@ -1,0 +1,175 @@
+"""Batches of any size, on every core: runs with their errors against the undelayed reference.
+
+Lanes are sorted by how long they will take and cut into tiles, each of which ends with its own slowest lane;
+tiles are dealt out to the devices in turn. Batches are padded to a few sizes, so that most calls reuse a
+compiled program.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import AxisType, PartitionSpec
+from jaxtyping import Array, Bool, Float
+
+from jaxhil.contact.laws import ContactParameters
+from jaxhil.contact.reference import Reference
+from jaxhil.simulation.loop import Loop
+from jaxhil.simulation.metrics import OK, Metrics
+from jaxhil.simulation.rollout import rollout
+from jaxhil.simulation.scenario import Scenario
+
+TILE = 256
+SMALLEST_TILE = 16
+
+
+class Outcome(NamedTuple):
+    """Per contact, (slots, *batch): the run's metrics; restitution and peak force [N] of the undelayed
+    reference entered at the same speed; error e - e*; |F_c|'s peak over the reference's peak; chatter, F_c's
+    excess variation (`Metrics`) over the reference's peak; whether the contact was asked for, and whether
+    it was reached and ended well."""
+
+    metrics: Metrics
+    reference_restitution: Float[Array, "slots *batch"]
+    reference_peak_force: Float[Array, "slots *batch"]
+    error: Float[Array, "slots *batch"]
+    peak_ratio: Float[Array, "slots *batch"]
+    chatter: Float[Array, "slots *batch"]
+    wanted: Bool[Array, "slots *batch"]
+    good: Bool[Array, "slots *batch"]
+
+
+def compare_with_reference(loop: Loop, scenario: Scenario, metrics: Metrics) -> Outcome:
+    """Set a run beside the same contacts in space, each entered at the speed it had on the rig."""
+    slots = metrics.restitution.shape[0]
+    number = jnp.arange(slots, dtype=scenario.contacts.dtype).reshape(
+        slots, *[1] * (metrics.restitution.ndim - 1)
+    )
+    wanted = number < scenario.contacts[None]
+    good = wanted & (metrics.status == OK)
+    velocity = jnp.where(good, metrics.approach_velocity, scenario.velocity[None])
+    contact = parameters_by_slot(scenario.contact)
+    mass = jnp.broadcast_to(scenario.equivalent_mass, velocity.shape)
+    reference = loop.law.reference(contact, mass, velocity)
+    known = scenario.reference
+    if known is not None:
+        given = ~jnp.isnan(known.restitution)
+        reference = Reference(*(jnp.where(given, a, b) for a, b in zip(known, reference, strict=True)))
+    return Outcome(
+        metrics=metrics,
+        reference_restitution=reference.restitution,
+        reference_peak_force=reference.peak_force,
+        error=metrics.restitution - reference.restitution,
+        peak_ratio=metrics.peak_command / reference.peak_force,
+        chatter=metrics.excess_variation / reference.peak_force,
+        wanted=wanted,
+        good=good,
+    )
+
+
+def parameters_by_slot(contact: ContactParameters) -> ContactParameters:
+    """Contact parameters of a scenario with slots as part of the batch: segments and depths come first."""
+    nested = contact.stiffness.ndim > contact.damping.ndim
+    return contact._replace(
+        stiffness=jnp.moveaxis(contact.stiffness, 0, 1) if nested else contact.stiffness,
+        depths=jnp.moveaxis(contact.depths, 0, 1),
+    )
+
+
+def evaluate(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least: int = 1) -> Outcome:
+    """Outcome (NumPy arrays) of `scenarios` (NumPy arrays, one batch axis), on every device.
+
+    `gains` are scalars, or all of them one value per lane; they are taken in the scenarios' precision.
+    Batches of up to `at_least` lanes share the compiled program of that many. To the bit, a lane's outcome
+    depends neither on the lanes beside it nor on its place among them.
+    """
+    return begin_evaluation(loop, gains, scenarios, at_least)()
+
+
+def begin_evaluation(
+    loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least: int = 1
+) -> Callable[[], Outcome]:
+    """Like `evaluate`, without waiting: what is returned waits for the outcome and returns it."""
+    number = len(scenarios.velocity)
+    order = _by_duration(scenarios)
+    running = run_tiles(loop, *deal(scenarios, gains, at_least))
+
+    def unfold(leaf):
+        leaf = np.moveaxis(leaf, (0, 1), (-2, -3))
+        leaf = leaf.reshape(*leaf.shape[:-3], -1)
+        back = np.empty_like(leaf[..., :number])
+        back[..., order] = leaf[..., :number]
+        return back
+
+    return lambda: jax.tree.map(unfold, jax.device_get(running))
+
+
+def deal(
+    scenarios: Scenario, gains: Mapping[str, Any], at_least: int = 1
+) -> tuple[dict[str, Any], dict[str, Any], Scenario]:
+    """Arguments of `run_tiles`: gains common to all lanes, gains per lane and scenarios as
+    (devices, tiles, ..., lanes of a tile), sorted by expected duration and padded with idle lanes."""
+    number = len(scenarios.velocity)
+    room = max(number, at_least)
+    devices = jax.device_count()
+    tile = TILE
+    while tile > SMALLEST_TILE and tile * devices >= 2 * room:
+        tile //= 2
+    # Tiles per device in powers of two up to 16, then multiples of 16: few programs, little padding.
+    tiles = -(-room // (tile * devices))
+    tiles = 1 << (tiles - 1).bit_length() if tiles <= 16 else -(-tiles // 16) * 16
+    lanes = tiles * tile * devices
+    padded = np.resize(_by_duration(scenarios), lanes)
+    idle = np.arange(lanes) >= number
+    scenarios = jax.tree.map(lambda leaf: np.asarray(leaf)[..., padded], scenarios)
+    contacts: Any = np.where(idle, 0, scenarios.contacts).astype(np.int32)
+    scenarios = scenarios._replace(contacts=contacts)
+    # The scenarios' precision is that of the program.
+    values = {name: np.asarray(value, scenarios.velocity.dtype) for name, value in gains.items()}
+    per_lane = {name: value[padded] for name, value in values.items() if value.ndim}
+    common = {name: value for name, value in values.items() if not value.ndim}
+
+    def fold(leaf):
+        # (..., lanes) -> (devices, tiles, ..., tile): neighbours in time fall to different devices.
+        leaf = leaf.reshape(*leaf.shape[:-1], tiles, devices, tile)
+        return np.moveaxis(leaf, (-2, -3), (0, 1))
+
+    return common, *jax.tree.map(fold, (per_lane, scenarios))
+
+
+def _by_duration(scenarios):
+    return np.argsort(-expected_duration(scenarios), kind="stable")
+
+
+def expected_duration(scenarios: Scenario) -> np.ndarray:
+    """Order of a run's duration [s]: half a period sqrt(M/k) per contact; for sorting only."""
+    stiffness = np.asarray(scenarios.contact.stiffness)
+    while stiffness.ndim > 2:
+        stiffness = stiffness[:, 0]
+    slots = np.arange(len(stiffness))[:, None] < np.asarray(scenarios.contacts)
+    periods = np.sqrt(np.asarray(scenarios.equivalent_mass) / np.maximum(stiffness, 1e-9))
+    return np.sum(np.where(slots, periods, 0), axis=0)
+
+
+@partial(jax.jit, static_argnums=0)
+def run_tiles(loop: Loop, common: Any, per_lane: Any, scenarios: Scenario) -> Outcome:
+    """Outcome of what `deal` made, each leaf (devices, tiles, ..., lanes of a tile)."""
+    mesh = jax.make_mesh((jax.device_count(),), ("device",), axis_types=(AxisType.Auto,))
+
+    def one_device(common, arguments):
+        def one_tile(arguments):
+            gains, scenario = arguments
+            metrics = rollout(loop, {**common, **gains}, scenario)
+            return compare_with_reference(loop, scenario, metrics)
+
+        own = jax.tree.map(lambda leaf: leaf[0], arguments)
+        return jax.tree.map(lambda leaf: leaf[None], jax.lax.map(one_tile, own))
+
+    own, everywhere = PartitionSpec("device"), PartitionSpec()
+    # Each device ends its tiles in its own time; nothing is exchanged.
+    return jax.shard_map(one_device, mesh=mesh, in_specs=(everywhere, own), out_specs=own, check_vma=False)(
+        common, (per_lane, scenarios)
+    )

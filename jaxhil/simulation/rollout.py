@@ -1,0 +1,323 @@
+"""Rollout: a batch of scenarios through the loop, from the first approach until the last contact is over.
+
+Ticks run in short stretches; between stretches, contacts that are over are entered into the metrics, the next
+ones begin, and free flight towards the other surface is skipped. The program ends with its slowest lane:
+nothing is computed for a fixed horizon. Forward-mode derivatives pass through to every array leaf.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxhil.compensators.base import Gains, Signals
+from jaxhil.simulation.contact_force import Motion, Panel, Truth, no_touch
+from jaxhil.simulation.loop import (
+    Loop,
+    Rig,
+    build_rig,
+    drive,
+    enter,
+    sense,
+)
+from jaxhil.simulation.loop_state import LoopState, Plant, Rings, Sensed
+from jaxhil.simulation.metrics import (
+    FADED,
+    OK,
+    Metrics,
+    Watch,
+    build_rules,
+    collect,
+    empty_metrics,
+    fresh_watch,
+    judge,
+    observe,
+)
+from jaxhil.simulation.probe import Probe, untouched
+from jaxhil.simulation.scenario import Scenario
+from jaxhil.simulation.sensors import Noise, draw_noise
+
+APPROACH = 0.02  # s of free approach before a contact, besides its phase
+SETTLED = 1e-6  # of the distance flown in a period: the motion simulator follows uniformly
+STILL = 1e-12  # of the speed, per period: nothing pushes the numerical model any more
+
+
+class Run(NamedTuple):
+    """Everything carried from tick to tick, and the ticks run so far."""
+
+    state: LoopState
+    watch: Watch
+    metrics: Metrics
+    index: Int[Array, "*batch"]
+    active: Bool[Array, "*batch"]
+    tick: Int[Array, ""]
+
+
+class Tick(NamedTuple):
+    """What is recorded of a tick: what the controller read and what it made of it, the truth, whether the
+    lane was still running, the number of the contact, what was identified [N/m, N s/m], and the position
+    command [m] sent to the drives at its end, before any limits of theirs."""
+
+    signals: Signals
+    command: Float[Array, "*batch"]
+    truth: Truth
+    active: Bool[Array, "*batch"]
+    contact: Int[Array, "*batch"]
+    identified: tuple[Array, Array] | None
+    sent: Float[Array, "*batch"]
+
+
+def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Metrics:
+    """Metrics (slots, *batch) of every contact of every lane: `build_rig`, then `run_contacts`.
+
+    `gains` are scalars or of the batch shape: many gains at once are many lanes, not a `jax.vmap`, under
+    which the loop's condition and the rings' pointer would be the lanes' own.
+    """
+    return run_contacts(loop, gains, build_rig(loop, scenario))
+
+
+def run_contacts(loop: Loop, gains: Gains, rig: Rig) -> Metrics:
+    """`rollout` on a rig built before, for when many gains are tried on it."""
+
+    def body(run):
+        run, _ = stretch(loop, rig, gains, run, record=False)
+        if loop.is_two_sided:
+            return turn_over(loop, rig, gains, run)
+        # Most stretches end no contact: lanes of a tile end theirs at about the same time. The rings, which
+        # a turn-over leaves alone, stay outside the branch, where they need not be copied.
+        rings = run.state.sensed.rings
+        light = run._replace(state=run.state._replace(sensed=run.state.sensed._replace(rings=None)))
+        light = lax.cond(
+            jnp.any(_pending(rig, run)), lambda run: turn_over(loop, rig, gains, run), lambda run: run, light
+        )
+        return light._replace(state=light.state._replace(sensed=light.state.sensed._replace(rings=rings)))
+
+    run = start(loop, rig, gains)
+    return lax.while_loop(lambda run: jnp.any(run.active), body, run).metrics
+
+
+def record(loop: Loop, gains: Gains, scenario: Scenario, ticks: int) -> tuple[Metrics, Tick]:
+    """Metrics and every tick, (ticks, *batch), of so many ticks or a few more, up to a whole number of
+    stretches; free flight is not skipped."""
+    rig = build_rig(loop, scenario)
+
+    def body(run, _):
+        run, seen = stretch(loop, rig, gains, run, record=True)
+        return turn_over(loop, rig, gains, run, skip_flight=False), seen
+
+    stretches = -(-ticks // stretch_length(loop))
+    run, seen = lax.scan(body, start(loop, rig, gains), None, length=stretches)
+    return run.metrics, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), seen)
+
+
+def stretch_length(loop: Loop) -> int:
+    """Ticks between turn-overs. Between two surfaces the next contact may begin at once."""
+    return 1 if loop.is_two_sided else 16
+
+
+def start(loop: Loop, rig: Rig, gains: Gains) -> Run:
+    """All lanes on their first approach."""
+    scenario, like = rig.scenario, rig.scenario.velocity
+    zeros = jnp.zeros_like(like)
+    index = jnp.zeros(like.shape, jnp.int32)
+    ring = jnp.zeros((loop.ring, *like.shape), like.dtype)
+    order = rig.propagation.steady_command.shape[0]
+    state = LoopState(
+        position=zeros,
+        velocity=zeros,
+        plant=Plant(
+            (zeros,) * (loop.latency + 1), zeros, (zeros,) * order, zeros if loop.has_limits else None
+        ),
+        sensed=Sensed(_rings(loop, ring), no_touch(like), zeros, zeros),
+        law=loop.law.init(zeros),
+        controller=loop.compensator.init(gains, rig.constants, loop.controller_ring),
+        parameters=_entry(scenario.contact, index),
+        entry_velocity=zeros,
+        entry_tick=index,
+        touched=untouched(zeros) if loop.probed else None,
+    )
+    # Rings are read up to one ring behind: start there, so that no index is negative.
+    tick = jnp.array(_first_tick(loop), jnp.int32)
+    state = enter(loop, rig, gains, state, *_approach(rig, index, like), tick)
+    slots = scenario.phase.shape[0]
+    return Run(
+        state=state,
+        watch=fresh_watch(loop, like),
+        metrics=empty_metrics(loop, slots, like),
+        index=index,
+        active=scenario.contacts > 0,
+        tick=tick,
+    )
+
+
+def stretch(loop: Loop, rig: Rig, gains: Gains, run: Run, record: bool) -> tuple[Run, Tick | None]:
+    """A few ticks of the loop."""
+
+    rules = build_rules(rig.scenario)
+    prepared = loop.compensator.prepare(gains, rig.constants)
+    probe: Probe | None = _entry(rig.scenario.probe, _slot(rig, run.index)) if loop.probed else None
+
+    def tick(carry, noise):
+        state, watch, now = carry
+        signals, truth = sense(loop, rig, state, now, noise)
+        command, controller = loop.compensator.step(prepared, state.controller, signals, now)
+        if loop.has_force_noise or loop.has_force_bias:
+            command = jnp.where(signals.age == 0, 0, command)
+        watch = observe(
+            loop, rig.constants, rules, watch, signals, truth, command, state.plant.shortfall, probe
+        )
+        push = None if probe is None else probe.push
+        state = drive(loop, rig, gains, state, now, truth, command, controller, push)
+        seen = None
+        if record:
+            identified = loop.compensator.identified(controller)
+            going = run.active & ~watch.over
+            seen = Tick(signals, command, truth, going, run.index, identified, state.plant.sent)
+        return (state, watch, now + 1), seen
+
+    carry, length = (run.state, run.watch, run.tick), stretch_length(loop)
+    (state, watch, now), seen = lax.scan(tick, carry, noise_ahead(loop, rig, run, length), length=length)
+    return run._replace(state=state, watch=watch, tick=now), seen
+
+
+def noise_ahead(loop: Loop, rig: Rig, run: Run, ticks: int) -> Noise:
+    """The sensors' noise, (ticks, *batch), at this tick and those that follow within a stretch."""
+    ahead = jnp.arange(ticks, dtype=jnp.int32).reshape(-1, *[1] * run.index.ndim)
+    age = run.tick + ahead - run.state.entry_tick[None]
+    return draw_noise(loop.has_force_noise, loop.has_position_noise, rig.scenario, run.index, age)
+
+
+def turn_over(loop: Loop, rig: Rig, gains: Gains, run: Run, skip_flight: bool = True) -> Run:
+    """Enter contacts that are over, begin the next, skip the free flight between two surfaces."""
+    watch, state, scenario = run.watch, run.state, rig.scenario
+    status = judge(scenario, watch, run.tick - state.entry_tick)
+    over = _pending(rig, run)
+    ticks = jnp.broadcast_to(run.tick - _first_tick(loop), run.index.shape)
+    delay = None
+    if loop.compensator.estimates_delay:
+        delay = loop.compensator.force_delay(gains, state.controller)
+    metrics = collect(scenario, run.metrics, watch, run.index, over, status, ticks, delay)
+    index = run.index + over.astype(jnp.int32)
+    active = run.active & ~(over & ((status != OK) | (index >= scenario.contacts)))
+    blank = fresh_watch(loop, watch.approach)
+    entry = _entry(scenario.contact, _slot(rig, index))
+    if watch.command is not None:
+        left = jnp.maximum(FADED * watch.peak_command, watch.command)
+        # A touch before the turn-over begins the next contact at once, at the speed of the rebound.
+        kept = {
+            "approach": watch.rebound,
+            "quiet": watch.quiet,
+            "recent": watch.recent,
+            "command": watch.command,
+        }
+        watch = _choose(over, blank._replace(left=left, **kept), watch)
+        # A damped contact is over while the mechanism is still dented: its law holds until it is free.
+        free = state.sensed.last.distance <= 0
+        state = state._replace(parameters=_choose(free, entry, state.parameters))
+        if state.touched is not None:
+            state = state._replace(touched=_choose(over, untouched(watch.approach), state.touched))
+        if skip_flight:
+            state = _skip_flight(loop, rig, gains, state, watch, run.tick)
+    else:
+        state = state._replace(parameters=_choose(over, entry, state.parameters))
+        position, velocity = _approach(rig, index, watch.rebound)
+        entered = enter(loop, rig, gains, state, position, velocity, run.tick)
+        state = _restart(loop, gains, state, entered, over, over)
+        watch = _choose(over, blank, watch)
+    return run._replace(state=state, watch=watch, metrics=metrics, index=index, active=active)
+
+
+def _rings(loop, ring):
+    """Empty delay lines of what the loop has."""
+    panel = None
+    if loop.is_two_sided:
+        motion = Motion(ring, ring)
+        ends = motion if loop.follows_panels else None
+        panel = Panel(motion, ends, ends)
+    truth = Truth(ring, (ring, ring) if loop.energies else None, ring if loop.has_corners else None)
+    return Rings(truth, ring if loop.has_lag else None, ring, panel)
+
+
+def _pending(rig, run):
+    """Lanes whose contact is over, or has failed."""
+    status = judge(rig.scenario, run.watch, run.tick - run.state.entry_tick)
+    return (run.watch.over | (status != OK)) & run.active
+
+
+def _first_tick(loop):
+    return max(loop.ring, loop.controller_ring)
+
+
+def _approach(rig, index, velocity):
+    """Where a run of the schedule starts: x_d(0) = -v (0.02 s + phi T)."""
+    phase = _entry(rig.scenario.phase, _slot(rig, index))
+    return -velocity * (APPROACH + phase * rig.constants.control_period), velocity
+
+
+def _skip_flight(loop, rig, gains, state, watch, tick):
+    """Move lanes in settled free flight by whole periods to shortly before the other surface."""
+    scenario, period = rig.scenario, rig.constants.control_period
+    velocity, position = state.velocity, state.position
+    stride = period * velocity
+    left = jnp.where(velocity > 0, -position, position + scenario.clearance)
+    spare = left - APPROACH * jnp.abs(velocity)
+    strides = spare / jnp.where(stride != 0, jnp.abs(stride), 1)
+    periods = lax.stop_gradient(jnp.floor(jnp.where(stride != 0, strides, 0)))
+    arrived = enter(loop, rig, gains, state, position + periods * stride, velocity, tick)
+    here = enter(loop, rig, gains, state, position, velocity, tick)
+    follows = (watch.elapsed == 0) & (watch.quiet > _first_tick(loop))
+    for component, steady in zip(state.plant.state, here.plant.state, strict=True):
+        # Components of the state are in periods, hence of like size.
+        scale = jnp.abs(rig.propagation.steady_command[0] * stride)
+        follows = follows & (jnp.abs(component - steady) <= SETTLED * scale)
+    # A force that still moves the model, noise for one, makes the flight an event.
+    push = jnp.abs(watch.command) * period / scenario.equivalent_mass
+    still = push <= STILL * jnp.abs(velocity)
+    skipped = follows & still & (periods >= 1)
+    return _restart(loop, gains, state, arrived, skipped, jnp.zeros_like(skipped))
+
+
+def _restart(loop, gains, state, entered, begins, fresh):
+    """Take over the entered run on the lanes where it `begins`; rings and the law's parameters stay."""
+    rings = state.sensed._replace(
+        last=entered.sensed.last,
+        lagged=entered.sensed.lagged,
+        first_position=entered.sensed.first_position,
+    )
+    chosen = _choose(
+        begins,
+        entered._replace(sensed=None, controller=None, parameters=None),
+        state._replace(sensed=None, controller=None, parameters=None),
+    )
+    sensed = rings._replace(
+        last=_choose(begins, rings.last, state.sensed.last),
+        lagged=jnp.where(begins, rings.lagged, state.sensed.lagged),
+        first_position=jnp.where(begins, rings.first_position, state.sensed.first_position),
+    )
+    return chosen._replace(
+        sensed=sensed,
+        controller=loop.compensator.restart(gains, state.controller, begins, fresh),
+        parameters=state.parameters,
+    )
+
+
+def _slot(rig, index):
+    """The slot of a contact; of one beyond them all, the last."""
+    return jnp.minimum(index, rig.scenario.phase.shape[0] - 1)
+
+
+def _entry(table, index):
+    """Entry `index` (per lane) of the leading axis of every leaf."""
+
+    def pick(leaf):
+        indices = jnp.broadcast_to(index, leaf.shape[1:])[None]
+        return jnp.take_along_axis(leaf, indices, axis=0, mode="promise_in_bounds")[0]
+
+    return jax.tree.map(pick, table)
+
+
+def _choose(condition, when_true, when_false):
+    """Leaf by leaf `where`; the condition is of the batch shape."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), when_true, when_false)

@@ -1,0 +1,155 @@
+"""The comparison itself: each law tuned to its own best, all judged on the same scenarios and probes.
+
+Laws, and groups of mechanisms that share a form, are dealt out to as many processes as there are cores, each
+with one device: compiling takes most of the time, and one process compiles on one core. No figure depends on
+how they are dealt.
+"""
+
+import multiprocessing
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from jaxhil.errors import one_line
+from jaxhil.mechanism.structs import Mechanism
+from tuning.transparency.figures import Figure
+
+LITERATURE, TUNED = "literature", "tuned"
+SEED = 0xFA1  # of the scenarios to judge on: tuning and its own validation never see them
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Numbers of scenarios to tune on, of starts and steps of the solver, of evaluations without derivatives
+    for each gain, of points scanned for starts; of scenarios to judge on; the error beyond which a contact
+    counts as a failure; the seed; whether to tune at all."""
+
+    scenarios: int = 32
+    starts: int = 3
+    steps: int = 16
+    polish: int = 20
+    scanned: int = 64
+    judged: int = 256
+    limit: float = 0.01
+    seed: int = 0
+    tuned: bool = True
+
+
+class LawFigures(NamedTuple):
+    """Of one law on one mechanism: gains by "literature", names of settings and "tuned", and what is said of
+    each. A law that has no gains to tune is only there with the literature's."""
+
+    law: str
+    mechanism: str
+    gains: dict[str, dict[str, float]]
+    figures: dict[str, dict[str, Figure]]
+
+
+class Failed(NamedTuple):
+    """A law that could not be judged on some mechanisms, and why; the others are none the worse for it."""
+
+    law: str
+    reason: str
+
+
+def compare(
+    mechanisms: Sequence[Mechanism],
+    laws: Sequence[str],
+    settings: Settings,
+    processes: int,
+    report: Callable[[str], None] = lambda text: None,
+) -> Iterator[LawFigures | Failed]:
+    """What is found of each law on every mechanism, as it is done."""
+    # A fresh interpreter each: jax does not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, context, _begin) as pool:
+        try:
+            report("contacts in space")
+            scenes = pool.submit(build_scenes, list(mechanisms), settings).result()
+            tasks = [(group, law) for group in scenes for law in sorted(laws, key=_gains, reverse=True)]
+            # Those with the most to compile first, so that no process is left with one of them at the end.
+            running = {pool.submit(judge_law, group, law, settings): (group, law) for group, law in tasks}
+            for done in as_completed(running):
+                group, law = running[done]
+                report(f"{law}, {len(group)} mechanism{'s' if len(group) > 1 else ''}")
+                error = done.exception()
+                if error is None:
+                    yield from done.result()
+                else:
+                    yield Failed(law, one_line(f"{type(error).__name__}: {error}", 200))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _gains(law: str) -> int:
+    """How many there are: the more, the longer it takes."""
+    from jaxhil.runtime import COMPENSATORS
+
+    return len(COMPENSATORS[law].gains)
+
+
+def build_scenes(mechanisms: list[Mechanism], settings: Settings) -> list[list[Any]]:
+    """What the laws are judged on (`tuning.benchmark.runs.Scene`), grouped by form."""
+    from tuning.benchmark.runs import build_scene
+    from tuning.gains.common_program import forms
+
+    seed = settings.seed + SEED
+    return [
+        [build_scene(mechanisms[i], form, settings.judged, seed) for i in group]
+        for group, form in forms(mechanisms)
+    ]
+
+
+def judge_law(scenes: list[Any], law: str, settings: Settings) -> list[LawFigures]:
+    """All figures of one law on mechanisms of one form, tuned together."""
+    from jaxhil.compensators import COMPENSATORS, literature_gains
+    from tuning.benchmark.runs import judge_gains
+    from tuning.gains.tune import Settings as Tuning
+    from tuning.gains.tune import tune_all
+
+    mechanisms = [scene.mechanism for scene in scenes]
+    others = [
+        name
+        for name in COMPENSATORS[law].settings
+        if any(literature_gains(one, law, name) != literature_gains(one, law) for one in mechanisms)
+    ]
+    gains = [
+        {which or LITERATURE: literature_gains(mechanism, law, which) for which in (None, *others)}
+        for mechanism in mechanisms
+    ]
+    moved = any(gain.tuned(mechanism) for gain in COMPENSATORS[law].gains for mechanism in mechanisms)
+    if settings.tuned and moved:
+        tuning = Tuning(
+            settings.scenarios,
+            settings.starts,
+            settings.steps,
+            validation=31,
+            seed=settings.seed,
+            polish=settings.polish,
+            scanned=settings.scanned,
+        )
+        for index, result in tune_all(mechanisms, law, tuning, form=scenes[0].form):
+            gains[index][TUNED] = result.gains
+    found = []
+    for scene, own in zip(scenes, gains, strict=True):
+        figures = {
+            which: judge_gains(scene, law, one, settings.limit, settings.seed) for which, one in own.items()
+        }
+        found.append(LawFigures(law, scene.mechanism.name, own, figures))
+    return found
+
+
+def _begin() -> None:
+    """A worker: one device, so that as many workers as there are cores share the machine."""
+    import os
+    import signal
+
+    # The parent hears of an interruption, and ends the workers.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    given = os.environ.get("XLA_FLAGS", "")
+    os.environ["XLA_FLAGS"] = f"{given} --xla_force_host_platform_device_count=1".strip()
+    from tuning.environment import prepare
+
+    prepare()

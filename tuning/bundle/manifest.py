@@ -1,0 +1,62 @@
+"""A bundle's manifest: what every file must be, in enough detail to say where one differs.
+
+SHA-256 of each file, a check of every line of those that are text, the values of the gain file, and at its
+end checks of the manifest itself. The bundle's own self-test reads it; `verify` does so from here, too.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from jaxhil.errors import one_line
+from tuning.bundle import selftest
+
+MARKS = (
+    selftest.MANIFEST,
+    "selftest.py",
+    "jaxhil_runtime.py",
+)  # of a folder that is meant as one
+
+
+def manifest_text(files: Mapping[str, bytes], document: Mapping[str, Any]) -> bytes:
+    """The manifest of these files, by their paths in the bundle, and of the gain document among them."""
+    entries = {}
+    for name, content in sorted(files.items()):
+        entry: dict[str, Any] = {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
+        if is_text(content):
+            entry["lines"] = selftest.line_checks(content)
+        entries[name] = entry
+    body = json.dumps(
+        {
+            "schema": selftest.SCHEMA,
+            "compensator": document["compensator"],
+            "gains_sha256": document["sha256"],
+            "values": dict(selftest.leaves(document, "")),
+            "files": entries,
+        },
+        indent=1,
+    ).encode("ascii")
+    body = body.removesuffix(b"\n}")
+    return body + selftest.own_seal(body)
+
+
+def is_text(content: bytes) -> bool:
+    """Whether a file is lines of text."""
+    try:
+        content.decode("utf-8")
+    except UnicodeDecodeError:
+        return False
+    return b"\0" not in content
+
+
+def is_bundle(folder: Path) -> bool:
+    """Whether a folder is one, or the remains of one."""
+    return folder.is_dir() and any((folder / name).is_file() for name in MARKS)
+
+
+def damage(folder: Path) -> list[str]:
+    """What differs from the manifest, a line each, found without running anything of the bundle."""
+    _, problems = selftest.differences(str(folder))
+    return [one_line(f"{name}: {text}", 300) for name, text in problems]

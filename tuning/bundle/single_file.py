@@ -1,0 +1,187 @@
+"""The runtime as one source file, with the exported law and what it imports, and no other.
+
+What the package's `__init__` offers in `__all__`, the law, and what their relative imports lead to: each
+module's text follows those that it imports, comments and all, without its own docstring and imports. Imports
+from outside come first, once each. So no two of the modules may bind one name: that is checked, and refused.
+"""
+
+import ast
+import importlib
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+import jaxhil.runtime
+
+OUTSIDE = {*sys.stdlib_module_names, "numpy"}
+
+
+class Source(NamedTuple):
+    """A module of the package.
+
+    name: its dotted name below the package, "" for the package itself.
+    text: all of it.
+    tree: its syntax tree.
+    inside: module and name of what it imports from the package, by the name that it has here.
+    outside: the import lines that it needs from elsewhere.
+    dropped: the statements that are of no use in one file: docstring, imports, `__all__`.
+    """
+
+    name: str
+    text: str
+    tree: ast.Module
+    inside: dict[str, str]
+    outside: tuple[str, ...]
+    dropped: tuple[ast.stmt, ...]
+
+
+def runtime_source(compensator: str, package: ModuleType = jaxhil.runtime) -> str:
+    """The text of `jaxhil_runtime.py` for one compensator: all that `package` offers, but for other laws.
+
+    Raises KeyError for a compensator that the runtime does not know, ValueError for a package that cannot be
+    put into one file: an import that is within a function, circular, renamed, or neither of the standard
+    library nor of NumPy; a name that two modules bind.
+    """
+    laws = importlib.import_module(f"{package.__name__}.registry").COMPENSATORS
+    law = laws[compensator].__module__.removeprefix(f"{package.__name__}.")
+    offered = read_source(Path(str(package.__file__)), "")
+    sources = _in_order(Path(str(package.__file__)).parent, [law, *_offering(offered)])
+    _check_unique(sources)
+    public = [name for name in _public(offered) if name in offered.inside]
+    imports = {line for source in sources for line in source.outside}
+    needed = "NumPy beside it" if any("numpy" in line for line in imports) else "nothing else to install"
+    lines = [
+        f'"""The controller for the rig, compensator {compensator}: its whole source in this one file.',
+        "",
+        f"Made of the package's modules by `jaxhil export`; Python 3.11 or later, {needed}.",
+        "",
+        "    controller = Controller.from_file('gains.json')",
+        '"""',
+        "",
+        *sorted(imports, key=lambda line: ("numpy" in line, line.startswith("from"), line)),
+        *(line for source in sources for line in _section(source)),
+        "",
+        "",
+        "__all__ = [" + ", ".join(f'"{name}"' for name in public) + "]",
+    ]
+    text = "\n".join(lines) + "\n"
+    try:
+        compile(text, "jaxhil_runtime.py", "exec")
+    except SyntaxError as error:
+        raise ValueError(f"the runtime in one file does not compile: {error}") from None
+    return text
+
+
+def read_source(path: Path, name: str) -> Source:
+    """A module of the package, its docstring, imports and `__all__` told apart from what it does."""
+    text = path.read_text(encoding="utf-8")
+    tree = ast.parse(text, str(path))
+    inside: dict[str, str] = {}
+    outside: list[str] = []
+    dropped = [one for one in tree.body if _assigns(one, "__all__")]
+    dropped += tree.body[:1] if ast.get_docstring(tree) is not None else []
+    for node in ast.walk(tree):
+        if not isinstance(node, (ast.Import, ast.ImportFrom)):
+            continue
+        where = f"{path.name}, line {node.lineno}"
+        if isinstance(node, ast.ImportFrom) and node.level:
+            if node not in tree.body:
+                raise ValueError(f"{where}: an import of the package within a block")
+            inside.update(_from_inside(node, name, where))
+        elif node in tree.body:
+            outside.extend(_from_outside(node, where))
+        if node in tree.body:
+            dropped.append(node)
+    return Source(name, text, tree, inside, tuple(outside), tuple(dropped))
+
+
+def _from_inside(node: ast.ImportFrom, name: str, where: str) -> Iterator[tuple[str, str]]:
+    """Each name that a relative import binds, and the module that it is from."""
+    above = name.split(".")[: -node.level] if name else []
+    for alias in node.names:
+        if node.module is None or alias.asname is not None:
+            raise ValueError(f"{where}: imports {alias.name}, allowed names of a module, under no other name")
+        yield alias.name, ".".join([*above, node.module])
+
+
+def _from_outside(node: ast.Import | ast.ImportFrom, where: str) -> Iterator[str]:
+    """One import line for each name."""
+    for alias in node.names:
+        module = node.module or "" if isinstance(node, ast.ImportFrom) else alias.name
+        if module.partition(".")[0] not in OUTSIDE:
+            raise ValueError(f"{where}: imports {module}, allowed the standard library and NumPy")
+        named = f"import {alias.name}" + (f" as {alias.asname}" if alias.asname else "")
+        yield f"from {module} {named}" if isinstance(node, ast.ImportFrom) else named
+
+
+def _in_order(folder: Path, wanted: Iterable[str]) -> list[Source]:
+    """The modules wanted and what they import, directly or not, each after those that it imports itself."""
+    ordered: dict[str, Source] = {}
+
+    def visit(name: str, above: tuple[str, ...]) -> None:
+        if name in above:
+            raise ValueError(f"modules that import each other: {' -> '.join([*above, name])}")
+        if name in ordered:
+            return
+        source = read_source(folder / f"{name.replace('.', '/')}.py", name)
+        for needed in dict.fromkeys(source.inside.values()):
+            visit(needed, (*above, name))
+        ordered[name] = source
+
+    for name in wanted:
+        visit(name, ())
+    return list(ordered.values())
+
+
+def _check_unique(sources: Iterable[Source]) -> None:
+    """Raises ValueError where two modules bind one name, or one name means two things from outside."""
+    owners: dict[str, str] = {}
+    for source in sources:
+        bound = {name: source.name for one in source.tree.body for name in _bound_by(one)}
+        for line in source.outside:
+            bound[re.split(r"[ .]", line.rpartition(" as ")[2].rpartition("import ")[2])[0]] = line
+        for name, owner in bound.items():
+            if owners.setdefault(name, owner) != owner:
+                raise ValueError(f"{name}: found in {owners[name]} and in {owner}, allowed once")
+
+
+def _bound_by(statement: ast.stmt) -> Iterator[str]:
+    if isinstance(statement, (ast.FunctionDef, ast.ClassDef)):
+        yield statement.name
+    elif not isinstance(statement, (ast.Import, ast.ImportFrom)) and not _assigns(statement, "__all__"):
+        for node in ast.walk(statement):
+            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+                yield node.id
+
+
+def _section(source: Source) -> Iterator[str]:
+    """The module's docstring as a comment, then its text without what is dropped."""
+    yield from ("", "", f"# ---- {source.name} " + "-" * (100 - len(source.name)))
+    for line in (ast.get_docstring(source.tree) or "").splitlines():
+        yield f"# {line}".rstrip()
+    yield ""
+    lines = source.text.splitlines()
+    for statement in source.dropped:
+        for number in range(statement.lineno - 1, statement.end_lineno or statement.lineno):
+            lines[number] = ""
+    yield re.sub(r"\n{4,}", "\n\n\n", "\n".join(lines)).strip("\n")
+
+
+def _public(offered: Source) -> list[str]:
+    for statement in offered.tree.body:
+        if isinstance(statement, ast.Assign) and _assigns(statement, "__all__"):
+            return list(ast.literal_eval(statement.value))
+    raise ValueError("the runtime's __init__ says nothing in __all__")
+
+
+def _offering(offered: Source) -> list[str]:
+    return [offered.inside[name] for name in _public(offered) if name in offered.inside]
+
+
+def _assigns(statement: ast.stmt, name: str) -> bool:
+    return isinstance(statement, ast.Assign) and any(
+        isinstance(target, ast.Name) and target.id == name for target in statement.targets
+    )

@@ -1,0 +1,287 @@
+"""A bundle on one page for people: what for, gains, limits and watchdog, what is reached, where it holds.
+
+One HTML file with its picture in it, made to print on one sheet of A4.
+"""
+
+import base64
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from html import escape
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from jaxhil.errors import one_line
+from tuning.bundle.writers import Entry, gain_entries, limit_entries
+from tuning.pictures.plots import BLACK, BLUE, LABELS, ORANGE, VERMILION, finish
+
+COLOURS = {"before": VERMILION, "literature": ORANGE, "tuned": BLUE}
+HATCHES = {"before": "///", "literature": "...", "tuned": ""}
+KEYS = {"rms": "rms", "p99": "99th percentile", "max": "largest"}  # of |e - e*|
+QUANTITIES = {
+    "contact_frequency": ("contact frequency", "Hz", 1.0),
+    "delay": ("delay", "ms", 1e3),
+    "approach_velocity": ("approach velocity", "mm/s", 1e3),
+    "force": ("contact force", "N", 1.0),
+}
+
+FITTED = (
+    "expected_",
+    "softness_",
+    "speed_",
+    "loss_",
+    "reference_",
+)  # what the watchdog's expectation is made of
+
+STYLE = """
+@page { size: A4; margin: 11mm 12mm; }
+* { box-sizing: border-box; }
+body { font: 8.6pt/1.25 Arial, sans-serif; color: #000; max-width: 186mm; margin: 0 auto; }
+h1 { font-size: 15pt; margin: 0 0 1mm; } h2 { font-size: 10pt; margin: 2.5mm 0 0.8mm; }
+p { margin: 0.8mm 0; } code { font-size: 7.4pt; overflow-wrap: anywhere; }
+.columns { display: flex; gap: 7mm; align-items: flex-start; } .columns > div { flex: 1 1 0; }
+.columns > div:first-child { flex-grow: 1.2; }
+table { border-collapse: collapse; width: 100%; font-size: 7.8pt; }
+td, th { text-align: left; padding: 0.25mm 2mm 0.25mm 0; border-bottom: 0.1mm solid #bbb; }
+td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
+td, th { white-space: nowrap; } img { width: 100%; margin-top: 2mm; } .note { color: #333; }
+"""
+
+
+def summary_html(document: Mapping[str, Any]) -> bytes:
+    """The page of a checked gain document."""
+    mechanism = document["mechanism"]
+    name = escape(one_line(mechanism["name"], 80))
+    picture = base64.b64encode(picture_png(document)).decode("ascii")
+    versions = ", ".join(f"{key} {value}" for key, value in document["versions"].items())
+    parts = [
+        "<!DOCTYPE html>",
+        f'<html lang="en"><head><meta charset="utf-8"><title>{name}: controller for the rig</title>',
+        f"<style>{STYLE}</style></head><body>",
+        f"<h1>{name}: compensator {escape(document['compensator'])}</h1>",
+        f"<p>{escape(about(mechanism))}</p>",
+        f"<p>Control period {_number(1e3 * document['control_period'])} ms. "
+        f"Tuned {escape(one_line(document['created'], 40))}; seed {document['seed']}; "
+        f"{escape(one_line(versions, 200))}.<br>",
+        f"SHA-256 of the gains' content <code>{escape(document['sha256'])}</code></p>",
+        f'<img alt="Restitution error, and what was tuned over" src="data:image/png;base64,{picture}">',
+        *_figures(document),
+        '<div class="columns"><div>',
+        *_gains(document),
+        *_watchdog(document),
+        "</div><div>",
+        *_limits(document),
+        "</div></div>",
+        "</body></html>",
+    ]
+    return ("\n".join(parts) + "\n").encode()
+
+
+def about(mechanism: Mapping[str, Any]) -> str:
+    """The mechanism and the rig in a sentence."""
+    bodies, contact, rig = mechanism["bodies"], mechanism["contact"], mechanism["rig"]
+    mass = bodies.get("equivalent_mass")
+    text = f"{_number(mass)} kg" if mass else f"bodies of {_listed(bodies.values())} kg"
+    approach = mechanism["approach"]
+    number = approach["contacts"]
+    stiffness = _listed(_flat(contact["stiffness"]))
+    return (
+        f"{text} at {_number(1e3 * approach['velocity'])} mm/s, {number} contact{'s' if number > 1 else ''}, "
+        f"{contact['law'].replace('_', ' ')} contact of stiffness {stiffness} (SI units); motion simulator "
+        f"{rig['simulator']['model'].replace('_', ' ')}, delay "
+        f"{_number(1e3 * rig['simulator'].get('delay', 0.0))} ms; force sensor delay "
+        f"{_number(1e3 * rig['force_sensor'].get('delay', 0.0))} ms."
+    )
+
+
+def picture_png(document: Mapping[str, Any]) -> bytes:
+    """Restitution error before and after, beside what the gains were tuned over."""
+    figure = Figure(figsize=(9.3, 3.1))
+    FigureCanvasAgg(figure)
+    left = figure.add_axes((0.075, 0.2, 0.48, 0.6))
+    _errors(left, document)
+    spans = [(key, one) for key, one in document["envelope"].items() if _is_span(one)][:4]
+    figure.text(0.61, 0.93, "Tuned over (the gains hold there)", fontsize=10, va="center")
+    if not spans:
+        figure.text(0.61, 0.5, "the gain file does not say", fontsize=9)
+    for number, (key, span) in enumerate(spans):
+        _strip(figure.add_axes((0.63, 0.72 - 0.2 * number, 0.34, 0.06)), key, span)
+    file = io.BytesIO()
+    figure.savefig(file, dpi=160, format="png", metadata={"Software": None})
+    return file.getvalue()
+
+
+def _errors(axes: Axes, document: Mapping[str, Any]) -> None:
+    """Groups of bars: of the nominal run and of fresh scenarios, each under the gains before and after."""
+    groups = _error_groups(document["figures"])
+    series = [name for name in COLOURS if any(name in values for _, values in groups)]
+    width = 0.8 / max(1, len(series))
+    axes.set_title("Restitution error |e - e*|", fontsize=10, loc="left", y=1.13)
+    for place, name in enumerate(series):
+        shown = [(i, values[name]) for i, (_, values) in enumerate(groups) if name in values]
+        centres = [i + (place - (len(series) - 1) / 2) * width for i, _ in shown]
+        bars = axes.bar(
+            centres, [value for _, value in shown], width * 0.92, color=COLOURS[name], hatch=HATCHES[name],
+            edgecolor="white", linewidth=0.4, label=LABELS[name].partition(":")[0],
+        )  # fmt: skip
+        axes.bar_label(bars, [f"{value:.2g}" for _, value in shown], fontsize=6, padding=1)
+    axes.set_xticks(range(len(groups)), [label for label, _ in groups], fontsize=8)
+    axes.tick_params(axis="y", labelsize=8)
+    axes.set_ylabel("|e - e*| [1]", fontsize=9)
+    finish(axes, None)
+    axes.grid(False, axis="x")
+    positive = [value for _, values in groups for value in values.values() if value > 0]
+    if positive:
+        axes.set_yscale("log")
+        axes.set_ylim(min(positive) / 2, max(positive) * 3)
+        axes.legend(
+            loc="lower left", bbox_to_anchor=(0, 0.98), ncols=3, fontsize=8, frameon=False, borderaxespad=0.2
+        )
+
+
+def _error_groups(figures: Mapping[str, Any]) -> list[tuple[str, dict[str, float]]]:
+    groups = []
+    for kind, key, label in (
+        ("nominal", "rms", "nominal run,\nrms"),
+        *(("robust", key, f"scenarios,\n{text}") for key, text in KEYS.items()),
+    ):
+        known = figures.get(kind, {})
+        values = {
+            name: one[key]
+            for name, one in (known.items() if isinstance(known, Mapping) else ())
+            if name in COLOURS and isinstance(one, Mapping) and isinstance(one.get(key), (int, float))
+        }
+        if values:
+            groups.append((label, values))
+    return groups
+
+
+def _strip(axes: Axes, key: str, span: Mapping[str, Any]) -> None:
+    """One quantity's range on an axis of its own."""
+    name, unit, factor = QUANTITIES.get(key, (key.replace("_", " "), span["unit"], 1.0))
+    low, high = sorted((factor * span["low"], factor * span["high"]))
+    room = 0.25 * (high - low) or 0.25 * abs(high) or 1.0
+    axes.barh(0, high - low, left=low, height=1, color=BLUE)
+    axes.plot([low, high], [0, 0], linestyle="none", marker="|", color=BLACK, markersize=9)
+    axes.set(xlim=(low - room, high + room), ylim=(-0.9, 0.9), yticks=[])
+    axes.tick_params(axis="x", labelsize=7, pad=1.5)
+    axes.set_title(
+        f"{one_line(name, 30)}: {low:.3g} to {high:.3g} {one_line(unit, 10)}", fontsize=8, loc="left", pad=3
+    )
+    for side in ("top", "right", "left"):
+        axes.spines[side].set_visible(False)
+
+
+def _figures(document: Mapping[str, Any]) -> Iterator[str]:
+    known = document["figures"].get("robust")
+    rows = []
+    for name, one in known.items() if isinstance(known, Mapping) else ():
+        if name in LABELS and isinstance(one, Mapping):
+            cells = [*(one.get(key) for key in (*KEYS, "mean", "peak_ratio")), one.get("failed")]
+            rows.append((LABELS[name], *(_number(value) for value in cells)))
+    if rows:
+        heads = ("fresh scenarios", *KEYS.values(), "mean e - e*", "peak force / reference", "not ended")
+        yield from _table("What is reached: restitution error |e - e*| [1]", heads, rows)
+    else:
+        yield "<p>The gain file holds no figures of what the gains reach.</p>"
+
+
+def _gains(document: Mapping[str, Any]) -> Iterator[str]:
+    rows = [
+        (name, _number(one.value, 6), one.unit, f"{_number(one.lower, 3)} to {_number(one.upper, 3)}")
+        for name, one in gain_entries(document).items()
+    ]
+    if rows:
+        yield from _table("Gains", ("gain", "value", "unit", "bounds"), rows)
+    else:
+        yield "<h2>Gains</h2><p>None: the measured force is passed on.</p>"
+
+
+def _limits(document: Mapping[str, Any]) -> Iterator[str]:
+    given = _given(document)
+    if not given:
+        yield "<h2>Limits</h2><p>None: only what is not finite trips the controller.</p>"
+        return
+    rows = [(name, _number(one.value, 5), one.unit) for name, one in given.items() if is_told(name)]
+    yield from _table("Limits", ("limit", "value", "unit"), rows, (1,))
+
+
+def _watchdog(document: Mapping[str, Any]) -> Iterator[str]:
+    """What there is to say of the limits beside their values."""
+    given = _given(document)
+    if not given:
+        return
+    yield "<h2>Watchdog</h2>"
+    rates = document["figures"].get("watchdog")
+    told = "; ".join(told_rates(rates)) if isinstance(rates, Mapping) else ""
+    told = one_line(told, 600) or "Rates of false and missed alarms are not known"
+    yield f"<p>{escape(told[0].upper() + told[1:])}.</p>"
+    fitted = sum(not is_told(name) for name in given)
+    if fitted:
+        yield f"<p>Its expected restitution: {fitted} fitted numbers in the gain file.</p>"
+    unset = [name for name in document["limits"] if name not in given]
+    if unset:
+        yield f'<p class="note">Not limited: {escape(", ".join(unset))}.</p>'
+
+
+def _given(document: Mapping[str, Any]) -> dict[str, Entry]:
+    """The limits that limit something."""
+    entries = limit_entries(document)
+    return {name: one for name, one in entries.items() if document["limits"][name]["value"] is not None}
+
+
+def is_told(limit: str) -> bool:
+    """Whether a limit says something to people: what the watchdog's expectation is made of does not."""
+    return not limit.startswith(FITTED)
+
+
+def told_rates(rates: Mapping[str, Any]) -> Iterator[str]:
+    """In words, how often the watchdog stops a good run and misses a bad one."""
+    for name, runs in (("false_alarms", "good runs"), ("missed_alarms", "runs to be stopped")):
+        one = rates.get(name)
+        if isinstance(one, Mapping) and {"runs", "alarms", "low", "high"} <= one.keys():
+            interval = f"95 %: {_number(one['low'], 2)} to {_number(one['high'], 2)}"
+            yield f"{name.replace('_', ' ')} {one['alarms']} of {one['runs']} {runs} ({interval})"
+    calibrated = rates.get("calibrated_on")
+    if isinstance(calibrated, Mapping) and calibrated.get("runs") not in (None, "good"):
+        yield "no run was good: the limits come from runs with errors beyond the limit"
+
+
+def _table(
+    title: str, heads: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] | None = None
+) -> Iterator[str]:
+    right = set(range(1, len(heads)) if numbers is None else numbers)
+    if numbers is None and "unit" in heads:
+        right.discard(list(heads).index("unit"))
+
+    def cells(tag: str, values: Sequence[str]) -> str:
+        return "".join(
+            f'<{tag} class="n">{escape(value)}</{tag}>' if i in right else f"<{tag}>{escape(value)}</{tag}>"
+            for i, value in enumerate(values)
+        )
+
+    yield f"<h2>{escape(title)}</h2><table><tr>{cells('th', heads)}</tr>"
+    yield from (f"<tr>{cells('td', row)}</tr>" for row in rows)
+    yield "</table>"
+
+
+def _number(value: Any, digits: int = 4) -> str:
+    return f"{value:.{digits}g}" if isinstance(value, (int, float)) else "-"
+
+
+def _listed(values: Any, most: int = 4) -> str:
+    texts = [_number(value) for value in values]
+    return ", ".join(texts[:most]) + (", ..." if len(texts) > most else "")
+
+
+def _flat(value: Any) -> Iterator[float]:
+    for one in value:
+        yield from _flat(one) if isinstance(one, (list, tuple)) else (one,)
+
+
+def _is_span(value: Any) -> bool:
+    return isinstance(value, Mapping) and all(
+        isinstance(value.get(key), (int, float)) for key in ("low", "high")
+    )

@@ -1,0 +1,57 @@
+"""`jaxhil mechanisms`: the built-in mechanism files and the standard suites, with their sources."""
+
+import math
+from typing import Any
+
+from jaxhil.mechanism.file import builtin_names, builtin_path, load, suite_names
+from jaxhil.mechanism.structs import Mechanism
+from tuning import terminal as report
+from tuning.cli.options import Mechanisms
+
+
+def run(options: Mechanisms) -> int:
+    """List them; always 0."""
+    titles = {"Built-in mechanisms": builtin_names(), "Standard suites": suite_names()}
+    tables = {
+        title: [_entry(name, load(name).mechanism) for name in names] for title, names in titles.items()
+    }
+    if options.json:
+        mechanisms, suites = tables.values()
+        report.emit_json({"mechanisms": mechanisms, "suites": suites})
+        return 0
+    headings = ["name", "law", "contacts", "mass [kg]", "contact frequencies [Hz]"]
+    for title, entries in tables.items():
+        report.emit(
+            report.table(title, headings, [_row(entry) for entry in entries], texts=(0, 1, 4)),
+            *(f"{entry['name']}: {entry['source']}\n" for entry in entries),
+        )
+    return 0
+
+
+def _row(entry: dict[str, Any]) -> list[Any]:
+    frequencies = " ".join(f"{value:.3g}" for value in entry["contact_frequencies"]) or "-"
+    return [entry["name"], entry["law"], entry["contacts"], entry["mass"], frequencies]
+
+
+def _entry(name: str, mechanism: Mechanism) -> dict[str, Any]:
+    return {
+        "name": name,
+        "law": mechanism.contact.law,
+        "contacts": mechanism.approach.contacts,
+        "mass": mechanism.bodies.mass,
+        "contact_frequencies": _frequencies(mechanism),
+        "control_period": mechanism.rig.control_period,
+        "source": mechanism.source,
+        "path": str(builtin_path(name)),
+    }
+
+
+def _frequencies(mechanism: Mechanism) -> list[float]:
+    """sqrt(k/M)/(2 pi) [Hz] of every stiffness in the file, each once; none for a power law."""
+    if mechanism.contact.law in ("hunt_crossley", "depth_damped"):
+        return []
+    stiffness: list[float] = []
+    for entry in mechanism.contact.stiffness:
+        stiffness.extend(entry if isinstance(entry, list) else [entry])
+    mass = mechanism.bodies.mass
+    return [math.sqrt(value / mass) / (2 * math.pi) for value in dict.fromkeys(stiffness)]

@@ -1,0 +1,214 @@
+"""`jaxhil rig`: the controller as a process of its own, against a rig played in real time over UDP."""
+
+import math
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from jaxhil.errors import InputError, one_line
+from tuning import terminal as report
+from tuning.cli.commands import checks
+from tuning.cli.options_rig import Rig
+
+LONGEST_EMPTY = 30.0  # s of empty loop at most
+EMPTY_SHARE = 0.2  # of the run's duration
+MOST_TICKS = 2_000_000
+PROCESS = "udp_controller.py"
+MOST_ROWS = 12  # contacts shown one by one
+
+
+def run(options: Rig) -> int:
+    """Play an empty loop and the run; 0 if all is good, 1 if not, 130 if interrupted."""
+    checks.limit(options.limit)
+    checks.at_least(0, seed=options.seed)
+    _check_injection(options)
+    if options.plot is not None:
+        checks.picture(options.plot)
+    gains = checks.gain_file(options.path)
+    document, mechanism = load(gains)
+    period = mechanism.rig.control_period
+    if not period <= options.duration <= MOST_TICKS * period:
+        allowed = f"{period:g} to {MOST_TICKS * period:g} s, {MOST_TICKS} control periods"
+        raise InputError(f"--duration: found {options.duration:g}, allowed {allowed}")
+
+    from tuning.rig.network import Injection
+    from tuning.rig.report import judge, reference_restitutions
+    from tuning.rig.session import Setup, real_time, run_session
+
+    try:
+        with real_time(options.realtime):
+            pass
+    except OSError as error:
+        reason = one_line(error.strerror or str(error), 100)
+        raise InputError(f"--realtime: found no such priority ({reason}), allowed without it") from None
+
+    with tempfile.TemporaryDirectory(prefix="jaxhil-rig-") as temporary:
+        scratch = Path(temporary)
+        setup = Setup(
+            folder=controller_folder(options.path, document["compensator"], scratch),
+            gains=gains,
+            mechanism=mechanism,
+            stroke=stroke(document),
+            duration=options.duration,
+            empty_duration=min(LONGEST_EMPTY, EMPTY_SHARE * options.duration),
+            injection=Injection(options.drops, options.jitter, options.delay),
+            seed=options.seed,
+            priority=options.realtime,
+        )
+        session = run_session(setup, scratch, report.note, _Progress(period).tell)
+    # jax is imported here for the first time: none of it runs beside the loop.
+    references = reference_restitutions(mechanism, session.contacts)
+    found = judge(setup, session, references, options.limit, document["compensator"])
+    if options.plot is not None:
+        from tuning.pictures.plots import save
+        from tuning.rig.plot import latency_plot
+
+        title = f"{mechanism.name}, {document['compensator']}: latencies at {1 / period:g} Hz over UDP"
+        save(latency_plot(session, title, period), options.plot)
+        report.note(f"wrote {options.plot}")
+    if options.json:
+        report.emit_json(found)
+    else:
+        _print(found)
+    if session.interrupted:
+        raise KeyboardInterrupt
+    return 0 if found["verdict"] == "good" else 1
+
+
+def controller_folder(given: str, compensator: str, scratch: Path) -> Path:
+    """The folder in which the controller's process is to run: the bundle itself or, for a bare gain file,
+    what such a process needs of a bundle, made in the folder `scratch`."""
+    from tuning.bundle.single_file import runtime_source
+    from tuning.rig.session import SOURCE
+
+    folder = Path(given)
+    if folder.is_dir() and (folder / PROCESS).is_file():
+        return folder
+    (scratch / "jaxhil_runtime.py").write_text(runtime_source(compensator), encoding="utf-8")
+    (scratch / PROCESS).write_bytes((SOURCE / PROCESS).read_bytes())
+    return scratch
+
+
+def load(gains: Path) -> tuple[dict[str, Any], Any]:
+    """The gain file's document and mechanism, checked as on the rig. Raises InputError."""
+    from jaxhil.mechanism.file import from_builtins
+    from jaxhil.runtime import GainFileError
+    from jaxhil.runtime.gain_file import check_gain_document, read_gain_document
+
+    source = one_line(str(gains))
+    try:
+        document = read_gain_document(gains)
+        check_gain_document(document, source)
+    except GainFileError as error:
+        raise InputError(str(error)) from None
+    return document, from_builtins(document["mechanism"], f"{source}: mechanism")
+
+
+def stroke(document: dict[str, Any]) -> tuple[float, float]:
+    """The least and largest position command [m] that a gain document allows; infinite where it has none."""
+    limits = document.get("limits", {})
+    low, high = (limits.get(f"command_{end}", {}).get("value") for end in ("lowest", "highest"))
+    return (-math.inf if low is None else low), (math.inf if high is None else high)
+
+
+class _Progress:
+    """How far the loop is, in few bytes: it is told from within."""
+
+    def __init__(self, period: float) -> None:
+        self._period, self._terminal = period, sys.stderr.isatty()
+
+    def tell(self, done: int, total: int) -> None:
+        """So many ticks of so many are done."""
+        seconds = round(done * self._period)
+        if self._terminal:
+            sys.stderr.write(f"\r{seconds} of {total * self._period:.0f} s \r")
+            sys.stderr.flush()
+        elif seconds and seconds % 60 == 0:
+            sys.stderr.write(f"{seconds} of {total * self._period:.0f} s\n")
+            sys.stderr.flush()
+
+
+def _check_injection(options: Rig) -> None:
+    if not 0.0 <= options.drops < 1.0:
+        raise InputError(f"--drops: found {options.drops:g}, allowed a probability >= 0 and < 1")
+    for name in ("jitter", "delay"):
+        value = getattr(options, name)
+        if not 0.0 <= value <= 1.0:
+            raise InputError(f"--{name}: found {value:g}, allowed 0 to 1 s")
+
+
+def _print(found: dict[str, Any]) -> None:
+    loops = {"empty loop": found["empty_loop"], "controller": found["run"]}
+    reached = {name: loop for name, loop in loops.items() if loop is not None}
+    ticks = report.table(
+        f"{found['mechanism']}, {found['compensator']}, {1 / found['control_period']:g} Hz over UDP: ticks",
+        ["loop", "ticks", "missed", "controller's fault", "injected", "the machine's"],
+        [
+            (name, *(loop[key] for key in ("ticks", "missed", *(f"missed_by_{one}" for one in _CAUSES))))
+            for name, loop in reached.items()
+        ],
+    )
+    times = report.table(
+        "Times [µs]: median, 99.9th percentile, maximum",
+        ["", "loop", "median", "99.9 %", "maximum"],
+        [
+            (words, name, *(f"{1e6 * value:.1f}" for value in loop[key].values()))
+            for key, words in _TIMES.items()
+            for name, loop in reached.items()
+        ],
+        texts=(0, 1),
+    )
+    shown = found["contacts"][:MOST_ROWS]
+    rows = [
+        (
+            *(number, one["number"] + 1, report.figure(one["restitution"], 5)),
+            *(report.figure(one["reference_restitution"], 5), report.signed(one["error"])),
+            *(one["peak_force"], 1e3 * one["duration"], one["status"]),
+        )
+        for number, one in enumerate(shown, start=1)
+    ]
+    headings = ["contact", "entry", "e", "e*", "error", "peak force [N]", "duration [ms]", "status"]
+    contacts = report.table(f"Contacts: {len(found['contacts'])}", headings, rows, texts=(7,))
+    lines = []
+    if len(found["contacts"]) > len(shown):
+        lines.append(f"... and {len(found['contacts']) - len(shown)} more contacts.")
+    if found["largest_error"] is not None:
+        lines.append(f"Largest error of {found['judged']} contacts: {found['largest_error']:+.5f}.")
+    lines += [
+        f"{loop['replayed']} ticks of the controller took more than their share of CPU time, and at most "
+        f"{1e6 * loop['replayed_most']:.0f} µs when the same packets were gone through again."
+        for loop in reached.values()
+        if loop["replayed"]
+    ]
+    if found["stalled"]:
+        lines.append(
+            f"{found['stalled']} contacts are not judged: the machine left the controller without time for "
+            "more than three periods."
+        )
+    if found["resets"]:
+        lines.append(f"{len(found['resets'])} times the controller tripped over that, and was reset.")
+    lines += [
+        f"The machine held up the rig of the {name}: its clock stood still for {loop['stood_still']:.3g} s."
+        for name, loop in reached.items()
+        if loop["stood_still"] > 0
+    ]
+    doubts = found["run"]["controller"]["doubts"] if found["run"] is not None else {}
+    if doubts:
+        said = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in doubts.items())
+        lines.append(f"Of {sum(doubts.values())} contacts the law says that it did not know them: {said}.")
+    if found["tripped"]:
+        lines.append(f"The controller {found['tripped']}.")
+    if found["interrupted"]:
+        lines.append("Interrupted: this is what was measured.")
+    lines += [f"Bad: {reason}" for reason in found["reasons"]] or [f"Good: {found['good']}"]
+    report.emit(ticks, times, *([contacts] if rows else []), *lines)
+
+
+_CAUSES = ("controller", "injection", "machine")
+_TIMES = {
+    "tick_time": "controller, per tick",
+    "tick_cpu": "of it CPU",
+    "round_trip": "round trip",
+    "lateness": "packet left late by",
+}

@@ -1,0 +1,83 @@
+"""The studies that `jaxhil sweep` runs beside its sweep, or finds in the store where it resumes."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from jaxhil.errors import InputError, one_line
+from tuning import terminal as report
+from tuning.cli.options import Sweep
+
+STAGE = 10_000  # scenarios between two lines of progress
+
+
+def drivers(options: Sweep, store, sweep, unwritten: list[InputError]) -> dict[str, Any]:
+    """What of the document says which input drives the error. `unwritten`: see `put_off`."""
+    from jaxhil.mechanism.uncertainty import dimensions
+    from tuning.statistics.sobol_indices import evaluations
+    from tuning.sweeps.kept import drivers_path, keep_drivers, kept_drivers
+    from tuning.sweeps.studies import error_drivers
+
+    number: Any = options.drivers
+    found = kept_drivers(store, number) if options.resume else None
+    if found is not None:
+        _say_kept("drivers", drivers_path(store, number))
+        return found._asdict()
+    # Noise, if there is any, adds an input; the bar need not know.
+    with report.progress(evaluations(len(dimensions(sweep.mechanism)), number), "scenarios") as progress:
+        found = error_drivers(sweep, number, lambda more: progress.advance(more, "drivers"))
+    with put_off(unwritten):
+        keep_drivers(store, number, found)
+    return found._asdict()
+
+
+def rare(options: Sweep, store, sweep, unwritten: list[InputError]) -> dict[str, Any]:
+    """What of the document says how probable an error beyond a limit is. `unwritten`: see `put_off`."""
+    from tuning.sweeps.kept import keep_rare, kept_rare, rare_path
+    from tuning.sweeps.studies import rare_failure
+
+    limit = float(options.rare or options.limit)
+    found = kept_rare(store, limit) if options.resume else None
+    if found is not None:
+        _say_kept("subset simulation", rare_path(store, limit))
+        return _rare_document(limit, found)
+    ran = 0
+    with report.stages(1) as stages:
+        stages.begin("subset simulation")
+
+        def done(more: int) -> None:
+            nonlocal ran
+            ran += more
+            if ran % STAGE == 0:
+                stages.say(f"subset simulation: {ran} scenarios")
+
+        found = rare_failure(sweep, limit, done)
+    with put_off(unwritten):
+        keep_rare(store, limit, found)
+    return _rare_document(limit, found)
+
+
+@contextmanager
+def put_off(unwritten: list[InputError]) -> Iterator[None]:
+    """What cannot be written is added to the list, to be told later."""
+    try:
+        yield
+    except InputError as error:
+        unwritten.append(error)
+
+
+def _rare_document(limit: float, found) -> dict[str, Any]:
+    from tuning.sweeps.studies import spread_beyond_formula
+
+    told = ("probability", "low", "high", "coefficient_of_variation", "formula_coefficient_of_variation")
+    return {
+        "limit": limit,
+        **{name: getattr(found, name) for name in (*told, "evaluations")},
+        "estimates": found.estimates.tolist(),
+        "spread_beyond_formula": spread_beyond_formula(found),
+    }
+
+
+def _say_kept(study: str, path: Path) -> None:
+    report.note(f"{study}: as kept in {one_line(str(path))}")

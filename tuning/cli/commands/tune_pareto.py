@@ -1,0 +1,182 @@
+"""`jaxhil tune --pareto N`: gains that trade accuracy for something else, a gain file for each point."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxhil.errors import InputError
+from jaxhil.mechanism.file import LoadedMechanism
+from tuning import terminal as report
+from tuning.cli.commands import checks
+from tuning.cli.options import Tune
+from tuning.environment import prepare
+
+FOLDER = "pareto"
+
+
+def check(options: Tune) -> None:
+    """There is a front to find, if one is asked for. Raises `InputError`."""
+    number = options.pareto
+    if number == 0:
+        return
+    if number < 2:
+        raise InputError(f"--pareto: found {number}, allowed 0 or an integer >= 2")
+    prepare()
+    from tuning.gains.pareto import AXES
+
+    if options.pareto_against is not None:
+        checks.one_of(tuple(AXES), **{"pareto-against": options.pareto_against})
+    if axis_of(options) is None:
+        raise InputError(
+            f"--pareto: found {number}, allowed 0 for {options.compensator}: there is no trade-off, it "
+            "passes sensor noise on as it is whatever its gains"
+        )
+
+
+def axis_of(options: Tune) -> Any:
+    """What the error is traded against (`tuning.gains.pareto.Axis`); None: nothing."""
+    from tuning.gains.pareto import AXES, NOISE, default_axis, has_trade_off
+
+    if options.pareto_against is None:
+        return default_axis(options.compensator)
+    axis = AXES[options.pareto_against]
+    return None if axis == NOISE and not has_trade_off(options.compensator) else axis
+
+
+def trade(
+    options: Tune,
+    loaded: Sequence[LoadedMechanism],
+    done: Mapping[int, Any],
+    entries: Mapping[int, dict[str, Any]],
+    problems: list[str],
+    stages: report.Stages,
+) -> dict[int, Any]:
+    """Fronts of the mechanisms that are `done`, written beside their gains and added to their entries."""
+    from tuning.gains.pareto import fronts
+
+    order, made = sorted(done), {}
+    for place, front in fronts(
+        [done[index] for index in order], options.pareto, stages.say, axis_of(options)
+    ):
+        index = order[place]
+        folder = Path(entries[index]["gain_file"]).parent
+        try:
+            entry = _write(options, loaded[index].sha256, done[index], front, folder)
+        except InputError as error:
+            problems.append(str(error))
+            report.note(f"jaxhil: {error}")
+            continue
+        entries[index]["pareto"], made[index] = entry, front
+        stages.finish()
+    return made
+
+
+def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -> None:
+    """Every point, and the quietest that is accurate enough."""
+    rows: list[list[Any]] = [
+        ["literature's rule", None, *_numbers(result, front.literature), ""],
+        ["tuned", None, *_numbers(result, front.tuned), ""],
+    ]
+    for number, point in enumerate(front.points, start=1):
+        like = next(n for n, other in enumerate(front.points, start=1) if other.place == point.place)
+        place = f"as point {like}" if like < number else "front" if point.on_front else "dominated"
+        rows.append([str(number), point.weight, *_numbers(result, point), place])
+    axis = front.axis
+    weight = axis.weight.replace("_", " ")
+    headings = ["point", weight, axis.name, *([] if _is_rms(result) else ["objective"])]
+    table = report.table(
+        f"{result.mechanism.name}: restitution error against {axis.words}, "
+        f"{options.validation} fresh scenarios",
+        [*headings, "rms", "99th pct", "max", "not ended", ""],
+        rows,
+        texts=(0, len(rows[0]) - 1),
+    )
+    paths = [one["gain_file"] for one in entry["points"]]
+    lines = [f"wrote {paths[0]} to {paths[-1]}", f"wrote {entry['plot']}"]
+    enough = [
+        (point.place[1], number, point.figures.rms)
+        for number, point in enumerate(front.points, start=1)
+        if point.figures.failed == 0 and point.figures.rms <= options.limit
+    ]
+    if enough:
+        cost, number, rms = min(enough)
+        words = {
+            "noise": f"Quietest within {options.limit:g}: point {number}, sensor noise x {cost:.4g}",
+            "peak": f"Gentlest within {options.limit:g}: point {number}, peak x {cost:.4g}",
+            "honesty": f"Most honest within {options.limit:g}: point {number}, error {cost:.2g}",
+        }
+        lines.append(f"{words[axis.name]}, rms {rms:.2g}.")
+    else:
+        lines.append(f"No point's rms error is within {options.limit:g}.")
+    report.emit(table, *lines, "")
+
+
+def _write(options: Tune, sha256: str, result: Any, front: Any, folder: Path) -> dict[str, Any]:
+    """Write a gain file for each point and the picture of all; what `--json` says of them."""
+    from tuning.gain_file import build_document, validity_envelope, write_gain_file
+    from tuning.pictures.plots import front_plot, save
+
+    envelope = validity_envelope(result.mechanism, result.scenarios)
+    axis, entries = front.axis, []
+    for number, point in enumerate(front.points, start=1):
+        place = folder / FOLDER / f"{number:02d}"
+        place.mkdir(parents=True, exist_ok=True)
+        traded = {
+            axis.weight: point.weight,
+            axis.cost: point.cost,
+            "error": point.error,
+            "on_front": point.on_front,
+        }
+        figures = {
+            "nominal": {**result.nominal, "tuned": point.nominal},
+            "robust": {**result.figures, "tuned": point.figures},
+            "tuned_intervals": point.intervals.plain(),
+        }
+        if point.honesty is not None:
+            figures["honesty"] = {**result.honesty, "tuned": point.honesty}
+        document = build_document(
+            options.compensator,
+            point.gains,
+            result.mechanism,
+            sha256,
+            envelope,
+            {**figures, "pareto": traded},
+            options.seed,
+            {},
+        )
+        write_gain_file(place / "gains.json", document)
+        gains = {"gain_file": str(place / "gains.json"), "gains": document["gains"]}
+        entries.append({**traded, **gains, "figures": point.figures, "nominal": point.nominal})
+    _remove_others(folder / FOLDER, len(entries))
+    plot = folder / "pareto.png"
+    save(front_plot(front, result, options.limit), plot)
+    beside = {
+        name: {axis.cost: one.cost, "error": one.error, "figures": one.figures}
+        for name, one in (("literature", front.literature), ("tuned", front.tuned))
+    }
+    return {"against": axis.name, "points": entries, **beside, "plot": str(plot)}
+
+
+def _remove_others(folder: Path, number: int) -> None:
+    """Gain files of a longer front that was written here before do not belong to this one."""
+    for path in folder.glob("*/gains.json"):
+        name = path.parent.name
+        if name.isdigit() and int(name) > number:
+            path.unlink()
+            if not any(path.parent.iterdir()):
+                path.parent.rmdir()
+
+
+def _is_rms(result: Any) -> bool:
+    """Whether the objective without what is traded is the rms error itself."""
+    one = result.settings.objective
+    weights = one.divergence_weight, one.command_weight, one.chatter_weight, one.honesty_weight
+    return (one.name, *weights) == ("rms", 1.0, 0.0, 0.0, 0.0)
+
+
+def _numbers(result: Any, point: Any) -> list[Any]:
+    one = point.figures
+    errors = [one.rms] if _is_rms(result) else [point.error, one.rms]
+    # An error is no factor.
+    cost = f"x {point.cost:.3f}" if point.cost >= 0.1 else f"{point.cost:.4g}"
+    return [cost, *errors, one.p99, one.max, one.failed]

@@ -1,0 +1,143 @@
+"""What `jaxhil tune` prints of its results: one mechanism in detail, or many side by side."""
+
+import math
+from typing import Any
+
+from tuning import terminal as report
+from tuning.cli.options import Tune
+
+
+def print_overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], drawn: bool) -> None:
+    """All mechanisms side by side."""
+    rows = []
+    # A column of noughts would only push the names onto two lines.
+    some_failed = any(result.figures["tuned"].failed for result in results)
+    for result, entry in zip(results, entries, strict=True):
+        tuned = result.figures["tuned"]
+        best = min(result.starts, key=lambda start: start.rms).status if result.starts else "nothing to tune"
+        verdict = entry["verdict"] if entry["better_than_literature"] else "NOT better than the literature's"
+        rms = (result.figures[key].rms for key in ("before", "literature", "tuned"))
+        above = [f"{100 * result.certified.above:+.1f} %"] if result.certified else []
+        failed = [tuned.failed] if some_failed else []
+        rows.append((entry["mechanism"], *rms, tuned.p99, tuned.peak_ratio, *failed, *above, best, verdict))
+    headings = ["mechanism", "before", "literature", "tuned", "99th pct", "peak ratio"]
+    headings += ["not ended"] if some_failed else []
+    headings += ["above best"] if results[0].certified else []
+    report.emit(
+        report.table(
+            f"rms of e - e* on {options.validation} fresh scenarios each, {options.compensator}",
+            [*headings, "best start", "verdict"],
+            rows,
+            texts=(0, len(headings), len(headings) + 1),
+        )
+    )
+    if not drawn:
+        report.emit(f"wrote {options.output}/NAME/gains.json and {options.output}/overview.png", "")
+
+
+def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
+    """Errors, gains and starts of one mechanism, and the verdict."""
+    from jaxhil.compensators import COMPENSATORS
+
+    law, mechanism = COMPENSATORS[options.compensator].gains, result.mechanism
+    names = {"before": "before (uncompensated)", "literature": "literature's rule", "tuned": "tuned"}
+    rows = []
+    for key, label in names.items():
+        one = result.figures[key]
+        if key == "tuned" and not entry["better_than_literature"]:
+            label = "tuned (NOT better than the literature's)"
+        rows.append(
+            (
+                *(label, one.rms, one.p99, one.max, f"{one.mean:+.4f}", f"{100 * one.diverging:.0f} %"),
+                *(f"{one.peak_ratio:.3f}", f"{one.chatter:.3f}", one.failed),
+            )
+        )
+    count = int(result.outcomes["tuned"].wanted.sum())
+    errors = report.table(
+        f"{mechanism.name}: errors e - e* of {count} contacts in {options.validation} fresh scenarios",
+        ["gains", "rms", "99th pct", "max", "mean", "e > e*", "peak ratio", "chatter", "not ended"],
+        rows,
+    )
+    gains = report.table(
+        f"Gains of {options.compensator}",
+        ["gain", "unit", "lower", "upper", "literature", "tuned", "free alone", "together"],
+        [
+            (
+                *(gain.name, gain.unit, float(gain.lower(mechanism)), float(gain.upper(mechanism))),
+                result.literature[gain.name],
+                result.gains[gain.name] if gain.tuned(mechanism) else "(not tuned)",
+                *(f"{100 * share:.1f} %" for share in result.freedom.get(gain.name, ())),
+                *([""] * (0 if gain.name in result.freedom else 2)),
+            )
+            for gain in law
+        ],
+        texts=(0, 1),
+    )
+    starts = _starts(options, result)
+    tuned = result.figures["tuned"]
+    low, high = result.intervals.rms
+    sure = f" (95 %: {low:.2g} to {high:.2g})" if math.isfinite(low + high) else ""
+    if entry["verdict"] == "good":
+        verdict = f"Good: the tuned rms error {tuned.rms:.2g}{sure} is within {options.limit:g}."
+    elif tuned.failed:
+        verdict = f"Bad: {tuned.failed} contacts did not end with the tuned gains."
+    else:
+        verdict = f"Bad: the tuned rms error {tuned.rms:.2g}{sure} exceeds {options.limit:g}."
+    seconds = ", ".join(f"{stage} {time:.1f} s" for stage, time in result.timings.items())
+    told = [f"took: {seconds}", verdict]
+    if not entry["sensor_noise"]:
+        told.insert(0, "No sensor noise in the mechanism; with it: --set rig.force_sensor.noise_std=2.67")
+    written = [entry["gain_file"], *entry["plots"]]
+    sure_of = []
+    if result.freedom:
+        sure_of.append(
+            "Free: the share of its range by which a gain may move, alone or with the others moved along, "
+            "before the loss rises by 1 %."
+        )
+    ends = sorted(start.rms for start in result.starts if math.isfinite(start.rms))
+    if result.settings.honest and len(ends) > 1:
+        above = 100 * (ends[-1] / ends[0] - 1)
+        sure_of.append(
+            f"Starts: {len(ends)} of {len(result.starts)} ended, the worst {above:.1f} % above the best."
+        )
+    if result.certified:
+        one = result.certified
+        sure_of.append(
+            f"Best of {one.evaluations} evaluations anywhere: {one.best:.4g}; tuned, with {one.spent}: "
+            f"{one.tuned:.4g}, {100 * abs(one.above):.1f} % {'above' if one.above > 0 else 'below'} it."
+        )
+    tables = [errors] + ([_honesty(result)] if result.honesty else [])
+    tables += ([gains] if law else []) + ([starts] if result.starts else [])
+    report.emit(*tables, *sure_of, *(f"wrote {path}" for path in written), *told, "")
+
+
+def _honesty(result: Any) -> Any:
+    """Whether it still is a test of the hardware, with the literature's and with tuned gains."""
+    labels = {"literature": "literature's rule", "tuned": "tuned"}
+    rows = [
+        [label, *(_with_ends(one) for one in result.honesty[key].values())] for key, label in labels.items()
+    ]
+    return report.table(
+        "Honesty: transparency to an early and a late push, slope of e against e*, peak command (95 %)",
+        ["gains", *result.honesty["tuned"]],
+        rows,
+    )
+
+
+def _with_ends(figure: Any) -> str:
+    value, low, high = (report.figure(float(number), 3) for number in figure)
+    return f"{value} ({low} to {high})"
+
+
+def _starts(options: Tune, result: Any) -> Any:
+    """Every start; a column of where they began, where one did not begin as usual."""
+    figure = "objective" if result.settings.honest else options.objective
+    headings = ["start", "status", "steps", f"{figure} on training scenarios"]
+    rows: list[list[Any]] = [[n, s.status, s.steps, s.rms] for n, s in enumerate(result.starts, start=1)]
+    if not result.first:
+        return report.table("Starts", headings, rows, texts=(1,))
+    begun = ["literature", *["spread"] * (len(rows) - 1)]
+    for number, one in enumerate(result.first, start=result.usual_starts):
+        begun[number] = f"gains of {one.source}"
+    rows = [[*row, place] for row, place in zip(rows, begun, strict=True)]
+    return report.table("Starts", [*headings, "begins at"], rows, texts=(1, 4))

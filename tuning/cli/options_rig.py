@@ -1,0 +1,104 @@
+"""The options of the commands that have to do with a rig, as tyro reads them."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
+
+from tuning.cli.options import Json, Limit, number
+
+DEFAULT_RIG_PLOT = "jaxhil-out/rig.png"
+
+
+@dataclass(frozen=True)
+class Export:
+    """A bundle for the rig: gains, controller, test vectors, self-test; nothing to install there.
+
+    Example: jaxhil export jaxhil-out/varying/gains.json -o bundle --sweep jaxhil-out/sweep
+
+    Exit code 1 if the controller on the rig does not do what was simulated.
+    """
+
+    gains: Annotated[Positional[str], arg(metavar="GAINS", help="Gain file, or its folder.")]
+    output: Annotated[str, arg(aliases=("-o",), metavar="DIR", help="Folder of the bundle.")] = (
+        "jaxhil-out/bundle"
+    )
+    sweep: Annotated[
+        str | None,
+        arg(
+            metavar="STORE",
+            help="Folder of a sweep of these gains: limits and the watchdog's rates come from it.",
+            help_behavior_hint="",
+        ),
+    ] = None
+    formats: Annotated[
+        UseAppendAction[tuple[str, ...]],
+        arg(
+            name="format",
+            metavar="NAME[,NAME]",
+            help="Also the gains for ros2, matlab, csv, c99; repeatable; by default all.",
+            help_behavior_hint="",
+        ),
+    ] = ()
+    limits: Annotated[
+        UseAppendAction[tuple[str, ...]],
+        arg(
+            name="set",
+            metavar="LIMIT=VALUE",
+            help="A limit of the rig's own, as command_lowest=-0.05 (SI), or none; repeatable.",
+            help_behavior_hint="",
+        ),
+    ] = ()
+    seed: Annotated[int, number("Seed of the test vectors.")] = 0
+    json: Json = False
+
+
+@dataclass(frozen=True)
+class Verify:
+    """Replay recorded signals through the rig's runtime; the exit code is the verdict.
+
+    Example: jaxhil verify jaxhil-out/varying/gains.json
+
+    Of a bundle, its self-test first. Exit code 1 also for what is corrupt or was tampered with.
+    """
+
+    path: Annotated[
+        Positional[str], arg(metavar="BUNDLE_OR_GAINS", help="Bundle, or gain file, or its folder.")
+    ]
+    scenarios: Annotated[int, number("Runs to replay: the nominal one, then draws.")] = 6
+    seed: Annotated[int, number("Seed of the draws.")] = 0
+    json: Json = False
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A loop in real time: the controller as a process of its own, the rig played to it over UDP.
+
+    Example: jaxhil rig jaxhil-out/varying/gains.json --duration 600 --plot
+
+    An empty loop comes first, for comparison. Exit code 1 for a missed tick that is the controller's fault, a
+    restitution error beyond the limit, or a trip where no faults are injected.
+    """
+
+    path: Annotated[Positional[str], arg(metavar="BUNDLE_OR_GAINS", help="Bundle, gain file, or its folder.")]
+    duration: Annotated[float, arg(metavar="SECONDS", help="How long the run lasts.")] = 10.0
+    drops: Annotated[
+        float, arg(metavar="PROBABILITY", help="Injected: that a packet is lost, either way.")
+    ] = 0.0
+    jitter: Annotated[
+        float, arg(metavar="SECONDS", help="Injected: width of a random delay of every packet, either way.")
+    ] = 0.0
+    delay: Annotated[
+        float, arg(metavar="SECONDS", help="Injected: constant delay of every packet, either way.")
+    ] = 0.0
+    realtime: Annotated[
+        FlagCreatePairsOff[bool],
+        arg(help="Ask the system for a real-time priority for both processes.", help_behavior_hint=""),
+    ] = False
+    seed: Annotated[int, number("Seed of sensor noise, contact phases and injected faults.")] = 0
+    plot: Annotated[
+        str | None,
+        arg(metavar="[PICTURE]", help=f"Latencies to a .png, .pdf or .svg file; bare: {DEFAULT_RIG_PLOT}."),
+    ] = None
+    limit: Limit = 0.01
+    json: Json = False

@@ -1,0 +1,1 @@
+"""Gains: what tuning minimises, how it searches, and how the result is judged."""

@@ -1,0 +1,147 @@
+"""One form for unlike mechanisms: contact law, number of segments and of contacts become a lane's numbers.
+
+What shapes a compiled program is then common to all, and optional parts of the loop that one of them has are
+inert where a lane's numbers say so. A second surface, which costs every lane time, stays apart.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from jaxhil.contact.laws import LAWS, ContactLaw, ContactParameters
+from jaxhil.contact.mixture import AnyOf
+from jaxhil.contact.reference import Reference
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.uncertainty import extremes
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop import Loop
+from jaxhil.simulation.scenario import Scenario, build_scenarios
+
+_PARTS = (
+    "has_lag",
+    "has_force_bias",
+    "has_force_noise",
+    "has_position_noise",
+    "has_sample_effects",
+    "has_limits",
+)
+_APART = ("integrator", "hold", "latency", "is_two_sided")
+
+
+@dataclass(frozen=True)
+class Form:
+    """Contact laws by name; numbers of segments and of result slots; names of the optional parts of the loop
+    that some mechanism has; the first derivative that breaks at a tick; samples in the delay lines; whether
+    references that have to be integrated are worked out beforehand, as every first contact's can be."""
+
+    laws: tuple[str, ...]
+    segments: int
+    slots: int
+    parts: tuple[str, ...]
+    first_break: int
+    ring: int
+    beforehand: bool
+
+    def law(self, beforehand: bool | None = None) -> AnyOf:
+        """The laws' mixture; with references that are integrated, unless they come `beforehand`."""
+        kinds = tuple(kind() for kind in self._kinds)
+        return AnyOf(kinds, self.beforehand if beforehand is None else beforehand)
+
+    @property
+    def _kinds(self) -> list[type[ContactLaw]]:
+        """Laws of two names may be of one kind."""
+        return list(dict.fromkeys(LAWS[name] for name in self.laws))
+
+    def loop(self, loop: Loop) -> Loop:
+        """The loop of one mechanism, in this form."""
+        parts = {name: name in self.parts for name in _PARTS}
+        return dataclasses.replace(
+            loop,
+            law=self.law(),
+            first_break=self.first_break,
+            ring=max(self.ring, loop.ring),
+            **parts,
+        )
+
+    def scenarios(self, mechanism: Mechanism, batch: Scenario) -> Scenario:
+        """The scenarios of one mechanism, in this form."""
+        slots, number = batch.phase.shape
+        chosen = np.minimum(np.arange(self.slots), slots - 1)
+
+        def by_slot(leaf: Any) -> Any:
+            return np.asarray(leaf)[chosen]
+
+        contact = jax.tree.map(by_slot, batch.contact)
+        stiffness, depths = contact.stiffness, contact.depths
+        if stiffness.ndim == 2:
+            stiffness = stiffness[:, None]
+        missing = self.segments - stiffness.shape[1]
+        # Beyond the last depth the last slope goes on.
+        stiffness = np.concatenate([stiffness, np.repeat(stiffness[:, -1:], missing, axis=1)], axis=1)
+        deepest = depths[:, -1:] if depths.shape[1] else np.full((self.slots, 1, number), UNREACHED)
+        further = deepest * (1 + np.arange(1, self.segments))[None, :, None]
+        depths = np.concatenate([depths, further], axis=1)[:, : self.segments - 1]
+        kind: Any = np.full((self.slots, number), self._kinds.index(LAWS[mechanism.contact.law]), np.int32)
+        contact = contact._replace(stiffness=stiffness, depths=depths, kind=kind)
+        reference: Any = None
+        if self.beforehand:
+            law = LAWS[mechanism.contact.law]()
+            unknown: Any = np.full((self.slots, number), np.nan)
+            reference = Reference(*[unknown] * 3) if law.closed_form else self._first(law, batch)
+        return batch._replace(contact=contact, phase=by_slot(batch.phase), reference=reference)
+
+    def _first(self, law: ContactLaw, batch: Scenario) -> Any:
+        """The first contact of every scenario in space, in every slot."""
+        contact: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[0], batch.contact)
+        found = jax.device_get(_reference(law, contact, batch.equivalent_mass, batch.velocity))
+        return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (self.slots, *leaf.shape)), found)
+
+
+UNREACHED = 1.0  # m: no mechanism is that deep
+
+
+@partial(jax.jit, static_argnums=0)
+def _reference(law: ContactLaw, contact: ContactParameters, mass: Array, velocity: Array) -> Reference:
+    return law.reference(contact, mass, velocity)
+
+
+def forms(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], Form]]:
+    """Indices of the mechanisms that share a form, and the form; in the order in which they come."""
+    # Every uncertain number at either end: what a draw may bring into the loop is seen.
+    batches = [build_scenarios(one, extremes(one)) for one in mechanisms]
+    loops = [build_loop(m, "none", batch) for m, batch in zip(mechanisms, batches, strict=True)]
+    groups: dict[Any, list[int]] = {}
+    for index, (loop, batch) in enumerate(zip(loops, batches, strict=True)):
+        key = (
+            *(getattr(loop, name) for name in _APART),
+            len(batch.simulator.denominator),
+            _later(mechanisms[index]),
+        )
+        groups.setdefault(key, []).append(index)
+    return [
+        (group, _form([mechanisms[i] for i in group], group, loops, batches)) for group in groups.values()
+    ]
+
+
+def _later(mechanism: Mechanism) -> bool:
+    """Whether there are contacts whose reference has to be integrated at a speed not known beforehand."""
+    return mechanism.approach.contacts > 1 and not LAWS[mechanism.contact.law]().closed_form
+
+
+def _form(mechanisms, group, loops, batches) -> Form:
+    segments = [b.contact.stiffness.shape[1] if b.contact.stiffness.ndim == 3 else 1 for b in batches]
+    return Form(
+        laws=tuple(dict.fromkeys(one.contact.law for one in mechanisms)),
+        segments=max(segments[i] for i in group),
+        slots=max(batches[i].phase.shape[0] for i in group),
+        parts=tuple(name for name in _PARTS if any(getattr(loops[i], name) for i in group)),
+        first_break=min(loops[i].first_break for i in group),
+        ring=max(loops[i].ring for i in group),
+        beforehand=not _later(mechanisms[0]) and not all(loops[i].law.closed_form for i in group),
+    )

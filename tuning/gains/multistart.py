@@ -1,0 +1,266 @@
+"""The best gains of many tasks: look around, descend by derivatives, and do more where starts disagree.
+
+The first lot of starts are the literature's gains and the best points of a scan. Where they do not end at the
+same value there may be something better: further lots begin at the best points of other scans, until several
+starts agree on the best. How many minima there are is not known; that the best one was met again and again is
+the sign that few are left. Contacts begin and end at ticks: the objective has kinks, on which a descent may
+stop, so that the best is then improved without derivatives.
+
+Source: multistart until a minimum recurs, Boender and Rinnooy Kan, "Bayesian stopping rules for multistart
+global optimization methods" (1987).
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from tuning.environment import program_folder
+from tuning.gains.objective import RMS, Objective, one_each
+from tuning.gains.rounds import Start, inverse_hessian, prepare_solver, solve_tasks
+from tuning.gains.tasks import spread_points
+from tuning.gains.validation import Trial
+from tuning.optimisation.derivative_free import apart, polish
+from tuning.optimisation.unit_box import to_shares
+
+SCANNED, SCAN_SCENARIOS = 256, 32  # points looked at before a lot, by default; on how many scenarios
+LOTS = 4  # of starts, at most
+SURE = 3  # starts that have to agree: two may have met in a poor basin
+AGREED = 0.005  # relative difference of values that count as the same minimum
+# The same where scenarios have copies: another draw of the scenarios would change the value by more.
+HONESTLY_AGREED = 0.02
+FREEING, FREEING_REACH = 24, 0.2  # generations of the search from a start that is stuck, its first reach
+REACH, CANDIDATES = 0.1, 16  # of the search without derivatives: first standard deviation in the box, lot
+
+
+class Found(NamedTuple):
+    """What was found for a task: the best of its starts, none if all failed; all of them, lot by lot;
+    evaluations of the objective that it took: a Jacobian over P gains counted as 1 + P, points of a scan by
+    their share of the scenarios."""
+
+    best: Start | None
+    starts: list[Start]
+    evaluations: int
+
+
+@dataclasses.dataclass
+class _Search:
+    """Of one task: every start so far, evaluations so far."""
+
+    starts: list[Start] = dataclasses.field(default_factory=list)
+    evaluations: int = 0
+
+
+def find(
+    trial: Trial,
+    starts: int,
+    steps: int,
+    polishing: int,
+    seed: int,
+    objective: Objective | Sequence[Objective] = RMS,
+    first: Sequence[Sequence[Mapping[str, float]]] | None = None,
+    report: Callable[[str], None] = lambda text: None,
+    scanned: int = SCANNED,
+) -> list[Found]:
+    """Best gains of every task, from lots of so many starts of so many steps, the best of so many points
+    `scanned`, and a polish of so many evaluations for each gain.
+
+    `first` has, of each task, gains to start at, in the places of the last starts of its first lot, never of
+    the literature's. One start alone is the literature's, and the only lot."""
+    tasks, objectives = trial.tasks, one_each(objective, len(trial.tasks))
+    told = [list(own) for own in first] if first else [[] for _ in tasks]
+    number = max(starts, 1 + max(map(len, told)))
+    agreed = HONESTLY_AGREED if tasks[0].honest else AGREED
+    searches = [_Search() for _ in tasks]
+    chosen = _while_compiling(
+        trial, number, objectives, lambda: choose_starts(trial, number, seed, objectives, told, scanned)
+    )
+    going = list(range(len(tasks)))
+    for lot in range(LOTS if number > 1 else 1):
+        if lot > 0:
+            report(f"lot {lot + 1} of starts, {len(going)} of {len(tasks)} mechanisms")
+            chosen = [np.empty((0, len(trial.names)))] * len(tasks)
+            for i, points in zip(
+                going, _scan(trial, going, number, (seed, lot), objectives, scanned), strict=True
+            ):
+                chosen[i] = points
+        ended = solve_tasks(tasks, chosen, steps, objectives, report)
+        for i in going:
+            own = searches[i]
+            own.starts += _exactly(trial, i, ended[i], objectives)
+            own.evaluations += (1 + len(trial.names)) * sum(start.steps for start in ended[i])
+            if lot > 0 or number > 1 + len(told[i]):
+                own.evaluations += _scan_evaluations(trial, number, scanned)
+        going = [i for i in going if not _agree(searches[i].starts, agreed)]
+        if not going:
+            break
+    if tasks[0].honest:
+        for i, own in enumerate(searches):
+            own.starts, more = _freed(trial, i, own.starts, agreed, seed, objectives)
+            own.evaluations += more
+    # Where starts agree to that, the rest of the way down is within what scenarios decide.
+    polishing = 0 if tasks[0].honest and not going else polishing * len(trial.names)
+    if polishing:
+        report("searching on without derivatives")
+    best = finish(trial, [own.starts for own in searches], polishing, seed, objectives)
+    return [
+        Found(top, own.starts, own.evaluations + (polishing if top else 0))
+        for top, own in zip(best, searches, strict=True)
+    ]
+
+
+def _freed(
+    trial: Trial, task: int, starts: list[Start], agreed: float, seed: int, objectives: list[Objective]
+) -> tuple[list[Start], int]:
+    """The starts, those that ended further above the best searched on from there without derivatives, and the
+    evaluations that took.
+
+    Where the correction's limit begins to bind the objective has a kink, and the solver stays there.
+    """
+    ranked = _ranked(starts)
+    stuck = (
+        [i for i, start in enumerate(starts) if start.rms > (1 + agreed) * ranked[0].rms] if ranked else []
+    )
+    if not stuck:
+        return starts, 0
+    number = CANDIDATES * FREEING
+
+    def losses(points):
+        flat = points.reshape(1, -1, points.shape[-1])
+        return trial.losses(objectives, [task], flat)[0].reshape(points.shape[:-1])
+
+    at = np.stack([starts[i].shares for i in stuck])
+    found = polish(losses, at, number, candidates=CANDIDATES, reach=FREEING_REACH, seed=seed)
+    freed = list(starts)
+    for i, shares, loss in zip(stuck, found.free, found.loss, strict=True):
+        freed[i] = _moved(trial, task, starts[i], shares, loss)
+    return freed, number * len(stuck)
+
+
+def _exactly(trial: Trial, task: int, starts: list[Start], objectives: list[Objective]) -> list[Start]:
+    """Starts with the value of the objective itself where the solver lowered a norm in its place."""
+    if objectives[task].name == "rms" or not starts:
+        return starts
+    values = trial.losses(objectives, [task], np.stack([start.shares for start in starts])[None])[0]
+    return [start._replace(rms=float(value)) for start, value in zip(starts, values, strict=True)]
+
+
+def _while_compiling(trial, number, objectives, work):
+    """Do some work while the solver's program compiles: each takes one core. Only one program runs: programs
+    on several devices could wait for one another for ever."""
+    if program_folder() is None:
+        return work()
+    with ThreadPoolExecutor(1) as meanwhile:
+        ready = meanwhile.submit(prepare_solver, trial.tasks, number, objectives)
+        done = work()
+        ready.result()
+        return done
+
+
+def choose_starts(
+    trial: Trial,
+    starts: int,
+    seed: int,
+    objective: Objective | Sequence[Objective] = RMS,
+    first: Sequence[Sequence[Mapping[str, float]]] | None = None,
+    scanned: int = SCANNED,
+) -> list[Float[np.ndarray, "starts gains"]]:
+    """Shares to start from, of every task: the literature's gains, then the best of a scan that lie apart
+    from each other. `first` has, of each task, gains that take the places of the last of these, never of the
+    literature's."""
+    tasks = range(len(trial.tasks))
+    told = [_shares(trial, i, first[i] if first else ()) for i in tasks]
+    usual = [max(starts - len(own), 1) for own in told]
+    literature = [_shares(trial, i, [trial.tasks[i].literature]) for i in tasks]
+    if max(usual) > 1:
+        further = _scan(trial, list(tasks), max(usual) - 1, seed, objective, scanned, literature)
+        literature = [np.concatenate(both) for both in zip(literature, further, strict=True)]
+    return [np.concatenate([literature[i][: usual[i]], told[i]]) for i in tasks]
+
+
+def _scan(
+    trial: Trial,
+    which: list[int],
+    number: int,
+    seed: int | tuple[int, ...],
+    objective: Objective | Sequence[Objective],
+    scanned: int,
+    beside: list[np.ndarray] | None = None,
+) -> list[Float[np.ndarray, "number gains"]]:
+    """The best points of a scan of the tasks `which`, so many that lie apart, and from those `beside`."""
+    around = [_shares(trial, i, [trial.tasks[i].literature])[0] for i in which]
+    points = np.stack([spread_points(own, max(scanned, 2 * number), seed)[1:] for own in around])
+    for own, i in zip(points, which, strict=True):
+        task = trial.tasks[i]
+        for gain in task.tuned:
+            if gain.begins is not None:
+                place, begins = trial.names.index(gain.name), {gain.name: gain.begins(task.mechanism)}
+                own[:, place] = _shares(trial, i, [{**task.literature, **begins}])[0, place]
+    values = trial.losses(objective, which, points, SCAN_SCENARIOS)
+    order = np.argsort(np.where(np.isfinite(values), values, np.inf), axis=1, kind="stable")
+    best = []
+    for place, i in enumerate(which):
+        known = beside[i] if beside else np.empty((0, len(trial.names)))
+        best.append(apart(points[place][order[place]], known, len(known) + number)[len(known) :])
+    return best
+
+
+def _scan_evaluations(trial: Trial, number: int, scanned: int) -> int:
+    scenarios = len(trial.tasks[0].scenarios.velocity)
+    return -(-max(scanned, 2 * number) * min(SCAN_SCENARIOS, scenarios) // scenarios)
+
+
+def _shares(
+    trial: Trial, task: int, several: Sequence[Mapping[str, float]]
+) -> Float[np.ndarray, "several gains"]:
+    gains = np.array([[gains[name] for name in trial.names] for gains in several])
+    return to_shares(gains.reshape(len(several), len(trial.names)), trial.bounds[task])
+
+
+def finish(
+    trial: Trial,
+    solved: list[list[Start]],
+    evaluations: int,
+    seed: int,
+    objective: Objective | Sequence[Objective] = RMS,
+) -> list[Start | None]:
+    """The best start of every task, none if all failed, polished without derivatives
+    (`tuning.optimisation.derivative_free.polish`) by so many evaluations each."""
+    best = [ranked[0] if (ranked := _ranked(own)) else None for own in solved]
+    some = [i for i, top in enumerate(best) if top]
+    if not some or evaluations == 0:
+        return best
+    tops = [top for top in best if top]
+    starts = np.stack([top.shares for top in tops])
+    shapes = np.stack([inverse_hessian(top.curvature, top.rms) for top in tops])
+
+    def losses(points):
+        return trial.losses(objective, some, points)
+
+    found = polish(
+        losses, starts, evaluations, candidates=CANDIDATES, reach=REACH, covariance=shapes, seed=seed
+    )
+    for i, top, shares, loss in zip(some, tops, found.free, found.loss, strict=True):
+        best[i] = _moved(trial, i, top, shares, loss)
+    return best
+
+
+def _moved(trial: Trial, task: int, start: Start, shares: np.ndarray, loss: float) -> Start:
+    """The start where a search from it ended; itself where that found nothing better."""
+    if (shares == start.shares).all():
+        return start
+    history = [*start.history, float(loss)]
+    return start._replace(rms=float(loss), gains=trial.gains(task, shares), shares=shares, history=history)
+
+
+def _ranked(starts: list[Start]) -> list[Start]:
+    return sorted((start for start in starts if np.isfinite(start.rms)), key=lambda start: start.rms)
+
+
+def _agree(starts: list[Start], agreed: float) -> bool:
+    """Whether enough of the best starts do."""
+    ranked = _ranked(starts)
+    return len(ranked) >= SURE and ranked[SURE - 1].rms <= (1 + agreed) * ranked[0].rms

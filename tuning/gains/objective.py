@@ -1,0 +1,304 @@
+"""What tuning minimises: a figure of the restitution errors of a batch of scenarios, and penalties beside it.
+
+With e - e* of every contact, divergence weighted against convergence (`Objective`), the figures are
+
+    rms     root of the mean square
+    cvar    mean magnitude of the worst 5 % of the contacts (the conditional value at risk)
+    worst   the largest magnitude
+
+and the penalties a command that peaks above the reference's force, one that chatters, and a compensator that
+amplifies the noise of the force sensor, all in one unit, that of a restitution error. `objective_value` has
+them exactly.
+
+Levenberg-Marquardt wants smooth sums of squares. That of `residuals` is the square of the norm
+
+    (sum of |E|^p / m)^(1/p)    rms: p = 2, m contacts;  cvar: p = 6, m the worst 5 %;  worst: p = 8, m = 1
+
+which is the rms, and never below the other two: the mean of the worst is at most the p-th root of the mean
+of their p-th powers. The exact tail is no use to a solver that linearises: contacts outside it weigh nothing,
+and a step that spoils one of them is not foreseen. By this norm the tail ends lower.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxhil.errors import InputError, shown
+from jaxhil.simulation.evaluation import Outcome, compare_with_reference
+from jaxhil.simulation.loop import Loop, Rig
+from jaxhil.simulation.rollout import run_contacts
+from tuning.transparency.probes import are_copies
+
+SCALE = 0.01  # an error of one: the solver's first steps are damped as for residuals of order one
+FAILED = 3.0  # error of a contact that does not end, or is not reached: as bad as a wild divergence
+CHUNK = 32  # lanes with copies that are computed side by side
+TAIL = 20  # cvar: the worst one in so many contacts, at least one
+POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # of the norms in the residuals; even
+OBJECTIVES = tuple(POWERS)
+WEIGHTS = tuple(f"{name}_weight" for name in ("divergence", "command", "noise", "chatter", "honesty"))
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What to minimise, J with
+
+        J^2 = figure(E)^2 + (honesty_weight rms(H))^2
+          + (command_weight rms(C))^2 + (chatter_weight rms(S))^2 + (noise_weight N)^2
+
+    E: per contact the restitution error e - e* [1], times sqrt(divergence_weight) where it is positive:
+    divergence_weight [1] is how much more a squared divergence (e > e*) counts than a squared convergence.
+    H: per contact of the scenarios' copies (`tuning.transparency.probes`) the restitution error e - e* [1],
+    e* their own. With a weight of 1 the errors of the copies count as much as those of the scenarios, E. C:
+    per contact, of copies too, max(0, peak |F_c| / the reference's peak force - 1) [1]. S: per contact, of
+    copies too, the chatter [1]: how far F_c goes up and down beyond a single swing
+    (`jaxhil.simulation.metrics`), over the reference's peak force. Where the sensors are noisy it holds what
+    the noise does to F_c. N: max(0, A - 1) [1], A the amplification of the force sensor's white noise, from
+    the gains alone (`Compensator.noise_amplification`); a quieter command than the measured force earns
+    nothing.
+
+    name: `figure`, one of `OBJECTIVES`. The weights of command, noise and chatter [1] are restitution errors:
+    that which weighs as much as a command one reference peak too high, as an amplification one too large, as
+    one swing over the reference's peak too many.
+
+    Raises `InputError` for another name or a weight that is negative or not finite, or 0 for divergence.
+    """
+
+    name: str = "rms"
+    divergence_weight: float = 1.0
+    command_weight: float = 0.0
+    noise_weight: float = 0.0
+    chatter_weight: float = 0.0
+    honesty_weight: float = 0.0
+
+    def __post_init__(self):
+        if self.name not in OBJECTIVES:
+            raise InputError(f"objective: found {shown(self.name)}, allowed {', '.join(OBJECTIVES)}")
+        for name in WEIGHTS:
+            weight, may_be_0 = getattr(self, name), name != "divergence_weight"
+            if not (0 < weight < math.inf or (may_be_0 and weight == 0)):
+                allowed = f"allowed finite numbers {'>=' if may_be_0 else '>'} 0"
+                raise InputError(f"objective: {name}: found {shown(weight)}, {allowed}")
+
+    @property
+    def weights(self) -> "Weights":
+        """The numbers in it, each a scalar array."""
+        return Weights(*(jnp.asarray(float(getattr(self, name))) for name in WEIGHTS))
+
+
+RMS = Objective()
+
+
+class Terms(NamedTuple):
+    """What of an objective shapes the program: its figure, whether command, noise and chatter have a part,
+    and whether the scenarios come with copies."""
+
+    name: str
+    command: bool
+    noise: bool
+    chatter: bool
+    honesty: bool = False
+
+
+class Weights(NamedTuple):
+    """The weights of an objective, see there: numbers that one program takes, each problem its own."""
+
+    divergence: Float[Array, "*problems"]
+    command: Float[Array, "*problems"]
+    noise: Float[Array, "*problems"]
+    chatter: Float[Array, "*problems"]
+    honesty: Float[Array, "*problems"]
+
+
+class Problem(NamedTuple):
+    """A rig built for a batch of scenarios, the gains that stay as they are and the objective's weights;
+    where there are several problems, each leaf has a leading axis of them."""
+
+    rig: Rig
+    fixed: dict[str, Array]
+    weights: Weights
+
+
+def one_each(objective: Objective | Sequence[Objective], number: int) -> list[Objective]:
+    """The objective of each of so many tasks, from that of all of them or a list of them."""
+    return [objective] * number if isinstance(objective, Objective) else list(objective)
+
+
+def common_terms(objectives: Sequence[Objective], honest: bool = False) -> Terms:
+    """The terms of objectives of one name: a part that one of them has, all have, some with a weight of 0.
+    `honest` scenarios come with copies.
+
+    Raises ValueError for objectives of several names.
+    """
+    (name,) = {objective.name for objective in objectives}
+    return Terms(
+        name,
+        any(objective.command_weight > 0 for objective in objectives),
+        any(objective.noise_weight > 0 for objective in objectives),
+        any(objective.chatter_weight > 0 for objective in objectives),
+        honest,
+    )
+
+
+def residuals(
+    static: tuple[Loop, tuple[str, ...], Terms],
+    gains: Float[Array, "problems gains"],
+    problems: Problem,
+) -> Float[Array, "problems residuals"]:
+    """(J / `SCALE`)^2 of every problem as a sum of squares, J as of `Objective`; the loss is half of it.
+
+    One residual per contact slot of every scenario for the figure, or the norm that stands for it, as many
+    for the command, as many for its chatter, one for the noise, and one for every contact slot of the copies,
+    where they are among the terms. Contacts that fail count with the constant error, excess and chatter
+    `FAILED`.
+
+    `static` is the loop, the names of the gains that are tuned and the objective's terms. The scenarios of
+    all problems run side by side, as the lanes of one batch.
+    """
+    loop, names, terms = static
+    if terms.chatter:
+        loop = dataclasses.replace(loop, chatter=True)
+    number, lanes = problems.rig.inverse_mass.shape
+    rig = jax.tree.map(_side_by_side, problems.rig)
+    values: dict[str, Any] = {name: gains[:, i] for i, name in enumerate(names)}
+    values = {name: jnp.repeat(value, lanes) for name, value in {**problems.fixed, **values}.items()}
+
+    def run(arguments):
+        values, rig = arguments
+        return compare_with_reference(loop, rig.scenario, run_contacts(loop, values, rig))
+
+    outcome = _in_chunks(run, (values, rig)) if terms.honesty else run((values, rig))
+
+    def by_problem(leaf):
+        return jnp.moveaxis(leaf.reshape(-1, number, lanes), 1, 0).reshape(number, -1)
+
+    error, excess, chatter = map(by_problem, contact_terms(outcome))
+    amplification = jnp.mean(by_problem(loop.compensator.noise_amplification(values, rig.constants)), axis=1)
+    copies = by_problem(jnp.broadcast_to(are_copies(number * lanes), outcome.wanted.shape))
+    return weigh(
+        terms, problems.weights, error, excess, chatter, by_problem(outcome.wanted), amplification, copies
+    )
+
+
+def weigh(
+    terms: Terms,
+    weights: Weights,
+    error: Float[Array, "problems contacts"],
+    excess: Float[Array, "problems contacts"],
+    chatter: Float[Array, "problems contacts"],
+    wanted: Bool[Array, "problems contacts"],
+    amplification: Float[Array, "problems"],
+    copies: Bool[Array, "problems contacts"] | None = None,
+) -> Float[Array, "problems residuals"]:
+    """The residuals of `contact_terms` and of the noise's amplification; `copies`: which contacts are of
+    copies, where the terms have honesty."""
+
+    # A problem that asks for no contact, which fills up a call, has errors of 0.
+    def counted(asked):
+        return jnp.maximum(jnp.sum(asked, axis=1, dtype=jnp.int32), 1)[:, None]
+
+    count = plain = counted(wanted)
+    blindness = []
+    if terms.honesty and copies is not None:
+        blind = _norm(jnp.where(copies, error, 0), counted(wanted & copies), 2)
+        blindness = [weights.honesty[:, None] * blind]
+        error, plain = jnp.where(copies, 0, error), counted(wanted & ~copies)
+    diverging = jnp.sqrt(weights.divergence)[:, None] * error
+    number = {"rms": plain, "cvar": _tail(plain), "worst": jnp.ones_like(plain)}[terms.name]
+    parts = [_norm(jnp.where(error > 0, diverging, error), number, POWERS[terms.name]), *blindness]
+    if terms.command:
+        parts.append(weights.command[:, None] * _norm(excess, count, 2))
+    if terms.chatter:
+        parts.append(weights.chatter[:, None] * _norm(chatter, count, 2))
+    if terms.noise:
+        beyond = amplification - 1
+        parts.append((weights.noise * jnp.where(beyond > 0, beyond, 0))[:, None])
+    return jnp.concatenate(parts, axis=1) / SCALE
+
+
+def contact_terms(
+    outcome: Outcome,
+) -> tuple[Float[Array, "slots *batch"], Float[Array, "slots *batch"], Float[Array, "slots *batch"]]:
+    """Per contact the restitution error, the command's excess over the reference's peak force, relative to
+    it, and the chatter: `FAILED` for contacts that failed, 0 for those not asked for."""
+    # The inner `where` keeps what a failed contact leaves behind out of the derivative.
+    usable = outcome.good & jnp.isfinite(outcome.error) & jnp.isfinite(outcome.peak_ratio)
+    usable = usable & jnp.isfinite(outcome.chatter)
+    error = jnp.where(usable, outcome.error, FAILED)
+    beyond = jnp.where(usable, outcome.peak_ratio, 1 + FAILED) - 1
+    excess = jnp.where(beyond > 0, beyond, 0)
+    chatter = jnp.where(usable, outcome.chatter, FAILED)
+    wanted = outcome.wanted
+    return jnp.where(wanted, error, 0), jnp.where(wanted, excess, 0), jnp.where(wanted, chatter, 0)
+
+
+def objective_value(
+    objective: Objective,
+    errors: Float[np.ndarray, "contacts"],
+    excesses: Float[np.ndarray, "contacts"] | None = None,
+    amplification: float = 1.0,
+    chatter: Float[np.ndarray, "contacts"] | None = None,
+    honesty: Float[np.ndarray, "contacts"] | None = None,
+) -> float:
+    """J [1] of `Objective`, exactly, for all three names: what a table of results is made of.
+
+    `errors`, `excesses` and `chatter` (none: no part in it) are those of `contact_terms`, of the contacts
+    asked for; `honesty` are the errors of the copies, which are not among `errors` then. What is not finite
+    counts as `FAILED`.
+    """
+    given = errors, excesses, chatter, honesty
+    error, excess, swings, blindness = (
+        np.where(np.isfinite(term), term, FAILED)
+        for term in (np.zeros(1) if term is None else np.ravel(term) for term in given)
+    )
+    size = np.sort(np.abs(np.where(error > 0, math.sqrt(objective.divergence_weight) * error, error)))
+    figure = {
+        "rms": np.sqrt(np.mean(size**2)),
+        "cvar": np.mean(size[-_tail(len(size)) :]),
+        "worst": size[-1],
+    }[objective.name]
+    command = objective.command_weight * np.sqrt(np.mean(excess**2))
+    restless = objective.chatter_weight * np.sqrt(np.mean(swings**2))
+    noise = objective.noise_weight * max(0.0, float(amplification) - 1)
+    blind = objective.honesty_weight * np.sqrt(np.mean(blindness**2))
+    return math.hypot(figure, command, restless, noise, blind)
+
+
+def _tail(count):
+    return -(-count // TAIL)
+
+
+def _norm(error: Float[Array, "problems contacts"], number: Int[Array, "problems 1"], power: int) -> Array:
+    """Sum of squares: (sum of |E|^p / m)^(2/p); residuals E (|E| / |E|_p)^(p/2 - 1) / m^(1/p).
+
+    They are of first degree in the errors, so that Gauss-Newton steps neither overshoot nor fall short.
+    """
+    size = jnp.abs(error)
+    largest = lax.stop_gradient(jnp.max(size, axis=1, keepdims=True))
+    unit = jnp.where(largest > 0, largest, 1)
+    total = jnp.sum((size / unit) ** power, axis=1, keepdims=True)
+    norm = unit * jnp.where(largest > 0, total, 1) ** (1 / power)
+    return error * (size / norm) ** (power // 2 - 1) / number.astype(error.dtype) ** (1 / power)
+
+
+def _in_chunks(function: Callable[[Any], Outcome], arguments: Any) -> Outcome:
+    """Lanes, the last axis of every leaf, `CHUNK` at a time: each chunk ends with its own slowest lane."""
+    lanes = jax.tree.leaves(arguments)[0].shape[-1]
+    size = math.gcd(lanes, CHUNK)
+    chunks = jax.tree.map(
+        lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes // size, size), -2, 0), arguments
+    )
+    done = lax.map(function, chunks)
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], lanes), done)
+
+
+def _side_by_side(leaf: Array) -> Array:
+    """(problems, ..., scenarios) -> (..., lanes)"""
+    return jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], leaf.shape[0] * leaf.shape[-1])

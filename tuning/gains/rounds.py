@@ -1,0 +1,243 @@
+"""Solving many tasks from many starts: a short round for all, further ones for what is worth it.
+
+A start of a task is a problem. One compiled program takes a fixed number of problems at a time; hard ones do
+not hold up easy ones, since every round deals out anew what has not converged. After the first round only the
+most promising starts of a task go on.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from operator import itemgetter
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxhil.simulation.evaluation import expected_duration
+from jaxhil.simulation.loop import build_rig
+from jaxhil.simulation.scenario import Scenario
+from tuning import program_cache as programs
+from tuning.environment import program_folder
+from tuning.gains.objective import RMS, SCALE, Objective, Problem, common_terms, one_each, residuals
+from tuning.gains.tasks import Task, common_loop, gain_bounds, gains_at, tuned_names
+from tuning.optimisation.levenberg_marquardt import STATUSES, Solution, solve
+from tuning.optimisation.unit_box import Bounds
+from tuning.transparency.probes import COPIES
+
+FEW, MANY = 4, 32  # problems in one call of the program
+TILE = 128  # lanes computed side by side on a device: more leave the cache
+FIRST_ROUND = 8  # steps
+PROMISING = 3  # starts of a task that go on after the first round
+LONGEST = 32  # steps of one call
+ENOUGH = 0.005  # by which a start with copies gets better in a round that is not its last
+STEP_LIMIT = STATUSES.index("step limit")
+GIVEN_UP = "given up"
+
+
+class Start(NamedTuple):
+    """One start of the solve: status, steps, value of the objective (its norm, `tuning.gains.objective`) it
+    ended with and had after every step, and its gains; of those that are tuned for any of the tasks also the
+    shares of their ranges, and J^T J by them."""
+
+    status: str
+    steps: int
+    rms: float
+    history: list[float]
+    gains: dict[str, float]
+    shares: np.ndarray = np.empty(0)
+    curvature: np.ndarray = np.empty((0, 0))
+
+
+@dataclasses.dataclass
+class _Problem:
+    """A start on its way: shares now, J^T J there, loss after every step so far."""
+
+    task: int
+    shares: np.ndarray
+    curvature: np.ndarray
+    status: int | str = STEP_LIMIT
+    history: list[float] = dataclasses.field(default_factory=list)
+
+    @property
+    def loss(self) -> float:
+        return self.history[-1] if self.history and np.isfinite(self.history[-1]) else np.inf
+
+
+def solve_tasks(
+    tasks: list[Task],
+    starts: list[Float[np.ndarray, "starts gains"]],
+    steps: int,
+    objective: Objective | Sequence[Objective] = RMS,
+    report: Callable[[str], None] = lambda text: None,
+) -> list[list[Start]]:
+    """Every start of every task; the tasks are alike (`tuning.gains.tasks.alike`). `starts` are shares of the
+    ranges of those gains that are tuned for any of the tasks; none ends worse than it began.
+
+    `objective` is that of all tasks, or one of each, which differ by their weights alone: tasks may be the
+    same but for it.
+    """
+    names = tuned_names(tasks)
+    bounds = [gain_bounds(task, names) for task in tasks]
+    nothing = np.zeros((len(names), len(names)))
+    problems = [_Problem(index, shares, nothing) for index, own in enumerate(starts) for shares in own]
+    objectives = one_each(objective, len(tasks))
+    # As many as if every task had as many starts: where few go on, the same program serves.
+    advance = _stepper(tasks, names, bounds, objectives, len(tasks) * max(map(len, starts)))
+    # Neighbours in a call take about as long.
+    order = np.argsort([-float(np.max(expected_duration(task.scenarios))) for task in tasks], kind="stable")
+    rank = {int(task): place for place, task in enumerate(order)}
+    problems.sort(key=lambda problem: rank[problem.task])
+    done, honest = 0, tasks[0].honest
+    while done < steps:
+        going = [problem for problem in problems if problem.status == STEP_LIMIT]
+        if not going:
+            break
+        several = honest or (done == 0 and max(map(len, starts)) > PROMISING)
+        limit = min(steps - done, FIRST_ROUND if several else LONGEST)
+        report(f"{len(going)} of {len(problems)} starts, {limit} steps")
+        before = [problem.loss for problem in going]
+        advance(going, limit)
+        done += limit
+        if honest and done > FIRST_ROUND:
+            _settle(going, before)
+        if done < steps and not honest:
+            _give_up(problems)
+    return [
+        [_finished(p, names, bounds[index], tasks[index]) for p in problems if p.task == index]
+        for index in range(len(tasks))
+    ]
+
+
+def _settle(problems: list[_Problem], before: list[float]) -> None:
+    """Those whose value hardly fell in the round have converged: the scenarios decide about the rest."""
+    for problem, loss in zip(problems, before, strict=True):
+        if problem.status == STEP_LIMIT and problem.loss > (1 - ENOUGH) ** 2 * loss:
+            problem.status = STATUSES.index("converged")
+
+
+def _give_up(problems: list[_Problem]) -> None:
+    """Leave each task its most promising starts."""
+    by_task: dict[int, list[_Problem]] = {}
+    for problem in problems:
+        by_task.setdefault(problem.task, []).append(problem)
+    for own in by_task.values():
+        for problem in sorted(own, key=lambda problem: problem.loss)[PROMISING:]:
+            if problem.status == STEP_LIMIT:
+                problem.status = GIVEN_UP
+
+
+def inverse_hessian(
+    curvature: Float[np.ndarray, "gains gains"], value: float
+) -> Float[np.ndarray, "gains gains"]:
+    """That of the value of the objective, over it, from J^T J of the loss; widths at most a quarter of the
+    box: the shape of the region in which the value rises by little."""
+    # Where derivatives overflow, nothing is known of the shape.
+    curvature = np.where(np.all(np.isfinite(curvature)), curvature, 0.0)
+    loss = (value / SCALE) ** 2 / 2
+    return np.linalg.inv(curvature / (2 * max(loss, 1e-12)) + 16 * np.eye(len(curvature)))
+
+
+def _finished(problem: _Problem, names: tuple[str, ...], bounds: Bounds, task: Task) -> Start:
+    history = [float(value) for value in SCALE * np.sqrt(2 * np.array(problem.history))]
+    status = problem.status if isinstance(problem.status, str) else STATUSES[problem.status]
+    gains = gains_at(task, names, bounds, problem.shares)
+    return Start(status, len(history), history[-1], history, gains, problem.shares, problem.curvature)
+
+
+def prepare_solver(tasks: list[Task], starts: int, objective: Objective | Sequence[Objective] = RMS) -> None:
+    """Compile what `solve_tasks` will run, into the compile cache."""
+    names = tuned_names(tasks)
+    bounds = [gain_bounds(task, names) for task in tasks]
+    nothing = np.zeros(len(names))
+    problems = [_Problem(index, nothing, nothing) for index in range(len(tasks)) for _ in range(starts)]
+    static, call = _calls(tasks, names, bounds, one_each(objective, len(tasks)), len(problems))
+    some = problems[: _size(len(problems))]
+    programs.prepare(_advance, static, call(some, 1), program_folder())
+
+
+def _stepper(tasks, names, bounds, objectives, number) -> Callable[[list[_Problem], int], None]:
+    """A function that takes problems up to so many steps further."""
+    static, call = _calls(tasks, names, bounds, objectives, number)
+    size = _size(number)
+
+    def advance(problems: list[_Problem], limit: int) -> None:
+        for begin in range(0, len(problems), size):
+            some = problems[begin : begin + size]
+            solution = jax.device_get(programs.run(_advance, static, call(some, limit), program_folder()))
+            for place, i in enumerate(_dealt(size)):
+                if i < len(some):
+                    _take(some[i], solution, place)
+
+    return advance
+
+
+def _size(number: int) -> int:
+    """Problems in one call, of so many in all."""
+    return FEW if number <= FEW else MANY
+
+
+def _dealt(size: int) -> np.ndarray:
+    """Which problem is in each place of a call: in turn for each device, whose places are side by side, so
+    that all of them have as many of the long ones."""
+    devices = math.gcd(jax.device_count(), size)
+    return np.arange(size).reshape(-1, devices).T.ravel()
+
+
+def _calls(tasks, names, bounds, objectives, number):
+    """Static part and, as a function of some problems and a number of steps, arguments of the program."""
+    loop = common_loop([task.loop for task in tasks])
+    fixed = [{k: v for k, v in task.literature.items() if k not in names} for task in tasks]
+    weights = [one.weights for one in objectives]
+    each = [(_in_order(t), f, w, b) for t, f, w, b in zip(tasks, fixed, weights, bounds, strict=True)]
+    table = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *each)
+    size = _size(number)
+    lanes = len(tasks[0].scenarios.velocity)
+    static = (loop, names, common_terms(objectives, tasks[0].honest)), LONGEST, max(1, TILE // lanes)
+
+    def call(some: list[_Problem], limit: int):
+        dealt = _dealt(size)
+        # Nothing runs in the places that only fill the call.
+        filled = [some[i] if i < len(some) else some[0] for i in dealt]
+        idle = dealt[:, None] >= len(some)
+        index = np.array([p.task for p in filled])
+        starts = np.stack([p.shares for p in filled])
+        scenarios, others, weighed, limits = jax.tree.map(itemgetter(index), table)
+        contacts = np.where(idle, 0, scenarios.contacts).astype(np.int32)
+        return scenarios._replace(contacts=contacts), others, weighed, limits, starts, np.array(limit)
+
+    return static, call
+
+
+def _in_order(task: Task) -> Scenario:
+    """The task's scenarios. Where each has its copies, those that take as long are neighbours."""
+    if not task.honest:
+        return task.scenarios
+    # That is made of how long the contacts take.
+    longest = np.asarray(task.scenarios.time_limit)[::COPIES]
+    order = np.argsort(-longest, kind="stable")
+    lanes = (COPIES * order[:, None] + np.arange(COPIES)).ravel()
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[..., lanes], task.scenarios)
+
+
+def _take(problem: _Problem, solution: Solution, i: int) -> None:
+    taken = int(solution.steps[i])
+    before = problem.history[-1] if problem.history else np.inf
+    losses = np.minimum.accumulate(np.append(before, np.asarray(solution.history[i])[: max(taken, 1)]))[1:]
+    problem.history.extend(float(loss) for loss in losses)
+    problem.status = int(solution.status[i])
+    # A round begins anew with cautious steps; none of them is worse than where it began.
+    if np.isfinite(solution.loss[i]):
+        problem.shares = np.clip(np.asarray(solution.shares[i]), 0, 1)
+        problem.curvature = np.asarray(solution.curvature[i])
+
+
+def _advance(static: tuple[Any, int, int], arguments: Any) -> Solution:
+    what, longest, tile = static
+    loop = what[0]
+    scenarios, fixed, weights, bounds, starts, limit = arguments
+
+    rigs = jax.vmap(lambda scenarios: build_rig(loop, scenarios))(scenarios)
+    problems = Problem(rigs, fixed, weights)
+    return solve(residuals, what, problems, bounds, starts, limit, longest=longest, tile=tile)

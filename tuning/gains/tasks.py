@@ -1,0 +1,169 @@
+"""What there is to solve: mechanisms with their training scenarios, and which of them share a program."""
+
+import dataclasses
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.stats import qmc
+
+from jaxhil.compensators import COMPENSATORS, Gain, literature_gains
+from jaxhil.contact.laws import ContactLaw
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.uncertainty import quasi_random
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.evaluation import parameters_by_slot
+from jaxhil.simulation.loop import Loop
+from jaxhil.simulation.scenario import Scenario, build_scenarios
+from tuning.gains.common_program import Form
+from tuning.optimisation.unit_box import Bounds, to_gains
+from tuning.transparency.probes import COPIES, probed_scenarios
+
+# In training a contact that takes longer than this many times its undelayed duration, and so many
+# seconds more, has failed.
+PATIENCE = 2.0
+SHORTEST_PATIENCE = 0.15  # s
+
+SCENARIOS, NOISY_SCENARIOS = 32, 128  # to tune on, without and with sensor noise, copies included
+
+
+@dataclass(frozen=True)
+class Task:
+    """A mechanism to tune: the compensator's literature gains, or those of a setting, the scenarios to tune
+    on and their loop; the form that scenarios and loop are brought to, if it shares a program with unlike
+    mechanisms; whether each scenario comes with its copies (`tuning.transparency.probes`)."""
+
+    mechanism: Mechanism
+    compensator: str
+    literature: dict[str, float]
+    scenarios: Scenario
+    loop: Loop
+    form: Form | None = None
+    honest: bool = False
+
+    @property
+    def number(self) -> int:
+        """Scenarios, copies not counted."""
+        return len(self.scenarios.velocity) // (COPIES if self.honest else 1)
+
+    @property
+    def tuned(self) -> tuple[Gain, ...]:
+        """The gains that tuning moves for this mechanism."""
+        return tuple(gain for gain in COMPENSATORS[self.compensator].gains if gain.tuned(self.mechanism))
+
+
+def build_task(
+    mechanism: Mechanism,
+    compensator: str,
+    scenarios: int | None,
+    seed: int,
+    form: Form | None = None,
+    setting: str | None = None,
+    honest: bool = False,
+) -> Task:
+    """Training scenarios are quasi-random: they fill the range evenly. Their contacts must end in time.
+
+    Each comes with a realisation of the sensors' noise of its own. Gains can be fitted to a few of them, so
+    that there are more, unless a number is given, where there is noise. The copies of `honest` ones are as
+    good for that: there are fewer scenarios then.
+
+    Raises ValueError for honest tasks in a form.
+    """
+    if honest and form is not None:
+        raise ValueError("honest: found True, allowed False for mechanisms of one form")
+    noisy = has_sensor_noise(mechanism)
+    number = scenarios or (NOISY_SCENARIOS // (COPIES if honest else 1) if noisy else SCENARIOS)
+    draws = quasi_random(mechanism, number, seed)
+    if honest:
+        batch = probed_scenarios(mechanism, draws, seed).scenarios
+    else:
+        batch = build_scenarios(mechanism, draws, seed)
+    loop = build_loop(mechanism, compensator, batch)
+    batch = batch._replace(time_limit=np.asarray(_patience(loop.law, batch)))
+    if form is not None:
+        batch, loop = form.scenarios(mechanism, batch), form.loop(loop)
+    gains = literature_gains(mechanism, compensator, setting)
+    return Task(mechanism, compensator, gains, batch, loop, form, honest)
+
+
+def has_sensor_noise(mechanism: Mechanism) -> bool:
+    """Whether either sensor is noisy, in some scenarios at least."""
+    rig = mechanism.rig
+    paths = "rig.force_sensor.noise_std", "rig.position_sensor.noise_std"
+    return max(rig.force_sensor.noise_std, rig.position_sensor.noise_std) > 0 or any(
+        path in mechanism.uncertainty for path in paths
+    )
+
+
+def alike(loops: list[Loop], scenarios: list[Scenario]) -> list[list[int]]:
+    """Indices of what one program serves: loops that differ by the length of their delay lines alone, with
+    scenario arrays of the same shapes. In the order in which they come."""
+    groups: dict[Any, list[int]] = {}
+    for index, (loop, batch) in enumerate(zip(loops, scenarios, strict=True)):
+        shapes = tuple(leaf.shape for leaf in jax.tree.leaves(batch))
+        groups.setdefault((_with_rings([loop], 0, 0), shapes), []).append(index)
+    return list(groups.values())
+
+
+def common_loop(loops: list[Loop]) -> Loop:
+    """The loop of like ones, with the longest of their delay lines."""
+    return _with_rings(loops, max(loop.ring for loop in loops), max(loop.controller_ring for loop in loops))
+
+
+def _with_rings(loops: list[Loop], ring: int, controller_ring: int) -> Loop:
+    return dataclasses.replace(loops[0], ring=ring, controller_ring=controller_ring)
+
+
+def tuned_names(tasks: list[Task]) -> tuple[str, ...]:
+    """Names of all gains that are tuned for at least one of the tasks."""
+    tuned = {gain.name for task in tasks for gain in task.tuned}
+    return tuple(gain.name for gain in COMPENSATORS[tasks[0].compensator].gains if gain.name in tuned)
+
+
+def gain_bounds(task: Task, names: tuple[str, ...]) -> Bounds:
+    """Bounds (gains,) of a task; of a gain that is not tuned for it both are the literature's value."""
+    gains = {gain.name: gain for gain in COMPENSATORS[task.compensator].gains}
+    moved = {gain.name for gain in task.tuned}
+
+    def bounds(name: str) -> tuple[float, float, float]:
+        gain, mechanism = gains[name], task.mechanism
+        if name not in moved:
+            return task.literature[name], task.literature[name], 0.0
+        return float(gain.lower(mechanism)), float(gain.upper(mechanism)), float(gain.logarithmic)
+
+    return Bounds(*np.array([bounds(name) for name in names]).reshape(-1, 3).T)
+
+
+def gains_at(
+    task: Task, names: tuple[str, ...], bounds: Bounds, shares: Float[np.ndarray, "gains"]
+) -> dict[str, float]:
+    """All of the compensator's gains: `names` at `shares` of their ranges, as far as tuned for the task."""
+    moved = {gain.name for gain in task.tuned}
+    found = zip(names, to_gains(shares, bounds), strict=True)
+    return {**task.literature, **{name: float(gain) for name, gain in found if name in moved}}
+
+
+def spread_points(first: np.ndarray, number: int, seed: int | tuple[int, ...]) -> np.ndarray:
+    """(number, gains) shares of the unit box: `first`, then Sobol points, every other one of them within a
+    quarter of each gain's range of `first`, the rest anywhere."""
+    points = qmc.Sobol(len(first), rng=np.random.default_rng(seed)).random(
+        1 << max(number - 1, 1).bit_length()
+    )
+    reach = np.where(np.arange(len(points)) % 2 == 0, 0.25, 1.0)[:, None]
+    near = np.clip(first + reach * (points - 0.5), 0, 1)
+    return np.concatenate([first[None], np.where(reach < 1, near, points)])[:number]
+
+
+@partial(jax.jit, static_argnums=0)
+def _patience(law: ContactLaw, scenarios: Scenario) -> Float[Array, "*batch"]:
+    """How long [s] a contact may take in training before it has failed: some of its undelayed durations."""
+    shape = scenarios.phase.shape
+    mass = jnp.broadcast_to(scenarios.equivalent_mass, shape)
+    velocity = jnp.broadcast_to(scenarios.velocity, shape)
+    reference = law.reference(parameters_by_slot(scenarios.contact), mass, velocity)
+    longest = PATIENCE * jnp.max(reference.duration, axis=0) + SHORTEST_PATIENCE
+    return jnp.minimum(longest, scenarios.time_limit)

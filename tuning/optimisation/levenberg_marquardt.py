@@ -1,0 +1,278 @@
+"""Levenberg-Marquardt in the unit box, many starts in one program: the one file that imports optimistix.
+
+A step minimises the damped linear model within the box: gains that the model would push through a bound end
+on it, and the others move as if those were constants (`_BoxedDescent`). The residuals' Jacobian is computed
+in forward mode, once per step and next to the residuals themselves.
+"""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax.extend.core import jaxpr_as_fun
+from jax.scipy.linalg import cho_solve
+from jax.sharding import AxisType, PartitionSpec
+from jaxtyping import Array, Float, Int
+
+from tuning.optimisation.unit_box import Bounds, to_gains
+
+
+class Solution(NamedTuple):
+    """Per start: shares of the gains' ranges; loss, half the sum of squared residuals; J^T J there, J the
+    residuals' Jacobian by the shares; loss after every step, the last repeated; steps taken; status, an index
+    into `STATUSES`."""
+
+    shares: Float[Array, "starts gains"]
+    curvature: Float[Array, "starts gains gains"]
+    loss: Float[Array, "starts"]
+    history: Float[Array, "starts steps"]
+    steps: Int[Array, "starts"]
+    status: Int[Array, "starts"]
+
+
+DAMPING = 0.1  # of the first step, relative to the mean diagonal of J^T J
+STANDSTILL = 1e-6  # of the box: a step no longer than that is the end
+PATIENCE, PROGRESS = 5, 1e-3  # steps in which the loss must fall by that share of itself
+STATUSES = ("converged", "step limit", "not finite", "failed")
+
+
+@partial(jax.jit, static_argnames=("residuals", "static", "longest", "tile"))
+def solve(
+    residuals: Callable[..., Float[Array, "problems residuals"]],
+    static: Any,
+    arguments: Any,
+    bounds: Bounds,
+    starts: Float[Array, "problems gains"],
+    steps: Int[Array, ""],
+    longest: int = 32,
+    tile: int | None = None,
+    rtol: float = 1e-4,
+    atol: float = 1e-6,
+) -> Solution:
+    """Minimise sum(residuals(static, gains, arguments)^2) / 2 of many problems at once, in at most `steps`
+    steps, themselves at most `longest`. Problems are dealt out to the devices.
+
+    A problem is a start: shares of its gains' ranges, their bounds and its arguments. It has converged when
+    residuals and shares have settled (`rtol`, `atol`), when a step is shorter than `STANDSTILL`, or when the
+    loss has fallen by less than `PROGRESS` of itself in `PATIENCE` steps. `residuals` gets several, a leading
+    axis of problems, which must not mix: `tile` of them at a time, by default all that a device has to do.
+    """
+
+    def of_shares(shares, arguments):
+        bounds, arguments = arguments
+        return residuals(static, to_gains(shares, bounds), arguments)
+
+    solver = _Recording(_BoxedLevenbergMarquardt(rtol, atol), steps, longest)
+
+    def one_device(starts, bounds, arguments):
+        function = _with_jacobian(of_shares, starts, (bounds, arguments), tile)
+        return jax.vmap(partial(one, function))(starts, bounds, arguments)
+
+    def one(function, start, bounds, arguments):
+        solution = optx.least_squares(
+            function,
+            solver,
+            start,
+            args=(bounds, arguments),
+            has_aux=True,
+            max_steps=longest,
+            throw=False,
+        )
+        stats = solution.stats
+        loss = jnp.min(stats["history"])
+        status = _status(solution.result, stats["converged"], loss)
+        steps = stats["num_steps"].astype(jnp.int32)
+        return Solution(solution.value, stats["curvature"], loss, stats["history"], steps, status)
+
+    devices = math.gcd(jax.device_count(), len(starts))
+    # Traced outside of `jax.shard_map`, inside of which the solver's linear algebra does not trace.
+    leaves, structure = jax.tree.flatten((starts, bounds, arguments))
+    local = [jax.ShapeDtypeStruct((len(leaf) // devices, *leaf.shape[1:]), leaf.dtype) for leaf in leaves]
+    traced = jax.make_jaxpr(lambda *leaves: one_device(*jax.tree.unflatten(structure, leaves)))(*local)
+    mesh = jax.make_mesh(
+        (devices,), ("device",), axis_types=(AxisType.Auto,), devices=jax.devices()[:devices]
+    )
+    own = PartitionSpec("device")
+    # Each device goes its own way to the end: nothing is exchanged, nothing waits for another.
+    found = jax.shard_map(jaxpr_as_fun(traced), mesh=mesh, in_specs=own, out_specs=own, check_vma=False)(
+        *leaves
+    )
+    return Solution(*found)
+
+
+def _with_jacobian(residuals, free, arguments, tile=None):
+    """(residuals, loss) of one problem, to be called under a `jax.vmap` over all of them.
+
+    Its derivative is one product with a Jacobian computed once, in forward mode, for all problems side by
+    side, `tile` at a time. `free` and `arguments` are like those to come, problems first.
+    """
+
+    def value_and_jacobian(free, arguments):
+        def along(direction):
+            every = jnp.broadcast_to(direction, free.shape)
+            return jax.jvp(lambda free: residuals(free, arguments), (free,), (every,))
+
+        # Problems do not mix: one direction serves all of them.
+        basis = jnp.eye(free.shape[-1], dtype=free.dtype)
+        return jax.vmap(along, out_axes=(None, -1))(basis)
+
+    def in_tiles(free, arguments):
+        # A tile ends with its own slowest lane, and its numbers stay in the cache.
+        size = math.gcd(len(free), tile or len(free))
+        shape = len(free) // size, size
+        tiles = jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), (free, arguments))
+        done = jax.lax.map(lambda one: value_and_jacobian(*one), tiles)
+        return jax.tree.map(lambda leaf: leaf.reshape(len(free), *leaf.shape[2:]), done)
+
+    # Traced once, however often the solver asks for it: tracing costs more than many a step.
+    shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), (free, arguments))
+    number = len(free)
+    traced = jaxpr_as_fun(jax.make_jaxpr(in_tiles)(*shapes))
+
+    @jax.custom_batching.custom_vmap
+    def several(free, arguments):
+        # One problem alone, run as often as there are problems: the program traced serves.
+        same = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (number, *leaf.shape)), (free, arguments))
+        return tuple(leaf[0] for leaf in traced(*jax.tree.leaves(same)))
+
+    @several.def_vmap
+    def rule(axis_size, in_batched, free, arguments):
+        if not all(jax.tree.leaves(in_batched)):
+            raise NotImplementedError("every argument must be mapped")
+        return tuple(traced(*jax.tree.leaves((free, arguments)))), (True, True)
+
+    @jax.custom_jvp
+    def function(free, arguments):
+        return several(free, arguments)[0]
+
+    @function.defjvp
+    def derivative(primals, tangents):
+        value, jacobian = several(*primals)
+        return value, jacobian @ tangents[0]
+
+    def with_loss(free, arguments):
+        value = function(free, arguments)
+        return value, jnp.sum(value**2) / 2
+
+    return with_loss
+
+
+class _Model(NamedTuple):
+    """What a step is made of: where it begins, J^T J and the loss's gradient J^T r there."""
+
+    shares: Float[Array, "gains"]
+    curvature: Float[Array, "gains gains"]
+    gradient: Float[Array, "gains"]
+
+
+class _BoxedDescent(optx.AbstractDescent):
+    """The step d in the unit box from the damped linear model: (J^T J + D) d = -J^T r for the gains that are
+    free, D = `DAMPING` mean(diag(J^T J)) / step_size."""
+
+    def init(self, y, f_info_struct):
+        return _Model(y, jnp.zeros((len(y), len(y)), y.dtype), jnp.zeros_like(y))
+
+    def query(self, y, f_info, state):
+        basis = jnp.eye(len(y), dtype=y.dtype)
+        jacobian = jax.vmap(f_info.jac.mv, out_axes=-1)(basis)
+        return _Model(y, jacobian.T @ jacobian, jacobian.T @ f_info.residual)
+
+    def step(self, step_size, state):
+        shares, curvature, gradient = state
+        number, dtype = len(shares), shares.dtype
+        damping = DAMPING * jnp.trace(curvature) / number / step_size.astype(dtype)
+        identity = jnp.eye(number, dtype=dtype)
+        # What no residual depends on has no curvature; it stays.
+        damped = curvature + (damping + jnp.finfo(dtype).tiny ** 0.5) * identity
+        room = -shares, 1 - shares
+        free = ~((shares <= 0) & (gradient > 0) | (shares >= 1) & (gradient < 0))
+
+        def bind(_, found):
+            free, step = found
+            step = jnp.where(free, 0, step)
+            both = free[:, None] & free[None, :]
+            matrix = jnp.where(both, damped, identity)
+            force = jnp.where(free, -gradient - curvature @ step, 0)
+            wanted = cho_solve((jnp.linalg.cholesky(matrix), True), force)
+            inside = jnp.clip(wanted, *room)
+            return free & (wanted == inside), jnp.where(free, inside, step)
+
+        # Each turn binds at least one gain more, or none ever after.
+        _, step = jax.lax.fori_loop(0, number + 1, bind, (free, jnp.zeros_like(shares)))
+        return step, optx.RESULTS.successful
+
+
+class _BoxedLevenbergMarquardt(optx.AbstractGaussNewton):
+    """Levenberg-Marquardt whose steps end in the unit box."""
+
+    rtol: float
+    atol: float
+    norm: Callable[[Any], Array]
+    descent: _BoxedDescent
+    search: optx.ClassicalTrustRegion
+    verbose: Callable[..., None]
+
+    def __init__(self, rtol: float, atol: float):
+        self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
+        self.descent = _BoxedDescent()
+        # Longer steps wherever the model holds roughly: it is never as good as the default asks for.
+        self.search = optx.ClassicalTrustRegion(0.75, 1e-3, 3.0, 0.25)
+        self.verbose = lambda **_: None
+
+
+class _Recording(optx.AbstractLeastSquaresSolver):
+    """A solver that keeps the loss of every accepted iterate, and ends after `steps` of them, a number that
+    is no part of the program."""
+
+    rtol: float
+    atol: float
+    norm: Callable[[Any], Array]
+    inner: optx.AbstractLeastSquaresSolver
+    steps: Int[Array, ""]
+    longest: int = eqx.field(static=True)
+
+    def __init__(self, inner: optx.AbstractLeastSquaresSolver, steps: Int[Array, ""], longest: int):
+        self.rtol, self.atol, self.norm = inner.rtol, inner.atol, inner.norm
+        self.inner, self.steps, self.longest = inner, steps, longest
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        inner = self.inner.init(fn, y, args, options, f_struct, aux_struct, tags)
+        history = jnp.full(self.longest, jnp.inf, y.dtype)
+        return inner, history, jnp.array(0)
+
+    def step(self, fn, y, args, options, state, tags):
+        inner, history, count = state
+        y, inner, aux = self.inner.step(fn, y, args, options, inner, tags)
+        # What it returns is one step old.
+        best = jnp.minimum(inner.aux, jnp.where(count > 0, history[count - 1], jnp.inf))
+        history = jnp.where(jnp.arange(self.longest) >= count, best, history)
+        return y, (inner, history, count + 1), aux
+
+    def terminate(self, fn, y, args, options, state, tags):
+        converged, result = self._converged(fn, y, args, options, state, tags)
+        return converged | (state[2] >= self.steps), result
+
+    def _converged(self, fn, y, args, options, state, tags):
+        inner, history, count = state
+        converged, result = self.inner.terminate(fn, y, args, options, inner, tags)
+        still = jnp.max(jnp.abs(inner.y_eval - y)) < STANDSTILL
+        before = history[jnp.maximum(count - 1 - PATIENCE, 0)]
+        slow = (count > PATIENCE) & (history[count - 1] > (1 - PROGRESS) * before)
+        return converged | ((count > 0) & (still | slow)), result
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        converged, _ = self._converged(fn, y, args, options, state, tags)
+        y, aux, stats = self.inner.postprocess(fn, y, aux, args, options, state[0], tags, result)
+        curvature = state[0].descent_state.curvature
+        return y, aux, {**stats, "history": state[1], "converged": converged, "curvature": curvature}
+
+
+def _status(result, converged, loss):
+    ended = (result == optx.RESULTS.successful) | (result == optx.RESULTS.nonlinear_max_steps_reached)
+    status = jnp.where(ended, jnp.where(converged, 0, 1), 3)
+    return jnp.where(jnp.isfinite(loss), status, 2).astype(jnp.int32)

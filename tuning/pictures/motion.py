@@ -1,0 +1,160 @@
+"""The nominal run tick by tick, and the same contacts in space: what plots are drawn from."""
+
+from collections.abc import Iterator, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxhil.contact.laws import LAWS, ContactLaw, ContactParameters, two_sided
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.rollout import APPROACH
+from jaxhil.simulation.scenario import Scenario, build_scenarios
+from tuning.gain_file import LoadedGains
+from tuning.verification.recording import Lane, prepare_recording, record_lanes
+
+STEPS = 8000  # of the integration in space
+POINTS = 800  # of them kept
+
+Laws = Mapping[str, tuple[str, Mapping[str, float]]]  # by name, a compensator and its gains
+
+
+class Curve(NamedTuple):
+    """Over `time` [s]: force [N] on the numerical model and its position [m]; on a rig, measured force [N]
+    and position [m] too. It entered at `velocity` [m/s]."""
+
+    velocity: float
+    time: np.ndarray
+    force: np.ndarray
+    position: np.ndarray
+    force_measured: np.ndarray | None
+    position_measured: np.ndarray | None
+
+
+class Piece(NamedTuple):
+    """One run of the schedule: a contact, or with two surfaces all of them. Time 0 is the first touch of
+    uniform motion. `surfaces` are the positions [m] of the mechanism's surfaces; `curves` by name, "in space"
+    among them."""
+
+    name: str
+    surfaces: tuple[float, ...]
+    curves: dict[str, Curve]
+
+
+def nominal_motion(mechanism: Mechanism, laws: Laws, seed: int = 0) -> list[Piece]:
+    """The pieces of the nominal run under each of the `laws`; the run in space enters as the last of them."""
+    runs: dict[str, list[Curve]] = {}
+    lanes = list(_lanes(mechanism, laws, seed))
+    for names, loaded, scenarios in lanes:
+        runs |= _runs(loaded, scenarios, names)
+    return _pieces(mechanism, lanes[0][-1], {name: runs[name] for name in laws})
+
+
+def scenario_motion(loaded: LoadedGains, scenarios: Scenario, name: str = "rig") -> list[Piece]:
+    """The pieces of one scenario's run, a batch of one lane, which the plots call `name`."""
+    return _pieces(loaded.mechanism, scenarios, _runs(loaded, scenarios, [name]))
+
+
+def prepare_motion(mechanism: Mechanism, laws: Laws) -> None:
+    """Compile what `nominal_motion` will run under such laws."""
+    for _, loaded, scenarios in _lanes(mechanism, laws, 0):
+        prepare_recording(loaded, scenarios)
+
+
+def _lanes(mechanism: Mechanism, laws: Laws, seed: int) -> Iterator[tuple[list[str], LoadedGains, Scenario]]:
+    """Of each compensator the names of its gains and the nominal scenario in as many lanes."""
+    for compensator in dict.fromkeys(compensator for compensator, _ in laws.values()):
+        own = {name: gains for name, (one, gains) in laws.items() if one == compensator}
+        phase = np.full(len(own), mechanism.approach.phase)
+        scenarios = build_scenarios(mechanism, {"approach.phase": phase}, seed)
+        every = list(own.values())
+        lanes: Any = {name: np.array([gains[name] for gains in every]) for name in every[0]}
+        yield list(own), LoadedGains({}, compensator, lanes, mechanism), scenarios
+
+
+def _runs(loaded: LoadedGains, scenarios: Scenario, names: list[str]) -> dict[str, list[Curve]]:
+    """A lane for each of the names; the lanes differ by their gains alone."""
+    _, recorded = record_lanes(loaded, scenarios)
+    return {name: _split(lane, scenarios) for name, lane in zip(names, recorded, strict=True)}
+
+
+def _pieces(mechanism: Mechanism, scenarios: Scenario, runs: dict[str, list[Curve]]) -> list[Piece]:
+    leading = list(runs.values())[-1]
+    clearance = float(scenarios.clearance[0])
+    two = bool(np.isfinite(clearance))
+    surfaces = (0.0, -clearance) if two else (0.0,)
+    pieces = []
+    for number, curve in enumerate(leading):
+        others = {name: run[number] for name, run in runs.items() if number < len(run)}
+        space = _space(mechanism, scenarios, number, curve.velocity, float(curve.time[-1]))
+        name = f"{mechanism.approach.contacts} contacts" if two else f"contact {number + 1}"
+        pieces.append(Piece(name, surfaces, {"in space": space, **others}))
+    return pieces
+
+
+def _split(lane: Lane, scenarios: Scenario) -> list[Curve]:
+    """A lane's runs."""
+    signals = lane.signals
+    begins = np.flatnonzero(signals.age == 0)
+    ends = np.append(begins[1:], len(signals.age))
+    period = float(scenarios.control_period[0])
+    pieces = []
+    for number, (begin, end) in enumerate(zip(begins, ends, strict=True)):
+        touch = APPROACH + float(scenarios.phase[number, 0]) * period
+        part = slice(begin, end)
+        curve = Curve(
+            float(signals.velocity_desired[begin]),
+            np.arange(end - begin) * period - touch,
+            np.asarray(lane.command[part]),
+            np.asarray(signals.position_desired[part]),
+            np.asarray(signals.force_measured[part]),
+            np.asarray(signals.position_measured[part]),
+        )
+        pieces.append(curve)
+    return pieces
+
+
+def _space(mechanism: Mechanism, scenarios: Scenario, first: int, velocity: float, end: float) -> Curve:
+    """The reference's motion from contact `first` on, from 0.02 s before the touch to `end` [s]."""
+    lane = jax.tree.map(lambda leaf: jnp.asarray(leaf[..., 0]), scenarios)
+    step = (end + APPROACH) / STEPS
+    force, position = _integrate(
+        LAWS[mechanism.contact.law](),
+        lane.contact,
+        jnp.asarray(first),
+        lane.clearance,
+        lane.equivalent_mass,
+        jnp.asarray(velocity),
+        jnp.asarray(step),
+    )
+    keep = slice(None, None, STEPS // POINTS)
+    time = -APPROACH + step * np.arange(STEPS)
+    return Curve(velocity, time[keep], np.asarray(force)[keep], np.asarray(position)[keep], None, None)
+
+
+@partial(jax.jit, static_argnums=0)
+def _integrate(
+    law: ContactLaw, contacts: ContactParameters, first: Array, clearance: Array, mass: Array, velocity, step
+) -> tuple[Float[Array, "steps"], Float[Array, "steps"]]:
+    """Force [N] and position [m] of M x'' = -F by semi-implicit Euler, in steps too small to see.
+
+    The next contact's parameters hold once a contact is left.
+    """
+    last = contacts.damping.shape[0] - 1
+
+    def advance(carry, _):
+        position, speed, index, touched = carry
+        parameters = jax.tree.map(lambda leaf: leaf[jnp.minimum(index, last)], contacts)
+        force, _ = two_sided(law, parameters, (), position, speed, clearance)
+        touching = (position > 0) | (position < -clearance)
+        index = jnp.where(touched & ~touching, index + 1, index)
+        speed = speed - step * force / mass
+        return (position + step * speed, speed, index, touching), (force, position)
+
+    start = (-velocity * APPROACH, velocity, first, jnp.array(False))
+    _, (force, position) = lax.scan(advance, start, None, length=STEPS)
+    return force, position

@@ -1,0 +1,49 @@
+"""Histograms of the latencies of a session: what the controller takes, and what the rig sees."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from tuning.pictures.plots import BLACK, BLUE, ORANGE, finish, new_figure
+from tuning.rig.loop import ANSWER_SHARE
+from tuning.rig.session import SessionReport
+
+STYLES = {"empty loop": (ORANGE, "--"), "controller": (BLUE, "-")}
+BINS_PER_DECADE = 20
+
+
+def latency_plot(session: SessionReport, title: str, period: float) -> Figure:
+    """Share of ticks by the controller's own time per tick, and by round trip; both axes logarithmic.
+
+    `period` [s] is the control period: the time that an answer has is drawn too.
+    """
+    figure = new_figure((10, 4.6), title)
+    left, right = figure.subplots(1, 2, sharey=True)
+    loops = {"empty loop": session.empty, "controller": session.run}
+    for axes, name in ((left, "tick_time"), (right, "round_trip")):
+        for label, loop in loops.items():
+            if loop is not None:
+                _histogram(axes, getattr(loop.times, name), label)
+        axes.axvline(1e6 * period, color=BLACK, linewidth=0.8, linestyle=":", label="control period")
+        axes.set(xscale="log", yscale="log")
+    share = 1e6 * ANSWER_SHARE * period
+    right.axvline(share, color=BLACK, linewidth=0.8, linestyle="-.", label="answer due")
+    left.set(xlabel="controller's time per tick [µs]", ylabel="share of ticks per bin [1]")
+    right.set(xlabel="round trip, as the rig sees it [µs]")
+    finish(left, "best")
+    finish(right, "best")
+    return figure
+
+
+def _histogram(axes: Axes, times: np.ndarray, label: str) -> None:
+    micro = 1e6 * times[times > 0]
+    if not len(micro):
+        return
+    colour, line = STYLES[label]
+    first, last = np.floor(BINS_PER_DECADE * np.log10([micro.min(), micro.max()]))
+    edges = 10 ** (np.arange(first, last + 2) / BINS_PER_DECADE)
+    counts, _ = np.histogram(micro, edges)
+    # An empty bin has no place on a logarithmic axis.
+    shares = np.where(counts > 0, counts / len(micro), np.nan)
+    style = {"color": colour, "linestyle": line, "linewidth": 1.5, "label": label}
+    axes.stairs(shares, edges, baseline=None, **style)

@@ -1,0 +1,148 @@
+"""What a session comes to: every contact beside the same one in space, and a verdict with its reasons."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxhil.mechanism.structs import Mechanism
+from tuning.rig.contact_watch import ContactResult
+from tuning.rig.hardware import BRIDGED, STALLED
+from tuning.rig.session import CONTROLLER, LoopReport, SessionReport, Setup
+
+
+def reference_restitutions(mechanism: Mechanism, contacts: Sequence[ContactResult]) -> list[float]:
+    """Restitution e* of each contact in space, entered at the speed it had on the rig; imports jax."""
+    if not contacts:
+        return []
+    from tuning.environment import prepare
+
+    prepare()
+    import jax
+    import jax.numpy as jnp
+
+    from jaxhil.contact.laws import LAWS
+    from jaxhil.simulation.evaluation import parameters_by_slot
+    from jaxhil.simulation.scenario import build_scenarios
+
+    scenario = build_scenarios(mechanism)
+    number = np.array([one.number for one in contacts])
+    # What differs between contacts is the trailing axis.
+    table = jax.tree.map(lambda leaf: leaf[number][..., 0], scenario.contact)
+    parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf)[..., None], table)
+    speeds = [one.approach_velocity for one in contacts]
+    velocity = jnp.array([speed if speed > 0.0 else 1.0 for speed in speeds])[:, None]
+    mass = jnp.broadcast_to(jnp.asarray(scenario.equivalent_mass), velocity.shape)
+    law = LAWS[mechanism.contact.law]()
+    reference = law.reference(parameters_by_slot(parameters), mass, velocity)
+    return [float(value) for value in np.asarray(reference.restitution)[:, 0]]
+
+
+def stalled(contact: ContactResult, setup: Setup, run: LoopReport | None) -> bool:
+    """Whether the machine, and nobody else, left a contact with commands older than `BRIDGED` periods.
+
+    Such a contact says nothing of the controller. Where faults are injected there are none of the kind.
+    """
+    if run is None or setup.injection.any or contact.oldest_command <= BRIDGED:
+        return False
+    first, last = contact.packets
+    return not np.any(run.causes[first : last + 1] == CONTROLLER)
+
+
+def judge(
+    setup: Setup, session: SessionReport, references: Sequence[float], limit: float, compensator: str
+) -> dict[str, Any]:
+    """The session as a document, in SI units: loops, contacts, what was commanded, verdict and reasons."""
+    contacts = [
+        {
+            **one._asdict(),
+            "status": STALLED if stalled(one, setup, session.run) else one.status,
+            "reference_restitution": reference,
+            "error": one.restitution - reference if one.status == "ok" else None,
+        }
+        for one, reference in zip(session.contacts, references, strict=True)
+    ]
+    ended = [one for one in contacts if one["status"] == "ok"]
+    errors = [one["error"] for one in ended]
+    reasons = _reasons(setup, session, [one["status"] for one in contacts], errors, limit)
+    good = f"no missed tick is the controller's fault, every error is within {limit:g}."
+    if session.tripped:
+        good = "tripped with a cause under injected faults, every command finite and within its limits."
+    return {
+        "mechanism": setup.mechanism.name,
+        "compensator": compensator,
+        "control_period": setup.mechanism.rig.control_period,
+        "duration": setup.duration,
+        "seed": setup.seed,
+        "realtime": setup.priority,
+        "injection": setup.injection._asdict(),
+        "empty_loop": _figures(session.empty),
+        "run": _figures(session.run),
+        "contacts": contacts,
+        "judged": len(errors),
+        "stalled": sum(one["status"] == STALLED for one in contacts),
+        "largest_error": max(errors, key=abs, default=None),
+        "commanded": None if session.commanded is None else session.commanded._asdict(),
+        "stroke": setup.stroke,
+        "tripped": session.tripped,
+        "resets": session.resets,
+        "interrupted": session.interrupted,
+        "limit": limit,
+        "reasons": reasons,
+        "good": good,
+        "verdict": "bad" if reasons else "good",
+    }
+
+
+def _figures(loop: LoopReport | None) -> dict[str, Any] | None:
+    if loop is None:
+        return None
+    figures = loop.figures._asdict()
+    for name in ("tick_time", "tick_cpu", "round_trip", "lateness"):
+        figures[name] = figures[name]._asdict()
+    said = {key: loop.controller[key] for key in ("ended", "status", "stale", "made_up", "jax")}
+    # A bundle brings the process that it was exported with, which may be too old to tell.
+    said["doubts"] = loop.controller.get("doubts", {})
+    again = loop.controller["replayed"]["cpu"]
+    return {
+        **figures,
+        "controller": said,
+        "replayed": len(again),
+        "replayed_most": max(again, default=0) * 1e-9,
+    }
+
+
+def _reasons(
+    setup: Setup, session: SessionReport, statuses: Sequence[str], errors: Sequence[float], limit: float
+) -> list[str]:
+    reasons = []
+    run, commanded = session.run, session.commanded
+    if run is not None:
+        missed = run.figures.missed_by_controller
+        if missed:
+            reasons.append(f"{missed} missed tick{'s are' if missed > 1 else ' is'} the controller's fault.")
+        if run.controller["ended"] not in ("stopped",):
+            reasons.append(f"the controller's process ended {run.controller['ended']}, before the run did.")
+    wrong = [error for error in errors if not abs(error) <= limit]
+    if wrong:
+        worst = max(wrong, key=abs)
+        kind = "divergence" if worst > 0 else "convergence"
+        reasons.append(
+            f"{len(wrong)} of {len(errors)} contacts have an error beyond {limit:g}, the largest "
+            f"{worst:+.4f} ({kind})."
+        )
+    failed = [status for status in statuses if status not in ("ok", "tripped", STALLED)]
+    if failed:
+        reasons.append(f"{len(failed)} contacts did not end well: {', '.join(sorted(set(failed)))}.")
+    if session.tripped and not setup.injection.any:
+        reasons.append("it tripped though no faults were injected.")
+    if commanded is not None and commanded.not_finite:
+        reasons.append(f"{commanded.not_finite} commands were not finite.")
+    if commanded is not None and commanded.beyond_limits:
+        reasons.append(f"{commanded.beyond_limits} position commands were beyond their limits.")
+    if not errors and not session.tripped and not session.interrupted:
+        reasons.append("no contact could be judged: the run was too short, or the machine too busy.")
+    if math.isnan(sum(errors)):
+        reasons.append("an error is not a number.")
+    return reasons

@@ -1,0 +1,1 @@
+"""Statistics of errors and failures: intervals, quantiles, resampling, Sobol indices, rare events."""

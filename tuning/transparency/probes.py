@@ -1,0 +1,109 @@
+"""What keeps tuning honest: each scenario once more with an early push, with a late push, and damped.
+
+A law that anticipates the contact can be tuned into a simulation that ignores the hardware: where all
+contacts are alike, that is the most accurate. So each scenario comes with three copies whose restitution it
+cannot know beforehand:
+
+    early, late   the push of `tuning.transparency.pushes` on the hardware, which no model knows of
+    damped        the scenario's twin of `tuning.transparency.damped_twins`, with more dissipation than it has
+
+Each has its own true restitution e*: that of the pushed, or damped, contact in space. A law that swallows the
+push, or gives back energy that is not there, errs by e - e* as in any other contact: transparency and slope
+are then restitution errors, differentiable, in one unit with all others. The push counts from the hardware's
+first touch, and is the same in space; it acts on the first contact, after which a copy ends.
+
+The four lie side by side, lanes 4 i to 4 i + 3 for scenario i: whatever takes the first few lanes has some
+of each.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.contact.laws import LAWS
+from jaxhil.contact.reference import Reference
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.evaluation import Outcome
+from jaxhil.simulation.probe import Probe, Push
+from jaxhil.simulation.scenario import Scenario, build_scenarios
+from tuning.transparency.damped_twins import damped_twins
+from tuning.transparency.figures import Figure, Judged, honesty
+from tuning.transparency.pushes import EARLY, LATE, SIZE, WIDTH, in_space
+
+COPIES = 4  # lanes of a scenario: plain, early, late, damped
+# Weights of the objective of a law that anticipates, unless others are given.
+ANTICIPATING = {"honesty_weight": 1.0, "command_weight": 0.003}
+
+
+class Probed(NamedTuple):
+    """A batch of scenarios with their copies, (..., scenarios * `COPIES`), and their restitution in space,
+    (scenarios,), without and with the early and the late push, all integrated alike."""
+
+    scenarios: Scenario
+    plain: Any
+    early: Any
+    late: Any
+
+
+def default_weights(compensator: str) -> dict[str, float]:
+    """Weights of `tuning.gains.objective.Objective` that a compensator has unless others are given, by name.
+
+    Where the law anticipates, the errors of the copies count as much as those of the scenarios, and force is
+    dear: what such a law is late by it can pay back by a kick, which the error alone rewards. Where a law can
+    but pass on what it measures, neither counts.
+    """
+    return dict(ANTICIPATING) if COMPENSATORS[compensator].anticipates else {}
+
+
+def are_copies(lanes: int) -> np.ndarray:
+    """Which of so many lanes, with those of the copies, are of copies."""
+    return np.arange(lanes) % COPIES > 0
+
+
+def probed_scenarios(
+    mechanism: Mechanism, draws: Mapping[str, np.ndarray] | None = None, seed: int = 0
+) -> Probed:
+    """The scenarios of `jaxhil.simulation.scenario.build_scenarios`, each with its copies."""
+    plain = build_scenarios(mechanism, draws, seed)
+    number = len(plain.velocity)
+    twin, damped = damped_twins(mechanism, draws or {"approach.phase": np.asarray(plain.phase).T})
+    slots = plain.phase.shape[0]
+    velocity: Any = np.broadcast_to(plain.velocity, (slots, number))
+    space = in_space(LAWS[mechanism.contact.law](), plain, velocity, 1)
+    own = build_scenarios(twin, damped, seed)
+    pushes = [_pushed(plain, space, share, e) for share, e in ((EARLY, space.early), (LATE, space.late))]
+    batches = [_pushed(plain, space), *pushes, _pushed(own, space)]
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves, axis=-1), *batches)
+    side_by_side = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-2], COPIES * number), stacked)
+    return Probed(side_by_side, space.restitution[0], space.early, space.late)
+
+
+def _pushed(scenarios: Scenario, space: Any, share: float | None = None, restitution: Any = None) -> Scenario:
+    """The scenarios with a push at a share of the first contact's duration in space, where one is given, and
+    what the contact's `restitution` then is."""
+    size = np.zeros_like(space.peak_force)
+    known = np.full((3, *size.shape), np.nan)
+    centre, contacts = size.copy(), scenarios.contacts
+    if share is not None:
+        size[0] = SIZE * space.peak_force[0]
+        centre[0] = share * space.duration[0]
+        known[:, 0] = restitution, space.peak_force[0], space.duration[0]
+        contacts = np.minimum(contacts, 1)
+    push: Any = Push(size, centre, np.full_like(size, WIDTH))
+    # Nobody asks how far the model is off the motion in space: its two ends will do.
+    probe: Any = Probe(push, space.depth[:, [0, -1]], space.duration)
+    reference: Any = Reference(*known)
+    return scenarios._replace(contacts=contacts, probe=probe, reference=reference)
+
+
+def honesty_figures(probed: Probed, copies: Outcome, seed: int = 0) -> dict[str, Figure]:
+    """early, late, slope and peak of `tuning.transparency.figures` from the outcome (slots, scenarios,
+    `COPIES`) of `probed` scenarios; the slope over the damped copies."""
+    plain, early, late, damped = (
+        jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[..., i], copies) for i in range(COPIES)
+    )
+    judged = Judged(plain, early, late, damped)
+    return honesty(judged, (probed.early, probed.late), probed.plain, seed)

@@ -1,0 +1,1 @@
+"""The controller of the rig held against the simulation: runs recorded tick by tick, and replayed."""

@@ -1,0 +1,294 @@
+"""Verification: does the runtime that goes to the rig do what was simulated and tuned?
+
+Two comparisons under the gains of a gain file. *Replay*: the loop is recorded with jax, for the nominal
+mechanism and some draws of its uncertainty, and what its controller read goes tick by tick through the
+runtime's; their force and position commands are compared. *Closed loop*: the nominal contacts are run once
+more with the runtime in the place of the jax controller, and each contact's restitution is compared.
+
+Each side rounds in its own order, so they agree to a fraction of the command's range, but for one thing: a
+decision (touching or not, force above the contact threshold or not) so close to its threshold that rounding
+decides. Such ticks are counted and compared separately; where the decisions fell differently, the comparison
+of that lane ends.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+
+import jax
+import msgspec
+import numpy as np
+
+from jaxhil.compensators import Signals
+from jaxhil.runtime import Controller
+from jaxhil.runtime.gain_file import GainFile, check_gain_document
+from jaxhil.runtime.limits import NO_LIMITS
+from jaxhil.simulation.metrics import OK, STATUS_NAMES, Metrics
+from tuning.gain_file import LoadedGains
+from tuning.verification.recording import Lane, nominal_and_draws, record_lanes, run_closed_loop
+
+REPLAY_LIMIT = 1e-11  # of the command's range
+CLOSED_LOOP_LIMIT = 1e-9  # of restitution
+NEAR = 1e-9  # relative distance from a threshold within which rounding may decide
+PARTED = 1e-6  # relative difference of identified parameters that tells of another decision
+LEAST_COMPARED = 0.5  # of all ticks; with less there is no verdict to speak of
+LANES = 6
+
+
+class LaneReplay(msgspec.Struct, frozen=True):
+    """One recorded lane through the runtime.
+
+    Ticks recorded, compared, and of those `near` a threshold; the command's range, 0 included [N]; the
+    largest difference away from thresholds and near them, as fractions of that range; the tick of the former,
+    and what either side commanded there [N]; the tick at which a decision at a threshold fell differently,
+    which ended the comparison; the runtime's status; the largest difference of the position commands, as a
+    fraction of their range.
+    """
+
+    ticks: int
+    compared: int
+    near: int
+    command_range: float
+    difference: float
+    near_difference: float
+    worst_tick: int
+    found: float
+    expected: float
+    parted: int | None
+    status: str
+    position_difference: float = 0.0
+
+
+class ContactComparison(msgspec.Struct, frozen=True):
+    """One nominal contact: restitution and status with the runtime in the loop, and simulated as a whole."""
+
+    restitution: float | None
+    simulated_restitution: float | None
+    status: str
+    simulated_status: str
+
+
+class VerificationReport(msgspec.Struct, frozen=True):
+    """The verdict, the reasons why it is bad if it is, and the numbers that it rests on."""
+
+    verdict: bool
+    reasons: tuple[str, ...]
+    compensator: str
+    replay_limit: float
+    closed_loop_limit: float
+    replay: tuple[LaneReplay, ...]
+    closed_loop: tuple[ContactComparison, ...]
+
+
+def verify(
+    loaded: LoadedGains,
+    scenarios: int = LANES,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda message: None,
+) -> VerificationReport:
+    """Replay `scenarios` runs (the nominal one and draws) and run the nominal contacts in closed loop.
+
+    `progress` is told in words what begins. Raises RuntimeError unless jax computes in float64, `InputError`
+    never: the gain file is checked when it is loaded.
+    """
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError("verification compares to 1e-11: switch jax_enable_x64 on first")
+    gain_file = check_gain_document(loaded.document)
+    progress(f"recording {scenarios} runs")
+    batch = nominal_and_draws(loaded.mechanism, scenarios, seed)
+    metrics, lanes = record_lanes(loaded, batch)
+    # What a draw makes of period and clearance, the controller of that rig knows. It is the law that is
+    # compared: some draw may well be what the limits are there to stop.
+    gain_files = [
+        gain_file._replace(control_period=float(period), clearance=float(clearance), limits=NO_LIMITS)
+        for period, clearance in zip(batch.control_period, batch.clearance, strict=True)
+    ]
+    progress(f"replaying {sum(len(lane.command) for lane in lanes)} ticks through the runtime")
+    replays = [replay(lane, file) for lane, file in zip(lanes, gain_files, strict=True)]
+    progress("running the nominal contacts with the runtime in the loop")
+    closed = run_closed_loop(loaded, gain_file, batch)
+    contacts = loaded.mechanism.approach.contacts
+    comparisons = [_compare_contact(closed, metrics, contact) for contact in range(contacts)]
+    reasons = (*_replay_reasons(replays), *_closed_loop_reasons(comparisons))
+    return VerificationReport(
+        verdict=not reasons,
+        reasons=reasons,
+        compensator=loaded.compensator,
+        replay_limit=REPLAY_LIMIT,
+        closed_loop_limit=CLOSED_LOOP_LIMIT,
+        replay=tuple(replays),
+        closed_loop=tuple(comparisons),
+    )
+
+
+def replay(lane: Lane, gain_file: GainFile) -> LaneReplay:
+    """The lane's signals tick by tick through the runtime, and how its commands compare."""
+    controller = Controller(gain_file)
+    commands, positions, stiffness, damping = replayed(controller, lane)
+    near = near_threshold(lane.signals, gain_file)
+    error, span = relative_difference(commands, np.asarray(lane.command))
+    parted = parting(error, (stiffness, damping), lane.identified, near)
+    compared = len(commands) if parted is None else parted
+    clear = np.where(near, 0.0, error)[:compared]
+    worst = int(np.argmax(clear)) if compared else 0
+    return LaneReplay(
+        ticks=len(commands),
+        compared=compared,
+        near=int(np.sum(near)),
+        command_range=span,
+        difference=float(np.max(clear, initial=0.0)),
+        near_difference=float(np.max(error[:compared][near[:compared]], initial=0.0)),
+        worst_tick=worst,
+        found=float(commands[worst]) if compared else 0.0,
+        expected=float(lane.command[worst]) if compared else 0.0,
+        parted=parted,
+        status=controller.status,
+        position_difference=position_difference(positions[:compared], lane),
+    )
+
+
+def replayed(controller: Controller, lane: Lane) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The runtime's commands [N] and [m] and identified stiffness and damping, (ticks,), for the lane's
+    signals; NaN for a position command after which no motion of the numerical model is recorded."""
+    controller.reset()
+    readings = list(zip(*(leaf.tolist() for leaf in lane.signals), strict=True))
+    results = []
+    for tick, (force, position, velocity, measured, age) in enumerate(readings):
+        if age == 0 and tick > 0:
+            controller.next_contact()
+        command = controller.step(force, position, velocity, measured)
+        identified, sent = controller.identified, math.nan
+        if lane.sent is not None and tick + 1 < len(readings) and readings[tick + 1][4] == age + 1:
+            # Every integrator has v(n+1) = v(n) + T a.
+            moved_to, moved_at = readings[tick + 1][1:3]
+            acceleration = (moved_at - velocity) / controller.control_period
+            sent = controller.position_command(moved_to, moved_at, acceleration)
+        results.append((0.0 if age == 0 and lane.zeroed else command, sent, *identified))
+    commands, positions, stiffness, damping = np.array(results, float).reshape(-1, 4).T
+    return commands, positions, stiffness, damping
+
+
+def position_difference(positions: np.ndarray, lane: Lane) -> float:
+    """Largest difference of the position commands, those that are not NaN, from the lane's: a fraction of the
+    range of these."""
+    if lane.sent is None:
+        return 0.0
+    expected = np.asarray(lane.sent)[: len(positions)]
+    error, _ = relative_difference(positions, np.where(np.isnan(positions), np.nan, expected))
+    return float(np.max(error, initial=0.0))
+
+
+def command_range(commands: np.ndarray) -> float:
+    """From the least to the greatest command [N] that is finite, 0 included."""
+    finite = commands[np.isfinite(commands)]
+    return float(np.max(finite, initial=0.0) - np.min(finite, initial=0.0))
+
+
+def relative_difference(commands: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, float]:
+    """Differences as fractions of the expected range, 0 where nothing (NaN) is expected; that range [N]."""
+    span = command_range(expected)
+    error = np.where(np.isnan(expected), 0.0, np.abs(commands - expected))
+    # Of a command that is always 0 no fraction can be taken: there, only equality will do.
+    return error / span if span > 0 else np.where(error == 0, 0.0, np.inf), span
+
+
+def parting(
+    error: np.ndarray,
+    identified: Sequence[np.ndarray],
+    expected: Sequence[np.ndarray | jax.Array] | None,
+    near: np.ndarray,
+) -> int | None:
+    """The first tick at which rounding decided at a threshold, and the two sides parted.
+
+    By `error` of the command, or by what either side identified, where it identifies anything.
+    """
+    apart = error > REPLAY_LIMIT
+    for mine, other in zip(identified, expected or (), strict=expected is not None):
+        other = np.asarray(other)[: len(error)]
+        apart |= np.abs(mine - other) > PARTED * np.max(np.abs(other), initial=0.0)
+    partings = np.nonzero(near & apart)[0]
+    # Differences grow before they show: a parting counts from the first time the two sides are apart.
+    return int(partings[0]) if len(partings) and not np.any(apart[: partings[0]]) else None
+
+
+def near_threshold(signals: Signals, gain_file: GainFile) -> np.ndarray:
+    """The ticks, (ticks,) of bool, at which a decision of the law is within `NEAR` of its threshold.
+
+    Two decisions, of laws that identify: on which side of a surface the delay-aligned position is, relative
+    to the size of the measured positions; and, in contact, whether |F| exceeds the contact threshold,
+    relative to either. A force and a threshold that are both 0 are equal on both sides, however it rounds.
+    """
+    gains, clearance = gain_file.gains, gain_file.clearance
+    near = np.zeros(len(signals.age), bool)
+    if "contact_threshold" not in gains or not len(near):
+        return near
+    aligned = _aligned(signals, gains["identification_delay"], gain_file.control_period)
+    margin = NEAR * np.max(np.abs(signals.position_measured))
+    near |= np.minimum(np.abs(aligned), np.abs(aligned + clearance)) < margin
+    force, threshold = np.abs(signals.force_measured), gains["contact_threshold"]
+    touching = (aligned > 0) | (aligned < -clearance)
+    return near | touching & (np.abs(force - threshold) < NEAR * np.maximum(force, threshold))
+
+
+def _aligned(signals: Signals, delay: float, period: float) -> np.ndarray:
+    """The measured position [m] a `delay` [s] ago, straight between ticks, in uniform motion before a run."""
+    measured, velocity, age = signals.position_measured, signals.velocity_desired, signals.age
+    tick = np.arange(len(measured))
+    begun = tick - age
+    back = delay / period
+    whole = int(np.floor(back + 1e-9))
+    past = np.maximum(tick - whole, 0), np.maximum(tick - whole - 1, 0)
+    between = measured[past[0]] + (back - whole) * (measured[past[1]] - measured[past[0]])
+    uniform = measured[begun] + (age - back) * period * velocity[begun]
+    return np.where(age <= whole, uniform, between)
+
+
+def _compare_contact(closed: Metrics, simulated: Metrics, contact: int) -> ContactComparison:
+    return ContactComparison(
+        restitution=_restitution(closed, contact),
+        simulated_restitution=_restitution(simulated, contact),
+        status=STATUS_NAMES[int(closed.status[contact, 0])],
+        simulated_status=STATUS_NAMES[int(simulated.status[contact, 0])],
+    )
+
+
+def _restitution(metrics: Metrics, contact: int) -> float | None:
+    return float(metrics.restitution[contact, 0]) if metrics.status[contact, 0] == OK else None
+
+
+def _replay_reasons(replays: list[LaneReplay]) -> Iterator[str]:
+    for number, lane in enumerate(replays):
+        run = "the nominal run" if number == 0 else f"draw {number}"
+        if lane.status != "ok":
+            yield f"{run}: the runtime's controller {lane.status}"
+        if lane.difference > REPLAY_LIMIT:
+            yield (
+                f"{run}, tick {lane.worst_tick}: force command found {lane.found!r} N, expected "
+                f"{lane.expected!r} N: they differ by {lane.difference:.1e} of the command's range "
+                f"{lane.command_range:.4g} N, allowed {REPLAY_LIMIT:.0e}"
+            )
+        if lane.position_difference > REPLAY_LIMIT:
+            yield (
+                f"{run}: position commands differ by {lane.position_difference:.1e} of their range, allowed "
+                f"{REPLAY_LIMIT:.0e}"
+            )
+    ticks, compared = sum(lane.ticks for lane in replays), sum(lane.compared for lane in replays)
+    if compared < LEAST_COMPARED * ticks:
+        yield (
+            f"replay: {compared} of {ticks} ticks could be compared before rounding decided at a threshold, "
+            f"allowed at least {LEAST_COMPARED:.0%}"
+        )
+
+
+def _closed_loop_reasons(comparisons: list[ContactComparison]) -> Iterator[str]:
+    for number, contact in enumerate(comparisons, start=1):
+        where = f"closed loop, contact {number}"
+        if contact.restitution is None or contact.simulated_restitution is None:
+            yield f"{where}: found {contact.status}, simulated {contact.simulated_status}, allowed ok"
+            continue
+        difference = abs(contact.restitution - contact.simulated_restitution)
+        if not difference <= CLOSED_LOOP_LIMIT:
+            yield (
+                f"{where}: restitution found {contact.restitution!r}, simulated "
+                f"{contact.simulated_restitution!r}: they differ by {difference:.1e}, allowed "
+                f"{CLOSED_LOOP_LIMIT:.0e}"
+            )

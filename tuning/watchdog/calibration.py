@@ -1,0 +1,405 @@
+"""The limits of a gain file, from what good runs did: `calibrate`.
+
+The scenarios of a sweep's store are run again, recorded, and judged: a run is good if no contact's error
+exceeds the sweep's limit. To some of the runs the watchdog's expected restitution is fitted, and limits are
+margins on what the good ones among them needed; what shares of the other runs are stopped for nothing, or
+missed, is stated with exact intervals.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxhil.errors import InputError
+from jaxhil.mechanism.uncertainty import extremes
+from jaxhil.runtime.limits import LIMITS
+from jaxhil.simulation.metrics import OK
+from jaxhil.simulation.scenario import build_scenarios
+from tuning.gain_file import LoadedGains
+from tuning.statistics.intervals import binomial_interval
+from tuning.sweeps.store import Store, read_part
+from tuning.watchdog.audited import Audited, Rules, audit_contacts, first_reached
+from tuning.watchdog.expectation import Expectation, Features, expected_restitution, fit_expectation
+from tuning.watchdog.extent import Extent, extent_of
+from tuning.watchdog.recorded import LANES, Chunk, Scenarios, recorded_chunks
+
+MARGIN = 1.5  # on what good runs did
+FITTED = 2048  # runs that are enough to fit to: all others judge, at least 3 of 4 and at most 15 of 16
+SMALLEST = 0.02  # of the largest force reading: what a limit on forces leaves a sensor at least
+WITHOUT_STORE = 512  # draws
+LIMIT = 0.01  # of the restitution error, where no sweep states one
+BRIDGED = 3  # ticks: bad readings, missed ticks, cut rates in a row
+TARE = 0.1  # s
+RETREAT = 0.005  # s of free approach: what counts as out of contact besides what the sensor may err
+BALANCE = 1e-6  # of the approach's energy: what rounding leaves is far below, one wrong force far above
+BEYOND = 1.25  # times the expectation's largest error among the fitted runs: what others may have
+LEAST, PLACE = (
+    0.25,
+    0.75,
+)  # of the limit: the least margin of the restitution, and the one that a good expectation has
+ENOUGH = 0.01  # of the limit: rms error of an expectation that need not be better
+TOLD_ERRORS = (0.5, 1.0)  # of the limit: below the one a run is good, beyond the other it must be stopped
+
+
+class Calibration(NamedTuple):
+    """Limits by name [SI units], of `jaxhil.runtime.limits.LIMITS`, None for no limit; what is known of the
+    watchdog's alarms, plain data for the gain file and the summary."""
+
+    limits: dict[str, float | None]
+    rates: dict[str, Any]
+
+
+class Judged(NamedTuple):
+    """Runs: their index, (lanes,); errors (slots, lanes), NaN where a contact did not end; the reference's
+    restitution; status; what the watchdog audits; extent of the signals."""
+
+    index: Int[np.ndarray, "lanes"]
+    error: Float[np.ndarray, "slots lanes"]
+    reference: Float[np.ndarray, "slots lanes"]
+    status: Int[np.ndarray, "slots lanes"]
+    audited: Audited
+    extent: Extent
+
+
+def calibrate(
+    loaded: LoadedGains,
+    store: Store | None = None,
+    scenarios: int | None = None,
+    limit: float | None = None,
+    lanes: int = LANES,
+    replaced: Mapping[str, float | None] | None = None,
+    progress: Callable[[int], None] = lambda runs: None,
+) -> Calibration:
+    """Limits for the rig, and the watchdog's rates of false and missed alarms.
+
+    Args: `loaded`, the gain file; `store`, a sweep's of that gain file, whose scenarios are run again, all of
+    them or the first so many `scenarios`; without a store so many draws of the file's own uncertainty (512).
+    `limit` of the restitution error: the store's own by default, else 0.01. `replaced` limits are as given,
+    whatever the runs say, and the rates are under them. So many `lanes` are run at a time; `progress` is told
+    how many more runs are done. Raises `InputError` for a store of another gain file, or a number that it
+    does not hold.
+    """
+    chosen = _chosen(loaded, store, scenarios)
+    if limit is None:
+        limit = store.manifest.limit if store is not None else None
+    limit = LIMIT if limit is None else limit
+    if not 0 < limit < np.inf:
+        raise InputError(f"--limit: found {limit!r}, allowed a number above 0")
+    rules, free_distance = watchdog_rules(loaded)
+    parts = []
+    for chunk in recorded_chunks(loaded, chosen, lanes):
+        parts.append(judge_chunk(chunk, rules, free_distance))
+        progress(len(parts[-1].index))
+    runs = _joined(parts)
+    fitted = runs.index % int(np.clip(len(runs.index) // FITTED, 4, 16)) == 0
+    good = good_runs(runs, limit) & fitted
+    used = good if np.any(good) else np.all(runs.status == OK, axis=0) & fitted
+    if not np.any(used):
+        raise InputError("limits: found no run all of whose contacts end, allowed gains with which they do")
+    expectation = fit_reached(runs, limit, rules.mass, fitted)
+    margin = restitution_margin(runs, expectation, limit, rules.mass, fitted)
+    limits = {
+        **guard_limits(loaded, runs, used, rules, free_distance),
+        **expectation.limits(),
+        "restitution_margin": margin,
+    }
+    found = {name: limits.get(name) for name in LIMITS} | dict(replaced or {})
+    rates = watchdog_rates(runs, expectation, found, limit, rules.mass, ~fitted)
+    rates["calibrated_on"] = {
+        "scenarios": chosen.number,
+        "sampling": chosen.sampling,
+        "seed": chosen.seed,
+        "sweep_sha256": None if store is None else store.manifest.sha256,
+        "runs": "good" if used is good else "ended, none good",
+        "number": int(np.sum(used)),
+        "margin": MARGIN,
+    }
+    return Calibration({name: _plain(value) for name, value in found.items()}, rates)
+
+
+def watchdog_rules(loaded: LoadedGains) -> tuple[Rules, float]:
+    """By what rules the watchdog audits, worked out from the mechanism alone, and `free_distance` [m]."""
+    mechanism = loaded.mechanism
+    rig = mechanism.rig
+    force, position, period = rig.force_sensor, rig.position_sensor, rig.control_period
+    drawn = _largest(loaded)
+    # The loop's own wait for the force to die out, with a margin that a drawn delay cannot use up.
+    wait = drawn["force_delay"] + 20 * drawn["force_lag"] + 2 * period
+    rules = Rules(
+        period=period,
+        clearance=mechanism.contact.clearance,
+        mass=mechanism.bodies.mass,
+        alignment=max(0.0, force.delay + force.time_constant - position.delay),
+        settling=MARGIN * wait,
+        fading=3 * drawn["force_noise"] + drawn["force_bias"] + drawn["force_quantum"],
+    )
+    error = 6 * drawn["position_noise"] + drawn["position_quantum"]
+    free_distance = error + drawn["velocity"] * (RETREAT + drawn["position_delay"])
+    return rules, min(free_distance, mechanism.contact.clearance / 4)
+
+
+def judge_chunk(chunk: Chunk, rules: Rules, free_distance: float) -> Judged:
+    """What became of some recorded runs."""
+    contacts, slots = chunk.contacts, len(chunk.contacts.status)
+    return Judged(
+        chunk.first + np.arange(contacts.status.shape[1]),
+        contacts.error,
+        contacts.reference,
+        contacts.status,
+        audit_contacts(chunk.signals, rules, slots),
+        extent_of(chunk.signals, rules.period, rules.clearance, free_distance, rules.settling),
+    )
+
+
+def good_runs(runs: Judged, limit: float) -> Bool[np.ndarray, "lanes"]:
+    """All contacts ended, none with an error beyond the limit."""
+    return np.all((runs.status == OK) & (np.abs(runs.error) <= limit), axis=0)
+
+
+def reached(runs: Judged, limit: float) -> Bool[np.ndarray, "slots lanes"]:
+    """Contacts that the rig would come to: none before them had to be stopped."""
+    bad = (runs.status != OK) | ~(np.abs(runs.error) <= limit)
+    first = first_reached(bad)
+    return (np.arange(len(bad))[:, None] <= first) & runs.audited.begun
+
+
+def fit_reached(runs: Judged, limit: float, mass: float, chosen: Bool[np.ndarray, "lanes"]) -> Expectation:
+    """The expectation, fitted to the contacts reached in the chosen runs."""
+    use = reached(runs, limit) & (runs.status == OK) & chosen & (runs.audited.approach > 0)
+    place = np.broadcast_to(np.cumsum(chosen), use.shape)[use]
+    features = Features(*(leaf[use] for leaf in _features(runs.audited)))
+    return fit_expectation(features, runs.reference[use], place, mass, ENOUGH * limit)
+
+
+def restitution_margin(
+    runs: Judged, expectation: Expectation, limit: float, mass: float, chosen: Bool[np.ndarray, "lanes"]
+) -> float:
+    """Where to trip: at `PLACE` of the limit, nearer to 0 if the expectation errs by more than the rest.
+
+    An error e - e* beyond the limit is seen if the expectation errs by less than limit - margin; it comes
+    first that none is missed, then that few are alarmed about for nothing.
+    """
+    use = reached(runs, limit) & (runs.status == OK) & chosen
+    expected = expected_restitution(expectation, _features(runs.audited), mass)
+    # Together with what the audit's own restitution differs from the loop's.
+    apart = runs.audited.restitution - expected - runs.error
+    apart = np.abs(apart[use])
+    largest = float(np.max(apart, initial=0.0))
+    return float(np.clip(limit - BEYOND * largest, LEAST * limit, PLACE * limit))
+
+
+def watchdog_rates(
+    runs: Judged,
+    expectation: Expectation,
+    limits: Mapping[str, float | None],
+    limit: float,
+    mass: float,
+    chosen: Bool[np.ndarray, "lanes"],
+) -> dict[str, Any]:
+    """False and missed alarms among the chosen runs, with exact intervals of 95 %.
+
+    A run is good if no error exceeds half the limit, and a false alarm if the watchdog or another guard stops
+    it. It has to be stopped if some contact does not end or has an error beyond the limit, and is missed if
+    the watchdog has not tripped by the end of that contact.
+    """
+    alarmed = alarms(runs, expectation, limits, mass)
+    first_alarm = first_reached(alarmed)
+    stopped_anyhow = np.any(alarmed, axis=0) | guard_trips(runs.extent, limits)
+    good = chosen & good_runs(runs, TOLD_ERRORS[0] * limit)
+    bad = (runs.status != OK) | ~(np.abs(runs.error) <= TOLD_ERRORS[1] * limit)
+    first_bad = first_reached(bad)
+    stopped = chosen & np.any(bad, axis=0)
+    use = reached(runs, limit) & (runs.status == OK) & chosen
+    expected = expected_restitution(expectation, _features(runs.audited), mass)
+    apart = np.abs((expected - runs.reference)[use])
+    return {
+        "limit": limit,
+        "restitution_margin": limits["restitution_margin"],
+        "terms": [term for term, value in expectation.coefficients.items() if value],
+        "expectation_rms": float(np.sqrt(np.mean(apart**2))) if len(apart) else None,
+        "expectation_largest": float(np.max(apart)) if len(apart) else None,
+        "false_alarms": _rate(stopped_anyhow[good]),
+        "missed_alarms": _rate(first_alarm[stopped] > first_bad[stopped]),
+        "held_out_runs": int(np.sum(chosen)),
+    }
+
+
+def alarms(
+    runs: Judged, expectation: Expectation, limits: Mapping[str, float | None], mass: float
+) -> Bool[np.ndarray, "slots lanes"]:
+    """Contacts about which the watchdog raises an alarm."""
+    audited = runs.audited
+    expected = expected_restitution(expectation, _features(audited), mass)
+    margin, balance, longest = (
+        np.inf if limits[name] is None else float(limits[name] or 0.0)
+        for name in ("restitution_margin", "energy_balance", "longest_contact")
+    )
+    with np.errstate(invalid="ignore"):
+        quiet = (
+            (np.abs(audited.restitution - expected) <= margin)
+            & (audited.imbalance <= balance)
+            & (audited.duration <= longest)
+        )
+    return audited.begun & ~quiet & ~(audited.approach == 0)
+
+
+def guard_trips(extent: Extent, limits: Mapping[str, float | None]) -> Bool[np.ndarray, "lanes"]:
+    """Runs that a guard other than the watchdog would stop, or flag readings of."""
+
+    def most(name: str) -> float:
+        value = limits[name]
+        return np.inf if value is None else value
+
+    def least(name: str) -> float:
+        value = limits[name]
+        return -np.inf if value is None else value
+
+    return (
+        (extent.reading >= most("force_range"))
+        | (extent.measured_lowest < least("measured_lowest"))
+        | (extent.measured_highest > most("measured_highest"))
+        | (extent.sent_lowest < least("command_lowest"))
+        | (extent.sent_highest > most("command_highest"))
+        | (extent.force_stuck > most("force_stuck_travel"))
+        | (extent.position_stuck > most("position_stuck_travel"))
+        | (extent.flight_force > most("free_force"))
+        | (extent.command > most("force_limit"))
+        | (extent.slew > most("force_slew"))
+        | (extent.sent_speed > most("velocity_limit"))
+    )
+
+
+def guard_limits(
+    loaded: LoadedGains, runs: Judged, used: Bool[np.ndarray, "lanes"], rules: Rules, free_distance: float
+) -> dict[str, float | None]:
+    """The limits of readings and commands: margins on the extent of the runs `used`."""
+    extent = Extent(*(leaf[used] for leaf in runs.extent))
+    rig, period = loaded.mechanism.rig, rules.period
+    most = {name: float(np.max(getattr(extent, name))) for name in Extent._fields}
+    smallest = SMALLEST * most["reading"]
+    drawn = _largest(loaded)
+    measured = _widened(float(np.min(extent.measured_lowest)), most["measured_highest"], rules.clearance)
+    sent = _widened(float(np.min(extent.sent_lowest)), most["sent_highest"], rules.clearance)
+    speed = MARGIN * most["sent_speed"]
+    acceleration = most["acceleration"]
+    limited = rig.simulator.acceleration_limit
+    duration = runs.audited.duration[:, used]
+    within = 5 * period * most["speed"]
+    return {
+        "force_range": drawn["force_range"] if np.isfinite(drawn["force_range"]) else 2 * most["reading"],
+        "measured_lowest": measured[0],
+        "measured_highest": measured[1],
+        "held_readings": float(BRIDGED),
+        "force_stuck_travel": MARGIN * max(most["force_stuck"], within),
+        "position_stuck_travel": MARGIN * max(most["position_stuck"], within),
+        "free_distance": free_distance,
+        "settling": rules.settling,
+        "free_force": max(MARGIN * most["flight_force"], smallest),
+        "late_fraction": LIMITS["late_fraction"].default,
+        "missed_in_a_row": float(BRIDGED),
+        "tare_ticks": float(max(10, round(TARE / period))),
+        "tare_spread": max(2 * MARGIN * most["flight_spread"], smallest),
+        "bias_limit": max(MARGIN * drawn["force_bias"], 5 * smallest),
+        "force_limit": MARGIN * most["command"],
+        "force_slew": MARGIN * max(most["slew"], smallest / period),
+        "limited_in_a_row": float(BRIDGED),
+        "command_lowest": sent[0],
+        "command_highest": sent[1],
+        "velocity_limit": speed,
+        "deceleration": min(acceleration, limited),
+        "retreat_velocity": min(loaded.mechanism.approach.velocity, speed),
+        "equivalent_mass": rules.mass,
+        "alignment": rules.alignment,
+        "fading": rules.fading,
+        "energy_balance": _balance(runs, used),
+        "longest_contact": MARGIN * float(np.nanmax(duration)),
+    }
+
+
+def _balance(runs: Judged, used) -> float:
+    """Rounding is far below `BALANCE`; a drawn mass that is not the file's is not."""
+    return max(BALANCE, MARGIN * float(np.nanmax(runs.audited.imbalance[:, used])))
+
+
+def _widened(low: float, high: float, clearance: float) -> tuple[float | None, float]:
+    """A stroke with half as much again on either side; the gap between two surfaces is part of it.
+
+    Of one surface the far side is free: from how far an approach comes, no run of the simulation says.
+    """
+    if np.isinf(clearance):
+        return None, high + (MARGIN - 1) * (high - low)
+    low, high = min(low, -clearance), max(high, 0.0)
+    spare = (MARGIN - 1) * (high - low)
+    return low - spare, high + spare
+
+
+def _features(audited: Audited) -> Features:
+    return Features(
+        np.nan_to_num(audited.stiffness), np.nan_to_num(audited.damping), np.nan_to_num(audited.approach)
+    )
+
+
+def _rate(alarmed: Bool[np.ndarray, "runs"]) -> dict[str, Any]:
+    number, count = len(alarmed), int(np.sum(alarmed))
+    _, low, high = binomial_interval(count, number)
+    rate = count / number if number else None
+    return {"runs": number, "alarms": count, "rate": rate, "low": float(low), "high": float(high)}
+
+
+def _largest(loaded: LoadedGains) -> dict[str, float]:
+    """The largest that can be drawn of what the rules go by."""
+    scenarios = build_scenarios(loaded.mechanism, extremes(loaded.mechanism))
+    force, position = scenarios.force_sensor, scenarios.position_sensor
+    largest = {
+        "force_delay": force.delay,
+        "force_lag": force.time_constant,
+        "force_noise": force.noise_std,
+        "force_bias": np.abs(force.bias),
+        "force_quantum": force.quantum,
+        "force_range": force.range,
+        "position_delay": position.delay,
+        "position_noise": position.noise_std,
+        "position_quantum": position.quantum,
+        "velocity": scenarios.velocity,
+    }
+    return {name: float(np.max(values)) for name, values in largest.items()}
+
+
+def _chosen(loaded: LoadedGains, store: Store | None, scenarios: int | None) -> Scenarios:
+    if scenarios is not None and scenarios < 2:
+        raise InputError(f"--scenarios: found {scenarios}, allowed 2 or more")
+    if store is None:
+        return Scenarios("random", 0, scenarios or WITHOUT_STORE)
+    manifest = store.manifest
+    if manifest.gains_sha256 != loaded.document["sha256"]:
+        found, allowed = manifest.gains_sha256[:12], loaded.document["sha256"][:12]
+        raise InputError(f"{store.folder}: gains_sha256: found {found}..., allowed {allowed}...")
+    held = manifest.scenarios if manifest.until_width is None else _held(store)
+    if scenarios is not None and scenarios > held:
+        raise InputError(f"--scenarios: found {scenarios}, allowed at most the store's {held}")
+    return Scenarios(manifest.sampling, manifest.seed, scenarios or held)
+
+
+def _held(store: Store) -> int:
+    """Scenarios that a sweep made which stopped when enough was known."""
+    held = 0
+    for part in range(store.manifest.parts):
+        if read_part(store, part) is None:
+            break
+        held += store.manifest.part_rows(part)[1]
+    return held
+
+
+def _joined(parts: list[Judged]) -> Judged:
+    def join(leaves):
+        if isinstance(leaves[0], tuple):
+            return type(leaves[0])(*(join(each) for each in zip(*leaves, strict=True)))
+        return np.concatenate(leaves, axis=-1)
+
+    return join(parts)
+
+
+def _plain(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else float(value)

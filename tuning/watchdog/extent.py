@@ -1,0 +1,100 @@
+"""How far the signals of recorded runs went: what the limits of readings and commands are margins on."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from tuning.watchdog.recorded import Signals
+
+
+class Extent(NamedTuple):
+    """Of every run, (lanes,), all at least 0 but the positions: largest |force reading| [N]; least and
+    largest measured position and position command [m]; largest |F_c| [N] and its fastest change [N/s];
+    fastest change of the position command [m/s], of the desired position [m/s] and of its velocity [m/s^2];
+    longest travel [m] of the measured position in contact under one force reading, and of the desired one
+    under one position reading; largest |force reading| in flight [N], and the most by which two of them
+    differ [N]."""
+
+    reading: Float[np.ndarray, "lanes"]
+    measured_lowest: Float[np.ndarray, "lanes"]
+    measured_highest: Float[np.ndarray, "lanes"]
+    sent_lowest: Float[np.ndarray, "lanes"]
+    sent_highest: Float[np.ndarray, "lanes"]
+    command: Float[np.ndarray, "lanes"]
+    slew: Float[np.ndarray, "lanes"]
+    sent_speed: Float[np.ndarray, "lanes"]
+    speed: Float[np.ndarray, "lanes"]
+    acceleration: Float[np.ndarray, "lanes"]
+    force_stuck: Float[np.ndarray, "lanes"]
+    position_stuck: Float[np.ndarray, "lanes"]
+    flight_force: Float[np.ndarray, "lanes"]
+    flight_spread: Float[np.ndarray, "lanes"]
+
+
+def extent_of(
+    signals: Signals, period: float, clearance: float, free_distance: float, settling: float
+) -> Extent:
+    """The extent of every lane's runs; flight is what `jaxhil.runtime.inputs` calls so."""
+    live, begins = signals.live, signals.begins
+    force, position, velocity, measured, command, sent = (np.where(live, leaf, 0.0) for leaf in signals[:6])
+    goes_on = live[1:] & ~begins[1:]
+
+    def largest(values, where):
+        return np.max(np.where(where, values, 0.0), axis=0, initial=0.0)
+
+    def least(values):
+        return np.min(np.where(live, values, np.inf), axis=0)
+
+    # The force goes on from one run to the next; positions begin anew.
+    step = np.abs(np.diff(command, axis=0, prepend=0.0))
+    flying = _flying(measured, begins, clearance, free_distance, settling / period) & live
+    lowest = np.min(np.where(flying, force, np.inf), axis=0, initial=np.inf)
+    highest = np.max(np.where(flying, force, -np.inf), axis=0, initial=-np.inf)
+    spread = np.where(highest >= lowest, highest - np.where(np.isfinite(lowest), lowest, 0.0), 0.0)
+    force_stuck, position_stuck = _stuck(signals, clearance)
+    return Extent(
+        reading=largest(np.abs(force), live),
+        measured_lowest=least(measured),
+        measured_highest=-least(-measured),
+        sent_lowest=least(sent),
+        sent_highest=-least(-sent),
+        command=largest(np.abs(command), live),
+        slew=largest(step, live) / period,
+        sent_speed=largest(np.abs(np.diff(sent, axis=0)), goes_on) / period,
+        speed=largest(np.abs(np.diff(position, axis=0)), goes_on) / period,
+        acceleration=largest(np.abs(np.diff(velocity, axis=0)), goes_on) / period,
+        force_stuck=force_stuck,
+        position_stuck=position_stuck,
+        flight_force=largest(np.abs(force), flying),
+        flight_spread=spread,
+    )
+
+
+def _flying(measured, begins, clearance, free_distance, settling):
+    """Out of contact by more than `free_distance` for more than `settling` ticks."""
+    free = (measured < -free_distance) & (measured > free_distance - clearance)
+    since = np.zeros(measured.shape[1])
+    flying = np.empty(measured.shape, bool)
+    for tick in range(len(measured)):
+        since = np.where(begins[tick], 0.0, since)
+        since = np.where(free[tick], since + 1, 0.0)
+        flying[tick] = since > settling
+    return flying
+
+
+def _stuck(signals: Signals, clearance: float):
+    """Longest travels under readings that stayed the same to the bit, as `InputGuard` sums them."""
+    zeros = np.zeros(signals.force.shape[1])
+    force_travel, position_travel, most_force, most_position = zeros, zeros, zeros, zeros
+    for tick in range(1, len(signals.force)):
+        counted = signals.live[tick] & ~signals.begins[tick]
+        now, before = signals.measured[tick], signals.measured[tick - 1]
+        touching = (now > 0) | (now < -clearance)
+        same = counted & touching & (signals.force[tick] == signals.force[tick - 1])
+        force_travel = np.where(same, force_travel + np.abs(now - before), 0.0)
+        moved = np.abs(signals.position[tick] - signals.position[tick - 1])
+        position_travel = np.where(counted & (now == before), position_travel + moved, 0.0)
+        most_force = np.maximum(most_force, force_travel)
+        most_position = np.maximum(most_position, position_travel)
+    return most_force, most_position

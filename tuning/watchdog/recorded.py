@@ -1,0 +1,118 @@
+"""Scenarios by index, recorded tick by tick: what a controller on the rig would have read and commanded.
+
+Scenario i is that of a sweep of the same seed at index i, sensor noise included; chunks of them share
+one compiled program and bounded memory.
+"""
+
+from collections.abc import Generator
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxhil.simulation.evaluation import compare_with_reference
+from jaxhil.simulation.loop import Loop
+from jaxhil.simulation.metrics import OK
+from jaxhil.simulation.scenario import Scenario
+from tuning.gain_file import LoadedGains
+from tuning.sweeps.chunks import widest_loop
+from tuning.sweeps.draws import drawn_scenarios
+from tuning.verification.recording import record_ticks
+
+LANES = 1024  # recorded at a time
+
+_compared = jax.jit(compare_with_reference, static_argnums=0)
+
+
+class Scenarios(NamedTuple):
+    """How scenarios are drawn (`tuning.sweeps.draws`), from which seed, how many from the first."""
+
+    sampling: str
+    seed: int
+    number: int
+
+
+class Signals(NamedTuple):
+    """Ticks of many runs, (ticks, lanes): measured force [N], the numerical model's position [m] and velocity
+    [m/s], measured position [m], force command F_c [N], position command sent to the drives [m]; on which
+    ticks a run of the lane is under way, and on which a run begins. Between two surfaces all contacts are one
+    run."""
+
+    force: Float[np.ndarray, "ticks lanes"]
+    position: Float[np.ndarray, "ticks lanes"]
+    velocity: Float[np.ndarray, "ticks lanes"]
+    measured: Float[np.ndarray, "ticks lanes"]
+    command: Float[np.ndarray, "ticks lanes"]
+    sent: Float[np.ndarray, "ticks lanes"]
+    live: Bool[np.ndarray, "ticks lanes"]
+    begins: Bool[np.ndarray, "ticks lanes"]
+
+
+class Contacts(NamedTuple):
+    """What became of the contacts, (slots, lanes): restitution and the reference's, status."""
+
+    restitution: Float[np.ndarray, "slots lanes"]
+    reference: Float[np.ndarray, "slots lanes"]
+    status: Int[np.ndarray, "slots lanes"]
+
+    @property
+    def error(self) -> Float[np.ndarray, "slots lanes"]:
+        """Restitution error; NaN where a contact did not end."""
+        return np.where(self.status == OK, self.restitution - self.reference, np.nan)
+
+
+class Chunk(NamedTuple):
+    """Some scenarios, recorded; `first` is the index of the first lane's."""
+
+    first: int
+    scenarios: Scenario
+    signals: Signals
+    contacts: Contacts
+
+
+def recorded_chunks(
+    loaded: LoadedGains, chosen: Scenarios, lanes: int = LANES
+) -> Generator[Chunk, None, None]:
+    """The scenarios 0 to `number` - 1, recorded `lanes` at a time."""
+    loop = widest_loop(loaded, works=False)
+    # A short last chunk is recorded as a whole one: scenarios have no end, and it needs no other program.
+    lanes = min(lanes, chosen.number)
+    for first in range(0, chosen.number, lanes):
+        _, scenarios = drawn_scenarios(loaded.mechanism, chosen.sampling, chosen.seed, first, lanes)
+        chunk = record_chunk(loop, loaded, scenarios, first)
+        kept = min(lanes, chosen.number - first)
+        yield chunk if kept == lanes else _first_lanes(chunk, kept)
+
+
+def record_chunk(loop: Loop, loaded: LoadedGains, scenarios: Scenario, first: int = 0) -> Chunk:
+    """The scenarios' runs under the gains, recorded."""
+    metrics, seen = record_ticks(loop, loaded.gains, scenarios)
+    outcome = jax.device_get(_compared(loop, scenarios, metrics))
+    made = loaded.mechanism.approach.contacts
+    contacts = Contacts(
+        *(
+            np.asarray(leaf)[:made]
+            for leaf in (metrics.restitution, outcome.reference_restitution, metrics.status)
+        )
+    )
+    ticks = np.arange(len(seen.active))[:, None]
+    # What follows the last active tick is nobody's; a pause between two contacts still is the controller's.
+    live = ticks <= np.max(np.where(seen.active, ticks, -1), axis=0)
+    force, position, velocity, measured, age = (np.asarray(leaf) for leaf in seen.signals)
+    begins = live & (age == 0)
+    command, sent = np.asarray(seen.command), np.asarray(seen.sent)
+    if loop.has_force_noise or loop.has_force_bias:
+        command = np.where(begins, 0.0, command)
+    columns = force, position, velocity, measured, command, sent
+    finite = np.all([np.isfinite(one) for one in columns], axis=0)
+    live &= np.logical_and.accumulate(finite | ~live, axis=0)
+    return Chunk(first, scenarios, Signals(*columns, live, begins), contacts)
+
+
+def _first_lanes(chunk: Chunk, number: int) -> Chunk:
+    return chunk._replace(
+        scenarios=jax.tree.map(lambda leaf: leaf[..., :number], chunk.scenarios),
+        signals=Signals(*(leaf[:, :number] for leaf in chunk.signals)),
+        contacts=Contacts(*(leaf[:, :number] for leaf in chunk.contacts)),
+    )

@@ -1,0 +1,53 @@
+"""Recorded runs through the rig's own controller: on which tick it trips, and why."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from jaxhil.runtime import Controller, digest
+from tuning.gain_file import LoadedGains
+from tuning.watchdog.recorded import Signals
+
+
+class Tripped(NamedTuple):
+    """A run that was stopped: before or on which tick of its record (one more than the last: at its end), and
+    the controller's status."""
+
+    tick: int
+    status: str
+
+
+def limited_controller(loaded: LoadedGains, limits: Mapping[str, Mapping[str, Any]]) -> Controller:
+    """The controller of a gain file with these limits, a gain file's `limits`."""
+    document = {**loaded.document, "limits": dict(limits)}
+    return Controller.from_dict({**document, "sha256": digest(document)})
+
+
+def replay_lane(controller: Controller, signals: Signals, lane: int, mass: float) -> Tripped | None:
+    """Feed one lane's record to the controller; None if it never trips.
+
+    The numerical model's motion is the record's: it goes on as if nothing had tripped. At the end the next
+    contact is announced, as it is between the contacts of a run.
+    """
+    if not controller.reset():
+        raise ValueError("the controller's emergency stop is active")
+    live = signals.live[:, lane]
+    ticks = int(live.sum())
+    force, position, velocity, measured = (leaf[:ticks, lane].tolist() for leaf in signals[:4])
+    command = signals.command[:ticks, lane].tolist()
+    begins = signals.begins[:ticks, lane].tolist()
+    period = controller.control_period
+    for tick in range(ticks):
+        if tick and begins[tick]:
+            controller.next_contact()
+        if not controller.tripped:
+            controller.step(force[tick], position[tick], velocity[tick], measured[tick])
+        if not controller.tripped:
+            acceleration = -command[tick] / mass
+            moved = velocity[tick] + period * acceleration
+            controller.position_command(position[tick] + period * moved, moved, acceleration)
+        if controller.tripped:
+            return Tripped(tick, controller.status)
+    controller.next_contact()
+    if controller.tripped:
+        return Tripped(ticks, controller.status)
+    return None
