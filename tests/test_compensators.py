@@ -6,7 +6,6 @@ in `test_c99`, the bundle and its self-test in `test_export`: all of them go by 
 
 import functools
 import math
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -108,7 +107,7 @@ def on_the_rig(name, signals):
 def test_every_law_is_there_in_three_languages():
     assert set(ON_THE_RIG) == set(LAWS)
     for name, law in COMPENSATORS.items():
-        assert law.name == name and (Path(str(FOLDER)) / f"{name}.c").exists()
+        assert law.name == name and (FOLDER / "laws" / f"{name}.c").is_file()
         assert {g.name: g.unit for g in law.gains} == {g: s.unit for g, s in ON_THE_RIG[name].gains.items()}
         assert set(law.knows) <= WORDS
 

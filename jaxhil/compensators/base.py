@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxhil.mechanism.structs import Mechanism
+from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
 
 Gains = dict[str, Array]
 
@@ -38,6 +39,23 @@ class Gain(NamedTuple):
     neutral: float | None = None
     tuned: Callable[[Mechanism], bool] = lambda mechanism: True
     begins: Callable[[Mechanism], float] | None = None
+
+
+_UNITS = {name: one.unit for law in ON_THE_RIG.values() for name, one in law.gains.items()}
+
+
+def rig_gain(
+    name: str,
+    lower: Callable[[Mechanism], float],
+    upper: Callable[[Mechanism], float],
+    nominal: Callable[[Mechanism], float],
+    **others: Any,
+) -> Gain:
+    """The `Gain` called `name` of a law that is in `jaxhil.runtime` too, with the unit that is stated there.
+
+    Raises KeyError for a name that no law there has.
+    """
+    return Gain(name, _UNITS[name], lower, upper, nominal, **others)
 
 
 class Signals(NamedTuple):

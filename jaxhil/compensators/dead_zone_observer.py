@@ -22,7 +22,7 @@ from typing import ClassVar, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxhil.compensators.base import Compensator, Gain, Gains
+from jaxhil.compensators.base import Compensator, Gain, Gains, rig_gain
 from jaxhil.compensators.delay_line import Delay, DelayLine, delayed, empty, split
 from jaxhil.compensators.estimates import (
     DEAD_ZONE,
@@ -92,20 +92,20 @@ class DeadZoneObserver(Compensator):
     gains: ClassVar[tuple[Gain, ...]] = (
         PHASE_LEAD,
         LEAD_FILTER,
-        Gain(
-            "observer_stiffness", "N/m", lambda m: 0.0, lambda m: 5 * typical_stiffness(m), typical_stiffness
+        rig_gain(
+            "observer_stiffness", lambda m: 0.0, lambda m: 5 * typical_stiffness(m), typical_stiffness
         ),
-        Gain(
-            "observer_bandwidth", "Hz", lambda m: 0.1 * _nominal_bandwidth(m), _widest, _nominal_bandwidth,
+        rig_gain(
+            "observer_bandwidth", lambda m: 0.1 * _nominal_bandwidth(m), _widest, _nominal_bandwidth,
             logarithmic=True,
         ),
-        Gain(
-            "observer_limit", "N", lambda m: 0.0,
+        rig_gain(
+            "observer_limit", lambda m: 0.0,
             lambda m: 2 * m.rig.force_sensor.dead_zone + peak_force(m),
             lambda m: m.rig.force_sensor.dead_zone, neutral=0.0,
         ),
-        Gain(
-            "identification_delay", "s", lambda m: 0.0, lambda m: 2 * force_delay(m) + 0.02,
+        rig_gain(
+            "identification_delay", lambda m: 0.0, lambda m: 2 * force_delay(m) + 0.02,
             _nominal_alignment,
         ),
     )  # fmt: skip

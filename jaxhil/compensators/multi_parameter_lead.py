@@ -22,7 +22,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from jaxhil.compensators.base import Compensator, Constants, Gain, Gains
+from jaxhil.compensators.base import Compensator, Constants, Gain, Gains, rig_gain
 from jaxhil.compensators.estimates import (
     CONTACT_FREQUENCY,
     FORCE_DELAY,
@@ -88,17 +88,15 @@ class MultiParameterLead(Compensator):
     knows: ClassVar[tuple[str, ...]] = (CONTACT_FREQUENCY, FORCE_DELAY, SIMULATOR_LAG)
     # Beyond a quarter of an oscillation of delay a is negative, beyond half of one b is.
     gains: ClassVar[tuple[Gain, ...]] = (
-        Gain(
-            name="force_gain",
-            unit="1",
+        rig_gain(
+            "force_gain",
             lower=lambda mechanism: min(0.0, 2 * _nominal(mechanism)[0]),
             upper=lambda mechanism: 2.0,
             nominal=lambda mechanism: _nominal(mechanism)[0],
             neutral=1.0,
         ),
-        Gain(
-            name="force_rate_gain",
-            unit="s",
+        rig_gain(
+            "force_rate_gain",
             lower=lambda mechanism: min(0.0, 2 * _nominal(mechanism)[1]),
             upper=lambda mechanism: 2 * max(0.0, _nominal(mechanism)[1]) + 0.02,
             nominal=lambda mechanism: _nominal(mechanism)[1],

@@ -9,20 +9,18 @@ from typing import ClassVar, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxhil.compensators.base import Compensator, Constants, Gain, Gains
+from jaxhil.compensators.base import Compensator, Constants, Gain, Gains, rig_gain
 from jaxhil.compensators.estimates import FORCE_DELAY, force_delay
 
-PHASE_LEAD = Gain(
-    name="phase_lead",
-    unit="s",
+PHASE_LEAD = rig_gain(
+    "phase_lead",
     lower=lambda mechanism: 0.0,
     upper=lambda mechanism: 2 * force_delay(mechanism) + 0.02,
     nominal=force_delay,
     neutral=0.0,
 )
-LEAD_FILTER = Gain(
-    name="lead_filter",
-    unit="s",
+LEAD_FILTER = rig_gain(
+    "lead_filter",
     lower=lambda mechanism: 0.5 * mechanism.rig.control_period,
     upper=lambda mechanism: 10 * mechanism.rig.control_period,
     nominal=lambda mechanism: mechanism.rig.control_period,

@@ -13,7 +13,7 @@ waits. The delay of the force measurement stays: this law does nothing about it.
 
 from typing import ClassVar
 
-from jaxhil.compensators.base import Compensator, Gain
+from jaxhil.compensators.base import Compensator, Gain, rig_gain
 from jaxhil.compensators.estimates import SIMULATOR_DYNAMICS, simulator_inverse
 
 
@@ -24,17 +24,15 @@ class PositionLead(Compensator):
     knows: ClassVar[tuple[str, ...]] = (SIMULATOR_DYNAMICS,)
     # Of an ideal simulator under commands held in jumps, or of one with zeros, either may be below 0.
     gains: ClassVar[tuple[Gain, ...]] = (
-        Gain(
-            name="position_lead",
-            unit="s",
+        rig_gain(
+            "position_lead",
             lower=lambda mechanism: min(0.0, 2 * simulator_inverse(mechanism)[0]),
             upper=lambda mechanism: 2 * max(0.0, simulator_inverse(mechanism)[0]) + 0.02,
             nominal=lambda mechanism: simulator_inverse(mechanism)[0],
             neutral=0.0,
         ),
-        Gain(
-            name="acceleration_lead",
-            unit="s^2",
+        rig_gain(
+            "acceleration_lead",
             lower=lambda mechanism: min(0.0, 2 * simulator_inverse(mechanism)[1]),
             upper=lambda mechanism: 2 * max(0.0, simulator_inverse(mechanism)[1]) + 0.02**2 / 2,
             nominal=lambda mechanism: simulator_inverse(mechanism)[1],

@@ -18,7 +18,7 @@ from typing import ClassVar, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxhil.compensators.base import Compensator, Gain, Gains
+from jaxhil.compensators.base import Compensator, Gain, Gains, rig_gain
 from jaxhil.compensators.delay_line import Delay, DelayLine, delayed, empty, split
 from jaxhil.compensators.estimates import (
     FORCE_DELAY,
@@ -95,38 +95,32 @@ class ResponseError(Compensator):
     gains: ClassVar[tuple[Gain, ...]] = (
         PHASE_LEAD,
         LEAD_FILTER._replace(tuned=_never),
-        Gain("response_error", "1", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0, neutral=0.0),
-        Gain(
-            "response_error_damping", "1", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0,
+        rig_gain("response_error", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0, neutral=0.0),
+        rig_gain(
+            "response_error_damping", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0,
             neutral=0.0, tuned=is_damped,
         ),
-        Gain(
-            "initial_stiffness", "N/m", lambda m: 0.0, lambda m: 5 * typical_stiffness(m),
+        rig_gain(
+            "initial_stiffness", lambda m: 0.0, lambda m: 5 * typical_stiffness(m),
             lambda m: 0.0, tuned=_never,
         ),
-        Gain(
-            "initial_damping", "N s/m", lambda m: 0.0, critical_damping, lambda m: 0.0,
-            tuned=_never,
-        ),
-        Gain(
-            "stiffness_covariance", "1/m^2", lambda m: 1e-3 * _stiffness_covariance(m),
+        rig_gain("initial_damping", lambda m: 0.0, critical_damping, lambda m: 0.0, tuned=_never),
+        rig_gain(
+            "stiffness_covariance", lambda m: 1e-3 * _stiffness_covariance(m),
             lambda m: 1e1 * _stiffness_covariance(m), _stiffness_covariance, logarithmic=True,
         ),
-        Gain(
-            "damping_covariance", "s^2/m^2", lambda m: 0.0, lambda m: 10 * _damping_covariance(m),
+        rig_gain(
+            "damping_covariance", lambda m: 0.0, lambda m: 10 * _damping_covariance(m),
             lambda m: _damping_covariance(m) if is_damped(m) else 0.0, tuned=_never,
         ),
-        Gain("forgetting", "1", lambda m: 0.8, lambda m: 1.0, lambda m: 0.98, tuned=_never),
-        Gain(
-            "contact_threshold", "N", lambda m: 0.0, lambda m: max(peak_force(m), noise_level(m)),
+        rig_gain("forgetting", lambda m: 0.8, lambda m: 1.0, lambda m: 0.98, tuned=_never),
+        rig_gain(
+            "contact_threshold", lambda m: 0.0, lambda m: max(peak_force(m), noise_level(m)),
             lambda m: max(0.01 * peak_force(m), noise_level(m)), tuned=_never,
         ),
-        Gain(
-            "identification_delay", "s", lambda m: 0.0, lambda m: 2 * force_delay(m) + 0.02,
-            force_delay,
-        ),
-        Gain(
-            "velocity_filter", "s", lambda m: 0.5 * m.rig.control_period,
+        rig_gain("identification_delay", lambda m: 0.0, lambda m: 2 * force_delay(m) + 0.02, force_delay),
+        rig_gain(
+            "velocity_filter", lambda m: 0.5 * m.rig.control_period,
             lambda m: 20 * m.rig.control_period, lambda m: 2 * m.rig.control_period,
             logarithmic=True, tuned=_never,
         ),

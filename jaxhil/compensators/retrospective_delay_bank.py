@@ -10,7 +10,7 @@ reference is integrated over again with are moved alike.
 
 from typing import ClassVar
 
-from jaxhil.compensators.base import Gain
+from jaxhil.compensators.base import Gain, rig_gain
 from jaxhil.compensators.delay_bank import begin, learn, no_bank
 from jaxhil.compensators.estimates import (
     DEAD_ZONE,
@@ -37,12 +37,11 @@ class RetrospectiveDelayBank(RetrospectiveReference):
             gain._replace(lower=lambda m: LEAST_FLOOR) if gain.name == "force_noise_floor" else gain
             for gain in RetrospectiveReference.gains
         ),
-        Gain(
+        rig_gain(
             "delay_spread",
-            "s",
-            lambda m: 0.0,
-            lambda m: MOST,
-            lambda m: min(force_delay_spread(m), MOST),
+            lower=lambda m: 0.0,
+            upper=lambda m: MOST,
+            nominal=lambda m: min(force_delay_spread(m), MOST),
             tuned=lambda m: False,
         ),
     )

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from jaxhil.compensators.base import Gain
+from jaxhil.compensators.base import Gain, rig_gain
 from jaxhil.compensators.estimates import force_delay, peak_force
 from jaxhil.mechanism.structs import Mechanism
 
@@ -42,10 +42,12 @@ def _fact(mechanism) -> bool:
 
 
 def _prior(
-    name: str, unit: str, lower: float, upper: float, tuned: Callable[[Mechanism], bool] = lambda m: True
+    name: str, lower: float, upper: float, tuned: Callable[[Mechanism], bool] = lambda m: True
 ) -> Gain:
     """A gain that no mechanism's numbers enter: what it scales is scaled by approach speed and mass."""
-    return Gain(name, unit, lambda m: lower, lambda m: upper, lambda m: SHARP[name], True, tuned=tuned)
+    return rig_gain(
+        name, lambda m: lower, lambda m: upper, lambda m: SHARP[name], logarithmic=True, tuned=tuned
+    )
 
 
 def _shows(*laws: str) -> Callable[[Mechanism], bool]:
@@ -54,41 +56,41 @@ def _shows(*laws: str) -> Callable[[Mechanism], bool]:
 
 
 GAINS: tuple[Gain, ...] = (
-    Gain(
-        "equivalent_mass", "kg", lambda m: 0.1 * m.bodies.mass, lambda m: 10 * m.bodies.mass,
+    rig_gain(
+        "equivalent_mass", lambda m: 0.1 * m.bodies.mass, lambda m: 10 * m.bodies.mass,
         lambda m: m.bodies.mass, logarithmic=True, tuned=_fact,
     ),
-    Gain(
-        "identification_delay", "s", lambda m: 0.0, lambda m: 2 * force_delay(m) + 0.02,
+    rig_gain(
+        "identification_delay", lambda m: 0.0, lambda m: 2 * force_delay(m) + 0.02,
         force_delay, tuned=_fact,
     ),
-    Gain(
-        "force_noise", "N", lambda m: 0.0, lambda m: m.rig.force_sensor.noise_std + peak_force(m),
+    rig_gain(
+        "force_noise", lambda m: 0.0, lambda m: m.rig.force_sensor.noise_std + peak_force(m),
         lambda m: m.rig.force_sensor.noise_std, tuned=_fact,
     ),
-    Gain(
-        "dead_zone", "N", lambda m: 0.0, lambda m: 2 * m.rig.force_sensor.dead_zone + peak_force(m),
+    rig_gain(
+        "dead_zone", lambda m: 0.0, lambda m: 2 * m.rig.force_sensor.dead_zone + peak_force(m),
         lambda m: m.rig.force_sensor.dead_zone, tuned=_fact,
     ),
     # Next to its spread it hardly matters.
-    _prior("prior_stiffness", "1/s^2", 0.1, 1e3, _fact),
-    _prior("prior_stiffness_spread", "1/s^2", 1.0, 5e3),
-    _prior("prior_slope_spread", "1/s^2", 0.1, 5e3),
-    _prior("prior_damping_spread", "1/s", 0.01, 50.0),
-    _prior("prior_depth_damping_spread", "1/s", 1e-4, 50.0, _shows("hunt_crossley", "depth_damped")),
-    _prior("prior_unloading_spread", "1/s^2", 1e-4, 5e3, _shows("elastoplastic")),
+    _prior("prior_stiffness", 0.1, 1e3, _fact),
+    _prior("prior_stiffness_spread", 1.0, 5e3),
+    _prior("prior_slope_spread", 0.1, 5e3),
+    _prior("prior_damping_spread", 0.01, 50.0),
+    _prior("prior_depth_damping_spread", 1e-4, 50.0, _shows("hunt_crossley", "depth_damped")),
+    _prior("prior_unloading_spread", 1e-4, 5e3, _shows("elastoplastic")),
     # Where there is noise, which it is told and sees, it hardly matters.
-    _prior("force_noise_floor", "1/s", 1e-4, 10.0, lambda m: not m.rig.force_sensor.noise_std),
-    Gain(
-        "velocity_gain", "1/s", lambda m: 1.0, lambda m: 1 / m.rig.control_period,
+    _prior("force_noise_floor", 1e-4, 10.0, lambda m: not m.rig.force_sensor.noise_std),
+    rig_gain(
+        "velocity_gain", lambda m: 1.0, lambda m: 1 / m.rig.control_period,
         lambda m: min(SHARP["velocity_gain"], 0.7 / m.rig.control_period), logarithmic=True,
     ),
     # Where the limit binds, it hides from the solver what the other gains do.
-    Gain(
-        "correction_limit", "1", lambda m: 0.01, lambda m: 20.0, lambda m: SHARP["correction_limit"],
+    rig_gain(
+        "correction_limit", lambda m: 0.01, lambda m: 20.0, lambda m: SHARP["correction_limit"],
         logarithmic=True, begins=lambda m: 3.0,
     ),
     # Neither is tuned: what is replayed is what makes it a test of the hardware, whatever that errs by.
-    Gain("force_replay", "1", lambda m: 0.0, lambda m: 1.0, lambda m: 1.0, tuned=_fact),
-    _prior("replay_noise", "1/s", 0.01, 100.0, _fact),
+    rig_gain("force_replay", lambda m: 0.0, lambda m: 1.0, lambda m: 1.0, tuned=_fact),
+    _prior("replay_noise", 0.01, 100.0, _fact),
 )  # fmt: skip

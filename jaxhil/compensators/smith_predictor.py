@@ -16,7 +16,7 @@ from typing import ClassVar, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxhil.compensators.base import Compensator, Constants, Gain, Gains
+from jaxhil.compensators.base import Compensator, Constants, Gain, Gains, rig_gain
 from jaxhil.compensators.estimates import FORCE_DELAY, SIMULATOR_LAG, simulator_lag
 from jaxhil.compensators.phase_lead import (
     LEAD_FILTER,
@@ -28,9 +28,8 @@ from jaxhil.compensators.phase_lead import (
 )
 
 # An ideal simulator under commands held in jumps is half a period ahead: a lag below 0 is none to predict.
-LAG = Gain(
-    name="simulator_lag",
-    unit="s",
+LAG = rig_gain(
+    "simulator_lag",
     lower=lambda mechanism: 0.0,
     upper=lambda mechanism: 2 * max(0.0, simulator_lag(mechanism)) + 0.02,
     nominal=lambda mechanism: max(0.0, simulator_lag(mechanism)),

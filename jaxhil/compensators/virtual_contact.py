@@ -16,7 +16,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from jaxhil.compensators.base import Compensator, Constants, Gain, Gains
+from jaxhil.compensators.base import Compensator, Constants, Gain, Gains, rig_gain
 from jaxhil.compensators.estimates import (
     CONTACT_FREQUENCY,
     FORCE_DELAY,
@@ -62,12 +62,12 @@ class VirtualContact(Compensator):
     name: ClassVar[str] = "virtual_contact"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY, SIMULATOR_LAG, STIFFNESS, CONTACT_FREQUENCY)
     gains: ClassVar[tuple[Gain, ...]] = (
-        Gain(
-            "virtual_stiffness", "N/m", lambda m: -typical_stiffness(m), typical_stiffness, lambda m: 0.0,
+        rig_gain(
+            "virtual_stiffness", lambda m: -typical_stiffness(m), typical_stiffness, lambda m: 0.0,
             neutral=0.0,
         ),
-        Gain(
-            "virtual_damping", "N s/m", lambda m: 0.0,
+        rig_gain(
+            "virtual_damping", lambda m: 0.0,
             lambda m: critical_damping(m) + 2 * _nominal_damping(m), _nominal_damping, neutral=0.0,
         ),
     )  # fmt: skip
