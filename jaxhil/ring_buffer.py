@@ -38,12 +38,12 @@ def write_in_turn(rings: Any, tick: Int[Array, ""], values: Any) -> Any:
     for ring, value in zip(leaves, jax.tree.leaves(values), strict=True):
         if written:
             oldest = (tick + 1) & (ring.shape[0] - 1)
-            value = tie(value, lax.dynamic_index_in_dim(written[-1], oldest, 0, keepdims=False))
+            value = depend_on(value, lax.dynamic_index_in_dim(written[-1], oldest, 0, keepdims=False))
         written.append(write(ring, tick, value))
     return jax.tree.unflatten(structure, written)
 
 
-def tie(value: Float[Array, "*batch"], *reads: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+def depend_on(value: Float[Array, "*batch"], *reads: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """`value`, made to depend on `reads` (it is NaN where one of them is)."""
     for read in reads:
         value = jnp.where(read == read, value, read)

@@ -17,7 +17,7 @@ from lanes import IDEAL, MASS, QUICK, mechanism, per_lane, spread, validated
 
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.loop import build_rig
+from jaxhil.simulation.loop import build_rig_constants
 from jaxhil.simulation.rollout import Tick, start, stretch, stretch_length
 
 OMEGA = 2 * pi * 3.0
@@ -43,7 +43,7 @@ def persistent(
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def _begin(loop, gains, scenario):
-    rig = build_rig(loop, scenario)
+    rig = build_rig_constants(loop, scenario)
     return rig, start(loop, rig, gains)
 
 

@@ -11,7 +11,7 @@ from jaxhil.runtime.gain_file import GainFile
 from tuning.rig.contact_watch import ContactResult, ContactWatch
 from tuning.rig.hardware import RigTask
 from tuning.rig.plant import Plant
-from tuning.rig.udp_controller import APPROACH, Answer, NumericalModel, Reading, Task
+from tuning.rig.udp_controller import APPROACH, Answer, ControllerTask, NumericalModel, Reading
 
 
 def controller(mechanism: Mechanism, compensator: str, gains: Mapping[str, float], **limits: float):
@@ -69,10 +69,10 @@ def packets(
     delivered: Callable[[str, Any], list[Any]] = lambda way, packet: [packet],
     seed: int = 0,
     resets: bool = False,
-) -> tuple[RigTask, Task, list[Answer]]:
+) -> tuple[RigTask, ControllerTask, list[Answer]]:
     """Rig and controller exchanging packets for so many ticks. `delivered(way, packet)` is what arrives at
     that tick instead of a packet `"there"` or `"back"`."""
-    rig, task = RigTask(mechanism, seed, resets=resets), Task(law, to_builtins(mechanism))
+    rig, task = RigTask(mechanism, seed, resets=resets), ControllerTask(law, to_builtins(mechanism))
     answers = []
     for _ in range(ticks):
         packet: Reading = rig.reading()

@@ -155,6 +155,6 @@ def test_limits_of_a_whole_contact(limits):
     # They do bind here, in the contact: the model is faster than the drives.
     assert metrics.status[0, 0] == OK
     # From the first touch to the tick at which the contact is over, with which it is no longer active.
-    begin, end = np.argmax(np.asarray(ticks.truth.force)[:, 0] != 0), np.argmin(going)
+    begin, end = np.argmax(np.asarray(ticks.plant_signals.force)[:, 0] != 0), np.argmin(going)
     largest = behind[begin : end + 1].max()
     assert largest > 1e-6 and metrics.position_shortfall[0, 0] == pytest.approx(largest, rel=1e-9)

@@ -14,7 +14,7 @@ from lanes import QUICK, first_contact, join, mechanism, nominal_gains, spread, 
 
 from jaxhil.compensators import Constants, Signals
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.contact_force import Truth
+from jaxhil.simulation.contact_force import PlantSignals
 from jaxhil.simulation.metrics import build_rules, collect, empty_metrics, fresh_watch, observe
 from jaxhil.simulation.scenario import build_scenarios
 
@@ -35,8 +35,8 @@ def excess(commands, touching):
         command, touches = now
         # It turns round at once, so that what ends the contact is the quiet after it.
         signals = Signals(zeros, zeros, zeros - 1, zeros, jnp.zeros(1, jnp.int32))
-        truth = Truth(jnp.where(touches, 10.0, 0.0)[None], None, None)
-        return observe(LOOP, CONSTANTS, rules, watch, signals, truth, command[None], None), None
+        plant_signals = PlantSignals(jnp.where(touches, 10.0, 0.0)[None], None, None)
+        return observe(LOOP, CONSTANTS, rules, watch, signals, plant_signals, command[None], None), None
 
     watch, _ = jax.lax.scan(tick, fresh_watch(LOOP, zeros), (commands, touching))
     index = jnp.zeros(1, jnp.int32)

@@ -16,7 +16,7 @@ from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import evaluate
-from jaxhil.simulation.loop import build_rig
+from jaxhil.simulation.loop import build_rig_constants
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gains.objective import (
     FAILED,
@@ -53,7 +53,7 @@ def build_batch(overrides=()):
     limit = np.where(np.arange(SCENARIOS) == SHORT, 0.05, scenarios.time_limit)
     scenarios = scenarios._replace(time_limit=limit)
     loop = build_loop(parsed, "phase_lead", scenarios)
-    rig = jax.jit(build_rig, static_argnums=0, compiler_options=QUICK)(loop, join([scenarios]))
+    rig = jax.jit(build_rig_constants, static_argnums=0, compiler_options=QUICK)(loop, join([scenarios]))
     rigs = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(GAINS), *leaf.shape)), rig)
     return loop, scenarios, rigs
 
@@ -396,7 +396,7 @@ def noisy_contact(velocity, damping=0.0, bodies=None, lanes=LANES, ticks=TICKS, 
     gains = nominal_gains(parsed, "response_error", **values)
     loop = build_loop(parsed, "response_error", scenario)
     _, seen = run_record(loop, per_lane(gains, lanes), scenario, ticks)
-    return gains, np.asarray(seen.command)[:ticks], np.asarray(seen.truth.force)[:ticks]
+    return gains, np.asarray(seen.command)[:ticks], np.asarray(seen.plant_signals.force)[:ticks]
 
 
 def steady_contact(**values):

@@ -141,9 +141,9 @@ def test_a_staircase_is_followed_in_its_steady_state():
     np.testing.assert_allclose(np.diff(readings), 0.001 * velocity, rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("delay, panels, place", [(0.0, 0, 1.0), (0.003, 3, 1.0), (0.0032, 3, 0.8)])
-def test_delays_are_split_at_the_ticks(delay, panels, place):
-    assert split_delay(delay, 0.001) == (panels, pytest.approx(place, abs=1e-12))
+@pytest.mark.parametrize("delay, intervals, place", [(0.0, 0, 1.0), (0.003, 3, 1.0), (0.0032, 3, 0.8)])
+def test_delays_are_split_at_the_ticks(delay, intervals, place):
+    assert split_delay(delay, 0.001) == (intervals, pytest.approx(place, abs=1e-12))
     assert split_delay(0.1 + 0.2, 0.1)[0] == 3
 
 

@@ -38,7 +38,7 @@ ACCURACY = {
 }
 # A cubic stands for the motion on which the deepest point is found.
 ACCURACY |= {name: 1e-7 for name in CASES if "elastoplastic" in name}
-# Corners of layers, and the panel in which a contact is over, are not split.
+# Corners of layers, and the sampling interval in which a contact is over, are not split.
 WORK_ACCURACY = {
     "layers": 1e-4,
     "damped layers": 1e-4,
@@ -178,7 +178,7 @@ def test_recorded_run_says_what_the_metrics_say(recorded):
         # `active` ends with the tick at which the contact is over, which still belongs to it.
         own = np.append(own, own[-1] + 1)
         velocity = ticks.signals.velocity_desired[own, lane]
-        force, works = ticks.truth.force[own, lane], [w[own, lane] for w in ticks.truth.works]
+        force, works = ticks.plant_signals.force[own, lane], [w[own, lane] for w in ticks.plant_signals.works]
         assert np.array_equal(own, np.arange(own[0], own[-1] + 1))
         assert ticks.signals.age[own[0], lane] == 0 and velocity[0] == metrics.approach_velocity[slot, lane]
         assert abs(velocity[-1]) / velocity[0] == pytest.approx(metrics.restitution[slot, lane], rel=1e-12)

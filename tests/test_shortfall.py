@@ -15,7 +15,7 @@ from cases import Case
 from lanes import SECOND_ORDER, VELOCITY, mechanism, run_rollout
 
 from jaxhil.compensators.none import NoCompensator
-from jaxhil.simulation.loop import build_rig
+from jaxhil.simulation.loop import build_rig_constants
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.rollout import start
 
@@ -134,7 +134,7 @@ def test_a_loop_without_limits_keeps_nothing_of_them(batch):
     free = cases.build_batch({"": CONTACTS["none"]})
     assert batch.loop.has_limits and not free.loop.has_limits
     for one in (batch, free):
-        rig = jax.eval_shape(functools.partial(build_rig, one.loop), one.scenario)
+        rig = jax.eval_shape(functools.partial(build_rig_constants, one.loop), one.scenario)
         run = jax.eval_shape(functools.partial(start, one.loop), rig, one.gains)
         kept = run.watch.shortfall, run.state.plant.wanted
         assert [leaf is not None for leaf in kept] == [one.loop.has_limits] * 2

@@ -52,9 +52,9 @@ from tuning.rig.udp_controller import (
     STOP,
     TICK,
     Answer,
+    ControllerTask,
     PacketError,
     Reading,
-    Task,
     TickRecord,
     decode_answer,
     decode_reading,
@@ -212,7 +212,7 @@ def a_reading(tick, sequence=None, force=0.0, position=-1.0, event=TICK, run=1):
 
 def prepared(mechanism, **limits):
     law = controller(mechanism, "none", {}, **limits)
-    task = Task(law, to_builtins(mechanism))
+    task = ControllerTask(law, to_builtins(mechanism))
     assert task.answer(a_reading(0, 1, event=PREPARE)).flags == READY
     return task
 
@@ -274,7 +274,7 @@ SMALL = st.integers(0, 40)
 def test_whatever_a_rig_sends_is_answered_with_finite_commands(varying, readings, compensator):
     mechanism, gains = varying
     law = controller(mechanism, compensator, gains if compensator == "response_error" else {})
-    task = Task(law, to_builtins(mechanism))
+    task = ControllerTask(law, to_builtins(mechanism))
     for number, reading in enumerate(readings):
         answer = task.answer(reading._replace(sequence=reading.sequence + 2 * number))
         if answer is not None:

@@ -7,7 +7,7 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 
 from tuning.statistics.intervals import (
-    Interval,
+    IntervalEstimate,
     Running,
     binomial_interval,
     confidence_sequence,
@@ -112,7 +112,7 @@ def walks(probability, repeats=1000, looks=150, step=25):
 def of_each(interval, failures, number):
     """The interval of many looks, computed once for looks that saw the same."""
     pairs, which = np.unique(np.stack([failures.ravel(), number.ravel()]), axis=1, return_inverse=True)
-    return Interval(*(part[which].reshape(failures.shape) for part in interval(*pairs)))
+    return IntervalEstimate(*(part[which].reshape(failures.shape) for part in interval(*pairs)))
 
 
 def ever_outside(interval, probability):
@@ -143,7 +143,7 @@ def test_stopping_at_a_width_covers(probability, width, capsys):
     narrow = (high - low <= width) & (low <= high)
     assert np.all(np.any(narrow, axis=1))
     stop = np.arange(1000), np.argmax(narrow, axis=1)
-    stopped = Interval(failures[stop] / number[stop], low[stop], high[stop])
+    stopped = IntervalEstimate(failures[stop] / number[stop], low[stop], high[stop])
     coverage, mean, needed = covered(stopped, probability), np.mean(stopped.width), np.mean(number[stop])
     with capsys.disabled():
         print(

@@ -60,7 +60,7 @@ from jaxhil.compensators.retrospective_episode import (
     sort_out,
 )
 from jaxhil.compensators.retrospective_gains import GAINS, GENTLE, SHARP
-from jaxhil.ring_buffer import tie
+from jaxhil.ring_buffer import depend_on
 from jaxhil.runtime.laws.retrospective import PRIOR
 
 FAREWELL = 0.006  # s for which it goes on after the hardware has left the surface
@@ -207,7 +207,7 @@ class RetrospectiveReference(Compensator):
         moved, hardware, number = move(old, sample, now, met, period, tick)
         # Written after it is read: only then the ring is updated in place.
         live = reference.live.depth
-        impulse = tie(moved.impulse, jnp.where(jnp.isfinite(live), live, 0))
+        impulse = depend_on(moved.impulse, jnp.where(jnp.isfinite(live), live, 0))
         stored = jnp.concatenate([jnp.stack([impulse, moved.read]), hardware])
         return command, RetrospectiveState(
             line=line,

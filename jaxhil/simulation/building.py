@@ -33,7 +33,7 @@ def build_loop(
     aligned = [g.upper(mechanism) for g in law.gains if g.name == "identification_delay"]
 
     def samples(delay) -> int:
-        """Read are samples up to the delay back, plus the panel under way and its start."""
+        """Read are samples up to the delay back, plus the interval under way and its start."""
         periods = float(np.max(delay / scenarios.control_period))
         return max(SHORTEST_RING, 1 << int(np.ceil(np.log2(periods + 4))))
 

@@ -1,8 +1,10 @@
-"""The real contact, panel by panel: its force, peak and work, and what a lagging force sensor makes of it.
+"""The real contact, one sampling interval after the other: its force, peak and work, and what a lagging force
+sensor makes of it.
 
-The motion simulator moves smoothly within a panel (`jaxhil.simulation.motion_simulator`); its corners are the
-panel's ends. The force is read where the sensor will sample it, once per panel. What depends on the force in
-between follows it along the cubic through the exact position and velocity at the ends of each smooth stretch.
+The motion simulator moves smoothly within a sampling interval (`jaxhil.simulation.motion_simulator`); its
+corners are the interval's ends. The force is read where the sensor will sample it, once per interval. What
+depends on the force in between follows it along the cubic through the exact position and velocity at the ends
+of each smooth stretch.
 """
 
 from typing import Any, NamedTuple
@@ -21,14 +23,14 @@ GAUSS = ((0.5 - 0.15**0.5, 5 / 18), (0.5, 4 / 9), (0.5 + 0.15**0.5, 5 / 18))  # 
 
 
 class Motion(NamedTuple):
-    """Position [m] and velocity [m/s] somewhere in a panel."""
+    """Position [m] and velocity [m/s] somewhere in a sampling interval."""
 
     position: Float[Array, "*batch"]
     velocity: Float[Array, "*batch"]
 
 
-class Panel(NamedTuple):
-    """Motion of the real mechanism over one panel: where the force is sampled and, for loops that look
+class SamplingInterval(NamedTuple):
+    """Motion of the real mechanism over one interval: where the force is sampled and, for loops that look
     between the samples, at its start and its end (limits from within; else None)."""
 
     sample: Motion
@@ -36,14 +38,14 @@ class Panel(NamedTuple):
     end: Any
 
 
-class Truth(NamedTuple):
-    """What really happens in a panel: contact force [N] where it is sampled; where energies are audited, work
-    done on the mechanism and work returned by it [J]; where the force has corners between samples, its peak
-    in the panel [N]."""
+class PlantSignals(NamedTuple):
+    """What really happens in a sampling interval: contact force [N] where it is sampled; where energies are
+    audited, work done on the mechanism and work returned by it [J]; where the force has corners between
+    samples, its peak in the interval [N]."""
 
     force: Float[Array, "*batch"]
     works: tuple[Array, Array] | None
-    crest: Float[Array, "*batch"] | None
+    peak: Float[Array, "*batch"] | None
 
 
 class Surfaces(NamedTuple):
@@ -79,16 +81,16 @@ class Surfaces(NamedTuple):
         side = jnp.sign(jnp.where(signed == 0, deflection(end.position, self.clearance), signed))
         return side, jnp.where(side < 0, -self.clearance, 0)
 
-    def touch(self, motion: Motion, force: Array) -> "Touch":
+    def touch(self, motion: Motion, force: Array) -> "ContactSample":
         """A sample of the contact, whose force is known."""
         far = -self.clearance - motion.position
         beyond = jnp.where(far > motion.position, far, motion.position)
         side = jnp.where(far > motion.position, -1, 1).astype(far.dtype)
         edge = side * self.law.edge(self.parameters, side * motion.velocity)
-        return Touch(beyond, force, edge, side)
+        return ContactSample(beyond, force, edge, side)
 
 
-class Touch(NamedTuple):
+class ContactSample(NamedTuple):
     """A sample of the contact: distance into the nearer surface [m], negative outside; force [N]; its limit
     at the surface [N]; side of that surface (1 or -1)."""
 
@@ -98,13 +100,13 @@ class Touch(NamedTuple):
     side: Float[Array, "*batch"]
 
 
-def no_touch(like: Array) -> Touch:
+def no_contact(like: Array) -> ContactSample:
     """Far from any surface."""
     zeros = jnp.zeros_like(like)
-    return Touch(zeros - 1, zeros, zeros, zeros + 1)
+    return ContactSample(zeros - 1, zeros, zeros, zeros + 1)
 
 
-def works_between(before: Touch, now: Touch) -> tuple[Array, Array]:
+def works_between(before: ContactSample, now: ContactSample) -> tuple[Array, Array]:
     """Work [J] done on the mechanism and returned by it from one sample to the next, exact for a force
     straight in the penetration."""
     depth_0 = jnp.where(before.distance > 0, before.distance, 0)
@@ -139,8 +141,9 @@ def works_along(surfaces: Surfaces, start: Motion, end: Motion, duration: Array)
     return done, returned
 
 
-def crest(surfaces: Surfaces, start: Motion, end: Motion, duration: Array) -> Float[Array, "*batch"]:
-    """Largest |force| [N] within a panel: at an end, or near the vertex of a parabola through its middle."""
+def largest_force(surfaces: Surfaces, start: Motion, end: Motion, duration: Array) -> Float[Array, "*batch"]:
+    """Largest |force| [N] within a sampling interval: at an end, or near the vertex of the parabola through
+    both ends and the middle."""
 
     def magnitude(motion, s):
         return jnp.abs(surfaces.after(start, end, duration, s).force(motion)[0])
@@ -157,28 +160,28 @@ def crest(surfaces: Surfaces, start: Motion, end: Motion, duration: Array) -> Fl
 def sensed_lag(
     surfaces: Surfaces,
     reading: Float[Array, "*batch"],
-    panel: Panel,
+    interval: SamplingInterval,
     until: Array,
     duration: Array,
     time_constant: Array,
 ) -> tuple[Array, Array]:
-    """A lagging sensor's readings [N] at a panel's sample, `until` [s] after its start, and at its end, after
-    `duration` [s]; `reading` was that at its start."""
+    """Readings [N] of a lagging sensor at an interval's sample, `until` [s] after its start, and at its end,
+    after `duration` [s]; `reading` was that at its start."""
 
-    def follow(reading, panel):
-        sample = _lag_along(surfaces, reading, panel.start, panel.sample, until, time_constant)
+    def follow(reading, interval):
+        sample = _lag_along(surfaces, reading, interval.start, interval.sample, until, time_constant)
         rest = duration - until
-        dented = surfaces.after(panel.start, panel.sample, until)
-        return sample, _lag_along(dented, sample, panel.sample, panel.end, rest, time_constant)
+        loaded = surfaces.after(interval.start, interval.sample, until)
+        return sample, _lag_along(loaded, sample, interval.sample, interval.end, rest, time_constant)
 
-    def fade(reading, panel):
+    def fade(reading, interval):
         # In the same steps as `follow`: to the bit, no lane depends on whether others touch.
         sample = reading * lag_decay(until, time_constant)
         return sample, sample * lag_decay(duration - until, time_constant)
 
     # Most of the time no lane touches.
-    outside = [deflection(motion.position, surfaces.clearance) == 0 for motion in panel]
-    return lax.cond(jnp.all(outside[0] & outside[1] & outside[2]), fade, follow, reading, panel)
+    outside = [deflection(motion.position, surfaces.clearance) == 0 for motion in interval]
+    return lax.cond(jnp.all(outside[0] & outside[1] & outside[2]), fade, follow, reading, interval)
 
 
 def along(start: Motion, end: Motion, duration: Array, s: Any) -> Motion:

@@ -7,7 +7,8 @@
     touch      the real contact: force where the force sensor will read it
 
 Time runs in control periods and each lane has its own. `Loop` is what is static (it shapes the compiled
-program), `Rig` what is constant during a run, `LoopState` (`jaxhil.simulation.loop_state`) what evolves.
+program), `RigConstants` what is constant during a run, `LoopState` (`jaxhil.simulation.loop_state`) what
+evolves.
 """
 
 from typing import Any, NamedTuple
@@ -19,14 +20,14 @@ from jaxtyping import Array, Float, Int
 
 from jaxhil.compensators.base import Compensator, Constants, Gains, Signals
 from jaxhil.contact.laws import ContactLaw, deflection
-from jaxhil.ring_buffer import look_back, tie, write_in_turn
+from jaxhil.ring_buffer import depend_on, look_back, write_in_turn
 from jaxhil.simulation.contact_force import (
     Motion,
-    Panel,
+    PlantSignals,
+    SamplingInterval,
     Surfaces,
-    Truth,
-    crest,
-    no_touch,
+    largest_force,
+    no_contact,
     sensed_lag,
     works_along,
     works_between,
@@ -42,15 +43,15 @@ from jaxhil.simulation.motion_simulator import (
     split_delay,
     steady_state,
 )
-from jaxhil.simulation.probe import Push, touch, untouched
+from jaxhil.simulation.probe import Push, before_contact, touch
 from jaxhil.simulation.rate_limits import limit_command
 from jaxhil.simulation.scenario import Scenario
 from jaxhil.simulation.sensors import Noise, quantise, sample_force
 
 
 class Delays(NamedTuple):
-    """The reading of force and of position as panels and fraction; panels to look back for the newest force
-    that has really happened by a tick; panels after which the law is evaluated.
+    """The reading of force and of position as intervals and fraction; intervals to look back for the newest
+    force that has really happened by a tick; intervals after which the law is evaluated.
 
     One-sided, the law is evaluated as soon as the motion is known, by the transport delay ahead of time.
     Between two surfaces its parameters may change meanwhile: it is evaluated when it happens, and the other
@@ -98,12 +99,12 @@ class Loop(eqx.Module):
         return self.first_break in (1, 2)
 
     @property
-    def follows_panels(self) -> bool:
+    def follows_intervals(self) -> bool:
         """Whether the motion is needed between samples."""
         return self.has_lag or self.has_corners or self.energies or self.law.remembers
 
 
-class Rig(NamedTuple):
+class RigConstants(NamedTuple):
     """Constants of a run, per lane; see `Propagation` and `Delay`."""
 
     scenario: Scenario
@@ -113,11 +114,11 @@ class Rig(NamedTuple):
     inverse_mass: Float[Array, "*batch"]
 
 
-def build_rig(loop: Loop, scenario: Scenario) -> Rig:
-    """Discretise the linear parts exactly and split every delay into panels and a fraction."""
+def build_rig_constants(loop: Loop, scenario: Scenario) -> RigConstants:
+    """Discretise the linear parts exactly and split every delay into intervals and a fraction."""
     period, simulator = scenario.control_period, scenario.simulator
     delays = split_delays(scenario, loop.is_two_sided)
-    return Rig(
+    return RigConstants(
         scenario=scenario,
         propagation=propagation(
             simulator.numerator,
@@ -126,7 +127,7 @@ def build_rig(loop: Loop, scenario: Scenario) -> Rig:
             delays.force.fraction,
             delays.position.fraction,
             loop.hold,
-            ends=loop.follows_panels,
+            ends=loop.follows_intervals,
         ),
         delays=delays,
         constants=Constants(period, scenario.clearance),
@@ -135,7 +136,7 @@ def build_rig(loop: Loop, scenario: Scenario) -> Rig:
 
 
 def split_delays(scenario: Scenario, is_two_sided: bool) -> Delays:
-    """Every delay of a scenario in panels."""
+    """Every delay of a scenario in intervals."""
     period, simulator = scenario.control_period, scenario.simulator
     force = split_delay(simulator.delay + scenario.force_sensor.delay, period)
     position = split_delay(simulator.delay + scenario.position_sensor.delay, period)
@@ -143,13 +144,13 @@ def split_delays(scenario: Scenario, is_two_sided: bool) -> Delays:
     real = jnp.ceil(behind - 1e-9).astype(jnp.int32) - 1
     now = jnp.zeros_like(real)
     if is_two_sided:
-        return Delays(force._replace(panels=force.panels - real), position, now, real)
+        return Delays(force._replace(intervals=force.intervals - real), position, now, real)
     return Delays(force, position, real, now)
 
 
 def enter(
     loop: Loop,
-    rig: Rig,
+    rig: RigConstants,
     gains: Gains,
     state: LoopState,
     position: Array,
@@ -186,23 +187,25 @@ def enter(
             commands[0] if loop.has_limits else None,
         ),
         sensed=state.sensed._replace(
-            last=no_touch(position), lagged=jnp.zeros_like(position), first_position=first_position
+            last=no_contact(position), lagged=jnp.zeros_like(position), first_position=first_position
         ),
         law=loop.law.init(position),
         entry_velocity=velocity,
         entry_tick=jnp.broadcast_to(tick, position.shape),
-        touched=untouched(position) if loop.probed else None,
+        first_contact=before_contact(position) if loop.probed else None,
     )
 
 
-def sense(loop: Loop, rig: Rig, state: LoopState, tick: Array, noise: Noise) -> tuple[Signals, Truth]:
-    """Stage 1: what the sensors read at this tick, noise included, and the truth beside it."""
+def sense(
+    loop: Loop, rig: RigConstants, state: LoopState, tick: Array, noise: Noise
+) -> tuple[Signals, PlantSignals]:
+    """Stage 1: what the sensors read at this tick, noise included, and the plant signals beside it."""
     scenario, sensed = rig.scenario, state.sensed
     age = tick - state.entry_tick
     rings, delays = sensed.rings, rig.delays
-    force_ring = rings.truth.force if rings.reading is None else rings.reading
-    force = _recall(force_ring, tick, age, delays.force.panels)
-    truth = jax.tree.map(lambda ring: _recall(ring, tick, age, delays.real), rings.truth)
+    force_ring = rings.plant_signals.force if rings.reading is None else rings.reading
+    force = _recall(force_ring, tick, age, delays.force.intervals)
+    plant_signals = jax.tree.map(lambda ring: _recall(ring, tick, age, delays.real), rings.plant_signals)
     sensor = scenario.force_sensor
     if loop.has_force_bias:
         force = force + sensor.bias
@@ -211,25 +214,25 @@ def sense(loop: Loop, rig: Rig, state: LoopState, tick: Array, noise: Noise) -> 
     if loop.has_sample_effects:
         force = sample_force(force, sensor.quantum, sensor.dead_zone, sensor.range)
 
-    panels = delays.position.panels
+    intervals = delays.position.intervals
     stride = rig.constants.control_period * state.entry_velocity
-    before = sensed.first_position + (age - panels).astype(stride.dtype) * stride
-    after = look_back(rings.position, tick - 1, panels)
-    position = jnp.where(age <= panels, before, after)
+    before = sensed.first_position + (age - intervals).astype(stride.dtype) * stride
+    after = look_back(rings.position, tick - 1, intervals)
+    position = jnp.where(age <= intervals, before, after)
     if noise.position is not None:
         position = position + noise.position
     if loop.has_sample_effects:
         position = quantise(position, scenario.position_sensor.quantum)
-    return Signals(force, state.position, state.velocity, position, age), truth
+    return Signals(force, state.position, state.velocity, position, age), plant_signals
 
 
 def drive(
     loop: Loop,
-    rig: Rig,
+    rig: RigConstants,
     gains: Gains,
     state: LoopState,
     tick: Array,
-    truth: Truth,
+    plant_signals: PlantSignals,
     force: Array,
     controller: Any,
     push: Push | None = None,
@@ -256,33 +259,33 @@ def drive(
     end = commands[loop.latency]
     start = commands[loop.latency + 1] if loop.hold == "linear" else end
     plant, x_now = rig.propagation, state.plant.state
-    panel = _panel(plant, x_now, start, end, scenario.contact_plane)
+    interval = _panel(plant, x_now, start, end, scenario.contact_plane)
     rings = sensed.rings
-    panels = rings.panel
-    if panels is not None:
-        panels = write_in_turn(panels, tick, panel)
-        panel = _arrived(rig, panels, tick, tick - state.entry_tick)
+    intervals = rings.interval
+    if intervals is not None:
+        intervals = write_in_turn(intervals, tick, interval)
+        interval = _arrived(rig, intervals, tick, tick - state.entry_tick)
     surfaces = Surfaces(loop.law, state.parameters, state.law, scenario.clearance)
     until = rig.delays.force.fraction * period
     if loop.law.remembers:
-        dented = surfaces.after(panel.start, panel.sample, until)
-        real, _ = dented.force(panel.sample)
-        law = dented.after(panel.sample, panel.end, period - until).state
+        loaded = surfaces.after(interval.start, interval.sample, until)
+        real, _ = loaded.force(interval.sample)
+        law = loaded.after(interval.sample, interval.end, period - until).state
     else:
-        real, law = surfaces.force(panel.sample)
+        real, law = surfaces.force(interval.sample)
     now, lagged, reading = sensed.last, sensed.lagged, None
     if loop.is_two_sided or loop.energies:
-        now = surfaces.touch(panel.sample, real)
+        now = surfaces.touch(interval.sample, real)
     if loop.has_lag:
         time_constant = scenario.force_sensor.time_constant
-        reading, lagged = sensed_lag(surfaces, lagged, panel, until, period, time_constant)
-    touched, pushed = state.touched, real
+        reading, lagged = sensed_lag(surfaces, lagged, interval, until, period, time_constant)
+    touched, pushed = state.first_contact, real
     if touched is not None and push is not None:
-        signed = deflection(panel.sample.position, scenario.clearance)
+        signed = deflection(interval.sample.position, scenario.clearance)
         side = jnp.sign(signed)
         now_in_run = (tick - state.entry_tick).astype(period.dtype)
-        touched = touch(touched, side * signed, side * panel.sample.velocity, side, now_in_run, period)
-        since = jnp.where(touched.yet, now_in_run - touched.time, -1e9) * period
+        touched = touch(touched, side * signed, side * interval.sample.velocity, side, now_in_run, period)
+        since = jnp.where(touched.made, now_in_run - touched.time, -1e9) * period
         pushed = real + touched.side * push.force(since)
         if reading is not None:
             time_constant = scenario.force_sensor.time_constant
@@ -291,12 +294,12 @@ def drive(
     if loop.energies and loop.first_break == 0:
         works = works_between(sensed.last, now)
     elif loop.energies:
-        works = works_along(surfaces, panel.start, panel.end, period)
+        works = works_along(surfaces, interval.start, interval.end, period)
     if loop.has_corners:
-        peak = crest(surfaces, panel.start, panel.end, period)
-    happened = jax.tree.map(tie, Truth(pushed, works, peak), truth)
+        peak = largest_force(surfaces, interval.start, interval.end, period)
+    happened = jax.tree.map(depend_on, PlantSignals(pushed, works, peak), plant_signals)
     samples = Rings(happened, reading, read(plant.measured_position, x_now, start, end), None)
-    rings = write_in_turn(rings._replace(panel=None), tick, samples)._replace(panel=panels)
+    rings = write_in_turn(rings._replace(interval=None), tick, samples)._replace(interval=intervals)
     return state._replace(
         position=position,
         velocity=velocity,
@@ -304,28 +307,28 @@ def drive(
         sensed=Sensed(rings, now, lagged, sensed.first_position),
         law=law,
         controller=controller,
-        touched=touched,
+        first_contact=touched,
     )
 
 
-def _recall(ring, tick, age, panels):
-    """Sample of the panel `panels` before the newest one; before the run there was no force."""
-    return jnp.where(age > panels, look_back(ring, tick - 1, panels), 0)
+def _recall(ring, tick, age, intervals):
+    """Sample of the interval `intervals` before the newest one; before the run there was no force."""
+    return jnp.where(age > intervals, look_back(ring, tick - 1, intervals), 0)
 
 
 def _panel(plant, state, start, end, plane):
-    """Motion of the real mechanism over the panel under way, from the plane in which it touches."""
+    """Motion of the real mechanism over the interval under way, from the plane in which it touches."""
 
     def motion(position, velocity):
         return Motion(read(position, state, start, end) - plane, read(velocity, state, start, end))
 
     sample = motion(plant.position, plant.velocity)
     if plant.start is None:
-        return Panel(sample, None, None)
-    return Panel(sample, motion(*plant.start), motion(*plant.end))
+        return SamplingInterval(sample, None, None)
+    return SamplingInterval(sample, motion(*plant.start), motion(*plant.end))
 
 
 def _arrived(rig, rings, tick, age):
-    """The panel that happens now; before the run, at rest at the surface, which does not push."""
-    panels = rig.delays.touch
-    return jax.tree.map(lambda ring: jnp.where(age >= panels, look_back(ring, tick, panels), 0), rings)
+    """The interval that happens now; before the run, at rest at the surface, which does not push."""
+    intervals = rig.delays.touch
+    return jax.tree.map(lambda ring: jnp.where(age >= intervals, look_back(ring, tick, intervals), 0), rings)

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 from jaxtyping import Array, Float, Int
 
 from jaxhil.contact.laws import ContactParameters
-from jaxhil.simulation.contact_force import Panel, Touch, Truth
-from jaxhil.simulation.probe import Touched
+from jaxhil.simulation.contact_force import ContactSample, PlantSignals, SamplingInterval
+from jaxhil.simulation.probe import FirstContact
 
 
 class Plant(NamedTuple):
@@ -30,21 +30,21 @@ class Plant(NamedTuple):
 
 
 class Rings(NamedTuple):
-    """Delay lines: of the truth, of what a lagging sensor makes of the force (else None), of the position,
-    and of the panels whose contact is still to come (else None)."""
+    """Delay lines: of the plant signals, of what a lagging sensor makes of the force (else None), of the
+    position, and of the intervals whose contact is still to come (else None)."""
 
-    truth: Truth
+    plant_signals: PlantSignals
     reading: Float[Array, "samples *batch"] | None
     position: Float[Array, "samples *batch"]
-    panel: Panel | None
+    interval: SamplingInterval | None
 
 
 class Sensed(NamedTuple):
     """What the sensors will read: delay lines; the last sample of the contact, the lag's reading at the end
-    of its panel, the position sample of the panel before the run."""
+    of its interval, the position sample of the interval before the run."""
 
     rings: Any
-    last: Touch
+    last: ContactSample
     lagged: Array
     first_position: Array
 
@@ -63,4 +63,4 @@ class LoopState(NamedTuple):
     parameters: ContactParameters
     entry_velocity: Float[Array, "*batch"]
     entry_tick: Int[Array, "*batch"]
-    touched: Touched | None
+    first_contact: FirstContact | None

@@ -1,7 +1,7 @@
 """What is said of each contact: begin, end and restitution, peaks and energies (model.md, conventions).
 
-`Watch` follows the contact under way, tick by tick, from what really happens (`Truth`) and from the command;
-`Metrics` collects the contacts that are over.
+`Watch` follows the contact under way, tick by tick, from what really happens (`PlantSignals`) and from the
+command; `Metrics` collects the contacts that are over.
 """
 
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.compensators.base import Constants, Signals
 from jaxhil.contact.laws import deflection
-from jaxhil.simulation.contact_force import Truth
+from jaxhil.simulation.contact_force import PlantSignals
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.probe import Deviation, Probe, follow, no_deviation, root_mean_square
 from jaxhil.simulation.scenario import Scenario
@@ -165,7 +165,7 @@ def observe(
     rules: Rules,
     watch: Watch,
     signals: Signals,
-    truth: Truth,
+    plant_signals: PlantSignals,
     command: Array,
     shortfall: Array | None,
     probe: Probe | None = None,
@@ -174,7 +174,7 @@ def observe(
     this contact."""
     clearance = constants.clearance
     velocity, position = signals.velocity_desired, signals.position_desired
-    speed, force, magnitude = jnp.abs(velocity), jnp.abs(truth.force), jnp.abs(command)
+    speed, force, magnitude = jnp.abs(velocity), jnp.abs(plant_signals.force), jnp.abs(command)
     touching = force > 0
     if loop.has_force_noise or loop.has_force_bias:
         starts = touching | (deflection(position, clearance) != 0)
@@ -196,14 +196,14 @@ def observe(
     quiet = jnp.where(touching, 0, watch.quiet + 1)
     faded = magnitude <= jnp.maximum(FADED * peak_command, rules.level)
     ends = begun & away & (quiet >= rules.quiet) & (faded | (quiet >= rules.patience))
-    if truth.crest is not None:
-        peak_force = truth.crest
+    if plant_signals.peak is not None:
+        peak_force = plant_signals.peak
     else:
         # The force of a motion in jumps is constant between them.
-        peak_force = force if loop.first_break == 0 else _crest(*watch.recent, force)
+        peak_force = force if loop.first_break == 0 else _peak(*watch.recent, force)
     works = watch.works
-    if truth.works is not None:
-        works = works[0] + truth.works[0], works[1] + truth.works[1]
+    if plant_signals.works is not None:
+        works = works[0] + plant_signals.works[0], works[1] + plant_signals.works[1]
     lasts = begun & ~watch.over
     largest = watch.shortfall
     if largest is not None and shortfall is not None:
@@ -309,9 +309,9 @@ def _swing(swings: Swings, command: Array, lasts: Array, ends: Array) -> Swings:
     )
 
 
-def _crest(before, middle, now):
+def _peak(before, middle, now):
     """Largest force of the last period: the vertex of the parabola through three samples, if there is one."""
     bend = 2 * middle - before - now
-    crests = (middle >= before) & (middle >= now) & (bend > 0) & (before > 0) & (now > 0)
-    vertex = middle + (now - before) ** 2 / (8 * jnp.where(crests, bend, 1))
-    return jnp.where(crests, vertex, now)
+    peaks = (middle >= before) & (middle >= now) & (bend > 0) & (before > 0) & (now > 0)
+    vertex = middle + (now - before) ** 2 / (8 * jnp.where(peaks, bend, 1))
+    return jnp.where(peaks, vertex, now)

@@ -3,9 +3,10 @@
 A transport delay commutes with a linear system. So G is driven by the *undelayed* command, whose corners
 are the ticks themselves; x_a at any time t is its response at t - tau_p, and a sensor with delay tau_f sees
 the response at t - tau_p - tau_f. Every delay becomes one number: how long ago the response is read. Between
-ticks ("panel" k spans t_k to t_{k+1}) the command is a straight line, and the response at the fraction s of a
-panel is a fixed row of numbers times (state, command at the panel's start, command at its end): the matrix
-exponential of the system augmented by its input. Nothing is interpolated and nothing is rounded to ticks.
+ticks (sampling interval k spans t_k to t_{k+1}) the command is a straight line, and the response at the
+fraction s of a interval is a fixed row of numbers times (state, command at the interval's start, command at
+its end): the matrix exponential of the system augmented by its input. Nothing is interpolated and nothing is
+rounded to ticks.
 
 Time inside is in control periods. States are w, w', ..., w^(n-1) with den(p) w = u, y = num(p) w.
 """
@@ -23,13 +24,13 @@ State = tuple[Array, ...]
 
 
 class Delay(NamedTuple):
-    """A delay of r control periods as whole panels to look back and a place within the panel.
+    """A delay of r control periods as whole intervals to look back and a place within the interval.
 
-    At tick n the newest panel is n - 1; the reading lies in panel n - 1 - `panels`, at `fraction` of it.
-    `fraction` lies in (0, 1]: a reading at a tick takes the value just before that tick acts.
+    At tick n the newest interval is n - 1; the reading lies in interval n - 1 - `intervals`, at `fraction` of
+    it. `fraction` lies in (0, 1]: a reading at a tick takes the value just before that tick acts.
     """
 
-    panels: Int[Array, "*batch"]
+    intervals: Int[Array, "*batch"]
     fraction: Float[Array, "*batch"]
 
 
@@ -37,8 +38,8 @@ class Propagation(NamedTuple):
     """Exact discrete motion simulator; rows act on (state, command at start, command at end).
 
     transition (order, order + 2, *batch); position and velocity rows (order + 2, *batch) at the force
-    sensor's place in the panel; measured_position likewise at the position sensor's; where asked for, both
-    rows at the panel's start and at its end, from within. velocity in m/s. steady_command and
+    sensor's place in the interval; measured_position likewise at the position sensor's; where asked for, both
+    rows at the interval's start and at its end, from within. velocity in m/s. steady_command and
     steady_velocity (order, *batch): the state of a uniform motion.
     """
 
@@ -53,7 +54,7 @@ class Propagation(NamedTuple):
 
 
 def split_delay(delay: Float[Array, "*batch"], control_period: Float[Array, "*batch"]) -> Delay:
-    """Whole panels and fraction of `delay` [s]; whole multiples of the period are met to 1e-9."""
+    """Whole intervals and fraction of `delay` [s]; whole multiples of the period are met to 1e-9."""
     periods = delay / control_period
     whole = jax.lax.stop_gradient(jnp.floor(periods + 1e-9))
     return Delay(whole.astype(jnp.int32), 1 - (periods - whole))
@@ -83,7 +84,7 @@ def propagation(
     generator += [[zero] * (order + 1) + [one], [zero] * (order + 2)]
     generator = jnp.stack([jnp.stack(row) for row in generator])
     fractions = jnp.stack([one, force_fraction, position_fraction, zero][: 4 if ends else 3])
-    # Axes: row, column, place in the panel, batch.
+    # Axes: row, column, place in the interval, batch.
     rows = exponential(generator[:, :, None] * fractions[None, None])[: order + 1]
     # Columns for (z, u(0), u(1)) instead of (z, u(0), u(1) - u(0)).
     rows = rows.at[:, order].add(-rows[:, order + 1])
@@ -133,7 +134,7 @@ def advance(transition: Array, state: State, start: Array, end: Array) -> State:
 
 
 def read(row: Array, state: State, start: Array, end: Array) -> Array:
-    """One row times (state, command at the panel's start, command at its end)."""
+    """One row times (state, command at the interval's start, command at its end)."""
     total = row[-2] * start + row[-1] * end
     for i, component in enumerate(state):
         total = total + row[i] * component

@@ -58,11 +58,11 @@ class Probe(NamedTuple):
     span: Float[Array, "slots *batch"]
 
 
-class Touched(NamedTuple):
+class FirstContact(NamedTuple):
     """The hardware's first touch of the contact under way: whether there was one, its time in periods of the
     run, the side of the surface (1 or -1)."""
 
-    yet: Bool[Array, "*batch"]
+    made: Bool[Array, "*batch"]
     time: Float[Array, "*batch"]
     side: Float[Array, "*batch"]
 
@@ -77,18 +77,20 @@ class Deviation(NamedTuple):
     count: Float[Array, "*batch"]
 
 
-def untouched(like: Float[Array, "*batch"]) -> Touched:
+def before_contact(like: Float[Array, "*batch"]) -> FirstContact:
     """Before the first touch."""
     zeros = jnp.zeros_like(like)
-    return Touched(jnp.zeros(like.shape, bool), zeros, zeros + 1)
+    return FirstContact(jnp.zeros(like.shape, bool), zeros, zeros + 1)
 
 
-def touch(touched: Touched, depth: Array, rate: Array, side: Array, now: Array, period: Array) -> Touched:
+def touch(
+    touched: FirstContact, depth: Array, rate: Array, side: Array, now: Array, period: Array
+) -> FirstContact:
     """Follow the hardware to a sample: at `now` [periods] it is `depth` [m] beyond the surface on `side`,
     going deeper at `rate` [m/s]. The first touch lies where uniform motion met the surface."""
-    first = ~touched.yet & (depth > 0)
-    return Touched(
-        touched.yet | first,
+    first = ~touched.made & (depth > 0)
+    return FirstContact(
+        touched.made | first,
         jnp.where(first, now - _since(depth, rate, period), touched.time),
         jnp.where(first, side, touched.side),
     )

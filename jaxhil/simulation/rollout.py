@@ -13,11 +13,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.compensators.base import Gains, Signals
-from jaxhil.simulation.contact_force import Motion, Panel, Truth, no_touch
+from jaxhil.simulation.contact_force import Motion, PlantSignals, SamplingInterval, no_contact
 from jaxhil.simulation.loop import (
     Loop,
-    Rig,
-    build_rig,
+    RigConstants,
+    build_rig_constants,
     drive,
     enter,
     sense,
@@ -35,7 +35,7 @@ from jaxhil.simulation.metrics import (
     judge,
     observe,
 )
-from jaxhil.simulation.probe import Probe, untouched
+from jaxhil.simulation.probe import Probe, before_contact
 from jaxhil.simulation.scenario import Scenario
 from jaxhil.simulation.sensors import Noise, draw_noise
 
@@ -56,13 +56,13 @@ class Run(NamedTuple):
 
 
 class Tick(NamedTuple):
-    """What is recorded of a tick: what the controller read and what it made of it, the truth, whether the
-    lane was still running, the number of the contact, what was identified [N/m, N s/m], and the position
+    """What is recorded of a tick: what the controller read and what it made of it, the plant signals, whether
+    the lane was still running, the number of the contact, what was identified [N/m, N s/m], and the position
     command [m] sent to the drives at its end, before any limits of theirs."""
 
     signals: Signals
     command: Float[Array, "*batch"]
-    truth: Truth
+    plant_signals: PlantSignals
     active: Bool[Array, "*batch"]
     contact: Int[Array, "*batch"]
     identified: tuple[Array, Array] | None
@@ -70,15 +70,15 @@ class Tick(NamedTuple):
 
 
 def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Metrics:
-    """Metrics (slots, *batch) of every contact of every lane: `build_rig`, then `run_contacts`.
+    """Metrics (slots, *batch) of every contact of every lane: `build_rig_constants`, then `run_contacts`.
 
     `gains` are scalars or of the batch shape: many gains at once are many lanes, not a `jax.vmap`, under
     which the loop's condition and the rings' pointer would be the lanes' own.
     """
-    return run_contacts(loop, gains, build_rig(loop, scenario))
+    return run_contacts(loop, gains, build_rig_constants(loop, scenario))
 
 
-def run_contacts(loop: Loop, gains: Gains, rig: Rig) -> Metrics:
+def run_contacts(loop: Loop, gains: Gains, rig: RigConstants) -> Metrics:
     """`rollout` on a rig built before, for when many gains are tried on it."""
 
     def body(run):
@@ -101,7 +101,7 @@ def run_contacts(loop: Loop, gains: Gains, rig: Rig) -> Metrics:
 def record(loop: Loop, gains: Gains, scenario: Scenario, ticks: int) -> tuple[Metrics, Tick]:
     """Metrics and every tick, (ticks, *batch), of so many ticks or a few more, up to a whole number of
     stretches; free flight is not skipped."""
-    rig = build_rig(loop, scenario)
+    rig = build_rig_constants(loop, scenario)
 
     def body(run, _):
         run, seen = stretch(loop, rig, gains, run, record=True)
@@ -117,7 +117,7 @@ def stretch_length(loop: Loop) -> int:
     return 1 if loop.is_two_sided else 16
 
 
-def start(loop: Loop, rig: Rig, gains: Gains) -> Run:
+def start(loop: Loop, rig: RigConstants, gains: Gains) -> Run:
     """All lanes on their first approach."""
     scenario, like = rig.scenario, rig.scenario.velocity
     zeros = jnp.zeros_like(like)
@@ -130,13 +130,13 @@ def start(loop: Loop, rig: Rig, gains: Gains) -> Run:
         plant=Plant(
             (zeros,) * (loop.latency + 1), zeros, (zeros,) * order, zeros if loop.has_limits else None
         ),
-        sensed=Sensed(_rings(loop, ring), no_touch(like), zeros, zeros),
+        sensed=Sensed(_rings(loop, ring), no_contact(like), zeros, zeros),
         law=loop.law.init(zeros),
         controller=loop.compensator.init(gains, rig.constants, loop.controller_ring),
         parameters=_entry(scenario.contact, index),
         entry_velocity=zeros,
         entry_tick=index,
-        touched=untouched(zeros) if loop.probed else None,
+        first_contact=before_contact(zeros) if loop.probed else None,
     )
     # Rings are read up to one ring behind: start there, so that no index is negative.
     tick = jnp.array(_first_tick(loop), jnp.int32)
@@ -152,7 +152,7 @@ def start(loop: Loop, rig: Rig, gains: Gains) -> Run:
     )
 
 
-def stretch(loop: Loop, rig: Rig, gains: Gains, run: Run, record: bool) -> tuple[Run, Tick | None]:
+def stretch(loop: Loop, rig: RigConstants, gains: Gains, run: Run, record: bool) -> tuple[Run, Tick | None]:
     """A few ticks of the loop."""
 
     rules = build_rules(rig.scenario)
@@ -161,20 +161,20 @@ def stretch(loop: Loop, rig: Rig, gains: Gains, run: Run, record: bool) -> tuple
 
     def tick(carry, noise):
         state, watch, now = carry
-        signals, truth = sense(loop, rig, state, now, noise)
+        signals, plant_signals = sense(loop, rig, state, now, noise)
         command, controller = loop.compensator.step(prepared, state.controller, signals, now)
         if loop.has_force_noise or loop.has_force_bias:
             command = jnp.where(signals.age == 0, 0, command)
         watch = observe(
-            loop, rig.constants, rules, watch, signals, truth, command, state.plant.shortfall, probe
+            loop, rig.constants, rules, watch, signals, plant_signals, command, state.plant.shortfall, probe
         )
         push = None if probe is None else probe.push
-        state = drive(loop, rig, gains, state, now, truth, command, controller, push)
+        state = drive(loop, rig, gains, state, now, plant_signals, command, controller, push)
         seen = None
         if record:
             identified = loop.compensator.identified(controller)
             going = run.active & ~watch.over
-            seen = Tick(signals, command, truth, going, run.index, identified, state.plant.sent)
+            seen = Tick(signals, command, plant_signals, going, run.index, identified, state.plant.sent)
         return (state, watch, now + 1), seen
 
     carry, length = (run.state, run.watch, run.tick), stretch_length(loop)
@@ -182,14 +182,14 @@ def stretch(loop: Loop, rig: Rig, gains: Gains, run: Run, record: bool) -> tuple
     return run._replace(state=state, watch=watch, tick=now), seen
 
 
-def noise_ahead(loop: Loop, rig: Rig, run: Run, ticks: int) -> Noise:
+def noise_ahead(loop: Loop, rig: RigConstants, run: Run, ticks: int) -> Noise:
     """The sensors' noise, (ticks, *batch), at this tick and those that follow within a stretch."""
     ahead = jnp.arange(ticks, dtype=jnp.int32).reshape(-1, *[1] * run.index.ndim)
     age = run.tick + ahead - run.state.entry_tick[None]
     return draw_noise(loop.has_force_noise, loop.has_position_noise, rig.scenario, run.index, age)
 
 
-def turn_over(loop: Loop, rig: Rig, gains: Gains, run: Run, skip_flight: bool = True) -> Run:
+def turn_over(loop: Loop, rig: RigConstants, gains: Gains, run: Run, skip_flight: bool = True) -> Run:
     """Enter contacts that are over, begin the next, skip the free flight between two surfaces."""
     watch, state, scenario = run.watch, run.state, rig.scenario
     status = judge(scenario, watch, run.tick - state.entry_tick)
@@ -216,8 +216,10 @@ def turn_over(loop: Loop, rig: Rig, gains: Gains, run: Run, skip_flight: bool = 
         # A damped contact is over while the mechanism is still dented: its law holds until it is free.
         free = state.sensed.last.distance <= 0
         state = state._replace(parameters=_choose(free, entry, state.parameters))
-        if state.touched is not None:
-            state = state._replace(touched=_choose(over, untouched(watch.approach), state.touched))
+        if state.first_contact is not None:
+            state = state._replace(
+                first_contact=_choose(over, before_contact(watch.approach), state.first_contact)
+            )
         if skip_flight:
             state = _skip_flight(loop, rig, gains, state, watch, run.tick)
     else:
@@ -231,13 +233,15 @@ def turn_over(loop: Loop, rig: Rig, gains: Gains, run: Run, skip_flight: bool = 
 
 def _rings(loop, ring):
     """Empty delay lines of what the loop has."""
-    panel = None
+    interval = None
     if loop.is_two_sided:
         motion = Motion(ring, ring)
-        ends = motion if loop.follows_panels else None
-        panel = Panel(motion, ends, ends)
-    truth = Truth(ring, (ring, ring) if loop.energies else None, ring if loop.has_corners else None)
-    return Rings(truth, ring if loop.has_lag else None, ring, panel)
+        ends = motion if loop.follows_intervals else None
+        interval = SamplingInterval(motion, ends, ends)
+    plant_signals = PlantSignals(
+        ring, (ring, ring) if loop.energies else None, ring if loop.has_corners else None
+    )
+    return Rings(plant_signals, ring if loop.has_lag else None, ring, interval)
 
 
 def _pending(rig, run):

@@ -55,7 +55,7 @@ struct Problem {
     const double *steady_command, *steady_velocity;                   // [2, lanes]
     const double *quiet, *patience;                                   // [lanes], ticks
     const double *gains;                                              // [GAINS, lanes]
-    const int32_t *contacts, *force_panels, *real_panels, *position_panels;  // [lanes]
+    const int32_t *contacts, *force_intervals, *real_intervals, *position_intervals;  // [lanes]
     double *restitution, *approach_velocity, *peak_force, *peak_command, *duration;  // [slots, lanes]
     int32_t *status, *ticks;                                          // [slots, lanes]
 };
@@ -196,9 +196,9 @@ private:
             b.threshold[l] = gain(THRESHOLD);
             const double periods = gain(IDENTIFICATION_DELAY) / period, whole = std::floor(periods + 1e-9);
             b.fraction[l] = periods - whole;
-            b.force_back[l] = l - int64_t(p.force_panels[n]) * W;
-            b.real_back[l] = l - int64_t(p.real_panels[n]) * W;
-            b.position_back[l] = l - int64_t(p.position_panels[n]) * W;
+            b.force_back[l] = l - int64_t(p.force_intervals[n]) * W;
+            b.real_back[l] = l - int64_t(p.real_intervals[n]) * W;
+            b.position_back[l] = l - int64_t(p.position_intervals[n]) * W;
             b.aligned_back[l] = l - int64_t(whole) * W;
             b.index[l] = 0;
             b.active[l] = first + l < p.lanes && p.contacts[n] > 0;
@@ -225,7 +225,7 @@ private:
 
         b.lead_force[l] = b.lead_output[l] = 0;
         if (kind == RESPONSE_ERROR) {
-            const double measured = first_position - double(p.position_panels[n]) * stride;
+            const double measured = first_position - double(p.position_intervals[n]) * stride;
             const double delay = p.gains[IDENTIFICATION_DELAY * p.lanes + n] / period;
             b.measured[l] = measured - stride;
             b.aligned[l] = measured - delay * stride - stride;

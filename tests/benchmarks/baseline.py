@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxhil.compensators.response_error import ResponseError
 from jaxhil.contact.laws import KelvinVoigt
-from jaxhil.simulation.loop import Loop, Rig
+from jaxhil.simulation.loop import Loop, RigConstants
 from jaxhil.simulation.metrics import NOT_REACHED, build_rules
 from jaxhil.simulation.scenario import Scenario
 
@@ -30,7 +30,7 @@ _NUMBERS = (
     "period", "mass", "velocity", "phase", "stiffness", "damping", "transition", "position_row",
     "velocity_row", "measured_row", "steady_command", "steady_velocity", "quiet", "patience", "gains",
 )  # fmt: skip
-_COUNTS = ("contacts", "force_panels", "real_panels", "position_panels")
+_COUNTS = ("contacts", "force_intervals", "real_intervals", "position_intervals")
 _OUTPUT_COUNTS = ("status", "ticks")
 
 
@@ -49,7 +49,7 @@ class Baseline(NamedTuple):
     def run(
         self,
         loop: Loop,
-        rig: Rig,
+        rig: RigConstants,
         gains: dict[str, Any],
         scenario: Scenario,
         horizon_ticks: int,
@@ -67,7 +67,7 @@ class Baseline(NamedTuple):
     def run_ticks(
         self,
         loop: Loop,
-        rig: Rig,
+        rig: RigConstants,
         gains: dict[str, Any],
         scenario: Scenario,
         ticks: int,
@@ -116,7 +116,7 @@ def compile_baseline(block_lanes: int | None = None) -> Baseline | None:
     return Baseline(library, library.block_lanes())
 
 
-def _check_scope(loop: Loop, rig: Rig, scenario: Scenario) -> None:
+def _check_scope(loop: Loop, rig: RigConstants, scenario: Scenario) -> None:
     supported = {
         "one axis of lanes": np.ndim(scenario.velocity) == 1,
         "Kelvin-Voigt contact": isinstance(loop.law, KelvinVoigt),
@@ -144,12 +144,12 @@ def _check_scope(loop: Loop, rig: Rig, scenario: Scenario) -> None:
 
 def _check_reach(loop: Loop, inputs: dict[str, np.ndarray]) -> None:
     """The C++ reads its delay lines unchecked."""
-    panels = [np.max(inputs[name]) for name in _COUNTS if name.endswith("_panels")]
+    intervals = [np.max(inputs[name]) for name in _COUNTS if name.endswith("_intervals")]
     if loop.compensator.name == "response_error":
         delay = inputs["gains"][GAINS.index("identification_delay")]
-        panels.append(np.max(delay / inputs["period"]))
-    if not max(panels) <= loop.ring - 2:
-        raise ValueError(f"delays: found {max(panels):g} periods, allowed {loop.ring - 2}")
+        intervals.append(np.max(delay / inputs["period"]))
+    if not max(intervals) <= loop.ring - 2:
+        raise ValueError(f"delays: found {max(intervals):g} periods, allowed {loop.ring - 2}")
 
 
 def _inputs(rig, gains, scenario, lanes) -> dict[str, np.ndarray]:
@@ -181,9 +181,9 @@ def _inputs(rig, gains, scenario, lanes) -> dict[str, np.ndarray]:
     }
     counts = {
         "contacts": scenario.contacts,
-        "force_panels": rig.delays.force.panels,
-        "real_panels": rig.delays.real,
-        "position_panels": rig.delays.position.panels,
+        "force_intervals": rig.delays.force.intervals,
+        "real_intervals": rig.delays.real,
+        "position_intervals": rig.delays.position.intervals,
     }
     return {name: spread(numbers[name], np.float64) for name in _NUMBERS} | {
         name: spread(counts[name], np.int32) for name in _COUNTS

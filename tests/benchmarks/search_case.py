@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.evaluation import expected_duration
-from jaxhil.simulation.loop import Loop, Rig, build_rig
+from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants
 from jaxhil.simulation.scenario import Scenario
 from tuning.gains.objective import RMS, Problem, common_terms, residuals
 from tuning.gains.tasks import Task, alike, build_task, common_loop, gain_bounds, spread_points, tuned_names
@@ -118,7 +118,7 @@ def _build_case(task: Task, loop: Loop) -> Case:
     if np.ptp(task.scenarios.contacts) > 0:
         raise ValueError(f"{task.mechanism.name}: scenarios of different numbers of contacts")
     names = tuned_names([task])
-    rig = jax.jit(_build_rig, static_argnums=0)(loop, _dealt(task.scenarios))
+    rig = jax.jit(_build_constants, static_argnums=0)(loop, _dealt(task.scenarios))
     fixed: Any = {name: np.asarray(value) for name, value in task.literature.items() if name not in names}
     mesh = _mesh()
     lanes_last = jax.tree.map(lambda leaf: NamedSharding(mesh, _lanes_last(leaf)), rig)
@@ -130,8 +130,8 @@ def _build_case(task: Task, loop: Loop) -> Case:
     return Case(task, loop, names, bounds, Problem(rig, fixed, weights), placed_bounds)
 
 
-def _build_rig(loop: Loop, scenarios: Scenario) -> Rig:
-    return build_rig(loop, scenarios)
+def _build_constants(loop: Loop, scenarios: Scenario) -> RigConstants:
+    return build_rig_constants(loop, scenarios)
 
 
 def _dealt(scenarios: Scenario) -> Scenario:

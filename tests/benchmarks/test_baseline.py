@@ -9,7 +9,7 @@ from jaxhil.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.loop import build_rig
+from jaxhil.simulation.loop import build_rig_constants
 from jaxhil.simulation.metrics import NOT_REACHED, OK
 from jaxhil.simulation.rollout import rollout
 from jaxhil.simulation.scenario import build_scenarios
@@ -40,7 +40,7 @@ def case(compensator, overrides=()):
         gains["initial_stiffness"] = generator.uniform(0, 5e4, LANES)
         gains["initial_damping"] = generator.uniform(0, 20, LANES)
     loop = build_loop(mechanism, compensator, scenario)
-    return loop, gains, scenario, jax.jit(build_rig, static_argnums=0)(loop, scenario)
+    return loop, gains, scenario, jax.jit(build_rig_constants, static_argnums=0)(loop, scenario)
 
 
 @pytest.mark.parametrize("compensator", ["none", "phase_lead", "response_error"])

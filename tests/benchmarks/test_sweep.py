@@ -16,7 +16,7 @@ from baseline import compile_baseline
 
 from jaxhil.compensators import literature_gains
 from jaxhil.mechanism.file import load
-from jaxhil.simulation.loop import build_rig
+from jaxhil.simulation.loop import build_rig_constants
 from tuning.gain_file import build_document, check_document, write_gain_file
 from tuning.sweeps.chunks import build_sweep, run_parts
 from tuning.sweeps.draws import drawn_scenarios
@@ -70,7 +70,7 @@ def test_sweep_beside_the_compiled_baseline(precision, tmp_path, capsys):
 
     _, scenarios = drawn_scenarios(sweep.mechanism, "random", 0, 0, BASELINE_LANES)
     on_device = jax.tree.map(jnp.asarray, scenarios)
-    rig = jax.jit(build_rig, static_argnums=0)(sweep.loop, on_device)
+    rig = jax.jit(build_rig_constants, static_argnums=0)(sweep.loop, on_device)
     # Every scenario ends within the horizon.
     found = baseline.run(sweep.loop, rig, sweep.gains, on_device, 4000)
     horizon = int(found["ticks"][: sweep.mechanism.approach.contacts].max())

@@ -18,7 +18,7 @@ from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation import evaluation
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.loop import build_rig
+from jaxhil.simulation.loop import build_rig_constants
 from jaxhil.simulation.rollout import run_contacts
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.batches import join
@@ -70,7 +70,7 @@ def test_rollout_beside_the_compiled_baseline(compensator, names, capsys):
         pytest.skip("no C++ compiler")
     loop, gains, scenarios = case(compensator, LANES, names)
     on_device = jax.tree.map(jnp.asarray, scenarios)
-    rig = jax.jit(build_rig, static_argnums=0)(loop, on_device)
+    rig = jax.jit(build_rig_constants, static_argnums=0)(loop, on_device)
     arguments = evaluation.deal(scenarios, gains)
     ticks = np.asarray(evaluation.run_tiles(loop, *arguments).metrics.ticks).max(axis=-2)
     # A tile runs as long as its slowest lane: (devices, tiles, tile) lanes.
@@ -98,7 +98,7 @@ def test_rollout_beside_the_compiled_baseline(compensator, names, capsys):
 @pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
 def test_gradient_costs_little_more_than_its_rollouts(compensator, capsys):
     loop, gains, scenarios = case(compensator, 256)
-    rig = jax.jit(build_rig, static_argnums=0)(loop, jax.tree.map(jnp.asarray, scenarios))
+    rig = jax.jit(build_rig_constants, static_argnums=0)(loop, jax.tree.map(jnp.asarray, scenarios))
     names = tuple(gains)
 
     def restitution(values, rig):

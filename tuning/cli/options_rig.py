@@ -71,7 +71,7 @@ class Verify:
 
 
 @dataclass(frozen=True)
-class Rig:
+class RigOptions:
     """A loop in real time: the controller as a process of its own, the rig played to it over UDP.
 
     Example: jaxhil rig jaxhil-out/varying/gains.json --duration 600 --plot

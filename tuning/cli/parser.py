@@ -23,7 +23,7 @@ from tuning.cli.options import (
     Sweep,
     Tune,
 )
-from tuning.cli.options_rig import DEFAULT_RIG_PLOT, Export, Rig, Verify
+from tuning.cli.options_rig import DEFAULT_RIG_PLOT, Export, RigOptions, Verify
 
 Command = (
     Annotated[Simulate, subcommand("simulate")]
@@ -32,7 +32,7 @@ Command = (
     | Annotated[Replay, subcommand("replay")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Verify, subcommand("verify")]
-    | Annotated[Rig, subcommand("rig")]
+    | Annotated[RigOptions, subcommand("rig")]
     | Annotated[Compare, subcommand("compare")]
     | Annotated[Mechanisms, subcommand("mechanisms")]
 )

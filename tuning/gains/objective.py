@@ -33,7 +33,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.errors import InputError, shown
 from jaxhil.simulation.evaluation import Outcome, compare_with_reference
-from jaxhil.simulation.loop import Loop, Rig
+from jaxhil.simulation.loop import Loop, RigConstants
 from jaxhil.simulation.rollout import run_contacts
 from tuning.transparency.probes import are_copies
 
@@ -121,7 +121,7 @@ class Problem(NamedTuple):
     """A rig built for a batch of scenarios, the gains that stay as they are and the objective's weights;
     where there are several problems, each leaf has a leading axis of them."""
 
-    rig: Rig
+    rig: RigConstants
     fixed: dict[str, Array]
     weights: Weights
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxhil.simulation.evaluation import expected_duration
-from jaxhil.simulation.loop import build_rig
+from jaxhil.simulation.loop import build_rig_constants
 from jaxhil.simulation.scenario import Scenario
 from tuning import program_cache as programs
 from tuning.environment import program_folder
@@ -238,6 +238,6 @@ def _advance(static: tuple[Any, int, int], arguments: Any) -> Solution:
     loop = what[0]
     scenarios, fixed, weights, bounds, starts, limit = arguments
 
-    rigs = jax.vmap(lambda scenarios: build_rig(loop, scenarios))(scenarios)
+    rigs = jax.vmap(lambda scenarios: build_rig_constants(loop, scenarios))(scenarios)
     problems = Problem(rigs, fixed, weights)
     return solve(residuals, what, problems, bounds, starts, limit, longest=longest, tile=tile)

@@ -15,14 +15,14 @@ class ContactLaw(NamedTuple):
     """One contact's law, functions of penetration d [m] and rate d' [m/s].
 
     `hold` [N or 1] is positive as long as penetrated surfaces hold on to each other; `force` [N] is that of
-    d > 0, 0 where they let go; `edge` [N], of d' alone, is its limit as d goes to 0 from above. `dented`, of
+    d > 0, 0 where they let go; `edge` [N], of d' alone, is its limit as d goes to 0 from above. `loaded`, of
     a law that remembers, is the law after the deepest penetration given [m]; that of 0 is the law as new.
     """
 
     force: Formula
     hold: Formula
     edge: Callable[[float], float]
-    dented: "Callable[[float], ContactLaw] | None" = None
+    loaded: "Callable[[float], ContactLaw] | None" = None
 
 
 def contact_law(contact: Contact, number: int) -> ContactLaw:
@@ -116,10 +116,10 @@ def _elastoplastic(stiffness: float, unloading_ratio: float, deepest: float) -> 
             return stiffness * depth
         return stiffness * deepest - stiffness * unloading_ratio * (deepest - depth)
 
-    def dented(depth: float) -> ContactLaw:
+    def loaded(depth: float) -> ContactLaw:
         return _elastoplastic(stiffness, unloading_ratio, depth)
 
-    return _clamped(spring, lambda rate: 0.0)._replace(dented=dented)
+    return _clamped(spring, lambda rate: 0.0)._replace(loaded=loaded)
 
 
 def _clamped(spring: Formula, edge: Callable[[float], float]) -> ContactLaw:

@@ -31,7 +31,7 @@ AHEAD = 50_000_000  # ns before the first tick
 AFTER_TRIP = 1.0  # s for which the rig plays on after a trip
 
 
-class Task(Protocol):
+class RealTimeTask(Protocol):
     """The rig's side, without network and clock: see `tuning.rig.hardware.RigTask`."""
 
     @property
@@ -73,7 +73,9 @@ class Timing:
         self.ticks, self.stood = 0, 0
 
 
-def play(task: Task, network: Network, period: float, timing: Timing, tell: Callable[[int], None]) -> None:
+def play(
+    task: RealTimeTask, network: Network, period: float, timing: Timing, tell: Callable[[int], None]
+) -> None:
     """Play `len(timing.met)` ticks of `period` [s], or until 1 s after a trip.
 
     `tell` is told once a second how many are done.
@@ -114,7 +116,7 @@ def play(task: Task, network: Network, period: float, timing: Timing, tell: Call
         gc.unfreeze()
 
 
-def _answered(task: Task, network: Network, deadline: int, left: array, timing: Timing) -> bool:
+def _answered(task: RealTimeTask, network: Network, deadline: int, left: array, timing: Timing) -> bool:
     """Take in what arrives, until this tick's answer does or the deadline has passed."""
     while True:
         met = False

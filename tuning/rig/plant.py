@@ -6,7 +6,7 @@
     plant.move(command)                               # the position command of the next tick; a period passes
 
 The physics of `jaxhil.simulation.loop` stages 1, 4 and 5 without jax, fast enough for a loop in real time:
-linear parts are discretised exactly, once; delays are read at their places within a panel
+linear parts are discretised exactly, once; delays are read at their places within a sampling interval
 (`tuning.rig.propagation`), and nothing is rounded to ticks.
 """
 
@@ -18,7 +18,8 @@ from tuning.rig.contact_laws import contact_law
 from tuning.rig.propagation import WHOLE, Place, apply, propagation, split_delay
 from tuning.rig.sensor_lag import Motion, deepest_within, lagged
 
-Panel = tuple[Motion, Motion | None, Motion | None]  # where the force is sampled, at its start, at its end
+# Motion where the force is sampled, at the interval's start, at its end.
+SamplingInterval = tuple[Motion, Motion | None, Motion | None]
 
 
 class Plant:
@@ -28,8 +29,8 @@ class Plant:
     def __init__(self, mechanism: Mechanism, seed: int = 0) -> None:
         rig = mechanism.rig
         simulator, period = rig.simulator, rig.control_period
-        force_panels, force_place = split_delay(simulator.delay + rig.force_sensor.delay, period)
-        position_panels, position_place = split_delay(simulator.delay + rig.position_sensor.delay, period)
+        force_intervals, force_place = split_delay(simulator.delay + rig.force_sensor.delay, period)
+        position_intervals, position_place = split_delay(simulator.delay + rig.position_sensor.delay, period)
         self._period, self._contact = period, mechanism.contact
         self._clearance, self._plane = mechanism.contact.clearance, rig.contact_plane
         self._hold, self._latency = rig.command_hold, rig.command_latency
@@ -38,10 +39,10 @@ class Plant:
         self._limits = simulator.velocity_limit, simulator.acceleration_limit
         self._limited = math.isfinite(min(self._limits))
         self._rows = propagation(simulator, period, rig.command_hold, force_place, position_place)
-        # A sample happens `real` panels after its panel's command, and is read so many panels later.
+        # A sample happens `real` intervals after its command, and is read so many intervals later.
         self._real = math.ceil(simulator.delay / period + force_place - WHOLE) - 1
-        self._force_panels, self._position_panels = force_panels - self._real, position_panels
-        self._size = 1 << (max(self._force_panels, position_panels, self._real) + 2).bit_length()
+        self._force_intervals, self._position_intervals = force_intervals - self._real, position_intervals
+        self._size = 1 << (max(self._force_intervals, position_intervals, self._real) + 2).bit_length()
         self.begin(-1.0, 0.0, -1.0, 0)
 
     def begin(self, position: float, velocity: float, command: float, number: int) -> None:
@@ -66,25 +67,25 @@ class Plant:
         ]
         size = self._size
         self._forces = [0.0] * size
-        self._panels: list[Panel | None] = [None] * size
-        # Panel -1 is the newest before the run, and lies at the ring's end.
+        self._intervals: list[SamplingInterval | None] = [None] * size
+        # Interval -1 is the newest before the run, and lies at the ring's end.
         self._positions = [first + (place - size + 1) * stride for place in range(size)]
         self._tick = 0
         self._lag = self.force = 0.0
-        self._dented, self._deepest = False, 0.0
+        self._in_contact, self._deepest = False, 0.0
 
     def read(self) -> tuple[float, float]:
         """Measured force [N] and position [m] at this tick, just before its command acts. Draws noise."""
         last = self._size - 1
         sensor, noise = self._force_sensor, self._noise
-        force = self._forces[(self._tick - 1 - self._force_panels) & last] + sensor.bias
+        force = self._forces[(self._tick - 1 - self._force_intervals) & last] + sensor.bias
         if sensor.noise_std > 0.0:
             force += sensor.noise_std * noise.gauss(0.0, 1.0)
         force = _quantised(force, sensor.quantum)
         if sensor.dead_zone > 0.0:
             force = math.copysign(max(0.0, abs(force) - sensor.dead_zone), force)
         force = min(max(force, -sensor.range), sensor.range)
-        position = self._positions[(self._tick - 1 - self._position_panels) & last]
+        position = self._positions[(self._tick - 1 - self._position_intervals) & last]
         if self._position_sensor.noise_std > 0.0:
             position += self._position_sensor.noise_std * noise.gauss(0.0, 1.0)
         return force, _quantised(position, self._position_sensor.quantum)
@@ -103,43 +104,43 @@ class Plant:
             position = apply(place.position, state, start, end) - self._plane
             return Motion(position, apply(place.velocity, state, start, end))
 
-        if self._force_sensor.time_constant > 0.0 or self._law.dented is not None:
-            panel = motion(rows.sample), motion(rows.start), motion(rows.end)
+        if self._force_sensor.time_constant > 0.0 or self._law.loaded is not None:
+            interval = motion(rows.sample), motion(rows.start), motion(rows.end)
         else:
-            panel = motion(rows.sample), None, None
-        self._panels[tick & last] = panel
+            interval = motion(rows.sample), None, None
+        self._intervals[tick & last] = interval
         self._positions[tick & last] = apply(rows.measured, state, start, end)
         self._state = [apply(row, state, start, end) for row in rows.transition]
-        self._forces[tick & last] = self._touch(self._panels[(tick - self._real) & last])
+        self._forces[tick & last] = self._contact_force(self._intervals[(tick - self._real) & last])
         self._tick = tick + 1
         self.expect(self._wanted_number)
 
     def expect(self, number: int) -> None:
         """The next contact of the run is `number` (from 0): its law holds once the mechanism is free."""
         self._wanted_number = number
-        if number != self._number and not self._dented:
+        if number != self._number and not self._in_contact:
             self._law, self._number = contact_law(self._contact, number), number
 
-    def _touch(self, panel: Panel | None) -> float:
-        """What happens in the panel whose motion arrives now; what the sensor makes of its force [N]."""
-        if panel is None:
+    def _contact_force(self, interval: SamplingInterval | None) -> float:
+        """What happens in the interval whose motion arrives now; what the sensor makes of its force [N]."""
+        if interval is None:
             return 0.0
-        sample, start, end = panel
+        sample, start, end = interval
         clearance, rest = self._clearance, self._period - self._place
         law, deepest = self._law, self._deepest
-        if law.dented is not None and start is not None and end is not None:
+        if law.loaded is not None and start is not None and end is not None:
             at_sample = self._deeper(deepest, start, sample, self._place)
-            law = law.dented(at_sample)
+            law = law.loaded(at_sample)
             self._deepest = self._deeper(at_sample, sample, end, rest)
         else:
             at_sample = 0.0
         if sample.position > 0.0:
-            self._dented, self.force = True, law.force(sample.position, sample.velocity)
+            self._in_contact, self.force = True, law.force(sample.position, sample.velocity)
         elif sample.position < -clearance:
-            self._dented = True
+            self._in_contact = True
             self.force = -law.force(-clearance - sample.position, -sample.velocity)
         else:
-            self._dented, self.force = False, 0.0
+            self._in_contact, self.force = False, 0.0
         time_constant = self._force_sensor.time_constant
         if start is None or end is None or time_constant == 0.0:
             return self.force

@@ -1,8 +1,9 @@
 """The motion simulator G(s) from tick to tick in plain floats, exact: one matrix exponential, then products.
 
 A transport delay commutes with a linear system: G is driven by the undelayed command, a straight line within
-each control period ("panel"), and every delay is how long ago its response is read. The response at the
-fraction s of a panel is a fixed row of numbers times (state, command at the panel's start, at its end).
+each control period ("sampling interval"), and every delay is how long ago its response is read. The response
+at the fraction s of a sampling interval is a fixed row of numbers times (state, command at its start, at its
+end).
 """
 
 import math
@@ -18,14 +19,14 @@ WHOLE = 1e-9  # periods by which a delay may miss a whole number of them
 
 
 class Place(NamedTuple):
-    """Rows that give position [m] and velocity [m/s] at one place of a panel."""
+    """Rows that give position [m] and velocity [m/s] at one place of a sampling interval."""
 
     position: Row
     velocity: Row
 
 
 class Propagation(NamedTuple):
-    """Rows of the state one period later; `start` and `end` of a panel, from within; `sample`, where the
+    """Rows of the state one period later; `start` and `end` of an interval, from within; `sample`, where the
     force is read, and `measured`, where the position is. `steady_command` and `steady_step`: the state of a
     uniform motion, per command now [m] and per its growth in a period [m]."""
 
@@ -39,7 +40,7 @@ class Propagation(NamedTuple):
 
 
 def split_delay(delay: float, period: float) -> tuple[int, float]:
-    """Whole panels to look back from the newest one, and the place in (0, 1] within that panel."""
+    """Whole sampling intervals to look back from the newest one, and the place in (0, 1] within that one."""
     periods = delay / period
     whole = math.floor(periods + WHOLE)
     return whole, min(1.0, 1.0 - (periods - whole))
@@ -116,7 +117,7 @@ def transfer_function(simulator: Simulator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def apply(row: Row, state: list[float], start: float, end: float) -> float:
-    """One row times (state, command at the panel's start, command at its end)."""
+    """One row times (state, command at the sampling interval's start, command at its end)."""
     total = row[-2] * start + row[-1] * end
     for weight, component in zip(row, state, strict=False):
         total += weight * component

@@ -48,12 +48,12 @@ def lagged(
     def depth(s: float) -> float:
         return side * (path.position(s) - surface)
 
-    turn, bottom = _turn(path, depth, side) if law.dented else (1.0, 0.0)
+    turn, bottom = _turn(path, depth, side) if law.loaded else (1.0, 0.0)
 
     def law_at(s: float) -> ContactLaw:
-        if law.dented is None:
+        if law.loaded is None:
             return law
-        return law.dented(max(deepest, depth(0.0), bottom if s > turn else depth(s)))
+        return law.loaded(max(deepest, depth(0.0), bottom if s > turn else depth(s)))
 
     def hold(s: float) -> float:
         return law_at(s).hold(depth(s), side * path.velocity(s))

@@ -186,7 +186,7 @@ class NumericalModel:
             self.position += period * self.velocity
 
 
-class Task:
+class ControllerTask:
     """What is done with one packet, without a network: readings in, answers out.
 
     `bridged`: how many missing ticks in a row are made up. Counts `made_up` and `stale`, packets of no
@@ -379,7 +379,7 @@ class TickRecord:
         return {name: list(getattr(self, name)[: self.count]) for name in ("sequence", "wall", "cpu")}
 
 
-def replayed(make: Callable[[], Task], record: TickRecord, limit: float) -> dict[int, int]:
+def replayed(make: Callable[[], ControllerTask], record: TickRecord, limit: float) -> dict[int, int]:
     """CPU time [ns], the least of a few replays, of the ticks that took more than `limit` [ns] when live."""
     found, cpu_now = record.above(limit), time.thread_time_ns
     for _ in range(REPLAYS if found else 0):
@@ -394,7 +394,7 @@ def replayed(make: Callable[[], Task], record: TickRecord, limit: float) -> dict
 
 
 def serve(
-    receiver: socket.socket, task: Task | Empty, record: TickRecord, wait: float, silence: float
+    receiver: socket.socket, task: ControllerTask | Empty, record: TickRecord, wait: float, silence: float
 ) -> str:
     """Answer packets until the rig stops or has been silent; returns which. Times in s.
 
@@ -455,7 +455,7 @@ def main(arguments: list[str] | None = None) -> int:
     limit = math.inf
     try:
         if options.empty:
-            task: Task | Empty = Empty()
+            task: ControllerTask | Empty = Empty()
         else:
             task = load(options.gains)
             limit = CPU_SHARE * task.period * 1e9
@@ -492,12 +492,12 @@ def main(arguments: list[str] | None = None) -> int:
     return 0 if ended == "stopped" else 1
 
 
-def load(path: str) -> Task:
+def load(path: str) -> ControllerTask:
     """The task of a gain file. Raises ValueError, OSError, KeyError, TypeError for one that does not fit."""
     controller = Controller.from_file(path)
     document = json.loads(Path(path).read_text(encoding="utf-8"))
     limit = document.get("limits", {}).get("missed_in_a_row", {}).get("value")
-    return Task(controller, document["mechanism"], MOST_MADE_UP if limit is None else limit)
+    return ControllerTask(controller, document["mechanism"], MOST_MADE_UP if limit is None else limit)
 
 
 def realtime() -> None:

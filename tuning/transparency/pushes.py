@@ -103,7 +103,7 @@ def probed(scenarios: Scenario, space: Any, share: float | None = None, duration
     return scenarios._replace(probe=Probe(Push(size, centre, width), space.depth, space.duration))
 
 
-class _Motion(NamedTuple):
+class _ReferencePath(NamedTuple):
     restitution: Array
     peak_force: Array
     duration: Array
@@ -113,7 +113,7 @@ class _Motion(NamedTuple):
 @partial(jax.jit, static_argnums=0)
 def _move(
     law: ContactLaw, parameters: ContactParameters, mass: Array, velocity: Array, size: Array, centre: Array
-) -> _Motion:
+) -> _ReferencePath:
     push = Push(size, centre, jnp.full_like(size, WIDTH))
     reference = law.reference(parameters, mass, velocity)
     share = jnp.linspace(0, 1, SAMPLES, dtype=velocity.dtype)[:, None]
@@ -121,4 +121,6 @@ def _move(
     motion = integrate_contact(
         law, parameters, mass, velocity, push.force, until, share * reference.duration[None]
     )
-    return _Motion(motion.restitution, motion.peak_force, reference.duration, jnp.asarray(motion.position))
+    return _ReferencePath(
+        motion.restitution, motion.peak_force, reference.duration, jnp.asarray(motion.position)
+    )

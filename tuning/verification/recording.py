@@ -22,9 +22,9 @@ from jaxhil.mechanism.uncertainty import draw
 from jaxhil.runtime import Controller
 from jaxhil.runtime.gain_file import GainFile
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.contact_force import Truth
+from jaxhil.simulation.contact_force import PlantSignals
 from jaxhil.simulation.integrators import INTEGRATORS
-from jaxhil.simulation.loop import Loop, Rig, build_rig, drive, sense
+from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants, drive, sense
 from jaxhil.simulation.metrics import Metrics, build_rules, observe
 from jaxhil.simulation.rollout import Run, Tick, noise_ahead, start, stretch, stretch_length, turn_over
 from jaxhil.simulation.scenario import Scenario, build_scenarios
@@ -111,7 +111,7 @@ def run_closed_loop(loaded: LoadedGains, gain_file: GainFile, batch: Scenario) -
     # A controller that has tripped commands nothing any more: no contact of it would end.
     while np.any(run.active) and controller.status == "ok":
         for _ in range(stretch_length(loop)):
-            signals, truth = program.sense(rig, run)
+            signals, plant_signals = program.sense(rig, run)
             force, position, velocity, measured, age = (float(leaf[0]) for leaf in jax.device_get(signals))
             if age == 0 and started:
                 controller.next_contact()
@@ -121,7 +121,7 @@ def run_closed_loop(loaded: LoadedGains, gain_file: GainFile, batch: Scenario) -
             force_command = np.array([command])
             moved = program.integrate(rig, run, force_command)
             sent = controller.position_command(*(float(leaf[0]) for leaf in jax.device_get(moved)))
-            run = program.advance(rig, gains, run, signals, truth, force_command, np.array([sent]))
+            run = program.advance(rig, gains, run, signals, plant_signals, force_command, np.array([sent]))
             started = True
         run = program.turn_over(rig, gains, run)
     return jax.device_get(run.metrics)
@@ -176,16 +176,16 @@ def _lane(seen: Tick, zeroed: bool) -> Lane:
 
 
 @jax.jit
-def _first_lane(started: tuple[Rig, Run]) -> tuple[Rig, Run]:
+def _first_lane(started: tuple[RigConstants, Run]) -> tuple[RigConstants, Run]:
     return jax.tree.map(lambda leaf: leaf[..., :1] if leaf.ndim else leaf, started)
 
 
 class _Program(NamedTuple):
     """The steps of one loop, compiled when first called."""
 
-    begin: Callable[..., tuple[Rig, Run]]
+    begin: Callable[..., tuple[RigConstants, Run]]
     record_chunk: Callable[..., tuple[Run, Tick]]
-    sense: Callable[..., tuple[Signals, Truth]]
+    sense: Callable[..., tuple[Signals, PlantSignals]]
     integrate: Callable[..., tuple[Array, Array, Array]]
     advance: Callable[..., Run]
     turn_over: Callable[..., Run]
@@ -197,12 +197,12 @@ def _compiled(loop: Loop) -> _Program:
     return _Program(*(jax.jit(partial(step, loop)) for step in steps))
 
 
-def _begin(loop: Loop, gains: Gains, scenario: Scenario) -> tuple[Rig, Run]:
-    rig = build_rig(loop, scenario)
+def _begin(loop: Loop, gains: Gains, scenario: Scenario) -> tuple[RigConstants, Run]:
+    rig = build_rig_constants(loop, scenario)
     return rig, start(loop, rig, gains)
 
 
-def _record_chunk(loop: Loop, rig: Rig, gains: Gains, run: Run) -> tuple[Run, Tick]:
+def _record_chunk(loop: Loop, rig: RigConstants, gains: Gains, run: Run) -> tuple[Run, Tick]:
     def body(run, _):
         run, ticks = stretch(loop, rig, gains, run, record=True)
         return turn_over(loop, rig, gains, run, skip_flight=False), ticks
@@ -211,12 +211,12 @@ def _record_chunk(loop: Loop, rig: Rig, gains: Gains, run: Run) -> tuple[Run, Ti
     return run, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), ticks)
 
 
-def _sense(loop: Loop, rig: Rig, run: Run) -> tuple[Signals, Truth]:
+def _sense(loop: Loop, rig: RigConstants, run: Run) -> tuple[Signals, PlantSignals]:
     noise = jax.tree.map(lambda leaf: leaf[0], noise_ahead(loop, rig, run, 1))
     return sense(loop, rig, run.state, run.tick, noise)
 
 
-def _integrate(loop: Loop, rig: Rig, run: Run, command: Array) -> tuple[Array, Array, Array]:
+def _integrate(loop: Loop, rig: RigConstants, run: Run, command: Array) -> tuple[Array, Array, Array]:
     """Position [m], velocity [m/s] and acceleration [m/s^2] that the numerical model will have next tick."""
     acceleration = -command * rig.inverse_mass
     period, state = rig.constants.control_period, run.state
@@ -225,16 +225,23 @@ def _integrate(loop: Loop, rig: Rig, run: Run, command: Array) -> tuple[Array, A
 
 
 def _advance(
-    loop: Loop, rig: Rig, gains: Gains, run: Run, signals: Signals, truth: Truth, command: Array, sent: Array
+    loop: Loop,
+    rig: RigConstants,
+    gains: Gains,
+    run: Run,
+    signals: Signals,
+    plant_signals: PlantSignals,
+    command: Array,
+    sent: Array,
 ) -> Run:
     """The tick's bookkeeping, then stages 3 to 5 under the command and the position sent to the drives."""
     rules = build_rules(rig.scenario)
     shortfall = run.state.plant.shortfall
-    watch = observe(loop, rig.constants, rules, run.watch, signals, truth, command, shortfall)
+    watch = observe(loop, rig.constants, rules, run.watch, signals, plant_signals, command, shortfall)
     controller = Sent(sent, run.state.controller)
-    state = drive(loop, rig, gains, run.state, run.tick, truth, command, controller)
+    state = drive(loop, rig, gains, run.state, run.tick, plant_signals, command, controller)
     return run._replace(state=state, watch=watch, tick=run.tick + 1)
 
 
-def _turn_over(loop: Loop, rig: Rig, gains: Gains, run: Run) -> Run:
+def _turn_over(loop: Loop, rig: RigConstants, gains: Gains, run: Run) -> Run:
     return turn_over(loop, rig, gains, run, skip_flight=False)

@@ -9,7 +9,7 @@ from typing import Any
 from jaxhil.errors import InputError, one_line
 from tuning import terminal as report
 from tuning.cli.commands import checks
-from tuning.cli.options_rig import Rig
+from tuning.cli.options_rig import RigOptions
 
 LONGEST_EMPTY = 30.0  # s of empty loop at most
 EMPTY_SHARE = 0.2  # of the run's duration
@@ -18,7 +18,7 @@ PROCESS = "udp_controller.py"
 MOST_ROWS = 12  # contacts shown one by one
 
 
-def run(options: Rig) -> int:
+def run(options: RigOptions) -> int:
     """Play an empty loop and the run; 0 if all is good, 1 if not, 130 if interrupted."""
     checks.limit(options.limit)
     checks.at_least(0, seed=options.seed)
@@ -129,7 +129,7 @@ class _Progress:
             sys.stderr.flush()
 
 
-def _check_injection(options: Rig) -> None:
+def _check_injection(options: RigOptions) -> None:
     if not 0.0 <= options.drops < 1.0:
         raise InputError(f"--drops: found {options.drops:g}, allowed a probability >= 0 and < 1")
     for name in ("jitter", "delay"):
