@@ -1,0 +1,173 @@
+"""README and guide say what is there: links, files, names, and numbers that follow from their theory."""
+
+import cmath
+import math
+import re
+from pathlib import Path
+
+import continuous
+import numpy as np
+import pytest
+from scipy.special import lambertw
+
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.contact.laws import LAWS
+from jaxhil.runtime.law_status import STATUSES
+
+ROOT = Path(__file__).resolve().parents[1]
+GUIDE = ROOT / "notebooks" / "guide"
+PAGES = [ROOT / "README.md", *sorted(GUIDE.glob("*.md"))]
+SECTIONS = [
+    "1 The loop",
+    "2 Conventions",
+    "3 Contact laws",
+    "4 What goes wrong",
+    "5 Compensation",
+    "6 Closed forms",
+]
+LINK = re.compile(r"\]\(([^)#]+)(#[^)]*)?\)")
+FILE = re.compile(r"(?<![\w/.-])(?:jaxhil|tuning|tests|notebooks|\.ci)/[\w/.-]*\w/?")
+CITED = re.compile(
+    r"(model|retrospective_reference)\.md[),]*\s+section\s+(\d+)(?:,\s+items?\s+([\d, and]+))?"
+)
+SETTING = re.compile(r"^\| `(\w+)` \|[^|]+\|[^|]*\| ([\d.]+) \| ([\d.]+) \|$", re.M)
+
+
+def text_of(name):
+    return (GUIDE / name).read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def model():
+    return text_of("model.md")
+
+
+@pytest.fixture(params=PAGES, ids=lambda path: path.name)
+def page(request):
+    return request.param
+
+
+def section(text, number):
+    """What stands under the heading with this number."""
+    return re.search(rf"^## {number} .*?(?=^## |\Z)", text, re.M | re.S)[0]
+
+
+def items(text):
+    """The closed forms of model.md, by their number."""
+    found = re.findall(r"^(\d+)\. (.*?)(?=^\d+\. |^\S|\Z)", section(text, 6), re.M | re.S)
+    return {int(number): words for number, words in found}
+
+
+def test_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 200
+
+
+def test_links_resolve(page):
+    links = [target for target, _ in LINK.findall(page.read_text(encoding="utf-8"))]
+    missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]
+    assert not missing
+
+
+def test_files_exist(page):
+    """Every path below a folder of the repository, but for those with a NAME of the reader's own."""
+    found = FILE.findall(page.read_text(encoding="utf-8"))
+    missing = [name for name in found if "NAME" not in name and not (ROOT / name).exists()]
+    assert not missing
+
+
+def test_every_page_and_notebook_is_in_the_index():
+    index = text_of("index.md")
+    linked = {(GUIDE / target).resolve() for target, _ in LINK.findall(index)}
+    assert {*PAGES, *(ROOT / "notebooks").glob("*.ipynb")} - {GUIDE / "index.md"} <= linked
+
+
+def test_sections_that_code_cites_are_there(model):
+    assert re.findall(r"^## (.*)$", model, re.M) == SECTIONS
+    headings = {
+        "model": len(SECTIONS),
+        "retrospective_reference": text_of("retrospective_reference.md").count("\n## "),
+    }
+    last, cited = max(items(model)), []
+    for path in (*ROOT.glob("jaxhil/**/*"), *ROOT.glob("tuning/**/*"), *ROOT.glob("tests/**/*.py")):
+        if path.suffix in (".py", ".c", ".toml"):
+            cited += [(path, *where) for where in CITED.findall(path.read_text(encoding="utf-8"))]
+    assert cited
+    for path, name, number, listed in cited:
+        assert 1 <= int(number) <= headings[name], path
+        assert all(1 <= int(item) <= last for item in re.findall(r"\d+", listed)), path
+
+
+def test_every_law_and_status_is_described(model):
+    in_tables = set(re.findall(r"^\| `(\w+)` \|", section(model, 3) + section(model, 5), re.M))
+    assert in_tables == {*COMPENSATORS, *LAWS}
+    statuses = section(text_of("retrospective_reference.md"), 6)
+    assert set(re.findall(r"^\| `(\w+)` \|", statuses, re.M)) == {status.name for status in STATUSES}
+
+
+def test_settings_of_our_law():
+    law = COMPENSATORS["retrospective_reference"]
+    rows = SETTING.findall(section(text_of("retrospective_reference.md"), 5))
+    stated = {
+        "sharp": {name: float(sharp) for name, sharp, _ in rows},
+        "gentle": {name: float(gentle) for name, _, gentle in rows},
+    }
+    assert stated == law.settings
+
+
+def numbers(words):
+    """Every number with a decimal point."""
+    return [float(number) for number in re.findall(r"\d+\.\d+", words)]
+
+
+def grown(root):
+    """e by a root of a characteristic equation."""
+    return math.exp(math.pi * root.real / abs(root.imag))
+
+
+def root_of(function, start):
+    """A root near `start`, by Newton's method."""
+    root, step = start, 1e-6
+    for _ in range(60):
+        root -= function(root) * 2 * step / (function(root + step) - function(root - step))
+    return root
+
+
+def test_closed_forms_of_a_delay(model):
+    rows = re.findall(r"\| (0\.\d+) \| (\d\.\d+) \|", items(model)[1])
+    assert len(rows) == 4
+    for phase, e in rows:
+        assert continuous.delayed_restitution(float(phase)) == pytest.approx(float(e), abs=1e-12)
+    found = numbers(items(model)[2])
+    phases = np.array([0.05, 0.2])
+    roots = 2 / phases * lambertw(0.5j * phases)
+    first_order = np.exp(np.pi * phases / 2)
+    expected = [grown(roots[0]), 0.05, grown(roots[1]), 0.2, *first_order]
+    assert found == pytest.approx(expected, abs=5e-7)
+
+
+def test_closed_forms_of_damping(model):
+    found = numbers(items(model)[3])
+    expected = [continuous.separates_at_surface(0.05), 0.05, continuous.separates_at_no_force(0.05), 0.05]
+    assert found == pytest.approx(expected, abs=5e-7)
+
+
+def test_lead_and_smith_predictor(model):
+    phase = 0.2
+    root = root_of(lambda s: s**2 + (1 + phase * s) * cmath.exp(-s * phase), 1j)
+    assert grown(root) - 1 == pytest.approx(math.expm1(math.pi / 6 * phase**3), rel=0.03)
+
+    omega, lag, delay = 6 * math.pi, 0.010, 0.008
+
+    def remaining(forward):
+        return grown(
+            root_of(lambda s: s**2 + omega**2 * forward(s) * cmath.exp(-s * (lag + delay)), 1j * omega)
+        )
+
+    def ahead(s):
+        return lag * s / (1 + lag * s / 2)
+
+    readings = [
+        remaining(lambda s: (1 + ahead(s)) * (1 + delay * s)),
+        remaining(lambda s: 1 + ahead(s) * (1 + delay * s)),
+    ]
+    assert numbers(items(model)[14]) == pytest.approx(readings, abs=5e-4)
