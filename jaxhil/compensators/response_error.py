@@ -3,7 +3,7 @@
     F_c = lead(F) + gate (g k_hat (x_d - x_a) + g_b b_hat (v_d - v_a))
 
 The phase lead makes up for the delay of the force measurement, the response error for the dynamics of the
-motion simulator, of which no model is used (Qi et al. 2016; model.md section 4). k_hat and b_hat come from
+motion simulator, of which no model is used (Qi et al. 2016; model.md section 5). k_hat and b_hat come from
 recursive least squares of the measured force on the measured position delayed by the same time
 (`identification_delay`): without that alignment they are biased (model.md section 6, item 6). v_a is a
 filtered difference, s/(1 + T_v s) by Tustin's rule.
