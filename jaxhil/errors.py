@@ -1,4 +1,4 @@
-"""Errors a user can cause, told in one line.
+"""Errors a user can cause, reported in one line.
 
 Whatever a person can get wrong (a file, a key, an option) ends as an `InputError` whose message is
 a single printable line: where it is, what was found there, and what is allowed.

@@ -46,7 +46,7 @@ def signed(files: dict[str, bytes], gain_document: dict[str, Any]) -> dict[str, 
 
 def run_selftest(folder, *arguments: str) -> tuple[bool, str]:
     """Whether the self-test of the bundle passes, and what it prints; run in this process."""
-    told = io.StringIO()
-    with contextlib.redirect_stdout(told):
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):
         good = selftest.main(arguments, str(folder))
-    return good, told.getvalue()
+    return good, output.getvalue()

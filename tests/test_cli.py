@@ -71,7 +71,7 @@ def test_set_reaches_the_mechanism(jaxhil):
     assert document["contacts"][0]["position_shortfall"] == 0
 
 
-def test_a_run_that_fails_is_told(jaxhil):
+def test_a_run_that_fails_is_reported(jaxhil):
     # Only 1 N is ever measured: the bodies are not stopped within any time.
     weak = ["--set", "rig.force_sensor.range=1e-6"]
     ran = jaxhil("simulate", "rig-300kg", "--json", *weak)
@@ -316,17 +316,17 @@ def test_gains_that_do_not_fit_are_refused(jaxhil, tuned):
         (["verify", "x", "--scenarios", "0"], ["--scenarios"]),
     ],
 )
-def test_unusable_input_is_told_in_one_line(jaxhil, arguments, words):
+def test_unusable_input_is_reported_in_one_line(jaxhil, arguments, words):
     refused(jaxhil(*arguments), *words)
 
 
-def test_a_plot_that_cannot_be_written_is_told(jaxhil, tmp_path):
+def test_a_plot_that_cannot_be_written_is_reported(jaxhil, tmp_path):
     (tmp_path / "taken").touch()
     ran = jaxhil("simulate", "rig-300kg", "--plot", tmp_path / "taken" / "plot.png")
     refused(ran, "taken")
 
 
-def test_an_output_folder_that_cannot_be_made_is_told(jaxhil, tmp_path):
+def test_an_output_folder_that_cannot_be_made_is_reported(jaxhil, tmp_path):
     (tmp_path / "taken").touch()
     refused(jaxhil("tune", "rig-300kg", "-o", tmp_path / "taken"), "taken")
 

@@ -71,8 +71,8 @@ class PlayedBack(Compensator):
         return jnp.where((depth > 0) & (force > 0), force, 0), state
 
 
-class Told(NamedTuple):
-    """The truth of every lane, which no law on a rig is told."""
+class Known(NamedTuple):
+    """The plant of every lane, which no law on a rig knows."""
 
     stiffness: Array
     damping: Array
@@ -82,13 +82,13 @@ def test_a_law_that_plays_back_the_reference_is_blind(monkeypatch):
     """Error 0 and slope 1, although the simulator is slow and the force late; transparency 0."""
     monkeypatch.setitem(compensators.COMPENSATORS, "played_back", PlayedBack())
 
-    def told(loop, gains, scenarios):
+    def known(loop, gains, scenarios):
         contact = scenarios.contact
         stiffness = contact.stiffness[0].reshape(-1, contact.damping.shape[-1])[0]
-        truth = Told(stiffness, contact.damping[0])
-        return evaluate(loop, truth._asdict(), scenarios)
+        plant_values = Known(stiffness, contact.damping[0])
+        return evaluate(loop, plant_values._asdict(), scenarios)
 
-    monkeypatch.setattr("tuning.benchmark.runs.evaluate", told)
+    monkeypatch.setattr("tuning.benchmark.runs.evaluate", known)
     figures = judged(mechanism({}, period=2.5e-4), "played_back")
     assert figures["rms"].value < 1e-3
     assert figures["slope"].value == pytest.approx(1, abs=1e-3)

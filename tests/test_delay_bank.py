@@ -184,9 +184,9 @@ def test_what_an_unknown_delay_leaves_on_the_standard_suites(capsys):
             rms[law] = 100 * np.sqrt(np.mean(np.asarray(outcome.error)[:8] ** 2, axis=1))
         squares.append(rms[LAW] ** 2)
         with capsys.disabled():
-            told, ours = rms.values()
+            given, ours = rms.values()
             print(f"{suite:10s} rms [%], contacts 1, 2, 4, 8:", *np.round(ours[[0, 1, 3, 7]], 2), end="")
-            print("; delay taken as told:", *np.round(told[[0, 7]], 2))
+            print("; delay taken as given:", *np.round(given[[0, 7]], 2))
     first, *_, eighth = np.sqrt(np.mean(squares, axis=0))
     with capsys.disabled():
         print(f"all five: {first:.2f} on the first, {eighth:.2f} on the eighth")
@@ -194,11 +194,11 @@ def test_what_an_unknown_delay_leaves_on_the_standard_suites(capsys):
 
 
 def test_simulate_and_the_controller_report_the_delay(jaxhil):
-    told = ["--set", "rig.force_sensor.delay=0.0085"]
-    answer = jaxhil("simulate", "suite-layered", "--compensator", LAW, *told, "--json")
+    given = ["--set", "rig.force_sensor.delay=0.0085"]
+    answer = jaxhil("simulate", "suite-layered", "--compensator", LAW, *given, "--json")
     [one] = answer.document["contacts"]
     assert one["force_delay"] == pytest.approx(0.0085, abs=3e-4)
-    table = jaxhil("simulate", "suite-layered", "--compensator", LAW, *told).out
+    table = jaxhil("simulate", "suite-layered", "--compensator", LAW, *given).out
     assert "force delay [ms]" in table and f"{1e3 * one['force_delay']:.2f}" in table
     document = gain_document(LAW)
     value = document["gains"]["identification_delay"]["value"]

@@ -80,8 +80,8 @@ def test_a_bundle_is_exported_and_verified(jaxhil, gains, tmp_path, quick):
 def test_every_compensator_that_can_be_tuned_can_be_exported(compensator, tmp_path, quick):
     made = build_bundle(document(compensator=compensator), list(WRITERS))
     write_bundle(tmp_path / "bundle", made.files)
-    good, told = run_selftest(tmp_path / "bundle", *(["--c"] if shutil.which("cc") else []))
-    assert good and made.ticks > 300 and not made.reasons, told
+    good, output = run_selftest(tmp_path / "bundle", *(["--c"] if shutil.which("cc") else []))
+    assert good and made.ticks > 300 and not made.reasons, output
 
 
 def test_equal_gains_and_seed_make_equal_bundles(monkeypatch):
@@ -111,7 +111,7 @@ def test_what_differs_from_the_simulation_is_not_written(jaxhil, gains, tmp_path
     assert not (tmp_path / "bundle").exists()
 
 
-def test_limits_that_stop_the_nominal_run_are_told(jaxhil, gains, tmp_path, quick, monkeypatch):
+def test_limits_that_stop_the_nominal_run_are_reported(jaxhil, gains, tmp_path, quick, monkeypatch):
     limits = {"force_limit": 1.0}
     monkeypatch.setattr("tuning.cli.commands.export._calibrated", lambda *given: (limits, {}))
     ran = jaxhil("export", gains, "-o", tmp_path / "bundle")
@@ -260,7 +260,7 @@ def test_what_is_left_of_a_bundle_is_corrupt_and_nothing_is_unusable(jaxhil, tmp
     refused(jaxhil("verify", "a" * 5000), "cannot be read")
 
 
-def test_a_self_test_that_fails_is_told(jaxhil, tmp_path):
+def test_a_self_test_that_fails_is_reported(jaxhil, tmp_path):
     files = small_files()
     lines = files["vectors.csv"].split(b"\n")
     fields = lines[50].split(b",")

@@ -308,11 +308,11 @@ def test_what_is_called_identified_errs_like_an_ordinary_contact(wrong, law):
     """By less than 1 %, whatever is wrong; and where nothing is, all are identified. The controller knows the
     nominal mechanism and its sensors."""
     changes, contacts = WRONG[wrong], 100
-    told = load("suite-noisy", [change for change in changes if "sensor" in change]).mechanism
+    known = load("suite-noisy", [change for change in changes if "sensor" in change]).mechanism
     for suite in ("noisy", "hertz", "hardening", "layered"):
         errors, said = np.empty(contacts), []
         for place, mechanism in enumerate(contacts_of(suite, 6, contacts, changes)):
-            one = controller(mechanism, law, literature_gains(told, law))
+            one = controller(mechanism, law, literature_gains(known, law))
             velocity = run(mechanism, one, place).rows[:, ROW.index("velocity")]
             errors[place] = 100 * (abs(velocity[-1]) / velocity[0] - 1)
             said.append(one.last_contact.status)

@@ -1,4 +1,4 @@
-"""What a mechanism may say: types, ranges, and rules that join keys, each told with its key."""
+"""What a mechanism may say: types, ranges, and rules that join keys, each reported with its key."""
 
 import copy
 import math

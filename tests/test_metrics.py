@@ -1,7 +1,7 @@
 """The command's excess variation: sequences of commands with known swings, through a contact's begin and end.
 
-The mechanism touches, with a given command at every tick; what is told of it is compared with the sum over
-the sequence by hand. Runs of the loop are compared with the oracle in test_rollout.
+The mechanism touches, with a given command at every tick; what is recorded of it is compared with the sum
+over the sequence by hand. Runs of the loop are compared with the oracle in test_rollout.
 """
 
 from functools import partial
@@ -44,7 +44,7 @@ def excess(commands, touching):
     return metrics.excess_variation[0, 0]
 
 
-def told(commands, after=()):
+def recorded(commands, after=()):
     """Excess variation of a contact with these commands; `after` it is over, others."""
     quiet = np.zeros(AFTER)
     late = AFTER - len(after)
@@ -79,17 +79,17 @@ HUMP = 60 * np.sin(np.linspace(0, np.pi, 101))
     ],
 )
 def test_known_sequences(commands, expected):
-    assert told(commands) == pytest.approx(expected, abs=1e-11)
+    assert recorded(commands) == pytest.approx(expected, abs=1e-11)
 
 
 def test_a_hand_made_sum():
     commands = 60 * np.random.default_rng(0).normal(size=200)
     path = np.array([0, *commands, 0])
-    assert told(commands) == pytest.approx(np.abs(np.diff(path)).sum() / 2 - np.ptp(path), rel=1e-13)
+    assert recorded(commands) == pytest.approx(np.abs(np.diff(path)).sum() / 2 - np.ptp(path), rel=1e-13)
 
 
 def test_what_comes_after_the_contact_is_none_of_it():
-    assert told(HUMP, after=[70, -70, 70]) == pytest.approx(0, abs=1e-11)
+    assert recorded(HUMP, after=[70, -70, 70]) == pytest.approx(0, abs=1e-11)
 
 
 def test_a_command_that_is_left_at_the_end_goes_back_to_nothing():
@@ -120,5 +120,5 @@ def test_derivatives_are_those_of_the_sum():
 def test_contacts_without_identification_swing_once():
     """The undershoot of a phase lead belongs to its one swing."""
     for compensator, gains in (("none", {}), ("phase_lead", nominal_gains(PARSED, "phase_lead"))):
-        told = first_contact(PARSED, spread(PARSED, 1), compensator, gains, chatter=True)
-        assert told["excess_variation"] == pytest.approx(0, abs=1e-11 * told["peak_command"][0])
+        recorded = first_contact(PARSED, spread(PARSED, 1), compensator, gains, chatter=True)
+        assert recorded["excess_variation"] == pytest.approx(0, abs=1e-11 * recorded["peak_command"][0])

@@ -169,7 +169,7 @@ def test_points_begin_at_what_their_neighbours_found():
     ]
 
 
-def test_what_a_start_reached_is_told_apart_from_its_noise():
+def test_what_a_start_reached_is_distinguished_from_its_noise():
     task = build_task(MECHANISMS[0], "phase_lead", 8, 0)
     excess = amplification(task.mechanism, "phase_lead", task.literature) - 1
     start = pareto.Start("converged", 1, math.hypot(0.02, 0.003 * excess), [], task.literature)

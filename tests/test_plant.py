@@ -39,7 +39,7 @@ def test_every_contact_against_the_oracle(name):
     mechanism = validated(case.mechanism)
     gains = nominal_gains(mechanism, case.compensator, **case.gains)
     found, shortfalls = closed_loop(mechanism, case.compensator, gains)
-    # The oracle is not told that a quantum is a level below which a command has died out.
+    # The oracle does not know that a quantum is a level below which a command has died out.
     expected = run_oracle(case, noise_level=0.5) if name == "quantum" else oracle_contacts(name)
     assert len(found) == len(expected) == mechanism.approach.contacts
     # So does a cubic for the motion on which the deepest point is found.

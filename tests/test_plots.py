@@ -154,7 +154,7 @@ def test_contacts_are_drawn_side_by_side_with_units():
     figure = contact_plot(pieces(), "title")
     force, _, position, _ = figure.axes
     assert "[N]" in force.get_ylabel() and "[mm]" in position.get_ylabel() and "[ms]" in position.get_xlabel()
-    # The speed at which a curve entered is told where it differs visibly.
+    # The speed at which a curve entered is stated where it differs visibly.
     assert force.get_title() == "contact 1, entered at 5 mm/s\n(before: 7 mm/s)"
     assert len(figure.legends) == 1
     assert "the first 4 of 6 contacts" in contact_plot(pieces(6), "title").get_suptitle()

@@ -195,7 +195,7 @@ def test_known_damping_needs_no_identified_one(calibrated):
     assert rates["expectation_largest"] < 2e-3 and rates["restitution_margin"] == 0.75 * LIMIT
 
 
-def test_unknown_damping_is_told_from_delay_by_nothing():
+def test_unknown_damping_is_distinguished_from_delay_by_nothing():
     rates = calibrate(
         gains(uncertainty={**UNCERTAIN, **DAMPING}), scenarios=2 * LANES, limit=LIMIT, lanes=LANES
     ).rates
@@ -241,9 +241,9 @@ def test_a_store_is_run_again(tmp_path):
         assert chunk.contacts.restitution[contact - 1, :32] == pytest.approx(
             rows[f"restitution_{contact}"], abs=1e-12
         )
-    told = []
-    limits, rates = calibrate(loaded, store, progress=told.append)
-    assert sum(told) == LANES and rates["limit"] == LIMIT and rates["calibrated_on"]["scenarios"] == LANES
+    done = []
+    limits, rates = calibrate(loaded, store, progress=done.append)
+    assert sum(done) == LANES and rates["limit"] == LIMIT and rates["calibrated_on"]["scenarios"] == LANES
     assert limits["equivalent_mass"] == loaded.mechanism.bodies.mass
     with pytest.raises(InputError, match="--scenarios: found 129, allowed at most the store's 128"):
         calibrate(loaded, store, scenarios=129)

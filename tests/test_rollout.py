@@ -45,7 +45,7 @@ WORK_ACCURACY = {
     "rattling against layers": 1e-4,
     "rattling, the next touch at once": 3e-4,
 }
-# The oracle is not told that a quantum is a level below which a command has died out.
+# The oracle does not know that a quantum is a level below which a command has died out.
 ORACLE = {"quantum": {"noise_level": 0.5}}
 
 every_case = pytest.mark.parametrize("name", CASES)

@@ -127,7 +127,7 @@ def test_a_model_that_does_not_integrate_its_force_is_found():
     position, velocity = -1e-4, SPEED
     for n in range(500):
         force = controller.step(STIFFNESS * max(position, 0.0), position, velocity, position, n * PERIOD)
-        velocity -= PERIOD * force / (1.02 * MASS)  # another mass than the watchdog was told
+        velocity -= PERIOD * force / (1.02 * MASS)  # another mass than the watchdog was given
         position += PERIOD * velocity
     assert controller.cause == ENERGY_BALANCE
 

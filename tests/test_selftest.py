@@ -113,7 +113,7 @@ def test_a_change_of_the_self_test_itself_never_passes(files, folder):
         changed, _ = mutated(source, content[begin:])
         (folder / "selftest.py").write_bytes(content[:begin] + changed)
         code, out, err = in_a_bare_process(folder)
-        # What is no Python any more is told by Python itself.
+        # What is no Python any more is reported by Python itself.
         assert code != 0 and "selftest.py" in out + err, (changed, out, err)
 
 
@@ -230,7 +230,7 @@ def test_garbage_ends_in_one_line_a_check(folder, name, garbage):
     assert all(re.match("self-test of|ok    |FAIL  |FAILED", line) for line in out.splitlines()), out
 
 
-def test_garbage_that_the_manifest_fits_is_told_too(files, folder):
+def test_garbage_that_the_manifest_fits_is_reported_too(files, folder):
     document = json.loads(files["gains.json"])
     for name, text, reason in [
         ("jaxhil_runtime.py", "raise SystemExit(0)", "cannot be run: SystemExit"),
@@ -260,7 +260,7 @@ def test_files_too_many_and_too_few_are_named(files, folder):
     assert "FAIL  summary.html: cannot be read: No such file or directory" in out
 
 
-def test_other_line_endings_are_told_as_such(files, folder):
+def test_other_line_endings_are_reported_as_such(files, folder):
     (folder / "gains.csv").write_bytes(files["gains.csv"].replace(b"\n", b"\r\n"))
     good, out = run_selftest(folder)
     assert not good and "FAIL  gains.csv: its line endings differ from those exported" in out

@@ -79,7 +79,7 @@ def batch():
 
 
 @pytest.fixture(scope="module", params=["float64", "float32"])
-def told(request, batch):
+def shortfalls_found(request, batch):
     """Shortfalls [m] of both contacts, by the case's name."""
     scenario = batch.scenario if request.param == "float64" else single(batch.scenario)
     metrics = batch._replace(scenario=scenario).run()
@@ -87,23 +87,23 @@ def told(request, batch):
     return dict(zip(batch.names, metrics.position_shortfall[:2].T, strict=True))
 
 
-def test_a_limit_that_does_not_bind_is_no_shortfall_to_the_bit(told):
-    assert {name for name, shortfalls in told.items() if np.all(shortfalls > 0)} == set(BINDING)
-    for name in set(told) - set(BINDING):
-        np.testing.assert_array_equal(told[name], 0, err_msg=name)
+def test_a_limit_that_does_not_bind_is_no_shortfall_to_the_bit(shortfalls_found):
+    assert {name for name, shortfalls in shortfalls_found.items() if np.all(shortfalls > 0)} == set(BINDING)
+    for name in set(shortfalls_found) - set(BINDING):
+        np.testing.assert_array_equal(shortfalls_found[name], 0, err_msg=name)
 
 
 @pytest.mark.parametrize("name", BINDING)
-def test_shortfall_is_the_oracles(told, name):
+def test_shortfall_is_the_oracles(shortfalls_found, name):
     expected = oracle_shortfalls(name)
     assert min(expected) > 1e-6
-    accuracy = 1e-10 if told[name].dtype == "float64" else 1e-3
-    np.testing.assert_allclose(told[name], expected, rtol=accuracy)
+    accuracy = 1e-10 if shortfalls_found[name].dtype == "float64" else 1e-3
+    np.testing.assert_allclose(shortfalls_found[name], expected, rtol=accuracy)
 
 
-def test_drives_slower_than_the_approach_are_behind_when_the_contact_begins(told):
+def test_drives_slower_than_the_approach_are_behind_when_the_contact_begins(shortfalls_found):
     """By 0.05 v times the 20 ms that the approach takes, at the least."""
-    assert told["below the approach"][0] > 0.05 * VELOCITY * 0.02
+    assert shortfalls_found["below the approach"][0] > 0.05 * VELOCITY * 0.02
 
 
 def test_shortfall_broadcasts_over_trailing_axes(batch):

@@ -116,7 +116,7 @@ def test_a_width_stops_the_sweep(jaxhil, gains, tmp_path):
     refused(jaxhil("replay", tmp_path / "n", 999), "before the sweep stopped")
 
 
-def test_quantiles_are_told(jaxhil, gains, store):
+def test_quantiles_are_reported(jaxhil, gains, store):
     again = ["sweep", gains, *TINY, "-o", store, "--limit", "1.5", "--resume"]
     found = document(jaxhil(*again, "--json"))["error_quantiles"]
     assert [one["order"] for one in found] == [0.5, 0.95, 0.99, 0.999]
@@ -125,7 +125,7 @@ def test_quantiles_are_told(jaxhil, gains, store):
     assert "99.9 %" in out and "no bound" in out
 
 
-def test_studies_are_told(jaxhil, own):
+def test_studies_are_reported(jaxhil, own):
     again = [*own[1], "--drivers", "16", "--rare"]
     found = document(jaxhil(*again, "--json"))
     drivers, rare = found["drivers"], found["rare"]

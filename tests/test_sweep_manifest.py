@@ -84,16 +84,16 @@ def test_parts_cover_all_scenarios():
     [("seed", 1), ("scenarios", 96), ("sampling", "sobol"), ("precision", "float32"), ("limit", 0.1)],
 )
 def test_what_differs_is_named(key, value):
-    (told,) = differences(manifest(scenarios=112), manifest(**{"scenarios": 112, key: value}))
-    assert told.startswith(f"{key}: found ")
+    (difference,) = differences(manifest(scenarios=112), manifest(**{"scenarios": 112, key: value}))
+    assert difference.startswith(f"{key}: found ")
 
 
 def test_other_gains_and_versions_differ():
-    (told,) = differences(GOOD, manifest(case(compensator="phase_lead")))
-    assert told.startswith("gains_sha256: ")
+    (difference,) = differences(GOOD, manifest(case(compensator="phase_lead")))
+    assert difference.startswith("gains_sha256: ")
     newer = msgspec.structs.replace(GOOD, versions={**GOOD.versions, "jax": "9.9"})
-    (told,) = differences(GOOD, newer)
-    assert told.startswith("versions.jax: ") and "9.9" in told
+    (difference,) = differences(GOOD, newer)
+    assert difference.startswith("versions.jax: ") and "9.9" in difference
     assert not differences(GOOD, manifest())
 
 

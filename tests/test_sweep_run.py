@@ -28,7 +28,7 @@ HERE = Path(__file__).parent
 
 
 class Log(list):
-    """Rows told of, found and computed."""
+    """Rows reported, found and computed."""
 
     def __init__(self):
         self.found, self.computed = 0, 0

@@ -131,11 +131,11 @@ def test_a_store_without_a_column_is_refused_by_name(tmp_path):
     old = msgspec.structs.replace(MANIFEST, columns=columns)
     old = msgspec.structs.replace(old, sha256=digest(msgspec.to_builtins(old)))
     folder = open_store(tmp_path / "store", old, resume=False).folder
-    told = "columns: found others than this version writes"
-    with refused("other inputs", told):
+    difference = "columns: found others than this version writes"
+    with refused("other inputs", difference):
         open_store(folder, MANIFEST, resume=True)
     # It can still be read, with a word of warning.
-    assert unlike_here(read_store(folder).manifest) == [told] and not unlike_here(MANIFEST)
+    assert unlike_here(read_store(folder).manifest) == [difference] and not unlike_here(MANIFEST)
 
 
 def test_resuming_removes_what_was_left_unfinished(store):

@@ -115,6 +115,6 @@ def test_a_law_of_three_files_and_one_entry_is_tested_and_exported(copied):
     environment = {**os.environ, "PYTHONPATH": str(copied), "JAXHIL_CACHE": str(copied / "cache")}
     folder = copied / "tests"
     ran = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    told = ran.stdout + ran.stderr
-    assert ran.returncode == 0, told
-    assert f"\n{len(RUN)} passed" in told and "skipped" not in told, told
+    output = ran.stdout + ran.stderr
+    assert ran.returncode == 0, output
+    assert f"\n{len(RUN)} passed" in output and "skipped" not in output, output

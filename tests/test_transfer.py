@@ -165,27 +165,27 @@ def solved(task, trial):
     return starts
 
 
-def test_starts_told_take_the_places_of_the_last(task, trial):
-    told = {"phase_lead": 0.011, "lead_filter": 0.0007}
+def test_given_starts_take_the_places_of_the_last(task, trial):
+    given = {"phase_lead": 0.011, "lead_filter": 0.0007}
     (usual,) = choose_starts(trial, 3, 0)
-    (points,) = choose_starts(trial, 3, 0, first=[[told]])
+    (points,) = choose_starts(trial, 3, 0, first=[[given]])
     np.testing.assert_array_equal(points[:2], usual[:2])
-    assert trial.gains(0, points[2]) == pytest.approx(told, rel=1e-12)
+    assert trial.gains(0, points[2]) == pytest.approx(given, rel=1e-12)
     # It begins at the very gains: its first value is theirs.
     (starts,) = solve_tasks([task], [points], 6)
-    errors = np.where(task.scenarios.contacts > 0, evaluate(task.loop, told, task.scenarios).error[0], 0)
+    errors = np.where(task.scenarios.contacts > 0, evaluate(task.loop, given, task.scenarios).error[0], 0)
     assert starts[2].history[0] == pytest.approx(objective_value(RMS, errors), rel=1e-9)
 
 
 @pytest.mark.parametrize("starts", [1, 2])
-def test_the_literature_s_gains_stay_beside_those_told(task, trial, starts):
-    told = [{"phase_lead": 0.011, "lead_filter": 0.0007}, {"phase_lead": 0.002, "lead_filter": 0.0005}]
-    (points,) = choose_starts(trial, starts, 0, first=[told])
-    for gains, point in zip([task.literature, *told], points, strict=True):
+def test_the_literature_s_gains_stay_beside_those_given(task, trial, starts):
+    given = [{"phase_lead": 0.011, "lead_filter": 0.0007}, {"phase_lead": 0.002, "lead_filter": 0.0005}]
+    (points,) = choose_starts(trial, starts, 0, first=[given])
+    for gains, point in zip([task.literature, *given], points, strict=True):
         assert trial.gains(0, point) == pytest.approx(gains, rel=1e-12)
 
 
-def test_a_start_told_never_ends_worse_than_it_was_told(task, trial, solved):
+def test_a_given_start_never_ends_worse_than_it_was(task, trial, solved):
     """Tuned gains lie at a bound here."""
     best = min(solved, key=lambda start: start.rms)
     upper = COMPENSATORS["phase_lead"].gains[0].upper(task.mechanism)

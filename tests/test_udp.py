@@ -195,14 +195,17 @@ def test_lost_and_late_packets_are_made_up_for(varying, drops, ticks):
 
 
 def test_contacts_that_the_law_did_not_know_are_counted():
-    """Too short ones, each told once by an answer; the process says how many."""
+    """Too short ones, each reported once by an answer; the process says how many."""
     mechanism = load("suite-fast", ["contact.stiffness=[884316.0]"]).mechanism
     gains = literature_gains(mechanism, "retrospective_reference")
     rig, task, answers = packets(mechanism, controller(mechanism, "retrospective_reference", gains), 900)
     assert udp_controller.LAW_IN_DOUBT == faults.LAW_IN_DOUBT and MISSED_TICK == faults.MISSED_TICK
-    told = [answer for answer in answers if answer.faults & faults.LAW_IN_DOUBT]
+    reported = [answer for answer in answers if answer.faults & faults.LAW_IN_DOUBT]
     assert len(rig.contacts) >= 3 and not rig.tripped
-    assert task.doubts == {"too_short": len(told)} and len(told) in (len(rig.contacts), len(rig.contacts) + 1)
+    assert task.doubts == {"too_short": len(reported)} and len(reported) in (
+        len(rig.contacts),
+        len(rig.contacts) + 1,
+    )
 
 
 def a_reading(tick, sequence=None, force=0.0, position=-1.0, event=TICK, run=1):
@@ -283,7 +286,7 @@ def test_whatever_a_rig_sends_is_answered_with_finite_commands(varying, readings
 
 
 @pytest.mark.parametrize("resets", [False, True])
-def test_a_trip_over_a_stall_of_the_machine_is_reset_and_told(varying, resets):
+def test_a_trip_over_a_stall_of_the_machine_is_reset_and_reported(varying, resets):
     mechanism, gains = varying
     law = controller(mechanism, "response_error", gains, missed_in_a_row=3.0)
     count = 0

@@ -134,7 +134,7 @@ def test_where_a_guard_acts_nothing_is_compared(loaded):
     assert not any(math.isnan(row.force_simulated) for row in found.rows[:end])
 
 
-def test_a_runtime_that_differs_is_told(loaded, monkeypatch):
+def test_a_runtime_that_differs_is_reported(loaded, monkeypatch):
     step = Controller.step
     monkeypatch.setattr(Controller, "step", lambda self, *inputs: step(self, *inputs) * (1 + 1e-9))
     found = make_vectors(loaded, seed=3, draws=2)

@@ -116,7 +116,7 @@ class Failing(ON_THE_RIG["response_error"]):
         (Failing, "the nominal run: the runtime's controller tripped: command_not_finite"),
     ],
 )
-def test_a_wrong_runtime_is_told(varying, monkeypatch, runtime, start):
+def test_a_wrong_runtime_is_reported(varying, monkeypatch, runtime, start):
     monkeypatch.setitem(ON_THE_RIG, "response_error", runtime)
     report = verify(varying, 4, seed=1)
     assert not report.verdict

@@ -1,7 +1,7 @@
 """The command `jaxhil`, also `python -m tuning`: from arguments to an exit code, without a traceback.
 
-0 done and good; 1 done, and the verdict is bad; 2 unusable input or an impossible write, told in one line;
-130 interrupted.
+0 done and good; 1 done, and the verdict is bad; 2 unusable input or an impossible write, reported in one
+line; 130 interrupted.
 """
 
 import io

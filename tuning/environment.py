@@ -1,4 +1,4 @@
-"""What jax must be told before it starts: devices, precision, and where compiled programs are kept.
+"""What must be set before jax starts: devices, precision, and where compiled programs are kept.
 
 Commands call `prepare` before anything that imports jax.
 """

@@ -96,7 +96,7 @@ def finite(value: Any) -> Any:
 
 
 class Stages:
-    """Progress through a known number of stages, told on standard error."""
+    """Progress through a known number of stages, shown on standard error."""
 
     def __init__(self, progress: rich.progress.Progress | None, task: Any):
         self._progress, self._task, self._begun = progress, task, False
@@ -141,12 +141,12 @@ def stages(total: int) -> Iterator[Stages]:
 
 
 class Progress:
-    """Progress through a known number of equal pieces of work, told on standard error."""
+    """Progress through a known number of equal pieces of work, shown on standard error."""
 
     def __init__(self, total: int, unit: str, bar: rich.progress.Progress | None, task: Any):
         self._total, self._unit, self._bar, self._task = total, unit, bar, task
         self._done, self._skipped = 0, 0
-        self._begun = self._told = time.monotonic()
+        self._begun = self._shown = time.monotonic()
 
     @property
     def rate(self) -> float | None:
@@ -168,8 +168,8 @@ class Progress:
         pace = f"{figure(rate, 3)} {self._unit}/s, {_span(left)} left"
         if self._bar is not None:
             self._bar.update(self._task, completed=self._done, description=f"{pace}, {text}")
-        elif time.monotonic() - self._told >= SECONDS_BETWEEN_LINES and self._done < self._total:
-            self._told = time.monotonic()
+        elif time.monotonic() - self._shown >= SECONDS_BETWEEN_LINES and self._done < self._total:
+            self._shown = time.monotonic()
             note(f"{self._done} of {self._total} {self._unit}, {pace}, {text}")
 
 

@@ -1,6 +1,6 @@
 """From a raw table to a `Mechanism`, key by key.
 
-Walks the table along the struct types of `jaxhil.mechanism.structs`, so that each wrong key is told with
+Walks the table along the struct types of `jaxhil.mechanism.structs`, so that each wrong key is reported with
 its path, what was found and what is allowed. Rules that join several keys are in
 `jaxhil.mechanism.rules`.
 """

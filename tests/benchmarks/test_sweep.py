@@ -105,6 +105,6 @@ def test_memory_does_not_grow_with_the_number_of_scenarios(tmp_path, capsys):
         done = subprocess.run(command, check=True, capture_output=True, text=True)
         peaks[number] = json.loads(done.stdout.splitlines()[-1])["peak_MiB"]
     with capsys.disabled():
-        told = ", ".join(f"{peak:.0f} MiB for {number}" for number, peak in peaks.items())
-        print(f"\npeak memory of a sweep: {told}")
+        shown = ", ".join(f"{peak:.0f} MiB for {number}" for number, peak in peaks.items())
+        print(f"\npeak memory of a sweep: {shown}")
     assert peaks[200_000] < min(1.1 * peaks[100_000], 1536)

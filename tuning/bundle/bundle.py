@@ -44,7 +44,7 @@ def build_bundle(
 ) -> Bundle:
     """The bundle of a checked gain document, with `limits` for the rig [SI units] if there are any.
 
-    `rates`, plain data, say what is known of the watchdog's alarms under these limits. `progress` is told
+    `rates`, plain data, say what is known of the watchdog's alarms under these limits. `progress` is given
     what begins. Raises `InputError` for limits that the runtime refuses or a compensator that a format lacks.
     """
     from tuning.bundle.readme import readme_text

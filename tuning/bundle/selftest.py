@@ -20,7 +20,7 @@ import zlib
 MANIFEST = "manifest.json"
 SCHEMA = "jaxhil/bundle/1"
 SIMULATED_LIMIT = 1e-11  # of the range of a run's commands: the simulation rounds in another order
-MOST_SHOWN = 8  # differences of one kind that are told one by one
+MOST_SHOWN = 8  # differences of one kind that are reported one by one
 C_SOURCES = ("test_vectors.c", "jaxhil_controller.c")
 C_FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 COLUMNS = (
@@ -44,19 +44,19 @@ def main(arguments, folder):
 
 
 def check_files(folder):
-    """Every file against the manifest; the names of those that differ, all of them told."""
+    """Every file against the manifest; the names of those that differ, all of them reported."""
     files, problems = differences(folder)
-    told = {}
+    reported = {}
     for name, text in problems:
-        told[name] = told.get(name, 0) + 1
-        if told[name] <= MOST_SHOWN:
+        reported[name] = reported.get(name, 0) + 1
+        if reported[name] <= MOST_SHOWN:
             fail(name, text)
-    for name, number in told.items():
+    for name, number in reported.items():
         if number > MOST_SHOWN:
             fail(name, f"and {number - MOST_SHOWN} more")
     if not problems:
         passed(MANIFEST, f"{len(files)} files are as they were exported")
-    return set(told)
+    return set(reported)
 
 
 def differences(folder):
@@ -311,8 +311,8 @@ def check_c(folder, damaged):
                 done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
                 lines = (done.stdout + done.stderr).replace(vectors, "vectors.csv").strip().split("\n")
                 if done.returncode:
-                    told = next((line for line in lines if "error" in line), lines[0])
-                    return fail("c99", plain(told) or f"exit code {done.returncode}")
+                    reported = next((line for line in lines if "error" in line), lines[0])
+                    return fail("c99", plain(reported) or f"exit code {done.returncode}")
     except Exception as error:
         return fail("c99", f"cannot be compiled and run: {describe(error)}")
     return passed("c99", plain(lines[-1]))
@@ -353,13 +353,13 @@ def look_again():
     try:
         own = json.loads(read(os.path.join(here, "manifest.json")))["files"]["selftest.py"]["sha256"]
     except (OSError, ValueError, KeyError, TypeError):
-        return  # the checks above have told
+        return  # the checks above have reported
     if hashlib.sha256(read(os.path.abspath(__file__))).hexdigest() != own:
         sys.exit("FAIL  selftest.py: differs from what the manifest says, and is not to be believed")
 
 
 def tell(kind, error, trace):
-    """What is told of an error that nothing expected: one line."""
+    """What is reported of an error that nothing expected: one line."""
     sys.stdout.flush()
     print(f"FAIL  selftest.py: cannot be run: {describe(error)}", file=sys.stderr)
 

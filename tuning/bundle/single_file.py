@@ -76,7 +76,7 @@ def runtime_source(compensator: str, package: ModuleType = jaxhil.runtime) -> st
 
 
 def read_source(path: Path, name: str) -> Source:
-    """A module of the package, its docstring, imports and `__all__` told apart from what it does."""
+    """A module of the package, its docstring, imports and `__all__` apart from what it does."""
     text = path.read_text(encoding="utf-8")
     tree = ast.parse(text, str(path))
     inside: dict[str, str] = {}

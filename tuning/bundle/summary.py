@@ -204,7 +204,7 @@ def _limits(document: Mapping[str, Any]) -> Iterator[str]:
     if not given:
         yield "<h2>Limits</h2><p>None: only what is not finite trips the controller.</p>"
         return
-    rows = [(name, _number(one.value, 5), one.unit) for name, one in given.items() if is_told(name)]
+    rows = [(name, _number(one.value, 5), one.unit) for name, one in given.items() if is_shown(name)]
     yield from _table("Limits", ("limit", "value", "unit"), rows, (1,))
 
 
@@ -215,10 +215,10 @@ def _watchdog(document: Mapping[str, Any]) -> Iterator[str]:
         return
     yield "<h2>Watchdog</h2>"
     rates = document["figures"].get("watchdog")
-    told = "; ".join(told_rates(rates)) if isinstance(rates, Mapping) else ""
-    told = one_line(told, 600) or "Rates of false and missed alarms are not known"
-    yield f"<p>{escape(told[0].upper() + told[1:])}.</p>"
-    fitted = sum(not is_told(name) for name in given)
+    rates_text = "; ".join(alarm_rates(rates)) if isinstance(rates, Mapping) else ""
+    rates_text = one_line(rates_text, 600) or "Rates of false and missed alarms are not known"
+    yield f"<p>{escape(rates_text[0].upper() + rates_text[1:])}.</p>"
+    fitted = sum(not is_shown(name) for name in given)
     if fitted:
         yield f"<p>Its expected restitution: {fitted} fitted numbers in the gain file.</p>"
     unset = [name for name in document["limits"] if name not in given]
@@ -232,12 +232,12 @@ def _given(document: Mapping[str, Any]) -> dict[str, Entry]:
     return {name: one for name, one in entries.items() if document["limits"][name]["value"] is not None}
 
 
-def is_told(limit: str) -> bool:
+def is_shown(limit: str) -> bool:
     """Whether a limit says something to people: what the watchdog's expectation is made of does not."""
     return not limit.startswith(FITTED)
 
 
-def told_rates(rates: Mapping[str, Any]) -> Iterator[str]:
+def alarm_rates(rates: Mapping[str, Any]) -> Iterator[str]:
     """In words, how often the watchdog stops a good run and misses a bad one."""
     for name, runs in (("false_alarms", "good runs"), ("missed_alarms", "runs to be stopped")):
         one = rates.get(name)

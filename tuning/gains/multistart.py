@@ -71,12 +71,12 @@ def find(
     `first` has, of each task, gains to start at, in the places of the last starts of its first lot, never of
     the literature's. One start alone is the literature's, and the only lot."""
     tasks, objectives = trial.tasks, one_each(objective, len(trial.tasks))
-    told = [list(own) for own in first] if first else [[] for _ in tasks]
-    number = max(starts, 1 + max(map(len, told)))
+    given = [list(own) for own in first] if first else [[] for _ in tasks]
+    number = max(starts, 1 + max(map(len, given)))
     agreed = HONESTLY_AGREED if tasks[0].honest else AGREED
     searches = [_Search() for _ in tasks]
     chosen = _while_compiling(
-        trial, number, objectives, lambda: choose_starts(trial, number, seed, objectives, told, scanned)
+        trial, number, objectives, lambda: choose_starts(trial, number, seed, objectives, given, scanned)
     )
     going = list(range(len(tasks)))
     for lot in range(LOTS if number > 1 else 1):
@@ -92,7 +92,7 @@ def find(
             own = searches[i]
             own.starts += _exactly(trial, i, ended[i], objectives)
             own.evaluations += (1 + len(trial.names)) * sum(start.steps for start in ended[i])
-            if lot > 0 or number > 1 + len(told[i]):
+            if lot > 0 or number > 1 + len(given[i]):
                 own.evaluations += _scan_evaluations(trial, number, scanned)
         going = [i for i in going if not _agree(searches[i].starts, agreed)]
         if not going:
@@ -172,13 +172,13 @@ def choose_starts(
     from each other. `first` has, of each task, gains that take the places of the last of these, never of the
     literature's."""
     tasks = range(len(trial.tasks))
-    told = [_shares(trial, i, first[i] if first else ()) for i in tasks]
-    usual = [max(starts - len(own), 1) for own in told]
+    given = [_shares(trial, i, first[i] if first else ()) for i in tasks]
+    usual = [max(starts - len(own), 1) for own in given]
     literature = [_shares(trial, i, [trial.tasks[i].literature]) for i in tasks]
     if max(usual) > 1:
         further = _scan(trial, list(tasks), max(usual) - 1, seed, objective, scanned, literature)
         literature = [np.concatenate(both) for both in zip(literature, further, strict=True)]
-    return [np.concatenate([literature[i][: usual[i]], told[i]]) for i in tasks]
+    return [np.concatenate([literature[i][: usual[i]], given[i]]) for i in tasks]
 
 
 def _scan(

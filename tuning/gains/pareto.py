@@ -37,7 +37,7 @@ from tuning.transparency.probes import honesty_figures
 ENDS, FIRST_ENDS = (0.5, 10.0), (1.0, 100.0)
 ACCURATE = 1.05  # error, over the least that is known, of gains that still are accurate
 LEAST_EXCESS = 0.1  # amplification beyond 1 that the ladder is made for where there is next to none
-DIGITS = 4  # significant ones, to which points are told apart
+DIGITS = 4  # significant ones, in which points are compared
 PASSES = 4  # in which points begin at what their neighbours found
 IMPROVED = 1e-3  # by which a point gets better in a pass that is not the last
 

@@ -21,7 +21,7 @@ from tuning.gains.pareto import Front
 from tuning.gains.tune import Result
 from tuning.pictures.motion import Curve, Piece
 
-# Okabe and Ito's colours, told apart by every kind of sight; line styles tell them apart in print.
+# Okabe and Ito's colours, which every kind of sight distinguishes; line styles distinguish them in print.
 BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION = "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00"
 STYLES = {
     "in space": (BLACK, "-", 3.0),

@@ -33,7 +33,7 @@ class Commanded(NamedTuple):
 
 
 class RigTask:
-    """Run after run of a mechanism's contacts, until told that it is enough.
+    """Run after run of a mechanism's contacts, until the controller says that it is enough.
 
     One-sided, every contact is a run of its own at the nominal approach speed; between two surfaces a run has
     as many contacts as the mechanism asks for. The lists of stiffness and damping are gone through again and

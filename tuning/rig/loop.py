@@ -78,7 +78,7 @@ def play(
 ) -> None:
     """Play `len(timing.met)` ticks of `period` [s], or until 1 s after a trip.
 
-    `tell` is told once a second how many are done.
+    `tell` is called once a second with how many are done.
 
     Interrupted, `timing` holds what was played until then.
     """

@@ -111,8 +111,8 @@ class Setup(NamedTuple):
 def run_session(
     setup: Setup, scratch: Path, say: Callable[[str], None], progress: Callable[[int, int], None]
 ) -> SessionReport:
-    """Play an empty loop, then the rig. Records go to the folder `scratch`; `say` is told what begins, and
-    `progress` once a second how many ticks of how many are done.
+    """Play an empty loop, then the rig. Records go to the folder `scratch`; `say` is called with what begins,
+    and `progress` once a second how many ticks of how many are done.
 
     Raises InputError when the controller's process does not start.
     """

@@ -251,12 +251,12 @@ class ControllerTask:
             model.place(*model.start)
         if self._run >= 0 and not self._controller.tripped:
             self._controller.next_contact()
-            faults = self._told()
+            faults = self._reported_faults()
         self._command = self._controller.position_command(model.position, model.velocity, model.acceleration)
         self._run, self._last, self._force = reading.run, None, 0.0
         return faults
 
-    def _told(self) -> int:
+    def _reported_faults(self) -> int:
         """The controller's faults now, a contact of which the law says that it did not know it counted."""
         controller = self._controller
         if controller.faults & LAW_IN_DOUBT:
@@ -306,7 +306,7 @@ class ControllerTask:
         self._force = force
         model.integrate(force)
         self._command = controller.position_command(model.position, model.velocity, model.acceleration)
-        return self._told()
+        return self._reported_faults()
 
     def _reply(
         self,

@@ -156,7 +156,7 @@ def loaded_gains(manifest: Manifest, source: str = "sweep") -> LoadedGains:
 
 def differences(old: Manifest, new: Manifest) -> list[str]:
     """What of the inputs is not the same, each as "key: found OLD, asked for NEW"."""
-    told = []
+    found_differences = []
     for key in (
         "gains_sha256",
         "scenarios",
@@ -171,22 +171,22 @@ def differences(old: Manifest, new: Manifest) -> list[str]:
     ):
         before, now = getattr(old, key), getattr(new, key)
         if before != now:
-            told.append(f"{key}: found {_short(before)}, asked for {_short(now)}")
-    told += _other_versions(old.versions, new.versions)
+            found_differences.append(f"{key}: found {_short(before)}, asked for {_short(now)}")
+    found_differences += _other_versions(old.versions, new.versions)
     if old.columns != new.columns:
-        told.append(OTHER_COLUMNS)
-    return told
+        found_differences.append(OTHER_COLUMNS)
+    return found_differences
 
 
 def unlike_here(manifest: Manifest) -> list[str]:
     """What of this process is not as the manifest says, so that its rows may differ in their last bits."""
     flags = rounding_flags(os.environ.get("XLA_FLAGS", ""))
-    told = _other_versions(manifest.versions, versions())
+    found_differences = _other_versions(manifest.versions, versions())
     if flags != manifest.xla_flags:
-        told.append(f"xla_flags: found {_short(manifest.xla_flags)}, here {_short(flags)}")
+        found_differences.append(f"xla_flags: found {_short(manifest.xla_flags)}, here {_short(flags)}")
     if manifest.columns != sweep_columns(loaded_gains(manifest).mechanism, manifest.works):
-        told.append(OTHER_COLUMNS)
-    return told
+        found_differences.append(OTHER_COLUMNS)
+    return found_differences
 
 
 def _other_versions(old: Mapping[str, str], new: Mapping[str, str]) -> list[str]:

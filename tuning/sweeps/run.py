@@ -188,8 +188,8 @@ def _remote_part(content: bytes, part: int) -> tuple[int, Rows]:
 
         prepare()
         sweep = _remote_sweep(content)
-        if told := unlike_here(sweep.manifest):
-            raise InputError(f"--scheduler: a worker: {told[0]}: its rows would differ")
+        if differing := unlike_here(sweep.manifest):
+            raise InputError(f"--scheduler: a worker: {differing[0]}: its rows would differ")
         return part, run_chunk(sweep, *sweep.manifest.part_rows(part))
 
 

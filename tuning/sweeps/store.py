@@ -58,8 +58,8 @@ def open_store(folder: Path, manifest: Manifest, resume: bool) -> Store:
         parts = any((folder / PARTS).iterdir())
     if NAME in held and resume:
         old = read_manifest(folder)
-        if told := differences(old, manifest):
-            raise InputError(f"{shown}: was made with other inputs: {'; '.join(told[:3])}")
+        if differing := differences(old, manifest):
+            raise InputError(f"{shown}: was made with other inputs: {'; '.join(differing[:3])}")
         return Store(folder, old)
     if held or parts:
         allowed = "an empty folder, or a store and --resume" if not resume else "a store with its manifest"

@@ -25,7 +25,7 @@ CAP_UNLIMITED = 10.0  # the same where there is no limit
 SAMPLES, REPLICATES = 1000, 10  # of subset simulation: per level and replicate, and how often it runs
 FAR_ABOVE = 2.0  # replicates that spread so much more than the formula says have not seen the same failures
 
-Done = Callable[[int], None]  # told of the number of scenarios that were run
+Done = Callable[[int], None]  # called with the number of scenarios that were run
 
 
 class Driver(NamedTuple):

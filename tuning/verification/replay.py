@@ -87,8 +87,8 @@ def verify(
 ) -> VerificationReport:
     """Replay `scenarios` runs (the nominal one and draws) and run the nominal contacts in closed loop.
 
-    `progress` is told in words what begins. Raises RuntimeError unless jax computes in float64, `InputError`
-    never: the gain file is checked when it is loaded.
+    `progress` is called with what begins, in words. Raises RuntimeError unless jax computes in float64,
+    `InputError` never: the gain file is checked when it is loaded.
     """
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError("verification compares to 1e-11: switch jax_enable_x64 on first")

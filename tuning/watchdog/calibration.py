@@ -77,9 +77,9 @@ def calibrate(
     Args: `loaded`, the gain file; `store`, a sweep's of that gain file, whose scenarios are run again, all of
     them or the first so many `scenarios`; without a store so many draws of the file's own uncertainty (512).
     `limit` of the restitution error: the store's own by default, else 0.01. `replaced` limits are as given,
-    whatever the runs say, and the rates are under them. So many `lanes` are run at a time; `progress` is told
-    how many more runs are done. Raises `InputError` for a store of another gain file, or a number that it
-    does not hold.
+    whatever the runs say, and the rates are under them. So many `lanes` are run at a time; `progress` is
+    given how many more runs are done. Raises `InputError` for a store of another gain file, or a number that
+    it does not hold.
     """
     chosen = _chosen(loaded, store, scenarios)
     if limit is None:

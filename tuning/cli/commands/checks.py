@@ -63,7 +63,7 @@ def gain_file(given: str) -> Path:
 
 
 def folder(given: str) -> Path | None:
-    """The folder at `given`; None if there is none, or it cannot be told."""
+    """The folder at `given`; None if there is none, or it cannot be read."""
     try:
         return Path(given) if Path(given).is_dir() else None
     except (OSError, ValueError):

@@ -14,7 +14,8 @@ from tuning.environment import prepare, usable_cores
 
 
 def run(options: Compare) -> int:
-    """Compare; what is finished is told and written, also when interrupted. 0, 1 if a law failed, or 130."""
+    """Compare; what is finished is reported and written, also when interrupted. 0, 1 if a law failed, or
+    130."""
     checks.limit(options.limit)
     checks.at_least(1, scenarios=options.scenarios)
     checks.at_least(2, judged=options.judged)
@@ -152,8 +153,8 @@ def _print(
     rows = [[law, ", ".join(COMPENSATORS[law].knows) or "nothing", cost] for law, cost in costs.items()]
     report.emit(
         report.table(
-            "What a law must be told, and what it costs",
-            ["law", "told beforehand", "Python [us per tick]"],
+            "What a law must know beforehand, and what it costs",
+            ["law", "known beforehand", "Python [us per tick]"],
             rows,
             texts=(0, 1),
         ),

@@ -105,14 +105,14 @@ def _formats(options: Export, available: list[str]) -> list[str]:
 
 
 def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
-    from tuning.bundle.summary import is_told, told_rates
+    from tuning.bundle.summary import alarm_rates, is_shown
 
     tables = []
     if document["limits"]:
         rows = [
             (name, report.figure(one["value"], 6), one["unit"])
             for name, one in document["limits"].items()
-            if is_told(name)
+            if is_shown(name)
         ]
         tables.append(report.table("Limits for the rig", ["limit", "value", "unit"], rows, texts=(0, 2)))
     lines = [
@@ -121,7 +121,7 @@ def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
         if end
     ]
     if document["rates"]:
-        lines += [f"Watchdog: {text}" for text in told_rates(document["rates"])]
+        lines += [f"Watchdog: {text}" for text in alarm_rates(document["rates"])]
     if document["bundle"]:
         lines += [
             f"wrote {len(sizes)} files, {sum(sizes.values()) / 1e6:.2g} MB, to {document['bundle']}",

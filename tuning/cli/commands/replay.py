@@ -87,5 +87,5 @@ def _print(document: dict[str, Any]) -> None:
         lines.append("Good: every number is the stored one, to the bit.")
     else:
         lines.append(f"Bad: differs from what is stored in {', '.join(document['different'][:8])}.")
-    lines += [f"The store was made elsewhere: {told}." for told in document["unlike"]]
+    lines += [f"The store was made elsewhere: {difference}." for difference in document["unlike"]]
     report.emit(inputs, report.table("Contacts", headings, rows, texts=(7,)), *lines)

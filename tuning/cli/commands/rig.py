@@ -113,7 +113,7 @@ def stroke(document: dict[str, Any]) -> tuple[float, float]:
 
 
 class _Progress:
-    """How far the loop is, in few bytes: it is told from within."""
+    """How far the loop is, in few bytes: it is reported from within."""
 
     def __init__(self, period: float) -> None:
         self._period, self._terminal = period, sys.stderr.isatty()

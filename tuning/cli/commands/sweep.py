@@ -34,7 +34,7 @@ def run(options: Sweep) -> int:
         store = open_store(folder, manifest, options.resume)
         with report.progress(manifest.scenarios, "scenarios") as progress:
 
-            def told(tally) -> str:
+            def so_far(tally) -> str:
                 known = failure_probability(tally)
                 text = f"failed {known.value:.3g} ({known.low:.2g} to {known.high:.2g})"
                 if options.until_width is None:
@@ -45,7 +45,7 @@ def run(options: Sweep) -> int:
             sweep, tally = run_sweep(
                 store,
                 lambda rows, _: progress.skip(rows),
-                lambda rows, tally: progress.advance(rows, told(tally)),
+                lambda rows, tally: progress.advance(rows, so_far(tally)),
                 options.scheduler,
             )
         document = _document(options, store, sweep, tally, progress.rate)
@@ -62,7 +62,7 @@ def run(options: Sweep) -> int:
 def _complete(options: Sweep, store, sweep, document: dict[str, Any]) -> list[InputError]:
     """Add what belongs beside the verdict, and keep all that is known in the store after every step.
 
-    What could not be written is returned, to be told after the verdict, which no full disk is to cost.
+    What could not be written is returned, to be reported after the verdict, which no full disk is to cost.
     """
     from tuning.sweeps.kept import write_verdict
     from tuning.sweeps.pictures import write_pictures

@@ -60,7 +60,7 @@ def rare(options: Sweep, store, sweep, unwritten: list[InputError]) -> dict[str,
 
 @contextmanager
 def put_off(unwritten: list[InputError]) -> Iterator[None]:
-    """What cannot be written is added to the list, to be told later."""
+    """What cannot be written is added to the list, to be reported later."""
     try:
         yield
     except InputError as error:
@@ -70,10 +70,10 @@ def put_off(unwritten: list[InputError]) -> Iterator[None]:
 def _rare_document(limit: float, found) -> dict[str, Any]:
     from tuning.sweeps.studies import spread_beyond_formula
 
-    told = ("probability", "low", "high", "coefficient_of_variation", "formula_coefficient_of_variation")
+    shown = ("probability", "low", "high", "coefficient_of_variation", "formula_coefficient_of_variation")
     return {
         "limit": limit,
-        **{name: getattr(found, name) for name in (*told, "evaluations")},
+        **{name: getattr(found, name) for name in (*shown, "evaluations")},
         "estimates": found.estimates.tolist(),
         "spread_beyond_formula": spread_beyond_formula(found),
     }

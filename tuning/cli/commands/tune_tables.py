@@ -84,9 +84,9 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
     else:
         verdict = f"Bad: the tuned rms error {tuned.rms:.2g}{sure} exceeds {options.limit:g}."
     seconds = ", ".join(f"{stage} {time:.1f} s" for stage, time in result.timings.items())
-    told = [f"took: {seconds}", verdict]
+    closing = [f"took: {seconds}", verdict]
     if not entry["sensor_noise"]:
-        told.insert(0, "No sensor noise in the mechanism; with it: --set rig.force_sensor.noise_std=2.67")
+        closing.insert(0, "No sensor noise in the mechanism; with it: --set rig.force_sensor.noise_std=2.67")
     written = [entry["gain_file"], *entry["plots"]]
     sure_of = []
     if result.freedom:
@@ -108,7 +108,7 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
         )
     tables = [errors] + ([_honesty(result)] if result.honesty else [])
     tables += ([gains] if law else []) + ([starts] if result.starts else [])
-    report.emit(*tables, *sure_of, *(f"wrote {path}" for path in written), *told, "")
+    report.emit(*tables, *sure_of, *(f"wrote {path}" for path in written), *closing, "")
 
 
 def _honesty(result: Any) -> Any:
