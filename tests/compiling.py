@@ -1,36 +1,24 @@
 """How the tests' programs are compiled: quickly, but where a module is about the programs that users run.
 
-A test's program runs once or twice: most of its time is the compiler's. With less optimisation that is a
-third, for the same numbers but for their last bits, which are held to the same tolerances. Modules marked
+A test's program runs once or twice: most of its time is the compiler's. With less optimisation that is half,
+for the same numbers but for their last bits, which are held to the same tolerances. Modules marked
 `users_options`, and the studies and benchmarks that are no part of the everyday suite, have the options of
 `tuning.environment`: where the last bits are what is tested, and where jax is held against the rig's own
 controller.
 """
 
-import functools
+from pathlib import Path
 
 import jax
-from jax._src import compiler
 
+# Of one program, given to `jax.jit`: more than can be switched for all that a module compiles.
 QUICK = {
     "xla_backend_optimization_level": 0,
     "xla_llvm_disable_expensive_passes": True,
     "xla_cpu_use_fusion_emitters": False,
 }
 
-# Not public: a jax without it compiles everything with the users' options.
-_given = getattr(compiler, "get_compile_options", None)
 _quick = False
-
-
-def _options(*arguments, env_options_overrides=None, **others):
-    overrides = {**(QUICK if _quick else {}), **(env_options_overrides or {})}
-    assert _given is not None
-    return _given(*arguments, env_options_overrides=overrides, **others)
-
-
-if _given is not None:
-    compiler.get_compile_options = functools.wraps(_given)(_options)
 
 
 def compile_quickly(quick: bool) -> None:
@@ -38,9 +26,21 @@ def compile_quickly(quick: bool) -> None:
     global _quick
     if quick != _quick:
         jax.clear_caches()
+        jax.config.update("jax_disable_most_optimizations", quick)
         _quick = quick
 
 
-def overridden() -> dict[str, object]:
-    """Of the users' options, those that a program compiled now would have otherwise."""
-    return dict(compiler.get_compile_options(1, 1).env_option_overrides)
+def is_quick() -> bool:
+    """Whether programs compiled now are compiled quickly."""
+    return _quick
+
+
+def forget_oldest(folder: Path, most: int) -> None:
+    """Leave of the kept programs those used last, in all so many bytes."""
+    files = [(file.stat(), file) for file in folder.glob("*") if file.is_file()]
+    files.sort(key=lambda entry: max(entry[0].st_atime, entry[0].st_mtime), reverse=True)
+    total = 0
+    for status, file in files:
+        total += status.st_size
+        if total > most:
+            file.unlink(missing_ok=True)

@@ -1,26 +1,28 @@
 """What every test runs under: float64, strict promotion, two host devices, checked shapes, quick compilation.
 The command line, as tests call it."""
 
-import gc
 import json
 import os
 from typing import NamedTuple
 
-from tuning.environment import settings
+from tuning.environment import CACHE, cache_folder, flags, prepare, settings
 
 # Two devices wherever the tests run, and otherwise what users have.
-os.environ["XLA_FLAGS"] = settings(
-    {"XLA_FLAGS": os.environ.get("XLA_FLAGS", "--xla_force_host_platform_device_count=2")}
-)["XLA_FLAGS"]
+os.environ["XLA_FLAGS"] = flags(os.environ.get("XLA_FLAGS", "--xla_force_host_platform_device_count=2"))
 os.environ["NPROC"] = settings(os.environ)["NPROC"]
 
 import hypothesis
 import jax
 import pytest
-from compiling import compile_quickly
+from compiling import compile_quickly, forget_oldest
 from jaxtyping import install_import_hook
 
-jax.config.update("jax_enable_x64", True)
+# Compiled programs are kept: for the next run, for other workers, for kernels and commands that tests start.
+FOLDER = "tests"
+if (_cache := cache_folder()) is not None and _cache.name != FOLDER:
+    os.environ[CACHE] = str(_cache / FOLDER)
+prepare()
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -32,8 +34,12 @@ install_import_hook([f"jaxhil.{name}" for name in ARRAY_MODULES], "beartype.bear
 hypothesis.settings.register_profile("jaxhil", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("jaxhil")
 
-# As in a command: tracing makes objects by the million, few of them in cycles.
-gc.set_threshold(100_000, 50, 50)
+KEPT = 1_000_000_000  # bytes of programs
+
+
+def pytest_configure(config):
+    if (folder := cache_folder()) is not None and not hasattr(config, "workerinput"):
+        forget_oldest(folder, KEPT)
 
 
 def pytest_collection_modifyitems(items):
@@ -57,13 +63,6 @@ class Ran(NamedTuple):
     @property
     def document(self):
         return json.loads(self.out, parse_constant=pytest.fail)
-
-
-@pytest.fixture
-def no_cache(monkeypatch, tmp_path):
-    """Compiled programs of tests are not kept: a folder below a file cannot be made."""
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("JAXHIL_CACHE", str(tmp_path / "file" / "cache"))
 
 
 @pytest.fixture

@@ -22,9 +22,6 @@ CONTACT_KEYS = {
 }
 
 
-pytestmark = pytest.mark.usefixtures("no_cache")
-
-
 @pytest.fixture(scope="module")
 def tuned(tmp_path_factory):
     """A tiny tuning, end to end: its folder."""
@@ -426,6 +423,8 @@ def test_flags_leave_the_user_s_alone(monkeypatch):
 
 
 def test_cache_folder_is_made_or_done_without(monkeypatch, tmp_path):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("JAXHIL_CACHE", str(tmp_path / "file" / "below"))
     assert environment.cache_folder() is None
     monkeypatch.setenv("JAXHIL_CACHE", str(tmp_path / "new"))
     assert environment.cache_folder() == tmp_path / "new"

@@ -16,7 +16,7 @@ from tuning.bundle.writers import WRITERS
 from tuning.files import TEMPORARY
 from tuning.gain_file import load_gain_file, write_gain_file
 
-pytestmark = [pytest.mark.usefixtures("no_cache"), pytest.mark.users_options]
+pytestmark = pytest.mark.users_options
 
 ALWAYS = {
     *("gains.json", "jaxhil_runtime.py", "vectors.csv", "selftest.py", "manifest.json", "README.md"),

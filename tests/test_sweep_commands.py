@@ -19,9 +19,6 @@ from tuning.sweeps.studies import rare_failure
 TINY = ["--scenarios", "100", "--chunk", "64"]
 
 
-pytestmark = pytest.mark.usefixtures("no_cache")
-
-
 @pytest.fixture(scope="module")
 def gains(tmp_path_factory):
     path = tmp_path_factory.mktemp("gains") / "gains.json"

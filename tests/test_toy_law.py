@@ -112,7 +112,7 @@ def copied(tmp_path):
 def test_a_law_of_three_files_and_one_entry_is_tested_and_exported(copied):
     """By the tests named `...[toy...]`, in a process that sees the copy alone."""
     command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "-k", "toy", *RUN]
-    environment = {**os.environ, "PYTHONPATH": str(copied), "JAXHIL_CACHE": str(copied / "cache")}
+    environment = {**os.environ, "PYTHONPATH": str(copied)}
     folder = copied / "tests"
     ran = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     output = ran.stdout + ran.stderr
