@@ -7,7 +7,7 @@ import pytest
 
 from jaxhil.compensators import literature_gains
 from jaxhil.mechanism.file import load
-from tuning.pictures.motion import nominal_motion
+from jaxhil.simulation.motion import nominal_motion
 
 MECHANISM = load("varying", ["approach.contacts=2", "contact.damping=[0.0]"]).mechanism
 GAINS = literature_gains(MECHANISM, "response_error")

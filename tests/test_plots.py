@@ -12,10 +12,10 @@ from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.evaluation import Outcome, parameters_by_slot
 from jaxhil.simulation.metrics import Metrics
+from jaxhil.simulation.motion import Curve, Piece, _space
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gains.pareto import Front, Point
 from tuning.gains.tune import Result, Settings, Start, figures
-from tuning.pictures.motion import Curve, Piece, _space
 from tuning.pictures.plots import STYLES, contact_plot, errors_plot, front_plot, loss_plot, save
 
 LANES = 40

@@ -12,11 +12,11 @@ from bundles import document
 
 from jaxhil.runtime import Controller
 from jaxhil.runtime.gain_file import check_gain_document
+from jaxhil.simulation.recording import nominal_and_draws, record_lanes
 from tuning.bundle import selftest
 from tuning.bundle.bundle import with_limits
 from tuning.bundle.vectors import BEGINS, NEXT_CONTACT, Row, as_csv, make_vectors, one_rig
 from tuning.gain_file import check_document
-from tuning.verification.recording import nominal_and_draws, record_lanes
 
 pytestmark = pytest.mark.users_options
 

@@ -2,43 +2,50 @@
 
 A gain file holds a compensator's gains with units and bounds, the whole mechanism that they were tuned for,
 what they were tuned over and what they reach. `build_document` makes one, `write_gain_file` signs and writes
-it, `load_gain_file` reads it back or says in one line what is wrong: first the checks that the rig makes too
-(`jaxhil.runtime`), then those that need the mechanism and the registry of compensators.
+it; `load_gain_file`, of `jaxhil.simulation.gain_file`, reads it back.
 """
 
 import json
 import math
 import os
 import platform
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from jaxhil.compensators import COMPENSATORS, Gain
-from jaxhil.errors import InputError, one_line, shown
-from jaxhil.mechanism.file import from_builtins, to_builtins
+from jaxhil.compensators import Gain
+from jaxhil.errors import InputError, shown
+from jaxhil.mechanism.file import to_builtins
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.runtime import GainFileError, digest
-from jaxhil.runtime.gain_file import SCHEMA, check_gain_document, read_gain_document
+from jaxhil.runtime import digest
+from jaxhil.runtime.gain_file import SCHEMA
+from jaxhil.simulation.gain_file import (
+    LoadedGains,
+    bounds_of,
+    check_document,
+    check_names,
+    load_gain_file,
+    look_up,
+)
 from jaxhil.simulation.scenario import Scenario
 from tuning.files import write_whole, writing
 
+__all__ = [
+    "LoadedGains",
+    "build_document",
+    "check_document",
+    "load_gain_file",
+    "plain",
+    "validity_envelope",
+    "versions",
+    "write_gain_file",
+]
+
 VERSIONED = ("jaxhil", "jax", "numpy", "optimistix")
-ROUNDING = 1e-9  # by which a bound worked out elsewhere may differ
-
-
-class LoadedGains(NamedTuple):
-    """A checked gain file: its whole content, compensator, gains [SI units], mechanism."""
-
-    document: dict[str, Any]
-    compensator: str
-    gains: dict[str, float]
-    mechanism: Mechanism
 
 
 def build_document(
@@ -58,8 +65,8 @@ def build_document(
     finite or not within its bounds.
     """
     source = "gains"
-    law = _registered(compensator, source)
-    _same_names(gains, law, source)
+    law = look_up(compensator, source).gains
+    check_names(gains, law, source)
     document = {
         "schema": SCHEMA,
         "compensator": compensator,
@@ -87,35 +94,6 @@ def write_gain_file(path: str | os.PathLike[str], document: Mapping[str, Any]) -
     text = json.dumps(signed, indent=2, sort_keys=True, allow_nan=False) + "\n"
     with writing(target):
         write_whole(target, text.encode("ascii"))
-
-
-def load_gain_file(path: str | os.PathLike[str]) -> LoadedGains:
-    """The gain file at `path`, checked as a whole. Raises `InputError`, one line, for whatever is wrong."""
-    source = one_line(os.fspath(path))
-    try:
-        document = read_gain_document(path)
-    except GainFileError as error:
-        raise InputError(str(error)) from None
-    return check_document(document, source)
-
-
-def check_document(document: dict[str, Any], source: str = "gain document") -> LoadedGains:
-    """The content of a gain file, checked as a whole; errors call it `source`. Raises `InputError`."""
-    try:
-        on_the_rig = check_gain_document(document, source)
-    except GainFileError as error:
-        raise InputError(str(error)) from None
-    for key, (fits, allowed) in _REQUIRED.items():
-        if key not in document:
-            raise _refusal(source, key, "nothing", "this key is required")
-        if not fits(document[key]):
-            raise _refusal(source, key, shown(document[key]), allowed)
-    mechanism = from_builtins(document["mechanism"], f"{source}: mechanism")
-    law = _registered(on_the_rig.compensator, source)
-    _same_names(on_the_rig.gains, law, f"{source}: gains")
-    for gain in law:
-        _check_entry(gain, document["gains"][gain.name], mechanism, source)
-    return LoadedGains(document, on_the_rig.compensator, dict(on_the_rig.gains), mechanism)
 
 
 def validity_envelope(mechanism: Mechanism, scenarios: Scenario) -> dict[str, dict[str, Any]]:
@@ -209,83 +187,10 @@ def _span(values: np.ndarray, unit: str) -> dict[str, Any]:
     return {"low": float(np.min(values)), "high": float(np.max(values)), "unit": unit}
 
 
-def _registered(compensator: str, source: str) -> tuple[Gain, ...]:
-    if compensator not in COMPENSATORS:
-        raise _refusal(source, "compensator", shown(compensator), f"one of {', '.join(COMPENSATORS)}")
-    return COMPENSATORS[compensator].gains
-
-
-def _same_names(gains: Mapping[str, Any], law: tuple[Gain, ...], source: str) -> None:
-    names = [gain.name for gain in law]
-    if set(gains) != set(names):
-        wrong = sorted(set(gains) ^ set(names))[0]
-        found = "an extra gain" if wrong in gains else "nothing"
-        raise _refusal(source, one_line(str(wrong), 60), found, ", ".join(names) or "no gains")
-
-
-def _bounds(gain: Gain, mechanism: Mechanism) -> tuple[float, float]:
-    return float(gain.lower(mechanism)), float(gain.upper(mechanism))
-
-
 def _gain_entry(gain: Gain, value: float, mechanism: Mechanism) -> dict[str, Any]:
-    lower, upper = _bounds(gain, mechanism)
-    margin = ROUNDING * max(abs(lower), abs(upper))
+    lower, upper, margin = bounds_of(gain, mechanism)
     number = float(value)
     if not lower - margin <= number <= upper + margin:
-        raise _refusal("gains", gain.name, shown(number), f"{lower:.12g} to {upper:.12g} {gain.unit}")
+        allowed = f"{lower:.12g} to {upper:.12g} {gain.unit}"
+        raise InputError(f"gains: {gain.name}: found {shown(number)}, allowed {allowed}")
     return {"value": min(max(number, lower), upper), "unit": gain.unit, "lower": lower, "upper": upper}
-
-
-def _check_entry(gain: Gain, entry: Mapping[str, Any], mechanism: Mechanism, source: str) -> None:
-    key = f"gains.{gain.name}"
-    if entry["unit"] != gain.unit:
-        raise _refusal(source, f"{key}.unit", shown(entry["unit"]), f"'{gain.unit}'")
-    lower, upper = _bounds(gain, mechanism)
-    margin = ROUNDING * max(abs(lower), abs(upper))
-    for bound in ("lower", "upper"):
-        if not lower - margin <= entry[bound] <= upper + margin:
-            allowed = f"{lower:.12g} to {upper:.12g} for this mechanism"
-            raise _refusal(source, f"{key}.{bound}", shown(entry[bound]), allowed)
-
-
-def _refusal(source: str, key: str, found: str, allowed: str) -> InputError:
-    return InputError(f"{source}: {key}: found {found}, allowed {allowed}")
-
-
-def _is_date(value: object) -> bool:
-    try:
-        return isinstance(value, str) and datetime.fromisoformat(value).tzinfo is not None
-    except ValueError:
-        return False
-
-
-def _is_envelope(value: object) -> bool:
-    return isinstance(value, Mapping) and all(
-        isinstance(span, Mapping) and {"low", "high", "unit"} <= span.keys() for span in value.values()
-    )
-
-
-def _is_object(value: object) -> bool:
-    return isinstance(value, Mapping)
-
-
-def _is_table_of_texts(value: object) -> bool:
-    return isinstance(value, Mapping) and all(isinstance(text, str) for text in value.values())
-
-
-# Of each further key of a gain file: whether its value will do, and what is allowed.
-_REQUIRED: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "mechanism_sha256": (
-        lambda value: isinstance(value, str) and re.fullmatch("[0-9a-f]{64}", value) is not None,
-        "64 hexadecimal digits",
-    ),
-    "envelope": (_is_envelope, "an object of {low, high, unit} objects"),
-    "figures": (_is_object, "an object"),
-    "seed": (
-        lambda value: isinstance(value, int) and not isinstance(value, bool) and value >= 0,
-        "an integer >= 0",
-    ),
-    "versions": (_is_table_of_texts, "an object of texts"),
-    "created": (_is_date, "a date and time with time zone, as 2030-01-31T12:00:00+00:00"),
-    "timings": (_is_object, "an object"),
-}

@@ -20,6 +20,7 @@ SCHEMA = "jaxhil/gains/1"
 LARGEST = 4 * 1024 * 1024
 DEEPEST = 32
 UNSIGNED = ("created", "timings", "sha256")
+NO_OTHERS: Mapping[str, Mapping[str, GainSpecification]] = {}
 
 
 class GainFile(NamedTuple):
@@ -68,14 +69,21 @@ def read_gain_document(path: str | os.PathLike[str]) -> dict[str, Any]:
     return document
 
 
-def check_gain_document(document: Mapping[str, Any], source: str = "gain document") -> GainFile:
-    """The controller's part of a gain document, named `source` in errors. Raises GainFileError."""
+def check_gain_document(
+    document: Mapping[str, Any],
+    source: str = "gain document",
+    others: Mapping[str, Mapping[str, GainSpecification]] = NO_OTHERS,
+) -> GainFile:
+    """The controller's part of a gain document, named `source` in errors. Raises GainFileError.
+
+    `others` are the gains of compensators, by name, that can be simulated but have no class here.
+    """
     _check_form(document, source)
     name = _entry(document, "compensator", source, "")
-    known = ", ".join(COMPENSATORS)
-    if not isinstance(name, str) or name not in COMPENSATORS:
-        raise refusal(source, "compensator", shown(name), f"one of {known}")
-    gains = _gains(document, COMPENSATORS[name].gains, source)
+    known = {**others, **{law: compensator.gains for law, compensator in COMPENSATORS.items()}}
+    if not isinstance(name, str) or name not in known:
+        raise refusal(source, "compensator", shown(name), f"one of {', '.join(known)}")
+    gains = _gains(document, known[name], source)
     period = _number(_entry(document, "control_period", source, ""), "control_period", source)
     if period <= 0.0:
         raise refusal(source, "control_period", shown(period), "> 0")

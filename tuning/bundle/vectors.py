@@ -21,8 +21,8 @@ from jaxhil.runtime import Controller
 from jaxhil.runtime.faults import LAW_IN_DOUBT, names
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
 from jaxhil.simulation.integrators import INTEGRATORS
+from jaxhil.simulation.recording import Lane, nominal_and_draws, record_lanes
 from tuning.gain_file import LoadedGains
-from tuning.verification.recording import Lane, nominal_and_draws, record_lanes
 from tuning.verification.replay import (
     REPLAY_LIMIT,
     command_range,

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from tuning.pictures.motion import Piece, scenario_motion
+from jaxhil.simulation.motion import Piece, scenario_motion
 from tuning.sweeps.chunks import Sweep, build_sweep, run_chunk
 from tuning.sweeps.draws import drawn_scenarios
 from tuning.sweeps.manifest import loaded_gains

@@ -14,11 +14,11 @@ from jaxtyping import Bool, Float, Int
 from jaxhil.simulation.evaluation import compare_with_reference
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.metrics import OK
+from jaxhil.simulation.recording import record_ticks
 from jaxhil.simulation.scenario import Scenario
 from tuning.gain_file import LoadedGains
 from tuning.sweeps.chunks import widest_loop
 from tuning.sweeps.draws import drawn_scenarios
-from tuning.verification.recording import record_ticks
 
 LANES = 1024  # recorded at a time
 

@@ -29,7 +29,7 @@ def run(options: Simulate) -> int:
     contacts, status = simulate(mechanism, compensator, gains, options.seed)
     good = status == "ok" and all(abs(contact["error"]) <= options.limit for contact in contacts)
     if options.plot is not None:
-        from tuning.pictures.motion import nominal_motion
+        from jaxhil.simulation.motion import nominal_motion
         from tuning.pictures.plots import contact_plot, save
 
         motion = nominal_motion(mechanism, {"rig": (compensator, gains)}, options.seed)

@@ -271,9 +271,9 @@ def _carried_over(result) -> list[dict[str, Any]]:
 def _prepare_drawing(mechanism, compensator: str) -> None:
     """Import and compile what drawing needs, while the solver's program compiles on another core."""
     from jaxhil.compensators import literature_gains
+    from jaxhil.simulation.motion import prepare_motion
     from tuning.gains.tune import uncompensated
     from tuning.pictures import plots  # noqa: F401
-    from tuning.pictures.motion import prepare_motion
 
     gains = literature_gains(mechanism, compensator)
     prepare_motion(mechanism, {"before": uncompensated(compensator, gains), "tuned": (compensator, gains)})
@@ -285,8 +285,8 @@ def is_better(figures, other) -> bool:
 
 
 def _draw(result, options: Tune, folder: Path) -> list[str]:
+    from jaxhil.simulation.motion import nominal_motion
     from tuning.gains.tune import uncompensated
-    from tuning.pictures.motion import nominal_motion
     from tuning.pictures.plots import contact_plot, errors_plot, loss_plot, save
 
     name, compensator = result.mechanism.name, options.compensator

@@ -12,10 +12,10 @@ from jaxtyping import Array, Float
 
 from jaxhil.contact.laws import LAWS, ContactLaw, ContactParameters, two_sided
 from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.gain_file import LoadedGains
+from jaxhil.simulation.recording import Lane, prepare_recording, record_lanes
 from jaxhil.simulation.rollout import APPROACH
 from jaxhil.simulation.scenario import Scenario, build_scenarios
-from tuning.gain_file import LoadedGains
-from tuning.verification.recording import Lane, prepare_recording, record_lanes
 
 STEPS = 8000  # of the integration in space
 POINTS = 800  # of them kept
@@ -147,14 +147,14 @@ def _integrate(
     last = contacts.damping.shape[0] - 1
 
     def advance(carry, _):
-        position, speed, index, touched = carry
+        position, speed, index, touched, state = carry
         parameters = jax.tree.map(lambda leaf: leaf[jnp.minimum(index, last)], contacts)
-        force, _ = two_sided(law, parameters, (), position, speed, clearance)
+        force, state = two_sided(law, parameters, state, position, speed, clearance)
         touching = (position > 0) | (position < -clearance)
         index = jnp.where(touched & ~touching, index + 1, index)
         speed = speed - step * force / mass
-        return (position + step * speed, speed, index, touching), (force, position)
+        return (position + step * speed, speed, index, touching, state), (force, position)
 
-    start = (-velocity * APPROACH, velocity, first, jnp.array(False))
+    start = (-velocity * APPROACH, velocity, first, jnp.array(False), law.init(velocity))
     _, (force, position) = lax.scan(advance, start, None, length=STEPS)
     return force, position

@@ -1,8 +1,7 @@
-"""The loop laid open tick by tick: recorded with jax, or closed over the runtime that goes to the rig.
+"""The loop closed over the runtime's controller: the contacts of one scenario as the rig will run them.
 
-`record_lanes` keeps what the controller read and commanded at every tick of a batch of runs: what
-verification replays, and what a bundle for the rig carries as test vectors. `run_closed_loop` runs the
-contacts of one scenario with the runtime in the place of the jax controller.
+Sensors, motion simulator and contact are those of the simulation, in jax; in the place of its controller
+stands that of `jaxhil.runtime`, in plain Python, called tick by tick.
 """
 
 import dataclasses
@@ -11,87 +10,21 @@ from functools import lru_cache, partial
 from typing import Any, ClassVar, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array
 
 from jaxhil.compensators import Compensator, Gain, Gains, Signals
-from jaxhil.mechanism.structs import Mechanism, value_at
-from jaxhil.mechanism.uncertainty import draw
 from jaxhil.runtime import Controller
 from jaxhil.runtime.gain_file import GainFile
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.contact_force import PlantSignals
+from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.integrators import INTEGRATORS
-from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants, drive, sense
+from jaxhil.simulation.loop import Loop, RigConstants, drive, sense
 from jaxhil.simulation.metrics import Metrics, build_rules, observe
-from jaxhil.simulation.rollout import Run, Tick, noise_ahead, start, stretch, stretch_length, turn_over
-from jaxhil.simulation.scenario import Scenario, build_scenarios
-from tuning.gain_file import LoadedGains
-
-CHUNK = 512  # ticks recorded by one call of the compiled program
-
-
-class Lane(NamedTuple):
-    """What the controller read and commanded [N] in one lane, (ticks,), up to the end of its last contact.
-
-    `sent` is the position command [m] that it made of the numerical model's motion after each tick.
-    `identified` is what it made of stiffness [N/m] and damping [N s/m], where it identifies them. With
-    `zeroed`, the loop takes F_c = 0 at the first tick of a run, whatever the controller says: before t = 0
-    there is no force, though a noisy or biased sensor reads some.
-    """
-
-    signals: Signals
-    command: np.ndarray | Array
-    identified: tuple[np.ndarray | Array, np.ndarray | Array] | None
-    zeroed: bool
-    sent: np.ndarray | Array | None = None
-
-
-def nominal_and_draws(mechanism: Mechanism, number: int, seed: int) -> Scenario:
-    """A batch of `number` >= 1 lanes: the nominal run, then draws of the mechanism's uncertain numbers."""
-    draws = {}
-    for path, drawn in draw(mechanism, number - 1, seed).items():
-        nominal = np.broadcast_to(np.asarray(value_at(mechanism, path), float), drawn.shape[1:])
-        draws[path] = np.concatenate([nominal[None], drawn])
-    return build_scenarios(mechanism, draws, seed=seed)
-
-
-def record_lanes(loaded: LoadedGains, batch: Scenario) -> tuple[Metrics, list[Lane]]:
-    """Run the loop with jax until every lane is done: metrics (slots, lanes), and each lane's record.
-
-    Free flight between two surfaces is not skipped: the rig does not skip it either. A record ends before its
-    first number that is not finite.
-    """
-    loop = build_loop(loaded.mechanism, loaded.compensator, batch)
-    metrics, seen = record_ticks(loop, loaded.gains, batch)
-    zeroed = loop.has_force_noise or loop.has_force_bias
-    return metrics, [
-        _lane(jax.tree.map(lambda leaf, index=index: leaf[:, index], seen), zeroed)
-        for index in range(seen.active.shape[1])
-    ]
-
-
-def record_ticks(loop: Loop, gains: dict[str, float], batch: Scenario) -> tuple[Metrics, Tick]:
-    """Run the loop with jax until every lane is done: metrics (slots, lanes), every tick (ticks, lanes)."""
-    arrays = _arrays(gains)
-    program = _compiled(loop)
-    rig, run = program.begin(arrays, batch)
-    chunks = []
-    while np.any(run.active):
-        run, ticks = program.record_chunk(rig, arrays, run)
-        chunks.append(jax.device_get(ticks))
-    return jax.device_get(run.metrics), jax.tree.map(lambda *parts: np.concatenate(parts), *chunks)
-
-
-def prepare_recording(loaded: LoadedGains, batch: Scenario) -> None:
-    """Compile what `record_lanes` will run on such arguments, without running it."""
-    program = _compiled(build_loop(loaded.mechanism, loaded.compensator, batch))
-    gains = _arrays(loaded.gains)
-    rig, run = jax.eval_shape(program.begin, gains, batch)
-    program.begin.lower(gains, batch).compile()
-    program.record_chunk.lower(rig, gains, run).compile()
+from jaxhil.simulation.recording import as_arrays, recorder
+from jaxhil.simulation.rollout import Run, noise_ahead, stretch_length, turn_over
+from jaxhil.simulation.scenario import Scenario
 
 
 def run_closed_loop(loaded: LoadedGains, gain_file: GainFile, batch: Scenario) -> Metrics:
@@ -101,9 +34,9 @@ def run_closed_loop(loaded: LoadedGains, gain_file: GainFile, batch: Scenario) -
     position command from the numerical model are the runtime's, in plain Python, tick by tick as on the rig.
     """
     loop = build_loop(loaded.mechanism, loaded.compensator, batch)
-    gains = _arrays(loaded.gains)
+    gains = as_arrays(loaded.gains)
     # A batch begins as it does with the jax controller in the loop, which is then compiled already.
-    rig, run = _first_lane(_compiled(loop).begin(gains, batch))
+    rig, run = _first_lane(recorder(loop).begin(gains, batch))
     program = _compiled(dataclasses.replace(loop, compensator=OnTheRig(loop.compensator)))
     zeroed = loop.has_force_noise or loop.has_force_bias
     controller = Controller(gain_file)
@@ -161,20 +94,6 @@ class Sent(NamedTuple):
     kept: Any
 
 
-def _arrays(gains: dict[str, float]) -> Gains:
-    return {name: jnp.asarray(value) for name, value in gains.items()}
-
-
-def _lane(seen: Tick, zeroed: bool) -> Lane:
-    # A pause between two contacts still is the controller's; what follows the last active tick is not.
-    end = int(np.max(np.nonzero(seen.active)[0], initial=-1)) + 1
-    numbers = [*seen.signals, seen.command, seen.sent, *(seen.identified or ())]
-    finite = np.all(np.isfinite(np.stack(numbers)[:, :end]), axis=0)
-    end = end if np.all(finite) else int(np.argmin(finite))
-    seen = jax.tree.map(lambda leaf: leaf[:end], seen)
-    return Lane(seen.signals, seen.command, seen.identified, zeroed, seen.sent)
-
-
 @jax.jit
 def _first_lane(started: tuple[RigConstants, Run]) -> tuple[RigConstants, Run]:
     return jax.tree.map(lambda leaf: leaf[..., :1] if leaf.ndim else leaf, started)
@@ -183,8 +102,6 @@ def _first_lane(started: tuple[RigConstants, Run]) -> tuple[RigConstants, Run]:
 class _Program(NamedTuple):
     """The steps of one loop, compiled when first called."""
 
-    begin: Callable[..., tuple[RigConstants, Run]]
-    record_chunk: Callable[..., tuple[Run, Tick]]
     sense: Callable[..., tuple[Signals, PlantSignals]]
     integrate: Callable[..., tuple[Array, Array, Array]]
     advance: Callable[..., Run]
@@ -193,22 +110,7 @@ class _Program(NamedTuple):
 
 @lru_cache(maxsize=32)
 def _compiled(loop: Loop) -> _Program:
-    steps = (_begin, _record_chunk, _sense, _integrate, _advance, _turn_over)
-    return _Program(*(jax.jit(partial(step, loop)) for step in steps))
-
-
-def _begin(loop: Loop, gains: Gains, scenario: Scenario) -> tuple[RigConstants, Run]:
-    rig = build_rig_constants(loop, scenario)
-    return rig, start(loop, rig, gains)
-
-
-def _record_chunk(loop: Loop, rig: RigConstants, gains: Gains, run: Run) -> tuple[Run, Tick]:
-    def body(run, _):
-        run, ticks = stretch(loop, rig, gains, run, record=True)
-        return turn_over(loop, rig, gains, run, skip_flight=False), ticks
-
-    run, ticks = lax.scan(body, run, None, length=CHUNK // stretch_length(loop))
-    return run, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), ticks)
+    return _Program(*(jax.jit(partial(step, loop)) for step in (_sense, _integrate, _advance, _turn_over)))
 
 
 def _sense(loop: Loop, rig: RigConstants, run: Run) -> tuple[Signals, PlantSignals]:

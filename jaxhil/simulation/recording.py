@@ -1,0 +1,131 @@
+"""The loop recorded tick by tick: what the controller read and commanded, in every lane of a batch of runs.
+
+A run's pictures and time series, the vectors of a bundle for the rig and what verification replays are made
+of it.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from jaxhil.compensators import Gains, Signals
+from jaxhil.mechanism.structs import Mechanism, value_at
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.gain_file import LoadedGains
+from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants
+from jaxhil.simulation.metrics import Metrics
+from jaxhil.simulation.rollout import Run, Tick, start, stretch, stretch_length, turn_over
+from jaxhil.simulation.scenario import Scenario, build_scenarios
+
+CHUNK = 512  # ticks recorded by one call of the compiled program
+
+
+class Lane(NamedTuple):
+    """What the controller read and commanded [N] in one lane, (ticks,), up to the end of its last contact.
+
+    `sent` is the position command [m] that it made of the numerical model's motion after each tick.
+    `identified` is what it made of stiffness [N/m] and damping [N s/m], where it identifies them. With
+    `zeroed`, the loop takes F_c = 0 at the first tick of a run, whatever the controller says: before t = 0
+    there is no force, though a noisy or biased sensor reads some.
+    """
+
+    signals: Signals
+    command: np.ndarray | Array
+    identified: tuple[np.ndarray | Array, np.ndarray | Array] | None
+    zeroed: bool
+    sent: np.ndarray | Array | None = None
+
+
+def nominal_and_draws(mechanism: Mechanism, number: int, seed: int) -> Scenario:
+    """A batch of `number` >= 1 lanes: the nominal run, then draws of the mechanism's uncertain numbers."""
+    draws = {}
+    for path, drawn in draw(mechanism, number - 1, seed).items():
+        nominal = np.broadcast_to(np.asarray(value_at(mechanism, path), float), drawn.shape[1:])
+        draws[path] = np.concatenate([nominal[None], drawn])
+    return build_scenarios(mechanism, draws, seed=seed)
+
+
+def record_lanes(loaded: LoadedGains, batch: Scenario) -> tuple[Metrics, list[Lane]]:
+    """Run the loop with jax until every lane is done: metrics (slots, lanes), and each lane's record.
+
+    Free flight between two surfaces is not skipped: the rig does not skip it either. A record ends before its
+    first number that is not finite.
+    """
+    loop = build_loop(loaded.mechanism, loaded.compensator, batch)
+    metrics, seen = record_ticks(loop, loaded.gains, batch)
+    zeroed = loop.has_force_noise or loop.has_force_bias
+    return metrics, [
+        _lane(jax.tree.map(lambda leaf, index=index: leaf[:, index], seen), zeroed)
+        for index in range(seen.active.shape[1])
+    ]
+
+
+def record_ticks(loop: Loop, gains: Mapping[str, Any], batch: Scenario) -> tuple[Metrics, Tick]:
+    """Run the loop with jax until every lane is done: metrics (slots, lanes), every tick (ticks, lanes)."""
+    arrays = as_arrays(gains)
+    program = recorder(loop)
+    rig, run = program.begin(arrays, batch)
+    chunks = []
+    while np.any(run.active):
+        run, ticks = program.record_chunk(rig, arrays, run)
+        chunks.append(jax.device_get(ticks))
+    return jax.device_get(run.metrics), jax.tree.map(lambda *parts: np.concatenate(parts), *chunks)
+
+
+def prepare_recording(loaded: LoadedGains, batch: Scenario) -> None:
+    """Compile what `record_lanes` will run on such arguments, without running it."""
+    program = recorder(build_loop(loaded.mechanism, loaded.compensator, batch))
+    gains = as_arrays(loaded.gains)
+    rig, run = jax.eval_shape(program.begin, gains, batch)
+    program.begin.lower(gains, batch).compile()
+    program.record_chunk.lower(rig, gains, run).compile()
+
+
+class Recorder(NamedTuple):
+    """The programs that record one loop, compiled when first called: a batch of scenarios begins under its
+    gains, then a chunk of ticks is recorded at a time."""
+
+    begin: Callable[..., tuple[RigConstants, Run]]
+    record_chunk: Callable[..., tuple[Run, Tick]]
+
+
+@lru_cache(maxsize=32)
+def recorder(loop: Loop) -> Recorder:
+    """The programs of `loop`."""
+    return Recorder(jax.jit(partial(_begin, loop)), jax.jit(partial(_record_chunk, loop)))
+
+
+def as_arrays(gains: Mapping[str, Any]) -> Gains:
+    """Gains as the programs take them."""
+    return {name: jnp.asarray(value) for name, value in gains.items()}
+
+
+def _lane(seen: Tick, zeroed: bool) -> Lane:
+    # A pause between two contacts still is the controller's; what follows the last active tick is not.
+    end = int(np.max(np.nonzero(seen.active)[0], initial=-1)) + 1
+    numbers = [*seen.signals, seen.command, seen.sent, *(seen.identified or ())]
+    finite = np.all(np.isfinite(np.stack(numbers)[:, :end]), axis=0)
+    end = end if np.all(finite) else int(np.argmin(finite))
+    seen = jax.tree.map(lambda leaf: leaf[:end], seen)
+    return Lane(seen.signals, seen.command, seen.identified, zeroed, seen.sent)
+
+
+def _begin(loop: Loop, gains: Gains, scenario: Scenario) -> tuple[RigConstants, Run]:
+    rig = build_rig_constants(loop, scenario)
+    return rig, start(loop, rig, gains)
+
+
+def _record_chunk(loop: Loop, rig: RigConstants, gains: Gains, run: Run) -> tuple[Run, Tick]:
+    def body(run, _):
+        run, ticks = stretch(loop, rig, gains, run, record=True)
+        return turn_over(loop, rig, gains, run, skip_flight=False), ticks
+
+    run, ticks = lax.scan(body, run, None, length=CHUNK // stretch_length(loop))
+    return run, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), ticks)
