@@ -139,7 +139,7 @@ def test_law_without_a_c_file_is_named(monkeypatch):
 
     monkeypatch.setitem(COMPENSATORS, "toy", Toy)
     document = sign(gain_document("none") | {"compensator": "toy"})
-    with pytest.raises(InputError, match=r"^jaxhil/c99/toy\.c: found no such file, allowed one per law$"):
+    with pytest.raises(InputError, match=r"^jaxhil/c99/laws/toy\.c: found no such file"):
         c99_texts(document)
 
 

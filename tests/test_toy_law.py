@@ -74,11 +74,17 @@ IN_C = {
     "char stateless; /* C has no empty structs */": "double share, before;",
     "(void)gains;\n    law->stateless = 0;": "law->share = gains->toy_share;\n    law->before = 0.0;",
     "(void)law, (void)position_desired": "(void)position_desired",
-    "return force_measured;": "const double command = force_measured + law->share * (force_measured - "
-    "law->before);\n    law->before = force_measured;\n    return command;",
-    "reset(jaxhil_law *law) {\n    (void)law;": "reset(jaxhil_law *law) {\n    law->before = 0.0;",
-    "next_contact(jaxhil_law *law) {\n    (void)law;": "next_contact(jaxhil_law *law) {\n"
-    "    law->before = 0.0;",
+    "return force_measured;\n}\n": """const double command =
+        force_measured + law->share * (force_measured - law->before);
+    law->before = force_measured;
+    return command;
+}
+
+#define JAXHIL_LAW_HAS_RESET
+static void jaxhil_law_reset(jaxhil_law *law) {
+    law->before = 0.0;
+}
+""",
 }
 # Agreement of JAX and runtime, derivatives, export with the bundle's self-test, of C, too.
 RUN = (

@@ -11,7 +11,7 @@
 
 #include "faults_table.c"
 #include "inputs.c"
-#include "law.c"
+#include "law_defaults.c"
 #include "law_status.c"
 #include "limits.c"
 #include "outputs.c"
@@ -285,11 +285,5 @@ jaxhil_contact_record jaxhil_last_contact(const jaxhil_controller *controller) {
 }
 
 double jaxhil_force_delay(const jaxhil_controller *controller) {
-#ifdef JAXHIL_LAW_ESTIMATES_DELAY
-    if (controller->usable) {
-        return jaxhil_law_force_delay(&controller->law);
-    }
-#endif
-    (void)controller;
-    return 0.0;
+    return controller->usable ? jaxhil_law_force_delay(&controller->law) : 0.0;
 }

@@ -3,8 +3,6 @@
 
 #include "limits_table.c"
 
-/* == Declarations == */
-
 /* == Definitions == */
 
 static bool jaxhil_limits_fit(const jaxhil_limits *limits) {

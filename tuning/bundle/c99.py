@@ -2,10 +2,10 @@
 
 The sources stand as fragments in `jaxhil/c99`, the laws' in `laws`, one file per subject, as in the Python
 runtime. A fragment opens with a comment and its `#include` lines; `/* == Declarations == */` begins what goes
-into the header, `/* == Definitions == */` what goes into the source. It includes the fragments that it needs
-by name; `law.c` stands for the exported law's own file, which has the law's name, `..._table.c` for what
-`c99_tables` makes of the runtime's tables. Where a fragment sizes an array by `JAXHIL_<NAME>_SAMPLES`, that
-constant is the length of a line which delays by the gain or limit of that name.
+into the header, if anything does, `/* == Definitions == */` what goes into the source. It includes the
+fragments that it needs by name; `law.c` stands for the exported law's own file, which has the law's name,
+`..._table.c` for what `c99_tables` makes of the runtime's tables. Where a fragment sizes an array by
+`JAXHIL_<NAME>_SAMPLES`, that constant is the length of a line which delays by the gain or limit of that name.
 """
 
 import math
@@ -108,9 +108,16 @@ _TABLES: Mapping[str, Callable[[str], Table]] = {
 
 
 class _Fragment(NamedTuple):
+    """A part of the C sources.
+
+    system: the headers that it includes, as `math.h`.
+    local: the fragments that it includes.
+    declarations: what it adds to the header, "" or a newline if nothing.
+    definitions: what it adds to the source, likewise.
+    """
+
     system: tuple[str, ...]
     local: tuple[str, ...]
-    comment: str
     declarations: str
     definitions: str
 
@@ -125,11 +132,8 @@ def c99_texts(document: Mapping[str, Any], source: str = "gain document") -> dic
     Controller(gain_file, source)  # refuses delays that no line can hold
     law = gain_file.compensator
     fragments = _in_order("controller.c", law)
-    declarations = "\n".join(
-        f"{fragment.comment}\n{fragment.declarations}" if fragment.declarations.strip() else fragment.comment
-        for fragment in fragments
-    )
-    definitions = "\n".join(fragment.definitions for fragment in fragments if fragment.definitions.strip())
+    declarations = "\n".join(part for fragment in fragments if (part := fragment.declarations).strip())
+    definitions = "\n".join(part for fragment in fragments if (part := fragment.definitions).strip())
     system = sorted({name for fragment in fragments for name in fragment.system} - {"float.h"})
     return {
         HEADER: _HEADER.format(
@@ -164,18 +168,22 @@ def _in_order(root: str, law: str) -> list[_Fragment]:
 
 def _fragment(name: str, law: str) -> _Fragment:
     if name in _TABLES:
-        return _Fragment(("math.h", "stdbool.h", "stdint.h"), (), *_TABLES[name](law))
-    head, declared, rest = _read(name).partition(DECLARATIONS)
-    declarations, defined, definitions = rest.partition(DEFINITIONS)
-    if not declared or not defined:
-        raise InputError(f"jaxhil/c99/{name}: found no two parts, allowed declarations, then definitions")
+        comment, declarations, definitions = _TABLES[name](law)
+        return _Fragment(("math.h", "stdbool.h", "stdint.h"), (), f"{comment}\n{declarations}", definitions)
+    before, marked, definitions = _read(name).partition(DEFINITIONS)
+    if not marked:
+        raise InputError(f"jaxhil/c99/{name}: found no definitions, allowed {DEFINITIONS.strip()}")
+    head, _, declarations = before.partition(DECLARATIONS)
     includes = _INCLUDE.findall(head)
+    comment = _INCLUDE.sub("", head).strip() + "\n"
+    parts = [declarations.strip("\n"), definitions.strip("\n")]
+    # The comment opens what there is: most fragments declare something.
+    first = 0 if parts[0] else 1
+    parts[first] = f"{comment}\n{parts[first]}"
     return _Fragment(
         tuple(file for mark, file in includes if mark == "<"),
         tuple(file for mark, file in includes if mark == '"'),
-        _INCLUDE.sub("", head).strip() + "\n",
-        declarations.strip("\n") + "\n",
-        definitions.strip("\n") + "\n",
+        *(f"{part}\n" for part in parts),
     )
 
 

@@ -8,7 +8,6 @@
 
 #include "filters.c"
 #include "gains_table.c"
-#include "law_status_table.c"
 #include "surfaces.c"
 
 /* == Declarations == */
@@ -58,30 +57,10 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
     return jaxhil_lead_filter_step(&law->lead, force_measured + observed);
 }
 
-static double jaxhil_law_position_command(jaxhil_law *law, double position, double velocity,
-                                          double acceleration) {
-    (void)law, (void)velocity, (void)acceleration;
-    return position;
-}
-
-static void jaxhil_law_identified(const jaxhil_law *law, double *stiffness, double *damping) {
-    (void)law;
-    *stiffness = 0.0;
-    *damping = 0.0;
-}
-
-static int jaxhil_law_own_status(const jaxhil_law *law) {
-    (void)law;
-    return JAXHIL_UNSTATED;
-}
-
+#define JAXHIL_LAW_HAS_RESET
 static void jaxhil_law_reset(jaxhil_law *law) {
     jaxhil_lead_filter_reset(&law->lead);
     law->withheld = 0.0;
     law->observed = 0.0;
     law->started = false;
-}
-
-static void jaxhil_law_next_contact(jaxhil_law *law) {
-    jaxhil_law_reset(law);
 }

@@ -4,7 +4,6 @@
 #include <stdbool.h>
 
 #include "gains_table.c"
-#include "law_status_table.c"
 
 /* == Declarations == */
 
@@ -26,26 +25,8 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
     return force_measured;
 }
 
+#define JAXHIL_LAW_HAS_POSITION_COMMAND
 static double jaxhil_law_position_command(jaxhil_law *law, double position, double velocity,
                                           double acceleration) {
     return position + law->of_velocity * velocity + law->of_acceleration * acceleration;
-}
-
-static void jaxhil_law_identified(const jaxhil_law *law, double *stiffness, double *damping) {
-    (void)law;
-    *stiffness = 0.0;
-    *damping = 0.0;
-}
-
-static int jaxhil_law_own_status(const jaxhil_law *law) {
-    (void)law;
-    return JAXHIL_UNSTATED;
-}
-
-static void jaxhil_law_reset(jaxhil_law *law) {
-    (void)law;
-}
-
-static void jaxhil_law_next_contact(jaxhil_law *law) {
-    (void)law;
 }

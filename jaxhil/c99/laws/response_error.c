@@ -11,7 +11,6 @@
 #include "gains_table.c"
 #include "gates.c"
 #include "identification.c"
-#include "law_status_table.c"
 #include "surfaces.c"
 
 /* == Declarations == */
@@ -107,28 +106,20 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
                     (velocity_desired - velocity_measured));
 }
 
-static double jaxhil_law_position_command(jaxhil_law *law, double position, double velocity,
-                                          double acceleration) {
-    (void)law, (void)velocity, (void)acceleration;
-    return position;
-}
-
+#define JAXHIL_LAW_HAS_IDENTIFIED
 static void jaxhil_law_identified(const jaxhil_law *law, double *stiffness, double *damping) {
     *stiffness = law->identification.stiffness;
     *damping = law->identification.damping;
 }
 
-static int jaxhil_law_own_status(const jaxhil_law *law) {
-    (void)law;
-    return JAXHIL_UNSTATED;
-}
-
+#define JAXHIL_LAW_HAS_RESET
 static void jaxhil_law_reset(jaxhil_law *law) {
     jaxhil_lead_filter_reset(&law->lead);
     jaxhil_identification_reset(&law->identification);
     law->started = false;
 }
 
+#define JAXHIL_LAW_HAS_NEXT_CONTACT
 static void jaxhil_law_next_contact(jaxhil_law *law) {
     jaxhil_lead_filter_reset(&law->lead);
     jaxhil_identification_restart_covariance(&law->identification);

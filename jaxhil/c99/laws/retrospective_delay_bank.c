@@ -4,12 +4,9 @@
 #include "delay_bank.c"
 #include "retrospective_law.c"
 
-/* == Declarations == */
-
-#define JAXHIL_LAW_ESTIMATES_DELAY
-
 /* == Definitions == */
 
+#define JAXHIL_LAW_HAS_FORCE_DELAY
 static double jaxhil_law_force_delay(const jaxhil_law *law) {
     return law->learnt.told + law->learnt.shift;
 }

@@ -352,27 +352,18 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
     return side * weight * command;
 }
 
-static double jaxhil_law_position_command(jaxhil_law *law, double position, double velocity,
-                                          double acceleration) {
-    (void)law, (void)velocity, (void)acceleration;
-    return position;
-}
-
-static void jaxhil_law_identified(const jaxhil_law *law, double *stiffness, double *damping) {
-    (void)law;
-    *stiffness = 0.0;
-    *damping = 0.0;
-}
-
+#define JAXHIL_LAW_HAS_STATUS
 static int jaxhil_law_own_status(const jaxhil_law *law) {
     return law->status;
 }
 
+#define JAXHIL_LAW_HAS_RESET
 static void jaxhil_law_reset(jaxhil_law *law) {
     jaxhil_law_restart(law);
     jaxhil_learnt_reset(&law->learnt);
 }
 
+#define JAXHIL_LAW_HAS_NEXT_CONTACT
 static void jaxhil_law_next_contact(jaxhil_law *law) {
     jaxhil_law_restart(law);
 }

@@ -5,6 +5,4 @@
 #include "one_delay.c"
 #include "retrospective_law.c"
 
-/* == Declarations == */
-
 /* == Definitions == */

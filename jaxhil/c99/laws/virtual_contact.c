@@ -4,7 +4,6 @@
 #include <stdbool.h>
 
 #include "gains_table.c"
-#include "law_status_table.c"
 #include "surfaces.c"
 
 /* == Declarations == */
@@ -30,29 +29,4 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
         return force_measured;
     }
     return force_measured + (law->stiffness * depth + law->damping * velocity_desired);
-}
-
-static double jaxhil_law_position_command(jaxhil_law *law, double position, double velocity,
-                                          double acceleration) {
-    (void)law, (void)velocity, (void)acceleration;
-    return position;
-}
-
-static void jaxhil_law_identified(const jaxhil_law *law, double *stiffness, double *damping) {
-    (void)law;
-    *stiffness = 0.0;
-    *damping = 0.0;
-}
-
-static int jaxhil_law_own_status(const jaxhil_law *law) {
-    (void)law;
-    return JAXHIL_UNSTATED;
-}
-
-static void jaxhil_law_reset(jaxhil_law *law) {
-    (void)law;
-}
-
-static void jaxhil_law_next_contact(jaxhil_law *law) {
-    (void)law;
 }

@@ -1,31 +1,14 @@
 """Smith predictor of the force: phase lead for its delay, a prediction for the motion simulator's lag."""
 
-from collections.abc import Mapping
-from typing import ClassVar
-
-from ..filters import LeadFilter
-from ..registry import Compensator, GainSpecification, register
+from ..registry import register
+from .smith import Smith
 
 
 @register("smith_predictor")
-class SmithPredictor(Compensator):
-    """F_c = (1 + T_s s/(1 + T_s s/2)) (1 + T_l s) F, each factor by Tustin's rule.
+class SmithPredictor(Smith):
+    """F_c = (1 + T_s s/(1 + T_s s/2)) (1 + T_l s) F, the factors as in `Smith`."""
 
-    T_l = phase_lead, filtered with lead_filter as in phase lead; T_s = simulator_lag.
-    """
-
-    __slots__ = ("_lead", "_predictor")
-
-    gains: ClassVar[Mapping[str, GainSpecification]] = {
-        "phase_lead": GainSpecification("s"),
-        "lead_filter": GainSpecification("s", lowest=0.0, exclusive=True),
-        "simulator_lag": GainSpecification("s", lowest=0.0),
-    }
-
-    def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
-        lag = gains["simulator_lag"]
-        self._lead = LeadFilter(gains["phase_lead"], gains["lead_filter"], period)
-        self._predictor = LeadFilter(lag, 0.5 * lag, period)
+    __slots__ = ()
 
     def step(
         self,
@@ -36,8 +19,3 @@ class SmithPredictor(Compensator):
     ) -> float:
         """The measured force [N], led and predicted."""
         return self._predictor.step(self._lead.step(force_measured))
-
-    def reset(self) -> None:
-        """Restart the filters."""
-        self._lead.reset()
-        self._predictor.reset()
