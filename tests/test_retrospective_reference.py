@@ -158,8 +158,8 @@ def test_reference_of_a_known_map_is_the_exact_motion(damping, first):
         time = (first + tick) * PERIOD
         if time < ends - PERIOD:
             exact = math.exp(-decay * time) * math.sin(rate * time) / rate
-            assert reference.depth == pytest.approx(exact, abs=2e-3 / rate)
-    assert reference.speed == pytest.approx(leaves, abs=2e-3)
+            assert reference.live.depth == pytest.approx(exact, abs=2e-3 / rate)
+    assert reference.live.speed == pytest.approx(leaves, abs=2e-3)
 
 
 def test_reference_loses_what_the_unloading_takes():
@@ -170,7 +170,7 @@ def test_reference_loses_what_the_unloading_takes():
     curve = curve_of(np.full(12, stiffness), unloading=(ratio - 1) * stiffness)
     for _ in range(200):
         reference.tick(curve)
-    assert reference.speed == pytest.approx(-1 / 1.2, abs=2e-3)
+    assert reference.live.speed == pytest.approx(-1 / 1.2, abs=2e-3)
 
 
 def test_replayed_force_makes_up_for_a_wrong_map():
@@ -190,7 +190,7 @@ def test_replayed_force_makes_up_for_a_wrong_map():
             reference.remember(index, *(float(value) for value in sample))
         for _ in range(last):
             reference.tick(wrong)
-        found[replay] = abs(reference.depth - depths[-1]) * rate
+        found[replay] = abs(reference.live.depth - depths[-1]) * rate
     assert found[1.0] < 2e-3 and found[0.0] > 0.1
 
 
@@ -215,7 +215,7 @@ def test_what_a_dead_zone_hides_is_left_to_the_map(shown):
         reference.remember(index, *(float(value) for value in sample))
     for _ in range(last):
         reference.tick(right)
-    error = abs(reference.speed - speeds[-1])
+    error = abs(reference.live.speed - speeds[-1])
     assert error < 2e-3 if shown else error > 0.1
 
 

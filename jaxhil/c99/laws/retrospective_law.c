@@ -10,22 +10,22 @@
 #include "doubts.c"
 #include "filters.c"
 #include "gains_table.c"
+#include "hardware_samples.c"
 #include "reintegration.c"
 #include "surfaces.c"
 
 /* == Declarations == */
 
 typedef struct {
-    double period, clearance, mass, share, force_noise, dead_zone, floor;
-    double velocity_gain, limit, replay, replay_noise;
+    double period, clearance, mass, share, force_noise, dead_zone, floor, velocity_gain, limit, replay, strength;
+    double middle, last, side, speed, gone, squares, count, deepest, hardware_deepest, plane, surface;
     jaxhil_delay_line line;
     jaxhil_learnt learnt;
     jaxhil_reference_motion reference;
-    double middle, last, side, speed, gone, squares, count, first, fraction, impulse, read, moved, plane, surface;
-    double sample, sample_depth, sample_speed, sample_deepest, deepest, hardware_deepest;
+    jaxhil_hardware_samples hardware;
     jaxhil_doubts doubts;
-    long offset, ticks, elapsed;
-    bool whole, touched, started, moved_shown, sample_shown;
+    long elapsed;
+    bool whole, entered, started;
     int status;
     double samples[JAXHIL_IDENTIFICATION_DELAY_SAMPLES];
 } jaxhil_law;
@@ -33,7 +33,7 @@ typedef struct {
 /* == Definitions == */
 
 static const double jaxhil_farewell = 0.006;   /* s for which it goes on after the hardware has left */
-static const double jaxhil_longest_lag = 0.1;  /* s for which it waits for hardware that has not touched yet */
+static const double jaxhil_longest_lag = 0.1;  /* s for which it waits for hardware that is not in contact yet */
 static const double jaxhil_seen = 8.0;         /* readings out of contact that show how noisy the force is */
 static const double jaxhil_outstanding = 16.0; /* times the noise's variance: what hardly is noise */
 
@@ -41,23 +41,11 @@ static const double jaxhil_outstanding = 16.0; /* times the noise's variance: wh
 static void jaxhil_law_restart(jaxhil_law *law) {
     law->side = 0.0;
     law->speed = 0.0;
-    law->touched = false;
+    law->entered = false;
     law->gone = 0.0;
     law->squares = 0.0;
     law->count = 0.0;
-    law->first = 0.0;
-    law->fraction = 0.0;
-    law->offset = 0;
-    law->ticks = 0;
-    law->impulse = 0.0;
-    law->read = 0.0;
-    law->moved = 0.0;
-    law->moved_shown = true;
-    law->sample = 0.0;
-    law->sample_shown = true;
-    law->sample_depth = 0.0;
-    law->sample_speed = 0.0;
-    law->sample_deepest = 0.0;
+    jaxhil_hardware_samples_reset(&law->hardware);
     law->deepest = 0.0;
     law->hardware_deepest = 0.0;
     law->elapsed = 0;
@@ -83,12 +71,13 @@ static bool jaxhil_law_init(jaxhil_law *law, const jaxhil_gains *gains) {
     law->velocity_gain = gains->velocity_gain;
     law->limit = gains->correction_limit;
     law->replay = gains->force_replay;
-    law->replay_noise = gains->replay_noise;
+    law->strength = gains->replay_noise * gains->replay_noise;
     law->middle = 0.0;
     law->last = 0.0;
     jaxhil_doubts_start(&law->doubts, 0.0, 0.0);
     jaxhil_learnt_init(&law->learnt, gains);
     jaxhil_reference_motion_init(&law->reference, period);
+    law->hardware.period = period;
     jaxhil_law_restart(law);
     law->whole = whole;
     /* The line delays by less than the capacity allows: a delay is refused like that of the other laws. */
@@ -130,56 +119,11 @@ static void jaxhil_law_take_noise(jaxhil_law *law, double force) {
     law->count += 1.0;
 }
 
-/* The hardware's entry: where its samples fall on the reference's grid. */
-static void jaxhil_law_touch(jaxhil_law *law, double depth, double rate) {
-    const double period = law->period;
-    double since = 0.5 * period;
-    if (rate > 0.0) {
-        since = depth / rate;
-        if (!(since <= period)) {
-            since = period;
-        }
-    }
-    const double shift = (law->first - since) / period;
-    const double whole = floor(shift);
-    law->fraction = shift - whole;
-    law->offset = -1 - (long)whole;
-    law->ticks = 0;
-    law->touched = true;
-    law->doubts.late = law->first + (double)law->elapsed * period;
-}
-
-/* This tick's sample, moved to the reference's grid, into its history. */
-static void jaxhil_law_remember(jaxhil_law *law, double force, bool hidden, double depth, double rate,
-                                double deepest) {
-    const double fraction = law->fraction;
-    const double moved = law->sample + fraction * (force - law->sample);
-    const bool shown = !hidden && law->sample_shown;
-    const long index = law->ticks + law->offset;
-    law->ticks++;
-    if (index == 0) {
-        const double ticks = shown ? law->first / law->period : 0.0;
-        law->impulse = 0.5 * moved * ticks;
-        law->read = ticks;
-    } else if (index > 0 && shown && law->moved_shown) {
-        law->impulse += 0.5 * (law->moved + moved);
-        law->read += 1.0;
-    }
-    law->moved = moved;
-    law->moved_shown = shown;
-    if (index >= 0) {
-        jaxhil_reference_motion_remember(&law->reference, index, law->impulse, law->read,
-                                         law->sample_depth + fraction * (depth - law->sample_depth),
-                                         law->sample_speed + fraction * (rate - law->sample_speed),
-                                         law->sample_deepest + fraction * (deepest - law->sample_deepest));
-    }
-}
-
-/* The force's variance [N^2]: what it is told, or what readings out of contact show if that is more. */
+/* The force's variance [N^2]: the known one, or what readings out of contact show if that is more. */
 static double jaxhil_law_noise(const jaxhil_law *law) {
-    const double told = law->force_noise * law->force_noise;
+    const double known = law->force_noise * law->force_noise;
     const double seen = law->squares / (law->count > 0.0 ? law->count : 1.0);
-    return seen > told ? seen : told;
+    return seen > known ? seen : known;
 }
 
 /* A reading [N] out of contact while one is under way: noise, or the hardware, met too early. */
@@ -199,24 +143,35 @@ static void jaxhil_law_sort_out(jaxhil_law *law, double force, double depth, dou
     }
 }
 
+/* f_e [1/s], for the speed of the model in the middle of the next period; `status` judges it. */
+static double jaxhil_law_repayment(jaxhil_law *law, const jaxhil_curve *curve, double speed, double deepest,
+                                   double zone) {
+    const double peak = jaxhil_curve_peak_force(curve);
+    const double limit = law->limit * peak;
+    const double correction = law->velocity_gain * (speed - law->reference.live.speed);
+    law->status = jaxhil_doubts_status(&law->doubts, curve, peak, deepest, jaxhil_learnt_variance(&law->learnt),
+                                       zone, law->speed);
+    if (!(correction > limit || correction < -limit)) {
+        return correction;
+    }
+    law->status = law->status == JAXHIL_IDENTIFIED ? JAXHIL_SATURATED : law->status;
+    return correction > limit ? limit : -limit;
+}
+
 /* The command over M v0 [1/s]; whether the numerical model has separated. */
-static double jaxhil_law_follow(jaxhil_law *law, bool enters, double x, double v, double told, double depth,
+static double jaxhil_law_follow(jaxhil_law *law, bool enters, double x, double v, double given, double depth,
                                 double rate, double force, bool hidden, double weight, bool *separated) {
     const double period = law->period;
     const jaxhil_curve *curve = jaxhil_learnt_curve(&law->learnt);
+    jaxhil_hardware_samples *hardware = &law->hardware;
     law->elapsed++;
     if (enters) {
         jaxhil_learnt_begin(&law->learnt);
         jaxhil_reference_motion_restart(&law->reference, x);
-        law->first = x;
+        jaxhil_hardware_samples_begin(hardware, x, force, !hidden, given - period * rate, rate);
         law->elapsed = 0;
         law->deepest = 0.0;
         law->hardware_deepest = 0.0;
-        law->sample = force;
-        law->sample_shown = !hidden;
-        law->sample_depth = told - period * rate;
-        law->sample_speed = rate;
-        law->sample_deepest = 0.0;
     }
     if (x > law->deepest) {
         law->deepest = x;
@@ -231,22 +186,23 @@ static double jaxhil_law_follow(jaxhil_law *law, bool enters, double x, double v
     const double noise = square > 0.0 ? jaxhil_law_noise(law) / square : 0.0;
     const double variance = law->floor * law->floor + noise;
     if (depth > 0.0) {
-        if (!law->touched) {
-            jaxhil_law_touch(law, depth, rate);
+        if (!law->entered) {
+            law->entered = true;
+            jaxhil_hardware_samples_enter(hardware, depth, rate);
+            law->doubts.late = hardware->first + (double)law->elapsed * period;
         }
         if (!hidden) {
             jaxhil_doubts_read(&law->doubts, depth, deepest, force, variance);
         }
     }
     law->reference.shift = jaxhil_learnt_shift(&law->learnt);
-    jaxhil_learnt_read(&law->learnt, told, rate, deepest, force, variance, hidden, zone);
+    jaxhil_learnt_read(&law->learnt, given, rate, deepest, force, variance, hidden, zone);
     const double expected = jaxhil_curve_force(curve, depth, rate, deepest);
     if (hidden) {
         force = expected > zone ? zone : (expected > 0.0 ? expected : 0.0);
     }
-    const double strength = law->replay_noise * law->replay_noise;
-    const double whole = strength + noise;
-    law->reference.replay = whole > 0.0 ? law->replay * strength / whole : 0.0;
+    const double whole = law->strength + noise;
+    law->reference.replay = whole > 0.0 ? law->replay * law->strength / whole : 0.0;
     jaxhil_reference_motion_tick(&law->reference, curve);
 
     double own = jaxhil_curve_force(curve, x, v, law->deepest);
@@ -254,28 +210,21 @@ static double jaxhil_law_follow(jaxhil_law *law, bool enters, double x, double v
     if (!(own > 0.0)) {
         own = 0.0;
     }
-    const double peak = jaxhil_curve_peak_force(curve);
-    const double limit = law->limit * peak;
-    double correction = law->velocity_gain * (v - 0.5 * period * own - law->reference.live.speed);
-    law->status = jaxhil_doubts_status(&law->doubts, curve, peak, deepest, jaxhil_learnt_variance(&law->learnt),
-                                       zone, law->speed);
-    if (correction > limit || correction < -limit) {
-        correction = correction > limit ? limit : -limit;
-        law->status = law->status == JAXHIL_IDENTIFIED ? JAXHIL_SATURATED : law->status;
-    }
-    double command = correction;
-    if (!*separated) {
-        command = own + (force - expected) + correction;
-    }
-    if (law->touched) {
-        jaxhil_law_remember(law, force, hidden, told, rate, deepest);
-    }
-    law->sample = force;
-    law->sample_shown = !hidden;
-    law->sample_depth = told;
-    law->sample_speed = rate;
-    law->sample_deepest = deepest;
-    return command;
+    const double correction = jaxhil_law_repayment(law, curve, v - 0.5 * period * own, deepest, zone);
+    jaxhil_hardware_samples_take(hardware, &law->reference, law->entered, force, !hidden, given, rate, deepest);
+    return *separated ? correction : own + (force - expected) + correction;
+}
+
+/* The numerical model is beyond another surface: a contact begins. */
+static void jaxhil_law_meet(jaxhil_law *law, double side, double depth, double velocity) {
+    const double approach = side * velocity;
+    const bool sound = law->mass * approach > 0.0 && fabs(depth) <= 2.0 * law->period * approach;
+    law->side = side;
+    law->speed = sound ? approach : 0.0;
+    law->entered = false;
+    law->gone = 0.0;
+    law->plane = 0.0;
+    jaxhil_doubts_restart(&law->doubts);
 }
 
 static double jaxhil_law_step(jaxhil_law *law, double force_measured, double position_desired,
@@ -285,18 +234,11 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
     double position, velocity;
     jaxhil_law_align(law, position_measured, velocity_desired, &position, &velocity);
     const double bent = jaxhil_deflection(position, clearance);
-    const double touching = jaxhil_deflection(position_desired, clearance);
-    const double now = touching > 0.0 ? 1.0 : (touching < 0.0 ? -1.0 : 0.0);
+    const double reach = jaxhil_deflection(position_desired, clearance);
+    const double now = reach > 0.0 ? 1.0 : (reach < 0.0 ? -1.0 : 0.0);
     const bool enters = now != 0.0 && now != law->side;
     if (enters) {
-        const double approach = now * velocity_desired;
-        const bool sound = law->mass * approach > 0.0 && fabs(touching) <= 2.0 * period * approach;
-        law->side = now;
-        law->speed = sound ? approach : 0.0;
-        law->touched = false;
-        law->gone = 0.0;
-        law->plane = 0.0;
-        jaxhil_doubts_restart(&law->doubts);
+        jaxhil_law_meet(law, now, reach, velocity_desired);
     }
     const double side = law->side;
     if (side == 0.0) {
@@ -311,9 +253,9 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
     const double weight = law->mass * scale;
     const double x = (side < 0.0 ? -clearance - position_desired : position_desired) / scale;
     const double v = side * velocity_desired / scale;
-    const double told = (side < 0.0 ? -clearance - position : position) / scale + law->plane;
+    const double given = (side < 0.0 ? -clearance - position : position) / scale + law->plane;
     const double rate = side * velocity / scale;
-    const double shifted = told - jaxhil_learnt_shift(&law->learnt) * rate;
+    const double shifted = given - jaxhil_learnt_shift(&law->learnt) * rate;
     const double depth = shifted >= -jaxhil_map_surface && shifted <= jaxhil_map_surface ? 0.0 : shifted;
     const double zone = law->dead_zone;
     bool hidden = false;
@@ -326,8 +268,8 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
             force = side * (force_measured - zone) / weight;
         }
     }
-    if (!law->touched && !(speed > 0.0 && depth > 0.0) && bent == 0.0) {
-        jaxhil_law_sort_out(law, force_measured, told, weight);
+    if (!law->entered && !(speed > 0.0 && depth > 0.0) && bent == 0.0) {
+        jaxhil_law_sort_out(law, force_measured, given, weight);
     }
     if (!enters) {
         law->gone += 1.0;
@@ -338,12 +280,12 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
     bool separated = x <= 0.0;
     double command = separated ? 0.0 : force;
     if (speed > 0.0) {
-        command = jaxhil_law_follow(law, enters, x, v, told, depth, rate, force, hidden, weight,
+        command = jaxhil_law_follow(law, enters, x, v, given, depth, rate, force, hidden, weight,
                                     &separated);
     } else {
         law->status = JAXHIL_UNSURE;
     }
-    const double patience = law->touched || !(speed > 0.0) ? jaxhil_farewell : jaxhil_longest_lag;
+    const double patience = law->entered || !(speed > 0.0) ? jaxhil_farewell : jaxhil_longest_lag;
     if (separated && law->gone * period > patience * (1.0 + 1e-9)) {
         law->side = 0.0;
         law->status = JAXHIL_OUT_OF_CONTACT;

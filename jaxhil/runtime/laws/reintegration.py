@@ -65,13 +65,13 @@ class ReferenceMotion:
         "_depths",
         "_first",
         "_impulses",
-        "_live",
         "_number",
         "_period",
         "_present",
         "_reached",
         "_reads",
         "_speeds",
+        "live",
         "replay",
         "shift",
     )
@@ -87,19 +87,9 @@ class ReferenceMotion:
         self._depths = [0.0] * HISTORY
         self._speeds = [0.0] * HISTORY
         self._deepest = [0.0] * HISTORY
-        self._live = Path()
+        self.live = Path()
         self._behind = Path()
         self.restart(0.0)
-
-    @property
-    def depth(self) -> float:
-        """Where the numerical model should be [s]."""
-        return self._live.depth
-
-    @property
-    def speed(self) -> float:
-        """How fast it should move, as a fraction of the approach speed."""
-        return self._live.speed
 
     def restart(self, first: float) -> None:
         """A contact whose sample 0, the next tick's, comes `first` [s] after its entry."""
@@ -126,7 +116,7 @@ class ReferenceMotion:
         """One tick of the live motion and of the pass."""
         present = self._present + 1
         self._present = present
-        live = self._live
+        live = self.live
         behind = self._behind
         reached = self._reached
         if reached >= 0 or self._number <= HISTORY:

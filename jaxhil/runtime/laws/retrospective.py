@@ -13,12 +13,11 @@ No model of the motion simulator is used. Without f_e it is the published law wi
 k_hat and b_hat: that is what remains while nothing is identified. A known dead zone is added to what the
 sensor reads; what it hides counts as half of it, where the map expects more than the dead zone, and nothing
 of it is replayed. The noisier the force, the less of what the map does not explain is replayed in the
-motion. Where forces stand out of the noise before the hardware was to touch, its surface is nearer than
-told: it is taken to be where the first of them was read.
+motion. Where forces stand out of the noise before the hardware should be in contact, its surface is nearer
+than it was taken to be: it is then taken to be where the first of them was read.
 """
 
 from collections.abc import Mapping
-from math import floor
 from typing import ClassVar
 
 from ..filters import DelayLine
@@ -26,13 +25,14 @@ from ..law_status import IDENTIFIED, OUT_OF_CONTACT, SATURATED, UNSURE
 from ..registry import Compensator, GainSpecification
 from ..surfaces import deflection
 from .doubts import EARLY, Doubts
-from .force_depth_map import SURFACE, Prior
+from .force_depth_map import SURFACE, Curve, Prior
+from .hardware_samples import HardwareSamples
 from .reintegration import ReferenceMotion
 
 SEEN = 8  # readings out of contact that show how noisy the force is
 OUTSTANDING = 16.0  # times the noise's variance: what hardly is noise
 FAREWELL = 0.006  # s for which it goes on after the hardware has left the surface
-LONGEST_LAG = 0.1  # s for which it waits for hardware that has not touched yet
+LONGEST_LAG = 0.1  # s for which it waits for hardware that is not in contact yet
 PRIOR = (  # the gains that `Prior` is made of, in its order
     "prior_stiffness",
     "prior_stiffness_spread",
@@ -46,7 +46,7 @@ PRIOR = (  # the gains that `Prior` is made of, in its order
 class Retrospective(Compensator):
     """Reference and repayment; what identifies the contact is the law's own.
 
-    `_shift` [s] is by how much the force is older than it was told to be. Every contact starts afresh, also
+    `_shift` [s] is by how much the force is older than by the given delay. Every contact starts afresh, also
     with the other surface. A run that begins in contact has no approach speed to scale by: there F_c is the
     measured force. `status` is what stands behind the last command: `OUT_OF_CONTACT`; `UNSURE`: nothing is
     identified yet, or there is nothing to scale by, and it goes by the measured force and what the prior says
@@ -61,41 +61,29 @@ class Retrospective(Compensator):
         "_deepest",
         "_doubts",
         "_elapsed",
-        "_first",
+        "_entered",
         "_floor",
         "_force_noise",
-        "_fraction",
         "_gone",
         "_hardware_deepest",
-        "_impulse",
         "_last",
         "_limit",
         "_line",
         "_mass",
         "_middle",
-        "_moved",
-        "_moved_shown",
-        "_offset",
         "_period",
         "_plane",
-        "_read",
         "_reference",
         "_replay",
-        "_replay_noise",
-        "_sample",
-        "_sample_deepest",
-        "_sample_depth",
-        "_sample_shown",
-        "_sample_speed",
+        "_samples",
         "_share",
         "_shift",
         "_side",
         "_speed",
         "_squares",
         "_started",
+        "_strength",
         "_surface",
-        "_ticks",
-        "_touched",
         "_velocity_gain",
         "status",
     )
@@ -128,13 +116,14 @@ class Retrospective(Compensator):
         self._line = DelayLine(delay - period, period) if whole else None
         self._share = 1.0 if whole else delay / period
         self._reference = ReferenceMotion(period)
+        self._samples = HardwareSamples(self._reference, period)
         self._force_noise = gains["force_noise"]
         self._dead_zone = gains["dead_zone"]
         self._floor = gains["force_noise_floor"]
         self._velocity_gain = gains["velocity_gain"]
         self._limit = gains["correction_limit"]
         self._replay = gains["force_replay"]
-        self._replay_noise = gains["replay_noise"]
+        self._strength = gains["replay_noise"] * gains["replay_noise"]
         self._middle = 0.0
         self._last = 0.0
         self._doubts = Doubts()
@@ -154,18 +143,11 @@ class Retrospective(Compensator):
         clearance = self._clearance
         position, velocity = self._align(position_measured, velocity_desired)
         bent = deflection(position, clearance)
-        touching = deflection(position_desired, clearance)
-        now = 1.0 if touching > 0.0 else (-1.0 if touching < 0.0 else 0.0)
+        reach = deflection(position_desired, clearance)
+        now = 1.0 if reach > 0.0 else (-1.0 if reach < 0.0 else 0.0)
         enters = now != 0.0 and now != self._side
         if enters:
-            approach = now * velocity_desired
-            sound = self._mass * approach > 0.0 and abs(touching) <= 2.0 * period * approach
-            self._side = now
-            self._speed = approach if sound else 0.0
-            self._touched = False
-            self._gone = 0.0
-            self._plane = 0.0
-            self._doubts.restart()
+            self._meet(now, reach, velocity_desired)
         side = self._side
         if side == 0.0:
             if bent == 0.0:
@@ -177,10 +159,9 @@ class Retrospective(Compensator):
         weight = self._mass * scale
         x = (-clearance - position_desired if side < 0.0 else position_desired) / scale
         v = side * velocity_desired / scale
-        told = (-clearance - position if side < 0.0 else position) / scale + self._plane
+        given = (-clearance - position if side < 0.0 else position) / scale + self._plane
         rate = side * velocity / scale
-        shift = self._shift
-        depth = told - shift * rate
+        depth = given - self._shift * rate
         if -SURFACE <= depth <= SURFACE:
             depth = 0.0
         zone = self._dead_zone
@@ -192,31 +173,42 @@ class Retrospective(Compensator):
                 force = side * (force_measured + zone) / weight
             elif force_measured < 0.0:
                 force = side * (force_measured - zone) / weight
-        if not self._touched and not (speed > 0.0 and depth > 0.0) and bent == 0.0:
-            self._sort_out(force_measured, told, weight)
+        if not self._entered and not (speed > 0.0 and depth > 0.0) and bent == 0.0:
+            self._sort_out(force_measured, given, weight)
         if not enters:
             self._gone += 1.0
         if depth > 0.0:
             self._gone = 0.0
         if speed > 0.0:
-            command, separated = self._follow(enters, x, v, told, depth, rate, force, hidden, weight)
+            command, separated = self._follow(enters, x, v, given, depth, rate, force, hidden, weight)
         else:
             separated = x <= 0.0
             command = 0.0 if separated else force
             self.status = UNSURE
-        patience = FAREWELL if self._touched or not speed > 0.0 else LONGEST_LAG
+        patience = FAREWELL if self._entered or not speed > 0.0 else LONGEST_LAG
         if separated and self._gone * period > patience * (1.0 + 1e-9):
             self._side = 0.0
             self.status = OUT_OF_CONTACT
             return 0.0
         return side * weight * command
 
+    def _meet(self, side: float, depth: float, velocity: float) -> None:
+        """The numerical model is beyond another surface: a contact begins."""
+        approach = side * velocity
+        sound = self._mass * approach > 0.0 and abs(depth) <= 2.0 * self._period * approach
+        self._side = side
+        self._speed = approach if sound else 0.0
+        self._entered = False
+        self._gone = 0.0
+        self._plane = 0.0
+        self._doubts.restart()
+
     def _follow(
         self,
         enters: bool,
         x: float,
         v: float,
-        told: float,
+        given: float,
         depth: float,
         rate: float,
         force: float,
@@ -227,19 +219,15 @@ class Retrospective(Compensator):
         period = self._period
         curve = self._curve
         reference = self._reference
+        samples = self._samples
         self._elapsed += 1
         if enters:
             self._begin()
             reference.restart(x)
-            self._first = x
+            samples.begin(x, force, not hidden, given - period * rate, rate)
             self._elapsed = 0
             self._deepest = 0.0
             self._hardware_deepest = 0.0
-            self._sample = force
-            self._sample_shown = not hidden
-            self._sample_depth = told - period * rate
-            self._sample_speed = rate
-            self._sample_deepest = 0.0
         if x > self._deepest:
             self._deepest = x
         if depth > self._hardware_deepest:
@@ -251,45 +239,40 @@ class Retrospective(Compensator):
         noise = self._noise() / square if square > 0.0 else 0.0
         variance = self._floor * self._floor + noise
         if depth > 0.0:
-            if not self._touched:
-                self._touch(depth, rate)
+            if not self._entered:
+                self._entered = True
+                samples.enter(depth, rate)
+                self._doubts.late = samples.first + self._elapsed * period
             if not hidden:
                 self._doubts.read(depth, deepest, force, variance)
         reference.shift = self._shift
-        self._learn(told, rate, deepest, force, variance, hidden, zone)
+        self._learn(given, rate, deepest, force, variance, hidden, zone)
         expected = curve.force(depth, rate, deepest)
         if hidden:
             force = zone if expected > zone else (expected if expected > 0.0 else 0.0)
-        strength = self._replay_noise * self._replay_noise
-        whole = strength + noise
-        reference.replay = self._replay * strength / whole if whole > 0.0 else 0.0
+        whole = self._strength + noise
+        reference.replay = self._replay * self._strength / whole if whole > 0.0 else 0.0
         reference.tick(curve)
 
         own = curve.force(x, v, self._deepest)
         separated = x <= 0.0 or (v < 0.0 and own <= 0.0)
         if not own > 0.0:
             own = 0.0
+        correction = self._repayment(curve, v - 0.5 * period * own, deepest, zone)
+        samples.take(self._entered, force, not hidden, given, rate, deepest)
+        return (correction if separated else own + (force - expected) + correction), separated
+
+    def _repayment(self, curve: Curve, speed: float, deepest: float, zone: float) -> float:
+        """f_e [1/s], for the speed of the model in the middle of the next period; `status` judges it."""
         peak = curve.peak_force()
         limit = self._limit * peak
-        correction = self._velocity_gain * (v - 0.5 * period * own - reference.speed)
+        correction = self._velocity_gain * (speed - self._reference.live.speed)
         self.status = self._doubts.status(curve, peak, deepest, self._variance(), zone, self._speed)
-        if correction > limit:
-            correction = limit
-            self.status = SATURATED if self.status == IDENTIFIED else self.status
-        elif correction < -limit:
-            correction = -limit
-            self.status = SATURATED if self.status == IDENTIFIED else self.status
-        command = correction
-        if not separated:
-            command = own + (force - expected) + correction
-        if self._touched:
-            self._remember(force, hidden, told, rate, deepest)
-        self._sample = force
-        self._sample_shown = not hidden
-        self._sample_depth = told
-        self._sample_speed = rate
-        self._sample_deepest = deepest
-        return command, separated
+        if correction > limit or correction < -limit:
+            correction = limit if correction > limit else -limit
+            if self.status == IDENTIFIED:
+                self.status = SATURATED
+        return correction
 
     def _prepare(self, gains: Mapping[str, float], prior: Prior) -> None:
         """What identifies the contact, and the curve that it makes of it, `_curve`."""
@@ -309,8 +292,8 @@ class Retrospective(Compensator):
         hidden: bool,
         zone: float,
     ) -> None:
-        """One reading more: depth [s] and speed as old as the force is told to be, the deepest point [s], the
-        force [1/s], its variance [1/s^2], whether the sensor's dead zone hides it, that zone [1/s]."""
+        """One reading more: depth [s] and speed, as old as the force by the given delay, the deepest point
+        [s], force [1/s], its variance [1/s^2], whether the dead zone hides it, that zone [1/s]."""
         raise NotImplementedError
 
     def _variance(self) -> float:
@@ -318,57 +301,10 @@ class Retrospective(Compensator):
         raise NotImplementedError
 
     def _noise(self) -> float:
-        """The force's variance [N^2]: what it is told, or what readings out of contact show if that is
-        more."""
-        told = self._force_noise * self._force_noise
+        """The force's variance [N^2]: the known one, or what readings out of contact show if that is more."""
+        known = self._force_noise * self._force_noise
         seen = self._squares / (self._count if self._count > 0.0 else 1.0)
-        return seen if seen > told else told
-
-    def _touch(self, depth: float, rate: float) -> None:
-        """The hardware's entry: where its samples fall on the reference's grid."""
-        period = self._period
-        since = 0.5 * period
-        if rate > 0.0:
-            since = depth / rate
-            if not since <= period:
-                since = period
-        shift = (self._first - since) / period
-        whole = floor(shift)
-        self._fraction = shift - whole
-        self._offset = -1 - whole
-        self._ticks = 0
-        self._touched = True
-        self._doubts.late = self._first + self._elapsed * period
-
-    def _remember(self, force: float, hidden: bool, depth: float, rate: float, deepest: float) -> None:
-        """This tick's sample, moved to the reference's grid, into its history."""
-        fraction = self._fraction
-        before = self._sample
-        moved = before + fraction * (force - before)
-        shown = not hidden and self._sample_shown
-        index = self._ticks + self._offset
-        self._ticks += 1
-        if index == 0:
-            ticks = self._first / self._period if shown else 0.0
-            self._impulse = 0.5 * moved * ticks
-            self._read = ticks
-        elif index > 0 and shown and self._moved_shown:
-            self._impulse += 0.5 * (self._moved + moved)
-            self._read += 1.0
-        self._moved = moved
-        self._moved_shown = shown
-        if index >= 0:
-            before_depth = self._sample_depth
-            before_rate = self._sample_speed
-            before_deepest = self._sample_deepest
-            self._reference.remember(
-                index,
-                self._impulse,
-                self._read,
-                before_depth + fraction * (depth - before_depth),
-                before_rate + fraction * (rate - before_rate),
-                before_deepest + fraction * (deepest - before_deepest),
-            )
+        return seen if seen > known else known
 
     def _align(self, position: float, velocity: float) -> tuple[float, float]:
         """The measured position [m] and velocity [m/s] as old as the force."""
@@ -415,23 +351,11 @@ class Retrospective(Compensator):
         """Forget everything."""
         self._side = 0.0
         self._speed = 0.0
-        self._touched = False
+        self._entered = False
         self._gone = 0.0
         self._squares = 0.0
         self._count = 0.0
-        self._first = 0.0
-        self._fraction = 0.0
-        self._offset = 0
-        self._ticks = 0
-        self._impulse = 0.0
-        self._read = 0.0
-        self._moved = 0.0
-        self._moved_shown = True
-        self._sample = 0.0
-        self._sample_shown = True
-        self._sample_depth = 0.0
-        self._sample_speed = 0.0
-        self._sample_deepest = 0.0
+        self._samples.reset()
         self._deepest = 0.0
         self._hardware_deepest = 0.0
         self._elapsed = 0
