@@ -170,6 +170,51 @@ static void jaxhil_input_guard_init(jaxhil_input_guard *guard, const jaxhil_limi
     jaxhil_input_guard_restart(guard);
 }
 
+/* Take this tick's position in [m], the numerical model's being `desired` [m]; its fault. */
+static uint32_t jaxhil_input_guard_position(jaxhil_input_guard *guard, double position, double desired) {
+    uint32_t fault = 0;
+    if (isfinite(position) && guard->lowest <= position && position <= guard->highest) {
+        guard->bad_positions = 0;
+        if (position == guard->measured) {
+            guard->position_travel += fabs(desired - guard->desired);
+            fault = guard->position_travel > guard->position_stuck ? JAXHIL_POSITION_STUCK : 0;
+            guard->fatal |= fault;
+        } else {
+            guard->position_travel = 0.0;
+        }
+        guard->measured = position;
+    } else {
+        fault = isfinite(position) ? JAXHIL_POSITION_OUT_OF_RANGE : JAXHIL_POSITION_NOT_FINITE;
+        guard->bad_positions++;
+        guard->fatal |= (double)guard->bad_positions > guard->held ? fault : 0;
+    }
+    guard->desired = desired;
+    return fault;
+}
+
+/* Take this tick's force reading in [N], the position having moved from `before` [m]; its fault. */
+static uint32_t jaxhil_input_guard_force(jaxhil_input_guard *guard, double reading, double before, double bias) {
+    const double measured = guard->measured;
+    uint32_t fault = 0;
+    if (isfinite(reading) && fabs(reading) < guard->range) {
+        guard->bad_forces = 0;
+        if (reading == guard->force_reading && (measured > 0.0 || measured < -guard->clearance)) {
+            guard->force_travel += fabs(measured - before);
+            fault = guard->force_travel > guard->force_stuck ? JAXHIL_FORCE_STUCK : 0;
+            guard->fatal |= fault;
+        } else {
+            guard->force_travel = 0.0;
+        }
+        guard->force_reading = reading;
+        guard->force = reading - bias;
+    } else {
+        fault = isfinite(reading) ? JAXHIL_FORCE_OUT_OF_RANGE : JAXHIL_FORCE_NOT_FINITE;
+        guard->bad_forces++;
+        guard->fatal |= (double)guard->bad_forces > guard->held ? fault : 0;
+    }
+    return fault;
+}
+
 /* The faults of the readings of a tick: force [N], the model's motion [m, m/s], position [m]. */
 static uint32_t jaxhil_input_guard_check(jaxhil_input_guard *guard, double reading, double desired,
                                          double velocity, double position, double bias) {
@@ -177,8 +222,7 @@ static uint32_t jaxhil_input_guard_check(jaxhil_input_guard *guard, double readi
         guard->fatal = JAXHIL_MODEL_NOT_FINITE;
         return JAXHIL_MODEL_NOT_FINITE;
     }
-    uint32_t faults = 0;
-    uint32_t fatal = 0;
+    guard->fatal = 0;
     if (!guard->known) {
         /* Before the first tick there is no good reading: no force, and the position as desired. */
         guard->known = true;
@@ -186,63 +230,10 @@ static uint32_t jaxhil_input_guard_check(jaxhil_input_guard *guard, double readi
         guard->measured = desired;
         guard->force_reading = INFINITY;
     }
-
-    uint32_t fault = 0;
-    if (!isfinite(position)) {
-        fault = JAXHIL_POSITION_NOT_FINITE;
-    } else if (position < guard->lowest || position > guard->highest) {
-        fault = JAXHIL_POSITION_OUT_OF_RANGE;
-    }
     const double before = guard->measured;
-    if (fault) {
-        faults |= fault;
-        guard->bad_positions++;
-        if ((double)guard->bad_positions > guard->held) {
-            fatal |= fault;
-        }
-    } else {
-        guard->bad_positions = 0;
-        if (position == before) {
-            guard->position_travel += fabs(desired - guard->desired);
-            if (guard->position_travel > guard->position_stuck) {
-                faults |= JAXHIL_POSITION_STUCK;
-                fatal |= JAXHIL_POSITION_STUCK;
-            }
-        } else {
-            guard->position_travel = 0.0;
-        }
-        guard->measured = position;
-    }
-    guard->desired = desired;
+    uint32_t faults = jaxhil_input_guard_position(guard, position, desired);
+    faults |= jaxhil_input_guard_force(guard, reading, before, bias);
     const double measured = guard->measured;
-
-    fault = 0;
-    if (!isfinite(reading)) {
-        fault = JAXHIL_FORCE_NOT_FINITE;
-    } else if (fabs(reading) >= guard->range) {
-        fault = JAXHIL_FORCE_OUT_OF_RANGE;
-    }
-    if (fault) {
-        faults |= fault;
-        guard->bad_forces++;
-        if ((double)guard->bad_forces > guard->held) {
-            fatal |= fault;
-        }
-    } else {
-        guard->bad_forces = 0;
-        if (reading == guard->force_reading && (measured > 0.0 || measured < -guard->clearance)) {
-            guard->force_travel += fabs(measured - before);
-            if (guard->force_travel > guard->force_stuck) {
-                faults |= JAXHIL_FORCE_STUCK;
-                fatal |= JAXHIL_FORCE_STUCK;
-            }
-        } else {
-            guard->force_travel = 0.0;
-        }
-        guard->force_reading = reading;
-        guard->force = reading - bias;
-    }
-
     if (measured < -guard->free_distance && measured > guard->free_distance - guard->clearance) {
         guard->flight++;
     } else {
@@ -251,12 +242,9 @@ static uint32_t jaxhil_input_guard_check(jaxhil_input_guard *guard, double readi
     if ((double)guard->flight > guard->settling && fabs(guard->force) > guard->free_force) {
         faults |= JAXHIL_FORCE_IN_FLIGHT;
         guard->forces_in_flight++;
-        if ((double)guard->forces_in_flight > guard->held) {
-            fatal |= JAXHIL_FORCE_IN_FLIGHT;
-        }
+        guard->fatal |= (double)guard->forces_in_flight > guard->held ? JAXHIL_FORCE_IN_FLIGHT : 0;
     } else {
         guard->forces_in_flight = 0;
     }
-    guard->fatal = fatal;
     return faults;
 }

@@ -60,58 +60,68 @@ static int read_row(char *text, double *row, int *given) {
     return 1;
 }
 
+/* One row through the controller: 0 if it does what the row says. */
+static int replay(const char *name, long number, const double *row, const int *given) {
+    const double force =
+        jaxhil_step(&controller, row[FORCE_MEASURED], row[POSITION_DESIRED], row[VELOCITY_DESIRED],
+                    row[POSITION_MEASURED], given[TIME] ? &row[TIME] : NULL);
+    const double position =
+        jaxhil_position_command(&controller, row[POSITION], row[VELOCITY], row[ACCELERATION]);
+    const double faults = (double)controller.faults;
+    if (!is_same(force, row[FORCE_COMMAND])) {
+        return differs(name, number, "force_command", force, row[FORCE_COMMAND]);
+    }
+    if (!is_same(position, row[POSITION_COMMAND])) {
+        return differs(name, number, "position_command", position, row[POSITION_COMMAND]);
+    }
+    return is_same(faults, row[FAULTS]) ? 0 : differs(name, number, "faults", faults, row[FAULTS]);
+}
+
+/* What comes before the row's tick: a run begins (1), the next contact does (2), nothing (0). */
+static int begin(const char *name, long number, double event, int *begun) {
+    if (event == 1.0) {
+        *begun = 1;
+        return jaxhil_init(&controller, &jaxhil_exported_gains, &jaxhil_exported_limits)
+                   ? 0
+                   : unreadable(name, number, "the controller refuses its own gains");
+    }
+    if (event == 2.0 && *begun) {
+        jaxhil_next_contact(&controller);
+    } else if (event != 0.0 || !*begun) {
+        return unreadable(name, number, "an unknown event, or a tick before a run");
+    }
+    return 0;
+}
+
 int main(int count, char **arguments) {
     const char *const name = count == 2 ? arguments[1] : "vectors.csv";
     FILE *const file = fopen(name, "rb");
     double row[COLUMNS];
     int given[COLUMNS];
     int begun = 0;
+    int failed = 0;
     long number = 0;
 
     if (file == NULL) {
         return unreadable(name, 0, strerror(errno));
     }
-    while (fgets(line, (int)sizeof line, file) != NULL) {
+    while (!failed && fgets(line, (int)sizeof line, file) != NULL) {
         number++;
         line[strcspn(line, "\r\n")] = '\0';
         if (number == 1) {
-            if (strcmp(line, header) != 0) {
-                return unreadable(name, number, "unknown columns");
-            }
+            failed = strcmp(line, header) != 0 ? unreadable(name, number, "unknown columns") : 0;
             continue;
         }
-        if (!read_row(line, row, given)) {
-            return unreadable(name, number, "not a row of numbers");
-        }
-        if (row[EVENT] == 1.0) {
-            if (!jaxhil_init(&controller, &jaxhil_exported_gains, &jaxhil_exported_limits)) {
-                return unreadable(name, number, "the controller refuses its own gains");
-            }
-            begun = 1;
-        } else if (row[EVENT] == 2.0 && begun) {
-            jaxhil_next_contact(&controller);
-        } else if (row[EVENT] != 0.0 || !begun) {
-            return unreadable(name, number, "an unknown event, or a tick before a run");
-        }
-        const double force =
-            jaxhil_step(&controller, row[FORCE_MEASURED], row[POSITION_DESIRED], row[VELOCITY_DESIRED],
-                        row[POSITION_MEASURED], given[TIME] ? &row[TIME] : NULL);
-        const double position =
-            jaxhil_position_command(&controller, row[POSITION], row[VELOCITY], row[ACCELERATION]);
-        if (!is_same(force, row[FORCE_COMMAND])) {
-            return differs(name, number, "force_command", force, row[FORCE_COMMAND]);
-        }
-        if (!is_same(position, row[POSITION_COMMAND])) {
-            return differs(name, number, "position_command", position, row[POSITION_COMMAND]);
-        }
-        if (!is_same((double)controller.faults, row[FAULTS])) {
-            return differs(name, number, "faults", (double)controller.faults, row[FAULTS]);
-        }
+        failed = read_row(line, row, given) ? begin(name, number, row[EVENT], &begun)
+                                            : unreadable(name, number, "not a row of numbers");
+        failed = failed ? failed : replay(name, number, row, given);
     }
-    if (ferror(file) || number < 2) {
-        return unreadable(name, number, "no rows");
+    if (!failed && (ferror(file) || number < 2)) {
+        failed = unreadable(name, number, "no rows");
     }
     fclose(file);
-    printf("%s: %ld ticks, the same bit for bit\n", name, number - 1);
-    return 0;
+    if (!failed) {
+        printf("%s: %ld ticks, the same bit for bit\n", name, number - 1);
+    }
+    return failed;
 }

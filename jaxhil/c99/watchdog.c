@@ -192,6 +192,26 @@ static void jaxhil_watchdog_regress(jaxhil_watchdog *watchdog, double force, dou
     }
 }
 
+/* One tick of a contact that is under way: its faults. */
+static uint32_t jaxhil_watchdog_follow(jaxhil_watchdog *watchdog, double given, double before, double velocity,
+                                       double side, bool in_contact) {
+    const double size = fabs(given);
+    watchdog->quiet = in_contact ? 0 : watchdog->quiet + 1;
+    watchdog->ticks++;
+    watchdog->work += watchdog->period * given * 0.5 * (before + velocity);
+    if (size > watchdog->peak) {
+        watchdog->peak = size;
+    }
+    const bool faded = size <= JAXHIL_FADED * watchdog->peak || size <= watchdog->fading ||
+                       (double)watchdog->quiet >= watchdog->faded;
+    const bool outside = !in_contact && (double)watchdog->quiet >= watchdog->quiet_ticks;
+    const bool leaving = outside && watchdog->side * velocity < 0.0 && faded;
+    if (leaving || side != watchdog->side) {
+        return jaxhil_watchdog_audit(watchdog, velocity);
+    }
+    return (double)watchdog->ticks > watchdog->longest ? JAXHIL_CONTACT_TOO_LONG : 0;
+}
+
 /* The faults that this tick shows, 0 if none. `given` [N] is the force that the controller gave on the tick
  * before, `status` what the law said of it, `force` [N] and `measured` [m] are this tick's readings, the rest the
  * numerical model's. */
@@ -206,35 +226,20 @@ static uint32_t jaxhil_watchdog_tick(jaxhil_watchdog *watchdog, double given, in
     }
     const double aligned = jaxhil_delay_line_step(&watchdog->alignment, watchdog->samples, measured);
     const double deflection = jaxhil_deflection(aligned, watchdog->clearance);
-    const bool touching = jaxhil_deflection(position, watchdog->clearance) != 0.0 ||
+    const bool in_contact = jaxhil_deflection(position, watchdog->clearance) != 0.0 ||
                           jaxhil_deflection(measured, watchdog->clearance) != 0.0;
     const double side = position > watchdog->middle ? 1.0 : -1.0;
     uint32_t fault = 0;
-    if (!watchdog->open && touching) {
+    if (!watchdog->open && in_contact) {
         jaxhil_watchdog_clear(watchdog);
         watchdog->open = true;
         watchdog->entry = before;
         watchdog->side = side;
     }
     if (watchdog->open) {
-        const double size = fabs(given);
-        watchdog->quiet = touching ? 0 : watchdog->quiet + 1;
-        watchdog->ticks++;
         jaxhil_contact_record_take(&watchdog->statuses, status);
-        watchdog->work += watchdog->period * given * 0.5 * (before + velocity);
-        if (size > watchdog->peak) {
-            watchdog->peak = size;
-        }
         jaxhil_watchdog_regress(watchdog, force, deflection);
-        const bool faded = size <= JAXHIL_FADED * watchdog->peak || size <= watchdog->fading ||
-                           (double)watchdog->quiet >= watchdog->faded;
-        const bool outside = !touching && (double)watchdog->quiet >= watchdog->quiet_ticks;
-        const bool leaving = outside && watchdog->side * velocity < 0.0 && faded;
-        if (leaving || side != watchdog->side) {
-            fault = jaxhil_watchdog_audit(watchdog, velocity);
-        } else if ((double)watchdog->ticks > watchdog->longest) {
-            fault = JAXHIL_CONTACT_TOO_LONG;
-        }
+        fault = jaxhil_watchdog_follow(watchdog, given, before, velocity, side, in_contact);
     }
     watchdog->velocity = velocity;
     watchdog->force = force;

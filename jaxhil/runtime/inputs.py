@@ -206,7 +206,7 @@ class InputGuard:
             self.fatal = MODEL_NOT_FINITE
             return MODEL_NOT_FINITE
         faults = 0
-        fatal = 0
+        self.fatal = 0
         if not self._known:
             # Before the first tick there is no good reading: no force, and the position as desired.
             self._known = True
@@ -214,51 +214,29 @@ class InputGuard:
             self.measured = desired
             self._force_reading = inf
 
-        fault = 0
-        if not isfinite(position):
-            fault = POSITION_NOT_FINITE
-        elif position < self._lowest or position > self._highest:
-            fault = POSITION_OUT_OF_RANGE
         before = self.measured
-        if fault:
-            faults |= fault
-            self._bad_positions += 1
-            if self._bad_positions > self._held:
-                fatal |= fault
-        else:
+        if isfinite(position) and self._lowest <= position <= self._highest:
             self._bad_positions = 0
             if position == before:
-                self._position_travel += abs(desired - self._desired)
-                if self._position_travel > self._position_stuck:
-                    faults |= POSITION_STUCK
-                    fatal |= POSITION_STUCK
+                faults = self._same_position(abs(desired - self._desired))
             else:
                 self._position_travel = 0.0
             self.measured = position
+        else:
+            faults = self._bad_position(position)
         self._desired = desired
         measured = self.measured
 
-        fault = 0
-        if not isfinite(reading):
-            fault = FORCE_NOT_FINITE
-        elif abs(reading) >= self._range:
-            fault = FORCE_OUT_OF_RANGE
-        if fault:
-            faults |= fault
-            self._bad_forces += 1
-            if self._bad_forces > self._held:
-                fatal |= fault
-        else:
+        if isfinite(reading) and abs(reading) < self._range:
             self._bad_forces = 0
             if reading == self._force_reading and (measured > 0.0 or measured < -self._clearance):
-                self._force_travel += abs(measured - before)
-                if self._force_travel > self._force_stuck:
-                    faults |= FORCE_STUCK
-                    fatal |= FORCE_STUCK
+                faults |= self._same_force(abs(measured - before))
             else:
                 self._force_travel = 0.0
             self._force_reading = reading
             self.force = reading - bias
+        else:
+            faults |= self._bad_force(reading)
 
         if measured < -self._free_distance and measured > self._free_distance - self._clearance:
             self._flight += 1
@@ -267,9 +245,35 @@ class InputGuard:
         if self._flight > self._settling and abs(self.force) > self._free_force:
             faults |= FORCE_IN_FLIGHT
             self._forces_in_flight += 1
-            if self._forces_in_flight > self._held:
-                fatal |= FORCE_IN_FLIGHT
+            self.fatal |= FORCE_IN_FLIGHT if self._forces_in_flight > self._held else 0
         else:
             self._forces_in_flight = 0
-        self.fatal = fatal
         return faults
+
+    # What only a tick that is not as it should be needs stands in functions of its own, which cost it alone.
+
+    def _bad_position(self, position: float) -> int:
+        fault = POSITION_OUT_OF_RANGE if isfinite(position) else POSITION_NOT_FINITE
+        self._bad_positions += 1
+        self.fatal |= fault if self._bad_positions > self._held else 0
+        return fault
+
+    def _bad_force(self, reading: float) -> int:
+        fault = FORCE_OUT_OF_RANGE if isfinite(reading) else FORCE_NOT_FINITE
+        self._bad_forces += 1
+        self.fatal |= fault if self._bad_forces > self._held else 0
+        return fault
+
+    def _same_position(self, travel: float) -> int:
+        """The position reads as before, while the model's has travelled so far [m]."""
+        self._position_travel += travel
+        fault = POSITION_STUCK if self._position_travel > self._position_stuck else 0
+        self.fatal |= fault
+        return fault
+
+    def _same_force(self, travel: float) -> int:
+        """The force reads as before, in contact, while the measured position has travelled so far [m]."""
+        self._force_travel += travel
+        fault = FORCE_STUCK if self._force_travel > self._force_stuck else 0
+        self.fatal |= fault
+        return fault

@@ -140,13 +140,13 @@ class Watchdog:
             before, given = velocity, 0.0
         clearance = self._clearance
         aligned = deflection(self._alignment.step(measured), clearance)
-        touching = deflection(position, clearance) != 0.0 or deflection(measured, clearance) != 0.0
+        in_contact = deflection(position, clearance) != 0.0 or deflection(measured, clearance) != 0.0
         side = 1.0 if position > self._middle else -1.0
         fault = 0
-        if not self._open and touching:
+        if not self._open and in_contact:
             self._begin(before, side)
         if self._open:
-            if touching:
+            if in_contact:
                 self._quiet = 0
             else:
                 self._quiet += 1
@@ -158,7 +158,7 @@ class Watchdog:
                 self._peak = size
             self._regress(force, aligned)
             faded = size <= FADED * self._peak or size <= self._fading or self._quiet >= self._faded
-            outside = not touching and self._quiet >= self._quiet_ticks
+            outside = not in_contact and self._quiet >= self._quiet_ticks
             leaving = outside and self._side * velocity < 0.0 and faded
             if leaving or side != self._side:
                 fault = self._audit(velocity)
