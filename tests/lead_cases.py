@@ -1,19 +1,19 @@
 """Small tasks for tests of the search: phase lead on a motion simulator that it can make up for."""
 
 from jaxhil.mechanism.file import load
-from tuning.gains.tasks import Task, build_task
+from tuning.gains.tasks import TuneTask, build_task
 
 SCENARIOS = 8
 FAST = ["rig.simulator.natural_frequency=60", "rig.simulator.delay=0.001"]
 STIFFNESSES = "[1e5]", "[4e4]", "[2e5]"
 
 
-def lead_tasks() -> list[Task]:
+def lead_tasks() -> list[TuneTask]:
     """Three that are alike."""
     return [lead_task(f"contact.stiffness={own}", f"name=m{i}") for i, own in enumerate(STIFFNESSES)]
 
 
-def lead_task(*overrides: str) -> Task:
+def lead_task(*overrides: str) -> TuneTask:
     """One, with some more of the mechanism overridden."""
     mechanism = load("rig-300kg", [*overrides, *FAST]).mechanism
     return build_task(mechanism, "phase_lead", SCENARIOS, 0)

@@ -14,7 +14,7 @@ from tuning.__main__ import main
 from tuning.cli.commands.tune import folder_name, is_better
 from tuning.cli.options import DEFAULT_DRIVERS, DEFAULT_PLOT
 from tuning.cli.parser import complete_bare
-from tuning.gains.tune import Figures
+from tuning.gains.tune import ErrorFigures
 
 TINY = ["--scenarios", "4", "--starts", "2", "--steps", "2", "--validation", "16"]
 CONTACT_KEYS = {
@@ -404,7 +404,7 @@ def test_names_become_folders():
 
 def test_better_means_fewer_failures_then_smaller_errors():
     def made(rms, failed):
-        return Figures(rms, rms, rms, rms, 0.0, 1.0, 0.0, failed)
+        return ErrorFigures(rms, rms, rms, rms, 0.0, 1.0, 0.0, failed)
 
     assert is_better(made(0.1, 0), made(0.2, 0)) and not is_better(made(0.2, 0), made(0.1, 0))
     assert is_better(made(0.2, 0), made(0.1, 1)) and not is_better(made(float("nan"), 0), made(0.1, 0))

@@ -10,13 +10,13 @@ from math import inf, nan
 
 import pytest
 
-from tuning import terminal as report
+from tuning import terminal
 from tuning.benchmark.cost import microseconds_per_tick
-from tuning.benchmark.plots import errors_plot, honesty_plot
+from tuning.benchmark.plots import errors_plot, transparency_plot
 from tuning.benchmark.study import LawFigures
 from tuning.benchmark.tables import HEADINGS, leaderboard, mechanism_table, winners
 from tuning.pictures.plots import save
-from tuning.transparency.figures import Figure
+from tuning.statistics.intervals import Estimate
 
 COMMAND = [sys.executable, "-m", "tuning", "compare"]
 SMALL = ["rig-300kg", "--set", "approach.contacts=1", "--compensators", "none", "passivity", "--judged", "8"]
@@ -54,8 +54,8 @@ def test_the_same_seed_gives_the_same_document(tmp_path):
 
 
 def figures(rms, **others):
-    own = dict.fromkeys(HEADINGS, Figure(1.0, 0.9, 1.1))
-    return {**own, "rms": Figure(rms, 0.9 * rms, 1.1 * rms), **others}
+    own = dict.fromkeys(HEADINGS, Estimate(1.0, 0.9, 1.1))
+    return {**own, "rms": Estimate(rms, 0.9 * rms, 1.1 * rms), **others}
 
 
 FOUND = [
@@ -64,13 +64,13 @@ FOUND = [
         "phase_lead",
         "m",
         {"literature": {"phase_lead": 0.1}, "tuned": {"phase_lead": 0.2}},
-        {"literature": figures(0.4), "tuned": figures(0.1, worst=Figure(nan, nan, nan))},
+        {"literature": figures(0.4), "tuned": figures(0.1, worst=Estimate(nan, nan, nan))},
     ),
 ]
 
 
 def test_tables_mark_what_wins(capsys):
-    report.emit(mechanism_table("m", FOUND), leaderboard(["m", "n"], {"m": FOUND, "n": FOUND[:1]}))
+    terminal.emit(mechanism_table("m", FOUND), leaderboard(["m", "n"], {"m": FOUND, "n": FOUND[:1]}))
     out = capsys.readouterr().out
     rows = [line.split() for line in out.splitlines() if line.strip()]
     assert ["none", "50"] in [row[:2] for row in rows] and ["phase_lead", "40"] in [row[:2] for row in rows]
@@ -83,7 +83,7 @@ def test_tables_mark_what_wins(capsys):
 def test_tables_of_what_is_not_tuned_do_not_say_so(capsys):
     both = {"literature": figures(0.4), "gentle": figures(0.3)}
     found = [FOUND[0], LawFigures("retrospective_reference", "m", {}, both)]
-    report.emit(mechanism_table("m", found), leaderboard(["m"], {"m": found}))
+    terminal.emit(mechanism_table("m", found), leaderboard(["m"], {"m": found}))
     out = capsys.readouterr().out
     assert "tuned" not in out and "  gentle  " in out
     assert out.count("with the literature's gains") == 2
@@ -92,7 +92,7 @@ def test_tables_of_what_is_not_tuned_do_not_say_so(capsys):
 def test_pictures_are_drawn(tmp_path):
     both = {"m": FOUND, "n": FOUND}
     save(errors_plot(["m", "n"], both, 0.01), tmp_path / "errors.png")
-    save(honesty_plot(["m", "n"], both), tmp_path / "honesty.png")
+    save(transparency_plot(["m", "n"], both), tmp_path / "honesty.png")
     assert all((tmp_path / name).stat().st_size > 10_000 for name in ("errors.png", "honesty.png"))
 
 

@@ -18,11 +18,11 @@ from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import evaluate
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.benchmark.runs import build_scene, judge_gains
-from tuning.gains.common_program import forms
+from tuning.gains.common_program import common_programs
 from tuning.transparency.damped_twins import MOST, damped_twins
 from tuning.transparency.figures import (
     CLOSER_TO_1,
-    Figure,
+    Estimate,
     distance,
     resampled,
     share,
@@ -37,7 +37,7 @@ SPREAD = {"contact.stiffness": {"distribution": "loguniform", "factor": [0.5, 2.
 
 def judged(raw, law, gains=None, number=LANES):
     parsed = validated({**raw, "uncertainty": SPREAD})
-    [(_, form)] = forms([parsed])
+    [(_, form)] = common_programs([parsed])
     scene = build_scene(parsed, form, number, SEED)
     return judge_gains(scene, law, gains or {}, LIMIT, SEED)
 
@@ -153,19 +153,19 @@ def test_intervals_cover_as_often_as_they_say():
 
 
 def test_a_winner_is_better_by_more_than_the_intervals():
-    figures = {"a": Figure(0.1, 0.09, 0.11), "b": Figure(0.2, 0.12, 0.3), "c": Figure(0.15, 0.105, 0.2)}
+    figures = {"a": Estimate(0.1, 0.09, 0.11), "b": Estimate(0.2, 0.12, 0.3), "c": Estimate(0.15, 0.105, 0.2)}
     assert winner("rms", figures) is None
     assert winner("rms", {name: figures[name] for name in "ab"}) == "a"
     assert winner("rms", {"a": figures["a"]}) is None
     # A law of which contacts did not end has no interval, and neither wins nor stands in the way.
-    assert winner("rms", {"a": figures["a"], "b": figures["b"], "d": Figure(0.01, np.nan, np.nan)}) == "a"
+    assert winner("rms", {"a": figures["a"], "b": figures["b"], "d": Estimate(0.01, np.nan, np.nan)}) == "a"
 
 
 def test_honesty_is_measured_from_1():
     assert set(CLOSER_TO_1) == {"early", "late", "slope"}
-    assert distance("early", Figure(0.7, 0.6, 0.8)) == pytest.approx((0.3, 0.2, 0.4))
-    assert distance("slope", Figure(1.1, 0.9, 1.3)) == pytest.approx((0.1, 0.0, 0.3))
-    assert distance("rms", Figure(0.7, 0.6, 0.8)) == (0.7, 0.6, 0.8)
+    assert distance("early", Estimate(0.7, 0.6, 0.8)) == pytest.approx((0.3, 0.2, 0.4))
+    assert distance("slope", Estimate(1.1, 0.9, 1.3)) == pytest.approx((0.1, 0.0, 0.3))
+    assert distance("rms", Estimate(0.7, 0.6, 0.8)) == (0.7, 0.6, 0.8)
 
 
 def test_scenarios_are_resampled_with_all_their_contacts():

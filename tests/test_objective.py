@@ -169,7 +169,7 @@ def test_terms_are_those_of_any():
     assert common_terms([Objective(), Objective(noise_weight=0.1)]) == ("rms", False, True, False, False)
     assert common_terms([Objective("cvar", 2.0, 0.1)]) == ("cvar", True, False, False, False)
     assert common_terms([Objective(chatter_weight=0.1), Objective()]) == ("rms", False, False, True, False)
-    assert common_terms([Objective()], honest=True) == ("rms", False, False, False, True)
+    assert common_terms([Objective()], probed=True) == ("rms", False, False, False, True)
     with pytest.raises(ValueError):
         common_terms([Objective("rms"), Objective("cvar")])
 

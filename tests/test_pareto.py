@@ -14,16 +14,16 @@ from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import evaluate
 from jaxhil.simulation.scenario import build_scenarios
-from tuning import program_cache as programs
+from tuning import program_cache
 from tuning.gains import pareto
 from tuning.gains.objective import Objective, objective_value
 from tuning.gains.pareto import ENDS, amplification, dominated, fronts, has_trade_off, ladder
 from tuning.gains.tasks import build_task
-from tuning.gains.tune import Settings, tune_all
-from tuning.gains.validation import VALIDATION_SEED, Trial
+from tuning.gains.tune import TuneSettings, tune_all
+from tuning.gains.validation import VALIDATION_SEED, Validation
 
 POINTS = 5
-SETTINGS = Settings(
+SETTINGS = TuneSettings(
     scenarios=8,
     starts=2,
     steps=10,
@@ -47,9 +47,9 @@ def results():
 @pytest.fixture(scope="module")
 def made(results):
     """Fronts, and how many programs they took to solve."""
-    programs._program.cache_clear()
+    program_cache._program.cache_clear()
     every = dict(fronts(results, POINTS))
-    count = programs._program.cache_info().misses
+    count = program_cache._program.cache_info().misses
     return [every[index] for index in range(len(MECHANISMS))], count
 
 
@@ -191,8 +191,10 @@ def test_settings_other_than_the_weight_stay(results, monkeypatch):
     monkeypatch.setattr(pareto, "solve_tasks", solve)
     objective = Objective("cvar", 3.0, 0.1, 0.5, 0.2)
     settings = dataclasses.replace(SETTINGS, objective=objective)
-    trial = Trial([build_task(MECHANISMS[0], "phase_lead", 8, 0)], settings.validation, settings.seed)
-    pareto._solve(trial, results[:1], 3, settings, print)
+    validation = Validation(
+        [build_task(MECHANISMS[0], "phase_lead", 8, 0)], settings.validation, settings.seed
+    )
+    pareto._solve(validation, results[:1], 3, settings, print)
     for objectives in seen:
         assert [dataclasses.replace(one, noise_weight=0.5) for one in objectives] == [objective] * 3
     assert len(seen) == 2  # the second found nothing better

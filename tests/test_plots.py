@@ -15,7 +15,7 @@ from jaxhil.simulation.metrics import Metrics
 from jaxhil.simulation.motion import Curve, Piece, _space
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gains.pareto import Front, Point
-from tuning.gains.tune import Result, Settings, Start, figures
+from tuning.gains.tune import Start, TuneResult, TuneSettings, figures
 from tuning.pictures.plots import STYLES, contact_plot, errors_plot, front_plot, loss_plot, save
 
 LANES = 40
@@ -45,8 +45,8 @@ def result(error_size=(0.5, 0.05, 0.005)):
         )
     summaries = {name: figures(outcome) for name, outcome in outcomes.items()}
     starts = [Start("converged", 3, 0.1 / n, [1.0, 0.5, 0.1 / n], {}) for n in (1, 3, 2)]
-    return Result(
-        "phase_lead", mechanism, {}, {}, summaries, summaries, starts, outcomes, scenarios, Settings()
+    return TuneResult(
+        "phase_lead", mechanism, {}, {}, summaries, summaries, starts, outcomes, scenarios, TuneSettings()
     )
 
 

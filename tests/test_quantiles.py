@@ -54,7 +54,7 @@ def test_repeated_sweeps_cover_the_quantile(order, capsys):
         wider = binned_quantile(parts, order)
         assert interval.low / (1 + RESOLUTION) < wider.low <= interval.low
         assert interval.high <= wider.high <= interval.high * (1 + RESOLUTION)
-        assert wider.estimate == pytest.approx(interval.estimate, rel=RESOLUTION / 2)
+        assert wider.value == pytest.approx(interval.value, rel=RESOLUTION / 2)
         exact.append(interval.low <= truth <= interval.high)
         binned.append(wider.low <= truth <= wider.high)
         widths.append(wider.high - wider.low)
@@ -80,7 +80,7 @@ def test_replicates_cover_the_quantile(order, sampling, capsys):
             points = rng.random((16, 64, 2))
         counted = np.stack([counts(values) for values in np.sum(points, axis=-1) - 1])
         interval = replicate_quantile(counted, order)
-        assert interval.low < interval.estimate < interval.high
+        assert interval.low < interval.value < interval.high
         inside.append(interval.low <= truth <= interval.high)
         widths.append(interval.width)
     with capsys.disabled():
@@ -98,7 +98,7 @@ def test_replicates_cover_the_quantile(order, sampling, capsys):
 def test_replicates_without_results_have_no_bound():
     none = np.stack([counts([np.nan] * 10)] * 4)
     interval = replicate_quantile(none, 0.5)
-    assert interval.estimate == np.inf and interval.high == np.inf and interval.low >= EDGES[-2]
+    assert interval.value == np.inf and interval.high == np.inf and interval.low >= EDGES[-2]
     zero = np.stack([counts([0.0] * 10)] * 4)
     assert replicate_quantile(zero, 0.5) == (0.0, 0.0, EDGES[0])
     with pytest.raises(ValueError, match="allowed equal numbers"):
@@ -133,22 +133,22 @@ def test_bins_merge_and_hold_everything():
 def test_failed_runs_are_the_largest_errors():
     values = [1.0] * 90 + [np.nan] * 10
     for interval in (quantile(values, 0.95), binned_quantile(counts(values), 0.95)):
-        assert np.isinf(interval.estimate) and np.isinf(interval.high)
+        assert np.isinf(interval.value) and np.isinf(interval.high)
     assert quantile(values, 0.5) == (1.0, 1.0, 1.0)
     small = binned_quantile(counts(np.zeros(50)), 0.5)
-    assert (small.estimate, small.low, small.high) == (0.0, 0.0, EDGES[0])
+    assert (small.value, small.low, small.high) == (0.0, 0.0, EDGES[0])
 
 
 @pytest.mark.parametrize("interval", (quantile([], 0.5), binned_quantile(counts([]), 0.5)))
 def test_without_values_nothing_is_known(interval):
-    assert np.isnan(interval.estimate) and interval.low == 0.0 and np.isinf(interval.high)
+    assert np.isnan(interval.value) and interval.low == 0.0 and np.isinf(interval.high)
 
 
 def test_few_values_do_not_bound_a_far_quantile():
     values = np.arange(1.0, 11.0)
     assert np.isinf(quantile(values, 0.99).high) and quantile(values, 0.01).low == 0.0
     # 100 n q in whole numbers: the rank is not rounded up.
-    assert quantile(np.arange(1.0, 101.0), 0.07).estimate == 7.0
+    assert quantile(np.arange(1.0, 101.0), 0.07).value == 7.0
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ from tuning.gains import rounds
 from tuning.gains.objective import RMS, Objective, objective_value
 from tuning.gains.rounds import GIVEN_UP, solve_tasks
 from tuning.gains.tasks import alike, gain_bounds, spread_points, tuned_names
-from tuning.gains.validation import Trial
-from tuning.optimisation.unit_box import to_shares
+from tuning.gains.validation import Validation
+from tuning.optimisation.unit_box import to_coordinates
 
 STARTS, STEPS = 5, 14
 
@@ -26,7 +26,7 @@ def spread(tasks, number=STARTS):
     starts = []
     for task in tasks:
         first = np.array([task.literature[name] for name in names])
-        starts.append(spread_points(to_shares(first, gain_bounds(task, names)), number, 0))
+        starts.append(spread_points(to_coordinates(first, gain_bounds(task, names)), number, 0))
     return starts
 
 
@@ -37,8 +37,8 @@ def solved(tasks):
 
 
 @pytest.fixture(scope="module")
-def trial(tasks):
-    return Trial(tasks, 15, 0)
+def validation(tasks):
+    return Validation(tasks, 15, 0)
 
 
 def test_every_start_is_accounted_for(solved):
@@ -86,23 +86,25 @@ def test_the_objective_is_what_is_lowered(tasks):
     assert np.maximum(errors[1], 0).sum() < np.maximum(errors[0], 0).sum()
 
 
-def test_the_search_sees_what_the_solver_sees(tasks, solved, trial):
+def test_the_search_sees_what_the_solver_sees(tasks, solved, validation):
     for index, starts in enumerate(solved):
-        shares = np.stack([start.shares for start in starts])
-        values = trial.losses(RMS, [index], shares[None])[0]
+        coordinates = np.stack([start.coordinates for start in starts])
+        values = validation.losses(RMS, [index], coordinates[None])[0]
         np.testing.assert_allclose(values, [start.rms for start in starts], rtol=1e-9)
         alone = evaluate(tasks[index].loop, starts[0].gains, tasks[index].scenarios)
         assert values[0] == pytest.approx(objective_value(RMS, alone.error[alone.wanted]), rel=1e-9)
 
 
-def test_every_task_is_searched_under_its_own_objective(tasks, trial):
+def test_every_task_is_searched_under_its_own_objective(tasks, validation):
     """The values, starts and ends of tasks together are those that each has alone under its objective."""
     several = [Objective(divergence_weight=4.0), Objective(noise_weight=0.01), Objective(noise_weight=0.1)]
     points = np.random.default_rng(0).random((2, 5, 2))
-    together = trial.losses(several, [2, 0], points)
+    together = validation.losses(several, [2, 0], points)
     for i, task in enumerate([2, 0]):
-        np.testing.assert_array_equal(together[i], trial.losses(several[task], [task], points[i : i + 1])[0])
-        assert (np.abs(together[i] / trial.losses(RMS, [task], points[i : i + 1])[0] - 1) > 1e-4).any()
+        np.testing.assert_array_equal(
+            together[i], validation.losses(several[task], [task], points[i : i + 1])[0]
+        )
+        assert (np.abs(together[i] / validation.losses(RMS, [task], points[i : i + 1])[0] - 1) > 1e-4).any()
 
 
 def restitution_errors_of(task, gains):

@@ -7,7 +7,7 @@ from sweep_cases import NOISY, UNCERTAIN, case, manifest
 from jaxhil.mechanism.uncertainty import dimensions
 from tuning.statistics.sobol_indices import evaluations
 from tuning.sweeps.chunks import build_sweep, run_chunk
-from tuning.sweeps.studies import NOISE, error_drivers, rare_failure, run_points, spread_beyond_formula
+from tuning.sweeps.studies import NOISE, error_indices, rare_failure, run_points, spread_beyond_formula
 from tuning.sweeps.tally import add_rows, empty_tally, error_sizes, failure_probability
 
 pytestmark = pytest.mark.users_options
@@ -31,7 +31,7 @@ def whole():
 def test_an_input_that_does_nothing_drives_nothing(whole):
     sweep, _ = whole
     ran = []
-    found = error_drivers(sweep, 128, ran.append)
+    found = error_indices(sweep, 128, ran.append)
     assert found.evaluations == sum(ran) == evaluations(4, 128) == 768
     assert {one.input for one in found.inputs} == set(dimensions(sweep.mechanism))
     totals = [one.total for one in found.inputs]
@@ -46,7 +46,7 @@ def test_an_input_that_does_nothing_drives_nothing(whole):
 def test_the_variance_of_one_input_is_all_its_own():
     # One input beside the phase; the law of total variance, by brute force, with the phase's mean in cells.
     sweep = sweep_of(case(uncertainty={"contact.stiffness": UNCERTAIN["contact.stiffness"]}))
-    found = {one.input: one for one in error_drivers(sweep, 256).inputs}
+    found = {one.input: one for one in error_indices(sweep, 256).inputs}
     cells = (np.arange(64) + 0.5) / 64
     grid = np.stack([axis.ravel() for axis in np.meshgrid(cells, cells, indexing="ij")], axis=1)
     sizes = error_sizes(run_points(sweep, grid, np.zeros(len(grid)))).reshape(64, 64)
@@ -59,7 +59,7 @@ def test_the_variance_of_one_input_is_all_its_own():
 
 def test_noise_is_an_input():
     document = case(force_sensor=NOISY, uncertainty={"bodies.equivalent_mass": TIGHT})
-    found = error_drivers(sweep_of(document), 64)
+    found = error_indices(sweep_of(document), 64)
     shares = {one.input: one for one in found.inputs}
     assert found.evaluations == 64 * 5 and shares.keys() == {
         "bodies.equivalent_mass",
@@ -69,7 +69,7 @@ def test_noise_is_an_input():
     assert shares[NOISE].total_low > 0.1 and found.inputs[0].input != "bodies.equivalent_mass"
     assert shares["bodies.equivalent_mass"].total_high < 1e-3
     # Without noise nothing is left of it.
-    quiet = error_drivers(sweep_of(case(uncertainty={"bodies.equivalent_mass": TIGHT})), 64)
+    quiet = error_indices(sweep_of(case(uncertainty={"bodies.equivalent_mass": TIGHT})), 64)
     assert NOISE not in {one.input for one in quiet.inputs}
 
 
@@ -80,7 +80,7 @@ def test_errors_beyond_the_cap_count_as_the_cap(whole):
     _, rows = whole
     limit = float(np.quantile(np.abs(rows["worst_error"]), 0.5)) / 10
     limited = sweep_of(case(uncertainty=UNCERTAIN | IDLE), limit=limit)
-    found = error_drivers(limited, 128)
+    found = error_indices(limited, 128)
     assert found.cap == 10 * limit
     assert 0.4 < found.capped / found.evaluations < 0.6
 

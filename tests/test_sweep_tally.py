@@ -121,7 +121,7 @@ def test_quantiles_are_those_of_the_errors(replicates):
     assert [one.order for one in found] == list(ORDERS)
     for one in found[:3]:
         exact = quantile(sizes, one.order)
-        assert one.value == pytest.approx(float(exact.estimate), rel=0.01)
+        assert one.value == pytest.approx(float(exact.value), rel=0.01)
         assert one.low == pytest.approx(float(exact.low), rel=0.05)
         assert one.high == pytest.approx(float(exact.high), rel=0.2)
         assert one.low < one.value < one.high

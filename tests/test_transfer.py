@@ -15,7 +15,7 @@ from tuning.gains.objective import RMS, objective_value
 from tuning.gains.rounds import solve_tasks
 from tuning.gains.tasks import build_task
 from tuning.gains.transfer import Tuned, carry_over, distance, nearest, traits
-from tuning.gains.validation import Trial
+from tuning.gains.validation import Validation
 
 MASS, STIFFNESS = 350.0, 124355.0
 OMEGA = math.sqrt(STIFFNESS / MASS)
@@ -155,22 +155,22 @@ def task():
 
 
 @pytest.fixture(scope="module")
-def trial(task):
-    return Trial([task], 15, 0)
+def validation(task):
+    return Validation([task], 15, 0)
 
 
 @pytest.fixture(scope="module")
-def solved(task, trial):
-    (starts,) = solve_tasks([task], choose_starts(trial, 3, 0), 6)
+def solved(task, validation):
+    (starts,) = solve_tasks([task], choose_starts(validation, 3, 0), 6)
     return starts
 
 
-def test_given_starts_take_the_places_of_the_last(task, trial):
+def test_given_starts_take_the_places_of_the_last(task, validation):
     given = {"phase_lead": 0.011, "lead_filter": 0.0007}
-    (usual,) = choose_starts(trial, 3, 0)
-    (points,) = choose_starts(trial, 3, 0, first=[[given]])
+    (usual,) = choose_starts(validation, 3, 0)
+    (points,) = choose_starts(validation, 3, 0, first=[[given]])
     np.testing.assert_array_equal(points[:2], usual[:2])
-    assert trial.gains(0, points[2]) == pytest.approx(given, rel=1e-12)
+    assert validation.gains(0, points[2]) == pytest.approx(given, rel=1e-12)
     # It begins at the very gains: its first value is theirs.
     (starts,) = solve_tasks([task], [points], 6)
     errors = np.where(task.scenarios.contacts > 0, evaluate(task.loop, given, task.scenarios).error[0], 0)
@@ -178,19 +178,19 @@ def test_given_starts_take_the_places_of_the_last(task, trial):
 
 
 @pytest.mark.parametrize("starts", [1, 2])
-def test_the_literature_s_gains_stay_beside_those_given(task, trial, starts):
+def test_the_literature_s_gains_stay_beside_those_given(task, validation, starts):
     given = [{"phase_lead": 0.011, "lead_filter": 0.0007}, {"phase_lead": 0.002, "lead_filter": 0.0005}]
-    (points,) = choose_starts(trial, starts, 0, first=[given])
+    (points,) = choose_starts(validation, starts, 0, first=[given])
     for gains, point in zip([task.literature, *given], points, strict=True):
-        assert trial.gains(0, point) == pytest.approx(gains, rel=1e-12)
+        assert validation.gains(0, point) == pytest.approx(gains, rel=1e-12)
 
 
-def test_a_given_start_never_ends_worse_than_it_was(task, trial, solved):
+def test_a_given_start_never_ends_worse_than_it_was(task, validation, solved):
     """Tuned gains lie at a bound here."""
     best = min(solved, key=lambda start: start.rms)
     upper = COMPENSATORS["phase_lead"].gains[0].upper(task.mechanism)
     assert best.gains["phase_lead"] == pytest.approx(upper, rel=1e-12)
-    (again,) = solve_tasks([task], choose_starts(trial, 2, 0, first=[[best.gains]]), 1)
+    (again,) = solve_tasks([task], choose_starts(validation, 2, 0, first=[[best.gains]]), 1)
     assert again[-1].rms <= best.rms * (1 + 1e-12)
 
 
@@ -212,7 +212,7 @@ def in_blocks(monkeypatch):
 
     def call(starts, tuned=()):
         mechanisms = [claw(f"contact.stiffness=[{k}]", f"name='{k}'") for k in ("1e5", "3e5", "2.9e5")]
-        settings = tune.Settings(scenarios=4, starts=starts)
+        settings = tune.TuneSettings(scenarios=4, starts=starts)
         every = dict(tune.tune_all(mechanisms, "phase_lead", settings, tuned=tuned))
         return [[one.source for one in every[i].near] for i in range(3)]
 

@@ -21,12 +21,12 @@ from tuning.gains.tasks import (
     spread_points,
     tuned_names,
 )
-from tuning.gains.tune import Settings, figures, tune, uncompensated
-from tuning.gains.validation import Trial
+from tuning.gains.tune import TuneSettings, figures, tune, uncompensated
+from tuning.gains.validation import Validation
 from tuning.optimisation.levenberg_marquardt import STATUSES
-from tuning.optimisation.unit_box import to_gains, to_shares
+from tuning.optimisation.unit_box import to_coordinates, to_gains
 
-SMALL = Settings(scenarios=16, starts=2, steps=12, validation=63)
+SMALL = TuneSettings(scenarios=16, starts=2, steps=12, validation=63)
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +54,8 @@ def test_gains_tuned_with_sensor_noise_are_better_where_there_is_noise(result):
     """Three times the published noise, on scenarios that neither of the two has seen."""
     noisy = load("varying", ["rig.force_sensor.noise_std=8"]).mechanism
     task = build_task(noisy, "phase_lead", SMALL.scenarios, SMALL.seed)
-    trial = Trial([task], 15, SMALL.seed)
-    (starts,) = solve_tasks([task], choose_starts(trial, SMALL.starts, SMALL.seed), SMALL.steps)
+    validation = Validation([task], 15, SMALL.seed)
+    (starts,) = solve_tasks([task], choose_starts(validation, SMALL.starts, SMALL.seed), SMALL.steps)
     tuned = min(starts, key=lambda start: start.rms).gains
     fresh = build_scenarios(noisy, draw(noisy, 255, 99), 99)
     loop = build_loop(noisy, "phase_lead", fresh)
@@ -97,8 +97,10 @@ def test_a_compensator_without_gains_is_judged_only():
 def test_a_setting_is_judged_as_it_is(monkeypatch):
     law = COMPENSATORS["phase_lead"]
     monkeypatch.setattr(type(law), "settings", {"mild": {"phase_lead": 0.0015}})
-    result = tune(load().mechanism, "phase_lead", dataclasses.replace(SMALL, setting="mild", certify=True))
-    assert result.starts == [] and result.certified is None
+    result = tune(
+        load().mechanism, "phase_lead", dataclasses.replace(SMALL, setting="mild", global_search=True)
+    )
+    assert result.starts == [] and result.global_comparison is None
     assert result.gains["phase_lead"] == 0.0015
     assert result.figures["literature"] == result.figures["tuned"] != result.figures["before"]
 
@@ -118,7 +120,7 @@ def test_starts_begin_with_the_literature_and_stay_inside():
     names = tuned_names([task])
     bounds = gain_bounds(task, names)
     first = np.array([task.literature[name] for name in names])
-    points = spread_points(to_shares(first, bounds), 9, seed=0)
+    points = spread_points(to_coordinates(first, bounds), 9, seed=0)
     np.testing.assert_allclose(to_gains(points[0], bounds), first, rtol=1e-12)
     assert ((points >= 0) & (points <= 1)).all()
     assert len(np.unique(points, axis=0)) == 9

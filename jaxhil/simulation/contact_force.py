@@ -53,10 +53,10 @@ class Surfaces(NamedTuple):
 
     law: ContactLaw
     parameters: ContactParameters
-    state: tuple[Array, ...]
+    state: tuple[Any, ...]
     clearance: Array
 
-    def force(self, motion: Motion) -> tuple[Array, tuple[Array, ...]]:
+    def force(self, motion: Motion) -> tuple[Array, tuple[Any, ...]]:
         """Signed force [N] and the law's next state."""
         return two_sided(
             self.law, self.parameters, self.state, motion.position, motion.velocity, self.clearance

@@ -95,7 +95,7 @@ def begin_evaluation(
     """Like `evaluate`, without waiting: what is returned waits for the outcome and returns it."""
     number = len(scenarios.velocity)
     order = _by_duration(scenarios)
-    running = run_tiles(loop, *deal(scenarios, gains, at_least))
+    running = run_tiles(loop, *shard(scenarios, gains, at_least))
 
     def unfold(leaf):
         leaf = np.moveaxis(leaf, (0, 1), (-2, -3))
@@ -107,7 +107,7 @@ def begin_evaluation(
     return lambda: jax.tree.map(unfold, jax.device_get(running))
 
 
-def deal(
+def shard(
     scenarios: Scenario, gains: Mapping[str, Any], at_least: int = 1
 ) -> tuple[dict[str, Any], dict[str, Any], Scenario]:
     """Arguments of `run_tiles`: gains common to all lanes, gains per lane and scenarios as
@@ -156,7 +156,7 @@ def expected_duration(scenarios: Scenario) -> np.ndarray:
 
 @partial(jax.jit, static_argnums=0)
 def run_tiles(loop: Loop, common: Any, per_lane: Any, scenarios: Scenario) -> Outcome:
-    """Outcome of what `deal` made, each leaf (devices, tiles, ..., lanes of a tile)."""
+    """Outcome of what `shard` made, each leaf (devices, tiles, ..., lanes of a tile)."""
     mesh = jax.make_mesh((jax.device_count(),), ("device",), axis_types=(AxisType.Auto,))
 
     def one_device(common, arguments):

@@ -1,6 +1,6 @@
 """What every method of the comparison is given: a mechanism to tune and one compiled loss, whoever calls it.
 
-A point is a vector of shares, in [0, 1], of each tuned gain's range on its own scale; its loss is half the
+A point is a vector of unit coordinates, each gain's place in its range on its own scale; its loss is half the
 sum of squares of `tuning.gains.objective.residuals` over all scenarios. The scenarios, not the points, are
 dealt out to the devices: one point alone keeps all of them busy, and so does a generation of any size.
 """
@@ -22,8 +22,16 @@ from jaxhil.simulation.evaluation import expected_duration
 from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants
 from jaxhil.simulation.scenario import Scenario
 from tuning.gains.objective import RMS, Problem, common_terms, residuals
-from tuning.gains.tasks import Task, alike, build_task, common_loop, gain_bounds, spread_points, tuned_names
-from tuning.optimisation.unit_box import Bounds, to_gains, to_shares
+from tuning.gains.tasks import (
+    TuneTask,
+    alike,
+    build_task,
+    common_loop,
+    gain_bounds,
+    spread_points,
+    tuned_names,
+)
+from tuning.optimisation.unit_box import Bounds, to_coordinates, to_gains
 
 COMPENSATOR = "response_error"
 SCENARIOS = 128
@@ -37,7 +45,7 @@ class Case:
     """A task, the loop it shares with its like, names and bounds of the gains tuned for it; on the devices
     its rig, dealt out to them, with the gains that stay as they are, and the bounds once more."""
 
-    task: Task
+    task: TuneTask
     loop: Loop
     names: tuple[str, ...]
     bounds: Bounds
@@ -73,13 +81,13 @@ class Case:
         first = np.array([self.task.literature[name] for name in self.names])
         return spread_points(self.shares_of(first), number, seed)
 
-    def gains_of(self, shares: Float[np.ndarray, "*points gains"]) -> Float[np.ndarray, "*points gains"]:
+    def gains_of(self, coordinates: Float[np.ndarray, "*points gains"]) -> Float[np.ndarray, "*points gains"]:
         """Gains in their own units."""
-        return to_gains(shares, self.bounds)
+        return to_gains(coordinates, self.bounds)
 
     def shares_of(self, gains: Float[np.ndarray, "*points gains"]) -> Float[np.ndarray, "*points gains"]:
         """Inverse of `gains_of`, inside the box."""
-        return to_shares(gains, self.bounds)
+        return to_coordinates(gains, self.bounds)
 
 
 def build_cases(mechanisms: Sequence[Mechanism]) -> list[Case]:
@@ -114,7 +122,7 @@ def over_scenarios(function: Callable[..., Array], problem: Problem, *arguments:
     )(problem, *arguments)
 
 
-def _build_case(task: Task, loop: Loop) -> Case:
+def _build_case(task: TuneTask, loop: Loop) -> Case:
     if np.ptp(task.scenarios.contacts) > 0:
         raise ValueError(f"{task.mechanism.name}: scenarios of different numbers of contacts")
     names = tuned_names([task])
@@ -150,9 +158,9 @@ def _losses(static, points, number, problem, bounds) -> Float[Array, "devices po
         copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (together, *leaf.shape)), problem)
 
         def some(i, found):
-            shares = jax.lax.dynamic_slice_in_dim(points, i * together, together)
+            coordinates = jax.lax.dynamic_slice_in_dim(points, i * together, together)
             rows = residuals(
-                (loop, names, common_terms([RMS])), jax.vmap(to_gains, (0, None))(shares, bounds), copies
+                (loop, names, common_terms([RMS])), jax.vmap(to_gains, (0, None))(coordinates, bounds), copies
             )
             losses = jnp.sum(rows**2, axis=1) / 2
             return jax.lax.dynamic_update_slice_in_dim(found, losses, i * together, 0)

@@ -49,11 +49,11 @@ def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = 
         stages.add_steps(going, 1 + gains, found)
         best = np.argsort(loss, axis=1)[:, :GO_ON] + DESCENTS * np.arange(len(going))[:, None]
         left = 1 if warming else STEPS - FIRST_ROUND
-        found = _descend(case, found.shares[best.reshape(-1)], left, number * GO_ON)
+        found = _descend(case, found.coordinates[best.reshape(-1)], left, number * GO_ON)
         stages.add_steps(going, 1 + gains, found)
         several = [
             np.asarray(leaf).reshape(len(going), GO_ON, *leaf.shape[1:])
-            for leaf in (found.loss, found.shares, found.curvature)
+            for leaf in (found.loss, found.coordinates, found.curvature)
         ]
         for i, *own in zip(going, *several, strict=True):
             ends[i] = _Ends(*(np.concatenate(both) for both in zip(ends[i], own, strict=True)))
@@ -62,7 +62,7 @@ def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = 
             break
 
     tops = [int(np.argmin(own.loss)) for own in ends]
-    shares = np.stack([own.shares[top] for own, top in zip(ends, tops, strict=True)])
+    coordinates = np.stack([own.coordinates[top] for own, top in zip(ends, tops, strict=True)])
     shapes = [
         inverse_hessian(own.curvature[top], SCALE * np.sqrt(2 * own.loss[top]))
         for own, top in zip(ends, tops, strict=True)
@@ -72,7 +72,7 @@ def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = 
         return case.losses(points.reshape(-1, gains)).reshape(points.shape[:-1])
 
     last = polish(
-        losses, shares, 1 if warming else POLISH,
+        losses, coordinates, 1 if warming else POLISH,
         candidates=CANDIDATES, reach=REACH, covariance=np.stack(shapes),
     )  # fmt: skip
     stages.add(np.arange(number), POLISH, last.loss)
@@ -83,7 +83,7 @@ class _Ends(NamedTuple):
     """Where the descents of a start ended."""
 
     loss: np.ndarray
-    shares: np.ndarray
+    coordinates: np.ndarray
     curvature: np.ndarray
 
 
@@ -106,16 +106,16 @@ def _sizes(number: int) -> list[int]:
     return [max(1, number >> halvings) for halvings in range(3)]
 
 
-def _descend(case: Case, shares, steps, most) -> Solution:
-    """From some shares, of `most` at any time, in the smallest program that takes so many."""
-    size = min(one for one in _sizes(most) if one >= len(shares))
-    padded = np.concatenate([shares, np.repeat(shares[:1], size - len(shares), axis=0)])
+def _descend(case: Case, coordinates, steps, most) -> Solution:
+    """From some coordinates, of `most` at any time, in the smallest program that takes so many."""
+    size = min(one for one in _sizes(most) if one >= len(coordinates))
+    padded = np.concatenate([coordinates, np.repeat(coordinates[:1], size - len(coordinates), axis=0)])
     problems, bounds = several((case.problem, case.bounds), size)
     static = case.loop, case.names, common_terms([RMS])
     found = solve(
         residuals, static, problems, bounds, np.clip(padded, 0, 1), np.array(steps), LONGEST, tile=1
     )
-    return jax.tree.map(lambda leaf: leaf[: len(shares)], jax.device_get(found))
+    return jax.tree.map(lambda leaf: leaf[: len(coordinates)], jax.device_get(found))
 
 
 class _Stages:

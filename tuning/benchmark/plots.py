@@ -11,7 +11,7 @@ from tuning.benchmark.tables import best
 from tuning.pictures.plots import GREEN, LABELS, MARKERS, STYLES, new_figure
 
 COLUMNS = 4  # of panels
-HONESTY = {
+TRANSPARENCY = {
     "early": "transparency, push at 25 %",
     "late": "transparency, push at 75 %",
     "slope": "slope of e against e*",
@@ -64,15 +64,15 @@ def errors_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]],
     return picture
 
 
-def honesty_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> Picture:
+def transparency_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> Picture:
     """Transparency, slope and peak force of every law, tuned: a point for every mechanism."""
     laws = list(dict.fromkeys(one.law for name in names for one in found[name]))
     size = (12.0, 1.7 + 0.34 * len(laws))
     gains = "Tuned gains" if TUNED in _keys(names, found) else "The literature's gains"
     picture = new_figure(size, f"Is it still a test of the hardware? {gains}, 1 is perfect", above=0.8)
-    panels = picture.subplots(1, len(HONESTY), sharey=True)
+    panels = picture.subplots(1, len(TRANSPARENCY), sharey=True)
     picture.subplots_adjust(left=1.6 / size[0], wspace=0.08)
-    for panel, (key, title) in zip(panels, HONESTY.items(), strict=True):
+    for panel, (key, title) in zip(panels, TRANSPARENCY.items(), strict=True):
         low, high = (0.3, 100.0) if key == "peak" else (-1.0, 2.5)
         for place, law in enumerate(laws):
             values = [best(one)[key].value for name in names for one in found[name] if one.law == law]

@@ -17,9 +17,10 @@ from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import Outcome, evaluate
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.batches import cut, join
-from tuning.gains.common_program import Form
+from tuning.gains.common_program import CommonProgram
+from tuning.statistics.intervals import Estimate
 from tuning.transparency.damped_twins import damped_twins
-from tuning.transparency.figures import Figure, Judged, judge
+from tuning.transparency.figures import Runs, judge
 from tuning.transparency.pushes import EARLY, LATE, Space, in_space, probed
 
 
@@ -28,26 +29,26 @@ class Scene(NamedTuple):
     twins, and the scenarios' first contacts in space."""
 
     mechanism: Mechanism
-    form: Form
+    common: CommonProgram
     plain: Scenario
     twins: Scenario
     space: Space
 
 
-def build_scene(mechanism: Mechanism, form: Form, scenarios: int, seed: int) -> Scene:
+def build_scene(mechanism: Mechanism, common: CommonProgram, scenarios: int, seed: int) -> Scene:
     """So many fresh scenarios of a mechanism."""
     draws = draw(mechanism, scenarios, seed)
     twin, twin_draws = damped_twins(mechanism, draws)
-    plain = form.scenarios(mechanism, build_scenarios(mechanism, draws, seed))
-    twins = form.scenarios(twin, build_scenarios(twin, twin_draws, seed))
+    plain = common.scenarios(mechanism, build_scenarios(mechanism, draws, seed))
+    twins = common.scenarios(twin, build_scenarios(twin, twin_draws, seed))
     return Scene(
-        mechanism, form, plain, twins, in_space(form.law(beforehand=False), plain, _nominal(plain), 1)
+        mechanism, common, plain, twins, in_space(common.law(beforehand=False), plain, _nominal(plain), 1)
     )
 
 
 def judge_gains(
     scene: Scene, law: str, gains: Mapping[str, float], limit: float, seed: int
-) -> dict[str, Figure]:
+) -> dict[str, Estimate]:
     """All figures of a law under these gains; `limit` and `seed` of `tuning.transparency.figures.judge`."""
     number = len(scene.plain.velocity)
     contacts = scene.mechanism.approach.contacts
@@ -61,12 +62,12 @@ def judge_gains(
     if contacts > 1:
         # Later contacts are entered at the speed that the law left them.
         entered = np.where(plain.good, plain.metrics.approach_velocity, _nominal(scene.plain))
-        space = in_space(scene.form.law(beforehand=False), scene.plain, entered, contacts)
+        space = in_space(scene.common.law(beforehand=False), scene.plain, entered, contacts)
     duration = np.where(plain.good[0], plain.metrics.duration[0], space.duration[0])
     pushed = [probed(scene.plain, space, share, duration) for share in (EARLY, LATE)]
     plain, early, late = run([probed(scene.plain, space), *pushed])
     return judge(
-        Judged(plain, early, late, twins),
+        Runs(plain, early, late, twins),
         (space.early, space.late),
         space.restitution[0],
         np.max(space.depth, axis=1),
@@ -77,7 +78,7 @@ def judge_gains(
 
 
 def _run(scene: Scene, law: str, gains: Mapping[str, float], scenarios: Scenario) -> Outcome:
-    loop = scene.form.loop(build_loop(scene.mechanism, law, scenarios))
+    loop = scene.common.loop(build_loop(scene.mechanism, law, scenarios))
     lanes = len(scenarios.velocity)
     return evaluate(loop, {name: np.full(lanes, value) for name, value in gains.items()}, scenarios)
 

@@ -13,14 +13,14 @@ from typing import Any, NamedTuple
 
 from jaxhil.errors import one_line
 from jaxhil.mechanism.structs import Mechanism
-from tuning.transparency.figures import Figure
+from tuning.statistics.intervals import Estimate
 
 LITERATURE, TUNED = "literature", "tuned"
 SEED = 0xFA1  # of the scenarios to judge on: tuning and its own validation never see them
 
 
 @dataclass(frozen=True)
-class Settings:
+class CompareSettings:
     """Numbers of scenarios to tune on, of starts and steps of the solver, of evaluations without derivatives
     for each gain, of points scanned for starts; of scenarios to judge on; the error beyond which a contact
     counts as a failure; the seed; whether to tune at all."""
@@ -43,7 +43,7 @@ class LawFigures(NamedTuple):
     law: str
     mechanism: str
     gains: dict[str, dict[str, float]]
-    figures: dict[str, dict[str, Figure]]
+    figures: dict[str, dict[str, Estimate]]
 
 
 class Failed(NamedTuple):
@@ -56,7 +56,7 @@ class Failed(NamedTuple):
 def compare(
     mechanisms: Sequence[Mechanism],
     laws: Sequence[str],
-    settings: Settings,
+    settings: CompareSettings,
     processes: int,
     report: Callable[[str], None] = lambda text: None,
 ) -> Iterator[LawFigures | Failed]:
@@ -90,24 +90,23 @@ def _gains(law: str) -> int:
     return len(COMPENSATORS[law].gains)
 
 
-def build_scenes(mechanisms: list[Mechanism], settings: Settings) -> list[list[Any]]:
+def build_scenes(mechanisms: list[Mechanism], settings: CompareSettings) -> list[list[Any]]:
     """What the laws are judged on (`tuning.benchmark.runs.Scene`), grouped by form."""
     from tuning.benchmark.runs import build_scene
-    from tuning.gains.common_program import forms
+    from tuning.gains.common_program import common_programs
 
     seed = settings.seed + SEED
     return [
-        [build_scene(mechanisms[i], form, settings.judged, seed) for i in group]
-        for group, form in forms(mechanisms)
+        [build_scene(mechanisms[i], common, settings.judged, seed) for i in group]
+        for group, common in common_programs(mechanisms)
     ]
 
 
-def judge_law(scenes: list[Any], law: str, settings: Settings) -> list[LawFigures]:
+def judge_law(scenes: list[Any], law: str, settings: CompareSettings) -> list[LawFigures]:
     """All figures of one law on mechanisms of one form, tuned together."""
     from jaxhil.compensators import COMPENSATORS, literature_gains
     from tuning.benchmark.runs import judge_gains
-    from tuning.gains.tune import Settings as Tuning
-    from tuning.gains.tune import tune_all
+    from tuning.gains.tune import TuneSettings, tune_all
 
     mechanisms = [scene.mechanism for scene in scenes]
     others = [
@@ -121,7 +120,7 @@ def judge_law(scenes: list[Any], law: str, settings: Settings) -> list[LawFigure
     ]
     moved = any(gain.tuned(mechanism) for gain in COMPENSATORS[law].gains for mechanism in mechanisms)
     if settings.tuned and moved:
-        tuning = Tuning(
+        tuning = TuneSettings(
             settings.scenarios,
             settings.starts,
             settings.steps,
@@ -130,7 +129,7 @@ def judge_law(scenes: list[Any], law: str, settings: Settings) -> list[LawFigure
             polish=settings.polish,
             scanned=settings.scanned,
         )
-        for index, result in tune_all(mechanisms, law, tuning, form=scenes[0].form):
+        for index, result in tune_all(mechanisms, law, tuning, common=scenes[0].common):
             gains[index][TUNED] = result.gains
     found = []
     for scene, own in zip(scenes, gains, strict=True):

@@ -4,9 +4,10 @@ from collections.abc import Mapping, Sequence
 
 from rich.table import Table
 
-from tuning import terminal as report
+from tuning import terminal
 from tuning.benchmark.study import LITERATURE, TUNED, LawFigures
-from tuning.transparency.figures import Figure, winner
+from tuning.statistics.intervals import Estimate
+from tuning.transparency.figures import winner
 
 PERCENT = ("rms", "p99", "worst", "failures", "trajectory")
 HEADINGS = {
@@ -30,7 +31,7 @@ def winners(found: Sequence[LawFigures], which: str = TUNED) -> dict[str, str | 
     return {name: winner(name, {law: own[name] for law, own in figures.items()}) for name in HEADINGS}
 
 
-def best(found: LawFigures, which: str = TUNED) -> dict[str, Figure]:
+def best(found: LawFigures, which: str = TUNED) -> dict[str, Estimate]:
     """Its figures with tuned gains; of a law without gains to tune, the only ones there are."""
     return found.figures.get(which) or found.figures[LITERATURE]
 
@@ -49,7 +50,7 @@ def mechanism_table(name: str, found: Sequence[LawFigures]) -> Table:
                 ]
             )
     title = f"{name}: each law with the literature's gains{', then tuned' if _tuned(found) else ''}"
-    return _unfolded(report.table(title, ["law", *HEADINGS.values()], rows))
+    return _unfolded(terminal.table(title, ["law", *HEADINGS.values()], rows))
 
 
 def leaderboard(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> Table:
@@ -64,7 +65,7 @@ def leaderboard(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]])
     headings = ["", *(law.replace("_", "\n") for law in laws)]
     tuned = any(_tuned(found[name]) for name in names)
     how = "each law tuned" if tuned else "each law with the literature's gains"
-    return _unfolded(report.table(f"Leaderboard: restitution error, rms [%], {how}", headings, rows))
+    return _unfolded(terminal.table(f"Leaderboard: restitution error, rms [%], {how}", headings, rows))
 
 
 def _tuned(found: Sequence[LawFigures]) -> bool:
@@ -78,7 +79,7 @@ def _unfolded(made: Table) -> Table:
     return made
 
 
-def shown(key: str, figure: Figure, wins: bool = False) -> str:
+def shown(key: str, figure: Estimate, wins: bool = False) -> str:
     """A figure in three digits, with a mark where it wins."""
     value = 100 * figure.value if key in PERCENT else figure.value
-    return report.figure(value, 3) + MARK * wins
+    return terminal.figure(value, 3) + MARK * wins

@@ -145,9 +145,10 @@ class Tune:
     chatter_weight: Annotated[
         float, number("Restitution error that weighs as much as a command that swings once too often.")
     ] = 0.0
-    honesty_weight: Annotated[
+    transparency_weight: Annotated[
         float | None,
         arg(
+            aliases=("--honesty-weight",),
             metavar="NUMBER",
             help="How much errors of the same scenarios count with a push on the hardware, and damped; by "
             "default 1 for retrospective_reference, 0 for others.",

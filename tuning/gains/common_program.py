@@ -35,7 +35,7 @@ _APART = ("integrator", "hold", "latency", "is_two_sided")
 
 
 @dataclass(frozen=True)
-class Form:
+class CommonProgram:
     """Contact laws by name; numbers of segments and of result slots; names of the optional parts of the loop
     that some mechanism has; the first derivative that breaks at a tick; samples in the delay lines; whether
     references that have to be integrated are worked out beforehand, as every first contact's can be."""
@@ -111,7 +111,7 @@ def _reference(law: ContactLaw, contact: ContactParameters, mass: Array, velocit
     return law.reference(contact, mass, velocity)
 
 
-def forms(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], Form]]:
+def common_programs(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], CommonProgram]]:
     """Indices of the mechanisms that share a form, and the form; in the order in which they come."""
     # Every uncertain number at either end: what a draw may bring into the loop is seen.
     batches = [build_scenarios(one, extremes(one)) for one in mechanisms]
@@ -134,9 +134,9 @@ def _later(mechanism: Mechanism) -> bool:
     return mechanism.approach.contacts > 1 and not LAWS[mechanism.contact.law]().closed_form
 
 
-def _form(mechanisms, group, loops, batches) -> Form:
+def _form(mechanisms, group, loops, batches) -> CommonProgram:
     segments = [b.contact.stiffness.shape[1] if b.contact.stiffness.ndim == 3 else 1 for b in batches]
-    return Form(
+    return CommonProgram(
         laws=tuple(dict.fromkeys(one.contact.law for one in mechanisms)),
         segments=max(segments[i] for i in group),
         slots=max(batches[i].phase.shape[0] for i in group),

@@ -22,21 +22,21 @@ from tuning.environment import program_folder
 from tuning.gains.objective import RMS, Objective, one_each
 from tuning.gains.rounds import Start, inverse_hessian, prepare_solver, solve_tasks
 from tuning.gains.tasks import spread_points
-from tuning.gains.validation import Trial
+from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import apart, polish
-from tuning.optimisation.unit_box import to_shares
+from tuning.optimisation.unit_box import to_coordinates
 
 SCANNED, SCAN_SCENARIOS = 256, 32  # points looked at before a lot, by default; on how many scenarios
 LOTS = 4  # of starts, at most
 SURE = 3  # starts that have to agree: two may have met in a poor basin
 AGREED = 0.005  # relative difference of values that count as the same minimum
 # The same where scenarios have copies: another draw of the scenarios would change the value by more.
-HONESTLY_AGREED = 0.02
+PROBED_AGREED = 0.02
 FREEING, FREEING_REACH = 24, 0.2  # generations of the search from a start that is stuck, its first reach
 REACH, CANDIDATES = 0.1, 16  # of the search without derivatives: first standard deviation in the box, lot
 
 
-class Found(NamedTuple):
+class MultistartResult(NamedTuple):
     """What was found for a task: the best of its starts, none if all failed; all of them, lot by lot;
     evaluations of the objective that it took: a Jacobian over P gains counted as 1 + P, points of a scan by
     their share of the scenarios."""
@@ -54,8 +54,8 @@ class _Search:
     evaluations: int = 0
 
 
-def find(
-    trial: Trial,
+def find_gains(
+    validation: Validation,
     starts: int,
     steps: int,
     polishing: int,
@@ -64,56 +64,64 @@ def find(
     first: Sequence[Sequence[Mapping[str, float]]] | None = None,
     report: Callable[[str], None] = lambda text: None,
     scanned: int = SCANNED,
-) -> list[Found]:
+) -> list[MultistartResult]:
     """Best gains of every task, from lots of so many starts of so many steps, the best of so many points
     `scanned`, and a polish of so many evaluations for each gain.
 
     `first` has, of each task, gains to start at, in the places of the last starts of its first lot, never of
     the literature's. One start alone is the literature's, and the only lot."""
-    tasks, objectives = trial.tasks, one_each(objective, len(trial.tasks))
+    tasks, objectives = validation.tasks, one_each(objective, len(validation.tasks))
     given = [list(own) for own in first] if first else [[] for _ in tasks]
     number = max(starts, 1 + max(map(len, given)))
-    agreed = HONESTLY_AGREED if tasks[0].honest else AGREED
+    agreed = PROBED_AGREED if tasks[0].probed else AGREED
     searches = [_Search() for _ in tasks]
     chosen = _while_compiling(
-        trial, number, objectives, lambda: choose_starts(trial, number, seed, objectives, given, scanned)
+        validation,
+        number,
+        objectives,
+        lambda: choose_starts(validation, number, seed, objectives, given, scanned),
     )
     going = list(range(len(tasks)))
     for lot in range(LOTS if number > 1 else 1):
         if lot > 0:
             report(f"lot {lot + 1} of starts, {len(going)} of {len(tasks)} mechanisms")
-            chosen = [np.empty((0, len(trial.names)))] * len(tasks)
+            chosen = [np.empty((0, len(validation.names)))] * len(tasks)
             for i, points in zip(
-                going, _scan(trial, going, number, (seed, lot), objectives, scanned), strict=True
+                going, _scan(validation, going, number, (seed, lot), objectives, scanned), strict=True
             ):
                 chosen[i] = points
         ended = solve_tasks(tasks, chosen, steps, objectives, report)
         for i in going:
             own = searches[i]
-            own.starts += _exactly(trial, i, ended[i], objectives)
-            own.evaluations += (1 + len(trial.names)) * sum(start.steps for start in ended[i])
+            own.starts += _exactly(validation, i, ended[i], objectives)
+            own.evaluations += (1 + len(validation.names)) * sum(start.steps for start in ended[i])
             if lot > 0 or number > 1 + len(given[i]):
-                own.evaluations += _scan_evaluations(trial, number, scanned)
+                own.evaluations += _scan_evaluations(validation, number, scanned)
         going = [i for i in going if not _agree(searches[i].starts, agreed)]
         if not going:
             break
-    if tasks[0].honest:
+    if tasks[0].probed:
         for i, own in enumerate(searches):
-            own.starts, more = _freed(trial, i, own.starts, agreed, seed, objectives)
+            own.starts, more = _freed(validation, i, own.starts, agreed, seed, objectives)
             own.evaluations += more
     # Where starts agree to that, the rest of the way down is within what scenarios decide.
-    polishing = 0 if tasks[0].honest and not going else polishing * len(trial.names)
+    polishing = 0 if tasks[0].probed and not going else polishing * len(validation.names)
     if polishing:
         report("searching on without derivatives")
-    best = finish(trial, [own.starts for own in searches], polishing, seed, objectives)
+    best = finish(validation, [own.starts for own in searches], polishing, seed, objectives)
     return [
-        Found(top, own.starts, own.evaluations + (polishing if top else 0))
+        MultistartResult(top, own.starts, own.evaluations + (polishing if top else 0))
         for top, own in zip(best, searches, strict=True)
     ]
 
 
 def _freed(
-    trial: Trial, task: int, starts: list[Start], agreed: float, seed: int, objectives: list[Objective]
+    validation: Validation,
+    task: int,
+    starts: list[Start],
+    agreed: float,
+    seed: int,
+    objectives: list[Objective],
 ) -> tuple[list[Start], int]:
     """The starts, those that ended further above the best searched on from there without derivatives, and the
     evaluations that took.
@@ -130,38 +138,40 @@ def _freed(
 
     def losses(points):
         flat = points.reshape(1, -1, points.shape[-1])
-        return trial.losses(objectives, [task], flat)[0].reshape(points.shape[:-1])
+        return validation.losses(objectives, [task], flat)[0].reshape(points.shape[:-1])
 
-    at = np.stack([starts[i].shares for i in stuck])
+    at = np.stack([starts[i].coordinates for i in stuck])
     found = polish(losses, at, number, candidates=CANDIDATES, reach=FREEING_REACH, seed=seed)
     freed = list(starts)
-    for i, shares, loss in zip(stuck, found.free, found.loss, strict=True):
-        freed[i] = _moved(trial, task, starts[i], shares, loss)
+    for i, coordinates, loss in zip(stuck, found.point, found.loss, strict=True):
+        freed[i] = _moved(validation, task, starts[i], coordinates, loss)
     return freed, number * len(stuck)
 
 
-def _exactly(trial: Trial, task: int, starts: list[Start], objectives: list[Objective]) -> list[Start]:
+def _exactly(
+    validation: Validation, task: int, starts: list[Start], objectives: list[Objective]
+) -> list[Start]:
     """Starts with the value of the objective itself where the solver lowered a norm in its place."""
     if objectives[task].name == "rms" or not starts:
         return starts
-    values = trial.losses(objectives, [task], np.stack([start.shares for start in starts])[None])[0]
+    values = validation.losses(objectives, [task], np.stack([start.coordinates for start in starts])[None])[0]
     return [start._replace(rms=float(value)) for start, value in zip(starts, values, strict=True)]
 
 
-def _while_compiling(trial, number, objectives, work):
+def _while_compiling(validation, number, objectives, work):
     """Do some work while the solver's program compiles: each takes one core. Only one program runs: programs
     on several devices could wait for one another for ever."""
     if program_folder() is None:
         return work()
     with ThreadPoolExecutor(1) as meanwhile:
-        ready = meanwhile.submit(prepare_solver, trial.tasks, number, objectives)
+        ready = meanwhile.submit(prepare_solver, validation.tasks, number, objectives)
         done = work()
         ready.result()
         return done
 
 
 def choose_starts(
-    trial: Trial,
+    validation: Validation,
     starts: int,
     seed: int,
     objective: Objective | Sequence[Objective] = RMS,
@@ -171,18 +181,18 @@ def choose_starts(
     """Shares to start from, of every task: the literature's gains, then the best of a scan that lie apart
     from each other. `first` has, of each task, gains that take the places of the last of these, never of the
     literature's."""
-    tasks = range(len(trial.tasks))
-    given = [_shares(trial, i, first[i] if first else ()) for i in tasks]
+    tasks = range(len(validation.tasks))
+    given = [_shares(validation, i, first[i] if first else ()) for i in tasks]
     usual = [max(starts - len(own), 1) for own in given]
-    literature = [_shares(trial, i, [trial.tasks[i].literature]) for i in tasks]
+    literature = [_shares(validation, i, [validation.tasks[i].literature]) for i in tasks]
     if max(usual) > 1:
-        further = _scan(trial, list(tasks), max(usual) - 1, seed, objective, scanned, literature)
+        further = _scan(validation, list(tasks), max(usual) - 1, seed, objective, scanned, literature)
         literature = [np.concatenate(both) for both in zip(literature, further, strict=True)]
     return [np.concatenate([literature[i][: usual[i]], given[i]]) for i in tasks]
 
 
 def _scan(
-    trial: Trial,
+    validation: Validation,
     which: list[int],
     number: int,
     seed: int | tuple[int, ...],
@@ -191,37 +201,37 @@ def _scan(
     beside: list[np.ndarray] | None = None,
 ) -> list[Float[np.ndarray, "number gains"]]:
     """The best points of a scan of the tasks `which`, so many that lie apart, and from those `beside`."""
-    around = [_shares(trial, i, [trial.tasks[i].literature])[0] for i in which]
+    around = [_shares(validation, i, [validation.tasks[i].literature])[0] for i in which]
     points = np.stack([spread_points(own, max(scanned, 2 * number), seed)[1:] for own in around])
     for own, i in zip(points, which, strict=True):
-        task = trial.tasks[i]
+        task = validation.tasks[i]
         for gain in task.tuned:
             if gain.begins is not None:
-                place, begins = trial.names.index(gain.name), {gain.name: gain.begins(task.mechanism)}
-                own[:, place] = _shares(trial, i, [{**task.literature, **begins}])[0, place]
-    values = trial.losses(objective, which, points, SCAN_SCENARIOS)
+                place, begins = validation.names.index(gain.name), {gain.name: gain.begins(task.mechanism)}
+                own[:, place] = _shares(validation, i, [{**task.literature, **begins}])[0, place]
+    values = validation.losses(objective, which, points, SCAN_SCENARIOS)
     order = np.argsort(np.where(np.isfinite(values), values, np.inf), axis=1, kind="stable")
     best = []
     for place, i in enumerate(which):
-        known = beside[i] if beside else np.empty((0, len(trial.names)))
+        known = beside[i] if beside else np.empty((0, len(validation.names)))
         best.append(apart(points[place][order[place]], known, len(known) + number)[len(known) :])
     return best
 
 
-def _scan_evaluations(trial: Trial, number: int, scanned: int) -> int:
-    scenarios = len(trial.tasks[0].scenarios.velocity)
+def _scan_evaluations(validation: Validation, number: int, scanned: int) -> int:
+    scenarios = len(validation.tasks[0].scenarios.velocity)
     return -(-max(scanned, 2 * number) * min(SCAN_SCENARIOS, scenarios) // scenarios)
 
 
 def _shares(
-    trial: Trial, task: int, several: Sequence[Mapping[str, float]]
+    validation: Validation, task: int, several: Sequence[Mapping[str, float]]
 ) -> Float[np.ndarray, "several gains"]:
-    gains = np.array([[gains[name] for name in trial.names] for gains in several])
-    return to_shares(gains.reshape(len(several), len(trial.names)), trial.bounds[task])
+    gains = np.array([[gains[name] for name in validation.names] for gains in several])
+    return to_coordinates(gains.reshape(len(several), len(validation.names)), validation.bounds[task])
 
 
 def finish(
-    trial: Trial,
+    validation: Validation,
     solved: list[list[Start]],
     evaluations: int,
     seed: int,
@@ -234,26 +244,28 @@ def finish(
     if not some or evaluations == 0:
         return best
     tops = [top for top in best if top]
-    starts = np.stack([top.shares for top in tops])
+    starts = np.stack([top.coordinates for top in tops])
     shapes = np.stack([inverse_hessian(top.curvature, top.rms) for top in tops])
 
     def losses(points):
-        return trial.losses(objective, some, points)
+        return validation.losses(objective, some, points)
 
     found = polish(
         losses, starts, evaluations, candidates=CANDIDATES, reach=REACH, covariance=shapes, seed=seed
     )
-    for i, top, shares, loss in zip(some, tops, found.free, found.loss, strict=True):
-        best[i] = _moved(trial, i, top, shares, loss)
+    for i, top, coordinates, loss in zip(some, tops, found.point, found.loss, strict=True):
+        best[i] = _moved(validation, i, top, coordinates, loss)
     return best
 
 
-def _moved(trial: Trial, task: int, start: Start, shares: np.ndarray, loss: float) -> Start:
+def _moved(validation: Validation, task: int, start: Start, coordinates: np.ndarray, loss: float) -> Start:
     """The start where a search from it ended; itself where that found nothing better."""
-    if (shares == start.shares).all():
+    if (coordinates == start.coordinates).all():
         return start
     history = [*start.history, float(loss)]
-    return start._replace(rms=float(loss), gains=trial.gains(task, shares), shares=shares, history=history)
+    return start._replace(
+        rms=float(loss), gains=validation.gains(task, coordinates), coordinates=coordinates, history=history
+    )
 
 
 def _ranked(starts: list[Start]) -> list[Start]:

@@ -35,7 +35,7 @@ from jaxhil.errors import InputError, shown
 from jaxhil.simulation.evaluation import Outcome, compare_with_reference
 from jaxhil.simulation.loop import Loop, RigConstants
 from jaxhil.simulation.rollout import run_contacts
-from tuning.transparency.probes import are_copies
+from tuning.transparency.probes import are_probes
 
 SCALE = 0.01  # an error of one: the solver's first steps are damped as for residuals of order one
 FAILED = 3.0  # error of a contact that does not end, or is not reached: as bad as a wild divergence
@@ -43,14 +43,14 @@ CHUNK = 32  # lanes with copies that are computed side by side
 TAIL = 20  # cvar: the worst one in so many contacts, at least one
 POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # of the norms in the residuals; even
 OBJECTIVES = tuple(POWERS)
-WEIGHTS = tuple(f"{name}_weight" for name in ("divergence", "command", "noise", "chatter", "honesty"))
+WEIGHTS = tuple(f"{name}_weight" for name in ("divergence", "command", "noise", "chatter", "transparency"))
 
 
 @dataclass(frozen=True)
 class Objective:
     """What to minimise, J with
 
-        J^2 = figure(E)^2 + (honesty_weight rms(H))^2
+        J^2 = figure(E)^2 + (transparency_weight rms(H))^2
           + (command_weight rms(C))^2 + (chatter_weight rms(S))^2 + (noise_weight N)^2
 
     E: per contact the restitution error e - e* [1], times sqrt(divergence_weight) where it is positive:
@@ -76,7 +76,7 @@ class Objective:
     command_weight: float = 0.0
     noise_weight: float = 0.0
     chatter_weight: float = 0.0
-    honesty_weight: float = 0.0
+    transparency_weight: float = 0.0
 
     def __post_init__(self):
         if self.name not in OBJECTIVES:
@@ -104,7 +104,7 @@ class Terms(NamedTuple):
     command: bool
     noise: bool
     chatter: bool
-    honesty: bool = False
+    transparency: bool = False
 
 
 class Weights(NamedTuple):
@@ -114,7 +114,7 @@ class Weights(NamedTuple):
     command: Float[Array, "*problems"]
     noise: Float[Array, "*problems"]
     chatter: Float[Array, "*problems"]
-    honesty: Float[Array, "*problems"]
+    transparency: Float[Array, "*problems"]
 
 
 class Problem(NamedTuple):
@@ -131,7 +131,7 @@ def one_each(objective: Objective | Sequence[Objective], number: int) -> list[Ob
     return [objective] * number if isinstance(objective, Objective) else list(objective)
 
 
-def common_terms(objectives: Sequence[Objective], honest: bool = False) -> Terms:
+def common_terms(objectives: Sequence[Objective], probed: bool = False) -> Terms:
     """The terms of objectives of one name: a part that one of them has, all have, some with a weight of 0.
     `honest` scenarios come with copies.
 
@@ -143,7 +143,7 @@ def common_terms(objectives: Sequence[Objective], honest: bool = False) -> Terms
         any(objective.command_weight > 0 for objective in objectives),
         any(objective.noise_weight > 0 for objective in objectives),
         any(objective.chatter_weight > 0 for objective in objectives),
-        honest,
+        probed,
     )
 
 
@@ -174,16 +174,16 @@ def residuals(
         values, rig = arguments
         return compare_with_reference(loop, rig.scenario, run_contacts(loop, values, rig))
 
-    outcome = _in_chunks(run, (values, rig)) if terms.honesty else run((values, rig))
+    outcome = _in_chunks(run, (values, rig)) if terms.transparency else run((values, rig))
 
     def by_problem(leaf):
         return jnp.moveaxis(leaf.reshape(-1, number, lanes), 1, 0).reshape(number, -1)
 
     error, excess, chatter = map(by_problem, contact_terms(outcome))
     amplification = jnp.mean(by_problem(loop.compensator.noise_amplification(values, rig.constants)), axis=1)
-    copies = by_problem(jnp.broadcast_to(are_copies(number * lanes), outcome.wanted.shape))
+    probes = by_problem(jnp.broadcast_to(are_probes(number * lanes), outcome.wanted.shape))
     return weigh(
-        terms, problems.weights, error, excess, chatter, by_problem(outcome.wanted), amplification, copies
+        terms, problems.weights, error, excess, chatter, by_problem(outcome.wanted), amplification, probes
     )
 
 
@@ -195,10 +195,10 @@ def weigh(
     chatter: Float[Array, "problems contacts"],
     wanted: Bool[Array, "problems contacts"],
     amplification: Float[Array, "problems"],
-    copies: Bool[Array, "problems contacts"] | None = None,
+    probes: Bool[Array, "problems contacts"] | None = None,
 ) -> Float[Array, "problems residuals"]:
     """The residuals of `contact_terms` and of the noise's amplification; `copies`: which contacts are of
-    copies, where the terms have honesty."""
+    copies, where the terms have transparency."""
 
     # A problem that asks for no contact, which fills up a call, has errors of 0.
     def counted(asked):
@@ -206,10 +206,10 @@ def weigh(
 
     count = plain = counted(wanted)
     blindness = []
-    if terms.honesty and copies is not None:
-        blind = _norm(jnp.where(copies, error, 0), counted(wanted & copies), 2)
-        blindness = [weights.honesty[:, None] * blind]
-        error, plain = jnp.where(copies, 0, error), counted(wanted & ~copies)
+    if terms.transparency and probes is not None:
+        blind = _norm(jnp.where(probes, error, 0), counted(wanted & probes), 2)
+        blindness = [weights.transparency[:, None] * blind]
+        error, plain = jnp.where(probes, 0, error), counted(wanted & ~probes)
     diverging = jnp.sqrt(weights.divergence)[:, None] * error
     number = {"rms": plain, "cvar": _tail(plain), "worst": jnp.ones_like(plain)}[terms.name]
     parts = [_norm(jnp.where(error > 0, diverging, error), number, POWERS[terms.name]), *blindness]
@@ -245,15 +245,15 @@ def objective_value(
     excesses: Float[np.ndarray, "contacts"] | None = None,
     amplification: float = 1.0,
     chatter: Float[np.ndarray, "contacts"] | None = None,
-    honesty: Float[np.ndarray, "contacts"] | None = None,
+    probe_errors: Float[np.ndarray, "contacts"] | None = None,
 ) -> float:
     """J [1] of `Objective`, exactly, for all three names: what a table of results is made of.
 
     `errors`, `excesses` and `chatter` (none: no part in it) are those of `contact_terms`, of the contacts
-    asked for; `honesty` are the errors of the copies, which are not among `errors` then. What is not finite
-    counts as `FAILED`.
+    asked for; `probe_errors` are the errors of the transparency probes, which are not among `errors` then.
+    What is not finite counts as `FAILED`.
     """
-    given = errors, excesses, chatter, honesty
+    given = errors, excesses, chatter, probe_errors
     error, excess, swings, blindness = (
         np.where(np.isfinite(term), term, FAILED)
         for term in (np.zeros(1) if term is None else np.ravel(term) for term in given)
@@ -267,7 +267,7 @@ def objective_value(
     command = objective.command_weight * np.sqrt(np.mean(excess**2))
     restless = objective.chatter_weight * np.sqrt(np.mean(swings**2))
     noise = objective.noise_weight * max(0.0, float(amplification) - 1)
-    blind = objective.honesty_weight * np.sqrt(np.mean(blindness**2))
+    blind = objective.transparency_weight * np.sqrt(np.mean(blindness**2))
     return math.hypot(figure, command, restless, noise, blind)
 
 

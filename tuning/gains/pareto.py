@@ -3,7 +3,7 @@
 A compensator that leads the measured force amplifies its noise. Tuned with a larger `Objective.noise_weight`
 it is quieter, and less accurate: each weight gives a point of the front. What passes the noise on as it is
 still may have to choose between accuracy and the peak of its command (`Objective.command_weight`), or between
-accuracy and honesty (`Objective.honesty_weight`). All weights of all mechanisms are
+accuracy and transparency (`Objective.transparency_weight`). All weights of all mechanisms are
 problems of one program, on the scenarios that the mechanisms were tuned on. Points help each other: gains
 found for one weight are what its neighbours on the ladder begin at next, until none gets better.
 """
@@ -24,13 +24,13 @@ from jaxhil.simulation.evaluation import Outcome
 from tuning.gains.multistart import choose_starts
 from tuning.gains.objective import FAILED, Objective, contact_terms, objective_value
 from tuning.gains.rounds import Start, solve_tasks
-from tuning.gains.tasks import Task, alike, build_task
-from tuning.gains.tune import BLOCK, Figures, Result, Settings, figures
-from tuning.gains.validation import Trial
-from tuning.optimisation.unit_box import to_shares
-from tuning.statistics.bootstrap import Intervals, interval
-from tuning.transparency.figures import Figure
-from tuning.transparency.probes import honesty_figures
+from tuning.gains.tasks import TuneTask, alike, build_task
+from tuning.gains.tune import BLOCK, ErrorFigures, TuneResult, TuneSettings, figures
+from tuning.gains.validation import Validation
+from tuning.optimisation.unit_box import to_coordinates
+from tuning.statistics.bootstrap import ErrorIntervals, error_intervals
+from tuning.statistics.intervals import Estimate
+from tuning.transparency.probes import probe_figures
 
 # The ladder's ends: how many times the noise of accurate gains weighs what their error does. The first one
 # reaches further: what is quiet without being accurate is a start that the solver does not come by itself.
@@ -55,10 +55,10 @@ class Axis(NamedTuple):
 
 NOISE = Axis("noise", "noise_weight", "noise_amplification", "amplification of sensor noise", LEAST_EXCESS)
 PEAK = Axis("peak", "command_weight", "peak_p99", "peak command over the reference's (99th percentile)", 0.1)
-HONESTY = Axis(
-    "honesty", "honesty_weight", "honesty_error", "error under pushes and other damping (rms)", 1e-3
+TRANSPARENCY = Axis(
+    "honesty", "transparency_weight", "honesty_error", "error under pushes and other damping (rms)", 1e-3
 )
-AXES = {axis.name: axis for axis in (NOISE, PEAK, HONESTY)}
+AXES = {axis.name: axis for axis in (NOISE, PEAK, TRANSPARENCY)}
 
 
 class Point(NamedTuple):
@@ -66,17 +66,17 @@ class Point(NamedTuple):
     amplification A of the force sensor's noise, or of fresh scenarios the 99th percentile of the peak command
     over the reference's, or the rms error of the copies; the objective without that term [1] on fresh
     scenarios; figures of these and of the nominal run, confidence intervals; whether no other point beats it
-    (`dominated`); transparency, slope and peak, where honesty counts."""
+    (`dominated`); transparency, slope and peak, where transparency counts."""
 
     gains: dict[str, float]
     weight: float | None
     cost: float
     error: float
-    figures: Figures
-    nominal: Figures
-    intervals: Intervals
+    figures: ErrorFigures
+    nominal: ErrorFigures
+    intervals: ErrorIntervals
     on_front: bool
-    honesty: dict[str, Figure] | None = None
+    transparency: dict[str, Estimate] | None = None
 
     @property
     def place(self) -> tuple[float, float]:
@@ -140,16 +140,16 @@ def dominated(places: Sequence[tuple[float, float]]) -> list[bool]:
 
 
 def fronts(
-    results: Sequence[Result],
+    results: Sequence[TuneResult],
     number: int,
     report: Callable[[str], None] = lambda text: None,
     axis: Axis = NOISE,
 ) -> Iterator[tuple[int, Front]]:
     """(index, front of `number` points) of mechanisms that were tuned by one compensator with the same
     settings, as they are done. Honesty is traded by those whose settings judge it."""
-    settings = results[0].settings if results else Settings()
+    settings = results[0].settings if results else TuneSettings()
     tasks = [
-        build_task(r.mechanism, r.compensator, settings.scenarios, settings.seed, honest=settings.honest)
+        build_task(r.mechanism, r.compensator, settings.scenarios, settings.seed, probed=settings.probed)
         for r in results
     ]
     for group in alike([task.loop for task in tasks], [task.scenarios for task in tasks]):
@@ -158,12 +158,12 @@ def fronts(
             some, tuned = [tasks[index] for index in block], [results[index] for index in block]
             name = some[0].mechanism.name if len(some) == 1 else f"{len(some)} mechanisms"
             report(f"{name}: accuracy against {axis.name}, {number} points")
-            trial = Trial(some, settings.validation, settings.seed)
+            validation = Validation(some, settings.validation, settings.seed)
             points = _solve(
-                trial, tuned, number, settings, lambda text, name=name: report(f"{name}: {text}"), axis
+                validation, tuned, number, settings, lambda text, name=name: report(f"{name}: {text}"), axis
             )
             report(f"{name}: judging {number} points")
-            yield from zip(block, _judge(trial, tuned, points, settings, axis), strict=True)
+            yield from zip(block, _judge(validation, tuned, points, settings, axis), strict=True)
 
 
 class _Found(NamedTuple):
@@ -180,16 +180,18 @@ class _Found(NamedTuple):
 
 
 def _solve(
-    trial: Trial,
-    tuned: list[Result],
+    validation: Validation,
+    tuned: list[TuneResult],
     number: int,
-    settings: Settings,
+    settings: TuneSettings,
     report: Callable[[str], None],
     axis: Axis = NOISE,
 ) -> list[list[tuple[float, dict[str, float]]]]:
     """Weight and gains of every point of every task."""
     weight = getattr(settings.objective, axis.weight)
-    pools = [_reached(trial, i, axis, settings.objective, weight, one.starts) for i, one in enumerate(tuned)]
+    pools = [
+        _reached(validation, i, axis, settings.objective, weight, one.starts) for i, one in enumerate(tuned)
+    ]
     ladders = []
     for turn in range(1 + PASSES):
         # How accurate gains can be, and how quiet those are, is known better every time.
@@ -199,8 +201,10 @@ def _solve(
         objectives = [
             [_weighed(settings.objective, axis, weight) for weight in weights] for weights in ladders
         ]
-        starts = _around(trial, before) if turn > 0 else _anywhere(trial, tuned, objectives, settings)
-        found = _search(trial, starts, objectives, settings, report, axis)
+        starts = (
+            _around(validation, before) if turn > 0 else _anywhere(validation, tuned, objectives, settings)
+        )
+        found = _search(validation, starts, objectives, settings, report, axis)
         pools = [pool + new for pool, new in zip(pools, found, strict=True)]
         after = [_picked(pool, weights) for pool, weights in zip(pools, ladders, strict=True)]
         if turn > 0 and not _improved(before, after, ladders):
@@ -222,61 +226,67 @@ def _weighed(objective: Objective, axis: Axis, weight: float) -> Objective:
 
 
 def _anywhere(
-    trial: Trial, tuned: list[Result], objectives: list[list[Objective]], settings: Settings
+    validation: Validation, tuned: list[TuneResult], objectives: list[list[Objective]], settings: TuneSettings
 ) -> list[list[np.ndarray]]:
     """Shares that every point of each task begins at: the usual ones for its weight, and those tuned
     before."""
     number, first = max(settings.starts, 2), [[one.gains] for one in tuned]
     by_point = [
-        choose_starts(trial, number, settings.seed, own, first) for own in zip(*objectives, strict=True)
+        choose_starts(validation, number, settings.seed, own, first) for own in zip(*objectives, strict=True)
     ]
     return [list(own) for own in zip(*by_point, strict=True)]
 
 
-def _around(trial: Trial, picked: list[list[_Found]]) -> list[list[np.ndarray]]:
+def _around(validation: Validation, picked: list[list[_Found]]) -> list[list[np.ndarray]]:
     """Shares that every point of each task begins at: what it and its neighbours found."""
     return [
         [
-            to_shares(np.array([[gains[name] for name in trial.names] for gains in several]), bounds)
+            to_coordinates(
+                np.array([[gains[name] for name in validation.names] for gains in several]), bounds
+            )
             for several in _neighbourhoods(own)
         ]
-        for own, bounds in zip(picked, trial.bounds, strict=True)
+        for own, bounds in zip(picked, validation.bounds, strict=True)
     ]
 
 
-def _search(trial: Trial, starts, objectives, settings, report, axis: Axis) -> list[list[_Found]]:
+def _search(validation: Validation, starts, objectives, settings, report, axis: Axis) -> list[list[_Found]]:
     """What all starts of all points of each task end with."""
     number = len(objectives[0])
-    every = [task for task in trial.tasks for _ in range(number)]
+    every = [task for task in validation.tasks for _ in range(number)]
     own = list(chain(*objectives))
     solved = solve_tasks(every, list(chain(*starts)), settings.steps, own, report)
     found = [
-        _reached(trial, place // number, axis, settings.objective, getattr(objective, axis.weight), ended)
+        _reached(
+            validation, place // number, axis, settings.objective, getattr(objective, axis.weight), ended
+        )
         for place, (objective, ended) in enumerate(zip(own, solved, strict=True))
     ]
     return [list(chain(*found[i : i + number])) for i in range(0, len(found), number)]
 
 
 def _reached(
-    trial: Trial, index: int, axis: Axis, objective: Objective, weight: float, starts: list[Start]
+    validation: Validation, index: int, axis: Axis, objective: Objective, weight: float, starts: list[Start]
 ) -> list[_Found]:
     """What the starts of a task ended with under a weight."""
-    task = trial.tasks[index]
+    task = validation.tasks[index]
     if axis == NOISE:
         return _found(task, weight, starts)
     kept = [start for start in starts if math.isfinite(start.rms)]
     if not kept:
         return [_Found(task.literature, FAILED, 0.0)]
-    gains = np.array([[start.gains[name] for name in trial.names] for start in kept])
-    shares = to_shares(gains, trial.bounds[index])[None]
-    without, beside = (trial.losses(_weighed(objective, axis, w), [index], shares)[0] for w in (0.0, 1.0))
+    gains = np.array([[start.gains[name] for name in validation.names] for start in kept])
+    coordinates = to_coordinates(gains, validation.bounds[index])[None]
+    without, beside = (
+        validation.losses(_weighed(objective, axis, w), [index], coordinates)[0] for w in (0.0, 1.0)
+    )
     excess = np.sqrt(np.maximum(0, beside**2 - without**2))
     return [
         _Found(start.gains, float(e), float(x)) for start, e, x in zip(kept, without, excess, strict=True)
     ]
 
 
-def _found(task: Task, weight: float, starts: list[Start]) -> list[_Found]:
+def _found(task: TuneTask, weight: float, starts: list[Start]) -> list[_Found]:
     found = []
     for start in starts:
         excess = max(0.0, amplification(task.mechanism, task.compensator, start.gains) - 1)
@@ -309,23 +319,23 @@ def _improved(before: list[list[_Found]], after: list[list[_Found]], ladders: li
 
 
 def _judge(
-    trial: Trial,
-    tuned: list[Result],
+    validation: Validation,
+    tuned: list[TuneResult],
     points: list[list[tuple[float, dict[str, float]]]],
-    settings: Settings,
+    settings: TuneSettings,
     axis: Axis,
 ) -> list[Front]:
     """The points of every task on fresh scenarios, the literature's gains and those tuned before beside."""
     plans = [
         [*own, (None, task.literature), (None, one.gains)]
-        for task, one, own in zip(trial.tasks, tuned, points, strict=True)
+        for task, one, own in zip(validation.tasks, tuned, points, strict=True)
     ]
     # One set of gains of every task at a time, as they were judged when they were tuned.
-    outcomes = [trial.judge_copies([gains for _, gains in row]) for row in zip(*plans, strict=True)]
+    outcomes = [validation.judge_probed([gains for _, gains in row]) for row in zip(*plans, strict=True)]
     fronts = []
     for index, (plan, own) in enumerate(zip(plans, zip(*outcomes, strict=True), strict=True)):
         judged = [
-            _point(trial, index, settings.objective, axis, weight, gains, *both)
+            _point(validation, index, settings.objective, axis, weight, gains, *both)
             for (weight, gains), both in zip(plan, own, strict=True)
         ]
         *made, literature, before = judged
@@ -336,7 +346,7 @@ def _judge(
 
 
 def _point(
-    trial: Trial,
+    validation: Validation,
     index: int,
     objective: Objective,
     axis: Axis,
@@ -345,32 +355,32 @@ def _point(
     outcome: Outcome,
     copies: Outcome | None,
 ) -> Point:
-    task, probed = trial.tasks[index], trial.probed[index]
+    task, probed = validation.tasks[index], validation.probed[index]
     fresh, nominal = (
         jax.tree.map(lambda leaf, cut=cut: leaf[..., cut], outcome) for cut in (slice(-1), slice(-1, None))
     )
     quiet = amplification(task.mechanism, task.compensator, gains)
     errors = np.asarray(contact_terms(fresh)[0])[fresh.wanted]
-    every, honesty = fresh, None
+    every, probe_errors = fresh, None
     if copies is not None:
         every = copies
         probes = jax.tree.map(lambda leaf: leaf[..., 1:], copies)
-        honesty = np.asarray(contact_terms(probes)[0])[probes.wanted]
+        probe_errors = np.asarray(contact_terms(probes)[0])[probes.wanted]
     excesses, chatter = (np.asarray(term)[every.wanted] for term in contact_terms(every)[1:])
     cost = quiet
     if axis == PEAK:
         cost = float(np.percentile(fresh.peak_ratio[fresh.good], 99)) if fresh.good.any() else math.nan
-    elif axis == HONESTY:
-        cost = math.nan if honesty is None else float(np.sqrt(np.mean(honesty**2)))
+    elif axis == TRANSPARENCY:
+        cost = math.nan if probe_errors is None else float(np.sqrt(np.mean(probe_errors**2)))
     rest = _weighed(objective, axis, 0.0)
     return Point(
         gains=gains,
         weight=weight,
         cost=cost,
-        error=objective_value(rest, errors, excesses, quiet, chatter, honesty),
+        error=objective_value(rest, errors, excesses, quiet, chatter, probe_errors),
         figures=figures(fresh),
         nominal=figures(nominal),
-        intervals=interval(fresh.error, fresh.good),
+        intervals=error_intervals(fresh.error, fresh.good),
         on_front=False,
-        honesty=honesty_figures(probed, copies) if probed is not None and copies is not None else None,
+        transparency=probe_figures(probed, copies) if probed is not None and copies is not None else None,
     )

@@ -18,13 +18,13 @@ from jaxtyping import Float
 from jaxhil.simulation.evaluation import expected_duration
 from jaxhil.simulation.loop import build_rig_constants
 from jaxhil.simulation.scenario import Scenario
-from tuning import program_cache as programs
+from tuning import program_cache
 from tuning.environment import program_folder
 from tuning.gains.objective import RMS, SCALE, Objective, Problem, common_terms, one_each, residuals
-from tuning.gains.tasks import Task, common_loop, gain_bounds, gains_at, tuned_names
+from tuning.gains.tasks import TuneTask, common_loop, gain_bounds, gains_at, tuned_names
 from tuning.optimisation.levenberg_marquardt import STATUSES, Solution, solve
 from tuning.optimisation.unit_box import Bounds
-from tuning.transparency.probes import COPIES
+from tuning.transparency.probes import LANES_PER_SCENARIO
 
 FEW, MANY = 4, 32  # problems in one call of the program
 TILE = 128  # lanes computed side by side on a device: more leave the cache
@@ -39,23 +39,23 @@ GIVEN_UP = "given up"
 class Start(NamedTuple):
     """One start of the solve: status, steps, value of the objective (its norm, `tuning.gains.objective`) it
     ended with and had after every step, and its gains; of those that are tuned for any of the tasks also the
-    shares of their ranges, and J^T J by them."""
+    coordinates of their ranges, and J^T J by them."""
 
     status: str
     steps: int
     rms: float
     history: list[float]
     gains: dict[str, float]
-    shares: np.ndarray = np.empty(0)
+    coordinates: np.ndarray = np.empty(0)
     curvature: np.ndarray = np.empty((0, 0))
 
 
 @dataclasses.dataclass
 class _Problem:
-    """A start on its way: shares now, J^T J there, loss after every step so far."""
+    """A start on its way: coordinates now, J^T J there, loss after every step so far."""
 
     task: int
-    shares: np.ndarray
+    coordinates: np.ndarray
     curvature: np.ndarray
     status: int | str = STEP_LIMIT
     history: list[float] = dataclasses.field(default_factory=list)
@@ -66,14 +66,14 @@ class _Problem:
 
 
 def solve_tasks(
-    tasks: list[Task],
+    tasks: list[TuneTask],
     starts: list[Float[np.ndarray, "starts gains"]],
     steps: int,
     objective: Objective | Sequence[Objective] = RMS,
     report: Callable[[str], None] = lambda text: None,
 ) -> list[list[Start]]:
-    """Every start of every task; the tasks are alike (`tuning.gains.tasks.alike`). `starts` are shares of the
-    ranges of those gains that are tuned for any of the tasks; none ends worse than it began.
+    """Every start of every task; the tasks are alike (`tuning.gains.tasks.alike`). `starts` are coordinates
+    of the ranges of those gains that are tuned for any of the tasks; none ends worse than it began.
 
     `objective` is that of all tasks, or one of each, which differ by their weights alone: tasks may be the
     same but for it.
@@ -81,7 +81,9 @@ def solve_tasks(
     names = tuned_names(tasks)
     bounds = [gain_bounds(task, names) for task in tasks]
     nothing = np.zeros((len(names), len(names)))
-    problems = [_Problem(index, shares, nothing) for index, own in enumerate(starts) for shares in own]
+    problems = [
+        _Problem(index, coordinates, nothing) for index, own in enumerate(starts) for coordinates in own
+    ]
     objectives = one_each(objective, len(tasks))
     # As many as if every task had as many starts: where few go on, the same program serves.
     advance = _stepper(tasks, names, bounds, objectives, len(tasks) * max(map(len, starts)))
@@ -89,20 +91,20 @@ def solve_tasks(
     order = np.argsort([-float(np.max(expected_duration(task.scenarios))) for task in tasks], kind="stable")
     rank = {int(task): place for place, task in enumerate(order)}
     problems.sort(key=lambda problem: rank[problem.task])
-    done, honest = 0, tasks[0].honest
+    done, probed = 0, tasks[0].probed
     while done < steps:
         going = [problem for problem in problems if problem.status == STEP_LIMIT]
         if not going:
             break
-        several = honest or (done == 0 and max(map(len, starts)) > PROMISING)
+        several = probed or (done == 0 and max(map(len, starts)) > PROMISING)
         limit = min(steps - done, FIRST_ROUND if several else LONGEST)
         report(f"{len(going)} of {len(problems)} starts, {limit} steps")
         before = [problem.loss for problem in going]
         advance(going, limit)
         done += limit
-        if honest and done > FIRST_ROUND:
+        if probed and done > FIRST_ROUND:
             _settle(going, before)
-        if done < steps and not honest:
+        if done < steps and not probed:
             _give_up(problems)
     return [
         [_finished(p, names, bounds[index], tasks[index]) for p in problems if p.task == index]
@@ -139,14 +141,16 @@ def inverse_hessian(
     return np.linalg.inv(curvature / (2 * max(loss, 1e-12)) + 16 * np.eye(len(curvature)))
 
 
-def _finished(problem: _Problem, names: tuple[str, ...], bounds: Bounds, task: Task) -> Start:
+def _finished(problem: _Problem, names: tuple[str, ...], bounds: Bounds, task: TuneTask) -> Start:
     history = [float(value) for value in SCALE * np.sqrt(2 * np.array(problem.history))]
     status = problem.status if isinstance(problem.status, str) else STATUSES[problem.status]
-    gains = gains_at(task, names, bounds, problem.shares)
-    return Start(status, len(history), history[-1], history, gains, problem.shares, problem.curvature)
+    gains = gains_at(task, names, bounds, problem.coordinates)
+    return Start(status, len(history), history[-1], history, gains, problem.coordinates, problem.curvature)
 
 
-def prepare_solver(tasks: list[Task], starts: int, objective: Objective | Sequence[Objective] = RMS) -> None:
+def prepare_solver(
+    tasks: list[TuneTask], starts: int, objective: Objective | Sequence[Objective] = RMS
+) -> None:
     """Compile what `solve_tasks` will run, into the compile cache."""
     names = tuned_names(tasks)
     bounds = [gain_bounds(task, names) for task in tasks]
@@ -154,7 +158,7 @@ def prepare_solver(tasks: list[Task], starts: int, objective: Objective | Sequen
     problems = [_Problem(index, nothing, nothing) for index in range(len(tasks)) for _ in range(starts)]
     static, call = _calls(tasks, names, bounds, one_each(objective, len(tasks)), len(problems))
     some = problems[: _size(len(problems))]
-    programs.prepare(_advance, static, call(some, 1), program_folder())
+    program_cache.prepare(_advance, static, call(some, 1), program_folder())
 
 
 def _stepper(tasks, names, bounds, objectives, number) -> Callable[[list[_Problem], int], None]:
@@ -165,7 +169,9 @@ def _stepper(tasks, names, bounds, objectives, number) -> Callable[[list[_Proble
     def advance(problems: list[_Problem], limit: int) -> None:
         for begin in range(0, len(problems), size):
             some = problems[begin : begin + size]
-            solution = jax.device_get(programs.run(_advance, static, call(some, limit), program_folder()))
+            solution = jax.device_get(
+                program_cache.run(_advance, static, call(some, limit), program_folder())
+            )
             for place, i in enumerate(_dealt(size)):
                 if i < len(some):
                     _take(some[i], solution, place)
@@ -194,7 +200,7 @@ def _calls(tasks, names, bounds, objectives, number):
     table = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *each)
     size = _size(number)
     lanes = len(tasks[0].scenarios.velocity)
-    static = (loop, names, common_terms(objectives, tasks[0].honest)), LONGEST, max(1, TILE // lanes)
+    static = (loop, names, common_terms(objectives, tasks[0].probed)), LONGEST, max(1, TILE // lanes)
 
     def call(some: list[_Problem], limit: int):
         dealt = _dealt(size)
@@ -202,7 +208,7 @@ def _calls(tasks, names, bounds, objectives, number):
         filled = [some[i] if i < len(some) else some[0] for i in dealt]
         idle = dealt[:, None] >= len(some)
         index = np.array([p.task for p in filled])
-        starts = np.stack([p.shares for p in filled])
+        starts = np.stack([p.coordinates for p in filled])
         scenarios, others, weighed, limits = jax.tree.map(itemgetter(index), table)
         contacts = np.where(idle, 0, scenarios.contacts).astype(np.int32)
         return scenarios._replace(contacts=contacts), others, weighed, limits, starts, np.array(limit)
@@ -210,14 +216,14 @@ def _calls(tasks, names, bounds, objectives, number):
     return static, call
 
 
-def _in_order(task: Task) -> Scenario:
+def _in_order(task: TuneTask) -> Scenario:
     """The task's scenarios. Where each has its copies, those that take as long are neighbours."""
-    if not task.honest:
+    if not task.probed:
         return task.scenarios
     # That is made of how long the contacts take.
-    longest = np.asarray(task.scenarios.time_limit)[::COPIES]
+    longest = np.asarray(task.scenarios.time_limit)[::LANES_PER_SCENARIO]
     order = np.argsort(-longest, kind="stable")
-    lanes = (COPIES * order[:, None] + np.arange(COPIES)).ravel()
+    lanes = (LANES_PER_SCENARIO * order[:, None] + np.arange(LANES_PER_SCENARIO)).ravel()
     return jax.tree.map(lambda leaf: np.asarray(leaf)[..., lanes], task.scenarios)
 
 
@@ -229,7 +235,7 @@ def _take(problem: _Problem, solution: Solution, i: int) -> None:
     problem.status = int(solution.status[i])
     # A round begins anew with cautious steps; none of them is worse than where it began.
     if np.isfinite(solution.loss[i]):
-        problem.shares = np.clip(np.asarray(solution.shares[i]), 0, 1)
+        problem.coordinates = np.clip(np.asarray(solution.coordinates[i]), 0, 1)
         problem.curvature = np.asarray(solution.curvature[i])
 
 

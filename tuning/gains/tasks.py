@@ -19,9 +19,9 @@ from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import parameters_by_slot
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.scenario import Scenario, build_scenarios
-from tuning.gains.common_program import Form
+from tuning.gains.common_program import CommonProgram
 from tuning.optimisation.unit_box import Bounds, to_gains
-from tuning.transparency.probes import COPIES, probed_scenarios
+from tuning.transparency.probes import LANES_PER_SCENARIO, probed_scenarios
 
 # In training a contact that takes longer than this many times its undelayed duration, and so many
 # seconds more, has failed.
@@ -32,7 +32,7 @@ SCENARIOS, NOISY_SCENARIOS = 32, 128  # to tune on, without and with sensor nois
 
 
 @dataclass(frozen=True)
-class Task:
+class TuneTask:
     """A mechanism to tune: the compensator's literature gains, or those of a setting, the scenarios to tune
     on and their loop; the form that scenarios and loop are brought to, if it shares a program with unlike
     mechanisms; whether each scenario comes with its copies (`tuning.transparency.probes`)."""
@@ -42,13 +42,13 @@ class Task:
     literature: dict[str, float]
     scenarios: Scenario
     loop: Loop
-    form: Form | None = None
-    honest: bool = False
+    common: CommonProgram | None = None
+    probed: bool = False
 
     @property
     def number(self) -> int:
         """Scenarios, copies not counted."""
-        return len(self.scenarios.velocity) // (COPIES if self.honest else 1)
+        return len(self.scenarios.velocity) // (LANES_PER_SCENARIO if self.probed else 1)
 
     @property
     def tuned(self) -> tuple[Gain, ...]:
@@ -61,33 +61,33 @@ def build_task(
     compensator: str,
     scenarios: int | None,
     seed: int,
-    form: Form | None = None,
+    common: CommonProgram | None = None,
     setting: str | None = None,
-    honest: bool = False,
-) -> Task:
+    probed: bool = False,
+) -> TuneTask:
     """Training scenarios are quasi-random: they fill the range evenly. Their contacts must end in time.
 
     Each comes with a realisation of the sensors' noise of its own. Gains can be fitted to a few of them, so
     that there are more, unless a number is given, where there is noise. The copies of `honest` ones are as
     good for that: there are fewer scenarios then.
 
-    Raises ValueError for honest tasks in a form.
+    Raises ValueError for probed tasks in a form.
     """
-    if honest and form is not None:
-        raise ValueError("honest: found True, allowed False for mechanisms of one form")
+    if probed and common is not None:
+        raise ValueError("probed: found True, allowed False for mechanisms that share a program")
     noisy = has_sensor_noise(mechanism)
-    number = scenarios or (NOISY_SCENARIOS // (COPIES if honest else 1) if noisy else SCENARIOS)
+    number = scenarios or (NOISY_SCENARIOS // (LANES_PER_SCENARIO if probed else 1) if noisy else SCENARIOS)
     draws = quasi_random(mechanism, number, seed)
-    if honest:
+    if probed:
         batch = probed_scenarios(mechanism, draws, seed).scenarios
     else:
         batch = build_scenarios(mechanism, draws, seed)
     loop = build_loop(mechanism, compensator, batch)
     batch = batch._replace(time_limit=np.asarray(_patience(loop.law, batch)))
-    if form is not None:
-        batch, loop = form.scenarios(mechanism, batch), form.loop(loop)
+    if common is not None:
+        batch, loop = common.scenarios(mechanism, batch), common.loop(loop)
     gains = literature_gains(mechanism, compensator, setting)
-    return Task(mechanism, compensator, gains, batch, loop, form, honest)
+    return TuneTask(mechanism, compensator, gains, batch, loop, common, probed)
 
 
 def has_sensor_noise(mechanism: Mechanism) -> bool:
@@ -118,13 +118,13 @@ def _with_rings(loops: list[Loop], ring: int, controller_ring: int) -> Loop:
     return dataclasses.replace(loops[0], ring=ring, controller_ring=controller_ring)
 
 
-def tuned_names(tasks: list[Task]) -> tuple[str, ...]:
+def tuned_names(tasks: list[TuneTask]) -> tuple[str, ...]:
     """Names of all gains that are tuned for at least one of the tasks."""
     tuned = {gain.name for task in tasks for gain in task.tuned}
     return tuple(gain.name for gain in COMPENSATORS[tasks[0].compensator].gains if gain.name in tuned)
 
 
-def gain_bounds(task: Task, names: tuple[str, ...]) -> Bounds:
+def gain_bounds(task: TuneTask, names: tuple[str, ...]) -> Bounds:
     """Bounds (gains,) of a task; of a gain that is not tuned for it both are the literature's value."""
     gains = {gain.name: gain for gain in COMPENSATORS[task.compensator].gains}
     moved = {gain.name for gain in task.tuned}
@@ -139,17 +139,18 @@ def gain_bounds(task: Task, names: tuple[str, ...]) -> Bounds:
 
 
 def gains_at(
-    task: Task, names: tuple[str, ...], bounds: Bounds, shares: Float[np.ndarray, "gains"]
+    task: TuneTask, names: tuple[str, ...], bounds: Bounds, coordinates: Float[np.ndarray, "gains"]
 ) -> dict[str, float]:
-    """All of the compensator's gains: `names` at `shares` of their ranges, as far as tuned for the task."""
+    """All of the compensator's gains: `names` at `coordinates` of their ranges, as far as tuned for the
+    task."""
     moved = {gain.name for gain in task.tuned}
-    found = zip(names, to_gains(shares, bounds), strict=True)
+    found = zip(names, to_gains(coordinates, bounds), strict=True)
     return {**task.literature, **{name: float(gain) for name, gain in found if name in moved}}
 
 
 def spread_points(first: np.ndarray, number: int, seed: int | tuple[int, ...]) -> np.ndarray:
-    """(number, gains) shares of the unit box: `first`, then Sobol points, every other one of them within a
-    quarter of each gain's range of `first`, the rest anywhere."""
+    """(number, gains) coordinates of the unit box: `first`, then Sobol points, every other one of them within
+    a quarter of each gain's range of `first`, the rest anywhere."""
     points = qmc.Sobol(len(first), rng=np.random.default_rng(seed)).random(
         1 << max(number - 1, 1).bit_length()
     )

@@ -12,29 +12,29 @@ from jaxhil.compensators import COMPENSATORS
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.evaluation import Outcome
 from jaxhil.simulation.scenario import Scenario
-from tuning.gains.common_program import Form
-from tuning.gains.global_search import Certified, certified
-from tuning.gains.multistart import SCANNED, Found, find
+from tuning.gains.common_program import CommonProgram
+from tuning.gains.global_search import GlobalComparison, compare_with_global_search
+from tuning.gains.multistart import SCANNED, MultistartResult, find_gains
 from tuning.gains.objective import RMS, SCALE, Objective
 from tuning.gains.rounds import Start
-from tuning.gains.tasks import Task, alike, build_task
+from tuning.gains.tasks import TuneTask, alike, build_task
 from tuning.gains.transfer import Tuned, carry_over, nearest
-from tuning.gains.validation import Trial
+from tuning.gains.validation import Validation
 from tuning.optimisation.sensitivity import sensitivity
-from tuning.statistics.bootstrap import Intervals, interval
-from tuning.transparency.figures import Figure
-from tuning.transparency.probes import honesty_figures
+from tuning.statistics.bootstrap import ErrorIntervals, error_intervals
+from tuning.statistics.intervals import Estimate
+from tuning.transparency.probes import probe_figures
 
 BLOCK = 16  # mechanisms tuned and judged together: what is done when work is interrupted is kept
 
 
 @dataclass(frozen=True)
-class Settings:
+class TuneSettings:
     """Numbers of scenarios to tune on (None: `tuning.gains.tasks` knows), of starts of a lot
     (`tuning.gains.multistart`), of solver steps, of scenarios to judge on; the seed; what to minimise;
     evaluations without derivatives at the end, for each gain; whether to search the whole box for something
     better; points looked at before a lot of starts; a setting of the compensator that is only judged, as it
-    is; whether honesty is judged also where the objective does not weigh it."""
+    is; whether transparency is judged also where the objective does not weigh it."""
 
     scenarios: int | None = None
     starts: int = 4
@@ -43,18 +43,18 @@ class Settings:
     seed: int = 0
     objective: Objective = RMS
     polish: int = 160
-    certify: bool = False
+    global_search: bool = False
     scanned: int = SCANNED
     setting: str | None = None
-    probed: bool = False
+    judge_transparency: bool = False
 
     @property
-    def honest(self) -> bool:
+    def probed(self) -> bool:
         """Whether scenarios come with the copies of `tuning.transparency.probes`."""
-        return self.probed or self.objective.honesty_weight > 0
+        return self.judge_transparency or self.objective.transparency_weight > 0
 
 
-class Figures(NamedTuple):
+class ErrorFigures(NamedTuple):
     """Over all contacts of a batch: rms, 99th percentile and maximum of |e - e*|, mean of e - e*; share of
     contacts that diverge (e > e*); largest |F_c| over the reference's peak; root of the mean square of the
     chatter (`jaxhil.simulation.evaluation.Outcome`); contacts that did not end."""
@@ -78,31 +78,30 @@ class Freedom(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Result:
+class TuneResult:
     """What tuning found: gains (all of the compensator's), the literature's; figures of "before" (no
     compensation), "literature" and "tuned" on the same fresh scenarios, and of their nominal run; every
-    start; outcomes and scenarios for plots; seconds spent; 95 % confidence
-    intervals of the tuned figures; of each tuned gain how far it may move
-    (`tuning.optimisation.sensitivity`); how far from the best anywhere, if asked for; what the last
-    of the starts took their gains from; where honesty counts, transparency, slope and peak of each on the
-    fresh scenarios (`tuning.transparency.probes`)."""
+    start; outcomes and scenarios for plots; seconds spent; 95 % confidence intervals of the tuned figures; of
+    each tuned gain how far it may move (`tuning.optimisation.sensitivity`); how far from the best anywhere,
+    if asked for; what the last of the starts took their gains from; where transparency counts, transparency,
+    slope and peak of each on the fresh scenarios (`tuning.transparency.probes`)."""
 
     compensator: str
     mechanism: Mechanism
     gains: dict[str, float]
     literature: dict[str, float]
-    figures: dict[str, Figures]
-    nominal: dict[str, Figures]
+    figures: dict[str, ErrorFigures]
+    nominal: dict[str, ErrorFigures]
     starts: list[Start]
     outcomes: dict[str, Outcome]
     scenarios: Scenario
-    settings: Settings
+    settings: TuneSettings
     timings: dict[str, float] = field(default_factory=dict)
-    intervals: Intervals | None = None
+    intervals: ErrorIntervals | None = None
     first: tuple[Tuned, ...] = ()
     freedom: dict[str, Freedom] = field(default_factory=dict)
-    certified: Certified | None = None
-    honesty: dict[str, dict[str, Figure]] = field(default_factory=dict)
+    global_comparison: GlobalComparison | None = None
+    transparency: dict[str, dict[str, Estimate]] = field(default_factory=dict)
 
     @property
     def usual_starts(self) -> int:
@@ -113,9 +112,9 @@ class Result:
 def tune(
     mechanism: Mechanism,
     compensator: str,
-    settings: Settings,
+    settings: TuneSettings,
     report: Callable[[str], None] = lambda text: None,
-) -> Result:
+) -> TuneResult:
     """Tune the gains of `compensator` for `mechanism`; `report` hears of each stage."""
     return next(tune_all([mechanism], compensator, settings, report))[1]
 
@@ -123,11 +122,11 @@ def tune(
 def tune_all(
     mechanisms: Sequence[Mechanism],
     compensator: str,
-    settings: Settings,
+    settings: TuneSettings,
     report: Callable[[str], None] = lambda text: None,
     tuned: Sequence[Tuned] = (),
-    form: Form | None = None,
-) -> Iterator[tuple[int, Result]]:
+    common: CommonProgram | None = None,
+) -> Iterator[tuple[int, TuneResult]]:
     """(index, result) of every mechanism, as they are done: like ones together, in one program.
 
     The gains of the nearest of those `tuned` before, with the same compensator, are a start for each, and so
@@ -135,7 +134,9 @@ def tune_all(
     literature's. Unlike mechanisms of one `form` are tuned together in it.
     """
     tasks = [
-        build_task(m, compensator, settings.scenarios, settings.seed, form, settings.setting, settings.honest)
+        build_task(
+            m, compensator, settings.scenarios, settings.seed, common, settings.setting, settings.probed
+        )
         for m in mechanisms
     ]
     found: list[Tuned] = []
@@ -151,16 +152,16 @@ def tune_all(
 
 
 def _tune_block(
-    tasks: list[Task],
-    settings: Settings,
+    tasks: list[TuneTask],
+    settings: TuneSettings,
     report: Callable[[str], None],
     near: list[list[Tuned]],
-) -> list[Result]:
+) -> list[TuneResult]:
     clock = _Clock()
     name = tasks[0].mechanism.name if len(tasks) == 1 else f"{len(tasks)} mechanisms"
     compensator = tasks[0].compensator
-    trial = Trial(tasks, settings.validation, settings.seed)
-    found = [Found(None, [], 0) for _ in tasks]
+    validation = Validation(tasks, settings.validation, settings.seed)
+    found = [MultistartResult(None, [], 0) for _ in tasks]
     if settings.setting is None and any(task.tuned for task in tasks):
         number = tasks[0].number
         report(f"{name}: tuning {compensator} on {number} scenarios each")
@@ -168,8 +169,8 @@ def _tune_block(
             [carry_over(compensator, one.gains, one.mechanism, task.mechanism) for one in own]
             for task, own in zip(tasks, near, strict=True)
         ]
-        found = find(
-            trial,
+        found = find_gains(
+            validation,
             settings.starts,
             settings.steps,
             settings.polish,
@@ -184,15 +185,17 @@ def _tune_block(
     report(f"{name}: judging on {settings.validation} fresh scenarios")
     plain = [uncompensated(compensator, task.literature) for task in tasks]
     judged = {
-        "before": trial.judge_copies([gains for _, gains in plain], plain[0][0]),
-        "literature": trial.judge_copies([task.literature for task in tasks]),
-        "tuned": trial.judge_copies(best),
+        "before": validation.judge_probed([gains for _, gains in plain], plain[0][0]),
+        "literature": validation.judge_probed([task.literature for task in tasks]),
+        "tuned": validation.judge_probed(best),
     }
     outcomes = {key: [own for own, _ in every] for key, every in judged.items()}
     clock.lap("judge")
-    certificates: list[Certified | None] = [None for _ in tasks]
-    if settings.certify and settings.setting is None:
-        certificates = _certify(trial, settings, found, lambda text: report(f"{name}: {text}"))
+    comparisons: list[GlobalComparison | None] = [None for _ in tasks]
+    if settings.global_search and settings.setting is None:
+        comparisons = _compare_with_global_search(
+            validation, settings, found, lambda text: report(f"{name}: {text}")
+        )
         clock.lap("certify")
     results = []
     for i, task in enumerate(tasks):
@@ -200,7 +203,7 @@ def _tune_block(
         fresh = {key: jax.tree.map(lambda leaf: leaf[..., :-1], one) for key, one in own.items()}
         nominal = {key: jax.tree.map(lambda leaf: leaf[..., -1:], one) for key, one in own.items()}
         results.append(
-            Result(
+            TuneResult(
                 compensator=compensator,
                 mechanism=task.mechanism,
                 gains=best[i],
@@ -209,36 +212,42 @@ def _tune_block(
                 nominal={key: figures(outcome) for key, outcome in nominal.items()},
                 starts=found[i].starts,
                 outcomes=fresh,
-                scenarios=trial.fresh[i],
+                scenarios=validation.fresh[i],
                 settings=settings,
                 timings=clock.laps,
-                intervals=interval(fresh["tuned"].error, fresh["tuned"].good),
+                intervals=error_intervals(fresh["tuned"].error, fresh["tuned"].good),
                 first=tuple(near[i]),
-                freedom=_freedom(task, trial.names, found[i].best),
-                certified=certificates[i],
-                honesty=_honesty(trial, i, {key: every[i][1] for key, every in judged.items()}),
+                freedom=_freedom(task, validation.names, found[i].best),
+                global_comparison=comparisons[i],
+                transparency=_transparency(
+                    validation, i, {key: every[i][1] for key, every in judged.items()}
+                ),
             )
         )
     return results
 
 
-def _certify(trial: Trial, settings: Settings, found: list[Found], report) -> list[Certified | None]:
-    certificates = []
+def _compare_with_global_search(
+    validation: Validation, settings: TuneSettings, found: list[MultistartResult], report
+) -> list[GlobalComparison | None]:
+    comparisons = []
     for i, one in enumerate(found):
         report(f"searching everywhere, {i + 1} of {len(found)}")
-        certificates.append(certified(trial, i, one, settings.objective, settings.seed))
-    return certificates
+        comparisons.append(compare_with_global_search(validation, i, one, settings.objective, settings.seed))
+    return comparisons
 
 
-def _honesty(trial: Trial, task: int, copies: Mapping[str, Outcome | None]) -> dict[str, dict[str, Figure]]:
+def _transparency(
+    validation: Validation, task: int, copies: Mapping[str, Outcome | None]
+) -> dict[str, dict[str, Estimate]]:
     """Of a task under several gains, where its scenarios have copies."""
-    probed = trial.probed[task]
+    probed = validation.probed[task]
     if probed is None:
         return {}
-    return {key: honesty_figures(probed, own) for key, own in copies.items() if own is not None}
+    return {key: probe_figures(probed, own) for key, own in copies.items() if own is not None}
 
 
-def _freedom(task: Task, names: tuple[str, ...], found: Start | None) -> dict[str, Freedom]:
+def _freedom(task: TuneTask, names: tuple[str, ...], found: Start | None) -> dict[str, Freedom]:
     """Of the gains tuned for the task, from the solver's last J^T J."""
     moved = [i for i, name in enumerate(names) if name in {gain.name for gain in task.tuned}]
     if found is None or not moved or not np.all(np.isfinite(found.curvature)):
@@ -250,15 +259,15 @@ def _freedom(task: Task, names: tuple[str, ...], found: Start | None) -> dict[st
     return {names[i]: Freedom(float(a), float(b)) for i, (a, b) in zip(moved, pairs, strict=True)}
 
 
-def figures(outcome: Outcome) -> Figures:
+def figures(outcome: Outcome) -> ErrorFigures:
     """Summary of a batch; NaN where no contact ended."""
     errors = outcome.error[outcome.good]
     failed = int(np.sum(outcome.wanted & ~outcome.good))
     if not len(errors):
         nan = float("nan")
-        return Figures(nan, nan, nan, nan, nan, nan, nan, failed)
+        return ErrorFigures(nan, nan, nan, nan, nan, nan, nan, failed)
     size = np.abs(errors)
-    return Figures(
+    return ErrorFigures(
         rms=float(np.sqrt(np.mean(errors**2))),
         p99=float(np.percentile(size, 99)),
         max=float(np.max(size)),

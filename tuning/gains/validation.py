@@ -22,43 +22,43 @@ from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.batches import cut, join
 from tuning.gains.objective import Objective, contact_terms, objective_value, one_each
-from tuning.gains.tasks import Task, common_loop, gain_bounds, gains_at, tuned_names
+from tuning.gains.tasks import TuneTask, common_loop, gain_bounds, gains_at, tuned_names
 from tuning.optimisation.unit_box import Bounds
-from tuning.transparency.probes import COPIES, Probed, are_copies, probed_scenarios
+from tuning.transparency.probes import LANES_PER_SCENARIO, ProbedScenarios, are_probes, probed_scenarios
 
 # Draws of the validation come from another seed than those of training.
 VALIDATION_SEED = 0x5EED
 
 
-class Trial:
+class Validation:
     """Like tasks with fresh scenarios, and the nominal run of each as one more lane of its own.
 
-    fresh: (tasks) scenarios of each; probed: the same with their copies, where the tasks are honest, as all
+    fresh: (tasks) scenarios of each; probed: the same with their copies, where the tasks are probed, as all
     are or none; names, bounds: of the gains that are tuned for any of the tasks.
     """
 
-    def __init__(self, tasks: list[Task], validation: int, seed: int):
+    def __init__(self, tasks: list[TuneTask], validation: int, seed: int):
         seed = seed + VALIDATION_SEED
         self.tasks = tasks
         self.fresh: list[Scenario] = []
-        self.probed: list[Probed | None] = []
+        self.probed: list[ProbedScenarios | None] = []
         every, loops = [], []
         for task in tasks:
             drawn = draw(task.mechanism, validation, seed)
             self.fresh.append(build_scenarios(task.mechanism, drawn, seed))
-            if task.honest:
+            if task.probed:
                 probed = probed_scenarios(task.mechanism, drawn, seed)
                 nominal = probed_scenarios(task.mechanism).scenarios
                 own = join([probed.scenarios, jax.tree.map(lambda leaf: leaf[..., :1], nominal)])
             else:
                 probed, own = None, join([self.fresh[-1], build_scenarios(task.mechanism)])
             self.probed.append(probed)
-            if task.form is None:
+            if task.common is None:
                 both = join([own, task.scenarios])
                 loop = build_loop(task.mechanism, task.compensator, both, chatter=True)
             else:
-                loop = task.form.loop(build_loop(task.mechanism, task.compensator, own, chatter=True))
-                own = task.form.scenarios(task.mechanism, own)
+                loop = task.common.loop(build_loop(task.mechanism, task.compensator, own, chatter=True))
+                own = task.common.scenarios(task.mechanism, own)
             every.append(own)
             loops.append(loop)
         self.loop: Loop = common_loop(loops)
@@ -69,32 +69,32 @@ class Trial:
             lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]),
             *[task.scenarios for task in tasks],
         )
-        self._honest = tasks[0].honest
-        self._each = validation * (COPIES if self._honest else 1) + 1
+        self._probed = tasks[0].probed
+        self._each = validation * (LANES_PER_SCENARIO if self._probed else 1) + 1
         self._lanes = self._each * len(tasks)
 
     def judge(self, gains: list[dict[str, float]]) -> list[Outcome]:
         """Outcome on the fresh scenarios of every task under its gains, the nominal run last."""
-        return [plain for plain, _ in self.judge_copies(gains)]
+        return [plain for plain, _ in self.judge_probed(gains)]
 
-    def judge_copies(
+    def judge_probed(
         self, gains: list[dict[str, float]], compensator: str | None = None
     ) -> list[tuple[Outcome, Outcome | None]]:
-        """What `judge` returns and, where the tasks are honest, the outcome of the fresh scenarios with their
-        copies, (slots, scenarios, `COPIES`); of another `compensator` than that of the tasks, if one is
-        given."""
+        """What `judge` returns and, where the tasks are probed, the outcome of the fresh scenarios with their
+        copies, (slots, scenarios, `LANES_PER_SCENARIO`); of another `compensator` than that of the tasks, if
+        one is given."""
         loop = self.loop
         if compensator is not None:
             loop = dataclasses.replace(loop, compensator=COMPENSATORS[compensator])
         every = cut(evaluate(loop, self._values(gains), self._scenarios), self._each)
-        if not self._honest:
+        if not self._probed:
             return [(own, None) for own in every]
 
         def plain(leaf):
-            return np.concatenate([leaf[..., :-1:COPIES], leaf[..., -1:]], axis=-1)
+            return np.concatenate([leaf[..., :-1:LANES_PER_SCENARIO], leaf[..., -1:]], axis=-1)
 
         def copies(leaf):
-            return leaf[..., :-1].reshape(*leaf.shape[:-1], -1, COPIES)
+            return leaf[..., :-1].reshape(*leaf.shape[:-1], -1, LANES_PER_SCENARIO)
 
         return [(jax.tree.map(plain, own), jax.tree.map(copies, own)) for own in every]
 
@@ -102,7 +102,7 @@ class Trial:
         self,
         objective: Objective | Sequence[Objective],
         which: list[int],
-        shares: Float[np.ndarray, "which points gains"],
+        coordinates: Float[np.ndarray, "which points gains"],
         scenarios: int | None = None,
         lanes: int = 0,
     ) -> Float[np.ndarray, "which points"]:
@@ -113,33 +113,35 @@ class Trial:
         noise = any(objectives[task].noise_weight > 0 for task in which)
         number = self._training.velocity.shape[-1]
         number = min(scenarios or number, number)
-        points = shares.shape[1]
+        points = coordinates.shape[1]
         pairs = [(i, point) for i in range(len(which)) for point in range(points)]
         found = np.empty((len(which), points))
         lanes = max(lanes, self._lanes)
         at_once = max(1, lanes // number)
         parts = [pairs[begin : begin + at_once] for begin in range(0, len(pairs), at_once)]
         # A part is prepared, and another one looked through, while one between them runs.
-        running = [self._begin(noise, which, shares, some, number, lanes) for some in parts]
+        running = [self._begin(noise, which, coordinates, some, number, lanes) for some in parts]
         for some, ended in zip(parts, running, strict=True):
             outcome, amplification = ended()
             # (slots, pairs, scenarios)
             terms = [np.asarray(term).reshape(-1, len(some), number) for term in contact_terms(outcome)]
             wanted = outcome.wanted.reshape(terms[0].shape)
-            copies = are_copies(number) & self._honest
+            copies = are_probes(number) & self._probed
             for k, (i, point) in enumerate(some):
                 asked = wanted[:, k]
                 excess, chatter = (term[:, k][asked] for term in terms[1:])
-                error, honesty = (terms[0][:, k][asked & ones] for ones in (~copies, copies))
+                error, probe_errors = (terms[0][:, k][asked & ones] for ones in (~copies, copies))
                 own = objectives[which[i]]
-                honesty = honesty if self._honest else None
-                found[i, point] = objective_value(own, error, excess, amplification[k], chatter, honesty)
+                probe_errors = probe_errors if self._probed else None
+                found[i, point] = objective_value(own, error, excess, amplification[k], chatter, probe_errors)
         return found
 
-    def _begin(self, noise, which, shares, some, number, lanes) -> Callable[[], tuple[Outcome, np.ndarray]]:
+    def _begin(
+        self, noise, which, coordinates, some, number, lanes
+    ) -> Callable[[], tuple[Outcome, np.ndarray]]:
         """Start some pairs; what is returned waits for their outcome and noise amplification."""
         index = np.array([which[i] for i, _ in some])
-        rows = [self.gains(which[i], shares[i, point]) for i, point in some]
+        rows = [self.gains(which[i], coordinates[i, point]) for i, point in some]
         values = {name: np.repeat([row[name] for row in rows], number) for name in rows[0]}
 
         def side_by_side(leaf):
@@ -156,9 +158,9 @@ class Trial:
         amplification = np.asarray(self.loop.compensator.noise_amplification(own, constants))
         return lambda: (ended(), np.mean(amplification.reshape(len(some), number), axis=1))
 
-    def gains(self, task: int, shares: Float[np.ndarray, "gains"]) -> dict[str, float]:
+    def gains(self, task: int, coordinates: Float[np.ndarray, "gains"]) -> dict[str, float]:
         """All of the compensator's gains at a point of the unit box."""
-        return gains_at(self.tasks[task], self.names, self.bounds[task], shares)
+        return gains_at(self.tasks[task], self.names, self.bounds[task], coordinates)
 
     def _values(self, gains: list[dict[str, float]]) -> dict[str, Any]:
         return {name: np.repeat([one[name] for one in gains], self._each) for name in gains[0]}

@@ -1,10 +1,9 @@
 """Derivative-free search in the unit box, batched: a local polish, and a search of the whole box.
 
-Gradients end at kinks and in the nearest basin. `polish` goes on from where they ended; `certify` looks
-everywhere, and says what there was to find. Both see an objective as a function from NumPy to NumPy that
-takes the same number of points at every call, so that a compiled one is compiled once. Points are shares of
-each gain's range on its own scale, all in [0, 1].
-"""
+Gradients end at kinks and in the nearest basin. `polish` goes on from where they ended; `search_globally`
+looks everywhere, and says what there was to find. Both see an objective as a function from NumPy to NumPy
+that takes the same number of points at every call, so that a compiled one is compiled once. Points are
+coordinates of each gain's range on its own scale, all in [0, 1]."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,8 +13,8 @@ from jaxtyping import Float
 from scipy.stats import qmc
 
 CANDIDATES = 16  # of a generation of `polish`
-PER_BASIN = 32  # of a generation of `certify`, for each basin of its first round
-BASINS = 8  # that `certify` goes down into at once
+PER_BASIN = 32  # of a generation of `search_globally`, for each basin of its first round
+BASINS = 8  # that `search_globally` goes down into at once
 SCAN = 8  # the part of its budget that is the scan
 REACHES = 0.1, 0.2, 0.01  # of its first round, of those between, of the last
 # What a failed evaluation counts as: worse than all others, and still a number.
@@ -24,20 +23,20 @@ WORST = np.finfo(float).max
 Losses = Callable[[Float[np.ndarray, "candidates gains"]], Float[np.ndarray, "candidates"]]
 
 
-class Found(NamedTuple):
+class PolishResult(NamedTuple):
     """Best point and its loss, and how often the objective was evaluated for it; `polish` of several starts
     gives each its own."""
 
-    free: Float[np.ndarray, "*starts gains"]
+    point: Float[np.ndarray, "*starts gains"]
     loss: Float[np.ndarray, "*starts"]
     evaluations: int
 
 
-class Certificate(NamedTuple):
+class GlobalSearchResult(NamedTuple):
     """Best point anywhere and its loss; evaluations used; the bottoms of the basins gone down into, best
     first, and their losses; the losses of the scan, sorted: where in it a loss lies says how rare it is."""
 
-    free: Float[np.ndarray, "gains"]
+    point: Float[np.ndarray, "gains"]
     loss: float
     evaluations: int
     basins: Float[np.ndarray, "basins gains"]
@@ -56,7 +55,7 @@ def polish(
     reach: float = 0.1,
     covariance: Float[np.ndarray, "*starts gains gains"] | None = None,
     seed: int = 0,
-) -> Found:
+) -> PolishResult:
     """Local minimum near `start` by evolution of a normal distribution (CMA-ES), never worse than `start`.
 
     `losses` gets (*starts, candidates, gains) and gives (*starts, candidates); starts are searched side by
@@ -93,10 +92,10 @@ def polish(
         best_loss = np.where(better, found[..., 0], best_loss)
         best = np.where(better[..., None], points[..., 0, :], best)
         state = _evolve(state, points, constants, generation)
-    return Found(best, best_loss, generations * candidates)
+    return PolishResult(best, best_loss, generations * candidates)
 
 
-def certify(
+def search_globally(
     losses: Losses,
     gains: int,
     budget: int,
@@ -105,7 +104,7 @@ def certify(
     candidates: int = PER_BASIN,
     basins: int = BASINS,
     seed: int = 0,
-) -> Certificate:
+) -> GlobalSearchResult:
     """Best point of the whole box within `budget` evaluations: a scan, then the best basins.
 
     An eighth of the budget is a scrambled Sobol sequence. The best points of it that lie apart, and those
@@ -145,12 +144,14 @@ def certify(
             seed=seed + turn,
         )
         used += generations * lot
-        bottoms = np.concatenate([found.free, bottoms[number:]])
+        bottoms = np.concatenate([found.point, bottoms[number:]])
         bottom_losses = np.concatenate([found.loss, bottom_losses[number:]])
         order = np.argsort(bottom_losses, kind="stable")
         bottoms, bottom_losses = bottoms[order], bottom_losses[order]
         starts = bottoms[: max(1, number // 2)]
-    return Certificate(bottoms[0], float(bottom_losses[0]), used, bottoms, bottom_losses, np.sort(scanned))
+    return GlobalSearchResult(
+        bottoms[0], float(bottom_losses[0]), used, bottoms, bottom_losses, np.sort(scanned)
+    )
 
 
 def mirror(points: Float[np.ndarray, "*points"]) -> Float[np.ndarray, "*points"]:

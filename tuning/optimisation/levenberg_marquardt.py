@@ -23,11 +23,11 @@ from tuning.optimisation.unit_box import Bounds, to_gains
 
 
 class Solution(NamedTuple):
-    """Per start: shares of the gains' ranges; loss, half the sum of squared residuals; J^T J there, J the
-    residuals' Jacobian by the shares; loss after every step, the last repeated; steps taken; status, an index
-    into `STATUSES`."""
+    """Per start: coordinates of the gains' ranges; loss, half the sum of squared residuals; J^T J there, J
+    the residuals' Jacobian by the coordinates; loss after every step, the last repeated; steps taken; status,
+    an index into `STATUSES`."""
 
-    shares: Float[Array, "starts gains"]
+    coordinates: Float[Array, "starts gains"]
     curvature: Float[Array, "starts gains gains"]
     loss: Float[Array, "starts"]
     history: Float[Array, "starts steps"]
@@ -57,15 +57,15 @@ def solve(
     """Minimise sum(residuals(static, gains, arguments)^2) / 2 of many problems at once, in at most `steps`
     steps, themselves at most `longest`. Problems are dealt out to the devices.
 
-    A problem is a start: shares of its gains' ranges, their bounds and its arguments. It has converged when
-    residuals and shares have settled (`rtol`, `atol`), when a step is shorter than `STANDSTILL`, or when the
-    loss has fallen by less than `PROGRESS` of itself in `PATIENCE` steps. `residuals` gets several, a leading
-    axis of problems, which must not mix: `tile` of them at a time, by default all that a device has to do.
-    """
+    A problem is a start: coordinates of its gains' ranges, their bounds and its arguments. It has converged
+    when residuals and coordinates have settled (`rtol`, `atol`), when a step is shorter than `STANDSTILL`, or
+    when the loss has fallen by less than `PROGRESS` of itself in `PATIENCE` steps. `residuals` gets several,
+    a leading axis of problems, which must not mix: `tile` of them at a time, by default all that a device has
+    to do."""
 
-    def of_shares(shares, arguments):
+    def of_shares(coordinates, arguments):
         bounds, arguments = arguments
-        return residuals(static, to_gains(shares, bounds), arguments)
+        return residuals(static, to_gains(coordinates, bounds), arguments)
 
     solver = _Recording(_BoxedLevenbergMarquardt(rtol, atol), steps, longest)
 
@@ -165,7 +165,7 @@ def _with_jacobian(residuals, free, arguments, tile=None):
 class _Model(NamedTuple):
     """What a step is made of: where it begins, J^T J and the loss's gradient J^T r there."""
 
-    shares: Float[Array, "gains"]
+    coordinates: Float[Array, "gains"]
     curvature: Float[Array, "gains gains"]
     gradient: Float[Array, "gains"]
 
@@ -183,14 +183,14 @@ class _BoxedDescent(optx.AbstractDescent):
         return _Model(y, jacobian.T @ jacobian, jacobian.T @ f_info.residual)
 
     def step(self, step_size, state):
-        shares, curvature, gradient = state
-        number, dtype = len(shares), shares.dtype
+        coordinates, curvature, gradient = state
+        number, dtype = len(coordinates), coordinates.dtype
         damping = DAMPING * jnp.trace(curvature) / number / step_size.astype(dtype)
         identity = jnp.eye(number, dtype=dtype)
         # What no residual depends on has no curvature; it stays.
         damped = curvature + (damping + jnp.finfo(dtype).tiny ** 0.5) * identity
-        room = -shares, 1 - shares
-        free = ~((shares <= 0) & (gradient > 0) | (shares >= 1) & (gradient < 0))
+        room = -coordinates, 1 - coordinates
+        free = ~((coordinates <= 0) & (gradient > 0) | (coordinates >= 1) & (gradient < 0))
 
         def bind(_, found):
             free, step = found
@@ -203,7 +203,7 @@ class _BoxedDescent(optx.AbstractDescent):
             return free & (wanted == inside), jnp.where(free, inside, step)
 
         # Each turn binds at least one gain more, or none ever after.
-        _, step = jax.lax.fori_loop(0, number + 1, bind, (free, jnp.zeros_like(shares)))
+        _, step = jax.lax.fori_loop(0, number + 1, bind, (free, jnp.zeros_like(coordinates)))
         return step, optx.RESULTS.successful
 
 

@@ -1,4 +1,4 @@
-"""Gains as points of the unit box: shares of each gain's range, on its own linear or logarithmic scale."""
+"""Gains as points of the unit box: each coordinate a gain's place in its range, linear or logarithmic."""
 
 from typing import Any, NamedTuple
 
@@ -16,20 +16,20 @@ class Bounds(NamedTuple):
     logarithmic: Float[Array | np.ndarray, "*problems gains"]
 
 
-def to_gains(shares: Float[Any, "*points gains"], bounds: Bounds) -> Float[Any, "*points gains"]:
-    """Gains at `shares` of their ranges; NumPy in, NumPy out. A share outside [0, 1] counts as the nearest
-    one inside, with the derivative of one inside."""
-    xp = jnp if isinstance(shares, jax.Array) else np
-    inside = xp.clip(shares, 0, 1)
+def to_gains(coordinates: Float[Any, "*points gains"], bounds: Bounds) -> Float[Any, "*points gains"]:
+    """Gains at `coordinates` of their ranges; NumPy in, NumPy out. A share outside [0, 1] counts as the
+    nearest one inside, with the derivative of one inside."""
+    xp = jnp if isinstance(coordinates, jax.Array) else np
+    inside = xp.clip(coordinates, 0, 1)
     if xp is jnp:
-        inside = shares + jax.lax.stop_gradient(inside - shares)
+        inside = coordinates + jax.lax.stop_gradient(inside - coordinates)
     curved = bounds.logarithmic > 0
     straight = bounds.lower + (bounds.upper - bounds.lower) * inside
     low, high = (xp.log(xp.where(curved, bound, 1)) for bound in (bounds.lower, bounds.upper))
     return xp.where(curved, xp.exp(xp.where(curved, low + (high - low) * inside, 0)), straight)
 
 
-def to_shares(
+def to_coordinates(
     gains: Float[np.ndarray, "*points gains"], bounds: Bounds
 ) -> Float[np.ndarray, "*points gains"]:
     """Inverse of `to_gains`; of a gain beyond its bounds the nearest bound's, 0 where both bounds are one."""

@@ -25,7 +25,7 @@ from jaxhil.simulation.contact_plot import (
 )
 from tuning.gains.objective import Objective
 from tuning.gains.pareto import Front
-from tuning.gains.tune import Result
+from tuning.gains.tune import TuneResult
 
 __all__ = [
     "BLACK",
@@ -50,7 +50,7 @@ __all__ = [
 MARKERS = {"before": "^", "literature": "s", "tuned": "o"}
 
 
-def errors_plot(result: Result, limit: float) -> Figure:
+def errors_plot(result: TuneResult, limit: float) -> Figure:
     """How large errors are and how often, and at which contact frequency, before and after tuning."""
     figure = new_figure(
         (11, 4.6), f"{result.mechanism.name}: restitution error on fresh scenarios", above=0.75
@@ -106,7 +106,7 @@ def errors_plot(result: Result, limit: float) -> Figure:
     return figure
 
 
-def loss_plot(result: Result) -> Figure:
+def loss_plot(result: TuneResult) -> Figure:
     """The objective that each start of the solver had reached after each step."""
     figure = new_figure((7, 4.6), f"{result.mechanism.name}: tuning from {len(result.starts)} starts")
     axes = figure.subplots()
@@ -135,7 +135,7 @@ def loss_plot(result: Result) -> Figure:
     return figure
 
 
-def overview_plot(results: Sequence[Result], limit: float) -> Figure:
+def overview_plot(results: Sequence[TuneResult], limit: float) -> Figure:
     """The rms restitution error of every mechanism before tuning, with the literature's gains, and tuned."""
     height = 1.6 + 0.2 * len(results)
     figure = new_figure(
@@ -158,7 +158,7 @@ def overview_plot(results: Sequence[Result], limit: float) -> Figure:
     return figure
 
 
-def front_plot(front: Front, result: Result, limit: float) -> Figure:
+def front_plot(front: Front, result: TuneResult, limit: float) -> Figure:
     """Restitution error against what it is traded for: numbered points, the front as a line of what
     is reached, the literature's gains and those tuned beside."""
     figure = new_figure(

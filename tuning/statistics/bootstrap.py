@@ -18,7 +18,7 @@ class Interval(NamedTuple):
     high: float
 
 
-class Intervals(NamedTuple):
+class ErrorIntervals(NamedTuple):
     """Of the rms and of the 99th percentile of |e - e*|; NaN where fewer than two scenarios count."""
 
     rms: Interval
@@ -29,14 +29,14 @@ class Intervals(NamedTuple):
         return {name: one._asdict() for name, one in self._asdict().items()}
 
 
-def interval(
+def error_intervals(
     errors: Float[np.ndarray, "slots scenarios"],
     good: Bool[np.ndarray, "slots scenarios"],
     *,
     resamples: int = RESAMPLES,
     level: float = LEVEL,
     seed: int = 0,
-) -> Intervals:
+) -> ErrorIntervals:
     """Bootstrap confidence intervals of the rms and the 99th percentile of |e - e*| over `good` contacts.
 
     Scenarios are resampled, each with all its contacts: those of one scenario depend on each other. Of the
@@ -53,10 +53,10 @@ def interval(
     size, good, counts = size[:, met], good[:, met], counts[met]
     if np.sum(met) < 2:
         nowhere = Interval(float("nan"), float("nan"))
-        return Intervals(nowhere, nowhere)
+        return ErrorIntervals(nowhere, nowhere)
     squares = np.sum(size**2, axis=0)
     if np.ptp(squares / counts) <= 1e-12 * np.max(squares / counts):
-        return Intervals(*[Interval(float(np.max(size)), float(np.max(size)))] * 2)
+        return ErrorIntervals(*[Interval(float(np.max(size)), float(np.max(size)))] * 2)
 
     def root_mean_square(squares, counts, axis):
         return np.sqrt(np.sum(squares, axis=axis) / np.sum(counts, axis=axis))
@@ -74,7 +74,7 @@ def interval(
     ).confidence_interval
     tails = np.array([(1 - level) / 2, (1 + level) / 2])
     percentiles = _resampled_percentile(size, good, 0.99, resamples, np.random.default_rng(seed))
-    return Intervals(
+    return ErrorIntervals(
         Interval(float(found.low), float(found.high)),
         Interval(*map(float, np.quantile(percentiles, tails))),
     )

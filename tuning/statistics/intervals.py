@@ -15,7 +15,7 @@ And `lognormal_interval` for the estimates of independent repeats of a method fo
 Pure functions of counts, which broadcast; NumPy and SciPy alone.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,12 +27,16 @@ FEW = 100  # failures (or successes) of all replicates below which Student's law
 _STEPS = 62  # of bisection, from a bracket of 1500 down to rounding
 
 
-class IntervalEstimate(NamedTuple):
-    """An estimate and the ends of its interval, in the unit of the estimate; scalars or equal shapes."""
+class Estimate(NamedTuple):
+    """An estimate and its interval, all in one unit: numbers, or arrays of one shape.
 
-    estimate: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    value: the estimate itself.
+    low, high: ends of the interval; NaN where there is none.
+    """
+
+    value: Any
+    low: Any
+    high: Any
 
     @property
     def width(self) -> np.ndarray:
@@ -49,7 +53,7 @@ class Running(NamedTuple):
     level: float = LEVEL
 
 
-def binomial_interval(failures: ArrayLike, number: ArrayLike, level: float = LEVEL) -> IntervalEstimate:
+def binomial_interval(failures: ArrayLike, number: ArrayLike, level: float = LEVEL) -> Estimate:
     """Exact interval of the probability behind `failures` among `number` independent scenarios.
 
     Its ends are the p at which as many failures or more, or as many or fewer, have probability
@@ -63,10 +67,10 @@ def binomial_interval(failures: ArrayLike, number: ArrayLike, level: float = LEV
     # A parameter of 0 has no beta distribution: there the end is 0 or 1.
     low = np.where(failures > 0, special.betaincinv(np.maximum(failures, 1.0), passes + 1.0, tail), 0.0)
     high = np.where(passes > 0, special.betainccinv(failures + 1.0, np.maximum(passes, 1.0), tail), 1.0)
-    return IntervalEstimate(_share(failures, number), low, high)
+    return Estimate(_share(failures, number), low, high)
 
 
-def confidence_sequence(failures: ArrayLike, number: ArrayLike, level: float = LEVEL) -> IntervalEstimate:
+def confidence_sequence(failures: ArrayLike, number: ArrayLike, level: float = LEVEL) -> Estimate:
     """Interval that covers, with at least `level`, at all numbers of scenarios at once.
 
     For s failures among n and the true probability p, with B the beta function and a = `PRIOR`,
@@ -93,7 +97,7 @@ def confidence_sequence(failures: ArrayLike, number: ArrayLike, level: float = L
     middle = np.clip(special.logit(np.nan_to_num(share, nan=0.5)), -750.0, 750.0)
     low = np.where(failures > 0, special.expit(_boundary(outside, np.full_like(middle, -750.0), middle)), 0.0)
     high = np.where(passes > 0, special.expit(_boundary(outside, np.full_like(middle, 750.0), middle)), 1.0)
-    return IntervalEstimate(share, low, high)
+    return Estimate(share, low, high)
 
 
 def updated(running: Running, failures: int, number: int) -> Running:
@@ -131,7 +135,7 @@ def scenarios_needed(probability: float, width: float, level: float = LEVEL) -> 
     return int(numbers[min(np.max(np.nonzero(~narrow)[0], initial=-1) + 1, len(numbers) - 1)])
 
 
-def replicate_interval(failures: ArrayLike, number: int, level: float = LEVEL) -> IntervalEstimate:
+def replicate_interval(failures: ArrayLike, number: int, level: float = LEVEL) -> Estimate:
     """Interval of the probability from independent scramblings of a Sobol sequence.
 
     `failures` (..., replicates) among `number` points each. Each share of failures has mean p, so Student's
@@ -174,7 +178,7 @@ def replicate_interval(failures: ArrayLike, number: int, level: float = LEVEL) -
     unseen = odds / (number + odds)
     high = np.where(total == 0, np.maximum(high, unseen), high)
     low = np.where(total == points, np.minimum(low, 1.0 - unseen), low)
-    return IntervalEstimate(mean, low, high)
+    return Estimate(mean, low, high)
 
 
 def lognormal_interval(

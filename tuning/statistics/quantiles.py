@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from tuning.statistics.intervals import LEVEL, PRIOR, IntervalEstimate, replicate_interval
+from tuning.statistics.intervals import LEVEL, PRIOR, Estimate, replicate_interval
 
 RESOLUTION = 0.01  # of an edge, to the next one
 _DECADES = -9, 3
@@ -55,9 +55,7 @@ def ranks(number: int, order: float, level: float = LEVEL, sequential: bool = Fa
     return _last(inside, middle, -1), _last(inside, middle, number + 1) + 1
 
 
-def quantile(
-    values: ArrayLike, order: float, level: float = LEVEL, sequential: bool = False
-) -> IntervalEstimate:
+def quantile(values: ArrayLike, order: float, level: float = LEVEL, sequential: bool = False) -> Estimate:
     """The quantile of order `order` of |values| and its interval, from all the values, in their unit.
 
     Ends beyond the least or greatest value are 0 and infinity. A non-finite value (a run without a result)
@@ -68,7 +66,7 @@ def quantile(
     bounded = np.concatenate([[0.0], ordered, [np.inf]])
     low, high = ranks(len(ordered), order, level, sequential)
     estimate = bounded[_rank(len(ordered), order)] if len(ordered) else np.nan
-    return IntervalEstimate(np.asarray(estimate), bounded[low], bounded[high])
+    return Estimate(np.asarray(estimate), bounded[low], bounded[high])
 
 
 def counts(values: ArrayLike) -> np.ndarray:
@@ -83,7 +81,7 @@ def counts(values: ArrayLike) -> np.ndarray:
 
 def binned_quantile(
     counted: np.ndarray, order: float, level: float = LEVEL, sequential: bool = False
-) -> IntervalEstimate:
+) -> Estimate:
     """As `quantile`, from the `counts` of the values: each end is moved outward, to the edge of its bin.
 
     So it covers as `quantile` does, and either end is off by less than `RESOLUTION` of itself (between the
@@ -96,7 +94,7 @@ def binned_quantile(
     low, high = ranks(number, order, level, sequential)
     lower = bounds[np.searchsorted(below, low)] if low > 0 else 0.0
     upper = bounds[np.searchsorted(below, high) + 1] if high <= number else np.inf
-    return IntervalEstimate(binned_estimate(counted, order), np.asarray(lower), np.asarray(upper))
+    return Estimate(binned_estimate(counted, order), np.asarray(lower), np.asarray(upper))
 
 
 def binned_estimate(counted: np.ndarray, order: float) -> np.ndarray:
@@ -108,7 +106,7 @@ def binned_estimate(counted: np.ndarray, order: float) -> np.ndarray:
     return np.where(number > 0, middles[place], np.nan)
 
 
-def replicate_quantile(counted: np.ndarray, order: float, level: float = LEVEL) -> IntervalEstimate:
+def replicate_quantile(counted: np.ndarray, order: float, level: float = LEVEL) -> Estimate:
     """As `binned_quantile`, from the `counts` (replicates, BINS) of equally many points of each of several
     independent scramblings of a Sobol sequence.
 
@@ -128,7 +126,7 @@ def replicate_quantile(counted: np.ndarray, order: float, level: float = LEVEL) 
     _, low, high = replicate_interval(np.cumsum(counted, axis=-1).T, int(numbers[0]), level)
     first = int(np.argmax(high >= order))
     last = int(np.max(np.nonzero(low[:-1] <= order)[0], initial=-1))
-    return IntervalEstimate(estimate, bounds[first], bounds[last + 2])
+    return Estimate(estimate, bounds[first], bounds[last + 2])
 
 
 def _rank(number: ArrayLike, order: float) -> np.ndarray:

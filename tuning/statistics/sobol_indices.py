@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tuning.statistics.intervals import LEVEL, IntervalEstimate
+from tuning.statistics.intervals import LEVEL, Estimate
 
 RESAMPLES = 1000
 _AT_ONCE = 2**22  # numbers of one block of resampling
@@ -29,8 +29,8 @@ _AT_ONCE = 2**22  # numbers of one block of resampling
 class Indices(NamedTuple):
     """First-order and total Sobol indices with their intervals, each (inputs,), as shares of the variance."""
 
-    first_order: IntervalEstimate
-    total: IntervalEstimate
+    first_order: Estimate
+    total: Estimate
 
 
 def evaluations(inputs: int | Sequence[int], number: int) -> int:
@@ -103,7 +103,7 @@ def sobol_indices(
         raise ValueError("values: found some that are not finite, allowed with a cap only")
     rows = values.reshape(count + 2, number)
     if np.all(rows[:2] == rows[0, 0]):
-        unknown = IntervalEstimate(np.full(count, np.nan), np.zeros(count), np.ones(count))
+        unknown = Estimate(np.full(count, np.nan), np.zeros(count), np.ones(count))
         return Indices(unknown, unknown)
     # The scale drops out, and squares then neither overflow nor vanish.
     rows = rows / np.max(np.abs(rows))
@@ -118,8 +118,8 @@ def sobol_indices(
     tail = (1.0 - level) / 2.0
     low, high = np.nanquantile(resampled, [tail, 1.0 - tail], axis=0)
     return Indices(
-        IntervalEstimate(estimate[:count], low[:count], high[:count]),
-        IntervalEstimate(estimate[count:], low[count:], high[count:]),
+        Estimate(estimate[:count], low[:count], high[:count]),
+        Estimate(estimate[count:], low[count:], high[count:]),
     )
 
 

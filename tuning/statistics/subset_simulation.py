@@ -1,4 +1,4 @@
-"""Rare failures: probabilities down to 1e-6 by subset simulation, with an interval that covers.
+"""SubsetSimulation failures: probabilities down to 1e-6 by subset simulation, with an interval that covers.
 
 A probability of 1e-6 is a product of six of 0.1: of failing the worst tenth, of failing the worst tenth of
 those, and so on. Each level's scenarios come from Markov chains that start at the worst of the level before
@@ -38,7 +38,7 @@ FIRST_SIGMA, LEAST_SIGMA = 0.6, 1e-4
 WORST = 10
 
 
-class Rare(NamedTuple):
+class SubsetSimulation(NamedTuple):
     """What subset simulation found.
 
     The probability and the ends of its interval; the coefficient of variation of `probability` from the
@@ -93,7 +93,7 @@ def subset_simulation(
     replicates: int = 10,
     level: float = LEVEL,
     levels: int = 12,
-) -> Rare:
+) -> SubsetSimulation:
     """Probability that performance(u) > limit, for u of `inputs` independent standard normals.
 
     `performance` maps (batch, inputs) to (batch,), always with a batch of replicates * samples / 10; what is
@@ -143,7 +143,7 @@ def subset_simulation(
     # Without a failure the formula is infinite, and the estimate says so.
     weighted = state.estimates * np.where(state.estimates > 0.0, formula, 0.0)
     combined = np.sqrt(np.sum(weighted**2)) / replicates
-    return Rare(
+    return SubsetSimulation(
         probability=float(mean),
         low=float(low),
         high=float(high),

@@ -3,7 +3,7 @@
     DIR/manifest.json
     DIR/parts/part-000000.parquet, part-000001.parquet, ...
     DIR/errors.png, failures.png, convergence.png
-    DIR/verdict.json, studies/drivers-1024.json, ... (`tuning.sweeps.kept`)
+    DIR/verdict.json, studies/drivers-1024.json, ... (`tuning.sweeps.stored_studies`)
 
 `DIR/parts` is a Parquet dataset, for pandas, DuckDB or Arrow; units are in the fields' metadata. A part is
 there as a whole or not at all: it is written under another name, forced to disk, then renamed. It carries the

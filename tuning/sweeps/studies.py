@@ -14,7 +14,7 @@ from jaxhil.mechanism.uncertainty import at_points, dimensions
 from jaxhil.simulation.evaluation import evaluate
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.statistics.sobol_indices import saltelli_design, sobol_indices
-from tuning.statistics.subset_simulation import Rare, subset_simulation, to_uniform
+from tuning.statistics.subset_simulation import SubsetSimulation, subset_simulation, to_uniform
 from tuning.sweeps.chunks import Rows, Sweep, in_precision
 from tuning.sweeps.columns import OUTCOMES, SATURATED, rows_of
 from tuning.sweeps.tally import error_sizes
@@ -28,7 +28,7 @@ FAR_ABOVE = 2.0  # replicates that spread so much more than the formula says hav
 Done = Callable[[int], None]  # called with the number of scenarios that were run
 
 
-class Driver(NamedTuple):
+class InputIndices(NamedTuple):
     """An uncertain input's first-order and total Sobol index, with intervals of 95 %; nan where nothing
     varies."""
 
@@ -41,17 +41,17 @@ class Driver(NamedTuple):
     total_high: float
 
 
-class Drivers(NamedTuple):
+class ErrorIndices(NamedTuple):
     """Inputs, those of largest total index first, of the worst |error| cut at `cap`; scenarios that were run,
     and how many of them reached the cap or had no error."""
 
-    inputs: tuple[Driver, ...]
+    inputs: tuple[InputIndices, ...]
     cap: float
     evaluations: int
     capped: int
 
 
-def error_drivers(sweep: Sweep, number: int, done: Done = lambda _: None) -> Drivers:
+def error_indices(sweep: Sweep, number: int, done: Done = lambda _: None) -> ErrorIndices:
     """Sobol indices of the worst |error|, from `number` (a power of two) times inputs + 2 scenarios.
 
     An input is a key of the mechanism's uncertainty, with all its entries; the phases of all contacts are
@@ -72,9 +72,9 @@ def error_drivers(sweep: Sweep, number: int, done: Done = lambda _: None) -> Dri
     cap = CAP_LIMITS * limit if limit else CAP_UNLIMITED
     indices = sobol_indices(sizes, entries, number, sweep.manifest.seed, cap=cap)
     numbers = np.stack([*indices.first_order, *indices.total], axis=1)
-    found = [Driver(name, *row.tolist()) for name, row in zip(names, numbers, strict=True)]
+    found = [InputIndices(name, *row.tolist()) for name, row in zip(names, numbers, strict=True)]
     found.sort(key=lambda one: -np.nan_to_num(one.total))
-    return Drivers(tuple(found), cap, len(points), int(np.sum(sizes >= cap)))
+    return ErrorIndices(tuple(found), cap, len(points), int(np.sum(sizes >= cap)))
 
 
 def rare_failure(
@@ -83,7 +83,7 @@ def rare_failure(
     done: Done = lambda _: None,
     samples: int = SAMPLES,
     replicates: int = REPLICATES,
-) -> Rare:
+) -> SubsetSimulation:
     """Subset simulation of the probability that a scenario fails, with `limit` in the place of the sweep's.
 
     The performance is the worst |error|, infinite where the scenario fails otherwise. Noise has a realisation
@@ -103,7 +103,7 @@ def rare_failure(
     return subset_simulation(performance, inputs, limit, sweep.manifest.seed, samples, replicates)
 
 
-def spread_beyond_formula(rare: Rare) -> bool:
+def spread_beyond_formula(rare: SubsetSimulation) -> bool:
     """Whether replicates differ by far more than one run's chains can explain."""
     return rare.coefficient_of_variation > FAR_ABOVE * rare.formula_coefficient_of_variation
 

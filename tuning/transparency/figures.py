@@ -19,7 +19,8 @@ from jaxtyping import Bool, Float
 from scipy.stats import binomtest, bootstrap
 
 from jaxhil.simulation.evaluation import Outcome
-from tuning.statistics.bootstrap import Interval, Intervals, interval
+from tuning.statistics.bootstrap import ErrorIntervals, Interval, error_intervals
+from tuning.statistics.intervals import Estimate
 
 RESAMPLES = 999
 LEVEL = 0.95
@@ -28,15 +29,7 @@ NOWHERE = Interval(np.nan, np.nan)
 CLOSER_TO_1 = ("early", "late", "slope")
 
 
-class Figure(NamedTuple):
-    """A figure and the ends of its interval; the ends are NaN where it has none."""
-
-    value: float
-    low: float
-    high: float
-
-
-class Judged(NamedTuple):
+class Runs(NamedTuple):
     """What runs of one law with one set of gains say: outcome (slots, scenarios) of the plain runs, e of the
     first contact under an early and a late push, outcome of the damped twins."""
 
@@ -47,42 +40,42 @@ class Judged(NamedTuple):
 
 
 def judge(
-    judged: Judged,
+    judged: Runs,
     pushed: tuple[Float[np.ndarray, "scenarios"], Float[np.ndarray, "scenarios"]],
     in_space: Float[np.ndarray, "scenarios"],
     depth: Float[np.ndarray, "slots scenarios"],
     amplification: float,
     limit: float,
     seed: int,
-) -> dict[str, Figure]:
+) -> dict[str, Estimate]:
     """All figures. `pushed`: e* under the early and the late push; `in_space`: e* without, integrated alike;
     `depth` [m]: the deepest point of each contact in space."""
     plain: Any = judged.plain
     good = plain.good
     size = np.abs(plain.error[good])
-    ends = interval(plain.error, good, seed=seed)
+    ends = error_intervals(plain.error, good, seed=seed)
     if np.any(plain.wanted & ~good):
         # What is said of the contacts that ended is no match for a law under which all of them do.
-        ends = Intervals(NOWHERE, NOWHERE)
+        ends = ErrorIntervals(NOWHERE, NOWHERE)
     wrong = np.any((plain.wanted & ~good) | (good & (np.abs(plain.error) > limit)), axis=0)
     found = {
-        "rms": Figure(_rms(size), *ends.rms),
-        "p99": Figure(_percentile(size, 99), *ends.p99),
-        "worst": Figure(float(np.max(size)) if len(size) else np.nan, np.nan, np.nan),
+        "rms": Estimate(_rms(size), *ends.rms),
+        "p99": Estimate(_percentile(size, 99), *ends.p99),
+        "worst": Estimate(float(np.max(size)) if len(size) else np.nan, np.nan, np.nan),
         "failures": share(wrong),
     }
-    found |= honesty(judged, pushed, in_space, seed)
+    found |= transparency_figures(judged, pushed, in_space, seed)
     found["trajectory"] = resampled(_root_mean_square, seed, good, plain.metrics.trajectory_error / depth)
-    found["noise"] = Figure(amplification, np.nan, np.nan)
+    found["noise"] = Estimate(amplification, np.nan, np.nan)
     return found
 
 
-def honesty(
-    judged: Judged,
+def transparency_figures(
+    judged: Runs,
     pushed: tuple[Float[np.ndarray, "scenarios"], Float[np.ndarray, "scenarios"]],
     in_space: Float[np.ndarray, "scenarios"],
     seed: int,
-) -> dict[str, Figure]:
+) -> dict[str, Estimate]:
     """Whether it still is a test of the hardware: early, late, slope and peak; arguments as of `judge`."""
     plain: Any = judged.plain
     twin: Any = judged.twins
@@ -115,10 +108,10 @@ def slope(
     return np.nansum(centred * restitution, axis=-1) / np.nansum(centred**2, axis=-1)
 
 
-def share(yes: Bool[np.ndarray, "scenarios"]) -> Figure:
+def share(yes: Bool[np.ndarray, "scenarios"]) -> Estimate:
     """How often, with the Clopper-Pearson interval."""
     ends = binomtest(int(np.sum(yes)), len(yes)).proportion_ci(LEVEL, method="exact")
-    return Figure(float(np.mean(yes)), float(ends.low), float(ends.high))
+    return Estimate(float(np.mean(yes)), float(ends.low), float(ends.high))
 
 
 def resampled(
@@ -126,7 +119,7 @@ def resampled(
     seed: int,
     good: Bool[np.ndarray, "slots scenarios"],
     *data: Float[np.ndarray, "slots scenarios"],
-) -> Figure:
+) -> Estimate:
     """A function of paired data, along their last axis, with its percentile bootstrap interval.
 
     It gets the `good` contacts of all scenarios side by side, and NaN for the others. Scenarios are
@@ -136,7 +129,7 @@ def resampled(
     """
     slots, met = np.any(good, axis=1), np.any(good, axis=0)
     if np.sum(met) < 2:
-        return Figure(np.nan, np.nan, np.nan)
+        return Estimate(np.nan, np.nan, np.nan)
     kept = [np.where(good, values, np.nan)[slots][:, met] for values in data]
 
     def of_contacts(*chosen: np.ndarray, axis: int) -> np.ndarray:
@@ -156,19 +149,19 @@ def resampled(
             method="percentile",
             rng=np.random.default_rng(seed),
         ).confidence_interval
-    return Figure(float(value), float(ends.low), float(ends.high))
+    return Estimate(float(value), float(ends.low), float(ends.high))
 
 
-def distance(name: str, figure: Figure) -> Figure:
+def distance(name: str, figure: Estimate) -> Estimate:
     """How far a figure is from its best: itself, or its distance from 1; NaN ends if it has no interval."""
     if name not in CLOSER_TO_1:
         return figure
     ends = sorted((abs(figure.low - 1), abs(figure.high - 1)))
     straddles = figure.low <= 1 <= figure.high
-    return Figure(abs(figure.value - 1), 0.0 if straddles else ends[0], ends[1])
+    return Estimate(abs(figure.value - 1), 0.0 if straddles else ends[0], ends[1])
 
 
-def winner(name: str, figures: dict[str, Figure]) -> str | None:
+def winner(name: str, figures: dict[str, Estimate]) -> str | None:
     """Of several laws the one whose interval lies below all others'; None where there is no such one."""
     apart = {law: distance(name, figure) for law, figure in figures.items()}
     known = {law: one for law, one in apart.items() if np.isfinite(one.value) and np.isfinite(one.high)}

@@ -29,18 +29,19 @@ from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.evaluation import Outcome
 from jaxhil.simulation.probe import Probe, Push
 from jaxhil.simulation.scenario import Scenario, build_scenarios
+from tuning.statistics.intervals import Estimate
 from tuning.transparency.damped_twins import damped_twins
-from tuning.transparency.figures import Figure, Judged, honesty
+from tuning.transparency.figures import Runs, transparency_figures
 from tuning.transparency.pushes import EARLY, LATE, SIZE, WIDTH, in_space
 
-COPIES = 4  # lanes of a scenario: plain, early, late, damped
+LANES_PER_SCENARIO = 4  # lanes of a scenario: plain, early, late, damped
 # Weights of the objective of a law that anticipates, unless others are given.
-ANTICIPATING = {"honesty_weight": 1.0, "command_weight": 0.003}
+ANTICIPATING = {"transparency_weight": 1.0, "command_weight": 0.003}
 
 
-class Probed(NamedTuple):
-    """A batch of scenarios with their copies, (..., scenarios * `COPIES`), and their restitution in space,
-    (scenarios,), without and with the early and the late push, all integrated alike."""
+class ProbedScenarios(NamedTuple):
+    """A batch of scenarios with their copies, (..., scenarios * `LANES_PER_SCENARIO`), and their restitution
+    in space, (scenarios,), without and with the early and the late push, all integrated alike."""
 
     scenarios: Scenario
     plain: Any
@@ -58,14 +59,14 @@ def default_weights(compensator: str) -> dict[str, float]:
     return dict(ANTICIPATING) if COMPENSATORS[compensator].anticipates else {}
 
 
-def are_copies(lanes: int) -> np.ndarray:
+def are_probes(lanes: int) -> np.ndarray:
     """Which of so many lanes, with those of the copies, are of copies."""
-    return np.arange(lanes) % COPIES > 0
+    return np.arange(lanes) % LANES_PER_SCENARIO > 0
 
 
 def probed_scenarios(
     mechanism: Mechanism, draws: Mapping[str, np.ndarray] | None = None, seed: int = 0
-) -> Probed:
+) -> ProbedScenarios:
     """The scenarios of `jaxhil.simulation.scenario.build_scenarios`, each with its copies."""
     plain = build_scenarios(mechanism, draws, seed)
     number = len(plain.velocity)
@@ -77,8 +78,10 @@ def probed_scenarios(
     pushes = [_pushed(plain, space, share, e) for share, e in ((EARLY, space.early), (LATE, space.late))]
     batches = [_pushed(plain, space), *pushes, _pushed(own, space)]
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves, axis=-1), *batches)
-    side_by_side = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-2], COPIES * number), stacked)
-    return Probed(side_by_side, space.restitution[0], space.early, space.late)
+    side_by_side = jax.tree.map(
+        lambda leaf: leaf.reshape(*leaf.shape[:-2], LANES_PER_SCENARIO * number), stacked
+    )
+    return ProbedScenarios(side_by_side, space.restitution[0], space.early, space.late)
 
 
 def _pushed(scenarios: Scenario, space: Any, share: float | None = None, restitution: Any = None) -> Scenario:
@@ -99,11 +102,11 @@ def _pushed(scenarios: Scenario, space: Any, share: float | None = None, restitu
     return scenarios._replace(contacts=contacts, probe=probe, reference=reference)
 
 
-def honesty_figures(probed: Probed, copies: Outcome, seed: int = 0) -> dict[str, Figure]:
+def probe_figures(probed: ProbedScenarios, copies: Outcome, seed: int = 0) -> dict[str, Estimate]:
     """early, late, slope and peak of `tuning.transparency.figures` from the outcome (slots, scenarios,
-    `COPIES`) of `probed` scenarios; the slope over the damped copies."""
+    `LANES_PER_SCENARIO`) of `probed` scenarios; the slope over the damped copies."""
     plain, early, late, damped = (
-        jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[..., i], copies) for i in range(COPIES)
+        jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[..., i], copies) for i in range(LANES_PER_SCENARIO)
     )
-    judged = Judged(plain, early, late, damped)
-    return honesty(judged, (probed.early, probed.late), probed.plain, seed)
+    judged = Runs(plain, early, late, damped)
+    return transparency_figures(judged, (probed.early, probed.late), probed.plain, seed)

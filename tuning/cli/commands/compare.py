@@ -7,7 +7,7 @@ from typing import Any
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import LoadedMechanism, load, suite_names
 from jaxhil.runtime.laws import LAWS, PUBLISHED
-from tuning import terminal as report
+from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options import Compare
 from tuning.environment import prepare, usable_cores
@@ -26,9 +26,9 @@ def run(options: Compare) -> int:
     loaded = _load(options)
     Path(options.output).mkdir(parents=True, exist_ok=True)
     prepare()
-    from tuning.benchmark.study import Failed, Settings, compare
+    from tuning.benchmark.study import CompareSettings, Failed, compare
 
-    settings = Settings(
+    settings = CompareSettings(
         options.scenarios,
         judged=options.judged,
         limit=options.limit,
@@ -38,13 +38,13 @@ def run(options: Compare) -> int:
     names = [one.mechanism.name for one in loaded]
     found: dict[str, dict[str, Any]] = {name: {} for name in names}
     interrupted, problems = False, []
-    with report.stages(len(names) * len(laws)) as stages:
+    with terminal.stages(len(names) * len(laws)) as stages:
         try:
             mechanisms = [one.mechanism for one in loaded]
             for one in compare(mechanisms, laws, settings, usable_cores(), stages.say):
                 if isinstance(one, Failed):
                     problems.append(f"{one.law}: {one.reason}")
-                    report.note(f"jaxhil: {problems[-1]}")
+                    terminal.note(f"jaxhil: {problems[-1]}")
                 else:
                     found[one.mechanism][one.law] = one
                     stages.finish()
@@ -53,16 +53,18 @@ def run(options: Compare) -> int:
     ordered = {name: [found[name][law] for law in laws if law in found[name]] for name in names}
     done = [name for name in names if ordered[name]]
     document = {**_document(options, loaded, ordered), "problems": problems, "interrupted": interrupted}
-    (Path(options.output) / "compare.json").write_text(report.as_json(document), encoding="utf-8")
+    (Path(options.output) / "compare.json").write_text(terminal.as_json(document), encoding="utf-8")
     if done and not interrupted:
         _draw(options, done, ordered)
     if options.json:
-        report.emit_json(document)
+        terminal.emit_json(document)
     else:
         _print(options, done, ordered, document)
     if interrupted:
         finished = sum(len(own) for own in ordered.values())
-        report.note(f"jaxhil: interrupted, {finished} of {len(names) * len(laws)} results finished and kept")
+        terminal.note(
+            f"jaxhil: interrupted, {finished} of {len(names) * len(laws)} results finished and kept"
+        )
         return 130
     return 1 if problems else 0
 
@@ -132,11 +134,11 @@ def _costs(loaded: LoadedMechanism, ordered: Mapping[str, Sequence[Any]]) -> dic
 
 
 def _draw(options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence[Any]]) -> None:
-    from tuning.benchmark.plots import errors_plot, honesty_plot
+    from tuning.benchmark.plots import errors_plot, transparency_plot
     from tuning.pictures.plots import save
 
     save(errors_plot(names, ordered, options.limit), Path(options.output) / "errors.png")
-    save(honesty_plot(names, ordered), Path(options.output) / "honesty.png")
+    save(transparency_plot(names, ordered), Path(options.output) / "honesty.png")
 
 
 def _print(
@@ -146,13 +148,13 @@ def _print(
     from tuning.benchmark.tables import leaderboard, mechanism_table
 
     for name in names:
-        report.emit(mechanism_table(name, ordered[name]))
+        terminal.emit(mechanism_table(name, ordered[name]))
     if len(names) > 1:
-        report.emit(leaderboard(names, ordered))
+        terminal.emit(leaderboard(names, ordered))
     costs = document["timings"]["microseconds_per_tick"]
     rows = [[law, ", ".join(COMPENSATORS[law].knows) or "nothing", cost] for law, cost in costs.items()]
-    report.emit(
-        report.table(
+    terminal.emit(
+        terminal.table(
             "What a law must know beforehand, and what it costs",
             ["law", "known beforehand", "Python [us per tick]"],
             rows,

@@ -6,7 +6,7 @@ from typing import Any
 
 from jaxhil.errors import InputError, shown
 from jaxhil.runtime.limits import LIMITS
-from tuning import terminal as report
+from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options_rig import Export
 from tuning.environment import prepare
@@ -28,7 +28,7 @@ def run(options: Export) -> int:
 
     loaded = load_gain_file(path)
     limits, rates = _calibrated(loaded, options, replaced)
-    with report.stages(2) as stages:
+    with terminal.stages(2) as stages:
         bundle = build_bundle(loaded.document, formats, limits, rates, options.seed, stages.begin)
         if not bundle.reasons:
             write_bundle(folder, bundle.files)
@@ -51,7 +51,7 @@ def run(options: Export) -> int:
         "verdict": "bad" if reasons else "good",
     }
     if options.json:
-        report.emit_json(document)
+        terminal.emit_json(document)
     else:
         _print(document, {name: len(content) for name, content in bundle.files.items()})
     return 1 if reasons else 0
@@ -64,7 +64,7 @@ def _calibrated(loaded, options: Export, replaced: dict[str, float | None]) -> t
 
     store = None if options.sweep is None else read_store(Path(options.sweep))
     runs = WITHOUT_STORE if store is None else store.manifest.scenarios
-    with report.progress(runs, "runs") as progress:
+    with terminal.progress(runs, "runs") as progress:
         found = calibrate(
             loaded,
             store,
@@ -110,11 +110,11 @@ def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
     tables = []
     if document["limits"]:
         rows = [
-            (name, report.figure(one["value"], 6), one["unit"])
+            (name, terminal.figure(one["value"], 6), one["unit"])
             for name, one in document["limits"].items()
             if is_shown(name)
         ]
-        tables.append(report.table("Limits for the rig", ["limit", "value", "unit"], rows, texts=(0, 2)))
+        tables.append(terminal.table("Limits for the rig", ["limit", "value", "unit"], rows, texts=(0, 2)))
     lines = [
         f"{'draw ' + str(number) if number else 'The nominal run'}, {end}: not compared from there on."
         for number, end in enumerate(document["ended"])
@@ -134,4 +134,4 @@ def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
             f"Good: {document['ticks']} ticks of {document['runs']} runs recorded; the controller's forces "
             "are those simulated."
         )
-    report.emit(*tables, *lines)
+    terminal.emit(*tables, *lines)

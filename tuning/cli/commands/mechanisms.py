@@ -5,7 +5,7 @@ from typing import Any
 
 from jaxhil.mechanism.file import builtin_names, builtin_path, load, suite_names
 from jaxhil.mechanism.structs import Mechanism
-from tuning import terminal as report
+from tuning import terminal
 from tuning.cli.options import Mechanisms
 
 
@@ -17,12 +17,12 @@ def run(options: Mechanisms) -> int:
     }
     if options.json:
         mechanisms, suites = tables.values()
-        report.emit_json({"mechanisms": mechanisms, "suites": suites})
+        terminal.emit_json({"mechanisms": mechanisms, "suites": suites})
         return 0
     headings = ["name", "law", "contacts", "mass [kg]", "contact frequencies [Hz]"]
     for title, entries in tables.items():
-        report.emit(
-            report.table(title, headings, [_row(entry) for entry in entries], texts=(0, 1, 4)),
+        terminal.emit(
+            terminal.table(title, headings, [_row(entry) for entry in entries], texts=(0, 1, 4)),
             *(f"{entry['name']}: {entry['source']}\n" for entry in entries),
         )
     return 0

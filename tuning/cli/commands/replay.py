@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from tuning import terminal as report
+from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options import Replay
 from tuning.environment import prepare
@@ -31,9 +31,9 @@ def run(options: Replay) -> int:
 
         title = f"{document['mechanism']}, scenario {options.index} of {store.folder.resolve().name}"
         save(contact_plot(motion_of(found.sweep, options.index), title, sensors="rig"), options.plot)
-        report.note(f"wrote {options.plot}")
+        terminal.note(f"wrote {options.plot}")
     if options.json:
-        report.emit_json(document)
+        terminal.emit_json(document)
     else:
         _print(document)
     return 0 if document["verdict"] == "good" else 1
@@ -66,17 +66,17 @@ def _document(options: Replay, store, found) -> dict[str, Any]:
 
 
 def _print(document: dict[str, Any]) -> None:
-    inputs = report.table(
+    inputs = terminal.table(
         f"{document['mechanism']}, compensation: {document['compensator']}, scenario {document['index']}",
         ["input", "drawn"],
-        [(name, report.figure(value, 6)) for name, value in document["inputs"].items()],
+        [(name, terminal.figure(value, 6)) for name, value in document["inputs"].items()],
     )
     rows = []
     for number, contact in enumerate(document["contacts"], start=1):
         rows.append(
             (
                 *(number, contact["restitution"], contact["reference_restitution"]),
-                report.signed(contact["error"]),
+                terminal.signed(contact["error"]),
                 *(contact["peak_force"], 1e3 * contact["duration"], 1e3 * contact["approach_velocity"]),
                 contact["status"],
             )
@@ -88,4 +88,4 @@ def _print(document: dict[str, Any]) -> None:
     else:
         lines.append(f"Bad: differs from what is stored in {', '.join(document['different'][:8])}.")
     lines += [f"The store was made elsewhere: {difference}." for difference in document["unlike"]]
-    report.emit(inputs, report.table("Contacts", headings, rows, texts=(7,)), *lines)
+    terminal.emit(inputs, terminal.table("Contacts", headings, rows, texts=(7,)), *lines)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError, one_line
-from tuning import terminal as report
+from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options_rig import RigOptions
 
@@ -56,7 +56,7 @@ def run(options: RigOptions) -> int:
             seed=options.seed,
             priority=options.realtime,
         )
-        session = run_session(setup, scratch, report.note, _Progress(period).tell)
+        session = run_session(setup, scratch, terminal.note, _Progress(period).tell)
     # jax is imported here for the first time: none of it runs beside the loop.
     references = reference_restitutions(mechanism, session.contacts)
     found = judge(setup, session, references, options.limit, document["compensator"])
@@ -66,9 +66,9 @@ def run(options: RigOptions) -> int:
 
         title = f"{mechanism.name}, {document['compensator']}: latencies at {1 / period:g} Hz over UDP"
         save(latency_plot(session, title, period), options.plot)
-        report.note(f"wrote {options.plot}")
+        terminal.note(f"wrote {options.plot}")
     if options.json:
-        report.emit_json(found)
+        terminal.emit_json(found)
     else:
         _print(found)
     if session.interrupted:
@@ -141,7 +141,7 @@ def _check_injection(options: RigOptions) -> None:
 def _print(found: dict[str, Any]) -> None:
     loops = {"empty loop": found["empty_loop"], "controller": found["run"]}
     reached = {name: loop for name, loop in loops.items() if loop is not None}
-    ticks = report.table(
+    ticks = terminal.table(
         f"{found['mechanism']}, {found['compensator']}, {1 / found['control_period']:g} Hz over UDP: ticks",
         ["loop", "ticks", "missed", "controller's fault", "injected", "the machine's"],
         [
@@ -149,7 +149,7 @@ def _print(found: dict[str, Any]) -> None:
             for name, loop in reached.items()
         ],
     )
-    times = report.table(
+    times = terminal.table(
         "Times [µs]: median, 99.9th percentile, maximum",
         ["", "loop", "median", "99.9 %", "maximum"],
         [
@@ -162,14 +162,14 @@ def _print(found: dict[str, Any]) -> None:
     shown = found["contacts"][:MOST_ROWS]
     rows = [
         (
-            *(number, one["number"] + 1, report.figure(one["restitution"], 5)),
-            *(report.figure(one["reference_restitution"], 5), report.signed(one["error"])),
+            *(number, one["number"] + 1, terminal.figure(one["restitution"], 5)),
+            *(terminal.figure(one["reference_restitution"], 5), terminal.signed(one["error"])),
             *(one["peak_force"], 1e3 * one["duration"], one["status"]),
         )
         for number, one in enumerate(shown, start=1)
     ]
     headings = ["contact", "entry", "e", "e*", "error", "peak force [N]", "duration [ms]", "status"]
-    contacts = report.table(f"Contacts: {len(found['contacts'])}", headings, rows, texts=(7,))
+    contacts = terminal.table(f"Contacts: {len(found['contacts'])}", headings, rows, texts=(7,))
     lines = []
     if len(found["contacts"]) > len(shown):
         lines.append(f"... and {len(found['contacts']) - len(shown)} more contacts.")
@@ -202,7 +202,7 @@ def _print(found: dict[str, Any]) -> None:
     if found["interrupted"]:
         lines.append("Interrupted: this is what was measured.")
     lines += [f"Bad: {reason}" for reason in found["reasons"]] or [f"Good: {found['good']}"]
-    report.emit(ticks, times, *([contacts] if rows else []), *lines)
+    terminal.emit(ticks, times, *([contacts] if rows else []), *lines)
 
 
 _CAUSES = ("controller", "injection", "machine")

@@ -7,7 +7,7 @@ from jaxhil.mechanism.conversion import KeyProblem
 from jaxhil.mechanism.file import from_builtins, load, to_builtins
 from jaxhil.mechanism.overrides import apply_override, parse_override
 from jaxhil.mechanism.structs import Mechanism
-from tuning import terminal as report
+from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options import Simulate
 from tuning.environment import prepare
@@ -35,9 +35,9 @@ def run(options: Simulate) -> int:
         motion = nominal_motion(mechanism, {"rig": (compensator, gains)}, options.seed)
         title = f"{mechanism.name}, compensation: {compensator}"
         save(contact_plot(motion, title, sensors="rig"), options.plot)
-        report.note(f"wrote {options.plot}")
+        terminal.note(f"wrote {options.plot}")
     if options.json:
-        report.emit_json(
+        terminal.emit_json(
             {
                 "mechanism": mechanism.name,
                 "compensator": compensator,
@@ -189,4 +189,4 @@ def _print(options, mechanism, compensator, contacts, status, good) -> None:
         worst = max((contact["error"] for contact in contacts), key=abs)
         kind = "divergence" if worst > 0 else "convergence"
         lines.append(f"Bad: the largest error is {worst:+.4f} ({kind}), allowed {options.limit:g}.")
-    report.emit(report.table(title, headings, rows, texts=(len(headings) - 1,)), *lines)
+    terminal.emit(terminal.table(title, headings, rows, texts=(len(headings) - 1,)), *lines)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError
-from tuning import terminal as report
+from tuning import terminal
 from tuning.cli.commands import checks, sweep_studies, sweep_tables
 from tuning.cli.options import Sweep
 from tuning.environment import prepare
@@ -32,7 +32,7 @@ def run(options: Sweep) -> int:
     folder = Path(options.output)
     with locked(folder):
         store = open_store(folder, manifest, options.resume)
-        with report.progress(manifest.scenarios, "scenarios") as progress:
+        with terminal.progress(manifest.scenarios, "scenarios") as progress:
 
             def so_far(tally) -> str:
                 known = failure_probability(tally)
@@ -51,7 +51,7 @@ def run(options: Sweep) -> int:
         document = _document(options, store, sweep, tally, progress.rate)
         unwritten = _complete(options, store, sweep, document)
     if options.json:
-        report.emit_json(document)
+        terminal.emit_json(document)
     else:
         sweep_tables.emit(document)
     if unwritten:
@@ -64,9 +64,9 @@ def _complete(options: Sweep, store, sweep, document: dict[str, Any]) -> list[In
 
     What could not be written is returned, to be reported after the verdict, which no full disk is to cost.
     """
-    from tuning.sweeps.kept import write_verdict
     from tuning.sweeps.pictures import write_pictures
     from tuning.sweeps.run import compare_precisions
+    from tuning.sweeps.stored_studies import write_verdict
 
     unwritten: list[InputError] = []
 
@@ -77,7 +77,7 @@ def _complete(options: Sweep, store, sweep, document: dict[str, Any]) -> list[In
 
     def keep() -> None:
         with sweep_studies.put_off(unwritten):
-            write_verdict(store, report.as_json(document))
+            write_verdict(store, terminal.as_json(document))
 
     steps: dict[str, Callable[[], Any]] = {"plots": plots}
     if store.manifest.precision == "float32":

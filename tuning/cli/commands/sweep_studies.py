@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError, one_line
-from tuning import terminal as report
+from tuning import terminal
 from tuning.cli.options import Sweep
 
 STAGE = 10_000  # scenarios between two lines of progress
@@ -16,34 +16,34 @@ def drivers(options: Sweep, store, sweep, unwritten: list[InputError]) -> dict[s
     """What of the document says which input drives the error. `unwritten`: see `put_off`."""
     from jaxhil.mechanism.uncertainty import dimensions
     from tuning.statistics.sobol_indices import evaluations
-    from tuning.sweeps.kept import drivers_path, keep_drivers, kept_drivers
-    from tuning.sweeps.studies import error_drivers
+    from tuning.sweeps.stored_studies import indices_path, read_indices, write_indices
+    from tuning.sweeps.studies import error_indices
 
     number: Any = options.drivers
-    found = kept_drivers(store, number) if options.resume else None
+    found = read_indices(store, number) if options.resume else None
     if found is not None:
-        _say_kept("drivers", drivers_path(store, number))
+        _say_kept("drivers", indices_path(store, number))
         return found._asdict()
     # Noise, if there is any, adds an input; the bar need not know.
-    with report.progress(evaluations(len(dimensions(sweep.mechanism)), number), "scenarios") as progress:
-        found = error_drivers(sweep, number, lambda more: progress.advance(more, "drivers"))
+    with terminal.progress(evaluations(len(dimensions(sweep.mechanism)), number), "scenarios") as progress:
+        found = error_indices(sweep, number, lambda more: progress.advance(more, "drivers"))
     with put_off(unwritten):
-        keep_drivers(store, number, found)
+        write_indices(store, number, found)
     return found._asdict()
 
 
 def rare(options: Sweep, store, sweep, unwritten: list[InputError]) -> dict[str, Any]:
     """What of the document says how probable an error beyond a limit is. `unwritten`: see `put_off`."""
-    from tuning.sweeps.kept import keep_rare, kept_rare, rare_path
+    from tuning.sweeps.stored_studies import rare_path, read_rare, write_rare
     from tuning.sweeps.studies import rare_failure
 
     limit = float(options.rare or options.limit)
-    found = kept_rare(store, limit) if options.resume else None
+    found = read_rare(store, limit) if options.resume else None
     if found is not None:
         _say_kept("subset simulation", rare_path(store, limit))
         return _rare_document(limit, found)
     ran = 0
-    with report.stages(1) as stages:
+    with terminal.stages(1) as stages:
         stages.begin("subset simulation")
 
         def done(more: int) -> None:
@@ -54,7 +54,7 @@ def rare(options: Sweep, store, sweep, unwritten: list[InputError]) -> dict[str,
 
         found = rare_failure(sweep, limit, done)
     with put_off(unwritten):
-        keep_rare(store, limit, found)
+        write_rare(store, limit, found)
     return _rare_document(limit, found)
 
 
@@ -80,4 +80,4 @@ def _rare_document(limit: float, found) -> dict[str, Any]:
 
 
 def _say_kept(study: str, path: Path) -> None:
-    report.note(f"{study}: as kept in {one_line(str(path))}")
+    terminal.note(f"{study}: as kept in {one_line(str(path))}")

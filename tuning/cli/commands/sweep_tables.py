@@ -3,7 +3,7 @@
 from typing import Any
 
 from jaxhil.errors import one_line
-from tuning import terminal as report
+from tuning import terminal
 
 
 def emit(document: dict[str, Any]) -> None:
@@ -11,21 +11,21 @@ def emit(document: dict[str, Any]) -> None:
     probability, number = document["failure_probability"], document["scenarios"]
     limit = document["limit"]
     title = f"{document['mechanism']}, compensation: {document['compensator']}, {number} scenarios"
-    outcomes = report.table(
+    outcomes = terminal.table(
         f"{title} ({document['sampling']}, {document['precision']})",
         ["outcome", "scenarios", "share"],
         [(name, count, count / number) for name, count in document["outcomes"].items()],
     )
     # All inputs beside each other would not fit; `replay` and the store have them.
-    worst = report.table(
+    worst = terminal.table(
         "Worst scenarios",
         ["index", "outcome", "error", "contact"],
         [
             (
                 one["index"],
                 one["outcome"],
-                report.signed(one["worst_error"]),
-                report.figure(one["worst_contact"]),
+                terminal.signed(one["worst_error"]),
+                terminal.figure(one["worst_contact"]),
             )
             for one in document["worst"]
         ],
@@ -55,7 +55,7 @@ def emit(document: dict[str, Any]) -> None:
     if (compared := document.get("float32")) is not None:
         lines.append(
             f"float32 beside float64 on {compared['scenarios']} scenarios: errors differ by at most "
-            f"{report.figure(compared['largest_difference'], 2)}, {compared['changed_outcomes']} outcomes "
+            f"{terminal.figure(compared['largest_difference'], 2)}, {compared['changed_outcomes']} outcomes "
             f"changed, {compared['failed_float32']} and {compared['failed_float64']} failed."
         )
     if document["scenarios_per_second"]:
@@ -64,11 +64,11 @@ def emit(document: dict[str, Any]) -> None:
     wanted = "no scenario may fail" if acceptable is None else f"acceptable up to {acceptable:g}"
     lines.append(f"{document['verdict'].capitalize()}: {wanted}. Wrote {one_line(document['store'])}")
     lines += [f"Wrote {one_line(path)}" for path in document["plots"]]
-    report.emit(*tables, *lines)
+    terminal.emit(*tables, *lines)
 
 
 def _quantiles(document: dict[str, Any]):
-    return report.table(
+    return terminal.table(
         "Worst |e - e*| of a scenario",
         ["share of scenarios", "|error| up to", "95 % from", "to"],
         [
@@ -84,7 +84,7 @@ def _quantiles(document: dict[str, Any]):
 
 
 def _drivers(drivers: dict[str, Any]):
-    return report.table(
+    return terminal.table(
         f"What drives the worst |e - e*|, errors cut at {drivers['cap']:g} ({drivers['capped']} of "
         f"{drivers['evaluations']} runs): shares of the variance",
         ["input", "first order", "95 % from", "to", "total", "95 % from", "to"],
@@ -96,7 +96,7 @@ def _drivers(drivers: dict[str, Any]):
 
 
 def _rare(rare: dict[str, Any]):
-    return report.table(
+    return terminal.table(
         "Subset simulation",
         [
             "|error| beyond",

@@ -7,7 +7,7 @@ from typing import Any
 
 from jaxhil.errors import InputError, one_line
 from jaxhil.mechanism.file import LoadedMechanism, load
-from tuning import terminal as report
+from tuning import terminal
 from tuning.cli.commands import checks, tune_pareto
 from tuning.cli.commands.tune_tables import print_one, print_overview
 from tuning.cli.options import Tune
@@ -39,7 +39,7 @@ def run(options: Tune) -> int:
         except _Interrupted as stop:
             entries, interrupted = stop.entries, True
     if options.json:
-        report.emit_json(
+        terminal.emit_json(
             {
                 "compensator": options.compensator,
                 "limit": options.limit,
@@ -50,7 +50,7 @@ def run(options: Tune) -> int:
             }
         )
     if interrupted:
-        report.note(f"jaxhil: interrupted, {len(entries)} of {len(loaded)} mechanisms finished and kept")
+        terminal.note(f"jaxhil: interrupted, {len(entries)} of {len(loaded)} mechanisms finished and kept")
         return 130
     if problems:
         return 2
@@ -99,7 +99,7 @@ def _load(options: Tune) -> tuple[list[LoadedMechanism], list[str]]:
             loaded.append(one)
         except InputError as error:
             problems.append(str(error))
-            report.note(f"jaxhil: {error}")
+            terminal.note(f"jaxhil: {error}")
     return loaded, problems
 
 
@@ -113,7 +113,7 @@ def _expand(files: tuple[str, ...], problems: list[str]) -> list[str | None]:
         found = sorted(str(path) for path in Path(file).glob("*.toml"))
         if not found:
             problems.append(f"{one_line(file)}: found no mechanism file, allowed a folder with .toml files")
-            report.note(f"jaxhil: {problems[-1]}")
+            terminal.note(f"jaxhil: {problems[-1]}")
         expanded.extend(found)
     return expanded if files else [None]
 
@@ -127,24 +127,24 @@ def _tune_all(
     options: Tune, loaded: list[LoadedMechanism], problems: list[str], known: list[Any]
 ) -> list[dict[str, Any]]:
     prepare()
-    from tuning.gains.tune import Settings, tune_all
+    from tuning.gains.tune import TuneSettings, tune_all
 
-    settings = Settings(
+    settings = TuneSettings(
         options.scenarios,
         options.starts,
         options.steps,
         options.validation,
         options.seed,
         _objective(options),
-        certify=options.certify,
+        global_search=options.certify,
         setting=options.setting,
-        probed=options.pareto_against == "honesty",
+        judge_transparency=options.pareto_against == "honesty",
     )
     mechanisms = [one.mechanism for one in loaded]
     entries, done, traded = {}, {}, {}
     drawn = len(loaded) <= MOST_DRAWN
     with (
-        report.stages(len(loaded) * (2 if options.pareto else 1)) as stages,
+        terminal.stages(len(loaded) * (2 if options.pareto else 1)) as stages,
         ThreadPoolExecutor(1) as meanwhile,
     ):
         if drawn and program_folder() is not None:
@@ -155,7 +155,7 @@ def _tune_all(
                     entries[index] = _finish(options, loaded[index], result, drawn, stages.say)
                 except InputError as error:
                     problems.append(str(error))
-                    report.note(f"jaxhil: {error}")
+                    terminal.note(f"jaxhil: {error}")
                     continue
                 done[index] = result
                 stages.finish()
@@ -177,7 +177,7 @@ def _tune_all(
         for index in sorted(traded):
             tune_pareto.print_front(options, done[index], traded[index], entries[index]["pareto"])
     elif not options.json and traded:
-        report.emit(
+        terminal.emit(
             f"wrote {options.output}/NAME/pareto/NN/gains.json and {options.output}/NAME/pareto.png", ""
         )
     return _in_order(entries)
@@ -214,7 +214,7 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) ->
             "nominal": result.nominal,
             "robust": result.figures,
             "tuned_intervals": result.intervals.plain(),
-            **({"honesty": result.honesty} if result.honesty else {}),
+            **({"honesty": result.transparency} if result.transparency else {}),
         },
         options.seed,
         result.timings,
@@ -237,11 +237,11 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) ->
         "figures": result.figures,
         "nominal": result.nominal,
         "tuned_intervals": result.intervals.plain(),
-        "honesty": result.honesty,
+        "honesty": result.transparency,
         "starts": [_start(start) for start in result.starts],
         "carried_over": _carried_over(result),
         "freedom": {name: one._asdict() for name, one in result.freedom.items()},
-        "certified": result.certified._asdict() if result.certified else None,
+        "certified": result.global_comparison._asdict() if result.global_comparison else None,
         "timings": result.timings,
         "sensor_noise": has_sensor_noise(loaded.mechanism),
         "better_than_literature": is_better(result.figures["tuned"], result.figures["literature"]),

@@ -6,7 +6,7 @@ from typing import Any
 
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import LoadedMechanism
-from tuning import terminal as report
+from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options import Tune
 from tuning.environment import prepare
@@ -49,7 +49,7 @@ def trade(
     done: Mapping[int, Any],
     entries: Mapping[int, dict[str, Any]],
     problems: list[str],
-    stages: report.Stages,
+    stages: terminal.Stages,
 ) -> dict[int, Any]:
     """Fronts of the mechanisms that are `done`, written beside their gains and added to their entries."""
     from tuning.gains.pareto import fronts
@@ -64,7 +64,7 @@ def trade(
             entry = _write(options, loaded[index].sha256, done[index], front, folder)
         except InputError as error:
             problems.append(str(error))
-            report.note(f"jaxhil: {error}")
+            terminal.note(f"jaxhil: {error}")
             continue
         entries[index]["pareto"], made[index] = entry, front
         stages.finish()
@@ -84,7 +84,7 @@ def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -
     axis = front.axis
     weight = axis.weight.replace("_", " ")
     headings = ["point", weight, axis.name, *([] if _is_rms(result) else ["objective"])]
-    table = report.table(
+    table = terminal.table(
         f"{result.mechanism.name}: restitution error against {axis.words}, "
         f"{options.validation} fresh scenarios",
         [*headings, "rms", "99th pct", "max", "not ended", ""],
@@ -108,7 +108,7 @@ def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -
         lines.append(f"{words[axis.name]}, rms {rms:.2g}.")
     else:
         lines.append(f"No point's rms error is within {options.limit:g}.")
-    report.emit(table, *lines, "")
+    terminal.emit(table, *lines, "")
 
 
 def _write(options: Tune, sha256: str, result: Any, front: Any, folder: Path) -> dict[str, Any]:
@@ -132,8 +132,8 @@ def _write(options: Tune, sha256: str, result: Any, front: Any, folder: Path) ->
             "robust": {**result.figures, "tuned": point.figures},
             "tuned_intervals": point.intervals.plain(),
         }
-        if point.honesty is not None:
-            figures["honesty"] = {**result.honesty, "tuned": point.honesty}
+        if point.transparency is not None:
+            figures["honesty"] = {**result.transparency, "tuned": point.transparency}
         document = build_document(
             options.compensator,
             point.gains,
@@ -170,7 +170,7 @@ def _remove_others(folder: Path, number: int) -> None:
 def _is_rms(result: Any) -> bool:
     """Whether the objective without what is traded is the rms error itself."""
     one = result.settings.objective
-    weights = one.divergence_weight, one.command_weight, one.chatter_weight, one.honesty_weight
+    weights = one.divergence_weight, one.command_weight, one.chatter_weight, one.transparency_weight
     return (one.name, *weights) == ("rms", 1.0, 0.0, 0.0, 0.0)
 
 

@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from tuning import terminal as report
+from tuning import terminal
 from tuning.cli.options import Tune
 
 
@@ -17,14 +17,14 @@ def print_overview(options: Tune, results: list[Any], entries: list[dict[str, An
         best = min(result.starts, key=lambda start: start.rms).status if result.starts else "nothing to tune"
         verdict = entry["verdict"] if entry["better_than_literature"] else "NOT better than the literature's"
         rms = (result.figures[key].rms for key in ("before", "literature", "tuned"))
-        above = [f"{100 * result.certified.above:+.1f} %"] if result.certified else []
+        above = [f"{100 * result.global_comparison.above:+.1f} %"] if result.global_comparison else []
         failed = [tuned.failed] if some_failed else []
         rows.append((entry["mechanism"], *rms, tuned.p99, tuned.peak_ratio, *failed, *above, best, verdict))
     headings = ["mechanism", "before", "literature", "tuned", "99th pct", "peak ratio"]
     headings += ["not ended"] if some_failed else []
-    headings += ["above best"] if results[0].certified else []
-    report.emit(
-        report.table(
+    headings += ["above best"] if results[0].global_comparison else []
+    terminal.emit(
+        terminal.table(
             f"rms of e - e* on {options.validation} fresh scenarios each, {options.compensator}",
             [*headings, "best start", "verdict"],
             rows,
@@ -32,7 +32,7 @@ def print_overview(options: Tune, results: list[Any], entries: list[dict[str, An
         )
     )
     if not drawn:
-        report.emit(f"wrote {options.output}/NAME/gains.json and {options.output}/overview.png", "")
+        terminal.emit(f"wrote {options.output}/NAME/gains.json and {options.output}/overview.png", "")
 
 
 def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
@@ -53,12 +53,12 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
             )
         )
     count = int(result.outcomes["tuned"].wanted.sum())
-    errors = report.table(
+    errors = terminal.table(
         f"{mechanism.name}: errors e - e* of {count} contacts in {options.validation} fresh scenarios",
         ["gains", "rms", "99th pct", "max", "mean", "e > e*", "peak ratio", "chatter", "not ended"],
         rows,
     )
-    gains = report.table(
+    gains = terminal.table(
         f"Gains of {options.compensator}",
         ["gain", "unit", "lower", "upper", "literature", "tuned", "free alone", "together"],
         [
@@ -95,49 +95,50 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
             "before the loss rises by 1 %."
         )
     ends = sorted(start.rms for start in result.starts if math.isfinite(start.rms))
-    if result.settings.honest and len(ends) > 1:
+    if result.settings.probed and len(ends) > 1:
         above = 100 * (ends[-1] / ends[0] - 1)
         sure_of.append(
             f"Starts: {len(ends)} of {len(result.starts)} ended, the worst {above:.1f} % above the best."
         )
-    if result.certified:
-        one = result.certified
+    if result.global_comparison:
+        one = result.global_comparison
         sure_of.append(
             f"Best of {one.evaluations} evaluations anywhere: {one.best:.4g}; tuned, with {one.spent}: "
             f"{one.tuned:.4g}, {100 * abs(one.above):.1f} % {'above' if one.above > 0 else 'below'} it."
         )
-    tables = [errors] + ([_honesty(result)] if result.honesty else [])
+    tables = [errors] + ([_transparency(result)] if result.transparency else [])
     tables += ([gains] if law else []) + ([starts] if result.starts else [])
-    report.emit(*tables, *sure_of, *(f"wrote {path}" for path in written), *closing, "")
+    terminal.emit(*tables, *sure_of, *(f"wrote {path}" for path in written), *closing, "")
 
 
-def _honesty(result: Any) -> Any:
+def _transparency(result: Any) -> Any:
     """Whether it still is a test of the hardware, with the literature's and with tuned gains."""
     labels = {"literature": "literature's rule", "tuned": "tuned"}
     rows = [
-        [label, *(_with_ends(one) for one in result.honesty[key].values())] for key, label in labels.items()
+        [label, *(_with_ends(one) for one in result.transparency[key].values())]
+        for key, label in labels.items()
     ]
-    return report.table(
+    return terminal.table(
         "Honesty: transparency to an early and a late push, slope of e against e*, peak command (95 %)",
-        ["gains", *result.honesty["tuned"]],
+        ["gains", *result.transparency["tuned"]],
         rows,
     )
 
 
 def _with_ends(figure: Any) -> str:
-    value, low, high = (report.figure(float(number), 3) for number in figure)
+    value, low, high = (terminal.figure(float(number), 3) for number in figure)
     return f"{value} ({low} to {high})"
 
 
 def _starts(options: Tune, result: Any) -> Any:
     """Every start; a column of where they began, where one did not begin as usual."""
-    figure = "objective" if result.settings.honest else options.objective
+    figure = "objective" if result.settings.probed else options.objective
     headings = ["start", "status", "steps", f"{figure} on training scenarios"]
     rows: list[list[Any]] = [[n, s.status, s.steps, s.rms] for n, s in enumerate(result.starts, start=1)]
     if not result.first:
-        return report.table("Starts", headings, rows, texts=(1,))
+        return terminal.table("Starts", headings, rows, texts=(1,))
     begun = ["literature", *["spread"] * (len(rows) - 1)]
     for number, one in enumerate(result.first, start=result.usual_starts):
         begun[number] = f"gains of {one.source}"
     rows = [[*row, place] for row, place in zip(rows, begun, strict=True)]
-    return report.table("Starts", [*headings, "begins at"], rows, texts=(1, 4))
+    return terminal.table("Starts", [*headings, "begins at"], rows, texts=(1, 4))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError
-from tuning import terminal as report
+from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options_rig import Verify
 from tuning.environment import prepare
@@ -48,7 +48,7 @@ def _verified(options: Verify, path: Path) -> dict[str, Any]:
     except InputError as error:
         document.update(verdict=False, reasons=[str(error)])
     else:
-        with report.stages(3) as stages:
+        with terminal.stages(3) as stages:
             found = verify(loaded, options.scenarios, options.seed, stages.begin)
         document.update(mechanism=loaded.mechanism.name, **msgspec.to_builtins(found))
     return document
@@ -56,7 +56,7 @@ def _verified(options: Verify, path: Path) -> dict[str, Any]:
 
 def _finish(options: Verify, document: dict[str, Any]) -> int:
     if options.json:
-        report.emit_json(document)
+        terminal.emit_json(document)
     else:
         _print(document)
     return 0 if document["verdict"] else 1
@@ -71,7 +71,7 @@ def _print(document: dict[str, Any]) -> None:
     tables: list[Any] = list(document.get("self_test", ()))
     if "replay" in document:
         tables += [
-            report.table(
+            terminal.table(
                 f"{document['mechanism']}, {document['compensator']}: recorded runs through the runtime",
                 ["run", "ticks", "compared", "near a threshold", "command range [N]", "largest difference"],
                 [
@@ -82,13 +82,13 @@ def _print(document: dict[str, Any]) -> None:
                     for number, lane in enumerate(document["replay"])
                 ],
             ),
-            report.table(
+            terminal.table(
                 "Nominal contacts with the runtime in the loop",
                 ["contact", "e", "e simulated", "status", "status simulated"],
                 [
                     (
-                        *(number, report.figure(one["restitution"], 9)),
-                        *(report.figure(one["simulated_restitution"], 9), one["status"]),
+                        *(number, terminal.figure(one["restitution"], 9)),
+                        *(terminal.figure(one["simulated_restitution"], 9), one["status"]),
                         one["simulated_status"],
                     )
                     for number, one in enumerate(document["closed_loop"], start=1)
@@ -103,4 +103,4 @@ def _print(document: dict[str, Any]) -> None:
         ]
     else:
         lines = [f"Bad: {reason}" for reason in document["reasons"]]
-    report.emit(*tables, *lines)
+    terminal.emit(*tables, *lines)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tuning.optimisation.derivative_free import certify, mirror, polish
+from tuning.optimisation.derivative_free import mirror, polish, search_globally
 
 
 def rosenbrock(points):
@@ -31,7 +31,7 @@ def test_polish_follows_a_curved_valley(gains):
     found = polish(rosenbrock, start, 1200 * gains, reach=0.05)
     assert found.loss < 1e-3 * rosenbrock(start)
     longer = polish(rosenbrock, start, 3000 * gains, reach=0.05)
-    np.testing.assert_allclose(longer.free, 0.75, atol=1e-4)
+    np.testing.assert_allclose(longer.point, 0.75, atol=1e-4)
 
 
 @pytest.mark.parametrize("gains", [2, 6, 12])
@@ -61,15 +61,15 @@ def test_polish_is_never_worse_than_its_start():
     start = np.array([0.3, 0.7])
     found = polish(kinked, start, 64, reach=0.4)
     assert found.loss == kinked(start) == 0
-    np.testing.assert_array_equal(found.free, start)
+    np.testing.assert_array_equal(found.point, start)
 
 
 def test_starts_are_searched_side_by_side_and_do_not_depend_on_each_other():
     starts = np.random.default_rng(1).random((3, 4))
     together = polish(rosenbrock, starts, 320)
-    for start, free, loss in zip(starts, together.free, together.loss, strict=True):
+    for start, free, loss in zip(starts, together.point, together.loss, strict=True):
         alone = polish(rosenbrock, start, 320)
-        np.testing.assert_allclose(alone.free, free, rtol=1e-9)
+        np.testing.assert_allclose(alone.point, free, rtol=1e-9)
         assert alone.loss == pytest.approx(loss, rel=1e-9)
     assert together.evaluations == 320
 
@@ -83,7 +83,7 @@ def test_the_same_seed_finds_the_same_and_calls_are_all_alike():
         return rippled(points)
 
     first, second = (polish(losses, np.full(3, 0.99), 200, candidates=16, reach=0.3) for _ in range(2))
-    np.testing.assert_array_equal(first.free, second.free)
+    np.testing.assert_array_equal(first.point, second.point)
     assert set(shapes) == {(16, 3)}
     # Whole generations, no more than asked for.
     assert first.evaluations == 192 and len(shapes) == 2 * 12
@@ -92,7 +92,7 @@ def test_the_same_seed_finds_the_same_and_calls_are_all_alike():
 def test_a_minimum_on_the_bound_is_found():
     target = np.array([0.0, 0.4, 1.0])
     found = polish(lambda points: np.sum(np.abs(points - target), axis=-1), np.full(3, 0.5), 1500, reach=0.1)
-    np.testing.assert_allclose(found.free, target, atol=1e-3)
+    np.testing.assert_allclose(found.point, target, atol=1e-3)
 
 
 def test_what_is_not_a_number_is_the_worst():
@@ -102,15 +102,15 @@ def test_what_is_not_a_number_is_the_worst():
     found = polish(losses, np.full(2, 0.5), 1000, reach=0.1)
     # Up to the wall the valley leads down to (1 - x)^2 at x = 0.2.
     assert found.loss == pytest.approx(0.64, rel=1e-3)
-    assert found.free[0] <= 0.55
+    assert found.point[0] <= 0.55
     nowhere = polish(lambda points: np.full(len(points), np.nan), np.full(2, 0.5), 64)
-    np.testing.assert_array_equal(nowhere.free, 0.5)
+    np.testing.assert_array_equal(nowhere.point, 0.5)
 
 
 @pytest.mark.parametrize("gains", [2, 5, 10])
 def test_certify_finds_the_best_of_many_basins(gains):
-    found = certify(rippled, gains, 10_000 * gains)
-    np.testing.assert_allclose(found.free, 0.6, atol=1e-3)
+    found = search_globally(rippled, gains, 10_000 * gains)
+    np.testing.assert_allclose(found.point, 0.6, atol=1e-3)
     assert found.loss < 1e-3
 
 
@@ -123,9 +123,9 @@ def test_certify_finds_what_a_local_search_misses():
 
     local = polish(losses, np.full(4, 0.3), 4000)
     assert local.loss == pytest.approx(0, abs=1e-6)
-    found = certify(losses, 4, 20_000)
+    found = search_globally(losses, 4, 20_000)
     assert found.loss == pytest.approx(-0.5, abs=1e-6)
-    assert found.loss == losses(found.free)
+    assert found.loss == losses(found.point)
 
 
 def test_certify_keeps_to_its_budget_and_to_one_shape_of_call():
@@ -135,12 +135,12 @@ def test_certify_keeps_to_its_budget_and_to_one_shape_of_call():
         shapes.append(points.shape)
         return kinked(points)
 
-    found = certify(losses, 3, 3000, candidates=8, basins=4)
+    found = search_globally(losses, 3, 3000, candidates=8, basins=4)
     assert set(shapes) == {(32, 3)}
     assert found.evaluations == 32 * len(shapes) <= 3000
     assert found.evaluations > 3000 - 64
     assert (np.diff(found.basin_losses) >= 0).all() and (np.diff(found.scanned) >= 0).all()
-    assert found.loss == found.basin_losses[0] == kinked(found.free)
+    assert found.loss == found.basin_losses[0] == kinked(found.point)
     assert found.basins.shape == (4, 3)
 
 
@@ -152,8 +152,8 @@ def test_what_is_known_is_looked_at():
         return 1 - np.exp(-np.sum(((points - hole) / 0.01) ** 2, axis=-1))
 
     known = hole[None] + 0.002
-    assert certify(losses, 5, 4096).loss > 0.5
-    assert certify(losses, 5, 4096, known=known).loss < 0.05 < losses(known)
+    assert search_globally(losses, 5, 4096).loss > 0.5
+    assert search_globally(losses, 5, 4096, known=known).loss < 0.05 < losses(known)
 
 
 def test_mirrored_points_are_inside():

@@ -15,22 +15,28 @@ from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import evaluate
 from tuning.gains import pareto
 from tuning.gains.objective import Objective, contact_terms, objective_value
-from tuning.gains.pareto import HONESTY, PEAK, default_axis, fronts
+from tuning.gains.pareto import PEAK, TRANSPARENCY, default_axis, fronts
 from tuning.gains.rounds import solve_tasks
 from tuning.gains.tasks import build_task
-from tuning.gains.tune import Settings, tune
-from tuning.gains.validation import Trial
-from tuning.transparency.probes import COPIES, are_copies, default_weights, honesty_figures, probed_scenarios
+from tuning.gains.tune import TuneSettings, tune
+from tuning.gains.validation import Validation
+from tuning.transparency.probes import (
+    LANES_PER_SCENARIO,
+    are_probes,
+    default_weights,
+    probe_figures,
+    probed_scenarios,
+)
 from tuning.transparency.pushes import SIZE, WIDTH
 
 DAMPED = load("varying", ["contact.stiffness=[1e5]", "approach.contacts=1"]).mechanism
-HONEST = Objective(command_weight=0.02, honesty_weight=0.7)
-SMALL = Settings(scenarios=4, starts=2, steps=4, validation=15, objective=HONEST, polish=0, scanned=8)
+WEIGHED = Objective(command_weight=0.02, transparency_weight=0.7)
+SMALL = TuneSettings(scenarios=4, starts=2, steps=4, validation=15, objective=WEIGHED, polish=0, scanned=8)
 
 
 def kind(scenarios, number):
     """One lane of each scenario: 0 plain, 1 early, 2 late, 3 damped."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[..., number::COPIES], scenarios)
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[..., number::LANES_PER_SCENARIO], scenarios)
 
 
 def test_a_pushed_contact_s_restitution_is_that_of_the_same_push_in_space():
@@ -63,32 +69,34 @@ def test_on_an_ideal_rig_no_copy_errs():
     probed = probed_scenarios(made, draw(made, 16, 0))
     outcome = evaluate(build_loop(made, "none", probed.scenarios), {}, probed.scenarios)
     assert outcome.good[0].all() and np.max(np.abs(outcome.error[0])) < 1e-3
-    copies = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], -1, COPIES), outcome)
-    figures = honesty_figures(probed, copies)
+    copies = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], -1, LANES_PER_SCENARIO), outcome)
+    figures = probe_figures(probed, copies)
     assert list(figures) == ["early", "late", "slope", "peak"]
     assert [one.value for one in figures.values()] == pytest.approx([1] * 4, abs=2e-3)
 
 
 def test_the_first_lanes_have_some_of_each():
-    assert list(are_copies(8)) == [False, True, True, True] * 2
+    assert list(are_probes(8)) == [False, True, True, True] * 2
     probed = probed_scenarios(DAMPED, draw(DAMPED, 5, 1)).scenarios
     damping = np.asarray(probed.contact.damping)[0]
-    assert (damping[3::COPIES] >= damping[::COPIES]).all() and (damping[3:] > damping[:-3]).any()
-    np.testing.assert_array_equal(damping[1::COPIES], damping[::COPIES])
+    assert (damping[3::LANES_PER_SCENARIO] >= damping[::LANES_PER_SCENARIO]).all() and (
+        damping[3:] > damping[:-3]
+    ).any()
+    np.testing.assert_array_equal(damping[1::LANES_PER_SCENARIO], damping[::LANES_PER_SCENARIO])
     pushed = probed.probe.push.size[0] > 0
-    np.testing.assert_array_equal(pushed, np.arange(20) % COPIES % 3 > 0)
+    np.testing.assert_array_equal(pushed, np.arange(20) % LANES_PER_SCENARIO % 3 > 0)
 
 
 def test_only_what_anticipates_is_weighed_unless_asked():
     weighed = [name for name in COMPENSATORS if default_weights(name)]
     ours = ["retrospective_reference", "retrospective_delay_bank"]
     assert weighed == ours == [n for n in COMPENSATORS if default_axis(n) == PEAK]
-    assert Objective(**default_weights(weighed[0])).honesty_weight > 0
+    assert Objective(**default_weights(weighed[0])).transparency_weight > 0
 
 
 @pytest.fixture(scope="module")
 def task():
-    return build_task(DAMPED, "phase_lead", 4, 0, honest=True)
+    return build_task(DAMPED, "phase_lead", 4, 0, probed=True)
 
 
 def of_training(task, gains):
@@ -96,29 +104,33 @@ def of_training(task, gains):
     outcome = evaluate(task.loop, gains, task.scenarios)
     assert outcome.good[outcome.wanted].all()
     error, excess, _ = (np.asarray(term)[0] for term in contact_terms(outcome))
-    copies = are_copies(len(error))
+    copies = are_probes(len(error))
     return error[~copies], error[copies], excess
 
 
 def test_solver_and_search_minimise_the_stated_objective(task):
-    assert task.number == 4 and len(task.scenarios.velocity) == 4 * COPIES
-    trial = Trial([task], 3, 0)
-    points = np.array([[0.3, 0.4], [0.6, 0.2]])[:, : len(trial.names)]
-    (starts,) = solve_tasks([task], [points], 1, HONEST)
-    for point, start, loss in zip(points, starts, trial.losses(HONEST, [0], points[None])[0], strict=True):
-        error, honesty, excess = of_training(task, trial.gains(0, point))
-        stated = np.sqrt(np.mean(error**2) + 0.7**2 * np.mean(honesty**2) + 0.02**2 * np.mean(excess**2))
+    assert task.number == 4 and len(task.scenarios.velocity) == 4 * LANES_PER_SCENARIO
+    validation = Validation([task], 3, 0)
+    points = np.array([[0.3, 0.4], [0.6, 0.2]])[:, : len(validation.names)]
+    (starts,) = solve_tasks([task], [points], 1, WEIGHED)
+    for point, start, loss in zip(
+        points, starts, validation.losses(WEIGHED, [0], points[None])[0], strict=True
+    ):
+        error, of_probes, excess = of_training(task, validation.gains(0, point))
+        stated = np.sqrt(np.mean(error**2) + 0.7**2 * np.mean(of_probes**2) + 0.02**2 * np.mean(excess**2))
         assert loss == pytest.approx(stated, rel=1e-9)
-        assert objective_value(HONEST, error, excess, honesty=honesty) == pytest.approx(stated, rel=1e-12)
+        assert objective_value(WEIGHED, error, excess, probe_errors=of_probes) == pytest.approx(
+            stated, rel=1e-12
+        )
         assert start.history[0] <= stated * (1 + 1e-9)
         ended = of_training(task, start.gains)
-        value = objective_value(HONEST, ended[0], ended[2], honesty=ended[1])
+        value = objective_value(WEIGHED, ended[0], ended[2], probe_errors=ended[1])
         assert start.rms >= value * (1 - 1e-9)
 
 
 def test_scenarios_of_a_form_have_no_copies():
     with pytest.raises(ValueError):
-        build_task(DAMPED, "phase_lead", 4, 0, form=object(), honest=True)  # pyright: ignore
+        build_task(DAMPED, "phase_lead", 4, 0, common=object(), probed=True)  # pyright: ignore
 
 
 @pytest.fixture(scope="module")
@@ -127,8 +139,8 @@ def result():
 
 
 def test_honesty_is_judged_of_literature_and_tuned_gains(result):
-    assert list(result.honesty) == ["before", "literature", "tuned"]
-    for key, own in result.honesty.items():
+    assert list(result.transparency) == ["before", "literature", "tuned"]
+    for key, own in result.transparency.items():
         peaks = result.outcomes[key].peak_ratio[result.outcomes[key].good]
         assert own["peak"].value == pytest.approx(np.percentile(peaks, 99), rel=1e-12)
         assert own["peak"].low <= own["peak"].value <= own["peak"].high
@@ -138,25 +150,25 @@ def test_honesty_is_judged_of_literature_and_tuned_gains(result):
 
 def test_without_the_weight_there_are_no_copies():
     plain = dataclasses.replace(SMALL, objective=Objective())
-    assert not plain.honest and dataclasses.replace(plain, probed=True).honest
+    assert not plain.probed and dataclasses.replace(plain, judge_transparency=True).probed
     assert len(build_task(DAMPED, "phase_lead", 4, 0).scenarios.velocity) == 4
 
 
-@pytest.mark.parametrize("axis", [PEAK, HONESTY])
+@pytest.mark.parametrize("axis", [PEAK, TRANSPARENCY])
 def test_the_error_is_traded_against_peak_or_honesty(result, axis):
     ((_, front),) = fronts([result], 2, axis=axis)
     assert front.axis == axis and front.points[0].weight == 0 < front.points[1].weight
     for point in (*front.points, front.tuned):
-        assert point.honesty is not None
+        assert point.transparency is not None
         if axis == PEAK:
-            assert point.cost == pytest.approx(point.honesty["peak"].value, rel=1e-12)
-    assert front.tuned.honesty == result.honesty["tuned"]
+            assert point.cost == pytest.approx(point.transparency["peak"].value, rel=1e-12)
+    assert front.tuned.transparency == result.transparency["tuned"]
     # On the training scenarios the heavier weight is no worse in what it weighs.
-    task = build_task(DAMPED, "phase_lead", SMALL.scenarios, SMALL.seed, honest=True)
-    trial = Trial([task], 3, 0)
+    task = build_task(DAMPED, "phase_lead", SMALL.scenarios, SMALL.seed, probed=True)
+    validation = Validation([task], 3, 0)
     starts = [pareto.Start("made up", 1, 1.0, [1.0], point.gains) for point in front.points]
-    light, heavy = pareto._reached(trial, 0, axis, HONEST, 0.0, starts)
+    light, heavy = pareto._reached(validation, 0, axis, WEIGHED, 0.0, starts)
     assert heavy.excess <= light.excess * (1 + 1e-6) and light.error <= heavy.error * (1 + 1e-6)
-    _, honesty, excess = of_training(task, front.points[1].gains)
-    traded = excess if axis == PEAK else honesty
+    _, of_probes, excess = of_training(task, front.points[1].gains)
+    traded = excess if axis == PEAK else of_probes
     assert heavy.excess == pytest.approx(np.sqrt(np.mean(traded**2)), rel=1e-6)

@@ -12,7 +12,7 @@ from compiling import is_quick
 from jax.sharding import AxisType, PartitionSpec
 
 from jaxhil.contact.laws import LAWS, HuntCrossley, KelvinVoigt
-from tuning import program_cache as programs
+from tuning import program_cache
 
 pytestmark = pytest.mark.users_options
 
@@ -44,14 +44,14 @@ VALUES = {"values": np.array([1.0, 2.0, 4.0, 8.0])}
 
 @pytest.fixture(autouse=True)
 def forgetful():
-    programs._program.cache_clear()
+    program_cache._program.cache_clear()
     traced.clear()
 
 
 def run(folder, static=STATIC, arguments=VALUES):
     """What a new process would find."""
-    programs._program.cache_clear()
-    result = programs.run(sums, static, arguments, folder)
+    program_cache._program.cache_clear()
+    result = program_cache.run(sums, static, arguments, folder)
     return float(result.total), np.asarray(result.parts)
 
 

@@ -7,11 +7,11 @@ import pytest
 from lead_cases import lead_tasks
 
 from tuning.gains import multistart as finding
-from tuning.gains.multistart import SCANNED, choose_starts, find, finish
+from tuning.gains.multistart import SCANNED, choose_starts, find_gains, finish
 from tuning.gains.objective import RMS, Objective
 from tuning.gains.rounds import Start, solve_tasks
 from tuning.gains.tasks import spread_points
-from tuning.gains.validation import Trial
+from tuning.gains.validation import Validation
 
 
 @pytest.fixture(scope="module")
@@ -20,32 +20,32 @@ def tasks():
 
 
 @pytest.fixture(scope="module")
-def trial(tasks):
-    return Trial(tasks, 15, 0)
+def validation(tasks):
+    return Validation(tasks, 15, 0)
 
 
-def value(trial, index, start, objective=RMS):
-    return trial.losses(objective, [index], start.shares[None, None])[0, 0]
+def value(validation, index, start, objective=RMS):
+    return validation.losses(objective, [index], start.coordinates[None, None])[0, 0]
 
 
-def test_every_task_is_found_under_its_own_objective(tasks, trial):
+def test_every_task_is_found_under_its_own_objective(tasks, validation):
     """Starts and ends of tasks together are those that each has alone under its objective."""
     several = [Objective(divergence_weight=weight) for weight in (1.0, 4.0, 16.0)]
-    chosen = choose_starts(trial, 3, 0, several)
-    polished = finish(trial, solve_tasks(tasks, chosen, 2, several), 32, 0, several)
+    chosen = choose_starts(validation, 3, 0, several)
+    polished = finish(validation, solve_tasks(tasks, chosen, 2, several), 32, 0, several)
     for i, (objective, end) in enumerate(zip(several, polished, strict=True)):
-        np.testing.assert_array_equal(chosen[i], choose_starts(trial, 3, 0, objective)[i])
+        np.testing.assert_array_equal(chosen[i], choose_starts(validation, 3, 0, objective)[i])
         assert end is not None
-        assert end.rms == pytest.approx(value(trial, i, end, objective), rel=1e-9)
+        assert end.rms == pytest.approx(value(validation, i, end, objective), rel=1e-9)
 
 
-def test_starts_are_the_literature_and_the_best_of_a_scan(tasks, trial):
-    chosen = choose_starts(trial, 4, seed=3)
+def test_starts_are_the_literature_and_the_best_of_a_scan(tasks, validation):
+    chosen = choose_starts(validation, 4, seed=3)
     for index, (task, points) in enumerate(zip(tasks, chosen, strict=True)):
-        assert trial.gains(index, points[0]) == pytest.approx(task.literature)
-        values = trial.losses(RMS, [index], points[None])[0]
+        assert validation.gains(index, points[0]) == pytest.approx(task.literature)
+        values = validation.losses(RMS, [index], points[None])[0]
         looked_at = spread_points(points[0], SCANNED, 3)
-        every = trial.losses(RMS, [index], looked_at[None])[0]
+        every = validation.losses(RMS, [index], looked_at[None])[0]
         # The best lies apart from the literature's gains, as all of them do from each other.
         assert np.min(every) <= values[1] <= np.quantile(every, 0.05)
         assert (values[1:] < np.median(every)).all()
@@ -54,11 +54,11 @@ def test_starts_are_the_literature_and_the_best_of_a_scan(tasks, trial):
         assert (apart >= 0.1 * np.sqrt(points.shape[1]) - 1e-12).all()
 
 
-def test_the_best_start_is_polished(tasks, trial):
+def test_the_best_start_is_polished(tasks, validation):
     """Stopped far too early, none is at its minimum yet; where all starts failed there is none to polish."""
-    early = solve_tasks(tasks, choose_starts(trial, 3, 0), 1)
+    early = solve_tasks(tasks, choose_starts(validation, 3, 0), 1)
     early[1] = [start._replace(rms=np.nan) for start in early[1]]
-    polished = finish(trial, early, 128, seed=0)
+    polished = finish(validation, early, 128, seed=0)
     for index, (own, found) in enumerate(zip(early, polished, strict=True)):
         if index == 1:
             assert found is None
@@ -66,13 +66,13 @@ def test_the_best_start_is_polished(tasks, trial):
         assert found is not None
         best = min(own, key=lambda start: start.rms)
         assert found.rms < best.rms
-        assert found.rms == pytest.approx(value(trial, index, found), rel=1e-12)
-        assert found.gains == trial.gains(index, found.shares)
+        assert found.rms == pytest.approx(value(validation, index, found), rel=1e-12)
+        assert found.gains == validation.gains(index, found.coordinates)
     failed = [[own[0]._replace(rms=np.nan)] for own in early]
-    assert finish(trial, failed, 64, seed=0) == [None] * 3
+    assert finish(validation, failed, 64, seed=0) == [None] * 3
 
 
-def test_lots_follow_until_starts_agree(tasks, trial, monkeypatch):
+def test_lots_follow_until_starts_agree(tasks, validation, monkeypatch):
     """One task's starts never agree, whatever they end at; the others' do at once."""
     asked = []
 
@@ -87,55 +87,55 @@ def test_lots_follow_until_starts_agree(tasks, trial, monkeypatch):
 
     monkeypatch.setattr(finding, "solve_tasks", solve)
     heard = []
-    found = find(trial, 3, 9, 16, 0, report=heard.append)
+    found = find_gains(validation, 3, 9, 16, 0, report=heard.append)
     assert asked == [[3, 3, 3]] + [[0, 3, 0]] * (finding.LOTS - 1)
     assert [len(one.starts) for one in found] == [3, 3 * finding.LOTS, 3]
     assert sum("lot" in text for text in heard) == finding.LOTS - 1
-    points = np.stack([start.shares for start in found[1].starts])
+    points = np.stack([start.coordinates for start in found[1].starts])
     assert len(np.unique(points, axis=0)) == len(points)
     # Steps of 1 + 2 evaluations, the scan at full cost on no more than 32 scenarios, the polish of 2 gains.
     assert found[0].evaluations == SCANNED + 3 * 3 + 32
     assert found[1].evaluations == finding.LOTS * (SCANNED + 3 * 3) + 32
 
 
-def test_a_start_alone_is_the_literature_s_and_polished(tasks, trial):
-    found = find(trial, 1, 2, 32, 0)
+def test_a_start_alone_is_the_literature_s_and_polished(tasks, validation):
+    found = find_gains(validation, 1, 2, 32, 0)
     for index, one in enumerate(found):
         (start,) = one.starts
         assert one.best is not None and one.best.rms <= start.rms
         assert one.evaluations == 3 * start.steps + 64
-        assert one.best.rms == pytest.approx(value(trial, index, one.best), rel=1e-9)
+        assert one.best.rms == pytest.approx(value(validation, index, one.best), rel=1e-9)
 
 
-def test_the_best_is_the_best_by_the_objective_itself(tasks, trial):
+def test_the_best_is_the_best_by_the_objective_itself(tasks, validation):
     """The solver lowers a norm in place of the mean of the worst contacts; what counts is that mean."""
     objective = Objective("cvar")
-    for index, one in enumerate(find(trial, 3, 4, 16, 0, objective)):
+    for index, one in enumerate(find_gains(validation, 3, 4, 16, 0, objective)):
         assert one.best is not None
-        values = [value(trial, index, start, objective) for start in one.starts]
+        values = [value(validation, index, start, objective) for start in one.starts]
         assert [start.rms for start in one.starts] == pytest.approx(values, rel=1e-12)
-        assert one.best.rms == pytest.approx(value(trial, index, one.best, objective), rel=1e-12)
+        assert one.best.rms == pytest.approx(value(validation, index, one.best, objective), rel=1e-12)
         assert one.best.rms <= min(values)
 
 
-def test_a_task_that_fails_leaves_the_others_their_best(tasks, trial):
+def test_a_task_that_fails_leaves_the_others_their_best(tasks, validation):
     broken = tasks[1].scenarios._replace(equivalent_mass=np.full(8, np.nan))
-    sick = Trial([tasks[0], dataclasses.replace(tasks[1], scenarios=broken)], 15, 0)
-    found = find(sick, 3, 6, 16, 0)
-    (alone,) = find(Trial([tasks[0]], 15, 0), 3, 6, 16, 0)
+    sick = Validation([tasks[0], dataclasses.replace(tasks[1], scenarios=broken)], 15, 0)
+    found = find_gains(sick, 3, 6, 16, 0)
+    (alone,) = find_gains(Validation([tasks[0]], 15, 0), 3, 6, 16, 0)
     assert found[0].best is not None and alone.best is not None
     assert found[0].best.rms == pytest.approx(alone.best.rms, rel=1e-6)
 
 
 class Kinked:
-    """A task whose objective has a kink that leads along an edge, in the place of a trial's."""
+    """A task whose objective has a kink that leads along an edge, in the place of a validation's."""
 
     def losses(self, objective, which, points):
         x, y = points[..., 0], points[..., 1]
         return 1 + 20 * np.abs(y - x) + (x - 0.8) ** 2
 
-    def gains(self, task, shares):
-        return {"x": float(shares[0]), "y": float(shares[1])}
+    def gains(self, task, coordinates):
+        return {"x": float(coordinates[0]), "y": float(coordinates[1])}
 
 
 def test_a_start_that_is_stuck_is_searched_on_and_the_others_are_left():
@@ -148,6 +148,6 @@ def test_a_start_that_is_stuck_is_searched_on_and_the_others_are_left():
     freed, evaluations = finding._freed(Kinked(), 0, starts, 0.02, 0, [RMS])  # pyright: ignore[reportArgumentType]
     assert freed[0] is starts[0] and freed[2] is starts[2]
     assert freed[1].rms < 1.02 and freed[1].history == [1.25, freed[1].rms]
-    assert freed[1].gains == {"x": freed[1].shares[0], "y": freed[1].shares[1]}
+    assert freed[1].gains == {"x": freed[1].coordinates[0], "y": freed[1].coordinates[1]}
     assert evaluations == finding.CANDIDATES * finding.FREEING
     assert finding._freed(Kinked(), 0, starts[:1], 0.02, 0, [RMS]) == (starts[:1], 0)  # pyright: ignore[reportArgumentType]

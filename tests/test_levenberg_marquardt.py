@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from tuning.optimisation.levenberg_marquardt import STATUSES, _with_jacobian, solve
-from tuning.optimisation.unit_box import Bounds, to_gains, to_shares
+from tuning.optimisation.unit_box import Bounds, to_coordinates, to_gains
 
 BOUNDS = Bounds(np.array([0.0, 1e-3]), np.array([2.0, 10.0]), np.array([0.0, 1.0]))
 
@@ -22,14 +22,16 @@ def blows_up(static, gains, arguments):
 
 def solved(residuals, targets, starts, steps):
     bounds = Bounds(*(np.tile(leaf, (len(starts), 1)) for leaf in BOUNDS))
-    shares = to_shares(np.array(starts), bounds)
-    return solve(residuals, 10.0, jnp.array(targets), bounds, shares, jnp.array(steps), longest=64, tile=2)
+    coordinates = to_coordinates(np.array(starts), bounds)
+    return solve(
+        residuals, 10.0, jnp.array(targets), bounds, coordinates, jnp.array(steps), longest=64, tile=2
+    )
 
 
 def test_every_problem_finds_its_own_minimum():
     targets = [[0.7, 0.2], [0.7, 0.2], [1.2, 3.0]]
     solution = solved(distance, targets, [[0.1, 0.01], [1.9, 5.0], [1.0, 1.0]], 60)
-    np.testing.assert_allclose(to_gains(np.asarray(solution.shares), BOUNDS), targets, rtol=1e-4)
+    np.testing.assert_allclose(to_gains(np.asarray(solution.coordinates), BOUNDS), targets, rtol=1e-4)
     assert [STATUSES[i] for i in solution.status] == ["converged"] * 3
     history = np.asarray(solution.history)
     assert (np.diff(history, axis=1) <= 0).all()
@@ -39,9 +41,11 @@ def test_every_problem_finds_its_own_minimum():
 def test_equal_bounds_hold_a_gain():
     bounds = Bounds(jnp.array([[0.4, 1e-3]] * 2), jnp.array([[0.4, 10.0]] * 2), jnp.array([[1.0, 1.0]] * 2))
     arguments, starts = jnp.array([[0.7, 0.2]] * 2), jnp.array([[0.4, 1.0], [0.4, 5.0]])
-    shares = to_shares(np.array(starts), bounds)
-    solution = solve(distance, 10.0, arguments, bounds, shares, jnp.array(30))
-    np.testing.assert_allclose(to_gains(np.asarray(solution.shares), bounds), [[0.4, 0.2]] * 2, rtol=1e-4)
+    coordinates = to_coordinates(np.array(starts), bounds)
+    solution = solve(distance, 10.0, arguments, bounds, coordinates, jnp.array(30))
+    np.testing.assert_allclose(
+        to_gains(np.asarray(solution.coordinates), bounds), [[0.4, 0.2]] * 2, rtol=1e-4
+    )
 
 
 def tilted(static, gains, arguments):
@@ -56,7 +60,7 @@ def test_a_minimum_on_the_bounds_is_that_of_bounded_linear_least_squares():
     starts = jnp.array([[0.5, 0.5], [0.0, 0.0], [1.0, 1.0], [1.0, 0.0]])
     solution = solve(tilted, None, jnp.array(targets), bounds, starts, jnp.array(30))
     matrix = np.array([[1.0, 0.9], [0.9, 1.0], [0.1, -0.1]])
-    for target, found, curvature in zip(targets, solution.shares, solution.curvature, strict=True):
+    for target, found, curvature in zip(targets, solution.coordinates, solution.curvature, strict=True):
         best = lsq_linear(matrix, matrix @ target, bounds=(0, 1), tol=1e-12).x
         np.testing.assert_allclose(found, best, atol=2e-5)
         np.testing.assert_allclose(curvature, matrix.T @ matrix)
@@ -68,7 +72,7 @@ def test_a_gain_that_nothing_depends_on_stays():
 
     bounds = Bounds(*(jnp.array([[leaf] * 2]) for leaf in (0.0, 1.0, 0.0)))
     solution = solve(blind, None, jnp.array([[0.7]]), bounds, jnp.array([[0.1, 0.3]]), jnp.array(30))
-    np.testing.assert_allclose(solution.shares, [[0.7, 0.3]], rtol=1e-6)
+    np.testing.assert_allclose(solution.coordinates, [[0.7, 0.3]], rtol=1e-6)
     assert [STATUSES[i] for i in solution.status] == ["converged"]
 
 

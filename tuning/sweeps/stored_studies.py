@@ -21,18 +21,18 @@ from msgspec import Meta
 
 from jaxhil.runtime import digest
 from tuning.files import write_whole, writing
-from tuning.statistics.subset_simulation import Rare
+from tuning.statistics.subset_simulation import SubsetSimulation
 from tuning.sweeps import LARGEST_SEED
 from tuning.sweeps.manifest import LARGEST, Digest, Manifest
 from tuning.sweeps.store import STUDIES, VERDICT, Store
-from tuning.sweeps.studies import REPLICATES, SAMPLES, Driver, Drivers
+from tuning.sweeps.studies import REPLICATES, SAMPLES, ErrorIndices, InputIndices
 
 SCHEMA = "jaxhil/study/1"
 Count = Annotated[int, Meta(ge=0)]
 
 
-class DriverEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`Driver`; None for nan."""
+class InputIndicesEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`InputIndices`; None for nan."""
 
     input: str
     first_order: float | None
@@ -43,17 +43,17 @@ class DriverEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     total_high: float | None
 
 
-class DriversEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`Drivers`."""
+class ErrorIndicesEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`ErrorIndices`."""
 
-    inputs: list[DriverEntry]
+    inputs: list[InputIndicesEntry]
     cap: float
     evaluations: Count
     capped: Count
 
 
-class RareEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`Rare`; None for nan among the thresholds, for an infinite number elsewhere."""
+class SubsetSimulationEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`SubsetSimulation`; None for nan among the thresholds, for an infinite number elsewhere."""
 
     probability: float
     low: float
@@ -78,11 +78,11 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     sha256: Digest
 
 
-class DriversStudy(Study, frozen=True, kw_only=True, tag="drivers"):
-    """`error_drivers`: its argument and what it found."""
+class IndicesStudy(Study, frozen=True, kw_only=True, tag="drivers"):
+    """`error_indices`: its argument and what it found."""
 
     number: Count
-    result: DriversEntry
+    result: ErrorIndicesEntry
 
 
 class RareStudy(Study, frozen=True, kw_only=True, tag="rare"):
@@ -91,10 +91,10 @@ class RareStudy(Study, frozen=True, kw_only=True, tag="rare"):
     limit: float
     samples: Count
     replicates: Count
-    result: RareEntry
+    result: SubsetSimulationEntry
 
 
-Kind = TypeVar("Kind", DriversStudy, RareStudy)
+Kind = TypeVar("Kind", IndicesStudy, RareStudy)
 
 
 def write_verdict(store: Store, text: str) -> None:
@@ -104,21 +104,21 @@ def write_verdict(store: Store, text: str) -> None:
         write_whole(path, text.encode("ascii"))
 
 
-def keep_drivers(store: Store, number: int, found: Drivers) -> None:
-    """Write what `error_drivers` found. Raises `InputError` when it cannot be written."""
-    path = drivers_path(store, number)
+def write_indices(store: Store, number: int, found: ErrorIndices) -> None:
+    """Write what `error_indices` found. Raises `InputError` when it cannot be written."""
+    path = indices_path(store, number)
     with writing(path):
-        _write(path, drivers_study(store.manifest, number, found))
+        _write(path, indices_study(store.manifest, number, found))
 
 
-def kept_drivers(store: Store, number: int) -> Drivers | None:
-    """What `keep_drivers` wrote; None if it is missing, damaged, or not of this sweep."""
-    study = _read(store, drivers_path(store, number), DriversStudy, {"number": number})
-    return None if study is None else drivers_of(study)
+def read_indices(store: Store, number: int) -> ErrorIndices | None:
+    """What `write_indices` wrote; None if it is missing, damaged, or not of this sweep."""
+    study = _read(store, indices_path(store, number), IndicesStudy, {"number": number})
+    return None if study is None else indices_of(study)
 
 
-def keep_rare(
-    store: Store, limit: float, found: Rare, samples: int = SAMPLES, replicates: int = REPLICATES
+def write_rare(
+    store: Store, limit: float, found: SubsetSimulation, samples: int = SAMPLES, replicates: int = REPLICATES
 ) -> None:
     """Write what `rare_failure` found. Raises `InputError` when it cannot be written."""
     path = rare_path(store, limit, samples, replicates)
@@ -126,16 +126,16 @@ def keep_rare(
         _write(path, rare_study(store.manifest, limit, samples, replicates, found))
 
 
-def kept_rare(
+def read_rare(
     store: Store, limit: float, samples: int = SAMPLES, replicates: int = REPLICATES
-) -> Rare | None:
-    """What `keep_rare` wrote; None if it is missing, damaged, or not of this sweep."""
+) -> SubsetSimulation | None:
+    """What `write_rare` wrote; None if it is missing, damaged, or not of this sweep."""
     asked = {"limit": limit, "samples": samples, "replicates": replicates}
     study = _read(store, rare_path(store, limit, samples, replicates), RareStudy, asked)
     return None if study is None else rare_of(study)
 
 
-def drivers_path(store: Store, number: int) -> Path:
+def indices_path(store: Store, number: int) -> Path:
     """Where the drivers of so many scenarios per input are kept."""
     return store.folder / STUDIES / f"drivers-{number}.json"
 
@@ -145,23 +145,27 @@ def rare_path(store: Store, limit: float, samples: int = SAMPLES, replicates: in
     return store.folder / STUDIES / f"rare-{float(limit)!r}-{replicates}x{samples}.json"
 
 
-def drivers_study(manifest: Manifest, number: int, found: Drivers) -> DriversStudy:
+def indices_study(manifest: Manifest, number: int, found: ErrorIndices) -> IndicesStudy:
     """The content of the file, signed. Raises ValueError for what JSON cannot express."""
-    inputs = [DriverEntry(name, *(None if x != x else x for x in shares)) for name, *shares in found.inputs]
-    return _signed(DriversStudy, manifest, {"number": number}, DriversEntry(inputs, *found[1:]))
+    inputs = [
+        InputIndicesEntry(name, *(None if x != x else x for x in shares)) for name, *shares in found.inputs
+    ]
+    return _signed(IndicesStudy, manifest, {"number": number}, ErrorIndicesEntry(inputs, *found[1:]))
 
 
-def drivers_of(study: DriversStudy) -> Drivers:
-    """The result that `drivers_study` got."""
+def indices_of(study: IndicesStudy) -> ErrorIndices:
+    """The result that `indices_study` got."""
     result = study.result
     rows = [msgspec.structs.astuple(one) for one in result.inputs]
-    inputs = [Driver(name, *(math.nan if x is None else x for x in shares)) for name, *shares in rows]
-    return Drivers(tuple(inputs), result.cap, result.evaluations, result.capped)
+    inputs = [InputIndices(name, *(math.nan if x is None else x for x in shares)) for name, *shares in rows]
+    return ErrorIndices(tuple(inputs), result.cap, result.evaluations, result.capped)
 
 
-def rare_study(manifest: Manifest, limit: float, samples: int, replicates: int, found: Rare) -> RareStudy:
+def rare_study(
+    manifest: Manifest, limit: float, samples: int, replicates: int, found: SubsetSimulation
+) -> RareStudy:
     """The content of the file, signed. Raises ValueError for what JSON cannot express."""
-    result = RareEntry(
+    result = SubsetSimulationEntry(
         found.probability,
         found.low,
         found.high,
@@ -178,11 +182,11 @@ def rare_study(manifest: Manifest, limit: float, samples: int, replicates: int, 
     return _signed(RareStudy, manifest, asked, result)
 
 
-def rare_of(study: RareStudy) -> Rare | None:
+def rare_of(study: RareStudy) -> SubsetSimulation | None:
     """The result that `rare_study` got; None if its arrays have not the shapes that belong together."""
     result = study.result
     try:
-        found = Rare(
+        found = SubsetSimulation(
             result.probability,
             result.low,
             result.high,

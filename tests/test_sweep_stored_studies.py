@@ -14,30 +14,30 @@ from sweep_cases import case, manifest
 
 from jaxhil.errors import InputError
 from jaxhil.runtime import digest
-from tuning.statistics.subset_simulation import Rare
+from tuning.statistics.subset_simulation import SubsetSimulation
 from tuning.sweeps.chunks import build_sweep
-from tuning.sweeps.kept import (
-    DriversStudy,
+from tuning.sweeps.store import Store, open_store
+from tuning.sweeps.stored_studies import (
+    IndicesStudy,
     RareStudy,
     decode,
-    drivers_of,
-    drivers_path,
-    drivers_study,
     encode,
-    keep_drivers,
-    keep_rare,
-    kept_drivers,
-    kept_rare,
+    indices_of,
+    indices_path,
+    indices_study,
     rare_of,
     rare_path,
     rare_study,
+    read_indices,
+    read_rare,
+    write_indices,
+    write_rare,
     write_verdict,
 )
-from tuning.sweeps.store import Store, open_store
-from tuning.sweeps.studies import Driver, Drivers, error_drivers, rare_failure
+from tuning.sweeps.studies import ErrorIndices, InputIndices, error_indices, rare_failure
 
 MANIFEST = manifest(limit=1.5)
-KINDS = (DriversStudy, RareStudy)
+KINDS = (IndicesStudy, RareStudy)
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 COUNTS = st.integers(0, 2**40)
 
@@ -53,8 +53,8 @@ def same(one, other):
 
 def drivers():
     numbers = [NUMBERS | st.just(math.nan)] * 6
-    inputs = st.lists(st.builds(Driver, st.text(st.characters(codec="utf-8")), *numbers), max_size=3)
-    return st.builds(Drivers, inputs.map(tuple), NUMBERS, COUNTS, COUNTS)
+    inputs = st.lists(st.builds(InputIndices, st.text(st.characters(codec="utf-8")), *numbers), max_size=3)
+    return st.builds(ErrorIndices, inputs.map(tuple), NUMBERS, COUNTS, COUNTS)
 
 
 def arrays(shape, numbers=NUMBERS):
@@ -66,7 +66,7 @@ def arrays(shape, numbers=NUMBERS):
 
 REPLICATES, ENDLESS = 3, NUMBERS | st.just(math.inf)
 RARE = st.builds(
-    Rare,
+    SubsetSimulation,
     *[NUMBERS] * 3,
     *[ENDLESS] * 2,
     arrays((REPLICATES,)),
@@ -76,13 +76,13 @@ RARE = st.builds(
     arrays((4, 5)),
     arrays((4,), ENDLESS),
 )
-A_DRIVER = Driver("contact.stiffness", 0.25, -0.125, 0.5, math.nan, 0.0, 1.0)
-SOME_DRIVERS = Drivers((A_DRIVER,), 15.0, 768, 3)
-SOME_RARE = Rare(
+A_DRIVER = InputIndices("contact.stiffness", 0.25, -0.125, 0.5, math.nan, 0.0, 1.0)
+SOME_DRIVERS = ErrorIndices((A_DRIVER,), 15.0, 768, 3)
+SOME_RARE = SubsetSimulation(
     1e-5, 0.0, 2e-5, math.inf, 0.25, np.array([0.0, 2e-5]), np.array([math.inf, 0.25]),
     np.array([[0.5, 0.25], [math.nan, 1.5]]), 4000, np.ones((2, 3)), np.array([math.inf, 2.0]),
 )  # fmt: skip
-STUDIES = (drivers_study(MANIFEST, 128, SOME_DRIVERS), rare_study(MANIFEST, 1.5, 1000, 2, SOME_RARE))
+STUDIES = (indices_study(MANIFEST, 128, SOME_DRIVERS), rare_study(MANIFEST, 1.5, 1000, 2, SOME_RARE))
 
 
 @pytest.fixture
@@ -101,8 +101,8 @@ def unwritten(*words):
 
 @given(drivers())
 def test_drivers_are_read_as_they_were_written(found):
-    study = decode(encode(drivers_study(MANIFEST, 128, found)), DriversStudy)
-    assert study is not None and same(drivers_of(study), found)
+    study = decode(encode(indices_study(MANIFEST, 128, found)), IndicesStudy)
+    assert study is not None and same(indices_of(study), found)
 
 
 @given(RARE)
@@ -142,32 +142,32 @@ def test_what_is_signed_is_read_as_it_says_or_not_at_all(study, data):
     if found is not None:
         assert msgspec.to_builtins(found) == document
         # Arrays that do not fit together are no result, and no crash.
-        result = drivers_of(found) if isinstance(found, DriversStudy) else rare_of(found)
+        result = indices_of(found) if isinstance(found, IndicesStudy) else rare_of(found)
         assert result is None or len(result) == len(msgspec.to_builtins(found.result))
 
 
 def test_what_json_cannot_express_is_not_written(store):
     # Where no nan can be, there is no sign for it.
     with unwritten("drivers-2.json: ", "JSON"):
-        keep_drivers(store, 2, SOME_DRIVERS._replace(cap=math.nan))
+        write_indices(store, 2, SOME_DRIVERS._replace(cap=math.nan))
     with unwritten("rare-1.5-10x1000.json: ", "JSON"):
-        keep_rare(store, 1.5, SOME_RARE._replace(coefficient_of_variation=math.nan))
+        write_rare(store, 1.5, SOME_RARE._replace(coefficient_of_variation=math.nan))
     assert not (store.folder / "studies").exists()
 
 
 def test_what_is_kept_is_what_would_be_found_again(store, sweep):
-    first, again = (error_drivers(sweep, 8) for _ in range(2))
-    keep_drivers(store, 8, first)
-    assert same(kept_drivers(store, 8), again)
-    content = drivers_path(store, 8).read_bytes()
-    keep_drivers(store, 8, again)
-    assert drivers_path(store, 8).read_bytes() == content
+    first, again = (error_indices(sweep, 8) for _ in range(2))
+    write_indices(store, 8, first)
+    assert same(read_indices(store, 8), again)
+    content = indices_path(store, 8).read_bytes()
+    write_indices(store, 8, again)
+    assert indices_path(store, 8).read_bytes() == content
 
     first, again = (rare_failure(sweep, 2.0, samples=20, replicates=2) for _ in range(2))
-    keep_rare(store, 2.0, first, 20, 2)
-    assert same(kept_rare(store, 2.0, 20, 2), again)
+    write_rare(store, 2.0, first, 20, 2)
+    assert same(read_rare(store, 2.0, 20, 2), again)
     content = rare_path(store, 2.0, 20, 2).read_bytes()
-    keep_rare(store, 2.0, again, 20, 2)
+    write_rare(store, 2.0, again, 20, 2)
     assert rare_path(store, 2.0, 20, 2).read_bytes() == content
 
 
@@ -176,35 +176,35 @@ def test_where_nothing_varies_and_nothing_fails(tmp_path):
     store = open_store(tmp_path / "store", still.manifest, resume=False)
     nothing = rare_failure(still, 1e9, samples=20, replicates=2)
     assert nothing.probability == 0 and nothing.coefficient_of_variation == math.inf
-    keep_rare(store, 1e9, nothing, 20, 2)
-    assert same(kept_rare(store, 1e9, 20, 2), nothing)
-    constant = Drivers((Driver("approach.phase", *[math.nan, 0.0, 1.0] * 2),), 15.0, 6, 0)
-    keep_drivers(store, 2, constant)
-    assert same(kept_drivers(store, 2), constant)
+    write_rare(store, 1e9, nothing, 20, 2)
+    assert same(read_rare(store, 1e9, 20, 2), nothing)
+    constant = ErrorIndices((InputIndices("approach.phase", *[math.nan, 0.0, 1.0] * 2),), 15.0, 6, 0)
+    write_indices(store, 2, constant)
+    assert same(read_indices(store, 2), constant)
 
 
 def test_only_a_study_of_the_same_arguments_and_sweep_is_taken(store):
-    keep_drivers(store, 128, SOME_DRIVERS)
-    keep_rare(store, 1.5, SOME_RARE, replicates=2)
-    assert kept_drivers(store, 128) is not None and kept_rare(store, 1.5, replicates=2) is not None
-    assert kept_drivers(store, 64) is None
-    assert kept_rare(store, 1.6, replicates=2) is None
-    assert kept_rare(store, 1.5, samples=500, replicates=2) is None and kept_rare(store, 1.5) is None
+    write_indices(store, 128, SOME_DRIVERS)
+    write_rare(store, 1.5, SOME_RARE, replicates=2)
+    assert read_indices(store, 128) is not None and read_rare(store, 1.5, replicates=2) is not None
+    assert read_indices(store, 64) is None
+    assert read_rare(store, 1.6, replicates=2) is None
+    assert read_rare(store, 1.5, samples=500, replicates=2) is None and read_rare(store, 1.5) is None
     # Nor one that another file's name was given to.
-    os.replace(drivers_path(store, 128), drivers_path(store, 64))
+    os.replace(indices_path(store, 128), indices_path(store, 64))
     os.replace(rare_path(store, 1.5, 1000, 2), rare_path(store, 1.6, 1000, 2))
-    assert kept_drivers(store, 64) is None and kept_rare(store, 1.6, replicates=2) is None
+    assert read_indices(store, 64) is None and read_rare(store, 1.6, replicates=2) is None
 
 
 @pytest.mark.parametrize("other", [manifest(limit=1.5, seed=1), manifest(limit=1.6)])
 def test_a_study_of_another_sweep_is_not_taken(store, other):
-    keep_drivers(Store(store.folder, other), 128, SOME_DRIVERS)
-    keep_rare(Store(store.folder, other), 1.5, SOME_RARE, replicates=2)
-    assert kept_drivers(store, 128) is None and kept_rare(store, 1.5, replicates=2) is None
+    write_indices(Store(store.folder, other), 128, SOME_DRIVERS)
+    write_rare(Store(store.folder, other), 1.5, SOME_RARE, replicates=2)
+    assert read_indices(store, 128) is None and read_rare(store, 1.5, replicates=2) is None
 
 
 def test_a_study_says_what_it_is_of(store):
-    keep_rare(store, 1.5, SOME_RARE, replicates=2)
+    write_rare(store, 1.5, SOME_RARE, replicates=2)
     found = json.loads(rare_path(store, 1.5, 1000, 2).read_bytes())
     del found["result"]
     assert found.pop("sha256") != MANIFEST.sha256
@@ -216,37 +216,37 @@ def test_a_study_says_what_it_is_of(store):
 
 @pytest.mark.parametrize("harm", ["cut", "empty", "folder", "large"])
 def test_a_damaged_study_is_none(store, harm):
-    keep_drivers(store, 128, SOME_DRIVERS)
-    path = drivers_path(store, 128)
+    write_indices(store, 128, SOME_DRIVERS)
+    path = indices_path(store, 128)
     content = path.read_bytes()
     path.unlink()
     if harm == "folder":
         path.mkdir()
     else:
         path.write_bytes({"cut": content[:-3], "empty": b"", "large": content + b" " * 2**23}[harm])
-    assert kept_drivers(store, 128) is None
+    assert read_indices(store, 128) is None
     if harm != "folder":
-        keep_drivers(store, 128, SOME_DRIVERS)
+        write_indices(store, 128, SOME_DRIVERS)
         assert path.read_bytes() == content
     else:
         with unwritten("drivers-128.json: ", "directory"):
-            keep_drivers(store, 128, SOME_DRIVERS)
+            write_indices(store, 128, SOME_DRIVERS)
 
 
 def test_a_full_disk_is_one_line_and_keeps_what_is_there(store):
-    keep_drivers(store, 128, SOME_DRIVERS)
+    write_indices(store, 128, SOME_DRIVERS)
     write_verdict(store, '{"verdict": "good"}\n')
-    before = drivers_path(store, 128).read_bytes()
+    before = indices_path(store, 128).read_bytes()
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
     try:
         with unwritten("drivers-128.json: ", ""):
-            keep_drivers(store, 128, SOME_DRIVERS._replace(capped=4))
+            write_indices(store, 128, SOME_DRIVERS._replace(capped=4))
         with unwritten("verdict.json: ", ""):
             write_verdict(store, '{"verdict": "bad"}\n')
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert drivers_path(store, 128).read_bytes() == before
+    assert indices_path(store, 128).read_bytes() == before
     assert (store.folder / "verdict.json").read_text() == '{"verdict": "good"}\n'
     assert {path.name for path in store.folder.rglob("*.tmp")} == set()
 
@@ -255,4 +255,4 @@ def test_a_full_disk_is_one_line_and_keeps_what_is_there(store):
 def test_a_read_only_folder_is_one_line(store):
     (store.folder / "studies").mkdir(mode=0o500)
     with unwritten("drivers-128.json: ", "Permission denied"):
-        keep_drivers(store, 128, SOME_DRIVERS)
+        write_indices(store, 128, SOME_DRIVERS)

@@ -11,7 +11,7 @@ from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import compare_with_reference, evaluate
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.batches import join
-from tuning.gains.common_program import forms
+from tuning.gains.common_program import common_programs
 
 SPREAD = {"contact.stiffness": {"distribution": "uniform", "factor": [0.5, 2.0]}}
 CONTACTS = {
@@ -46,7 +46,7 @@ GAINS, LANES = {"phase_lead": 0.005, "lead_filter": 0.001}, 4
 
 
 def test_one_form_has_every_contact_law():
-    groups = forms(list(MEMBERS.values()))
+    groups = common_programs(list(MEMBERS.values()))
     assert [len(group) for group, _ in groups] == [len(MEMBERS)]
     assert set(groups[0][1].laws) == set(LAWS)
 
@@ -59,17 +59,17 @@ def test_two_surfaces_and_other_orders_stay_apart():
         mechanism({}, SECOND_ORDER, command_hold="zoh"),
         mechanism(CONTACTS["hardening"], contacts=2),
     ]
-    groups = [group for group, _ in forms([validated(raw) for raw in others])]
+    groups = [group for group, _ in common_programs([validated(raw) for raw in others])]
     assert groups == [[0], [1], [2], [3], [4]]
 
 
 def test_the_same_as_alone():
     some = [MEMBERS[name] for name in ALONE]
-    [(_, form)] = forms(some)
+    [(_, common)] = common_programs(some)
     scenarios = [build_scenarios(one, draw(one, LANES, 1), 1) for one in some]
-    in_form = [form.scenarios(one, batch) for one, batch in zip(some, scenarios, strict=True)]
+    in_form = [common.scenarios(one, batch) for one, batch in zip(some, scenarios, strict=True)]
     joined = join(in_form)
-    together = evaluate(form.loop(build_loop(MEMBERS["noisy"], "phase_lead", joined)), GAINS, joined)
+    together = evaluate(common.loop(build_loop(MEMBERS["noisy"], "phase_lead", joined)), GAINS, joined)
     for place, (name, one, batch) in enumerate(zip(ALONE, some, scenarios, strict=True)):
         loop = build_loop(one, "phase_lead", batch)
         batch = jax.tree.map(jnp.asarray, batch)

@@ -38,8 +38,8 @@ def found(case, number, seed):
 def test_indices_are_those_in_closed_form(case):
     _, first_order, total = CASES[case]
     indices = found(case, 4096, seed=0)
-    np.testing.assert_allclose(indices.first_order.estimate, first_order, rtol=0, atol=3e-3)
-    np.testing.assert_allclose(indices.total.estimate, total, rtol=0, atol=3e-3)
+    np.testing.assert_allclose(indices.first_order.value, first_order, rtol=0, atol=3e-3)
+    np.testing.assert_allclose(indices.total.value, total, rtol=0, atol=3e-3)
     for interval, truth in ((indices.first_order, first_order), (indices.total, total)):
         assert np.all((interval.low <= truth) & (truth <= interval.high)) and np.all(interval.width < 0.1)
 
@@ -49,8 +49,8 @@ def test_the_estimates_are_those_of_scipy():
     a, b, mixed = values[None, :512], values[None, 512:1024], values[1024:].reshape(3, 1, 512)
     expected = stats.sobol_indices(func={"f_A": a, "f_B": b, "f_AB": mixed}, n=512)
     indices = sobol_indices(values, 3, 512)
-    np.testing.assert_allclose(indices.first_order.estimate, expected.first_order, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(indices.total.estimate, expected.total_order, rtol=1e-9)
+    np.testing.assert_allclose(indices.first_order.value, expected.first_order, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(indices.total.value, expected.total_order, rtol=1e-9)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -78,8 +78,8 @@ def test_an_input_may_have_several_columns():
     weights = np.array([2.0, 1.0, 1.0, 1.0, 0.5])
     variances = np.array([4.0, 3.0, 0.25])
     indices = sobol_indices(points @ weights, columns, 2048)
-    np.testing.assert_allclose(indices.total.estimate, variances / np.sum(variances), atol=3e-3)
-    np.testing.assert_allclose(indices.first_order.estimate, variances / np.sum(variances), atol=3e-3)
+    np.testing.assert_allclose(indices.total.value, variances / np.sum(variances), atol=3e-3)
+    np.testing.assert_allclose(indices.first_order.value, variances / np.sum(variances), atol=3e-3)
 
 
 def test_the_design_is_two_sets_and_their_mixtures():
@@ -103,7 +103,7 @@ def test_results_are_cut_where_asked():
     cut = sobol_indices(np.minimum(values, 3.5), 2, 256)
     blown = np.where(values > 3.7, np.nan, np.where(values > 3.6, np.inf, values))
     np.testing.assert_array_equal(sobol_indices(blown, 2, 256, cap=3.5).total, cut.total)
-    assert not np.array_equal(sobol_indices(values, 2, 256).total.estimate, cut.total.estimate)
+    assert not np.array_equal(sobol_indices(values, 2, 256).total.value, cut.total.value)
 
 
 def test_the_scale_does_not_matter():
@@ -119,7 +119,7 @@ def test_where_nothing_varies_nothing_is_known():
     for constant in (0.0, 7.3):
         indices = sobol_indices(np.full(5 * 16, constant), 3, 16)
         for interval in indices:
-            assert np.all(np.isnan(interval.estimate))
+            assert np.all(np.isnan(interval.value))
             assert np.all(interval.low == 0) and np.all(interval.high == 1)
 
 

@@ -7,7 +7,7 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 
 from tuning.statistics.intervals import (
-    IntervalEstimate,
+    Estimate,
     Running,
     binomial_interval,
     confidence_sequence,
@@ -31,7 +31,7 @@ def test_the_exact_interval_is_that_of_scipy():
         expected = stats.binomtest(failures, number).proportion_ci(0.95, method="exact")
         found = binomial_interval(failures, number)
         np.testing.assert_allclose([found.low, found.high], expected, rtol=1e-10)
-        assert found.estimate == failures / number
+        assert found.value == failures / number
     both = binomial_interval([0, 3], [10, 40], level=0.9)
     assert both.low.shape == (2,) and both.low[0] == 0.0
     assert both.high[1] == pytest.approx(stats.beta.ppf(0.95, 4, 37), rel=1e-12)
@@ -40,7 +40,7 @@ def test_the_exact_interval_is_that_of_scipy():
 @pytest.mark.parametrize("interval", (binomial_interval, confidence_sequence))
 def test_without_scenarios_nothing_is_known(interval):
     none = interval(0, 0)
-    assert np.isnan(none.estimate) and none.low == 0.0 and none.high == 1.0
+    assert np.isnan(none.value) and none.low == 0.0 and none.high == 1.0
 
 
 @pytest.mark.parametrize("number", (20, 200, 2000))
@@ -112,7 +112,7 @@ def walks(probability, repeats=1000, looks=150, step=25):
 def of_each(interval, failures, number):
     """The interval of many looks, computed once for looks that saw the same."""
     pairs, which = np.unique(np.stack([failures.ravel(), number.ravel()]), axis=1, return_inverse=True)
-    return IntervalEstimate(*(part[which].reshape(failures.shape) for part in interval(*pairs)))
+    return Estimate(*(part[which].reshape(failures.shape) for part in interval(*pairs)))
 
 
 def ever_outside(interval, probability):
@@ -143,7 +143,7 @@ def test_stopping_at_a_width_covers(probability, width, capsys):
     narrow = (high - low <= width) & (low <= high)
     assert np.all(np.any(narrow, axis=1))
     stop = np.arange(1000), np.argmax(narrow, axis=1)
-    stopped = IntervalEstimate(failures[stop] / number[stop], low[stop], high[stop])
+    stopped = Estimate(failures[stop] / number[stop], low[stop], high[stop])
     coverage, mean, needed = covered(stopped, probability), np.mean(stopped.width), np.mean(number[stop])
     with capsys.disabled():
         print(
@@ -256,7 +256,7 @@ def test_replicates_of_perfect_evenness_cover(part):
 
 def test_replicates_that_all_agree():
     none, every = replicate_interval(np.zeros(16), 1000), replicate_interval(np.full(16, 1000), 1000)
-    assert none.estimate == none.low == 0.0 and every.estimate == every.high == 1.0
+    assert none.value == none.low == 0.0 and every.value == every.high == 1.0
     # The largest p of which Cantelli's inequality lets none of 16 replicates show a failure.
     assert (1 + 1000 * none.high / (1 - none.high)) ** -16 == pytest.approx(0.025, rel=1e-9)
     assert none.high == pytest.approx(1 - every.low, rel=1e-12)
