@@ -3,14 +3,13 @@
 import json
 import os
 import shutil
-from types import SimpleNamespace
 
 import pytest
 from bundles import document, run_selftest, signed, small_files
 
 from jaxhil.compensators import COMPENSATORS
+from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
 from jaxhil.runtime.faults import FAULTS
-from tuning.bundle import bundle, vectors
 from tuning.bundle.bundle import build_bundle, check_target, with_limits, write_bundle
 from tuning.bundle.writers import WRITERS
 from tuning.files import TEMPORARY
@@ -31,13 +30,6 @@ def gains(tmp_path):
     return path
 
 
-@pytest.fixture
-def quick(monkeypatch):
-    """Few vectors, and no limits worked out."""
-    monkeypatch.setattr(vectors, "HOSTILE_RUNS", 4)
-    monkeypatch.setattr("tuning.cli.commands.export._calibrated", lambda *given: (None, None))
-
-
 def refused(ran, *words):
     assert ran.code == 2 and ran.out == ""
     last = ran.err.splitlines()[-1]
@@ -55,7 +47,7 @@ def files_of(folder):
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_bundle_is_exported_and_verified(jaxhil, gains, tmp_path, quick):
+def test_a_bundle_is_exported_and_verified(jaxhil, gains, tmp_path):
     folder = tmp_path / "new" / "bundle"
     ran = jaxhil("export", gains, "-o", folder, "--format", "csv,ros2", "--json")
     assert ran.code == 0, ran
@@ -66,7 +58,8 @@ def test_a_bundle_is_exported_and_verified(jaxhil, gains, tmp_path, quick):
         == {*said["files"]}
         == ALWAYS | {"ros2.yaml", "gains.csv"} | ({"udp_controller.py"} & {*said["files"]})
     )
-    assert load_gain_file(folder / "gains.json").document == load_gain_file(gains).document
+    written, given = (load_gain_file(path).document for path in (folder / "gains.json", gains))
+    assert {name for name in written if written[name] != given.get(name)} == {"limits", "figures", "sha256"}
     assert os.listdir(tmp_path / "new") == ["bundle"]
     ran = jaxhil("verify", folder, "--scenarios", "4")
     assert ran.code == 0 and "Good: commands agree" in ran.out and "\nPASSED\n" in ran.out
@@ -77,15 +70,14 @@ def test_a_bundle_is_exported_and_verified(jaxhil, gains, tmp_path, quick):
 
 
 @pytest.mark.parametrize("compensator", COMPENSATORS)
-def test_every_compensator_that_can_be_tuned_can_be_exported(compensator, tmp_path, quick):
+def test_every_compensator_that_can_be_tuned_can_be_exported(compensator, tmp_path):
     made = build_bundle(document(compensator=compensator), list(WRITERS))
     write_bundle(tmp_path / "bundle", made.files)
     good, output = run_selftest(tmp_path / "bundle", *(["--c"] if shutil.which("cc") else []))
     assert good and made.ticks > 300 and not made.reasons, output
 
 
-def test_equal_gains_and_seed_make_equal_bundles(monkeypatch):
-    monkeypatch.setattr(vectors, "HOSTILE_RUNS", 4)
+def test_equal_gains_and_seed_make_equal_bundles():
     made = document()
     first, second = (build_bundle(made, ["matlab", "csv"], {"force_limit": 900.0}).files for _ in range(2))
     assert first == second
@@ -104,17 +96,20 @@ def test_limits_are_signed_and_rates_kept():
     assert with_limits(made, None) == made
 
 
-def test_what_differs_from_the_simulation_is_not_written(jaxhil, gains, tmp_path, quick, monkeypatch):
-    monkeypatch.setattr(vectors, "REPLAY_LIMIT", -1.0)
+def test_what_differs_from_the_simulation_is_not_written(jaxhil, gains, tmp_path, monkeypatch):
+    class Wrong(ON_THE_RIG["phase_lead"]):
+        def step(self, *readings):
+            return (1 + 1e-8) * super().step(*readings)
+
+    Wrong.__module__ = ON_THE_RIG["phase_lead"].__module__
+    monkeypatch.setitem(ON_THE_RIG, "phase_lead", Wrong)
     ran = jaxhil("export", gains, "-o", tmp_path / "bundle")
     assert ran.code == 1 and "Bad: the nominal run, tick " in ran.out and "wrote" not in ran.out
     assert not (tmp_path / "bundle").exists()
 
 
-def test_limits_that_stop_the_nominal_run_are_reported(jaxhil, gains, tmp_path, quick, monkeypatch):
-    limits = {"force_limit": 1.0}
-    monkeypatch.setattr("tuning.cli.commands.export._calibrated", lambda *given: (limits, {}))
-    ran = jaxhil("export", gains, "-o", tmp_path / "bundle")
+def test_limits_that_stop_the_nominal_run_are_reported(jaxhil, gains, tmp_path):
+    ran = jaxhil("export", gains, "-o", tmp_path / "bundle", "--set", "force_limit=1")
     assert (
         ran.code == 1
         and "Bad: the nominal run, tick " in ran.out
@@ -123,41 +118,22 @@ def test_limits_that_stop_the_nominal_run_are_reported(jaxhil, gains, tmp_path, 
     assert (tmp_path / "bundle" / "manifest.json").exists()
 
 
-def test_limits_come_from_the_sweep_that_is_named(jaxhil, gains, tmp_path, monkeypatch):
-    store = SimpleNamespace(manifest=SimpleNamespace(scenarios=8))
-    asked = []
-
-    def calibrate(loaded, given, replaced, progress):
-        asked.append((loaded.compensator, given, replaced))
-        progress(8)
-        return SimpleNamespace(limits={"force_limit": 900.0, "velocity_limit": None}, rates=RATES)
-
-    monkeypatch.setattr("tuning.sweeps.store.read_store", lambda folder: store)
-    monkeypatch.setattr("tuning.watchdog.calibration.calibrate", calibrate)
-    monkeypatch.setattr(vectors, "HOSTILE_RUNS", 4)
-    ran = jaxhil(
-        "export",
-        gains,
-        "-o",
-        tmp_path / "bundle",
-        "--sweep",
-        "store",
-        "--format",
-        "csv",
-        "--set",
-        "command_lowest=-0.05",
-        "--set",
-        "force_range=none",
-    )
-    replaced = {"command_lowest": -0.05, "force_range": None}
-    assert ran.code == 0 and asked == [("phase_lead", store, replaced)], ran
-    assert "false alarms 1 of 50 good runs (95 %: 0.0005 to 0.1)" in ran.out and "force_limit" in ran.out
-    written = load_gain_file(tmp_path / "bundle" / "gains.json").document
-    assert written["limits"]["force_limit"] == {"value": 900.0, "unit": "N"}
-    assert written["figures"]["watchdog"] == RATES
-
-
-RATES = {"limit": 0.01, "false_alarms": {"runs": 50, "alarms": 1, "rate": 0.02, "low": 0.0005, "high": 0.1}}
+def test_limits_come_from_the_sweep_that_is_named(jaxhil, gains, tmp_path):
+    store, folder = tmp_path / "store", tmp_path / "bundle"
+    assert jaxhil("sweep", gains, "--scenarios", "40", "--limit", "5", "-o", store).code == 0
+    replaced = ["--set", "command_lowest=-0.05", "--set", "force_range=none"]
+    ran = jaxhil("export", gains, "-o", folder, "--sweep", store, "--format", "csv", *replaced)
+    assert ran.code == 0, ran
+    written = load_gain_file(folder / "gains.json").document
+    rates = written["figures"]["watchdog"]
+    assert rates["limit"] == 5.0
+    assert rates["calibrated_on"]["scenarios"] == 40 and rates["calibrated_on"]["sweep_sha256"]
+    alarms, runs = (rates["false_alarms"][name] for name in ("alarms", "runs"))
+    assert 0 < runs < 40 and f"false alarms {alarms} of {runs} good runs (95 %: " in ran.out
+    limits = written["limits"]
+    assert limits["command_lowest"] == {"value": -0.05, "unit": "m"}
+    assert limits["force_range"] == {"value": None, "unit": "N"}
+    assert limits["force_limit"]["value"] > 0 and "force_limit" in ran.out
 
 
 @pytest.mark.parametrize(
@@ -214,13 +190,22 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch, before)
         if len(calls) == 3:
             raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(bundle.os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(ValueError, match="bundle: cannot be written: No space left"):
         write_bundle(folder, small_files())
     assert {name: (folder / name).read_bytes() for name in files_of(folder)} == there
     assert [name for name in os.listdir(tmp_path) if name.endswith(TEMPORARY)] == []
     monkeypatch.undo()
-    monkeypatch.setattr(bundle, "_put", lambda *places: (_ for _ in ()).throw(KeyboardInterrupt))
+    move, moved = os.replace, []
+
+    def interrupted(source, target):
+        """What was there has been put aside."""
+        moved.append(target)
+        if len(moved) == 1 + before:
+            raise KeyboardInterrupt
+        move(source, target)
+
+    monkeypatch.setattr(os, "replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_bundle(folder, small_files())
     assert {name: (folder / name).read_bytes() for name in files_of(folder)} == there
