@@ -298,6 +298,7 @@ def test_what_cannot_be_is_refused(jaxhil, gains, store, tmp_path):
     refused(jaxhil("sweep", tmp_path / "none.json", *new), "none.json")
     refused(jaxhil("sweep", gains, *TINY, "-o", store), "--resume")
     refused(jaxhil("sweep", gains, *TINY, "-o", store, "--resume"), "limit: found 1.5, asked for 0.01")
+    (tmp_path / "file").touch()
     refused(jaxhil("sweep", gains, *TINY, "-o", tmp_path / "file" / "store"), "cannot be written")
     refused(jaxhil("replay", store, 100), "found 100, allowed 0 to 99")
     refused(jaxhil("replay", tmp_path, 0), "manifest.json")

@@ -1,6 +1,7 @@
 """Sweeps that are interrupted, resumed, spread over workers: the store is the same, row for row."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,8 +19,8 @@ from tuning.gain_file import write_gain_file
 from tuning.statistics.intervals import Running, enough, updated
 from tuning.sweeps.chunks import run_chunk
 from tuning.sweeps.replay import motion_of, replay
-from tuning.sweeps.run import compare_precisions, describe_outcomes, run_sweep
-from tuning.sweeps.store import open_store, read_part, read_store, same_rows
+from tuning.sweeps.run import compare_precisions, describe_outcomes, on_cluster, run_sweep
+from tuning.sweeps.store import open_store, read_part, read_store, same_rows, write_part
 
 pytestmark = pytest.mark.users_options
 
@@ -127,12 +128,14 @@ def test_any_row_replays_to_the_bit(whole):
         np.testing.assert_array_equal(found.again["error_1"], rows["error_1"][index])
 
 
-def test_a_row_that_was_changed_is_found_out(whole, monkeypatch):
-    store, rows, _, _ = whole
-    changed = {name: values[5:6].copy() for name, values in rows.items()}
-    changed["peak_force_1"] = np.nextafter(changed["peak_force_1"], np.inf)
-    monkeypatch.setattr("tuning.sweeps.replay.read_row", lambda *_: changed)
+def test_a_row_that_was_changed_is_found_out(whole, tmp_path):
+    store = read_store(shutil.copytree(whole[0].folder, tmp_path / "store"))
+    changed = dict(read_part(store, 0))
+    changed["peak_force_1"] = changed["peak_force_1"].copy()
+    changed["peak_force_1"][5] = np.nextafter(changed["peak_force_1"][5], np.inf)
+    write_part(store, 0, changed)
     assert replay(store, 5).different == ["peak_force_1"]
+    assert replay(store, 6).different == []
 
 
 def test_the_motion_is_that_of_the_scenario(whole):
@@ -196,16 +199,14 @@ def test_a_sweep_that_stopped_stays_where_it_is(stopped):
         Log().sweep(store.folder, label=manifest(case(), scenarios=300, limit=1.5, until_width=0.1))
 
 
-def test_parts_in_any_order_stop_it_at_the_same_look(whole, stopped, tmp_path, monkeypatch):
-    _, _, sweep, _ = whole
+def test_parts_in_any_order_stop_it_at_the_same_look(stopped, tmp_path):
     _, parts, tally = stopped
 
-    def shuffled(label, missing, address):
+    def shuffled(sweep, missing):
         for part in np.random.default_rng(0).permutation(list(missing)):
-            yield int(part), run_chunk(sweep, *label.part_rows(int(part)))
+            yield int(part), run_chunk(sweep, *sweep.manifest.part_rows(int(part)))
 
-    monkeypatch.setattr("tuning.sweeps.run._run_on_cluster", shuffled)
-    store, _, again = Log().sweep(tmp_path / "store", label=UNTIL, scheduler="any")
+    store, _, again = Log().sweep(tmp_path / "store", label=UNTIL, computer=shuffled)
     assert again == tally and parts_of(store) == parts
     # With gaps too.
     store.part_path(0).unlink()
@@ -229,7 +230,7 @@ def test_the_most_is_the_most(whole, tmp_path):
 def test_a_scheduler_that_is_not_there_is_one_line(tmp_path):
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
-        Log().sweep(tmp_path / "store", scheduler="nowhere://x")
+        Log().sweep(tmp_path / "store", computer=on_cluster("nowhere://x"))
 
 
 @pytest.mark.slow
@@ -248,7 +249,7 @@ def test_a_cluster_makes_the_same_rows_though_a_worker_is_killed(whole, tmp_path
         warnings.simplefilter("ignore")
         with distributed.LocalCluster(n_workers=2, threads_per_worker=2, dashboard_address=None) as cluster:
             store = open_store(tmp_path / "store", MANIFEST, resume=False)
-            _, again = run_sweep(store, lambda *_: None, kill_one, cluster.scheduler_address)
+            _, again = run_sweep(store, lambda *_: None, kill_one, on_cluster(cluster.scheduler_address))
     assert killed
     assert same_rows(all_rows(store), rows) == [] and again == tally
 

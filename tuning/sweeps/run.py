@@ -28,6 +28,8 @@ COMPARED = 4096  # scenarios that a float32 sweep runs in float64 too
 
 # Called with the number of rows that are there now and the tally so far: those found, then those computed.
 Progress = Callable[[int, Tally], None]
+# Runs some parts of a sweep and gives their rows, in any order.
+Computer = Callable[[Sweep, Iterable[int]], Generator[tuple[int, Rows], None, None]]
 
 
 class Precision(NamedTuple):
@@ -43,17 +45,16 @@ class Precision(NamedTuple):
 
 
 def run_sweep(
-    store: Store, found: Progress, computed: Progress, scheduler: str | None = None
+    store: Store, found: Progress, computed: Progress, computer: Computer = run_parts
 ) -> tuple[Sweep, Tally]:
     """Compute and write every part that is missing, as far as it goes: the sweep and its tally.
 
-    `scheduler` is the address of a `dask.distributed` scheduler. Raises `InputError` when a part cannot be
-    written or the cluster cannot be reached.
+    Raises `InputError` when a part cannot be written or a cluster cannot be reached.
     """
     manifest = store.manifest
     sweep = build_sweep(manifest)
     if manifest.until_width is not None:
-        return sweep, _run_until(store, sweep, found, computed, scheduler)
+        return sweep, _run_until(store, sweep, found, computed, computer)
     tally, missing = empty_tally(manifest.replicates, manifest.scenarios), []
     for part in range(manifest.parts):
         rows = read_part(store, part)
@@ -62,7 +63,7 @@ def run_sweep(
             continue
         tally = add_rows(tally, rows)
         found(len(rows["index"]), tally)
-    for part, rows in _computed_parts(sweep, missing, scheduler):
+    for part, rows in computer(sweep, missing):
         write_part(store, part, rows)
         tally = add_rows(tally, rows)
         computed(len(rows["index"]), tally)
@@ -86,14 +87,17 @@ def compare_precisions(sweep: Sweep, number: int = COMPARED) -> Precision:
     )
 
 
+def on_cluster(address: str) -> Computer:
+    """Parts computed by the workers of the `dask.distributed` scheduler at this address."""
+    return lambda sweep, parts: _run_on_cluster(sweep.manifest, parts, address)
+
+
 def describe_outcomes(tally: Tally) -> dict[str, int]:
     """Number of scenarios of each outcome that was met."""
     return {name: count for name, count in zip(OUTCOMES, tally.outcomes, strict=True) if count}
 
 
-def _run_until(
-    store: Store, sweep: Sweep, found: Progress, computed: Progress, scheduler: str | None
-) -> Tally:
+def _run_until(store: Store, sweep: Sweep, found: Progress, computed: Progress, computer: Computer) -> Tally:
     """The tally at the first part after which the interval is narrow enough, or at the last one."""
     manifest = store.manifest
     tally = empty_tally(manifest.replicates, manifest.scenarios, looked_at=True)
@@ -119,7 +123,7 @@ def _run_until(
 
     if not look_at_stored():
         missing = (part for part in range(following, manifest.parts) if read_part(store, part) is None)
-        with closing(_computed_parts(sweep, missing, scheduler)) as parts:
+        with closing(computer(sweep, missing)) as parts:
             for part, rows in parts:
                 write_part(store, part, rows)
                 own.add(part)
@@ -128,14 +132,6 @@ def _run_until(
                     break
     remove_parts(store, following)
     return tally
-
-
-def _computed_parts(
-    sweep: Sweep, parts: Iterable[int], scheduler: str | None
-) -> Generator[tuple[int, Rows], None, None]:
-    if scheduler is None:
-        return run_parts(sweep, parts)
-    return _run_on_cluster(sweep.manifest, parts, scheduler)
 
 
 def _run_on_cluster(

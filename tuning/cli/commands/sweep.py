@@ -23,7 +23,7 @@ def run(options: Sweep) -> int:
     from tuning.gain_file import load_gain_file
     from tuning.statistics.intervals import scenarios_needed
     from tuning.sweeps.manifest import Choices, build_manifest
-    from tuning.sweeps.run import run_sweep
+    from tuning.sweeps.run import on_cluster, run_parts, run_sweep
     from tuning.sweeps.store import locked, open_store
     from tuning.sweeps.tally import failure_probability
 
@@ -46,7 +46,7 @@ def run(options: Sweep) -> int:
                 store,
                 lambda rows, _: progress.skip(rows),
                 lambda rows, tally: progress.advance(rows, so_far(tally)),
-                options.scheduler,
+                run_parts if options.scheduler is None else on_cluster(options.scheduler),
             )
         document = _document(options, store, sweep, tally, progress.rate)
         unwritten = _complete(options, store, sweep, document)
