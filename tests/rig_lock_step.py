@@ -11,7 +11,7 @@ from jaxhil.runtime.gain_file import GainFile
 from tuning.rig.contact_watch import ContactResult, ContactWatch
 from tuning.rig.hardware import RigTask
 from tuning.rig.plant import Plant
-from tuning.rig.udp_controller import APPROACH, Answer, ControllerTask, NumericalModel, Reading
+from tuning.rig.udp_protocol import APPROACH, Answer, ControllerTask, NumericalModel, Reading
 
 
 def controller(mechanism: Mechanism, compensator: str, gains: Mapping[str, float], **limits: float):

@@ -37,7 +37,7 @@ from jaxhil.runtime.law_status import (
 )
 from jaxhil.runtime.limits import NO_LIMITS
 from tuning.rig.plant import Plant
-from tuning.rig.udp_controller import NumericalModel
+from tuning.rig.udp_protocol import NumericalModel
 
 LAW = "retrospective_reference"
 AFTER = 60  # ticks that are run on once both have left the surface

@@ -23,7 +23,7 @@ from jaxhil.compensators import literature_gains
 from jaxhil.mechanism.file import load, to_builtins
 from jaxhil.runtime import faults
 from tuning.gain_file import build_document, write_gain_file
-from tuning.rig import udp_controller
+from tuning.rig import udp_controller, udp_protocol
 from tuning.rig.contact_watch import ContactResult
 from tuning.rig.hardware import BRIDGED
 from tuning.rig.loop import EmptyTask, Timing, answered_by, play
@@ -34,6 +34,7 @@ from tuning.rig.session import (
     INJECTED,
     MACHINE,
     MET,
+    PROCESS,
     SOURCE,
     LoopReport,
     Setup,
@@ -42,7 +43,8 @@ from tuning.rig.session import (
     quantiles,
     start_controller,
 )
-from tuning.rig.udp_controller import (
+from tuning.rig.udp_controller import TickRecord, replayed
+from tuning.rig.udp_protocol import (
     FLAGS,
     MISSED_TICK,
     MOST_MADE_UP,
@@ -55,12 +57,10 @@ from tuning.rig.udp_controller import (
     ControllerTask,
     PacketError,
     Reading,
-    TickRecord,
     decode_answer,
     decode_reading,
     encode_answer,
     encode_reading,
-    replayed,
 )
 
 ROOT = Path(__file__).parents[1]
@@ -199,7 +199,7 @@ def test_contacts_that_the_law_did_not_know_are_counted():
     mechanism = load("suite-fast", ["contact.stiffness=[884316.0]"]).mechanism
     gains = literature_gains(mechanism, "retrospective_reference")
     rig, task, answers = packets(mechanism, controller(mechanism, "retrospective_reference", gains), 900)
-    assert udp_controller.LAW_IN_DOUBT == faults.LAW_IN_DOUBT and MISSED_TICK == faults.MISSED_TICK
+    assert udp_protocol.LAW_IN_DOUBT == faults.LAW_IN_DOUBT and MISSED_TICK == faults.MISSED_TICK
     reported = [answer for answer in answers if answer.faults & faults.LAW_IN_DOUBT]
     assert len(rig.contacts) >= 3 and not rig.tripped
     assert task.doubts == {"too_short": len(reported)} and len(reported) in (
@@ -527,7 +527,8 @@ def test_the_controllers_process_answers_its_rig_and_nobody_else(tmp_path):
 
 def test_the_controllers_process_of_a_bundle_runs_the_bundles_runtime(jaxhil, tmp_path):
     gain_file(tmp_path)
-    (tmp_path / "udp_controller.py").write_bytes((SOURCE / "udp_controller.py").read_bytes())
+    for name in PROCESS:
+        (tmp_path / name).write_bytes((SOURCE / name).read_bytes())
     stand_in = (
         "import sys\n"
         f"open({str(tmp_path / 'used')!r}, 'w').write(str(sys.flags.isolated))\n"

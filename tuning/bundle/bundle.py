@@ -19,7 +19,8 @@ from tuning.bundle.manifest import is_bundle, manifest_text
 from tuning.files import TEMPORARY, writing
 
 TUNING = Path(__file__).parents[1]
-COPIED = ("bundle/selftest.py", "rig/udp_controller.py")  # files that a bundle holds as they are here
+# Files that a bundle holds as they are here.
+COPIED = ("bundle/selftest.py", "rig/udp_controller.py", "rig/udp_protocol.py")
 
 
 class Bundle(NamedTuple):

@@ -19,6 +19,7 @@ CONTENT = {
     "selftest.py": "checks all files and replays the vectors",
     "summary.html": "one page for people: gains, limits, what they reach, where they hold",
     "udp_controller.py": "the controller as a process that answers a rig over UDP",
+    "udp_protocol.py": "what that process and a rig say to each other",
     "c99": "the controller in C99, its gains, its test program",
     "ros2.yaml": "the gains as ROS 2 parameters",
     "gains.mat": "the gains for MATLAB",

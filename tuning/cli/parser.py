@@ -49,8 +49,8 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
     )
 
     def run() -> int:
-        module = importlib.import_module(f"tuning.cli.commands.{type(options).__name__.lower()}")
-        return module.run(options)
+        command = type(options).__name__.removesuffix("Options").lower()
+        return importlib.import_module(f"tuning.cli.commands.{command}").run(options)
 
     return run
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from jaxhil.mechanism.structs import Mechanism
 from tuning.rig.contact_watch import ContactResult, ContactWatch
 from tuning.rig.plant import Plant
-from tuning.rig.udp_controller import APPROACH, PREPARE, READY, RESET, TICK, TRIPPED, Answer, Reading
+from tuning.rig.udp_protocol import APPROACH, PREPARE, READY, RESET, TICK, TRIPPED, Answer, Reading
 
 EXTRAPOLATED = 10  # periods for which a command goes on at its rate
 BRIDGED = 3  # periods: what follows from an older command is not the controller's doing

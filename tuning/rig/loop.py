@@ -14,15 +14,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from tuning.rig.network import Network
-from tuning.rig.udp_controller import (
-    EMPTY,
-    TICK,
-    Answer,
-    PacketError,
-    Reading,
-    decode_answer,
-    encode_reading,
-)
+from tuning.rig.udp_protocol import EMPTY, TICK, Answer, PacketError, Reading, decode_answer, encode_reading
 
 ANSWER_SHARE = 0.8  # of a period, within which the answer has to be there
 MOST_BEHIND = 10  # periods that the rig catches up with

@@ -25,13 +25,15 @@ from tuning.rig.contact_watch import ContactResult
 from tuning.rig.hardware import Commanded, RigTask
 from tuning.rig.loop import ANSWER_SHARE, EmptyTask, Timing, answered_by, play
 from tuning.rig.network import Injection, Network
-from tuning.rig.udp_controller import CPU_SHARE, STOP, Reading, encode_reading, realtime
+from tuning.rig.udp_controller import CPU_SHARE, realtime
+from tuning.rig.udp_protocol import STOP, Reading, encode_reading
 
 STARTING = 30.0  # s in which the controller's process has to listen
 ENDING = 120.0  # s in which it has to end, going through its packets again included
 SILENCE = 2.0  # s without a packet, after which it ends by itself
 
 SOURCE = Path(__file__).parent
+PROCESS = ("udp_controller.py", "udp_protocol.py")  # what the controller's process is, beside its runtime
 LAST = Reading(STOP, 0xFFFFFFFF, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 

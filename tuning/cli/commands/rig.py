@@ -14,7 +14,6 @@ from tuning.cli.options_rig import RigOptions
 LONGEST_EMPTY = 30.0  # s of empty loop at most
 EMPTY_SHARE = 0.2  # of the run's duration
 MOST_TICKS = 2_000_000
-PROCESS = "udp_controller.py"
 MOST_ROWS = 12  # contacts shown one by one
 
 
@@ -80,13 +79,14 @@ def controller_folder(given: str, compensator: str, scratch: Path) -> Path:
     """The folder in which the controller's process is to run: the bundle itself or, for a bare gain file,
     what such a process needs of a bundle, made in the folder `scratch`."""
     from tuning.bundle.single_file import runtime_source
-    from tuning.rig.session import SOURCE
+    from tuning.rig.session import PROCESS, SOURCE
 
     folder = Path(given)
-    if folder.is_dir() and (folder / PROCESS).is_file():
+    if folder.is_dir() and (folder / PROCESS[0]).is_file():
         return folder
     (scratch / "jaxhil_runtime.py").write_text(runtime_source(compensator), encoding="utf-8")
-    (scratch / PROCESS).write_bytes((SOURCE / PROCESS).read_bytes())
+    for name in PROCESS:
+        (scratch / name).write_bytes((SOURCE / name).read_bytes())
     return scratch
 
 
