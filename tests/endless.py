@@ -18,7 +18,8 @@ from lanes import IDEAL, MASS, QUICK, mechanism, per_lane, spread, validated
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.loop import build_rig_constants
-from jaxhil.simulation.rollout import Tick, start, stretch, stretch_length
+from jaxhil.simulation.rollout import start, stretch, stretch_length
+from jaxhil.simulation.tick import Tick
 
 OMEGA = 2 * pi * 3.0
 STIFFNESS = MASS * OMEGA**2

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from lanes import QUICK, first_contact, join, mechanism, nominal_gains, spread, validated
 
-from jaxhil.compensators import Constants, Signals
+from jaxhil.compensators import Signals
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.contact_force import PlantSignals
-from jaxhil.simulation.metrics import build_rules, collect, empty_metrics, fresh_watch, observe
+from jaxhil.simulation.metrics import collect, empty_metrics
 from jaxhil.simulation.scenario import build_scenarios
+from jaxhil.simulation.watch import build_rules, fresh_watch, record_contact
 
 PARSED = validated(mechanism({}))
 SCENARIO = join([build_scenarios(PARSED)])
-CONSTANTS = Constants(SCENARIO.control_period, SCENARIO.clearance)
 LOOP = build_loop(PARSED, "none", SCENARIO, chatter=True)
 BEFORE, AFTER = 5, 40  # ticks without force
 
@@ -36,7 +36,7 @@ def excess(commands, touching):
         # It turns round at once, so that what ends the contact is the quiet after it.
         signals = Signals(zeros, zeros, zeros - 1, zeros, jnp.zeros(1, jnp.int32))
         plant_signals = PlantSignals(jnp.where(touches, 10.0, 0.0)[None], None, None)
-        return observe(LOOP, CONSTANTS, rules, watch, signals, plant_signals, command[None], None), None
+        return record_contact(LOOP, rules, watch, signals, plant_signals, command[None], None), None
 
     watch, _ = jax.lax.scan(tick, fresh_watch(LOOP, zeros), (commands, touching))
     index = jnp.zeros(1, jnp.int32)

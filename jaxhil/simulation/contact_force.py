@@ -30,8 +30,12 @@ class Motion(NamedTuple):
 
 
 class SamplingInterval(NamedTuple):
-    """Motion of the real mechanism over one interval: where the force is sampled and, for loops that look
-    between the samples, at its start and its end (limits from within; else None)."""
+    """Motion of the real mechanism from one tick to the next.
+
+    sample: where the force is sampled.
+    start: at the interval's start, from within; None for loops that do not look between the samples.
+    end: at its end, likewise.
+    """
 
     sample: Motion
     start: Any
@@ -39,17 +43,43 @@ class SamplingInterval(NamedTuple):
 
 
 class PlantSignals(NamedTuple):
-    """What really happens in a sampling interval: contact force [N] where it is sampled; where energies are
-    audited, work done on the mechanism and work returned by it [J]; where the force has corners between
-    samples, its peak in the interval [N]."""
+    """What really happens in a sampling interval.
+
+    force: of the contact, where it is sampled [N].
+    works: done on the mechanism and returned by it [J]; None unless energies are followed.
+    peak: of the force in the interval [N]; None unless the force has corners between samples.
+    """
 
     force: Float[Array, "*batch"]
     works: tuple[Array, Array] | None
     peak: Float[Array, "*batch"] | None
 
 
+class Contact(NamedTuple):
+    """What the contact of a sampling interval leaves.
+
+    plant_signals: what really happens.
+    reading: of a lagging force sensor, where it samples [N]; None without lag.
+    lagged: its reading at the interval's end [N].
+    last: the sample of the contact.
+    law: state of the contact law at the interval's end.
+    """
+
+    plant_signals: PlantSignals
+    reading: Float[Array, "*batch"] | None
+    lagged: Array
+    last: "ContactSample"
+    law: tuple[Array, ...]
+
+
 class Surfaces(NamedTuple):
-    """A contact law with its parameters and state, at one surface or (finite clearance [m]) two."""
+    """A contact law at one surface or two.
+
+    law: the contact law.
+    parameters: its parameters.
+    state: its state.
+    clearance: between two surfaces [m]; infinite for one.
+    """
 
     law: ContactLaw
     parameters: ContactParameters
@@ -81,7 +111,7 @@ class Surfaces(NamedTuple):
         side = jnp.sign(jnp.where(signed == 0, deflection(end.position, self.clearance), signed))
         return side, jnp.where(side < 0, -self.clearance, 0)
 
-    def touch(self, motion: Motion, force: Array) -> "ContactSample":
+    def sample(self, motion: Motion, force: Array) -> "ContactSample":
         """A sample of the contact, whose force is known."""
         far = -self.clearance - motion.position
         beyond = jnp.where(far > motion.position, far, motion.position)
@@ -91,8 +121,13 @@ class Surfaces(NamedTuple):
 
 
 class ContactSample(NamedTuple):
-    """A sample of the contact: distance into the nearer surface [m], negative outside; force [N]; its limit
-    at the surface [N]; side of that surface (1 or -1)."""
+    """A sample of the contact.
+
+    distance: into the nearer surface [m], negative outside.
+    force: [N].
+    edge: limit of the force at that surface [N].
+    side: of that surface, 1 or -1.
+    """
 
     distance: Float[Array, "*batch"]
     force: Float[Array, "*batch"]
@@ -123,7 +158,7 @@ def works_along(surfaces: Surfaces, start: Motion, end: Motion, duration: Array)
 
     A pulling force acts while the penetration recedes: it takes from the work returned.
     """
-    contact = _contact(surfaces, start, end, duration)
+    contact = _touching(surfaces, start, end, duration)
 
     def inward(s):
         return contact.side * along(start, end, duration, s).velocity
@@ -214,9 +249,15 @@ def _force_along(surfaces, start, end, duration, s):
     return motion, force
 
 
-class _Contact(NamedTuple):
-    """Contact during a stretch of motion: whether there is any, with which side, from which fraction of the
-    stretch until which, and whether it begins and ends there at the surface."""
+class _Touching(NamedTuple):
+    """Contact during a stretch of motion.
+
+    touches: whether there is any.
+    side: of the surface, 1 or -1.
+    first: fraction of the stretch at which it begins.
+    last: fraction of the stretch at which it ends.
+    at_surface: whether it begins, and whether it ends, at the surface.
+    """
 
     touches: Array
     side: Array
@@ -225,7 +266,7 @@ class _Contact(NamedTuple):
     at_surface: tuple[Array, Array]
 
 
-def _contact(surfaces, start, end, duration):
+def _touching(surfaces, start, end, duration):
     """Both instants are roots on the stretch's cubic: of the depth, or of the force that lets go before."""
     side, surface = surfaces.side(start, end)
 
@@ -244,7 +285,7 @@ def _contact(surfaces, start, end, duration):
     touches = (side != 0) & (first < last)
     begins_at_surface = (enters > 0) & (enters >= catches)
     ends_at_surface = (leaves < 1) & (leaves <= lets_go)
-    return _Contact(
+    return _Touching(
         touches,
         side,
         jnp.where(touches, first, 0),
@@ -272,7 +313,7 @@ def _crossing(function, like):
 def _lag_along(surfaces, reading, start, end, duration, time_constant):
     """The lagging reading after a smooth stretch of motion: the force is taken along parabolas, whose lag is
     exact, from where contact begins to where it ends."""
-    contact = _contact(surfaces, start, end, duration)
+    contact = _touching(surfaces, start, end, duration)
     span = contact.last - contact.first
     forces = []
     for i in range(2 * ARCS + 1):

@@ -1,4 +1,4 @@
-"""What evolves in the loop from tick to tick, but for what the compensator keeps to itself."""
+"""What the loop carries from tick to tick: numerical model, motion simulator, delay lines of the sensors."""
 
 from typing import Any, NamedTuple
 
@@ -10,8 +10,13 @@ from jaxhil.simulation.probe import FirstContact
 
 
 class Plant(NamedTuple):
-    """Motion simulator and drives: recent commands c(n), c(n-1) [m], last step of the command [m], state;
-    c(n) before the limits, where there are any (else None)."""
+    """Drives and motion simulator.
+
+    commands: position commands sent to the drives, c(n), c(n-1), ... [m].
+    step: last step of the command [m].
+    state: of the motion simulator.
+    wanted: c(n) before the limits [m]; None without limits.
+    """
 
     commands: tuple[Array, ...]
     step: Array
@@ -30,8 +35,13 @@ class Plant(NamedTuple):
 
 
 class Rings(NamedTuple):
-    """Delay lines: of the plant signals, of what a lagging sensor makes of the force (else None), of the
-    position, and of the intervals whose contact is still to come (else None)."""
+    """Delay lines, each a ring of samples.
+
+    plant_signals: what really happened.
+    reading: what a lagging sensor makes of the force [N]; None without lag.
+    position: of the mechanism, where its sensor samples it [m].
+    interval: sampling intervals whose contact is still to come; None with one surface.
+    """
 
     plant_signals: PlantSignals
     reading: Float[Array, "samples *batch"] | None
@@ -40,8 +50,13 @@ class Rings(NamedTuple):
 
 
 class Sensed(NamedTuple):
-    """What the sensors will read: delay lines; the last sample of the contact, the lag's reading at the end
-    of its interval, the position sample of the interval before the run."""
+    """What the sensors will read.
+
+    rings: delay lines (`Rings`; None where they are held apart).
+    last: last sample of the contact.
+    lagged: reading of a lagging force sensor at the end of its sampling interval [N].
+    first_position: position sample of the sampling interval before the run [m].
+    """
 
     rings: Any
     last: ContactSample
@@ -50,9 +65,19 @@ class Sensed(NamedTuple):
 
 
 class LoopState(NamedTuple):
-    """All that evolves: the model's position [m] and velocity [m/s], and the rest. The run under way was
-    entered at `entry_tick`, in uniform motion of `entry_velocity` [m/s]. Where the run is probed, the
-    hardware's first touch (else None)."""
+    """All that evolves.
+
+    position: of the numerical model [m].
+    velocity: of the numerical model [m/s].
+    plant: drives and motion simulator.
+    sensed: what the sensors will read.
+    law: state of the contact law.
+    controller: state of the compensator.
+    parameters: of the contact law, for the contact under way.
+    entry_velocity: of the uniform motion in which the run began [m/s].
+    entry_tick: at which the run began.
+    first_contact: of the hardware, where the run is probed (else None).
+    """
 
     position: Float[Array, "*batch"]
     velocity: Float[Array, "*batch"]

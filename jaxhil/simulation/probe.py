@@ -50,8 +50,12 @@ class Push(NamedTuple):
 
 
 class Probe(NamedTuple):
-    """Of each contact: the push, leaves (slots, *batch), and the penetration [m] of the same contact in
-    space, (slots, samples, *batch), at as many times evenly spaced from its first touch to `span` [s]."""
+    """What each contact of a run is probed with.
+
+    push: on the hardware, leaves (slots, *batch).
+    depth: penetration of the same contact in space [m] at times evenly spaced from its first touch to `span`.
+    span: how long that contact is followed [s].
+    """
 
     push: Push
     depth: Float[Array, "slots samples *batch"]
@@ -59,8 +63,12 @@ class Probe(NamedTuple):
 
 
 class FirstContact(NamedTuple):
-    """The hardware's first touch of the contact under way: whether there was one, its time in periods of the
-    run, the side of the surface (1 or -1)."""
+    """The hardware's first touch in the contact under way.
+
+    made: whether there was one.
+    time: of it, in periods of the run.
+    side: of the surface, 1 or -1.
+    """
 
     made: Bool[Array, "*batch"]
     time: Float[Array, "*batch"]
@@ -68,8 +76,13 @@ class FirstContact(NamedTuple):
 
 
 class Deviation(NamedTuple):
-    """The numerical model beside the reference: whether it has entered, when, in periods of the run, sum of
-    the squares [m^2] of x_d's depth off the reference's, and how many there are."""
+    """The numerical model beside the contact in space.
+
+    entered: whether the numerical model has entered the contact.
+    time: of that, in periods of the run.
+    squares: sum of the squares of what its depth is off by [m^2].
+    count: how many they are.
+    """
 
     entered: Bool[Array, "*batch"]
     time: Float[Array, "*batch"]
@@ -83,16 +96,16 @@ def before_contact(like: Float[Array, "*batch"]) -> FirstContact:
     return FirstContact(jnp.zeros(like.shape, bool), zeros, zeros + 1)
 
 
-def touch(
-    touched: FirstContact, depth: Array, rate: Array, side: Array, now: Array, period: Array
+def follow_hardware(
+    first_contact: FirstContact, depth: Array, rate: Array, side: Array, now: Array, period: Array
 ) -> FirstContact:
     """Follow the hardware to a sample: at `now` [periods] it is `depth` [m] beyond the surface on `side`,
     going deeper at `rate` [m/s]. The first touch lies where uniform motion met the surface."""
-    first = ~touched.made & (depth > 0)
+    first = ~first_contact.made & (depth > 0)
     return FirstContact(
-        touched.made | first,
-        jnp.where(first, now - _since(depth, rate, period), touched.time),
-        jnp.where(first, side, touched.side),
+        first_contact.made | first,
+        jnp.where(first, now - _since(depth, rate, period), first_contact.time),
+        jnp.where(first, side, first_contact.side),
     )
 
 
@@ -102,7 +115,7 @@ def no_deviation(like: Float[Array, "*batch"]) -> Deviation:
     return Deviation(jnp.zeros(like.shape, bool), zeros, zeros, zeros)
 
 
-def follow(
+def follow_model(
     deviation: Deviation,
     reference: Float[Array, "samples *batch"],
     span: Array,

@@ -21,8 +21,9 @@ from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants
 from jaxhil.simulation.metrics import Metrics
-from jaxhil.simulation.rollout import Run, Tick, start, stretch, stretch_length, turn_over
+from jaxhil.simulation.rollout import start, stretch, stretch_length, turn_over
 from jaxhil.simulation.scenario import Scenario, build_scenarios
+from jaxhil.simulation.tick import Run, Tick
 
 CHUNK = 512  # ticks recorded by one call of the compiled program
 

@@ -5,68 +5,24 @@ ones begin, and free flight towards the other surface is skipped. The program en
 nothing is computed for a fixed horizon. Forward-mode derivatives pass through to every array leaf.
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
 
-from jaxhil.compensators.base import Gains, Signals
+from jaxhil.compensators.base import Gains
 from jaxhil.simulation.contact_force import Motion, PlantSignals, SamplingInterval, no_contact
-from jaxhil.simulation.loop import (
-    Loop,
-    RigConstants,
-    build_rig_constants,
-    drive,
-    enter,
-    sense,
-)
+from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants, enter
 from jaxhil.simulation.loop_state import LoopState, Plant, Rings, Sensed
-from jaxhil.simulation.metrics import (
-    FADED,
-    OK,
-    Metrics,
-    Watch,
-    build_rules,
-    collect,
-    empty_metrics,
-    fresh_watch,
-    judge,
-    observe,
-)
-from jaxhil.simulation.probe import Probe, before_contact
+from jaxhil.simulation.metrics import OK, Metrics, collect, empty_metrics, judge
+from jaxhil.simulation.probe import before_contact
 from jaxhil.simulation.scenario import Scenario
 from jaxhil.simulation.sensors import Noise, draw_noise
+from jaxhil.simulation.tick import Prepared, Run, Tick, tick
+from jaxhil.simulation.watch import FADED, build_rules, fresh_watch
 
 APPROACH = 0.02  # s of free approach before a contact, besides its phase
 SETTLED = 1e-6  # of the distance flown in a period: the motion simulator follows uniformly
 STILL = 1e-12  # of the speed, per period: nothing pushes the numerical model any more
-
-
-class Run(NamedTuple):
-    """Everything carried from tick to tick, and the ticks run so far."""
-
-    state: LoopState
-    watch: Watch
-    metrics: Metrics
-    index: Int[Array, "*batch"]
-    active: Bool[Array, "*batch"]
-    tick: Int[Array, ""]
-
-
-class Tick(NamedTuple):
-    """What is recorded of a tick: what the controller read and what it made of it, the plant signals, whether
-    the lane was still running, the number of the contact, what was identified [N/m, N s/m], and the position
-    command [m] sent to the drives at its end, before any limits of theirs."""
-
-    signals: Signals
-    command: Float[Array, "*batch"]
-    plant_signals: PlantSignals
-    active: Bool[Array, "*batch"]
-    contact: Int[Array, "*batch"]
-    identified: tuple[Array, Array] | None
-    sent: Float[Array, "*batch"]
 
 
 def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Metrics:
@@ -154,32 +110,25 @@ def start(loop: Loop, rig: RigConstants, gains: Gains) -> Run:
 
 def stretch(loop: Loop, rig: RigConstants, gains: Gains, run: Run, record: bool) -> tuple[Run, Tick | None]:
     """A few ticks of the loop."""
+    prepared = prepare(loop, rig, gains, run)
 
-    rules = build_rules(rig.scenario)
-    prepared = loop.compensator.prepare(gains, rig.constants)
-    probe: Probe | None = _entry(rig.scenario.probe, _slot(rig, run.index)) if loop.probed else None
+    def body(carry, noise):
+        now, seen = tick(loop, rig, prepared, _resumed(run, carry), noise)
+        return _evolving(now), seen if record else None
 
-    def tick(carry, noise):
-        state, watch, now = carry
-        signals, plant_signals = sense(loop, rig, state, now, noise)
-        command, controller = loop.compensator.step(prepared, state.controller, signals, now)
-        if loop.has_force_noise or loop.has_force_bias:
-            command = jnp.where(signals.age == 0, 0, command)
-        watch = observe(
-            loop, rig.constants, rules, watch, signals, plant_signals, command, state.plant.shortfall, probe
-        )
-        push = None if probe is None else probe.push
-        state = drive(loop, rig, gains, state, now, plant_signals, command, controller, push)
-        seen = None
-        if record:
-            identified = loop.compensator.identified(controller)
-            going = run.active & ~watch.over
-            seen = Tick(signals, command, plant_signals, going, run.index, identified, state.plant.sent)
-        return (state, watch, now + 1), seen
+    length = stretch_length(loop)
+    carry, seen = lax.scan(body, _evolving(run), noise_ahead(loop, rig, run, length), length=length)
+    return _resumed(run, carry), seen
 
-    carry, length = (run.state, run.watch, run.tick), stretch_length(loop)
-    (state, watch, now), seen = lax.scan(tick, carry, noise_ahead(loop, rig, run, length), length=length)
-    return run._replace(state=state, watch=watch, tick=now), seen
+
+def prepare(loop: Loop, rig: RigConstants, gains: Gains, run: Run) -> Prepared:
+    """What the ticks of a stretch share."""
+    return Prepared(
+        gains=gains,
+        rules=build_rules(rig.scenario),
+        controller=loop.compensator.prepare(gains, rig.constants),
+        probe=_entry(rig.scenario.probe, _slot(rig, run.index)) if loop.probed else None,
+    )
 
 
 def noise_ahead(loop: Loop, rig: RigConstants, run: Run, ticks: int) -> Noise:
@@ -229,6 +178,16 @@ def turn_over(loop: Loop, rig: RigConstants, gains: Gains, run: Run, skip_flight
         state = _restart(loop, gains, state, entered, over, over)
         watch = _choose(over, blank, watch)
     return run._replace(state=state, watch=watch, metrics=metrics, index=index, active=active)
+
+
+def _evolving(run):
+    """What changes from tick to tick."""
+    return run.state, run.watch, run.tick
+
+
+def _resumed(run, evolving):
+    state, watch, now = evolving
+    return run._replace(state=state, watch=watch, tick=now)
 
 
 def _rings(loop, ring):

@@ -13,14 +13,21 @@ from jaxtyping import Array, Float, Int, UInt32
 
 from jaxhil.contact.laws import ContactParameters
 from jaxhil.contact.reference import Reference
-from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.simulation.probe import Probe
 
 LONGEST_CONTACT = 10.0  # s
 
 
 class MotionSimulator(NamedTuple):
-    """num(s)/den(s) in descending powers of s [rad/s], delay [s], limits [m/s, m/s^2] (inf if none)."""
+    """The motion simulator num(s)/den(s) e^(-s delay).
+
+    numerator: coefficients in descending powers of s [rad/s].
+    denominator: likewise.
+    delay: transport delay [s].
+    velocity_limit: [m/s]; infinite if none.
+    acceleration_limit: [m/s^2]; infinite if none.
+    """
 
     numerator: Float[Array, "order *batch"]
     denominator: Float[Array, "order_plus_1 *batch"]
@@ -30,7 +37,16 @@ class MotionSimulator(NamedTuple):
 
 
 class ForceSensor(NamedTuple):
-    """delay, time_constant [s]; noise_std, quantum, dead_zone, bias, range [N]."""
+    """The force sensor.
+
+    delay: transport delay [s].
+    time_constant: of its first-order lag [s].
+    noise_std: standard deviation of white noise [N].
+    quantum: [N]; 0 for none.
+    dead_zone: [N].
+    bias: [N].
+    range: [N]; infinite for none.
+    """
 
     delay: Float[Array, "*batch"]
     time_constant: Float[Array, "*batch"]
@@ -42,7 +58,12 @@ class ForceSensor(NamedTuple):
 
 
 class PositionSensor(NamedTuple):
-    """delay [s]; noise_std, quantum [m]."""
+    """The position sensor.
+
+    delay: [s].
+    noise_std: standard deviation of white noise [m].
+    quantum: [m]; 0 for none.
+    """
 
     delay: Float[Array, "*batch"]
     noise_std: Float[Array, "*batch"]
@@ -50,10 +71,23 @@ class PositionSensor(NamedTuple):
 
 
 class Scenario(NamedTuple):
-    """One run per lane: equivalent_mass [kg], velocity [m/s] of the first approach, number of contacts,
-    phase of each contact [1], clearance [m] (inf if one-sided), the contacts' parameters, the rig with the
-    contact_plane [m] in which it touches, the time_limit [s] of a contact, a random key (seed, index) for
-    sensor noise; what it is probed with; the contacts in space, where they are known beforehand (else NaN).
+    """One run per lane.
+
+    equivalent_mass: M [kg].
+    velocity: of the first approach [m/s].
+    contacts: how many there are.
+    phase: of each contact within a control period [1].
+    clearance: between two surfaces [m]; infinite for one.
+    contact: parameters of the contact law, of each contact.
+    control_period: T [s].
+    contact_plane: where the hardware's surface is [m]; the controller takes it to be at 0.
+    simulator: motion simulator.
+    force_sensor: force sensor.
+    position_sensor: position sensor.
+    time_limit: of a contact [s].
+    key: of the sensors' noise: seed, index of the scenario.
+    probe: what the run is probed with; None if not at all.
+    reference: the contacts in space where they are known beforehand, NaN where not; None if nowhere.
     """
 
     equivalent_mass: Float[Array, "*batch"]
@@ -89,112 +123,120 @@ def build_scenarios(
     `draws` maps dotted paths to values, (number,) or for lists (number, entries); what it lacks is nominal.
     Without it, a batch of one: the nominal run. Noise keys depend on `seed` and `first` + lane alone.
     """
-    draws = dict(draws or {})
-    number = len(next(iter(draws.values()))) if draws else 1
-    contacts = mechanism.approach.contacts
-    slots = contact_slots(contacts)
-    contact, rig = mechanism.contact, mechanism.rig
-
-    def scalar(path: str, nominal) -> Any:
-        value = draws.get(path, nominal)
-        return np.broadcast_to(np.asarray(value, float), (number,))
-
-    def table(path: str, nominal) -> Any:
-        """(entries, ..., number)"""
-        nominal = np.asarray(nominal, float)
-        value = np.asarray(draws.get(path, np.broadcast_to(nominal, (number, *nominal.shape))))
-        return np.moveaxis(value.reshape(number, *nominal.shape), 0, -1)
-
-    def successive(path: str, nominal) -> Any:
-        """One entry per slot, the last repeated."""
-        entries = table(path, nominal)
-        return entries[np.minimum(np.arange(slots), len(entries) - 1)]
-
-    def every(entry: np.ndarray) -> Any:
-        """The same entry in every slot."""
-        return np.broadcast_to(entry, (slots, *entry.shape))
-
-    phase = np.asarray(draws.get("approach.phase", mechanism.approach.phase), float)
-    phase = np.atleast_2d(phase.T).T  # (number or 1, contacts or 1)
-    phase = np.broadcast_to(phase, (number, phase.shape[1]))
-    phase: Any = phase[:, np.minimum(np.arange(slots), phase.shape[1] - 1)].T
-    simulator = _simulator(rig.simulator, scalar, table)
+    table = _Table(mechanism, dict(draws or {}))
+    contact, rig, number = mechanism.contact, mechanism.rig, table.number
     indices = np.arange(first, first + number, dtype=np.uint32)
     key: Any = np.stack([np.full(number, seed & 0xFFFFFFFF, np.uint32), indices])
+    contacts: Any = np.full(number, mechanism.approach.contacts, np.int32)
     return Scenario(
-        equivalent_mass=_mass(mechanism, scalar),
-        velocity=scalar("approach.velocity", mechanism.approach.velocity),
-        contacts=every(np.full(number, contacts, np.int32))[0],
-        phase=phase,
-        clearance=scalar("contact.clearance", contact.clearance),
+        equivalent_mass=_mass(mechanism, table),
+        velocity=table.scalar("approach.velocity"),
+        contacts=contacts,
+        phase=_phase(mechanism, table),
+        clearance=table.scalar("contact.clearance"),
         contact=ContactParameters(
-            stiffness=successive("contact.stiffness", contact.stiffness),
-            damping=successive("contact.damping", contact.damping) * (contact.law != "linear"),
-            exponent=every(scalar("contact.exponent", contact.exponent)),
-            depths=every(table("contact.depths", contact.depths)),
-            tension=every(np.full(number, contact.tension and contact.law == "kelvin_voigt")),
-            reference_depth=every(scalar("contact.reference_depth", contact.reference_depth or 1.0)),
-            unloading_ratio=every(scalar("contact.unloading_ratio", contact.unloading_ratio or 1.0)),
+            stiffness=table.successive("contact.stiffness"),
+            damping=table.successive("contact.damping") * (contact.law != "linear"),
+            exponent=table.repeated(table.scalar("contact.exponent")),
+            depths=table.repeated(table.entries("contact.depths")),
+            tension=table.repeated(np.full(number, contact.tension and contact.law == "kelvin_voigt")),
+            reference_depth=table.repeated(table.scalar("contact.reference_depth", 1.0)),
+            unloading_ratio=table.repeated(table.scalar("contact.unloading_ratio", 1.0)),
         ),
-        control_period=scalar("rig.control_period", rig.control_period),
-        contact_plane=scalar("rig.contact_plane", rig.contact_plane),
-        simulator=simulator,
-        force_sensor=ForceSensor(
-            *(
-                scalar(f"rig.force_sensor.{name}", getattr(rig.force_sensor, name))
-                for name in ForceSensor._fields
-            )
-        ),
+        control_period=table.scalar("rig.control_period"),
+        contact_plane=table.scalar("rig.contact_plane"),
+        simulator=_simulator(rig.simulator, table),
+        force_sensor=ForceSensor(*(table.scalar(f"rig.force_sensor.{name}") for name in ForceSensor._fields)),
         position_sensor=PositionSensor(
-            *(
-                scalar(f"rig.position_sensor.{name}", getattr(rig.position_sensor, name))
-                for name in PositionSensor._fields
-            )
+            *(table.scalar(f"rig.position_sensor.{name}") for name in PositionSensor._fields)
         ),
-        time_limit=scalar("", LONGEST_CONTACT),
+        time_limit=table.constant(LONGEST_CONTACT),
         key=key,
     )
 
 
-def _mass(mechanism, scalar):
-    bodies = mechanism.bodies
-    if bodies.equivalent_mass is not None:
-        return scalar("bodies.equivalent_mass", bodies.equivalent_mass)
-    chaser = scalar("bodies.chaser_mass", bodies.chaser_mass)
-    target = scalar("bodies.target_mass", bodies.target_mass)
+class _Table:
+    """The numbers of a mechanism by dotted path, drawn or nominal, one per lane."""
+
+    def __init__(self, mechanism: Mechanism, draws: dict[str, np.ndarray]) -> None:
+        self.number = len(next(iter(draws.values()))) if draws else 1
+        self.slots = contact_slots(mechanism.approach.contacts)
+        self._mechanism, self._draws = mechanism, draws
+
+    def drawn(self, path: str, default: Any = None) -> np.ndarray:
+        """What was drawn, else the nominal value or, where the file has none, the `default`."""
+        value = self._draws.get(path)
+        if value is None:
+            value = value_at(self._mechanism, path)
+        return np.asarray(default if value is None else value, float)
+
+    def scalar(self, path: str, default: float | None = None) -> Any:
+        return np.broadcast_to(self.drawn(path, default), (self.number,))
+
+    def constant(self, value: float) -> Any:
+        return np.broadcast_to(np.asarray(value, float), (self.number,))
+
+    def entries(self, path: str) -> Any:
+        """A list, (entries, ..., number)."""
+        nominal = np.asarray(value_at(self._mechanism, path), float)
+        value = np.asarray(self._draws.get(path, np.broadcast_to(nominal, (self.number, *nominal.shape))))
+        return np.moveaxis(value.reshape(self.number, *nominal.shape), 0, -1)
+
+    def successive(self, path: str) -> Any:
+        """A list as one entry per slot, the last repeated."""
+        entries = self.entries(path)
+        return entries[np.minimum(np.arange(self.slots), len(entries) - 1)]
+
+    def repeated(self, entry: np.ndarray) -> Any:
+        """The same entry in every slot."""
+        return np.broadcast_to(entry, (self.slots, *entry.shape))
+
+
+def _phase(mechanism, table) -> Any:
+    """(slots, number); a phase of its own for every contact where it is drawn so."""
+    phase = table.drawn("approach.phase")
+    phase = np.atleast_2d(phase.T).T  # (number or 1, contacts or 1)
+    phase = np.broadcast_to(phase, (table.number, phase.shape[1]))
+    return phase[:, np.minimum(np.arange(table.slots), phase.shape[1] - 1)].T
+
+
+def _mass(mechanism, table) -> Any:
+    if mechanism.bodies.equivalent_mass is not None:
+        return table.scalar("bodies.equivalent_mass")
+    chaser, target = table.scalar("bodies.chaser_mass"), table.scalar("bodies.target_mass")
     return chaser * target / (chaser + target)
 
 
-def _simulator(simulator, scalar, table) -> MotionSimulator:
+def _simulator(simulator, table) -> MotionSimulator:
     """Every model as a transfer function; `ideal` has order 0."""
     path = "rig.simulator."
-    one = scalar("", 1.0)
+    one = table.constant(1.0)
     numerator: Any
     denominator: Any
     if simulator.model == "ideal":
         numerator, denominator = np.zeros((0, len(one))), one[None]
     elif simulator.model == "first_order":
-        time_constant = scalar(path + "time_constant", simulator.time_constant)
+        time_constant = table.scalar(path + "time_constant")
         numerator, denominator = one[None], np.stack([time_constant, one])
     elif simulator.model == "second_order":
-        frequency = 2 * np.pi * scalar(path + "natural_frequency", simulator.natural_frequency)
-        damping = scalar(path + "damping_ratio", simulator.damping_ratio)
+        frequency = 2 * np.pi * table.scalar(path + "natural_frequency")
+        damping = table.scalar(path + "damping_ratio")
         numerator = np.stack([0 * one, frequency**2])
         denominator = np.stack([one, 2 * damping * frequency, frequency**2])
     elif simulator.model == "third_order":
-        a_1, a_2, a_3 = table(path + "coefficients", simulator.coefficients)
+        a_1, a_2, a_3 = table.entries(path + "coefficients")
         numerator = np.stack([0 * one, 0 * one, one])
         denominator = np.stack([a_3, a_2, a_1, one])
     else:
-        denominator = table(path + "denominator", simulator.denominator)
-        numerator = table(path + "numerator", simulator.numerator)
+        denominator = table.entries(path + "denominator")
+        numerator = table.entries(path + "numerator")
         missing = len(denominator) - 1 - len(numerator)
         numerator = np.concatenate([np.zeros((max(missing, 0), len(one))), numerator])
         numerator = numerator[len(numerator) - (len(denominator) - 1) :]
     return MotionSimulator(
         numerator,
         denominator,
-        scalar(path + "delay", simulator.delay),
-        scalar(path + "velocity_limit", simulator.velocity_limit),
-        scalar(path + "acceleration_limit", simulator.acceleration_limit),
+        table.scalar(path + "delay"),
+        table.scalar(path + "velocity_limit"),
+        table.scalar(path + "acceleration_limit"),
     )

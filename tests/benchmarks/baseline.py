@@ -15,8 +15,9 @@ import numpy as np
 from jaxhil.compensators.response_error import ResponseError
 from jaxhil.contact.laws import KelvinVoigt
 from jaxhil.simulation.loop import Loop, RigConstants
-from jaxhil.simulation.metrics import NOT_REACHED, build_rules
+from jaxhil.simulation.metrics import NOT_REACHED
 from jaxhil.simulation.scenario import Scenario
+from jaxhil.simulation.watch import build_rules
 
 SOURCE = Path(__file__).with_name("baseline.cpp")
 FLAGS = ("-O3", "-march=native", "-std=c++17", "-pthread")

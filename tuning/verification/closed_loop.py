@@ -19,12 +19,13 @@ from jaxhil.runtime.gain_file import GainFile
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.contact_force import PlantSignals
 from jaxhil.simulation.gain_file import LoadedGains
-from jaxhil.simulation.integrators import INTEGRATORS
-from jaxhil.simulation.loop import Loop, RigConstants, drive, sense
-from jaxhil.simulation.metrics import Metrics, build_rules, observe
+from jaxhil.simulation.loop import Loop, RigConstants
+from jaxhil.simulation.metrics import Metrics
 from jaxhil.simulation.recording import as_arrays, recorder
-from jaxhil.simulation.rollout import Run, noise_ahead, stretch_length, turn_over
+from jaxhil.simulation.rollout import noise_ahead, stretch_length, turn_over
 from jaxhil.simulation.scenario import Scenario
+from jaxhil.simulation.tick import Model, Run, actuate, contact_force, integrate, next_state, sense
+from jaxhil.simulation.watch import build_rules, record_contact
 
 
 def run_closed_loop(loaded: LoadedGains, gain_file: GainFile, batch: Scenario) -> Metrics:
@@ -103,7 +104,7 @@ class _Program(NamedTuple):
     """The steps of one loop, compiled when first called."""
 
     sense: Callable[..., tuple[Signals, PlantSignals]]
-    integrate: Callable[..., tuple[Array, Array, Array]]
+    integrate: Callable[..., Model]
     advance: Callable[..., Run]
     turn_over: Callable[..., Run]
 
@@ -118,12 +119,8 @@ def _sense(loop: Loop, rig: RigConstants, run: Run) -> tuple[Signals, PlantSigna
     return sense(loop, rig, run.state, run.tick, noise)
 
 
-def _integrate(loop: Loop, rig: RigConstants, run: Run, command: Array) -> tuple[Array, Array, Array]:
-    """Position [m], velocity [m/s] and acceleration [m/s^2] that the numerical model will have next tick."""
-    acceleration = -command * rig.inverse_mass
-    period, state = rig.constants.control_period, run.state
-    moved = INTEGRATORS[loop.integrator](state.position, state.velocity, acceleration, period)
-    return *moved, acceleration
+def _integrate(loop: Loop, rig: RigConstants, run: Run, command: Array) -> Model:
+    return integrate(loop, rig, run.state, command)
 
 
 def _advance(
@@ -136,13 +133,15 @@ def _advance(
     command: Array,
     sent: Array,
 ) -> Run:
-    """The tick's bookkeeping, then stages 3 to 5 under the command and the position sent to the drives."""
-    rules = build_rules(rig.scenario)
-    shortfall = run.state.plant.shortfall
-    watch = observe(loop, rig.constants, rules, run.watch, signals, plant_signals, command, shortfall)
-    controller = Sent(sent, run.state.controller)
-    state = drive(loop, rig, gains, run.state, run.tick, plant_signals, command, controller)
-    return run._replace(state=state, watch=watch, tick=run.tick + 1)
+    """Stages 3 to 6 of a tick under the command and the position sent to the drives."""
+    state, now = run.state, run.tick
+    model = integrate(loop, rig, state, command)
+    actuated = actuate(loop, rig, gains, state, now, model, Sent(sent, state.controller))
+    contact = contact_force(loop, rig, state, actuated.interval)
+    rules, shortfall = build_rules(rig.scenario), state.plant.shortfall
+    watch = record_contact(loop, rules, run.watch, signals, plant_signals, command, shortfall)
+    state = next_state(state, now, plant_signals, model, actuated, contact)
+    return run._replace(state=state, watch=watch, tick=now + 1)
 
 
 def _turn_over(loop: Loop, rig: RigConstants, gains: Gains, run: Run) -> Run:

@@ -1,0 +1,68 @@
+"""Beside the ticks of a probed run: the hardware is pushed, the numerical model compared with space."""
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxhil.compensators.base import Constants, Signals
+from jaxhil.contact.laws import deflection
+from jaxhil.simulation.contact_force import Contact, Motion
+from jaxhil.simulation.loop import RigConstants
+from jaxhil.simulation.loop_state import LoopState
+from jaxhil.simulation.probe import FirstContact, Probe, follow_hardware, follow_model
+from jaxhil.simulation.watch import Watch
+
+
+def probe_beside(
+    rig: RigConstants,
+    probe: Probe,
+    state: LoopState,
+    over: Array,
+    signals: Signals,
+    sample: Motion,
+    contact: Contact,
+    watch: Watch,
+) -> tuple[LoopState, Contact, Watch]:
+    """State, contact and watch of a tick with the probe's part in them.
+
+    `sample` is the motion where the force is sampled; the contact may have been `over` before this tick.
+    """
+    first_contact, contact = push(rig, probe, state.first_contact, signals.age, sample, contact)
+    watch = compare(rig.constants, probe, over, signals, watch)
+    return state._replace(first_contact=first_contact), contact, watch
+
+
+def push(
+    rig: RigConstants,
+    probe: Probe,
+    first_contact: FirstContact | None,
+    age: Array,
+    sample: Motion,
+    contact: Contact,
+) -> tuple[FirstContact, Contact]:
+    """Push the hardware, by the time since its first contact; the force sensor reads the push as well."""
+    assert first_contact is not None
+    scenario, period = rig.scenario, rig.constants.control_period
+    signed = deflection(sample.position, scenario.clearance)
+    side = jnp.sign(signed)
+    now = age.astype(period.dtype)
+    first = follow_hardware(first_contact, side * signed, side * sample.velocity, side, now, period)
+    since = jnp.where(first.made, now - first.time, -1e9) * period
+    force = contact.plant_signals.force + first.side * probe.push.force(since)
+    reading = contact.reading
+    if reading is not None:
+        reading = reading + first.side * probe.push.lagged(since, scenario.force_sensor.time_constant)
+    return first, contact._replace(plant_signals=contact.plant_signals._replace(force=force), reading=reading)
+
+
+def compare(constants: Constants, probe: Probe, over: Array, signals: Signals, watch: Watch) -> Watch:
+    """Compare x_d with the same contact in space, until it is `over`."""
+    assert watch.deviation is not None
+    depth, rate = signals.position_desired, signals.velocity_desired
+    if watch.side is not None:
+        depth = jnp.where(watch.side > 0, depth, -constants.clearance - depth)
+        rate = watch.side * rate
+    now = signals.age.astype(rate.dtype)
+    deviation = follow_model(
+        watch.deviation, probe.depth, probe.span, depth, rate, now, constants.control_period, ~over
+    )
+    return watch._replace(deviation=deviation)

@@ -1,0 +1,310 @@
+"""One tick of the hardware-in-the-loop contact rig, in the six stages of notebooks/guide/model.md section 1.
+
+    sense           read the force sensor and the position sensor
+    compensate      F_c from (F, x_d, v_d, x_a)
+    integrate       M x_d'' = -F_c over one control period
+    actuate         command -> limits, latency, hold -> motion simulator
+    contact_force   force of the real contact, where the force sensor will read it
+    record_contact  beginning, end, restitution, peaks and energies of the contact under way
+
+`Run` is what is carried from tick to tick, `Tick` what is recorded of one.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxhil.compensators.base import Gains, Signals
+from jaxhil.ring_buffer import depend_on, look_back, write_in_turn
+from jaxhil.simulation.contact_force import (
+    Contact,
+    Motion,
+    PlantSignals,
+    SamplingInterval,
+    Surfaces,
+    largest_force,
+    sensed_lag,
+    works_along,
+    works_between,
+)
+from jaxhil.simulation.integrators import INTEGRATORS
+from jaxhil.simulation.loop import Loop, RigConstants
+from jaxhil.simulation.loop_state import LoopState, Plant, Rings
+from jaxhil.simulation.metrics import Metrics
+from jaxhil.simulation.motion_simulator import advance, read
+from jaxhil.simulation.probe import Probe
+from jaxhil.simulation.probing import probe_beside
+from jaxhil.simulation.rate_limits import limit_command
+from jaxhil.simulation.sensors import Noise, quantise, sample_force
+from jaxhil.simulation.watch import Rules, Watch, record_contact
+
+
+class Run(NamedTuple):
+    """What is carried from tick to tick.
+
+    state: of the loop.
+    watch: the contact under way.
+    metrics: of the contacts that are over.
+    index: of the contact under way, from 0.
+    active: whether the lane still has contacts to come.
+    tick: the number of ticks run, common to all lanes.
+    """
+
+    state: LoopState
+    watch: Watch
+    metrics: Metrics
+    index: Int[Array, "*batch"]
+    active: Bool[Array, "*batch"]
+    tick: Int[Array, ""]
+
+
+class Tick(NamedTuple):
+    """What is recorded of a tick.
+
+    signals: what the controller read.
+    command: F_c [N], what the compensator made of it.
+    plant_signals: what really happened by then.
+    active: whether the lane was still running.
+    contact: index of the contact, from 0.
+    identified: stiffness [N/m] and damping [N s/m], by a compensator that identifies them.
+    sent: position command at the tick's end [m], before any limits of the drives.
+    """
+
+    signals: Signals
+    command: Float[Array, "*batch"]
+    plant_signals: PlantSignals
+    active: Bool[Array, "*batch"]
+    contact: Int[Array, "*batch"]
+    identified: tuple[Array, Array] | None
+    sent: Float[Array, "*batch"]
+
+
+class Prepared(NamedTuple):
+    """What is worked out once for many ticks of a contact.
+
+    gains: of the compensator.
+    controller: what the compensator has prepared from them.
+    rules: when a contact is over.
+    probe: of the contact under way, where the run is probed.
+    """
+
+    gains: Gains
+    controller: Any
+    rules: Rules
+    probe: Probe | None
+
+
+class Model(NamedTuple):
+    """The numerical model after a control period.
+
+    position: x_d [m].
+    velocity: v_d [m/s].
+    acceleration: a_d during the period [m/s^2].
+    """
+
+    position: Float[Array, "*batch"]
+    velocity: Float[Array, "*batch"]
+    acceleration: Float[Array, "*batch"]
+
+
+class Actuated(NamedTuple):
+    """What a position command makes of the rig.
+
+    plant: drives and motion simulator after the control period.
+    controller: state of the compensator.
+    position: of the mechanism where its sensor samples it [m].
+    interval: motion whose contact happens now.
+    under_way: ring of the motions whose contact is still to come; None with one surface.
+    """
+
+    plant: Plant
+    controller: Any
+    position: Float[Array, "*batch"]
+    interval: SamplingInterval
+    under_way: SamplingInterval | None
+
+
+def tick(loop: Loop, rig: RigConstants, prepared: Prepared, run: Run, noise: Noise) -> tuple[Run, Tick]:
+    """One control period: what is carried on, and what is recorded of it."""
+    state, now = run.state, run.tick
+    signals, plant_signals = sense(loop, rig, state, now, noise)
+    force, controller = compensate(loop, prepared, state, signals, now)
+    model = integrate(loop, rig, state, force)
+    actuated = actuate(loop, rig, prepared.gains, state, now, model, controller)
+    contact = contact_force(loop, rig, state, actuated.interval)
+    watch = record_contact(
+        loop, prepared.rules, run.watch, signals, plant_signals, force, state.plant.shortfall
+    )
+    if prepared.probe is not None:
+        state, contact, watch = probe_beside(
+            rig, prepared.probe, state, run.watch.over, signals, actuated.interval.sample, contact, watch
+        )
+    state = next_state(state, now, plant_signals, model, actuated, contact)
+    seen = Tick(
+        signals,
+        force,
+        plant_signals,
+        active=run.active & ~watch.over,
+        contact=run.index,
+        identified=loop.compensator.identified(controller),
+        sent=state.plant.sent,
+    )
+    return run._replace(state=state, watch=watch, tick=now + 1), seen
+
+
+def sense(
+    loop: Loop, rig: RigConstants, state: LoopState, now: Array, noise: Noise
+) -> tuple[Signals, PlantSignals]:
+    """Stage 1: what the sensors read at tick `now`, noise included, and beside it what really happened."""
+    scenario, sensed = rig.scenario, state.sensed
+    age = now - state.entry_tick
+    rings, delays = sensed.rings, rig.delays
+    force_ring = rings.plant_signals.force if rings.reading is None else rings.reading
+    force = _recall(force_ring, now, age, delays.force.intervals)
+    plant_signals = jax.tree.map(lambda ring: _recall(ring, now, age, delays.real), rings.plant_signals)
+    sensor = scenario.force_sensor
+    if loop.has_force_bias:
+        force = force + sensor.bias
+    if noise.force is not None:
+        force = force + noise.force
+    if loop.has_sample_effects:
+        force = sample_force(force, sensor.quantum, sensor.dead_zone, sensor.range)
+
+    intervals = delays.position.intervals
+    stride = rig.constants.control_period * state.entry_velocity
+    before = sensed.first_position + (age - intervals).astype(stride.dtype) * stride
+    after = look_back(rings.position, now - 1, intervals)
+    position = jnp.where(age <= intervals, before, after)
+    if noise.position is not None:
+        position = position + noise.position
+    if loop.has_sample_effects:
+        position = quantise(position, scenario.position_sensor.quantum)
+    return Signals(force, state.position, state.velocity, position, age), plant_signals
+
+
+def compensate(
+    loop: Loop, prepared: Prepared, state: LoopState, signals: Signals, now: Array
+) -> tuple[Array, Any]:
+    """Stage 2: the force command F_c [N], and the compensator's next state."""
+    force, controller = loop.compensator.step(prepared.controller, state.controller, signals, now)
+    if loop.reads_always:
+        force = jnp.where(signals.age == 0, 0, force)
+    return force, controller
+
+
+def integrate(loop: Loop, rig: RigConstants, state: LoopState, force: Array) -> Model:
+    """Stage 3: the numerical model after one control period of M x_d'' = -F_c, F_c = `force` [N]."""
+    acceleration = -force * rig.inverse_mass
+    step = INTEGRATORS[loop.integrator]
+    position, velocity = step(state.position, state.velocity, acceleration, rig.constants.control_period)
+    return Model(position, velocity, acceleration)
+
+
+def actuate(
+    loop: Loop, rig: RigConstants, gains: Gains, state: LoopState, now: Array, model: Model, controller: Any
+) -> Actuated:
+    """Stage 4: position command, its limits, latency and hold, and the motion simulator that follows it."""
+    command, controller = loop.compensator.position_command(gains, controller, *model)
+    command, step, wanted = _limited(rig, state.plant, command)
+    commands = (command, *state.plant.commands)
+    end = commands[loop.latency]
+    start = commands[loop.latency + 1] if loop.hold == "linear" else end
+    rows, simulator = rig.propagation, state.plant.state
+    interval = _interval(rows, simulator, start, end, rig.scenario.contact_plane)
+    under_way = state.sensed.rings.interval
+    if under_way is not None:
+        under_way = write_in_turn(under_way, now, interval)
+        interval = _arrived(rig, under_way, now, now - state.entry_tick)
+    simulator = advance(rows.transition, simulator, start, end)
+    return Actuated(
+        plant=Plant(commands[: loop.latency + 1], step, simulator, wanted),
+        controller=controller,
+        position=read(rows.measured_position, state.plant.state, start, end),
+        interval=interval,
+        under_way=under_way,
+    )
+
+
+def contact_force(loop: Loop, rig: RigConstants, state: LoopState, interval: SamplingInterval) -> Contact:
+    """Stage 5: the real contact during the sampling interval that happens now."""
+    scenario, period = rig.scenario, rig.constants.control_period
+    surfaces = Surfaces(loop.law, state.parameters, state.law, scenario.clearance)
+    until = rig.delays.force.fraction * period
+    if loop.law.remembers:
+        loaded = surfaces.after(interval.start, interval.sample, until)
+        force, _ = loaded.force(interval.sample)
+        law = loaded.after(interval.sample, interval.end, period - until).state
+    else:
+        force, law = surfaces.force(interval.sample)
+    last, lagged, reading = state.sensed.last, state.sensed.lagged, None
+    if loop.is_two_sided or loop.energies:
+        last = surfaces.sample(interval.sample, force)
+    if loop.has_lag:
+        time_constant = scenario.force_sensor.time_constant
+        reading, lagged = sensed_lag(surfaces, lagged, interval, until, period, time_constant)
+    works = peak = None
+    if loop.energies and loop.first_break == 0:
+        works = works_between(state.sensed.last, last)
+    elif loop.energies:
+        works = works_along(surfaces, interval.start, interval.end, period)
+    if loop.has_corners:
+        peak = largest_force(surfaces, interval.start, interval.end, period)
+    return Contact(PlantSignals(force, works, peak), reading, lagged, last, law)
+
+
+def next_state(
+    state: LoopState, now: Array, before: PlantSignals, model: Model, actuated: Actuated, contact: Contact
+) -> LoopState:
+    """The state after the tick; what happened goes into the delay lines, from which `before` was read."""
+    plant_signals = jax.tree.map(depend_on, contact.plant_signals, before)
+    samples = Rings(plant_signals, contact.reading, actuated.position, None)
+    rings = write_in_turn(state.sensed.rings._replace(interval=None), now, samples)
+    return state._replace(
+        position=model.position,
+        velocity=model.velocity,
+        plant=actuated.plant,
+        sensed=state.sensed._replace(
+            rings=rings._replace(interval=actuated.under_way), last=contact.last, lagged=contact.lagged
+        ),
+        law=contact.law,
+        controller=actuated.controller,
+    )
+
+
+def _recall(ring, now, age, intervals):
+    """The sample so many sampling intervals before the newest; before the run there was no force."""
+    return jnp.where(age > intervals, look_back(ring, now - 1, intervals), 0)
+
+
+def _limited(rig, plant, command):
+    """The command after the limits, its step [m], and the command before them, where there are any."""
+    if plant.wanted is None:
+        return command, plant.step, None
+    simulator = rig.scenario.simulator
+    limited, step = limit_command(
+        command, plant.wanted, plant.commands[0], plant.step, rig.constants.control_period,
+        simulator.velocity_limit, simulator.acceleration_limit,
+    )  # fmt: skip
+    return limited, step, command
+
+
+def _interval(rows, state, start, end, plane):
+    """Motion of the real mechanism over the interval under way, from the plane in which it touches."""
+
+    def motion(position, velocity):
+        return Motion(read(position, state, start, end) - plane, read(velocity, state, start, end))
+
+    sample = motion(rows.position, rows.velocity)
+    if rows.start is None:
+        return SamplingInterval(sample, None, None)
+    return SamplingInterval(sample, motion(*rows.start), motion(*rows.end))
+
+
+def _arrived(rig, under_way, now, age):
+    """The interval that happens now; before the run, at rest at the surface, which does not push."""
+    intervals = rig.delays.contact
+    return jax.tree.map(
+        lambda ring: jnp.where(age >= intervals, look_back(ring, now, intervals), 0), under_way
+    )

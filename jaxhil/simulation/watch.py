@@ -1,0 +1,225 @@
+"""The contact under way, followed tick by tick: when it begins and ends, its speeds, forces and energies.
+
+What counts is what really happens (`PlantSignals`) and the force command; notebooks/guide/model.md section 2
+says when a contact begins and when it is over.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxhil.compensators.base import Signals
+from jaxhil.contact.laws import deflection
+from jaxhil.simulation.contact_force import PlantSignals
+from jaxhil.simulation.loop import Loop
+from jaxhil.simulation.probe import Deviation, no_deviation
+from jaxhil.simulation.scenario import Scenario
+
+LONGEST_FADING = 0.1  # s, waited for the compensator's command to die out
+FADED = 1e-6  # of the command's peak
+
+
+class Swings(NamedTuple):
+    """F_c of the contact under way; all of it begins with the 0 before the contact.
+
+    last: value [N].
+    highest: value so far [N].
+    lowest: value so far [N].
+    variation: total variation so far [N].
+    """
+
+    last: Float[Array, "*batch"]
+    highest: Float[Array, "*batch"]
+    lowest: Float[Array, "*batch"]
+    variation: Float[Array, "*batch"]
+
+
+class Watch(NamedTuple):
+    """The contact under way.
+
+    elapsed: ticks since it began; 0 before.
+    over: whether it is over.
+    approach: speed of the numerical model before it [m/s].
+    rebound: speed of the numerical model now [m/s].
+    peak_force: of the real force [N].
+    peak_command: of |F_c| [N].
+    recent: real force at the last two ticks [N].
+    touched: ticks with a real force.
+    quiet: ticks since the last real force.
+    works: done on the mechanism and returned by it [J], where energies are followed.
+    swings: of the command, where they are followed.
+    shortfall: largest of the position command [m], where it has limits.
+    side: of the surface, 1 or -1, between two of them.
+    command: |F_c| of the last tick [N], between two surfaces.
+    left: what was left of |F_c| when the last contact was over [N], between two surfaces.
+    deviation: of x_d from the contact in space, where the run is probed.
+    """
+
+    elapsed: Float[Array, "*batch"]
+    over: Bool[Array, "*batch"]
+    approach: Float[Array, "*batch"]
+    rebound: Float[Array, "*batch"]
+    peak_force: Float[Array, "*batch"]
+    peak_command: Float[Array, "*batch"]
+    recent: tuple[Array, Array]
+    touched: Float[Array, "*batch"]
+    quiet: Float[Array, "*batch"]
+    works: tuple[Array, ...]
+    swings: Swings | None
+    shortfall: Float[Array, "*batch"] | None
+    side: Float[Array, "*batch"] | None
+    command: Float[Array, "*batch"] | None
+    left: Float[Array, "*batch"] | None
+    deviation: Deviation | None
+
+
+class Rules(NamedTuple):
+    """When a contact is over.
+
+    quiet: ticks without a real force.
+    patience: ticks without a real force after which the command need not have died out.
+    level: below which the command has died out [N].
+    clearance: between two surfaces [m]; infinite for one.
+    """
+
+    quiet: Float[Array, "*batch"]
+    patience: Float[Array, "*batch"]
+    level: Float[Array, "*batch"]
+    clearance: Float[Array, "*batch"]
+
+
+def build_rules(scenario: Scenario) -> Rules:
+    """h = tau_f + 20 sensor time constants + 2 T without force; 0.1 s more for the command to fade."""
+    sensor, period = scenario.force_sensor, scenario.control_period
+    quiet = jnp.floor((sensor.delay + 20 * sensor.time_constant) / period + (2 + 1e-9)) + 1
+    level = 3 * sensor.noise_std + jnp.abs(sensor.bias) + sensor.quantum
+    return Rules(quiet, quiet + jnp.ceil(LONGEST_FADING / period), level, scenario.clearance)
+
+
+def fresh_watch(loop: Loop, like: Array) -> Watch:
+    """No contact, nor one for long."""
+    zeros = jnp.zeros_like(like)
+    return Watch(
+        elapsed=zeros,
+        over=jnp.zeros(like.shape, bool),
+        approach=zeros,
+        rebound=zeros,
+        peak_force=zeros,
+        peak_command=zeros,
+        recent=(zeros, zeros),
+        touched=zeros,
+        quiet=zeros + 1e6,
+        works=(zeros, zeros) if loop.energies else (),
+        swings=Swings(zeros, zeros, zeros, zeros) if loop.chatter else None,
+        shortfall=zeros if loop.has_limits else None,
+        side=zeros + 1 if loop.is_two_sided else None,
+        command=zeros if loop.is_two_sided else None,
+        left=zeros if loop.is_two_sided else None,
+        deviation=no_deviation(like) if loop.probed else None,
+    )
+
+
+def record_contact(
+    loop: Loop,
+    rules: Rules,
+    watch: Watch,
+    signals: Signals,
+    plant_signals: PlantSignals,
+    command: Array,
+    shortfall: Array | None,
+) -> Watch:
+    """Stage 6 of a tick: follow the contact; `command` is F_c [N], `shortfall` that of `Plant`."""
+    speed, magnitude = jnp.abs(signals.velocity_desired), jnp.abs(command)
+    force = jnp.abs(plant_signals.force)
+    touching = force > 0
+    begun = _has_begun(loop, rules, watch, signals, touching, magnitude)
+    side = _side(rules, watch, signals)
+    peak_command = jnp.maximum(watch.peak_command, magnitude)
+    quiet = jnp.where(touching, 0, watch.quiet + 1)
+    ends = _ends(rules, begun, signals, side, quiet, magnitude, peak_command)
+    lasts = begun & ~watch.over
+    return Watch(
+        elapsed=jnp.where(begun, watch.elapsed + 1, watch.elapsed),
+        over=watch.over | ends,
+        # Each speed stops being followed at its event; the approach's is that of the tick before.
+        approach=jnp.where(begun | watch.over, watch.approach, speed),
+        rebound=jnp.where(watch.over, watch.rebound, speed),
+        peak_force=jnp.maximum(watch.peak_force, _peak_force(loop, watch, plant_signals, force)),
+        peak_command=peak_command,
+        recent=(watch.recent[1], force),
+        touched=jnp.where(touching, watch.touched + 1, watch.touched),
+        quiet=quiet,
+        works=tuple(total + work for total, work in zip(watch.works, plant_signals.works or (), strict=True)),
+        swings=watch.swings and _swing(watch.swings, command, lasts, ends),
+        shortfall=_largest_shortfall(watch, shortfall, lasts),
+        side=side,
+        command=magnitude if loop.is_two_sided else None,
+        left=watch.left,
+        deviation=watch.deviation,
+    )
+
+
+def _has_begun(loop, rules, watch, signals, touching, magnitude):
+    """Whether the contact has begun: by a force or, where there is always a reading, by a penetration."""
+    if loop.reads_always:
+        starts = touching | (deflection(signals.position_desired, rules.clearance) != 0)
+    elif watch.left is not None:
+        # What is left of the last contact's command does not begin the next one.
+        starts = touching | (magnitude > watch.left)
+    else:
+        starts = touching | (magnitude > 0)
+    fresh = watch.elapsed == 0
+    begun = ~fresh | starts
+    return begun if watch.side is None else begun & ~watch.over
+
+
+def _side(rules, watch, signals):
+    """The nearer of two surfaces until the contact begins; None with one surface."""
+    if watch.side is None:
+        return None
+    position = signals.position_desired
+    near = jnp.where(position > -rules.clearance / 2, 1, -1).astype(position.dtype)
+    return jnp.where(watch.elapsed == 0, near, watch.side)
+
+
+def _ends(rules, begun, signals, side, quiet, magnitude, peak_command):
+    """Where the model moves away, without a force for long enough, and the command died out."""
+    velocity = signals.velocity_desired
+    away = velocity < 0 if side is None else side * velocity < 0
+    faded = magnitude <= jnp.maximum(FADED * peak_command, rules.level)
+    return begun & away & (quiet >= rules.quiet) & (faded | (quiet >= rules.patience))
+
+
+def _peak_force(loop, watch, plant_signals, force):
+    """Largest real force [N] since the tick before."""
+    if plant_signals.peak is not None:
+        return plant_signals.peak
+    # The force of a motion in jumps is constant between them.
+    return force if loop.first_break == 0 else _vertex(watch.recent[0], watch.recent[1], force)
+
+
+def _largest_shortfall(watch, shortfall, lasts):
+    """Of the position command while the contact lasts [m]; None without limits."""
+    if watch.shortfall is None or shortfall is None:
+        return watch.shortfall
+    return jnp.where(lasts, jnp.maximum(watch.shortfall, shortfall), watch.shortfall)
+
+
+def _swing(swings: Swings, command: Array, lasts: Array, ends: Array) -> Swings:
+    """One tick further, where the contact `lasts`; where it `ends` with this tick, the command is 0 next."""
+    step = jnp.abs(command - swings.last) + jnp.where(ends, jnp.abs(command), 0)
+    return Swings(
+        last=jnp.where(lasts, command, swings.last),
+        highest=jnp.where(lasts & (command > swings.highest), command, swings.highest),
+        lowest=jnp.where(lasts & (command < swings.lowest), command, swings.lowest),
+        variation=swings.variation + jnp.where(lasts, step, 0),
+    )
+
+
+def _vertex(before, middle, now):
+    """Largest force of the last period: the vertex of the parabola through three samples, if there is one."""
+    bend = 2 * middle - before - now
+    peaks = (middle >= before) & (middle >= now) & (bend > 0) & (before > 0) & (now > 0)
+    vertex = middle + (now - before) ** 2 / (8 * jnp.where(peaks, bend, 1))
+    return jnp.where(peaks, vertex, now)
