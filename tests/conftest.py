@@ -35,6 +35,7 @@ hypothesis.settings.register_profile("jaxhil", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("jaxhil")
 
 KEPT = 1_000_000_000  # bytes of programs
+LONG = ("test_notebooks", "test_rollout")
 
 
 def pytest_configure(config):
@@ -43,8 +44,10 @@ def pytest_configure(config):
 
 
 def pytest_collection_modifyitems(items):
-    """Modules of a kind side by side, so that they share the programs of single operations."""
-    items.sort(key=lambda item: item.get_closest_marker("users_options") is None)
+    """The longest first, so that workers end together; then modules of a kind, which share programs."""
+    items.sort(
+        key=lambda item: (item.path.stem not in LONG, item.get_closest_marker("users_options") is None)
+    )
 
 
 @pytest.fixture(scope="module", autouse=True)
