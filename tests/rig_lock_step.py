@@ -4,6 +4,8 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from hypothesis import strategies as st
+
 from jaxhil.mechanism.file import to_builtins
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.runtime import Controller
@@ -11,7 +13,19 @@ from jaxhil.runtime.gain_file import GainFile
 from tuning.rig.contact_watch import ContactResult, ContactWatch
 from tuning.rig.hardware import RigTask
 from tuning.rig.plant import Plant
-from tuning.rig.udp_protocol import APPROACH, Answer, ControllerTask, NumericalModel, Reading
+from tuning.rig.udp_protocol import (
+    APPROACH,
+    PREPARE,
+    READY,
+    TICK,
+    Answer,
+    ControllerTask,
+    NumericalModel,
+    Reading,
+)
+
+ANY = st.floats(width=64)
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
 
 
 def controller(mechanism: Mechanism, compensator: str, gains: Mapping[str, float], **limits: float):
@@ -84,3 +98,22 @@ def packets(
                     rig.take(arrived)
         rig.advance()
     return rig, task, answers
+
+
+def same(one, other):
+    """Whether two packets hold the same numbers, nan among them."""
+    return all(a == b or (a != a and b != b) for a, b in zip(one, other, strict=True))
+
+
+def a_reading(tick, sequence=None, force=0.0, position=-1.0, event=TICK, run=1):
+    """What the rig sends of a tick."""
+    sequence = tick + 10 if sequence is None else sequence
+    return Reading(event, sequence, run, tick, 0.001 * sequence, force, position, -1.0, 0.005)
+
+
+def prepared(mechanism, **limits):
+    """The controller's task, its law without compensation, ready for a run."""
+    law = controller(mechanism, "none", {}, **limits)
+    task = ControllerTask(law, to_builtins(mechanism))
+    assert task.answer(a_reading(0, 1, event=PREPARE)).flags == READY
+    return task

@@ -1,0 +1,239 @@
+"""Rig and controller in lock-step: the contacts of the closed loop, and what becomes of lost packets."""
+
+import math
+from random import Random
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rig_lock_step import ANY, FINITE, a_reading, closed_loop, controller, packets, prepared, same
+
+from jaxhil.compensators import literature_gains
+from jaxhil.mechanism.file import load, to_builtins
+from jaxhil.runtime import faults
+from tuning.rig import udp_protocol
+from tuning.rig.udp_protocol import (
+    MISSED_TICK,
+    MOST_MADE_UP,
+    PREPARE,
+    READY,
+    RESET,
+    TICK,
+    ControllerTask,
+    Reading,
+    decode_answer,
+    encode_answer,
+)
+
+
+@pytest.fixture(scope="module")
+def varying():
+    mechanism = load("varying").mechanism
+    return mechanism, literature_gains(mechanism, "response_error")
+
+
+@pytest.mark.parametrize("name", ["varying", "layered", "rattling"])
+def test_first_contacts_as_in_the_closed_loop(name):
+    mechanism = load(name).mechanism
+    gains = literature_gains(mechanism, "response_error")
+    contacts, _ = closed_loop(mechanism, "response_error", gains)
+    wanted = contacts if name == "rattling" else contacts[:1]
+    rig, _, _ = packets(mechanism, controller(mechanism, "response_error", gains), 2500)
+    found = rig.contacts[: len(wanted)]
+    assert [one.restitution for one in found] == [one.restitution for one in wanted]
+    assert [one.begun for one in found] == [one.begun for one in wanted]
+    # Run after run, through the lists of the mechanism again and again, at the nominal speed.
+    numbers = [one.number for one in rig.contacts]
+    assert len(numbers) > len(wanted)
+    assert numbers == [i % mechanism.approach.contacts for i in range(len(numbers))]
+    firsts = rig.contacts if name != "rattling" else rig.contacts[:: mechanism.approach.contacts]
+    assert all(one.approach_velocity == mechanism.approach.velocity for one in firsts)
+
+
+class Unreliable:
+    """Packets lost with a probability, or held back by up to so many ticks."""
+
+    def __init__(self, drops, ticks, seed):
+        self.random, self.drops, self.ticks = Random(seed), drops, ticks
+        self.queues = {way: [[] for _ in range(ticks + 1)] for way in ("there", "back")}
+
+    def __call__(self, way, packet):
+        queue = self.queues[way]
+        if self.random.random() >= self.drops:
+            queue[self.random.randint(0, self.ticks)].append(packet)
+        arrived = queue.pop(0)
+        queue.append([])
+        return arrived
+
+
+@pytest.mark.parametrize("drops, ticks", [(0.01, 0), (0.05, 0), (0.0, 2), (0.01, 2)])
+def test_lost_and_late_packets_are_made_up_for(varying, drops, ticks):
+    mechanism, gains = varying
+    law = controller(mechanism, "response_error", gains)
+    whole, _, _ = packets(mechanism, controller(mechanism, "response_error", gains), 2500)
+    rig, task, answers = packets(mechanism, law, 2500, Unreliable(drops, ticks, seed=1))
+    assert not rig.tripped and task.made_up > (10 if drops else 0)
+    assert (task.stale > 0) == (ticks > 0)
+    assert all(math.isfinite(answer.position_command) for answer in answers)
+    assert len(rig.contacts) >= 5
+    for found, expected in zip(rig.contacts, whole.contacts, strict=False):
+        assert found.status == "ok"
+        assert found.restitution == pytest.approx(expected.restitution, abs=0.006)
+    assert rig.commanded.not_finite == rig.commanded.beyond_limits == 0
+
+
+def test_contacts_that_the_law_did_not_know_are_counted():
+    """Too short ones, each reported once by an answer; the process says how many."""
+    mechanism = load("suite-fast", ["contact.stiffness=[884316.0]"]).mechanism
+    gains = literature_gains(mechanism, "retrospective_reference")
+    rig, task, answers = packets(mechanism, controller(mechanism, "retrospective_reference", gains), 900)
+    assert udp_protocol.LAW_IN_DOUBT == faults.LAW_IN_DOUBT and MISSED_TICK == faults.MISSED_TICK
+    reported = [answer for answer in answers if answer.faults & faults.LAW_IN_DOUBT]
+    assert len(rig.contacts) >= 3 and not rig.tripped
+    assert task.doubts == {"too_short": len(reported)} and len(reported) in (
+        len(rig.contacts),
+        len(rig.contacts) + 1,
+    )
+
+
+def test_a_tick_made_up_is_the_tick_on_the_line_between(varying):
+    mechanism, _ = varying
+    whole, gappy = prepared(mechanism), prepared(mechanism)
+    for tick, force in enumerate((0.0, 10.0, 20.0, 30.0, 40.0)):
+        expected = whole.answer(a_reading(tick, force=force))
+    for tick in (0, 1, 4):
+        found = gappy.answer(a_reading(tick, force=10.0 * tick))
+    assert found == expected._replace(faults=MISSED_TICK)
+    assert gappy.made_up == 2 and gappy.stale == 0
+
+
+def test_a_long_gap_is_the_controllers_to_judge(varying):
+    mechanism, _ = varying
+    task = prepared(mechanism, missed_in_a_row=20.0)
+    first = task.answer(a_reading(0, force=7.0))
+    gap = MOST_MADE_UP + 1
+    answer = task.answer(a_reading(1 + gap, force=7.0))
+    assert task.made_up == 0 and not answer.words and answer.faults & MISSED_TICK
+    # Model time is rig time: it went on under the last force.
+    mass, period = mechanism.bodies.equivalent_mass, mechanism.rig.control_period
+    assert answer.velocity == pytest.approx(first.velocity - (gap + 1) * period * 7.0 / mass, rel=1e-12)
+    tripped = task.answer(a_reading(60, force=7.0))
+    assert "missed_tick" in tripped.words and tripped.force_command == 0.0
+    assert math.isfinite(tripped.position_command) and math.isfinite(tripped.command_rate)
+
+
+def test_stale_packets_are_dropped_and_counted(varying):
+    task = prepared(varying[0])
+    assert task.answer(a_reading(3)) is not None
+    assert task.answer(a_reading(2)) is None  # overtaken
+    assert task.answer(a_reading(3)) is None  # twice
+    assert task.answer(a_reading(4, run=9)) is None  # a run that was never prepared
+    assert task.stale == 3
+    assert task.answer(a_reading(4)) is not None
+
+
+SMALL = st.integers(0, 40)
+
+
+@given(
+    st.lists(
+        st.builds(
+            Reading,
+            st.sampled_from([PREPARE, TICK, RESET]),
+            SMALL,
+            st.integers(0, 3),
+            SMALL,
+            FINITE,
+            *[ANY] * 4,
+        ),
+        max_size=30,
+    ),
+    st.sampled_from(["none", "response_error"]),
+)
+def test_whatever_a_rig_sends_is_answered_with_finite_commands(varying, readings, compensator):
+    mechanism, gains = varying
+    law = controller(mechanism, compensator, gains if compensator == "response_error" else {})
+    task = ControllerTask(law, to_builtins(mechanism))
+    for number, reading in enumerate(readings):
+        answer = task.answer(reading._replace(sequence=reading.sequence + 2 * number))
+        if answer is not None:
+            assert math.isfinite(answer.position_command) and math.isfinite(answer.force_command)
+            assert same(decode_answer(encode_answer(answer)), answer)
+
+
+@pytest.mark.parametrize("resets", [False, True])
+def test_a_trip_over_a_stall_of_the_machine_is_reset_and_reported(varying, resets):
+    mechanism, gains = varying
+    law = controller(mechanism, "response_error", gains, missed_in_a_row=3.0)
+    count = 0
+
+    def stalled_twice(way, packet):
+        nonlocal count
+        count += way == "there"
+        return [] if 100 <= count < 130 or 900 <= count < 930 else [packet]
+
+    rig, task, _ = packets(mechanism, law, 3000, stalled_twice, resets=resets)
+    rig.finish()
+    if not resets:
+        assert "missed_tick" in rig.tripped and rig.forgiven == () and len(rig.contacts) == 1
+        return
+    assert not rig.tripped and task.status == "ok"
+    assert len(rig.forgiven) == 2 and all("missed_tick" in words for words in rig.forgiven)
+    statuses = [one.status for one in rig.contacts]
+    assert statuses.count("stalled") == 2 and statuses.count("ok") == len(statuses) - 2 > 6
+    assert all(one.oldest_command > 3 for one in rig.contacts if one.status == "stalled")
+    assert all(abs(one.restitution - 0.94) < 0.05 for one in rig.contacts if one.status == "ok")
+
+
+def test_a_trip_that_no_stall_explains_is_not_reset(varying):
+    mechanism, gains = varying
+    law = controller(mechanism, "response_error", gains, force_limit=20.0, missed_in_a_row=1e9)
+    count = 0
+
+    def stalled_once(way, packet):
+        nonlocal count
+        count += way == "there"
+        return [] if 20 <= count < 25 else [packet]
+
+    rig, _, _ = packets(mechanism, law, 1000, stalled_once, resets=True)
+    rig.finish()
+    assert "force_limit" in rig.tripped and rig.forgiven == ()
+
+
+def test_a_sensor_that_fails_trips_and_the_rig_is_safe(varying):
+    mechanism, gains = varying
+    limits = {"held_readings": 3.0, "retreat_velocity": 0.01, "deceleration": 0.5, "velocity_limit": 0.1}
+    law = controller(mechanism, "response_error", gains, **limits)
+    count = 0
+
+    def broken(way, packet):
+        nonlocal count
+        if way == "there":
+            count += 1
+            if count > 60:
+                packet = packet._replace(force=math.nan)
+        return [packet]
+
+    rig, _, answers = packets(mechanism, law, 1500, broken)
+    rig.finish()
+    assert "force_not_finite" in rig.tripped
+    assert [one.status for one in rig.contacts] == ["tripped"]
+    assert all(math.isfinite(one.position_command) for one in answers) and rig.commanded.not_finite == 0
+    last = answers[-1]
+    assert last.position_command < 0.0 and last.command_rate == 0.0 and last.force_command == 0.0
+    steps = np.diff([one.position_command for one in answers[60:]])
+    assert np.max(np.abs(steps)) <= 0.1 * mechanism.rig.control_period * (1 + 1e-9)
+
+
+def test_tare_comes_before_the_first_run():
+    mechanism = load("rig-300kg", ("rig.force_sensor.bias=3.0",)).mechanism
+    law = controller(mechanism, "none", {}, tare_ticks=50.0, bias_limit=5.0)
+    rig, _, answers = packets(mechanism, law, 600)
+    assert law.bias == pytest.approx(3.0, abs=1e-12)
+    assert next(i for i, one in enumerate(answers) if one.flags & READY) == 49
+    assert rig.contacts and rig.contacts[0].status == "ok"
+    # What is left of the bias would push the model all the way through its approach.
+    quiet = load("rig-300kg").mechanism
+    expected = packets(quiet, controller(quiet, "none", {}), 600)[0].contacts[0]
+    assert rig.contacts[0].restitution == pytest.approx(expected.restitution, abs=1e-6)

@@ -1,0 +1,241 @@
+"""`jaxhil rig` and the controller's process beside it: short runs over UDP, and what both refuse."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections import deque
+from pathlib import Path
+
+import pytest
+from gain_documents import gain_document, sign
+from rig_lock_step import a_reading
+
+from jaxhil.compensators import literature_gains
+from jaxhil.mechanism.file import load
+from tuning.gain_file import build_document, write_gain_file
+from tuning.rig import udp_controller
+from tuning.rig.session import (
+    PROCESS,
+    SOURCE,
+    listening_port,
+    start_controller,
+)
+from tuning.rig.udp_protocol import (
+    PREPARE,
+    READY,
+    STOP,
+    decode_answer,
+    encode_reading,
+)
+
+ROOT = Path(__file__).parents[1]
+
+
+def gain_file(folder, compensator="response_error", limits=None, **values):
+    document = gain_document(compensator, **values)
+    if limits is not None:
+        from jaxhil.runtime.limits import LIMITS
+
+        document["limits"] = {name: {"value": v, "unit": LIMITS[name].unit} for name, v in limits.items()}
+    path = folder / "gains.json"
+    path.write_text(json.dumps(sign(document)))
+    return path
+
+
+def test_the_controllers_process_answers_its_rig_and_nobody_else(tmp_path):
+    record = tmp_path / "ticks.json"
+    arguments = ["--gains", str(gain_file(tmp_path)), "--record", str(record), "--ticks", "100"]
+    process = start_controller(SOURCE, arguments)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as rig:
+        address = ("127.0.0.1", listening_port(process))
+        rig.settimeout(10)
+
+        def ask(reading):
+            rig.sendto(encode_reading(reading), address)
+            return decode_answer(rig.recv(1000))
+
+        rig.sendto(b"no packet at all", address)
+        assert ask(a_reading(0, 1, event=PREPARE)).flags == READY
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.sendto(encode_reading(a_reading(50)), address)
+        for tick in range(5):
+            answer = ask(a_reading(tick))
+            assert (answer.tick, answer.sequence, answer.words) == (tick, tick + 10, "")
+        rig.sendto(encode_reading(a_reading(0, 99, event=STOP)), address)
+    assert process.wait(20) == 0
+    process.stdout.close()
+    found = json.loads(record.read_text())
+    assert found["ended"] == "stopped" and found["jax"] is False and found["made_up"] == found["stale"] == 0
+    ticks = found["ticks"]
+    assert ticks["sequence"] == [10, 11, 12, 13, 14]
+    assert all(value > 0 for value in ticks["wall"] + ticks["cpu"])
+
+
+def test_the_controllers_process_of_a_bundle_runs_the_bundles_runtime(jaxhil, tmp_path):
+    gain_file(tmp_path)
+    for name in PROCESS:
+        (tmp_path / name).write_bytes((SOURCE / name).read_bytes())
+    stand_in = (
+        "import sys\n"
+        f"open({str(tmp_path / 'used')!r}, 'w').write(str(sys.flags.isolated))\n"
+        f"sys.path.insert(0, {str(ROOT)!r})\n"
+        "from jaxhil.runtime import Controller\n"
+    )
+    (tmp_path / "jaxhil_runtime.py").write_text(stand_in)
+    ran = jaxhil("rig", tmp_path, "--duration", 0.5, "--json", "--limit", "inf")
+    assert ran.document["run"]["ticks"] == 500
+    assert (tmp_path / "used").read_text() == "1"
+    assert not (tmp_path / "__pycache__").exists()
+
+
+@pytest.mark.parametrize("options", [("--wait", "0.1"), ("--wait", "20", "--silence", "0.1")])
+def test_a_silent_rig_ends_the_controllers_process(tmp_path, options):
+    record = tmp_path / "ticks.json"
+    process = start_controller(SOURCE, ["--empty", "--record", str(record), *options])
+    port = listening_port(process)
+    if "20" in options:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as rig:
+            rig.settimeout(10)
+            rig.sendto(encode_reading(a_reading(0, 1)), ("127.0.0.1", port))
+            assert decode_answer(rig.recv(1000)).sequence == 1
+            assert process.wait(20) == 1
+    assert process.wait(20) == 1
+    process.stdout.close()
+    assert json.loads(record.read_text())["ended"] == "silent"
+
+
+def test_a_controllers_process_without_a_gain_file(capfd):
+    assert udp_controller.main(["--gains", "nowhere.json"]) == 2
+    error = capfd.readouterr().err
+    assert "nowhere.json" in error and error.count("\n") == 1
+
+
+def test_rig_reports_a_short_run(jaxhil, tmp_path):
+    path = gain_file(tmp_path)
+    # One contact of this gain file's takes most of a second.
+    ran = jaxhil("rig", path, "--duration", 2, "--limit", "inf", "--json", "--plot", tmp_path / "rig.png")
+    found = ran.document
+    assert found["empty_loop"]["ticks"] == 400 and found["run"]["ticks"] == 2000
+    assert (tmp_path / "rig.png").stat().st_size > 10_000
+    for loop in (found["empty_loop"], found["run"]):
+        missed = [loop[f"missed_by_{cause}"] for cause in ("controller", "injection", "machine")]
+        assert sum(missed) == loop["missed"] and missed[1] == 0
+        assert loop["controller"]["ended"] == "stopped" and loop["controller"]["jax"] is False
+        for name in ("tick_time", "tick_cpu", "round_trip", "lateness"):
+            assert 0 < loop[name]["median"] <= loop[name]["p999"] <= loop[name]["maximum"]
+    assert found["contacts"] and not found["tripped"] and not found["interrupted"]
+    assert found["commanded"]["not_finite"] == found["commanded"]["beyond_limits"] == 0
+    for contact in found["contacts"]:
+        assert contact["reference_restitution"] == pytest.approx(1.0, abs=1e-9)
+        assert contact["error"] == contact["restitution"] - contact["reference_restitution"]
+    assert ran.code == (0 if found["verdict"] == "good" else 1)
+
+
+def test_rig_under_injected_faults_ends_safely(jaxhil, tmp_path):
+    limits = {"command_lowest": -0.01, "command_highest": 0.01, "velocity_limit": 0.05, "deceleration": 1.0}
+    limits |= {"held_readings": 3.0, "missed_in_a_row": 5.0, "retreat_velocity": 0.01}
+    limits |= {"limited_in_a_row": 5.0, "force_limit": 200.0}
+    path = gain_file(tmp_path, limits=limits)
+    ran = jaxhil("rig", path, "--duration", 1, "--drops", 0.01, "--jitter", 0.002, "--limit", "inf")
+    assert "injected" in ran.out and "missed" in ran.out
+    ran = jaxhil("rig", path, "--duration", 1, "--drops", 0.2, "--delay", 0.003, "--limit", "inf", "--json")
+    found = ran.document
+    assert found["run"]["missed_by_injection"] > 100
+    assert found["stroke"] == [-0.01, 0.01]
+    assert -0.01 <= found["commanded"]["lowest"] <= found["commanded"]["highest"] <= 0.01
+    assert found["commanded"]["not_finite"] == found["commanded"]["beyond_limits"] == 0
+
+
+def test_rig_trips_without_injection_and_is_bad(jaxhil, tmp_path):
+    limits = {"force_limit": 5.0, "retreat_velocity": 0.01, "deceleration": 1.0}
+    path = gain_file(tmp_path, limits=limits)
+    ran = jaxhil("rig", path.parent, "--duration", 5, "--limit", "inf")
+    assert ran.code == 1
+    assert "tripped: force_limit" in ran.out and "though no faults were injected" in ran.out
+
+
+def test_rig_interrupted_says_what_it_measured(tmp_path):
+    path = gain_file(tmp_path)
+    # A shell's background jobs ignore interrupts, and hand that on.
+    heeding = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from tuning.__main__ import main; sys.exit(main(sys.argv[1:]))"
+    )
+    command = [sys.executable, "-c", heeding, "rig", str(path), "--duration", "60", "--json"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(
+        command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    seen = deque(maxlen=10)
+    for line in process.stderr:
+        seen.append(line)
+        if "empty loop" in line:
+            break
+    # While the empty loop lasts: the run is never reached.
+    time.sleep(2.0)
+    process.send_signal(signal.SIGINT)
+    out, error = process.communicate(timeout=60)
+    assert process.returncode == 130, (seen, error)
+    found = json.loads(out)
+    assert found["interrupted"] and found["run"] is None
+    assert 0 < found["empty_loop"]["ticks"] < 12_000
+    assert "Traceback" not in error
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        (("nowhere.json",), "nowhere.json"),
+        (("GAINS", "--drops", "1"), "--drops: found 1, allowed a probability"),
+        (("GAINS", "--jitter", "-1"), "--jitter: found -1"),
+        (("GAINS", "--delay", "nan"), "--delay: found nan"),
+        (("GAINS", "--duration", "0"), "--duration: found 0, allowed 0.001 to 2000 s"),
+        (("BROKEN",), "sha256"),
+    ],
+)
+def test_unusable_input_of_rig(jaxhil, tmp_path, options, words):
+    good = gain_file(tmp_path)
+    broken = tmp_path / "broken.json"
+    broken.write_text(good.read_text().replace("0.005", "0.006"))
+    names = {"GAINS": good, "BROKEN": broken}
+    ran = jaxhil("rig", *(names.get(option, option) for option in options))
+    assert ran.code == 2 and words in ran.err and ran.out == ""
+    assert ran.err.strip().count("\n") == 0
+
+
+def test_a_priority_that_is_not_to_be_had(jaxhil, tmp_path, monkeypatch):
+    def refuse(*arguments):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse, raising=False)
+    ran = jaxhil("rig", gain_file(tmp_path), "--realtime")
+    assert ran.code == 2 and "--realtime: found no such priority (Operation not permitted)" in ran.err
+
+
+def test_help_of_rig_has_an_example(jaxhil):
+    ran = jaxhil("rig", "--help")
+    assert ran.code == 0 and "Example: jaxhil rig" in ran.out
+
+
+def test_the_loop_runs_without_jax():
+    program = (
+        "import sys, tuning.cli.commands.rig as command, tuning.rig.session, tuning.rig.report\n"
+        "assert 'jax' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
+
+
+@pytest.mark.benchmark
+def test_ten_minutes_at_1_khz(jaxhil, tmp_path):
+    mechanism, sha256, _ = load("varying")
+    gains = literature_gains(mechanism, "response_error")
+    path = tmp_path / "gains.json"
+    write_gain_file(path, build_document("response_error", gains, mechanism, sha256, {}, {}, 0, {}))
+    assert mechanism.rig.control_period == 1e-3
+    ran = jaxhil("rig", path, "--duration", 600)
+    print(ran.out)
+    assert ran.code == 0
