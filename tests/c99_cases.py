@@ -227,11 +227,11 @@ def drawn_limits(law: str, rng: np.random.Generator, hostile: bool, period: floa
         return NO_LIMITS
 
 
-def drawn_rows(kind: str, count: int, rng: np.random.Generator, period: float) -> np.ndarray:
-    """Ticks of a `contact`, of `random` size, or `hostile`; now and then a reset or the next contact."""
+def contact_rows(
+    count: int, rng: np.random.Generator, period: float, phase: float, rate: float, amplitude: float
+) -> np.ndarray:
+    """Ticks of one contact after another: a motion of this phase, rate [rad/s] and amplitude [m], noise."""
     time = period * np.arange(count)
-    phase = rng.uniform(0, 2 * np.pi)
-    rate, amplitude = rng.uniform(10, 60), 10 ** rng.uniform(-5, -3)
 
     def motion(late: float) -> np.ndarray:
         return amplitude * (np.sin(rate * (time - late) + phase) - 0.3)
@@ -243,6 +243,14 @@ def drawn_rows(kind: str, count: int, rng: np.random.Generator, period: float) -
     rows[:, 1:] = np.stack(
         [force, motion(0), speed, measured, time, np.ones(count), motion(0), speed, -force / 350], axis=1
     )
+    return rows
+
+
+def drawn_rows(kind: str, count: int, rng: np.random.Generator, period: float) -> np.ndarray:
+    """Ticks of a `contact`, of `random` size, or `hostile`; now and then a reset or the next contact."""
+    phase, rate, amplitude = rng.uniform(0, 2 * np.pi), rng.uniform(10, 60), 10 ** rng.uniform(-5, -3)
+    rows = contact_rows(count, rng, period, phase, rate, amplitude)
+    time = rows[:, 5].copy()
     if kind != "contact":
         size = 10 ** rng.uniform(-12, 12, (count, 9))
         rows[:, 1:] = np.where(

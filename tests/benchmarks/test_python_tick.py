@@ -8,9 +8,9 @@ import time
 
 import numpy as np
 import pytest
-from c99_cases import drawn_rows
+from c99_cases import contact_rows
 from gain_documents import gain_document, sign
-from test_c_tick import WIDE
+from test_c_tick import CONTACTS, WIDE
 
 from jaxhil.runtime import COMPENSATORS, Controller
 from jaxhil.runtime.limits import LIMITS
@@ -31,7 +31,7 @@ def test_time_of_a_tick(law, guarded, capsys):
             name: {"value": value, "unit": LIMITS[name].unit} for name, value in WIDE.items()
         }
     controller = Controller.from_dict(sign(document))
-    rows = drawn_rows("contact", TICKS, np.random.default_rng(0), controller.control_period).tolist()
+    rows = contact_rows(TICKS, np.random.default_rng(0), controller.control_period, *CONTACTS).tolist()
     took, empty = [], []
     clock, step, position_command = time.perf_counter_ns, controller.step, controller.position_command
     for _, force, desired, velocity, measured, now, _, x, v, a in rows:
