@@ -20,14 +20,9 @@ from tuning.bundle.bundle import limits_section
 from tuning.gain_file import build_document, check_document
 from tuning.sweeps.run import run_sweep
 from tuning.sweeps.store import open_store, read_part
+from tuning.watchdog.alarms import good_runs, judge_chunk
 from tuning.watchdog.audited import audit_contacts, first_reached
-from tuning.watchdog.calibration import (
-    calibrate,
-    good_runs,
-    guard_limits,
-    judge_chunk,
-    watchdog_rules,
-)
+from tuning.watchdog.calibration import calibrate, guard_limits, watchdog_rules
 from tuning.watchdog.expectation import TERMS, Expectation, Features, expected_restitution, fit_expectation
 from tuning.watchdog.extent import extent_of
 from tuning.watchdog.recorded import Scenarios, Signals, recorded_chunks

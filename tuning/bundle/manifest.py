@@ -13,11 +13,8 @@ from typing import Any
 from jaxhil.errors import one_line
 from tuning.bundle import selftest
 
-MARKS = (
-    selftest.MANIFEST,
-    "selftest.py",
-    "jaxhil_runtime.py",
-)  # of a folder that is meant as one
+# Of a folder that is meant as a bundle.
+MARKS = (selftest.MANIFEST, "selftest.py", "jaxhil_runtime.py")
 
 
 def manifest_text(files: Mapping[str, bytes], document: Mapping[str, Any]) -> bytes:

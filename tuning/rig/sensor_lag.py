@@ -43,39 +43,10 @@ def lagged(
     side, surface = _surface(start.position, end.position, clearance)
     if side == 0.0:
         return reading * math.exp(-duration / time_constant)
-    path = _Cubic(start, end, duration)
-
-    def depth(s: float) -> float:
-        return side * (path.position(s) - surface)
-
-    turn, bottom = _turn(path, depth, side) if law.loaded else (1.0, 0.0)
-
-    def law_at(s: float) -> ContactLaw:
-        if law.loaded is None:
-            return law
-        return law.loaded(max(deepest, depth(0.0), bottom if s > turn else depth(s)))
-
-    def hold(s: float) -> float:
-        return law_at(s).hold(depth(s), side * path.velocity(s))
-
-    enters, leaves = _span(depth)
-    catches, lets_go = _span(hold)
-    first, last = max(enters, catches), min(leaves, lets_go)
+    stretch = _Stretch(_Cubic(start, end, duration), side, surface, law, deepest)
+    first, last, forces = stretch.pressed()
     if not first < last:
         return reading * math.exp(-duration / time_constant)
-    begins_at_surface = enters > 0.0 and enters >= catches
-    ends_at_surface = leaves < 1.0 and leaves <= lets_go
-    forces = []
-    for i in range(2 * ARCS + 1):
-        s = first + (last - first) * (i / (2 * ARCS))
-        rate = side * path.velocity(s)
-        if (i == 0 and begins_at_surface) or (i == 2 * ARCS and ends_at_surface):
-            # At the surface the force has a limit from inside.
-            force = law.edge(rate)
-        else:
-            penetration = depth(s)
-            force = law_at(s).force(penetration, rate) if penetration > 0.0 else 0.0
-        forces.append(side * force)
     reading *= math.exp(-first * duration / time_constant)
     span = (last - first) * duration / ARCS / time_constant
     decay, straight, bow = _arc(span)
@@ -99,8 +70,54 @@ def deepest_within(start: Motion, end: Motion, duration: float, clearance: float
     return max(depth(0.0), depth(1.0), _turn(path, depth, side)[1], 0.0)
 
 
+class _Stretch:
+    """One stretch of motion at one surface, by the fraction s of it: where it presses, and with what force.
+
+    A law that remembers holds, at s, after the deepest penetration so far.
+    """
+
+    def __init__(self, path: "_Cubic", side: float, surface: float, law: ContactLaw, deepest: float) -> None:
+        self._path, self._side, self._surface, self._law = path, side, surface, law
+        self._turn, bottom = _turn(path, self._depth, side) if law.loaded else (1.0, 0.0)
+        self._before = max(deepest, self._depth(0.0))
+        self._bottom = max(self._before, bottom)
+
+    def pressed(self) -> tuple[float, float, list[float]]:
+        """From which s until which there is a force; its values [N] at the ends of `ARCS` arcs and within."""
+        enters, leaves = _span(self._depth)
+        catches, lets_go = _span(self._hold)
+        first, last = max(enters, catches), min(leaves, lets_go)
+        if not first < last:
+            return first, last, []
+        edges = {0: enters > 0.0 and enters >= catches, 2 * ARCS: leaves < 1.0 and leaves <= lets_go}
+        forces = []
+        for i in range(2 * ARCS + 1):
+            s = first + (last - first) * (i / (2 * ARCS))
+            forces.append(self._side * self._force(s, edges.get(i, False)))
+        return first, last, forces
+
+    def _depth(self, s: float) -> float:
+        return self._side * (self._path.position(s) - self._surface)
+
+    def _law_at(self, s: float) -> ContactLaw:
+        if self._law.loaded is None:
+            return self._law
+        return self._law.loaded(self._bottom if s > self._turn else max(self._before, self._depth(s)))
+
+    def _hold(self, s: float) -> float:
+        return self._law_at(s).hold(self._depth(s), self._side * self._path.velocity(s))
+
+    def _force(self, s: float, at_surface: bool) -> float:
+        rate = self._side * self._path.velocity(s)
+        if at_surface:
+            # At the surface the force has a limit from inside.
+            return self._law.edge(rate)
+        penetration = self._depth(s)
+        return self._law_at(s).force(penetration, rate) if penetration > 0.0 else 0.0
+
+
 def _surface(start: float, end: float, clearance: float) -> tuple[float, float]:
-    """Side (1, -1, or 0 for none) and position [m] of the surface that a stretch touches."""
+    """Side (1, -1, or 0 for none) and position [m] of the surface that a stretch reaches."""
     for position in (start, end):
         if position > 0.0:
             return 1.0, 0.0

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool
 
 from jaxhil.errors import InputError
 from jaxhil.mechanism.uncertainty import extremes
@@ -18,12 +18,19 @@ from jaxhil.runtime.limits import LIMITS
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gain_file import LoadedGains
-from tuning.statistics.intervals import binomial_interval
 from tuning.sweeps.store import Store, read_part
-from tuning.watchdog.audited import Audited, Rules, audit_contacts, first_reached
+from tuning.watchdog.alarms import (
+    JudgedRuns,
+    features_of,
+    good_runs,
+    judge_chunk,
+    reached,
+    watchdog_rates,
+)
+from tuning.watchdog.audited import Rules
 from tuning.watchdog.expectation import Expectation, Features, expected_restitution, fit_expectation
-from tuning.watchdog.extent import Extent, extent_of
-from tuning.watchdog.recorded import LANES, Chunk, Scenarios, recorded_chunks
+from tuning.watchdog.extent import Extent
+from tuning.watchdog.recorded import LANES, Scenarios, recorded_chunks
 
 MARGIN = 1.5  # on what good runs did
 FITTED = 2048  # runs that are enough to fit to: all others judge, at least 3 of 4 and at most 15 of 16
@@ -35,32 +42,20 @@ TARE = 0.1  # s
 RETREAT = 0.005  # s of free approach: what counts as out of contact besides what the sensor may err
 BALANCE = 1e-6  # of the approach's energy: what rounding leaves is far below, one wrong force far above
 BEYOND = 1.25  # times the expectation's largest error among the fitted runs: what others may have
-LEAST, PLACE = (
-    0.25,
-    0.75,
-)  # of the limit: the least margin of the restitution, and the one that a good expectation has
+# Of the limit: the least margin of the restitution, and the one that a good expectation has.
+LEAST, PLACE = 0.25, 0.75
 ENOUGH = 0.01  # of the limit: rms error of an expectation that need not be better
-TOLD_ERRORS = (0.5, 1.0)  # of the limit: below the one a run is good, beyond the other it must be stopped
 
 
 class Calibration(NamedTuple):
-    """Limits by name [SI units], of `jaxhil.runtime.limits.LIMITS`, None for no limit; what is known of the
-    watchdog's alarms, plain data for the gain file and the summary."""
+    """What a gain file says of its limits.
+
+    limits: by name [SI units], all of `jaxhil.runtime.limits.LIMITS`; None for no limit.
+    rates: what is known of the watchdog's alarms under them, plain data.
+    """
 
     limits: dict[str, float | None]
     rates: dict[str, Any]
-
-
-class Judged(NamedTuple):
-    """Runs: their index, (lanes,); errors (slots, lanes), NaN where a contact did not end; the reference's
-    restitution; status; what the watchdog audits; extent of the signals."""
-
-    index: Int[np.ndarray, "lanes"]
-    error: Float[np.ndarray, "slots lanes"]
-    reference: Float[np.ndarray, "slots lanes"]
-    status: Int[np.ndarray, "slots lanes"]
-    audited: Audited
-    extent: Extent
 
 
 def calibrate(
@@ -140,41 +135,18 @@ def watchdog_rules(loaded: LoadedGains) -> tuple[Rules, float]:
     return rules, min(free_distance, mechanism.contact.clearance / 4)
 
 
-def judge_chunk(chunk: Chunk, rules: Rules, free_distance: float) -> Judged:
-    """What became of some recorded runs."""
-    contacts, slots = chunk.contacts, len(chunk.contacts.status)
-    return Judged(
-        chunk.first + np.arange(contacts.status.shape[1]),
-        contacts.error,
-        contacts.reference,
-        contacts.status,
-        audit_contacts(chunk.signals, rules, slots),
-        extent_of(chunk.signals, rules.period, rules.clearance, free_distance, rules.settling),
-    )
-
-
-def good_runs(runs: Judged, limit: float) -> Bool[np.ndarray, "lanes"]:
-    """All contacts ended, none with an error beyond the limit."""
-    return np.all((runs.status == OK) & (np.abs(runs.error) <= limit), axis=0)
-
-
-def reached(runs: Judged, limit: float) -> Bool[np.ndarray, "slots lanes"]:
-    """Contacts that the rig would come to: none before them had to be stopped."""
-    bad = (runs.status != OK) | ~(np.abs(runs.error) <= limit)
-    first = first_reached(bad)
-    return (np.arange(len(bad))[:, None] <= first) & runs.audited.begun
-
-
-def fit_reached(runs: Judged, limit: float, mass: float, chosen: Bool[np.ndarray, "lanes"]) -> Expectation:
+def fit_reached(
+    runs: JudgedRuns, limit: float, mass: float, chosen: Bool[np.ndarray, "lanes"]
+) -> Expectation:
     """The expectation, fitted to the contacts reached in the chosen runs."""
     use = reached(runs, limit) & (runs.status == OK) & chosen & (runs.audited.approach > 0)
     place = np.broadcast_to(np.cumsum(chosen), use.shape)[use]
-    features = Features(*(leaf[use] for leaf in _features(runs.audited)))
+    features = Features(*(leaf[use] for leaf in features_of(runs.audited)))
     return fit_expectation(features, runs.reference[use], place, mass, ENOUGH * limit)
 
 
 def restitution_margin(
-    runs: Judged, expectation: Expectation, limit: float, mass: float, chosen: Bool[np.ndarray, "lanes"]
+    runs: JudgedRuns, expectation: Expectation, limit: float, mass: float, chosen: Bool[np.ndarray, "lanes"]
 ) -> float:
     """Where to trip: at `PLACE` of the limit, nearer to 0 if the expectation errs by more than the rest.
 
@@ -182,7 +154,7 @@ def restitution_margin(
     first that none is missed, then that few are alarmed about for nothing.
     """
     use = reached(runs, limit) & (runs.status == OK) & chosen
-    expected = expected_restitution(expectation, _features(runs.audited), mass)
+    expected = expected_restitution(expectation, features_of(runs.audited), mass)
     # Together with what the audit's own restitution differs from the loop's.
     apart = runs.audited.restitution - expected - runs.error
     apart = np.abs(apart[use])
@@ -190,89 +162,8 @@ def restitution_margin(
     return float(np.clip(limit - BEYOND * largest, LEAST * limit, PLACE * limit))
 
 
-def watchdog_rates(
-    runs: Judged,
-    expectation: Expectation,
-    limits: Mapping[str, float | None],
-    limit: float,
-    mass: float,
-    chosen: Bool[np.ndarray, "lanes"],
-) -> dict[str, Any]:
-    """False and missed alarms among the chosen runs, with exact intervals of 95 %.
-
-    A run is good if no error exceeds half the limit, and a false alarm if the watchdog or another guard stops
-    it. It has to be stopped if some contact does not end or has an error beyond the limit, and is missed if
-    the watchdog has not tripped by the end of that contact.
-    """
-    alarmed = alarms(runs, expectation, limits, mass)
-    first_alarm = first_reached(alarmed)
-    stopped_anyhow = np.any(alarmed, axis=0) | guard_trips(runs.extent, limits)
-    good = chosen & good_runs(runs, TOLD_ERRORS[0] * limit)
-    bad = (runs.status != OK) | ~(np.abs(runs.error) <= TOLD_ERRORS[1] * limit)
-    first_bad = first_reached(bad)
-    stopped = chosen & np.any(bad, axis=0)
-    use = reached(runs, limit) & (runs.status == OK) & chosen
-    expected = expected_restitution(expectation, _features(runs.audited), mass)
-    apart = np.abs((expected - runs.reference)[use])
-    return {
-        "limit": limit,
-        "restitution_margin": limits["restitution_margin"],
-        "terms": [term for term, value in expectation.coefficients.items() if value],
-        "expectation_rms": float(np.sqrt(np.mean(apart**2))) if len(apart) else None,
-        "expectation_largest": float(np.max(apart)) if len(apart) else None,
-        "false_alarms": _rate(stopped_anyhow[good]),
-        "missed_alarms": _rate(first_alarm[stopped] > first_bad[stopped]),
-        "held_out_runs": int(np.sum(chosen)),
-    }
-
-
-def alarms(
-    runs: Judged, expectation: Expectation, limits: Mapping[str, float | None], mass: float
-) -> Bool[np.ndarray, "slots lanes"]:
-    """Contacts about which the watchdog raises an alarm."""
-    audited = runs.audited
-    expected = expected_restitution(expectation, _features(audited), mass)
-    margin, balance, longest = (
-        np.inf if limits[name] is None else float(limits[name] or 0.0)
-        for name in ("restitution_margin", "energy_balance", "longest_contact")
-    )
-    with np.errstate(invalid="ignore"):
-        quiet = (
-            (np.abs(audited.restitution - expected) <= margin)
-            & (audited.imbalance <= balance)
-            & (audited.duration <= longest)
-        )
-    return audited.begun & ~quiet & ~(audited.approach == 0)
-
-
-def guard_trips(extent: Extent, limits: Mapping[str, float | None]) -> Bool[np.ndarray, "lanes"]:
-    """Runs that a guard other than the watchdog would stop, or flag readings of."""
-
-    def most(name: str) -> float:
-        value = limits[name]
-        return np.inf if value is None else value
-
-    def least(name: str) -> float:
-        value = limits[name]
-        return -np.inf if value is None else value
-
-    return (
-        (extent.reading >= most("force_range"))
-        | (extent.measured_lowest < least("measured_lowest"))
-        | (extent.measured_highest > most("measured_highest"))
-        | (extent.sent_lowest < least("command_lowest"))
-        | (extent.sent_highest > most("command_highest"))
-        | (extent.force_stuck > most("force_stuck_travel"))
-        | (extent.position_stuck > most("position_stuck_travel"))
-        | (extent.flight_force > most("free_force"))
-        | (extent.command > most("force_limit"))
-        | (extent.slew > most("force_slew"))
-        | (extent.sent_speed > most("velocity_limit"))
-    )
-
-
 def guard_limits(
-    loaded: LoadedGains, runs: Judged, used: Bool[np.ndarray, "lanes"], rules: Rules, free_distance: float
+    loaded: LoadedGains, runs: JudgedRuns, used: Bool[np.ndarray, "lanes"], rules: Rules, free_distance: float
 ) -> dict[str, float | None]:
     """The limits of readings and commands: margins on the extent of the runs `used`."""
     extent = Extent(*(leaf[used] for leaf in runs.extent))
@@ -318,7 +209,7 @@ def guard_limits(
     }
 
 
-def _balance(runs: Judged, used) -> float:
+def _balance(runs: JudgedRuns, used) -> float:
     """Rounding is far below `BALANCE`; a drawn mass that is not the file's is not."""
     return max(BALANCE, MARGIN * float(np.nanmax(runs.audited.imbalance[:, used])))
 
@@ -333,19 +224,6 @@ def _widened(low: float, high: float, clearance: float) -> tuple[float | None, f
     low, high = min(low, -clearance), max(high, 0.0)
     spare = (MARGIN - 1) * (high - low)
     return low - spare, high + spare
-
-
-def _features(audited: Audited) -> Features:
-    return Features(
-        np.nan_to_num(audited.stiffness), np.nan_to_num(audited.damping), np.nan_to_num(audited.approach)
-    )
-
-
-def _rate(alarmed: Bool[np.ndarray, "runs"]) -> dict[str, Any]:
-    number, count = len(alarmed), int(np.sum(alarmed))
-    _, low, high = binomial_interval(count, number)
-    rate = count / number if number else None
-    return {"runs": number, "alarms": count, "rate": rate, "low": float(low), "high": float(high)}
 
 
 def _largest(loaded: LoadedGains) -> dict[str, float]:
@@ -392,7 +270,7 @@ def _held(store: Store) -> int:
     return held
 
 
-def _joined(parts: list[Judged]) -> Judged:
+def _joined(parts: list[JudgedRuns]) -> JudgedRuns:
     def join(leaves):
         if isinstance(leaves[0], tuple):
             return type(leaves[0])(*(join(each) for each in zip(*leaves, strict=True)))

@@ -1,0 +1,160 @@
+"""What the watchdog and the other guards would do about recorded runs: whom they stop, and whom they miss.
+
+A run is good where no contact's error exceeds a limit. Under given limits a good run that is stopped is a
+false alarm, and a bad one that goes on past its bad contact is a missed alarm.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxhil.simulation.metrics import OK
+from tuning.statistics.intervals import binomial_interval
+from tuning.watchdog.audited import Audited, Rules, audit_contacts, first_reached
+from tuning.watchdog.expectation import Expectation, Features, expected_restitution
+from tuning.watchdog.extent import Extent, extent_of
+from tuning.watchdog.recorded import Chunk
+
+# Of the limit: up to the first a run is good, beyond the second it has to be stopped.
+GOOD_ERROR, BAD_ERROR = 0.5, 1.0
+
+
+class JudgedRuns(NamedTuple):
+    """Recorded runs, and what became of them.
+
+    index: of each run, in its sweep.
+    error: restitution error; NaN where a contact did not end.
+    reference: the reference's restitution.
+    status: of each contact, as in `jaxhil.simulation.metrics`.
+    audited: what the watchdog audits.
+    extent: how far the signals went.
+    """
+
+    index: Int[np.ndarray, "lanes"]
+    error: Float[np.ndarray, "slots lanes"]
+    reference: Float[np.ndarray, "slots lanes"]
+    status: Int[np.ndarray, "slots lanes"]
+    audited: Audited
+    extent: Extent
+
+
+def judge_chunk(chunk: Chunk, rules: Rules, free_distance: float) -> JudgedRuns:
+    """What became of some recorded runs."""
+    contacts, slots = chunk.contacts, len(chunk.contacts.status)
+    return JudgedRuns(
+        chunk.first + np.arange(contacts.status.shape[1]),
+        contacts.error,
+        contacts.reference,
+        contacts.status,
+        audit_contacts(chunk.signals, rules, slots),
+        extent_of(chunk.signals, rules.period, rules.clearance, free_distance, rules.settling),
+    )
+
+
+def good_runs(runs: JudgedRuns, limit: float) -> Bool[np.ndarray, "lanes"]:
+    """All contacts ended, none with an error beyond the limit."""
+    return np.all((runs.status == OK) & (np.abs(runs.error) <= limit), axis=0)
+
+
+def reached(runs: JudgedRuns, limit: float) -> Bool[np.ndarray, "slots lanes"]:
+    """Contacts that the rig would come to: none before them had to be stopped."""
+    bad = (runs.status != OK) | ~(np.abs(runs.error) <= limit)
+    first = first_reached(bad)
+    return (np.arange(len(bad))[:, None] <= first) & runs.audited.begun
+
+
+def features_of(audited: Audited) -> Features:
+    """What the expectation is a function of; 0 where there is nothing to identify it from."""
+    return Features(
+        np.nan_to_num(audited.stiffness), np.nan_to_num(audited.damping), np.nan_to_num(audited.approach)
+    )
+
+
+def watchdog_rates(
+    runs: JudgedRuns,
+    expectation: Expectation,
+    limits: Mapping[str, float | None],
+    limit: float,
+    mass: float,
+    chosen: Bool[np.ndarray, "lanes"],
+) -> dict[str, Any]:
+    """False and missed alarms among the chosen runs, with exact intervals of 95 %.
+
+    A run is good if no error exceeds half the limit, and a false alarm if the watchdog or another guard stops
+    it. It has to be stopped if some contact does not end or has an error beyond the limit, and is missed if
+    the watchdog has not tripped by the end of that contact.
+    """
+    alarmed = alarms(runs, expectation, limits, mass)
+    first_alarm = first_reached(alarmed)
+    stopped_anyhow = np.any(alarmed, axis=0) | guard_trips(runs.extent, limits)
+    good = chosen & good_runs(runs, GOOD_ERROR * limit)
+    bad = (runs.status != OK) | ~(np.abs(runs.error) <= BAD_ERROR * limit)
+    first_bad = first_reached(bad)
+    stopped = chosen & np.any(bad, axis=0)
+    use = reached(runs, limit) & (runs.status == OK) & chosen
+    expected = expected_restitution(expectation, features_of(runs.audited), mass)
+    apart = np.abs((expected - runs.reference)[use])
+    return {
+        "limit": limit,
+        "restitution_margin": limits["restitution_margin"],
+        "terms": [term for term, value in expectation.coefficients.items() if value],
+        "expectation_rms": float(np.sqrt(np.mean(apart**2))) if len(apart) else None,
+        "expectation_largest": float(np.max(apart)) if len(apart) else None,
+        "false_alarms": _rate(stopped_anyhow[good]),
+        "missed_alarms": _rate(first_alarm[stopped] > first_bad[stopped]),
+        "held_out_runs": int(np.sum(chosen)),
+    }
+
+
+def alarms(
+    runs: JudgedRuns, expectation: Expectation, limits: Mapping[str, float | None], mass: float
+) -> Bool[np.ndarray, "slots lanes"]:
+    """Contacts about which the watchdog raises an alarm."""
+    audited = runs.audited
+    expected = expected_restitution(expectation, features_of(audited), mass)
+    margin, balance, longest = (
+        np.inf if limits[name] is None else float(limits[name] or 0.0)
+        for name in ("restitution_margin", "energy_balance", "longest_contact")
+    )
+    with np.errstate(invalid="ignore"):
+        quiet = (
+            (np.abs(audited.restitution - expected) <= margin)
+            & (audited.imbalance <= balance)
+            & (audited.duration <= longest)
+        )
+    return audited.begun & ~quiet & ~(audited.approach == 0)
+
+
+def guard_trips(extent: Extent, limits: Mapping[str, float | None]) -> Bool[np.ndarray, "lanes"]:
+    """Runs that a guard other than the watchdog would stop, or flag readings of."""
+
+    def most(name: str) -> float:
+        value = limits[name]
+        return np.inf if value is None else value
+
+    def least(name: str) -> float:
+        value = limits[name]
+        return -np.inf if value is None else value
+
+    return (
+        (extent.reading >= most("force_range"))
+        | (extent.measured_lowest < least("measured_lowest"))
+        | (extent.measured_highest > most("measured_highest"))
+        | (extent.sent_lowest < least("command_lowest"))
+        | (extent.sent_highest > most("command_highest"))
+        | (extent.force_stuck > most("force_stuck_travel"))
+        | (extent.position_stuck > most("position_stuck_travel"))
+        | (extent.flight_force > most("free_force"))
+        | (extent.command > most("force_limit"))
+        | (extent.slew > most("force_slew"))
+        | (extent.sent_speed > most("velocity_limit"))
+    )
+
+
+def _rate(alarmed: Bool[np.ndarray, "runs"]) -> dict[str, Any]:
+    number, count = len(alarmed), int(np.sum(alarmed))
+    _, low, high = binomial_interval(count, number)
+    rate = count / number if number else None
+    return {"runs": number, "alarms": count, "rate": rate, "low": float(low), "high": float(high)}
