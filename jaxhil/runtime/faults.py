@@ -10,7 +10,13 @@ from typing import NamedTuple
 
 
 class Fault(NamedTuple):
-    """A fault: its bit, its name, when it is raised, what the controller does."""
+    """One fault.
+
+    bit: its bit in `Controller.faults`.
+    name: its name.
+    condition: when it is raised.
+    reaction: what the controller does.
+    """
 
     bit: int
     name: str

@@ -24,7 +24,14 @@ NO_OTHERS: Mapping[str, Mapping[str, GainSpecification]] = {}
 
 
 class GainFile(NamedTuple):
-    """What the controller needs of a gain file: gains (SI), period [s], clearance [m], limits (SI)."""
+    """What the controller needs of a gain file.
+
+    compensator: the law's name.
+    gains: by name, in SI units.
+    control_period: [s].
+    clearance: of a contact with two sides [m]; infinite with one.
+    limits: by name, in SI units.
+    """
 
     compensator: str
     gains: Mapping[str, float]

@@ -10,7 +10,7 @@ exports are made from. Over a contact they are counted, and the contact is
     identified     else.
 
 In all but the last case the law could not know the contact, or the correction had little time or room. Until
-the hardware has touched, every contact is unsure: of 1835 contacts of the standard suites that the law never
+the hardware has entered, every contact is unsure: of 1835 contacts of the standard suites that the law never
 called too short, none was in doubt for more than 0.29 of its ticks; of 165 that it did, 19 in 20 are for 0.67
 and more. `DOUBTFUL` lies between. The correction is at its limit for up to 0.22 of the ticks in the sharp
 setting, 0.44 in the gentle one. With the contact plane wrong by 10 ms x v0, position noise of 1 ms x v0 or
@@ -39,9 +39,9 @@ STATUSES = (
     Status("identified", "the command is that of a contact that has been identified"),
     Status("unsure", "nothing is identified yet, or there is nothing to scale by"),
     Status("saturated", "identified, and the correction is at its limit"),
-    Status("too_short", "the hardware touched when half of the contact was over: little time is left"),
+    Status("too_short", "the hardware entered when half of the contact was over: little time is left"),
     Status("unstated", "the law says nothing of itself"),
-    Status("displaced", "the hardware does not touch where it is told to: the contact plane is wrong"),
+    Status("displaced", "the hardware enters contact elsewhere than given: the contact plane is wrong"),
     Status("noisy", "noise of force or position, or a dead zone, leaves the contact uncertain"),
 )
 
@@ -49,9 +49,13 @@ _NAMES = tuple(status.name for status in STATUSES)
 
 
 class ContactRecord(NamedTuple):
-    """What the law said of a contact: the contact's number, the status that counts, on how many ticks the law
-    acted, and on how many of them it was unsure, saturated, or found the contact too short, displaced or
-    noisy."""
+    """What the law said of one contact.
+
+    number: of the contact; 0 before the first.
+    status: what counts, one of `STATUSES` by name.
+    ticks: on which the law acted.
+    unsure, saturated, too_short, displaced, noisy: of these, the ticks with that status.
+    """
 
     number: int = 0
     status: str = _NAMES[UNSTATED]

@@ -13,7 +13,13 @@ MINUTE = 1e-30  # where 0 would be divided by
 
 
 class LimitSpecification(NamedTuple):
-    """One limit: its unit, its value where a file has none, its least value, what it is."""
+    """One limit.
+
+    unit: of its value.
+    default: its value where a file has none.
+    lowest: its least value.
+    meaning: what it is.
+    """
 
     unit: str
     default: float

@@ -14,8 +14,9 @@ from .law_status import UNSTATED
 class GainSpecification(NamedTuple):
     """One gain of a compensator: its unit, and the values for which the law is defined.
 
-    The range is [lowest, highest], or (lowest, highest] where `exclusive`. The narrower bounds
-    used in tuning stand in the gain file itself.
+    unit: "1" if it has none.
+    lowest, highest: the ends of its range; the narrower bounds used in tuning stand in the gain file itself.
+    exclusive: whether `lowest` itself is not in the range.
     """
 
     unit: str

@@ -24,8 +24,15 @@ COPIED = ("bundle/selftest.py", "rig/udp_controller.py", "rig/udp_protocol.py")
 
 
 class Bundle(NamedTuple):
-    """The gain document as exported, every file by its path, what the vectors say: ticks, runs, what ended
-    the comparison with the simulation in each recorded run (None: nothing), and what disagrees."""
+    """A bundle in memory, and what its vectors say.
+
+    document: the gain document as exported.
+    files: the content of every file, by its path.
+    ticks: of the vectors.
+    runs: of the vectors.
+    ended: what ended the comparison with the simulation in each recorded run; None: nothing.
+    reasons: what disagrees, in words.
+    """
 
     document: dict[str, Any]
     files: dict[str, bytes]

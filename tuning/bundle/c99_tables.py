@@ -21,7 +21,12 @@ WIDTH = 110
 
 
 class Table(NamedTuple):
-    """A fragment made of a table: opening comment, declarations, definitions."""
+    """A fragment made of a table.
+
+    comment: what it opens with.
+    declarations: what goes into the header.
+    definitions: what goes into the source.
+    """
 
     comment: str
     declarations: str

@@ -41,8 +41,19 @@ EXTREMES = (nan, inf, -inf, 1e308, -1e308, 1e30, -1e200, 5e-324, -0.0)
 
 
 class Inputs(NamedTuple):
-    """One tick: run, event, readings [N, m, m/s, m] and time [s], None for none; the model's next motion is
-    given [m, m/s, m/s^2] or, if None, integrated; the force that jax commands [N]."""
+    """What the controller reads in one tick.
+
+    run: number of the run.
+    event: `BEGINS`, `NEXT_CONTACT`, or 0.
+    force_measured: [N].
+    position_desired: of the numerical model [m].
+    velocity_desired: of the numerical model [m/s].
+    position_measured: [m].
+    time: [s]; None for none.
+    motion: the model's next position, velocity and acceleration [SI]; None: it is integrated.
+    force_simulated: what the simulation's controller commands [N].
+    zeroed: whether the model feels no force, whatever is commanded.
+    """
 
     run: int
     event: int
@@ -76,8 +87,13 @@ class Row(NamedTuple):
 
 
 class Recorded(NamedTuple):
-    """The rows of recorded runs and the nominal run's mass [kg]; of each run what ended the comparison with
-    jax, or None; what disagrees, in words."""
+    """The vectors of recorded runs.
+
+    rows: their ticks.
+    mass: equivalent mass of the nominal run [kg].
+    ended: of each run what ended the comparison with the simulation; None: nothing.
+    reasons: what disagrees, in words.
+    """
 
     rows: list[Row]
     mass: float

@@ -21,7 +21,12 @@ _MAT_HEADER = b"MATLAB 5.0 MAT-file, made by jaxhil export"
 
 
 class Entry(NamedTuple):
-    """A gain or limit: value, unit, bounds (None for a limit, which has none)."""
+    """A gain or a limit.
+
+    value: [SI].
+    unit: of the value.
+    lower, upper: bounds; None for a limit, which has none.
+    """
 
     value: float
     unit: str

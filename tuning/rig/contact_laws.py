@@ -12,11 +12,12 @@ Formula = Callable[[float, float], float]
 
 
 class ContactLaw(NamedTuple):
-    """One contact's law, functions of penetration d [m] and rate d' [m/s].
+    """One contact's law: functions of penetration d [m] and rate d' [m/s].
 
-    `hold` [N or 1] is positive as long as penetrated surfaces hold on to each other; `force` [N] is that of
-    d > 0, 0 where they let go; `edge` [N], of d' alone, is its limit as d goes to 0 from above. `loaded`, of
-    a law that remembers, is the law after the deepest penetration given [m]; that of 0 is the law as new.
+    force: [N] at d > 0; 0 where the surfaces let go.
+    hold: [N or 1]; positive as long as penetrated surfaces hold on to each other.
+    edge: [N], of d' alone: the limit of the force as d goes to 0 from above.
+    loaded: of a law that remembers, the law after a deepest penetration [m]; that of 0 is the law as new.
     """
 
     force: Formula

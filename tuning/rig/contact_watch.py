@@ -1,6 +1,7 @@
-"""Where contacts begin and end, tick by tick, and their restitution (model.md, conventions), in plain floats.
+"""Where contacts begin and end, tick by tick, and their restitution, in plain floats.
 
-`jaxhil.simulation.metrics` follows batches by the same rules; a loop in real time cannot wait for it.
+The rules are those of `notebooks/guide/model.md`, section 2. `jaxhil.simulation.metrics` follows batches by
+the same ones; a loop in real time cannot wait for it.
 """
 
 import math
@@ -15,11 +16,18 @@ RUNAWAY = 1e3  # of the approach speed
 
 
 class ContactResult(NamedTuple):
-    """One contact: its number in the mechanism's lists; approach_velocity [m/s]; restitution; peak_force, the
-    largest sample of the real force [N]; duration, the time in touch [s]; status, as in
-    `jaxhil.simulation.metrics`, or "tripped"; begun, the tick of the run at which it began. Filled in by who
-    exchanges packets: the numbers of the first and the last packet about it, and the age of the oldest
-    command used [periods]."""
+    """One contact.
+
+    number: in the mechanism's lists.
+    approach_velocity: [m/s].
+    restitution: not a number where the contact did not end.
+    peak_force: the largest sample of the real force [N].
+    duration: time in contact [s].
+    status: as in `jaxhil.simulation.metrics`, or "tripped".
+    begun: the tick of the run at which it began.
+    packets: numbers of the first and last packet about it, filled in by who exchanges them.
+    oldest_command: age of the oldest command used [periods], likewise.
+    """
 
     number: int
     approach_velocity: float
@@ -66,12 +74,12 @@ class ContactWatch:
         """One tick: the model's position [m] and velocity [m/s], the force F_c [N] it feels, the real force
         [N]. The contact that is over with this tick, if one is; the next of the run may follow."""
         magnitude, speed, size = abs(command), abs(velocity), abs(force)
-        touching = size > 0.0
+        in_contact = size > 0.0
         if self._begun < 0:
             if self._noisy:
-                begins = touching or position > 0.0 or position < -self._clearance
+                begins = in_contact or position > 0.0 or position < -self._clearance
             else:
-                begins = touching or magnitude > self._left
+                begins = in_contact or magnitude > self._left
             if begins:
                 self._begun = self._tick
                 self._side = 1.0 if position > -self._clearance / 2 else -1.0
@@ -80,8 +88,8 @@ class ContactWatch:
         self._rebound = speed
         self._peak_command = max(self._peak_command, magnitude)
         self._peak_force = max(self._peak_force, size)
-        self._touched += touching
-        self._quiet = 0 if touching else self._quiet + 1
+        self._contact_ticks += in_contact
+        self._quiet = 0 if in_contact else self._quiet + 1
         self._tick += 1
         faded = magnitude <= max(FADED * self._peak_command, self._level)
         quiet = self._quiet >= self._quiet_ticks and (faded or self._quiet >= self._patience)
@@ -113,7 +121,7 @@ class ContactWatch:
             approach_velocity=approach,
             restitution=restitution,
             peak_force=self._peak_force,
-            duration=self._touched * self._period,
+            duration=self._contact_ticks * self._period,
             status=status,
             begun=self._begun,
         )
@@ -123,5 +131,5 @@ class ContactWatch:
         return result
 
     def _clear(self) -> None:
-        self._begun, self._side, self._touched = -1, 1.0, 0
+        self._begun, self._side, self._contact_ticks = -1, 1.0, 0
         self._peak_force = self._peak_command = 0.0

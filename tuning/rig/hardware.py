@@ -22,8 +22,13 @@ STALLED = "stalled"  # a contact that the machine left without new commands
 
 
 class Commanded(NamedTuple):
-    """Lowest and highest position command of the controller [m]; how many were not finite, and how many
-    beyond its limits (neither reach the drives); the largest |F_c| [N]."""
+    """What the controller has commanded.
+
+    lowest, highest: position commands [m].
+    not_finite: how many were not finite; these do not reach the drives.
+    beyond_limits: how many were beyond the drives' stroke; neither do these.
+    largest_force: the largest |F_c| [N].
+    """
 
     lowest: float
     highest: float

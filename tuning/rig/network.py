@@ -17,8 +17,12 @@ LONGEST_PACKET = 512
 
 
 class Injection(NamedTuple):
-    """Faults put into the network, of each packet and each way: probability of a loss; delay [s]; jitter, the
-    width of a further delay drawn uniformly from 0 on [s]."""
+    """Faults put into the network, of each packet and each way.
+
+    drops: probability of a loss.
+    jitter: width of a delay drawn uniformly from 0 on [s].
+    delay: constant delay [s].
+    """
 
     drops: float = 0.0
     jitter: float = 0.0

@@ -26,9 +26,15 @@ class Place(NamedTuple):
 
 
 class Propagation(NamedTuple):
-    """Rows of the state one period later; `start` and `end` of an interval, from within; `sample`, where the
-    force is read, and `measured`, where the position is. `steady_command` and `steady_step`: the state of a
-    uniform motion, per command now [m] and per its growth in a period [m]."""
+    """The response over one period: rows of numbers, see the module's text.
+
+    transition: the state one period later.
+    start, end: of an interval, from within.
+    sample: where the force is read.
+    measured: where the position is read.
+    steady_command: the state of a uniform motion, per command now [m].
+    steady_step: the same, per growth of the command in a period [m].
+    """
 
     transition: tuple[Row, ...]
     start: Place

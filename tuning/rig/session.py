@@ -46,9 +46,17 @@ class Quantiles(NamedTuple):
 
 
 class LoopFigures(NamedTuple):
-    """One loop: ticks played and missed, and whose fault the missed ones were; for how long the rig's clock
-    stood still [s]; the controller's own time per tick and the CPU time in it, the round trip, and by how
-    much packets left late; all quantiles in s."""
+    """One loop in figures.
+
+    ticks: played.
+    missed: of these.
+    missed_by_controller, missed_by_injection, missed_by_machine: of the missed, by whose fault.
+    stood_still: for how long the rig's clock stood still [s].
+    tick_time: the controller's own time per tick [s].
+    tick_cpu: the CPU time in it [s].
+    round_trip: from a packet to its answer [s].
+    lateness: by how much packets left late [s].
+    """
 
     ticks: int
     missed: int
@@ -63,15 +71,24 @@ class LoopFigures(NamedTuple):
 
 
 class LoopTimes(NamedTuple):
-    """What `LoopFigures` are made of: the controller's time per tick and round trips [s], for pictures."""
+    """What `LoopFigures` are made of, for pictures.
+
+    tick_time: the controller's time per tick [s].
+    round_trip: [s].
+    """
 
     tick_time: np.ndarray
     round_trip: np.ndarray
 
 
 class LoopReport(NamedTuple):
-    """One loop: figures and times; whose fault each tick was (`attribute`); what the controller's process
-    said at its end."""
+    """One loop.
+
+    figures: what it comes to.
+    times: for pictures.
+    causes: whose fault each tick was (`attribute`).
+    controller: what the controller's process said at its end.
+    """
 
     figures: LoopFigures
     times: LoopTimes
@@ -80,9 +97,16 @@ class LoopReport(NamedTuple):
 
 
 class SessionReport(NamedTuple):
-    """The empty loop and the run (None where not reached); contacts that are over; what was commanded; why
-    the controller tripped, if it did; whether the session was interrupted; why the controller tripped and was
-    reset, where the machine had left it without time."""
+    """A session.
+
+    empty: the empty loop; None where it was not reached.
+    run: the run against the rig, likewise.
+    contacts: those that are over.
+    commanded: what was commanded.
+    tripped: why the controller tripped; empty if it did not.
+    interrupted: whether the session was.
+    resets: why the controller tripped and was reset, where the machine had left it without time.
+    """
 
     empty: LoopReport | None
     run: LoopReport | None
@@ -94,10 +118,18 @@ class SessionReport(NamedTuple):
 
 
 class Setup(NamedTuple):
-    """A session: `folder` with the controller's process (a bundle, or `SOURCE`), its gain file and the
-    mechanism in that; what positions the drives take [m], as in `RigTask`; how long the run and the empty
-    loop before it last [s]; what is injected into the run; a seed of all draws; whether to ask the system for
-    a real-time priority for both processes."""
+    """What a session is to be.
+
+    folder: with the controller's process: a bundle, or `SOURCE`.
+    gains: its gain file.
+    mechanism: the one in that.
+    stroke: lowest and highest position that the drives take [m].
+    duration: of the run [s].
+    empty_duration: of the empty loop before it [s].
+    injection: faults put into the run.
+    seed: of all draws.
+    priority: whether to ask the system for a real-time priority for both processes.
+    """
 
     folder: Path
     gains: Path

@@ -6,7 +6,7 @@ runtime's; their force and position commands are compared. *Closed loop*: the no
 more with the runtime in the place of the jax controller, and each contact's restitution is compared.
 
 Each side rounds in its own order, so they agree to a fraction of the command's range, but for one thing: a
-decision (touching or not, force above the contact threshold or not) so close to its threshold that rounding
+decision (in contact or not, force above the contact threshold or not) so close to its threshold that rounding
 decides. Such ticks are counted and compared separately; where the decisions fell differently, the comparison
 of that lane ends.
 """
@@ -38,11 +38,17 @@ LANES = 6
 class LaneReplay(msgspec.Struct, frozen=True):
     """One recorded lane through the runtime.
 
-    Ticks recorded, compared, and of those `near` a threshold; the command's range, 0 included [N]; the
-    largest difference away from thresholds and near them, as fractions of that range; the tick of the former,
-    and what either side commanded there [N]; the tick at which a decision at a threshold fell differently,
-    which ended the comparison; the runtime's status; the largest difference of the position commands, as a
-    fraction of their range.
+    ticks: recorded.
+    compared: of these.
+    near: of those, near a threshold.
+    command_range: of the force command, 0 included [N].
+    difference: the largest away from thresholds, as a fraction of that range.
+    near_difference: the largest near them, likewise.
+    worst_tick: the tick of `difference`.
+    found, expected: what runtime and simulation commanded there [N].
+    parted: the tick at which a decision at a threshold fell differently, which ended the comparison.
+    status: the runtime's.
+    position_difference: the largest of the position commands, as a fraction of their range.
     """
 
     ticks: int
@@ -60,7 +66,11 @@ class LaneReplay(msgspec.Struct, frozen=True):
 
 
 class ContactComparison(msgspec.Struct, frozen=True):
-    """One nominal contact: restitution and status with the runtime in the loop, and simulated as a whole."""
+    """One nominal contact.
+
+    restitution, status: with the runtime in the loop.
+    simulated_restitution, simulated_status: simulated as a whole.
+    """
 
     restitution: float | None
     simulated_restitution: float | None
@@ -69,7 +79,16 @@ class ContactComparison(msgspec.Struct, frozen=True):
 
 
 class VerificationReport(msgspec.Struct, frozen=True):
-    """The verdict, the reasons why it is bad if it is, and the numbers that it rests on."""
+    """The verdict, and the numbers that it rests on.
+
+    verdict: whether all agree.
+    reasons: why they do not, if they do not.
+    compensator: the law.
+    replay_limit: allowed difference of commands, as a fraction of their range.
+    closed_loop_limit: allowed difference of a restitution.
+    replay: lane by lane.
+    closed_loop: contact by contact.
+    """
 
     verdict: bool
     reasons: tuple[str, ...]
@@ -226,8 +245,8 @@ def near_threshold(signals: Signals, gain_file: GainFile) -> np.ndarray:
     margin = NEAR * np.max(np.abs(signals.position_measured))
     near |= np.minimum(np.abs(aligned), np.abs(aligned + clearance)) < margin
     force, threshold = np.abs(signals.force_measured), gains["contact_threshold"]
-    touching = (aligned > 0) | (aligned < -clearance)
-    return near | touching & (np.abs(force - threshold) < NEAR * np.maximum(force, threshold))
+    in_contact = (aligned > 0) | (aligned < -clearance)
+    return near | in_contact & (np.abs(force - threshold) < NEAR * np.maximum(force, threshold))
 
 
 def _aligned(signals: Signals, delay: float, period: float) -> np.ndarray:

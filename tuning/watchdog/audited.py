@@ -16,9 +16,15 @@ from tuning.watchdog.recorded import Signals
 
 
 class Rules(NamedTuple):
-    """Control period [s], clearance [m], equivalent mass [kg] by which the numerical model is audited; delay
-    of the force reading against the position reading [s], time that force and command need to die out [s],
-    command that counts as died out [N]."""
+    """By what the numerical model is audited.
+
+    period: control period [s].
+    clearance: [m].
+    mass: equivalent mass [kg].
+    alignment: delay of the force reading against the position reading [s].
+    settling: time that force and command need to die out [s].
+    fading: command that counts as died out [N].
+    """
 
     period: float
     clearance: float
@@ -29,9 +35,15 @@ class Rules(NamedTuple):
 
 
 class Audited(NamedTuple):
-    """Contact by contact, (slots, lanes): speed before and after [m/s], identified stiffness [N/m] and
-    damping [N s/m] (0 where there is nothing to identify them from), energy out of balance over the
-    approach's, duration [s] until the audit; the tick on which it began; whether there was such a contact."""
+    """Contact by contact, what the audit sees.
+
+    approach, rebound: speed before and after [m/s].
+    stiffness, damping: identified [N/m, N s/m]; 0 where there is nothing to identify them from.
+    imbalance: energy out of balance, over the approach's.
+    duration: until the audit [s].
+    tick: on which the contact began.
+    begun: whether there was such a contact.
+    """
 
     approach: Float[np.ndarray, "slots lanes"]
     rebound: Float[np.ndarray, "slots lanes"]
@@ -130,14 +142,14 @@ def audit_contacts(signals: Signals, rules: Rules, slots: int) -> Audited:
             given = np.where(begins, 0.0, given)
             deflection = _deflection(alignment.step(measured, velocity, begins), clearance)
             aligned_before = np.where(begins, 0.0, aligned_before)
-            touching = (_deflection(position, clearance) != 0) | (_deflection(measured, clearance) != 0)
+            in_contact = (_deflection(position, clearance) != 0) | (_deflection(measured, clearance) != 0)
             side = np.where(position > middle, 1.0, -1.0)
-            fresh = live & ~state.open & touching
+            fresh = live & ~state.open & in_contact
             if np.any(fresh):
                 state.begin(fresh, tick, velocity_before, side)
             going = live & state.open
             if np.any(going):
-                state.quiet = np.where(touching, 0.0, state.quiet + 1)
+                state.quiet = np.where(in_contact, 0.0, state.quiet + 1)
                 state.ticks += going
                 state.work += np.where(going, period * given * 0.5 * (velocity_before + velocity), 0.0)
                 size = np.abs(given)
@@ -150,7 +162,7 @@ def audit_contacts(signals: Signals, rules: Rules, slots: int) -> Audited:
                 for name, product in zip(SUMS, (x * x, x * v, v * v, x * f, v * f), strict=True):
                     state.sums[name] += product
                 faded = (size <= FADED * state.peak) | (size <= rules.fading) | (state.quiet >= patience)
-                leaves = ~touching & (state.quiet >= quiet_ticks) & (own * velocity < 0) & faded
+                leaves = ~in_contact & (state.quiet >= quiet_ticks) & (own * velocity < 0) & faded
                 over = going & (leaves | (side != own))
                 if np.any(over):
                     state.audit(over, velocity, np.zeros(lanes))

@@ -21,7 +21,12 @@ SINGULAR = 1e-9
 
 
 class Expectation(NamedTuple):
-    """Coefficients by term; reference stiffness [N/m] and velocity [m/s]; ranges of p, w, z fitted over."""
+    """The fitted polynomial.
+
+    coefficients: by term.
+    stiffness, velocity: those of reference, k_0 [N/m] and v_0 [m/s].
+    softness, speed, loss: the ranges of p, w and z that it was fitted over.
+    """
 
     coefficients: dict[str, float]
     stiffness: float
@@ -43,7 +48,12 @@ class Expectation(NamedTuple):
 
 
 class Features(NamedTuple):
-    """Identified stiffness [N/m] and damping [N s/m], approach speed [m/s] of contacts; equal shapes."""
+    """What is known of contacts; equal shapes.
+
+    stiffness: identified [N/m].
+    damping: identified [N s/m].
+    velocity: approach speed [m/s].
+    """
 
     stiffness: Float[np.ndarray, "*shape"]
     damping: Float[np.ndarray, "*shape"]

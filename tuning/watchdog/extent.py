@@ -9,12 +9,21 @@ from tuning.watchdog.recorded import Signals
 
 
 class Extent(NamedTuple):
-    """Of every run, (lanes,), all at least 0 but the positions: largest |force reading| [N]; least and
-    largest measured position and position command [m]; largest |F_c| [N] and its fastest change [N/s];
-    fastest change of the position command [m/s], of the desired position [m/s] and of its velocity [m/s^2];
-    longest travel [m] of the measured position in contact under one force reading, and of the desired one
-    under one position reading; largest |force reading| in flight [N], and the most by which two of them
-    differ [N]."""
+    """Of every run; all at least 0 but the positions.
+
+    reading: largest |force reading| [N].
+    measured_lowest, measured_highest: measured position [m].
+    sent_lowest, sent_highest: position command [m].
+    command: largest |F_c| [N].
+    slew: its fastest change [N/s].
+    sent_speed: fastest change of the position command [m/s].
+    speed: fastest change of the desired position [m/s].
+    acceleration: fastest change of the desired velocity [m/s^2].
+    force_stuck: longest travel of the measured position in contact under one force reading [m].
+    position_stuck: longest travel of the desired position under one position reading [m].
+    flight_force: largest |force reading| in flight [N].
+    flight_spread: the most by which two of these differ [N].
+    """
 
     reading: Float[np.ndarray, "lanes"]
     measured_lowest: Float[np.ndarray, "lanes"]
@@ -90,8 +99,8 @@ def _stuck(signals: Signals, clearance: float):
     for tick in range(1, len(signals.force)):
         counted = signals.live[tick] & ~signals.begins[tick]
         now, before = signals.measured[tick], signals.measured[tick - 1]
-        touching = (now > 0) | (now < -clearance)
-        same = counted & touching & (signals.force[tick] == signals.force[tick - 1])
+        in_contact = (now > 0) | (now < -clearance)
+        same = counted & in_contact & (signals.force[tick] == signals.force[tick - 1])
         force_travel = np.where(same, force_travel + np.abs(now - before), 0.0)
         moved = np.abs(signals.position[tick] - signals.position[tick - 1])
         position_travel = np.where(counted & (now == before), position_travel + moved, 0.0)

@@ -26,7 +26,12 @@ _compared = jax.jit(compare_with_reference, static_argnums=0)
 
 
 class Scenarios(NamedTuple):
-    """How scenarios are drawn (`tuning.sweeps.draws`), from which seed, how many from the first."""
+    """Which scenarios.
+
+    sampling: how they are drawn (`tuning.sweeps.draws`).
+    seed: from which.
+    number: how many from the first.
+    """
 
     sampling: str
     seed: int
@@ -34,10 +39,16 @@ class Scenarios(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """Ticks of many runs, (ticks, lanes): measured force [N], the numerical model's position [m] and velocity
-    [m/s], measured position [m], force command F_c [N], position command sent to the drives [m]; on which
-    ticks a run of the lane is under way, and on which a run begins. Between two surfaces all contacts are one
-    run."""
+    """Ticks of many runs. Between two surfaces all contacts are one run.
+
+    force: measured [N].
+    position, velocity: of the numerical model [m, m/s].
+    measured: position [m].
+    command: F_c [N].
+    sent: position command sent to the drives [m].
+    live: whether a run of the lane is under way.
+    begins: whether one begins.
+    """
 
     force: Float[np.ndarray, "ticks lanes"]
     position: Float[np.ndarray, "ticks lanes"]
@@ -50,7 +61,12 @@ class Signals(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """What became of the contacts, (slots, lanes): restitution and the reference's, status."""
+    """What became of the contacts.
+
+    restitution: of each.
+    reference: the reference's.
+    status: as in `jaxhil.simulation.metrics`.
+    """
 
     restitution: Float[np.ndarray, "slots lanes"]
     reference: Float[np.ndarray, "slots lanes"]

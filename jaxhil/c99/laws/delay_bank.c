@@ -1,5 +1,5 @@
 /* Hypotheses of the force delay side by side, each with a map of its own, weighed by what they explain.
- * Hypothesis h takes the force to be d_h older than it is told: it belongs to the depth X - d_h V. It expects to read
+ * Hypothesis h takes the force to be d_h older than given: it belongs to the depth X - d_h V. It expects to read
  * f_h with a variance s_h (0 with the noise's own variance r out of contact, and where what it expects while the
  * contact opens is not positive). Its weight is the product of the likelihoods of all readings of this contact and
  * of those before, (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), and of how well its damping, of mean B and variance s^2,
@@ -18,9 +18,9 @@ enum { JAXHIL_HYPOTHESES = 9 };
 
 /* Of each hypothesis its delay, map, deepest point, the likelihoods of this contact and of those before; sums over
  * these of the damping's precision and of precision times mean, their number `met`; whether this contact is to be
- * added to them. The mean of the maps and, `shift` [s], of the delays; the delay that was `told`. */
+ * added to them. The mean of the maps and, `shift` [s], of the delays; the delay that was `given`. */
 typedef struct {
-    double told, shift, met, variance;
+    double given, shift, met, variance;
     double known[JAXHIL_HYPOTHESES];
     jaxhil_force_depth_map prior;
     double offsets[JAXHIL_HYPOTHESES], deepest[JAXHIL_HYPOTHESES];
@@ -92,7 +92,7 @@ static void jaxhil_learnt_reset(jaxhil_learnt *bank) {
 }
 
 static void jaxhil_learnt_init(jaxhil_learnt *bank, const jaxhil_gains *gains) {
-    bank->told = gains->identification_delay;
+    bank->given = gains->identification_delay;
     jaxhil_force_depth_map_init(&bank->prior, gains);
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         bank->offsets[h] = (0.25 * (double)h - 1.0) * gains->delay_spread;
@@ -265,8 +265,8 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
     return 0.25 * (missed * missed) / wide;
 }
 
-/* One reading: depth [s] and speed as old as the force is told to be, the force [1/s], its variance [1/s^2], whether
- * the sensor's dead zone hides it, that zone [1/s]. */
+/* One reading: depth [s] and speed as old as the force by the given delay, force [1/s], its variance [1/s^2], whether the
+ * sensor's dead zone hides it, that zone [1/s]. */
 static void jaxhil_learnt_read(jaxhil_learnt *bank, double depth, double rate, double deepest, double force,
                                double variance, bool hidden, double zone) {
     double surprise[JAXHIL_HYPOTHESES], sharpness[JAXHIL_HYPOTHESES], weights[JAXHIL_HYPOTHESES];

@@ -1,6 +1,6 @@
 /* What speaks against a contact's being known, scaled by approach speed and equivalent mass: it is unsure, where it
- * was hardly read; too short, where the hardware touched when half of it was over; displaced, where readings stood
- * out of the noise before the hardware was to touch, or there was hardly any force on the first 10 ms of its way
+ * was hardly read; too short, where the hardware entered when half of it was over; displaced, where readings stood
+ * out of the noise before the hardware should enter, or there was hardly any force on the first 10 ms of its way
  * in; noisy, where the force that the map expects is uncertain by a hundredth of its peak, the dead zone is a tenth
  * of that, or second differences show that the measured position is noisy; else identified.
  */
@@ -13,7 +13,7 @@
 /* == Declarations == */
 
 /* Of one contact: position [m] measured last and its step; squares and number of second differences; sums over the
- * readings of the first 10 ms; by how much [s] the hardware touched late; readings in contact, those of the first
+ * readings of the first 10 ms; by how much [s] the hardware entered late; readings in contact, those of the first
  * 10 ms, those that stood out of the noise too early. */
 typedef struct {
     double position, step, swings, swung, force, depth, variance, late;

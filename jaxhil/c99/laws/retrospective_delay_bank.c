@@ -8,5 +8,5 @@
 
 #define JAXHIL_LAW_HAS_FORCE_DELAY
 static double jaxhil_law_force_delay(const jaxhil_law *law) {
-    return law->learnt.told + law->learnt.shift;
+    return law->learnt.given + law->learnt.shift;
 }

@@ -1,4 +1,4 @@
-/* The retrospective reference with one force-depth map: the force is as old as it is told to be. */
+/* The retrospective reference with one force-depth map: the force is as old as the given delay says. */
 #include <stdbool.h>
 
 #include "force_depth_map.c"

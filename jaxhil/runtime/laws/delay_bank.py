@@ -1,6 +1,6 @@
 """Hypotheses of the force delay side by side, each with a map of its own, weighed by what they explain.
 
-Hypothesis h takes the force to be d_h [s] older than it is told: it belongs to the depth X - d_h V. Each
+Hypothesis h takes the force to be d_h [s] older than given: it belongs to the depth X - d_h V. Each
 identifies a force-depth map (`force_depth_map`) and says beforehand what it expects to read, f_h with a
 variance s_h (0 with the noise's own variance r out of contact, and where what it expects while the contact
 opens is not positive). Its weight is the product of the likelihoods of all readings of this contact and of
@@ -34,11 +34,11 @@ _0, _1 = np.zeros(HYPOTHESES), np.ones(HYPOTHESES)
 
 
 class DelayBank:
-    """The bank. `curve`: the mean of the maps; `shift` [s]: the mean of the hypotheses' delays; `variance`
-    [1/s^2]: that of the force that each expects where it was read last.
+    """The bank, made of how far [s] the farthest hypotheses lie from the given delay, and of the map's prior.
 
-    `spread` [s] is how far the farthest hypotheses lie from the delay that is told; the rest is the map's
-    prior, as of `ForceDepthMap`.
+    curve: the mean of the maps.
+    shift: the mean of the hypotheses' delays [s].
+    variance: of the force that each expects where it was read last [1/s^2].
     """
 
     __slots__ = (
@@ -95,7 +95,7 @@ class DelayBank:
     def learn(
         self, depth: float, rate: float, force: float, variance: float, hidden: bool, zone: float
     ) -> None:
-        """One reading: depth [s] and speed as old as the force is told to be, the force [1/s], its variance
+        """One reading: depth [s] and speed as old as the force by the given delay, force [1/s], its variance
         [1/s^2], whether the sensor's dead zone hides it, that zone [1/s]."""
         self._read(depth, rate, force, variance, hidden, zone)
         weights = self._weigh()

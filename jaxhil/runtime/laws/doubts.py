@@ -3,16 +3,17 @@
 In this order, with p the peak force that the map predicts, scaled as in `retrospective`:
 
     unsure       fewer than FEW readings in contact
-    too short    the hardware touched when LATE of the contact was over, pi/p its duration
-    displaced    more than EARLY readings stood out of the noise before the hardware was to touch; or, once
-                 it is 24 ms deep, those of the first 10 ms are, but for chance, less than SOFTEST of what a
-                 spring from there to the surface would push: its surface is nearer, or deeper, than told
+    too short    the hardware entered when LATE of the contact was over, pi/p its duration
+    displaced    more than EARLY readings stood out of the noise before the hardware should be in contact; or,
+                 once it is 24 ms deep, those of the first 10 ms are, but for chance, less than SOFTEST of
+                 what a spring from there to the surface would push: its surface is nearer, or deeper, than
+                 given
     noisy        the force that the map expects where it was read last has a standard deviation above WIDE p;
                  the sensor's dead zone is above HIDING p; the measured position's noise is above SHAKING: the
                  mean square of its second differences is 6 times its variance: the motion has hardly any
     identified   else
 
-Contact that is as soft as a gap at first cannot be told from a surface that is deeper than told.
+Contact that is as soft as a gap at first cannot be distinguished from a surface that is deeper than given.
 """
 
 from math import pi, sqrt
@@ -31,8 +32,12 @@ SHAKING = 0.0005  # s, over the approach speed
 
 
 class Doubts:
-    """Of one contact: `readings` in contact; `late` [s]: the hardware's touch after the numerical model's;
-    readings that stood out of the noise too `early`."""
+    """What is counted of one contact.
+
+    readings: in contact.
+    late: by how much [s] the hardware enters after the numerical model.
+    early: readings that stood out of the noise before the hardware should be in contact.
+    """
 
     __slots__ = (
         "_depth",

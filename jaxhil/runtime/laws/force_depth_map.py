@@ -21,8 +21,17 @@ OUTLYING = 4.0  # times the noise's variance: a force that hardly is noise
 
 
 class Prior(NamedTuple):
-    """What is known before any reading: slopes N(stiffness, common^2 + wandering^2 min(kappa_i, kappa_j) /
-    30 ms) [1/s^2], what dissipates N(0, spread^2): `damping` and `depth_damping` [1/s], `unloading` [1/s^2].
+    """What is known before any reading.
+
+    Slopes are N(stiffness, common^2 + wandering^2 min(kappa_i, kappa_j) / 30 ms), what dissipates is
+    N(0, spread^2).
+
+    stiffness: mean of the slopes [1/s^2].
+    common: how uncertain all slopes are together [1/s^2].
+    wandering: how far they differ from depth to depth [1/s^2].
+    damping: spread of the damping [1/s].
+    depth_damping: spread of the damping that grows with depth [1/s].
+    unloading: spread of what unloading takes away [1/s^2].
     """
 
     stiffness: float
@@ -51,8 +60,13 @@ class Prior(NamedTuple):
 
 
 class Curve:
-    """What counts of a map: `slopes` [1/s^2], the force `at_knots` [1/s], `damping`, `depth_damping` [1/s],
-    `unloading` [1/s^2]."""
+    """What counts of a map.
+
+    slopes: [1/s^2].
+    at_knots: force there [1/s].
+    damping, depth_damping: [1/s].
+    unloading: [1/s^2].
+    """
 
     __slots__ = ("at_knots", "damping", "depth_damping", "slopes", "unloading")
 

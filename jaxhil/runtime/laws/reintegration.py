@@ -21,9 +21,18 @@ HISTORY = 1024  # samples kept; a longer contact is not integrated over again
 
 
 class Path:
-    """A motion under a `curve` of its own, at one sample: depth [s], speed, deepest point so far [s], force
-    without damping [1/s]; of the measured sample there, the force's integral since the entry [ticks/s], over
-    how many ticks that is, and the map's force [1/s]; whether it has separated."""
+    """A motion, at one sample.
+
+    curve: the map that it moves under.
+    depth: [s].
+    speed: as a fraction of the approach speed.
+    deepest: point so far [s].
+    force: without damping [1/s].
+    impulse: of the measured sample there, the force's integral since the entry [ticks/s].
+    read: over how many ticks that is.
+    expected: the map's force at the measured sample [1/s].
+    free: whether it has separated.
+    """
 
     __slots__ = ("curve", "deepest", "depth", "expected", "force", "free", "impulse", "read", "speed")
 
@@ -55,8 +64,13 @@ class Path:
 
 
 class ReferenceMotion:
-    """The live motion, `depth` [s] and `speed`, and the pass behind it; `replay`: rho; `shift` [s]: by how
-    much older the force is than it was taken for when samples were remembered: it belongs to X - shift V."""
+    """The live motion and the pass behind it.
+
+    live: where the numerical model should be by now, and how fast.
+    replay: rho.
+    shift: by how much [s] the force is older than it was taken for when samples were remembered: it belongs
+        to X - shift V.
+    """
 
     __slots__ = (
         "_behind",

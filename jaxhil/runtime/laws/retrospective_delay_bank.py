@@ -19,7 +19,7 @@ from .retrospective import Retrospective
 class RetrospectiveDelayBank(Retrospective):
     """Bank of delays, reference and repayment."""
 
-    __slots__ = ("_bank", "_told_delay")
+    __slots__ = ("_bank", "_given_delay")
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
         **Retrospective.gains,
@@ -29,7 +29,7 @@ class RetrospectiveDelayBank(Retrospective):
     @property
     def force_delay(self) -> float:
         """The estimated delay [s] of the force measurement."""
-        return self._told_delay + self._shift
+        return self._given_delay + self._shift
 
     def reset(self) -> None:
         """Forget everything, what was learnt of the delay as well."""
@@ -42,7 +42,7 @@ class RetrospectiveDelayBank(Retrospective):
         super().reset()
 
     def _prepare(self, gains: Mapping[str, float], prior: Prior) -> None:
-        self._told_delay = gains["identification_delay"]
+        self._given_delay = gains["identification_delay"]
         self._bank = DelayBank(gains["delay_spread"], prior)
         self._curve = self._bank.curve
 

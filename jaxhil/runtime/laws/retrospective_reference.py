@@ -1,4 +1,4 @@
-"""The retrospective reference with one force-depth map: the force is as old as it is told to be.
+"""The retrospective reference with one force-depth map: the force is as old as the given delay says.
 
 See `retrospective`. With F the map, (X, V, y) the delay-aligned readings, f_0 = max(F(x_d, v_d), 0):
 
