@@ -1,1 +1,67 @@
-"""Contact in a hardware-in-the-loop docking rig: its physics, and the controller that runs on it."""
+"""Contact in a hardware-in-the-loop docking rig: its physics, and the controller that runs on it.
+
+    load       a mechanism file, or a built-in one, as a `Mechanism`
+    simulate   its contacts under a compensator, once
+    jacobian   by how much a figure of each contact changes with the mechanism and the gains
+    register   a compensator or a contact law of your own
+
+Numbers are in SI units; arrays are NumPy's, float64 whatever jax is set to. Whatever is wrong with an
+argument raises `InputError`, one line. Nothing is imported before it is used: the rig's controller,
+`jaxhil.runtime`, needs neither jax nor NumPy.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jaxhil.compensators.base import Compensator, Gain
+    from jaxhil.contact.base import ContactLaw
+    from jaxhil.errors import InputError
+    from jaxhil.mechanism.loading import load
+    from jaxhil.mechanism.structs import Mechanism
+    from jaxhil.simulation.jacobian import jacobian
+    from jaxhil.simulation.registration import register
+    from jaxhil.simulation.run import simulate
+
+    __version__: str
+
+__all__ = [
+    "Compensator",
+    "ContactLaw",
+    "Gain",
+    "InputError",
+    "Mechanism",
+    "__version__",
+    "jacobian",
+    "load",
+    "register",
+    "simulate",
+]
+
+_HOMES = {
+    "Compensator": "jaxhil.compensators.base",
+    "ContactLaw": "jaxhil.contact.base",
+    "Gain": "jaxhil.compensators.base",
+    "InputError": "jaxhil.errors",
+    "Mechanism": "jaxhil.mechanism.structs",
+    "jacobian": "jaxhil.simulation.jacobian",
+    "load": "jaxhil.mechanism.loading",
+    "register": "jaxhil.simulation.registration",
+    "simulate": "jaxhil.simulation.run",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("jaxhil")
+    if name not in _HOMES:
+        raise AttributeError(f"module 'jaxhil' has no attribute {name!r}")
+    value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})

@@ -120,12 +120,12 @@ def test_damped_twins_span_a_third_of_the_speed(name):
     lossy = []
     for one, values in ((parsed, draws), (twin, twin_draws)):
         batch = build_scenarios(one, values)
-        assert build_loop(one, "none", batch).law == LAWS[one.contact.law]()
+        assert build_loop(one, "none", batch).law == LAWS[one.contact.law]
         contact = type(batch.contact)(
             *(jnp.asarray(leaf)[0] if leaf is not None else None for leaf in batch.contact)
         )
         mass, velocity = jnp.asarray(batch.equivalent_mass), jnp.asarray(batch.velocity)
-        lossy.append(np.asarray(LAWS[one.contact.law]().reference(contact, mass, velocity).restitution))
+        lossy.append(np.asarray(LAWS[one.contact.law].reference(contact, mass, velocity).restitution))
     before, after = lossy
     lost = 1 - after / before
     assert np.all(lost >= -1e-9) and np.min(lost) < 0.02

@@ -28,7 +28,7 @@ def contact(**values):
 
 def reference(name, **values):
     mass, velocity = (jnp.full((LANES,), value) for value in (MASS, VELOCITY))
-    run = jax.jit(LAWS[name]().reference, compiler_options=QUICK)
+    run = jax.jit(LAWS[name].reference, compiler_options=QUICK)
     return run(contact(**values), mass, velocity)
 
 
@@ -60,14 +60,14 @@ def test_elastoplastic_in_closed_form_and_integrated():
     found = reference("elastoplastic", unloading_ratio=ratio)
     np.testing.assert_allclose(found.restitution, ratio**-0.5, rtol=1e-15)
     mass, velocity = (jnp.full((LANES,), value) for value in (MASS, VELOCITY))
-    law = LAWS["elastoplastic"]()
+    law = LAWS["elastoplastic"]
     run = jax.jit(lambda c: integrate_contact(law, c, mass, velocity), compiler_options=QUICK)
     for got, wanted in zip(run(contact(unloading_ratio=ratio))[:3], found, strict=True):
         np.testing.assert_allclose(got, wanted, rtol=1e-8)
 
 
 def test_elastoplastic_loads_unloads_reloads_and_forgets():
-    law, parameters = LAWS["elastoplastic"](), contact(unloading_ratio=2.0)
+    law, parameters = LAWS["elastoplastic"], contact(unloading_ratio=2.0)
     state, forces = law.init(jnp.zeros(LANES)), []
     depths = np.array([1.0, 3.0, 2.0, 1.6, 1.0, 2.5, 4.0, 3.0, 0.0, 1.0])
     for depth in depths:
@@ -81,7 +81,7 @@ def test_derivatives_of_integrated_references():
     values = {"damping": np.linspace(50.0, 900.0, LANES)}
 
     for name in ("hardening", "depth_damped"):
-        law = LAWS[name]()
+        law = LAWS[name]
         parameters = contact(**values, stiffness=1e7 if name == "depth_damped" else STIFFNESS)
 
         def function(scales, law=law, parameters=parameters):

@@ -42,7 +42,7 @@ def undelayed(members, damped: bool) -> Any:
         }
         mass = np.array([members[i].bodies.mass for i in own])
         velocity = np.array([members[i].approach.velocity for i in own])
-        reference = jax.jit(CONTACT_LAWS[name]().reference, compiler_options=QUICK)
+        reference = jax.jit(CONTACT_LAWS[name].reference, compiler_options=QUICK)
         for field, values in reference(ContactParameters(**parameters), mass, velocity)._asdict().items():
             found[field][own] = values
     return SimpleNamespace(**found)

@@ -193,7 +193,7 @@ def test_motion_in_space_is_the_reference(name):
     curve = _space(mechanism, scenarios, 0, velocity, 0.4)
     contact = parameters_by_slot(jax.tree.map(jax.numpy.asarray, scenarios.contact))
     like = jax.numpy.full(scenarios.phase.shape, velocity)
-    reference = LAWS[mechanism.contact.law]().reference(contact, 0 * like + mechanism.bodies.mass, like)
+    reference = LAWS[mechanism.contact.law].reference(contact, 0 * like + mechanism.bodies.mass, like)
     assert np.max(curve.force) == pytest.approx(float(reference.peak_force[0, 0]), rel=2e-3)
     rebound = -np.diff(curve.position)[-1] / np.diff(curve.time)[-1]
     assert rebound == pytest.approx(velocity * float(reference.restitution[0, 0]), rel=2e-3)

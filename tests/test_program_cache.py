@@ -11,7 +11,7 @@ import pytest
 from compiling import is_quick
 from jax.sharding import AxisType, PartitionSpec
 
-from jaxhil.contact.laws import LAWS, HuntCrossley, KelvinVoigt
+from jaxhil.contact.laws import HuntCrossley, KelvinVoigt
 from tuning import program_cache
 
 pytestmark = pytest.mark.users_options
@@ -93,13 +93,13 @@ def test_changed_sources_are_another_program(tmp_path, monkeypatch):
     package = tmp_path / "package"
     package.mkdir()
     (package / "__init__.py").write_text("changed = True\n")
-    monkeypatch.setattr(programs.sys.modules["tuning"], "__file__", str(package / "__init__.py"))
+    monkeypatch.setattr(program_cache.sys.modules["tuning"], "__file__", str(package / "__init__.py"))
     run(tmp_path)
     assert len(traced) == 2
 
 
 def test_a_law_from_elsewhere_is_not_kept(tmp_path):
-    class Mine(LAWS["linear"]):
+    class Mine(KelvinVoigt):
         pass
 
     class Holder(eqx.Module):

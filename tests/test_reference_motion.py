@@ -58,7 +58,7 @@ def within(law, parameters, mass, velocity, tolerance):
 
 def integrated(name, values, tolerance=TOLERANCE, **options):
     mass, velocity = (jnp.full((LANES,), value) for value in (MASS, VELOCITY))
-    law = LAWS[name]()
+    law = LAWS[name]
     parameters = contact(**values)
     if options:
         run = jax.jit(lambda c, m, v: integrate_contact(law, c, m, v, **options), compiler_options=QUICK)
@@ -170,7 +170,7 @@ def test_trajectory_of_linear_contact():
 def test_derivatives_of_the_closed_forms(case, tolerance):
     """Where a step has a kink inside, its derivative is that of a force a bit off: short as it is."""
     name, values = CASES[case]
-    law, parameters = LAWS[name](), contact(**values)
+    law, parameters = LAWS[name], contact(**values)
     mass, velocity = (jnp.full((LANES,), value) for value in (MASS, VELOCITY))
 
     def derivatives(reference):
@@ -192,7 +192,7 @@ def test_derivatives_of_the_closed_forms(case, tolerance):
 
 
 def test_single_precision_and_vmap():
-    law, parameters = LAWS["kelvin_voigt"](), contact(np.float32, **KELVIN_VOIGT)
+    law, parameters = LAWS["kelvin_voigt"], contact(np.float32, **KELVIN_VOIGT)
     mass, velocity = (jnp.full((LANES,), value, np.float32) for value in (MASS, VELOCITY))
 
     def run(damping, mass, velocity):

@@ -1,4 +1,4 @@
-"""Adding a law takes a file each in JAX, Python and C, and one entry in the list of laws."""
+"""Adding a law takes a file each in JAX, Python and C, an entry in the list of laws, one in the registry."""
 
 import os
 import re
@@ -112,10 +112,17 @@ def copied(tmp_path):
     text, entries = re.subn(r'\n    "none",\n', r'\n    "none",\n    "toy",\n', laws.read_text())
     assert entries == 1
     laws.write_text(text)
+    registry = folder / "jaxhil/compensators/__init__.py"
+    text, entries = re.subn(
+        r"\n    NoCompensator\(\),\n", r"\n    NoCompensator(),\n    Toy(),\n", registry.read_text()
+    )
+    assert entries == 1
+    imported = "from jaxhil.compensators.toy import Toy\n"
+    registry.write_text(text.replace("from jaxhil.mechanism", imported + "from jaxhil.mechanism"))
     return folder
 
 
-def test_a_law_of_three_files_and_one_entry_is_tested_and_exported(copied):
+def test_a_law_of_three_files_and_two_entries_is_tested_and_exported(copied):
     """By the tests named `...[toy...]`, in a process that sees the copy alone."""
     command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "-k", "toy", *RUN]
     environment = {**os.environ, "PYTHONPATH": str(copied)}

@@ -1,26 +1,39 @@
-"""The registry of compensators: tests, tuning, gain files and the command line pick them up from here.
+"""The registry of compensators: simulation, tuning, gain files and the command line know those entered here.
 
-Which laws there are says `jaxhil.runtime.laws`; each is the module of its name.
+A compensator of this package is the module of its name, here and in `jaxhil.runtime.laws`, and an entry in
+either registry. `jaxhil.register` enters those of other packages.
 """
 
-from collections.abc import Callable
-from importlib import import_module
-from typing import cast
-
 from jaxhil.compensators.base import Compensator, Constants, Gain, Gains, Signals
+from jaxhil.compensators.dead_zone_observer import DeadZoneObserver
+from jaxhil.compensators.multi_parameter_lead import MultiParameterLead
+from jaxhil.compensators.none import NoCompensator
+from jaxhil.compensators.passivity import Passivity
+from jaxhil.compensators.phase_lead import PhaseLead
+from jaxhil.compensators.position_lead import PositionLead
+from jaxhil.compensators.response_error import ResponseError
+from jaxhil.compensators.retrospective_delay_bank import RetrospectiveDelayBank
+from jaxhil.compensators.retrospective_reference import RetrospectiveReference
+from jaxhil.compensators.smith_hybrid import SmithHybrid
+from jaxhil.compensators.smith_predictor import SmithPredictor
+from jaxhil.compensators.virtual_contact import VirtualContact
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.runtime.laws import LAWS
 
-
-def _law(name: str) -> Compensator:
-    """The compensator called `name`, the one of that name in its module."""
-    members = vars(import_module(f"{__name__}.{name}")).values()
-    laws = [member for member in members if isinstance(member, type) and issubclass(member, Compensator)]
-    [law] = [one for one in laws if vars(one).get("name") == name]
-    return cast(Callable[[], Compensator], law)()
-
-
-COMPENSATORS: dict[str, Compensator] = {name: _law(name) for name in LAWS}
+_BUILT_IN = (
+    NoCompensator(),
+    PhaseLead(),
+    MultiParameterLead(),
+    SmithPredictor(),
+    SmithHybrid(),
+    PositionLead(),
+    VirtualContact(),
+    DeadZoneObserver(),
+    Passivity(),
+    ResponseError(),
+    RetrospectiveReference(),
+    RetrospectiveDelayBank(),
+)
+COMPENSATORS: dict[str, Compensator] = {law.name: law for law in _BUILT_IN}
 
 
 def literature_gains(mechanism: Mechanism, compensator: str, setting: str | None = None) -> dict[str, float]:

@@ -6,12 +6,13 @@ broadcasts to the batch shape; slopes and depths of the piecewise-linear law car
 """
 
 import abc
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.contact.reference import Reference
+from jaxhil.contact.reference_motion import integrate_contact
 
 
 class ContactParameters(NamedTuple):
@@ -33,7 +34,10 @@ class ContactParameters(NamedTuple):
 
 
 class ContactLaw(eqx.Module):
-    """Interface of all contact laws."""
+    """Interface of all contact laws. A law holds no arrays: all numbers come with the parameters."""
+
+    # What mechanism files call a law that `jaxhil.register` enters; the built-in ones are entered by name.
+    name: ClassVar[str] = ""
 
     @property
     def remembers(self) -> bool:
@@ -45,7 +49,7 @@ class ContactLaw(eqx.Module):
     @property
     def closed_form(self) -> bool:
         """Whether the reference is quick enough to be worked out with every run; else it is integrated."""
-        return True
+        return type(self).reference is not ContactLaw.reference
 
     def init(self, penetration: Array) -> tuple[Array, ...]:
         """State before the first touch, for a batch shaped like `penetration`."""
@@ -72,6 +76,7 @@ class ContactLaw(eqx.Module):
         """Smooth and positive as long as penetrated surfaces hold on to each other, else not: they let go
         where it goes through 0. The force before its clamp, or anything of its sign."""
 
-    @abc.abstractmethod
     def reference(self, parameters: ContactParameters, mass: Array, velocity: Array) -> Reference:
-        """The same contact in space, entered at `velocity` [m/s]: see `jaxhil.contact.reference`."""
+        """The same contact in space, entered at `velocity` [m/s]: see `jaxhil.contact.reference`. By default
+        its motion is integrated (`jaxhil.contact.reference_motion`)."""
+        return Reference(*integrate_contact(self, parameters, mass, velocity)[:3])

@@ -3,8 +3,6 @@
 import jax.numpy as jnp
 
 from jaxhil.contact.base import ContactLaw
-from jaxhil.contact.reference import Reference
-from jaxhil.contact.reference_motion import integrate_contact
 
 
 class DepthDamped(ContactLaw):
@@ -15,10 +13,6 @@ class DepthDamped(ContactLaw):
     The reference is integrated. Without damping it is that of Hunt and Crossley's law; with n = 1 their law
     with chi = 2 b/(3 k d_0), whose reference has a closed form.
     """
-
-    @property
-    def closed_form(self):
-        return False
 
     def step(self, parameters, state, penetration, rate):
         # The inner `where` keeps the derivative of d^n finite at d <= 0.
@@ -37,6 +31,3 @@ class DepthDamped(ContactLaw):
         power = jnp.where(touching, penetration, 1) ** (parameters.exponent - 1)
         power = jnp.where(touching | (parameters.exponent == 1), power, 0)
         return parameters.stiffness * power + parameters.damping * rate / parameters.reference_depth
-
-    def reference(self, parameters, mass, velocity):
-        return Reference(*integrate_contact(self, parameters, mass, velocity)[:3])

@@ -3,8 +3,6 @@
 import jax.numpy as jnp
 
 from jaxhil.contact.base import ContactLaw
-from jaxhil.contact.reference import Reference
-from jaxhil.contact.reference_motion import integrate_contact
 
 
 class Hardening(ContactLaw):
@@ -14,10 +12,6 @@ class Hardening(ContactLaw):
     The reference is integrated. Without damping e = 1, and k d^2/2 + k d^4/(4 d_0^2) = M v^2/2 at the
     deepest point, where the force is largest.
     """
-
-    @property
-    def closed_form(self):
-        return False
 
     def step(self, parameters, state, penetration, rate):
         force = self.hold(parameters, state, penetration, rate)
@@ -30,6 +24,3 @@ class Hardening(ContactLaw):
     def hold(self, parameters, state, penetration, rate):
         stiffening = 1 + (penetration / parameters.reference_depth) ** 2
         return parameters.stiffness * penetration * stiffening + parameters.damping * rate
-
-    def reference(self, parameters, mass, velocity):
-        return Reference(*integrate_contact(self, parameters, mass, velocity)[:3])

@@ -1,6 +1,7 @@
-"""All contact laws by their names, and contact with one surface or two.
+"""All contact laws by the names that mechanism files use, and contact with one surface or two.
 
-A law is one file of `jaxhil.contact` and an entry here; `jaxhil.contact.base` says what it has to offer.
+A law is one file of `jaxhil.contact`, an entry here and its name in `jaxhil.mechanism.structs.CONTACT_LAWS`;
+`jaxhil.contact.base` says what it has to offer. `jaxhil.register` enters those of other packages.
 """
 
 import jax.numpy as jnp
@@ -28,14 +29,15 @@ __all__ = [
     "two_sided",
 ]
 
-LAWS: dict[str, type[ContactLaw]] = {
-    "linear": KelvinVoigt,
-    "kelvin_voigt": KelvinVoigt,
-    "hunt_crossley": HuntCrossley,
-    "piecewise_linear": PiecewiseLinear,
-    "hardening": Hardening,
-    "depth_damped": DepthDamped,
-    "elastoplastic": Elastoplastic,
+_KELVIN_VOIGT = KelvinVoigt()
+LAWS: dict[str, ContactLaw] = {
+    "linear": _KELVIN_VOIGT,
+    "kelvin_voigt": _KELVIN_VOIGT,
+    "hunt_crossley": HuntCrossley(),
+    "piecewise_linear": PiecewiseLinear(),
+    "hardening": Hardening(),
+    "depth_damped": DepthDamped(),
+    "elastoplastic": Elastoplastic(),
 }
 
 

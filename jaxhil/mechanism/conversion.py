@@ -119,8 +119,11 @@ def _clean(kind: inspect.Type, value: Any, path: Path, infinite: bool) -> Any:
     if path in _NUMBER_FOR_LIST and isinstance(value, (int, float)) and not isinstance(value, bool):
         value = [value]
     match kind:
+        case inspect.Metadata(extra={"one_of": names}):
+            if isinstance(value, str) and value in names:
+                return value
         case inspect.Metadata(type=inner, extra=extra):
-            return _clean(inner, value, path, bool(extra))
+            return _clean(inner, value, path, "infinite" in (extra or {}))
         case inspect.UnionType(types=members):
             return _clean(_member(members, value), value, path, infinite)
         case inspect.NoneType():
@@ -189,8 +192,10 @@ def _member(members: Iterable[inspect.Type], value: Any) -> inspect.Type:
 
 def _allowed(kind: inspect.Type, infinite: bool) -> str:
     match kind:
+        case inspect.Metadata(extra={"one_of": names}):
+            return f"one of {', '.join(names)}"
         case inspect.Metadata(type=inner, extra=extra):
-            return _allowed(inner, bool(extra))
+            return _allowed(inner, "infinite" in (extra or {}))
         case inspect.UnionType(types=members):
             kinds = [_allowed(m, infinite) for m in members if not isinstance(m, inspect.NoneType)]
             return " or ".join(kinds)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -16,7 +17,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from jaxhil.errors import InputError, one_line
+from jaxhil.errors import InputError, one_line, shown
 from jaxhil.mechanism import rules as mechanism_rules
 from jaxhil.mechanism.conversion import KeyProblem, close_match, to_mechanism
 from jaxhil.mechanism.overrides import apply_override, parse_override
@@ -36,6 +37,8 @@ __all__ = [
 DEFAULT = "varying"
 MAX_BYTES = 1 << 20
 MAX_KEY_PARTS = 64
+
+Overrides = Sequence[str] | Mapping[str, Any]
 
 SUITE = "suite-"  # begins the names of the standard suites
 
@@ -58,12 +61,13 @@ class LoadedMechanism(NamedTuple):
     label: str
 
 
-def load(path_or_name: str | Path | None = None, overrides: Sequence[str] = ()) -> LoadedMechanism:
+def load(path_or_name: str | os.PathLike[str] | None = None, overrides: Overrides = ()) -> LoadedMechanism:
     """The mechanism of a TOML file or of a built-in's name (`None`: the default built-in).
 
     `overrides` are ``PATH=VALUE`` texts as given to ``--set``, applied in order before validation:
     PATH a dotted TOML key, possibly with an index (``contact.stiffness[1]``), VALUE a TOML value; a
-    bare word is a string. A table given as VALUE replaces the one there.
+    bare word is a string. A table given as VALUE replaces the one there. A mapping of PATH to the value
+    itself does the same.
 
     Raises `InputError`, one line, for whatever is wrong.
     """
@@ -177,13 +181,14 @@ def _longest_key(text: str) -> int:
     return longest
 
 
-def _resolve(raw: Mapping[str, Any], label: str, overrides: Sequence[str]) -> Mechanism:
+def _resolve(raw: Mapping[str, Any], label: str, overrides: Overrides) -> Mechanism:
     changed = raw
-    for text in overrides:
+    for override in overrides.items() if isinstance(overrides, Mapping) else overrides:
         try:
-            changed = apply_override(changed, *parse_override(text))
+            changed = apply_override(changed, *parse_override(override))
         except KeyProblem as problem:
-            raise InputError(f"{label}: --set {one_line(text, 60)}: {problem}") from None
+            given = override if isinstance(override, str) else override[0]
+            raise InputError(f"{label}: {_option(overrides)} {_short(given)}: {problem}") from None
     try:
         return _validated(changed)
     except KeyProblem as problem:
@@ -205,9 +210,18 @@ def _problem_of(raw: Mapping[str, Any]) -> str:
     return ""
 
 
-def _listed(overrides: Sequence[str]) -> str:
-    shortened = " ".join(one_line(text, 60) for text in overrides[:3])
-    return f": --set {shortened}{' ...' if len(overrides) > 3 else ''}" if overrides else ""
+def _listed(overrides: Overrides) -> str:
+    shortened = " ".join(_short(given) for given in list(overrides)[:3])
+    return f": {_option(overrides)} {shortened}{' ...' if len(overrides) > 3 else ''}" if overrides else ""
+
+
+def _option(overrides: Overrides) -> str:
+    """What overrides are called where they are given: on the command line, or as an argument."""
+    return "overrides" if isinstance(overrides, Mapping) else "--set"
+
+
+def _short(given: object) -> str:
+    return one_line(given, 60) if isinstance(given, str) else shown(given)
 
 
 def _without_empty(value: Any) -> Any:

@@ -15,17 +15,43 @@ from jaxhil.errors import shown
 from jaxhil.mechanism.conversion import KeyProblem, Path, close_match, dotted, entry_count, step_into
 from jaxhil.mechanism.structs import numeric_keys, schema_type
 
-__all__ = ["apply_override", "parse_override"]
+__all__ = ["apply_override", "parse_key", "parse_override"]
 
 _EXAMPLE = "PATH=VALUE, such as approach.velocity=0.01"
+_EXAMPLE_KEY = "a dotted path, such as 'approach.velocity' or 'contact.stiffness[1]'"
 _PART = re.compile(r"""\s*("(?:[^"\\]|\\.)*"|'[^']*'|[A-Za-z0-9_-]+)\s*""")
 _INDEX = re.compile(r"\[\s*([0-9]{1,6})\s*\]\s*")
 _WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")
 _MAX_LENGTH = 100_000
 
 
-def parse_override(text: str) -> tuple[Path, Any]:
-    """The path and the value of a ``PATH=VALUE`` text. Raises `KeyProblem`."""
+def parse_override(override: str | tuple[object, Any]) -> tuple[Path, Any]:
+    """Path and value of a ``PATH=VALUE`` text, or of a pair of PATH and the value. Raises `KeyProblem`."""
+    if not isinstance(override, str):
+        key, value = override
+        return parse_key(key), _plain(value)
+    return _parse_text(override)
+
+
+def parse_key(key: object) -> Path:
+    """The path that a dotted key names. Raises `KeyProblem`."""
+    if isinstance(key, str):
+        path, end = _parse_path(f"{key}=", key)
+        if end == len(key) + 1:
+            return path
+    raise KeyProblem((), shown(key), _EXAMPLE_KEY)
+
+
+def _plain(value: Any) -> Any:
+    """Numbers and arrays of NumPy and jax as those of Python."""
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+def _parse_text(text: str) -> tuple[Path, Any]:
     path, position = _parse_path(text)
     written = text[position:].strip()
     if len(written) > _MAX_LENGTH:
@@ -63,19 +89,20 @@ def apply_override(raw: Mapping[str, Any], path: Path, value: Any) -> dict[str, 
     return _replaced(raw, path, 0, value)
 
 
-def _parse_path(text: str) -> tuple[Path, int]:
-    """The path in front of ``=`` and the position behind it."""
+def _parse_path(text: str, key: str | None = None) -> tuple[Path, int]:
+    """The path in front of ``=`` and the position behind it; problems speak of the `key`, if one is given."""
+    given, example = (text, _EXAMPLE) if key is None else (key, _EXAMPLE_KEY)
     path: list[str | int] = []
     position = 0
     while True:
         part = _PART.match(text, position)
         if part is None or len(path) > 16:
-            raise KeyProblem((), shown(text), _EXAMPLE)
+            raise KeyProblem((), shown(given), example)
         word = part.group(1)
         try:
             path.append(next(iter(tomllib.loads(f"{word} = 0"))))
         except ValueError:
-            raise KeyProblem((), shown(text), _EXAMPLE) from None
+            raise KeyProblem((), shown(given), example) from None
         position = part.end()
         while index := _INDEX.match(text, position):
             path.append(int(index.group(1)))
@@ -83,7 +110,7 @@ def _parse_path(text: str) -> tuple[Path, int]:
         if text[position : position + 1] == "=":
             return tuple(path), position + 1
         if text[position : position + 1] != ".":
-            raise KeyProblem((), shown(text), _EXAMPLE)
+            raise KeyProblem((), shown(given), example)
         position += 1
 
 

@@ -17,7 +17,15 @@ import numpy as np
 
 from jaxhil.errors import shown
 from jaxhil.mechanism.conversion import KeyProblem, close_match
-from jaxhil.mechanism.structs import Contact, Mechanism, Simulator, Uncertainty, numeric_keys, value_at
+from jaxhil.mechanism.structs import (
+    BUILT_IN_LAWS,
+    Contact,
+    Mechanism,
+    Simulator,
+    Uncertainty,
+    numeric_keys,
+    value_at,
+)
 
 __all__ = ["check", "is_hurwitz"]
 
@@ -118,7 +126,8 @@ def _check_dissipation(mechanism: Mechanism) -> None:
         if contact.law in laws and value is None:
             allowed = f"{numeric_keys()[f'contact.{key}']} (law {contact.law} needs it)"
             raise KeyProblem(("contact", key), "nothing", allowed)
-        if contact.law not in laws and value is not None:
+        # What a law from elsewhere makes of it, only that law knows.
+        if contact.law not in laws and contact.law in BUILT_IN_LAWS and value is not None:
             raise KeyProblem(("contact", key), shown(value), f"nothing (only for law {' or '.join(laws)})")
     if contact.law == "elastoplastic" and _is_damped(mechanism):
         damping = shown(contact.damping) if any(contact.damping) else "an uncertain damping"

@@ -19,6 +19,8 @@ import msgspec
 from msgspec import Meta, Struct, field
 
 __all__ = [
+    "BUILT_IN_LAWS",
+    "CONTACT_LAWS",
     "MAX_CONTACTS",
     "SCHEMA",
     "Approach",
@@ -40,7 +42,7 @@ __all__ = [
 SCHEMA = "jaxhil/mechanism/1"
 MAX_CONTACTS = 1000
 
-Law = Literal[
+BUILT_IN_LAWS = (
     "linear",
     "kelvin_voigt",
     "hunt_crossley",
@@ -48,7 +50,10 @@ Law = Literal[
     "hardening",
     "depth_damped",
     "elastoplastic",
-]
+)
+CONTACT_LAWS = [*BUILT_IN_LAWS]  # and those that `jaxhil.register` enters
+
+Law = Annotated[str, Meta(extra={"one_of": CONTACT_LAWS})]
 SimulatorModel = Literal["ideal", "first_order", "second_order", "third_order", "transfer_function"]
 Integrator = Literal["semi_implicit_euler", "zoh", "explicit_euler"]
 CommandHold = Literal["linear", "zoh"]
@@ -251,7 +256,7 @@ def numeric_keys() -> dict[str, Range]:
                 for entry in fields:
                     visit(entry.type, f"{path}.{entry.name}".lstrip("."))
             case msgspec.inspect.Metadata(type=inner, extra=extra):
-                visit(inner, path, bool(extra))
+                visit(inner, path, "infinite" in (extra or {}))
             case msgspec.inspect.UnionType(types=members):
                 for member in members:
                     visit(member, path, infinite)

@@ -39,7 +39,7 @@ def build_loop(
 
     is_two_sided = bool(np.any(np.isfinite(scenarios.clearance)))
     return Loop(
-        law=LAWS[mechanism.contact.law](),
+        law=LAWS[mechanism.contact.law],
         compensator=law,
         integrator=rig.integrator,
         hold=rig.command_hold,

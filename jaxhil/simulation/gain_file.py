@@ -106,7 +106,8 @@ def _check_entry(gain: Gain, entry: Mapping[str, Any], mechanism: Mechanism, sou
 
 
 def _refusal(source: str, key: str, found: str, allowed: str) -> InputError:
-    return InputError(f"{source}: {key}: found {found}, allowed {allowed}")
+    where = f"{source}: {key}" if source else key
+    return InputError(f"{where}: found {found}, allowed {allowed}")
 
 
 def _is_date(value: object) -> bool:

@@ -123,7 +123,7 @@ def _space(mechanism: Mechanism, scenarios: Scenario, first: int, velocity: floa
     lane = jax.tree.map(lambda leaf: jnp.asarray(leaf[..., 0]), scenarios)
     step = (end + APPROACH) / STEPS
     force, position = _integrate(
-        LAWS[mechanism.contact.law](),
+        LAWS[mechanism.contact.law],
         lane.contact,
         jnp.asarray(first),
         lane.clearance,

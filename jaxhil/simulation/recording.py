@@ -42,6 +42,7 @@ class Lane(NamedTuple):
     identified: tuple[np.ndarray | Array, np.ndarray | Array] | None
     zeroed: bool
     sent: np.ndarray | Array | None = None
+    contact: np.ndarray | Array | None = None  # index of the contact of each tick
 
 
 def nominal_and_draws(mechanism: Mechanism, number: int, seed: int) -> Scenario:
@@ -115,7 +116,7 @@ def _lane(seen: Tick, zeroed: bool) -> Lane:
     finite = np.all(np.isfinite(np.stack(numbers)[:, :end]), axis=0)
     end = end if np.all(finite) else int(np.argmin(finite))
     seen = jax.tree.map(lambda leaf: leaf[:end], seen)
-    return Lane(seen.signals, seen.command, seen.identified, zeroed, seen.sent)
+    return Lane(seen.signals, seen.command, seen.identified, zeroed, seen.sent, seen.contact)
 
 
 def _begin(loop: Loop, gains: Gains, scenario: Scenario) -> tuple[RigConstants, Run]:

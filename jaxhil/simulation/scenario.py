@@ -8,15 +8,18 @@ The batch is the trailing axis; successive contacts, segments and polynomial coe
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
 from jaxhil.contact.laws import ContactParameters
 from jaxhil.contact.reference import Reference
-from jaxhil.mechanism.structs import Mechanism, value_at
+from jaxhil.mechanism.structs import BUILT_IN_LAWS, Mechanism, value_at
 from jaxhil.simulation.probe import Probe
 
 LONGEST_CONTACT = 10.0  # s
+_PUSH_ONLY = frozenset(BUILT_IN_LAWS) - {"kelvin_voigt"}  # laws to which tension means nothing
 
 
 class MotionSimulator(NamedTuple):
@@ -114,11 +117,11 @@ def contact_slots(contacts: int) -> int:
 
 def build_scenarios(
     mechanism: Mechanism,
-    draws: Mapping[str, np.ndarray] | None = None,
+    draws: Mapping[str, Any] | None = None,
     seed: int = 0,
     first: int = 0,
 ) -> Scenario:
-    """Batch of scenarios of a mechanism, as NumPy arrays.
+    """Batch of scenarios of a mechanism, as NumPy arrays; as jax arrays where draws are such.
 
     `draws` maps dotted paths to values, (number,) or for lists (number, entries); what it lacks is nominal.
     Without it, a batch of one: the nominal run. Noise keys depend on `seed` and `first` + lane alone.
@@ -136,10 +139,10 @@ def build_scenarios(
         clearance=table.scalar("contact.clearance"),
         contact=ContactParameters(
             stiffness=table.successive("contact.stiffness"),
-            damping=table.successive("contact.damping") * (contact.law != "linear"),
+            damping=table.successive("contact.damping") * float(contact.law != "linear"),
             exponent=table.repeated(table.scalar("contact.exponent")),
             depths=table.repeated(table.entries("contact.depths")),
-            tension=table.repeated(np.full(number, contact.tension and contact.law == "kelvin_voigt")),
+            tension=table.repeated(np.full(number, contact.tension and contact.law not in _PUSH_ONLY)),
             reference_depth=table.repeated(table.scalar("contact.reference_depth", 1.0)),
             unloading_ratio=table.repeated(table.scalar("contact.unloading_ratio", 1.0)),
         ),
@@ -158,45 +161,48 @@ def build_scenarios(
 class _Table:
     """The numbers of a mechanism by dotted path, drawn or nominal, one per lane."""
 
-    def __init__(self, mechanism: Mechanism, draws: dict[str, np.ndarray]) -> None:
+    def __init__(self, mechanism: Mechanism, draws: dict[str, Any]) -> None:
+        # The namespace of the arrays.
+        self.np: Any = jnp if any(isinstance(drawn, jax.Array) for drawn in draws.values()) else np
         self.number = len(next(iter(draws.values()))) if draws else 1
         self.slots = contact_slots(mechanism.approach.contacts)
         self._mechanism, self._draws = mechanism, draws
 
-    def drawn(self, path: str, default: Any = None) -> np.ndarray:
+    def drawn(self, path: str, default: Any = None) -> Any:
         """What was drawn, else the nominal value or, where the file has none, the `default`."""
         value = self._draws.get(path)
         if value is None:
             value = value_at(self._mechanism, path)
-        return np.asarray(default if value is None else value, float)
+        return self.np.asarray(default if value is None else value, float)
 
     def scalar(self, path: str, default: float | None = None) -> Any:
-        return np.broadcast_to(self.drawn(path, default), (self.number,))
+        return self.np.broadcast_to(self.drawn(path, default), (self.number,))
 
     def constant(self, value: float) -> Any:
-        return np.broadcast_to(np.asarray(value, float), (self.number,))
+        return self.np.broadcast_to(self.np.asarray(value, float), (self.number,))
 
     def entries(self, path: str) -> Any:
         """A list, (entries, ..., number)."""
         nominal = np.asarray(value_at(self._mechanism, path), float)
-        value = np.asarray(self._draws.get(path, np.broadcast_to(nominal, (self.number, *nominal.shape))))
-        return np.moveaxis(value.reshape(self.number, *nominal.shape), 0, -1)
+        repeated = np.broadcast_to(nominal, (self.number, *nominal.shape))
+        value = self.np.asarray(self._draws.get(path, repeated))
+        return self.np.moveaxis(value.reshape(self.number, *nominal.shape), 0, -1)
 
     def successive(self, path: str) -> Any:
         """A list as one entry per slot, the last repeated."""
         entries = self.entries(path)
         return entries[np.minimum(np.arange(self.slots), len(entries) - 1)]
 
-    def repeated(self, entry: np.ndarray) -> Any:
+    def repeated(self, entry: Any) -> Any:
         """The same entry in every slot."""
-        return np.broadcast_to(entry, (self.slots, *entry.shape))
+        return self.np.broadcast_to(entry, (self.slots, *entry.shape))
 
 
 def _phase(mechanism, table) -> Any:
     """(slots, number); a phase of its own for every contact where it is drawn so."""
     phase = table.drawn("approach.phase")
-    phase = np.atleast_2d(phase.T).T  # (number or 1, contacts or 1)
-    phase = np.broadcast_to(phase, (table.number, phase.shape[1]))
+    phase = table.np.atleast_2d(phase.T).T  # (number or 1, contacts or 1)
+    phase = table.np.broadcast_to(phase, (table.number, phase.shape[1]))
     return phase[:, np.minimum(np.arange(table.slots), phase.shape[1] - 1)].T
 
 
@@ -217,21 +223,21 @@ def _simulator(simulator, table) -> MotionSimulator:
         numerator, denominator = np.zeros((0, len(one))), one[None]
     elif simulator.model == "first_order":
         time_constant = table.scalar(path + "time_constant")
-        numerator, denominator = one[None], np.stack([time_constant, one])
+        numerator, denominator = one[None], table.np.stack([time_constant, one])
     elif simulator.model == "second_order":
         frequency = 2 * np.pi * table.scalar(path + "natural_frequency")
         damping = table.scalar(path + "damping_ratio")
-        numerator = np.stack([0 * one, frequency**2])
-        denominator = np.stack([one, 2 * damping * frequency, frequency**2])
+        numerator = table.np.stack([0 * one, frequency**2])
+        denominator = table.np.stack([one, 2 * damping * frequency, frequency**2])
     elif simulator.model == "third_order":
         a_1, a_2, a_3 = table.entries(path + "coefficients")
-        numerator = np.stack([0 * one, 0 * one, one])
-        denominator = np.stack([a_3, a_2, a_1, one])
+        numerator = table.np.stack([0 * one, 0 * one, one])
+        denominator = table.np.stack([a_3, a_2, a_1, one])
     else:
         denominator = table.entries(path + "denominator")
         numerator = table.entries(path + "numerator")
         missing = len(denominator) - 1 - len(numerator)
-        numerator = np.concatenate([np.zeros((max(missing, 0), len(one))), numerator])
+        numerator = table.np.concatenate([np.zeros((max(missing, 0), len(one))), numerator])
         numerator = numerator[len(numerator) - (len(denominator) - 1) :]
     return MotionSimulator(
         numerator,

@@ -50,13 +50,12 @@ class CommonProgram:
 
     def law(self, beforehand: bool | None = None) -> AnyOf:
         """The laws' mixture; with references that are integrated, unless they come `beforehand`."""
-        kinds = tuple(kind() for kind in self._kinds)
-        return AnyOf(kinds, self.beforehand if beforehand is None else beforehand)
+        return AnyOf(self._kinds, self.beforehand if beforehand is None else beforehand)
 
     @property
-    def _kinds(self) -> list[type[ContactLaw]]:
+    def _kinds(self) -> tuple[ContactLaw, ...]:
         """Laws of two names may be of one kind."""
-        return list(dict.fromkeys(LAWS[name] for name in self.laws))
+        return tuple(dict.fromkeys(LAWS[name] for name in self.laws))
 
     def loop(self, loop: Loop) -> Loop:
         """The loop of one mechanism, in this form."""
@@ -91,7 +90,7 @@ class CommonProgram:
         contact = contact._replace(stiffness=stiffness, depths=depths, kind=kind)
         reference: Any = None
         if self.beforehand:
-            law = LAWS[mechanism.contact.law]()
+            law = LAWS[mechanism.contact.law]
             unknown: Any = np.full((self.slots, number), np.nan)
             reference = Reference(*[unknown] * 3) if law.closed_form else self._first(law, batch)
         return batch._replace(contact=contact, phase=by_slot(batch.phase), reference=reference)
@@ -131,7 +130,7 @@ def common_programs(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], Co
 
 def _later(mechanism: Mechanism) -> bool:
     """Whether there are contacts whose reference has to be integrated at a speed not known beforehand."""
-    return mechanism.approach.contacts > 1 and not LAWS[mechanism.contact.law]().closed_form
+    return mechanism.approach.contacts > 1 and not LAWS[mechanism.contact.law].closed_form
 
 
 def _form(mechanisms, group, loops, batches) -> CommonProgram:

@@ -34,7 +34,7 @@ def reference_restitutions(mechanism: Mechanism, contacts: Sequence[ContactResul
     speeds = [one.approach_velocity for one in contacts]
     velocity = jnp.array([speed if speed > 0.0 else 1.0 for speed in speeds])[:, None]
     mass = jnp.broadcast_to(jnp.asarray(scenario.equivalent_mass), velocity.shape)
-    law = LAWS[mechanism.contact.law]()
+    law = LAWS[mechanism.contact.law]
     reference = law.reference(parameters_by_slot(parameters), mass, velocity)
     return [float(value) for value in np.asarray(reference.restitution)[:, 0]]
 

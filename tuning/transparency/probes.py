@@ -73,7 +73,7 @@ def probed_scenarios(
     twin, damped = damped_twins(mechanism, draws or {"approach.phase": np.asarray(plain.phase).T})
     slots = plain.phase.shape[0]
     velocity: Any = np.broadcast_to(plain.velocity, (slots, number))
-    space = in_space(LAWS[mechanism.contact.law](), plain, velocity, 1)
+    space = in_space(LAWS[mechanism.contact.law], plain, velocity, 1)
     own = build_scenarios(twin, damped, seed)
     pushes = [_pushed(plain, space, share, e) for share, e in ((EARLY, space.early), (LATE, space.late))]
     batches = [_pushed(plain, space), *pushes, _pushed(own, space)]

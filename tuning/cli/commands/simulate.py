@@ -1,6 +1,7 @@
 """`jaxhil simulate`: the contacts of one mechanism, run once."""
 
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.mechanism.conversion import KeyProblem
@@ -11,6 +12,9 @@ from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options import Simulate
 from tuning.environment import prepare
+
+if TYPE_CHECKING:
+    from jaxhil.simulation.run import ContactResult, Run
 
 
 def run(options: Simulate) -> int:
@@ -25,95 +29,46 @@ def run(options: Simulate) -> int:
     if options.gains is None or options.file is not None:
         mechanism = load(options.file, options.overrides).mechanism
     prepare()
-    mechanism, compensator, gains = _gains(options, mechanism)
-    contacts, status = simulate(mechanism, compensator, gains, options.seed)
-    good = status == "ok" and all(abs(contact["error"]) <= options.limit for contact in contacts)
-    if options.plot is not None:
-        from jaxhil.simulation.motion import nominal_motion
-        from tuning.pictures.plots import contact_plot, save
+    from jaxhil.simulation.run import simulate
 
-        motion = nominal_motion(mechanism, {"rig": (compensator, gains)}, options.seed)
-        title = f"{mechanism.name}, compensation: {compensator}"
-        save(contact_plot(motion, title, sensors="rig"), options.plot)
+    mechanism, compensator, gains = _chosen(options, mechanism)
+    done = simulate(mechanism, compensator, gains, seed=options.seed)
+    good = done.status == "ok" and all(abs(contact.error) <= options.limit for contact in done.contacts)
+    if options.plot is not None:
+        done.plot(options.plot)
         terminal.note(f"wrote {options.plot}")
+    contacts = [_entry(contact) for contact in done.contacts]
     if options.json:
         terminal.emit_json(
             {
                 "mechanism": mechanism.name,
-                "compensator": compensator,
-                "gains": gains,
+                "compensator": done.compensator,
+                "gains": done.gains,
                 "contacts": contacts,
-                "status": status,
+                "status": done.status,
                 "limit": options.limit,
                 "verdict": "good" if good else "bad",
             }
         )
     else:
-        _print(options, mechanism, compensator, contacts, status, good)
+        _print(options, done, contacts, good)
     return 0 if good else 1
 
 
-def simulate(
-    mechanism: Mechanism, compensator: str, gains: dict[str, float], seed: int
-) -> tuple[list[dict[str, Any]], str]:
-    """The contacts that were reached, in SI units, and "ok" or the status of the first that failed.
-
-    A contact that did not end has no restitution and no error.
-    """
-    from jaxhil.compensators import COMPENSATORS
-    from jaxhil.simulation.building import build_loop
-    from jaxhil.simulation.evaluation import evaluate
-    from jaxhil.simulation.metrics import NOT_REACHED, OK, STATUS_NAMES
-    from jaxhil.simulation.scenario import build_scenarios
-
-    scenarios = build_scenarios(mechanism, seed=seed)
-    outcome = evaluate(build_loop(mechanism, compensator, scenarios), gains, scenarios)
-    metrics = outcome.metrics
-    estimates = COMPENSATORS[compensator].estimates_delay
-    contacts, overall = [], "ok"
-    for slot in range(mechanism.approach.contacts):
-        status = int(metrics.status[slot, 0])
-        if status == NOT_REACHED:
-            break
-        ended = status == OK
-
-        def value(array, ended=True, slot=slot):
-            return float(array[slot, 0]) if ended else float("nan")
-
-        contacts.append(
-            {
-                "restitution": value(metrics.restitution, ended),
-                "reference_restitution": value(outcome.reference_restitution, ended),
-                "error": value(outcome.error, ended),
-                "peak_force": value(metrics.peak_force),
-                "reference_peak_force": value(outcome.reference_peak_force, ended),
-                "peak_command": value(metrics.peak_command),
-                "position_shortfall": value(metrics.position_shortfall),
-                "duration": value(metrics.duration),
-                "approach_velocity": value(metrics.approach_velocity),
-                **({"force_delay": value(metrics.force_delay)} if estimates else {}),
-                "status": STATUS_NAMES[status],
-            }
-        )
-        if not ended:
-            overall = STATUS_NAMES[status]
-            break
-    if overall == "ok" and len(contacts) < mechanism.approach.contacts:
-        overall = STATUS_NAMES[NOT_REACHED]
-    return contacts, overall
+def _entry(contact: "ContactResult") -> dict[str, Any]:
+    """A contact as JSON says it: the estimated delay only of a law that estimates it."""
+    return {name: value for name, value in contact._asdict().items() if value is not None}
 
 
-def _gains(options: Simulate, mechanism: Mechanism | None) -> tuple[Mechanism, str, dict[str, float]]:
-    """Mechanism, compensator and gains: the gain file's, or the literature's gains."""
-    from jaxhil.compensators import literature_gains
-
+def _chosen(options: Simulate, mechanism: Mechanism | None) -> tuple[Mechanism, str, str | Path | None]:
+    """Mechanism, compensator, and its setting or gain file, if one is given."""
     if options.gains is None:
         assert mechanism is not None
         compensator = options.compensator or "none"
         checks.setting(compensator, options.setting)
-        return mechanism, compensator, literature_gains(mechanism, compensator, options.setting)
+        return mechanism, compensator, options.setting
 
-    from tuning.gain_file import load_gain_file
+    from jaxhil.simulation.gain_file import load_gain_file
 
     if options.setting is not None:
         raise InputError(f"--setting: found {shown(options.setting)}, allowed none beside a gain file")
@@ -125,8 +80,7 @@ def _gains(options: Simulate, mechanism: Mechanism | None) -> tuple[Mechanism, s
         )
     if mechanism is None:
         mechanism = _overridden(loaded.mechanism, options.overrides, label)
-    _check_fit(mechanism, loaded, label)
-    return mechanism, loaded.compensator, loaded.gains
+    return mechanism, loaded.compensator, Path(options.gains)
 
 
 def _overridden(mechanism: Mechanism, overrides: tuple[str, ...], label: str) -> Mechanism:
@@ -139,24 +93,9 @@ def _overridden(mechanism: Mechanism, overrides: tuple[str, ...], label: str) ->
     return from_builtins(raw, label) if overrides else mechanism
 
 
-def _check_fit(mechanism: Mechanism, loaded, label: str) -> None:
-    """Gains act per control period, and a delay line is as long as a gain's bound."""
-    from jaxhil.compensators import COMPENSATORS
-
-    period, tuned = mechanism.rig.control_period, loaded.mechanism.rig.control_period
-    if period != tuned:
-        raise InputError(f"{label}: control_period: found {tuned:g} s, allowed {period:g} s of the mechanism")
-    for gain in COMPENSATORS[loaded.compensator].gains:
-        value, lower, upper = loaded.gains[gain.name], gain.lower(mechanism), gain.upper(mechanism)
-        margin = 1e-9 * max(abs(lower), abs(upper))
-        if not lower - margin <= value <= upper + margin:
-            raise InputError(
-                f"{label}: gains.{gain.name}: found {value:.6g}, allowed {lower:.6g} to {upper:.6g} "
-                f"{gain.unit} for this mechanism"
-            )
-
-
-def _print(options, mechanism, compensator, contacts, status, good) -> None:
+def _print(options: Simulate, done: "Run", contacts: list[dict[str, Any]], good: bool) -> None:
+    # Contacts that were not reached are told apart, below the table.
+    contacts = [contact for contact in contacts if contact["status"] != "not reached"]
     estimates = any("force_delay" in contact for contact in contacts)
     rows = [
         [
@@ -175,16 +114,16 @@ def _print(options, mechanism, compensator, contacts, status, good) -> None:
     headings = ["contact", "e", "e*", "error", "peak force [N]", "duration [ms]", "approach [mm/s]"]
     headings += ["force delay [ms]"] * estimates + ["status"]
     rule = "the gain file's gains" if options.gains is not None else "gains by the literature's rule"
-    title = f"{mechanism.name}, compensation: {compensator}"
-    title += f", {rule}" if compensator != "none" else ""
-    wanted = mechanism.approach.contacts
+    title = f"{done.mechanism.name}, compensation: {done.compensator}"
+    title += f", {rule}" if done.compensator != "none" else ""
+    wanted = len(done.contacts)
     lines = []
     if len(contacts) < wanted:
         lines.append(f"{wanted - len(contacts)} of {wanted} contacts were not reached.")
     if good:
         lines.append(f"Good: every error is within {options.limit:g}.")
-    elif status != "ok":
-        lines.append(f"Bad: the run ended with status '{status}'.")
+    elif done.status != "ok":
+        lines.append(f"Bad: the run ended with status '{done.status}'.")
     else:
         worst = max((contact["error"] for contact in contacts), key=abs)
         kind = "divergence" if worst > 0 else "convergence"

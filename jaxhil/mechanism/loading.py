@@ -1,0 +1,44 @@
+"""A mechanism from whatever names it: a built-in's name, a file's path, or the `Mechanism` itself."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+from jaxhil.errors import InputError, shown
+from jaxhil.mechanism import file
+from jaxhil.mechanism.structs import Mechanism
+
+__all__ = ["as_mechanism", "load"]
+
+
+def load(
+    name_or_path: str | os.PathLike[str] = file.DEFAULT, overrides: Mapping[str, Any] | None = None
+) -> Mechanism:
+    """The mechanism of a built-in's name, or of a TOML file.
+
+    `overrides` maps keys to values, in SI units, which replace those of the file: a key is a dotted path,
+    such as ``rig.force_sensor.delay``, possibly with an index (``contact.stiffness[1]``); None takes a value
+    away.
+
+    Raises `InputError`, one line, for whatever is wrong: file, key, what was found and what is allowed.
+    """
+    if not (overrides is None or isinstance(overrides, Mapping)):
+        raise InputError(f"overrides: found {shown(overrides)}, allowed a dict from dotted paths to values")
+    return file.load(_source(name_or_path), overrides or {}).mechanism
+
+
+def as_mechanism(given: object) -> Mechanism:
+    """The mechanism given, checked; or that of the name or path given. Raises `InputError`."""
+    if not isinstance(given, Mechanism):
+        return file.load(_source(given)).mechanism
+    # Structs hold what they are given: one that was not read from a file was not checked yet.
+    return file.from_builtins(file.to_builtins(given), f"mechanism {shown(given.name)}")
+
+
+def _source(given: object) -> str | os.PathLike[str]:
+    if isinstance(given, (str, os.PathLike)) and isinstance(os.fspath(given), str):
+        return given
+    allowed = "a Mechanism, the name of a built-in one or a path"
+    raise InputError(f"mechanism: found {shown(given)}, allowed {allowed}")

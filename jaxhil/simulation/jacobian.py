@@ -1,0 +1,197 @@
+"""Derivatives of what a run gives, by the numbers of its mechanism and by the gains.
+
+Forward mode, through every tick of the run: each number asked for has a lane of its own in one batch of equal
+runs, and in that lane alone it moves.
+"""
+
+import os
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxhil.compensators import COMPENSATORS, Compensator, Gains
+from jaxhil.errors import InputError, shown
+from jaxhil.mechanism.conversion import close_match, dotted
+from jaxhil.mechanism.loading import as_mechanism
+from jaxhil.mechanism.overrides import KeyProblem, parse_key
+from jaxhil.mechanism.structs import Mechanism, numeric_keys, value_at
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.double_precision import double_precision
+from jaxhil.simulation.evaluation import Outcome, compare_with_reference
+from jaxhil.simulation.gain_choice import choose_gains
+from jaxhil.simulation.loop import Loop
+from jaxhil.simulation.metrics import OK
+from jaxhil.simulation.rollout import rollout
+from jaxhil.simulation.run import ContactResult, check_seed
+from jaxhil.simulation.scenario import Scenario, build_scenarios
+
+GAINS = "gains."
+# Counted in ticks, or no number: without a derivative.
+WITHOUT = ("duration", "status")
+FIGURES = tuple(name for name in ContactResult._fields if name not in WITHOUT)
+_ROUNDING = ("rig.force_sensor.quantum", "rig.position_sensor.quantum")
+# At 0 the part of the rig that the key describes is not there: what follows has a corner.
+_CORNERS_AT_0 = ("rig.force_sensor.time_constant", "rig.force_sensor.dead_zone")
+_NUDGE = 1e-9  # parts of the loop that a key switches on are then there
+
+
+class _Key(NamedTuple):
+    """A number to differentiate by: a gain's name, or a key of the mechanism, of a list one entry or all."""
+
+    gain: str | None
+    path: str
+    entry: tuple[int, ...]
+
+
+def jacobian(
+    mechanism: Mechanism | str | os.PathLike[str],
+    compensator: str = "none",
+    gains: Mapping[str, float] | str | os.PathLike[str] | None = None,
+    *,
+    of: str = "restitution",
+    by: str | Sequence[str],
+    seed: int = 0,
+) -> dict[str, np.ndarray]:
+    """d(of)/d(by) of every contact of the nominal run: by each entry of `by` an array of shape (contacts,).
+
+    `of` is a number of `ContactResult`, such as "restitution", "error" or "peak_force"; `by` holds dotted
+    paths of real numbers of the mechanism, such as "rig.force_sensor.delay", and "gains.NAME". The entries of
+    a list move together, by the same amount; "contact.stiffness[1]" is one entry. The unit is that of `of`
+    over that of the key. A contact that did not end well has NaN; the others count what all contacts before
+    them pass on. Mechanism, compensator, gains and seed are those of `simulate`.
+
+    Derivatives are those of the program: a damped contact begins with a jump of the force, and by when the
+    sensor sees that jump, from one tick to the next, is not in them.
+
+    Raises `InputError`, one line, for an unknown `of` or key, a key that is no real number or has no finite
+    value, and for what the run is not differentiable by: quantisation, and delays or dead zones that are 0.
+    """
+    checked = as_mechanism(mechanism)
+    number = check_seed(seed)
+    name, values = choose_gains(checked, compensator, gains)
+    law = COMPENSATORS[name]
+    _check_figure(of, law)
+    paths = [by] if isinstance(by, str) else by
+    if not isinstance(paths, Sequence) or isinstance(paths, bytes) or not paths:
+        allowed = "dotted paths, such as ['rig.force_sensor.delay', 'gains.phase_lead']"
+        raise InputError(f"by: found {shown(by)}, allowed {allowed}")
+    keys = [_key(checked, law, path) for path in paths]
+    _check_rounding(checked)
+    with double_precision():
+        slopes, status = _slopes(
+            of, _loop(checked, name, keys, number), *_moving(checked, keys, values, number)
+        )
+    ended = np.asarray(status) == OK
+    slopes = np.where(ended, np.asarray(slopes, float), np.nan)[: checked.approach.contacts]
+    return {path: slopes[:, lane].copy() for lane, path in enumerate(paths)}
+
+
+def _check_figure(of: object, law: Compensator) -> None:
+    known = [name for name in FIGURES if name != "force_delay" or law.estimates_delay]
+    if of not in known:
+        hint = close_match(of, known) if isinstance(of, str) else ""
+        raise InputError(f"of: found {shown(of)}, allowed one of {', '.join(known)}{hint}")
+
+
+def _check_rounding(mechanism: Mechanism) -> None:
+    for path in _ROUNDING:
+        if value_at(mechanism, path) != 0.0:
+            allowed = "0: what is rounded has no derivative"
+            raise InputError(f"{path}: found {shown(value_at(mechanism, path))}, allowed {allowed}")
+
+
+def _key(mechanism: Mechanism, law: Compensator, path: object) -> _Key:
+    """The number that an entry of `by` names. Raises `InputError`."""
+    if isinstance(path, str) and path.startswith(GAINS):
+        gain, known = path.removeprefix(GAINS), [gain.name for gain in law.gains]
+        if gain not in known:
+            allowed = ", ".join(GAINS + one for one in known) or f"no gain: {law.name} has none"
+            raise InputError(f"by: found {shown(path)}, allowed {allowed}{close_match(gain, known)}")
+        return _Key(gain, "", ())
+    try:
+        parts = parse_key(path)
+    except KeyProblem:
+        raise InputError(
+            f"by: found {shown(path)}, allowed a dotted path of the mechanism, or gains.NAME"
+        ) from None
+    entry = tuple(part for part in parts if isinstance(part, int))
+    key = dotted(parts[: len(parts) - len(entry)])
+    if key not in numeric_keys() or key in _ROUNDING:
+        known = [one for one in numeric_keys() if not one.startswith("uncertainty") and one not in _ROUNDING]
+        raise _refusal(path, "no key to differentiate by", f"a real number{close_match(key, [*known])}")
+    value = value_at(mechanism, key)
+    if value is None or value == [] or (isinstance(value, float) and not np.isfinite(value)):
+        raise _refusal(path, f"{shown(value)} as its value", "a key with a finite value")
+    if key in _CORNERS_AT_0 and value == 0.0:
+        raise _refusal(path, "0 as its value", "a number > 0: there is a corner at 0")
+    shape = np.shape(value)
+    if len(entry) > len(shape) or any(index >= size for index, size in zip(entry, shape, strict=False)):
+        raise _refusal(path, f"a value of the shape {shape}", "indices into it")
+    return _Key(None, key, entry)
+
+
+def _refusal(path: object, found: str, allowed: str) -> InputError:
+    return InputError(f"by {path}: found {found}, allowed {allowed}")
+
+
+def _loop(mechanism: Mechanism, compensator: str, keys: list[_Key], seed: int) -> Loop:
+    """The loop with all that its numbers switch on when they move."""
+    scenarios = build_scenarios(mechanism, _draws(mechanism, keys, np.full(len(keys), _NUDGE)), seed)
+    return build_loop(mechanism, compensator, scenarios)
+
+
+def _draws(mechanism: Mechanism, keys: list[_Key], moved: Any) -> dict[str, Any]:
+    """The values of all keys in as many lanes; in the lane of a key it has `moved`, (keys,), by that much."""
+    # Something has to say how many lanes there are.
+    draws: dict[str, Any] = {"approach.phase": np.full(len(keys), mechanism.approach.phase)}
+    for lane, key in enumerate(keys):
+        if key.gain is None:
+            nominal = np.asarray(value_at(mechanism, key.path), float)
+            direction = np.zeros((len(keys), *nominal.shape))
+            direction[(lane, *key.entry)] = 1.0
+            step = moved.reshape(-1, *[1] * nominal.ndim) * direction
+            draws[key.path] = draws.get(key.path, np.broadcast_to(nominal, direction.shape)) + step
+    return draws
+
+
+def _moving(
+    mechanism: Mechanism, keys: list[_Key], gains: dict[str, float], seed: int
+) -> tuple[Gains, Gains, Scenario, Scenario]:
+    """Gains and scenarios, a lane for each key, and their derivatives by the key of the lane."""
+    lanes = len(keys)
+    values = {name: jnp.full(lanes, value) for name, value in gains.items()}
+    rates = {name: jnp.array([1.0 * (key.gain == name) for key in keys]) for name in gains}
+
+    def scenarios(moved: Array) -> Scenario:
+        return build_scenarios(
+            mechanism, {k: jnp.asarray(v) for k, v in _draws(mechanism, keys, moved).items()}, seed
+        )
+
+    batch, slopes = jax.jvp(scenarios, (jnp.zeros(lanes),), (jnp.ones(lanes),))
+    # The noise of every lane is that of the first.
+    batch = batch._replace(key=jnp.broadcast_to(batch.key[:, :1], batch.key.shape))
+    slopes = jax.tree.map(lambda leaf, slope: slope if eqx.is_inexact_array(leaf) else None, batch, slopes)
+    return values, rates, batch, slopes
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _slopes(
+    of: str, loop: Loop, gains: Gains, gain_rates: Gains, batch: Scenario, batch_rates: Any
+) -> tuple[Array, Array]:
+    """Derivative of the figure `of` and status of every contact, (slots, lanes)."""
+    moving, fixed = eqx.partition(batch, eqx.is_inexact_array)
+
+    def figure(gains: Gains, moving: Any) -> tuple[Array, Array]:
+        scenario = eqx.combine(moving, fixed)
+        metrics = rollout(loop, gains, scenario)
+        outcome = compare_with_reference(loop, scenario, metrics)
+        return getattr(outcome if of in Outcome._fields else metrics, of), metrics.status
+
+    _, slopes, status = jax.jvp(figure, (gains, moving), (gain_rates, batch_rates), has_aux=True)
+    return slopes, status

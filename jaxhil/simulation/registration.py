@@ -1,0 +1,130 @@
+"""Laws from elsewhere: a compensator or a contact law of the user's own, entered under its name.
+
+A law is one object whose class may be anywhere. From its registration on it is what a built-in one is: the
+mechanism files, gains and functions that name it mean this object. Registering is per process.
+"""
+
+import inspect
+import math
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from jaxhil.compensators import COMPENSATORS, Compensator, Gain
+from jaxhil.contact.laws import LAWS, ContactLaw
+from jaxhil.errors import InputError, one_line, shown
+from jaxhil.mechanism.file import DEFAULT, load
+from jaxhil.mechanism.structs import CONTACT_LAWS, Mechanism
+from jaxhil.runtime.registry import COMPENSATORS as RUNTIME_COMPENSATORS
+
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,59}")
+_RUNTIME_METHODS = ("step", "reset", "position_command", "next_contact")
+
+
+def register(law: Compensator | ContactLaw, runtime: type | None = None) -> None:
+    """Enter a compensator or a contact law under its `name`: simulation, tuning and gain files then know it.
+
+    `runtime` is the compensator's class for the rig, in plain Python, with gains of the same names and units
+    (`jaxhil.runtime.registry.Compensator`): what exports a controller needs it. The law's own class may be
+    defined and registered again, as a notebook's cell that runs twice does; another name taken is refused.
+
+    Raises `InputError`, one line, for what is no law's instance, a name that is taken or not a word of
+    letters, digits and underscores, a law that holds arrays, gains without a unit or without bounds that
+    enclose the nominal value (tried on the default mechanism), a runtime class that does not fit the law.
+    """
+    if not isinstance(law, (Compensator, ContactLaw)):
+        found = f"the class {law.__name__}" if isinstance(law, type) else shown(law)
+        allowed = "an instance of jaxhil.Compensator or jaxhil.ContactLaw"
+        raise InputError(f"register: found {one_line(found, 60)}, allowed {allowed}")
+    table: dict[str, Any] = COMPENSATORS if isinstance(law, Compensator) else LAWS
+    _check_name(law, table)
+    _check_static(law)
+    if isinstance(law, Compensator):
+        _check_gains(law)
+        if runtime is not None:
+            _check_runtime(law, runtime)
+            RUNTIME_COMPENSATORS[law.name] = runtime
+        else:
+            RUNTIME_COMPENSATORS.pop(law.name, None)
+    elif runtime is not None:
+        raise _refusal(law, "runtime", shown(runtime), "none: a contact law runs in the simulation alone")
+    elif law.name not in CONTACT_LAWS:
+        CONTACT_LAWS.append(law.name)
+    table[law.name] = law
+
+
+def _check_name(law: Compensator | ContactLaw, table: dict[str, Any]) -> None:
+    name = getattr(law, "name", None)
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
+        where = f"register: {type(law).__name__}.name"
+        allowed = "a word of letters, digits and underscores, as `name: ClassVar[str] = ...` gives it"
+        raise InputError(f"{where}: found {shown(name or None)}, allowed {allowed}")
+    if name in table:
+        home, other = ((type(one).__module__, type(one).__qualname__) for one in (law, table[name]))
+        if home != other or home[0].startswith("jaxhil."):
+            raise _refusal(law, "name", "the name of another law", f"none of {', '.join(table)}")
+
+
+def _check_static(law: Compensator | ContactLaw) -> None:
+    """Programs are compiled for a law: it has to be hashable, and equal to itself."""
+    try:
+        hash(law)
+        same = bool(law == law)
+    except Exception:
+        same = False
+    if not same:
+        allowed = "plain numbers, texts and tuples: a law holds no arrays"
+        raise _refusal(law, "fields", "what cannot be hashed", allowed)
+
+
+def _check_gains(law: Compensator) -> None:
+    gains = getattr(law, "gains", None)
+    if not isinstance(gains, tuple) or not all(isinstance(gain, Gain) for gain in gains):
+        raise _refusal(law, "gains", shown(gains), "a tuple of jaxhil.Gain")
+    names = [gain.name for gain in gains]
+    for gain in gains:
+        if not isinstance(gain.name, str) or not _NAME.fullmatch(gain.name) or names.count(gain.name) > 1:
+            raise _refusal(law, "gains", shown(gain.name), "a word of letters, digits and underscores, once")
+        if not isinstance(gain.unit, str) or not gain.unit:
+            raise _refusal(law, f"gains.{gain.name}.unit", shown(gain.unit), "a unit, '1' if there is none")
+        _check_bounds(law, gain, load(DEFAULT).mechanism)
+
+
+def _check_bounds(law: Compensator, gain: Gain, mechanism: Mechanism) -> None:
+    values = {}
+    for part in ("lower", "nominal", "upper"):
+        try:
+            values[part] = float(getattr(gain, part)(mechanism))
+        except Exception as error:
+            found = f"{type(error).__name__}: {error}"
+            allowed = f"a function of the mechanism that returns a number (tried on {mechanism.name})"
+            raise _refusal(law, f"gains.{gain.name}.{part}", one_line(found, 100), allowed) from None
+    lower, nominal, upper = values.values()
+    if not (math.isfinite(lower) and math.isfinite(upper) and lower <= nominal <= upper):
+        allowed = f"lower <= nominal <= upper, all finite (tried on {mechanism.name})"
+        raise _refusal(law, f"gains.{gain.name}", f"{lower:g}, {nominal:g}, {upper:g}", allowed)
+
+
+def _check_runtime(law: Compensator, runtime: object) -> None:
+    if not inspect.isclass(runtime):
+        raise _refusal(law, "runtime", shown(runtime), "a class, as of jaxhil.runtime.registry.Compensator")
+    missing = [name for name in _RUNTIME_METHODS if not callable(getattr(runtime, name, None))]
+    if missing:
+        raise _refusal(law, "runtime", f"{runtime.__name__} without {missing[0]}", "a class with this method")
+    stated = getattr(runtime, "gains", None)
+    found = (
+        {name: getattr(one, "unit", None) for name, one in stated.items()}
+        if isinstance(stated, Mapping)
+        else {}
+    )
+    wanted = {gain.name: gain.unit for gain in law.gains}
+    if found != wanted:
+        raise _refusal(law, "runtime.gains", _units(found), f"{_units(wanted)}, as the law has them")
+
+
+def _units(gains: dict[str, Any]) -> str:
+    return one_line(", ".join(f"{name} [{unit}]" for name, unit in gains.items()), 200) or "no gains"
+
+
+def _refusal(law: Compensator | ContactLaw, what: str, found: str, allowed: str) -> InputError:
+    return InputError(f"register {law.name}: {what}: found {found}, allowed {allowed}")

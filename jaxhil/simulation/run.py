@@ -1,0 +1,226 @@
+"""One run of a mechanism's contacts: what became of each contact, and every tick of the way there."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.errors import InputError, one_line, shown
+from jaxhil.mechanism.loading import as_mechanism
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.double_precision import double_precision
+from jaxhil.simulation.evaluation import Outcome, evaluate
+from jaxhil.simulation.gain_choice import choose_gains
+from jaxhil.simulation.gain_file import LoadedGains
+from jaxhil.simulation.metrics import NOT_REACHED, OK, STATUS_NAMES
+from jaxhil.simulation.recording import record_lanes
+from jaxhil.simulation.scenario import build_scenarios
+
+PICTURES = (".png", ".pdf", ".svg")
+
+
+class ContactResult(NamedTuple):
+    """What became of one contact; NaN for what it does not have."""
+
+    restitution: float  # e, rebound speed over approach speed of the numerical model [1]
+    reference_restitution: float  # e*, that of the same contact in space, entered at the same speed [1]
+    error: float  # e - e* [1]; above 0 the contact diverges
+    peak_force: float  # of the real contact force [N]
+    reference_peak_force: float  # of the same contact in space [N]
+    peak_command: float  # of |F_c|, the force on the numerical model [N]
+    position_shortfall: float  # by which the motion simulator's limits cut the position command [m]
+    duration: float  # time in contact [s]
+    approach_velocity: float  # of the numerical model, on the tick before the contact [m/s]
+    force_delay: float | None  # of the measurement, as the compensator estimates it [s]; None if it does not
+    status: str  # "ok", or why it has no restitution: "timeout", "diverged", "non-finite", "not reached"
+
+
+class Ticks(NamedTuple):
+    """Every tick of a run, all contacts one after the other; arrays of shape (ticks,)."""
+
+    time: np.ndarray  # [s], from 0 on, a control period a tick
+    force_measured: np.ndarray  # what the force sensor reads [N]
+    force_command: np.ndarray  # F_c, what the compensator makes of it: the force on the numerical model [N]
+    position_desired: np.ndarray  # of the numerical model [m]
+    velocity_desired: np.ndarray  # of the numerical model [m/s]
+    position_measured: np.ndarray  # what the position sensor reads of the motion simulator [m]
+    contact: np.ndarray  # index of the contact under way or ahead, from 0
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """The contacts of a mechanism under a compensator, run once.
+
+    The ticks (`time`, `force_measured`, ...: see `Ticks`) are recorded when first asked for.
+    """
+
+    mechanism: Mechanism = field(repr=False)
+    compensator: str  # its name
+    gains: dict[str, float]  # by name, in SI units
+    seed: int  # of the sensors' noise
+    contacts: tuple[ContactResult, ...]  # one for every contact of the schedule
+    status: str  # "ok", or the status of the first contact that is not
+
+    @cached_property
+    def ticks(self) -> Ticks:
+        """Every tick up to the end of the last contact, or to the first number that is not finite."""
+        with double_precision():
+            scenarios = build_scenarios(self.mechanism, seed=self.seed)
+            loaded = LoadedGains({}, self.compensator, self.gains, self.mechanism)
+            _, [lane] = record_lanes(loaded, scenarios)
+        signals = lane.signals
+        return Ticks(
+            time=np.arange(len(signals.age)) * self.mechanism.rig.control_period,
+            force_measured=np.asarray(signals.force_measured, float),
+            force_command=np.asarray(lane.command, float),
+            position_desired=np.asarray(signals.position_desired, float),
+            velocity_desired=np.asarray(signals.velocity_desired, float),
+            position_measured=np.asarray(signals.position_measured, float),
+            contact=np.asarray(lane.contact, np.int64),
+        )
+
+    @property
+    def time(self) -> np.ndarray:
+        """Time of every tick [s]."""
+        return self.ticks.time
+
+    @property
+    def force_measured(self) -> np.ndarray:
+        """What the force sensor reads at every tick [N]."""
+        return self.ticks.force_measured
+
+    @property
+    def force_command(self) -> np.ndarray:
+        """The force on the numerical model at every tick [N]."""
+        return self.ticks.force_command
+
+    @property
+    def position_desired(self) -> np.ndarray:
+        """Position of the numerical model at every tick [m]."""
+        return self.ticks.position_desired
+
+    @property
+    def velocity_desired(self) -> np.ndarray:
+        """Velocity of the numerical model at every tick [m/s]."""
+        return self.ticks.velocity_desired
+
+    @property
+    def position_measured(self) -> np.ndarray:
+        """What the position sensor reads at every tick [m]."""
+        return self.ticks.position_measured
+
+    @property
+    def contact(self) -> np.ndarray:
+        """Index of the contact at every tick."""
+        return self.ticks.contact
+
+    def to_csv(self, path: str | os.PathLike[str]) -> None:
+        """Write the ticks, a line each, under a line of their names; numbers in SI units, to the last bit.
+
+        Raises `InputError` when the file cannot be written.
+        """
+        columns = [column.tolist() for column in self.ticks]
+        rows = [",".join(map(repr, row)) for row in zip(*columns, strict=True)]
+        target = _target(path)
+        try:
+            target.write_text("\n".join([",".join(Ticks._fields), *rows, ""]), encoding="ascii")
+        except (OSError, ValueError) as error:
+            raise _unwritable(target, error) from None
+
+    def plot(self, path: str | os.PathLike[str]) -> None:
+        """Draw force and position over time, contact by contact, beside the same contacts in space.
+
+        The name ends in .png, .pdf or .svg; folders on the way are made. Raises `InputError` when the file
+        cannot be written.
+        """
+        target = _target(path)
+        if target.suffix.lower() not in PICTURES:
+            allowed = f"a name that ends in {', '.join(PICTURES)}"
+            raise InputError(f"plot: found {shown(str(target))}, allowed {allowed}")
+        from jaxhil.simulation.contact_plot import contact_plot, save
+        from jaxhil.simulation.motion import nominal_motion
+
+        with double_precision():
+            motion = nominal_motion(self.mechanism, {"rig": (self.compensator, self.gains)}, self.seed)
+        title = f"{self.mechanism.name}, compensation: {self.compensator}"
+        try:
+            save(contact_plot(motion, title, sensors="rig"), target)
+        except (OSError, ValueError) as error:
+            raise _unwritable(target, error) from None
+
+
+def simulate(
+    mechanism: Mechanism | str | os.PathLike[str],
+    compensator: str = "none",
+    gains: Mapping[str, float] | str | os.PathLike[str] | None = None,
+    *,
+    seed: int = 0,
+) -> Run:
+    """Run the contacts of a mechanism once, as it is nominally.
+
+    `mechanism` is a `Mechanism`, the name of a built-in one, or a path. `compensator` is a law's name.
+    `gains` is None (what the literature's rules say), a dict of some of them (the others are the
+    literature's), the name of one of the law's settings, or the path of a gain file; with a file, "none"
+    stands for its law. `seed` is that of the sensors' noise.
+
+    Raises `InputError`, one line, for whatever is wrong with them.
+    """
+    checked = as_mechanism(mechanism)
+    number = check_seed(seed)
+    name, values = choose_gains(checked, compensator, gains)
+    with double_precision():
+        scenarios = build_scenarios(checked, seed=number)
+        outcome = evaluate(build_loop(checked, name, scenarios), values, scenarios)
+    estimates = COMPENSATORS[name].estimates_delay
+    contacts = tuple(_contact(outcome, slot, estimates) for slot in range(checked.approach.contacts))
+    status = next((contact.status for contact in contacts if contact.status != STATUS_NAMES[OK]), "ok")
+    return Run(checked, name, values, number, contacts, status)
+
+
+def check_seed(seed: Any) -> int:
+    """The seed, an integer >= 0. Raises `InputError`."""
+    number = seed.item() if isinstance(seed, np.integer) else seed
+    if isinstance(number, bool) or not isinstance(number, int) or number < 0:
+        raise InputError(f"seed: found {shown(seed)}, allowed an integer >= 0")
+    return number
+
+
+def _contact(outcome: Outcome, slot: int, estimates: bool) -> ContactResult:
+    metrics = outcome.metrics
+    status = int(metrics.status[slot, 0])
+    ended = status == OK
+
+    def value(array: Any, known: bool) -> float:
+        return float(array[slot, 0]) if known else float("nan")
+
+    reached = status != NOT_REACHED
+    return ContactResult(
+        restitution=value(metrics.restitution, ended),
+        reference_restitution=value(outcome.reference_restitution, ended),
+        error=value(outcome.error, ended),
+        peak_force=value(metrics.peak_force, reached),
+        reference_peak_force=value(outcome.reference_peak_force, ended),
+        peak_command=value(metrics.peak_command, reached),
+        position_shortfall=value(metrics.position_shortfall, reached),
+        duration=value(metrics.duration, reached),
+        approach_velocity=value(metrics.approach_velocity, reached),
+        force_delay=value(metrics.force_delay, reached) if estimates else None,
+        status=STATUS_NAMES[status],
+    )
+
+
+def _target(path: Any) -> Path:
+    if isinstance(path, (str, os.PathLike)) and isinstance(os.fspath(path), str):
+        return Path(path)
+    raise InputError(f"path: found {shown(path)}, allowed a path")
+
+
+def _unwritable(target: Path, error: Exception) -> InputError:
+    reason = getattr(error, "strerror", None) or str(error)
+    return InputError(f"{one_line(str(target))}: cannot be written: {one_line(reason, 100)}")
