@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from lanes import QUICK
+from scipy.signal import bilinear, lfilter
 
 from jaxhil.compensators import COMPENSATORS, Constants
 from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
@@ -51,3 +52,12 @@ def check_amplification(name: str, cases: Sequence[Mapping[str, float]], period:
                 for h in (-step, step)
             )
             np.testing.assert_allclose(slopes[gain], (high - low) / (2 * step), rtol=1e-6, atol=1e-6)
+
+
+def amplification(gains, period=1e-3):
+    """Of the lead filter: the root of the sum of the squares of its impulse response, filtered by SciPy."""
+    lead, smoothing = gains
+    numerator, denominator = bilinear([lead + smoothing, 1], [smoothing, 1], 1 / period)
+    impulse = np.zeros(3000)
+    impulse[0] = 1
+    return np.sqrt(np.sum(lfilter(numerator, denominator, impulse) ** 2))

@@ -1,10 +1,8 @@
-"""The controller in C99 is the runtime in Python, bit for bit, and compiles without a warning."""
+"""The controller in C99 is the runtime in Python, bit for bit: gains, limits, commands, faults."""
 
 import ctypes
-import functools
 import math
 import re
-import shutil
 import struct
 import subprocess
 from pathlib import Path
@@ -28,13 +26,11 @@ from gain_documents import gain_document, sign
 from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 
-from jaxhil.errors import InputError
 from jaxhil.runtime import COMPENSATORS, GainFileError
 from jaxhil.runtime.faults import FAULTS, LAW_IN_DOUBT, names
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
 from jaxhil.runtime.law_status import STATUSES
 from jaxhil.runtime.limits import LIMITS, complete
-from tuning.bundle import c99
 from tuning.bundle.c99 import c99_texts
 from tuning.bundle.c99_tables import UNUSABLE, decimal
 
@@ -58,96 +54,6 @@ def sanitized(tmp_path: Path, law: str) -> Path:
         pytest.skip("the compiler has no sanitizers")
     folder = c99_cases.write_sources(tmp_path / law, c99_cases.long_document(law))
     return compiled(folder, "c99_driver.c", "sanitized", "-O1", "-DDRIVER_MAIN", *SANITIZED)
-
-
-# Sources
-
-
-@pytest.fixture(scope="module")
-def controller_object(tmp_path_factory):
-    """`controller_object(law)`: the folder with the law's sources and its controller.o."""
-
-    @functools.cache
-    def made(law):
-        folder = c99_cases.write_sources(tmp_path_factory.mktemp(law), gain_document(law))
-        strict = ("-Wconversion", "-Wshadow", "-Wstrict-prototypes", "-Wfloat-conversion")
-        compiled(folder, "jaxhil_controller.c", "controller.o", "-c", "-O2", *strict)
-        return folder
-
-    return made
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_every_law_compiles_without_a_warning(law, controller_object):
-    compiled(controller_object(law), "test_vectors.c", "test.o", "-c", "-O0")
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_controller_keeps_no_memory_of_its_own_and_calls_nothing_but_math(law, controller_object):
-    if shutil.which("nm") is None:
-        pytest.skip("no nm on this machine")
-    folder = controller_object(law)
-    listed = subprocess.run(["nm", "-P", "controller.o"], cwd=folder, capture_output=True, text=True).stdout
-    symbols = [line.split()[:2] for line in listed.splitlines()]
-    # memset, memcpy and memmove are what compilers make of loops and assignments, also for a free-standing
-    # program.
-    wanted = {name for name, kind in symbols if kind == "U"}
-    assert wanted <= {
-        "floor",
-        "sqrt",
-        "memset",
-        "memcpy",
-        "memmove",
-        "_GLOBAL_OFFSET_TABLE_",
-        "__stack_chk_fail",
-    }
-    assert not [name for name, kind in symbols if kind in "BbDdC"]
-    visible = {name for name, kind in symbols if kind == "T"}
-    assert {"jaxhil_init", "jaxhil_step"} <= visible
-    assert all(name.startswith("jaxhil_") for name in visible)
-
-
-def test_header_can_be_used_from_cpp(tmp_path):
-    if shutil.which("c++") is None:
-        pytest.skip("no C++ compiler (c++) on this machine")
-    folder = c99_cases.write_sources(tmp_path, gain_document())
-    (folder / "use.cpp").write_text('#include "jaxhil_controller.h"\njaxhil_controller controller;\n')
-    command = ["c++", "-std=c++11", "-Wall", "-Wextra", "-Werror", "-pedantic", "-c", "use.cpp"]
-    assert subprocess.run(command, cwd=folder).returncode == 0
-
-
-def test_unsafe_arithmetic_is_refused_by_the_header(tmp_path):
-    folder = c99_cases.write_sources(tmp_path, gain_document())
-    command = [str(c99_cases.COMPILER), *c99.FLAGS, "-ffast-math", "-fsyntax-only", "jaxhil_controller.c"]
-    ran = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-    assert ran.returncode != 0 and "-ffast-math loses" in ran.stderr
-
-
-def test_only_what_the_law_needs_is_exported():
-    texts = c99_texts(gain_document("phase_lead"))
-    assert "jaxhil_lead_filter_step" in texts["jaxhil_controller.c"]
-    assert "identification" not in texts["jaxhil_controller.c"]
-    assert "IDENTIFICATION" not in texts["jaxhil_controller.h"]
-    includes = set(re.findall(r"#include <(.*)>", texts["jaxhil_controller.h"]))
-    assert includes <= {"float.h", "math.h", "stdbool.h", "stddef.h", "stdint.h"}
-    assert texts == c99_texts(gain_document("phase_lead"))
-
-
-def test_law_without_a_c_file_is_named(monkeypatch):
-    class Toy(COMPENSATORS["none"]):
-        pass
-
-    monkeypatch.setitem(COMPENSATORS, "toy", Toy)
-    document = sign(gain_document("none") | {"compensator": "toy"})
-    with pytest.raises(InputError, match=r"^jaxhil/c99/laws/toy\.c: found no such file"):
-        c99_texts(document)
-
-
-def test_document_that_the_runtime_refuses_is_refused():
-    document = gain_document()
-    document["gains"]["forgetting"]["value"] = 0.99
-    with pytest.raises(GainFileError, match="sha256"):
-        c99_texts(document)
 
 
 def test_faults_are_those_of_the_runtime(batch):
@@ -435,97 +341,3 @@ def test_same_bits_over_ten_million_ticks(law, batch):
     for n in range(math.ceil(1e7 / len(LAWS) / chunk)):
         gain_file = drawn_gains(law, rng, hostile=n % 2 == 1)
         compare(batch(law), gain_file, drawn_rows(KINDS[n % 3], chunk, rng, gain_file.control_period))
-
-
-# Vectors
-
-
-VECTORS_LIMITS = {"held_readings": 4.0, "late_fraction": 0.25, "force_slew": 1e5, "limited_in_a_row": 50.0}
-
-
-def vectors_document():
-    """A gain document whose limits bind now and then, without a trip at once."""
-    document = gain_document()
-    document["limits"] = {
-        name: {"value": value, "unit": LIMITS[name].unit} for name, value in VECTORS_LIMITS.items()
-    }
-    return sign(document)
-
-
-def vectors(*kinds: str) -> list[str]:
-    """A vectors.csv of the Python controller's own ticks, one run per kind of rows, as lines."""
-    gain_file = check_gain_document(vectors_document())
-    lines = [
-        "run,event,force_measured,position_desired,velocity_desired,position_measured,time,position,velocity,"
-        "acceleration,force_command,position_command,faults,force_simulated"
-    ]
-    for run, kind in enumerate(kinds):
-        rows = drawn_rows(kind, 200, np.random.default_rng([9, run]), PERIOD)
-        rows[:, 0] = c99_cases.TICK
-        rows[100, 0] = c99_cases.NEXT_CONTACT
-        results = c99_cases.controller_in_python(gain_file, rows)
-        for n, (row, result) in enumerate(zip(rows.tolist(), results.tolist(), strict=True)):
-            event = 1 if n == 0 else int(row[0])
-            readings = [repr(number) for number in row[1:6]]
-            if not row[6]:
-                readings[-1] = ""
-            numbers = [*row[7:], *result[:2], int(result[c99_cases.RESULT.index("faults")]), math.nan]
-            lines.append(",".join([str(run), str(event), *readings, *(repr(number) for number in numbers)]))
-    return lines
-
-
-@pytest.fixture(scope="module")
-def replay(tmp_path_factory):
-    """`replay(lines)`: exit code and output of the exported test program."""
-    folder = c99_cases.write_sources(tmp_path_factory.mktemp("vectors"), vectors_document())
-    program = compiled(folder, "test_vectors.c", "test_vectors", "-O2", "jaxhil_controller.c")
-
-    def run(lines):
-        (folder / "vectors.csv").write_text("\n".join(lines) + "\n")
-        ran = subprocess.run([str(program), "vectors.csv"], cwd=folder, capture_output=True, text=True)
-        return ran.returncode, ran.stdout + ran.stderr
-
-    return run
-
-
-def test_recorded_vectors_are_replayed(replay):
-    """Of contacts, and of what is not finite, late, or without a time."""
-    lines = vectors("contact", "contact", "random", "hostile", "hostile")
-    assert len({line.split(",")[12] for line in lines[1:]}) > 3
-    assert replay(lines) == (0, "vectors.csv: 1000 ticks, the same bit for bit\n")
-
-
-def test_one_expected_fault_that_did_not_happen_is_found(replay):
-    lines = vectors("contact")
-    fields = lines[20].split(",")
-    fields[12] = str(int(fields[12]) ^ 8)
-    lines[20] = ",".join(fields)
-    code, output = replay(lines)
-    assert code == 1 and output.startswith("vectors.csv:21: faults: found ")
-
-
-@pytest.mark.parametrize("column", ["force_command", "position_command"])
-def test_one_bit_of_an_expected_command_is_found(column, replay):
-    lines = vectors("contact", "contact")
-    place = lines[0].split(",").index(column)
-    fields = lines[150].split(",")
-    value = float(fields[place])
-    fields[place] = repr(math.nextafter(value, math.inf))
-    lines[150] = ",".join(fields)
-    expected = f"found {value:.17g}, expected {math.nextafter(value, math.inf):.17g}\n"
-    assert replay(lines) == (1, f"vectors.csv:151: {column}: {expected}")
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda lines: lines[:1], "no rows"),
-        (lambda lines: [lines[0] + ",more", *lines[1:]], "unknown columns"),
-        (lambda lines: [*lines, "1,0,1.0"], "not a row of numbers"),
-        (lambda lines: [*lines, lines[5].replace(",", ";", 3)], "not a row of numbers"),
-        (lambda lines: [lines[0], *lines[2:]], "an unknown event, or a tick before a run"),
-    ],
-)
-def test_vectors_that_cannot_be_read_are_named(change, message, replay):
-    code, output = replay(change(vectors("contact")))
-    assert code == 2 and message in output

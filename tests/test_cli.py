@@ -1,20 +1,11 @@
 """The command line: exit codes, one JSON document, one line for what a user got wrong, files kept."""
 
 import json
-import os
-import subprocess
-import sys
 
 import pytest
-from conftest import Ran
 
-from jaxhil.mechanism.file import builtin_names, builtin_path, suite_names
-from tuning import environment
+from jaxhil.mechanism.file import builtin_path
 from tuning.__main__ import main
-from tuning.cli.commands.tune import folder_name, is_better
-from tuning.cli.options import DEFAULT_DRIVERS, DEFAULT_PLOT
-from tuning.cli.parser import complete_bare
-from tuning.gains.tune import ErrorFigures
 
 TINY = ["--scenarios", "4", "--starts", "2", "--steps", "2", "--validation", "16"]
 CONTACT_KEYS = {
@@ -238,14 +229,6 @@ def test_a_folder_without_mechanisms_is_refused(jaxhil, tmp_path):
     assert "found no mechanism file" in ran.err
 
 
-def test_interrupt_anywhere_is_130(jaxhil, monkeypatch):
-    def interrupted(arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("tuning.cli.parser.parse", interrupted)
-    assert jaxhil("mechanisms") == Ran(130, "", "jaxhil: interrupted\n")
-
-
 def test_verify_accepts_what_tune_wrote(jaxhil, tuned):
     ran = jaxhil("verify", tuned, "--json", "--scenarios", "2")
     assert ran.code == 0
@@ -286,146 +269,3 @@ def test_gains_that_do_not_fit_are_refused(jaxhil, tuned):
     slower = ["--set", "rig.control_period=0.002"]
     refused(jaxhil("simulate", "--gains", path, *slower), "control_period", "0.001", "0.002")
     refused(jaxhil("simulate", "--gains", path, "--set", "bodies.weight=1"), "--set", "bodies.weight")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["simulate", "nowhere.toml"], ["nowhere.toml", "no such file"]),
-        (["simulate", "rig-300"], ["did you mean rig-300kg"]),
-        (["simulate", "--set", "approach.velocity=-1"], ["approach.velocity", "-1", "> 0"]),
-        (["simulate", "--set", "approach.speed=1"], ["approach.speed", "unknown key"]),
-        (["simulate", "--compensator", "magic"], ["magic", "none, phase_lead, multi_parameter_lead"]),
-        (["simulate", "--gains", "nowhere.json"], ["nowhere.json"]),
-        (
-            ["simulate", "--compensator", "phase_lead", "--setting", "sharp"],
-            ["sharp", "none, phase_lead has"],
-        ),
-        (["simulate", "--compensator", "retrospective_reference", "--setting", "x"], ["x", "sharp, gentle"]),
-        (["simulate", "--gains", "x.json", "--setting", "sharp"], ["--setting", "none beside a gain file"]),
-        (["tune", "--setting", "sharp"], ["--setting", "sharp", "none, response_error has"]),
-        (["simulate", "--limit", "nan"], ["--limit"]),
-        (["simulate", "--plot=plot.doc"], ["--plot", "plot.doc", ".png"]),
-        (["simulate", "--seed", "-1"], ["--seed", "-1"]),
-        (["tune", "--starts", "0"], ["--starts", ">= 1"]),
-        (["tune", "--compensator", "magic"], ["magic", "response_error"]),
-        (["verify", "nowhere.json"], ["nowhere.json", "No such file"]),
-        (["verify", "x", "--scenarios", "0"], ["--scenarios"]),
-    ],
-)
-def test_unusable_input_is_reported_in_one_line(jaxhil, arguments, words):
-    refused(jaxhil(*arguments), *words)
-
-
-def test_a_plot_that_cannot_be_written_is_reported(jaxhil, tmp_path):
-    (tmp_path / "taken").touch()
-    ran = jaxhil("simulate", "rig-300kg", "--plot", tmp_path / "taken" / "plot.png")
-    refused(ran, "taken")
-
-
-def test_an_output_folder_that_cannot_be_made_is_reported(jaxhil, tmp_path):
-    (tmp_path / "taken").touch()
-    refused(jaxhil("tune", "rig-300kg", "-o", tmp_path / "taken"), "taken")
-
-
-def test_what_goes_wrong_inside_is_one_line(jaxhil, monkeypatch):
-    def broken(*arguments):
-        raise ZeroDivisionError("inside")
-
-    monkeypatch.setattr("tuning.cli.commands.mechanisms.load", broken)
-    refused(jaxhil("mechanisms"), "internal error", "ZeroDivisionError: inside")
-
-
-@pytest.mark.parametrize("arguments", [["--no-such"], ["fly"], [], ["tune", "--starts", "x"], ["verify"]])
-def test_wrong_usage_is_2(jaxhil, arguments):
-    ran = jaxhil(*arguments)
-    assert ran.code == 2 and ran.out == "" and ran.err != ""
-
-
-@pytest.mark.parametrize("command", ["simulate", "tune", "export", "verify", "rig", "mechanisms"])
-def test_help_has_an_example(jaxhil, command):
-    ran = jaxhil(command, "--help")
-    assert ran.code == 0
-    assert f"Example: jaxhil {command}" in ran.out
-    assert "--json" in ran.out
-
-
-def test_help_and_refusals_do_not_import_jax():
-    program = (
-        "import sys\nfrom tuning.__main__ import main\n"
-        "for words in (['tune', '--help'], ['mechanisms'], ['tune', '--compensator', 'x'], ['tune', 'x'],\n"
-        "    ['export', 'x', '--format', 'y'], ['export', 'x']):\n"
-        "    try: main(words)\n"
-        "    except SystemExit: pass\n"
-        "assert not {'jax', 'matplotlib'} & set(sys.modules), 'slow imports'"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-
-
-def test_module_runs_like_the_command_and_a_closed_pipe_is_quiet():
-    command = [sys.executable, "-m", "tuning", "mechanisms"]
-    read, write = os.pipe()
-    os.close(read)
-    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
-    os.close(write)
-    assert (done.returncode, done.stderr) == (0, "")
-
-
-def test_mechanisms_lists_the_built_in_files(jaxhil):
-    document = jaxhil("mechanisms", "--json").document
-    entries = document["mechanisms"]
-    assert [entry["name"] for entry in entries] == builtin_names()
-    assert [entry["name"] for entry in document["suites"]] == suite_names()
-    assert all(entry["source"] for entry in entries)
-    rig = next(entry for entry in entries if entry["name"] == "rig-300kg")
-    assert rig["contact_frequencies"] == [pytest.approx(3.0, rel=1e-5)]
-    listed = jaxhil("mechanisms").out
-    assert all(entry["source"][:20] in listed for entry in [*entries, *document["suites"]])
-
-
-def test_plot_without_a_name_gets_one():
-    assert complete_bare(["simulate", "--plot", "a.png", "x"]) == ["simulate", "--plot", "a.png", "x"]
-    assert complete_bare(["--plot", "--json"]) == ["--plot", DEFAULT_PLOT, "--json"]
-    assert complete_bare(["x", "--plot"]) == ["x", "--plot", DEFAULT_PLOT]
-
-
-def test_studies_without_a_number_get_one():
-    assert complete_bare(["--drivers", "64", "--rare", "0.02"]) == ["--drivers", "64", "--rare", "0.02"]
-    assert complete_bare(["--rare", "gains.json"]) == ["--rare", "0", "gains.json"]
-    assert complete_bare(["--drivers", "--rare"]) == ["--drivers", str(DEFAULT_DRIVERS), "--rare", "0"]
-
-
-def test_names_become_folders():
-    assert folder_name("rig-300kg") == "rig-300kg"
-    assert folder_name("../a b/c") == "a_b_c"
-    assert folder_name("..") == "mechanism"
-
-
-def test_better_means_fewer_failures_then_smaller_errors():
-    def made(rms, failed):
-        return ErrorFigures(rms, rms, rms, rms, 0.0, 1.0, 0.0, failed)
-
-    assert is_better(made(0.1, 0), made(0.2, 0)) and not is_better(made(0.2, 0), made(0.1, 0))
-    assert is_better(made(0.2, 0), made(0.1, 1)) and not is_better(made(float("nan"), 0), made(0.1, 0))
-
-
-def test_flags_leave_the_user_s_alone(monkeypatch):
-    names = [flag.split("=")[0] for flag in environment.flags("").split()]
-    assert names == [
-        "--xla_force_host_platform_device_count",
-        "--xla_backend_optimization_level",
-        "--xla_backend_extra_options",
-    ]
-    given = "--xla_backend_optimization_level=3 --xla_dump_to=x"
-    assert environment.flags(given).startswith(given)
-    assert environment.flags(given).count("optimization_level") == 1
-
-
-def test_cache_folder_is_made_or_done_without(monkeypatch, tmp_path):
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("JAXHIL_CACHE", str(tmp_path / "file" / "below"))
-    assert environment.cache_folder() is None
-    monkeypatch.setenv("JAXHIL_CACHE", str(tmp_path / "new"))
-    assert environment.cache_folder() == tmp_path / "new"
-    assert (tmp_path / "new").is_dir()

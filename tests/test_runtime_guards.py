@@ -2,14 +2,11 @@
 
 import itertools
 import math
-import random
-import tracemalloc
 from typing import Any
 
 import pytest
 from gain_documents import gain_document, sign
-from hypothesis import given
-from hypothesis import strategies as st
+from guarded import PERIOD, limited
 
 from jaxhil.runtime import Controller, GainFileError
 from jaxhil.runtime.faults import (
@@ -32,40 +29,6 @@ from jaxhil.runtime.faults import (
     VELOCITY_LIMIT,
     names,
 )
-from jaxhil.runtime.limits import LIMITS
-
-PERIOD = 1e-3
-LIMITED = {
-    "force_range": 2000.0,
-    "measured_lowest": -0.05,
-    "measured_highest": 0.01,
-    "held_readings": 2.0,
-    "force_stuck_travel": 2e-4,
-    "position_stuck_travel": 1e-4,
-    "free_distance": 5e-4,
-    "settling": 0.01,
-    "free_force": 5.0,
-    "late_fraction": 0.25,
-    "missed_in_a_row": 3.0,
-    "tare_ticks": 50.0,
-    "tare_spread": 4.0,
-    "bias_limit": 20.0,
-    "force_limit": 1000.0,
-    "force_slew": 1e5,
-    "limited_in_a_row": 4.0,
-    "command_lowest": -0.04,
-    "command_highest": 0.008,
-    "velocity_limit": 0.02,
-    "deceleration": 0.5,
-    "retreat_velocity": 0.01,
-}
-
-
-def limited(name: str = "none", **changed: float | None) -> Controller:
-    document = gain_document(name)
-    limits = {**LIMITED, **changed}
-    document["limits"] = {name: {"value": value, "unit": LIMITS[name].unit} for name, value in limits.items()}
-    return Controller.from_dict(sign(document))
 
 
 def fly(controller: Controller, ticks: int, start: float = -0.02) -> float:
@@ -347,67 +310,3 @@ def test_limits_that_do_not_fit_are_refused(limits, words):
     with pytest.raises(GainFileError) as caught:
         Controller.from_dict(signed)
     assert all(word in str(caught.value) for word in words), str(caught.value)
-
-
-hostile = st.floats(allow_nan=True, allow_infinity=True) | st.sampled_from(
-    [0.0, -0.0, 1e308, 5e-324, math.nan]
-)
-calls = st.lists(
-    st.tuples(
-        st.sampled_from(["step", "timed", "position", "tare", "next", "reset", "stop", "release"]),
-        st.tuples(hostile, hostile, hostile, hostile, hostile),
-    ),
-    max_size=60,
-)
-
-
-@given(calls=calls, name=st.sampled_from(["none", "phase_lead", "response_error"]))
-def test_outputs_are_finite_and_inside_their_limits_whatever_comes(calls, name):
-    controller = limited(name)
-    force, sent = 0.0, None
-    for call, values in calls:
-        if call in ("step", "timed"):
-            new = controller.step(*values[:4], values[4] if call == "timed" else None)
-            assert abs(new) <= 1000.0 and abs(new - force) <= 100.0 * (1 + 1e-12)
-            force = new
-        elif call == "position":
-            new = controller.position_command(*values[:3])
-            if sent is not None:
-                assert -0.04 <= new <= 0.008 and abs(new - sent) <= 2e-5 * (1 + 1e-9)
-            sent = new
-        elif call == "tare":
-            controller.tare(values[0])
-        elif call == "next":
-            if not controller.tripped:
-                sent = None
-            controller.next_contact()
-        elif call == "reset":
-            controller.reset()
-        else:
-            controller.emergency_stop(call == "stop")
-        assert controller.tripped is (controller.status != "ok")
-        assert "\n" not in controller.status
-
-
-@pytest.mark.parametrize("name", ["none", "phase_lead", "response_error"])
-def test_memory_does_not_grow(name):
-    controller = limited(name)
-    rng = random.Random(1)
-    ticks = [(rng.gauss(0, 1), -0.02 + 1e-9 * n, 5e-3, -0.02 + 1e-9 * n) for n in range(1000)]
-
-    def run(first: int) -> None:
-        for n, tick in enumerate(ticks, start=first):
-            controller.step(*tick, n * PERIOD)
-            controller.position_command(*tick[1:3], 0.0)
-
-    run(0)
-    tracemalloc.start()
-    try:
-        run(1000)
-        before = tracemalloc.get_traced_memory()[0]
-        for n in range(2, 6):
-            run(1000 * n)
-        assert tracemalloc.get_traced_memory()[0] - before < 2000
-    finally:
-        tracemalloc.stop()
-    assert controller.status == "ok"

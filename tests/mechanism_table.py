@@ -1,0 +1,103 @@
+"""A mechanism's whole table for tests of its keys, and ways to change it."""
+
+import copy
+
+import pytest
+
+from jaxhil.errors import InputError
+from jaxhil.mechanism.file import from_builtins
+
+# Every key of the schema, apart from those that exclude each other.
+FULL = {
+    "schema": "jaxhil/mechanism/1",
+    "name": "full",
+    "source": "assumed",
+    "bodies": {"equivalent_mass": 350.0},
+    "approach": {"velocity": 0.005, "contacts": 3, "phase": 0.25},
+    "contact": {
+        "law": "kelvin_voigt",
+        "stiffness": [124355.0, 373065.0],
+        "damping": [100.0],
+        "tension": False,
+        "clearance": 0.02,
+        "exponent": 1.5,
+        "depths": [0.001, 0.002],
+    },
+    "rig": {
+        "control_period": 0.001,
+        "integrator": "zoh",
+        "command_latency": 1,
+        "command_hold": "zoh",
+        "simulator": {
+            "model": "second_order",
+            "natural_frequency": 12.0,
+            "damping_ratio": 0.8,
+            "time_constant": 0.01,
+            "coefficients": [0.1, 0.1, 0.001],
+            "numerator": [1.0],
+            "denominator": [1.0, 1.0],
+            "delay": 0.004,
+            "velocity_limit": 0.5,
+            "acceleration_limit": 2.0,
+        },
+        "force_sensor": {
+            "delay": 0.008,
+            "time_constant": 0.001,
+            "noise_std": 2.0,
+            "quantum": 0.1,
+            "dead_zone": 1.0,
+            "bias": -1.0,
+            "range": 1000.0,
+        },
+        "position_sensor": {"delay": 0.001, "noise_std": 1e-6, "quantum": 1e-6},
+        "contact_plane": 2e-5,
+    },
+    "uncertainty": {
+        "contact.stiffness": {"distribution": "loguniform", "factor": [0.3, 3.0]},
+        "rig.simulator.natural_frequency": {"distribution": "uniform", "low": 10.0, "high": 14.0},
+        "rig.force_sensor.delay": {"distribution": "normal", "std": 0.0005, "independent": True},
+    },
+}
+
+
+# Refused beside the law of the full table.
+OF_ONE_LAW = ("contact.reference_depth", "contact.unloading_ratio")
+
+
+def changed(changes=(), base=FULL):
+    """A copy of the full table with the values at dotted paths replaced; `...` removes a key."""
+    raw = copy.deepcopy(base)
+    for path, value in dict(changes).items():
+        *tables, key = path.split(".")
+        node = raw
+        for table in tables:
+            node = node.setdefault(table, {})
+        if value is ...:
+            del node[key]
+        else:
+            node[key] = value
+    return raw
+
+
+def refusal(raw):
+    """The message of a refused table: one printable line that names the source."""
+    with pytest.raises(InputError) as caught:
+        from_builtins(raw, "some file")
+    message = str(caught.value)
+    assert message.isprintable() and message.startswith("some file: ") and len(message) < 500
+    return message
+
+
+def leaves(node=FULL, path=""):
+    for key, value in node.items():
+        if isinstance(value, dict) and key != "uncertainty":
+            yield from leaves(value, f"{path}{key}.")
+        else:
+            yield f"{path}{key}"
+
+
+def tables(node=FULL, path=""):
+    yield path
+    for key, value in node.items():
+        if isinstance(value, dict) and key != "uncertainty":
+            yield from tables(value, f"{path}{key}.")

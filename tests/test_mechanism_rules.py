@@ -1,0 +1,194 @@
+"""What a mechanism's keys must be together: laws, models, where a run starts, transfer functions."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mechanism_table import OF_ONE_LAW, changed, refusal
+
+from jaxhil.mechanism.file import from_builtins, to_builtins
+from jaxhil.mechanism.rules import is_hurwitz
+from jaxhil.mechanism.structs import value_at
+
+HARDENING = {"contact.law": "hardening", "contact.reference_depth": 2e-4}
+DEPTH_DAMPED = {"contact.law": "depth_damped", "contact.reference_depth": 2e-4}
+ELASTOPLASTIC = {
+    "contact.law": "elastoplastic",
+    "contact.unloading_ratio": 1.0,
+    "contact.damping": [0.0, 0.0],
+}
+
+
+@pytest.mark.parametrize("contact", [HARDENING, DEPTH_DAMPED, ELASTOPLASTIC], ids=lambda c: c["contact.law"])
+def test_keys_of_one_law(contact):
+    name, key = contact["contact.law"], list(contact)[1]
+    drawn = {"uncertainty": {key: {"distribution": "uniform", "factor": [1.0, 1.5]}}}
+    mechanism = from_builtins(changed({**contact, **drawn}), "f")
+    assert value_at(mechanism, key) == contact[key]
+    message = refusal(changed({k: value for k, value in contact.items() if k != key}))
+    assert f": {key}: found nothing, allowed a number >" in message and f"(law {name} needs it)" in message
+    for value in (0.99 if "ratio" in key else 0.0, math.inf, "1", [1.0]):
+        assert f": {key}: found " in refusal(changed({**contact, key: value}))
+    message = refusal(changed({key: contact[key]}))
+    assert f": {key}: found {contact[key]}, allowed nothing (only for law " in message and name in message
+    other = OF_ONE_LAW[key == OF_ONE_LAW[0]]
+    assert f": {other}: found 2.0, allowed nothing" in refusal(changed({**contact, other: 2.0}))
+    low = {key: {"distribution": "uniform", "low": 0.0, "high": 2.0}}
+    assert f': uncertainty."{key}": found values as far as 0' in refusal(
+        changed({**contact, "uncertainty": low})
+    )
+
+
+def test_elastoplastic_contact_has_no_damping():
+    message = refusal(changed({**ELASTOPLASTIC, "contact.damping": [0.0, 3.0]}))
+    assert ": contact.damping: found [0.0, 3.0], allowed 0 (law elastoplastic" in message
+    drawn = {"contact.damping": {"distribution": "uniform", "low": 0.0, "high": 2.0}}
+    assert "found an uncertain damping" in refusal(changed({**ELASTOPLASTIC, "uncertainty": drawn}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"bodies.chaser_mass": 1.0}, "bodies.equivalent_mass"),
+        ({"bodies": {"chaser_mass": 1.0}}, "bodies.target_mass"),
+        ({"bodies": {"target_mass": 1.0}}, "bodies.chaser_mass"),
+        ({"bodies": {"chaser_mass": 1e308, "target_mass": 1e308}}, "bodies"),
+        ({"contact.stiffness": [1e5, [1e5]]}, "contact.stiffness[1]"),
+        ({"contact.law": "piecewise_linear"}, "contact.stiffness[0]"),
+        (
+            {"contact.law": "piecewise_linear", "contact.stiffness": [[1e5, 2e5]]},
+            "contact.stiffness[0]",
+        ),
+        ({"contact.law": "piecewise_linear", "contact.depths": []}, "contact.depths"),
+        (
+            {"contact.law": "piecewise_linear", "contact.stiffness": [[1e5, 0.0, 1.0]]},
+            "contact.stiffness[0][1]",
+        ),
+        ({"contact.clearance": 1e-4}, "contact.clearance"),
+        (
+            {"rig.simulator.model": "first_order", "rig.simulator.time_constant": 0.0},
+            "rig.simulator.time_constant",
+        ),
+        (
+            {"rig.simulator.model": "third_order", "rig.simulator.coefficients": [0.1, 0.1, 0.011]},
+            "rig.simulator.coefficients",
+        ),
+        (
+            {"rig.simulator.model": "third_order", "rig.simulator.coefficients": ...},
+            "rig.simulator.coefficients",
+        ),
+        ({"rig.simulator.coefficients": [0.1, 0.1]}, "rig.simulator.coefficients"),
+        ({"rig.simulator.model": "ideal"}, "rig.command_hold"),
+    ],
+)
+def test_rules_across_keys(changes, key):
+    assert f": {key}: found" in refusal(changed(changes))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"bodies": {"chaser_mass": 300, "target_mass": 1000}},
+        {"contact.law": "piecewise_linear", "contact.stiffness": [[1e5, 2e5, 3e5]]},
+        {"rig.simulator.model": "first_order"},
+        {"rig.simulator.model": "third_order"},
+        {"rig.simulator.model": "transfer_function"},
+        {"rig.simulator.model": "ideal", "contact.damping": 0.0},
+        {"rig.simulator.model": "ideal", "contact.law": "linear"},
+        {"rig.simulator.model": "ideal", "rig.command_hold": "linear"},
+    ],
+)
+def test_other_laws_and_models(changes):
+    mechanism = from_builtins(changed(changes), "f")
+    assert from_builtins(to_builtins(mechanism), "f") == mechanism
+
+
+@pytest.mark.parametrize(
+    ("changes", "lag"),
+    [
+        ({"rig.simulator.model": "ideal", "contact.damping": 0.0}, 0.0),
+        ({"rig.simulator.model": "first_order"}, 0.01),
+        # Drawn down to 10 Hz.
+        ({}, 2 * 0.8 / (2 * math.pi * 10.0)),
+        ({"rig.simulator.model": "third_order"}, 0.1),
+        (
+            {
+                "rig.simulator.model": "transfer_function",
+                "rig.simulator.numerator": [0.3, 2.0],
+                "rig.simulator.denominator": [1e-3, 0.5, 2.0],
+            },
+            0.25 - 0.15,
+        ),
+    ],
+)
+def test_both_positions_start_inside_the_gap(changes, lag):
+    # Free approach and phase, then latency, transport delay and lag of x_a.
+    start = 0.005 * (0.02 + 0.001 + 0.001 + 0.004 + lag)
+    changes = changes | {"rig.contact_plane": ...}
+    assert from_builtins(changed(changes | {"contact.clearance": start * (1 + 1e-9)}), "f")
+    message = refusal(changed(changes | {"contact.clearance": start * (1 - 1e-9)}))
+    assert ": contact.clearance: found " in message and f"allowed a clearance > {start:g}" in message
+
+
+@pytest.mark.parametrize(
+    ("clearance", "plane", "allowed"),
+    [
+        (math.inf, -1.001e-4, "a number > -0.0001, -0.02 s v: the start"),
+        (0.02, -1.001e-4, "a number > -0.0001, -0.02 s v, and < 0.0197427"),
+        # Free approach and phase, then latency, transport delay and lag of x_a.
+        (0.02, 0.02 - 0.99 * 0.005 * (0.026 + 2 * 0.8 / (2 * math.pi * 10.0)), "and < 0.0197427, the clear"),
+    ],
+)
+def test_the_start_is_free_of_the_contact_plane(clearance, plane, allowed):
+    changes = {"contact.clearance": clearance}
+    assert from_builtins(changed(changes | {"rig.contact_plane": 0.99 * plane}), "f")
+    message = refusal(changed(changes | {"rig.contact_plane": plane}))
+    assert ": rig.contact_plane: found " in message and allowed in message
+
+
+@pytest.mark.parametrize(
+    ("numerator", "denominator", "key"),
+    [
+        ([1.0, 1.0], [1.0, 1.0], "numerator"),
+        ([1.0], [1.0], "numerator"),
+        ([1.0 + 2e-9], [1.0, 1.0], "numerator"),
+        ([0.0], [1.0, 1.0], "numerator"),
+        ([-1.0], [1.0, -1.0], "denominator"),
+        ([1.0], [1.0, 0.0, 1.0], "denominator"),
+        ([1.0], [1.0, 1.0, 0.0], "denominator"),
+        ([1.0], [1.0, 1.0, 1.0, 1.0], "denominator"),
+        ([1.0], [1e308, 1e-308, 1e308, 1.0], "denominator"),
+        ([1.0 + 5e-10], [1.0, 1.0], None),
+        ([0.0, 0.0, 2.0], [0.0, 1.0, 3.0, 2.0], None),
+        ([-1.0], [-1.0, -1.0], None),
+        ([1.0, 1.0], np.poly(-np.ones(20)).tolist(), None),
+    ],
+)
+def test_transfer_function(numerator, denominator, key):
+    # One-sided: a gap would have to be wider than the lag of some of these.
+    changes = {"rig.simulator.model": "transfer_function", "contact.clearance": ...}
+    changes |= {"rig.simulator.numerator": numerator, "rig.simulator.denominator": denominator}
+    raw = changed(changes)
+    if key:
+        assert f": rig.simulator.{key}: found" in refusal(raw)
+    else:
+        simulator = from_builtins(raw, "f").rig.simulator
+        assert simulator.numerator == list(np.trim_zeros(numerator, "f"))
+        assert simulator.denominator == list(np.trim_zeros(denominator, "f"))
+
+
+@settings(deadline=None)
+@given(
+    st.lists(st.complex_numbers(min_magnitude=0.01, max_magnitude=100.0), max_size=3),
+    st.lists(st.floats(-100.0, 100.0), max_size=3),
+)
+def test_hurwitz_against_roots(pairs, reals):
+    roots = [*pairs, *np.conj(pairs), *reals]
+    rightmost = max((root.real for root in map(complex, roots)), default=-1.0)
+    polynomial = np.real(np.poly(roots)) if roots else np.ones(1)
+    # Rounding of the coefficients moves roots next to the axis over it.
+    if abs(rightmost) > 1e-2:
+        assert is_hurwitz(polynomial.tolist()) == (rightmost < 0.0)
+        assert is_hurwitz((-polynomial).tolist()) == (rightmost < 0.0)

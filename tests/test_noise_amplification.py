@@ -1,0 +1,110 @@
+"""How much louder than the sensor's noise a law's force is: of its filter, and of a loop in contact."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from lanes import QUICK, mechanism, nominal_gains, per_lane, run_record, spread, validated
+from noise_cases import amplification
+from scipy.signal import bilinear, lfilter
+
+from jaxhil.compensators import COMPENSATORS, Constants
+from jaxhil.simulation.building import build_loop
+
+NAMES = ("phase_lead", "lead_filter")
+GAINS = np.array([[0.004, 0.001], [0.0077, 0.0031], [0.002, 0.0008]])
+TICKS, LANES, DEVIATION = 3000, 16, 2.0
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICK)
+def _amplified(compensator, gains, period):
+    def value(gains):
+        return COMPENSATORS[compensator].noise_amplification(gains, Constants(period, jnp.inf))
+
+    return value(gains), jax.jacfwd(value)(gains) if gains else {}
+
+
+def amplified(compensator, gains, period=1e-3):
+    """Amplification of noise, and its derivative by every gain."""
+    gains = {name: np.asarray(value, float) for name, value in gains.items()}
+    return _amplified(compensator, gains, np.asarray(period))
+
+
+@pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
+def test_amplification_is_that_of_the_filter(compensator):
+    for gains in GAINS:
+        values = dict(zip(NAMES, gains, strict=True))
+        ours, slopes = amplified(compensator, values)
+        np.testing.assert_allclose(ours, amplification(gains), rtol=1e-12)
+        numerator, denominator = bilinear([sum(gains), 1], [gains[1], 1], 1e3)
+        noise = np.random.default_rng(2).normal(size=1_000_000)
+        np.testing.assert_allclose(ours, np.std(lfilter(numerator, denominator, noise)), rtol=4e-3)
+        for gain in NAMES:
+            step = 1e-5 * values[gain]
+            low, high = (amplified(compensator, {**values, gain: values[gain] + h})[0] for h in (-step, step))
+            np.testing.assert_allclose(slopes[gain], (high - low) / (2 * step), rtol=1e-7)
+
+
+def test_no_compensation_and_no_lead_pass_the_noise_on():
+    assert amplified("none", {})[0] == 1
+    no_lead = {"phase_lead": 0, "lead_filter": 0.003}
+    np.testing.assert_allclose(amplified("phase_lead", no_lead)[0], 1, rtol=1e-14)
+
+
+LEAD_ALONE = {"response_error": 0.0, "response_error_damping": 0.0}
+
+
+def noisy_contact(velocity, damping=0.0, bodies=None, lanes=LANES, ticks=TICKS, **values):
+    """Gains of response_error; F_c and the real force [N] of a noisy contact, (ticks, lanes)."""
+    contact, sensor = {"damping": [damping]}, {"noise_std": DEVIATION}
+    raw = mechanism(contact, period=1e-3, velocity=velocity, force_sensor=sensor)
+    parsed = validated(raw | ({"bodies": bodies} if bodies else {}))
+    scenario = spread(parsed, lanes, key=np.stack([np.zeros(lanes), np.arange(lanes)]))
+    gains = nominal_gains(parsed, "response_error", **values)
+    loop = build_loop(parsed, "response_error", scenario)
+    _, seen = run_record(loop, per_lane(gains, lanes), scenario, ticks)
+    return gains, np.asarray(seen.command)[:ticks], np.asarray(seen.plant_signals.force)[:ticks]
+
+
+def steady_contact(**values):
+    """Gains; what F_c deviates from its straight line [N], (ticks, lanes): a heavy body that hardly moves,
+    seconds of contact under a force that rises slowly."""
+    gains, command, force = noisy_contact(1e-3, bodies={"equivalent_mass": 1e9}, **values)
+    assert force[500:].min() > 3 * DEVIATION
+    command, time = command[500:], np.arange(TICKS - 500)
+    line = np.polynomial.polynomial.polyfit(time, command, 1)
+    return gains, command - np.polynomial.polynomial.polyval(time, line).T
+
+
+def test_amplification_is_that_of_the_loop_in_steady_contact():
+    gains, whole = steady_contact()
+    _, lead = steady_contact(**LEAD_ALONE)
+    expected = amplified("response_error", gains)[0]
+    assert expected > 3
+    # 40000 samples, neighbours of which are anticorrelated.
+    np.testing.assert_allclose(np.std(lead) / DEVIATION, expected, rtol=0.005)
+    np.testing.assert_allclose(np.std(whole) / DEVIATION, expected, rtol=0.01)
+    # The noise is the same: identification adds a tenth, independently, which is half a percent in all.
+    assert 0 < np.std(whole - lead) < 0.15 * np.std(lead)
+
+
+def test_a_young_contact_is_noisier_by_what_is_identified():
+    """The more, the larger the initial covariance, and by less than a quarter: a force above the contact
+    threshold is hardly ever noise."""
+
+    def noise(**values):
+        gains, command, force = noisy_contact(0.005, 300.0, **values)
+        touching = np.flatnonzero((force > 0).all(axis=1))
+        spans = np.array_split(np.std(command, axis=1)[touching[0] : touching[-1]], 10)
+        expected = amplified("response_error", gains)[0] * DEVIATION
+        return gains, np.array([np.sqrt(np.mean(span**2)) for span in spans]) / expected
+
+    # By tenths of the contact.
+    np.testing.assert_allclose(noise(**LEAD_ALONE)[1], 1, atol=0.1)
+    gains, own = noise()
+    covariance = gains["stiffness_covariance"]
+    known, large, huge = (noise(stiffness_covariance=covariance * times)[1] for times in (0, 10, 1e4))
+    assert known[0] < 1 < 1.05 < own[0] < large[0] < huge[0] < 1.25
+    assert max(max(spans[1:]) for spans in (own, large, huge)) < 1.25
