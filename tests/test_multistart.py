@@ -1,4 +1,4 @@
-"""The best gains of many tasks: scans, lots of starts until several agree, the polish of the best."""
+"""The best gains of many tasks: scans, batches of starts until several agree, the polish of the best."""
 
 import dataclasses
 
@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 from lead_cases import lead_tasks
 
-from tuning.gains import multistart as finding
-from tuning.gains.multistart import SCANNED, choose_starts, find_gains, finish
+from tuning.gains import multistart
+from tuning.gains.multistart import BATCHES, choose_starts, find_gains, finish
 from tuning.gains.objective import RMS, Objective
 from tuning.gains.rounds import Start, solve_tasks
+from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import spread_points
-from tuning.gains.validation import Validation
+from tuning.gains.validation import build_validation
+
+SCANNED = TuneSettings().scanned
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +24,11 @@ def tasks():
 
 @pytest.fixture(scope="module")
 def validation(tasks):
-    return Validation(tasks, 15, 0)
+    return build_validation(tasks, 15, 0)
+
+
+def searched(starts, steps, polish, objective=RMS):
+    return TuneSettings(starts=starts, steps=steps, polish=polish, objective=objective)
 
 
 def value(validation, index, start, objective=RMS):
@@ -72,34 +79,34 @@ def test_the_best_start_is_polished(tasks, validation):
     assert finish(validation, failed, 64, seed=0) == [None] * 3
 
 
-def test_lots_follow_until_starts_agree(tasks, validation, monkeypatch):
+def test_batches_follow_until_starts_agree(tasks, validation, monkeypatch):
     """One task's starts never agree, whatever they end at; the others' do at once."""
     asked = []
 
     def solve(tasks, starts, steps, objective, report):
         asked.append([len(own) for own in starts])
         ended = solve_tasks(tasks, starts, 1, objective)
-        lot = len(asked)
+        batch = len(asked)
         return [
-            [s._replace(rms=0.1 if i != 1 else 0.1 * 0.9**lot * 1.2**n) for n, s in enumerate(own)]
+            [s._replace(rms=0.1 if i != 1 else 0.1 * 0.9**batch * 1.2**n) for n, s in enumerate(own)]
             for i, own in enumerate(ended)
         ]
 
-    monkeypatch.setattr(finding, "solve_tasks", solve)
+    monkeypatch.setattr(multistart, "solve_tasks", solve)
     heard = []
-    found = find_gains(validation, 3, 9, 16, 0, report=heard.append)
-    assert asked == [[3, 3, 3]] + [[0, 3, 0]] * (finding.LOTS - 1)
-    assert [len(one.starts) for one in found] == [3, 3 * finding.LOTS, 3]
-    assert sum("lot" in text for text in heard) == finding.LOTS - 1
+    found = find_gains(validation, searched(3, 9, 16), report=heard.append)
+    assert asked == [[3, 3, 3]] + [[0, 3, 0]] * (BATCHES - 1)
+    assert [len(one.starts) for one in found] == [3, 3 * BATCHES, 3]
+    assert sum("batch" in text for text in heard) == BATCHES - 1
     points = np.stack([start.coordinates for start in found[1].starts])
     assert len(np.unique(points, axis=0)) == len(points)
     # Steps of 1 + 2 evaluations, the scan at full cost on no more than 32 scenarios, the polish of 2 gains.
     assert found[0].evaluations == SCANNED + 3 * 3 + 32
-    assert found[1].evaluations == finding.LOTS * (SCANNED + 3 * 3) + 32
+    assert found[1].evaluations == BATCHES * (SCANNED + 3 * 3) + 32
 
 
 def test_a_start_alone_is_the_literature_s_and_polished(tasks, validation):
-    found = find_gains(validation, 1, 2, 32, 0)
+    found = find_gains(validation, searched(1, 2, 32))
     for index, one in enumerate(found):
         (start,) = one.starts
         assert one.best is not None and one.best.rms <= start.rms
@@ -110,7 +117,7 @@ def test_a_start_alone_is_the_literature_s_and_polished(tasks, validation):
 def test_the_best_is_the_best_by_the_objective_itself(tasks, validation):
     """The solver lowers a norm in place of the mean of the worst contacts; what counts is that mean."""
     objective = Objective("cvar")
-    for index, one in enumerate(find_gains(validation, 3, 4, 16, 0, objective)):
+    for index, one in enumerate(find_gains(validation, searched(3, 4, 16, objective))):
         assert one.best is not None
         values = [value(validation, index, start, objective) for start in one.starts]
         assert [start.rms for start in one.starts] == pytest.approx(values, rel=1e-12)
@@ -120,9 +127,9 @@ def test_the_best_is_the_best_by_the_objective_itself(tasks, validation):
 
 def test_a_task_that_fails_leaves_the_others_their_best(tasks, validation):
     broken = tasks[1].scenarios._replace(equivalent_mass=np.full(8, np.nan))
-    sick = Validation([tasks[0], dataclasses.replace(tasks[1], scenarios=broken)], 15, 0)
-    found = find_gains(sick, 3, 6, 16, 0)
-    (alone,) = find_gains(Validation([tasks[0]], 15, 0), 3, 6, 16, 0)
+    sick = build_validation([tasks[0], dataclasses.replace(tasks[1], scenarios=broken)], 15, 0)
+    found = find_gains(sick, searched(3, 6, 16))
+    (alone,) = find_gains(build_validation([tasks[0]], 15, 0), searched(3, 6, 16))
     assert found[0].best is not None and alone.best is not None
     assert found[0].best.rms == pytest.approx(alone.best.rms, rel=1e-6)
 
@@ -145,9 +152,9 @@ def test_a_start_that_is_stuck_is_searched_on_and_the_others_are_left():
         Start("converged", 3, 1.25, [1.25], {"x": 0.3, "y": 0.3}, corner),
         Start("failed", 3, np.nan, [], {}, corner),
     ]
-    freed, evaluations = finding._freed(Kinked(), 0, starts, 0.02, 0, [RMS])  # pyright: ignore[reportArgumentType]
+    freed, evaluations = multistart._freed(Kinked(), 0, starts, 0.02, 0, RMS)  # pyright: ignore[reportArgumentType]
     assert freed[0] is starts[0] and freed[2] is starts[2]
     assert freed[1].rms < 1.02 and freed[1].history == [1.25, freed[1].rms]
     assert freed[1].gains == {"x": freed[1].coordinates[0], "y": freed[1].coordinates[1]}
-    assert evaluations == finding.CANDIDATES * finding.FREEING
-    assert finding._freed(Kinked(), 0, starts[:1], 0.02, 0, [RMS]) == (starts[:1], 0)  # pyright: ignore[reportArgumentType]
+    assert evaluations == multistart.CANDIDATES * multistart.FREEING
+    assert multistart._freed(Kinked(), 0, starts[:1], 0.02, 0, RMS) == (starts[:1], 0)  # pyright: ignore[reportArgumentType]

@@ -15,12 +15,14 @@ from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import evaluate
 from jaxhil.simulation.scenario import build_scenarios
 from tuning import program_cache
-from tuning.gains import pareto
+from tuning.gains import pareto_search
 from tuning.gains.objective import Objective, objective_value
-from tuning.gains.pareto import ENDS, amplification, dominated, fronts, has_trade_off, ladder
+from tuning.gains.pareto import dominated, fronts
+from tuning.gains.pareto_search import ENDS, amplification, has_trade_off, ladder
+from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import build_task
-from tuning.gains.tune import TuneSettings, tune_all
-from tuning.gains.validation import VALIDATION_SEED, Validation
+from tuning.gains.tune import tune_all
+from tuning.gains.validation import VALIDATION_SEED
 
 POINTS = 5
 SETTINGS = TuneSettings(
@@ -160,8 +162,8 @@ def test_all_weights_of_all_mechanisms_share_one_program(made):
 
 
 def test_points_begin_at_what_their_neighbours_found():
-    found = [pareto._Found({"gain": float(n)}, 0.1, 1.0) for n in (1, 2, 2, 4)]
-    assert [[gains["gain"] for gains in own] for own in pareto._neighbourhoods(found)] == [
+    found = [pareto_search._Found({"gain": float(n)}, 0.1, 1.0) for n in (1, 2, 2, 4)]
+    assert [[gains["gain"] for gains in own] for own in pareto_search._neighbourhoods(found)] == [
         [1, 2],
         [2, 1],
         [2, 4],
@@ -172,13 +174,13 @@ def test_points_begin_at_what_their_neighbours_found():
 def test_what_a_start_reached_is_distinguished_from_its_noise():
     task = build_task(MECHANISMS[0], "phase_lead", 8, 0)
     excess = amplification(task.mechanism, "phase_lead", task.literature) - 1
-    start = pareto.Start("converged", 1, math.hypot(0.02, 0.003 * excess), [], task.literature)
+    start = pareto_search.Start("converged", 1, math.hypot(0.02, 0.003 * excess), [], task.literature)
     broken = start._replace(rms=math.nan)
-    (one,) = pareto._found(task, 0.003, [broken, start])
+    (one,) = pareto_search._found(task, 0.003, [broken, start])
     assert one.excess == pytest.approx(excess) and one.error == pytest.approx(0.02, rel=1e-12)
     assert one.value(0.003) == pytest.approx(start.rms, rel=1e-12)
     # Where nothing is usable there are the literature's gains.
-    assert pareto._found(task, 0.003, [broken])[0].gains == task.literature
+    assert pareto_search._found(task, 0.003, [broken])[0].gains == task.literature
 
 
 def test_settings_other_than_the_weight_stay(results, monkeypatch):
@@ -186,15 +188,15 @@ def test_settings_other_than_the_weight_stay(results, monkeypatch):
 
     def solve(tasks, starts, steps, objectives, report):
         seen.append(objectives)
-        return [[pareto.Start("made up", 1, 0.1, [0.1], task.literature)] for task in tasks]
+        return [[pareto_search.Start("made up", 1, 0.1, [0.1], task.literature)] for task in tasks]
 
-    monkeypatch.setattr(pareto, "solve_tasks", solve)
+    monkeypatch.setattr(pareto_search, "solve_tasks", solve)
     objective = Objective("cvar", 3.0, 0.1, 0.5, 0.2)
     settings = dataclasses.replace(SETTINGS, objective=objective)
-    validation = Validation(
+    validation = build_validation(
         [build_task(MECHANISMS[0], "phase_lead", 8, 0)], settings.validation, settings.seed
     )
-    pareto._solve(validation, results[:1], 3, settings, print)
+    pareto_search.solve_ladders(validation, results[:1], 3, settings, print)
     for objectives in seen:
         assert [dataclasses.replace(one, noise_weight=0.5) for one in objectives] == [objective] * 3
     assert len(seen) == 2  # the second found nothing better

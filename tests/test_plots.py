@@ -15,7 +15,9 @@ from jaxhil.simulation.metrics import Metrics
 from jaxhil.simulation.motion import Curve, Piece, _space
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gains.pareto import Front, Point
-from tuning.gains.tune import Start, TuneResult, TuneSettings, figures
+from tuning.gains.rounds import Start
+from tuning.gains.settings import TuneSettings
+from tuning.gains.tune import TuneResult, figures
 from tuning.pictures.plots import STYLES, contact_plot, errors_plot, front_plot, loss_plot, save
 
 LANES = 40

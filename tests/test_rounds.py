@@ -9,7 +9,7 @@ from tuning.gains import rounds
 from tuning.gains.objective import RMS, Objective, objective_value
 from tuning.gains.rounds import GIVEN_UP, solve_tasks
 from tuning.gains.tasks import alike, gain_bounds, spread_points, tuned_names
-from tuning.gains.validation import Validation
+from tuning.gains.validation import build_validation
 from tuning.optimisation.unit_box import to_coordinates
 
 STARTS, STEPS = 5, 14
@@ -38,7 +38,7 @@ def solved(tasks):
 
 @pytest.fixture(scope="module")
 def validation(tasks):
-    return Validation(tasks, 15, 0)
+    return build_validation(tasks, 15, 0)
 
 
 def test_every_start_is_accounted_for(solved):

@@ -13,9 +13,10 @@ from tuning.gains import tune
 from tuning.gains.multistart import choose_starts
 from tuning.gains.objective import RMS, objective_value
 from tuning.gains.rounds import solve_tasks
+from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import build_task
 from tuning.gains.transfer import Tuned, carry_over, distance, nearest, traits
-from tuning.gains.validation import Validation
+from tuning.gains.validation import build_validation
 
 MASS, STIFFNESS = 350.0, 124355.0
 OMEGA = math.sqrt(STIFFNESS / MASS)
@@ -156,7 +157,7 @@ def task():
 
 @pytest.fixture(scope="module")
 def validation(task):
-    return Validation([task], 15, 0)
+    return build_validation([task], 15, 0)
 
 
 @pytest.fixture(scope="module")
@@ -208,11 +209,11 @@ def in_blocks(monkeypatch):
             for t, own in zip(tasks, near, strict=True)
         ]
 
-    monkeypatch.setattr(tune, "_tune_block", block)
+    monkeypatch.setattr(tune, "tune_block", block)
 
     def call(starts, tuned=()):
         mechanisms = [claw(f"contact.stiffness=[{k}]", f"name='{k}'") for k in ("1e5", "3e5", "2.9e5")]
-        settings = tune.TuneSettings(scenarios=4, starts=starts)
+        settings = TuneSettings(scenarios=4, starts=starts)
         every = dict(tune.tune_all(mechanisms, "phase_lead", settings, tuned=tuned))
         return [[one.source for one in every[i].near] for i in range(3)]
 

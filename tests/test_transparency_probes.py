@@ -13,13 +13,15 @@ from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import evaluate
-from tuning.gains import pareto
+from tuning.gains import pareto_search
 from tuning.gains.objective import Objective, contact_terms, objective_value
-from tuning.gains.pareto import PEAK, TRANSPARENCY, default_axis, fronts
+from tuning.gains.pareto import fronts
+from tuning.gains.pareto_search import PEAK, TRANSPARENCY, default_axis
 from tuning.gains.rounds import solve_tasks
+from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import build_task
-from tuning.gains.tune import TuneSettings, tune
-from tuning.gains.validation import Validation
+from tuning.gains.tune import tune
+from tuning.gains.validation import build_validation
 from tuning.transparency.probes import (
     LANES_PER_SCENARIO,
     are_probes,
@@ -110,7 +112,7 @@ def of_training(task, gains):
 
 def test_solver_and_search_minimise_the_stated_objective(task):
     assert task.number == 4 and len(task.scenarios.velocity) == 4 * LANES_PER_SCENARIO
-    validation = Validation([task], 3, 0)
+    validation = build_validation([task], 3, 0)
     points = np.array([[0.3, 0.4], [0.6, 0.2]])[:, : len(validation.names)]
     (starts,) = solve_tasks([task], [points], 1, WEIGHED)
     for point, start, loss in zip(
@@ -165,9 +167,9 @@ def test_the_error_is_traded_against_peak_or_honesty(result, axis):
     assert front.tuned.transparency == result.transparency["tuned"]
     # On the training scenarios the heavier weight is no worse in what it weighs.
     task = build_task(DAMPED, "phase_lead", SMALL.scenarios, SMALL.seed, probed=True)
-    validation = Validation([task], 3, 0)
-    starts = [pareto.Start("made up", 1, 1.0, [1.0], point.gains) for point in front.points]
-    light, heavy = pareto._reached(validation, 0, axis, WEIGHED, 0.0, starts)
+    validation = build_validation([task], 3, 0)
+    starts = [pareto_search.Start("made up", 1, 1.0, [1.0], point.gains) for point in front.points]
+    light, heavy = pareto_search._reached(validation, 0, axis, WEIGHED, 0.0, starts)
     assert heavy.excess <= light.excess * (1 + 1e-6) and light.error <= heavy.error * (1 + 1e-6)
     _, of_probes, excess = of_training(task, front.points[1].gains)
     traded = excess if axis == PEAK else of_probes

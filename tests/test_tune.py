@@ -11,8 +11,9 @@ from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import evaluate
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.gains.multistart import LOTS, choose_starts
+from tuning.gains.multistart import BATCHES, choose_starts
 from tuning.gains.rounds import solve_tasks
+from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import (
     NOISY_SCENARIOS,
     SCENARIOS,
@@ -21,8 +22,8 @@ from tuning.gains.tasks import (
     spread_points,
     tuned_names,
 )
-from tuning.gains.tune import TuneSettings, figures, tune, uncompensated
-from tuning.gains.validation import Validation
+from tuning.gains.tune import figures, tune, uncompensated
+from tuning.gains.validation import build_validation
 from tuning.optimisation.levenberg_marquardt import STATUSES
 from tuning.optimisation.unit_box import to_coordinates, to_gains
 
@@ -42,7 +43,7 @@ def test_tuned_gains_beat_the_literature_on_fresh_scenarios(result):
 
 
 def test_every_start_has_a_status_and_a_falling_history(result):
-    assert 0 < len(result.starts) <= LOTS * SMALL.starts and len(result.starts) % SMALL.starts == 0
+    assert 0 < len(result.starts) <= BATCHES * SMALL.starts and len(result.starts) % SMALL.starts == 0
     for start in result.starts:
         assert start.status in STATUSES
         assert len(start.history) == start.steps
@@ -54,7 +55,7 @@ def test_gains_tuned_with_sensor_noise_are_better_where_there_is_noise(result):
     """Three times the published noise, on scenarios that neither of the two has seen."""
     noisy = load("varying", ["rig.force_sensor.noise_std=8"]).mechanism
     task = build_task(noisy, "phase_lead", SMALL.scenarios, SMALL.seed)
-    validation = Validation([task], 15, SMALL.seed)
+    validation = build_validation([task], 15, SMALL.seed)
     (starts,) = solve_tasks([task], choose_starts(validation, SMALL.starts, SMALL.seed), SMALL.steps)
     tuned = min(starts, key=lambda start: start.rms).gains
     fresh = build_scenarios(noisy, draw(noisy, 255, 99), 99)

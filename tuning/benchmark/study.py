@@ -106,7 +106,8 @@ def judge_law(scenes: list[Any], law: str, settings: CompareSettings) -> list[La
     """All figures of one law on mechanisms of one form, tuned together."""
     from jaxhil.compensators import COMPENSATORS, literature_gains
     from tuning.benchmark.runs import judge_gains
-    from tuning.gains.tune import TuneSettings, tune_all
+    from tuning.gains.settings import TuneSettings
+    from tuning.gains.tune import tune_all
 
     mechanisms = [scene.mechanism for scene in scenes]
     others = [

@@ -1,6 +1,6 @@
-"""How far tuned gains are from the best there is: a search of the whole box on the same objective.
+"""How much better gains could be: the whole box is searched on the same objective, and the best compared.
 
-It knows nothing of what tuning found, and takes `FACTOR` times as many evaluations.
+The search knows nothing of what tuning found, and takes `FACTOR` times as many evaluations.
 """
 
 from typing import NamedTuple
@@ -8,18 +8,23 @@ from typing import NamedTuple
 import numpy as np
 
 from tuning.gains.multistart import MultistartResult
-from tuning.gains.objective import Objective
+from tuning.gains.settings import TuneSettings
 from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import search_globally
 
 FACTOR = 50
-LANES_PER_SCENARIO = 8192  # side by side, which is quicker than few at a time
+LANES = 8192  # side by side, which is quicker than few at a time
 
 
 class GlobalComparison(NamedTuple):
-    """Value of the objective of the tuned gains and of the best found anywhere; by what share of the latter
-    the former lies above it (below: negative); evaluations of tuning, a Jacobian over P gains counted as
-    1 + P, and of the search; the gains of the best."""
+    """Tuned gains beside the best found anywhere.
+
+    tuned, best: values of the objective [1].
+    above: by what share of the best value the tuned one lies above it; negative: below.
+    spent: evaluations of tuning, a Jacobian over P gains counted as 1 + P.
+    evaluations: those of the search.
+    gains: the best ones.
+    """
 
     tuned: float
     best: float
@@ -33,8 +38,7 @@ def compare_with_global_search(
     validation: Validation,
     task: int,
     found: MultistartResult,
-    objective: Objective,
-    seed: int,
+    settings: TuneSettings,
     factor: int = FACTOR,
 ) -> GlobalComparison | None:
     """Search the box of one task with `factor` times the evaluations that tuning took; none where all starts
@@ -43,9 +47,10 @@ def compare_with_global_search(
         return None
 
     def losses(points):
-        return validation.losses(objective, [task], points[None], lanes=LANES_PER_SCENARIO)[0]
+        return validation.losses(settings.objective, [task], points[None], lanes=LANES)[0]
 
-    everywhere = search_globally(losses, len(validation.names), factor * found.evaluations, seed=seed + 1)
+    budget = factor * found.evaluations
+    everywhere = search_globally(losses, len(validation.names), budget, seed=settings.seed + 1)
     tuned = float(losses(found.best.coordinates[None])[0])
     gains = validation.gains(task, everywhere.point)
     above = tuned / everywhere.loss - 1 if everywhere.loss > 0 else np.inf

@@ -1,127 +1,181 @@
-"""The best gains of many tasks: look around, descend by derivatives, and do more where starts disagree.
+"""The best gains of many tasks: scan, descend by derivatives from several starts, go on where they disagree.
 
-The first lot of starts are the literature's gains and the best points of a scan. Where they do not end at the
-same value there may be something better: further lots begin at the best points of other scans, until several
-starts agree on the best. How many minima there are is not known; that the best one was met again and again is
-the sign that few are left. Contacts begin and end at ticks: the objective has kinks, on which a descent may
-stop, so that the best is then improved without derivatives.
+The first batch of starts holds the literature's gains and the best points of a scan. Where its starts do not
+end at the same value there may be something better: further batches start at the best points of other scans,
+until several starts agree on the best. How many minima there are is not known; that the best one was met
+again and again is the sign that few are left. Contacts begin and end at ticks: the objective has kinks, on
+which a descent may stop, so that the best is then improved without derivatives.
 
 Source: multistart until a minimum recurs, Boender and Rinnooy Kan, "Bayesian stopping rules for multistart
 global optimization methods" (1987).
 """
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from tuning.environment import program_folder
-from tuning.gains.objective import RMS, Objective, one_each
+from tuning.gains.objective import RMS, Objective
 from tuning.gains.rounds import Start, inverse_hessian, prepare_solver, solve_tasks
+from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import spread_points
 from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import apart, polish
 from tuning.optimisation.unit_box import to_coordinates
 
-SCANNED, SCAN_SCENARIOS = 256, 32  # points looked at before a lot, by default; on how many scenarios
-LOTS = 4  # of starts, at most
+SCAN_SCENARIOS = 32  # on which the points of a scan are tried
+BATCHES = 4  # of starts, at most
 SURE = 3  # starts that have to agree: two may have met in a poor basin
 AGREED = 0.005  # relative difference of values that count as the same minimum
-# The same where scenarios have copies: another draw of the scenarios would change the value by more.
+# The same where scenarios have probes: another draw of the scenarios would change the value by more.
 PROBED_AGREED = 0.02
 FREEING, FREEING_REACH = 24, 0.2  # generations of the search from a start that is stuck, its first reach
-REACH, CANDIDATES = 0.1, 16  # of the search without derivatives: first standard deviation in the box, lot
+REACH, CANDIDATES = 0.1, 16  # of the search without derivatives: first standard deviation, points at a time
+
+Objectives = Objective | Sequence[Objective]  # that of all tasks, or one of each
 
 
 class MultistartResult(NamedTuple):
-    """What was found for a task: the best of its starts, none if all failed; all of them, lot by lot;
-    evaluations of the objective that it took: a Jacobian over P gains counted as 1 + P, points of a scan by
-    their share of the scenarios."""
+    """What was found for a task.
+
+    best: the best of its starts, improved without derivatives; None if all failed.
+    starts: all of them, batch by batch.
+    evaluations: of the objective, that it took. A Jacobian over P gains counts as 1 + P of them, a point of a
+        scan as the share of the scenarios it was tried on.
+    """
 
     best: Start | None
     starts: list[Start]
     evaluations: int
 
 
-@dataclasses.dataclass
+@dataclass
 class _Search:
-    """Of one task: every start so far, evaluations so far."""
+    """The starts of one task so far, and the evaluations they took."""
 
-    starts: list[Start] = dataclasses.field(default_factory=list)
+    starts: list[Start] = field(default_factory=list)
     evaluations: int = 0
 
 
 def find_gains(
     validation: Validation,
-    starts: int,
-    steps: int,
-    polishing: int,
-    seed: int,
-    objective: Objective | Sequence[Objective] = RMS,
+    settings: TuneSettings,
     first: Sequence[Sequence[Mapping[str, float]]] | None = None,
     report: Callable[[str], None] = lambda text: None,
-    scanned: int = SCANNED,
 ) -> list[MultistartResult]:
-    """Best gains of every task, from lots of so many starts of so many steps, the best of so many points
-    `scanned`, and a polish of so many evaluations for each gain.
+    """The best gains of every task of `validation`.
 
-    `first` has, of each task, gains to start at, in the places of the last starts of its first lot, never of
-    the literature's. One start alone is the literature's, and the only lot."""
-    tasks, objectives = validation.tasks, one_each(objective, len(validation.tasks))
-    given = [list(own) for own in first] if first else [[] for _ in tasks]
-    number = max(starts, 1 + max(map(len, given)))
-    agreed = PROBED_AGREED if tasks[0].probed else AGREED
+    `first` has, of each task, gains to start at, in the places of the last starts of its first batch, never
+    of the literature's. One start alone is the literature's, and the only batch.
+    """
+    tasks, objective = validation.tasks, settings.objective
+    probed = tasks[0].probed
+    agreed = PROBED_AGREED if probed else AGREED
     searches = [_Search() for _ in tasks]
-    chosen = _while_compiling(
-        validation,
-        number,
-        objectives,
-        lambda: choose_starts(validation, number, seed, objectives, given, scanned),
-    )
-    going = list(range(len(tasks)))
-    for lot in range(LOTS if number > 1 else 1):
-        if lot > 0:
-            report(f"lot {lot + 1} of starts, {len(going)} of {len(tasks)} mechanisms")
-            chosen = [np.empty((0, len(validation.names)))] * len(tasks)
-            for i, points in zip(
-                going, _scan(validation, going, number, (seed, lot), objectives, scanned), strict=True
-            ):
-                chosen[i] = points
-        ended = solve_tasks(tasks, chosen, steps, objectives, report)
-        for i in going:
-            own = searches[i]
-            own.starts += _exactly(validation, i, ended[i], objectives)
-            own.evaluations += (1 + len(validation.names)) * sum(start.steps for start in ended[i])
-            if lot > 0 or number > 1 + len(given[i]):
-                own.evaluations += _scan_evaluations(validation, number, scanned)
-        going = [i for i in going if not _agree(searches[i].starts, agreed)]
-        if not going:
-            break
-    if tasks[0].probed:
+    going = _solve_batches(validation, settings, first, agreed, searches, report)
+    if probed:
         for i, own in enumerate(searches):
-            own.starts, more = _freed(validation, i, own.starts, agreed, seed, objectives)
+            own.starts, more = _freed(validation, i, own.starts, agreed, settings.seed, objective)
             own.evaluations += more
     # Where starts agree to that, the rest of the way down is within what scenarios decide.
-    polishing = 0 if tasks[0].probed and not going else polishing * len(validation.names)
+    polishing = 0 if probed and not going else settings.polish * len(validation.names)
     if polishing:
         report("searching on without derivatives")
-    best = finish(validation, [own.starts for own in searches], polishing, seed, objectives)
+    best = finish(validation, [own.starts for own in searches], polishing, settings.seed, objective)
     return [
         MultistartResult(top, own.starts, own.evaluations + (polishing if top else 0))
         for top, own in zip(best, searches, strict=True)
     ]
 
 
-def _freed(
+def _solve_batches(validation, settings, first, agreed, searches: list[_Search], report) -> list[int]:
+    """Solve batch after batch of starts; the tasks whose starts do not agree even so."""
+    tasks, objective = validation.tasks, settings.objective
+    given = [len(own) for own in first] if first else [0 for _ in tasks]
+    number = max(settings.starts, 1 + max(given))
+    chosen = _while_compiling(
+        validation,
+        number,
+        objective,
+        lambda: choose_starts(validation, number, settings.seed, objective, first, settings.scanned),
+    )
+    going = list(range(len(tasks)))
+    for batch in range(BATCHES if number > 1 else 1):
+        if batch > 0:
+            report(f"batch {batch + 1} of starts, {len(going)} of {len(tasks)} mechanisms")
+            seed = settings.seed, batch
+            chosen = [np.empty((0, len(validation.names)))] * len(tasks)
+            scans = _scan(validation, going, number, seed, objective, settings.scanned)
+            for i, points in zip(going, scans, strict=True):
+                chosen[i] = points
+        ended = solve_tasks(tasks, chosen, settings.steps, objective, report)
+        for i in going:
+            own = searches[i]
+            own.starts += _exactly(validation, i, ended[i], objective)
+            own.evaluations += (1 + len(validation.names)) * sum(start.steps for start in ended[i])
+            if batch > 0 or number > 1 + given[i]:
+                own.evaluations += _scan_evaluations(validation, number, settings.scanned)
+        going = [i for i in going if not _agree(searches[i].starts, agreed)]
+        if not going:
+            break
+    return going
+
+
+def choose_starts(
     validation: Validation,
-    task: int,
-    starts: list[Start],
-    agreed: float,
+    starts: int,
     seed: int,
-    objectives: list[Objective],
+    objective: Objectives = RMS,
+    first: Sequence[Sequence[Mapping[str, float]]] | None = None,
+    scanned: int = TuneSettings.scanned,
+) -> list[Float[np.ndarray, "starts gains"]]:
+    """Points of the unit box to start from, of every task: the literature's gains, then the best of a scan
+    that lie apart from each other. `first` has, of each task, gains that take the places of the last of
+    these, never of the literature's."""
+    tasks = range(len(validation.tasks))
+    given = [_coordinates(validation, i, first[i] if first else ()) for i in tasks]
+    usual = [max(starts - len(own), 1) for own in given]
+    literature = [_coordinates(validation, i, [validation.tasks[i].literature]) for i in tasks]
+    if max(usual) > 1:
+        further = _scan(validation, list(tasks), max(usual) - 1, seed, objective, scanned, literature)
+        literature = [np.concatenate(both) for both in zip(literature, further, strict=True)]
+    return [np.concatenate([literature[i][: usual[i]], given[i]]) for i in tasks]
+
+
+def finish(
+    validation: Validation,
+    solved: list[list[Start]],
+    evaluations: int,
+    seed: int,
+    objective: Objectives = RMS,
+) -> list[Start | None]:
+    """The best start of every task, none if all failed, improved without derivatives
+    (`tuning.optimisation.derivative_free.polish`) by so many evaluations each."""
+    best = [ranked[0] if (ranked := _ranked(own)) else None for own in solved]
+    some = [i for i, top in enumerate(best) if top]
+    if not some or evaluations == 0:
+        return best
+    tops = [top for top in best if top]
+    found = polish(
+        lambda points: validation.losses(objective, some, points),
+        np.stack([top.coordinates for top in tops]),
+        evaluations,
+        candidates=CANDIDATES,
+        reach=REACH,
+        covariance=np.stack([inverse_hessian(top.curvature, top.rms) for top in tops]),
+        seed=seed,
+    )
+    for i, top, point, loss in zip(some, tops, found.point, found.loss, strict=True):
+        best[i] = _moved(validation, i, top, point, loss)
+    return best
+
+
+def _freed(
+    validation: Validation, task: int, starts: list[Start], agreed: float, seed: int, objective: Objectives
 ) -> tuple[list[Start], int]:
     """The starts, those that ended further above the best searched on from there without derivatives, and the
     evaluations that took.
@@ -129,66 +183,41 @@ def _freed(
     Where the correction's limit begins to bind the objective has a kink, and the solver stays there.
     """
     ranked = _ranked(starts)
-    stuck = (
-        [i for i, start in enumerate(starts) if start.rms > (1 + agreed) * ranked[0].rms] if ranked else []
-    )
+    stuck = [i for i, start in enumerate(starts) if ranked and start.rms > (1 + agreed) * ranked[0].rms]
     if not stuck:
         return starts, 0
     number = CANDIDATES * FREEING
 
     def losses(points):
         flat = points.reshape(1, -1, points.shape[-1])
-        return validation.losses(objectives, [task], flat)[0].reshape(points.shape[:-1])
+        return validation.losses(objective, [task], flat)[0].reshape(points.shape[:-1])
 
     at = np.stack([starts[i].coordinates for i in stuck])
     found = polish(losses, at, number, candidates=CANDIDATES, reach=FREEING_REACH, seed=seed)
     freed = list(starts)
-    for i, coordinates, loss in zip(stuck, found.point, found.loss, strict=True):
-        freed[i] = _moved(validation, task, starts[i], coordinates, loss)
+    for i, point, loss in zip(stuck, found.point, found.loss, strict=True):
+        freed[i] = _moved(validation, task, starts[i], point, loss)
     return freed, number * len(stuck)
 
 
-def _exactly(
-    validation: Validation, task: int, starts: list[Start], objectives: list[Objective]
-) -> list[Start]:
+def _exactly(validation: Validation, task: int, starts: list[Start], objective: Objective) -> list[Start]:
     """Starts with the value of the objective itself where the solver lowered a norm in its place."""
-    if objectives[task].name == "rms" or not starts:
+    if objective.name == "rms" or not starts:
         return starts
-    values = validation.losses(objectives, [task], np.stack([start.coordinates for start in starts])[None])[0]
+    values = validation.losses(objective, [task], np.stack([start.coordinates for start in starts])[None])[0]
     return [start._replace(rms=float(value)) for start, value in zip(starts, values, strict=True)]
 
 
-def _while_compiling(validation, number, objectives, work):
+def _while_compiling(validation: Validation, number: int, objective: Objective, work: Callable):
     """Do some work while the solver's program compiles: each takes one core. Only one program runs: programs
     on several devices could wait for one another for ever."""
     if program_folder() is None:
         return work()
     with ThreadPoolExecutor(1) as meanwhile:
-        ready = meanwhile.submit(prepare_solver, validation.tasks, number, objectives)
+        ready = meanwhile.submit(prepare_solver, validation.tasks, number, objective)
         done = work()
         ready.result()
         return done
-
-
-def choose_starts(
-    validation: Validation,
-    starts: int,
-    seed: int,
-    objective: Objective | Sequence[Objective] = RMS,
-    first: Sequence[Sequence[Mapping[str, float]]] | None = None,
-    scanned: int = SCANNED,
-) -> list[Float[np.ndarray, "starts gains"]]:
-    """Shares to start from, of every task: the literature's gains, then the best of a scan that lie apart
-    from each other. `first` has, of each task, gains that take the places of the last of these, never of the
-    literature's."""
-    tasks = range(len(validation.tasks))
-    given = [_shares(validation, i, first[i] if first else ()) for i in tasks]
-    usual = [max(starts - len(own), 1) for own in given]
-    literature = [_shares(validation, i, [validation.tasks[i].literature]) for i in tasks]
-    if max(usual) > 1:
-        further = _scan(validation, list(tasks), max(usual) - 1, seed, objective, scanned, literature)
-        literature = [np.concatenate(both) for both in zip(literature, further, strict=True)]
-    return [np.concatenate([literature[i][: usual[i]], given[i]]) for i in tasks]
 
 
 def _scan(
@@ -196,19 +225,19 @@ def _scan(
     which: list[int],
     number: int,
     seed: int | tuple[int, ...],
-    objective: Objective | Sequence[Objective],
+    objective: Objectives,
     scanned: int,
     beside: list[np.ndarray] | None = None,
 ) -> list[Float[np.ndarray, "number gains"]]:
     """The best points of a scan of the tasks `which`, so many that lie apart, and from those `beside`."""
-    around = [_shares(validation, i, [validation.tasks[i].literature])[0] for i in which]
+    around = [_coordinates(validation, i, [validation.tasks[i].literature])[0] for i in which]
     points = np.stack([spread_points(own, max(scanned, 2 * number), seed)[1:] for own in around])
     for own, i in zip(points, which, strict=True):
         task = validation.tasks[i]
         for gain in task.tuned:
             if gain.begins is not None:
                 place, begins = validation.names.index(gain.name), {gain.name: gain.begins(task.mechanism)}
-                own[:, place] = _shares(validation, i, [{**task.literature, **begins}])[0, place]
+                own[:, place] = _coordinates(validation, i, [{**task.literature, **begins}])[0, place]
     values = validation.losses(objective, which, points, SCAN_SCENARIOS)
     order = np.argsort(np.where(np.isfinite(values), values, np.inf), axis=1, kind="stable")
     best = []
@@ -223,49 +252,20 @@ def _scan_evaluations(validation: Validation, number: int, scanned: int) -> int:
     return -(-max(scanned, 2 * number) * min(SCAN_SCENARIOS, scenarios) // scenarios)
 
 
-def _shares(
+def _coordinates(
     validation: Validation, task: int, several: Sequence[Mapping[str, float]]
 ) -> Float[np.ndarray, "several gains"]:
     gains = np.array([[gains[name] for name in validation.names] for gains in several])
     return to_coordinates(gains.reshape(len(several), len(validation.names)), validation.bounds[task])
 
 
-def finish(
-    validation: Validation,
-    solved: list[list[Start]],
-    evaluations: int,
-    seed: int,
-    objective: Objective | Sequence[Objective] = RMS,
-) -> list[Start | None]:
-    """The best start of every task, none if all failed, polished without derivatives
-    (`tuning.optimisation.derivative_free.polish`) by so many evaluations each."""
-    best = [ranked[0] if (ranked := _ranked(own)) else None for own in solved]
-    some = [i for i, top in enumerate(best) if top]
-    if not some or evaluations == 0:
-        return best
-    tops = [top for top in best if top]
-    starts = np.stack([top.coordinates for top in tops])
-    shapes = np.stack([inverse_hessian(top.curvature, top.rms) for top in tops])
-
-    def losses(points):
-        return validation.losses(objective, some, points)
-
-    found = polish(
-        losses, starts, evaluations, candidates=CANDIDATES, reach=REACH, covariance=shapes, seed=seed
-    )
-    for i, top, coordinates, loss in zip(some, tops, found.point, found.loss, strict=True):
-        best[i] = _moved(validation, i, top, coordinates, loss)
-    return best
-
-
-def _moved(validation: Validation, task: int, start: Start, coordinates: np.ndarray, loss: float) -> Start:
+def _moved(validation: Validation, task: int, start: Start, point: np.ndarray, loss: float) -> Start:
     """The start where a search from it ended; itself where that found nothing better."""
-    if (coordinates == start.coordinates).all():
+    if (point == start.coordinates).all():
         return start
     history = [*start.history, float(loss)]
-    return start._replace(
-        rms=float(loss), gains=validation.gains(task, coordinates), coordinates=coordinates, history=history
-    )
+    gains = validation.gains(task, point)
+    return start._replace(rms=float(loss), gains=gains, coordinates=point, history=history)
 
 
 def _ranked(starts: list[Start]) -> list[Start]:

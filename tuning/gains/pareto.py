@@ -3,70 +3,43 @@
 A compensator that leads the measured force amplifies its noise. Tuned with a larger `Objective.noise_weight`
 it is quieter, and less accurate: each weight gives a point of the front. What passes the noise on as it is
 still may have to choose between accuracy and the peak of its command (`Objective.command_weight`), or between
-accuracy and transparency (`Objective.transparency_weight`). All weights of all mechanisms are
-problems of one program, on the scenarios that the mechanisms were tuned on. Points help each other: gains
-found for one weight are what its neighbours on the ladder begin at next, until none gets better.
+accuracy and transparency (`Objective.transparency_weight`).
 """
 
-import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import chain
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxhil.compensators import COMPENSATORS, Compensator, Constants
-from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.evaluation import Outcome
-from tuning.gains.multistart import choose_starts
-from tuning.gains.objective import FAILED, Objective, contact_terms, objective_value
-from tuning.gains.rounds import Start, solve_tasks
-from tuning.gains.tasks import TuneTask, alike, build_task
-from tuning.gains.tune import BLOCK, ErrorFigures, TuneResult, TuneSettings, figures
-from tuning.gains.validation import Validation
-from tuning.optimisation.unit_box import to_coordinates
+from tuning.gains.objective import Objective, contact_terms, objective_value
+from tuning.gains.pareto_search import NOISE, PEAK, TRANSPARENCY, Axis, amplification, solve_ladders, weighed
+from tuning.gains.settings import TuneSettings
+from tuning.gains.tasks import alike, build_task
+from tuning.gains.tune import BLOCK, ErrorFigures, TuneResult, block_name, figures
+from tuning.gains.validation import Validation, build_validation, split_nominal
 from tuning.statistics.bootstrap import ErrorIntervals, error_intervals
 from tuning.statistics.intervals import Estimate
 from tuning.transparency.probes import probe_figures
 
-# The ladder's ends: how many times the noise of accurate gains weighs what their error does. The first one
-# reaches further: what is quiet without being accurate is a start that the solver does not come by itself.
-ENDS, FIRST_ENDS = (0.5, 10.0), (1.0, 100.0)
-ACCURATE = 1.05  # error, over the least that is known, of gains that still are accurate
-LEAST_EXCESS = 0.1  # amplification beyond 1 that the ladder is made for where there is next to none
 DIGITS = 4  # significant ones, in which points are compared
-PASSES = 4  # in which points begin at what their neighbours found
-IMPROVED = 1e-3  # by which a point gets better in a pass that is not the last
-
-
-class Axis(NamedTuple):
-    """What the error is traded against: its name; the objective's weight of it; the name and the words of the
-    cost; what the ladder is made for where there is next to nothing to trade."""
-
-    name: str
-    weight: str
-    cost: str
-    words: str
-    least: float
-
-
-NOISE = Axis("noise", "noise_weight", "noise_amplification", "amplification of sensor noise", LEAST_EXCESS)
-PEAK = Axis("peak", "command_weight", "peak_p99", "peak command over the reference's (99th percentile)", 0.1)
-TRANSPARENCY = Axis(
-    "honesty", "transparency_weight", "honesty_error", "error under pushes and other damping (rms)", 1e-3
-)
-AXES = {axis.name: axis for axis in (NOISE, PEAK, TRANSPARENCY)}
 
 
 class Point(NamedTuple):
-    """Gains, the weight [1] of the axis they were tuned with (None: otherwise), the cost [1] on it: the
-    amplification A of the force sensor's noise, or of fresh scenarios the 99th percentile of the peak command
-    over the reference's, or the rms error of the copies; the objective without that term [1] on fresh
-    scenarios; figures of these and of the nominal run, confidence intervals; whether no other point beats it
-    (`dominated`); transparency, slope and peak, where transparency counts."""
+    """Gains on the way between accuracy and the axis's cost, judged on fresh scenarios.
+
+    gains: all of the compensator's.
+    weight: of the axis [1], that they were tuned with; None: tuned otherwise.
+    cost: on the axis [1]: the amplification A of the force sensor's noise, the 99th percentile of the peak
+        command over the reference's, or the rms error of the transparency probes.
+    error: the objective without the axis's term [1].
+    figures, nominal: figures of fresh scenarios and of the nominal run.
+    intervals: 95 % intervals of `figures`.
+    on_front: whether no other point beats it (`dominated`).
+    transparency: transparency, slope and peak, where scenarios are probed.
+    """
 
     gains: dict[str, float]
     weight: float | None
@@ -85,50 +58,17 @@ class Point(NamedTuple):
 
 
 class Front(NamedTuple):
-    """Points in the order of their weights, the first without; the literature's gains and those tuned before
-    beside them."""
+    """What can be had of accuracy and of the axis's cost.
+
+    points: in the order of their weights, the first without.
+    literature, tuned: the literature's gains, and those tuned before.
+    axis: what accuracy is traded against.
+    """
 
     points: list[Point]
     literature: Point
     tuned: Point
     axis: Axis = NOISE
-
-
-def has_trade_off(compensator: str) -> bool:
-    """Whether a compensator's gains change how much sensor noise it passes on."""
-    return type(COMPENSATORS[compensator]).noise_amplification is not Compensator.noise_amplification
-
-
-def amplification(mechanism: Mechanism, compensator: str, gains: Mapping[str, float]) -> float:
-    """A [1], nominally: `Compensator.noise_amplification`."""
-    period, clearance = mechanism.rig.control_period, mechanism.contact.clearance
-    constants = Constants(jnp.asarray(period), jnp.asarray(clearance))
-    values = {name: jnp.asarray(value) for name, value in gains.items()}
-    return float(COMPENSATORS[compensator].noise_amplification(values, constants))
-
-
-def default_axis(compensator: str) -> Axis | None:
-    """What a compensator's error is traded against unless something is asked for; None: nothing."""
-    if has_trade_off(compensator):
-        return NOISE
-    return PEAK if COMPENSATORS[compensator].anticipates else None
-
-
-def ladder(
-    number: int,
-    error: float,
-    excess: float,
-    ends: tuple[float, float] = ENDS,
-    least: float = LEAST_EXCESS,
-) -> np.ndarray:
-    """(number,) weights [1]: 0, then evenly on a logarithmic scale.
-
-    `error` and `excess` are J and what is weighed, A - 1 or the like, of accurate gains: the weights at the
-    ends make that term so many times their error.
-    """
-    light, heavy = ends
-    weights = np.geomspace(heavy, light, number - 1)[::-1] * error / max(excess, least)
-    return np.concatenate([[0.0], weights])
 
 
 def dominated(places: Sequence[tuple[float, float]]) -> list[bool]:
@@ -156,166 +96,14 @@ def fronts(
         for begin in range(0, len(group), BLOCK):
             block = group[begin : begin + BLOCK]
             some, tuned = [tasks[index] for index in block], [results[index] for index in block]
-            name = some[0].mechanism.name if len(some) == 1 else f"{len(some)} mechanisms"
+            name = block_name(some)
             report(f"{name}: accuracy against {axis.name}, {number} points")
-            validation = Validation(some, settings.validation, settings.seed)
-            points = _solve(
+            validation = build_validation(some, settings.validation, settings.seed)
+            points = solve_ladders(
                 validation, tuned, number, settings, lambda text, name=name: report(f"{name}: {text}"), axis
             )
             report(f"{name}: judging {number} points")
             yield from zip(block, _judge(validation, tuned, points, settings, axis), strict=True)
-
-
-class _Found(NamedTuple):
-    """Gains of a mechanism, and what they reach on its training scenarios: J without the term traded, and
-    what its weight is of: max(0, A - 1), or the rms of the peaks' excess, or of the copies' errors."""
-
-    gains: dict[str, float]
-    error: float
-    excess: float
-
-    def value(self, weight: float) -> float:
-        """J for a weight."""
-        return math.hypot(self.error, weight * self.excess)
-
-
-def _solve(
-    validation: Validation,
-    tuned: list[TuneResult],
-    number: int,
-    settings: TuneSettings,
-    report: Callable[[str], None],
-    axis: Axis = NOISE,
-) -> list[list[tuple[float, dict[str, float]]]]:
-    """Weight and gains of every point of every task."""
-    weight = getattr(settings.objective, axis.weight)
-    pools = [
-        _reached(validation, i, axis, settings.objective, weight, one.starts) for i, one in enumerate(tuned)
-    ]
-    ladders = []
-    for turn in range(1 + PASSES):
-        # How accurate gains can be, and how quiet those are, is known better every time.
-        ends = ENDS if turn > 0 else FIRST_ENDS
-        ladders = [_fitting_ladder(pool, number, ends, axis) for pool in pools]
-        before = [_picked(pool, weights) for pool, weights in zip(pools, ladders, strict=True)]
-        objectives = [
-            [_weighed(settings.objective, axis, weight) for weight in weights] for weights in ladders
-        ]
-        starts = (
-            _around(validation, before) if turn > 0 else _anywhere(validation, tuned, objectives, settings)
-        )
-        found = _search(validation, starts, objectives, settings, report, axis)
-        pools = [pool + new for pool, new in zip(pools, found, strict=True)]
-        after = [_picked(pool, weights) for pool, weights in zip(pools, ladders, strict=True)]
-        if turn > 0 and not _improved(before, after, ladders):
-            break
-    return [
-        [(float(weight), one.gains) for weight, one in zip(weights, _picked(pool, weights), strict=True)]
-        for pool, weights in zip(pools, ladders, strict=True)
-    ]
-
-
-def _fitting_ladder(pool: list[_Found], number: int, ends: tuple[float, float], axis: Axis) -> np.ndarray:
-    least = min(one.error for one in pool)
-    accurate = min((one for one in pool if one.error <= ACCURATE * least), key=lambda one: one.excess)
-    return ladder(number, accurate.error, accurate.excess, ends, axis.least)
-
-
-def _weighed(objective: Objective, axis: Axis, weight: float) -> Objective:
-    return dataclasses.replace(objective, **{axis.weight: float(weight)})
-
-
-def _anywhere(
-    validation: Validation, tuned: list[TuneResult], objectives: list[list[Objective]], settings: TuneSettings
-) -> list[list[np.ndarray]]:
-    """Shares that every point of each task begins at: the usual ones for its weight, and those tuned
-    before."""
-    number, first = max(settings.starts, 2), [[one.gains] for one in tuned]
-    by_point = [
-        choose_starts(validation, number, settings.seed, own, first) for own in zip(*objectives, strict=True)
-    ]
-    return [list(own) for own in zip(*by_point, strict=True)]
-
-
-def _around(validation: Validation, picked: list[list[_Found]]) -> list[list[np.ndarray]]:
-    """Shares that every point of each task begins at: what it and its neighbours found."""
-    return [
-        [
-            to_coordinates(
-                np.array([[gains[name] for name in validation.names] for gains in several]), bounds
-            )
-            for several in _neighbourhoods(own)
-        ]
-        for own, bounds in zip(picked, validation.bounds, strict=True)
-    ]
-
-
-def _search(validation: Validation, starts, objectives, settings, report, axis: Axis) -> list[list[_Found]]:
-    """What all starts of all points of each task end with."""
-    number = len(objectives[0])
-    every = [task for task in validation.tasks for _ in range(number)]
-    own = list(chain(*objectives))
-    solved = solve_tasks(every, list(chain(*starts)), settings.steps, own, report)
-    found = [
-        _reached(
-            validation, place // number, axis, settings.objective, getattr(objective, axis.weight), ended
-        )
-        for place, (objective, ended) in enumerate(zip(own, solved, strict=True))
-    ]
-    return [list(chain(*found[i : i + number])) for i in range(0, len(found), number)]
-
-
-def _reached(
-    validation: Validation, index: int, axis: Axis, objective: Objective, weight: float, starts: list[Start]
-) -> list[_Found]:
-    """What the starts of a task ended with under a weight."""
-    task = validation.tasks[index]
-    if axis == NOISE:
-        return _found(task, weight, starts)
-    kept = [start for start in starts if math.isfinite(start.rms)]
-    if not kept:
-        return [_Found(task.literature, FAILED, 0.0)]
-    gains = np.array([[start.gains[name] for name in validation.names] for start in kept])
-    coordinates = to_coordinates(gains, validation.bounds[index])[None]
-    without, beside = (
-        validation.losses(_weighed(objective, axis, w), [index], coordinates)[0] for w in (0.0, 1.0)
-    )
-    excess = np.sqrt(np.maximum(0, beside**2 - without**2))
-    return [
-        _Found(start.gains, float(e), float(x)) for start, e, x in zip(kept, without, excess, strict=True)
-    ]
-
-
-def _found(task: TuneTask, weight: float, starts: list[Start]) -> list[_Found]:
-    found = []
-    for start in starts:
-        excess = max(0.0, amplification(task.mechanism, task.compensator, start.gains) - 1)
-        if math.isfinite(start.rms) and math.isfinite(excess):
-            error = math.sqrt(max(0.0, start.rms**2 - (weight * excess) ** 2))
-            found.append(_Found(start.gains, error, excess))
-    return found or [_Found(task.literature, FAILED, 0.0)]
-
-
-def _picked(pool: list[_Found], weights: np.ndarray) -> list[_Found]:
-    """The best of all that was found, weight by weight."""
-    return [min(pool, key=lambda one, weight=weight: one.value(weight)) for weight in weights]
-
-
-def _neighbourhoods(picked: list[_Found]) -> list[list[dict[str, float]]]:
-    """Of each point its gains and those of the points beside it, as far as they differ."""
-    several = []
-    for place, own in enumerate(picked):
-        beside = [own, *picked[max(place - 1, 0) : place], *picked[place + 1 : place + 2]]
-        several.append([one.gains for i, one in enumerate(beside) if one not in beside[:i]])
-    return several
-
-
-def _improved(before: list[list[_Found]], after: list[list[_Found]], ladders: list[np.ndarray]) -> bool:
-    return any(
-        new.value(weight) < (1 - IMPROVED) * old.value(weight)
-        for olds, news, weights in zip(before, after, ladders, strict=True)
-        for old, new, weight in zip(olds, news, weights, strict=True)
-    )
 
 
 def _judge(
@@ -331,7 +119,7 @@ def _judge(
         for task, one, own in zip(validation.tasks, tuned, points, strict=True)
     ]
     # One set of gains of every task at a time, as they were judged when they were tuned.
-    outcomes = [validation.judge_probed([gains for _, gains in row]) for row in zip(*plans, strict=True)]
+    outcomes = [validation.judge([gains for _, gains in row]) for row in zip(*plans, strict=True)]
     fronts = []
     for index, (plan, own) in enumerate(zip(plans, zip(*outcomes, strict=True), strict=True)):
         judged = [
@@ -353,18 +141,16 @@ def _point(
     weight: float | None,
     gains: dict[str, float],
     outcome: Outcome,
-    copies: Outcome | None,
+    with_probes: Outcome | None,
 ) -> Point:
     task, probed = validation.tasks[index], validation.probed[index]
-    fresh, nominal = (
-        jax.tree.map(lambda leaf, cut=cut: leaf[..., cut], outcome) for cut in (slice(-1), slice(-1, None))
-    )
+    fresh, nominal = split_nominal(outcome)
     quiet = amplification(task.mechanism, task.compensator, gains)
     errors = np.asarray(contact_terms(fresh)[0])[fresh.wanted]
     every, probe_errors = fresh, None
-    if copies is not None:
-        every = copies
-        probes = jax.tree.map(lambda leaf: leaf[..., 1:], copies)
+    if with_probes is not None:
+        every = with_probes
+        probes = jax.tree.map(lambda leaf: leaf[..., 1:], with_probes)
         probe_errors = np.asarray(contact_terms(probes)[0])[probes.wanted]
     excesses, chatter = (np.asarray(term)[every.wanted] for term in contact_terms(every)[1:])
     cost = quiet
@@ -372,7 +158,7 @@ def _point(
         cost = float(np.percentile(fresh.peak_ratio[fresh.good], 99)) if fresh.good.any() else math.nan
     elif axis == TRANSPARENCY:
         cost = math.nan if probe_errors is None else float(np.sqrt(np.mean(probe_errors**2)))
-    rest = _weighed(objective, axis, 0.0)
+    rest = weighed(objective, axis, 0.0)
     return Point(
         gains=gains,
         weight=weight,
@@ -382,5 +168,5 @@ def _point(
         nominal=figures(nominal),
         intervals=error_intervals(fresh.error, fresh.good),
         on_front=False,
-        transparency=probe_figures(probed, copies) if probed is not None and copies is not None else None,
+        transparency=probe_figures(probed, with_probes) if probed and with_probes else None,
     )

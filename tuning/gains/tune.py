@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from jaxhil.compensators import COMPENSATORS
@@ -14,12 +13,13 @@ from jaxhil.simulation.evaluation import Outcome
 from jaxhil.simulation.scenario import Scenario
 from tuning.gains.common_program import CommonProgram
 from tuning.gains.global_search import GlobalComparison, compare_with_global_search
-from tuning.gains.multistart import SCANNED, MultistartResult, find_gains
-from tuning.gains.objective import RMS, SCALE, Objective
+from tuning.gains.multistart import MultistartResult, find_gains
+from tuning.gains.objective import SCALE
 from tuning.gains.rounds import Start
+from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import TuneTask, alike, build_task
 from tuning.gains.transfer import Tuned, carry_over, nearest
-from tuning.gains.validation import Validation
+from tuning.gains.validation import Validation, build_validation, split_nominal
 from tuning.optimisation.sensitivity import sensitivity
 from tuning.statistics.bootstrap import ErrorIntervals, error_intervals
 from tuning.statistics.intervals import Estimate
@@ -28,36 +28,16 @@ from tuning.transparency.probes import probe_figures
 BLOCK = 16  # mechanisms tuned and judged together: what is done when work is interrupted is kept
 
 
-@dataclass(frozen=True)
-class TuneSettings:
-    """Numbers of scenarios to tune on (None: `tuning.gains.tasks` knows), of starts of a lot
-    (`tuning.gains.multistart`), of solver steps, of scenarios to judge on; the seed; what to minimise;
-    evaluations without derivatives at the end, for each gain; whether to search the whole box for something
-    better; points looked at before a lot of starts; a setting of the compensator that is only judged, as it
-    is; whether transparency is judged also where the objective does not weigh it."""
-
-    scenarios: int | None = None
-    starts: int = 4
-    steps: int = 25
-    validation: int = 511
-    seed: int = 0
-    objective: Objective = RMS
-    polish: int = 160
-    global_search: bool = False
-    scanned: int = SCANNED
-    setting: str | None = None
-    judge_transparency: bool = False
-
-    @property
-    def probed(self) -> bool:
-        """Whether scenarios come with the copies of `tuning.transparency.probes`."""
-        return self.judge_transparency or self.objective.transparency_weight > 0
-
-
 class ErrorFigures(NamedTuple):
-    """Over all contacts of a batch: rms, 99th percentile and maximum of |e - e*|, mean of e - e*; share of
-    contacts that diverge (e > e*); largest |F_c| over the reference's peak; root of the mean square of the
-    chatter (`jaxhil.simulation.evaluation.Outcome`); contacts that did not end."""
+    """What is said of the restitution errors e - e* of all contacts of a batch.
+
+    rms, p99, max: root mean square, 99th percentile and maximum of |e - e*| [1].
+    mean: of e - e* [1].
+    diverging: share of contacts with e > e* [1].
+    peak_ratio: largest |F_c| over the reference's peak force [1].
+    chatter: root mean square of the chatter [1] (`jaxhil.simulation.evaluation.Outcome`).
+    failed: contacts that did not end.
+    """
 
     rms: float
     p99: float
@@ -70,8 +50,11 @@ class ErrorFigures(NamedTuple):
 
 
 class Freedom(NamedTuple):
-    """How far a gain may move, as a share of its range, before the loss rises by a hundredth: the others
-    held, and the others moved along."""
+    """How far a gain may move before the loss rises by a hundredth, as a share of its range.
+
+    alone: the others held.
+    together: the others moved along, at their best.
+    """
 
     alone: float
     together: float
@@ -79,12 +62,22 @@ class Freedom(NamedTuple):
 
 @dataclass(frozen=True)
 class TuneResult:
-    """What tuning found: gains (all of the compensator's), the literature's; figures of "before" (no
-    compensation), "literature" and "tuned" on the same fresh scenarios, and of their nominal run; every
-    start; outcomes and scenarios for plots; seconds spent; 95 % confidence intervals of the tuned figures; of
-    each tuned gain how far it may move (`tuning.optimisation.sensitivity`); how far from the best anywhere,
-    if asked for; what the last of the starts took their gains from; where transparency counts, transparency,
-    slope and peak of each on the fresh scenarios (`tuning.transparency.probes`)."""
+    """What tuning found for one mechanism; "before" is no compensation.
+
+    compensator, mechanism, settings: what was tuned, for what, and how.
+    gains, literature: all of the compensator's gains, as tuned and by the literature's rule.
+    figures: of "before", "literature" and "tuned" on the same fresh scenarios.
+    nominal: the same figures of the nominal run.
+    starts: every start of the solver.
+    outcomes, scenarios: on the fresh scenarios, for plots.
+    timings: seconds by stage.
+    intervals: 95 % intervals of the tuned figures.
+    first: what the last starts of the first batch took their gains from.
+    freedom: how far each tuned gain may move (`tuning.optimisation.sensitivity`).
+    global_comparison: how far from the best anywhere, if that was searched.
+    transparency: transparency, slope and peak of each on the fresh scenarios, where they are probed
+        (`tuning.transparency.probes`).
+    """
 
     compensator: str
     mechanism: Mechanism
@@ -131,7 +124,7 @@ def tune_all(
 
     The gains of the nearest of those `tuned` before, with the same compensator, are a start for each, and so
     are those of the nearest that an earlier block found: in the places of the last other starts, never of the
-    literature's. Unlike mechanisms of one `form` are tuned together in it.
+    literature's. Unlike mechanisms of one `common` program are tuned together in it.
     """
     tasks = [
         build_task(
@@ -146,105 +139,100 @@ def tune_all(
             sources = [known for known in (tuned, found) if known]
             sources = sources[: max(settings.starts - 1, 1 if tuned else 0)]
             near = [[nearest(mechanisms[i], known) for known in sources] for i in block]
-            results = _tune_block([tasks[index] for index in block], settings, report, near)
+            results = tune_block([tasks[index] for index in block], settings, report, near)
             found.extend(Tuned(one.mechanism, one.gains, one.mechanism.name) for one in results)
             yield from zip(block, results, strict=True)
 
 
-def _tune_block(
+def tune_block(
     tasks: list[TuneTask],
     settings: TuneSettings,
     report: Callable[[str], None],
     near: list[list[Tuned]],
 ) -> list[TuneResult]:
-    clock = _Clock()
-    name = tasks[0].mechanism.name if len(tasks) == 1 else f"{len(tasks)} mechanisms"
-    compensator = tasks[0].compensator
-    validation = Validation(tasks, settings.validation, settings.seed)
-    found = [MultistartResult(None, [], 0) for _ in tasks]
-    if settings.setting is None and any(task.tuned for task in tasks):
-        number = tasks[0].number
-        report(f"{name}: tuning {compensator} on {number} scenarios each")
-        first = [
-            [carry_over(compensator, one.gains, one.mechanism, task.mechanism) for one in own]
-            for task, own in zip(tasks, near, strict=True)
-        ]
-        found = find_gains(
-            validation,
-            settings.starts,
-            settings.steps,
-            settings.polish,
-            settings.seed,
-            settings.objective,
-            first,
-            lambda text: report(f"{name}: {text}"),
-            settings.scanned,
-        )
-    best = [one.best.gains if one.best else task.literature for one, task in zip(found, tasks, strict=True)]
+    clock, validation = _Clock(), build_validation(tasks, settings.validation, settings.seed)
+
+    def say(text: str) -> None:
+        report(f"{block_name(tasks)}: {text}")
+
+    found = _search(validation, settings, near, say)
     clock.lap("tune")
-    report(f"{name}: judging on {settings.validation} fresh scenarios")
-    plain = [uncompensated(compensator, task.literature) for task in tasks]
-    judged = {
-        "before": validation.judge_probed([gains for _, gains in plain], plain[0][0]),
-        "literature": validation.judge_probed([task.literature for task in tasks]),
-        "tuned": validation.judge_probed(best),
-    }
-    outcomes = {key: [own for own, _ in every] for key, every in judged.items()}
+    say(f"judging on {settings.validation} fresh scenarios")
+    best = [one.best.gains if one.best else task.literature for one, task in zip(found, tasks, strict=True)]
+    judged = _judge(validation, best)
     clock.lap("judge")
     comparisons: list[GlobalComparison | None] = [None for _ in tasks]
     if settings.global_search and settings.setting is None:
-        comparisons = _compare_with_global_search(
-            validation, settings, found, lambda text: report(f"{name}: {text}")
-        )
+        for i, one in enumerate(found):
+            say(f"searching everywhere, {i + 1} of {len(found)}")
+            comparisons[i] = compare_with_global_search(validation, i, one, settings)
         clock.lap("certify")
     results = []
     for i, task in enumerate(tasks):
-        own = {key: every[i] for key, every in outcomes.items()}
-        fresh = {key: jax.tree.map(lambda leaf: leaf[..., :-1], one) for key, one in own.items()}
-        nominal = {key: jax.tree.map(lambda leaf: leaf[..., -1:], one) for key, one in own.items()}
-        results.append(
-            TuneResult(
-                compensator=compensator,
-                mechanism=task.mechanism,
-                gains=best[i],
-                literature=task.literature,
-                figures={key: figures(outcome) for key, outcome in fresh.items()},
-                nominal={key: figures(outcome) for key, outcome in nominal.items()},
-                starts=found[i].starts,
-                outcomes=fresh,
-                scenarios=validation.fresh[i],
-                settings=settings,
-                timings=clock.laps,
-                intervals=error_intervals(fresh["tuned"].error, fresh["tuned"].good),
-                first=tuple(near[i]),
-                freedom=_freedom(task, validation.names, found[i].best),
-                global_comparison=comparisons[i],
-                transparency=_transparency(
-                    validation, i, {key: every[i][1] for key, every in judged.items()}
-                ),
-            )
+        split = {key: split_nominal(every[i][0]) for key, every in judged.items()}
+        fresh = {key: outcome for key, (outcome, _) in split.items()}
+        result = TuneResult(
+            compensator=task.compensator,
+            mechanism=task.mechanism,
+            gains=best[i],
+            literature=task.literature,
+            figures={key: figures(outcome) for key, outcome in fresh.items()},
+            nominal={key: figures(nominal) for key, (_, nominal) in split.items()},
+            starts=found[i].starts,
+            outcomes=fresh,
+            scenarios=validation.fresh[i],
+            settings=settings,
+            timings=clock.laps,
+            intervals=error_intervals(fresh["tuned"].error, fresh["tuned"].good),
+            first=tuple(near[i]),
+            freedom=_freedom(task, validation.names, found[i].best),
+            global_comparison=comparisons[i],
+            transparency=_transparency(validation, i, {key: every[i][1] for key, every in judged.items()}),
         )
+        results.append(result)
     return results
 
 
-def _compare_with_global_search(
-    validation: Validation, settings: TuneSettings, found: list[MultistartResult], report
-) -> list[GlobalComparison | None]:
-    comparisons = []
-    for i, one in enumerate(found):
-        report(f"searching everywhere, {i + 1} of {len(found)}")
-        comparisons.append(compare_with_global_search(validation, i, one, settings.objective, settings.seed))
-    return comparisons
+def block_name(tasks: Sequence[TuneTask]) -> str:
+    """What messages call mechanisms that are tuned together."""
+    return tasks[0].mechanism.name if len(tasks) == 1 else f"{len(tasks)} mechanisms"
+
+
+def _search(
+    validation: Validation, settings: TuneSettings, near: list[list[Tuned]], say: Callable[[str], None]
+) -> list[MultistartResult]:
+    """The best gains of every task; none where there are none to tune, or a setting is judged as it is."""
+    tasks = validation.tasks
+    if settings.setting is not None or not any(task.tuned for task in tasks):
+        return [MultistartResult(None, [], 0) for _ in tasks]
+    compensator = tasks[0].compensator
+    say(f"tuning {compensator} on {tasks[0].number} scenarios each")
+    first = [
+        [carry_over(compensator, one.gains, one.mechanism, task.mechanism) for one in own]
+        for task, own in zip(tasks, near, strict=True)
+    ]
+    return find_gains(validation, settings, first, say)
+
+
+def _judge(validation: Validation, best: list[dict[str, float]]) -> dict[str, list]:
+    """What `Validation.judge` says of no compensation, of the literature's gains and of the `best`."""
+    literature = [task.literature for task in validation.tasks]
+    plain = [uncompensated(validation.tasks[0].compensator, gains) for gains in literature]
+    return {
+        "before": validation.judge([gains for _, gains in plain], plain[0][0]),
+        "literature": validation.judge(literature),
+        "tuned": validation.judge(best),
+    }
 
 
 def _transparency(
-    validation: Validation, task: int, copies: Mapping[str, Outcome | None]
+    validation: Validation, task: int, outcomes: Mapping[str, Outcome | None]
 ) -> dict[str, dict[str, Estimate]]:
-    """Of a task under several gains, where its scenarios have copies."""
+    """Of a task under several gains, where its scenarios have probes."""
     probed = validation.probed[task]
     if probed is None:
         return {}
-    return {key: probe_figures(probed, own) for key, own in copies.items() if own is not None}
+    return {key: probe_figures(probed, own) for key, own in outcomes.items() if own is not None}
 
 
 def _freedom(task: TuneTask, names: tuple[str, ...], found: Start | None) -> dict[str, Freedom]:

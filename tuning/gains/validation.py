@@ -6,6 +6,7 @@ call.
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -30,73 +31,52 @@ from tuning.transparency.probes import LANES_PER_SCENARIO, ProbedScenarios, are_
 VALIDATION_SEED = 0x5EED
 
 
+@dataclass(frozen=True)
 class Validation:
-    """Like tasks with fresh scenarios, and the nominal run of each as one more lane of its own.
+    """Like tasks with fresh scenarios, ready to be evaluated under any gains; see `build_validation`.
 
-    fresh: (tasks) scenarios of each; probed: the same with their copies, where the tasks are probed, as all
-    are or none; names, bounds: of the gains that are tuned for any of the tasks.
+    tasks: the tasks, whose scenarios are those of training.
+    fresh: fresh scenarios of each.
+    probed: the same with their transparency probes; None of each where the tasks are not probed.
+    loop: that of all tasks.
+    names: of the gains that are tuned for any of the tasks.
+    bounds: of those gains, of each task.
+    judged: fresh scenarios of all tasks side by side, with probes if any, after each task's its nominal run.
+    training: training scenarios, (tasks, ..., scenarios).
+    lanes: of `judged` that belong to a task.
     """
 
-    def __init__(self, tasks: list[TuneTask], validation: int, seed: int):
-        seed = seed + VALIDATION_SEED
-        self.tasks = tasks
-        self.fresh: list[Scenario] = []
-        self.probed: list[ProbedScenarios | None] = []
-        every, loops = [], []
-        for task in tasks:
-            drawn = draw(task.mechanism, validation, seed)
-            self.fresh.append(build_scenarios(task.mechanism, drawn, seed))
-            if task.probed:
-                probed = probed_scenarios(task.mechanism, drawn, seed)
-                nominal = probed_scenarios(task.mechanism).scenarios
-                own = join([probed.scenarios, jax.tree.map(lambda leaf: leaf[..., :1], nominal)])
-            else:
-                probed, own = None, join([self.fresh[-1], build_scenarios(task.mechanism)])
-            self.probed.append(probed)
-            if task.common is None:
-                both = join([own, task.scenarios])
-                loop = build_loop(task.mechanism, task.compensator, both, chatter=True)
-            else:
-                loop = task.common.loop(build_loop(task.mechanism, task.compensator, own, chatter=True))
-                own = task.common.scenarios(task.mechanism, own)
-            every.append(own)
-            loops.append(loop)
-        self.loop: Loop = common_loop(loops)
-        self.names = tuned_names(tasks)
-        self.bounds: list[Bounds] = [gain_bounds(task, self.names) for task in tasks]
-        self._scenarios: Scenario = join(every)
-        self._training: Any = jax.tree.map(
-            lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]),
-            *[task.scenarios for task in tasks],
-        )
-        self._probed = tasks[0].probed
-        self._each = validation * (LANES_PER_SCENARIO if self._probed else 1) + 1
-        self._lanes = self._each * len(tasks)
+    tasks: list[TuneTask]
+    fresh: list[Scenario]
+    probed: list[ProbedScenarios | None]
+    loop: Loop
+    names: tuple[str, ...]
+    bounds: list[Bounds]
+    judged: Scenario
+    training: Any
+    lanes: int
 
-    def judge(self, gains: list[dict[str, float]]) -> list[Outcome]:
-        """Outcome on the fresh scenarios of every task under its gains, the nominal run last."""
-        return [plain for plain, _ in self.judge_probed(gains)]
-
-    def judge_probed(
+    def judge(
         self, gains: list[dict[str, float]], compensator: str | None = None
     ) -> list[tuple[Outcome, Outcome | None]]:
-        """What `judge` returns and, where the tasks are probed, the outcome of the fresh scenarios with their
-        copies, (slots, scenarios, `LANES_PER_SCENARIO`); of another `compensator` than that of the tasks, if
-        one is given."""
+        """Of every task under its gains: outcome on fresh scenarios, the nominal run last; where tasks are
+        probed, outcome (slots, scenarios, `LANES_PER_SCENARIO`) of the fresh scenarios with their probes.
+        Of another `compensator` than that of the tasks, if one is given."""
         loop = self.loop
         if compensator is not None:
             loop = dataclasses.replace(loop, compensator=COMPENSATORS[compensator])
-        every = cut(evaluate(loop, self._values(gains), self._scenarios), self._each)
-        if not self._probed:
+        values = {name: np.repeat([one[name] for one in gains], self.lanes) for name in gains[0]}
+        every = cut(evaluate(loop, values, self.judged), self.lanes)
+        if not self.tasks[0].probed:
             return [(own, None) for own in every]
 
         def plain(leaf):
             return np.concatenate([leaf[..., :-1:LANES_PER_SCENARIO], leaf[..., -1:]], axis=-1)
 
-        def copies(leaf):
+        def with_probes(leaf):
             return leaf[..., :-1].reshape(*leaf.shape[:-1], -1, LANES_PER_SCENARIO)
 
-        return [(jax.tree.map(plain, own), jax.tree.map(copies, own)) for own in every]
+        return [(jax.tree.map(plain, own), jax.tree.map(with_probes, own)) for own in every]
 
     def losses(
         self,
@@ -107,16 +87,16 @@ class Validation:
         lanes: int = 0,
     ) -> Float[np.ndarray, "which points"]:
         """`objective_value` of points of the unit box on the training scenarios of the tasks `which`, or on
-        the first so many `scenarios` of each, copies counted; the objective is that of all tasks, or one of
+        the first so many `scenarios` of each, probes counted; the objective is that of all tasks, or one of
         each. At least so many `lanes` are computed at a time."""
         objectives = one_each(objective, len(self.tasks))
         noise = any(objectives[task].noise_weight > 0 for task in which)
-        number = self._training.velocity.shape[-1]
+        number = self.training.velocity.shape[-1]
         number = min(scenarios or number, number)
         points = coordinates.shape[1]
         pairs = [(i, point) for i in range(len(which)) for point in range(points)]
         found = np.empty((len(which), points))
-        lanes = max(lanes, self._lanes)
+        lanes = max(lanes, self.lanes * len(self.tasks))
         at_once = max(1, lanes // number)
         parts = [pairs[begin : begin + at_once] for begin in range(0, len(pairs), at_once)]
         # A part is prepared, and another one looked through, while one between them runs.
@@ -126,14 +106,14 @@ class Validation:
             # (slots, pairs, scenarios)
             terms = [np.asarray(term).reshape(-1, len(some), number) for term in contact_terms(outcome)]
             wanted = outcome.wanted.reshape(terms[0].shape)
-            copies = are_probes(number) & self._probed
+            probes = are_probes(number) & self.tasks[0].probed
             for k, (i, point) in enumerate(some):
                 asked = wanted[:, k]
                 excess, chatter = (term[:, k][asked] for term in terms[1:])
-                error, probe_errors = (terms[0][:, k][asked & ones] for ones in (~copies, copies))
+                error, probe_errors = (terms[0][:, k][asked & ones] for ones in (~probes, probes))
                 own = objectives[which[i]]
-                probe_errors = probe_errors if self._probed else None
-                found[i, point] = objective_value(own, error, excess, amplification[k], chatter, probe_errors)
+                of_probes = probe_errors if self.tasks[0].probed else None
+                found[i, point] = objective_value(own, error, excess, amplification[k], chatter, of_probes)
         return found
 
     def _begin(
@@ -148,7 +128,7 @@ class Validation:
             picked = np.moveaxis(leaf[index][..., :number], 0, -2)
             return picked.reshape(*picked.shape[:-2], picked.shape[-2] * picked.shape[-1])
 
-        scenarios = jax.tree.map(side_by_side, self._training)
+        scenarios = jax.tree.map(side_by_side, self.training)
         ended = begin_evaluation(self.loop, values, scenarios, at_least=lanes)
         if not noise:
             return lambda: (ended(), np.ones(len(some)))
@@ -162,5 +142,49 @@ class Validation:
         """All of the compensator's gains at a point of the unit box."""
         return gains_at(self.tasks[task], self.names, self.bounds[task], coordinates)
 
-    def _values(self, gains: list[dict[str, float]]) -> dict[str, Any]:
-        return {name: np.repeat([one[name] for one in gains], self._each) for name in gains[0]}
+
+def build_validation(tasks: list[TuneTask], scenarios: int, seed: int) -> Validation:
+    """So many fresh scenarios of each of the tasks, which are alike (`tuning.gains.tasks.alike`)."""
+    drawn = [_fresh(task, scenarios, seed + VALIDATION_SEED) for task in tasks]
+    fresh, probed, judged, loops = (list(each) for each in zip(*drawn, strict=True))
+    names = tuned_names(tasks)
+    return Validation(
+        tasks=tasks,
+        fresh=fresh,
+        probed=probed,
+        loop=common_loop(loops),
+        names=names,
+        bounds=[gain_bounds(task, names) for task in tasks],
+        judged=join(judged),
+        training=jax.tree.map(
+            lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]),
+            *[task.scenarios for task in tasks],
+        ),
+        lanes=scenarios * (LANES_PER_SCENARIO if tasks[0].probed else 1) + 1,
+    )
+
+
+def split_nominal(outcome: Outcome) -> tuple[Any, Any]:
+    """What `Validation.judge` gives, as outcome of the fresh scenarios and of the nominal run."""
+    fresh, nominal = (
+        jax.tree.map(lambda leaf, part=part: leaf[..., part], outcome)
+        for part in (slice(-1), slice(-1, None))
+    )
+    return fresh, nominal
+
+
+def _fresh(task: TuneTask, number: int, seed: int) -> tuple[Scenario, ProbedScenarios | None, Scenario, Loop]:
+    """Fresh scenarios of a task, the same with their probes, what is judged of it, its loop."""
+    drawn = draw(task.mechanism, number, seed)
+    fresh, probed = build_scenarios(task.mechanism, drawn, seed), None
+    if task.probed:
+        probed = probed_scenarios(task.mechanism, drawn, seed)
+        nominal = probed_scenarios(task.mechanism).scenarios
+        judged = join([probed.scenarios, jax.tree.map(lambda leaf: leaf[..., :1], nominal)])
+    else:
+        judged = join([fresh, build_scenarios(task.mechanism)])
+    if task.common is None:
+        both = join([judged, task.scenarios])
+        return fresh, probed, judged, build_loop(task.mechanism, task.compensator, both, chatter=True)
+    loop = task.common.loop(build_loop(task.mechanism, task.compensator, judged, chatter=True))
+    return fresh, probed, task.common.scenarios(task.mechanism, judged), loop

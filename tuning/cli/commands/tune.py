@@ -127,7 +127,8 @@ def _tune_all(
     options: Tune, loaded: list[LoadedMechanism], problems: list[str], known: list[Any]
 ) -> list[dict[str, Any]]:
     prepare()
-    from tuning.gains.tune import TuneSettings, tune_all
+    from tuning.gains.settings import TuneSettings
+    from tuning.gains.tune import tune_all
 
     settings = TuneSettings(
         options.scenarios,

@@ -22,7 +22,7 @@ def check(options: Tune) -> None:
     if number < 2:
         raise InputError(f"--pareto: found {number}, allowed 0 or an integer >= 2")
     prepare()
-    from tuning.gains.pareto import AXES
+    from tuning.gains.pareto_search import AXES
 
     if options.pareto_against is not None:
         checks.one_of(tuple(AXES), **{"pareto-against": options.pareto_against})
@@ -35,7 +35,7 @@ def check(options: Tune) -> None:
 
 def axis_of(options: Tune) -> Any:
     """What the error is traded against (`tuning.gains.pareto.Axis`); None: nothing."""
-    from tuning.gains.pareto import AXES, NOISE, default_axis, has_trade_off
+    from tuning.gains.pareto_search import AXES, NOISE, default_axis, has_trade_off
 
     if options.pareto_against is None:
         return default_axis(options.compensator)

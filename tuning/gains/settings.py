@@ -1,0 +1,40 @@
+"""What a tuning run is asked to do: how many scenarios, starts and steps, and what to minimise."""
+
+from dataclasses import dataclass
+
+from tuning.gains.objective import RMS, Objective
+
+
+@dataclass(frozen=True)
+class TuneSettings:
+    """Settings of `tuning.gains.tune`, the same for all mechanisms of a run.
+
+    scenarios: how many to tune on; None: 32, or 128 with sensor noise (`tuning.gains.tasks`).
+    starts: points that the solver starts from, in every batch of starts (`tuning.gains.multistart`).
+    steps: most solver steps from each start.
+    validation: fresh scenarios to judge the gains on.
+    seed: of scenarios and starts.
+    objective: what to minimise.
+    polish: evaluations without derivatives at the end, for each gain.
+    global_search: whether to search the gains' whole ranges as well, and say how much better they can be.
+    scanned: points of a scan, the best of which become starts.
+    setting: name of the compensator's gains that are judged as they are, in the place of tuning.
+    judge_transparency: whether to judge transparency even where the objective does not weigh it.
+    """
+
+    scenarios: int | None = None
+    starts: int = 4
+    steps: int = 25
+    validation: int = 511
+    seed: int = 0
+    objective: Objective = RMS
+    polish: int = 160
+    global_search: bool = False
+    scanned: int = 256
+    setting: str | None = None
+    judge_transparency: bool = False
+
+    @property
+    def probed(self) -> bool:
+        """Whether every scenario comes with its transparency probes (`tuning.transparency.probes`)."""
+        return self.judge_transparency or self.objective.transparency_weight > 0
