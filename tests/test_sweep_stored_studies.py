@@ -5,7 +5,6 @@ import math
 import os
 import resource
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -16,28 +15,19 @@ from jaxhil.errors import InputError
 from jaxhil.runtime import digest
 from tuning.statistics.subset_simulation import SubsetSimulation
 from tuning.sweeps.chunks import build_sweep
-from tuning.sweeps.store import Store, open_store
+from tuning.sweeps.store import Store, open_store, write_verdict
 from tuning.sweeps.stored_studies import (
-    IndicesStudy,
-    RareStudy,
+    IndicesRequest,
+    RareRequest,
     decode,
     encode,
-    indices_of,
-    indices_path,
-    indices_study,
-    rare_of,
-    rare_path,
-    rare_study,
-    read_indices,
-    read_rare,
-    write_indices,
-    write_rare,
-    write_verdict,
+    read_study,
+    study_path,
+    write_study,
 )
 from tuning.sweeps.studies import ErrorIndices, InputIndices, error_indices, rare_failure
 
 MANIFEST = manifest(limit=1.5)
-KINDS = (IndicesStudy, RareStudy)
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 COUNTS = st.integers(0, 2**40)
 
@@ -82,7 +72,8 @@ SOME_RARE = SubsetSimulation(
     1e-5, 0.0, 2e-5, math.inf, 0.25, np.array([0.0, 2e-5]), np.array([math.inf, 0.25]),
     np.array([[0.5, 0.25], [math.nan, 1.5]]), 4000, np.ones((2, 3)), np.array([math.inf, 2.0]),
 )  # fmt: skip
-STUDIES = (indices_study(MANIFEST, 128, SOME_DRIVERS), rare_study(MANIFEST, 1.5, 1000, 2, SOME_RARE))
+REQUESTS = IndicesRequest(128), RareRequest(1.5, replicates=2)
+STUDIES = tuple(zip(REQUESTS, (SOME_DRIVERS, SOME_RARE), strict=True))
 
 
 @pytest.fixture
@@ -101,27 +92,29 @@ def unwritten(*words):
 
 @given(drivers())
 def test_drivers_are_read_as_they_were_written(found):
-    study = decode(encode(indices_study(MANIFEST, 128, found)), IndicesStudy)
-    assert study is not None and same(indices_of(study), found)
+    request = IndicesRequest(128)
+    assert same(decode(MANIFEST, request, encode(MANIFEST, request, found)), found)
 
 
 @given(RARE)
 def test_rare_failures_are_read_as_they_were_written(found):
-    study = decode(encode(rare_study(MANIFEST, 1.5, 1000, REPLICATES, found)), RareStudy)
-    assert study is not None and same(rare_of(study), found)
+    request = RareRequest(1.5, replicates=REPLICATES)
+    assert same(decode(MANIFEST, request, encode(MANIFEST, request, found)), found)
 
 
-@given(st.sampled_from(KINDS), st.binary(max_size=300))
-def test_any_bytes_are_no_study(kind, content):
-    assert decode(content, kind) is None
+@given(st.sampled_from(REQUESTS), st.binary(max_size=300))
+def test_any_bytes_are_no_study(request, content):
+    assert decode(MANIFEST, request, content) is None
 
 
 @given(st.sampled_from(STUDIES), st.data())
 @settings(max_examples=400)
 def test_no_bit_of_a_study_can_change_unseen(study, data):
-    content = bytearray(encode(study))
+    request, found = study
+    content = bytearray(encode(MANIFEST, request, found))
     content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
-    assert decode(bytes(content), type(study)) in (None, study)
+    read = decode(MANIFEST, request, bytes(content))
+    assert read is None or same(read, found)
 
 
 JSON = st.recursive(
@@ -134,41 +127,42 @@ JSON = st.recursive(
 @given(st.sampled_from(STUDIES), st.data())
 @settings(max_examples=300)
 def test_what_is_signed_is_read_as_it_says_or_not_at_all(study, data):
-    document = json.loads(encode(study))
+    """Also where types or shapes are others: that is no result, and no crash."""
+    request, found = study
+    document = json.loads(encode(MANIFEST, request, found))
     place = data.draw(st.sampled_from([document, document["result"]]))
     place[data.draw(st.sampled_from([*place, "more"]))] = data.draw(JSON)
     document["sha256"] = digest(document)
-    found = decode(json.dumps(document).encode(), type(study))
-    if found is not None:
-        assert msgspec.to_builtins(found) == document
-        # Arrays that do not fit together are no result, and no crash.
-        result = indices_of(found) if isinstance(found, IndicesStudy) else rare_of(found)
-        assert result is None or len(result) == len(msgspec.to_builtins(found.result))
+    read = decode(MANIFEST, request, json.dumps(document).encode())
+    if read is not None:
+        again = json.loads(encode(MANIFEST, request, read))
+        # Another digest, where 1 was said for 1.0.
+        assert {**again, "sha256": document["sha256"]} == document
 
 
 def test_what_json_cannot_express_is_not_written(store):
     # Where no nan can be, there is no sign for it.
     with unwritten("drivers-2.json: ", "JSON"):
-        write_indices(store, 2, SOME_DRIVERS._replace(cap=math.nan))
+        write_study(store, IndicesRequest(2), SOME_DRIVERS._replace(cap=math.nan))
     with unwritten("rare-1.5-10x1000.json: ", "JSON"):
-        write_rare(store, 1.5, SOME_RARE._replace(coefficient_of_variation=math.nan))
+        write_study(store, RareRequest(1.5), SOME_RARE._replace(coefficient_of_variation=math.nan))
     assert not (store.folder / "studies").exists()
 
 
 def test_what_is_kept_is_what_would_be_found_again(store, sweep):
     first, again = (error_indices(sweep, 8) for _ in range(2))
-    write_indices(store, 8, first)
-    assert same(read_indices(store, 8), again)
-    content = indices_path(store, 8).read_bytes()
-    write_indices(store, 8, again)
-    assert indices_path(store, 8).read_bytes() == content
+    write_study(store, IndicesRequest(8), first)
+    assert same(read_study(store, IndicesRequest(8)), again)
+    content = study_path(store, IndicesRequest(8)).read_bytes()
+    write_study(store, IndicesRequest(8), again)
+    assert study_path(store, IndicesRequest(8)).read_bytes() == content
 
     first, again = (rare_failure(sweep, 2.0, samples=20, replicates=2) for _ in range(2))
-    write_rare(store, 2.0, first, 20, 2)
-    assert same(read_rare(store, 2.0, 20, 2), again)
-    content = rare_path(store, 2.0, 20, 2).read_bytes()
-    write_rare(store, 2.0, again, 20, 2)
-    assert rare_path(store, 2.0, 20, 2).read_bytes() == content
+    write_study(store, RareRequest(2.0, 20, 2), first)
+    assert same(read_study(store, RareRequest(2.0, 20, 2)), again)
+    content = study_path(store, RareRequest(2.0, 20, 2)).read_bytes()
+    write_study(store, RareRequest(2.0, 20, 2), again)
+    assert study_path(store, RareRequest(2.0, 20, 2)).read_bytes() == content
 
 
 def test_where_nothing_varies_and_nothing_fails(tmp_path):
@@ -176,36 +170,48 @@ def test_where_nothing_varies_and_nothing_fails(tmp_path):
     store = open_store(tmp_path / "store", still.manifest, resume=False)
     nothing = rare_failure(still, 1e9, samples=20, replicates=2)
     assert nothing.probability == 0 and nothing.coefficient_of_variation == math.inf
-    write_rare(store, 1e9, nothing, 20, 2)
-    assert same(read_rare(store, 1e9, 20, 2), nothing)
+    write_study(store, RareRequest(1e9, 20, 2), nothing)
+    assert same(read_study(store, RareRequest(1e9, 20, 2)), nothing)
     constant = ErrorIndices((InputIndices("approach.phase", *[math.nan, 0.0, 1.0] * 2),), 15.0, 6, 0)
-    write_indices(store, 2, constant)
-    assert same(read_indices(store, 2), constant)
+    write_study(store, IndicesRequest(2), constant)
+    assert same(read_study(store, IndicesRequest(2)), constant)
 
 
 def test_only_a_study_of_the_same_arguments_and_sweep_is_taken(store):
-    write_indices(store, 128, SOME_DRIVERS)
-    write_rare(store, 1.5, SOME_RARE, replicates=2)
-    assert read_indices(store, 128) is not None and read_rare(store, 1.5, replicates=2) is not None
-    assert read_indices(store, 64) is None
-    assert read_rare(store, 1.6, replicates=2) is None
-    assert read_rare(store, 1.5, samples=500, replicates=2) is None and read_rare(store, 1.5) is None
+    write_study(store, IndicesRequest(128), SOME_DRIVERS)
+    write_study(store, RareRequest(1.5, replicates=2), SOME_RARE)
+    assert (
+        read_study(store, IndicesRequest(128)) is not None
+        and read_study(store, RareRequest(1.5, replicates=2)) is not None
+    )
+    assert read_study(store, IndicesRequest(64)) is None
+    assert read_study(store, RareRequest(1.6, replicates=2)) is None
+    assert (
+        read_study(store, RareRequest(1.5, samples=500, replicates=2)) is None
+        and read_study(store, RareRequest(1.5)) is None
+    )
     # Nor one that another file's name was given to.
-    os.replace(indices_path(store, 128), indices_path(store, 64))
-    os.replace(rare_path(store, 1.5, 1000, 2), rare_path(store, 1.6, 1000, 2))
-    assert read_indices(store, 64) is None and read_rare(store, 1.6, replicates=2) is None
+    os.replace(study_path(store, IndicesRequest(128)), study_path(store, IndicesRequest(64)))
+    os.replace(study_path(store, RareRequest(1.5, 1000, 2)), study_path(store, RareRequest(1.6, 1000, 2)))
+    assert (
+        read_study(store, IndicesRequest(64)) is None
+        and read_study(store, RareRequest(1.6, replicates=2)) is None
+    )
 
 
 @pytest.mark.parametrize("other", [manifest(limit=1.5, seed=1), manifest(limit=1.6)])
 def test_a_study_of_another_sweep_is_not_taken(store, other):
-    write_indices(Store(store.folder, other), 128, SOME_DRIVERS)
-    write_rare(Store(store.folder, other), 1.5, SOME_RARE, replicates=2)
-    assert read_indices(store, 128) is None and read_rare(store, 1.5, replicates=2) is None
+    write_study(Store(store.folder, other), IndicesRequest(128), SOME_DRIVERS)
+    write_study(Store(store.folder, other), RareRequest(1.5, replicates=2), SOME_RARE)
+    assert (
+        read_study(store, IndicesRequest(128)) is None
+        and read_study(store, RareRequest(1.5, replicates=2)) is None
+    )
 
 
 def test_a_study_says_what_it_is_of(store):
-    write_rare(store, 1.5, SOME_RARE, replicates=2)
-    found = json.loads(rare_path(store, 1.5, 1000, 2).read_bytes())
+    write_study(store, RareRequest(1.5, replicates=2), SOME_RARE)
+    found = json.loads(study_path(store, RareRequest(1.5, 1000, 2)).read_bytes())
     del found["result"]
     assert found.pop("sha256") != MANIFEST.sha256
     assert found == {
@@ -216,37 +222,37 @@ def test_a_study_says_what_it_is_of(store):
 
 @pytest.mark.parametrize("harm", ["cut", "empty", "folder", "large"])
 def test_a_damaged_study_is_none(store, harm):
-    write_indices(store, 128, SOME_DRIVERS)
-    path = indices_path(store, 128)
+    write_study(store, IndicesRequest(128), SOME_DRIVERS)
+    path = study_path(store, IndicesRequest(128))
     content = path.read_bytes()
     path.unlink()
     if harm == "folder":
         path.mkdir()
     else:
         path.write_bytes({"cut": content[:-3], "empty": b"", "large": content + b" " * 2**23}[harm])
-    assert read_indices(store, 128) is None
+    assert read_study(store, IndicesRequest(128)) is None
     if harm != "folder":
-        write_indices(store, 128, SOME_DRIVERS)
+        write_study(store, IndicesRequest(128), SOME_DRIVERS)
         assert path.read_bytes() == content
     else:
         with unwritten("drivers-128.json: ", "directory"):
-            write_indices(store, 128, SOME_DRIVERS)
+            write_study(store, IndicesRequest(128), SOME_DRIVERS)
 
 
 def test_a_full_disk_is_one_line_and_keeps_what_is_there(store):
-    write_indices(store, 128, SOME_DRIVERS)
+    write_study(store, IndicesRequest(128), SOME_DRIVERS)
     write_verdict(store, '{"verdict": "good"}\n')
-    before = indices_path(store, 128).read_bytes()
+    before = study_path(store, IndicesRequest(128)).read_bytes()
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
     try:
         with unwritten("drivers-128.json: ", ""):
-            write_indices(store, 128, SOME_DRIVERS._replace(capped=4))
+            write_study(store, IndicesRequest(128), SOME_DRIVERS._replace(capped=4))
         with unwritten("verdict.json: ", ""):
             write_verdict(store, '{"verdict": "bad"}\n')
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert indices_path(store, 128).read_bytes() == before
+    assert study_path(store, IndicesRequest(128)).read_bytes() == before
     assert (store.folder / "verdict.json").read_text() == '{"verdict": "good"}\n'
     assert {path.name for path in store.folder.rglob("*.tmp")} == set()
 
@@ -255,4 +261,4 @@ def test_a_full_disk_is_one_line_and_keeps_what_is_there(store):
 def test_a_read_only_folder_is_one_line(store):
     (store.folder / "studies").mkdir(mode=0o500)
     with unwritten("drivers-128.json: ", "Permission denied"):
-        write_indices(store, 128, SOME_DRIVERS)
+        write_study(store, IndicesRequest(128), SOME_DRIVERS)

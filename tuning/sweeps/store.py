@@ -3,7 +3,8 @@
     DIR/manifest.json
     DIR/parts/part-000000.parquet, part-000001.parquet, ...
     DIR/errors.png, failures.png, convergence.png
-    DIR/verdict.json, studies/drivers-1024.json, ... (`tuning.sweeps.stored_studies`)
+    DIR/verdict.json
+    DIR/studies/drivers-1024.json, ... (`tuning.sweeps.stored_studies`)
 
 `DIR/parts` is a Parquet dataset, for pandas, DuckDB or Arrow; units are in the fields' metadata. A part is
 there as a whole or not at all: it is written under another name, forced to disk, then renamed. It carries the
@@ -132,6 +133,13 @@ def read_part(store: Store, part: int) -> dict[str, np.ndarray] | None:
         return None
     rows = from_table(manifest, table)
     return rows if np.array_equal(rows["index"], np.arange(first, first + number)) else None
+
+
+def write_verdict(store: Store, text: str) -> None:
+    """Write the verdict, whole or not at all. Raises `InputError` when it cannot be written."""
+    path = store.folder / VERDICT
+    with writing(path):
+        write_whole(path, text.encode("ascii"))
 
 
 def remove_parts(store: Store, first: int) -> None:

@@ -66,7 +66,7 @@ def _complete(options: Sweep, store, sweep, document: dict[str, Any]) -> list[In
     """
     from tuning.sweeps.pictures import write_pictures
     from tuning.sweeps.run import compare_precisions
-    from tuning.sweeps.stored_studies import write_verdict
+    from tuning.sweeps.store import write_verdict
 
     unwritten: list[InputError] = []
 

@@ -16,31 +16,33 @@ def drivers(options: Sweep, store, sweep, unwritten: list[InputError]) -> dict[s
     """What of the document says which input drives the error. `unwritten`: see `put_off`."""
     from jaxhil.mechanism.uncertainty import dimensions
     from tuning.statistics.sobol_indices import evaluations
-    from tuning.sweeps.stored_studies import indices_path, read_indices, write_indices
+    from tuning.sweeps.stored_studies import IndicesRequest, read_study, study_path, write_study
     from tuning.sweeps.studies import error_indices
 
     number: Any = options.drivers
-    found = read_indices(store, number) if options.resume else None
+    request = IndicesRequest(number)
+    found = read_study(store, request) if options.resume else None
     if found is not None:
-        _say_kept("drivers", indices_path(store, number))
+        _say_kept("drivers", study_path(store, request))
         return found._asdict()
     # Noise, if there is any, adds an input; the bar need not know.
     with terminal.progress(evaluations(len(dimensions(sweep.mechanism)), number), "scenarios") as progress:
         found = error_indices(sweep, number, lambda more: progress.advance(more, "drivers"))
     with put_off(unwritten):
-        write_indices(store, number, found)
+        write_study(store, request, found)
     return found._asdict()
 
 
 def rare(options: Sweep, store, sweep, unwritten: list[InputError]) -> dict[str, Any]:
     """What of the document says how probable an error beyond a limit is. `unwritten`: see `put_off`."""
-    from tuning.sweeps.stored_studies import rare_path, read_rare, write_rare
+    from tuning.sweeps.stored_studies import RareRequest, read_study, study_path, write_study
     from tuning.sweeps.studies import rare_failure
 
     limit = float(options.rare or options.limit)
-    found = read_rare(store, limit) if options.resume else None
+    request = RareRequest(limit)
+    found = read_study(store, request) if options.resume else None
     if found is not None:
-        _say_kept("subset simulation", rare_path(store, limit))
+        _say_kept("subset simulation", study_path(store, request))
         return _rare_document(limit, found)
     ran = 0
     with terminal.stages(1) as stages:
@@ -54,7 +56,7 @@ def rare(options: Sweep, store, sweep, unwritten: list[InputError]) -> dict[str,
 
         found = rare_failure(sweep, limit, done)
     with put_off(unwritten):
-        write_rare(store, limit, found)
+        write_study(store, request, found)
     return _rare_document(limit, found)
 
 
