@@ -251,7 +251,8 @@ def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) ->
 
 
 def _start(start) -> dict[str, Any]:
-    return {name: value for name, value in start._asdict().items() if name not in ("shares", "curvature")}
+    hidden = "coordinates", "curvature"
+    return {name: value for name, value in start._asdict().items() if name not in hidden}
 
 
 def _carried_over(result) -> list[dict[str, Any]]:
