@@ -5,12 +5,30 @@ from math import atan2, exp, factorial, pi, sqrt
 
 import numpy as np
 import pytest
-from oracle import PhaseLead, simulate, simulator_matrices
-from scipy.integrate import solve_ivp
+from brute_force import brute_force
+from oracle import simulate
+from oracle_motion import simulator_matrices
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
 MASS, VELOCITY = 350.0, 0.005
+
+
+class PhaseLead:
+    """(1 + T1 s)/(1 + T2 s) by Tustin at period T; states start at 0."""
+
+    def __init__(self, T1, T2, T):
+        self.lead, self.lag = 2.0 * T1 / T, 2.0 * T2 / T
+        self.reset()
+
+    def reset(self):
+        self.force, self.output = 0.0, 0.0
+
+    def step(self, force_measured, x_desired, v_desired, x_measured):
+        numerator = (1.0 + self.lead) * force_measured + (1.0 - self.lead) * self.force
+        self.output = (numerator - (1.0 - self.lag) * self.output) / (1.0 + self.lag)
+        self.force = force_measured
+        return self.output
 
 
 def mechanism(T=1e-3, *, contact, simulator=None, force_delay=0.0, sensor=None, approach=None, **rig):
@@ -175,97 +193,6 @@ def test_start_is_the_steady_state_of_the_held_history(simulator, hold):
     assert offset[0] == pytest.approx(float(C @ z), rel=1e-10)
 
 
-def brute_force(case, compensator, ticks):
-    """v_d at every tick of a second-order case: method of steps, restarted at every break."""
-    rig, contact = case["rig"], case["contact"]
-    T, simulator, sensor = rig["control_period"], rig["simulator"], rig["force_sensor"]
-    latency, zoh = rig["command_latency"], rig["command_hold"] == "zoh"
-    w, zeta = 2 * pi * simulator["natural_frequency"], simulator["damping_ratio"]
-    k, b, delay = contact["stiffness"][0], contact["damping"][0], simulator["delay"]
-    x, v = -VELOCITY * (0.02 + T / 3), VELOCITY
-    history = {m: x + VELOCITY * m * T for m in range(-2000, 1)}
-
-    def law(state):
-        depth, rate = state
-        if contact["law"] == "hunt_crossley":
-            return k * max(depth, 0.0) ** 1.5 * (1 + 1.5 * b * rate)
-        return max(0.0, k * depth + b * rate) if depth > 0 else 0.0
-
-    options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-16}
-    state = np.array([0.0, 0.0])
-    time = (-300 + delay / T) * T
-    start = history[-300 + 1 - latency]
-    state[:] = start, VELOCITY  # forgotten long before t = 0
-    dense, lagged, speeds = [], 0.0, []
-
-    def events(level):
-        def event(t, y):
-            return y[0] if level == 0 else k * y[0] + b * y[1]
-
-        event.__dict__["terminal"] = True
-        return event
-
-    def move(until):
-        nonlocal time, state
-        while time < until - 1e-15:
-            j = int(np.floor((time - delay) / T + 1e-7))
-            end = min(until, (j + 1) * T + delay)
-            u1 = history[j + 1 - latency]
-            u0 = u1 if zoh else history[j - latency]
-            origin = j * T + delay
-
-            def rhs(t, y, u0=u0, u1=u1, origin=origin):
-                return [
-                    y[1],
-                    w * w * (u0 + (u1 - u0) * (t - origin) / T - y[0]) - 2 * zeta * w * y[1],
-                ]
-
-            while end - time > 1e-15:
-                found = solve_ivp(
-                    rhs,
-                    (time, end),
-                    state,
-                    events=[events(0), events(1)],
-                    dense_output=True,
-                    **options,
-                )
-                dense.append((time, found.t[-1], found.sol))
-                time, state = found.t[-1], found.y[:, -1]
-                if found.status == 1 and end - time > 1e-12:  # step off the event
-                    nudge = solve_ivp(rhs, (time, time + 1e-12), state, **options)
-                    time, state = nudge.t[-1], nudge.y[:, -1]
-            time = end
-
-    def lag(a, b, value):
-        pieces = [(s + sensor["delay"], e + sensor["delay"], f) for s, e, f in dense[-60:]]
-        for s, e, f in pieces:
-            low, high = max(s, a), min(e, b)
-            if high > low >= sensor["delay"]:
-                middle = law(f((low + high) / 2 - sensor["delay"]))
-                if middle == 0.0:
-                    value *= exp(-(high - low) / sensor["time_constant"])
-                    continue
-                value = solve_ivp(
-                    lambda t, y, f=f: (law(f(t - sensor["delay"])) - y) / sensor["time_constant"],
-                    (low, high),
-                    [value],
-                    **options,
-                ).y[0, -1]
-        return value
-
-    move(0.0)
-    for n in range(ticks):
-        if n:
-            move(n * T)
-            lagged = lag((n - 1) * T, n * T, lagged)
-        speeds.append(v)
-        command = compensator.step(lagged, x, v, state[0])
-        v -= T * command / MASS
-        x += T * v
-        history[n + 1] = x
-    return np.array(speeds)
-
-
 @pytest.mark.parametrize(
     "contact, hold, latency",
     [
@@ -292,7 +219,7 @@ def test_against_brute_force(contact, hold, latency):
     )
     result = simulate(case, PhaseLead(0.004, 0.001, T), record=True)[0]
     count = len(result["signals"]["tick"])
-    speeds = brute_force(case, PhaseLead(0.004, 0.001, T), count)
+    speeds = brute_force(case, PhaseLead(0.004, 0.001, T), count, MASS, VELOCITY)
     difference = np.abs(speeds - result["signals"]["v_desired"]).max() / VELOCITY
     assert result["status"] == "over" and result["restitution"] > 0.5
     assert difference < 1e-10

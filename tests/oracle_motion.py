@@ -1,0 +1,147 @@
+"""The oracle's motion simulator: the exact output of a linear system whose command is a constant or a ramp.
+
+Between two breakpoints of the delayed command it is kept as a Taylor polynomial to machine precision, so
+that position and velocity can be evaluated at any real time, counted in control periods ("ticks").
+"""
+
+from __future__ import annotations
+
+from math import ceil, floor
+from typing import Any
+
+import numpy as np
+from numpy.polynomial.polynomial import polyval
+from scipy.linalg import expm
+
+TIME_TOLERANCE = 1e-9  # ticks: closer than this, two times are the same
+TAYLOR_ORDER = 24
+
+
+def delay_in_ticks(delay, period):
+    """A delay in ticks; an integer number of them to within 1e-9 is exactly that integer."""
+    ticks = delay / period
+    return float(round(ticks)) if abs(ticks - round(ticks)) <= TIME_TOLERANCE else ticks
+
+
+def simulator_matrices(simulator) -> Any:
+    """(A, B, C) of G(s), or None for the ideal simulator; states scaled by the fastest pole."""
+    model = simulator["model"]
+    if model == "ideal":
+        return None
+    if model == "first_order":
+        numerator, denominator = [1.0], [simulator["time_constant"], 1.0]
+    elif model == "second_order":
+        omega, zeta = 2.0 * np.pi * simulator["natural_frequency"], simulator["damping_ratio"]
+        numerator, denominator = [1.0], [1.0 / omega**2, 2.0 * zeta / omega, 1.0]
+    elif model == "third_order":
+        a1, a2, a3 = simulator["coefficients"]
+        numerator, denominator = [1.0], [a3, a2, a1, 1.0]
+    elif model == "transfer_function":
+        numerator, denominator = simulator["numerator"], simulator["denominator"]
+    else:
+        raise ValueError(f"unknown simulator model {model!r}")
+    numerator = np.trim_zeros(np.asarray(numerator, float), "f")
+    denominator = np.trim_zeros(np.asarray(denominator, float), "f")
+    poles = np.roots(denominator)
+    if len(numerator) >= len(denominator) or np.any(poles.real >= 0.0):
+        raise ValueError("the simulator must be strictly proper and stable")
+    if abs(numerator[-1] / denominator[-1] - 1.0) > 1e-9:
+        raise ValueError("the simulator must have G(0) = 1")
+    fastest, order = np.abs(poles).max(), len(denominator) - 1
+    scaled = denominator * fastest ** np.arange(order, -1.0, -1.0)
+    A = np.diag(np.ones(order - 1), 1)
+    A[-1] = -scaled[:0:-1] / scaled[0]
+    B = np.zeros(order)
+    B[-1] = 1.0
+    C = np.zeros(order)
+    C[: len(numerator)] = (numerator * fastest ** np.arange(len(numerator) - 1, -1.0, -1.0))[::-1]
+    return fastest * A, fastest * B, C / scaled[0]
+
+
+class Motion:
+    """x_a(t) as polynomials: command c(m) -> latency, hold -> u(t) -> transport delay, G(s)."""
+
+    def __init__(self, rig, period, position, velocity, history):
+        """Command `position`, `velocity` at t = 0, uniform before; kept `history` ticks back."""
+        simulator = rig["simulator"]
+        self.period, self.velocity = period, velocity
+        self.latency = int(rig.get("command_latency", 0))
+        self.hold = rig.get("command_hold", "linear")
+        if self.latency not in (0, 1) or self.hold not in ("linear", "zoh"):
+            raise ValueError("command_latency is 0 or 1, command_hold linear or zoh")
+        self.delay = delay_in_ticks(simulator.get("delay", 0.0), period)
+        self.matrices = simulator_matrices(simulator)
+        self.position = position
+        self.commands: list[float] = [position]
+        self.first = -ceil(self.delay + history) - 3
+        self.substeps = 1
+        if self.matrices is not None:
+            A, B, _ = self.matrices
+            self.substeps = max(1, ceil(2.0 * np.linalg.norm(A, 2) * period))
+            gain: Any = -np.linalg.solve(A, B)
+            if self.hold == "linear":
+                start = self._command(self.first - self.latency)
+                self.state = gain * start + np.linalg.solve(A, gain) * velocity
+            else:
+                # z = gain U - w with z(t + T) = z(t) + gain v T over every step of the staircase.
+                start = self._command(self.first + 1 - self.latency)
+                steps = gain * velocity * period
+                transition = expm(A * period)
+                self.state = gain * start - np.linalg.solve(np.eye(len(B)) - transition, steps)
+        self.intervals = []
+
+    def append(self, command):
+        self.commands.append(command)
+
+    def _command(self, m) -> float:
+        if m >= 0:
+            return self.commands[m]
+        return self.position + self.velocity * m * self.period
+
+    def segment(self, j, i):
+        """Taylor coefficients of x_a on substep i of the interval from j + delay, theta = 0..1."""
+        while self.first + len(self.intervals) <= j:
+            self.intervals.append(self._solve(self.first + len(self.intervals)))
+        return self.intervals[j - self.first][i]
+
+    def _solve(self, j):
+        end = self._command(j + 1 - self.latency)
+        start = self._command(j - self.latency) if self.hold == "linear" else end
+        if self.matrices is None:
+            return [np.array([start, end - start])]
+        A, B, C = self.matrices
+        length, polynomials = self.period / self.substeps, []
+        for i in range(self.substeps):
+            ramp = (end - start) / self.substeps
+            drive = [start + ramp * i, ramp] + [0.0] * TAYLOR_ORDER
+            states = [self.state]
+            for k in range(TAYLOR_ORDER):
+                states.append(length * (A @ states[-1] + B * drive[k]) / (k + 1))
+            polynomials.append(np.array([C @ z for z in states]))
+            self.state = np.sum(states[::-1], axis=0)
+        return polynomials
+
+    def locate_left(self, time):
+        """(j, i, theta) of a time as the end of what came before it: theta in (0, 1]."""
+        scaled = (time - self.delay) * self.substeps
+        q = ceil(scaled - TIME_TOLERANCE * self.substeps) - 1
+        j = q // self.substeps
+        return j, q - j * self.substeps, min(scaled - q, 1.0)
+
+    def at_left(self, time):
+        j, i, theta = self.locate_left(time)
+        return float(polyval(theta, self.segment(j, i)))
+
+    def segments_between(self, start, end):
+        """(polynomial, origin, theta_a, theta_b) covering (start, end], in order."""
+        q = floor((start - self.delay) * self.substeps + TIME_TOLERANCE)
+        while True:
+            origin = self.delay + q / self.substeps
+            theta_a = max(0.0, (start - origin) * self.substeps)
+            theta_b = min(1.0, (end - origin) * self.substeps)
+            if theta_b <= TIME_TOLERANCE:
+                return
+            j = q // self.substeps
+            if theta_b > theta_a:
+                yield self.segment(j, q - j * self.substeps), origin, theta_a, theta_b
+            q += 1
