@@ -27,7 +27,7 @@ from tuning.batches import join
 pytestmark = pytest.mark.benchmark
 LANES = 8192
 REPEATS = 12
-# Bars, of what the C++ loop does, by the kind of processor. With vectors of 512 bits (AVX-512) its loop without
+# Bars beside the C++ loop, by the kind of processor. With vectors of 512 bits (AVX-512) that loop without
 # a law takes twice as many lanes at a time as the code of XLA, which uses 256 bits: on a quiet AMD EPYC the
 # rollout makes 0.44 of its lane-steps/s, and that its lanes end early makes up for a part of that only.
 PROCESSOR = Path("/proc/cpuinfo")
