@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from cases import SECOND_ORDER, mechanism, nominal_gains, validated
+from limited_replay import limited_controller, replay_lane
 from sweep_cases import NOISY, UNCERTAIN, case
 from sweep_cases import manifest as sweep_manifest
 
@@ -26,7 +27,6 @@ from tuning.watchdog.calibration import calibrate, guard_limits, watchdog_rules
 from tuning.watchdog.expectation import TERMS, Expectation, Features, expected_restitution, fit_expectation
 from tuning.watchdog.extent import extent_of
 from tuning.watchdog.recorded import Scenarios, Signals, recorded_chunks
-from tuning.watchdog.replayed import limited_controller, replay_lane
 
 DAMPING = {"contact.damping": {"distribution": "loguniform", "factor": [0.5, 2.0]}}
 LIMIT = 0.02

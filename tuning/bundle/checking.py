@@ -12,7 +12,11 @@ LONGEST = 600.0  # s
 
 
 class Checked(NamedTuple):
-    """What the self-test printed, and why the bundle is bad; no reasons if it is good."""
+    """The verdict on a bundle.
+
+    lines: what its self-test printed.
+    reasons: why it is bad; none if it is good.
+    """
 
     lines: list[str]
     reasons: list[str]

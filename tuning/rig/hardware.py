@@ -1,5 +1,6 @@
 """The rig's side of the loop: what it sends at every tick, and what it does with the answers.
 
+It stands for the drives, the contact and the sensors of a rig, in the rig's process, whose clock is `loop`.
 `RigTask` knows nothing of networks and clocks: `reading` is what to send at a tick, `take` an answer that
 came in time or late, `advance` ends the tick. Ticks that no answer came for go on at the rate of the newest
 command for up to `EXTRAPOLATED` periods, and hold it from then on.
@@ -82,11 +83,6 @@ class RigTask:
     def forgiven(self) -> tuple[str, ...]:
         """Why the controller has tripped where the machine had left the rig with old commands."""
         return tuple(self._forgiven)
-
-    @property
-    def running(self) -> bool:
-        """Whether a run's ticks go on; else the next one is being prepared."""
-        return self._tick >= 0
 
     @property
     def commanded(self) -> Commanded:

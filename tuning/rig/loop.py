@@ -1,10 +1,11 @@
 """The rig's loop in real time: absolute deadlines on the monotonic clock, one packet per control period.
 
-At t_n the sensors' packet leaves; its answer counts if it is there within `ANSWER_SHARE` of the period, the
-rest of which is the rig's own. A tick without an answer by then is a missed one: the rig goes on with what it
-has (`RigTask.advance`), and takes the answer in when it comes. A rig that was itself held up catches up:
-every tick whose time has passed is played at once, and missed. Only where it was held up for more than
-`MOST_BEHIND` periods has its clock stood still: nothing of it went on meanwhile.
+This is the clock of the rig's process. At t_n the sensors' packet leaves for the controller's process; the
+answer counts if it is there within `ANSWER_SHARE` of the period, the rest of which is the rig's own. A tick
+without an answer by then is a missed one: the rig goes on with what it has (`RigTask.advance`), and takes the
+answer in when it comes. A rig that was itself held up catches up: every tick whose time has passed is played
+at once, and missed. Only where it was held up for more than `MOST_BEHIND` periods has its clock stood still:
+nothing of it went on meanwhile.
 """
 
 import gc

@@ -1,9 +1,10 @@
 """A session: the controller's process, an empty loop for comparison, the run, and whose fault what was.
 
-A missed tick is the controller's if its process took more than `CPU_SHARE` of the period of CPU time for
-that tick, live and when the same packets were gone through again, or if it follows such a tick without one in
-between that was met; else it is an injected fault's, if one hit its packets; else the machine's: the
-operating system, or another machine on the same processor, ran something else.
+The rig's process, which is this one, starts the controller's, plays the rig to it and stops it. Whose fault a
+missed tick is, is found out afterwards. It is the controller's if its process took more than `CPU_SHARE` of
+the period of CPU time for that tick, live and when the same packets were gone through again, or if it follows
+such a tick without one in between that was met; else it is an injected fault's, if one hit its packets; else
+the machine's: the operating system, or another machine on the same processor, ran something else.
 """
 
 import json

@@ -9,8 +9,11 @@ from tuning.watchdog.recorded import Signals
 
 
 class Tripped(NamedTuple):
-    """A run that was stopped: before or on which tick of its record (one more than the last: at its end), and
-    the controller's status."""
+    """A run that was stopped.
+
+    tick: before or on which of its record; one more than the last: at its end.
+    status: the controller's.
+    """
 
     tick: int
     status: str
