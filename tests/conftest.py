@@ -3,6 +3,7 @@ The command line, as tests call it."""
 
 import json
 import os
+from pathlib import Path
 from typing import NamedTuple
 
 from tuning.environment import CACHE, cache_folder, flags, prepare, settings
@@ -27,8 +28,17 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # Shapes are checked where there are shapes: the modules that compute with arrays.
-ARRAY_MODULES = ("compensators", "contact", "ring_buffer", "simulation")
-install_import_hook([f"jaxhil.{name}" for name in ARRAY_MODULES], "beartype.beartype")
+ARRAY_MODULES = ("compensators", "contact", "ring_buffer")
+# What a caller gives them, these check themselves.
+FRONT_DOOR = ("gain_choice", "gain_file", "jacobian", "registration", "run")
+simulation = sorted(
+    path.stem for path in (Path(__file__).parent.parent / "jaxhil/simulation").glob("[a-z]*.py")
+)
+install_import_hook(
+    [f"jaxhil.{name}" for name in ARRAY_MODULES]
+    + [f"jaxhil.simulation.{name}" for name in simulation if name not in FRONT_DOOR],
+    "beartype.beartype",
+)
 
 # A shared machine has no deadlines to keep, and a test that fails must fail again.
 hypothesis.settings.register_profile("jaxhil", deadline=None, derandomize=True)

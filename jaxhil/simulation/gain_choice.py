@@ -75,7 +75,7 @@ def _partial(mechanism: Mechanism, law: Compensator, given: Mapping[Any, Any]) -
         if not lower - margin <= number <= upper + margin:
             allowed = f"{lower:.6g} to {upper:.6g} {known[name].unit} for this mechanism"
             raise InputError(f"gains.{name}: found {shown(value)}, allowed {allowed}")
-        gains[name] = number
+        gains[name] = min(max(number, lower), upper)
     return gains
 
 

@@ -94,7 +94,7 @@ def jacobian(
 
 def _check_figure(of: object, law: Compensator) -> None:
     known = [name for name in FIGURES if name != "force_delay" or law.estimates_delay]
-    if of not in known:
+    if not isinstance(of, str) or of not in known:
         hint = close_match(of, known) if isinstance(of, str) else ""
         raise InputError(f"of: found {shown(of)}, allowed one of {', '.join(known)}{hint}")
 

@@ -1,0 +1,478 @@
+"""`import jaxhil`: what it offers, what it computes, whose settings it leaves alone, and what it refuses."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import hypothesis
+import hypothesis.strategies as st
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from laws_from_elsewhere import ScaledLead, ScaledLeadOnTheRig, SquaredSpring
+
+import jaxhil
+from jaxhil.mechanism.structs import value_at
+from tuning.gain_file import build_document
+
+OFFERED = (
+    "load simulate jacobian register Mechanism Compensator Gain ContactLaw InputError __version__".split()
+)
+TWO = {"approach.contacts": 2, "contact.stiffness": [124355.0, 90000.0], "contact.damping": [0.0]}
+
+
+def refusal(function, *arguments, **named):
+    """The one line with which a call is refused."""
+    with pytest.raises(jaxhil.InputError) as refused:
+        function(*arguments, **named)
+    message = str(refused.value)
+    assert isinstance(refused.value, ValueError)
+    assert "\n" not in message and message.isprintable()
+    return message
+
+
+def plain_process(script, **environment):
+    """What a script prints in a process of its own, with jax as it is by default."""
+    outside = {name: value for name, value in os.environ.items() if not name.startswith(("XLA", "JAX_"))}
+    outside["PYTHONPATH"] = str(Path(__file__).parent.parent)
+    command = [sys.executable, "-W", "error", "-c", script]
+    ran = subprocess.run(command, env=outside | environment, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0 and not ran.stderr, ran.stderr
+    return ran.stdout
+
+
+@pytest.fixture
+def command(request):
+    """`jaxhil ARGUMENTS` in this process."""
+    return request.getfixturevalue("jaxhil")
+
+
+# What is offered.
+
+
+def test_all_names_are_offered_and_listed():
+    assert set(jaxhil.__all__) == {*OFFERED, "__version__"} <= set(dir(jaxhil))
+    for name in OFFERED:
+        assert getattr(jaxhil, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'simulat'"):
+        _ = jaxhil.simulat
+    assert Path(jaxhil.__file__).with_name("py.typed").exists()
+
+
+def test_the_controller_is_imported_without_jax_and_numpy():
+    imports = "import sys; sys.modules['jax'] = None; import jaxhil, jaxhil.runtime"
+    assert plain_process(f"{imports}\nprint(jaxhil.runtime.Controller.__name__)") == "Controller\n"
+    loaded = "print([name for name in ('jax', 'numpy', 'scipy', 'msgspec') if name in sys.modules])"
+    assert plain_process(f"import sys, jaxhil\n{loaded}") == "[]\n"
+
+
+# Loading.
+
+
+def test_overrides_are_those_of_the_command(command):
+    mechanism = jaxhil.load("varying", {"rig.force_sensor.delay": np.float32(0.0035), **TWO})
+    assert mechanism.contact.stiffness == [124355.0, 90000.0] and mechanism.approach.contacts == 2
+    assert mechanism.rig.force_sensor.delay == float(np.float32(0.0035))
+    assert jaxhil.load() == jaxhil.load("varying")
+    for path, value, text in (
+        ("rig.force_sensor.delay", -1.0, "-1.0"),
+        ("rig.force_sensr.delay", 0.1, "0.1"),
+        ("contact.stiffness[4]", 1.0, "1.0"),
+        ("contact.law", "hertz", '"hertz"'),
+    ):
+        said = refusal(jaxhil.load, "varying", {path: value}).removeprefix(f"varying: overrides {path}: ")
+        assert command("simulate", "--set", f"{path}={text}").err.endswith(f": {said}\n")
+
+
+# Anything at all that is no mechanism, path, value, compensator or gain.
+ANYTHING = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers().filter(bool),
+    st.floats(),
+    st.text("abc.\0/[=", max_size=20),
+    st.binary(max_size=20),
+    st.lists(st.floats(), max_size=3),
+    st.dictionaries(st.text(max_size=5), st.integers(), max_size=2),
+    st.just(np.array([1.0, np.nan])),
+    st.just(object),
+)
+
+
+@hypothesis.settings(max_examples=60)
+@hypothesis.given(
+    path=st.one_of(st.sampled_from(["approach.velocity", "contact.law", "rig"]), ANYTHING), value=ANYTHING
+)
+def test_whatever_overrides_hold_is_loaded_or_refused(path, value):
+    try:
+        overrides = {path: value}
+    except TypeError:
+        overrides = value
+    try:
+        assert isinstance(jaxhil.load("varying", overrides), jaxhil.Mechanism)
+    except jaxhil.InputError as refused:
+        assert str(refused).isprintable()
+
+
+@hypothesis.settings(max_examples=60)
+@hypothesis.given(one=ANYTHING)
+def test_whatever_is_no_mechanism_compensator_gain_or_seed_is_refused(one):
+    refusal(jaxhil.simulate, one)
+    refusal(jaxhil.simulate, "varying", one)
+    if not isinstance(one, float) or not -1e-9 <= one <= 0.03:
+        refusal(jaxhil.simulate, "varying", "phase_lead", {"phase_lead": one})
+    if one is not None and not (isinstance(one, dict) and not one):
+        refusal(jaxhil.simulate, "varying", "phase_lead", one)
+    if isinstance(one, bool) or not isinstance(one, int) or one < 0:
+        refusal(jaxhil.simulate, "varying", seed=one)
+    refusal(jaxhil.jacobian, "varying", of=one, by="approach.velocity")
+    refusal(jaxhil.jacobian, "varying", by=one)
+
+
+# Simulating.
+
+
+@pytest.fixture(scope="module")
+def run():
+    return jaxhil.simulate(jaxhil.load("varying", TWO), "phase_lead")
+
+
+def test_a_run_is_the_command_s(run, command, tmp_path):
+    options = [f"--set={path}={value}" for path, value in TWO.items()]
+    document = command("simulate", "--compensator", "phase_lead", "--json", *options).document
+    assert [
+        {name: value for name, value in contact._asdict().items() if name != "force_delay"}
+        for contact in run.contacts
+    ] == document["contacts"]
+    assert (run.gains, run.status, run.compensator) == (document["gains"], "ok", "phase_lead")
+    run.plot(tmp_path / "new" / "run.svg")
+    command("simulate", "--compensator", "phase_lead", "--plot", tmp_path / "command.svg", *options)
+    assert (tmp_path / "new" / "run.svg").read_bytes() == (tmp_path / "command.svg").read_bytes()
+
+
+def test_ticks_are_those_of_the_run(run):
+    period = run.mechanism.rig.control_period
+    ticks = len(run.time)
+    for name in run.ticks._fields[:-1]:
+        array = getattr(run, name)
+        assert isinstance(array, np.ndarray) and array.dtype == np.float64 and array.shape == (ticks,)
+    np.testing.assert_allclose(run.time, period * np.arange(ticks), rtol=1e-12)
+    assert np.all(np.diff(run.contact) >= 0) and set(run.contact) == {0, 1}
+    for index, contact in enumerate(run.contacts):
+        own = run.contact == index
+        assert run.velocity_desired[own][0] == pytest.approx(contact.approach_velocity, rel=1e-12)
+        rebound = contact.restitution * contact.approach_velocity
+        # The contact is over a tick later, when the command has died out.
+        assert -run.velocity_desired[own][-1] == pytest.approx(rebound, rel=1e-6)
+        assert np.max(np.abs(run.force_command[own])) == pytest.approx(contact.peak_command, rel=1e-12)
+        # M dv = -F_c T, tick by tick.
+        kicks = -run.force_command[own][:-1] * period / run.mechanism.bodies.mass
+        np.testing.assert_allclose(np.diff(run.velocity_desired[own]), kicks, rtol=1e-9, atol=1e-18)
+    with pytest.raises(AttributeError):
+        run.status = "good"
+
+
+def test_ticks_are_written_to_the_last_bit(run, tmp_path):
+    run.to_csv(tmp_path / "run.csv")
+    table = np.genfromtxt(tmp_path / "run.csv", delimiter=",", names=True)
+    assert table.dtype.names == run.ticks._fields
+    for name in table.dtype.names:
+        np.testing.assert_array_equal(table[name], getattr(run, name))
+    assert "cannot be written" in refusal(run.to_csv, tmp_path / "missing" / "run.csv")
+    assert "allowed a path" in refusal(run.to_csv, 3)
+    assert "ends in .png" in refusal(run.plot, tmp_path / "run.gif")
+
+
+def test_a_contact_that_is_not_reached_is_listed():
+    diverging = {**TWO, "rig.force_sensor.delay": 0.9, "contact.stiffness": [1e7]}
+    run = jaxhil.simulate(jaxhil.load("varying", diverging), "none")
+    first, second = run.contacts
+    assert run.status == first.status == "diverged" and second.status == "not reached"
+    assert math.isnan(first.error) and not math.isnan(first.peak_force) and math.isnan(second.peak_force)
+
+
+def test_gains_are_chosen_by_dict_setting_and_file(tmp_path):
+    mechanism = jaxhil.load("varying", TWO)
+    literature = jaxhil.simulate(mechanism, "phase_lead")
+    some = jaxhil.simulate(mechanism, "phase_lead", {"phase_lead": np.float64(0.003)})
+    assert some.gains == literature.gains | {"phase_lead": 0.003}
+    assert some.contacts[0].error != literature.contacts[0].error
+    document = build_document("phase_lead", some.gains, mechanism, 64 * "0", {}, {}, 0, {})
+    path = tmp_path / "gains.json"
+    path.write_text(json.dumps(document))
+    for law in ("phase_lead", "none"):
+        run = jaxhil.simulate(mechanism, law, path)
+        assert (run.gains, run.compensator, run.contacts) == (some.gains, "phase_lead", some.contacts)
+    other = jaxhil.load("varying", {"rig.control_period": 0.00037})
+    assert "control_period" in refusal(jaxhil.simulate, other, "phase_lead", str(path))
+    assert "which" in refusal(jaxhil.simulate, mechanism, "response_error", path)
+    path.write_text(json.dumps(document | {"control_period": 0.002}))
+    assert "was it edited?" in refusal(jaxhil.simulate, mechanism, "phase_lead", path)
+
+
+@pytest.mark.parametrize(
+    ("compensator", "gains", "said"),
+    [
+        ("phase_led", None, "compensator: found 'phase_led', allowed one of none, phase_lead"),
+        ("phase_led", None, "did you mean phase_lead?"),
+        (
+            "phase_lead",
+            {"phase_led": 1.0},
+            "gains: found 'phase_led', allowed phase_lead, lead_filter (did you",
+        ),
+        ("phase_lead", {"phase_lead": 5.0}, "gains.phase_lead: found 5.0, allowed 0 to 0.028 s"),
+        ("phase_lead", {"phase_lead": "5"}, "gains.phase_lead: found '5', allowed 0 to 0.028 s"),
+        ("none", {"phase_lead": 5.0}, "gains: found 'phase_lead', allowed none: none has no gains"),
+        ("retrospective_reference", "shrp", "'sharp', 'gentle' (did you mean sharp?)"),
+        ("phase_lead", "gains.json", "gains.json: cannot be read"),
+        ("phase_lead", "sharp", "no setting's name (phase_lead has none)"),
+    ],
+)
+def test_wrong_gains_are_refused_with_what_is_allowed(compensator, gains, said, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert said in refusal(jaxhil.simulate, "varying", compensator, gains)
+
+
+# The caller's own jax.
+
+GUEST = """
+import jax, jax.numpy as jnp, json
+{flags}
+import jaxhil
+before = dict(jax.config.values)
+run = jaxhil.simulate("varying", "phase_lead")
+slope = jaxhil.jacobian("varying", "phase_lead", by="gains.phase_lead")["gains.phase_lead"]
+ticks = run.force_measured
+assert dict(jax.config.values) == before
+assert ticks.dtype == slope.dtype == "float64" and jnp.ones(2).dtype == {dtype}
+print(json.dumps([[c.restitution, c.error, c.peak_force] for c in run.contacts] + [slope.tolist()]))
+"""
+
+
+@pytest.fixture(scope="module")
+def as_by_default():
+    return plain_process(GUEST.format(flags="", dtype="'float32'"))
+
+
+def test_in_a_process_of_float32_figures_are_the_command_s(as_by_default, command):
+    *contacts, slope = json.loads(as_by_default)
+    document = command("simulate", "varying", "--compensator", "phase_lead", "--json").document
+    wanted = [[one[name] for name in ("restitution", "error", "peak_force")] for one in document["contacts"]]
+    np.testing.assert_allclose(contacts, wanted, rtol=1e-13, atol=1e-14)
+    here = jaxhil.jacobian("varying", "phase_lead", by="gains.phase_lead")["gains.phase_lead"]
+    np.testing.assert_allclose(slope, here, rtol=1e-10)
+
+
+def test_the_caller_s_flags_neither_matter_nor_change(as_by_default):
+    flags = "\n".join(
+        f"jax.config.update({name!r}, {value!r})"
+        for name, value in {
+            "jax_enable_x64": True,
+            "jax_numpy_dtype_promotion": "strict",
+            "jax_numpy_rank_promotion": "raise",
+            "jax_debug_nans": True,
+        }.items()
+    )
+    assert plain_process(GUEST.format(flags=flags, dtype="'float64'")) == as_by_default
+
+
+# Derivatives.
+
+KEYS = {
+    "rig.force_sensor.delay": 1e-7,
+    "contact.stiffness[0]": 1.0,
+    "contact.stiffness": 1.0,
+    "rig.simulator.natural_frequency": 1e-4,
+    "rig.simulator.damping_ratio": 1e-6,
+    "bodies.equivalent_mass": 1e-3,
+    "approach.phase": 1e-5,
+    "gains.phase_lead": 1e-7,
+}
+
+
+def central_difference(law, of, key, step):
+    """The figure's difference quotient, at twice the step apart."""
+    base = jaxhil.load("varying", TWO)
+    gains = jaxhil.simulate(base, law).gains
+    figures = []
+    for sign in (1, -1):
+        changed, own = dict(TWO), dict(gains)
+        if key.startswith("gains."):
+            own[key[6:]] += sign * step
+        elif key == "contact.stiffness":
+            changed[key] = [value + sign * step for value in base.contact.stiffness]
+        else:
+            value = base.contact.stiffness[0] if key.endswith("[0]") else value_at(base, key)
+            changed[key] = value + sign * step
+        run = jaxhil.simulate(jaxhil.load("varying", changed), law, own)
+        figures.append(np.array([getattr(contact, of) for contact in run.contacts]))
+    return (figures[0] - figures[1]) / (2 * step)
+
+
+@pytest.mark.parametrize(("law", "of"), [("phase_lead", "restitution"), ("response_error", "peak_force")])
+def test_derivatives_are_those_of_differences(law, of):
+    slopes = jaxhil.jacobian(jaxhil.load("varying", TWO), law, of=of, by=list(KEYS))
+    assert list(slopes) == list(KEYS)
+    for key, step in KEYS.items():
+        assert slopes[key].shape == (2,) and slopes[key].dtype == np.float64
+        wanted = central_difference(law, of, key, step)
+        np.testing.assert_allclose(
+            slopes[key], wanted, rtol=2e-4, atol=1e-4 * np.max(np.abs(wanted)), err_msg=key
+        )
+
+
+def test_a_derivative_by_both_masses_is_that_by_their_sum_in_parallel():
+    masses = {"bodies": {"chaser_mass": 500.0, "target_mass": 1000.0}}
+    together = jaxhil.load("varying", {**TWO, **masses})
+    slopes = jaxhil.jacobian(together, "phase_lead", by=["bodies.chaser_mass", "bodies.target_mass"])
+    single = jaxhil.load("varying", {**TWO, "bodies": {"equivalent_mass": together.bodies.mass}})
+    whole = jaxhil.jacobian(single, "phase_lead", by=["bodies.equivalent_mass"] * 2)["bodies.equivalent_mass"]
+    # d(m1 m2/(m1 + m2))/d(m1) = (m2/(m1 + m2))^2.
+    np.testing.assert_allclose(slopes["bodies.chaser_mass"], whole * 4 / 9, rtol=1e-10)
+    np.testing.assert_allclose(slopes["bodies.target_mass"], whole / 9, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("by", "said"),
+    [
+        (
+            "approach.contacts",
+            "by approach.contacts: found no key to differentiate by, allowed a real number",
+        ),
+        ("rig.force_sensor.dely", "did you mean rig.force_sensor.delay"),
+        ("rig.force_sensor.quantum", "found no key to differentiate by"),
+        ("contact.clearance", "found inf as its value, allowed a key with a finite value"),
+        ("contact.reference_depth", "found nothing as its value"),
+        ("contact.stiffness[7]", "allowed indices into it"),
+        ("rig.force_sensor.time_constant", "there is a corner at 0"),
+        ("gains.phase_led", "allowed gains.phase_lead, gains.lead_filter (did you mean phase_lead?)"),
+        ([], "allowed dotted paths"),
+    ],
+)
+def test_what_has_no_derivative_is_refused(by, said):
+    assert said in refusal(jaxhil.jacobian, "varying", "phase_lead", by=by)
+
+
+def test_figures_without_a_derivative_are_refused():
+    said = refusal(jaxhil.jacobian, "varying", "phase_lead", of="duration", by="approach.velocity")
+    assert "of: found 'duration', allowed one of restitution" in said
+    rounded = jaxhil.load("varying", {"rig.force_sensor.quantum": 0.5})
+    said = refusal(jaxhil.jacobian, rounded, "phase_lead", by="approach.velocity")
+    assert said == "rig.force_sensor.quantum: found 0.5, allowed 0: what is rounded has no derivative"
+
+
+# Laws from elsewhere.
+
+
+@pytest.fixture(scope="module")
+def registered():
+    for law in (ScaledLead(), SquaredSpring()):
+        jaxhil.register(law)
+        jaxhil.register(law)  # as a notebook's cell that runs twice
+
+
+def test_a_compensator_from_elsewhere_is_simulated(registered):
+    """Its lead is that of the built-in phase lead, without a filter: they differ by little."""
+    mechanism = jaxhil.load("varying", TWO)
+    plain, none = jaxhil.simulate(mechanism, "scaled_lead", {"toy_lead": 0.0}), jaxhil.simulate(mechanism)
+    assert [c.restitution for c in plain.contacts] == [c.restitution for c in none.contacts]
+    run = jaxhil.simulate(mechanism, "scaled_lead")
+    assert run.gains == {"toy_lead": mechanism.rig.force_sensor.delay}
+    filtered = jaxhil.simulate(mechanism, "phase_lead").contacts[0].error
+    assert run.contacts[0].error == pytest.approx(filtered, abs=2e-3)
+    assert run.contacts[0].error < none.contacts[0].error - 0.1
+    slope = jaxhil.jacobian(mechanism, "scaled_lead", by="gains.toy_lead")["gains.toy_lead"]
+    step = 1e-6
+    high, low = (
+        np.array(
+            [c.restitution for c in jaxhil.simulate(mechanism, "scaled_lead", {"toy_lead": value}).contacts]
+        )
+        for value in (run.gains["toy_lead"] + step, run.gains["toy_lead"] - step)
+    )
+    np.testing.assert_allclose(slope, (high - low) / (2 * step), rtol=1e-5)
+
+
+def test_a_contact_law_from_elsewhere_is_simulated_against_its_integrated_reference(registered):
+    own = {"contact": {"law": "squared_spring", "stiffness": [1e8]}, "approach.contacts": 1}
+    prompt = {"rig.simulator": {"model": "ideal"}, "rig.force_sensor.delay": 0.0, "uncertainty": {}}
+    mechanism = jaxhil.load("rig-300kg", own | prompt)
+    [contact] = jaxhil.simulate(mechanism, "phase_lead").contacts
+    # M v^2/2 = k d^3/3 at the deepest point, and nothing is lost.
+    mass, speed = mechanism.bodies.mass, mechanism.approach.velocity
+    deepest = (1.5 * mass * speed**2 / 1e8) ** (1 / 3)
+    assert contact.reference_restitution == pytest.approx(1.0, abs=1e-8)
+    assert contact.reference_peak_force == pytest.approx(1e8 * deepest**2, rel=1e-8)
+    assert contact.status == "ok" and contact.restitution == pytest.approx(1.0, abs=0.01)
+    by = "contact.stiffness"
+    slope = jaxhil.jacobian(mechanism, "phase_lead", of="reference_peak_force", by=by)[by]
+    # F = k (1.5 M v^2/k)^(2/3), hence dF/dk = F/(3 k).
+    np.testing.assert_allclose(slope, contact.reference_peak_force / 3e8, rtol=1e-6)
+
+
+def test_what_cannot_be_registered_is_refused(registered):
+    class Unnamed(SquaredSpring):
+        name = ""
+
+    class Taken(ScaledLead):
+        name = "phase_lead"
+
+    class Boundless(ScaledLead):
+        name = "boundless"
+        gains = (jaxhil.Gain("toy_lead", "s", lambda m: 0.0, lambda m: math.inf, lambda m: 1.0),)
+
+    class Broken(ScaledLead):
+        name = "broken"
+        gains = (jaxhil.Gain("toy_lead", "s", lambda m: m.nothing, lambda m: 1.0, lambda m: 1.0),)
+
+    class Unitless(ScaledLead):
+        name = "unitless"
+        gains = (jaxhil.Gain("toy_lead", "", lambda m: 0.0, lambda m: 1.0, lambda m: 1.0),)
+
+    class Holding(ScaledLead):
+        name = "holding"
+        table: jnp.ndarray = eqx.field(default_factory=lambda: jnp.ones(3))
+
+    for law, said in (
+        (ScaledLead, "found the class ScaledLead, allowed an instance of"),
+        (3, "found 3, allowed an instance of"),
+        (Unnamed(), "Unnamed.name: found"),
+        (Taken(), "register phase_lead: name: found the name of another law"),
+        (Boundless(), "gains.toy_lead: found 0, 1, inf, allowed lower <= nominal <= upper"),
+        (Broken(), "gains.toy_lead.lower: found AttributeError"),
+        (Unitless(), "gains.toy_lead.unit: found ''"),
+        (Holding(), "a law holds no arrays"),
+    ):
+        assert said in refusal(jaxhil.register, law)
+    assert "allowed one of none" in refusal(jaxhil.simulate, "varying", "holding")
+    assert "a contact law runs in the simulation alone" in refusal(
+        jaxhil.register, SquaredSpring(), runtime=ScaledLeadOnTheRig
+    )
+    assert "allowed a class" in refusal(
+        jaxhil.register, ScaledLead(), runtime=ScaledLeadOnTheRig({"toy_lead": 0}, 1, 1)
+    )
+    assert "runtime: found object without step" in refusal(jaxhil.register, ScaledLead(), runtime=object)
+    jaxhil.register(ScaledLead(), runtime=ScaledLeadOnTheRig)
+    jaxhil.register(ScaledLead())
+
+
+def test_a_law_that_is_defined_anew_is_the_one_that_runs():
+    """No compiled program of the first is served for the second."""
+
+    def defined(share):
+        class Share(ScaledLead):
+            name = "share"
+
+            def step(self, prepared, state, signals, tick):
+                return share * signals.force_measured, state
+
+        return Share()
+
+    restitutions = []
+    for share in (1.0, 0.98):
+        jaxhil.register(defined(share))
+        restitutions.append(jaxhil.simulate(jaxhil.load("varying", TWO), "share").contacts[0].restitution)
+    assert abs(restitutions[0] - restitutions[1]) > 1e-3
