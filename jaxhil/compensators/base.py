@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -23,11 +24,15 @@ Gains = dict[str, Array]
 class Gain(NamedTuple):
     """One tunable number of a compensator.
 
-    unit ("1" if none), lower and upper bounds and the literature's own rule, each a function of the
-    mechanism; `logarithmic` says that the gain is searched on a logarithmic scale; `neutral` is the value
-    at which it does nothing, where it has one (with all of them neutral the law passes the force on);
-    `tuned` whether tuning moves it for this mechanism; if not, it stays at the literature's value; `begins`
-    where all starts of tuning but the literature's have it, if not anywhere.
+    name: of the gain.
+    unit: "1" if it has none.
+    lower: bound, a function of the mechanism.
+    upper: bound, likewise.
+    nominal: the literature's own rule, likewise.
+    logarithmic: whether it is searched on a logarithmic scale.
+    neutral: value at which it does nothing, if any; with all of them neutral the law passes the force on.
+    tuned: whether tuning moves it for this mechanism; if not, it stays at the nominal value.
+    begins: where all starts of tuning but the literature's have it, if not anywhere.
     """
 
     name: str
@@ -59,10 +64,13 @@ def rig_gain(
 
 
 class Signals(NamedTuple):
-    """What the controller knows at a tick; all of the batch shape.
+    """What the controller knows at a tick.
 
-    force_measured [N], position_desired [m] and velocity_desired [m/s] of the numerical model,
-    position_measured [m] of the motion simulator, age: ticks since this run began (0 at its first).
+    force_measured: [N].
+    position_desired: x_d of the numerical model [m].
+    velocity_desired: v_d of the numerical model [m/s].
+    position_measured: x_a of the motion simulator [m].
+    age: ticks since this run began, 0 at its first.
     """
 
     force_measured: Float[Array, "*batch"]
@@ -73,17 +81,26 @@ class Signals(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """What the controller is told of the rig: control period [s] and clearance [m], inf if one-sided."""
+    """What the controller knows of the rig.
+
+    control_period: T [s].
+    clearance: between two surfaces [m]; infinite for one.
+    """
 
     control_period: Float[Array, "*batch"]
     clearance: Float[Array, "*batch"]
+
+
+def cleared(state: Any, begins: Array) -> Any:
+    """A state with zeros on the lanes where a run begins."""
+    return jax.tree.map(lambda leaf: jnp.where(begins, 0, leaf), state)
 
 
 class Compensator(eqx.Module):
     """Interface; see the module's text."""
 
     name: eqx.AbstractClassVar[str]
-    # What it must be told of mechanism and rig beforehand, in the words of `estimates`.
+    # What it must know of mechanism and rig beforehand, in the words of `estimates`.
     knows: eqx.AbstractClassVar[tuple[str, ...]]
     gains: eqx.AbstractClassVar[tuple[Gain, ...]]
     # Sets of gains that serve any mechanism, by name: those that differ from the nominal ones.
@@ -97,17 +114,18 @@ class Compensator(eqx.Module):
         """What `step` needs of the gains, worked out once per run; the gains themselves by default."""
         return gains
 
-    @abc.abstractmethod
     def init(self, gains: Gains, constants: Constants, ring: int) -> Any:
-        """State before the first tick; `ring` is the number of samples a delay line must hold."""
+        """State before the first tick, none by default; `ring` is the number of samples a delay line must
+        hold."""
+        return ()
 
-    @abc.abstractmethod
     def restart(self, gains: Gains, state: Any, begins: Array, fresh: Array) -> Any:
-        """State before the first tick of the next run, on the lanes where `begins`.
+        """State before the first tick of the next run, on the lanes where `begins`; by default all zeros.
 
         Filters and delay lines restart. Where `fresh`, it is the next contact of a schedule; else the
         same run goes on after a stretch of free flight and nothing learnt is dropped.
         """
+        return cleared(state, begins)
 
     @abc.abstractmethod
     def step(self, prepared: Any, state: Any, signals: Signals, tick: Array) -> tuple[Array, Any]:

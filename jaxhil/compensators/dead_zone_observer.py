@@ -22,7 +22,7 @@ from typing import ClassVar, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxhil.compensators.base import Compensator, Gain, Gains, rig_gain
+from jaxhil.compensators.base import Compensator, Gain, Gains, cleared, rig_gain
 from jaxhil.compensators.delay_line import Delay, DelayLine, delayed, empty, split
 from jaxhil.compensators.estimates import (
     DEAD_ZONE,
@@ -129,7 +129,7 @@ class DeadZoneObserver(Compensator):
 
     def restart(self, gains, state, begins, fresh):
         return state._replace(
-            lead=LeadState(*(jnp.where(begins, 0, leaf) for leaf in state.lead)),
+            lead=cleared(state.lead, begins),
             withheld=jnp.where(begins, 0, state.withheld),
             observed=jnp.where(begins, 0, state.observed),
         )

@@ -1,7 +1,7 @@
-"""What a law is told of mechanism and rig before a run: estimates, from the nominal values of the file.
+"""What a law knows of mechanism and rig before a run: estimates, from the nominal values of the file.
 
-Never the truth of a scenario: where the file states an uncertainty, what is drawn from it is what the
-estimate is wrong by. A law names what it must be told in `Compensator.knows`.
+They are never the values of a scenario: where the file states an uncertainty, the draw is what the estimate
+is wrong by. A law names what it must know in `Compensator.knows`.
 """
 
 import math
@@ -18,7 +18,7 @@ DEAD_ZONE = "dead zone"
 FORCE_NOISE = "force noise"
 EQUIVALENT_MASS = "equivalent mass"
 
-UNTOLD_DELAY_SPREAD = 0.001  # s
+UNKNOWN_DELAY_SPREAD = 0.001  # s
 
 
 def force_delay(mechanism: Mechanism) -> float:
@@ -32,7 +32,7 @@ def force_delay_spread(mechanism: Mechanism) -> float:
     or two standard deviations; 1 ms where it says nothing of that."""
     found = mechanism.uncertainty.get("rig.force_sensor.delay")
     if found is None:
-        return UNTOLD_DELAY_SPREAD
+        return UNKNOWN_DELAY_SPREAD
     nominal = mechanism.rig.force_sensor.delay
     if found.std is not None:
         return 2 * found.std
@@ -47,7 +47,7 @@ def simulator_inverse(mechanism: Mechanism) -> tuple[float, float]:
     """a_1 [s] and a_2 [s^2] of 1 + a_1 s + a_2 s^2 + ..., the series of e^(s tau)/G(s).
 
     tau is the transport delay of the motion simulator and what latency and hold of the command add on
-    average: L T held linearly, (L - 1/2) T in jumps (model.md section 6, item 7).
+    average: L T held linearly, (L - 1/2) T in jumps (notebooks/guide/model.md section 6, item 7).
     """
     rig = mechanism.rig
     first, second = _inverse(rig.simulator)

@@ -115,8 +115,5 @@ class MultiParameterLead(Compensator):
         zeros = jnp.zeros_like(constants.control_period)
         return LeadState(zeros, zeros)
 
-    def restart(self, gains, state, begins, fresh):
-        return LeadState(*(jnp.where(begins, 0, leaf) for leaf in state))
-
     def step(self, prepared, state, signals, tick):
         return lead(prepared, state, signals.force_measured)

@@ -12,11 +12,5 @@ class NoCompensator(Compensator):
     knows: ClassVar[tuple[str, ...]] = ()
     gains: ClassVar[tuple[Gain, ...]] = ()
 
-    def init(self, gains, constants, ring):
-        return ()
-
-    def restart(self, gains, state, begins, fresh):
-        return ()
-
     def step(self, prepared, state, signals, tick):
         return signals.force_measured, state

@@ -40,12 +40,6 @@ class PositionLead(Compensator):
         ),
     )
 
-    def init(self, gains, constants, ring):
-        return ()
-
-    def restart(self, gains, state, begins, fresh):
-        return ()
-
     def step(self, prepared, state, signals, tick):
         return signals.force_measured, state
 

@@ -33,10 +33,18 @@ COARSE = 0.002  # s, the longest step of that pass, at least a tick
 HISTORY = 1024  # samples kept; a longer contact is not integrated over again
 
 
-class Motion(NamedTuple):
-    """Depth [s], speed [1], deepest point so far [s], force without damping [1/s]; of the measured sample
-    there, the force's integral since the entry [ticks/s], over how many ticks that is, and the map's force
-    [1/s]; whether (1) it has separated."""
+class ReferenceState(NamedTuple):
+    """The reference somewhere on its way.
+
+    depth: [s].
+    speed: [1].
+    deepest: point so far [s].
+    force: without damping [1/s].
+    impulse: integral of the measured force since the entry, at the measured sample there [ticks/s].
+    read: over how many ticks that is.
+    expected: force of the map at that sample [1/s].
+    free: whether (1) it has separated.
+    """
 
     depth: Float[Array, "*batch"]
     speed: Float[Array, "*batch"]
@@ -49,32 +57,58 @@ class Motion(NamedTuple):
 
 
 class History(NamedTuple):
-    """Ring of measured samples on the reference's grid, by the tick at which each came: integral since the
-    entry [ticks/s] of the y that could be read, over how many ticks that is, depth X [s], speed V [1],
-    deepest point X_m [s]; the tick at which sample 0 came, how many have come."""
+    """Measured samples on the reference's grid, by the tick at which each came.
+
+    ring: per sample the integral since the entry [ticks/s] of the y that could be read, over how many ticks
+        that is, depth X [s], speed V [1], deepest point X_m [s].
+    origin: tick at which sample 0 came.
+    number: of samples that have come.
+    """
 
     ring: Float[Array, "samples 5 *batch"]
     origin: Int[Array, "*batch"]
     number: Int[Array, "*batch"]
 
 
-class Reference(NamedTuple):
-    """The live motion; the pass under way, the sample that it has reached (-1: the entry), its map."""
+class Reintegration(NamedTuple):
+    """Both integrations of the reference.
 
-    live: Motion
-    behind: Motion
+    live: motion that goes on tick by tick.
+    behind: motion of the pass from the entry.
+    reached: sample that the pass has reached; -1 for the entry.
+    curve: map of the pass.
+    """
+
+    live: ReferenceState
+    behind: ReferenceState
     reached: Int[Array, "*batch"]
     curve: Curve
 
 
-def entry(like: Array) -> Motion:
+class Measured(NamedTuple):
+    """What the reference is integrated with beside the map.
+
+    history: measured samples.
+    replay: rho, share of the force that the map does not explain.
+    period: control period [s].
+    shift: by how much the force is older than it was taken for when the samples were remembered [s]; it then
+        belongs to X - shift V. None for nothing.
+    """
+
+    history: History
+    replay: Array
+    period: Array
+    shift: Array | None
+
+
+def entry(like: Array) -> ReferenceState:
     """Depth 0, speed 1, no force."""
     zeros = jnp.zeros_like(like)
-    return Motion(zeros, zeros + 1, zeros, zeros, zeros, zeros, zeros, zeros)
+    return ReferenceState(zeros, zeros + 1, zeros, zeros, zeros, zeros, zeros, zeros)
 
 
 def no_history(like: Array) -> History:
-    """Nothing measured yet."""
+    """Nothing measured so far."""
     counts = jnp.zeros(like.shape, jnp.int32)
     return History(jnp.zeros((HISTORY, 5, *like.shape), like.dtype), counts, counts)
 
@@ -85,71 +119,24 @@ def remember(history: History, tick: Array, sample: Array) -> Float[Array, "samp
 
 
 def follow(
-    old: Reference,
+    old: Reintegration,
     curve: Curve,
-    history: History,
-    replay: Array,
+    measured: Measured,
     first: Array,
-    period: Array,
     present: Int[Array, "*batch"],
-    shift: Array | None = None,
-) -> Reference:
+) -> Reintegration:
     """One tick of the live motion, to the sample `present` (0 at the first tick in contact, where all starts
     afresh), and of the pass.
 
-    `replay` is rho, `first` [s] the time from the entry to sample 0. With a `shift` [s] the force is that
-    much older than it was taken for when the samples were remembered: it belongs to X - shift V.
+    `first` [s] is the time from the entry to sample 0.
     """
+    period = measured.period
     starts = (old.reached < 0) | (present == 0)
     old = old._replace(
         behind=_choose(starts, entry(period), old.behind), reached=jnp.where(starts, -1, old.reached)
     )
     curve_behind = _choose(starts, curve, old.curve)
-    may_start = history.number <= HISTORY
-
-    def recall(index):
-        """A measured sample, and whether it has come."""
-        slot = (history.origin + index) & (HISTORY - 1)
-        taken = jnp.take_along_axis(history.ring, slot[None, None], axis=0, mode="promise_in_bounds")[0]
-        return taken, (index >= 0) & (index < history.number)
-
-    def advance(curve, motion, index, ticks):
-        (impulse, read, *hardware), known = recall(index)
-        if shift is not None:
-            hardware[0] = hardware[0] - shift * hardware[1]
-        known = known & (ticks > 0)
-        expected = force_of(curve, *hardware)
-        modelled = 0.5 * (motion.expected + expected)
-        gap = (impulse - motion.impulse) - (read - motion.read) * modelled
-        missing = jnp.where(known, replay * (gap / jnp.where(known, ticks, 1)), 0)
-        duration = ticks * period
-        half = 0.5 * duration
-        push = jnp.where(motion.free > 0, 0, 1)
-
-        def damping(depth):
-            return curve.damping + curve.depth_damping * jnp.where(depth > 0, depth, 0) / REACH
-
-        drag = damping(motion.depth) * half * push
-        middle = (motion.speed - half * push * (motion.force + missing)) / (1 + drag)
-        depth = motion.depth + duration * middle
-        deeper = (depth > motion.deepest) & (push > 0)
-        deepest = jnp.where(deeper, depth, motion.deepest)
-        force = jnp.where(depth > 0, elastic(curve.slopes, depth) - curve.unloading * (deepest - depth), 0)
-        dragging = damping(depth)
-        speed = middle - push * half * (force + missing + dragging * middle)
-        free = (depth <= 0) | ((speed < 0) & (force + missing + dragging * speed <= 0))
-        free = (motion.free > 0) | free
-        return Motion(
-            depth,
-            speed,
-            deepest,
-            force,
-            impulse=jnp.where(known, impulse, motion.impulse),
-            read=jnp.where(known, read, motion.read),
-            expected=jnp.where(known, expected, motion.expected),
-            free=free.astype(depth.dtype),
-        )
-
+    may_start = measured.history.number <= HISTORY
     coarse = jnp.clip(jnp.floor(COARSE / period + 1e-9), 1, HISTORY).astype(jnp.int32)
 
     def one(_, carry):
@@ -158,22 +145,70 @@ def follow(
         jump = jnp.where((reached >= 0) & (present - reached >= coarse), coarse, 1)
         index = reached + jump
         ticks = jnp.where(reached < 0, first / period, jump.astype(period.dtype))
-        moved = advance(curve_behind, motion, index, ticks)
+        moved = _advance(curve_behind, motion, measured, index, ticks)
         chosen = jax.tree.map(lambda a, b: jnp.where(ahead, a, b), moved, motion)
-        return Motion(*chosen), jnp.where(ahead, index, reached)
+        return ReferenceState(*chosen), jnp.where(ahead, index, reached)
 
     behind, reached = lax.fori_loop(0, STRIDE, one, (old.behind, old.reached))
-    live = advance(curve, old.live, present, jnp.ones_like(period))
+    live = _advance(curve, old.live, measured, present, jnp.ones_like(period))
     held = starts & ~may_start
     behind = _choose(held, old.behind, behind)
     reached = jnp.where(held, old.reached, reached)
     done = reached == present
-    return Reference(
+    return Reintegration(
         _choose(done, behind, live),
         behind,
         jnp.where(done, -1, reached),
         curve_behind,
     )
+
+
+def _advance(
+    curve: Curve, motion: ReferenceState, measured: Measured, index: Array, ticks: Array
+) -> ReferenceState:
+    """One step of so many `ticks`, to the sample `index`."""
+    (impulse, read, *hardware), known = _recall(measured.history, index)
+    if measured.shift is not None:
+        hardware[0] = hardware[0] - measured.shift * hardware[1]
+    known = known & (ticks > 0)
+    expected = force_of(curve, *hardware)
+    modelled = 0.5 * (motion.expected + expected)
+    gap = (impulse - motion.impulse) - (read - motion.read) * modelled
+    missing = jnp.where(known, measured.replay * (gap / jnp.where(known, ticks, 1)), 0)
+    duration = ticks * measured.period
+    half = 0.5 * duration
+    push = jnp.where(motion.free > 0, 0, 1)
+
+    def damping(depth):
+        return curve.damping + curve.depth_damping * jnp.where(depth > 0, depth, 0) / REACH
+
+    drag = damping(motion.depth) * half * push
+    middle = (motion.speed - half * push * (motion.force + missing)) / (1 + drag)
+    depth = motion.depth + duration * middle
+    deeper = (depth > motion.deepest) & (push > 0)
+    deepest = jnp.where(deeper, depth, motion.deepest)
+    force = jnp.where(depth > 0, elastic(curve.slopes, depth) - curve.unloading * (deepest - depth), 0)
+    dragging = damping(depth)
+    speed = middle - push * half * (force + missing + dragging * middle)
+    free = (depth <= 0) | ((speed < 0) & (force + missing + dragging * speed <= 0))
+    free = (motion.free > 0) | free
+    return ReferenceState(
+        depth,
+        speed,
+        deepest,
+        force,
+        impulse=jnp.where(known, impulse, motion.impulse),
+        read=jnp.where(known, read, motion.read),
+        expected=jnp.where(known, expected, motion.expected),
+        free=free.astype(depth.dtype),
+    )
+
+
+def _recall(history, index):
+    """A measured sample, and whether it has come."""
+    slot = (history.origin + index) & (HISTORY - 1)
+    taken = jnp.take_along_axis(history.ring, slot[None, None], axis=0, mode="promise_in_bounds")[0]
+    return taken, (index >= 0) & (index < history.number)
 
 
 def _choose(condition, when_true, when_false):

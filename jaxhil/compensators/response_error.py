@@ -3,10 +3,10 @@
     F_c = lead(F) + gate (g k_hat (x_d - x_a) + g_b b_hat (v_d - v_a))
 
 The phase lead makes up for the delay of the force measurement, the response error for the dynamics of the
-motion simulator, of which no model is used (Qi et al. 2016; model.md section 5). k_hat and b_hat come from
-recursive least squares of the measured force on the measured position delayed by the same time
-(`identification_delay`): without that alignment they are biased (model.md section 6, item 6). v_a is a
-filtered difference, s/(1 + T_v s) by Tustin's rule.
+motion simulator, of which no model is used (Qi et al. 2016; notebooks/guide/model.md section 5). k_hat and
+b_hat come from recursive least squares of the measured force on the measured position delayed by the same
+time (`identification_delay`): without that alignment they are biased (section 6, item 6). v_a is a filtered
+difference, s/(1 + T_v s) by Tustin's rule.
 
 `gate` is 1 while the aligned position is in contact and 0 outside; it opens and closes within two periods, by
 where between two ticks the surface was met (see `gates`). A reading's weight in the identification is that
@@ -18,7 +18,7 @@ from typing import ClassVar, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxhil.compensators.base import Compensator, Gain, Gains, rig_gain
+from jaxhil.compensators.base import Compensator, Gain, Gains, cleared, rig_gain
 from jaxhil.compensators.delay_line import Delay, DelayLine, delayed, empty, split
 from jaxhil.compensators.estimates import (
     FORCE_DELAY,
@@ -164,7 +164,7 @@ class ResponseError(Compensator):
         old = state.identified
         fresh = begins & fresh
         return state._replace(
-            lead=LeadState(*(jnp.where(begins, 0, leaf) for leaf in state.lead)),
+            lead=cleared(state.lead, begins),
             contact_share=jnp.where(begins, 0, state.contact_share),
             force_share=jnp.where(begins, 0, state.force_share),
             identified=old._replace(

@@ -3,7 +3,7 @@
 Signals are aligned with the force that is read, and scaled by the contact's approach speed v0 and the mass M.
 What was measured is moved to the grid of the reference's samples, such that the hardware's own entry falls on
 the reference's. A force that stands out of the noise before the hardware was to touch is the hardware, met
-too early: its surface is nearer than told, and is taken to be where the first of them was read.
+too early: its surface is nearer than expected, and is taken to be where the first of them was read.
 """
 
 from typing import NamedTuple
@@ -18,34 +18,49 @@ from jaxhil.contact.laws import deflection
 
 SEEN = 8  # readings out of contact that show how noisy the force is
 OUTSTANDING = 16.0  # times the noise's variance: what hardly is noise
-EARLY = 2  # such readings before the hardware is to touch, that its surface is nearer than told
+EARLY = 2  # such readings before the hardware is to touch, that its surface is nearer than expected
 
 
 class Aligned(NamedTuple):
-    """Measured position [m] delayed by tau and by tau + T, of the tick before."""
+    """Measured positions of the tick before.
+
+    middle: delayed by tau [m].
+    last: delayed by tau + T [m].
+    """
 
     middle: Float[Array, "*batch"]
     last: Float[Array, "*batch"]
 
 
 class Noise(NamedTuple):
-    """Of the forces read out of contact: sum of squares [N^2], number."""
+    """Of the forces read out of contact.
+
+    squares: their sum [N^2].
+    number: how many they are.
+    """
 
     squares: Float[Array, "*batch"]
     number: Float[Array, "*batch"]
 
 
 class Sample(NamedTuple):
-    """What was measured at a tick: force y [1/s], depth X [s], speed V [1], deepest point X_m [s]; whether
-    (1) the force could be read."""
+    """What was measured at a tick.
+
+    measured: force y [1/s], depth X [s], speed V [1], deepest point X_m [s].
+    shown: whether (1) the force could be read.
+    """
 
     measured: Float[Array, "4 *batch"]
     shown: Float[Array, "*batch"]
 
 
 class Early(NamedTuple):
-    """Readings that stood out of the noise before the hardware was to touch; how much nearer [s] the surface
-    was at the first of them, and is taken to be."""
+    """Readings that stood out of the noise before the hardware was to touch.
+
+    number: how many they are.
+    surface: how much nearer the surface was at the first of them [s].
+    plane: how much nearer it is taken to be [s].
+    """
 
     number: Int[Array, "*batch"]
     surface: Float[Array, "*batch"]
@@ -53,8 +68,13 @@ class Early(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """A sample on the reference's grid: the force y [1/s] there, whether (1) it could be read; integral
-    [ticks/s] of those that could since the entry, over how many ticks that is."""
+    """A sample on the reference's grid.
+
+    force: y there [1/s].
+    shown: whether (1) it could be read.
+    impulse: integral since the entry of those that could [ticks/s].
+    read: over how many ticks that is.
+    """
 
     force: Float[Array, "*batch"]
     shown: Float[Array, "*batch"]
@@ -63,11 +83,21 @@ class Moved(NamedTuple):
 
 
 class Episode(NamedTuple):
-    """One contact: side (1 or -1; 0: none), approach speed [m/s] (0: unusable), time [s] from the entry to
-    the first tick, ticks since that one, whether (1) the hardware has touched, ticks since it left, where
-    between two ticks its samples fall on the reference's grid; deepest points so far [s] of the numerical
-    model and of the hardware; what was measured at the tick before, and what that made on the grid; what was
-    read too early."""
+    """One contact.
+
+    side: of the surface, 1 or -1; 0 for no contact.
+    velocity: approach speed [m/s]; 0 if unusable.
+    first: time from the entry to the first tick [s].
+    elapsed: ticks since that one.
+    touched: whether (1) the hardware has touched.
+    gone: ticks since it left.
+    fraction: where between two ticks its samples fall on the reference's grid.
+    deepest: point of the numerical model so far [s].
+    hardware_deepest: point of the hardware so far [s].
+    sample: measured at the tick before.
+    moved: what that made on the grid.
+    early: what was read too early.
+    """
 
     side: Float[Array, "*batch"]
     velocity: Float[Array, "*batch"]
@@ -84,10 +114,24 @@ class Episode(NamedTuple):
 
 
 class Now(NamedTuple):
-    """A tick on the scales of its contact: whether that `enters`, its side, approach speed [m/s], whether it
-    is `usable`, M v0 [kg m/s]; depth x [s] and speed v of the numerical model; of the hardware, as old as the
-    force: depth by the delay that is told, depth, speed, whether it is away from both surfaces; the force
-    [1/s], whether the dead zone hides it; time [s] from the entry to the first tick, ticks since that one."""
+    """A tick on the scales of its contact; the hardware is that of the time when the force acted.
+
+    enters: whether the contact begins.
+    side: of the surface, 1 or -1.
+    speed: approach speed v0 [m/s].
+    usable: whether there is one to scale by.
+    weight: M v0 [kg m/s].
+    x: depth of the numerical model [s].
+    v: its speed [1].
+    aligned: depth of the hardware by the delay that is a gain [s].
+    depth: of the hardware, by the delay as it is estimated [s].
+    rate: speed of the hardware [1].
+    away: whether the hardware is away from both surfaces.
+    force: as read [1/s].
+    hidden: whether the dead zone hides it.
+    first: time from the entry to the first tick [s].
+    elapsed: ticks since that one.
+    """
 
     enters: Bool[Array, "*batch"]
     side: Float[Array, "*batch"]
@@ -96,7 +140,7 @@ class Now(NamedTuple):
     weight: Float[Array, "*batch"]
     x: Float[Array, "*batch"]
     v: Float[Array, "*batch"]
-    told: Float[Array, "*batch"]
+    aligned: Float[Array, "*batch"]
     depth: Float[Array, "*batch"]
     rate: Float[Array, "*batch"]
     away: Bool[Array, "*batch"]
@@ -107,8 +151,12 @@ class Now(NamedTuple):
 
 
 class Entry(NamedTuple):
-    """Whether the hardware has touched, where between two ticks its samples fall on the reference's grid, and
-    the history that begins there."""
+    """The hardware's entry.
+
+    touched: whether it has touched.
+    fraction: where between two ticks its samples fall on the reference's grid.
+    history: that begins there.
+    """
 
     touched: Bool[Array, "*batch"]
     fraction: Float[Array, "*batch"]
@@ -116,7 +164,7 @@ class Entry(NamedTuple):
 
 
 def no_episode(like: Float[Array, "*batch"]) -> Episode:
-    """No contact yet."""
+    """Before the first contact."""
     zeros, counts = jnp.zeros_like(like), jnp.zeros(like.shape, jnp.int32)
     return Episode(
         side=zeros,
@@ -156,7 +204,8 @@ def scaled(
     velocity: Array,
     older: Array | None,
 ) -> Now:
-    """Which contact it is, and its numbers on that contact's scales; the force is `older` [s] than told."""
+    """Which contact it is, and its numbers on that contact's scales; the force is `older` [s] than
+    assumed."""
     period, clearance = constants.control_period, constants.clearance
     touching = deflection(signals.position_desired, clearance)
     side_now = jnp.sign(touching)
@@ -172,9 +221,9 @@ def scaled(
         return jnp.where(side < 0, -clearance - measured, measured) / scale
 
     x, v = depth_of(signals.position_desired), side * signals.velocity_desired / scale
-    told = depth_of(position) + jnp.where(enters, 0, old.early.plane)
+    aligned = depth_of(position) + jnp.where(enters, 0, old.early.plane)
     rate = side * velocity / scale
-    depth = told if older is None else told - older * rate
+    depth = aligned if older is None else aligned - older * rate
     bent = deflection(position, clearance)
     elsewhere = jnp.sign(bent) == -side
     weight = gains["equivalent_mass"] * scale
@@ -187,7 +236,7 @@ def scaled(
         weight=weight,
         x=x,
         v=v,
-        told=told,
+        aligned=aligned,
         depth=jnp.where((depth > SURFACE) | (depth < -SURFACE), depth, 0),
         rate=rate,
         away=bent == 0,
@@ -222,7 +271,7 @@ def sort_out(
     free = (~under_way | ~touched) & now.away
     stands = free & under_way & (noise.number >= SEEN) & (square > OUTSTANDING * usual)
     number = jnp.where(now.enters, 0, old.number) + jnp.where(stands, 1, 0)
-    surface = jnp.where(stands & (number == 1), -now.told, old.surface)
+    surface = jnp.where(stands & (number == 1), -now.aligned, old.surface)
     plane = jnp.where(now.enters, 0, old.plane)
     plane = jnp.where(stands & (number > EARLY), surface, plane)
     free = free & ~stands
@@ -231,10 +280,11 @@ def sort_out(
 
 
 def force_noise(gains: Gains, seen: Noise) -> Float[Array, "*batch"]:
-    """The force's variance [N^2]: what it is told, or what readings out of contact show if that is more."""
-    told = gains["force_noise"] ** 2
+    """The force's variance [N^2]: what the gains say, or what readings out of contact show if that is
+    more."""
+    known = gains["force_noise"] ** 2
     shown = seen.squares / jnp.where(seen.number > 0, seen.number, 1)
-    return jnp.where(shown > told, shown, told)
+    return jnp.where(shown > known, shown, known)
 
 
 def move(
@@ -242,8 +292,8 @@ def move(
 ) -> tuple[Moved, Float[Array, "3 *batch"], Int[Array, "*batch"]]:
     """The tick's sample on the reference's grid; depth, speed and deepest point there; samples in the history
     with it."""
-    force, told, rate, _ = sample.measured
-    before = jnp.stack([force, told - period * rate, rate, jnp.zeros_like(rate)])
+    force, depth, rate, _ = sample.measured
+    before = jnp.stack([force, depth - period * rate, rate, jnp.zeros_like(rate)])
     before = jnp.where(now.enters[None], before, old.sample.measured)
     moved = before + entry.fraction[None] * (sample.measured - before)
     arrived = tick - entry.history.origin + 1

@@ -1,4 +1,5 @@
-"""The retrospective reference: identify the contact, work out what should have happened, and pay it back.
+"""The retrospective reference: identify the contact, work out the motion it should have had, pay back what is
+missing.
 
 A map from depth to force is identified on delay-aligned readings (`force_depth_map`). From it the motion that
 the contact should have had since its entry is integrated over again while the map improves
@@ -21,7 +22,7 @@ force, as it is.
 A sensor's known dead zone is added to what it reads. What it hides (a reading of 0 in contact) counts as
 half of it, with the variance of a uniform distribution, and only where the map expects more; nothing of it
 is replayed. Where forces stand out of the noise before the hardware was to touch, its surface is nearer than
-told: it is taken to be where the first of them was read. Where the noise's standard deviation s is not
+expected: it is taken to be where the first of them was read. Where the noise's standard deviation s is not
 small, less of the bracket of `reintegration` is replayed: rho = force_replay/(1 + (s/replay_noise)^2).
 """
 
@@ -31,7 +32,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxhil.compensators.base import Compensator, Constants, Gain, Gains
+from jaxhil.compensators.base import Compensator, Constants, Gain, Gains, cleared
 from jaxhil.compensators.delay_line import Delay, DelayLine, delayed, empty, split
 from jaxhil.compensators.estimates import DEAD_ZONE, EQUIVALENT_MASS, FORCE_DELAY, FORCE_NOISE
 from jaxhil.compensators.force_depth_map import (
@@ -45,7 +46,15 @@ from jaxhil.compensators.force_depth_map import (
     prior,
     update,
 )
-from jaxhil.compensators.reintegration import History, Reference, entry, follow, no_history, remember
+from jaxhil.compensators.reintegration import (
+    History,
+    Measured,
+    Reintegration,
+    entry,
+    follow,
+    no_history,
+    remember,
+)
 from jaxhil.compensators.retrospective_episode import (
     Aligned,
     Episode,
@@ -61,27 +70,41 @@ from jaxhil.compensators.retrospective_episode import (
 )
 from jaxhil.compensators.retrospective_gains import GAINS, GENTLE, SHARP
 from jaxhil.ring_buffer import depend_on
-from jaxhil.runtime.laws.retrospective import PRIOR
 
 FAREWELL = 0.006  # s for which it goes on after the hardware has left the surface
 LONGEST_LAG = 0.1  # s for which it waits for hardware that has not touched yet
 
 
 class RetrospectiveState(NamedTuple):
-    """Delay line and aligned readings; the force's noise; the contact under way, what was learnt of it (its
-    map), its reference and history."""
+    """What the law carries from tick to tick.
+
+    line: delay line of the measured position.
+    aligned: measured positions as old as the force.
+    noise: of the force.
+    episode: the contact under way.
+    learnt: of that contact: its map, or its bank of them.
+    reference: motion that the contact should have had.
+    history: samples that were measured.
+    """
 
     line: DelayLine
     aligned: Aligned
     noise: Noise
     episode: Episode
     learnt: Any
-    reference: Reference
+    reference: Reintegration
     history: History
 
 
 class Prepared(NamedTuple):
-    """Gains, constants, prior of the map, delay tau - T (or 0) of the line, share of the sample before."""
+    """What is worked out once per run.
+
+    gains: of the batch shape.
+    constants: what the controller knows of the rig.
+    prior: of the map.
+    delay: of the delay line: tau - T, at least 0.
+    share: of the sample before, for what is left of tau.
+    """
 
     gains: Gains
     constants: Constants
@@ -107,7 +130,7 @@ class RetrospectiveReference(Compensator):
         return Prepared(
             full,
             constants,
-            prior(*(full[name] for name in PRIOR)),
+            map_prior(full),
             split(jnp.where(whole, delay - period, 0), period),
             jnp.where(whole, 1, delay / period),
         )
@@ -115,14 +138,14 @@ class RetrospectiveReference(Compensator):
     def init(self, gains, constants, ring):
         zeros = jnp.zeros_like(constants.control_period)
         nowhere = jnp.full(zeros.shape, -1, jnp.int32)
-        unknown = prior(*(zeros for _ in PRIOR))
+        unknown = prior(*[zeros] * 6)
         return RetrospectiveState(
             line=empty(ring, zeros),
             aligned=Aligned(zeros, zeros),
             noise=Noise(zeros, zeros),
             episode=no_episode(zeros),
             learnt=self.unlearnt(unknown),
-            reference=Reference(entry(zeros), entry(zeros), nowhere, curve(unknown)),
+            reference=Reintegration(entry(zeros), entry(zeros), nowhere, curve(unknown)),
             history=no_history(zeros),
         )
 
@@ -131,7 +154,7 @@ class RetrospectiveReference(Compensator):
         return prior
 
     def delay_shift(self, learnt: Any) -> Float[Array, "*batch"] | None:
-        """By how much [s] the force is older than the law was told; None: as old as that."""
+        """By how much [s] the force is older than the law assumes; None: as old as that."""
         return None
 
     def learn(
@@ -157,7 +180,7 @@ class RetrospectiveReference(Compensator):
     def restart(self, gains, state, begins, fresh):
         episode = state.episode
         return state._replace(
-            noise=Noise(*(jnp.where(begins, 0, leaf) for leaf in state.noise)),
+            noise=cleared(state.noise, begins),
             episode=episode._replace(side=jnp.where(begins, 0, episode.side)),
         )
 
@@ -168,66 +191,84 @@ class RetrospectiveReference(Compensator):
         position, velocity, aligned = align(state.aligned, newest, prepared.share, signals, period)
         older = self.delay_shift(state.learnt)
         now = scaled(gains, prepared.constants, old, signals, position, velocity, older)
-        x, v, depth, rate = now.x, now.v, now.depth, now.rate
         met = enter_grid(old, state.history, now, period, tick)
         noise, early = sort_out(gains, state.noise, old.early, now, signals.force_measured, met.touched)
 
-        deepest = jnp.where(now.enters, 0, old.deepest)
-        deepest = jnp.where(x > deepest, x, deepest)
-        hardware_deepest = jnp.where(now.enters, 0, old.hardware_deepest)
-        hardware_deepest = jnp.where(depth > hardware_deepest, depth, hardware_deepest)
+        deepest = _deepest(old.deepest, now.enters, now.x)
+        hardware_deepest = _deepest(old.hardware_deepest, now.enters, now.depth)
         zone = gains["dead_zone"] / now.weight
         spread = force_noise(gains, noise) / now.weight**2
         variance = gains["force_noise_floor"] ** 2 + spread
-        reading = Reading(now.told, rate, now.force, variance, now.hidden, zone, now.usable)
+        reading = Reading(now.aligned, now.rate, now.force, variance, now.hidden, zone, now.usable)
         learnt, known = self.learn(prepared, state.learnt, now.enters, reading, hardware_deepest)
-        expected = force(known, depth, rate, hardware_deepest)
+        expected = force(known, now.depth, now.rate, hardware_deepest)
         guess = jnp.where(expected > zone, zone, jnp.where(expected > 0, expected, 0))
-        measured = jnp.where(now.hidden & now.usable, guess, now.force)
+        read = jnp.where(now.hidden & now.usable, guess, now.force)
         strength = gains["replay_noise"] ** 2
         replay = gains["force_replay"] * strength / (strength + spread)
-        reference = follow(state.reference, known, met.history, replay, now.first, period, now.elapsed, older)
+        measured = Measured(met.history, replay, period, older)
+        reference = follow(state.reference, known, measured, now.first, now.elapsed)
 
-        own = force(known, x, v, deepest)
-        separated = (x <= 0) | (now.usable & (v < 0) & (own <= 0))
-        own = jnp.where(own > 0, own, 0)
-        limit = gains["correction_limit"] * peak_force(known.slopes)
-        wanted = gains["velocity_gain"] * (v - 0.5 * period * own - reference.live.speed)
-        correction = jnp.where(wanted > limit, limit, jnp.where(wanted < -limit, -limit, wanted))
-        command = jnp.where(separated, correction, own + (measured - expected) + correction)
-        command = jnp.where(now.usable, command, jnp.where(separated, 0, measured))
-
-        gone = jnp.where(now.enters | (depth > 0), 0, old.gone + 1)
+        own = force(known, now.x, now.v, deepest)
+        separated = (now.x <= 0) | (now.usable & (now.v < 0) & (own <= 0))
+        command = _command(gains, now, known, own, separated, read, expected, reference.live.speed, period)
+        gone = jnp.where(now.enters | (now.depth > 0), 0, old.gone + 1)
         patience = jnp.where(met.touched | ~now.usable, FAREWELL, LONGEST_LAG)
         over = separated & (gone * period > patience * (1 + 1e-9))
         command = jnp.where((now.side != 0) & ~over, now.side * now.weight * command, 0)
 
-        measured = jnp.stack([measured, now.told, rate, hardware_deepest])
-        sample = Sample(measured, (~now.hidden).astype(depth.dtype))
+        sampled = jnp.stack([read, now.aligned, now.rate, hardware_deepest])
+        sample = Sample(sampled, (~now.hidden).astype(period.dtype))
         moved, hardware, number = move(old, sample, now, met, period, tick)
-        # Written after it is read: only then the ring is updated in place.
-        live = reference.live.depth
-        impulse = depend_on(moved.impulse, jnp.where(jnp.isfinite(live), live, 0))
-        stored = jnp.concatenate([jnp.stack([impulse, moved.read]), hardware])
-        return command, RetrospectiveState(
-            line=line,
-            aligned=aligned,
-            noise=noise,
-            episode=Episode(
-                side=jnp.where(over, 0, now.side),
-                velocity=now.speed,
-                first=now.first,
-                elapsed=now.elapsed,
-                touched=met.touched.astype(depth.dtype),
-                gone=gone,
-                fraction=met.fraction,
-                deepest=deepest,
-                hardware_deepest=hardware_deepest,
-                sample=sample,
-                moved=moved,
-                early=early,
-            ),
-            learnt=learnt,
-            reference=reference,
-            history=met.history._replace(ring=remember(met.history, tick, stored), number=number),
+        ring = _remembered(met.history, reference, moved, hardware, tick)
+        episode = Episode(
+            side=jnp.where(over, 0, now.side),
+            velocity=now.speed,
+            first=now.first,
+            elapsed=now.elapsed,
+            touched=met.touched.astype(period.dtype),
+            gone=gone,
+            fraction=met.fraction,
+            deepest=deepest,
+            hardware_deepest=hardware_deepest,
+            sample=sample,
+            moved=moved,
+            early=early,
         )
+        history = met.history._replace(ring=ring, number=number)
+        return command, RetrospectiveState(line, aligned, noise, episode, learnt, reference, history)
+
+
+def map_prior(gains: Gains) -> Map:
+    """The map before the first reading of a contact, of the gains called `prior_...`."""
+    return prior(
+        stiffness=gains["prior_stiffness"],
+        common=gains["prior_stiffness_spread"],
+        wandering=gains["prior_slope_spread"],
+        damping=gains["prior_damping_spread"],
+        depth_damping=gains["prior_depth_damping_spread"],
+        unloading=gains["prior_unloading_spread"],
+    )
+
+
+def _deepest(before, enters, depth):
+    """The deepest point of this contact so far [s]."""
+    before = jnp.where(enters, 0, before)
+    return jnp.where(depth > before, depth, before)
+
+
+def _command(gains, now, known, own, separated, read, expected, reference_speed, period):
+    """F_c/(M v0) [1/s], of the module's text; `own` is the map's force on the numerical model."""
+    own = jnp.where(own > 0, own, 0)
+    limit = gains["correction_limit"] * peak_force(known.slopes)
+    wanted = gains["velocity_gain"] * (now.v - 0.5 * period * own - reference_speed)
+    correction = jnp.where(wanted > limit, limit, jnp.where(wanted < -limit, -limit, wanted))
+    command = jnp.where(separated, correction, own + (read - expected) + correction)
+    return jnp.where(now.usable, command, jnp.where(separated, 0, read))
+
+
+def _remembered(history, reference, moved, hardware, tick):
+    """The ring of measured samples with this tick's; written after it is read, it is updated in place."""
+    live = reference.live.depth
+    impulse = depend_on(moved.impulse, jnp.where(jnp.isfinite(live), live, 0))
+    return remember(history, tick, jnp.concatenate([jnp.stack([impulse, moved.read]), hardware]))

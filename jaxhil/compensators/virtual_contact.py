@@ -75,12 +75,6 @@ class VirtualContact(Compensator):
     def prepare(self, gains: Gains, constants: Constants):
         return gains, constants.clearance
 
-    def init(self, gains, constants, ring):
-        return ()
-
-    def restart(self, gains, state, begins, fresh):
-        return ()
-
     def step(self, prepared, state, signals, tick):
         gains, clearance = prepared
         depth = deflection(signals.position_desired, clearance)

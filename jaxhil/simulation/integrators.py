@@ -1,8 +1,8 @@
 """One control period of the numerical model M x'' = -F_c, for the three integrators in use on rigs.
 
-Their own delay (model.md section 6, item 7): semi-implicit Euler none, exact zero-order hold T/2, explicit
-Euler T. All arrays broadcast, plain floats stay such; position [m], velocity [m/s], acceleration [m/s^2],
-control period T [s].
+Their own delay (notebooks/guide/model.md section 6, item 7): semi-implicit Euler none, exact zero-order hold
+T/2, explicit Euler T. All arrays broadcast, plain floats stay such; position [m], velocity [m/s],
+acceleration [m/s^2], control period T [s].
 """
 
 from typing import TypeVar
