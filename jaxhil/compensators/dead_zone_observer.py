@@ -64,7 +64,13 @@ def _nominal_alignment(mechanism: Mechanism) -> float:
 
 
 class DeadZoneObserverState(NamedTuple):
-    """Lead filter; Q's input and output of the tick before [N]; measured positions."""
+    """What the law carries from tick to tick.
+
+    lead: lead filter.
+    withheld: Q's input of the tick before [N].
+    observed: Q's output of the tick before [N].
+    line: measured positions.
+    """
 
     lead: LeadState
     withheld: Float[Array, "*batch"]
@@ -73,8 +79,15 @@ class DeadZoneObserverState(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """Gains, clearance [m], lead filter, coefficients of Q's y(n) = pole y(n-1) + share (u(n) + u(n-1)),
-    alignment."""
+    """What is worked out once per run.
+
+    gains: of the law.
+    clearance: between two surfaces [m].
+    lead: lead filter.
+    pole: of Q, y(n) = pole y(n-1) + share (u(n) + u(n-1)).
+    share: of Q's input.
+    delay: by which positions are aligned.
+    """
 
     gains: Gains
     clearance: Float[Array, "*batch"]

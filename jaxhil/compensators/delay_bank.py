@@ -1,6 +1,6 @@
 """Hypotheses of the force delay side by side, each with a map of its own, weighed by what they explain.
 
-Hypothesis h takes the force to be d_h [s] older than it is told: it belongs to the depth X - d_h V, to first
+Hypothesis h takes the force to be d_h [s] older than assumed: it belongs to the depth X - d_h V, to first
 order. Each identifies a `force_depth_map` of its own and says beforehand what it expects to read, f_h with a
 variance s_h (0 with the noise's own variance r out of contact, and where what it expects while the contact
 opens is not positive). Its weight is the product of
@@ -52,9 +52,18 @@ DAMPING = SEGMENTS
 
 
 class Bank(NamedTuple):
-    """Of each hypothesis its map, the deepest point [s] of this contact, the likelihoods of this contact's
-    readings and of those before; sum over the contacts before of the damping's precision 1/s^2 [s^2] and of
-    B/s^2 [s], their number; whether (1) this contact is to be added to them; the mean of d_h [s]."""
+    """What is known of each hypothesis, and of the delay.
+
+    maps: of each hypothesis.
+    deepest: point of this contact [s].
+    likelihood: of this contact's readings.
+    carried: likelihood of the readings of the contacts before.
+    precision: sum of the damping's 1/s^2 over the contacts before [s^2].
+    weighted: sum of B/s^2 over them [s].
+    met: how many they are.
+    learning: whether (1) this contact is to be added to them.
+    shift: mean of d_h [s].
+    """
 
     maps: Map
     deepest: Float[Array, "hypotheses *batch"]
@@ -68,7 +77,7 @@ class Bank(NamedTuple):
 
 
 def no_bank(prior: Map) -> Bank:
-    """Nothing met yet."""
+    """Before the first contact."""
     zero = jnp.zeros_like(prior.mean[0])
     each = jnp.stack([zero] * HYPOTHESES)
     return Bank(_repeated(prior), each, each + 1, each + 1, each, each, zero, zero, zero)

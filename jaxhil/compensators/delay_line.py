@@ -11,7 +11,12 @@ from jaxhil.ring_buffer import look_back, write
 
 
 class Delay(NamedTuple):
-    """A delay as whole periods and a rest [1], and the control period [s]."""
+    """A delay in control periods.
+
+    lookback: whole periods.
+    fraction: the rest [1].
+    period: control period [s].
+    """
 
     lookback: Int[Array, "*batch"]
     fraction: Float[Array, "*batch"]
@@ -19,7 +24,12 @@ class Delay(NamedTuple):
 
 
 class DelayLine(NamedTuple):
-    """The run's first reading [m] and speed [m/s]; ring of readings [m]."""
+    """Readings of the measured position.
+
+    first_position: the run's first reading [m].
+    first_velocity: its speed then [m/s].
+    ring: of readings [m].
+    """
 
     first_position: Float[Array, "*batch"]
     first_velocity: Float[Array, "*batch"]

@@ -32,15 +32,27 @@ OUTLYING = 4.0  # times the noise's variance: a force that hardly is noise
 
 
 class Map(NamedTuple):
-    """Mean and covariance of theta."""
+    """What is known of theta.
+
+    mean: of theta.
+    covariance: of theta.
+    """
 
     mean: Float[Array, "parameters *batch"]
     covariance: Float[Array, "parameters parameters *batch"]
 
 
 class Reading(NamedTuple):
-    """Of a tick: depth X [s] and speed V [1] as old as the force is told to be, the force y [1/s], its
-    variance r [1/s^2], whether the sensor's dead zone hides it, that zone [1/s], whether to learn from it."""
+    """What is read at a tick.
+
+    depth: X, as old as the force is taken to be [s].
+    rate: V, likewise [1].
+    force: y [1/s].
+    variance: r of its noise [1/s^2].
+    hidden: whether the sensor's dead zone hides the force.
+    zone: that dead zone [1/s].
+    counts: whether to learn from it.
+    """
 
     depth: Float[Array, "*batch"]
     rate: Float[Array, "*batch"]
@@ -52,7 +64,12 @@ class Reading(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """Of a reading: phi.theta [1/s], g = P phi, variance s = phi.g + that of the reading's noise [1/s^2]."""
+    """What a reading will be by a map.
+
+    force: phi.theta [1/s].
+    gain: g = P phi.
+    variance: s = phi.g + that of the reading's noise [1/s^2].
+    """
 
     force: Float[Array, "*batch"]
     gain: Float[Array, "parameters *batch"]
@@ -60,7 +77,13 @@ class Prediction(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """What counts of a map: slopes [1/s^2], damping and depth damping [1/s], unloading [1/s^2]."""
+    """What counts of a map.
+
+    slopes: between the knots [1/s^2].
+    damping: [1/s].
+    depth_damping: at the depth `REACH` [1/s].
+    unloading: [1/s^2].
+    """
 
     slopes: Float[Array, "segments *batch"]
     damping: Float[Array, "*batch"]

@@ -15,7 +15,14 @@ from jaxtyping import Array, Float
 
 
 class Identified(NamedTuple):
-    """Estimate (k [N/m], b [N s/m]) and the factors (u, d_1, d_2) of its covariance."""
+    """Estimate of theta = (k, b), and its covariance P = U D U^T.
+
+    stiffness: k [N/m].
+    damping: b [N s/m].
+    coupling: u.
+    stiffness_variance: d_1.
+    damping_variance: d_2.
+    """
 
     stiffness: Float[Array, "*batch"]
     damping: Float[Array, "*batch"]

@@ -29,14 +29,23 @@ LEAD_FILTER = rig_gain(
 
 
 class LeadState(NamedTuple):
-    """Force and output of the tick before [N]."""
+    """The tick before.
+
+    force: at the input [N].
+    output: [N].
+    """
 
     force: Float[Array, "*batch"]
     output: Float[Array, "*batch"]
 
 
 class LeadFilter(NamedTuple):
-    """Coefficients of y(n) = pole y(n-1) + now F(n) + before F(n-1)."""
+    """Coefficients of y(n) = pole y(n-1) + now F(n) + before F(n-1).
+
+    pole: of the output before.
+    now: of the force.
+    before: of the force before.
+    """
 
     pole: Array
     now: Array

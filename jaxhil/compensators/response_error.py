@@ -59,9 +59,18 @@ def _never(mechanism) -> bool:
 
 
 class ResponseErrorState(NamedTuple):
-    """lead filter; measured and aligned positions [m] and their filtered rates [m/s], of the tick before;
-    shares [1] of the last period in contact and with a force above the threshold; what is identified; the
-    readings that are delayed."""
+    """What the law carries from tick to tick.
+
+    lead: lead filter.
+    position: measured at the tick before [m].
+    velocity: its filtered rate [m/s].
+    aligned: position as old as the force, at the tick before [m].
+    aligned_velocity: its filtered rate [m/s].
+    contact_share: of the last period in contact [1].
+    force_share: of the last period with a force above the threshold [1].
+    identified: stiffness and damping.
+    line: readings that are delayed.
+    """
 
     lead: LeadState
     position: Float[Array, "*batch"]
@@ -75,8 +84,16 @@ class ResponseErrorState(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """Gains, control period [s], clearance [m], lead filter, coefficients of the velocity filter
-    v(n) = rate_pole v(n-1) + rate_gain (x(n) - x(n-1)), alignment delay."""
+    """What is worked out once per run.
+
+    gains: of the law.
+    period: control period [s].
+    clearance: between two surfaces [m].
+    lead: lead filter.
+    rate_pole: of the velocity filter v(n) = rate_pole v(n-1) + rate_gain (x(n) - x(n-1)).
+    rate_gain: of that filter [1/s].
+    delay: by which positions are aligned.
+    """
 
     gains: Gains
     period: Float[Array, "*batch"]

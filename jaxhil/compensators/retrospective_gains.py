@@ -79,7 +79,7 @@ GAINS: tuple[Gain, ...] = (
     _prior("prior_damping_spread", 0.01, 50.0),
     _prior("prior_depth_damping_spread", 1e-4, 50.0, _shows("hunt_crossley", "depth_damped")),
     _prior("prior_unloading_spread", 1e-4, 5e3, _shows("elastoplastic")),
-    # Where there is noise, which it is told and sees, it hardly matters.
+    # Where there is noise, which is given and seen, it hardly matters.
     _prior("force_noise_floor", 1e-4, 10.0, lambda m: not m.rig.force_sensor.noise_std),
     rig_gain(
         "velocity_gain", lambda m: 1.0, lambda m: 1 / m.rig.control_period,

@@ -25,8 +25,9 @@ from jaxhil.contact.reference_closed_form import arccosine_over_sine, chained_os
 class Reference(NamedTuple):
     """What a contact in space does: arrays of the batch shape.
 
-    `restitution` is rebound speed / approach speed, `peak_force` [N] the largest contact force,
-    `duration` [s] the time from first touch to separation (infinite if the bodies never separate).
+    restitution: rebound speed over approach speed [1].
+    peak_force: largest contact force [N].
+    duration: time from first touch to separation [s]; infinite if the bodies never separate.
     """
 
     restitution: Float[Array, "*batch"]

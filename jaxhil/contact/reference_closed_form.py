@@ -77,37 +77,117 @@ def arccosine_over_sine(cosine):
 
 
 class _Layer(NamedTuple):
-    """One segment, per unit mass: slope, spring force at its lower depth; its thickness."""
+    """One segment, per unit mass.
+
+    number: from 0.
+    stiffness: its slope [1/s^2].
+    acceleration: spring force at its lower depth [m/s^2].
+    thickness: [m]; the last one's is infinite.
+    """
 
     number: Int[Array, ""]
     stiffness: Float[Array, "*batch"]
     acceleration: Float[Array, "*batch"]
-    thickness: Float[Array, "*batch"]  # the last one's is infinite
+    thickness: Float[Array, "*batch"]
 
 
 class _State(NamedTuple):
-    depth: Float[Array, "*batch"]  # of the turning point, above the lower depth of its segment
+    """Between two segments.
+
+    depth: of the turning point above the lower depth of its segment [m].
+    velocity: [m/s].
+    time: since the first touch [s].
+    peak: largest force so far over mass [m/s^2].
+    segment: the deepest reached.
+    ended: on the way in whether it has turned, on the way out whether the bodies have separated.
+    """
+
+    depth: Float[Array, "*batch"]
     velocity: Float[Array, "*batch"]
     time: Float[Array, "*batch"]
-    peak: Float[Array, "*batch"]  # largest force so far / mass
-    segment: Int[Array, "*batch"]  # the deepest reached
-    ended: Bool[Array, "*batch"]  # on the way in: turned; on the way out: separated
+    peak: Float[Array, "*batch"]
+    segment: Int[Array, "*batch"]
+    ended: Bool[Array, "*batch"]
+
+
+class _Piece(NamedTuple):
+    """How one segment is passed: what comes after the start, and how it ends.
+
+    spring: force of the spring over mass at the start [m/s^2].
+    velocity: at the start [m/s].
+    crosses: whether it ends at the segment's far end, else by itself: turning point or separation.
+    target: distance to that end [m]; 0 where it ends by itself.
+    time: until the end, without derivative [s].
+    grows: whether, on the way in, the force grows at first.
+    culmination: time until the force is largest [s].
+    """
+
+    spring: Array
+    velocity: Array
+    crosses: Array
+    target: Array
+    time: Array
+    grows: Array
+    culmination: Array
 
 
 def _traverse(decay, layer: _Layer, inward, state: _State) -> _State:
     """Through one segment, inward or outward, to its far end, the turning point or separation."""
-    stiffness, velocity = layer.stiffness, state.velocity
-    turns_here = state.segment == layer.number
     active = jnp.where(inward, ~state.ended, ~state.ended & (state.segment >= layer.number))
+    piece = _piece(decay, layer, inward, state, active)
+    stiffness = layer.stiffness
+    distances, speeds = _travel(
+        decay[None],
+        stiffness[None],
+        piece.spring[None],
+        piece.velocity[None],
+        jnp.stack([piece.time, piece.culmination]),
+    )
+    forces = piece.spring[None] + stiffness[None] * distances + 2 * decay[None] * speeds
+    distance, speed, end_force = distances[0], speeds[0], forces[0]
+
+    # The event is the zero of `residual`: one Newton step carries its derivative, and nothing else.
+    # At the culmination none is needed: F is stationary there.
+    crosses = piece.crosses
+    force_rate = stiffness * speed - 2 * decay * end_force
+    residual = jnp.where(crosses, distance - piece.target, jnp.where(inward, speed, end_force))
+    rate = jnp.where(crosses, speed, jnp.where(inward, -end_force, force_rate))
+    step = jnp.where(rate == 0, 0.0, -residual) / jnp.where(rate == 0, 1.0, rate)
+    step = step - lax.stop_gradient(step)
+    time = piece.time + step
+    distance = jnp.where(crosses, piece.target, distance + speed * step)
+    speed = speed - end_force * step
+    end_force = end_force + force_rate * step
+    speed = jnp.where(inward, jnp.where(crosses, jnp.maximum(speed, 0.0), 0.0), speed)
+
+    inside = piece.grows & (piece.culmination < time)
+    peak = jnp.where(inside, forces[1], jnp.where(inward, end_force, 0.0))
+    new = _State(
+        depth=jnp.where(inward & ~crosses, distance, state.depth),
+        velocity=speed,
+        time=state.time + time,
+        peak=jnp.where(peak > state.peak, peak, state.peak),
+        segment=jnp.where(inward & crosses, state.segment + 1, state.segment),
+        ended=~crosses,
+    )
+    chosen = _State(*(jnp.where(active, a, b) for a, b in zip(new, state, strict=True)))
+    # At the innermost point, being turned ends the way in and begins the way out.
+    innermost = inward & jnp.isinf(layer.thickness)
+    return chosen._replace(ended=jnp.where(innermost, False, chosen.ended))
+
+
+def _piece(decay, layer: _Layer, inward, state: _State, active) -> _Piece:
+    """How a segment is passed where `active`; times are found without derivative."""
+    stiffness, turns_here = layer.stiffness, state.segment == layer.number
     # Outward, a segment is entered at its upper depth, the turning segment where it was left.
     depth = jnp.where(inward, 0.0, jnp.where(turns_here, state.depth, layer.thickness))
     depth = jnp.where(active, depth, 0.0)
-    velocity = jnp.where(active, velocity, 0.0)
+    velocity = jnp.where(active, state.velocity, 0.0)
     spring = layer.acceleration + stiffness * depth
     force = jnp.maximum(spring + 2 * decay * velocity, 0.0)
 
-    # Times are found without derivative. The piece ends by itself at d' = 0 or at F = 0. On the way
-    # in F is largest at an end of the piece or, if it grows at first, where F' = 0.
+    # The piece ends by itself at d' = 0 or at F = 0. On the way in F is largest at an end of the piece or, if
+    # it grows at first, where F' = 0.
     fixed = lax.stop_gradient((decay, stiffness, spring, velocity))
     growth = stiffness * velocity - 2 * decay * force
     grows = inward & (growth > 0)
@@ -126,41 +206,9 @@ def _traverse(decay, layer: _Layer, inward, state: _State) -> _State:
     target = jnp.where(crosses, boundary, 0.0)
     start = jnp.where(crosses & ~inward, by_itself, 0.0)
     crossing = _crossing_time(*fixed, *lax.stop_gradient((target, start)))
-    time = jnp.where(crosses, crossing, by_itself)
-
-    distances, speeds = _travel(
-        decay[None], stiffness[None], spring[None], velocity[None], jnp.stack([time, culmination])
+    return _Piece(
+        spring, velocity, crosses, target, jnp.where(crosses, crossing, by_itself), grows, culmination
     )
-    forces = spring[None] + stiffness[None] * distances + 2 * decay[None] * speeds
-    distance, speed, end_force = distances[0], speeds[0], forces[0]
-
-    # The event is the zero of `residual`: one Newton step carries its derivative, and nothing else.
-    # At the culmination none is needed: F is stationary there.
-    force_rate = stiffness * speed - 2 * decay * end_force
-    residual = jnp.where(crosses, distance - target, jnp.where(inward, speed, end_force))
-    rate = jnp.where(crosses, speed, jnp.where(inward, -end_force, force_rate))
-    step = jnp.where(rate == 0, 0.0, -residual) / jnp.where(rate == 0, 1.0, rate)
-    step = step - lax.stop_gradient(step)
-    time = time + step
-    distance = jnp.where(crosses, target, distance + speed * step)
-    speed = speed - end_force * step
-    end_force = end_force + force_rate * step
-    speed = jnp.where(inward, jnp.where(crosses, jnp.maximum(speed, 0.0), 0.0), speed)
-
-    inside = grows & (culmination < time)
-    peak = jnp.where(inside, forces[1], jnp.where(inward, end_force, 0.0))
-    new = _State(
-        depth=jnp.where(inward & ~crosses, distance, state.depth),
-        velocity=speed,
-        time=state.time + time,
-        peak=jnp.where(peak > state.peak, peak, state.peak),
-        segment=jnp.where(inward & crosses, state.segment + 1, state.segment),
-        ended=~crosses,
-    )
-    chosen = _State(*(jnp.where(active, a, b) for a, b in zip(new, state, strict=True)))
-    # At the innermost point, being turned ends the way in and begins the way out.
-    innermost = inward & jnp.isinf(layer.thickness)
-    return chosen._replace(ended=jnp.where(innermost, False, chosen.ended))
 
 
 def _crossing_time(decay, stiffness, spring, velocity, target, start):

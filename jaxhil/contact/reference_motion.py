@@ -22,6 +22,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxhil.contact.dormand_prince import Step, along, take_step
+
 if TYPE_CHECKING:
     from jaxhil.contact.base import ContactLaw, ContactParameters
 
@@ -32,27 +34,16 @@ MOST_STEPS = 1000  # rejected ones included
 ROOT_STEPS = 16  # of the false position method (Illinois) towards an event
 INWARD, OUTWARD, FREE, OVER = range(4)  # phases of the motion, the last but one with a push only
 
-# Dormand and Prince 1980: nodes, coefficients of the stages, the last of which is the solution of order 5,
-# and the error, solution of order 5 less that of order 4.
-_NODES = (0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)
-_STAGES = (
-    (1 / 5,),
-    (3 / 40, 9 / 40),
-    (44 / 45, -56 / 15, 32 / 9),
-    (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
-    (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
-    (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
-)
-_ERROR = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
-
 
 class ReferenceMotion(NamedTuple):
     """What a contact in space does, of the batch shape, and its motion at the times asked for.
 
-    `restitution` is the speed |d'| after contact and push are over / v, `peak_force` [N] the largest contact
-    force (without the push), `duration` [s] the time from first touch to separation (infinite if there is
-    none within 10 s, or they come to rest; `restitution` is then that of the speed by that time).
-    `position` [m] and `velocity` [m/s], (samples, *batch), belong to the times asked for, else are None.
+    restitution: speed |d'| after contact and push are over, over v [1].
+    peak_force: largest contact force, without the push [N].
+    duration: time from first touch to separation [s]; infinite if there is none within 10 s, or the bodies
+        come to rest (`restitution` is then that of the speed by that time).
+    position: at the times asked for [m]; None without.
+    velocity: at the times asked for [m/s]; None without.
     """
 
     restitution: Float[Array, "*batch"]
@@ -117,8 +108,18 @@ class _Problem(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Time since first touch, penetration, its rate, the law's state; phase; deepest penetration and largest
-    contact force so far; `hold` at the turning point; time of separation."""
+    """The motion so far.
+
+    time: since first touch [s].
+    depth: penetration [m].
+    velocity: its rate [m/s].
+    memory: state of the contact law.
+    phase: INWARD, OUTWARD, FREE or OVER.
+    deepest: penetration so far [m].
+    peak: largest contact force so far [N].
+    grip: `hold` at the turning point.
+    separated: time of separation [s].
+    """
 
     time: Array
     depth: Array
@@ -132,8 +133,16 @@ class _State(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """The step to try next; false positions tried so far towards an event, 0 while there is none in sight;
-    the steps known to end before and behind it, what the event's function is there, which of them moved."""
+    """The search for the next step.
+
+    step: to try next [s].
+    tries: false positions tried so far towards an event; 0 while there is none in sight.
+    low: step known to end before the event [s].
+    high: step known to end behind it [s].
+    at_low: value of the event's function there.
+    at_high: value of the event's function there.
+    side: which of the two moved last.
+    """
 
     step: Array
     tries: Array
@@ -144,18 +153,15 @@ class _Search(NamedTuple):
     side: Array
 
 
-class _Step(NamedTuple):
-    """Motion at a step's end, accelerations at both its ends, errors of penetration and rate."""
-
-    depth: Array
-    velocity: Array
-    first: Array
-    last: Array
-    errors: tuple[Array, Array]
-
-
 class _Nodes(NamedTuple):
-    """Where steps begin, (nodes, *batch): the motion, and its acceleration at both ends of the step."""
+    """Where steps begin, (nodes, *batch).
+
+    time: [s].
+    depth: penetration [m].
+    velocity: its rate [m/s].
+    first: acceleration at the step's start [m/s^2].
+    last: acceleration at its end [m/s^2].
+    """
 
     time: Array
     depth: Array
@@ -182,8 +188,8 @@ def _contact_force(problem, state, depth, rate):
     return jnp.where(state.phase < FREE, force, 0)
 
 
-def _try(problem, state, step):
-    """One step of Dormand and Prince."""
+def _try(problem, state, length):
+    """One step of a `length` [s]."""
     pushes = state.time < problem.until
 
     def acceleration(time, depth, rate):
@@ -192,18 +198,7 @@ def _try(problem, state, step):
             force = force + jnp.where(pushes, problem.push(time), 0)
         return -force / problem.mass
 
-    def total(row, slopes):
-        return sum((a * slope for a, slope in zip(row, slopes, strict=True) if a), 0.0)
-
-    depth, rate = state.depth, state.velocity
-    rates, slopes = [rate], [acceleration(state.time, depth, rate)]
-    for node, row in zip(_NODES[1:], _STAGES, strict=True):
-        depth = state.depth + step * total(row, rates)
-        rate = state.velocity + step * total(row, slopes)
-        rates.append(rate)
-        slopes.append(acceleration(state.time + node * step, depth, rate))
-    errors = step * total(_ERROR, rates), step * total(_ERROR, slopes)
-    return _Step(depth, rate, slopes[0], slopes[-1], errors)
+    return take_step(acceleration, state.time, state.depth, state.velocity, length)
 
 
 def _follow(problem, records):
@@ -223,13 +218,7 @@ def _follow(problem, records):
         state, search, count, nodes = carry
         active = (state.phase < OVER) & (state.time < LONGEST)
         searching = search.tries > 0
-        rise = search.at_high - search.at_low
-        middle = search.high - search.at_high * (search.high - search.low) / jnp.where(rise < 0, rise, -1)
-        # No step across the end of the push, nor across much of it.
-        left = problem.until - state.time
-        bounded = jnp.minimum(jnp.minimum(search.step, problem.until / 50), left)
-        step = jnp.where(searching, middle, jnp.where(left > 0, bounded, search.step))
-        step = lax.stop_gradient(step)
+        step = _proposed(problem, state, search)
         tried = _try(problem, state, step)
         if nodes is not None:
             here = state.time, state.depth, state.velocity, tried.first, tried.last
@@ -266,11 +255,26 @@ def _follow(problem, records):
         return jnp.any((state.phase < OVER) & (state.time < LONGEST)) & (count < MOST_STEPS)
 
     end, _, count, nodes = lax.while_loop(goes_on, body, (start, search, jnp.zeros((), jnp.int32), nodes))
-    if nodes is not None:
-        late = jnp.arange(MOST_STEPS, dtype=count.dtype).reshape(-1, *[1] * like.ndim) >= count
-        rest = end.time, end.depth, end.velocity, zeros, zeros
-        nodes = _Nodes(*(jnp.where(late, r[None], leaf) for leaf, r in zip(nodes, rest, strict=True)))
-    return end, nodes
+    return end, None if nodes is None else _filled(nodes, end, count)
+
+
+def _proposed(problem, state, search):
+    """The step to try: towards an event that is in sight, else as the errors so far allow."""
+    rise = search.at_high - search.at_low
+    middle = search.high - search.at_high * (search.high - search.low) / jnp.where(rise < 0, rise, -1)
+    # No step across the end of the push, nor across much of it.
+    left = problem.until - state.time
+    bounded = jnp.minimum(jnp.minimum(search.step, problem.until / 50), left)
+    step = jnp.where(search.tries > 0, middle, jnp.where(left > 0, bounded, search.step))
+    return lax.stop_gradient(step)
+
+
+def _filled(nodes, end, count):
+    """The nodes, from the number `count` on those of the end."""
+    like, zeros = end.time, jnp.zeros_like(end.time)
+    late = jnp.arange(MOST_STEPS, dtype=count.dtype).reshape(-1, *[1] * like.ndim) >= count
+    rest = end.time, end.depth, end.velocity, zeros, zeros
+    return _Nodes(*(jnp.where(late, r[None], leaf) for leaf, r in zip(nodes, rest, strict=True)))
 
 
 def _narrowed(search, step, proposed, value, at_start, crosses, found):
@@ -299,7 +303,7 @@ def _moved(problem, state, step, tried, rest, found):
     """The state at the end of a step and, where an event was `found`, a `rest` of time later."""
 
     def force_at(s):
-        depth, rate = _along(s, step, state.depth, state.velocity, tried)
+        depth, rate = along(s, step, state.depth, state.velocity, tried)
         return _contact_force(problem, state, depth, rate)
 
     first = _contact_force(problem, state, state.depth, state.velocity)
@@ -330,20 +334,6 @@ def _moved(problem, state, step, tried, rest, found):
     )
 
 
-def _along(s, step, depth, velocity, tried):
-    """Position and velocity at the fraction s of a step, by its quintic (Hermite)."""
-    speed, bend = velocity * step, tried.first * step**2 / 2
-    moved = tried.depth - depth - speed - bend
-    turned = tried.velocity * step - speed - 2 * bend
-    curled = tried.last * step**2 - 2 * bend
-    cubic = 10 * moved - 4 * turned + curled / 2
-    quartic = -15 * moved + 7 * turned - curled
-    quintic = 6 * moved - 3 * turned + curled / 2
-    position = depth + s * (speed + s * (bend + s * (cubic + s * (quartic + s * quintic))))
-    rate = speed + s * (2 * bend + s * (3 * cubic + s * (4 * quartic + s * 5 * quintic)))
-    return position, jnp.where(step > 0, rate / jnp.where(step > 0, step, 1), velocity)
-
-
 def _at_times(nodes, end, approach, times):
     """Position and velocity at `times`, uniform before the first node and after the last."""
     lines = _Nodes(*(leaf.reshape(leaf.shape[0], -1) for leaf in nodes))
@@ -358,7 +348,7 @@ def _at_times(nodes, end, approach, times):
 
     time, depth, velocity = (pick(leaf, index) for leaf in lines[:3])
     step = pick(lines.time, index + 1) - time
-    tried = _Step(
+    tried = Step(
         depth=pick(lines.depth, index + 1),
         velocity=pick(lines.velocity, index + 1),
         first=pick(lines.first, index),
@@ -366,7 +356,7 @@ def _at_times(nodes, end, approach, times):
         errors=(step, step),
     )
     s = (asked - time) / jnp.where(step > 0, step, 1)
-    position, rate = _along(s, step, depth, velocity, tried)
+    position, rate = along(s, step, depth, velocity, tried)
     before, after = asked < 0, asked >= last[0]
     approach = approach.reshape(1, -1)
     position = jnp.where(after, last[1] + last[2] * (asked - last[0]), position)

@@ -24,7 +24,7 @@ def build_loop(
 ) -> Loop:
     """The loop of `mechanism` under the compensator called `compensator`, for all `scenarios` at once.
 
-    Works of the real force, and the command's excess variation, are told of contacts only where asked for.
+    `energies` asks for the works of the real force, `chatter` for the command's excess variation.
     """
     rig, force, position = mechanism.rig, scenarios.force_sensor, scenarios.position_sensor
     simulator = scenarios.simulator

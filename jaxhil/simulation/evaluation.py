@@ -27,10 +27,17 @@ SMALLEST_TILE = 16
 
 
 class Outcome(NamedTuple):
-    """Per contact, (slots, *batch): the run's metrics; restitution and peak force [N] of the undelayed
-    reference entered at the same speed; error e - e*; |F_c|'s peak over the reference's peak; chatter, F_c's
-    excess variation (`Metrics`) over the reference's peak; whether the contact was asked for, and whether
-    it was reached and ended well."""
+    """A run beside the undelayed reference, per contact, (slots, *batch).
+
+    metrics: of the run.
+    reference_restitution: e* of the same contact in space, entered at the same speed [1].
+    reference_peak_force: of that contact [N].
+    error: e - e* [1].
+    peak_ratio: largest |F_c| over the reference's peak force [1].
+    chatter: excess variation of F_c (`Metrics`) over the reference's peak force [1].
+    wanted: whether the contact was asked for.
+    good: whether it was reached and ended well.
+    """
 
     metrics: Metrics
     reference_restitution: Float[Array, "slots *batch"]

@@ -24,10 +24,10 @@ State = tuple[Array, ...]
 
 
 class Delay(NamedTuple):
-    """A delay of r control periods as whole intervals to look back and a place within the interval.
+    """A delay of r control periods, as whole sampling intervals to look back and a place within one.
 
-    At tick n the newest interval is n - 1; the reading lies in interval n - 1 - `intervals`, at `fraction` of
-    it. `fraction` lies in (0, 1]: a reading at a tick takes the value just before that tick acts.
+    intervals: to look back from the newest one, which is interval n - 1 at tick n.
+    fraction: place in (0, 1] within it: a reading at a tick takes the value just before the tick acts.
     """
 
     intervals: Int[Array, "*batch"]
@@ -37,10 +37,14 @@ class Delay(NamedTuple):
 class Propagation(NamedTuple):
     """Exact discrete motion simulator; rows act on (state, command at start, command at end).
 
-    transition (order, order + 2, *batch); position and velocity rows (order + 2, *batch) at the force
-    sensor's place in the interval; measured_position likewise at the position sensor's; where asked for, both
-    rows at the interval's start and at its end, from within. velocity in m/s. steady_command and
-    steady_velocity (order, *batch): the state of a uniform motion.
+    transition: rows of the state one period later.
+    position: row at the force sensor's place in the sampling interval [m].
+    velocity: row there [m/s].
+    measured_position: row at the position sensor's place [m].
+    start: rows of position and velocity at the interval's start, from within, where asked for.
+    end: at its end, likewise.
+    steady_command: state of a uniform motion, per command now.
+    steady_velocity: state of a uniform motion, per its growth in a period.
     """
 
     transition: Float[Array, "order columns *batch"]

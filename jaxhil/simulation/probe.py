@@ -12,9 +12,11 @@ from jaxtyping import Array, Bool, Float
 
 
 class Push(NamedTuple):
-    """A force p(t) = size sin(pi (t - centre + width/2)/width) for as long as the sine is positive, else 0.
+    """A force p(t) = size sin(pi (t - centre + width/2)/width) while the sine is positive, else 0.
 
-    size [N] against the penetration, centre and width [s]; t counts from the hardware's first touch.
+    size: against the penetration [N].
+    centre: in time since the hardware's first touch [s].
+    width: [s].
     """
 
     size: Float[Array, "*batch"]

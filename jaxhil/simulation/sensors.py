@@ -21,8 +21,11 @@ PARITY = 0x1BD11BDA  # of its key schedule
 
 
 class Noise(NamedTuple):
-    """What noise adds to the readings of force [N] and position [m], (ticks, *batch) or at one tick; None for
-    a sensor without."""
+    """What noise adds to readings, (ticks, *batch) or at one tick.
+
+    force: [N]; None for a sensor without noise.
+    position: [m]; None for a sensor without noise.
+    """
 
     force: Array | None
     position: Array | None
