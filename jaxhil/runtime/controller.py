@@ -39,20 +39,9 @@ class Controller:
     """
 
     __slots__ = (
-        "_clock",
-        "_compensator",
-        "_detail",
-        "_forces",
-        "_inputs",
-        "_period",
-        "_positions",
-        "_stopped",
-        "_tare",
-        "_watchdog",
-        "cause",
-        "faults",
-        "seen",
-    )
+        "_clock", "_compensator", "_detail", "_forces", "_inputs", "_period", "_positions", "_stopped",
+        "_tare", "_watchdog", "cause", "faults", "seen",
+    )  # fmt: skip
 
     def __init__(self, gain_file: GainFile, source: str = "gain document") -> None:
         compensator = COMPENSATORS[gain_file.compensator]

@@ -83,17 +83,8 @@ class Tare:
     """
 
     __slots__ = (
-        "_count",
-        "_highest",
-        "_limit",
-        "_lowest",
-        "_range",
-        "_spread",
-        "_sum",
-        "_ticks",
-        "bias",
-        "fatal",
-    )
+        "_count", "_highest", "_limit", "_lowest", "_range", "_spread", "_sum", "_ticks", "bias", "fatal",
+    )  # fmt: skip
 
     def __init__(self, limits: Mapping[str, float]) -> None:
         self._ticks = limits["tare_ticks"]
@@ -147,30 +138,11 @@ class InputGuard:
     """
 
     __slots__ = (
-        "_bad_forces",
-        "_bad_positions",
-        "_clearance",
-        "_desired",
-        "_flight",
-        "_force_limit",
-        "_force_reading",
-        "_force_stuck",
-        "_force_travel",
-        "_forces_in_flight",
-        "_free_distance",
-        "_free_force",
-        "_held",
-        "_highest",
-        "_known",
-        "_lowest",
-        "_position_stuck",
-        "_position_travel",
-        "_range",
-        "_settling",
-        "fatal",
-        "force",
-        "measured",
-    )
+        "_bad_forces", "_bad_positions", "_clearance", "_desired", "_flight", "_force_limit",
+        "_force_reading", "_force_stuck", "_force_travel", "_forces_in_flight", "_free_distance",
+        "_free_force", "_held", "_highest", "_known", "_lowest", "_position_stuck", "_position_travel",
+        "_range", "_settling", "fatal", "force", "measured",
+    )  # fmt: skip
 
     def __init__(self, limits: Mapping[str, float], period: float, clearance: float) -> None:
         self._clearance = clearance

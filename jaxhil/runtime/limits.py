@@ -83,10 +83,7 @@ LIMITS: dict[str, LimitSpecification] = {
 def complete(limits: Mapping[str, float]) -> dict[str, float]:
     """All limits, those that are not given at their defaults. Raises ValueError for limits that clash."""
     found = {name: limits.get(name, one.default) for name, one in LIMITS.items()}
-    for low, high in (
-        ("measured_lowest", "measured_highest"),
-        ("command_lowest", "command_highest"),
-    ):
+    for low, high in (("measured_lowest", "measured_highest"), ("command_lowest", "command_highest")):
         if not found[low] < found[high]:
             raise ValueError(f"{low} {found[low]!r} is not below {high} {found[high]!r}")
     if found["retreat_velocity"] > found["velocity_limit"]:

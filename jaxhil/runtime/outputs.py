@@ -64,22 +64,9 @@ class PositionGuard:
     """
 
     __slots__ = (
-        "_braking",
-        "_clearance",
-        "_cut",
-        "_cut_tolerated",
-        "_distance",
-        "_engaged",
-        "_highest",
-        "_lowest",
-        "_most",
-        "_rate",
-        "_retreat",
-        "at_rest",
-        "fatal",
-        "known",
-        "output",
-    )
+        "_braking", "_clearance", "_cut", "_cut_tolerated", "_distance", "_engaged", "_highest", "_lowest",
+        "_most", "_rate", "_retreat", "at_rest", "fatal", "known", "output",
+    )  # fmt: skip
 
     def __init__(self, limits: Mapping[str, float], period: float, clearance: float) -> None:
         self._clearance = clearance

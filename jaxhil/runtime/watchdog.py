@@ -44,43 +44,11 @@ class Watchdog:
     """
 
     __slots__ = (
-        "_aligned",
-        "_alignment",
-        "_clearance",
-        "_entry",
-        "_expectation",
-        "_faded",
-        "_fading",
-        "_force",
-        "_known",
-        "_longest",
-        "_margin",
-        "_mass",
-        "_middle",
-        "_open",
-        "_peak",
-        "_period",
-        "_quiet",
-        "_quiet_ticks",
-        "_side",
-        "_stated",
-        "_statuses",
-        "_svf",
-        "_svv",
-        "_sxf",
-        "_sxv",
-        "_sxx",
-        "_ticks",
-        "_tolerance",
-        "_velocity",
-        "_work",
-        "balance",
-        "contacts",
-        "expected",
-        "on",
-        "record",
-        "restitution",
-    )
+        "_aligned", "_alignment", "_clearance", "_entry", "_expectation", "_faded", "_fading", "_force",
+        "_known", "_longest", "_margin", "_mass", "_middle", "_open", "_peak", "_period", "_quiet",
+        "_quiet_ticks", "_side", "_stated", "_statuses", "_svf", "_svv", "_sxf", "_sxv", "_sxx", "_ticks",
+        "_tolerance", "_velocity", "_work", "balance", "contacts", "expected", "on", "record", "restitution",
+    )  # fmt: skip
 
     def __init__(
         self, limits: Mapping[str, float], period: float, clearance: float, stated: bool = False
@@ -247,13 +215,8 @@ class Expectation:
     """The restitution that a contact should have, by its stiffness [N/m], damping [N s/m], speed [m/s]."""
 
     __slots__ = (
-        "_coefficients",
-        "_loss",
-        "_reference_stiffness",
-        "_reference_velocity",
-        "_softness",
-        "_speed",
-    )
+        "_coefficients", "_loss", "_reference_stiffness", "_reference_velocity", "_softness", "_speed",
+    )  # fmt: skip
 
     def __init__(self, limits: Mapping[str, float]) -> None:
         self._reference_stiffness = limits["reference_stiffness"]

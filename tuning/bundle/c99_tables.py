@@ -47,11 +47,7 @@ def gains_table(law: str) -> Table:
         ("control_period", "s, > 0"),
         ("clearance", "m, of a contact with two sides; infinite with one"),
     ]
-    checks = [
-        "isfinite(gains->control_period)",
-        "gains->control_period > 0.0",
-        "gains->clearance >= 0.0",
-    ]
+    checks = ["isfinite(gains->control_period)", "gains->control_period > 0.0", "gains->clearance >= 0.0"]
     for name, gain in COMPENSATORS[law].gains.items():
         limited = gain.lowest > -math.inf or gain.highest < math.inf
         entries.append((name, f"{gain.unit}, {gain.description()}" if limited else gain.unit))

@@ -120,11 +120,7 @@ def replayed(make: Callable[[], udp.ControllerTask], record: TickRecord, limit: 
 
 
 def serve(
-    receiver: socket.socket,
-    task: udp.ControllerTask | Empty,
-    record: TickRecord,
-    wait: float,
-    silence: float,
+    receiver: socket.socket, task: udp.ControllerTask | Empty, record: TickRecord, wait: float, silence: float
 ) -> str:
     """Answer packets until the rig stops or has been silent; returns which. Times in s.
 

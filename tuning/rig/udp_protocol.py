@@ -302,6 +302,5 @@ class ControllerTask:
             self._words = self._words or self.status[:96]
         _, sequence, run, tick, *_ = reading
         return Answer(
-            *(flags, sequence, run, tick, self._command, rate, position, velocity, force, faults),
-            self._words,
+            *(flags, sequence, run, tick, self._command, rate, position, velocity, force, faults), self._words
         )

@@ -1,4 +1,4 @@
-"""The limits of a gain file, from what good runs did: `calibrate`.
+"""`calibrate` finds the limits of a gain file, from what good runs did.
 
 The scenarios of a sweep's store are run again, recorded, and judged: a run is good if no contact's error
 exceeds the sweep's limit. To some of the runs the watchdog's expected restitution is fitted, and limits are
@@ -19,14 +19,7 @@ from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gain_file import LoadedGains
 from tuning.sweeps.store import Store, read_part
-from tuning.watchdog.alarms import (
-    JudgedRuns,
-    features_of,
-    good_runs,
-    judge_chunk,
-    reached,
-    watchdog_rates,
-)
+from tuning.watchdog.alarms import JudgedRuns, features_of, good_runs, judge_chunk, reached, watchdog_rates
 from tuning.watchdog.audited import Rules
 from tuning.watchdog.expectation import Expectation, Features, expected_restitution, fit_expectation
 from tuning.watchdog.extent import Extent

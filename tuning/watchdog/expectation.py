@@ -72,11 +72,7 @@ def expected_restitution(expectation: Expectation, features: Features, mass: flo
 
 
 def fit_expectation(
-    features: Features,
-    reference: Float[np.ndarray, "contacts"],
-    run: np.ndarray,
-    mass: float,
-    enough: float,
+    features: Features, reference: Float[np.ndarray, "contacts"], run: np.ndarray, mass: float, enough: float
 ) -> Expectation:
     """Least squares over contacts, of `reference` restitution e*, each of the run with that number.
 

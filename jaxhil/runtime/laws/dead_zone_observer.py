@@ -22,18 +22,9 @@ class DeadZoneObserver(Compensator):
     """
 
     __slots__ = (
-        "_alignment",
-        "_clearance",
-        "_corner",
-        "_denominator",
-        "_lead",
-        "_limit",
-        "_observed",
-        "_of_observed",
-        "_started",
-        "_stiffness",
-        "_withheld",
-    )
+        "_alignment", "_clearance", "_corner", "_denominator", "_lead", "_limit", "_observed", "_of_observed",
+        "_started", "_stiffness", "_withheld",
+    )  # fmt: skip
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
         "phase_lead": GainSpecification("s"),
@@ -58,13 +49,7 @@ class DeadZoneObserver(Compensator):
         self._observed = 0.0
         self._started = False
 
-    def step(
-        self,
-        force_measured: float,
-        position_desired: float,
-        velocity_desired: float,
-        position_measured: float,
-    ) -> float:
+    def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """The measured force and what the dead zone withholds of it [N], led."""
         alignment = self._alignment
         if not self._started:

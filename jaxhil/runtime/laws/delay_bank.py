@@ -1,4 +1,4 @@
-"""Hypotheses of the force delay side by side, each with a map of its own, weighed by what they explain.
+"""Hypotheses of the force delay side by side, each with a force-depth map, weighed by what they explain.
 
 Hypothesis h takes the force to be d_h [s] older than given: it belongs to the depth X - d_h V. Each
 identifies a force-depth map (`force_depth_map`) and says beforehand what it expects to read, f_h with a
@@ -42,24 +42,10 @@ class DelayBank:
     """
 
     __slots__ = (
-        "_carried",
-        "_covariance",
-        "_damping",
-        "_deepest",
-        "_estimate",
-        "_known",
-        "_learning",
-        "_likelihood",
-        "_met",
-        "_offsets",
-        "_precision",
-        "_prior_covariance",
-        "_prior_estimate",
-        "_weighted",
-        "curve",
-        "shift",
-        "variance",
-    )
+        "_carried", "_covariance", "_damping", "_deepest", "_estimate", "_known", "_learning", "_likelihood",
+        "_met", "_offsets", "_precision", "_prior_covariance", "_prior_estimate", "_weighted", "curve",
+        "shift", "variance",
+    )  # fmt: skip
 
     def __init__(self, spread: float, prior: Prior) -> None:
         self._offsets = np.array([0.25 * step - 1.0 for step in range(HYPOTHESES)]) * spread

@@ -1,6 +1,6 @@
-"""What speaks against a contact's being known: what the retrospective references say of themselves.
+"""Reasons to doubt that a contact is identified, which the retrospective laws report as their status.
 
-In this order, with p the peak force that the map predicts, scaled as in `retrospective`:
+The first that holds is reported, with p the peak force that the map predicts, scaled as in `retrospective`:
 
     unsure       fewer than FEW readings in contact
     too short    the hardware entered when LATE of the contact was over, pi/p its duration
@@ -40,18 +40,9 @@ class Doubts:
     """
 
     __slots__ = (
-        "_depth",
-        "_force",
-        "_position",
-        "_shallow",
-        "_step",
-        "_swings",
-        "_swung",
-        "_variance",
-        "early",
-        "late",
-        "readings",
-    )
+        "_depth", "_force", "_position", "_shallow", "_step", "_swings", "_swung", "_variance", "early",
+        "late", "readings",
+    )  # fmt: skip
 
     def __init__(self) -> None:
         self.start(0.0, 0.0)

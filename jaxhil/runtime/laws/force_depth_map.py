@@ -1,4 +1,4 @@
-"""A force-depth map of unknown contact, identified while it is met: slopes between knots, and dissipation.
+"""A force-depth map of unknown contact, identified while it lasts: slopes between knots, and dissipation.
 
 f(x, v, x_m) = sum_j slope_j clip(x - kappa_j, 0, kappa_{j+1} - kappa_j) + (damping + depth_damping x/REACH) v
 - unloading (x_m - x) at x > 0, else 0; x_m is the deepest point so far. Depth in s (over the approach speed),

@@ -17,22 +17,9 @@ class HardwareSamples:
     """
 
     __slots__ = (
-        "_deepest",
-        "_depth",
-        "_force",
-        "_fraction",
-        "_impulse",
-        "_moved",
-        "_moved_shown",
-        "_offset",
-        "_period",
-        "_read",
-        "_reference",
-        "_shown",
-        "_speed",
-        "_ticks",
-        "first",
-    )
+        "_deepest", "_depth", "_force", "_fraction", "_impulse", "_moved", "_moved_shown", "_offset",
+        "_period", "_read", "_reference", "_shown", "_speed", "_ticks", "first",
+    )  # fmt: skip
 
     def __init__(self, reference: ReferenceMotion, period: float) -> None:
         self._reference = reference

@@ -17,15 +17,9 @@ class ContactIdentification:
     """
 
     __slots__ = (
-        "_d1",
-        "_d2",
-        "_forgetting",
-        "_initial_covariance",
-        "_initial_parameters",
-        "_u",
-        "damping",
+        "_d1", "_d2", "_forgetting", "_initial_covariance", "_initial_parameters", "_u", "damping",
         "stiffness",
-    )
+    )  # fmt: skip
 
     def __init__(
         self,

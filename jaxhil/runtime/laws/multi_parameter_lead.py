@@ -28,13 +28,7 @@ class MultiParameterLead(Compensator):
         self._force_rate_gain = gains["force_rate_gain"]
         self._rate = VelocityFilter(gains["lead_filter"], period)
 
-    def step(
-        self,
-        force_measured: float,
-        position_desired: float,
-        velocity_desired: float,
-        position_measured: float,
-    ) -> float:
+    def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """The measured force [N] and its rate, weighed."""
         rate = self._rate.step(force_measured)
         return self._force_gain * force_measured + self._force_rate_gain * rate

@@ -17,12 +17,6 @@ class NoCompensation(Compensator):
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
         pass
 
-    def step(
-        self,
-        force_measured: float,
-        position_desired: float,
-        velocity_desired: float,
-        position_measured: float,
-    ) -> float:
+    def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """The measured force [N]."""
         return force_measured

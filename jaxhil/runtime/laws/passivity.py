@@ -23,13 +23,7 @@ class Passivity(Compensator):
         self._period = period
         self._energy = 0.0
 
-    def step(
-        self,
-        force_measured: float,
-        position_desired: float,
-        velocity_desired: float,
-        position_measured: float,
-    ) -> float:
+    def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """The measured force [N], less where the contact would give back more than it has taken."""
         travel = self._period * velocity_desired
         before = self._energy

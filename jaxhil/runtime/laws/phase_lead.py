@@ -25,13 +25,7 @@ class PhaseLead(Compensator):
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
         self._lead = LeadFilter(gains["phase_lead"], gains["lead_filter"], period)
 
-    def step(
-        self,
-        force_measured: float,
-        position_desired: float,
-        velocity_desired: float,
-        position_measured: float,
-    ) -> float:
+    def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """The measured force [N], led."""
         return self._lead.step(force_measured)
 

@@ -24,13 +24,7 @@ class PositionLead(Compensator):
         self._of_velocity = gains["position_lead"]
         self._of_acceleration = gains["acceleration_lead"]
 
-    def step(
-        self,
-        force_measured: float,
-        position_desired: float,
-        velocity_desired: float,
-        position_measured: float,
-    ) -> float:
+    def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """The measured force [N]."""
         return force_measured
 

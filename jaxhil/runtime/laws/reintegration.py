@@ -1,4 +1,7 @@
-"""The motion that a contact should have had, integrated over again from its entry while the map improves.
+"""The reference motion: what a contact should have made of the numerical model, had nothing been late.
+
+It follows from the force-depth map (`force_depth_map`), which improves while the contact lasts: so the motion
+is integrated over again from the entry.
 
 From depth 0 at speed 1: x' = v, v' = -f, f = F(x, v, x_m) + rho [y - F(X, V, X_m)], the bracket only as far
 as the hardware has been measured, until it separates: x <= 0, or v < 0 and f <= 0; x_m and X_m are the
@@ -73,22 +76,9 @@ class ReferenceMotion:
     """
 
     __slots__ = (
-        "_behind",
-        "_coarse",
-        "_deepest",
-        "_depths",
-        "_first",
-        "_impulses",
-        "_number",
-        "_period",
-        "_present",
-        "_reached",
-        "_reads",
-        "_speeds",
-        "live",
-        "replay",
-        "shift",
-    )
+        "_behind", "_coarse", "_deepest", "_depths", "_first", "_impulses", "_number", "_period", "_present",
+        "_reached", "_reads", "_speeds", "live", "replay", "shift",
+    )  # fmt: skip
 
     def __init__(self, period: float) -> None:
         self.replay = 0.0

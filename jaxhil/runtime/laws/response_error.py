@@ -33,22 +33,10 @@ class ResponseError(Compensator):
     """
 
     __slots__ = (
-        "_aligned",
-        "_aligned_velocity",
-        "_alignment",
-        "_clearance",
-        "_contact_share",
-        "_force",
-        "_force_share",
-        "_identification",
-        "_lead",
-        "_period",
-        "_response_error",
-        "_response_error_damping",
-        "_started",
-        "_threshold",
-        "_velocity",
-    )
+        "_aligned", "_aligned_velocity", "_alignment", "_clearance", "_contact_share", "_force",
+        "_force_share", "_identification", "_lead", "_period", "_response_error", "_response_error_damping",
+        "_started", "_threshold", "_velocity",
+    )  # fmt: skip
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
         "phase_lead": GainSpecification("s"),
@@ -93,13 +81,7 @@ class ResponseError(Compensator):
         """Identified stiffness [N/m] and damping [N s/m]."""
         return self._identification.stiffness, self._identification.damping
 
-    def step(
-        self,
-        force_measured: float,
-        position_desired: float,
-        velocity_desired: float,
-        position_measured: float,
-    ) -> float:
+    def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """The compensated force F_c [N]."""
         if not self._started:
             self._start(position_measured, velocity_desired)

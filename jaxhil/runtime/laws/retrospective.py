@@ -1,4 +1,9 @@
-"""What the retrospective references share: to work out what should have happened, and to pay it back.
+"""What the retrospective laws share: to work out what should have happened, and to make up for it.
+
+A rig reads the contact force late, and its drives follow late: the numerical model gains or loses energy that
+contact in space would not give it. These laws identify the contact while it lasts, as a map from depth to
+force; they integrate the motion that it should have had since its entry, the reference; and they add to the
+force a correction that brings the model's speed back to the reference's.
 
 Scaled by approach speed v0 and equivalent mass M, F the force-depth map identified on delay-aligned readings
 (X, V, y), p the peak force that it predicts, v_r the speed of the motion that the contact should have had
@@ -54,39 +59,11 @@ class Retrospective(Compensator):
     """
 
     __slots__ = (
-        "_clearance",
-        "_count",
-        "_curve",
-        "_dead_zone",
-        "_deepest",
-        "_doubts",
-        "_elapsed",
-        "_entered",
-        "_floor",
-        "_force_noise",
-        "_gone",
-        "_hardware_deepest",
-        "_last",
-        "_limit",
-        "_line",
-        "_mass",
-        "_middle",
-        "_period",
-        "_plane",
-        "_reference",
-        "_replay",
-        "_samples",
-        "_share",
-        "_shift",
-        "_side",
-        "_speed",
-        "_squares",
-        "_started",
-        "_strength",
-        "_surface",
-        "_velocity_gain",
-        "status",
-    )
+        "_clearance", "_count", "_curve", "_dead_zone", "_deepest", "_doubts", "_elapsed", "_entered",
+        "_floor", "_force_noise", "_gone", "_hardware_deepest", "_last", "_limit", "_line", "_mass",
+        "_middle", "_period", "_plane", "_reference", "_replay", "_samples", "_share", "_shift", "_side",
+        "_speed", "_squares", "_started", "_strength", "_surface", "_velocity_gain", "status",
+    )  # fmt: skip
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
         "equivalent_mass": GainSpecification("kg", lowest=0.0, exclusive=True),
@@ -131,13 +108,7 @@ class Retrospective(Compensator):
         self._prepare(gains, Prior(*(gains[name] for name in PRIOR)))
         self.reset()
 
-    def step(
-        self,
-        force_measured: float,
-        position_desired: float,
-        velocity_desired: float,
-        position_measured: float,
-    ) -> float:
+    def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """The force F_c [N]."""
         period = self._period
         clearance = self._clearance

@@ -49,16 +49,7 @@ class RetrospectiveDelayBank(Retrospective):
     def _begin(self) -> None:
         self._bank.begin()
 
-    def _learn(
-        self,
-        depth: float,
-        rate: float,
-        deepest: float,
-        force: float,
-        variance: float,
-        hidden: bool,
-        zone: float,
-    ) -> None:
+    def _learn(self, depth, rate, deepest, force, variance, hidden, zone) -> None:
         self._bank.learn(depth, rate, force, variance, hidden, zone)
         self._shift = self._bank.shift
 

@@ -26,16 +26,7 @@ class RetrospectiveReference(Retrospective):
     def _begin(self) -> None:
         self._map.restart()
 
-    def _learn(
-        self,
-        depth: float,
-        rate: float,
-        deepest: float,
-        force: float,
-        variance: float,
-        hidden: bool,
-        zone: float,
-    ) -> None:
+    def _learn(self, depth, rate, deepest, force, variance, hidden, zone) -> None:
         if depth > 0.0:
             if not hidden:
                 self._map.update(depth, rate, deepest, force, variance)

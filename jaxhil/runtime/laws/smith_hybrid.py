@@ -10,13 +10,7 @@ class SmithHybrid(Smith):
 
     __slots__ = ()
 
-    def step(
-        self,
-        force_measured: float,
-        position_desired: float,
-        velocity_desired: float,
-        position_measured: float,
-    ) -> float:
+    def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """The mean of the measured force [N] led, and led and predicted."""
         led = self._lead.step(force_measured)
         return 0.5 * (self._predictor.step(led) + led)

@@ -10,12 +10,6 @@ class SmithPredictor(Smith):
 
     __slots__ = ()
 
-    def step(
-        self,
-        force_measured: float,
-        position_desired: float,
-        velocity_desired: float,
-        position_measured: float,
-    ) -> float:
+    def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """The measured force [N], led and predicted."""
         return self._predictor.step(self._lead.step(force_measured))

@@ -23,13 +23,7 @@ class VirtualContact(Compensator):
         self._damping = gains["virtual_damping"]
         self._clearance = clearance
 
-    def step(
-        self,
-        force_measured: float,
-        position_desired: float,
-        velocity_desired: float,
-        position_measured: float,
-    ) -> float:
+    def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """The measured force and the virtual contact's [N]."""
         depth = deflection(position_desired, self._clearance)
         if depth == 0.0:
