@@ -156,10 +156,12 @@ def test_a_part_of_weight_0_is_no_part():
 
 
 def test_terms_are_those_of_any():
-    assert common_terms([Objective(), Objective(noise_weight=0.1)]) == ("rms", False, True, False, False)
-    assert common_terms([Objective("cvar", 2.0, 0.1)]) == ("cvar", True, False, False, False)
-    assert common_terms([Objective(chatter_weight=0.1), Objective()]) == ("rms", False, False, True, False)
-    assert common_terms([Objective()], probed=True) == ("rms", False, False, False, True)
+    assert common_terms([Objective(), Objective(noise_weight=0.1)]) == Terms("rms", False, True, False, False)
+    assert common_terms([Objective("cvar", 2.0, 0.1)]) == Terms("cvar", True, False, False, False)
+    assert common_terms([Objective(chatter_weight=0.1), Objective()]) == Terms(
+        "rms", False, False, True, False
+    )
+    assert common_terms([Objective()], probed=True) == Terms("rms", False, False, False, True)
     with pytest.raises(ValueError):
         common_terms([Objective("rms"), Objective("cvar")])
 

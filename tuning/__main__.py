@@ -31,7 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return code
     except InputError as error:
-        return _complain(str(error), UNUSABLE)
+        # What is wrong with an argument of a function is wrong with the option of that name.
+        return _complain(getattr(error, "option", str(error)), UNUSABLE)
     except KeyboardInterrupt:
         return _complain("interrupted", INTERRUPTED)
     except BrokenPipeError:

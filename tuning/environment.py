@@ -1,19 +1,33 @@
-"""What must be set before jax starts: devices, precision, and where compiled programs are kept.
+"""What jax is told: devices, quick compilation, precision, and where compiled programs are kept.
 
-Commands call `prepare` before anything that imports jax.
+A command has its process to itself: it calls `prepare` before anything that imports jax. A function called
+from Python is a guest in its caller's process: it computes within `computing`, after which jax's settings and
+the environment are the caller's again.
 """
 
 import gc
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 CACHE = "JAXHIL_CACHE"
+DEVICES = "--xla_force_host_platform_device_count"
+# Tracing makes objects by the million, few of them in cycles: looking for those takes a tenth of the time of
+# a short command.
+RARELY = 100_000, 50, 50
+# What compiled programs are kept under: all that takes longer to compile than to read.
+KEEPING = {
+    "jax_persistent_cache_min_compile_time_secs": 0.1,
+    "jax_persistent_cache_min_entry_size_bytes": 0,
+}
+_started_with: list[str] = []  # XLA_FLAGS that jax was started with, once `start` did it
 
 
 def prepare() -> None:
-    """Float64, one device per usable core, quick compilation, compiled programs kept between calls.
+    """For the rest of the process: float64, one device per usable core, quick compilation, compiled programs
+    kept between calls.
 
     What the user says in XLA_FLAGS stands. Flags have no effect once jax runs, and are left alone then.
     """
@@ -21,15 +35,82 @@ def prepare() -> None:
         os.environ.update(settings(os.environ))
     import jax
 
-    # Tracing makes objects by the million, few of them in cycles: looking for those takes a tenth of the time
-    # of a short command.
-    gc.set_threshold(100_000, 50, 50)
+    gc.set_threshold(*RARELY)
     jax.config.update("jax_enable_x64", True)
     folder = cache_folder()
     if folder is not None and not program_folder():
         jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+        for name, value in KEEPING.items():
+            jax.config.update(name, value)
+
+
+@contextmanager
+def computing() -> Iterator[None]:
+    """Float64 and compiled programs kept, for the calls within and this thread; jax started, if it does not
+    run yet, as for a command. Afterwards the caller's settings hold again."""
+    start()
+    collected = gc.get_threshold()
+    try:
+        gc.set_threshold(*RARELY)
+        with float64(), _programs_kept():
+            yield
+    finally:
+        gc.set_threshold(*collected)
+
+
+def start() -> None:
+    """Start jax as for a command, unless it runs already; the environment is then as it was."""
+    import jax
+
+    ours = settings(os.environ)
+    before = {name: os.environ.get(name) for name in ours}
+    os.environ.update(ours)
+    try:
+        # The flags are read when the first device is asked for. Nothing happens if that was before, and then
+        # there are as many devices as there were.
+        count, named = jax.device_count(), ours["XLA_FLAGS"]
+        if not _started_with and f"{DEVICES}={count}" in named.split():
+            _started_with.append(named)
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def float64() -> Iterator[None]:
+    """Float64 in this thread, and none of jax's debugging modes, to which NaN would be a mistake."""
+    import jax
+
+    with ExitStack() as stack:
+        for setting in (jax.enable_x64(True), jax.debug_nans(False), jax.debug_infs(False)):
+            stack.enter_context(setting)
+        yield
+
+
+@contextmanager
+def _programs_kept() -> Iterator[None]:
+    """Compiled programs are kept in our folder, unless the caller keeps his somewhere."""
+    import jax
+    from jax.experimental.compilation_cache import compilation_cache
+
+    folder = None if program_folder() else cache_folder()
+    if folder is None:
+        yield
+        return
+    ours = {"jax_compilation_cache_dir": str(folder), **KEEPING}
+    before = {name: getattr(jax.config, name) for name in ours}
+    try:
+        for name, value in ours.items():
+            jax.config.update(name, value)
+        yield
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
+        # It would go on keeping the caller's programs otherwise.
+        compilation_cache.reset_cache()
 
 
 def program_folder() -> str | None:
@@ -49,10 +130,15 @@ def settings(given: Mapping[str, str]) -> dict[str, str]:
     return {"XLA_FLAGS": flags(given.get("XLA_FLAGS", "")), "NPROC": threads}
 
 
+def xla_flags() -> str:
+    """The flags that programs are compiled with here, as far as is known."""
+    return _started_with[0] if _started_with else os.environ.get("XLA_FLAGS", "")
+
+
 def flags(given: str) -> str:
     """XLA_FLAGS: what the user gave, and what of ours it does not settle."""
     ours = {
-        "--xla_force_host_platform_device_count": usable_cores(),
+        DEVICES: usable_cores(),
         # A third of the compile time, for programs that run as fast.
         "--xla_backend_optimization_level": 1,
         # The tick's loop as one function, its arrays computed several at a time, instead of some 60 calls a

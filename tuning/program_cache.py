@@ -79,11 +79,11 @@ def _program(function, static, structure, shapes, folder):
 
 
 def _is_foreign(value: Any) -> bool:
-    """Whether a module of another package is in it."""
+    """Whether anything of another package is in it, or what its text does not tell: an array, a function."""
     if isinstance(value, tuple):
         return any(_is_foreign(entry) for entry in value)
     if not dataclasses.is_dataclass(value):
-        return False
+        return not (value is None or isinstance(value, (str, bool, int, float)))
     home = type(value).__module__.split(".")[0]
     fields = (getattr(value, field.name) for field in dataclasses.fields(value))
     return home not in PACKAGES or any(_is_foreign(field) for field in fields)

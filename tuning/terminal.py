@@ -96,15 +96,16 @@ def finite(value: Any) -> Any:
 
 
 class Stages:
-    """Progress through a known number of stages, shown on standard error."""
+    """Progress through a known number of stages, shown on standard error, unless `quiet`."""
 
-    def __init__(self, progress: rich.progress.Progress | None, task: Any):
+    def __init__(self, progress: rich.progress.Progress | None, task: Any, quiet: bool = False):
         self._progress, self._task, self._begun = progress, task, False
+        self._note = (lambda text: None) if quiet else note
 
     def begin(self, text: str) -> None:
         """The stage before, if any, is over and `text` begins."""
         if self._progress is None:
-            note(text)
+            self._note(text)
             return
         self._progress.update(self._task, advance=int(self._begun), description=text)
         self._begun = True
@@ -112,7 +113,7 @@ class Stages:
     def say(self, text: str) -> None:
         """What is going on; no stage is over by it."""
         if self._progress is None:
-            note(text)
+            self._note(text)
         else:
             self._progress.update(self._task, description=text)
 
@@ -123,11 +124,11 @@ class Stages:
 
 
 @contextmanager
-def stages(total: int) -> Iterator[Stages]:
-    """A bar on a terminal, a plain line per stage elsewhere."""
+def stages(total: int, shown: bool = True) -> Iterator[Stages]:
+    """A bar on a terminal, a plain line per stage elsewhere; nothing if it is not to be shown."""
     console = _console(sys.stderr)
-    if not console.is_terminal:
-        yield Stages(None, None)
+    if not shown or not console.is_terminal:
+        yield Stages(None, None, quiet=not shown)
         return
     columns = (
         SpinnerColumn(),
@@ -141,10 +142,12 @@ def stages(total: int) -> Iterator[Stages]:
 
 
 class Progress:
-    """Progress through a known number of equal pieces of work, shown on standard error."""
+    """Progress through a known number of equal pieces of work, shown on standard error, unless `quiet`."""
 
-    def __init__(self, total: int, unit: str, bar: rich.progress.Progress | None, task: Any):
-        self._total, self._unit, self._bar, self._task = total, unit, bar, task
+    def __init__(
+        self, total: int, unit: str, bar: rich.progress.Progress | None, task: Any, quiet: bool = False
+    ):
+        self._total, self._unit, self._bar, self._task, self._quiet = total, unit, bar, task, quiet
         self._done, self._skipped = 0, 0
         self._begun = self._shown = time.monotonic()
 
@@ -168,17 +171,19 @@ class Progress:
         pace = f"{figure(rate, 3)} {self._unit}/s, {_span(left)} left"
         if self._bar is not None:
             self._bar.update(self._task, completed=self._done, description=f"{pace}, {text}")
+        elif self._quiet:
+            return
         elif time.monotonic() - self._shown >= SECONDS_BETWEEN_LINES and self._done < self._total:
             self._shown = time.monotonic()
             note(f"{self._done} of {self._total} {self._unit}, {pace}, {text}")
 
 
 @contextmanager
-def progress(total: int, unit: str) -> Iterator[Progress]:
-    """A bar on a terminal, a plain line now and then elsewhere."""
+def progress(total: int, unit: str, shown: bool = True) -> Iterator[Progress]:
+    """A bar on a terminal, a plain line now and then elsewhere; nothing if it is not to be shown."""
     console = _console(sys.stderr)
-    if not console.is_terminal:
-        yield Progress(total, unit, None, None)
+    if not shown or not console.is_terminal:
+        yield Progress(total, unit, None, None, quiet=not shown)
         return
     columns = (BarColumn(bar_width=20), MofNCompleteColumn(), TextColumn("{task.description}", markup=False))
     with rich.progress.Progress(*columns, console=console, transient=True) as bar:

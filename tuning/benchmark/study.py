@@ -60,7 +60,15 @@ def compare(
     processes: int,
     report: Callable[[str], None] = lambda text: None,
 ) -> Iterator[LawFigures | Failed]:
-    """What is found of each law on every mechanism, as it is done."""
+    """What is found of each law on every mechanism, as it is done: in so many processes or, with 0 of them,
+    one after the other in this one, where an error ends all."""
+    if processes == 0:
+        report("contacts in space")
+        for group in build_scenes(list(mechanisms), settings):
+            for law in laws:
+                report(_progress(law, group))
+                yield from judge_law(group, law, settings)
+        return
     # A fresh interpreter each: jax does not survive a fork.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(processes, context, _begin) as pool:
@@ -72,7 +80,7 @@ def compare(
             running = {pool.submit(judge_law, group, law, settings): (group, law) for group, law in tasks}
             for done in as_completed(running):
                 group, law = running[done]
-                report(f"{law}, {len(group)} mechanism{'s' if len(group) > 1 else ''}")
+                report(_progress(law, group))
                 error = done.exception()
                 if error is None:
                     yield from done.result()
@@ -81,6 +89,10 @@ def compare(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def _progress(law: str, scenes: Sequence[Any]) -> str:
+    return f"{law}, {len(scenes)} mechanism{'s' if len(scenes) > 1 else ''}"
 
 
 def _gains(law: str) -> int:

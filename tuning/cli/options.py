@@ -165,10 +165,11 @@ class Tune:
             help_behavior_hint="",
         ),
     ] = None
-    certify: Annotated[
+    global_search: Annotated[
         bool,
         arg(
-            name="certify",
+            name="global-search",
+            aliases=("--certify",),
             metavar="",
             help="Also search all gains' whole ranges, with 50 times the evaluations: is there better?",
         ),

@@ -18,7 +18,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from tuning.environment import program_folder
+from jaxhil.errors import InputError
+from tuning.environment import float64, program_folder
+from tuning.gains.metrics_function import ALLOWED
 from tuning.gains.objective import RMS, Objective
 from tuning.gains.rounds import Start, inverse_hessian, prepare_solver, solve_tasks
 from tuning.gains.settings import TuneSettings
@@ -76,8 +78,9 @@ def find_gains(
     probed = tasks[0].probed
     agreed = PROBED_AGREED if probed else AGREED
     searches = [_Search() for _ in tasks]
+    _check_function(validation, objective)
     going = _solve_batches(validation, settings, first, agreed, searches, report)
-    if probed:
+    if probed or objective.function is not None:
         for i, own in enumerate(searches):
             own.starts, more = _freed(validation, i, own.starts, agreed, settings.seed, objective)
             own.evaluations += more
@@ -174,6 +177,18 @@ def finish(
     return best
 
 
+def _check_function(validation: Validation, objective: Objective) -> None:
+    """The user's function, if there is one, is a number for the literature's gains. Raises `InputError`."""
+    if objective.function is None:
+        return
+    tasks = range(len(validation.tasks))
+    objective.function.check(validation.tasks[0].contacts, validation.tasks[0].number)
+    literature = [_coordinates(validation, i, [validation.tasks[i].literature]) for i in tasks]
+    for value in validation.losses(objective, list(tasks), np.stack(literature))[:, 0]:
+        if not np.isfinite(value):
+            raise InputError(f"objective: found {value:g} for the literature's gains, allowed {ALLOWED}")
+
+
 def _freed(
     validation: Validation, task: int, starts: list[Start], agreed: float, seed: int, objective: Objectives
 ) -> tuple[list[Start], int]:
@@ -214,10 +229,16 @@ def _while_compiling(validation: Validation, number: int, objective: Objective, 
     if program_folder() is None:
         return work()
     with ThreadPoolExecutor(1) as meanwhile:
-        ready = meanwhile.submit(prepare_solver, validation.tasks, number, objective)
+        ready = meanwhile.submit(_prepare, validation, number, objective)
         done = work()
         ready.result()
         return done
+
+
+def _prepare(validation: Validation, number: int, objective: Objectives) -> None:
+    # A thread has jax's settings from the process, not from the caller.
+    with float64():
+        prepare_solver(validation.tasks, number, objective)
 
 
 def _scan(

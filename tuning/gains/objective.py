@@ -35,6 +35,7 @@ from jaxhil.errors import InputError, shown
 from jaxhil.simulation.evaluation import Outcome, compare_with_reference
 from jaxhil.simulation.loop import Loop, RigConstants
 from jaxhil.simulation.rollout import run_contacts
+from tuning.gains.metrics_function import MetricsFunction, ScenarioMetrics, scenario_metrics
 from tuning.transparency.probes import are_probes
 
 SCALE = 0.01  # an error of one: the solver's first steps are damped as for residuals of order one
@@ -64,9 +65,10 @@ class Objective:
     the gains alone (`Compensator.noise_amplification`); a quieter command than the measured force earns
     nothing.
 
-    name: `figure`, one of `OBJECTIVES`. The weights of command, noise and chatter [1] are restitution errors:
-    that which weighs as much as a command one reference peak too high, as an amplification one too large, as
-    one swing over the reference's peak too many.
+    name: `figure`, one of `OBJECTIVES`. function: a function of the user's own in its place, of the metrics
+    of all scenarios but the copies, in which divergence_weight has no part. The weights of command, noise and
+    chatter [1] are restitution errors: that which weighs as much as a command one reference peak too high, as
+    an amplification one too large, as one swing over the reference's peak too many.
 
     Raises `InputError` for another name or a weight that is negative or not finite, or 0 for divergence.
     """
@@ -77,6 +79,7 @@ class Objective:
     noise_weight: float = 0.0
     chatter_weight: float = 0.0
     transparency_weight: float = 0.0
+    function: MetricsFunction | None = None
 
     def __post_init__(self):
         if self.name not in OBJECTIVES:
@@ -98,13 +101,16 @@ RMS = Objective()
 
 class Terms(NamedTuple):
     """What of an objective shapes the program: its figure, whether command, noise and chatter have a part,
-    and whether the scenarios come with copies."""
+    whether the scenarios come with copies, and the user's function in the place of the figure, if any, with
+    the number of contacts that it gets."""
 
     name: str
     command: bool
     noise: bool
     chatter: bool
     transparency: bool = False
+    function: MetricsFunction | None = None
+    contacts: int = 0
 
 
 class Weights(NamedTuple):
@@ -131,19 +137,21 @@ def one_each(objective: Objective | Sequence[Objective], number: int) -> list[Ob
     return [objective] * number if isinstance(objective, Objective) else list(objective)
 
 
-def common_terms(objectives: Sequence[Objective], probed: bool = False) -> Terms:
-    """The terms of objectives of one name: a part that one of them has, all have, some with a weight of 0.
-    `honest` scenarios come with copies.
+def common_terms(objectives: Sequence[Objective], probed: bool = False, contacts: int = 0) -> Terms:
+    """The terms of objectives of one name and function: a part that one of them has, all have, some with a
+    weight of 0. `probed` scenarios come with copies; all have so many `contacts`, if there is a function.
 
-    Raises ValueError for objectives of several names.
+    Raises ValueError for objectives of several names or functions.
     """
-    (name,) = {objective.name for objective in objectives}
+    [(name, function)] = {(objective.name, objective.function) for objective in objectives}
     return Terms(
         name,
         any(objective.command_weight > 0 for objective in objectives),
         any(objective.noise_weight > 0 for objective in objectives),
         any(objective.chatter_weight > 0 for objective in objectives),
         probed,
+        function,
+        contacts if function else 0,
     )
 
 
@@ -182,9 +190,11 @@ def residuals(
     error, excess, chatter = map(by_problem, contact_terms(outcome))
     amplification = jnp.mean(by_problem(loop.compensator.noise_amplification(values, rig.constants)), axis=1)
     probes = by_problem(jnp.broadcast_to(are_probes(number * lanes), outcome.wanted.shape))
-    return weigh(
-        terms, problems.weights, error, excess, chatter, by_problem(outcome.wanted), amplification, probes
-    )
+    wanted = by_problem(outcome.wanted)
+    figure = None
+    if terms.function is not None:
+        figure = terms.function.values(metrics_of(outcome, number, terms.contacts, terms.transparency))
+    return weigh(terms, problems.weights, error, excess, chatter, wanted, amplification, probes, figure)
 
 
 def weigh(
@@ -196,9 +206,11 @@ def weigh(
     wanted: Bool[Array, "problems contacts"],
     amplification: Float[Array, "problems"],
     probes: Bool[Array, "problems contacts"] | None = None,
+    figure: Float[Array, "problems"] | None = None,
 ) -> Float[Array, "problems residuals"]:
     """The residuals of `contact_terms` and of the noise's amplification; `copies`: which contacts are of
-    copies, where the terms have transparency."""
+    copies, where the terms have transparency; `figure`: the value of the user's function, which is one
+    residual, where they have one."""
 
     # A problem that asks for no contact, which fills up a call, has errors of 0.
     def counted(asked):
@@ -212,7 +224,10 @@ def weigh(
         error, plain = jnp.where(probes, 0, error), counted(wanted & ~probes)
     diverging = jnp.sqrt(weights.divergence)[:, None] * error
     number = {"rms": plain, "cvar": _tail(plain), "worst": jnp.ones_like(plain)}[terms.name]
-    parts = [_norm(jnp.where(error > 0, diverging, error), number, POWERS[terms.name]), *blindness]
+    if figure is None:
+        parts = [_norm(jnp.where(error > 0, diverging, error), number, POWERS[terms.name]), *blindness]
+    else:
+        parts = [figure[:, None], *blindness]
     if terms.command:
         parts.append(weights.command[:, None] * _norm(excess, count, 2))
     if terms.chatter:
@@ -239,6 +254,17 @@ def contact_terms(
     return jnp.where(wanted, error, 0), jnp.where(wanted, excess, 0), jnp.where(wanted, chatter, 0)
 
 
+def metrics_of(outcome: Outcome, number: int, contacts: int, probed: bool) -> ScenarioMetrics:
+    """What a user's function gets, for each of so many problems whose scenarios are side by side: leaves
+    (problems, contacts, scenarios), without the copies of `probed` ones."""
+
+    def by_problem(leaf):
+        several = leaf[:contacts].reshape(contacts, number, -1)
+        return jnp.moveaxis(several[..., ~(are_probes(several.shape[-1]) & probed)], 1, 0)
+
+    return jax.tree.map(by_problem, scenario_metrics(outcome, FAILED))
+
+
 def objective_value(
     objective: Objective,
     errors: Float[np.ndarray, "contacts"],
@@ -246,12 +272,13 @@ def objective_value(
     amplification: float = 1.0,
     chatter: Float[np.ndarray, "contacts"] | None = None,
     probe_errors: Float[np.ndarray, "contacts"] | None = None,
+    value: float | None = None,
 ) -> float:
     """J [1] of `Objective`, exactly, for all three names: what a table of results is made of.
 
     `errors`, `excesses` and `chatter` (none: no part in it) are those of `contact_terms`, of the contacts
     asked for; `probe_errors` are the errors of the transparency probes, which are not among `errors` then.
-    What is not finite counts as `FAILED`.
+    What is not finite counts as `FAILED`. `value` is that of the user's function, which is the figure then.
     """
     given = errors, excesses, chatter, probe_errors
     error, excess, swings, blindness = (
@@ -264,6 +291,7 @@ def objective_value(
         "cvar": np.mean(size[-_tail(len(size)) :]),
         "worst": size[-1],
     }[objective.name]
+    figure = figure if value is None else value
     command = objective.command_weight * np.sqrt(np.mean(excess**2))
     restless = objective.chatter_weight * np.sqrt(np.mean(swings**2))
     noise = objective.noise_weight * max(0.0, float(amplification) - 1)

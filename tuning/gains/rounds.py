@@ -200,7 +200,8 @@ def _calls(tasks, names, bounds, objectives, number):
     table = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *each)
     size = _size(number)
     lanes = len(tasks[0].scenarios.velocity)
-    static = (loop, names, common_terms(objectives, tasks[0].probed)), LONGEST, max(1, TILE // lanes)
+    terms = common_terms(objectives, tasks[0].probed, tasks[0].contacts)
+    static = (loop, names, terms), LONGEST, max(1, TILE // lanes)
 
     def call(some: list[_Problem], limit: int):
         dealt = _dealt(size)

@@ -51,6 +51,11 @@ class TuneTask:
         return len(self.scenarios.velocity) // (LANES_PER_SCENARIO if self.probed else 1)
 
     @property
+    def contacts(self) -> int:
+        """Contacts of each scenario."""
+        return self.mechanism.approach.contacts
+
+    @property
     def tuned(self) -> tuple[Gain, ...]:
         """The gains that tuning moves for this mechanism."""
         return tuple(gain for gain in COMPENSATORS[self.compensator].gains if gain.tuned(self.mechanism))

@@ -133,7 +133,7 @@ def tune_all(
         for m in mechanisms
     ]
     found: list[Tuned] = []
-    for group in alike([task.loop for task in tasks], [task.scenarios for task in tasks]):
+    for group in _groups(tasks, settings):
         for begin in range(0, len(group), BLOCK):
             block = group[begin : begin + BLOCK]
             sources = [known for known in (tuned, found) if known]
@@ -142,6 +142,16 @@ def tune_all(
             results = tune_block([tasks[index] for index in block], settings, report, near)
             found.extend(Tuned(one.mechanism, one.gains, one.mechanism.name) for one in results)
             yield from zip(block, results, strict=True)
+
+
+def _groups(tasks: list[TuneTask], settings: TuneSettings) -> list[list[int]]:
+    """Indices of what one program serves; a user's function also gets as many contacts of all."""
+    groups = alike([task.loop for task in tasks], [task.scenarios for task in tasks])
+    if settings.objective.function is None:
+        return groups
+    numbers = {task.contacts for task in tasks}
+    split = ([i for i in group if tasks[i].contacts == number] for group in groups for number in numbers)
+    return [group for group in split if group]
 
 
 def tune_block(

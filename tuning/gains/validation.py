@@ -22,7 +22,7 @@ from jaxhil.simulation.evaluation import Outcome, begin_evaluation, evaluate
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.batches import cut, join
-from tuning.gains.objective import Objective, contact_terms, objective_value, one_each
+from tuning.gains.objective import Objective, contact_terms, metrics_of, objective_value, one_each
 from tuning.gains.tasks import TuneTask, common_loop, gain_bounds, gains_at, tuned_names
 from tuning.optimisation.unit_box import Bounds
 from tuning.transparency.probes import LANES_PER_SCENARIO, ProbedScenarios, are_probes, probed_scenarios
@@ -107,14 +107,26 @@ class Validation:
             terms = [np.asarray(term).reshape(-1, len(some), number) for term in contact_terms(outcome)]
             wanted = outcome.wanted.reshape(terms[0].shape)
             probes = are_probes(number) & self.tasks[0].probed
+            values = self._values_of(objectives[which[0]], outcome, len(some))
             for k, (i, point) in enumerate(some):
                 asked = wanted[:, k]
                 excess, chatter = (term[:, k][asked] for term in terms[1:])
                 error, probe_errors = (terms[0][:, k][asked & ones] for ones in (~probes, probes))
                 own = objectives[which[i]]
                 of_probes = probe_errors if self.tasks[0].probed else None
-                found[i, point] = objective_value(own, error, excess, amplification[k], chatter, of_probes)
+                found[i, point] = objective_value(
+                    own, error, excess, amplification[k], chatter, of_probes, values[k]
+                )
         return found
+
+    def _values_of(
+        self, objective: Objective, outcome: Outcome, pairs: int
+    ) -> Sequence[float] | Sequence[None]:
+        """Of the user's function, if there is one, for every pair of task and point."""
+        if objective.function is None:
+            return [None] * pairs
+        task = self.tasks[0]
+        return objective.function.numbers(metrics_of(outcome, pairs, task.contacts, task.probed)).tolist()
 
     def _begin(
         self, noise, which, coordinates, some, number, lanes

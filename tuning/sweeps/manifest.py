@@ -6,7 +6,6 @@ part of the store, so that no part of another sweep is taken for one of this.
 
 import json
 import math
-import os
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,6 +16,7 @@ from msgspec import Meta
 
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.runtime import digest
+from tuning.environment import xla_flags
 from tuning.gain_file import LoadedGains, check_document, versions
 from tuning.sweeps import LARGEST_CHUNK, LARGEST_SEED, MOST
 from tuning.sweeps.columns import Column, sweep_columns
@@ -100,7 +100,7 @@ def build_manifest(loaded: LoadedGains, choices: Choices) -> Manifest:
         "mechanism_sha256": loaded.document["mechanism_sha256"],
         "gain_file": loaded.document,
         "versions": versions(),
-        "xla_flags": rounding_flags(os.environ.get("XLA_FLAGS", "")),
+        "xla_flags": rounding_flags(xla_flags()),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     if choices.until_width is None:
@@ -180,7 +180,7 @@ def differences(old: Manifest, new: Manifest) -> list[str]:
 
 def unlike_here(manifest: Manifest) -> list[str]:
     """What of this process is not as the manifest says, so that its rows may differ in their last bits."""
-    flags = rounding_flags(os.environ.get("XLA_FLAGS", ""))
+    flags = rounding_flags(xla_flags())
     found_differences = _other_versions(manifest.versions, versions())
     if flags != manifest.xla_flags:
         found_differences.append(f"xla_flags: found {_short(manifest.xla_flags)}, here {_short(flags)}")

@@ -1,58 +1,50 @@
 """`jaxhil compare`: every compensator, each tuned to its own best, on the same scenarios."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from jaxhil.errors import InputError
 from jaxhil.mechanism.file import LoadedMechanism, load, suite_names
-from jaxhil.runtime.laws import LAWS, PUBLISHED
 from tuning import terminal
-from tuning.cli.commands import checks
 from tuning.cli.options import Compare
 from tuning.environment import prepare, usable_cores
+from tuning.front_door.compare import CompareOptions, board, check_names, compare_each
 
 
 def run(options: Compare) -> int:
     """Compare; what is finished is reported and written, also when interrupted. 0, 1 if a law failed, or
     130."""
-    checks.limit(options.limit)
-    checks.at_least(1, scenarios=options.scenarios)
-    checks.at_least(2, judged=options.judged)
-    checks.at_least(0, seed=options.seed)
-    laws = tuple(dict.fromkeys(options.compensators or PUBLISHED))
-    for law in laws:
-        checks.one_of(LAWS, compensators=law)
+    asked = CompareOptions(**{field.name: getattr(options, field.name) for field in fields(CompareOptions)})
+    asked.check()
     loaded = _load(options)
     Path(options.output).mkdir(parents=True, exist_ok=True)
     prepare()
-    from tuning.benchmark.study import CompareSettings, Failed, compare
+    from tuning.benchmark.study import Failed
 
-    settings = CompareSettings(
-        options.scenarios,
-        judged=options.judged,
-        limit=options.limit,
-        seed=options.seed,
-        tuned=not options.untuned,
-    )
-    names = [one.mechanism.name for one in loaded]
+    laws, names = asked.laws, [one.mechanism.name for one in loaded]
     found: dict[str, dict[str, Any]] = {name: {} for name in names}
     interrupted, problems = False, []
     with terminal.stages(len(names) * len(laws)) as stages:
         try:
-            mechanisms = [one.mechanism for one in loaded]
-            for one in compare(mechanisms, laws, settings, usable_cores(), stages.say):
+            for one in compare_each(loaded, asked, usable_cores(), stages):
                 if isinstance(one, Failed):
                     problems.append(f"{one.law}: {one.reason}")
                     terminal.note(f"jaxhil: {problems[-1]}")
                 else:
                     found[one.mechanism][one.law] = one
-                    stages.finish()
         except KeyboardInterrupt:
             interrupted = True
     ordered = {name: [found[name][law] for law in laws if law in found[name]] for name in names}
     done = [name for name in names if ordered[name]]
-    document = {**_document(options, loaded, ordered), "problems": problems, "interrupted": interrupted}
+    document = {
+        **{key: getattr(options, key) for key in ("limit", "seed", "scenarios", "judged")},
+        "tuned": not options.untuned,
+        "mechanisms": [board(one, asked, found[one.mechanism.name]).document for one in loaded],
+        "timings": {"microseconds_per_tick": _costs(loaded[0], ordered)},
+        "problems": problems,
+        "interrupted": interrupted,
+    }
     (Path(options.output) / "compare.json").write_text(terminal.as_json(document), encoding="utf-8")
     if done and not interrupted:
         _draw(options, done, ordered)
@@ -72,50 +64,8 @@ def run(options: Compare) -> int:
 def _load(options: Compare) -> list[LoadedMechanism]:
     files: list[str | None] = [*options.files, *(suite_names() if options.suites else [])]
     loaded = [load(file, options.overrides) for file in files or [None]]
-    known: dict[str, str] = {}
-    for one in loaded:
-        name = one.mechanism.name
-        if name in known:
-            raise InputError(
-                f"{one.label}: name: found {name}, allowed a name other than that of {known[name]}"
-            )
-        known[name] = one.label
+    check_names(loaded)
     return loaded
-
-
-def _document(
-    options: Compare,
-    loaded: Sequence[LoadedMechanism],
-    ordered: Mapping[str, Sequence[Any]],
-) -> dict[str, Any]:
-    from jaxhil.compensators import COMPENSATORS
-    from tuning.benchmark.tables import winners
-
-    return {
-        "limit": options.limit,
-        "seed": options.seed,
-        "scenarios": options.scenarios,
-        "judged": options.judged,
-        "tuned": not options.untuned,
-        "mechanisms": [
-            {
-                "mechanism": one.mechanism.name,
-                "file": one.label,
-                "laws": [
-                    {
-                        "law": own.law,
-                        "knows": list(COMPENSATORS[own.law].knows),
-                        "gains": own.gains,
-                        "figures": own.figures,
-                    }
-                    for own in ordered[one.mechanism.name]
-                ],
-                "winners": winners(ordered[one.mechanism.name]) if ordered[one.mechanism.name] else {},
-            }
-            for one in loaded
-        ],
-        "timings": {"microseconds_per_tick": _costs(loaded[0], ordered)},
-    }
 
 
 def _costs(loaded: LoadedMechanism, ordered: Mapping[str, Sequence[Any]]) -> dict[str, float]:

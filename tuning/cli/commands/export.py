@@ -7,71 +7,27 @@ from typing import Any
 from jaxhil.errors import InputError, shown
 from jaxhil.runtime.limits import LIMITS
 from tuning import terminal
-from tuning.cli.commands import checks
 from tuning.cli.options_rig import Export
-from tuning.environment import prepare
+from tuning.front_door.export import export
 
 
 def run(options: Export) -> int:
     """0 if the runtime does what was simulated; 1 if not: nothing is written if the forces differ."""
-    checks.at_least(0, seed=options.seed)
-    from tuning.bundle.bundle import build_bundle, check_target, write_bundle
-    from tuning.bundle.writers import WRITERS
-
-    formats = _formats(options, list(WRITERS))
-    replaced = _replaced(options.limits)
-    path = checks.gain_file(options.gains)
-    folder = Path(options.output)
-    check_target(folder)
-    prepare()
-    from tuning.gain_file import load_gain_file
-
-    loaded = load_gain_file(path)
-    limits, rates = _calibrated(loaded, options, replaced)
-    with terminal.stages(2) as stages:
-        bundle = build_bundle(loaded.document, formats, limits, rates, options.seed, stages.begin)
-        if not bundle.reasons:
-            write_bundle(folder, bundle.files)
-    # A run that ends early in the bundle itself does so on the rig.
-    stopped = bundle.ended[0] if bundle.ended else None
-    reasons = [*bundle.reasons, *([f"the nominal run, {stopped}"] if stopped else [])]
-    document: dict[str, Any] = {
-        "bundle": None if bundle.reasons else str(folder),
-        "mechanism": loaded.mechanism.name,
-        "compensator": loaded.compensator,
-        "gains_sha256": bundle.document["sha256"],
-        "formats": formats,
-        "files": sorted(bundle.files),
-        "limits": bundle.document.get("limits"),
-        "rates": rates,
-        "ticks": bundle.ticks,
-        "runs": bundle.runs,
-        "ended": bundle.ended,
-        "reasons": reasons,
-        "verdict": "bad" if reasons else "good",
-    }
+    formats = [name.strip() for given in options.formats for name in given.split(",")]
+    found = export(
+        options.gains,
+        options.output,
+        sweep=options.sweep,
+        formats=formats or None,
+        limits=_replaced(options.limits),
+        seed=options.seed,
+        progress=True,
+    )
     if options.json:
-        terminal.emit_json(document)
+        terminal.emit_json(found.document)
     else:
-        _print(document, {name: len(content) for name, content in bundle.files.items()})
-    return 1 if reasons else 0
-
-
-def _calibrated(loaded, options: Export, replaced: dict[str, float | None]) -> tuple[Any, Any]:
-    """The limits for the rig, and what is known of the watchdog's alarms."""
-    from tuning.sweeps.store import read_store
-    from tuning.watchdog.calibration import WITHOUT_STORE, calibrate
-
-    store = None if options.sweep is None else read_store(Path(options.sweep))
-    runs = WITHOUT_STORE if store is None else store.manifest.scenarios
-    with terminal.progress(runs, "runs") as progress:
-        found = calibrate(
-            loaded,
-            store,
-            replaced=replaced,
-            progress=lambda number: progress.advance(number, "working out the limits"),
-        )
-    return found.limits, found.rates
+        _print(found.document, found.sizes)
+    return 0 if found.good else 1
 
 
 def _replaced(given: tuple[str, ...]) -> dict[str, float | None]:
@@ -93,15 +49,6 @@ def _replaced(given: tuple[str, ...]) -> dict[str, float | None]:
             raise InputError(f"--set: found {shown(words)}, allowed a finite number{at_least}, or none")
         replaced[name] = value
     return replaced
-
-
-def _formats(options: Export, available: list[str]) -> list[str]:
-    """The formats asked for, or all. Raises `InputError` for one that is not there."""
-    asked = [name.strip() for given in options.formats for name in given.split(",")]
-    for name in asked:
-        if name not in available:
-            raise InputError(f"--format: found {shown(name)}, allowed {', '.join(available)}")
-    return [name for name in available if name in asked or not asked]
 
 
 def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:

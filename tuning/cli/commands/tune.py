@@ -1,41 +1,42 @@
 """`jaxhil tune`: gains for every mechanism file, judged on scenarios that tuning never saw."""
 
 import re
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError, one_line
 from jaxhil.mechanism.file import LoadedMechanism, load
 from tuning import terminal
-from tuning.cli.commands import checks, tune_pareto
+from tuning.cli.commands import tune_pareto
 from tuning.cli.commands.tune_tables import print_one, print_overview
 from tuning.cli.options import Tune
 from tuning.environment import prepare, program_folder
+from tuning.front_door.tune import TunedGains, TuneOptions, tune_each
 
 MOST_DRAWN = 4  # mechanisms whose plots are drawn; of more there is one picture of all
 
 
 def run(options: Tune) -> int:
     """Tune file by file. What is finished is written at once and stays, whatever happens to the rest."""
-    checks.limit(options.limit)
-    checks.at_least(1, starts=options.starts, steps=options.steps, validation=options.validation)
-    if options.scenarios is not None:
-        checks.at_least(1, scenarios=options.scenarios)
-    checks.at_least(0, seed=options.seed)
-    checks.compensator(options.compensator)
-    tune_pareto.check(options)
-    known = _known(options)
-    if options.setting is not None:
+    asked = TuneOptions(**{field.name: getattr(options, field.name) for field in fields(TuneOptions)})
+    if options.pareto:
         prepare()
-        checks.setting(options.compensator, options.setting)
+    asked.check()
+    if options.start or options.setting is not None:
+        # What is wrong with these is reported before what is wrong with the files.
+        prepare()
+        asked.settings()
+        asked.known()
     loaded, problems = _load(options)
     entries, interrupted = [], False
     if loaded:
         # Before jax starts: a folder that cannot be written costs no tuning.
         Path(options.output).mkdir(parents=True, exist_ok=True)
         try:
-            entries = _tune_all(options, loaded, problems, known)
+            entries = _tune_all(options, asked, loaded, problems)
         except _Interrupted as stop:
             entries, interrupted = stop.entries, True
     if options.json:
@@ -60,27 +61,6 @@ def run(options: Tune) -> int:
 class _Interrupted(Exception):
     def __init__(self, entries: list[dict[str, Any]]):
         self.entries = entries
-
-
-def _known(options: Tune) -> list[Any]:
-    """What the gain files to begin at hold, as `tuning.gains.transfer.Tuned`. Raises `InputError`."""
-    if not options.start:
-        return []
-    prepare()
-    from tuning.gain_file import load_gain_file
-    from tuning.gains.transfer import Tuned
-
-    known = []
-    for given in options.start:
-        path = Path(given) / "gains.json" if Path(given).is_dir() else given
-        found = load_gain_file(path)
-        if found.compensator != options.compensator:
-            raise InputError(
-                f"--start: {one_line(given)}: found gains of {found.compensator}, allowed gains of "
-                f"{options.compensator}"
-            )
-        known.append(Tuned(found.mechanism, found.gains, str(given)))
-    return known
 
 
 def _load(options: Tune) -> tuple[list[LoadedMechanism], list[str]]:
@@ -124,34 +104,19 @@ def folder_name(name: str) -> str:
 
 
 def _tune_all(
-    options: Tune, loaded: list[LoadedMechanism], problems: list[str], known: list[Any]
+    options: Tune, asked: TuneOptions, loaded: list[LoadedMechanism], problems: list[str]
 ) -> list[dict[str, Any]]:
     prepare()
-    from tuning.gains.settings import TuneSettings
-    from tuning.gains.tune import tune_all
-
-    settings = TuneSettings(
-        options.scenarios,
-        options.starts,
-        options.steps,
-        options.validation,
-        options.seed,
-        _objective(options),
-        global_search=options.certify,
-        setting=options.setting,
-        judge_transparency=options.pareto_against == "honesty",
-    )
-    mechanisms = [one.mechanism for one in loaded]
-    entries, done, traded = {}, {}, {}
+    entries, done, fronts = {}, {}, {}
     drawn = len(loaded) <= MOST_DRAWN
     with (
         terminal.stages(len(loaded) * (2 if options.pareto else 1)) as stages,
         ThreadPoolExecutor(1) as meanwhile,
     ):
         if drawn and program_folder() is not None:
-            meanwhile.submit(_prepare_drawing, mechanisms[0], options.compensator)
+            meanwhile.submit(_prepare_drawing, loaded[0].mechanism, options.compensator)
         try:
-            for index, result in tune_all(mechanisms, options.compensator, settings, stages.say, known):
+            for index, result in tune_each(loaded, asked, stages.say):
                 try:
                     entries[index] = _finish(options, loaded[index], result, drawn, stages.say)
                 except InputError as error:
@@ -161,98 +126,77 @@ def _tune_all(
                 done[index] = result
                 stages.finish()
                 if not options.json and drawn:
-                    print_one(options, result, entries[index])
+                    print_one(options, result.found, entries[index])
             if options.pareto and done:
-                traded = tune_pareto.trade(options, loaded, done, entries, problems, stages)
+                fronts = tune_pareto.trade(options, done, entries, problems, stages)
         except KeyboardInterrupt:
             raise _Interrupted(_in_order(entries)) from None
     if len(loaded) > 1 and done:
-        results, finished = _in_order(done), _in_order(entries)
-        if not drawn:
-            from tuning.pictures.plots import overview_plot, save
-
-            save(overview_plot(results, options.limit), Path(options.output) / "overview.png")
-        if not options.json:
-            print_overview(options, results, finished, drawn)
+        _overview(options, [one.found for one in _in_order(done)], _in_order(entries), drawn)
     if not options.json and drawn:
-        for index in sorted(traded):
-            tune_pareto.print_front(options, done[index], traded[index], entries[index]["pareto"])
-    elif not options.json and traded:
+        for index in sorted(fronts):
+            tune_pareto.print_front(options, done[index].found, fronts[index], entries[index]["pareto"])
+    elif not options.json and fronts:
         terminal.emit(
             f"wrote {options.output}/NAME/pareto/NN/gains.json and {options.output}/NAME/pareto.png", ""
         )
     return _in_order(entries)
 
 
-def _objective(options: Tune):
-    """What is asked for and, where nothing is, what the compensator's kind calls for."""
-    from tuning.gains.objective import WEIGHTS, Objective
-    from tuning.transparency.probes import default_weights
+def _overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], drawn: bool) -> None:
+    """All mechanisms in one table and, where none has pictures of its own, in one picture."""
+    if not drawn:
+        from tuning.pictures.plots import overview_plot, save
 
-    given = {name: getattr(options, name) for name in WEIGHTS}
-    stated = {name: weight for name, weight in given.items() if weight is not None}
-    return Objective(options.objective, **{**default_weights(options.compensator), **stated})
+        save(overview_plot(results, options.limit), Path(options.output) / "overview.png")
+    if not options.json:
+        print_overview(options, results, entries, drawn)
 
 
 def _in_order(by_index: dict[int, Any]) -> list[Any]:
     return [by_index[index] for index in sorted(by_index)]
 
 
-def _finish(options: Tune, loaded: LoadedMechanism, result, drawn: bool, say) -> dict[str, Any]:
+def _finish(
+    options: Tune, loaded: LoadedMechanism, result: TunedGains, drawn: bool, say: Callable[[str], None]
+) -> dict[str, Any]:
     """Write what was found for one mechanism."""
-    from tuning.gain_file import build_document, validity_envelope, write_gain_file
     from tuning.gains.tasks import has_sensor_noise
 
     folder = Path(options.output) / folder_name(loaded.mechanism.name)
     folder.mkdir(exist_ok=True)
-    document = build_document(
-        options.compensator,
-        result.gains,
-        loaded.mechanism,
-        loaded.sha256,
-        validity_envelope(loaded.mechanism, result.scenarios),
-        {
-            "nominal": result.nominal,
-            "robust": result.figures,
-            "tuned_intervals": result.intervals.plain(),
-            **({"honesty": result.transparency} if result.transparency else {}),
-        },
-        options.seed,
-        result.timings,
-    )
-    write_gain_file(folder / "gains.json", document)
-    plots = []
+    result.save(folder / "gains.json")
+    found, plots = result.found, []
     if drawn:
         say(f"{loaded.mechanism.name}: drawing")
-        plots = _draw(result, options, folder)
-    tuned = result.figures["tuned"]
-    good = tuned.failed == 0 and tuned.rms <= options.limit
+        plots = _draw(found, options, folder)
     return {
         "mechanism": loaded.mechanism.name,
         "file": loaded.label,
         "compensator": options.compensator,
         "gain_file": str(folder / "gains.json"),
         "plots": plots,
-        "gains": document["gains"],
-        "literature": result.literature,
-        "figures": result.figures,
-        "nominal": result.nominal,
-        "tuned_intervals": result.intervals.plain(),
-        "honesty": result.transparency,
-        "starts": [_start(start) for start in result.starts],
-        "carried_over": _carried_over(result),
-        "freedom": {name: one._asdict() for name, one in result.freedom.items()},
-        "certified": result.global_comparison._asdict() if result.global_comparison else None,
-        "timings": result.timings,
+        "gains": result.document["gains"],
+        "literature": found.literature,
+        "figures": found.figures,
+        "nominal": found.nominal,
+        "tuned_intervals": found.intervals.plain() if found.intervals else None,
+        "honesty": found.transparency,
+        "starts": [_start(start) for start in found.starts],
+        "carried_over": _carried_over(found),
+        "freedom": {name: one._asdict() for name, one in found.freedom.items()},
+        "certified": found.global_comparison._asdict() if found.global_comparison else None,
+        "timings": found.timings,
         "sensor_noise": has_sensor_noise(loaded.mechanism),
-        "better_than_literature": is_better(result.figures["tuned"], result.figures["literature"]),
-        "verdict": "good" if good else "bad",
+        "better_than_literature": is_better(found.figures["tuned"], found.figures["literature"]),
+        "verdict": result.verdict,
     }
 
 
 def _start(start) -> dict[str, Any]:
-    hidden = "coordinates", "curvature"
-    return {name: value for name, value in start._asdict().items() if name not in hidden}
+    return {
+        name: value for name, value in start._asdict().items() if name not in ("coordinates", "curvature")
+    }
 
 
 def _carried_over(result) -> list[dict[str, Any]]:

@@ -5,68 +5,35 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError
-from jaxhil.mechanism.file import LoadedMechanism
 from tuning import terminal
-from tuning.cli.commands import checks
 from tuning.cli.options import Tune
-from tuning.environment import prepare
+from tuning.front_door import tune_pareto
+from tuning.front_door.tune import TunedGains
+from tuning.front_door.tune_pareto import TradedGains
 
 FOLDER = "pareto"
 
 
-def check(options: Tune) -> None:
-    """There is a front to find, if one is asked for. Raises `InputError`."""
-    number = options.pareto
-    if number == 0:
-        return
-    if number < 2:
-        raise InputError(f"--pareto: found {number}, allowed 0 or an integer >= 2")
-    prepare()
-    from tuning.gains.pareto_search import AXES
-
-    if options.pareto_against is not None:
-        checks.one_of(tuple(AXES), **{"pareto-against": options.pareto_against})
-    if axis_of(options) is None:
-        raise InputError(
-            f"--pareto: found {number}, allowed 0 for {options.compensator}: there is no trade-off, it "
-            "passes sensor noise on as it is whatever its gains"
-        )
-
-
-def axis_of(options: Tune) -> Any:
-    """What the error is traded against (`tuning.gains.pareto.Axis`); None: nothing."""
-    from tuning.gains.pareto_search import AXES, NOISE, default_axis, has_trade_off
-
-    if options.pareto_against is None:
-        return default_axis(options.compensator)
-    axis = AXES[options.pareto_against]
-    return None if axis == NOISE and not has_trade_off(options.compensator) else axis
-
-
 def trade(
     options: Tune,
-    loaded: Sequence[LoadedMechanism],
-    done: Mapping[int, Any],
+    done: Mapping[int, TunedGains],
     entries: Mapping[int, dict[str, Any]],
     problems: list[str],
     stages: terminal.Stages,
 ) -> dict[int, Any]:
     """Fronts of the mechanisms that are `done`, written beside their gains and added to their entries."""
-    from tuning.gains.pareto import fronts
-
     order, made = sorted(done), {}
-    for place, front in fronts(
-        [done[index] for index in order], options.pareto, stages.say, axis_of(options)
-    ):
+    results = [done[index] for index in order]
+    for place, points in tune_pareto.trade(results, options.pareto, options.pareto_against, stages.say):
         index = order[place]
         folder = Path(entries[index]["gain_file"]).parent
         try:
-            entry = _write(options, loaded[index].sha256, done[index], front, folder)
+            entry = _write(options, points, folder)
         except InputError as error:
             problems.append(str(error))
             terminal.note(f"jaxhil: {error}")
             continue
-        entries[index]["pareto"], made[index] = entry, front
+        entries[index]["pareto"], made[index] = entry, points[0].front
         stages.finish()
     return made
 
@@ -111,45 +78,21 @@ def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -
     terminal.emit(table, *lines, "")
 
 
-def _write(options: Tune, sha256: str, result: Any, front: Any, folder: Path) -> dict[str, Any]:
+def _write(options: Tune, points: Sequence[TradedGains], folder: Path) -> dict[str, Any]:
     """Write a gain file for each point and the picture of all; what `--json` says of them."""
-    from tuning.gain_file import build_document, validity_envelope, write_gain_file
     from tuning.pictures.plots import front_plot, save
 
-    envelope = validity_envelope(result.mechanism, result.scenarios)
-    axis, entries = front.axis, []
-    for number, point in enumerate(front.points, start=1):
+    front, result, entries = points[0].front, points[0].tuned.found, []
+    for number, point in enumerate(points, start=1):
         place = folder / FOLDER / f"{number:02d}"
         place.mkdir(parents=True, exist_ok=True)
-        traded = {
-            axis.weight: point.weight,
-            axis.cost: point.cost,
-            "error": point.error,
-            "on_front": point.on_front,
-        }
-        figures = {
-            "nominal": {**result.nominal, "tuned": point.nominal},
-            "robust": {**result.figures, "tuned": point.figures},
-            "tuned_intervals": point.intervals.plain(),
-        }
-        if point.transparency is not None:
-            figures["honesty"] = {**result.transparency, "tuned": point.transparency}
-        document = build_document(
-            options.compensator,
-            point.gains,
-            result.mechanism,
-            sha256,
-            envelope,
-            {**figures, "pareto": traded},
-            options.seed,
-            {},
-        )
-        write_gain_file(place / "gains.json", document)
-        gains = {"gain_file": str(place / "gains.json"), "gains": document["gains"]}
-        entries.append({**traded, **gains, "figures": point.figures, "nominal": point.nominal})
+        point.save(place / "gains.json")
+        gains = {"gain_file": str(place / "gains.json"), "gains": point.document["gains"]}
+        entries.append({**point.traded, **gains, "figures": point.figures, "nominal": point.point.nominal})
     _remove_others(folder / FOLDER, len(entries))
     plot = folder / "pareto.png"
     save(front_plot(front, result, options.limit), plot)
+    axis = front.axis
     beside = {
         name: {axis.cost: one.cost, "error": one.error, "figures": one.figures}
         for name, one in (("literature", front.literature), ("tuned", front.tuned))

@@ -1,4 +1,4 @@
-"""The studies that `jaxhil sweep` runs beside its sweep, or finds in the store where it resumes."""
+"""The studies that `tuning.sweep` runs beside its sweep, or finds in the store where it resumes."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,33 +7,33 @@ from typing import Any
 
 from jaxhil.errors import InputError, one_line
 from tuning import terminal
-from tuning.cli.options import Sweep
 
 STAGE = 10_000  # scenarios between two lines of progress
 
 
-def drivers(options: Sweep, store, sweep, unwritten: list[InputError]) -> dict[str, Any]:
+def drivers(options: Any, store, sweep, unwritten: list[InputError], progress: bool) -> dict[str, Any]:
     """What of the document says which input drives the error. `unwritten`: see `put_off`."""
     from jaxhil.mechanism.uncertainty import dimensions
     from tuning.statistics.sobol_indices import evaluations
     from tuning.sweeps.stored_studies import IndicesRequest, read_study, study_path, write_study
     from tuning.sweeps.studies import error_indices
 
-    number: Any = options.drivers
+    number: int = options.drivers
     request = IndicesRequest(number)
     found = read_study(store, request) if options.resume else None
     if found is not None:
-        _say_kept("drivers", study_path(store, request))
+        _say_kept("drivers", study_path(store, request), progress)
         return found._asdict()
     # Noise, if there is any, adds an input; the bar need not know.
-    with terminal.progress(evaluations(len(dimensions(sweep.mechanism)), number), "scenarios") as progress:
-        found = error_indices(sweep, number, lambda more: progress.advance(more, "drivers"))
+    total = evaluations(len(dimensions(sweep.mechanism)), number)
+    with terminal.progress(total, "scenarios", progress) as bar:
+        found = error_indices(sweep, number, lambda more: bar.advance(more, "drivers"))
     with put_off(unwritten):
         write_study(store, request, found)
     return found._asdict()
 
 
-def rare(options: Sweep, store, sweep, unwritten: list[InputError]) -> dict[str, Any]:
+def rare(options: Any, store, sweep, unwritten: list[InputError], progress: bool) -> dict[str, Any]:
     """What of the document says how probable an error beyond a limit is. `unwritten`: see `put_off`."""
     from tuning.sweeps.stored_studies import RareRequest, read_study, study_path, write_study
     from tuning.sweeps.studies import rare_failure
@@ -42,10 +42,10 @@ def rare(options: Sweep, store, sweep, unwritten: list[InputError]) -> dict[str,
     request = RareRequest(limit)
     found = read_study(store, request) if options.resume else None
     if found is not None:
-        _say_kept("subset simulation", study_path(store, request))
+        _say_kept("subset simulation", study_path(store, request), progress)
         return _rare_document(limit, found)
     ran = 0
-    with terminal.stages(1) as stages:
+    with terminal.stages(1, progress) as stages:
         stages.begin("subset simulation")
 
         def done(more: int) -> None:
@@ -81,5 +81,6 @@ def _rare_document(limit: float, found) -> dict[str, Any]:
     }
 
 
-def _say_kept(study: str, path: Path) -> None:
-    terminal.note(f"{study}: as kept in {one_line(str(path))}")
+def _say_kept(study: str, path: Path, progress: bool) -> None:
+    if progress:
+        terminal.note(f"{study}: as kept in {one_line(str(path))}")

@@ -1,0 +1,187 @@
+"""Arguments of the front door's functions: each checked, and refused in one line if it will not do.
+
+The same line serves function and command: an `ArgumentError` knows how its argument is called as an option.
+"""
+
+import functools
+import hashlib
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+
+from jaxhil.errors import InputError, one_line, shown
+from jaxhil.mechanism.file import LoadedMechanism, load, to_builtins
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.runtime.laws import LAWS
+
+if TYPE_CHECKING:
+    from tuning.gain_file import LoadedGains
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+
+class ArgumentError(InputError):
+    """An unusable argument: "name: found X, allowed Y"; `option` says it of the command's option. Where an
+    argument holds several things, `which` of them is meant comes after the name."""
+
+    def __init__(self, name: str, found: str, allowed: str, which: str = ""):
+        text = f"{f': {which}' if which else ''}: found {found}, allowed {allowed}"
+        super().__init__(name + text)
+        self.option = f"--{name.replace('_', '-')}{text}"
+
+
+def entry(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """A function of the front door: what the system refuses is an `InputError` too."""
+
+    @functools.wraps(function)
+    def called(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
+        try:
+            return function(*arguments, **named)
+        except OSError as error:
+            where = f"{one_line(os.fspath(error.filename))}: " if isinstance(error.filename, str) else ""
+            raise InputError(f"{where}{one_line(error.strerror or str(error), 200)}") from None
+
+    return called
+
+
+def integers(least: int, most: int | None = None, **given: Any) -> None:
+    """Every argument given is an integer, `least` <= it <= `most`."""
+    for name, value in given.items():
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise ArgumentError(name, shown(value), f"an integer >= {least}")
+        if value < least:
+            raise ArgumentError(name, str(value), f"an integer >= {least}")
+        if most is not None and value > most:
+            raise ArgumentError(name, str(value), f"at most {most}")
+
+
+def one_of(allowed: Sequence[str], **given: Any) -> None:
+    """Every argument given is one of the `allowed` names."""
+    for name, value in given.items():
+        if value not in allowed:
+            raise ArgumentError(name, shown(value), ", ".join(allowed))
+
+
+def limit(value: Any) -> None:
+    """A limit of the restitution error is a number >= 0; infinite where there is none."""
+    if not is_number(value) or math.isnan(value) or value < 0:
+        raise ArgumentError("limit", str(value) if is_number(value) else shown(value), "a number >= 0")
+
+
+def flags(**given: Any) -> None:
+    """Every argument given is true or false."""
+    for name, value in given.items():
+        if not isinstance(value, bool):
+            raise ArgumentError(name, shown(value), "true or false")
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a real number, of Python or of NumPy."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def compensators(names: Iterable[Any], argument: str = "compensator") -> None:
+    """Every name is a compensator's, built in or registered."""
+    known = compensator_names()
+    for name in names:
+        one_of(known, **{argument: name})
+
+
+def compensator_names() -> tuple[str, ...]:
+    """Of all compensators, the registered ones last. Starts no jax where there are none."""
+    loaded = sys.modules.get("jaxhil.compensators")
+    return tuple(dict.fromkeys([*LAWS, *(loaded.COMPENSATORS if loaded else ())]))
+
+
+def setting(compensator: str, value: Any) -> None:
+    """The compensator has a setting of that name, if one is given. Imports jax then."""
+    if value is None:
+        return
+    from jaxhil.compensators import COMPENSATORS
+
+    names = COMPENSATORS[compensator].settings
+    if value not in names:
+        allowed = ", ".join(names) or f"none, {compensator} has no settings"
+        raise ArgumentError("setting", shown(value), allowed)
+
+
+def several(given: Any, kinds: tuple[type, ...]) -> tuple[list[Any], bool]:
+    """What is given as a list, one of the `kinds` alone being a list of one; whether it was a list."""
+    if isinstance(given, kinds) or not isinstance(given, Iterable) or isinstance(given, Mapping):
+        return [given], False
+    return list(given), True
+
+
+def folder(name: str, value: Any) -> Path:
+    """A path, whatever is there."""
+    if not isinstance(value, (str, os.PathLike)):
+        raise ArgumentError(name, shown(value), "a path")
+    return Path(value)
+
+
+def mechanisms(given: Any) -> tuple[list[LoadedMechanism], bool]:
+    """The mechanisms given, one or several, each as `jaxhil.load` returns it or by its name or file; whether
+    there were several. Raises `InputError`."""
+    listed, many = several(given, (Mechanism, str, os.PathLike, tuple))
+    if not listed:
+        raise ArgumentError("mechanism", "an empty list", "one mechanism or more")
+    loaded = []
+    for one in listed:
+        if isinstance(one, Mechanism):
+            one = _without_file(one)
+        elif isinstance(one, (str, os.PathLike)):
+            one = load(one if isinstance(one, str) else Path(one))
+        if not hasattr(one, "sha256") or not isinstance(getattr(one, "mechanism", None), Mechanism):
+            raise ArgumentError("mechanism", shown(one), "what jaxhil.load returns, or a name or path for it")
+        loaded.append(one)
+    return loaded, many
+
+
+def _without_file(mechanism: Mechanism) -> LoadedMechanism:
+    """A mechanism that comes from no file, with the digest of its content."""
+    content = json.dumps(to_builtins(mechanism), sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return LoadedMechanism(mechanism, hashlib.sha256(content.encode()).hexdigest(), mechanism.name)
+
+
+def gain_file(given: Any, argument: str = "gains") -> "LoadedGains":
+    """The gains given: a gain file's path, or its folder's, or what has a gain file's `document`."""
+    from tuning.gain_file import check_document, load_gain_file
+
+    document = getattr(given, "document", None)
+    if isinstance(document, Mapping):
+        return check_document(dict(document))
+    path = folder(argument, given)
+    return load_gain_file(path / "gains.json" if path.is_dir() else path)
+
+
+def readable_gain_file(given: Any, argument: str = "gains") -> Path:
+    """The gain file at `given`, or in the folder there. Raises `InputError` if it cannot be read at all."""
+    try:
+        path = folder(argument, given)
+        if path.is_dir():
+            path = path / "gains.json"
+        with path.open("rb") as file:
+            file.read(1)
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = getattr(error, "strerror", None) or str(error)
+        where = one_line(os.fspath(given)) or repr(given)
+        raise InputError(f"{where}: cannot be read: {one_line(reason)}") from None
+    return path
+
+
+def runtime(compensator: str) -> None:
+    """The law can run on the rig. Raises `InputError` for one that was registered without a runtime."""
+    from jaxhil.runtime import COMPENSATORS
+
+    if compensator not in COMPENSATORS:
+        raise InputError(
+            f"{compensator}: found no runtime class for the rig, "
+            f"allowed a law registered with one: jaxhil.register(law, runtime=...)"
+        )

@@ -1,0 +1,194 @@
+"""`tuning.compare`: several compensators, each tuned to its own best, judged on the same fresh scenarios."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+from jaxhil.errors import InputError, shown
+from jaxhil.mechanism.file import LoadedMechanism
+from jaxhil.runtime.laws import PUBLISHED
+from tuning import terminal
+from tuning.environment import computing
+from tuning.front_door import arguments
+
+if TYPE_CHECKING:
+    from tuning.benchmark.study import LawFigures
+
+
+class Estimated(float):
+    """A number with an interval of 95 %, from `low` to `high`."""
+
+    low: float
+    high: float
+
+    def __new__(cls, value: float, low: float, high: float) -> "Estimated":
+        made = super().__new__(cls, value)
+        made.low, made.high = low, high
+        return made
+
+    @property
+    def value(self) -> float:
+        """The number alone."""
+        return float(self)
+
+
+@dataclass(frozen=True)
+class Board:
+    """What `compare` returns of one mechanism.
+
+    document: all that is known of it, as in `jaxhil compare --json` under `mechanisms`.
+    figures: by law, then by its gains ("literature", "tuned", or a setting's name), with rms, p99, worst,
+        early, late, slope, peak and more, each a number with `low` and `high`.
+    gains: by law, then by name as in `figures`: the gains [SI units].
+    winners: of each figure the law that is better than every other by more than the intervals, or None.
+    """
+
+    document: dict[str, Any]
+    figures: dict[str, dict[str, Any]]
+    gains: dict[str, dict[str, dict[str, float]]]
+    winners: dict[str, str | None]
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """What `compare` is to do; `compare` says what each means."""
+
+    compensators: Sequence[str] = ()
+    untuned: bool = False
+    scenarios: int = 32
+    judged: int = 256
+    limit: float = 0.01
+    seed: int = 0
+
+    def check(self) -> None:
+        """Raises `InputError` for what will not do."""
+        arguments.limit(self.limit)
+        arguments.integers(1, scenarios=self.scenarios)
+        arguments.integers(2, judged=self.judged)
+        arguments.integers(0, seed=self.seed)
+        arguments.flags(untuned=self.untuned)
+        arguments.compensators(self.laws, "compensators")
+
+    @property
+    def laws(self) -> tuple[str, ...]:
+        """The compensators to compare, each once; all that are published if none is named."""
+        named = [self.compensators] if isinstance(self.compensators, str) else self.compensators
+        return tuple(dict.fromkeys(named or PUBLISHED))
+
+
+@arguments.entry
+def compare(
+    mechanism: Any,
+    compensators: Sequence[str] = (),
+    *,
+    untuned: bool = False,
+    scenarios: int = 32,
+    judged: int = 256,
+    limit: float = 0.01,
+    seed: int = 0,
+    progress: bool = False,
+) -> Any:
+    """Compensators for a mechanism, each tuned to its best, on the same fresh scenarios, with intervals.
+
+    The figures are those of `jaxhil compare`. They are computed in this process, where that command starts
+    one for each core.
+
+    Args:
+        mechanism: what `jaxhil.load` returns, or a name or path for it; or a list of those.
+        compensators: names of laws, built in or registered; by default all that are published.
+        untuned: tune nothing: judge the literature's gains, and a law's settings, as they are.
+        scenarios: how many to tune on.
+        judged: how many fresh scenarios to judge on.
+        limit: the restitution error [1] that counts as a failure.
+        seed: of scenarios, starts and resampling.
+        progress: say on standard error what is going on.
+
+    Returns:
+        A `Board`; a list of them for a list of mechanisms.
+
+    Raises:
+        InputError: one line, for an argument that will not do.
+    """
+    loaded, several = arguments.mechanisms(mechanism)
+    options = CompareOptions(tuple(_names(compensators)), untuned, scenarios, judged, limit, seed)
+    options.check()
+    arguments.flags(progress=progress)
+    check_names(loaded)
+    found: dict[str, dict[str, LawFigures]] = {one.mechanism.name: {} for one in loaded}
+    with computing(), terminal.stages(len(loaded) * len(options.laws), progress) as stages:
+        for one in compare_each(loaded, options, 0, stages):
+            found[one.mechanism][one.law] = one
+        boards = [board(one, options, found[one.mechanism.name]) for one in loaded]
+    return boards if several else boards[0]
+
+
+def compare_each(
+    loaded: Sequence[LoadedMechanism], options: CompareOptions, processes: int, stages: terminal.Stages
+) -> Iterator[Any]:
+    """What `tuning.benchmark.study.compare` finds, as it is done."""
+    from tuning.benchmark.study import CompareSettings, Failed, compare
+
+    settings = CompareSettings(
+        options.scenarios,
+        judged=options.judged,
+        limit=options.limit,
+        seed=options.seed,
+        tuned=not options.untuned,
+    )
+    mechanisms = [one.mechanism for one in loaded]
+    for one in compare(mechanisms, options.laws, settings, processes, stages.say):
+        yield one
+        if not isinstance(one, Failed):
+            stages.finish()
+
+
+def check_names(loaded: Sequence[LoadedMechanism]) -> None:
+    """Mechanisms are told apart by their names. Raises `InputError` where two have one."""
+    known: dict[str, str] = {}
+    for one in loaded:
+        name = one.mechanism.name
+        if name in known:
+            raise InputError(
+                f"{one.label}: name: found {name}, allowed a name other than that of {known[name]}"
+            )
+        known[name] = one.label
+
+
+def board(one: LoadedMechanism, options: CompareOptions, found: "Mapping[str, LawFigures]") -> Board:
+    """What is said of one mechanism, of the laws that are done."""
+    from jaxhil.compensators import COMPENSATORS
+    from tuning.benchmark.tables import winners
+
+    laws = [found[law] for law in options.laws if law in found]
+    won = winners(laws) if laws else {}
+    document = {
+        "mechanism": one.mechanism.name,
+        "file": one.label,
+        "laws": [
+            {
+                "law": own.law,
+                "knows": list(COMPENSATORS[own.law].knows),
+                "gains": own.gains,
+                "figures": own.figures,
+            }
+            for own in laws
+        ],
+        "winners": won,
+    }
+    figures = {
+        own.law: {
+            which: SimpleNamespace(**{name: Estimated(*each[:3]) for name, each in several.items()})
+            for which, several in own.figures.items()
+        }
+        for own in laws
+    }
+    return Board(document, figures, {own.law: own.gains for own in laws}, won)
+
+
+def _names(given: Any) -> list[Any]:
+    names, _ = arguments.several(given, (str,))
+    for name in names:
+        if not isinstance(name, str):
+            raise arguments.ArgumentError("compensators", shown(name), "names of compensators")
+    return names

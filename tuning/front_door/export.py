@@ -1,0 +1,167 @@
+"""`tuning.export`: gains as a bundle that a rig computer can check and run by itself."""
+
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from jaxhil.errors import shown
+from jaxhil.runtime.limits import LIMITS
+from tuning import terminal
+from tuning.environment import computing
+from tuning.front_door import arguments
+from tuning.front_door.arguments import ArgumentError
+
+if TYPE_CHECKING:
+    from tuning.sweeps.store import Store
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What `export` returns.
+
+    document: all that is known, as `jaxhil export --json` prints it.
+    sizes: bytes of each of the bundle's files.
+    """
+
+    document: dict[str, Any]
+    sizes: dict[str, int]
+
+    @property
+    def good(self) -> bool:
+        """Whether the controller on the rig does what was simulated; else no bundle may have been written."""
+        return not self.document["reasons"]
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why it is bad; none if it is good."""
+        return list(self.document["reasons"])
+
+
+@arguments.entry
+def export(
+    gains: Any,
+    folder: str | os.PathLike[str],
+    *,
+    sweep: Any = None,
+    formats: Sequence[str] | None = None,
+    limits: Mapping[str, float | None] | None = None,
+    seed: int = 0,
+    progress: bool = False,
+) -> Exported:
+    """Write a bundle for the rig: gains, controller, test vectors, self-test; nothing to install there.
+
+    Args:
+        gains: what `tuning.tune` returned, or a gain file's path, or its folder's.
+        folder: where to write the bundle: new, empty, or a bundle, which is replaced.
+        sweep: what `tuning.sweep` returned for these gains, or its store's folder: limits and the watchdog's
+            rates come from it.
+        formats: also the gains for "ros2", "matlab", "csv", "c99"; None: all that there are for the law.
+        limits: limits of the rig's own by name [SI units], None for no limit, instead of those worked out.
+        seed: of the test vectors.
+        progress: say on standard error what is going on.
+
+    Raises:
+        InputError: one line, for an argument that will not do, a law without a runtime, or a folder that
+            cannot be written.
+    """
+    arguments.integers(0, seed=seed)
+    arguments.flags(progress=progress)
+    from tuning.bundle.bundle import build_bundle, check_target, write_bundle
+
+    target = arguments.folder("folder", folder)
+    replaced = _replaced({} if limits is None else limits)
+    path = gains if hasattr(gains, "document") else arguments.readable_gain_file(gains)
+    _check_formats(formats)
+    check_target(target)
+    with computing():
+        loaded = arguments.gain_file(path)
+        arguments.runtime(loaded.compensator)
+        chosen = _formats(formats, loaded.compensator)
+        found = _calibrated(loaded, sweep, replaced, progress)
+        with terminal.stages(2, progress) as stages:
+            bundle = build_bundle(loaded.document, chosen, found.limits, found.rates, seed, stages.begin)
+            if not bundle.reasons:
+                write_bundle(target, bundle.files)
+    # A run that ends early in the bundle itself does so on the rig.
+    stopped = bundle.ended[0] if bundle.ended else None
+    document: dict[str, Any] = {
+        "bundle": None if bundle.reasons else str(target),
+        "mechanism": loaded.mechanism.name,
+        "compensator": loaded.compensator,
+        "gains_sha256": bundle.document["sha256"],
+        "formats": chosen,
+        "files": sorted(bundle.files),
+        "limits": bundle.document.get("limits"),
+        "rates": found.rates,
+        "ticks": bundle.ticks,
+        "runs": bundle.runs,
+        "ended": bundle.ended,
+        "reasons": [*bundle.reasons, *([f"the nominal run, {stopped}"] if stopped else [])],
+    }
+    document["verdict"] = "bad" if document["reasons"] else "good"
+    return Exported(document, {name: len(content) for name, content in bundle.files.items()})
+
+
+def _calibrated(loaded, sweep: Any, replaced: dict[str, float | None], progress: bool):
+    """The limits for the rig, and what is known of the watchdog's alarms."""
+    from tuning.watchdog.calibration import WITHOUT_STORE, calibrate
+
+    with _store(sweep) as store:
+        runs = WITHOUT_STORE if store is None else store.manifest.scenarios
+        with terminal.progress(runs, "runs", progress) as bar:
+            return calibrate(
+                loaded,
+                store,
+                replaced=replaced,
+                progress=lambda number: bar.advance(number, "working out the limits"),
+            )
+
+
+@contextmanager
+def _store(sweep: Any) -> "Iterator[Store | None]":
+    """The rows of a sweep, if there is one."""
+    from tuning.front_door.sweep import SweepStudy
+    from tuning.sweeps.store import read_store
+
+    if isinstance(sweep, SweepStudy):
+        with sweep.store() as store:
+            yield store
+    else:
+        yield None if sweep is None else read_store(arguments.folder("sweep", sweep))
+
+
+def _replaced(given: Any) -> dict[str, float | None]:
+    """The limits that the user sets, None for no limit. Raises `InputError`."""
+    if not isinstance(given, Mapping):
+        raise ArgumentError("limits", shown(given), "limits by name")
+    for name, value in given.items():
+        if name not in LIMITS:
+            raise ArgumentError("limits", shown(name), f"one of {', '.join(LIMITS)}")
+        lowest = LIMITS[name].lowest
+        usable = value is None or (arguments.is_number(value) and math.isfinite(value) and value >= lowest)
+        if not usable:
+            at_least = "" if math.isinf(lowest) else f" of at least {lowest:g}"
+            raise ArgumentError("limits", shown(value), f"a finite number{at_least}, or none", name)
+    return {name: None if value is None else float(value) for name, value in given.items()}
+
+
+def _check_formats(formats: Any) -> None:
+    """Raises `InputError` for a format that there is not."""
+    from tuning.bundle.writers import WRITERS
+
+    for name in formats or ():
+        arguments.one_of(tuple(WRITERS), format=name)
+
+
+def _formats(formats: Sequence[str] | None, compensator: str) -> list[str]:
+    """The formats asked for, in the order of the table; by default all that there are for the law."""
+    from tuning.bundle.c99 import FOLDER
+    from tuning.bundle.writers import WRITERS
+
+    if formats:
+        return [name for name in WRITERS if name in formats]
+    has_c = (FOLDER / "laws" / f"{compensator}.c").is_file()
+    return [name for name in WRITERS if name != "c99" or has_c]

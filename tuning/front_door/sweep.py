@@ -1,0 +1,341 @@
+"""`tuning.sweep`: how probable is a failure, how close do the worst scenarios come to one?
+
+The rows are the store's (`tuning.sweeps.store`), in a folder that stays, or in one that is gone when the
+sweep is done. Beside them stands one document, which `jaxhil sweep --json` prints.
+"""
+
+import math
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from jaxhil.errors import InputError, shown
+from tuning import terminal
+from tuning.environment import computing
+from tuning.front_door import arguments, sweep_studies
+from tuning.front_door.arguments import ArgumentError
+from tuning.sweeps import LARGEST_CHUNK, LARGEST_SEED, MOST, PRECISIONS, SAMPLINGS
+
+if TYPE_CHECKING:
+    import pyarrow
+
+    from tuning.sweeps.manifest import Manifest
+    from tuning.sweeps.store import Store
+
+MOST_DRIVERS = 2**20  # scenarios for each input
+
+
+class Interval(NamedTuple):
+    """Ends of an interval of 95 %."""
+
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class SweepStudy:
+    """What `sweep` returns.
+
+    document: all that is known, as `jaxhil sweep --json` prints it.
+    table: the rows, one a scenario, as an Arrow table; units and meanings are its fields' metadata.
+    manifest: everything that the rows follow from.
+    folder: where the rows are kept; None if they are not.
+    unwritten: what could not be written beside the rows, and why.
+    """
+
+    document: dict[str, Any]
+    table: "pyarrow.Table"
+    manifest: "Manifest"
+    folder: Path | None
+    unwritten: list[InputError] = field(default_factory=list)
+
+    @property
+    def failure_probability(self) -> float:
+        """The share of scenarios that failed: an error beyond the limit, or a run that does not end well."""
+        return self.document["failure_probability"]["value"]
+
+    @property
+    def interval(self) -> Interval:
+        """In which the failure probability lies, with 95 % confidence."""
+        known = self.document["failure_probability"]
+        return Interval(known["low"], known["high"])
+
+    @property
+    def verdict(self) -> str:
+        """ "good" if no scenario failed or, with an acceptable probability, if the interval ends below it,
+        else "bad"."""
+        return self.document["verdict"]
+
+    @contextmanager
+    def store(self) -> Iterator["Store"]:
+        """The rows in a store: the folder's, or one that is there within the context alone."""
+        from tuning.sweeps.store import from_table, open_store, read_store, write_part
+
+        if self.folder is not None:
+            yield read_store(self.folder)
+            return
+        with tempfile.TemporaryDirectory(prefix="jaxhil-sweep-") as temporary:
+            store = open_store(Path(temporary), self.manifest, resume=False)
+            for part in range(-(-self.table.num_rows // self.manifest.chunk)):
+                rows = self.table.slice(part * self.manifest.chunk, self.manifest.chunk)
+                write_part(store, part, from_table(self.manifest, rows))
+            yield store
+
+
+@dataclass(frozen=True)
+class SweepOptions:
+    """What `sweep` is to do; `sweep` says what each means."""
+
+    scenarios: int = 100_000
+    seed: int = 0
+    sampling: str = "random"
+    precision: str = "float64"
+    works: bool = False
+    limit: float = 0.01
+    until_width: float | None = None
+    drivers: int | None = None
+    rare: float | None = None
+    acceptable: float | None = None
+    resume: bool = False
+    chunk: int = 16384
+    scheduler: str | None = None
+
+    def check(self) -> None:
+        """Raises `InputError` for what will not do."""
+        arguments.integers(1, scenarios=self.scenarios, chunk=self.chunk)
+        arguments.integers(0, seed=self.seed)
+        arguments.integers(1, MOST, scenarios=self.scenarios)
+        arguments.integers(1, LARGEST_CHUNK, chunk=self.chunk)
+        arguments.integers(0, LARGEST_SEED, seed=self.seed)
+        arguments.one_of(SAMPLINGS, sampling=self.sampling)
+        arguments.one_of(PRECISIONS, precision=self.precision)
+        arguments.flags(works=self.works, resume=self.resume)
+        arguments.limit(self.limit)
+        self._check_studies()
+        if (width := self.until_width) is not None:
+            if not (arguments.is_number(width) and 0 < width <= 1):
+                raise ArgumentError("until_width", _shown(width), "a width above 0, at most 1")
+            if self.sampling != "random":
+                raise ArgumentError("until_width", f"with --sampling {self.sampling}", "with random")
+        if (probability := self.acceptable) is not None:
+            if not (arguments.is_number(probability) and 0 <= probability <= 1):
+                raise ArgumentError("acceptable", _shown(probability), "a probability, 0 to 1")
+
+    def _check_studies(self) -> None:
+        number, rare = self.drivers, self.rare
+        if number is not None:
+            whole = isinstance(number, int) and not isinstance(number, bool)
+            if not (whole and 2 <= number <= MOST_DRIVERS and number & (number - 1) == 0):
+                raise ArgumentError("drivers", _shown(number), f"a power of two, 2 to {MOST_DRIVERS}")
+        if rare is not None:
+            known = arguments.is_number(rare)
+            if not (known and (rare == 0 or (math.isfinite(rare) and rare >= self.limit))):
+                raise ArgumentError("rare", _shown(rare), "a finite error, at least --limit")
+            if rare == 0 and not math.isfinite(self.limit):
+                raise ArgumentError("rare", "without a limit", "with a finite --limit")
+
+
+@arguments.entry
+def sweep(
+    gains: Any,
+    *,
+    scenarios: int = 100_000,
+    seed: int = 0,
+    sampling: str = "random",
+    precision: str = "float64",
+    works: bool = False,
+    limit: float = 0.01,
+    until_width: float | None = None,
+    drivers: int | None = None,
+    rare: float | None = None,
+    acceptable: float | None = None,
+    folder: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    chunk: int = 16384,
+    scheduler: str | None = None,
+    progress: bool = False,
+) -> SweepStudy:
+    """Monte Carlo robustness of a gain file: scenarios drawn from its mechanism's uncertainty and run.
+
+    Scenario i depends on the seed and on i alone; its row is that of `jaxhil sweep`, to the bit.
+
+    Args:
+        gains: a gain file's path, or its folder's, or what `tuning.tune` returned.
+        scenarios: how many to draw and run; with `until_width` the most.
+        seed: of the draws.
+        sampling: "random", or "sobol" (scrambled, several replicates).
+        precision: "float64", or "float32": faster, and compared with float64 on a subset.
+        works: also the real contact force's works; 3 times the time.
+        limit: the restitution error [1] beyond which a scenario has failed.
+        until_width: stop once the probability's interval is so narrow.
+        drivers: also Sobol indices, what drives the error, from so many scenarios for each input: a power of
+            two.
+        rare: also subset simulation of an error beyond this [1], however rare; 0: beyond the limit.
+        acceptable: the failure probability that the interval's upper end may reach; None: no run may fail.
+        folder: where to keep the rows, with pictures; None keeps nothing.
+        resume: go on with the sweep in the folder.
+        chunk: scenarios computed at a time, and rows of each part of the store.
+        scheduler: address of a dask.distributed cluster's scheduler, which then computes the parts.
+        progress: say on standard error how far it is.
+
+    Raises:
+        InputError: one line, for an argument that will not do, or a folder that cannot be written.
+    """
+    given = {**locals()}
+    for name in ("gains", "folder", "progress"):
+        del given[name]
+    options = SweepOptions(**given)
+    options.check()
+    arguments.flags(progress=progress)
+    if folder is not None:
+        target = arguments.folder("folder", folder)
+        return run_study(gains, options, target, progress)
+    if resume:
+        raise ArgumentError("resume", "without a folder", "with the folder of a sweep")
+    with tempfile.TemporaryDirectory(prefix="jaxhil-sweep-") as temporary:
+        return run_study(gains, options, Path(temporary), progress, keep=False)
+
+
+def run_study(
+    gains: Any, options: SweepOptions, folder: Path, progress: bool, keep: bool = True
+) -> SweepStudy:
+    """Compute what the store in the folder lacks; what is to `keep` gets pictures and the document too."""
+    path = gains if hasattr(gains, "document") else arguments.readable_gain_file(gains)
+    with computing():
+        from tuning.statistics.intervals import scenarios_needed
+        from tuning.sweeps.manifest import Choices, build_manifest
+        from tuning.sweeps.run import on_cluster, run_parts, run_sweep
+        from tuning.sweeps.store import locked, open_store
+        from tuning.sweeps.tally import failure_probability
+
+        choices = Choices(**{name: getattr(options, name) for name in Choices._fields})
+        manifest = build_manifest(arguments.gain_file(path), choices)
+        with locked(folder):
+            store = open_store(folder, manifest, options.resume)
+            with terminal.progress(manifest.scenarios, "scenarios", progress) as bar:
+
+                def so_far(tally) -> str:
+                    known = failure_probability(tally)
+                    text = f"failed {known.value:.3g} ({known.low:.2g} to {known.high:.2g})"
+                    if options.until_width is None:
+                        return text
+                    needed = scenarios_needed(known.value, options.until_width)
+                    return f"{text}, about {needed} wanted"
+
+                done, tally = run_sweep(
+                    store,
+                    lambda rows, _: bar.skip(rows),
+                    lambda rows, tally: bar.advance(rows, so_far(tally)),
+                    run_parts if options.scheduler is None else on_cluster(options.scheduler),
+                )
+            document = _document(options, store, done, tally, bar.rate)
+            if not keep:
+                document["store"] = None
+            unwritten = _complete(options, store, done, document, progress, keep)
+            return SweepStudy(document, _table(store), manifest, folder if keep else None, unwritten)
+
+
+def _complete(
+    options: SweepOptions, store: "Store", done, document: dict[str, Any], progress: bool, keep: bool
+) -> list[InputError]:
+    """Add what belongs beside the verdict, and keep all that is known in the store after every step.
+
+    What could not be written is returned, to be reported after the verdict, which no full disk is to cost.
+    """
+    from tuning.sweeps.pictures import write_pictures
+    from tuning.sweeps.run import compare_precisions
+    from tuning.sweeps.store import write_verdict
+
+    unwritten: list[InputError] = []
+
+    def plots() -> list[str]:
+        with sweep_studies.put_off(unwritten):
+            return write_pictures(store, options.acceptable) if keep else []
+        return []
+
+    def write() -> None:
+        with sweep_studies.put_off(unwritten):
+            if keep:
+                write_verdict(store, terminal.as_json(document))
+
+    steps: dict[str, Callable[[], Any]] = {"plots": plots}
+    if store.manifest.precision == "float32":
+        steps["float32"] = lambda: compare_precisions(done)._asdict()
+    if options.drivers is not None:
+        steps["drivers"] = lambda: sweep_studies.drivers(options, store, done, unwritten, progress)
+    if options.rare is not None:
+        steps["rare"] = lambda: sweep_studies.rare(options, store, done, unwritten, progress)
+    write()
+    for key, step in steps.items():
+        document[key] = step()
+        write()
+    return unwritten
+
+
+def _document(options: SweepOptions, store: "Store", done, tally, rate: float | None) -> dict[str, Any]:
+    from tuning.sweeps.run import describe_outcomes
+    from tuning.sweeps.tally import error_quantiles, failure_probability
+
+    manifest = store.manifest
+    probability = failure_probability(tally)
+    if options.acceptable is None:
+        good = tally.failed == 0
+    else:
+        good = probability.high <= options.acceptable
+    return {
+        "store": str(store.folder),
+        "gains_sha256": manifest.gains_sha256,
+        "mechanism": done.mechanism.name,
+        "compensator": done.loop.compensator.name,
+        "scenarios": tally.scenarios,
+        "most_scenarios": manifest.scenarios,
+        **{key: getattr(manifest, key) for key in ("seed", "sampling", "precision", "limit", "until_width")},
+        "failed": tally.failed,
+        "failure_probability": probability._asdict(),
+        "left_out_of_replicates": tally.left_out,
+        "error_quantiles": [one._asdict() for one in error_quantiles(tally)],
+        "outcomes": describe_outcomes(tally),
+        "worst": [_scenario(store, index) for _, _, index in tally.worst],
+        "scenarios_per_second": rate,
+        "acceptable": options.acceptable,
+        "verdict": "good" if good else "bad",
+    }
+
+
+def _scenario(store: "Store", index: int) -> dict[str, Any]:
+    """What is said of one scenario: how it ended, its worst contact, what was drawn."""
+    from tuning.sweeps.columns import texts_of
+    from tuning.sweeps.store import read_row
+
+    row = read_row(store, index)
+    columns = store.manifest.columns
+    numbers = {one.name: row[one.name][0].item() for one in columns if one.kind != "text"}
+    errors = {name: value for name, value in numbers.items() if name.startswith("error_")}
+    worst = numbers["worst_error"]
+    return {
+        "index": index,
+        "outcome": texts_of("outcome")[int(row["outcome"][0])],
+        "worst_error": worst,
+        # None if no contact ended.
+        "worst_contact": next((int(name[6:]) for name, value in errors.items() if value == worst), None),
+        "inputs": {one.name: numbers[one.name] for one in columns if one.kind == "input"},
+    }
+
+
+def _table(store: "Store") -> "pyarrow.Table":
+    """All rows of the store, in the order of their indices."""
+    import pyarrow
+
+    from tuning.sweeps.store import read_part, schema, to_table
+
+    parts = (read_part(store, part) for part in range(store.manifest.parts))
+    tables = [to_table(store.manifest, rows) for rows in parts if rows is not None]
+    return pyarrow.concat_tables(tables) if tables else schema(store.manifest).empty_table()
+
+
+def _shown(value: Any) -> str:
+    return str(value) if arguments.is_number(value) else shown(value)

@@ -1,0 +1,266 @@
+"""`tuning.tune`: the gains of one compensator for one mechanism or several, judged on fresh scenarios."""
+
+import dataclasses
+import functools
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from jaxhil.errors import one_line
+from jaxhil.mechanism.file import LoadedMechanism
+from jaxhil.mechanism.structs import Mechanism
+from tuning import terminal
+from tuning.environment import computing
+from tuning.front_door import arguments, tune_pareto
+from tuning.front_door.arguments import ArgumentError
+from tuning.front_door.tune_pareto import TradedGains
+
+if TYPE_CHECKING:
+    from tuning.gains.objective import Objective
+    from tuning.gains.settings import TuneSettings
+    from tuning.gains.transfer import Tuned
+    from tuning.gains.tune import ErrorFigures, TuneResult
+
+
+@dataclass(frozen=True)
+class TuneOptions:
+    """What `tune` is to do; `tune` says what each means."""
+
+    compensator: str = "response_error"
+    setting: str | None = None
+    scenarios: int | None = None
+    starts: int = 4
+    start: Sequence[Any] = ()
+    steps: int = 25
+    validation: int = 511
+    objective: str | Callable[[Any], Any] = "rms"
+    divergence_weight: float = 1.0
+    command_weight: float | None = None
+    noise_weight: float = 0.0
+    chatter_weight: float = 0.0
+    transparency_weight: float | None = None
+    global_search: bool = False
+    seed: int = 0
+    limit: float = 0.01
+    pareto: int = 0
+    pareto_against: str | None = None
+
+    def check(self) -> None:
+        """What can be checked without jax. Raises `InputError`."""
+        arguments.limit(self.limit)
+        arguments.integers(1, starts=self.starts, steps=self.steps, validation=self.validation)
+        if self.scenarios is not None:
+            arguments.integers(1, scenarios=self.scenarios)
+        arguments.integers(0, seed=self.seed)
+        arguments.compensators([self.compensator])
+        arguments.flags(global_search=self.global_search)
+        if callable(self.objective) and self.pareto:
+            raise ArgumentError("objective", "a function beside pareto", "one of rms, cvar, worst")
+        tune_pareto.check(self.pareto, self.pareto_against, self.compensator)
+
+    def settings(self) -> "TuneSettings":
+        """The same as tuning takes it. Raises `InputError`; imports jax."""
+        from tuning.gains.settings import TuneSettings
+
+        arguments.setting(self.compensator, self.setting)
+        return TuneSettings(
+            self.scenarios,
+            self.starts,
+            self.steps,
+            self.validation,
+            self.seed,
+            self._objective(),
+            global_search=self.global_search,
+            setting=self.setting,
+            judge_transparency=self.pareto_against == "honesty",
+        )
+
+    def _objective(self) -> "Objective":
+        """What is asked for and, where nothing is, what the compensator's kind calls for."""
+        from tuning.gains.objective import WEIGHTS, Objective
+        from tuning.transparency.probes import default_weights
+
+        given = {name: getattr(self, name) for name in WEIGHTS}
+        stated = {name: weight for name, weight in given.items() if weight is not None}
+        if not callable(self.objective):
+            return Objective(self.objective, **{**default_weights(self.compensator), **stated})
+        from tuning.gains.metrics_function import MetricsFunction
+
+        # What the user wants small is all that he says it is.
+        return Objective(**stated, function=MetricsFunction(self.objective))
+
+    def known(self) -> "list[Tuned]":
+        """What the gain files to start from hold. Raises `InputError`; imports jax."""
+        from tuning.gains.transfer import Tuned
+
+        given = [self.start] if isinstance(self.start, (str, os.PathLike, TunedGains)) else self.start
+        found = []
+        for one in given:
+            loaded = arguments.gain_file(one, "start")
+            label = str(one) if isinstance(one, (str, os.PathLike)) else loaded.mechanism.name
+            if loaded.compensator != self.compensator:
+                allowed = f"gains of {self.compensator}"
+                raise ArgumentError("start", f"gains of {loaded.compensator}", allowed, one_line(label))
+            found.append(Tuned(loaded.mechanism, loaded.gains, label))
+        return found
+
+
+@dataclass(frozen=True)
+class TunedGains:
+    """What `tune` returns of one mechanism.
+
+    found: all that tuning found (`tuning.gains.tune.TuneResult`).
+    mechanism_sha256: SHA-256 of the mechanism's file.
+    limit: the rms error [1] that is still good.
+    pareto: the front of gains that trade the error for something else, if one was asked for.
+    """
+
+    found: "TuneResult"
+    mechanism_sha256: str
+    limit: float
+    pareto: tuple[TradedGains, ...] = ()
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """What was tuned for."""
+        return self.found.mechanism
+
+    @property
+    def compensator(self) -> str:
+        """The name of the law that was tuned."""
+        return self.found.compensator
+
+    @property
+    def gains(self) -> dict[str, float]:
+        """The tuned gains by name [SI units], those that are not tuned among them."""
+        return self.found.gains
+
+    @property
+    def literature(self) -> dict[str, float]:
+        """The gains that the literature's rules give, or those of the setting, by name [SI units]."""
+        return self.found.literature
+
+    @property
+    def figures(self) -> "dict[str, ErrorFigures]":
+        """Errors on fresh scenarios "before" (no compensation), with the "literature"'s gains and with the
+        "tuned" ones: each has rms, p99, max [1] and more."""
+        return self.found.figures
+
+    @property
+    def verdict(self) -> str:
+        """ "good" if every contact ended with the tuned gains, and their rms error is within the limit, else
+        "bad"."""
+        tuned = self.figures["tuned"]
+        return "good" if tuned.failed == 0 and tuned.rms <= self.limit else "bad"
+
+    @functools.cached_property
+    def document(self) -> dict[str, Any]:
+        """The content of the gain file."""
+        from tuning.gain_file import build_document, validity_envelope
+
+        found = self.found
+        return build_document(
+            found.compensator,
+            found.gains,
+            found.mechanism,
+            self.mechanism_sha256,
+            validity_envelope(found.mechanism, found.scenarios),
+            {
+                "nominal": found.nominal,
+                "robust": found.figures,
+                "tuned_intervals": found.intervals.plain() if found.intervals else None,
+                **({"honesty": found.transparency} if found.transparency else {}),
+            },
+            found.settings.seed,
+            found.timings,
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the gain file. Raises `InputError` when it cannot be written."""
+        from tuning.gain_file import write_gain_file
+
+        write_gain_file(arguments.folder("path", path), self.document)
+
+
+@arguments.entry
+def tune(
+    mechanism: Any,
+    compensator: str = "response_error",
+    *,
+    setting: str | None = None,
+    scenarios: int | None = None,
+    starts: int = 4,
+    start: Any = (),
+    steps: int = 25,
+    validation: int = 511,
+    objective: str | Callable[[Any], Any] = "rms",
+    divergence_weight: float = 1.0,
+    command_weight: float | None = None,
+    noise_weight: float = 0.0,
+    chatter_weight: float = 0.0,
+    transparency_weight: float | None = None,
+    global_search: bool = False,
+    pareto: int = 0,
+    pareto_against: str | None = None,
+    seed: int = 0,
+    limit: float = 0.01,
+    progress: bool = False,
+) -> Any:
+    """Tune a compensator's gains for a mechanism; judge them on scenarios that tuning never saw.
+
+    Equal arguments give equal gains to the bit, and those of `jaxhil tune`.
+
+    Args:
+        mechanism: what `jaxhil.load` returns, or a name or path for it; or a list of those, which are tuned
+            together.
+        compensator: name of a law, built in or registered.
+        setting: take the law's gains of that name as they are, and only judge them.
+        scenarios: how many to tune on; by default 32, or 128 where sensors are noisy.
+        starts: of the solver, and of each further batch of starts where they disagree.
+        start: gain files, or results of `tune`, of the same compensator: each mechanism is tuned from the
+            gains of the nearest of their mechanisms too.
+        steps: most solver steps from each start.
+        validation: how many fresh scenarios to judge on.
+        objective: of the errors e - e*: "rms", "cvar" (mean of the worst 5 percent) or "worst"; or a
+            function of the metrics of all scenarios, which returns a number >= 0 to be made small.
+        divergence_weight, command_weight, noise_weight, chatter_weight, transparency_weight: of the penalties
+            beside the objective, see `tuning.gains.objective.Objective`; None: what the law calls for.
+        global_search: also search all gains' whole ranges, with 50 times the evaluations.
+        pareto: also so many gains that trade the error for something else.
+        pareto_against: for what: "noise", "peak" (of the command) or "honesty"; by default "noise", or "peak"
+            where the law anticipates.
+        seed: of scenarios and starts.
+        limit: the rms error [1] that is still good.
+        progress: say on standard error what is going on.
+
+    Returns:
+        A `TunedGains`; a list of them for a list.
+
+    Raises:
+        InputError: one line, for an argument that will not do.
+    """
+    given = {name: value for name, value in locals().items() if name not in ("mechanism", "progress")}
+    options = TuneOptions(**given)
+    arguments.flags(progress=progress)
+    loaded, several = arguments.mechanisms(mechanism)
+    options.check()
+    with computing(), terminal.stages(len(loaded), progress) as stages:
+        found = dict(tune_each(loaded, options, stages.say))
+        results = [found[index] for index in range(len(loaded))]
+        if pareto:
+            for place, front in tune_pareto.trade(results, pareto, pareto_against, stages.say):
+                results[place] = dataclasses.replace(results[place], pareto=tuple(front))
+    return results if several else results[0]
+
+
+def tune_each(
+    loaded: Sequence[LoadedMechanism], options: TuneOptions, say: Callable[[str], None]
+) -> Iterator[tuple[int, TunedGains]]:
+    """Index and result of every mechanism, as they are done; `say` hears what is going on."""
+    from tuning.gains.tune import tune_all
+
+    settings, known = options.settings(), options.known()
+    mechanisms = [one.mechanism for one in loaded]
+    for index, found in tune_all(mechanisms, options.compensator, settings, say, known):
+        yield index, TunedGains(found, loaded[index].sha256, options.limit)
