@@ -31,10 +31,11 @@ def test_time_of_a_tick(law, guarded, capsys):
             name: {"value": value, "unit": LIMITS[name].unit} for name, value in WIDE.items()
         }
     controller = Controller.from_dict(sign(document))
-    rows = contact_rows(TICKS, np.random.default_rng(0), controller.control_period, *CONTACTS).tolist()
+    rows = contact_rows(TICKS, np.random.default_rng(0), controller.control_period, *CONTACTS)
+    in_contact = rows[:, 2] > 0.0
     took, empty = [], []
     clock, step, position_command = time.perf_counter_ns, controller.step, controller.position_command
-    for _, force, desired, velocity, measured, now, _, x, v, a in rows:
+    for _, force, desired, velocity, measured, now, _, x, v, a in rows.tolist():
         begin = clock()
         step(force, desired, velocity, measured, now)
         position_command(x, v, a)
@@ -42,10 +43,12 @@ def test_time_of_a_tick(law, guarded, capsys):
         begin = clock()
         empty.append(clock() - begin)
     assert controller.status == "ok"
-    (median, tail), (bare, bare_tail) = (np.percentile(times, [50, 99.9]) / 1e3 for times in (took, empty))
+    (median, tail), (bare, bare_tail) = (
+        np.percentile(np.array(times)[in_contact], [50, 99.9]) / 1e3 for times in (took, empty)
+    )
     with capsys.disabled():
         print(
-            f"\n{law}, {'guarded' if guarded else 'bare'}: {median:.2f} us a tick (median), {tail:.2f} us "
-            f"(99.9th percentile); empty loop {bare:.2f} and {bare_tail:.2f} us"
+            f"\n{law}, {'guarded' if guarded else 'bare'}: {median:.2f} us a tick in contact (median), "
+            f"{tail:.2f} us (99.9th percentile); empty loop {bare:.2f} and {bare_tail:.2f} us"
         )
     assert median <= BARS.get(law, BAR)
