@@ -18,7 +18,10 @@ QUICK = {
     "xla_cpu_use_fusion_emitters": False,
 }
 
+COMPILED = "/jax/core/compile/backend_compile_duration"
+
 _quick = False
+_made: list[str] = []
 
 
 def compile_quickly(quick: bool) -> None:
@@ -33,6 +36,19 @@ def compile_quickly(quick: bool) -> None:
 def is_quick() -> bool:
     """Whether programs compiled now are compiled quickly."""
     return _quick
+
+
+def _note(event: str, seconds: float, **details: str) -> None:
+    if event == COMPILED:
+        _made.append(details.get("fun_name", ""))
+
+
+jax.monitoring.register_event_duration_secs_listener(_note)
+
+
+def programs_of(function: str) -> int:
+    """How many programs of a jitted function were made in this process, compiled or from the cache."""
+    return sum(name in (function, f"jit({function})") for name in _made)
 
 
 def forget_oldest(folder: Path, most: int) -> None:

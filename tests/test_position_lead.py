@@ -26,6 +26,7 @@ from lanes import (
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.compensators.estimates import simulator_inverse
 from jaxhil.mechanism.file import builtin_names, load
+from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.recording import nominal_and_draws, record_lanes
 from tuning.bundle.vectors import make_vectors
@@ -150,10 +151,12 @@ def test_verification_sees_a_position_command_that_is_wrong(monkeypatch):
     assert good.replay[0].position_difference < 1e-11
     vectors = make_vectors(loaded, seed=1, draws=0)
     assert not vectors.reasons
-    from jaxhil.runtime.laws.position_lead import PositionLead
 
-    right = PositionLead.position_command
-    monkeypatch.setattr(PositionLead, "position_command", lambda *args: right(*args) + 1e-12)
+    class Wrong(ON_THE_RIG["position_lead"]):
+        def position_command(self, *motion):
+            return super().position_command(*motion) + 1e-12
+
+    monkeypatch.setitem(ON_THE_RIG, "position_lead", Wrong)
     bad = verify(loaded, scenarios=1)
     assert not bad.verdict and bad.replay[0].difference == 0.0
     assert any(reason.startswith("the nominal run: position commands differ") for reason in bad.reasons)
