@@ -22,7 +22,7 @@ from tuning.gains.pareto_search import ENDS, amplification, has_trade_off, ladde
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import build_task
 from tuning.gains.tune import tune_all
-from tuning.gains.validation import VALIDATION_SEED
+from tuning.gains.validation import VALIDATION_SEED, build_validation
 
 POINTS = 5
 SETTINGS = TuneSettings(
