@@ -18,9 +18,14 @@ from jaxhil.contact.reference_motion import integrate_contact
 class ContactParameters(NamedTuple):
     """What a law needs of one contact; a leading axis of contacts, where there is one, comes first.
 
-    stiffness [N/m, or N/m^n for Hunt-Crossley; (segments, ...) for piecewise-linear], damping [N s/m,
-    or chi in s/m for Hunt-Crossley], exponent [1], depths [m, (segments - 1, ...)], tension [bool],
-    reference_depth [m], unloading_ratio [1]; for `jaxhil.contact.mixture` the law's number, else None.
+    stiffness: [N/m], or [N/m^n] with an exponent n; (segments, ...) for piecewise-linear.
+    damping: [N s/m], or chi [s/m] for Hunt-Crossley.
+    exponent: n [1].
+    depths: between segments [m], (segments - 1, ...).
+    tension: whether the contact may pull.
+    reference_depth: d_0 [m].
+    unloading_ratio: r [1].
+    kind: number of the law for `jaxhil.contact.mixture`, else None.
     """
 
     stiffness: Float[Array, "..."]

@@ -43,7 +43,7 @@ class SamplingInterval(NamedTuple):
 
 
 class PlantSignals(NamedTuple):
-    """What really happens in a sampling interval.
+    """The contact in a sampling interval, as it is without the sensors.
 
     force: of the contact, where it is sampled [N].
     works: done on the mechanism and returned by it [J]; None unless energies are followed.
@@ -58,7 +58,7 @@ class PlantSignals(NamedTuple):
 class Contact(NamedTuple):
     """What the contact of a sampling interval leaves.
 
-    plant_signals: what really happens.
+    plant_signals: of the contact, without the sensors.
     reading: of a lagging force sensor, where it samples [N]; None without lag.
     lagged: its reading at the interval's end [N].
     last: the sample of the contact.
@@ -210,7 +210,7 @@ def sensed_lag(
         return sample, _lag_along(loaded, sample, interval.sample, interval.end, rest, time_constant)
 
     def fade(reading, interval):
-        # In the same steps as `follow`: to the bit, no lane depends on whether others touch.
+        # In the same steps as `follow`: to the bit, no lane depends on whether others are in contact.
         sample = reading * lag_decay(until, time_constant)
         return sample, sample * lag_decay(duration - until, time_constant)
 

@@ -95,7 +95,7 @@ class Delays(NamedTuple):
 
     force: at which the force is read.
     position: at which the position is read.
-    real: intervals to look back for the newest force that has really happened by a tick.
+    real: intervals to look back for the newest force that acts by a tick.
     contact: intervals after which the contact law is evaluated.
     """
 

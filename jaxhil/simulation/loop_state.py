@@ -37,7 +37,7 @@ class Plant(NamedTuple):
 class Rings(NamedTuple):
     """Delay lines, each a ring of samples.
 
-    plant_signals: what really happened.
+    plant_signals: of the contact, without the sensors.
     reading: what a lagging sensor makes of the force [N]; None without lag.
     position: of the mechanism, where its sensor samples it [m].
     interval: sampling intervals whose contact is still to come; None with one surface.

@@ -123,7 +123,7 @@ def collect(
         peak_command=watch.peak_command,
         excess_variation=excess,
         position_shortfall=none if watch.shortfall is None else watch.shortfall,
-        duration=watch.touched * period,
+        duration=watch.in_contact * period,
         work_in=work_in,
         work_out=work_out,
         trajectory_error=none if watch.deviation is None else root_mean_square(watch.deviation),

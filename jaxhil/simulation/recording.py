@@ -23,7 +23,7 @@ from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants
 from jaxhil.simulation.metrics import Metrics
 from jaxhil.simulation.rollout import start, stretch, stretch_length, turn_over
 from jaxhil.simulation.scenario import Scenario, build_scenarios
-from jaxhil.simulation.tick import Run, Tick
+from jaxhil.simulation.tick import RunState, Tick
 
 CHUNK = 512  # ticks recorded by one call of the compiled program
 
@@ -94,8 +94,8 @@ class Recorder(NamedTuple):
     """The programs that record one loop, compiled when first called: a batch of scenarios begins under its
     gains, then a chunk of ticks is recorded at a time."""
 
-    begin: Callable[..., tuple[RigConstants, Run]]
-    record_chunk: Callable[..., tuple[Run, Tick]]
+    begin: Callable[..., tuple[RigConstants, RunState]]
+    record_chunk: Callable[..., tuple[RunState, Tick]]
 
 
 @lru_cache(maxsize=32)
@@ -119,12 +119,12 @@ def _lane(seen: Tick, zeroed: bool) -> Lane:
     return Lane(seen.signals, seen.command, seen.identified, zeroed, seen.sent, seen.contact)
 
 
-def _begin(loop: Loop, gains: Gains, scenario: Scenario) -> tuple[RigConstants, Run]:
+def _begin(loop: Loop, gains: Gains, scenario: Scenario) -> tuple[RigConstants, RunState]:
     rig = build_rig_constants(loop, scenario)
     return rig, start(loop, rig, gains)
 
 
-def _record_chunk(loop: Loop, rig: RigConstants, gains: Gains, run: Run) -> tuple[Run, Tick]:
+def _record_chunk(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) -> tuple[RunState, Tick]:
     def body(run, _):
         run, ticks = stretch(loop, rig, gains, run, record=True)
         return turn_over(loop, rig, gains, run, skip_flight=False), ticks

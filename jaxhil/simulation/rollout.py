@@ -17,7 +17,7 @@ from jaxhil.simulation.metrics import OK, Metrics, collect, empty_metrics, judge
 from jaxhil.simulation.probe import before_contact
 from jaxhil.simulation.scenario import Scenario
 from jaxhil.simulation.sensors import Noise, draw_noise
-from jaxhil.simulation.tick import Prepared, Run, Tick, tick
+from jaxhil.simulation.tick import Prepared, RunState, Tick, tick
 from jaxhil.simulation.watch import FADED, build_rules, fresh_watch
 
 APPROACH = 0.02  # s of free approach before a contact, besides its phase
@@ -73,7 +73,7 @@ def stretch_length(loop: Loop) -> int:
     return 1 if loop.is_two_sided else 16
 
 
-def start(loop: Loop, rig: RigConstants, gains: Gains) -> Run:
+def start(loop: Loop, rig: RigConstants, gains: Gains) -> RunState:
     """All lanes on their first approach."""
     scenario, like = rig.scenario, rig.scenario.velocity
     zeros = jnp.zeros_like(like)
@@ -98,7 +98,7 @@ def start(loop: Loop, rig: RigConstants, gains: Gains) -> Run:
     tick = jnp.array(_first_tick(loop), jnp.int32)
     state = enter(loop, rig, gains, state, *_approach(rig, index, like), tick)
     slots = scenario.phase.shape[0]
-    return Run(
+    return RunState(
         state=state,
         watch=fresh_watch(loop, like),
         metrics=empty_metrics(loop, slots, like),
@@ -108,7 +108,9 @@ def start(loop: Loop, rig: RigConstants, gains: Gains) -> Run:
     )
 
 
-def stretch(loop: Loop, rig: RigConstants, gains: Gains, run: Run, record: bool) -> tuple[Run, Tick | None]:
+def stretch(
+    loop: Loop, rig: RigConstants, gains: Gains, run: RunState, record: bool
+) -> tuple[RunState, Tick | None]:
     """A few ticks of the loop."""
     prepared = prepare(loop, rig, gains, run)
 
@@ -121,7 +123,7 @@ def stretch(loop: Loop, rig: RigConstants, gains: Gains, run: Run, record: bool)
     return _resumed(run, carry), seen
 
 
-def prepare(loop: Loop, rig: RigConstants, gains: Gains, run: Run) -> Prepared:
+def prepare(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) -> Prepared:
     """What the ticks of a stretch share."""
     return Prepared(
         gains=gains,
@@ -131,14 +133,16 @@ def prepare(loop: Loop, rig: RigConstants, gains: Gains, run: Run) -> Prepared:
     )
 
 
-def noise_ahead(loop: Loop, rig: RigConstants, run: Run, ticks: int) -> Noise:
+def noise_ahead(loop: Loop, rig: RigConstants, run: RunState, ticks: int) -> Noise:
     """The sensors' noise, (ticks, *batch), at this tick and those that follow within a stretch."""
     ahead = jnp.arange(ticks, dtype=jnp.int32).reshape(-1, *[1] * run.index.ndim)
     age = run.tick + ahead - run.state.entry_tick[None]
     return draw_noise(loop.has_force_noise, loop.has_position_noise, rig.scenario, run.index, age)
 
 
-def turn_over(loop: Loop, rig: RigConstants, gains: Gains, run: Run, skip_flight: bool = True) -> Run:
+def turn_over(
+    loop: Loop, rig: RigConstants, gains: Gains, run: RunState, skip_flight: bool = True
+) -> RunState:
     """Enter contacts that are over, begin the next, skip the free flight between two surfaces."""
     watch, state, scenario = run.watch, run.state, rig.scenario
     status = judge(scenario, watch, run.tick - state.entry_tick)
@@ -154,7 +158,7 @@ def turn_over(loop: Loop, rig: RigConstants, gains: Gains, run: Run, skip_flight
     entry = _entry(scenario.contact, _slot(rig, index))
     if watch.command is not None:
         left = jnp.maximum(FADED * watch.peak_command, watch.command)
-        # A touch before the turn-over begins the next contact at once, at the speed of the rebound.
+        # A force before the turn-over begins the next contact at once, at the speed of the rebound.
         kept = {
             "approach": watch.rebound,
             "quiet": watch.quiet,
@@ -162,7 +166,7 @@ def turn_over(loop: Loop, rig: RigConstants, gains: Gains, run: Run, skip_flight
             "command": watch.command,
         }
         watch = _choose(over, blank._replace(left=left, **kept), watch)
-        # A damped contact is over while the mechanism is still dented: its law holds until it is free.
+        # A damped contact is over while the mechanism is still pressed in: its law holds until it is free.
         free = state.sensed.last.distance <= 0
         state = state._replace(parameters=_choose(free, entry, state.parameters))
         if state.first_contact is not None:

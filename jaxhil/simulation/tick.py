@@ -7,7 +7,7 @@
     contact_force   force of the real contact, where the force sensor will read it
     record_contact  beginning, end, restitution, peaks and energies of the contact under way
 
-`Run` is what is carried from tick to tick, `Tick` what is recorded of one.
+`RunState` is what is carried from tick to tick, `Tick` what is recorded of one.
 """
 
 from typing import Any, NamedTuple
@@ -41,7 +41,7 @@ from jaxhil.simulation.sensors import Noise, quantise, sample_force
 from jaxhil.simulation.watch import Rules, Watch, record_contact
 
 
-class Run(NamedTuple):
+class RunState(NamedTuple):
     """What is carried from tick to tick.
 
     state: of the loop.
@@ -65,7 +65,7 @@ class Tick(NamedTuple):
 
     signals: what the controller read.
     command: F_c [N], what the compensator made of it.
-    plant_signals: what really happened by then.
+    plant_signals: of the contact, without the sensors.
     active: whether the lane was still running.
     contact: index of the contact, from 0.
     identified: stiffness [N/m] and damping [N s/m], by a compensator that identifies them.
@@ -126,7 +126,9 @@ class Actuated(NamedTuple):
     under_way: SamplingInterval | None
 
 
-def tick(loop: Loop, rig: RigConstants, prepared: Prepared, run: Run, noise: Noise) -> tuple[Run, Tick]:
+def tick(
+    loop: Loop, rig: RigConstants, prepared: Prepared, run: RunState, noise: Noise
+) -> tuple[RunState, Tick]:
     """One control period: what is carried on, and what is recorded of it."""
     state, now = run.state, run.tick
     signals, plant_signals = sense(loop, rig, state, now, noise)
@@ -157,7 +159,7 @@ def tick(loop: Loop, rig: RigConstants, prepared: Prepared, run: Run, noise: Noi
 def sense(
     loop: Loop, rig: RigConstants, state: LoopState, now: Array, noise: Noise
 ) -> tuple[Signals, PlantSignals]:
-    """Stage 1: what the sensors read at tick `now`, noise included, and beside it what really happened."""
+    """Stage 1: what the sensors read at tick `now`, noise included, and the plant's own signals."""
     scenario, sensed = rig.scenario, state.sensed
     age = now - state.entry_tick
     rings, delays = sensed.rings, rig.delays
@@ -257,7 +259,7 @@ def contact_force(loop: Loop, rig: RigConstants, state: LoopState, interval: Sam
 def next_state(
     state: LoopState, now: Array, before: PlantSignals, model: Model, actuated: Actuated, contact: Contact
 ) -> LoopState:
-    """The state after the tick; what happened goes into the delay lines, from which `before` was read."""
+    """The state after the tick; the contact goes into the delay lines, from which `before` was read."""
     plant_signals = jax.tree.map(depend_on, contact.plant_signals, before)
     samples = Rings(plant_signals, contact.reading, actuated.position, None)
     rings = write_in_turn(state.sensed.rings._replace(interval=None), now, samples)

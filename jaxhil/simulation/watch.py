@@ -1,6 +1,6 @@
 """The contact under way, followed tick by tick: when it begins and ends, its speeds, forces and energies.
 
-What counts is what really happens (`PlantSignals`) and the force command; notebooks/guide/model.md section 2
+What counts are the real contact (`PlantSignals`) and the force command; notebooks/guide/model.md section 2
 says when a contact begins and when it is over.
 """
 
@@ -45,7 +45,7 @@ class Watch(NamedTuple):
     peak_force: of the real force [N].
     peak_command: of |F_c| [N].
     recent: real force at the last two ticks [N].
-    touched: ticks with a real force.
+    in_contact: ticks with a real force.
     quiet: ticks since the last real force.
     works: done on the mechanism and returned by it [J], where energies are followed.
     swings: of the command, where they are followed.
@@ -63,7 +63,7 @@ class Watch(NamedTuple):
     peak_force: Float[Array, "*batch"]
     peak_command: Float[Array, "*batch"]
     recent: tuple[Array, Array]
-    touched: Float[Array, "*batch"]
+    in_contact: Float[Array, "*batch"]
     quiet: Float[Array, "*batch"]
     works: tuple[Array, ...]
     swings: Swings | None
@@ -108,7 +108,7 @@ def fresh_watch(loop: Loop, like: Array) -> Watch:
         peak_force=zeros,
         peak_command=zeros,
         recent=(zeros, zeros),
-        touched=zeros,
+        in_contact=zeros,
         quiet=zeros + 1e6,
         works=(zeros, zeros) if loop.energies else (),
         swings=Swings(zeros, zeros, zeros, zeros) if loop.chatter else None,
@@ -148,7 +148,7 @@ def record_contact(
         peak_force=jnp.maximum(watch.peak_force, _peak_force(loop, watch, plant_signals, force)),
         peak_command=peak_command,
         recent=(watch.recent[1], force),
-        touched=jnp.where(touching, watch.touched + 1, watch.touched),
+        in_contact=jnp.where(touching, watch.in_contact + 1, watch.in_contact),
         quiet=quiet,
         works=tuple(total + work for total, work in zip(watch.works, plant_signals.works or (), strict=True)),
         swings=watch.swings and _swing(watch.swings, command, lasts, ends),

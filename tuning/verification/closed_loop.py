@@ -24,7 +24,7 @@ from jaxhil.simulation.metrics import Metrics
 from jaxhil.simulation.recording import as_arrays, recorder
 from jaxhil.simulation.rollout import noise_ahead, stretch_length, turn_over
 from jaxhil.simulation.scenario import Scenario
-from jaxhil.simulation.tick import Model, Run, actuate, contact_force, integrate, next_state, sense
+from jaxhil.simulation.tick import Model, RunState, actuate, contact_force, integrate, next_state, sense
 from jaxhil.simulation.watch import build_rules, record_contact
 
 
@@ -96,7 +96,7 @@ class Sent(NamedTuple):
 
 
 @jax.jit
-def _first_lane(started: tuple[RigConstants, Run]) -> tuple[RigConstants, Run]:
+def _first_lane(started: tuple[RigConstants, RunState]) -> tuple[RigConstants, RunState]:
     return jax.tree.map(lambda leaf: leaf[..., :1] if leaf.ndim else leaf, started)
 
 
@@ -105,8 +105,8 @@ class _Program(NamedTuple):
 
     sense: Callable[..., tuple[Signals, PlantSignals]]
     integrate: Callable[..., Model]
-    advance: Callable[..., Run]
-    turn_over: Callable[..., Run]
+    advance: Callable[..., RunState]
+    turn_over: Callable[..., RunState]
 
 
 @lru_cache(maxsize=32)
@@ -114,12 +114,12 @@ def _compiled(loop: Loop) -> _Program:
     return _Program(*(jax.jit(partial(step, loop)) for step in (_sense, _integrate, _advance, _turn_over)))
 
 
-def _sense(loop: Loop, rig: RigConstants, run: Run) -> tuple[Signals, PlantSignals]:
+def _sense(loop: Loop, rig: RigConstants, run: RunState) -> tuple[Signals, PlantSignals]:
     noise = jax.tree.map(lambda leaf: leaf[0], noise_ahead(loop, rig, run, 1))
     return sense(loop, rig, run.state, run.tick, noise)
 
 
-def _integrate(loop: Loop, rig: RigConstants, run: Run, command: Array) -> Model:
+def _integrate(loop: Loop, rig: RigConstants, run: RunState, command: Array) -> Model:
     return integrate(loop, rig, run.state, command)
 
 
@@ -127,12 +127,12 @@ def _advance(
     loop: Loop,
     rig: RigConstants,
     gains: Gains,
-    run: Run,
+    run: RunState,
     signals: Signals,
     plant_signals: PlantSignals,
     command: Array,
     sent: Array,
-) -> Run:
+) -> RunState:
     """Stages 3 to 6 of a tick under the command and the position sent to the drives."""
     state, now = run.state, run.tick
     model = integrate(loop, rig, state, command)
@@ -144,5 +144,5 @@ def _advance(
     return run._replace(state=state, watch=watch, tick=now + 1)
 
 
-def _turn_over(loop: Loop, rig: RigConstants, gains: Gains, run: Run) -> Run:
+def _turn_over(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) -> RunState:
     return turn_over(loop, rig, gains, run, skip_flight=False)
