@@ -13,14 +13,14 @@ from jaxtyping import Float
 from search_case import Case, several
 from search_methods import Trace
 
-from tuning.gains.multistart import AGREED, CANDIDATES, LOTS, REACH, SURE
+from tuning.gains.multistart import AGREED, BATCHES, CANDIDATES, REACH, SURE
 from tuning.gains.objective import RMS, SCALE, common_terms, residuals
 from tuning.gains.rounds import FIRST_ROUND, inverse_hessian
 from tuning.gains.tasks import spread_points
 from tuning.optimisation.derivative_free import apart, polish
 from tuning.optimisation.levenberg_marquardt import Solution, solve
 
-SCANNED, DESCENTS, GO_ON = 64, 6, 3  # points looked at, those descended from, those that go on; of a lot
+SCANNED, DESCENTS, GO_ON = 64, 6, 3  # points looked at, those descended from, those that go on; of a batch
 STEPS = 25  # of Levenberg-Marquardt
 POLISH = 320  # evaluations
 LONGEST = 32  # steps that the program is made for
@@ -38,8 +38,8 @@ def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = 
     stages = _Stages(number, time.perf_counter())
     ends = [_Ends(np.empty(0), np.empty((0, gains)), np.empty((0, gains, gains))) for _ in starts]
     going = np.arange(number)
-    for lot in range(1 if warming else LOTS):
-        points = np.stack([spread_points(starts[i], SCANNED, (int(i), lot)) for i in going])
+    for batch in range(1 if warming else BATCHES):
+        points = np.stack([spread_points(starts[i], SCANNED, (int(i), batch)) for i in going])
         values = case.losses(points.reshape(-1, gains)).reshape(len(going), -1)
         stages.add(going, SCANNED, np.min(values, axis=1))
         order = np.argsort(values, axis=1)
