@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from msgspec.inspect import ListType, Metadata, StructType, UnionType
 
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import (
@@ -24,7 +25,7 @@ from jaxhil.mechanism.file import (
     suite_names,
     to_builtins,
 )
-from jaxhil.mechanism.structs import numeric_keys
+from jaxhil.mechanism.structs import numeric_keys, schema_type
 
 TEXT = builtin_path("claw-350kg").read_text()
 
@@ -334,3 +335,33 @@ def test_reading_needs_no_jax():
     code = "import sys, jaxhil.mechanism.file, jaxhil.mechanism.uncertainty; sys.exit('jax' in sys.modules)"
     root = Path(__file__).parent.parent
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
+
+
+def test_every_key_says_what_it_is_and_every_number_its_unit():
+    def keys(kind, path=""):
+        fields = kind.type.fields if isinstance(kind, Metadata) else kind.fields
+        for field in fields:
+            yield f"{path}{field.name}", field.type
+            if isinstance(field.type, Metadata) and isinstance(field.type.type, StructType):
+                yield from keys(field.type, f"{path}{field.name}.")
+
+    def texts(kind):
+        """Meanings and units anywhere in a type."""
+        if isinstance(kind, UnionType):
+            return [text for member in kind.types for text in texts(member)]
+        if not isinstance(kind, Metadata):
+            return texts(kind.item_type) if isinstance(kind, ListType) else []
+        return [*texts(kind.type), ((kind.extra_json_schema or {}).get("description"), kind.extra or {})]
+
+    said = {path: texts(kind) for path, kind in keys(schema_type())}
+    assert "rig.force_sensor.delay" in said and len(said) > 40
+    for path, found in said.items():
+        assert any(meaning for meaning, _ in found), path
+    assert any(extra.get("unit") == "s" for _, extra in said["rig.force_sensor.delay"])
+    for path, message in (
+        ("rig.control_period=1", "found 1, allowed a number > 0 s and <= 0.1 s"),
+        ("rig.force_sensor.delay=2", "found 2, allowed a number from 0 to 1 s"),
+        ("rig.force_sensor.bias=x", "found 'x', allowed a finite number of N"),
+        ("contact.damping=[-1]", "found -1, allowed a number >= 0 N s/m"),
+    ):
+        assert message in refusal("varying", [path])

@@ -17,7 +17,7 @@ import msgspec
 from msgspec import inspect
 
 from jaxhil.errors import one_line, shown
-from jaxhil.mechanism.structs import Mechanism, range_of, schema_type
+from jaxhil.mechanism.structs import PLAIN, Mechanism, range_of, schema_type
 
 __all__ = [
     "KeyProblem",
@@ -30,6 +30,7 @@ __all__ = [
 ]
 
 Path = tuple[str | int, ...]
+Extra = Mapping[str, Any]  # what `jaxhil.mechanism.structs.says` puts beside a type
 
 # Lists for which a bare number stands for a list of one entry.
 _NUMBER_FOR_LIST = {("contact", "stiffness"), ("contact", "damping")}
@@ -82,7 +83,7 @@ def to_mechanism(raw: Mapping[str, Any]) -> Mechanism:
     `contact.damping`; leading zeros of a transfer function's polynomials are dropped. Raises
     `KeyProblem` for the first key that is not usable.
     """
-    return msgspec.convert(_clean(schema_type(), raw, (), False), Mechanism)
+    return msgspec.convert(_clean(schema_type(), raw, (), PLAIN), Mechanism)
 
 
 def step_into(kind: inspect.Type, part: str | int, path: Path) -> inspect.Type:
@@ -91,7 +92,7 @@ def step_into(kind: inspect.Type, part: str | int, path: Path) -> inspect.Type:
         case inspect.Metadata(type=inner):
             return step_into(inner, part, path)
         case inspect.UnionType(types=members):
-            inner = [m for m in members if isinstance(m, (inspect.ListType, inspect.Metadata))]
+            inner = [member for member in members if isinstance(_bare(member), inspect.ListType)]
             if isinstance(part, int) and inner:
                 return step_into(inner[0], part, path)
         case inspect.StructType(fields=fields) if isinstance(part, str):
@@ -105,7 +106,11 @@ def step_into(kind: inspect.Type, part: str | int, path: Path) -> inspect.Type:
             return item
         case _:
             pass
-    raise KeyProblem((*path, part), "no such key", _allowed(kind, False) + f" at {dotted(path)}")
+    raise KeyProblem((*path, part), "no such key", _allowed(kind, PLAIN) + f" at {dotted(path)}")
+
+
+def _bare(kind: inspect.Type) -> inspect.Type:
+    return _bare(kind.type) if isinstance(kind, inspect.Metadata) else kind
 
 
 def _unknown_key(kind: inspect.StructType, key: str, path: Path) -> KeyProblem:
@@ -114,7 +119,7 @@ def _unknown_key(kind: inspect.StructType, key: str, path: Path) -> KeyProblem:
     return KeyProblem((*path, key), "an unknown key", allowed)
 
 
-def _clean(kind: inspect.Type, value: Any, path: Path, infinite: bool) -> Any:
+def _clean(kind: inspect.Type, value: Any, path: Path, extra: Extra) -> Any:
     """`value` as plain data of type `kind`, numbers as floats; raises `KeyProblem`."""
     if path in _NUMBER_FOR_LIST and isinstance(value, (int, float)) and not isinstance(value, bool):
         value = [value]
@@ -122,21 +127,21 @@ def _clean(kind: inspect.Type, value: Any, path: Path, infinite: bool) -> Any:
         case inspect.Metadata(extra={"one_of": names}):
             if isinstance(value, str) and value in names:
                 return value
-        case inspect.Metadata(type=inner, extra=extra):
-            return _clean(inner, value, path, "infinite" in (extra or {}))
+        case inspect.Metadata(type=inner):
+            return _clean(inner, value, path, kind.extra or PLAIN)
         case inspect.UnionType(types=members):
-            return _clean(_member(members, value), value, path, infinite)
+            return _clean(_member(members, value), value, path, extra)
         case inspect.NoneType():
             return None
         case inspect.StructType() if isinstance(value, Mapping):
             return _clean_struct(kind, value, path)
         case inspect.DictType(value_type=inner) if isinstance(value, Mapping):
-            return {key: _clean(inner, entry, (*path, key), False) for key, entry in value.items()}
+            return {key: _clean(inner, entry, (*path, key), PLAIN) for key, entry in value.items()}
         case inspect.ListType(item_type=item) if isinstance(value, (list, tuple)):
             shortest, longest = kind.min_length or 0, kind.max_length
             if len(value) < shortest or (longest is not None and len(value) > longest):
-                raise KeyProblem(path, entry_count(value), _allowed(kind, False))
-            cleaned = [_clean(item, entry, (*path, i), False) for i, entry in enumerate(value)]
+                raise KeyProblem(path, entry_count(value), _allowed(kind, PLAIN))
+            cleaned = [_clean(item, entry, (*path, i), PLAIN) for i, entry in enumerate(value)]
             while path in _POLYNOMIALS and len(cleaned) > 1 and cleaned[0] == 0.0:
                 del cleaned[0]
             return cleaned
@@ -145,10 +150,10 @@ def _clean(kind: inspect.Type, value: Any, path: Path, infinite: bool) -> Any:
                 number = float(value)
             except OverflowError:
                 number = math.nan
-            if range_of(kind, infinite).allows(number):
+            if range_of(kind, extra).allows(number):
                 return number
         case inspect.IntType() if isinstance(value, int) and not isinstance(value, bool):
-            if range_of(kind, False).allows(value):
+            if range_of(kind, PLAIN).allows(value):
                 return value
         case inspect.BoolType() if isinstance(value, bool):
             return value
@@ -160,7 +165,7 @@ def _clean(kind: inspect.Type, value: Any, path: Path, infinite: bool) -> Any:
             return value
         case _:
             pass
-    raise KeyProblem(path, shown(value), _allowed(kind, infinite))
+    raise KeyProblem(path, shown(value), _allowed(kind, extra))
 
 
 def _clean_struct(kind: inspect.StructType, value: Mapping[Any, Any], path: Path) -> dict[str, Any]:
@@ -172,9 +177,9 @@ def _clean_struct(kind: inspect.StructType, value: Mapping[Any, Any], path: Path
     cleaned = {}
     for entry in kind.fields:
         if entry.name in value:
-            cleaned[entry.name] = _clean(entry.type, value[entry.name], (*path, entry.name), False)
+            cleaned[entry.name] = _clean(entry.type, value[entry.name], (*path, entry.name), PLAIN)
         elif entry.required:
-            raise KeyProblem((*path, entry.name), "nothing", _allowed(entry.type, False))
+            raise KeyProblem((*path, entry.name), "nothing", _allowed(entry.type, PLAIN))
     return cleaned
 
 
@@ -190,17 +195,17 @@ def _member(members: Iterable[inspect.Type], value: Any) -> inspect.Type:
     return wanted[0]
 
 
-def _allowed(kind: inspect.Type, infinite: bool) -> str:
+def _allowed(kind: inspect.Type, extra: Extra) -> str:
     match kind:
         case inspect.Metadata(extra={"one_of": names}):
             return f"one of {', '.join(names)}"
-        case inspect.Metadata(type=inner, extra=extra):
-            return _allowed(inner, "infinite" in (extra or {}))
+        case inspect.Metadata(type=inner):
+            return _allowed(inner, kind.extra or PLAIN)
         case inspect.UnionType(types=members):
-            kinds = [_allowed(m, infinite) for m in members if not isinstance(m, inspect.NoneType)]
+            kinds = [_allowed(m, extra) for m in members if not isinstance(m, inspect.NoneType)]
             return " or ".join(kinds)
         case inspect.FloatType():
-            return str(range_of(kind, infinite))
+            return str(range_of(kind, extra))
         case inspect.IntType():
             return f"an integer from {kind.ge} to {kind.le}"
         case inspect.BoolType():
@@ -212,6 +217,6 @@ def _allowed(kind: inspect.Type, infinite: bool) -> str:
         case inspect.ListType(item_type=item):
             shortest, longest = kind.min_length or 0, kind.max_length
             length = f"{shortest}" if shortest == longest else f"{shortest} to {longest}"
-            return f"a list of {length} entries, each {_allowed(item, False)}"
+            return f"a list of {length} entries, each {_allowed(item, PLAIN)}"
         case _:
             return "a table"

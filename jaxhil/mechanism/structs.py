@@ -2,8 +2,8 @@
 
 A `Mechanism` is one docking mechanism on one rig: the two bodies, how they approach, the contact,
 the rig (motion simulator, sensors, period), and how uncertain each number is. Every number is in SI
-units, natural frequencies in Hz. The type of a field carries its range, so that the reader of
-files, the error messages and the truncation of random draws all take it from here.
+units, natural frequencies in Hz. The type of a field carries its meaning, unit and range: the reader of
+files, the error messages and the truncation of random draws all take them from here.
 
 The structs themselves hold what they are given; `jaxhil.mechanism.file` reads and validates.
 """
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
@@ -41,6 +41,7 @@ __all__ = [
 
 SCHEMA = "jaxhil/mechanism/1"
 MAX_CONTACTS = 1000
+PLAIN: Mapping[str, Any] = {}  # what a type without metadata says
 
 BUILT_IN_LAWS = (
     "linear",
@@ -53,21 +54,27 @@ BUILT_IN_LAWS = (
 )
 CONTACT_LAWS = [*BUILT_IN_LAWS]  # and those that `jaxhil.register` enters
 
-Law = Annotated[str, Meta(extra={"one_of": CONTACT_LAWS})]
+
+def says(meaning: str, unit: str = "1", **limits: Any) -> Meta:
+    """What a key's type says of it: a line of meaning, the unit, and the allowed values."""
+    infinite = limits.pop("infinite", False)
+    return Meta(description=meaning, extra={"unit": unit, "infinite": infinite}, **limits)
+
+
+Law = Annotated[str, Meta(description="which force the mechanism gives", extra={"one_of": CONTACT_LAWS})]
 SimulatorModel = Literal["ideal", "first_order", "second_order", "third_order", "transfer_function"]
 Integrator = Literal["semi_implicit_euler", "zoh", "explicit_euler"]
 CommandHold = Literal["linear", "zoh"]
 Distribution = Literal["uniform", "loguniform", "normal"]
 
-# A number is finite unless its type says "infinite".
-Positive = Annotated[float, Meta(gt=0.0)]
-NonNegative = Annotated[float, Meta(ge=0.0)]
-PositiveOrInfinite = Annotated[float, Meta(gt=0.0, extra={"infinite": True})]
-UnitInterval = Annotated[float, Meta(ge=0.0, le=1.0)]
-Delay = Annotated[float, Meta(ge=0.0, le=1.0)]
-ControlPeriod = Annotated[float, Meta(gt=0.0, le=0.1)]
-Coefficients = Annotated[list[float], Meta(min_length=1, max_length=21)]
-Slopes = Annotated[list[Positive], Meta(min_length=1, max_length=21)]
+# Entries of lists. A number is finite unless its type says otherwise.
+Stiffness = Annotated[float, says("slope of the force", "N/m", gt=0.0)]
+Slopes = Annotated[list[Stiffness], Meta(min_length=1, max_length=21)]
+Damping = Annotated[float, says("damping of the contact", "N s/m", ge=0.0)]
+Depth = Annotated[float, says("where the slope changes", "m", gt=0.0)]
+Factor = Annotated[float, says("share of the nominal value", gt=0.0)]
+Coefficient = Annotated[float, says("a power's coefficient, the n-th has the unit s^n", gt=0.0)]
+Polynomial = Annotated[list[float], Meta(min_length=1, max_length=21)]
 
 
 def _only(value: float) -> Callable[[], list[float]]:
@@ -75,11 +82,11 @@ def _only(value: float) -> Callable[[], list[float]]:
 
 
 class Bodies(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The two free bodies [kg]: their equivalent mass, or both masses."""
+    """The two free bodies: their equivalent mass, or both masses."""
 
-    equivalent_mass: Positive | None = None
-    chaser_mass: Positive | None = None
-    target_mass: Positive | None = None
+    equivalent_mass: Annotated[float, says("mass of the relative motion", "kg", gt=0.0)] | None = None
+    chaser_mass: Annotated[float, says("mass of the one body", "kg", gt=0.0)] | None = None
+    target_mass: Annotated[float, says("mass of the other body", "kg", gt=0.0)] | None = None
 
     @property
     def mass(self) -> float:
@@ -92,121 +99,147 @@ class Bodies(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Approach(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How the bodies meet: speed [m/s], successive contacts, phase of the first one in a period."""
+    """How the bodies meet."""
 
-    velocity: Positive
-    contacts: Annotated[int, Meta(ge=1, le=MAX_CONTACTS)] = 1
-    phase: UnitInterval = 1.0 / 3.0
+    velocity: Annotated[float, says("speed of the first approach", "m/s", gt=0.0)]
+    contacts: Annotated[int, says("how many successive contacts a run makes", ge=1, le=MAX_CONTACTS)] = 1
+    phase: Annotated[float, says("of the first contact within a control period", ge=0.0, le=1.0)] = 1.0 / 3.0
 
 
 class Contact(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The contact law and its parameters, one entry per successive contact; the last repeats.
 
-    `stiffness` in N/m (N/m^exponent for hunt_crossley and depth_damped); for piecewise_linear one list of
-    slopes per contact, one slope more than there are `depths` [m]. `damping` in N s/m (s/m for
-    hunt_crossley; none for elastoplastic). `clearance` [m] between two surfaces; infinite when there is one
-    surface. `reference_depth` [m] of hardening and depth_damped, `unloading_ratio` [1] of elastoplastic.
+    For piecewise_linear `stiffness` has one list of slopes per contact, one slope more than there are depths.
     """
 
     law: Law
-    stiffness: Annotated[list[Positive | Slopes], Meta(min_length=1, max_length=MAX_CONTACTS)]
-    damping: Annotated[list[NonNegative], Meta(min_length=1, max_length=MAX_CONTACTS)] = field(
-        default_factory=_only(0.0)
-    )
-    tension: bool = False
-    clearance: PositiveOrInfinite = math.inf
-    exponent: Annotated[float, Meta(ge=1.0)] = 1.5
-    depths: Annotated[list[Positive], Meta(max_length=20)] = field(default_factory=list)
-    reference_depth: Positive | None = None
-    unloading_ratio: Annotated[float, Meta(ge=1.0)] | None = None
+    stiffness: Annotated[
+        list[Stiffness | Slopes],
+        Meta(
+            min_length=1,
+            max_length=MAX_CONTACTS,
+            description="of each contact; in N/m^exponent for hunt_crossley and depth_damped",
+        ),
+    ]
+    damping: Annotated[
+        list[Damping],
+        Meta(
+            min_length=1,
+            max_length=MAX_CONTACTS,
+            description="of each contact; in s/m for hunt_crossley, none for elastoplastic",
+        ),
+    ] = field(default_factory=_only(0.0))
+    tension: Annotated[bool, says("whether kelvin_voigt may pull")] = False
+    clearance: Annotated[
+        float, says("between two surfaces; infinite where there is one", "m", gt=0.0, infinite=True)
+    ] = math.inf
+    exponent: Annotated[float, says("of the depth, for hunt_crossley and depth_damped", ge=1.0)] = 1.5
+    depths: Annotated[
+        list[Depth], Meta(max_length=20, description="where the slope changes, for piecewise_linear")
+    ] = field(default_factory=list)
+    reference_depth: (
+        Annotated[float, says("at which hardening has four times its first slope, and depth_damped its "
+                              "damping", "m", gt=0.0)] | None
+    ) = None  # fmt: skip
+    unloading_ratio: (
+        Annotated[float, says("slope of unloading over that of loading, for elastoplastic", ge=1.0)] | None
+    ) = None
 
 
 class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The motion simulator, from commanded to actual position: G(s) exp(-s delay), and its limits.
+    """The motion simulator, from commanded to actual position: G(s) exp(-s delay), and its limits."""
 
-    `natural_frequency` [Hz]; `coefficients` [a1, a2, a3] of 1/(1 + a1 s + a2 s^2 + a3 s^3);
-    `numerator` and `denominator` in descending powers of s; limits in m/s and m/s^2.
-    """
-
-    model: SimulatorModel
-    natural_frequency: Positive | None = None
-    damping_ratio: Positive | None = None
-    time_constant: NonNegative | None = None
-    coefficients: Annotated[list[Positive], Meta(min_length=3, max_length=3)] | None = None
-    numerator: Coefficients | None = None
-    denominator: Coefficients | None = None
-    delay: Delay = 0.0
-    velocity_limit: PositiveOrInfinite = math.inf
-    acceleration_limit: PositiveOrInfinite = math.inf
+    model: Annotated[SimulatorModel, says("what G(s) is")]
+    natural_frequency: Annotated[float, says("of second_order", "Hz", gt=0.0)] | None = None
+    damping_ratio: Annotated[float, says("of second_order", gt=0.0)] | None = None
+    time_constant: Annotated[float, says("of first_order", "s", ge=0.0)] | None = None
+    coefficients: (
+        Annotated[
+            list[Coefficient],
+            Meta(min_length=3, max_length=3, description="[a1, a2, a3] of 1/(1 + a1 s + a2 s^2 + a3 s^3)"),
+        ]
+        | None
+    ) = None
+    numerator: Annotated[Polynomial, Meta(description="of G(s), in descending powers of s")] | None = None
+    denominator: Annotated[Polynomial, Meta(description="of G(s), in descending powers of s")] | None = None
+    delay: Annotated[float, says("transport delay of the motion", "s", ge=0.0, le=1.0)] = 0.0
+    velocity_limit: Annotated[float, says("of the position command", "m/s", gt=0.0, infinite=True)] = math.inf
+    acceleration_limit: Annotated[float, says("of the position command", "m/s^2", gt=0.0, infinite=True)] = (
+        math.inf
+    )
 
 
 class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The force sensor: delay and lag [s], then bias, noise, quantum, dead zone and range [N]."""
+    """The force sensor: delay and lag, then noise and bias, quantum, dead zone and range."""
 
-    delay: Delay = 0.0
-    time_constant: NonNegative = 0.0
-    noise_std: NonNegative = 0.0
-    quantum: NonNegative = 0.0
-    dead_zone: NonNegative = 0.0
-    bias: float = 0.0
-    range: PositiveOrInfinite = math.inf
+    delay: Annotated[float, says("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
+    time_constant: Annotated[float, says("of the reading's first-order lag", "s", ge=0.0)] = 0.0
+    noise_std: Annotated[float, says("standard deviation of white noise", "N", ge=0.0)] = 0.0
+    quantum: Annotated[float, says("to multiples of which a reading is rounded", "N", ge=0.0)] = 0.0
+    dead_zone: Annotated[float, says("below which nothing is read", "N", ge=0.0)] = 0.0
+    bias: Annotated[float, says("added to every reading", "N")] = 0.0
+    range: Annotated[float, says("beyond which a reading saturates", "N", gt=0.0, infinite=True)] = math.inf
 
 
 class PositionSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The position sensor: delay [s], noise and quantum [m]."""
+    """The position sensor of the motion simulator."""
 
-    delay: Delay = 0.0
-    noise_std: NonNegative = 0.0
-    quantum: NonNegative = 0.0
+    delay: Annotated[float, says("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
+    noise_std: Annotated[float, says("standard deviation of white noise", "m", ge=0.0)] = 0.0
+    quantum: Annotated[float, says("to multiples of which a reading is rounded", "m", ge=0.0)] = 0.0
 
 
 class Rig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The controller: period [s], integrator, command; the motion simulator, the sensors.
+    """The controller, the motion simulator, the sensors."""
 
-    `contact_plane` [m] is where the hardware touches; the controller takes it to be at 0.
-    """
-
-    control_period: ControlPeriod
-    integrator: Integrator = "semi_implicit_euler"
-    command_latency: Annotated[int, Meta(ge=0, le=1)] = 0
-    command_hold: CommandHold = "linear"
-    contact_plane: float = 0.0
-    simulator: Simulator
-    force_sensor: ForceSensor = ForceSensor()
-    position_sensor: PositionSensor = PositionSensor()
+    control_period: Annotated[float, says("time from tick to tick", "s", gt=0.0, le=0.1)]
+    integrator: Annotated[Integrator, says("of the numerical model")] = "semi_implicit_euler"
+    command_latency: Annotated[int, says("periods until a command reaches the drives", ge=0, le=1)] = 0
+    command_hold: Annotated[CommandHold, says("of the command within a period")] = "linear"
+    contact_plane: Annotated[
+        float, says("where the hardware touches; the controller takes it to be at 0", "m")
+    ] = 0.0
+    simulator: Annotated[Simulator, says("the motion simulator")]
+    force_sensor: Annotated[ForceSensor, says("the force sensor")] = ForceSensor()
+    position_sensor: Annotated[PositionSensor, says("the position sensor")] = PositionSensor()
 
 
 class Uncertainty(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How one number varies: see `jaxhil.mechanism.uncertainty`."""
 
-    distribution: Distribution
-    low: float | None = None
-    high: float | None = None
-    factor: Annotated[list[Positive], Meta(min_length=2, max_length=2)] | None = None
-    std: Positive | None = None
-    independent: bool = False
+    distribution: Annotated[Distribution, says("how it is drawn")]
+    low: Annotated[float, says("least value, in the key's unit", "")] | None = None
+    high: Annotated[float, says("greatest value, in the key's unit", "")] | None = None
+    factor: (
+        Annotated[list[Factor], Meta(min_length=2, max_length=2, description="least and greatest")] | None
+    ) = None
+    std: Annotated[float, says("standard deviation, in the key's unit", "", gt=0.0)] | None = None
+    independent: Annotated[bool, says("whether each entry of a list is drawn apart")] = False
 
 
 class Mechanism(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One docking mechanism on one rig."""
 
-    schema: Literal["jaxhil/mechanism/1"]
-    name: Annotated[str, Meta(min_length=1, max_length=100)]
-    source: Annotated[str, Meta(max_length=10_000)] = "assumed"
-    bodies: Bodies
-    approach: Approach
-    contact: Contact
-    rig: Rig
-    uncertainty: dict[str, Uncertainty] = field(default_factory=dict)
+    schema: Annotated[Literal["jaxhil/mechanism/1"], says("what kind of file it is")]
+    name: Annotated[str, says("what to call it", min_length=1, max_length=100)]
+    source: Annotated[str, says("where its numbers come from", max_length=10_000)] = "assumed"
+    bodies: Annotated[Bodies, says("the two bodies")]
+    approach: Annotated[Approach, says("how they meet")]
+    contact: Annotated[Contact, says("the contact")]
+    rig: Annotated[Rig, says("the rig")]
+    uncertainty: Annotated[
+        dict[str, Uncertainty], says("how uncertain the number of each dotted path is")
+    ] = field(default_factory=dict)
 
 
 class Range(NamedTuple):
-    """The allowed values of a number: the interval from low to high, each end in it or not."""
+    """The allowed values of a number: the interval from low to high, each end in it or not; its unit."""
 
     low: float
     high: float
     low_open: bool
     high_open: bool
+    unit: str = "1"
 
     def allows(self, value: float) -> bool:
         """Whether `value` is in the interval; never for NaN."""
@@ -215,25 +248,27 @@ class Range(NamedTuple):
         return above and below
 
     def __str__(self) -> str:
+        unit = f" {self.unit}" if self.unit not in ("", "1") else ""
         if math.isinf(self.low):
-            return "a finite number"
+            return f"a finite number{' of' * bool(unit)}{unit}"
         if math.isinf(self.high):
             ending = "" if self.high_open else ", inf included"
-            return f"a number {'>' if self.low_open else '>='} {self.low:g}{ending}"
+            return f"a number {'>' if self.low_open else '>='} {self.low:g}{unit}{ending}"
         if self.low_open:
-            return f"a number > {self.low:g} and <= {self.high:g}"
-        return f"a number from {self.low:g} to {self.high:g}"
+            return f"a number > {self.low:g}{unit} and <= {self.high:g}{unit}"
+        return f"a number from {self.low:g} to {self.high:g}{unit}"
 
 
-def range_of(kind: msgspec.inspect.FloatType | msgspec.inspect.IntType, infinite: bool) -> Range:
-    """The allowed values that the type of a numeric field states."""
+def range_of(kind: msgspec.inspect.FloatType | msgspec.inspect.IntType, extra: Mapping[str, Any]) -> Range:
+    """The allowed values that the type of a numeric field states, with what `says` put beside it."""
     low = kind.gt if kind.gt is not None else kind.ge
     high = kind.lt if kind.lt is not None else kind.le
     return Range(
         -math.inf if low is None else float(low),
         math.inf if high is None else float(high),
         low is None or kind.gt is not None,
-        not infinite if high is None else kind.lt is not None,
+        not extra.get("infinite") if high is None else kind.lt is not None,
+        extra.get("unit", "1"),
     )
 
 
@@ -250,20 +285,20 @@ def numeric_keys() -> dict[str, Range]:
     """Every key of real numbers by dotted path, and its allowed values (or its entries')."""
     keys: dict[str, Range] = {}
 
-    def visit(kind: msgspec.inspect.Type, path: str, infinite: bool = False) -> None:
+    def visit(kind: msgspec.inspect.Type, path: str, extra: Mapping[str, Any] = PLAIN) -> None:
         match kind:
             case msgspec.inspect.StructType(fields=fields):
                 for entry in fields:
                     visit(entry.type, f"{path}.{entry.name}".lstrip("."))
-            case msgspec.inspect.Metadata(type=inner, extra=extra):
-                visit(inner, path, "infinite" in (extra or {}))
+            case msgspec.inspect.Metadata(type=inner):
+                visit(inner, path, kind.extra or PLAIN)
             case msgspec.inspect.UnionType(types=members):
                 for member in members:
-                    visit(member, path, infinite)
+                    visit(member, path, extra)
             case msgspec.inspect.ListType(item_type=item):
                 visit(item, path)
             case msgspec.inspect.FloatType():
-                keys[path] = range_of(kind, infinite)
+                keys[path] = range_of(kind, extra)
             case _:
                 pass
 
