@@ -2,7 +2,10 @@
 
 import cmath
 import math
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import continuous
@@ -30,6 +33,7 @@ FILE = re.compile(r"(?<![\w/.-])(?:jaxhil|tuning|tests|notebooks|\.ci)/[\w/.-]*\
 CITED = re.compile(
     r"(model|retrospective_reference)\.md[),]*\s+section\s+(\d+)(?:,\s+items?\s+([\d, and]+))?"
 )
+RUNNABLE = re.compile(r"^<!-- runnable -->\n```python\n(.*?)^```", re.M | re.S)
 SETTING = re.compile(r"^\| `(\w+)` \|[^|]+\|[^|]*\| ([\d.]+) \| ([\d.]+) \|$", re.M)
 
 
@@ -171,3 +175,19 @@ def test_lead_and_smith_predictor(model):
         remaining(lambda s: 1 + ahead(s) * (1 + delay * s)),
     ]
     assert numbers(items(model)[14]) == pytest.approx(readings, abs=5e-4)
+
+
+@pytest.mark.parametrize("path", [ROOT / "README.md", GUIDE / "python.md"], ids=lambda path: path.name)
+def test_examples_run(path, tmp_path):
+    """The blocks of a page that are marked as runnable, one after the other in a process of their own."""
+    blocks = RUNNABLE.findall(path.read_text(encoding="utf-8"))
+    assert blocks
+    script = "\n".join(blocks).replace("scenarios=2_000", "scenarios=200").replace("starts=2", "starts=1")
+    inherited = os.environ.get("PYTHONPATH")
+    places = os.pathsep.join([str(ROOT), *([inherited] if inherited else [])])
+    ran = subprocess.run(
+        [sys.executable, "-W", "error", "-c", script],
+        cwd=tmp_path, env={**os.environ, "PYTHONPATH": places}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert ran.returncode == 0 and not ran.stderr, ran.stderr
+    assert ran.stdout

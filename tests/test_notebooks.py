@@ -15,7 +15,10 @@ ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 LARGEST = 500_000  # bytes
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
-SOLVER = re.compile(r"\b(?:tune|tune_all|fronts)\(")
+SOLVER = re.compile(r"\btune\(")
+IMPORTED = re.compile(r"^(?:import|from)\s+([\w.]+)", re.M)
+# Beside the front door: the rig's controller, and intervals of many sweeps at once.
+ALSO_PUBLIC = {"jaxhil.runtime", "tuning.statistics.intervals"}
 MACHINE_PATH = re.compile(r"(?:/(?:home|root|tmp|work|Users|usr|opt)/|[A-Z]:\\\\)[\w.-]")
 
 
@@ -79,10 +82,13 @@ def test_committed_outputs_are_those_of_one_run(path):
     assert "display_data" in kinds and "error" not in kinds
 
 
-def test_float64_is_switched_on_first(path):
+def test_only_the_front_door_is_imported(path):
     notebook = nbformat.read(path, as_version=4)
-    first = next(cell.source for cell in notebook.cells if cell.cell_type == "code")
-    assert first.startswith('import jax\n\njax.config.update("jax_enable_x64", True)\n')
+    code = [cell.source for cell in notebook.cells if cell.cell_type == "code"]
+    assert len(code[0].splitlines()) <= 8
+    assert set(IMPORTED.findall(code[0])) == {"jaxhil", "tuning", "numpy", "matplotlib.pyplot"}
+    later = {module for cell in code for module in IMPORTED.findall(cell)}
+    assert {module for module in later if module.startswith(("jaxhil.", "tuning."))} <= ALSO_PUBLIC
 
 
 def test_committed_file_is_small_and_names_no_machine(path):
