@@ -177,16 +177,24 @@ def test_lead_and_smith_predictor(model):
     assert numbers(items(model)[14]) == pytest.approx(readings, abs=5e-4)
 
 
+def test_the_script_is_the_one_that_is_run():
+    """`test_front_door_tuning` runs it with small numbers."""
+    block = re.search(r"^```python\n(.*?)^```", text_of("python.md"), re.M | re.S)
+    run = (ROOT / "tests" / "interface_script.py").read_text(encoding="utf-8")
+    sizes = re.compile(r"\b(scenarios|starts|judged)=[\d_]+")
+    assert block is not None
+    assert sizes.sub(r"\1", run).endswith(sizes.sub(r"\1", block[1]))
+
+
 @pytest.mark.parametrize("path", [ROOT / "README.md", GUIDE / "python.md"], ids=lambda path: path.name)
 def test_examples_run(path, tmp_path):
     """The blocks of a page that are marked as runnable, one after the other in a process of their own."""
     blocks = RUNNABLE.findall(path.read_text(encoding="utf-8"))
     assert blocks
-    script = "\n".join(blocks).replace("scenarios=2_000", "scenarios=200").replace("starts=2", "starts=1")
     inherited = os.environ.get("PYTHONPATH")
     places = os.pathsep.join([str(ROOT), *([inherited] if inherited else [])])
     ran = subprocess.run(
-        [sys.executable, "-W", "error", "-c", script],
+        [sys.executable, "-W", "error", "-c", "\n".join(blocks)],
         cwd=tmp_path, env={**os.environ, "PYTHONPATH": places}, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert ran.returncode == 0 and not ran.stderr, ran.stderr
