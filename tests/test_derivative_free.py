@@ -108,13 +108,13 @@ def test_what_is_not_a_number_is_the_worst():
 
 
 @pytest.mark.parametrize("gains", [2, 5, 10])
-def test_certify_finds_the_best_of_many_basins(gains):
+def test_a_global_search_finds_the_best_of_many_basins(gains):
     found = search_globally(rippled, gains, 10_000 * gains)
     np.testing.assert_allclose(found.point, 0.6, atol=1e-3)
     assert found.loss < 1e-3
 
 
-def test_certify_finds_what_a_local_search_misses():
+def test_a_global_search_finds_what_a_local_search_misses():
     def losses(points):
         """A wide basin at 0.2, a narrow and deeper one at 0.8."""
         wide = np.sum((points - 0.2) ** 2, axis=-1)
@@ -128,7 +128,7 @@ def test_certify_finds_what_a_local_search_misses():
     assert found.loss == losses(found.point)
 
 
-def test_certify_keeps_to_its_budget_and_to_one_shape_of_call():
+def test_a_global_search_keeps_to_its_budget_and_to_one_shape_of_call():
     shapes = []
 
     def losses(points):
@@ -139,21 +139,7 @@ def test_certify_keeps_to_its_budget_and_to_one_shape_of_call():
     assert set(shapes) == {(32, 3)}
     assert found.evaluations == 32 * len(shapes) <= 3000
     assert found.evaluations > 3000 - 64
-    assert (np.diff(found.basin_losses) >= 0).all() and (np.diff(found.scanned) >= 0).all()
-    assert found.loss == found.basin_losses[0] == kinked(found.point)
-    assert found.basins.shape == (4, 3)
-
-
-def test_what_is_known_is_looked_at():
-    hole = np.array([0.123, 0.456, 0.789, 0.321, 0.654])
-
-    def losses(points):
-        """Flat but for a hole that a scan does not meet."""
-        return 1 - np.exp(-np.sum(((points - hole) / 0.01) ** 2, axis=-1))
-
-    known = hole[None] + 0.002
-    assert search_globally(losses, 5, 4096).loss > 0.5
-    assert search_globally(losses, 5, 4096, known=known).loss < 0.05 < losses(known)
+    assert found.loss == kinked(found.point)
 
 
 def test_mirrored_points_are_inside():

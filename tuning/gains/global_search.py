@@ -53,5 +53,6 @@ def compare_with_global_search(
     everywhere = search_globally(losses, len(validation.names), budget, seed=settings.seed + 1)
     tuned = float(losses(found.best.coordinates[None])[0])
     gains = validation.gains(task, everywhere.point)
-    above = tuned / everywhere.loss - 1 if everywhere.loss > 0 else np.inf
-    return GlobalComparison(tuned, everywhere.loss, above, found.evaluations, everywhere.evaluations, gains)
+    best = float(everywhere.loss)
+    above = tuned / best - 1 if best > 0 else np.inf
+    return GlobalComparison(tuned, best, above, found.evaluations, everywhere.evaluations, gains)

@@ -1,9 +1,9 @@
-"""Derivative-free search in the unit box, batched: a local polish, and a search of the whole box.
+"""Search without derivatives in the unit box, batched: near a point or everywhere.
 
-Gradients end at kinks and in the nearest basin. `polish` goes on from where they ended; `search_globally`
-looks everywhere, and says what there was to find. Both see an objective as a function from NumPy to NumPy
-that takes the same number of points at every call, so that a compiled one is compiled once. Points are
-coordinates of each gain's range on its own scale, all in [0, 1]."""
+Gradients end at kinks and in the nearest basin; these searches do not. Both see an objective as a function
+from NumPy to NumPy that takes the same number of points at every call, so that a compiled one is compiled
+once. A point holds unit coordinates: each gain's place in its range, 0 at the lower bound and 1 at the upper.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -23,25 +23,17 @@ WORST = np.finfo(float).max
 Losses = Callable[[Float[np.ndarray, "candidates gains"]], Float[np.ndarray, "candidates"]]
 
 
-class PolishResult(NamedTuple):
-    """Best point and its loss, and how often the objective was evaluated for it; `polish` of several starts
-    gives each its own."""
+class SearchResult(NamedTuple):
+    """What a search found; `polish` of several starts gives each its own.
+
+    point: the best point.
+    loss: there.
+    evaluations: of the objective that it took.
+    """
 
     point: Float[np.ndarray, "*starts gains"]
     loss: Float[np.ndarray, "*starts"]
     evaluations: int
-
-
-class GlobalSearchResult(NamedTuple):
-    """Best point anywhere and its loss; evaluations used; the bottoms of the basins gone down into, best
-    first, and their losses; the losses of the scan, sorted: where in it a loss lies says how rare it is."""
-
-    point: Float[np.ndarray, "gains"]
-    loss: float
-    evaluations: int
-    basins: Float[np.ndarray, "basins gains"]
-    basin_losses: Float[np.ndarray, "basins"]
-    scanned: Float[np.ndarray, "points"]
 
 
 def polish(
@@ -55,7 +47,7 @@ def polish(
     reach: float = 0.1,
     covariance: Float[np.ndarray, "*starts gains gains"] | None = None,
     seed: int = 0,
-) -> PolishResult:
+) -> SearchResult:
     """Local minimum near `start` by evolution of a normal distribution (CMA-ES), never worse than `start`.
 
     `losses` gets (*starts, candidates, gains) and gives (*starts, candidates); starts are searched side by
@@ -92,7 +84,7 @@ def polish(
         best_loss = np.where(better, found[..., 0], best_loss)
         best = np.where(better[..., None], points[..., 0, :], best)
         state = _evolve(state, points, constants, generation)
-    return PolishResult(best, best_loss, generations * candidates)
+    return SearchResult(best, best_loss, generations * candidates)
 
 
 def search_globally(
@@ -100,58 +92,55 @@ def search_globally(
     gains: int,
     budget: int,
     *,
-    known: Float[np.ndarray, "known gains"] | None = None,
     candidates: int = PER_BASIN,
     basins: int = BASINS,
     seed: int = 0,
-) -> GlobalSearchResult:
+) -> SearchResult:
     """Best point of the whole box within `budget` evaluations: a scan, then the best basins.
 
-    An eighth of the budget is a scrambled Sobol sequence. The best points of it that lie apart, and those
-    `known`, are then polished side by side, in rounds of equal cost: each goes on with the better half, from
-    the bottoms found, with twice the candidates (which see over the ripples of a rough objective) and afresh,
-    without the shape that the last had shrunk to. The last round goes
-    into the best one closely. `losses` always gets basins * candidates points; `basins` is a power of two.
+    An eighth of the budget is a scrambled Sobol sequence. The best points of it that lie apart are then
+    polished side by side, in rounds of equal cost: each goes on with the better half, from the bottoms found,
+    with twice the candidates (which see over the ripples of a rough objective) and afresh, without the shape
+    that the last had shrunk to. The last round goes into the best one closely. `losses` always gets
+    basins * candidates points; `basins` is a power of two.
 
     Source: restarts with a growing population, Auger and Hansen, "A restart CMA evolution strategy with
     increasing population size" (2005); halving, Jamieson and Talwalkar (2016).
     """
-    lot = basins * candidates
-    scan = max(1, budget // (SCAN * lot))
+    together = basins * candidates
+    scan = max(1, budget // (SCAN * together))
     sequence = qmc.Sobol(gains, rng=np.random.default_rng(seed))
     # Drawn as a power of two, used in order: what is left of the balance is that of its prefix.
-    points = sequence.random(1 << (scan * lot - 1).bit_length())[: scan * lot]
-    points = points.reshape(scan, lot, gains)
+    points = sequence.random(1 << (scan * together - 1).bit_length())[: scan * together]
+    points = points.reshape(scan, together, gains)
     scanned = np.concatenate([_finite(losses(part)) for part in points])
     points = points.reshape(-1, gains)
-    starts = apart(points[np.argsort(scanned, kind="stable")], known, basins)
+    starts = apart(points[np.argsort(scanned, kind="stable")], None, basins)
 
-    used = scan * lot
+    used = scan * together
     rounds = [basins >> turn for turn in range(basins.bit_length())] + [1]
     bottoms, bottom_losses = np.empty((0, gains)), np.empty(0)
     for turn, number in enumerate(rounds):
 
         def side_by_side(points, number=number):
-            return losses(points.reshape(lot, gains)).reshape(number, -1)
+            return losses(points.reshape(together, gains)).reshape(number, -1)
 
-        generations = max(1, (budget - used) // lot // (len(rounds) - turn))
+        generations = max(1, (budget - used) // together // (len(rounds) - turn))
         found = polish(
             side_by_side,
             starts,
-            generations * lot // number,
-            candidates=lot // number,
+            generations * together // number,
+            candidates=together // number,
             reach=REACHES[0 if turn == 0 else 2 if turn == len(rounds) - 1 else 1],
             seed=seed + turn,
         )
-        used += generations * lot
+        used += generations * together
         bottoms = np.concatenate([found.point, bottoms[number:]])
         bottom_losses = np.concatenate([found.loss, bottom_losses[number:]])
         order = np.argsort(bottom_losses, kind="stable")
         bottoms, bottom_losses = bottoms[order], bottom_losses[order]
         starts = bottoms[: max(1, number // 2)]
-    return GlobalSearchResult(
-        bottoms[0], float(bottom_losses[0]), used, bottoms, bottom_losses, np.sort(scanned)
-    )
+    return SearchResult(bottoms[0], bottom_losses[0], used)
 
 
 def mirror(points: Float[np.ndarray, "*points"]) -> Float[np.ndarray, "*points"]:
@@ -161,7 +150,12 @@ def mirror(points: Float[np.ndarray, "*points"]) -> Float[np.ndarray, "*points"]
 
 
 class _Generation(NamedTuple):
-    """Mean, step and covariance C of the distribution, the root of C, and the two evolution paths."""
+    """The normal distribution that candidates are drawn from, of every start.
+
+    mean, step, covariance: its mean, and its covariance step^2 C.
+    root, inverse_root: of C.
+    step_path, shape_path: evolution paths, of the step and of C.
+    """
 
     mean: np.ndarray
     step: np.ndarray
@@ -173,7 +167,14 @@ class _Generation(NamedTuple):
 
 
 class _Constants(NamedTuple):
-    """Weights of the better half; the tutorial's c_sigma, d_sigma, c_c, c_1, c_mu, mu_eff, E|N(0, I)|."""
+    """Constants of the evolution; in brackets the tutorial's names.
+
+    weights: of the better half of the candidates.
+    step_rate, damping: of the step (c_sigma, d_sigma).
+    path_rate, rank_one, rank_mu: of the covariance (c_c, c_1, c_mu).
+    effective: number of candidates (mu_eff).
+    length: of a path of random steps, expected (E|N(0, I)|).
+    """
 
     weights: np.ndarray
     step_rate: float

@@ -23,9 +23,15 @@ from tuning.optimisation.unit_box import Bounds, to_gains
 
 
 class Solution(NamedTuple):
-    """Per start: coordinates of the gains' ranges; loss, half the sum of squared residuals; J^T J there, J
-    the residuals' Jacobian by the coordinates; loss after every step, the last repeated; steps taken; status,
-    an index into `STATUSES`."""
+    """Where the starts ended.
+
+    coordinates: unit coordinates of the gains.
+    curvature: J^T J there, J the residuals' Jacobian by the coordinates.
+    loss: half the sum of squared residuals.
+    history: loss after every step, the last repeated.
+    steps: steps taken.
+    status: an index into `STATUSES`.
+    """
 
     coordinates: Float[Array, "starts gains"]
     curvature: Float[Array, "starts gains gains"]
@@ -55,22 +61,22 @@ def solve(
     atol: float = 1e-6,
 ) -> Solution:
     """Minimise sum(residuals(static, gains, arguments)^2) / 2 of many problems at once, in at most `steps`
-    steps, themselves at most `longest`. Problems are dealt out to the devices.
+    steps, themselves at most `longest`. Problems are sharded over the devices.
 
-    A problem is a start: coordinates of its gains' ranges, their bounds and its arguments. It has converged
+    A problem is a start: unit coordinates of its gains, their bounds and its arguments. It has converged
     when residuals and coordinates have settled (`rtol`, `atol`), when a step is shorter than `STANDSTILL`, or
     when the loss has fallen by less than `PROGRESS` of itself in `PATIENCE` steps. `residuals` gets several,
     a leading axis of problems, which must not mix: `tile` of them at a time, by default all that a device has
     to do."""
 
-    def of_shares(coordinates, arguments):
+    def of_coordinates(coordinates, arguments):
         bounds, arguments = arguments
         return residuals(static, to_gains(coordinates, bounds), arguments)
 
     solver = _Recording(_BoxedLevenbergMarquardt(rtol, atol), steps, longest)
 
     def one_device(starts, bounds, arguments):
-        function = _with_jacobian(of_shares, starts, (bounds, arguments), tile)
+        function = _with_jacobian(of_coordinates, starts, (bounds, arguments), tile)
         return jax.vmap(partial(one, function))(starts, bounds, arguments)
 
     def one(function, start, bounds, arguments):
@@ -89,9 +95,14 @@ def solve(
         steps = stats["num_steps"].astype(jnp.int32)
         return Solution(solution.value, stats["curvature"], loss, stats["history"], steps, status)
 
-    devices = math.gcd(jax.device_count(), len(starts))
+    return Solution(*_sharded(one_device, starts, bounds, arguments))
+
+
+def _sharded(one_device: Callable[..., Solution], *arguments: Any) -> tuple[Array, ...]:
+    """`one_device` of arguments whose leading axis is shared out among the devices."""
+    leaves, structure = jax.tree.flatten(arguments)
+    devices = math.gcd(jax.device_count(), len(leaves[0]))
     # Traced outside of `jax.shard_map`, inside of which the solver's linear algebra does not trace.
-    leaves, structure = jax.tree.flatten((starts, bounds, arguments))
     local = [jax.ShapeDtypeStruct((len(leaf) // devices, *leaf.shape[1:]), leaf.dtype) for leaf in leaves]
     traced = jax.make_jaxpr(lambda *leaves: one_device(*jax.tree.unflatten(structure, leaves)))(*local)
     mesh = jax.make_mesh(
@@ -99,10 +110,8 @@ def solve(
     )
     own = PartitionSpec("device")
     # Each device goes its own way to the end: nothing is exchanged, nothing waits for another.
-    found = jax.shard_map(jaxpr_as_fun(traced), mesh=mesh, in_specs=own, out_specs=own, check_vma=False)(
-        *leaves
-    )
-    return Solution(*found)
+    run = jax.shard_map(jaxpr_as_fun(traced), mesh=mesh, in_specs=own, out_specs=own, check_vma=False)
+    return tuple(run(*leaves))
 
 
 def _with_jacobian(residuals, free, arguments, tile=None):
@@ -163,7 +172,12 @@ def _with_jacobian(residuals, free, arguments, tile=None):
 
 
 class _Model(NamedTuple):
-    """What a step is made of: where it begins, J^T J and the loss's gradient J^T r there."""
+    """The linear model that a step is made of.
+
+    coordinates: where the step begins.
+    curvature: J^T J there.
+    gradient: of the loss, J^T r.
+    """
 
     coordinates: Float[Array, "gains"]
     curvature: Float[Array, "gains gains"]

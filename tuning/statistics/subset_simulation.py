@@ -41,11 +41,14 @@ WORST = 10
 class SubsetSimulation(NamedTuple):
     """What subset simulation found.
 
-    The probability and the ends of its interval; the coefficient of variation of `probability` from the
-    spread of the replicates' estimates, and as the formula for single runs has it; (replicates,) estimates
-    and their coefficients by that formula; (levels, replicates) thresholds of the levels, the last one the
-    limit, nan where a replicate needed fewer; evaluations of the performance; (worst, inputs) normals of the
-    worst distinct scenarios met, worst first, and (worst,) their performance, infinite where not finite.
+    probability, low, high: of failing, and the ends of its interval.
+    coefficient_of_variation: of `probability`, from the spread of the replicates' estimates.
+    formula_coefficient_of_variation: the same by the formula for single runs.
+    estimates, formula_coefficients: (replicates,) estimates, and their coefficients by that formula.
+    thresholds: (levels, replicates), the last one the limit; nan where a replicate needed fewer levels.
+    evaluations: of the performance.
+    worst_points: (worst, inputs) normals of the worst distinct scenarios met, worst first.
+    worst_values: (worst,) their performance, infinite where not finite.
     """
 
     probability: float
@@ -64,9 +67,13 @@ class SubsetSimulation(NamedTuple):
 class _State(NamedTuple):
     """All replicates at one level.
 
-    Points (steps, replicates, chains, inputs) and their values, without the last axis, above the replicate's
-    last threshold. Per replicate: the probability of that, log sigma, the sum of squared coefficients of
-    variation so far, whether another level is to be run, and the estimate when none is.
+    points: (steps, replicates, chains, inputs), above the replicate's last threshold.
+    values: their performance, (steps, replicates, chains).
+    reached: per replicate, probability of the last threshold.
+    log_sigma: per replicate, of the proposals.
+    variance: per replicate, sum of squared coefficients of variation so far.
+    open: per replicate, whether another level is to be run.
+    estimates: per replicate, where none is.
     """
 
     points: np.ndarray
@@ -132,17 +139,29 @@ def subset_simulation(
         if np.any(state.open):
             state, worst = _chained(state, threshold, performance, worst, rng)
 
+    return _summary(state, thresholds, worst, failing, level)
+
+
+def to_uniform(normals: np.ndarray) -> np.ndarray:
+    """The uniform numbers of standard normals, above 0 and below 1, for the inputs' quantile functions."""
+    return np.clip(special.ndtr(normals), np.finfo(float).tiny, 1.0 - 2.0**-53)
+
+
+def _summary(
+    state: _State, thresholds: list[np.ndarray], worst: _Worst, failing: float, level: float
+) -> SubsetSimulation:
+    """What the replicates, all at their end, say together."""
     formula = np.sqrt(state.variance)
     if len(thresholds) == 1:
         # Independent scenarios, all of them: the exact interval.
-        _, low, high = binomial_interval(np.sum(values >= failing), values.size, level)
+        _, low, high = binomial_interval(np.sum(state.values >= failing), state.values.size, level)
     else:
         low, high = lognormal_interval(state.estimates, state.reached, formula, level)
     mean = np.mean(state.estimates)
-    spread = np.std(state.estimates, ddof=1) / np.sqrt(replicates)
+    spread = np.std(state.estimates, ddof=1) / np.sqrt(len(formula))
     # Without a failure the formula is infinite, and the estimate says so.
     weighted = state.estimates * np.where(state.estimates > 0.0, formula, 0.0)
-    combined = np.sqrt(np.sum(weighted**2)) / replicates
+    combined = np.sqrt(np.sum(weighted**2)) / len(formula)
     return SubsetSimulation(
         probability=float(mean),
         low=float(low),
@@ -156,11 +175,6 @@ def subset_simulation(
         worst_points=worst.points,
         worst_values=worst.values,
     )
-
-
-def to_uniform(normals: np.ndarray) -> np.ndarray:
-    """The uniform numbers of standard normals, above 0 and below 1, for the inputs' quantile functions."""
-    return np.clip(special.ndtr(normals), np.finfo(float).tiny, 1.0 - 2.0**-53)
 
 
 def _levelled(state: _State, failing: float, independent: bool, last: bool) -> tuple[np.ndarray, _State]:
