@@ -1,4 +1,4 @@
-"""Pictures of a comparison: errors with their intervals, and how honest the laws are."""
+"""Pictures of a comparison: errors with their intervals, and how transparent the laws are."""
 
 from collections.abc import Mapping, Sequence
 

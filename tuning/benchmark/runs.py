@@ -1,6 +1,6 @@
 """The runs behind the figures: plain, pushed and damped ones of one mechanism under one law.
 
-Of a law, all mechanisms of a form go through one compiled program.
+Of a law, all mechanisms that share a program go through one compiled program.
 """
 
 from collections.abc import Mapping
@@ -25,8 +25,13 @@ from tuning.transparency.pushes import EARLY, LATE, Space, in_space, probed
 
 
 class Scene(NamedTuple):
-    """What every law is judged on, NumPy arrays: a mechanism with its form, its scenarios and their damped
-    twins, and the scenarios' first contacts in space."""
+    """What every law is judged on for one mechanism; NumPy arrays.
+
+    common: the program that it shares with others.
+    plain: its scenarios.
+    twins: their damped twins (`tuning.transparency.damped_twins`).
+    space: the scenarios' first contacts in space.
+    """
 
     mechanism: Mechanism
     common: CommonProgram

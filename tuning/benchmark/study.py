@@ -1,8 +1,8 @@
 """The comparison itself: each law tuned to its own best, all judged on the same scenarios and probes.
 
-Laws, and groups of mechanisms that share a form, are dealt out to as many processes as there are cores, each
-with one device: compiling takes most of the time, and one process compiles on one core. No figure depends on
-how they are dealt.
+Laws, and groups of mechanisms that share a program, go to as many processes as there are cores, each with
+one device: compiling takes most of the time, and one process compiles on one core. No figure depends on
+which process computes it.
 """
 
 import multiprocessing
@@ -21,9 +21,17 @@ SEED = 0xFA1  # of the scenarios to judge on: tuning and its own validation neve
 
 @dataclass(frozen=True)
 class CompareSettings:
-    """Numbers of scenarios to tune on, of starts and steps of the solver, of evaluations without derivatives
-    for each gain, of points scanned for starts; of scenarios to judge on; the error beyond which a contact
-    counts as a failure; the seed; whether to tune at all."""
+    """Settings of a comparison.
+
+    scenarios: to tune on.
+    starts, steps: of the solver.
+    polish: evaluations without derivatives, for each gain.
+    scanned: points of a scan for starts.
+    judged: scenarios to judge on.
+    limit: error beyond which a contact counts as a failure [1].
+    seed: of scenarios, starts and resampling.
+    tuned: whether to tune at all.
+    """
 
     scenarios: int = 32
     starts: int = 3
@@ -37,8 +45,11 @@ class CompareSettings:
 
 
 class LawFigures(NamedTuple):
-    """Of one law on one mechanism: gains by "literature", names of settings and "tuned", and what is said of
-    each. A law that has no gains to tune is only there with the literature's."""
+    """Of one law on one mechanism; a law without gains to tune is only there with the literature's.
+
+    gains: by "literature", names of settings and "tuned".
+    figures: what is said of each (`tuning.transparency.figures`).
+    """
 
     law: str
     mechanism: str
@@ -103,7 +114,7 @@ def _gains(law: str) -> int:
 
 
 def build_scenes(mechanisms: list[Mechanism], settings: CompareSettings) -> list[list[Any]]:
-    """What the laws are judged on (`tuning.benchmark.runs.Scene`), grouped by form."""
+    """What the laws are judged on (`tuning.benchmark.runs.Scene`), grouped by program."""
     from tuning.benchmark.runs import build_scene
     from tuning.gains.common_program import common_programs
 
@@ -115,7 +126,7 @@ def build_scenes(mechanisms: list[Mechanism], settings: CompareSettings) -> list
 
 
 def judge_law(scenes: list[Any], law: str, settings: CompareSettings) -> list[LawFigures]:
-    """All figures of one law on mechanisms of one form, tuned together."""
+    """All figures of one law on mechanisms of one program, tuned together."""
     from jaxhil.compensators import COMPENSATORS, literature_gains
     from tuning.benchmark.runs import judge_gains
     from tuning.gains.settings import TuneSettings

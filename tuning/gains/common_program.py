@@ -1,7 +1,7 @@
-"""One form for unlike mechanisms: contact law, number of segments and of contacts become a lane's numbers.
+"""One compiled program for unlike mechanisms: contact law, segments and number of contacts become numbers.
 
-What shapes a compiled program is then common to all, and optional parts of the loop that one of them has are
-inert where a lane's numbers say so. A second surface, which costs every lane time, stays apart.
+What shapes the program is then common to all, and optional parts of the loop that one of the mechanisms has
+are inert where a lane's numbers say so. A second surface, which costs every lane time, stays apart.
 """
 
 import dataclasses
@@ -36,9 +36,15 @@ _APART = ("integrator", "hold", "latency", "is_two_sided")
 
 @dataclass(frozen=True)
 class CommonProgram:
-    """Contact laws by name; numbers of segments and of result slots; names of the optional parts of the loop
-    that some mechanism has; the first derivative that breaks at a tick; samples in the delay lines; whether
-    references that have to be integrated are worked out beforehand, as every first contact's can be."""
+    """What mechanisms that share a program have in common.
+
+    laws: contact laws by name.
+    segments, slots: numbers of segments, and of result slots.
+    parts: names of the optional parts of the loop that some mechanism has.
+    first_break: the first derivative that breaks at a tick.
+    ring: samples in the delay lines.
+    beforehand: whether integrated references are computed beforehand, as every first contact's can be.
+    """
 
     laws: tuple[str, ...]
     segments: int
@@ -58,7 +64,7 @@ class CommonProgram:
         return tuple(dict.fromkeys(LAWS[name] for name in self.laws))
 
     def loop(self, loop: Loop) -> Loop:
-        """The loop of one mechanism, in this form."""
+        """The loop of one mechanism, as this program takes it."""
         parts = {name: name in self.parts for name in _PARTS}
         return dataclasses.replace(
             loop,
@@ -69,7 +75,7 @@ class CommonProgram:
         )
 
     def scenarios(self, mechanism: Mechanism, batch: Scenario) -> Scenario:
-        """The scenarios of one mechanism, in this form."""
+        """The scenarios of one mechanism, as this program takes them."""
         slots, number = batch.phase.shape
         chosen = np.minimum(np.arange(self.slots), slots - 1)
 
@@ -111,7 +117,7 @@ def _reference(law: ContactLaw, contact: ContactParameters, mass: Array, velocit
 
 
 def common_programs(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], CommonProgram]]:
-    """Indices of the mechanisms that share a form, and the form; in the order in which they come."""
+    """Indices of the mechanisms that share a program, and the program; in the order in which they come."""
     # Every uncertain number at either end: what a draw may bring into the loop is seen.
     batches = [build_scenarios(one, extremes(one)) for one in mechanisms]
     loops = [build_loop(m, "none", batch) for m, batch in zip(mechanisms, batches, strict=True)]
@@ -124,7 +130,7 @@ def common_programs(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], Co
         )
         groups.setdefault(key, []).append(index)
     return [
-        (group, _form([mechanisms[i] for i in group], group, loops, batches)) for group in groups.values()
+        (group, _common([mechanisms[i] for i in group], group, loops, batches)) for group in groups.values()
     ]
 
 
@@ -133,7 +139,7 @@ def _later(mechanism: Mechanism) -> bool:
     return mechanism.approach.contacts > 1 and not LAWS[mechanism.contact.law].closed_form
 
 
-def _form(mechanisms, group, loops, batches) -> CommonProgram:
+def _common(mechanisms, group, loops, batches) -> CommonProgram:
     segments = [b.contact.stiffness.shape[1] if b.contact.stiffness.ndim == 3 else 1 for b in batches]
     return CommonProgram(
         laws=tuple(dict.fromkeys(one.contact.law for one in mechanisms)),

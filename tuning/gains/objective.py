@@ -40,7 +40,7 @@ from tuning.transparency.probes import are_probes
 
 SCALE = 0.01  # an error of one: the solver's first steps are damped as for residuals of order one
 FAILED = 3.0  # error of a contact that does not end, or is not reached: as bad as a wild divergence
-CHUNK = 32  # lanes with copies that are computed side by side
+CHUNK = 32  # lanes with probes that are computed side by side
 TAIL = 20  # cvar: the worst one in so many contacts, at least one
 POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # of the norms in the residuals; even
 OBJECTIVES = tuple(POWERS)
@@ -49,26 +49,27 @@ WEIGHTS = tuple(f"{name}_weight" for name in ("divergence", "command", "noise", 
 
 @dataclass(frozen=True)
 class Objective:
-    """What to minimise, J with
+    """What to minimise: J with
 
         J^2 = figure(E)^2 + (transparency_weight rms(H))^2
           + (command_weight rms(C))^2 + (chatter_weight rms(S))^2 + (noise_weight N)^2
 
-    E: per contact the restitution error e - e* [1], times sqrt(divergence_weight) where it is positive:
-    divergence_weight [1] is how much more a squared divergence (e > e*) counts than a squared convergence.
-    H: per contact of the scenarios' copies (`tuning.transparency.probes`) the restitution error e - e* [1],
-    e* their own. With a weight of 1 the errors of the copies count as much as those of the scenarios, E. C:
-    per contact, of copies too, max(0, peak |F_c| / the reference's peak force - 1) [1]. S: per contact, of
-    copies too, the chatter [1]: how far F_c goes up and down beyond a single swing
-    (`jaxhil.simulation.metrics`), over the reference's peak force. Where the sensors are noisy it holds what
-    the noise does to F_c. N: max(0, A - 1) [1], A the amplification of the force sensor's white noise, from
-    the gains alone (`Compensator.noise_amplification`); a quieter command than the measured force earns
-    nothing.
+        E  per contact the restitution error e - e* [1], times sqrt(divergence_weight) where it is positive
+        H  the same of the transparency probes, e* their own (`tuning.transparency.probes`)
+        C  per contact, of probes too, max(0, peak |F_c| / the reference's peak force - 1) [1]
+        S  per contact, of probes too, the chatter [1]: how far F_c goes up and down beyond a single swing
+           (`jaxhil.simulation.metrics`), over the reference's peak force; with the sensors' noise in it
+        N  max(0, A - 1) [1], A the amplification of the force sensor's white noise, from the gains alone
+           (`Compensator.noise_amplification`); a command quieter than the measured force earns nothing
 
-    name: `figure`, one of `OBJECTIVES`. function: a function of the user's own in its place, of the metrics
-    of all scenarios but the copies, in which divergence_weight has no part. The weights of command, noise and
-    chatter [1] are restitution errors: that which weighs as much as a command one reference peak too high, as
-    an amplification one too large, as one swing over the reference's peak too many.
+    name: of the figure, one of `OBJECTIVES`.
+    function: a function of the user's own in its place, of the metrics of all scenarios but the probes;
+        divergence_weight has no part in it.
+    divergence_weight: how much more a squared divergence (e > e*) counts than a squared convergence [1].
+    command_weight: restitution error that weighs as much as a command one reference peak too high [1].
+    noise_weight: as much as an amplification one too large [1].
+    chatter_weight: as much as one swing over the reference's peak too many [1].
+    transparency_weight: with 1, the probes' errors count as much as those of the scenarios [1].
 
     Raises `InputError` for another name or a weight that is negative or not finite, or 0 for divergence.
     """
@@ -100,9 +101,13 @@ RMS = Objective()
 
 
 class Terms(NamedTuple):
-    """What of an objective shapes the program: its figure, whether command, noise and chatter have a part,
-    whether the scenarios come with copies, and the user's function in the place of the figure, if any, with
-    the number of contacts that it gets."""
+    """What of an objective shapes the compiled program.
+
+    name: its figure.
+    command, noise, chatter: whether these have a part.
+    transparency: whether the scenarios come with probes.
+    function, contacts: the user's function in the place of the figure, if any, and how many contacts it gets.
+    """
 
     name: str
     command: bool
@@ -114,7 +119,7 @@ class Terms(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """The weights of an objective, see there: numbers that one program takes, each problem its own."""
+    """The weights of an objective (`Objective`): numbers that one program takes, each problem its own."""
 
     divergence: Float[Array, "*problems"]
     command: Float[Array, "*problems"]
@@ -124,8 +129,12 @@ class Weights(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """A rig built for a batch of scenarios, the gains that stay as they are and the objective's weights;
-    where there are several problems, each leaf has a leading axis of them."""
+    """What one start is solved for; where there are several problems, each leaf has a leading axis of them.
+
+    rig: built for a batch of scenarios.
+    fixed: gains that stay as they are.
+    weights: the objective's.
+    """
 
     rig: RigConstants
     fixed: dict[str, Array]
@@ -139,7 +148,7 @@ def one_each(objective: Objective | Sequence[Objective], number: int) -> list[Ob
 
 def common_terms(objectives: Sequence[Objective], probed: bool = False, contacts: int = 0) -> Terms:
     """The terms of objectives of one name and function: a part that one of them has, all have, some with a
-    weight of 0. `probed` scenarios come with copies; all have so many `contacts`, if there is a function.
+    weight of 0. `probed` scenarios come with probes; all have so many `contacts`, if there is a function.
 
     Raises ValueError for objectives of several names or functions.
     """
@@ -163,7 +172,7 @@ def residuals(
     """(J / `SCALE`)^2 of every problem as a sum of squares, J as of `Objective`; the loss is half of it.
 
     One residual per contact slot of every scenario for the figure, or the norm that stands for it, as many
-    for the command, as many for its chatter, one for the noise, and one for every contact slot of the copies,
+    for the command, as many for its chatter, one for the noise, and one for every contact slot of the probes,
     where they are among the terms. Contacts that fail count with the constant error, excess and chatter
     `FAILED`.
 
@@ -208,8 +217,8 @@ def weigh(
     probes: Bool[Array, "problems contacts"] | None = None,
     figure: Float[Array, "problems"] | None = None,
 ) -> Float[Array, "problems residuals"]:
-    """The residuals of `contact_terms` and of the noise's amplification; `copies`: which contacts are of
-    copies, where the terms have transparency; `figure`: the value of the user's function, which is one
+    """The residuals of `contact_terms` and of the noise's amplification; `probes`: which contacts are of
+    probes, where the terms have transparency; `figure`: the value of the user's function, which is one
     residual, where they have one."""
 
     # A problem that asks for no contact, which fills up a call, has errors of 0.

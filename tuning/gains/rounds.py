@@ -31,15 +31,22 @@ TILE = 128  # lanes computed side by side on a device: more leave the cache
 FIRST_ROUND = 8  # steps
 PROMISING = 3  # starts of a task that go on after the first round
 LONGEST = 32  # steps of one call
-ENOUGH = 0.005  # by which a start with copies gets better in a round that is not its last
+ENOUGH = 0.005  # by which a start with probes gets better in a round that is not its last
 STEP_LIMIT = STATUSES.index("step limit")
 GIVEN_UP = "given up"
 
 
 class Start(NamedTuple):
-    """One start of the solve: status, steps, value of the objective (its norm, `tuning.gains.objective`) it
-    ended with and had after every step, and its gains; of those that are tuned for any of the tasks also the
-    coordinates of their ranges, and J^T J by them."""
+    """One start of the solve.
+
+    status: how it ended.
+    steps: of the solver.
+    rms: value of the objective it ended with (its norm, see `tuning.gains.objective`).
+    history: that value after every step.
+    gains: all of the compensator's.
+    coordinates: unit coordinates of the gains that are tuned for any of the tasks.
+    curvature: J^T J by those, J the residuals' Jacobian.
+    """
 
     status: str
     steps: int
@@ -52,7 +59,13 @@ class Start(NamedTuple):
 
 @dataclasses.dataclass
 class _Problem:
-    """A start on its way: coordinates now, J^T J there, loss after every step so far."""
+    """A start on its way.
+
+    task: index of its task.
+    coordinates, curvature: unit coordinates now, and J^T J there.
+    status: index into `STATUSES`, or why it was given up.
+    history: loss after every step so far.
+    """
 
     task: int
     coordinates: np.ndarray
@@ -172,7 +185,7 @@ def _stepper(tasks, names, bounds, objectives, number) -> Callable[[list[_Proble
             solution = jax.device_get(
                 program_cache.run(_advance, static, call(some, limit), program_folder())
             )
-            for place, i in enumerate(_dealt(size)):
+            for place, i in enumerate(_sharded(size)):
                 if i < len(some):
                     _take(some[i], solution, place)
 
@@ -184,7 +197,7 @@ def _size(number: int) -> int:
     return FEW if number <= FEW else MANY
 
 
-def _dealt(size: int) -> np.ndarray:
+def _sharded(size: int) -> np.ndarray:
     """Which problem is in each place of a call: in turn for each device, whose places are side by side, so
     that all of them have as many of the long ones."""
     devices = math.gcd(jax.device_count(), size)
@@ -204,10 +217,10 @@ def _calls(tasks, names, bounds, objectives, number):
     static = (loop, names, terms), LONGEST, max(1, TILE // lanes)
 
     def call(some: list[_Problem], limit: int):
-        dealt = _dealt(size)
+        sharded = _sharded(size)
         # Nothing runs in the places that only fill the call.
-        filled = [some[i] if i < len(some) else some[0] for i in dealt]
-        idle = dealt[:, None] >= len(some)
+        filled = [some[i] if i < len(some) else some[0] for i in sharded]
+        idle = sharded[:, None] >= len(some)
         index = np.array([p.task for p in filled])
         starts = np.stack([p.coordinates for p in filled])
         scenarios, others, weighed, limits = jax.tree.map(itemgetter(index), table)
@@ -218,7 +231,7 @@ def _calls(tasks, names, bounds, objectives, number):
 
 
 def _in_order(task: TuneTask) -> Scenario:
-    """The task's scenarios. Where each has its copies, those that take as long are neighbours."""
+    """The task's scenarios. Where each has its probes, those that take as long are neighbours."""
     if not task.probed:
         return task.scenarios
     # That is made of how long the contacts take.

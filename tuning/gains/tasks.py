@@ -28,14 +28,19 @@ from tuning.transparency.probes import LANES_PER_SCENARIO, probed_scenarios
 PATIENCE = 2.0
 SHORTEST_PATIENCE = 0.15  # s
 
-SCENARIOS, NOISY_SCENARIOS = 32, 128  # to tune on, without and with sensor noise, copies included
+SCENARIOS, NOISY_SCENARIOS = 32, 128  # to tune on, without and with sensor noise, probes included
 
 
 @dataclass(frozen=True)
 class TuneTask:
-    """A mechanism to tune: the compensator's literature gains, or those of a setting, the scenarios to tune
-    on and their loop; the form that scenarios and loop are brought to, if it shares a program with unlike
-    mechanisms; whether each scenario comes with its copies (`tuning.transparency.probes`)."""
+    """A mechanism to tune.
+
+    mechanism, compensator: what is tuned for what.
+    literature: the compensator's gains by the literature's rule, or those of a setting.
+    scenarios, loop: scenarios to tune on, and the loop that runs them.
+    common: the program it shares with unlike mechanisms, if it does.
+    probed: whether each scenario comes with its transparency probes (`tuning.transparency.probes`).
+    """
 
     mechanism: Mechanism
     compensator: str
@@ -47,7 +52,7 @@ class TuneTask:
 
     @property
     def number(self) -> int:
-        """Scenarios, copies not counted."""
+        """Scenarios, probes not counted."""
         return len(self.scenarios.velocity) // (LANES_PER_SCENARIO if self.probed else 1)
 
     @property
@@ -73,10 +78,10 @@ def build_task(
     """Training scenarios are quasi-random: they fill the range evenly. Their contacts must end in time.
 
     Each comes with a realisation of the sensors' noise of its own. Gains can be fitted to a few of them, so
-    that there are more, unless a number is given, where there is noise. The copies of `honest` ones are as
-    good for that: there are fewer scenarios then.
+    that there are more, unless a number is given, where there is noise. The transparency probes of `probed`
+    ones are as good for that: there are fewer scenarios then.
 
-    Raises ValueError for probed tasks in a form.
+    Raises ValueError for probed tasks of a common program.
     """
     if probed and common is not None:
         raise ValueError("probed: found True, allowed False for mechanisms that share a program")

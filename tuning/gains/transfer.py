@@ -19,9 +19,16 @@ from tuning.gain_file import validity_envelope
 
 
 class Traits(NamedTuple):
-    """What a mechanism's restitution without compensation depends on, nominally: slowest and fastest contact
-    omega [rad/s]; delay and lag of force sensor and of motion simulator with its command, control period [s];
-    damping ratio [1]; contact law, whether there are two surfaces."""
+    """What a mechanism's restitution without compensation depends on, nominally.
+
+    slowest, fastest: contact omega [rad/s].
+    force_delay: delay and lag of the force sensor [s].
+    simulator_delay: those of the motion simulator with its command [s].
+    control_period: [s].
+    damping_ratio: [1].
+    law: contact law.
+    two_sided: whether there are two surfaces.
+    """
 
     slowest: float
     fastest: float
@@ -35,7 +42,12 @@ class Traits(NamedTuple):
 
 @dataclass(frozen=True)
 class Tuned:
-    """A mechanism, gains [SI units] that were tuned for it, and where they come from, as a user would say."""
+    """Gains that were tuned before.
+
+    mechanism: that they were tuned for.
+    gains: [SI units].
+    source: where they come from, as a user would say.
+    """
 
     mechanism: Mechanism
     gains: Mapping[str, float]

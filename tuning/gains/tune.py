@@ -98,7 +98,7 @@ class TuneResult:
 
     @property
     def usual_starts(self) -> int:
-        """Starts before those that began at gains known before: the rest of the first lot."""
+        """Starts before those that began at gains known before: the rest of the first batch."""
         return max(self.settings.starts, 1 + len(self.first)) - len(self.first)
 
 

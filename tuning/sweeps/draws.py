@@ -71,7 +71,7 @@ def _quiet_random(engine, number: int) -> np.ndarray:
         return np.empty((0, engine.d))
     if engine.num_generated:
         return engine.random(number)
-    # SciPy warns of a first lot that is no power of two.
+    # SciPy warns of a first batch that is no power of two.
     head = engine.random(1)
     return np.concatenate([head, engine.random(number - 1)]) if number > 1 else head
 

@@ -1,19 +1,19 @@
-"""What keeps tuning honest: each scenario once more with an early push, with a late push, and damped.
+"""Transparency probes: each scenario once more with an early push, with a late push, and damped.
 
 A law that anticipates the contact can be tuned into a simulation that ignores the hardware: where all
-contacts are alike, that is the most accurate. So each scenario comes with three copies whose restitution it
-cannot know beforehand:
+contacts are alike, that is the most accurate. So each scenario comes with three probes whose restitution the
+law cannot know beforehand:
 
-    early, late   the push of `tuning.transparency.pushes` on the hardware, which no model knows of
-    damped        the scenario's twin of `tuning.transparency.damped_twins`, with more dissipation than it has
+    early, late   a push on the hardware, which no model knows of (`tuning.transparency.pushes`)
+    damped        the same contact with more dissipation than it has (`tuning.transparency.damped_twins`)
 
 Each has its own true restitution e*: that of the pushed, or damped, contact in space. A law that swallows the
 push, or gives back energy that is not there, errs by e - e* as in any other contact: transparency and slope
 are then restitution errors, differentiable, in one unit with all others. The push counts from the hardware's
-first touch, and is the same in space; it acts on the first contact, after which a copy ends.
+first touch, and is the same in space; it acts on the first contact, after which a probe ends.
 
-The four lie side by side, lanes 4 i to 4 i + 3 for scenario i: whatever takes the first few lanes has some
-of each.
+Scenario and probes lie side by side, lanes 4 i to 4 i + 3 for scenario i: whatever takes the first few lanes
+has some of each.
 """
 
 from collections.abc import Mapping
@@ -40,8 +40,11 @@ ANTICIPATING = {"transparency_weight": 1.0, "command_weight": 0.003}
 
 
 class ProbedScenarios(NamedTuple):
-    """A batch of scenarios with their copies, (..., scenarios * `LANES_PER_SCENARIO`), and their restitution
-    in space, (scenarios,), without and with the early and the late push, all integrated alike."""
+    """A batch of scenarios with their transparency probes.
+
+    scenarios: (..., scenarios * `LANES_PER_SCENARIO`).
+    plain, early, late: restitution in space without and with either push, (scenarios,), integrated alike.
+    """
 
     scenarios: Scenario
     plain: Any
@@ -52,7 +55,7 @@ class ProbedScenarios(NamedTuple):
 def default_weights(compensator: str) -> dict[str, float]:
     """Weights of `tuning.gains.objective.Objective` that a compensator has unless others are given, by name.
 
-    Where the law anticipates, the errors of the copies count as much as those of the scenarios, and force is
+    Where the law anticipates, the errors of the probes count as much as those of the scenarios, and force is
     dear: what such a law is late by it can pay back by a kick, which the error alone rewards. Where a law can
     but pass on what it measures, neither counts.
     """
@@ -60,14 +63,14 @@ def default_weights(compensator: str) -> dict[str, float]:
 
 
 def are_probes(lanes: int) -> np.ndarray:
-    """Which of so many lanes, with those of the copies, are of copies."""
+    """Which of so many lanes, with those of the probes, are of probes."""
     return np.arange(lanes) % LANES_PER_SCENARIO > 0
 
 
 def probed_scenarios(
     mechanism: Mechanism, draws: Mapping[str, np.ndarray] | None = None, seed: int = 0
 ) -> ProbedScenarios:
-    """The scenarios of `jaxhil.simulation.scenario.build_scenarios`, each with its copies."""
+    """The scenarios of `jaxhil.simulation.scenario.build_scenarios`, each with its probes."""
     plain = build_scenarios(mechanism, draws, seed)
     number = len(plain.velocity)
     twin, damped = damped_twins(mechanism, draws or {"approach.phase": np.asarray(plain.phase).T})
@@ -102,11 +105,11 @@ def _pushed(scenarios: Scenario, space: Any, share: float | None = None, restitu
     return scenarios._replace(contacts=contacts, probe=probe, reference=reference)
 
 
-def probe_figures(probed: ProbedScenarios, copies: Outcome, seed: int = 0) -> dict[str, Estimate]:
+def probe_figures(probed: ProbedScenarios, outcome: Outcome, seed: int = 0) -> dict[str, Estimate]:
     """early, late, slope and peak of `tuning.transparency.figures` from the outcome (slots, scenarios,
-    `LANES_PER_SCENARIO`) of `probed` scenarios; the slope over the damped copies."""
+    `LANES_PER_SCENARIO`) of `probed` scenarios; the slope over the damped ones."""
     plain, early, late, damped = (
-        jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[..., i], copies) for i in range(LANES_PER_SCENARIO)
+        jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[..., i], outcome) for i in range(LANES_PER_SCENARIO)
     )
     judged = Runs(plain, early, late, damped)
     return transparency_figures(judged, (probed.early, probed.late), probed.plain, seed)

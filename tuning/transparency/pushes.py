@@ -30,8 +30,14 @@ LANES = 256  # integrated in one call
 
 
 class Space(NamedTuple):
-    """Contacts in space, (slots, scenarios): restitution, peak force [N], duration [s], penetration [m] at
-    `SAMPLES` times (slots, samples, scenarios); restitution under an early and under a late push."""
+    """Contacts in space, (slots, scenarios).
+
+    restitution: e* [1].
+    peak_force: [N].
+    duration: [s].
+    depth: penetration [m] at `SAMPLES` times, (slots, samples, scenarios).
+    early, late: restitution under an early and under a late push [1].
+    """
 
     restitution: Float[np.ndarray, "slots scenarios"]
     peak_force: Float[np.ndarray, "slots scenarios"]
