@@ -3,8 +3,8 @@
 A test's program runs once or twice: most of its time is the compiler's. With less optimisation that is half,
 for the same numbers but for their last bits, which are held to the same tolerances. Modules marked
 `users_options`, and the studies and benchmarks that are no part of the everyday suite, have the options of
-`tuning.environment`: where the last bits are what is tested, and where jax is held against the rig's own
-controller.
+`jaxhil.simulation.environment`: where the last bits are what is tested, and where jax is held against the
+rig's own controller.
 """
 
 from pathlib import Path

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
-from tuning.environment import CACHE, cache_folder, flags, prepare, settings
+from jaxhil.simulation.environment import CACHE, cache_folder, flags, prepare, settings
 
 # Two devices wherever the tests run, and otherwise what users have.
 os.environ["XLA_FLAGS"] = flags(os.environ.get("XLA_FLAGS", "--xla_force_host_platform_device_count=2"))

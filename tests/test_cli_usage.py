@@ -8,7 +8,7 @@ import pytest
 from conftest import Ran
 
 from jaxhil.mechanism.file import builtin_names, suite_names
-from tuning import environment
+from jaxhil.simulation import environment
 from tuning.cli.commands.tune import folder_name, is_better
 from tuning.cli.options import DEFAULT_DRIVERS, DEFAULT_PLOT
 from tuning.cli.parser import complete_bare

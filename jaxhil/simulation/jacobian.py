@@ -22,7 +22,7 @@ from jaxhil.mechanism.loading import as_mechanism
 from jaxhil.mechanism.overrides import KeyProblem, parse_key
 from jaxhil.mechanism.structs import Mechanism, numeric_keys, value_at
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.double_precision import double_precision
+from jaxhil.simulation.environment import computing
 from jaxhil.simulation.evaluation import Outcome, compare_with_reference
 from jaxhil.simulation.gain_choice import choose_gains
 from jaxhil.simulation.loop import Loop
@@ -83,7 +83,7 @@ def jacobian(
         raise InputError(f"by: found {shown(by)}, allowed {allowed}")
     keys = [_key(checked, law, path) for path in paths]
     _check_rounding(checked)
-    with double_precision():
+    with computing():
         slopes, status = _slopes(
             of, _loop(checked, name, keys, number), *_moving(checked, keys, values, number)
         )

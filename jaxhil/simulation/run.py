@@ -14,7 +14,7 @@ from jaxhil.errors import InputError, one_line, shown
 from jaxhil.mechanism.loading import as_mechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.double_precision import double_precision
+from jaxhil.simulation.environment import computing
 from jaxhil.simulation.evaluation import Outcome, evaluate
 from jaxhil.simulation.gain_choice import choose_gains
 from jaxhil.simulation.gain_file import LoadedGains
@@ -70,7 +70,7 @@ class Run:
     @cached_property
     def ticks(self) -> Ticks:
         """Every tick up to the end of the last contact, or to the first number that is not finite."""
-        with double_precision():
+        with computing():
             scenarios = build_scenarios(self.mechanism, seed=self.seed)
             loaded = LoadedGains({}, self.compensator, self.gains, self.mechanism)
             _, [lane] = record_lanes(loaded, scenarios)
@@ -146,7 +146,7 @@ class Run:
         from jaxhil.simulation.contact_plot import contact_plot, save
         from jaxhil.simulation.motion import nominal_motion
 
-        with double_precision():
+        with computing():
             motion = nominal_motion(self.mechanism, {"rig": (self.compensator, self.gains)}, self.seed)
         title = f"{self.mechanism.name}, compensation: {self.compensator}"
         try:
@@ -174,7 +174,7 @@ def simulate(
     checked = as_mechanism(mechanism)
     number = check_seed(seed)
     name, values = choose_gains(checked, compensator, gains)
-    with double_precision():
+    with computing():
         scenarios = build_scenarios(checked, seed=number)
         outcome = evaluate(build_loop(checked, name, scenarios), values, scenarios)
     estimates = COMPENSATORS[name].estimates_delay

@@ -173,6 +173,6 @@ def _begin() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     given = os.environ.get("XLA_FLAGS", "")
     os.environ["XLA_FLAGS"] = f"{given} --xla_force_host_platform_device_count=1".strip()
-    from tuning.environment import prepare
+    from jaxhil.simulation.environment import prepare
 
     prepare()

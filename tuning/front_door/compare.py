@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from jaxhil.errors import InputError, shown
 from jaxhil.mechanism.file import LoadedMechanism
 from jaxhil.runtime.laws import PUBLISHED
+from jaxhil.simulation.environment import computing
 from tuning import terminal
-from tuning.environment import computing
 from tuning.front_door import arguments
 
 if TYPE_CHECKING:

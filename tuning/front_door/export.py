@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from jaxhil.errors import shown
 from jaxhil.runtime.limits import LIMITS
+from jaxhil.simulation.environment import computing
 from tuning import terminal
-from tuning.environment import computing
 from tuning.front_door import arguments
 from tuning.front_door.arguments import ArgumentError
 

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jaxhil.errors import InputError, shown
+from jaxhil.simulation.environment import computing
 from tuning import terminal
-from tuning.environment import computing
 from tuning.front_door import arguments, sweep_studies
 from tuning.front_door.arguments import ArgumentError
 from tuning.sweeps import LARGEST_CHUNK, LARGEST_SEED, MOST, PRECISIONS, SAMPLINGS

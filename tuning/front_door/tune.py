@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from jaxhil.errors import one_line
 from jaxhil.mechanism.file import LoadedMechanism
 from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.environment import computing
 from tuning import terminal
-from tuning.environment import computing
 from tuning.front_door import arguments, tune_pareto
 from tuning.front_door.arguments import ArgumentError
 from tuning.front_door.tune_pareto import TradedGains

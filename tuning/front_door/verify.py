@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError
+from jaxhil.simulation.environment import computing
 from tuning import terminal
-from tuning.environment import computing
 from tuning.front_door import arguments
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxhil.errors import InputError
-from tuning.environment import float64, program_folder
+from jaxhil.simulation.environment import float64, program_folder
 from tuning.gains.metrics_function import ALLOWED
 from tuning.gains.objective import RMS, Objective
 from tuning.gains.rounds import Start, inverse_hessian, prepare_solver, solve_tasks

@@ -16,7 +16,7 @@ def reference_restitutions(mechanism: Mechanism, contacts: Sequence[ContactResul
     """Restitution e* of each contact in space, entered at the speed it had on the rig; imports jax."""
     if not contacts:
         return []
-    from tuning.environment import prepare
+    from jaxhil.simulation.environment import prepare
 
     prepare()
     import jax

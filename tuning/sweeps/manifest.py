@@ -16,7 +16,7 @@ from msgspec import Meta
 
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.runtime import digest
-from tuning.environment import xla_flags
+from jaxhil.simulation.environment import xla_flags
 from tuning.gain_file import LoadedGains, check_document, versions
 from tuning.sweeps import LARGEST_CHUNK, LARGEST_SEED, MOST
 from tuning.sweeps.columns import Column, sweep_columns

@@ -180,7 +180,7 @@ _one_at_a_time = threading.Lock()
 def _remote_part(content: bytes, part: int) -> tuple[int, Rows]:
     """A part's rows, on a worker."""
     with _one_at_a_time:
-        from tuning.environment import prepare
+        from jaxhil.simulation.environment import prepare
 
         prepare()
         sweep = _remote_sweep(content)

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.mechanism.file import LoadedMechanism, load, suite_names
+from jaxhil.simulation.environment import prepare, usable_cores
 from tuning import terminal
 from tuning.cli.options import Compare
-from tuning.environment import prepare, usable_cores
 from tuning.front_door.compare import CompareOptions, board, check_names, compare_each
 
 

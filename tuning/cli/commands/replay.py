@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Any
 
+from jaxhil.simulation.environment import prepare
 from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options import Replay
-from tuning.environment import prepare
 
 KEYS = ("restitution", "reference_restitution", "error", "peak_force", "peak_command", "duration")
 KEYS = (*KEYS, "position_shortfall", "approach_velocity", "energy_in", "energy_out")

@@ -8,10 +8,10 @@ from jaxhil.mechanism.conversion import KeyProblem
 from jaxhil.mechanism.file import from_builtins, load, to_builtins
 from jaxhil.mechanism.overrides import apply_override, parse_override
 from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.environment import prepare
 from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options import Simulate
-from tuning.environment import prepare
 
 if TYPE_CHECKING:
     from jaxhil.simulation.run import ContactResult, Run

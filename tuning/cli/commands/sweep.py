@@ -3,10 +3,10 @@
 from dataclasses import fields
 from pathlib import Path
 
+from jaxhil.simulation.environment import prepare
 from tuning import terminal
 from tuning.cli.commands import sweep_tables
 from tuning.cli.options import Sweep
-from tuning.environment import prepare
 from tuning.front_door.arguments import readable_gain_file
 from tuning.front_door.sweep import SweepOptions, run_study
 

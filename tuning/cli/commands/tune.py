@@ -9,11 +9,11 @@ from typing import Any
 
 from jaxhil.errors import InputError, one_line
 from jaxhil.mechanism.file import LoadedMechanism, load
+from jaxhil.simulation.environment import prepare, program_folder
 from tuning import terminal
 from tuning.cli.commands import tune_pareto
 from tuning.cli.commands.tune_tables import print_one, print_overview
 from tuning.cli.options import Tune
-from tuning.environment import prepare, program_folder
 from tuning.front_door.tune import TunedGains, TuneOptions, tune_each
 
 MOST_DRAWN = 4  # mechanisms whose plots are drawn; of more there is one picture of all
