@@ -64,37 +64,23 @@ def _nominal_alignment(mechanism: Mechanism) -> float:
 
 
 class DeadZoneObserverState(NamedTuple):
-    """What the law carries from tick to tick.
+    """What the law carries from tick to tick."""
 
-    lead: lead filter.
-    withheld: Q's input of the tick before [N].
-    observed: Q's output of the tick before [N].
-    line: measured positions.
-    """
-
-    lead: LeadState
-    withheld: Float[Array, "*batch"]
-    observed: Float[Array, "*batch"]
-    line: DelayLine
+    lead: LeadState  # lead filter
+    withheld: Float[Array, "*batch"]  # Q's input of the tick before [N]
+    observed: Float[Array, "*batch"]  # Q's output of the tick before [N]
+    line: DelayLine  # measured positions
 
 
 class Prepared(NamedTuple):
-    """What is worked out once per run.
+    """What is worked out once per run."""
 
-    gains: of the law.
-    clearance: between two surfaces [m].
-    lead: lead filter.
-    pole: of Q, y(n) = pole y(n-1) + share (u(n) + u(n-1)).
-    share: of Q's input.
-    delay: by which positions are aligned.
-    """
-
-    gains: Gains
-    clearance: Float[Array, "*batch"]
-    lead: LeadFilter
-    pole: Float[Array, "*batch"]
-    share: Float[Array, "*batch"]
-    delay: Delay
+    gains: Gains  # of the law
+    clearance: Float[Array, "*batch"]  # between two surfaces [m]
+    lead: LeadFilter  # lead filter
+    pole: Float[Array, "*batch"]  # of Q, y(n) = pole y(n-1) + share (u(n) + u(n-1))
+    share: Float[Array, "*batch"]  # of Q's input
+    delay: Delay  # by which positions are aligned
 
 
 class DeadZoneObserver(Compensator):

@@ -52,28 +52,17 @@ DAMPING = SEGMENTS
 
 
 class Bank(NamedTuple):
-    """What is known of each hypothesis, and of the delay.
+    """What is known of each hypothesis, and of the delay."""
 
-    maps: of each hypothesis.
-    deepest: point of this contact [s].
-    likelihood: of this contact's readings.
-    carried: likelihood of the readings of the contacts before.
-    precision: sum of the damping's 1/s^2 over the contacts before [s^2].
-    weighted: sum of B/s^2 over them [s].
-    met: how many they are.
-    learning: whether (1) this contact is to be added to them.
-    shift: mean of d_h [s].
-    """
-
-    maps: Map
-    deepest: Float[Array, "hypotheses *batch"]
-    likelihood: Float[Array, "hypotheses *batch"]
-    carried: Float[Array, "hypotheses *batch"]
-    precision: Float[Array, "hypotheses *batch"]
-    weighted: Float[Array, "hypotheses *batch"]
-    met: Float[Array, "*batch"]
-    learning: Float[Array, "*batch"]
-    shift: Float[Array, "*batch"]
+    maps: Map  # of each hypothesis
+    deepest: Float[Array, "hypotheses *batch"]  # point of this contact [s]
+    likelihood: Float[Array, "hypotheses *batch"]  # of this contact's readings
+    carried: Float[Array, "hypotheses *batch"]  # likelihood of the readings of the contacts before
+    precision: Float[Array, "hypotheses *batch"]  # sum of the damping's 1/s^2 over the contacts before [s^2]
+    weighted: Float[Array, "hypotheses *batch"]  # sum of B/s^2 over them [s]
+    met: Float[Array, "*batch"]  # how many they are
+    learning: Float[Array, "*batch"]  # whether (1) this contact is to be added to them
+    shift: Float[Array, "*batch"]  # mean of d_h [s]
 
 
 def no_bank(prior: Map) -> Bank:

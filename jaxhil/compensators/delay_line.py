@@ -11,29 +11,19 @@ from jaxhil.ring_buffer import look_back, write
 
 
 class Delay(NamedTuple):
-    """A delay in control periods.
+    """A delay in control periods."""
 
-    lookback: whole periods.
-    fraction: the rest [1].
-    period: control period [s].
-    """
-
-    lookback: Int[Array, "*batch"]
-    fraction: Float[Array, "*batch"]
-    period: Float[Array, "*batch"]
+    lookback: Int[Array, "*batch"]  # whole periods
+    fraction: Float[Array, "*batch"]  # the rest [1]
+    period: Float[Array, "*batch"]  # control period [s]
 
 
 class DelayLine(NamedTuple):
-    """Readings of the measured position.
+    """Readings of the measured position."""
 
-    first_position: the run's first reading [m].
-    first_velocity: its speed then [m/s].
-    ring: of readings [m].
-    """
-
-    first_position: Float[Array, "*batch"]
-    first_velocity: Float[Array, "*batch"]
-    ring: Float[Array, "samples *batch"]
+    first_position: Float[Array, "*batch"]  # the run's first reading [m]
+    first_velocity: Float[Array, "*batch"]  # its speed then [m/s]
+    ring: Float[Array, "samples *batch"]  # of readings [m]
 
 
 def split(delay: Array, period: Array) -> Delay:

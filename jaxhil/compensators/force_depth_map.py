@@ -32,63 +32,39 @@ OUTLYING = 4.0  # times the noise's variance: a force that hardly is noise
 
 
 class Map(NamedTuple):
-    """What is known of theta.
+    """What is known of theta."""
 
-    mean: of theta.
-    covariance: of theta.
-    """
-
-    mean: Float[Array, "parameters *batch"]
-    covariance: Float[Array, "parameters parameters *batch"]
+    mean: Float[Array, "parameters *batch"]  # of theta
+    covariance: Float[Array, "parameters parameters *batch"]  # of theta
 
 
 class Reading(NamedTuple):
-    """What is read at a tick.
+    """What is read at a tick."""
 
-    depth: X, as old as the force is taken to be [s].
-    rate: V, likewise [1].
-    force: y [1/s].
-    variance: r of its noise [1/s^2].
-    hidden: whether the sensor's dead zone hides the force.
-    zone: that dead zone [1/s].
-    counts: whether to learn from it.
-    """
-
-    depth: Float[Array, "*batch"]
-    rate: Float[Array, "*batch"]
-    force: Float[Array, "*batch"]
-    variance: Float[Array, "*batch"]
-    hidden: Bool[Array, "*batch"]
-    zone: Float[Array, "*batch"]
-    counts: Bool[Array, "*batch"]
+    depth: Float[Array, "*batch"]  # X, as old as the force is taken to be [s]
+    rate: Float[Array, "*batch"]  # V, likewise [1]
+    force: Float[Array, "*batch"]  # y [1/s]
+    variance: Float[Array, "*batch"]  # r of its noise [1/s^2]
+    hidden: Bool[Array, "*batch"]  # whether the sensor's dead zone hides the force
+    zone: Float[Array, "*batch"]  # that dead zone [1/s]
+    counts: Bool[Array, "*batch"]  # whether to learn from it
 
 
 class Prediction(NamedTuple):
-    """What a reading will be by a map.
+    """What a reading will be by a map."""
 
-    force: phi.theta [1/s].
-    gain: g = P phi.
-    variance: s = phi.g + that of the reading's noise [1/s^2].
-    """
-
-    force: Float[Array, "*batch"]
-    gain: Float[Array, "parameters *batch"]
-    variance: Float[Array, "*batch"]
+    force: Float[Array, "*batch"]  # phi.theta [1/s]
+    gain: Float[Array, "parameters *batch"]  # g = P phi
+    variance: Float[Array, "*batch"]  # s = phi.g + that of the reading's noise [1/s^2]
 
 
 class Curve(NamedTuple):
-    """What counts of a map.
+    """What counts of a map."""
 
-    slopes: between the knots [1/s^2].
-    damping: [1/s].
-    depth_damping: at the depth `REACH` [1/s].
-    unloading: [1/s^2].
-    """
-
-    slopes: Float[Array, "segments *batch"]
-    damping: Float[Array, "*batch"]
-    depth_damping: Float[Array, "*batch"]
-    unloading: Float[Array, "*batch"]
+    slopes: Float[Array, "segments *batch"]  # between the knots [1/s^2]
+    damping: Float[Array, "*batch"]  # [1/s]
+    depth_damping: Float[Array, "*batch"]  # at the depth `REACH` [1/s]
+    unloading: Float[Array, "*batch"]  # [1/s^2]
 
 
 def prior(

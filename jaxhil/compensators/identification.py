@@ -15,20 +15,13 @@ from jaxtyping import Array, Float
 
 
 class Identified(NamedTuple):
-    """Estimate of theta = (k, b), and its covariance P = U D U^T.
+    """Estimate of theta = (k, b), and its covariance P = U D U^T."""
 
-    stiffness: k [N/m].
-    damping: b [N s/m].
-    coupling: u.
-    stiffness_variance: d_1.
-    damping_variance: d_2.
-    """
-
-    stiffness: Float[Array, "*batch"]
-    damping: Float[Array, "*batch"]
-    coupling: Float[Array, "*batch"]
-    stiffness_variance: Float[Array, "*batch"]
-    damping_variance: Float[Array, "*batch"]
+    stiffness: Float[Array, "*batch"]  # k [N/m]
+    damping: Float[Array, "*batch"]  # b [N s/m]
+    coupling: Float[Array, "*batch"]  # u
+    stiffness_variance: Float[Array, "*batch"]  # d_1
+    damping_variance: Float[Array, "*batch"]  # d_2
 
 
 def update(

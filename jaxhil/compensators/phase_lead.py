@@ -29,27 +29,18 @@ LEAD_FILTER = rig_gain(
 
 
 class LeadState(NamedTuple):
-    """The tick before.
+    """The tick before."""
 
-    force: at the input [N].
-    output: [N].
-    """
-
-    force: Float[Array, "*batch"]
-    output: Float[Array, "*batch"]
+    force: Float[Array, "*batch"]  # at the input [N]
+    output: Float[Array, "*batch"]  # [N]
 
 
 class LeadFilter(NamedTuple):
-    """Coefficients of y(n) = pole y(n-1) + now F(n) + before F(n-1).
+    """Coefficients of y(n) = pole y(n-1) + now F(n) + before F(n-1)."""
 
-    pole: of the output before.
-    now: of the force.
-    before: of the force before.
-    """
-
-    pole: Array
-    now: Array
-    before: Array
+    pole: Array  # of the output before
+    now: Array  # of the force
+    before: Array  # of the force before
 
 
 def lead_filter(gains: Gains, constants: Constants) -> LeadFilter:

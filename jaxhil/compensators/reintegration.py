@@ -34,70 +34,46 @@ HISTORY = 1024  # samples kept; a longer contact is not integrated over again
 
 
 class ReferenceState(NamedTuple):
-    """The reference somewhere on its way.
+    """The reference somewhere on its way."""
 
-    depth: [s].
-    speed: [1].
-    deepest: point so far [s].
-    force: without damping [1/s].
-    impulse: integral of the measured force since the entry, at the measured sample there [ticks/s].
-    read: over how many ticks that is.
-    expected: force of the map at that sample [1/s].
-    free: whether (1) it has separated.
-    """
-
-    depth: Float[Array, "*batch"]
-    speed: Float[Array, "*batch"]
-    deepest: Float[Array, "*batch"]
-    force: Float[Array, "*batch"]
+    depth: Float[Array, "*batch"]  # [s]
+    speed: Float[Array, "*batch"]  # [1]
+    deepest: Float[Array, "*batch"]  # point so far [s]
+    force: Float[Array, "*batch"]  # without damping [1/s]
+    # integral of the measured force since the entry, at the measured sample there [ticks/s]
     impulse: Float[Array, "*batch"]
-    read: Float[Array, "*batch"]
-    expected: Float[Array, "*batch"]
-    free: Float[Array, "*batch"]
+    read: Float[Array, "*batch"]  # over how many ticks that is
+    expected: Float[Array, "*batch"]  # force of the map at that sample [1/s]
+    free: Float[Array, "*batch"]  # whether (1) it has separated
 
 
 class History(NamedTuple):
-    """Measured samples on the reference's grid, by the tick at which each came.
+    """Measured samples on the reference's grid, by the tick at which each came."""
 
-    ring: per sample the integral since the entry [ticks/s] of the y that could be read, over how many ticks
-        that is, depth X [s], speed V [1], deepest point X_m [s].
-    origin: tick at which sample 0 came.
-    number: of samples that have come.
-    """
-
+    # per sample the integral since the entry [ticks/s] of the y that could be read, over how many ticks that
+    # is, depth X [s], speed V [1], deepest point X_m [s]
     ring: Float[Array, "samples 5 *batch"]
-    origin: Int[Array, "*batch"]
-    number: Int[Array, "*batch"]
+    origin: Int[Array, "*batch"]  # tick at which sample 0 came
+    number: Int[Array, "*batch"]  # of samples that have come
 
 
 class Reintegration(NamedTuple):
-    """Both integrations of the reference.
+    """Both integrations of the reference."""
 
-    live: motion that goes on tick by tick.
-    behind: motion of the pass from the entry.
-    reached: sample that the pass has reached; -1 for the entry.
-    curve: map of the pass.
-    """
-
-    live: ReferenceState
-    behind: ReferenceState
-    reached: Int[Array, "*batch"]
-    curve: Curve
+    live: ReferenceState  # motion that goes on tick by tick
+    behind: ReferenceState  # motion of the pass from the entry
+    reached: Int[Array, "*batch"]  # sample that the pass has reached; -1 for the entry
+    curve: Curve  # map of the pass
 
 
 class Measured(NamedTuple):
-    """What the reference is integrated with beside the map.
+    """What the reference is integrated with beside the map."""
 
-    history: measured samples.
-    replay: rho, share of the force that the map does not explain.
-    period: control period [s].
-    shift: by how much the force is older than it was taken for when the samples were remembered [s]; it then
-        belongs to X - shift V. None for nothing.
-    """
-
-    history: History
-    replay: Array
-    period: Array
+    history: History  # measured samples
+    replay: Array  # rho, share of the force that the map does not explain
+    period: Array  # control period [s]
+    # by how much the force is older than it was taken for when the samples were remembered [s]; it then
+    # belongs to X - shift V. None for nothing.
     shift: Array | None
 
 

@@ -59,49 +59,30 @@ def _never(mechanism) -> bool:
 
 
 class ResponseErrorState(NamedTuple):
-    """What the law carries from tick to tick.
+    """What the law carries from tick to tick."""
 
-    lead: lead filter.
-    position: measured at the tick before [m].
-    velocity: its filtered rate [m/s].
-    aligned: position as old as the force, at the tick before [m].
-    aligned_velocity: its filtered rate [m/s].
-    contact_share: of the last period in contact [1].
-    force_share: of the last period with a force above the threshold [1].
-    identified: stiffness and damping.
-    line: readings that are delayed.
-    """
-
-    lead: LeadState
-    position: Float[Array, "*batch"]
-    velocity: Float[Array, "*batch"]
-    aligned: Float[Array, "*batch"]
-    aligned_velocity: Float[Array, "*batch"]
-    contact_share: Float[Array, "*batch"]
-    force_share: Float[Array, "*batch"]
-    identified: Identified
-    line: DelayLine
+    lead: LeadState  # lead filter
+    position: Float[Array, "*batch"]  # measured at the tick before [m]
+    velocity: Float[Array, "*batch"]  # its filtered rate [m/s]
+    aligned: Float[Array, "*batch"]  # position as old as the force, at the tick before [m]
+    aligned_velocity: Float[Array, "*batch"]  # its filtered rate [m/s]
+    contact_share: Float[Array, "*batch"]  # of the last period in contact [1]
+    force_share: Float[Array, "*batch"]  # of the last period with a force above the threshold [1]
+    identified: Identified  # stiffness and damping
+    line: DelayLine  # readings that are delayed
 
 
 class Prepared(NamedTuple):
-    """What is worked out once per run.
+    """What is worked out once per run."""
 
-    gains: of the law.
-    period: control period [s].
-    clearance: between two surfaces [m].
-    lead: lead filter.
-    rate_pole: of the velocity filter v(n) = rate_pole v(n-1) + rate_gain (x(n) - x(n-1)).
-    rate_gain: of that filter [1/s].
-    delay: by which positions are aligned.
-    """
-
-    gains: Gains
-    period: Float[Array, "*batch"]
-    clearance: Float[Array, "*batch"]
-    lead: LeadFilter
+    gains: Gains  # of the law
+    period: Float[Array, "*batch"]  # control period [s]
+    clearance: Float[Array, "*batch"]  # between two surfaces [m]
+    lead: LeadFilter  # lead filter
+    # of the velocity filter v(n) = rate_pole v(n-1) + rate_gain (x(n) - x(n-1))
     rate_pole: Float[Array, "*batch"]
-    rate_gain: Float[Array, "*batch"]
-    delay: Delay
+    rate_gain: Float[Array, "*batch"]  # of that filter [1/s]
+    delay: Delay  # by which positions are aligned
 
 
 class ResponseError(Compensator):

@@ -22,145 +22,86 @@ EARLY = 2  # such readings before the hardware is to touch, that its surface is 
 
 
 class Aligned(NamedTuple):
-    """Measured positions of the tick before.
+    """Measured positions of the tick before."""
 
-    middle: delayed by tau [m].
-    last: delayed by tau + T [m].
-    """
-
-    middle: Float[Array, "*batch"]
-    last: Float[Array, "*batch"]
+    middle: Float[Array, "*batch"]  # delayed by tau [m]
+    last: Float[Array, "*batch"]  # delayed by tau + T [m]
 
 
 class Noise(NamedTuple):
-    """Of the forces read out of contact.
+    """Of the forces read out of contact."""
 
-    squares: their sum [N^2].
-    number: how many they are.
-    """
-
-    squares: Float[Array, "*batch"]
-    number: Float[Array, "*batch"]
+    squares: Float[Array, "*batch"]  # their sum [N^2]
+    number: Float[Array, "*batch"]  # how many they are
 
 
 class Sample(NamedTuple):
-    """What was measured at a tick.
+    """What was measured at a tick."""
 
-    measured: force y [1/s], depth X [s], speed V [1], deepest point X_m [s].
-    shown: whether (1) the force could be read.
-    """
-
-    measured: Float[Array, "4 *batch"]
-    shown: Float[Array, "*batch"]
+    measured: Float[Array, "4 *batch"]  # force y [1/s], depth X [s], speed V [1], deepest point X_m [s]
+    shown: Float[Array, "*batch"]  # whether (1) the force could be read
 
 
 class Early(NamedTuple):
-    """Readings that stood out of the noise before the hardware was to touch.
+    """Readings that stood out of the noise before the hardware was to touch."""
 
-    number: how many they are.
-    surface: how much nearer the surface was at the first of them [s].
-    plane: how much nearer it is taken to be [s].
-    """
-
-    number: Int[Array, "*batch"]
-    surface: Float[Array, "*batch"]
-    plane: Float[Array, "*batch"]
+    number: Int[Array, "*batch"]  # how many they are
+    surface: Float[Array, "*batch"]  # how much nearer the surface was at the first of them [s]
+    plane: Float[Array, "*batch"]  # how much nearer it is taken to be [s]
 
 
 class Moved(NamedTuple):
-    """A sample on the reference's grid.
+    """A sample on the reference's grid."""
 
-    force: y there [1/s].
-    shown: whether (1) it could be read.
-    impulse: integral since the entry of those that could [ticks/s].
-    read: over how many ticks that is.
-    """
-
-    force: Float[Array, "*batch"]
-    shown: Float[Array, "*batch"]
-    impulse: Float[Array, "*batch"]
-    read: Float[Array, "*batch"]
+    force: Float[Array, "*batch"]  # y there [1/s]
+    shown: Float[Array, "*batch"]  # whether (1) it could be read
+    impulse: Float[Array, "*batch"]  # integral since the entry of those that could [ticks/s]
+    read: Float[Array, "*batch"]  # over how many ticks that is
 
 
 class Episode(NamedTuple):
-    """One contact.
+    """One contact."""
 
-    side: of the surface, 1 or -1; 0 for no contact.
-    velocity: approach speed [m/s]; 0 if unusable.
-    first: time from the entry to the first tick [s].
-    elapsed: ticks since that one.
-    touched: whether (1) the hardware has touched.
-    gone: ticks since it left.
-    fraction: where between two ticks its samples fall on the reference's grid.
-    deepest: point of the numerical model so far [s].
-    hardware_deepest: point of the hardware so far [s].
-    sample: measured at the tick before.
-    moved: what that made on the grid.
-    early: what was read too early.
-    """
-
-    side: Float[Array, "*batch"]
-    velocity: Float[Array, "*batch"]
-    first: Float[Array, "*batch"]
-    elapsed: Int[Array, "*batch"]
-    touched: Float[Array, "*batch"]
-    gone: Float[Array, "*batch"]
-    fraction: Float[Array, "*batch"]
-    deepest: Float[Array, "*batch"]
-    hardware_deepest: Float[Array, "*batch"]
-    sample: Sample
-    moved: Moved
-    early: Early
+    side: Float[Array, "*batch"]  # of the surface, 1 or -1; 0 for no contact
+    velocity: Float[Array, "*batch"]  # approach speed [m/s]; 0 if unusable
+    first: Float[Array, "*batch"]  # time from the entry to the first tick [s]
+    elapsed: Int[Array, "*batch"]  # ticks since that one
+    touched: Float[Array, "*batch"]  # whether (1) the hardware has touched
+    gone: Float[Array, "*batch"]  # ticks since it left
+    fraction: Float[Array, "*batch"]  # where between two ticks its samples fall on the reference's grid
+    deepest: Float[Array, "*batch"]  # point of the numerical model so far [s]
+    hardware_deepest: Float[Array, "*batch"]  # point of the hardware so far [s]
+    sample: Sample  # measured at the tick before
+    moved: Moved  # what that made on the grid
+    early: Early  # what was read too early
 
 
 class Now(NamedTuple):
-    """A tick on the scales of its contact; the hardware is that of the time when the force acted.
+    """A tick on the scales of its contact; the hardware is that of the time when the force acted."""
 
-    enters: whether the contact begins.
-    side: of the surface, 1 or -1.
-    speed: approach speed v0 [m/s].
-    usable: whether there is one to scale by.
-    weight: M v0 [kg m/s].
-    x: depth of the numerical model [s].
-    v: its speed [1].
-    aligned: depth of the hardware by the delay that is a gain [s].
-    depth: of the hardware, by the delay as it is estimated [s].
-    rate: speed of the hardware [1].
-    away: whether the hardware is away from both surfaces.
-    force: as read [1/s].
-    hidden: whether the dead zone hides it.
-    first: time from the entry to the first tick [s].
-    elapsed: ticks since that one.
-    """
-
-    enters: Bool[Array, "*batch"]
-    side: Float[Array, "*batch"]
-    speed: Float[Array, "*batch"]
-    usable: Bool[Array, "*batch"]
-    weight: Float[Array, "*batch"]
-    x: Float[Array, "*batch"]
-    v: Float[Array, "*batch"]
-    aligned: Float[Array, "*batch"]
-    depth: Float[Array, "*batch"]
-    rate: Float[Array, "*batch"]
-    away: Bool[Array, "*batch"]
-    force: Float[Array, "*batch"]
-    hidden: Bool[Array, "*batch"]
-    first: Float[Array, "*batch"]
-    elapsed: Int[Array, "*batch"]
+    enters: Bool[Array, "*batch"]  # whether the contact begins
+    side: Float[Array, "*batch"]  # of the surface, 1 or -1
+    speed: Float[Array, "*batch"]  # approach speed v0 [m/s]
+    usable: Bool[Array, "*batch"]  # whether there is one to scale by
+    weight: Float[Array, "*batch"]  # M v0 [kg m/s]
+    x: Float[Array, "*batch"]  # depth of the numerical model [s]
+    v: Float[Array, "*batch"]  # its speed [1]
+    aligned: Float[Array, "*batch"]  # depth of the hardware by the delay that is a gain [s]
+    depth: Float[Array, "*batch"]  # of the hardware, by the delay as it is estimated [s]
+    rate: Float[Array, "*batch"]  # speed of the hardware [1]
+    away: Bool[Array, "*batch"]  # whether the hardware is away from both surfaces
+    force: Float[Array, "*batch"]  # as read [1/s]
+    hidden: Bool[Array, "*batch"]  # whether the dead zone hides it
+    first: Float[Array, "*batch"]  # time from the entry to the first tick [s]
+    elapsed: Int[Array, "*batch"]  # ticks since that one
 
 
 class Entry(NamedTuple):
-    """The hardware's entry.
+    """The hardware's entry."""
 
-    touched: whether it has touched.
-    fraction: where between two ticks its samples fall on the reference's grid.
-    history: that begins there.
-    """
-
-    touched: Bool[Array, "*batch"]
-    fraction: Float[Array, "*batch"]
-    history: History
+    touched: Bool[Array, "*batch"]  # whether it has touched
+    fraction: Float[Array, "*batch"]  # where between two ticks its samples fall on the reference's grid
+    history: History  # that begins there
 
 
 def no_episode(like: Float[Array, "*batch"]) -> Episode:

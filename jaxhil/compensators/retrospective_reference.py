@@ -76,41 +76,25 @@ LONGEST_LAG = 0.1  # s for which it waits for hardware that has not come into co
 
 
 class RetrospectiveState(NamedTuple):
-    """What the law carries from tick to tick.
+    """What the law carries from tick to tick."""
 
-    line: delay line of the measured position.
-    aligned: measured positions as old as the force.
-    noise: of the force.
-    episode: the contact under way.
-    learnt: of that contact: its map, or its bank of them.
-    reference: motion that the contact should have had.
-    history: samples that were measured.
-    """
-
-    line: DelayLine
-    aligned: Aligned
-    noise: Noise
-    episode: Episode
-    learnt: Any
-    reference: Reintegration
-    history: History
+    line: DelayLine  # delay line of the measured position
+    aligned: Aligned  # measured positions as old as the force
+    noise: Noise  # of the force
+    episode: Episode  # the contact under way
+    learnt: Any  # of that contact: its map, or its bank of them
+    reference: Reintegration  # motion that the contact should have had
+    history: History  # samples that were measured
 
 
 class Prepared(NamedTuple):
-    """What is worked out once per run.
+    """What is worked out once per run."""
 
-    gains: of the batch shape.
-    constants: what the controller knows of the rig.
-    prior: of the map.
-    delay: of the delay line: tau - T, at least 0.
-    share: of the sample before, for what is left of tau.
-    """
-
-    gains: Gains
-    constants: Constants
-    prior: Map
-    delay: Delay
-    share: Float[Array, "*batch"]
+    gains: Gains  # of the batch shape
+    constants: Constants  # what the controller knows of the rig
+    prior: Map  # of the map
+    delay: Delay  # of the delay line: tau - T, at least 0
+    share: Float[Array, "*batch"]  # of the sample before, for what is left of tau
 
 
 class RetrospectiveReference(Compensator):

@@ -22,14 +22,10 @@ LAG = rig_gain(
 
 
 class Cascade(NamedTuple):
-    """Filters one behind the other, or their states.
+    """Filters one behind the other, or their states."""
 
-    lead: 1 + T_l s, filtered as in phase lead.
-    predictor: (1 + (3/2) T_s s)/(1 + T_s s/2).
-    """
-
-    lead: Any
-    predictor: Any
+    lead: Any  # 1 + T_l s, filtered as in phase lead
+    predictor: Any  # (1 + (3/2) T_s s)/(1 + T_s s/2)
 
 
 class Smith(Compensator):

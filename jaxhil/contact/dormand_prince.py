@@ -21,20 +21,13 @@ _ERROR = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1
 
 
 class Step(NamedTuple):
-    """Motion at a step's end.
+    """Motion at a step's end."""
 
-    depth: penetration [m].
-    velocity: its rate [m/s].
-    first: acceleration at the step's start [m/s^2].
-    last: acceleration at its end [m/s^2].
-    errors: of penetration and rate.
-    """
-
-    depth: Array
-    velocity: Array
-    first: Array
-    last: Array
-    errors: tuple[Array, Array]
+    depth: Array  # penetration [m]
+    velocity: Array  # its rate [m/s]
+    first: Array  # acceleration at the step's start [m/s^2]
+    last: Array  # acceleration at its end [m/s^2]
+    errors: tuple[Array, Array]  # of penetration and rate
 
 
 def take_step(

@@ -23,15 +23,11 @@ from jaxhil.contact.reference_closed_form import arccosine_over_sine, chained_os
 
 
 class Reference(NamedTuple):
-    """What a contact in space does: arrays of the batch shape.
+    """What a contact in space does: arrays of the batch shape."""
 
-    restitution: rebound speed over approach speed [1].
-    peak_force: largest contact force [N].
-    duration: time from first touch to separation [s]; infinite if the bodies never separate.
-    """
-
-    restitution: Float[Array, "*batch"]
-    peak_force: Float[Array, "*batch"]
+    restitution: Float[Array, "*batch"]  # rebound speed over approach speed [1]
+    peak_force: Float[Array, "*batch"]  # largest contact force [N]
+    # time from first touch to separation [s]; infinite if the bodies never separate
     duration: Float[Array, "*batch"]
 
 

@@ -77,58 +77,36 @@ def arccosine_over_sine(cosine):
 
 
 class _Layer(NamedTuple):
-    """One segment, per unit mass.
+    """One segment, per unit mass."""
 
-    number: from 0.
-    stiffness: its slope [1/s^2].
-    acceleration: spring force at its lower depth [m/s^2].
-    thickness: [m]; the last one's is infinite.
-    """
-
-    number: Int[Array, ""]
-    stiffness: Float[Array, "*batch"]
-    acceleration: Float[Array, "*batch"]
-    thickness: Float[Array, "*batch"]
+    number: Int[Array, ""]  # from 0
+    stiffness: Float[Array, "*batch"]  # its slope [1/s^2]
+    acceleration: Float[Array, "*batch"]  # spring force at its lower depth [m/s^2]
+    thickness: Float[Array, "*batch"]  # [m]; the last one's is infinite
 
 
 class _State(NamedTuple):
-    """Between two segments.
+    """Between two segments."""
 
-    depth: of the turning point above the lower depth of its segment [m].
-    velocity: [m/s].
-    time: since the first touch [s].
-    peak: largest force so far over mass [m/s^2].
-    segment: the deepest reached.
-    ended: on the way in whether it has turned, on the way out whether the bodies have separated.
-    """
-
-    depth: Float[Array, "*batch"]
-    velocity: Float[Array, "*batch"]
-    time: Float[Array, "*batch"]
-    peak: Float[Array, "*batch"]
-    segment: Int[Array, "*batch"]
+    depth: Float[Array, "*batch"]  # of the turning point above the lower depth of its segment [m]
+    velocity: Float[Array, "*batch"]  # [m/s]
+    time: Float[Array, "*batch"]  # since the first touch [s]
+    peak: Float[Array, "*batch"]  # largest force so far over mass [m/s^2]
+    segment: Int[Array, "*batch"]  # the deepest reached
+    # on the way in whether it has turned, on the way out whether the bodies have separated
     ended: Bool[Array, "*batch"]
 
 
 class _Piece(NamedTuple):
-    """How one segment is passed: what comes after the start, and how it ends.
+    """How one segment is passed: what comes after the start, and how it ends."""
 
-    spring: force of the spring over mass at the start [m/s^2].
-    velocity: at the start [m/s].
-    crosses: whether it ends at the segment's far end, else by itself: turning point or separation.
-    target: distance to that end [m]; 0 where it ends by itself.
-    time: until the end, without derivative [s].
-    grows: whether, on the way in, the force grows at first.
-    culmination: time until the force is largest [s].
-    """
-
-    spring: Array
-    velocity: Array
-    crosses: Array
-    target: Array
-    time: Array
-    grows: Array
-    culmination: Array
+    spring: Array  # force of the spring over mass at the start [m/s^2]
+    velocity: Array  # at the start [m/s]
+    crosses: Array  # whether it ends at the segment's far end, else by itself: turning point or separation
+    target: Array  # distance to that end [m]; 0 where it ends by itself
+    time: Array  # until the end, without derivative [s]
+    grows: Array  # whether, on the way in, the force grows at first
+    culmination: Array  # time until the force is largest [s]
 
 
 def _traverse(decay, layer: _Layer, inward, state: _State) -> _State:

@@ -36,21 +36,15 @@ INWARD, OUTWARD, FREE, OVER = range(4)  # phases of the motion, the last but one
 
 
 class ReferenceMotion(NamedTuple):
-    """What a contact in space does, of the batch shape, and its motion at the times asked for.
+    """What a contact in space does, of the batch shape, and its motion at the times asked for."""
 
-    restitution: speed |d'| after contact and push are over, over v [1].
-    peak_force: largest contact force, without the push [N].
-    duration: time from first touch to separation [s]; infinite if there is none within 10 s, or the bodies
-        come to rest (`restitution` is then that of the speed by that time).
-    position: at the times asked for [m]; None without.
-    velocity: at the times asked for [m/s]; None without.
-    """
-
-    restitution: Float[Array, "*batch"]
-    peak_force: Float[Array, "*batch"]
+    restitution: Float[Array, "*batch"]  # speed |d'| after contact and push are over, over v [1]
+    peak_force: Float[Array, "*batch"]  # largest contact force, without the push [N]
+    # time from first touch to separation [s]; infinite if there is none within 10 s, or the bodies come to
+    # rest (`restitution` is then that of the speed by that time)
     duration: Float[Array, "*batch"]
-    position: Float[Array, "samples *batch"] | None
-    velocity: Float[Array, "samples *batch"] | None
+    position: Float[Array, "samples *batch"] | None  # at the times asked for [m]; None without
+    velocity: Float[Array, "samples *batch"] | None  # at the times asked for [m/s]; None without
 
 
 def integrate_contact(
@@ -108,66 +102,39 @@ class _Problem(NamedTuple):
 
 
 class _State(NamedTuple):
-    """The motion so far.
+    """The motion so far."""
 
-    time: since first touch [s].
-    depth: penetration [m].
-    velocity: its rate [m/s].
-    memory: state of the contact law.
-    phase: INWARD, OUTWARD, FREE or OVER.
-    deepest: penetration so far [m].
-    peak: largest contact force so far [N].
-    grip: `hold` at the turning point.
-    separated: time of separation [s].
-    """
-
-    time: Array
-    depth: Array
-    velocity: Array
-    memory: Any
-    phase: Array
-    deepest: Array
-    peak: Array
-    grip: Array
-    separated: Array
+    time: Array  # since first touch [s]
+    depth: Array  # penetration [m]
+    velocity: Array  # its rate [m/s]
+    memory: Any  # state of the contact law
+    phase: Array  # INWARD, OUTWARD, FREE or OVER
+    deepest: Array  # penetration so far [m]
+    peak: Array  # largest contact force so far [N]
+    grip: Array  # `hold` at the turning point
+    separated: Array  # time of separation [s]
 
 
 class _Search(NamedTuple):
-    """The search for the next step.
+    """The search for the next step."""
 
-    step: to try next [s].
-    tries: false positions tried so far towards an event; 0 while there is none in sight.
-    low: step known to end before the event [s].
-    high: step known to end behind it [s].
-    at_low: value of the event's function there.
-    at_high: value of the event's function there.
-    side: which of the two moved last.
-    """
-
-    step: Array
-    tries: Array
-    low: Array
-    high: Array
-    at_low: Array
-    at_high: Array
-    side: Array
+    step: Array  # to try next [s]
+    tries: Array  # false positions tried so far towards an event; 0 while there is none in sight
+    low: Array  # step known to end before the event [s]
+    high: Array  # step known to end behind it [s]
+    at_low: Array  # value of the event's function there
+    at_high: Array  # value of the event's function there
+    side: Array  # which of the two moved last
 
 
 class _Nodes(NamedTuple):
-    """Where steps begin, (nodes, *batch).
+    """Where steps begin, (nodes, *batch)."""
 
-    time: [s].
-    depth: penetration [m].
-    velocity: its rate [m/s].
-    first: acceleration at the step's start [m/s^2].
-    last: acceleration at its end [m/s^2].
-    """
-
-    time: Array
-    depth: Array
-    velocity: Array
-    first: Array
-    last: Array
+    time: Array  # [s]
+    depth: Array  # penetration [m]
+    velocity: Array  # its rate [m/s]
+    first: Array  # acceleration at the step's start [m/s^2]
+    last: Array  # acceleration at its end [m/s^2]
 
 
 def _event(problem, state, time, depth, rate):

@@ -10,18 +10,12 @@ from typing import NamedTuple
 
 
 class Fault(NamedTuple):
-    """One fault.
+    """One fault."""
 
-    bit: its bit in `Controller.faults`.
-    name: its name.
-    condition: when it is raised.
-    reaction: what the controller does.
-    """
-
-    bit: int
-    name: str
-    condition: str
-    reaction: str
+    bit: int  # its bit in `Controller.faults`
+    name: str  # its name
+    condition: str  # when it is raised
+    reaction: str  # what the controller does
 
 
 FORCE_NOT_FINITE = 0x1

@@ -24,20 +24,13 @@ NO_OTHERS: Mapping[str, Mapping[str, GainSpecification]] = {}
 
 
 class GainFile(NamedTuple):
-    """What the controller needs of a gain file.
+    """What the controller needs of a gain file."""
 
-    compensator: the law's name.
-    gains: by name, in SI units.
-    control_period: [s].
-    clearance: of a contact with two sides [m]; infinite with one.
-    limits: by name, in SI units.
-    """
-
-    compensator: str
-    gains: Mapping[str, float]
-    control_period: float
-    clearance: float
-    limits: Mapping[str, float] = NO_LIMITS
+    compensator: str  # the law's name
+    gains: Mapping[str, float]  # by name, in SI units
+    control_period: float  # [s]
+    clearance: float  # of a contact with two sides [m]; infinite with one
+    limits: Mapping[str, float] = NO_LIMITS  # by name, in SI units
 
 
 def digest(document: Mapping[str, Any]) -> str:

@@ -13,18 +13,12 @@ MINUTE = 1e-30  # where 0 would be divided by
 
 
 class LimitSpecification(NamedTuple):
-    """One limit.
+    """One limit."""
 
-    unit: of its value.
-    default: its value where a file has none.
-    lowest: its least value.
-    meaning: what it is.
-    """
-
-    unit: str
-    default: float
-    lowest: float
-    meaning: str
+    unit: str  # of its value
+    default: float  # its value where a file has none
+    lowest: float  # its least value
+    meaning: str  # what it is
 
 
 LIMITS: dict[str, LimitSpecification] = {

@@ -30,16 +30,11 @@ class Motion(NamedTuple):
 
 
 class SamplingInterval(NamedTuple):
-    """Motion of the real mechanism from one tick to the next.
+    """Motion of the real mechanism from one tick to the next."""
 
-    sample: where the force is sampled.
-    start: at the interval's start, from within; None for loops that do not look between the samples.
-    end: at its end, likewise.
-    """
-
-    sample: Motion
-    start: Any
-    end: Any
+    sample: Motion  # where the force is sampled
+    start: Any  # at the interval's start, from within; None for loops that do not look between the samples
+    end: Any  # at its end, likewise
 
 
 class PlantSignals(NamedTuple):
@@ -56,35 +51,23 @@ class PlantSignals(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """What the contact of a sampling interval leaves.
+    """What the contact of a sampling interval leaves."""
 
-    plant_signals: of the contact, without the sensors.
-    reading: of a lagging force sensor, where it samples [N]; None without lag.
-    lagged: its reading at the interval's end [N].
-    last: the sample of the contact.
-    law: state of the contact law at the interval's end.
-    """
-
-    plant_signals: PlantSignals
+    plant_signals: PlantSignals  # of the contact, without the sensors
+    # of a lagging force sensor, where it samples [N]; None without lag
     reading: Float[Array, "*batch"] | None
-    lagged: Array
-    last: "ContactSample"
-    law: tuple[Array, ...]
+    lagged: Array  # its reading at the interval's end [N]
+    last: "ContactSample"  # the sample of the contact
+    law: tuple[Array, ...]  # state of the contact law at the interval's end
 
 
 class Surfaces(NamedTuple):
-    """A contact law at one surface or two.
+    """A contact law at one surface or two."""
 
-    law: the contact law.
-    parameters: its parameters.
-    state: its state.
-    clearance: between two surfaces [m]; infinite for one.
-    """
-
-    law: ContactLaw
-    parameters: ContactParameters
-    state: tuple[Any, ...]
-    clearance: Array
+    law: ContactLaw  # the contact law
+    parameters: ContactParameters  # its parameters
+    state: tuple[Any, ...]  # its state
+    clearance: Array  # between two surfaces [m]; infinite for one
 
     def force(self, motion: Motion) -> tuple[Array, tuple[Any, ...]]:
         """Signed force [N] and the law's next state."""
@@ -121,18 +104,12 @@ class Surfaces(NamedTuple):
 
 
 class ContactSample(NamedTuple):
-    """A sample of the contact.
+    """A sample of the contact."""
 
-    distance: into the nearer surface [m], negative outside.
-    force: [N].
-    edge: limit of the force at that surface [N].
-    side: of that surface, 1 or -1.
-    """
-
-    distance: Float[Array, "*batch"]
-    force: Float[Array, "*batch"]
-    edge: Float[Array, "*batch"]
-    side: Float[Array, "*batch"]
+    distance: Float[Array, "*batch"]  # into the nearer surface [m], negative outside
+    force: Float[Array, "*batch"]  # [N]
+    edge: Float[Array, "*batch"]  # limit of the force at that surface [N]
+    side: Float[Array, "*batch"]  # of that surface, 1 or -1
 
 
 def no_contact(like: Array) -> ContactSample:
@@ -250,20 +227,13 @@ def _force_along(surfaces, start, end, duration, s):
 
 
 class _Touching(NamedTuple):
-    """Contact during a stretch of motion.
+    """Contact during a stretch of motion."""
 
-    touches: whether there is any.
-    side: of the surface, 1 or -1.
-    first: fraction of the stretch at which it begins.
-    last: fraction of the stretch at which it ends.
-    at_surface: whether it begins, and whether it ends, at the surface.
-    """
-
-    touches: Array
-    side: Array
-    first: Array
-    last: Array
-    at_surface: tuple[Array, Array]
+    touches: Array  # whether there is any
+    side: Array  # of the surface, 1 or -1
+    first: Array  # fraction of the stretch at which it begins
+    last: Array  # fraction of the stretch at which it ends
+    at_surface: tuple[Array, Array]  # whether it begins, and whether it ends, at the surface
 
 
 def _touching(surfaces, start, end, duration):

@@ -27,26 +27,18 @@ SMALLEST_TILE = 16
 
 
 class Outcome(NamedTuple):
-    """A run beside the undelayed reference, per contact, (slots, *batch).
+    """A run beside the undelayed reference, per contact, (slots, *batch)."""
 
-    metrics: of the run.
-    reference_restitution: e* of the same contact in space, entered at the same speed [1].
-    reference_peak_force: of that contact [N].
-    error: e - e* [1].
-    peak_ratio: largest |F_c| over the reference's peak force [1].
-    chatter: excess variation of F_c (`Metrics`) over the reference's peak force [1].
-    wanted: whether the contact was asked for.
-    good: whether it was reached and ended well.
-    """
-
-    metrics: Metrics
+    metrics: Metrics  # of the run
+    # e* of the same contact in space, entered at the same speed [1]
     reference_restitution: Float[Array, "slots *batch"]
-    reference_peak_force: Float[Array, "slots *batch"]
-    error: Float[Array, "slots *batch"]
-    peak_ratio: Float[Array, "slots *batch"]
+    reference_peak_force: Float[Array, "slots *batch"]  # of that contact [N]
+    error: Float[Array, "slots *batch"]  # e - e* [1]
+    peak_ratio: Float[Array, "slots *batch"]  # largest |F_c| over the reference's peak force [1]
+    # excess variation of F_c (`Metrics`) over the reference's peak force [1]
     chatter: Float[Array, "slots *batch"]
-    wanted: Bool[Array, "slots *batch"]
-    good: Bool[Array, "slots *batch"]
+    wanted: Bool[Array, "slots *batch"]  # whether the contact was asked for
+    good: Bool[Array, "slots *batch"]  # whether it was reached and ended well
 
 
 def compare_with_reference(loop: Loop, scenario: Scenario, metrics: Metrics) -> Outcome:

@@ -28,47 +28,30 @@ from jaxhil.simulation.scenario import Scenario
 
 
 class Loop(eqx.Module):
-    """What shapes the compiled loop; every field is static.
+    """What shapes the compiled loop; every field is static."""
 
-    law: contact law.
-    compensator: the law of the controller.
-    integrator: of the numerical model, a name of `INTEGRATORS`.
-    hold: of the command within a period, "linear" or "zoh".
-    latency: of the command, 0 or 1 periods.
-    has_lag: whether the force sensor has a first-order lag.
-    has_force_bias: whether the force sensor has a bias.
-    has_force_noise: whether the force sensor has noise.
-    has_position_noise: whether the position sensor has noise.
-    has_sample_effects: whether a reading has a quantum, a dead zone or a range.
-    has_limits: whether the motion simulator has limits of velocity or acceleration.
-    first_break: the first derivative of the mechanism's position that jumps at the ticks (0: the position
-        itself; 3 stands for all higher ones)
-    is_two_sided: whether there is a second surface.
-    ring: samples in the delay lines of the sensors.
-    controller_ring: samples in the delay lines of the controller.
-    energies: whether the work of the contact force is followed.
-    probed: whether scenarios have a `Probe`.
-    chatter: whether the swings of the force command are followed.
-    """
-
-    law: ContactLaw = eqx.field(static=True)
-    compensator: Compensator = eqx.field(static=True)
-    integrator: str = eqx.field(static=True)
-    hold: str = eqx.field(static=True)
-    latency: int = eqx.field(static=True)
-    has_lag: bool = eqx.field(static=True)
-    has_force_bias: bool = eqx.field(static=True)
-    has_force_noise: bool = eqx.field(static=True)
-    has_position_noise: bool = eqx.field(static=True)
+    law: ContactLaw = eqx.field(static=True)  # contact law
+    compensator: Compensator = eqx.field(static=True)  # the law of the controller
+    integrator: str = eqx.field(static=True)  # of the numerical model, a name of `INTEGRATORS`
+    hold: str = eqx.field(static=True)  # of the command within a period, "linear" or "zoh"
+    latency: int = eqx.field(static=True)  # of the command, 0 or 1 periods
+    has_lag: bool = eqx.field(static=True)  # whether the force sensor has a first-order lag
+    has_force_bias: bool = eqx.field(static=True)  # whether the force sensor has a bias
+    has_force_noise: bool = eqx.field(static=True)  # whether the force sensor has noise
+    has_position_noise: bool = eqx.field(static=True)  # whether the position sensor has noise
+    # whether a reading has a quantum, a dead zone or a range
     has_sample_effects: bool = eqx.field(static=True)
+    # whether the motion simulator has limits of velocity or acceleration
     has_limits: bool = eqx.field(static=True)
+    # the first derivative of the mechanism's position that jumps at the ticks (0: the position itself; 3
+    # stands for all higher ones)
     first_break: int = eqx.field(static=True)
-    is_two_sided: bool = eqx.field(static=True)
-    ring: int = eqx.field(static=True)
-    controller_ring: int = eqx.field(static=True)
-    energies: bool = eqx.field(static=True)
-    probed: bool = eqx.field(static=True)
-    chatter: bool = eqx.field(static=True)
+    is_two_sided: bool = eqx.field(static=True)  # whether there is a second surface
+    ring: int = eqx.field(static=True)  # samples in the delay lines of the sensors
+    controller_ring: int = eqx.field(static=True)  # samples in the delay lines of the controller
+    energies: bool = eqx.field(static=True)  # whether the work of the contact force is followed
+    probed: bool = eqx.field(static=True)  # whether scenarios have a `Probe`
+    chatter: bool = eqx.field(static=True)  # whether the swings of the force command are followed
 
     @property
     def reads_always(self) -> bool:
@@ -91,35 +74,22 @@ class Delays(NamedTuple):
 
     With one surface the contact law is evaluated as soon as the motion is known, by the transport delay ahead
     of time. With two its parameters may change meanwhile: it is then evaluated when the motion happens, and
-    the other numbers count from there.
+    the other numbers count from there."""
 
-    force: at which the force is read.
-    position: at which the position is read.
-    real: intervals to look back for the newest force that acts by a tick.
-    contact: intervals after which the contact law is evaluated.
-    """
-
-    force: Delay
-    position: Delay
-    real: Int[Array, "*batch"]
-    contact: Int[Array, "*batch"]
+    force: Delay  # at which the force is read
+    position: Delay  # at which the position is read
+    real: Int[Array, "*batch"]  # intervals to look back for the newest force that acts by a tick
+    contact: Int[Array, "*batch"]  # intervals after which the contact law is evaluated
 
 
 class RigConstants(NamedTuple):
-    """What stays constant during a run, per lane.
+    """What stays constant during a run, per lane."""
 
-    scenario: the lane's own numbers.
-    propagation: motion simulator, discretised.
-    delays: in sampling intervals.
-    constants: what the controller knows of the rig.
-    inverse_mass: [1/kg], of the equivalent mass.
-    """
-
-    scenario: Scenario
-    propagation: Propagation
-    delays: Delays
-    constants: Constants
-    inverse_mass: Float[Array, "*batch"]
+    scenario: Scenario  # the lane's own numbers
+    propagation: Propagation  # motion simulator, discretised
+    delays: Delays  # in sampling intervals
+    constants: Constants  # what the controller knows of the rig
+    inverse_mass: Float[Array, "*batch"]  # [1/kg], of the equivalent mass
 
 
 def build_rig_constants(loop: Loop, scenario: Scenario) -> RigConstants:

@@ -10,18 +10,12 @@ from jaxhil.simulation.probe import FirstContact
 
 
 class Plant(NamedTuple):
-    """Drives and motion simulator.
+    """Drives and motion simulator."""
 
-    commands: position commands sent to the drives, c(n), c(n-1), ... [m].
-    step: last step of the command [m].
-    state: of the motion simulator.
-    wanted: c(n) before the limits [m]; None without limits.
-    """
-
-    commands: tuple[Array, ...]
-    step: Array
-    state: tuple[Array, ...]
-    wanted: Float[Array, "*batch"] | None
+    commands: tuple[Array, ...]  # position commands sent to the drives, c(n), c(n-1), ... [m].
+    step: Array  # last step of the command [m]
+    state: tuple[Array, ...]  # of the motion simulator
+    wanted: Float[Array, "*batch"] | None  # c(n) before the limits [m]; None without limits
 
     @property
     def sent(self) -> Float[Array, "*batch"]:
@@ -35,57 +29,35 @@ class Plant(NamedTuple):
 
 
 class Rings(NamedTuple):
-    """Delay lines, each a ring of samples.
+    """Delay lines, each a ring of samples."""
 
-    plant_signals: of the contact, without the sensors.
-    reading: what a lagging sensor makes of the force [N]; None without lag.
-    position: of the mechanism, where its sensor samples it [m].
-    interval: sampling intervals whose contact is still to come; None with one surface.
-    """
-
-    plant_signals: PlantSignals
+    plant_signals: PlantSignals  # of the contact, without the sensors
+    # what a lagging sensor makes of the force [N]; None without lag
     reading: Float[Array, "samples *batch"] | None
-    position: Float[Array, "samples *batch"]
+    position: Float[Array, "samples *batch"]  # of the mechanism, where its sensor samples it [m]
+    # sampling intervals whose contact is still to come; None with one surface
     interval: SamplingInterval | None
 
 
 class Sensed(NamedTuple):
-    """What the sensors will read.
+    """What the sensors will read."""
 
-    rings: delay lines (`Rings`; None where they are held apart).
-    last: last sample of the contact.
-    lagged: reading of a lagging force sensor at the end of its sampling interval [N].
-    first_position: position sample of the sampling interval before the run [m].
-    """
-
-    rings: Any
-    last: ContactSample
-    lagged: Array
-    first_position: Array
+    rings: Any  # delay lines (`Rings`; None where they are held apart)
+    last: ContactSample  # last sample of the contact
+    lagged: Array  # reading of a lagging force sensor at the end of its sampling interval [N]
+    first_position: Array  # position sample of the sampling interval before the run [m]
 
 
 class LoopState(NamedTuple):
-    """All that evolves.
+    """All that evolves."""
 
-    position: of the numerical model [m].
-    velocity: of the numerical model [m/s].
-    plant: drives and motion simulator.
-    sensed: what the sensors will read.
-    law: state of the contact law.
-    controller: state of the compensator.
-    parameters: of the contact law, for the contact under way.
-    entry_velocity: of the uniform motion in which the run began [m/s].
-    entry_tick: at which the run began.
-    first_contact: of the hardware, where the run is probed (else None).
-    """
-
-    position: Float[Array, "*batch"]
-    velocity: Float[Array, "*batch"]
-    plant: Plant
-    sensed: Sensed
-    law: tuple[Array, ...]
-    controller: Any
-    parameters: ContactParameters
-    entry_velocity: Float[Array, "*batch"]
-    entry_tick: Int[Array, "*batch"]
-    first_contact: FirstContact | None
+    position: Float[Array, "*batch"]  # of the numerical model [m]
+    velocity: Float[Array, "*batch"]  # of the numerical model [m/s]
+    plant: Plant  # drives and motion simulator
+    sensed: Sensed  # what the sensors will read
+    law: tuple[Array, ...]  # state of the contact law
+    controller: Any  # state of the compensator
+    parameters: ContactParameters  # of the contact law, for the contact under way
+    entry_velocity: Float[Array, "*batch"]  # of the uniform motion in which the run began [m/s]
+    entry_tick: Int[Array, "*batch"]  # at which the run began
+    first_contact: FirstContact | None  # of the hardware, where the run is probed (else None)

@@ -24,37 +24,25 @@ State = tuple[Array, ...]
 
 
 class Delay(NamedTuple):
-    """A delay of r control periods, as whole sampling intervals to look back and a place within one.
+    """A delay of r control periods, as whole sampling intervals to look back and a place within one."""
 
-    intervals: to look back from the newest one, which is interval n - 1 at tick n.
-    fraction: place in (0, 1] within it: a reading at a tick takes the value just before the tick acts.
-    """
-
-    intervals: Int[Array, "*batch"]
+    intervals: Int[Array, "*batch"]  # to look back from the newest one, which is interval n - 1 at tick n
+    # place in (0, 1] within it: a reading at a tick takes the value just before the tick acts
     fraction: Float[Array, "*batch"]
 
 
 class Propagation(NamedTuple):
-    """Exact discrete motion simulator; rows act on (state, command at start, command at end).
+    """Exact discrete motion simulator; rows act on (state, command at start, command at end)."""
 
-    transition: rows of the state one period later.
-    position: row at the force sensor's place in the sampling interval [m].
-    velocity: row there [m/s].
-    measured_position: row at the position sensor's place [m].
-    start: rows of position and velocity at the interval's start, from within, where asked for.
-    end: at its end, likewise.
-    steady_command: state of a uniform motion, per command now.
-    steady_velocity: state of a uniform motion, per its growth in a period.
-    """
-
-    transition: Float[Array, "order columns *batch"]
-    position: Float[Array, "columns *batch"]
-    velocity: Float[Array, "columns *batch"]
-    measured_position: Float[Array, "columns *batch"]
+    transition: Float[Array, "order columns *batch"]  # rows of the state one period later
+    position: Float[Array, "columns *batch"]  # row at the force sensor's place in the sampling interval [m]
+    velocity: Float[Array, "columns *batch"]  # row there [m/s]
+    measured_position: Float[Array, "columns *batch"]  # row at the position sensor's place [m]
+    # rows of position and velocity at the interval's start, from within, where asked for
     start: tuple[Array, Array] | None
-    end: tuple[Array, Array] | None
-    steady_command: Float[Array, "order *batch"]
-    steady_velocity: Float[Array, "order *batch"]
+    end: tuple[Array, Array] | None  # at its end, likewise
+    steady_command: Float[Array, "order *batch"]  # state of a uniform motion, per command now
+    steady_velocity: Float[Array, "order *batch"]  # state of a uniform motion, per its growth in a period
 
 
 def split_delay(delay: Float[Array, "*batch"], control_period: Float[Array, "*batch"]) -> Delay:

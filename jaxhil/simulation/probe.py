@@ -12,16 +12,11 @@ from jaxtyping import Array, Bool, Float
 
 
 class Push(NamedTuple):
-    """A force p(t) = size sin(pi (t - centre + width/2)/width) while the sine is positive, else 0.
+    """A force p(t) = size sin(pi (t - centre + width/2)/width) while the sine is positive, else 0."""
 
-    size: against the penetration [N].
-    centre: in time since the hardware's first touch [s].
-    width: [s].
-    """
-
-    size: Float[Array, "*batch"]
-    centre: Float[Array, "*batch"]
-    width: Float[Array, "*batch"]
+    size: Float[Array, "*batch"]  # against the penetration [N]
+    centre: Float[Array, "*batch"]  # in time since the hardware's first touch [s]
+    width: Float[Array, "*batch"]  # [s]
 
     def force(self, time: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """p [N] at a time [s] since the first touch."""
@@ -52,44 +47,29 @@ class Push(NamedTuple):
 
 
 class Probe(NamedTuple):
-    """What each contact of a run is probed with.
+    """What each contact of a run is probed with."""
 
-    push: on the hardware, leaves (slots, *batch).
-    depth: penetration of the same contact in space [m] at times evenly spaced from its first touch to `span`.
-    span: how long that contact is followed [s].
-    """
-
-    push: Push
+    push: Push  # on the hardware, leaves (slots, *batch)
+    # penetration of the same contact in space [m] at times evenly spaced from its first touch to `span`
     depth: Float[Array, "slots samples *batch"]
-    span: Float[Array, "slots *batch"]
+    span: Float[Array, "slots *batch"]  # how long that contact is followed [s]
 
 
 class FirstContact(NamedTuple):
-    """The hardware's first touch in the contact under way.
+    """The hardware's first touch in the contact under way."""
 
-    made: whether there was one.
-    time: of it, in periods of the run.
-    side: of the surface, 1 or -1.
-    """
-
-    made: Bool[Array, "*batch"]
-    time: Float[Array, "*batch"]
-    side: Float[Array, "*batch"]
+    made: Bool[Array, "*batch"]  # whether there was one
+    time: Float[Array, "*batch"]  # of it, in periods of the run
+    side: Float[Array, "*batch"]  # of the surface, 1 or -1
 
 
 class Deviation(NamedTuple):
-    """The numerical model beside the contact in space.
+    """The numerical model beside the contact in space."""
 
-    entered: whether the numerical model has entered the contact.
-    time: of that, in periods of the run.
-    squares: sum of the squares of what its depth is off by [m^2].
-    count: how many they are.
-    """
-
-    entered: Bool[Array, "*batch"]
-    time: Float[Array, "*batch"]
-    squares: Float[Array, "*batch"]
-    count: Float[Array, "*batch"]
+    entered: Bool[Array, "*batch"]  # whether the numerical model has entered the contact
+    time: Float[Array, "*batch"]  # of that, in periods of the run
+    squares: Float[Array, "*batch"]  # sum of the squares of what its depth is off by [m^2]
+    count: Float[Array, "*batch"]  # how many they are
 
 
 def before_contact(like: Float[Array, "*batch"]) -> FirstContact:

@@ -23,90 +23,54 @@ _PUSH_ONLY = frozenset(BUILT_IN_LAWS) - {"kelvin_voigt"}  # laws to which tensio
 
 
 class MotionSimulator(NamedTuple):
-    """The motion simulator num(s)/den(s) e^(-s delay).
+    """The motion simulator num(s)/den(s) e^(-s delay)."""
 
-    numerator: coefficients in descending powers of s [rad/s].
-    denominator: likewise.
-    delay: transport delay [s].
-    velocity_limit: [m/s]; infinite if none.
-    acceleration_limit: [m/s^2]; infinite if none.
-    """
-
-    numerator: Float[Array, "order *batch"]
-    denominator: Float[Array, "order_plus_1 *batch"]
-    delay: Float[Array, "*batch"]
-    velocity_limit: Float[Array, "*batch"]
-    acceleration_limit: Float[Array, "*batch"]
+    numerator: Float[Array, "order *batch"]  # coefficients in descending powers of s [rad/s]
+    denominator: Float[Array, "order_plus_1 *batch"]  # likewise
+    delay: Float[Array, "*batch"]  # transport delay [s]
+    velocity_limit: Float[Array, "*batch"]  # [m/s]; infinite if none
+    acceleration_limit: Float[Array, "*batch"]  # [m/s^2]; infinite if none
 
 
 class ForceSensor(NamedTuple):
-    """The force sensor.
+    """The force sensor."""
 
-    delay: transport delay [s].
-    time_constant: of its first-order lag [s].
-    noise_std: standard deviation of white noise [N].
-    quantum: [N]; 0 for none.
-    dead_zone: [N].
-    bias: [N].
-    range: [N]; infinite for none.
-    """
-
-    delay: Float[Array, "*batch"]
-    time_constant: Float[Array, "*batch"]
-    noise_std: Float[Array, "*batch"]
-    quantum: Float[Array, "*batch"]
-    dead_zone: Float[Array, "*batch"]
-    bias: Float[Array, "*batch"]
-    range: Float[Array, "*batch"]
+    delay: Float[Array, "*batch"]  # transport delay [s]
+    time_constant: Float[Array, "*batch"]  # of its first-order lag [s]
+    noise_std: Float[Array, "*batch"]  # standard deviation of white noise [N]
+    quantum: Float[Array, "*batch"]  # [N]; 0 for none
+    dead_zone: Float[Array, "*batch"]  # [N]
+    bias: Float[Array, "*batch"]  # [N]
+    range: Float[Array, "*batch"]  # [N]; infinite for none
 
 
 class PositionSensor(NamedTuple):
-    """The position sensor.
+    """The position sensor."""
 
-    delay: [s].
-    noise_std: standard deviation of white noise [m].
-    quantum: [m]; 0 for none.
-    """
-
-    delay: Float[Array, "*batch"]
-    noise_std: Float[Array, "*batch"]
-    quantum: Float[Array, "*batch"]
+    delay: Float[Array, "*batch"]  # [s]
+    noise_std: Float[Array, "*batch"]  # standard deviation of white noise [m]
+    quantum: Float[Array, "*batch"]  # [m]; 0 for none
 
 
 class Scenario(NamedTuple):
-    """One run per lane.
+    """One run per lane."""
 
-    equivalent_mass: M [kg].
-    velocity: of the first approach [m/s].
-    contacts: how many there are.
-    phase: of each contact within a control period [1].
-    clearance: between two surfaces [m]; infinite for one.
-    contact: parameters of the contact law, of each contact.
-    control_period: T [s].
-    contact_plane: where the hardware's surface is [m]; the controller takes it to be at 0.
-    simulator: motion simulator.
-    force_sensor: force sensor.
-    position_sensor: position sensor.
-    time_limit: of a contact [s].
-    key: of the sensors' noise: seed, index of the scenario.
-    probe: what the run is probed with; None if not at all.
-    reference: the contacts in space where they are known beforehand, NaN where not; None if nowhere.
-    """
-
-    equivalent_mass: Float[Array, "*batch"]
-    velocity: Float[Array, "*batch"]
-    contacts: Int[Array, "*batch"]
-    phase: Float[Array, "slots *batch"]
-    clearance: Float[Array, "*batch"]
-    contact: ContactParameters
-    control_period: Float[Array, "*batch"]
+    equivalent_mass: Float[Array, "*batch"]  # M [kg]
+    velocity: Float[Array, "*batch"]  # of the first approach [m/s]
+    contacts: Int[Array, "*batch"]  # how many there are
+    phase: Float[Array, "slots *batch"]  # of each contact within a control period [1]
+    clearance: Float[Array, "*batch"]  # between two surfaces [m]; infinite for one
+    contact: ContactParameters  # parameters of the contact law, of each contact
+    control_period: Float[Array, "*batch"]  # T [s]
+    # where the hardware's surface is [m]; the controller takes it to be at 0
     contact_plane: Float[Array, "*batch"]
-    simulator: MotionSimulator
-    force_sensor: ForceSensor
-    position_sensor: PositionSensor
-    time_limit: Float[Array, "*batch"]
-    key: UInt32[Array, "2 *batch"]
-    probe: Probe | None = None
+    simulator: MotionSimulator  # motion simulator
+    force_sensor: ForceSensor  # force sensor
+    position_sensor: PositionSensor  # position sensor
+    time_limit: Float[Array, "*batch"]  # of a contact [s]
+    key: UInt32[Array, "2 *batch"]  # of the sensors' noise: seed, index of the scenario
+    probe: Probe | None = None  # what the run is probed with; None if not at all
+    # the contacts in space where they are known beforehand, NaN where not; None if nowhere
     reference: Reference | None = None
 
 

@@ -21,14 +21,10 @@ PARITY = 0x1BD11BDA  # of its key schedule
 
 
 class Noise(NamedTuple):
-    """What noise adds to readings, (ticks, *batch) or at one tick.
+    """What noise adds to readings, (ticks, *batch) or at one tick."""
 
-    force: [N]; None for a sensor without noise.
-    position: [m]; None for a sensor without noise.
-    """
-
-    force: Array | None
-    position: Array | None
+    force: Array | None  # [N]; None for a sensor without noise
+    position: Array | None  # [m]; None for a sensor without noise
 
 
 def draw_noise(

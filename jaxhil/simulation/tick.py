@@ -42,87 +42,54 @@ from jaxhil.simulation.watch import Rules, Watch, record_contact
 
 
 class RunState(NamedTuple):
-    """What is carried from tick to tick.
+    """What is carried from tick to tick."""
 
-    state: of the loop.
-    watch: the contact under way.
-    metrics: of the contacts that are over.
-    index: of the contact under way, from 0.
-    active: whether the lane still has contacts to come.
-    tick: the number of ticks run, common to all lanes.
-    """
-
-    state: LoopState
-    watch: Watch
-    metrics: Metrics
-    index: Int[Array, "*batch"]
-    active: Bool[Array, "*batch"]
-    tick: Int[Array, ""]
+    state: LoopState  # of the loop
+    watch: Watch  # the contact under way
+    metrics: Metrics  # of the contacts that are over
+    index: Int[Array, "*batch"]  # of the contact under way, from 0
+    active: Bool[Array, "*batch"]  # whether the lane still has contacts to come
+    tick: Int[Array, ""]  # the number of ticks run, common to all lanes
 
 
 class Tick(NamedTuple):
-    """What is recorded of a tick.
+    """What is recorded of a tick."""
 
-    signals: what the controller read.
-    command: F_c [N], what the compensator made of it.
-    plant_signals: of the contact, without the sensors.
-    active: whether the lane was still running.
-    contact: index of the contact, from 0.
-    identified: stiffness [N/m] and damping [N s/m], by a compensator that identifies them.
-    sent: position command at the tick's end [m], before any limits of the drives.
-    """
-
-    signals: Signals
-    command: Float[Array, "*batch"]
-    plant_signals: PlantSignals
-    active: Bool[Array, "*batch"]
-    contact: Int[Array, "*batch"]
+    signals: Signals  # what the controller read
+    command: Float[Array, "*batch"]  # F_c [N], what the compensator made of it
+    plant_signals: PlantSignals  # of the contact, without the sensors
+    active: Bool[Array, "*batch"]  # whether the lane was still running
+    contact: Int[Array, "*batch"]  # index of the contact, from 0
+    # stiffness [N/m] and damping [N s/m], by a compensator that identifies them
     identified: tuple[Array, Array] | None
-    sent: Float[Array, "*batch"]
+    sent: Float[Array, "*batch"]  # position command at the tick's end [m], before any limits of the drives
 
 
 class Prepared(NamedTuple):
-    """What is worked out once for many ticks of a contact.
+    """What is worked out once for many ticks of a contact."""
 
-    gains: of the compensator.
-    controller: what the compensator has prepared from them.
-    rules: when a contact is over.
-    probe: of the contact under way, where the run is probed.
-    """
-
-    gains: Gains
-    controller: Any
-    rules: Rules
-    probe: Probe | None
+    gains: Gains  # of the compensator
+    controller: Any  # what the compensator has prepared from them
+    rules: Rules  # when a contact is over
+    probe: Probe | None  # of the contact under way, where the run is probed
 
 
 class Model(NamedTuple):
-    """The numerical model after a control period.
+    """The numerical model after a control period."""
 
-    position: x_d [m].
-    velocity: v_d [m/s].
-    acceleration: a_d during the period [m/s^2].
-    """
-
-    position: Float[Array, "*batch"]
-    velocity: Float[Array, "*batch"]
-    acceleration: Float[Array, "*batch"]
+    position: Float[Array, "*batch"]  # x_d [m]
+    velocity: Float[Array, "*batch"]  # v_d [m/s]
+    acceleration: Float[Array, "*batch"]  # a_d during the period [m/s^2]
 
 
 class Actuated(NamedTuple):
-    """What a position command makes of the rig.
+    """What a position command makes of the rig."""
 
-    plant: drives and motion simulator after the control period.
-    controller: state of the compensator.
-    position: of the mechanism where its sensor samples it [m].
-    interval: motion whose contact happens now.
-    under_way: ring of the motions whose contact is still to come; None with one surface.
-    """
-
-    plant: Plant
-    controller: Any
-    position: Float[Array, "*batch"]
-    interval: SamplingInterval
+    plant: Plant  # drives and motion simulator after the control period
+    controller: Any  # state of the compensator
+    position: Float[Array, "*batch"]  # of the mechanism where its sensor samples it [m]
+    interval: SamplingInterval  # motion whose contact happens now
+    # ring of the motions whose contact is still to come; None with one surface
     under_way: SamplingInterval | None
 
 

@@ -21,72 +21,44 @@ FADED = 1e-6  # of the command's peak
 
 
 class Swings(NamedTuple):
-    """F_c of the contact under way; all of it begins with the 0 before the contact.
+    """F_c of the contact under way; all of it begins with the 0 before the contact."""
 
-    last: value [N].
-    highest: value so far [N].
-    lowest: value so far [N].
-    variation: total variation so far [N].
-    """
-
-    last: Float[Array, "*batch"]
-    highest: Float[Array, "*batch"]
-    lowest: Float[Array, "*batch"]
-    variation: Float[Array, "*batch"]
+    last: Float[Array, "*batch"]  # value [N]
+    highest: Float[Array, "*batch"]  # value so far [N]
+    lowest: Float[Array, "*batch"]  # value so far [N]
+    variation: Float[Array, "*batch"]  # total variation so far [N]
 
 
 class Watch(NamedTuple):
-    """The contact under way.
+    """The contact under way."""
 
-    elapsed: ticks since it began; 0 before.
-    over: whether it is over.
-    approach: speed of the numerical model before it [m/s].
-    rebound: speed of the numerical model now [m/s].
-    peak_force: of the real force [N].
-    peak_command: of |F_c| [N].
-    recent: real force at the last two ticks [N].
-    in_contact: ticks with a real force.
-    quiet: ticks since the last real force.
-    works: done on the mechanism and returned by it [J], where energies are followed.
-    swings: of the command, where they are followed.
-    shortfall: largest of the position command [m], where it has limits.
-    side: of the surface, 1 or -1, between two of them.
-    command: |F_c| of the last tick [N], between two surfaces.
-    left: what was left of |F_c| when the last contact was over [N], between two surfaces.
-    deviation: of x_d from the contact in space, where the run is probed.
-    """
-
-    elapsed: Float[Array, "*batch"]
-    over: Bool[Array, "*batch"]
-    approach: Float[Array, "*batch"]
-    rebound: Float[Array, "*batch"]
-    peak_force: Float[Array, "*batch"]
-    peak_command: Float[Array, "*batch"]
-    recent: tuple[Array, Array]
-    in_contact: Float[Array, "*batch"]
-    quiet: Float[Array, "*batch"]
-    works: tuple[Array, ...]
-    swings: Swings | None
-    shortfall: Float[Array, "*batch"] | None
-    side: Float[Array, "*batch"] | None
-    command: Float[Array, "*batch"] | None
+    elapsed: Float[Array, "*batch"]  # ticks since it began; 0 before
+    over: Bool[Array, "*batch"]  # whether it is over
+    approach: Float[Array, "*batch"]  # speed of the numerical model before it [m/s]
+    rebound: Float[Array, "*batch"]  # speed of the numerical model now [m/s]
+    peak_force: Float[Array, "*batch"]  # of the real force [N]
+    peak_command: Float[Array, "*batch"]  # of |F_c| [N]
+    recent: tuple[Array, Array]  # real force at the last two ticks [N]
+    in_contact: Float[Array, "*batch"]  # ticks with a real force
+    quiet: Float[Array, "*batch"]  # ticks since the last real force
+    works: tuple[Array, ...]  # done on the mechanism and returned by it [J], where energies are followed
+    swings: Swings | None  # of the command, where they are followed
+    shortfall: Float[Array, "*batch"] | None  # largest of the position command [m], where it has limits
+    side: Float[Array, "*batch"] | None  # of the surface, 1 or -1, between two of them
+    command: Float[Array, "*batch"] | None  # |F_c| of the last tick [N], between two surfaces
+    # what was left of |F_c| when the last contact was over [N], between two surfaces
     left: Float[Array, "*batch"] | None
-    deviation: Deviation | None
+    deviation: Deviation | None  # of x_d from the contact in space, where the run is probed
 
 
 class Rules(NamedTuple):
-    """When a contact is over.
+    """When a contact is over."""
 
-    quiet: ticks without a real force.
-    patience: ticks without a real force after which the command need not have died out.
-    level: below which the command has died out [N].
-    clearance: between two surfaces [m]; infinite for one.
-    """
-
-    quiet: Float[Array, "*batch"]
+    quiet: Float[Array, "*batch"]  # ticks without a real force
+    # ticks without a real force after which the command need not have died out
     patience: Float[Array, "*batch"]
-    level: Float[Array, "*batch"]
-    clearance: Float[Array, "*batch"]
+    level: Float[Array, "*batch"]  # below which the command has died out [N]
+    clearance: Float[Array, "*batch"]  # between two surfaces [m]; infinite for one
 
 
 def build_rules(scenario: Scenario) -> Rules:

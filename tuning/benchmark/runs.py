@@ -25,19 +25,13 @@ from tuning.transparency.pushes import EARLY, LATE, Space, in_space, probed
 
 
 class Scene(NamedTuple):
-    """What every law is judged on for one mechanism; NumPy arrays.
-
-    common: the program that it shares with others.
-    plain: its scenarios.
-    twins: their damped twins (`tuning.transparency.damped_twins`).
-    space: the scenarios' first contacts in space.
-    """
+    """What every law is judged on for one mechanism; NumPy arrays."""
 
     mechanism: Mechanism
-    common: CommonProgram
-    plain: Scenario
-    twins: Scenario
-    space: Space
+    common: CommonProgram  # the program that it shares with others
+    plain: Scenario  # its scenarios
+    twins: Scenario  # their damped twins (`tuning.transparency.damped_twins`)
+    space: Space  # the scenarios' first contacts in space
 
 
 def build_scene(mechanism: Mechanism, common: CommonProgram, scenarios: int, seed: int) -> Scene:

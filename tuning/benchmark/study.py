@@ -45,16 +45,12 @@ class CompareSettings:
 
 
 class LawFigures(NamedTuple):
-    """Of one law on one mechanism; a law without gains to tune is only there with the literature's.
-
-    gains: by "literature", names of settings and "tuned".
-    figures: what is said of each (`tuning.transparency.figures`).
-    """
+    """Of one law on one mechanism; a law without gains to tune is only there with the literature's."""
 
     law: str
     mechanism: str
-    gains: dict[str, dict[str, float]]
-    figures: dict[str, dict[str, Estimate]]
+    gains: dict[str, dict[str, float]]  # by "literature", names of settings and "tuned"
+    figures: dict[str, dict[str, Estimate]]  # what is said of each (`tuning.transparency.figures`)
 
 
 class Failed(NamedTuple):

@@ -24,22 +24,15 @@ COPIED = ("bundle/selftest.py", "rig/udp_controller.py", "rig/udp_protocol.py")
 
 
 class Bundle(NamedTuple):
-    """A bundle in memory, and what its vectors say.
+    """A bundle in memory, and what its vectors say."""
 
-    document: the gain document as exported.
-    files: the content of every file, by its path.
-    ticks: of the vectors.
-    runs: of the vectors.
-    ended: what ended the comparison with the simulation in each recorded run; None: nothing.
-    reasons: what disagrees, in words.
-    """
-
-    document: dict[str, Any]
-    files: dict[str, bytes]
-    ticks: int
-    runs: int
+    document: dict[str, Any]  # the gain document as exported
+    files: dict[str, bytes]  # the content of every file, by its path
+    ticks: int  # of the vectors
+    runs: int  # of the vectors
+    # what ended the comparison with the simulation in each recorded run; None: nothing
     ended: list[str | None]
-    reasons: list[str]
+    reasons: list[str]  # what disagrees, in words
 
 
 def build_bundle(

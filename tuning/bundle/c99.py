@@ -108,18 +108,12 @@ _TABLES: Mapping[str, Callable[[str], Table]] = {
 
 
 class _Fragment(NamedTuple):
-    """A part of the C sources.
+    """A part of the C sources."""
 
-    system: the headers that it includes, as `math.h`.
-    local: the fragments that it includes.
-    declarations: what it adds to the header, "" or a newline if nothing.
-    definitions: what it adds to the source, likewise.
-    """
-
-    system: tuple[str, ...]
-    local: tuple[str, ...]
-    declarations: str
-    definitions: str
+    system: tuple[str, ...]  # the headers that it includes, as `math.h`
+    local: tuple[str, ...]  # the fragments that it includes
+    declarations: str  # what it adds to the header, "" or a newline if nothing
+    definitions: str  # what it adds to the source, likewise
 
 
 def c99_texts(document: Mapping[str, Any], source: str = "gain document") -> dict[str, str]:

@@ -21,16 +21,11 @@ WIDTH = 110
 
 
 class Table(NamedTuple):
-    """A fragment made of a table.
+    """A fragment made of a table."""
 
-    comment: what it opens with.
-    declarations: what goes into the header.
-    definitions: what goes into the source.
-    """
-
-    comment: str
-    declarations: str
-    definitions: str
+    comment: str  # what it opens with
+    declarations: str  # what goes into the header
+    definitions: str  # what goes into the source
 
 
 def decimal(value: float) -> str:

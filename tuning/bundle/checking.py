@@ -12,14 +12,10 @@ LONGEST = 600.0  # s
 
 
 class Checked(NamedTuple):
-    """The verdict on a bundle.
+    """The verdict on a bundle."""
 
-    lines: what its self-test printed.
-    reasons: why it is bad; none if it is good.
-    """
-
-    lines: list[str]
-    reasons: list[str]
+    lines: list[str]  # what its self-test printed
+    reasons: list[str]  # why it is bad; none if it is good
 
 
 def check_bundle(folder: Path) -> Checked:

@@ -20,21 +20,15 @@ OUTSIDE = {*sys.stdlib_module_names, "numpy"}
 
 
 class Source(NamedTuple):
-    """A module of the package.
+    """A module of the package."""
 
-    name: its dotted name below the package, "" for the package itself.
-    text: all of it.
-    tree: its syntax tree.
-    inside: module and name of what it imports from the package, by the name that it has here.
-    outside: the import lines that it needs from elsewhere.
-    dropped: the statements that are of no use in one file: docstring, imports, `__all__`.
-    """
-
-    name: str
-    text: str
-    tree: ast.Module
+    name: str  # its dotted name below the package, "" for the package itself
+    text: str  # all of it
+    tree: ast.Module  # its syntax tree
+    # module and name of what it imports from the package, by the name that it has here
     inside: dict[str, str]
-    outside: tuple[str, ...]
+    outside: tuple[str, ...]  # the import lines that it needs from elsewhere
+    # the statements that are of no use in one file: docstring, imports, `__all__`
     dropped: tuple[ast.stmt, ...]
 
 

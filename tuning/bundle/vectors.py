@@ -41,30 +41,19 @@ EXTREMES = (nan, inf, -inf, 1e308, -1e308, 1e30, -1e200, 5e-324, -0.0)
 
 
 class Inputs(NamedTuple):
-    """What the controller reads in one tick.
+    """What the controller reads in one tick."""
 
-    run: number of the run.
-    event: `BEGINS`, `NEXT_CONTACT`, or 0.
-    force_measured: [N].
-    position_desired: of the numerical model [m].
-    velocity_desired: of the numerical model [m/s].
-    position_measured: [m].
-    time: [s]; None for none.
-    motion: the model's next position, velocity and acceleration [SI]; None: it is integrated.
-    force_simulated: what the simulation's controller commands [N].
-    zeroed: whether the model feels no force, whatever is commanded.
-    """
-
-    run: int
-    event: int
-    force_measured: float
-    position_desired: float
-    velocity_desired: float
-    position_measured: float
-    time: float | None
+    run: int  # number of the run
+    event: int  # `BEGINS`, `NEXT_CONTACT`, or 0
+    force_measured: float  # [N]
+    position_desired: float  # of the numerical model [m]
+    velocity_desired: float  # of the numerical model [m/s]
+    position_measured: float  # [m]
+    time: float | None  # [s]; None for none
+    # the model's next position, velocity and acceleration [SI]; None: it is integrated
     motion: tuple[float, float, float] | None = None
-    force_simulated: float = nan
-    zeroed: bool = False
+    force_simulated: float = nan  # what the simulation's controller commands [N]
+    zeroed: bool = False  # whether the model feels no force, whatever is commanded
 
 
 class Row(NamedTuple):
@@ -87,18 +76,12 @@ class Row(NamedTuple):
 
 
 class Recorded(NamedTuple):
-    """The vectors of recorded runs.
+    """The vectors of recorded runs."""
 
-    rows: their ticks.
-    mass: equivalent mass of the nominal run [kg].
-    ended: of each run what ended the comparison with the simulation; None: nothing.
-    reasons: what disagrees, in words.
-    """
-
-    rows: list[Row]
-    mass: float
-    ended: list[str | None]
-    reasons: list[str]
+    rows: list[Row]  # their ticks
+    mass: float  # equivalent mass of the nominal run [kg]
+    ended: list[str | None]  # of each run what ended the comparison with the simulation; None: nothing
+    reasons: list[str]  # what disagrees, in words
 
 
 def recorded(loaded: LoadedGains, gain_file: GainFile, seed: int, draws: int = DRAWS) -> Recorded:

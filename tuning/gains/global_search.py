@@ -19,19 +19,14 @@ LANES = 8192  # side by side, which is quicker than few at a time
 class GlobalComparison(NamedTuple):
     """Tuned gains beside the best found anywhere.
 
-    tuned, best: values of the objective [1].
-    above: by what share of the best value the tuned one lies above it; negative: below.
-    spent: evaluations of tuning, a Jacobian over P gains counted as 1 + P.
-    evaluations: those of the search.
-    gains: the best ones.
-    """
+    tuned, best: values of the objective [1]."""
 
     tuned: float
     best: float
-    above: float
-    spent: int
-    evaluations: int
-    gains: dict[str, float]
+    above: float  # by what share of the best value the tuned one lies above it; negative: below
+    spent: int  # evaluations of tuning, a Jacobian over P gains counted as 1 + P
+    evaluations: int  # those of the search
+    gains: dict[str, float]  # the best ones
 
 
 def compare_with_global_search(

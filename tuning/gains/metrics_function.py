@@ -22,25 +22,17 @@ class ScenarioMetrics(NamedTuple):
     """What the function gets: jax arrays, a contact a row, a scenario a column.
 
     Of a contact that does not end, error and restitution are those of a wild divergence (an error of 3), and
-    the command peaks at four times the force in space; the rest is as far as it got.
+    the command peaks at four times the force in space; the rest is as far as it got."""
 
-    error: restitution error e - e* [1].
-    restitution: rebound speed over approach speed, e [1].
-    reference_restitution: the same in space, entered at the same speed, e* [1].
-    peak_command: largest magnitude of the commanded force F_c [N].
-    peak_force: largest magnitude of the real contact force [N].
-    duration: from a contact's beginning to its end [s].
-    approach_velocity: with which the contact is entered [m/s].
-    status: 0 for a contact that ended, else why not (`jaxhil.simulation.metrics.STATUS_NAMES`).
-    """
-
-    error: Float[Array, "contacts scenarios"]
-    restitution: Float[Array, "contacts scenarios"]
+    error: Float[Array, "contacts scenarios"]  # restitution error e - e* [1]
+    restitution: Float[Array, "contacts scenarios"]  # rebound speed over approach speed, e [1]
+    # the same in space, entered at the same speed, e* [1]
     reference_restitution: Float[Array, "contacts scenarios"]
-    peak_command: Float[Array, "contacts scenarios"]
-    peak_force: Float[Array, "contacts scenarios"]
-    duration: Float[Array, "contacts scenarios"]
-    approach_velocity: Float[Array, "contacts scenarios"]
+    peak_command: Float[Array, "contacts scenarios"]  # largest magnitude of the commanded force F_c [N]
+    peak_force: Float[Array, "contacts scenarios"]  # largest magnitude of the real contact force [N]
+    duration: Float[Array, "contacts scenarios"]  # from a contact's beginning to its end [s]
+    approach_velocity: Float[Array, "contacts scenarios"]  # with which the contact is entered [m/s]
+    # 0 for a contact that ended, else why not (`jaxhil.simulation.metrics.STATUS_NAMES`)
     status: Int[Array, "contacts scenarios"]
 
 

@@ -42,16 +42,12 @@ Objectives = Objective | Sequence[Objective]  # that of all tasks, or one of eac
 
 
 class MultistartResult(NamedTuple):
-    """What was found for a task.
+    """What was found for a task."""
 
-    best: the best of its starts, improved without derivatives; None if all failed.
-    starts: all of them, batch by batch.
-    evaluations: of the objective, that it took. A Jacobian over P gains counts as 1 + P of them, a point of a
-        scan as the share of the scenarios it was tried on.
-    """
-
-    best: Start | None
-    starts: list[Start]
+    best: Start | None  # the best of its starts, improved without derivatives; None if all failed
+    starts: list[Start]  # all of them, batch by batch
+    # of the objective, that it took. A Jacobian over P gains counts as 1 + P of them, a point of a scan as
+    # the share of the scenarios it was tried on.
     evaluations: int
 
 

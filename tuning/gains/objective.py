@@ -129,16 +129,11 @@ class Weights(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What one start is solved for; where there are several problems, each leaf has a leading axis of them.
+    """What one start is solved for; where there are several, each leaf has a leading axis of them."""
 
-    rig: built for a batch of scenarios.
-    fixed: gains that stay as they are.
-    weights: the objective's.
-    """
-
-    rig: RigConstants
-    fixed: dict[str, Array]
-    weights: Weights
+    rig: RigConstants  # built for a batch of scenarios
+    fixed: dict[str, Array]  # gains that stay as they are
+    weights: Weights  # the objective's
 
 
 def one_each(objective: Objective | Sequence[Objective], number: int) -> list[Objective]:

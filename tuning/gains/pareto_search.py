@@ -96,14 +96,11 @@ def ladder(
 
 
 class _Found(NamedTuple):
-    """Gains of a mechanism, and what they reach on its training scenarios.
-
-    error: J without the term traded [1].
-    excess: what its weight is of [1]: max(0, A - 1), or the rms of peaks' excess or of probes' errors.
-    """
+    """Gains of a mechanism, and what they reach on its training scenarios."""
 
     gains: dict[str, float]
-    error: float
+    error: float  # J without the term traded [1]
+    # what its weight is of [1]: max(0, A - 1), or the rms of peaks' excess or of probes' errors
     excess: float
 
     def value(self, weight: float) -> float:

@@ -37,24 +37,15 @@ GIVEN_UP = "given up"
 
 
 class Start(NamedTuple):
-    """One start of the solve.
+    """One start of the solve."""
 
-    status: how it ended.
-    steps: of the solver.
-    rms: value of the objective it ended with (its norm, see `tuning.gains.objective`).
-    history: that value after every step.
-    gains: all of the compensator's.
-    coordinates: unit coordinates of the gains that are tuned for any of the tasks.
-    curvature: J^T J by those, J the residuals' Jacobian.
-    """
-
-    status: str
-    steps: int
-    rms: float
-    history: list[float]
-    gains: dict[str, float]
-    coordinates: np.ndarray = np.empty(0)
-    curvature: np.ndarray = np.empty((0, 0))
+    status: str  # how it ended
+    steps: int  # of the solver
+    rms: float  # value of the objective it ended with (its norm, see `tuning.gains.objective`)
+    history: list[float]  # that value after every step
+    gains: dict[str, float]  # all of the compensator's
+    coordinates: np.ndarray = np.empty(0)  # unit coordinates of the gains that are tuned for any of the tasks
+    curvature: np.ndarray = np.empty((0, 0))  # J^T J by those, J the residuals' Jacobian
 
 
 @dataclasses.dataclass

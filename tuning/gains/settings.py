@@ -7,31 +7,23 @@ from tuning.gains.objective import RMS, Objective
 
 @dataclass(frozen=True)
 class TuneSettings:
-    """Settings of `tuning.gains.tune`, the same for all mechanisms of a run.
+    """Settings of `tuning.gains.tune`, the same for all mechanisms of a run."""
 
-    scenarios: how many to tune on; None: 32, or 128 with sensor noise (`tuning.gains.tasks`).
-    starts: points that the solver starts from, in every batch of starts (`tuning.gains.multistart`).
-    steps: most solver steps from each start.
-    validation: fresh scenarios to judge the gains on.
-    seed: of scenarios and starts.
-    objective: what to minimise.
-    polish: evaluations without derivatives at the end, for each gain.
-    global_search: whether to search the gains' whole ranges as well, and say how much better they can be.
-    scanned: points of a scan, the best of which become starts.
-    setting: name of the compensator's gains that are judged as they are, in the place of tuning.
-    judge_transparency: whether to judge transparency even where the objective does not weigh it.
-    """
-
+    # how many to tune on; None: 32, or 128 with sensor noise (`tuning.gains.tasks`)
     scenarios: int | None = None
+    # points that the solver starts from, in every batch of starts (`tuning.gains.multistart`)
     starts: int = 4
-    steps: int = 25
-    validation: int = 511
-    seed: int = 0
-    objective: Objective = RMS
-    polish: int = 160
+    steps: int = 25  # most solver steps from each start
+    validation: int = 511  # fresh scenarios to judge the gains on
+    seed: int = 0  # of scenarios and starts
+    objective: Objective = RMS  # what to minimise
+    polish: int = 160  # evaluations without derivatives at the end, for each gain
+    # whether to search the gains' whole ranges as well, and say how much better they can be
     global_search: bool = False
-    scanned: int = 256
+    scanned: int = 256  # points of a scan, the best of which become starts
+    # name of the compensator's gains that are judged as they are, in the place of tuning
     setting: str | None = None
+    # whether to judge transparency even where the objective does not weigh it
     judge_transparency: bool = False
 
     @property

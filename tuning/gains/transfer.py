@@ -21,37 +21,25 @@ from tuning.gain_file import validity_envelope
 class Traits(NamedTuple):
     """What a mechanism's restitution without compensation depends on, nominally.
 
-    slowest, fastest: contact omega [rad/s].
-    force_delay: delay and lag of the force sensor [s].
-    simulator_delay: those of the motion simulator with its command [s].
-    control_period: [s].
-    damping_ratio: [1].
-    law: contact law.
-    two_sided: whether there are two surfaces.
-    """
+    slowest, fastest: contact omega [rad/s]."""
 
     slowest: float
     fastest: float
-    force_delay: float
-    simulator_delay: float
-    control_period: float
-    damping_ratio: float
-    law: str
-    two_sided: bool
+    force_delay: float  # delay and lag of the force sensor [s]
+    simulator_delay: float  # those of the motion simulator with its command [s]
+    control_period: float  # [s]
+    damping_ratio: float  # [1]
+    law: str  # contact law
+    two_sided: bool  # whether there are two surfaces
 
 
 @dataclass(frozen=True)
 class Tuned:
-    """Gains that were tuned before.
+    """Gains that were tuned before."""
 
-    mechanism: that they were tuned for.
-    gains: [SI units].
-    source: where they come from, as a user would say.
-    """
-
-    mechanism: Mechanism
-    gains: Mapping[str, float]
-    source: str
+    mechanism: Mechanism  # that they were tuned for
+    gains: Mapping[str, float]  # [SI units]
+    source: str  # where they come from, as a user would say
 
     @functools.cached_property
     def traits(self) -> Traits:

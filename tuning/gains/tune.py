@@ -31,33 +31,23 @@ BLOCK = 16  # mechanisms tuned and judged together: what is done when work is in
 class ErrorFigures(NamedTuple):
     """What is said of the restitution errors e - e* of all contacts of a batch.
 
-    rms, p99, max: root mean square, 99th percentile and maximum of |e - e*| [1].
-    mean: of e - e* [1].
-    diverging: share of contacts with e > e* [1].
-    peak_ratio: largest |F_c| over the reference's peak force [1].
-    chatter: root mean square of the chatter [1] (`jaxhil.simulation.evaluation.Outcome`).
-    failed: contacts that did not end.
-    """
+    rms, p99, max: root mean square, 99th percentile and maximum of |e - e*| [1]."""
 
     rms: float
     p99: float
     max: float
-    mean: float
-    diverging: float
-    peak_ratio: float
-    chatter: float
-    failed: int
+    mean: float  # of e - e* [1]
+    diverging: float  # share of contacts with e > e* [1]
+    peak_ratio: float  # largest |F_c| over the reference's peak force [1]
+    chatter: float  # root mean square of the chatter [1] (`jaxhil.simulation.evaluation.Outcome`)
+    failed: int  # contacts that did not end
 
 
 class Freedom(NamedTuple):
-    """How far a gain may move before the loss rises by a hundredth, as a share of its range.
+    """How far a gain may move before the loss rises by a hundredth, as a share of its range."""
 
-    alone: the others held.
-    together: the others moved along, at their best.
-    """
-
-    alone: float
-    together: float
+    alone: float  # the others held
+    together: float  # the others moved along, at their best
 
 
 @dataclass(frozen=True)

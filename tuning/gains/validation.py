@@ -33,28 +33,19 @@ VALIDATION_SEED = 0x5EED
 
 @dataclass(frozen=True)
 class Validation:
-    """Like tasks with fresh scenarios, ready to be evaluated under any gains; see `build_validation`.
+    """Like tasks with fresh scenarios, ready to be evaluated under any gains; see `build_validation`."""
 
-    tasks: the tasks, whose scenarios are those of training.
-    fresh: fresh scenarios of each.
-    probed: the same with their transparency probes; None of each where the tasks are not probed.
-    loop: that of all tasks.
-    names: of the gains that are tuned for any of the tasks.
-    bounds: of those gains, of each task.
-    judged: fresh scenarios of all tasks side by side, with probes if any, after each task's its nominal run.
-    training: training scenarios, (tasks, ..., scenarios).
-    lanes: of `judged` that belong to a task.
-    """
-
-    tasks: list[TuneTask]
-    fresh: list[Scenario]
+    tasks: list[TuneTask]  # the tasks, whose scenarios are those of training
+    fresh: list[Scenario]  # fresh scenarios of each
+    # the same with their transparency probes; None of each where the tasks are not probed
     probed: list[ProbedScenarios | None]
-    loop: Loop
-    names: tuple[str, ...]
-    bounds: list[Bounds]
+    loop: Loop  # that of all tasks
+    names: tuple[str, ...]  # of the gains that are tuned for any of the tasks
+    bounds: list[Bounds]  # of those gains, of each task
+    # fresh scenarios of all tasks side by side, with probes if any, after each task's its nominal run
     judged: Scenario
-    training: Any
-    lanes: int
+    training: Any  # training scenarios, (tasks, ..., scenarios)
+    lanes: int  # of `judged` that belong to a task
 
     def judge(
         self, gains: list[dict[str, float]], compensator: str | None = None

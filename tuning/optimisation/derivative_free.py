@@ -24,16 +24,11 @@ Losses = Callable[[Float[np.ndarray, "candidates gains"]], Float[np.ndarray, "ca
 
 
 class SearchResult(NamedTuple):
-    """What a search found; `polish` of several starts gives each its own.
+    """What a search found; `polish` of several starts gives each its own."""
 
-    point: the best point.
-    loss: there.
-    evaluations: of the objective that it took.
-    """
-
-    point: Float[np.ndarray, "*starts gains"]
-    loss: Float[np.ndarray, "*starts"]
-    evaluations: int
+    point: Float[np.ndarray, "*starts gains"]  # the best point
+    loss: Float[np.ndarray, "*starts"]  # there
+    evaluations: int  # of the objective that it took
 
 
 def polish(

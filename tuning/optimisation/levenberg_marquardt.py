@@ -23,22 +23,14 @@ from tuning.optimisation.unit_box import Bounds, to_gains
 
 
 class Solution(NamedTuple):
-    """Where the starts ended.
+    """Where the starts ended."""
 
-    coordinates: unit coordinates of the gains.
-    curvature: J^T J there, J the residuals' Jacobian by the coordinates.
-    loss: half the sum of squared residuals.
-    history: loss after every step, the last repeated.
-    steps: steps taken.
-    status: an index into `STATUSES`.
-    """
-
-    coordinates: Float[Array, "starts gains"]
-    curvature: Float[Array, "starts gains gains"]
-    loss: Float[Array, "starts"]
-    history: Float[Array, "starts steps"]
-    steps: Int[Array, "starts"]
-    status: Int[Array, "starts"]
+    coordinates: Float[Array, "starts gains"]  # unit coordinates of the gains
+    curvature: Float[Array, "starts gains gains"]  # J^T J there, J the residuals' Jacobian by the coordinates
+    loss: Float[Array, "starts"]  # half the sum of squared residuals
+    history: Float[Array, "starts steps"]  # loss after every step, the last repeated
+    steps: Int[Array, "starts"]  # steps taken
+    status: Int[Array, "starts"]  # an index into `STATUSES`
 
 
 DAMPING = 0.1  # of the first step, relative to the mean diagonal of J^T J
@@ -172,16 +164,11 @@ def _with_jacobian(residuals, free, arguments, tile=None):
 
 
 class _Model(NamedTuple):
-    """The linear model that a step is made of.
+    """The linear model that a step is made of."""
 
-    coordinates: where the step begins.
-    curvature: J^T J there.
-    gradient: of the loss, J^T r.
-    """
-
-    coordinates: Float[Array, "gains"]
-    curvature: Float[Array, "gains gains"]
-    gradient: Float[Array, "gains"]
+    coordinates: Float[Array, "gains"]  # where the step begins
+    curvature: Float[Array, "gains gains"]  # J^T J there
+    gradient: Float[Array, "gains"]  # of the loss, J^T r
 
 
 class _BoxedDescent(optx.AbstractDescent):

@@ -12,14 +12,10 @@ RISE = 0.01  # of the loss
 
 
 class Sensitivity(NamedTuple):
-    """How far each gain may move, as a share of its range; see `sensitivity`.
+    """How far each gain may move, as a share of its range; see `sensitivity`."""
 
-    alone: the others held.
-    together: the others moved along, at their best.
-    """
-
-    alone: Float[np.ndarray, "gains"]
-    together: Float[np.ndarray, "gains"]
+    alone: Float[np.ndarray, "gains"]  # the others held
+    together: Float[np.ndarray, "gains"]  # the others moved along, at their best
 
 
 def sensitivity(jacobian: Float[np.ndarray, "residuals gains"], loss: float) -> Sensitivity:

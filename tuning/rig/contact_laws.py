@@ -12,17 +12,12 @@ Formula = Callable[[float, float], float]
 
 
 class ContactLaw(NamedTuple):
-    """One contact's law: functions of penetration d [m] and rate d' [m/s].
+    """One contact's law: functions of penetration d [m] and rate d' [m/s]."""
 
-    force: [N] at d > 0; 0 where the surfaces let go.
-    hold: [N or 1]; positive as long as penetrated surfaces hold on to each other.
-    edge: [N], of d' alone: the limit of the force as d goes to 0 from above.
-    loaded: of a law that remembers, the law after a deepest penetration [m]; that of 0 is the law as new.
-    """
-
-    force: Formula
-    hold: Formula
-    edge: Callable[[float], float]
+    force: Formula  # [N] at d > 0; 0 where the surfaces let go
+    hold: Formula  # [N or 1]; positive as long as penetrated surfaces hold on to each other
+    edge: Callable[[float], float]  # [N], of d' alone: the limit of the force as d goes to 0 from above
+    # of a law that remembers, the law after a deepest penetration [m]; that of 0 is the law as new
     loaded: "Callable[[float], ContactLaw] | None" = None
 
 

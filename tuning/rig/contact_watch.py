@@ -16,28 +16,18 @@ RUNAWAY = 1e3  # of the approach speed
 
 
 class ContactResult(NamedTuple):
-    """One contact.
+    """One contact."""
 
-    number: in the mechanism's lists.
-    approach_velocity: [m/s].
-    restitution: not a number where the contact did not end.
-    peak_force: the largest sample of the real force [N].
-    duration: time in contact [s].
-    status: as in `jaxhil.simulation.metrics`, or "tripped".
-    begun: the tick of the run at which it began.
-    packets: numbers of the first and last packet about it, filled in by who exchanges them.
-    oldest_command: age of the oldest command used [periods], likewise.
-    """
-
-    number: int
-    approach_velocity: float
-    restitution: float
-    peak_force: float
-    duration: float
-    status: str
-    begun: int
+    number: int  # in the mechanism's lists
+    approach_velocity: float  # [m/s]
+    restitution: float  # not a number where the contact did not end
+    peak_force: float  # the largest sample of the real force [N]
+    duration: float  # time in contact [s]
+    status: str  # as in `jaxhil.simulation.metrics`, or "tripped"
+    begun: int  # the tick of the run at which it began
+    # numbers of the first and last packet about it, filled in by who exchanges them
     packets: tuple[int, int] = (0, 0)
-    oldest_command: int = 0
+    oldest_command: int = 0  # age of the oldest command used [periods], likewise
 
 
 class ContactWatch:

@@ -25,17 +25,13 @@ STALLED = "stalled"  # a contact that the machine left without new commands
 class Commanded(NamedTuple):
     """What the controller has commanded.
 
-    lowest, highest: position commands [m].
-    not_finite: how many were not finite; these do not reach the drives.
-    beyond_limits: how many were beyond the drives' stroke; neither do these.
-    largest_force: the largest |F_c| [N].
-    """
+    lowest, highest: position commands [m]."""
 
     lowest: float
     highest: float
-    not_finite: int
-    beyond_limits: int
-    largest_force: float
+    not_finite: int  # how many were not finite; these do not reach the drives
+    beyond_limits: int  # how many were beyond the drives' stroke; neither do these
+    largest_force: float  # the largest |F_c| [N]
 
 
 class RigTask:

@@ -17,16 +17,11 @@ LONGEST_PACKET = 512
 
 
 class Injection(NamedTuple):
-    """Faults put into the network, of each packet and each way.
+    """Faults put into the network, of each packet and each way."""
 
-    drops: probability of a loss.
-    jitter: width of a delay drawn uniformly from 0 on [s].
-    delay: constant delay [s].
-    """
-
-    drops: float = 0.0
-    jitter: float = 0.0
-    delay: float = 0.0
+    drops: float = 0.0  # probability of a loss
+    jitter: float = 0.0  # width of a delay drawn uniformly from 0 on [s]
+    delay: float = 0.0  # constant delay [s]
 
     @property
     def any(self) -> bool:

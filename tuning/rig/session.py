@@ -72,75 +72,46 @@ class LoopFigures(NamedTuple):
 
 
 class LoopTimes(NamedTuple):
-    """What `LoopFigures` are made of, for pictures.
+    """What `LoopFigures` are made of, for pictures."""
 
-    tick_time: the controller's time per tick [s].
-    round_trip: [s].
-    """
-
-    tick_time: np.ndarray
-    round_trip: np.ndarray
+    tick_time: np.ndarray  # the controller's time per tick [s]
+    round_trip: np.ndarray  # [s]
 
 
 class LoopReport(NamedTuple):
-    """One loop.
+    """One loop."""
 
-    figures: what it comes to.
-    times: for pictures.
-    causes: whose fault each tick was (`attribute`).
-    controller: what the controller's process said at its end.
-    """
-
-    figures: LoopFigures
-    times: LoopTimes
-    causes: np.ndarray
-    controller: dict[str, Any]
+    figures: LoopFigures  # what it comes to
+    times: LoopTimes  # for pictures
+    causes: np.ndarray  # whose fault each tick was (`attribute`)
+    controller: dict[str, Any]  # what the controller's process said at its end
 
 
 class SessionReport(NamedTuple):
-    """A session.
+    """A session."""
 
-    empty: the empty loop; None where it was not reached.
-    run: the run against the rig, likewise.
-    contacts: those that are over.
-    commanded: what was commanded.
-    tripped: why the controller tripped; empty if it did not.
-    interrupted: whether the session was.
-    resets: why the controller tripped and was reset, where the machine had left it without time.
-    """
-
-    empty: LoopReport | None
-    run: LoopReport | None
-    contacts: tuple[ContactResult, ...]
-    commanded: Commanded | None
-    tripped: str
-    interrupted: bool
+    empty: LoopReport | None  # the empty loop; None where it was not reached
+    run: LoopReport | None  # the run against the rig, likewise
+    contacts: tuple[ContactResult, ...]  # those that are over
+    commanded: Commanded | None  # what was commanded
+    tripped: str  # why the controller tripped; empty if it did not
+    interrupted: bool  # whether the session was
+    # why the controller tripped and was reset, where the machine had left it without time
     resets: tuple[str, ...] = ()
 
 
 class Setup(NamedTuple):
-    """What a session is to be.
+    """What a session is to be."""
 
-    folder: with the controller's process: a bundle, or `SOURCE`.
-    gains: its gain file.
-    mechanism: the one in that.
-    stroke: lowest and highest position that the drives take [m].
-    duration: of the run [s].
-    empty_duration: of the empty loop before it [s].
-    injection: faults put into the run.
-    seed: of all draws.
-    priority: whether to ask the system for a real-time priority for both processes.
-    """
-
-    folder: Path
-    gains: Path
-    mechanism: Mechanism
-    stroke: tuple[float, float]
-    duration: float
-    empty_duration: float
-    injection: Injection
-    seed: int
-    priority: bool = False
+    folder: Path  # with the controller's process: a bundle, or `SOURCE`
+    gains: Path  # its gain file
+    mechanism: Mechanism  # the one in that
+    stroke: tuple[float, float]  # lowest and highest position that the drives take [m]
+    duration: float  # of the run [s]
+    empty_duration: float  # of the empty loop before it [s]
+    injection: Injection  # faults put into the run
+    seed: int  # of all draws
+    priority: bool = False  # whether to ask the system for a real-time priority for both processes
 
 
 def run_session(

@@ -37,28 +37,17 @@ class PacketError(ValueError):
 
 
 class Reading(NamedTuple):
-    """From the rig, at one tick.
+    """From the rig, at one tick."""
 
-    event: the kind of packet, one of `EVENTS`.
-    sequence: its number in the session.
-    run: the number of the run.
-    tick: the tick of the run.
-    time: the rig's time [s].
-    force: measured force [N].
-    position: measured position [m].
-    start_position: position [m] of the numerical model at the run's tick 0.
-    start_velocity: its velocity [m/s] there.
-    """
-
-    event: int
-    sequence: int
-    run: int
-    tick: int
-    time: float
-    force: float
-    position: float
-    start_position: float
-    start_velocity: float
+    event: int  # the kind of packet, one of `EVENTS`
+    sequence: int  # its number in the session
+    run: int  # the number of the run
+    tick: int  # the tick of the run
+    time: float  # the rig's time [s]
+    force: float  # measured force [N]
+    position: float  # measured position [m]
+    start_position: float  # position [m] of the numerical model at the run's tick 0
+    start_velocity: float  # its velocity [m/s] there
 
 
 class Answer(NamedTuple):

@@ -65,24 +65,15 @@ class SubsetSimulation(NamedTuple):
 
 
 class _State(NamedTuple):
-    """All replicates at one level.
+    """All replicates at one level."""
 
-    points: (steps, replicates, chains, inputs), above the replicate's last threshold.
-    values: their performance, (steps, replicates, chains).
-    reached: per replicate, probability of the last threshold.
-    log_sigma: per replicate, of the proposals.
-    variance: per replicate, sum of squared coefficients of variation so far.
-    open: per replicate, whether another level is to be run.
-    estimates: per replicate, where none is.
-    """
-
-    points: np.ndarray
-    values: np.ndarray
-    reached: np.ndarray
-    log_sigma: np.ndarray
-    variance: np.ndarray
-    open: np.ndarray
-    estimates: np.ndarray
+    points: np.ndarray  # (steps, replicates, chains, inputs), above the replicate's last threshold
+    values: np.ndarray  # their performance, (steps, replicates, chains)
+    reached: np.ndarray  # per replicate, probability of the last threshold
+    log_sigma: np.ndarray  # per replicate, of the proposals
+    variance: np.ndarray  # per replicate, sum of squared coefficients of variation so far
+    open: np.ndarray  # per replicate, whether another level is to be run
+    estimates: np.ndarray  # per replicate, where none is
 
 
 class _Worst(NamedTuple):

@@ -79,24 +79,15 @@ class ContactComparison(msgspec.Struct, frozen=True):
 
 
 class VerificationReport(msgspec.Struct, frozen=True):
-    """The verdict, and the numbers that it rests on.
+    """The verdict, and the numbers that it rests on."""
 
-    verdict: whether all agree.
-    reasons: why they do not, if they do not.
-    compensator: the law.
-    replay_limit: allowed difference of commands, as a fraction of their range.
-    closed_loop_limit: allowed difference of a restitution.
-    replay: lane by lane.
-    closed_loop: contact by contact.
-    """
-
-    verdict: bool
-    reasons: tuple[str, ...]
-    compensator: str
-    replay_limit: float
-    closed_loop_limit: float
-    replay: tuple[LaneReplay, ...]
-    closed_loop: tuple[ContactComparison, ...]
+    verdict: bool  # whether all agree
+    reasons: tuple[str, ...]  # why they do not, if they do not
+    compensator: str  # the law
+    replay_limit: float  # allowed difference of commands, as a fraction of their range
+    closed_loop_limit: float  # allowed difference of a restitution
+    replay: tuple[LaneReplay, ...]  # lane by lane
+    closed_loop: tuple[ContactComparison, ...]  # contact by contact
 
 
 def verify(

@@ -22,22 +22,14 @@ GOOD_ERROR, BAD_ERROR = 0.5, 1.0
 
 
 class JudgedRuns(NamedTuple):
-    """Recorded runs, and what became of them.
+    """Recorded runs, and what became of them."""
 
-    index: of each run, in its sweep.
-    error: restitution error; NaN where a contact did not end.
-    reference: the reference's restitution.
-    status: of each contact, as in `jaxhil.simulation.metrics`.
-    audited: what the watchdog audits.
-    extent: how far the signals went.
-    """
-
-    index: Int[np.ndarray, "lanes"]
-    error: Float[np.ndarray, "slots lanes"]
-    reference: Float[np.ndarray, "slots lanes"]
-    status: Int[np.ndarray, "slots lanes"]
-    audited: Audited
-    extent: Extent
+    index: Int[np.ndarray, "lanes"]  # of each run, in its sweep
+    error: Float[np.ndarray, "slots lanes"]  # restitution error; NaN where a contact did not end
+    reference: Float[np.ndarray, "slots lanes"]  # the reference's restitution
+    status: Int[np.ndarray, "slots lanes"]  # of each contact, as in `jaxhil.simulation.metrics`
+    audited: Audited  # what the watchdog audits
+    extent: Extent  # how far the signals went
 
 
 def judge_chunk(chunk: Chunk, rules: Rules, free_distance: float) -> JudgedRuns:

@@ -16,43 +16,30 @@ from tuning.watchdog.recorded import Signals
 
 
 class Rules(NamedTuple):
-    """By what the numerical model is audited.
+    """By what the numerical model is audited."""
 
-    period: control period [s].
-    clearance: [m].
-    mass: equivalent mass [kg].
-    alignment: delay of the force reading against the position reading [s].
-    settling: time that force and command need to die out [s].
-    fading: command that counts as died out [N].
-    """
-
-    period: float
-    clearance: float
-    mass: float
-    alignment: float
-    settling: float
-    fading: float
+    period: float  # control period [s]
+    clearance: float  # [m]
+    mass: float  # equivalent mass [kg]
+    alignment: float  # delay of the force reading against the position reading [s]
+    settling: float  # time that force and command need to die out [s]
+    fading: float  # command that counts as died out [N]
 
 
 class Audited(NamedTuple):
     """Contact by contact, what the audit sees.
 
     approach, rebound: speed before and after [m/s].
-    stiffness, damping: identified [N/m, N s/m]; 0 where there is nothing to identify them from.
-    imbalance: energy out of balance, over the approach's.
-    duration: until the audit [s].
-    tick: on which the contact began.
-    begun: whether there was such a contact.
-    """
+    stiffness, damping: identified [N/m, N s/m]; 0 where there is nothing to identify them from."""
 
     approach: Float[np.ndarray, "slots lanes"]
     rebound: Float[np.ndarray, "slots lanes"]
     stiffness: Float[np.ndarray, "slots lanes"]
     damping: Float[np.ndarray, "slots lanes"]
-    imbalance: Float[np.ndarray, "slots lanes"]
-    duration: Float[np.ndarray, "slots lanes"]
-    tick: Float[np.ndarray, "slots lanes"]
-    begun: Bool[np.ndarray, "slots lanes"]
+    imbalance: Float[np.ndarray, "slots lanes"]  # energy out of balance, over the approach's
+    duration: Float[np.ndarray, "slots lanes"]  # until the audit [s]
+    tick: Float[np.ndarray, "slots lanes"]  # on which the contact began
+    begun: Bool[np.ndarray, "slots lanes"]  # whether there was such a contact
 
     @property
     def restitution(self) -> Float[np.ndarray, "slots lanes"]:

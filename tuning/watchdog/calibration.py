@@ -41,14 +41,11 @@ ENOUGH = 0.01  # of the limit: rms error of an expectation that need not be bett
 
 
 class Calibration(NamedTuple):
-    """What a gain file says of its limits.
+    """What a gain file says of its limits."""
 
-    limits: by name [SI units], all of `jaxhil.runtime.limits.LIMITS`; None for no limit.
-    rates: what is known of the watchdog's alarms under them, plain data.
-    """
-
+    # by name [SI units], all of `jaxhil.runtime.limits.LIMITS`; None for no limit
     limits: dict[str, float | None]
-    rates: dict[str, Any]
+    rates: dict[str, Any]  # what is known of the watchdog's alarms under them, plain data
 
 
 def calibrate(

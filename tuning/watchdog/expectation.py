@@ -48,16 +48,11 @@ class Expectation(NamedTuple):
 
 
 class Features(NamedTuple):
-    """What is known of contacts; equal shapes.
+    """What is known of contacts; equal shapes."""
 
-    stiffness: identified [N/m].
-    damping: identified [N s/m].
-    velocity: approach speed [m/s].
-    """
-
-    stiffness: Float[np.ndarray, "*shape"]
-    damping: Float[np.ndarray, "*shape"]
-    velocity: Float[np.ndarray, "*shape"]
+    stiffness: Float[np.ndarray, "*shape"]  # identified [N/m]
+    damping: Float[np.ndarray, "*shape"]  # identified [N s/m]
+    velocity: Float[np.ndarray, "*shape"]  # approach speed [m/s]
 
 
 def expected_restitution(expectation: Expectation, features: Features, mass: float) -> np.ndarray:

@@ -26,16 +26,11 @@ _compared = jax.jit(compare_with_reference, static_argnums=0)
 
 
 class Scenarios(NamedTuple):
-    """Which scenarios.
+    """Which scenarios."""
 
-    sampling: how they are drawn (`tuning.sweeps.draws`).
-    seed: from which.
-    number: how many from the first.
-    """
-
-    sampling: str
-    seed: int
-    number: int
+    sampling: str  # how they are drawn (`tuning.sweeps.draws`)
+    seed: int  # from which
+    number: int  # how many from the first
 
 
 class Signals(NamedTuple):
@@ -61,16 +56,11 @@ class Signals(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """What became of the contacts.
+    """What became of the contacts."""
 
-    restitution: of each.
-    reference: the reference's.
-    status: as in `jaxhil.simulation.metrics`.
-    """
-
-    restitution: Float[np.ndarray, "slots lanes"]
-    reference: Float[np.ndarray, "slots lanes"]
-    status: Int[np.ndarray, "slots lanes"]
+    restitution: Float[np.ndarray, "slots lanes"]  # of each
+    reference: Float[np.ndarray, "slots lanes"]  # the reference's
+    status: Int[np.ndarray, "slots lanes"]  # as in `jaxhil.simulation.metrics`
 
     @property
     def error(self) -> Float[np.ndarray, "slots lanes"]:

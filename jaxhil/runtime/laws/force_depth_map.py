@@ -24,22 +24,14 @@ class Prior(NamedTuple):
     """What is known before any reading.
 
     Slopes are N(stiffness, common^2 + wandering^2 min(kappa_i, kappa_j) / 30 ms), what dissipates is
-    N(0, spread^2).
+    N(0, spread^2)."""
 
-    stiffness: mean of the slopes [1/s^2].
-    common: how uncertain all slopes are together [1/s^2].
-    wandering: how far they differ from depth to depth [1/s^2].
-    damping: spread of the damping [1/s].
-    depth_damping: spread of the damping that grows with depth [1/s].
-    unloading: spread of what unloading takes away [1/s^2].
-    """
-
-    stiffness: float
-    common: float
-    wandering: float
-    damping: float
-    depth_damping: float
-    unloading: float
+    stiffness: float  # mean of the slopes [1/s^2]
+    common: float  # how uncertain all slopes are together [1/s^2]
+    wandering: float  # how far they differ from depth to depth [1/s^2]
+    damping: float  # spread of the damping [1/s]
+    depth_damping: float  # spread of the damping that grows with depth [1/s]
+    unloading: float  # spread of what unloading takes away [1/s^2]
 
     def moments(self) -> tuple[list[float], list[list[float]]]:
         """Mean and covariance of all parameters."""
