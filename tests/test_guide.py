@@ -199,3 +199,6 @@ def test_examples_run(path, tmp_path):
     )  # fmt: skip
     assert ran.returncode == 0 and not ran.stderr, ran.stderr
     assert ran.stdout
+    # What a page prints below the example that comes last is what that prints.
+    *_, shown = re.findall(r"^```text\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S)
+    assert path.name == "README.md" or ran.stdout.endswith(shown)
