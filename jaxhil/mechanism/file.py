@@ -7,6 +7,7 @@ into a validated `Mechanism`. Whatever is wrong with them raises `InputError` wi
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import os
 import re
@@ -30,6 +31,7 @@ __all__ = [
     "builtin_path",
     "from_builtins",
     "load",
+    "source_sha256",
     "suite_names",
     "to_builtins",
 ]
@@ -41,6 +43,8 @@ MAX_KEY_PARTS = 64
 Overrides = Sequence[str] | Mapping[str, Any]
 
 SUITE = "suite-"  # begins the names of the standard suites
+
+_sources: dict[str, str] = {}  # digests of the files read, by those of what was read
 
 _FOLDER = Path(__file__).parent / "builtin"
 # The pieces of a TOML text that matter for where a dotted key begins and ends. An unclosed string
@@ -77,9 +81,16 @@ def load(path_or_name: str | os.PathLike[str] | None = None, overrides: Override
     else:
         path, label = Path(name), one_line(str(name)) or "''"
     data = _read(path, label)
-    return LoadedMechanism(
-        _resolve(_parse(data, label), label, overrides), hashlib.sha256(data).hexdigest(), label
-    )
+    mechanism, sha256 = _resolve(_parse(data, label), label, overrides), hashlib.sha256(data).hexdigest()
+    _sources[_content_sha256(mechanism)] = sha256
+    return LoadedMechanism(mechanism, sha256, label)
+
+
+def source_sha256(mechanism: Mechanism) -> str:
+    """SHA-256 in hex of the file that an equal mechanism was read from, or of its content if it was not read
+    from any."""
+    content = _content_sha256(mechanism)
+    return _sources.get(content, content)
 
 
 def from_builtins(raw: Mapping[str, Any], label: str) -> Mechanism:
@@ -118,6 +129,11 @@ def builtin_path(name: str) -> Path:
             f"allowed {', '.join(names)}{close_match(name, names)}"
         )
     return _FOLDER / f"{name}.toml"
+
+
+def _content_sha256(mechanism: Mechanism) -> str:
+    content = json.dumps(to_builtins(mechanism), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(content.encode()).hexdigest()
 
 
 def _names() -> list[str]:

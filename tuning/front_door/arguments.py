@@ -4,8 +4,6 @@ The same line serves function and command: an `ArgumentError` knows how its argu
 """
 
 import functools
-import hashlib
-import json
 import math
 import os
 import sys
@@ -14,7 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from jaxhil.errors import InputError, one_line, shown
-from jaxhil.mechanism.file import LoadedMechanism, load, to_builtins
+from jaxhil.mechanism.file import LoadedMechanism, source_sha256
+from jaxhil.mechanism.loading import as_mechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.runtime.laws import LAWS
 
@@ -127,25 +126,14 @@ def folder(name: str, value: Any) -> Path:
 def mechanisms(given: Any) -> tuple[list[LoadedMechanism], bool]:
     """The mechanisms given, one or several, each as `jaxhil.load` returns it or by its name or file; whether
     there were several. Raises `InputError`."""
-    listed, many = several(given, (Mechanism, str, os.PathLike, tuple))
+    listed, many = several(given, (Mechanism, str, os.PathLike))
     if not listed:
         raise ArgumentError("mechanism", "an empty list", "one mechanism or more")
     loaded = []
     for one in listed:
-        if isinstance(one, Mechanism):
-            one = _without_file(one)
-        elif isinstance(one, (str, os.PathLike)):
-            one = load(one if isinstance(one, str) else Path(one))
-        if not hasattr(one, "sha256") or not isinstance(getattr(one, "mechanism", None), Mechanism):
-            raise ArgumentError("mechanism", shown(one), "what jaxhil.load returns, or a name or path for it")
-        loaded.append(one)
+        checked = as_mechanism(one)
+        loaded.append(LoadedMechanism(checked, source_sha256(checked), checked.name))
     return loaded, many
-
-
-def _without_file(mechanism: Mechanism) -> LoadedMechanism:
-    """A mechanism that comes from no file, with the digest of its content."""
-    content = json.dumps(to_builtins(mechanism), sort_keys=True, separators=(",", ":"), ensure_ascii=True)
-    return LoadedMechanism(mechanism, hashlib.sha256(content.encode()).hexdigest(), mechanism.name)
 
 
 def gain_file(given: Any, argument: str = "gains") -> "LoadedGains":

@@ -30,6 +30,7 @@ from tuning.optimisation.derivative_free import apart, polish
 from tuning.optimisation.unit_box import to_coordinates
 
 SCAN_SCENARIOS = 32  # on which the points of a scan are tried
+KINKED = 3  # times as many evaluations without derivatives for a user's function
 BATCHES = 4  # of starts, at most
 SURE = 3  # starts that have to agree: two may have met in a poor basin
 AGREED = 0.005  # relative difference of values that count as the same minimum
@@ -82,6 +83,9 @@ def find_gains(
             own.evaluations += more
     # Where starts agree to that, the rest of the way down is within what scenarios decide.
     polishing = 0 if probed and not going else settings.polish * len(validation.names)
+    if objective.function is not None:
+        # It may have kinks everywhere, as a largest magnitude has.
+        polishing *= KINKED
     if polishing:
         report("searching on without derivatives")
     best = finish(validation, [own.starts for own in searches], polishing, settings.seed, objective)
