@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import NamedTuple
 
 import jaxhil.runtime
+from tuning.bundle.foreign_law import module_text
 
 OUTSIDE = {*sys.stdlib_module_names, "numpy"}
 
@@ -40,9 +41,12 @@ def runtime_source(compensator: str, package: ModuleType = jaxhil.runtime) -> st
     library nor of NumPy; a name that two modules bind.
     """
     laws = importlib.import_module(f"{package.__name__}.registry").COMPENSATORS
-    law = laws[compensator].__module__.removeprefix(f"{package.__name__}.")
+    law, own = laws[compensator].__module__.removeprefix(f"{package.__name__}."), {}
+    if law == laws[compensator].__module__:
+        law = f"laws.{compensator}"
+        own[law] = source_of(module_text(laws[compensator], compensator), law, f"{compensator}.py")
     offered = read_source(Path(str(package.__file__)), "")
-    sources = _in_order(Path(str(package.__file__)).parent, [law, *_offering(offered)])
+    sources = _in_order(Path(str(package.__file__)).parent, [law, *_offering(offered)], own)
     _check_unique(sources)
     public = [name for name in _public(offered) if name in offered.inside]
     imports = {line for source in sources for line in source.outside}
@@ -71,8 +75,12 @@ def runtime_source(compensator: str, package: ModuleType = jaxhil.runtime) -> st
 
 def read_source(path: Path, name: str) -> Source:
     """A module of the package, its docstring, imports and `__all__` apart from what it does."""
-    text = path.read_text(encoding="utf-8")
-    tree = ast.parse(text, str(path))
+    return source_of(path.read_text(encoding="utf-8"), name, path.name)
+
+
+def source_of(text: str, name: str, file: str) -> Source:
+    """The same of a module's text; errors name the `file`."""
+    tree = ast.parse(text, file)
     inside: dict[str, str] = {}
     outside: list[str] = []
     dropped = [one for one in tree.body if _assigns(one, "__all__")]
@@ -80,7 +88,7 @@ def read_source(path: Path, name: str) -> Source:
     for node in ast.walk(tree):
         if not isinstance(node, (ast.Import, ast.ImportFrom)):
             continue
-        where = f"{path.name}, line {node.lineno}"
+        where = f"{file}, line {node.lineno}"
         if isinstance(node, ast.ImportFrom) and node.level:
             if node not in tree.body:
                 raise ValueError(f"{where}: an import of the package within a block")
@@ -111,8 +119,9 @@ def _from_outside(node: ast.Import | ast.ImportFrom, where: str) -> Iterator[str
         yield f"from {module} {named}" if isinstance(node, ast.ImportFrom) else named
 
 
-def _in_order(folder: Path, wanted: Iterable[str]) -> list[Source]:
-    """The modules wanted and what they import, directly or not, each after those that it imports itself."""
+def _in_order(folder: Path, wanted: Iterable[str], own: dict[str, Source]) -> list[Source]:
+    """The modules wanted and what they import, directly or not, each after those that it imports itself;
+    those of the `own` sources are not read from the folder."""
     ordered: dict[str, Source] = {}
 
     def visit(name: str, above: tuple[str, ...]) -> None:
@@ -120,7 +129,7 @@ def _in_order(folder: Path, wanted: Iterable[str]) -> list[Source]:
             raise ValueError(f"modules that import each other: {' -> '.join([*above, name])}")
         if name in ordered:
             return
-        source = read_source(folder / f"{name.replace('.', '/')}.py", name)
+        source = own.get(name) or read_source(folder / f"{name.replace('.', '/')}.py", name)
         for needed in dict.fromkeys(source.inside.values()):
             visit(needed, (*above, name))
         ordered[name] = source

@@ -1,0 +1,156 @@
+"""`import tuning`: five functions, the same figures as the commands, laws from outside, one-line refusals."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import jax.numpy as jnp
+import pytest
+from front_door_laws import Difference, DifferenceOnTheRig, Quadratic
+
+import jaxhil
+import tuning
+
+SCRIPT = Path(__file__).parent / "interface_script.py"
+SMALL = {"scenarios": 4, "starts": 1, "steps": 2, "validation": 16}
+TINY = ["--scenarios", "4", "--starts", "1", "--steps", "2", "--validation", "16"]
+
+
+@pytest.fixture(scope="module")
+def tuned():
+    return tuning.tune("rig-300kg", "phase_lead", **SMALL)
+
+
+@pytest.mark.users_options
+def test_the_script_of_the_interface_runs(tmp_path):
+    """In a process of its own, whose jax computes in float32 and stays so."""
+    shutil.copy(SCRIPT, tmp_path)
+    check = "import jax; assert not jax.config.jax_enable_x64 and 'XLA_FLAGS' not in __import__('os').environ"
+    (tmp_path / "script.py").write_text(f"{SCRIPT.read_text()}\n{check}\n")
+    environment = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "NPROC")}
+    environment["PYTHONPATH"] = str(SCRIPT.parent.parent)
+    ran = subprocess.run(
+        [sys.executable, "-W", "error", "script.py"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stderr == ""
+    printed = ran.stdout.splitlines()
+    assert printed[3].split()[-1] == "64" and printed[5] == "True"
+    written = {path.name for path in tmp_path.iterdir()}
+    assert written == {SCRIPT.name, "script.py", "run.csv", "run.png", "gains.json", "bundle"}
+
+
+def test_nothing_is_loaded_before_it_is_asked_for():
+    code = "import sys, tuning; assert 'sweep' in dir(tuning); tuning.sweep; assert 'jax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_command_tunes_the_same(jaxhil, tuned, tmp_path):
+    jaxhil("tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY)
+    written = json.loads((tmp_path / "rig-300kg" / "gains.json").read_text())
+    assert written["sha256"] == tuned.document["sha256"]
+    assert tuned.verdict == "bad" and tuned.figures["tuned"].rms < tuned.figures["before"].rms
+
+
+def test_a_study_that_keeps_nothing_is_the_stored_one(tuned, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    study = tuning.sweep(tuned, scenarios=40, chunk=32, limit=0.5)
+    assert not list(tmp_path.iterdir()) and capsys.readouterr() == ("", "")
+    kept = tuning.sweep(tuned, scenarios=40, chunk=32, limit=0.5, folder="store")
+    assert study.table.equals(kept.table) and study.table.num_rows == 40
+    assert study.failure_probability == kept.failure_probability
+    assert study.interval.low <= study.failure_probability <= study.interval.high
+    with study.store() as one, kept.store() as other:
+        assert one.manifest.sha256 == other.manifest.sha256
+
+
+def test_laws_from_outside_go_all_the_way(tmp_path):
+    jaxhil.register(Quadratic())
+    jaxhil.register(Difference())
+    mechanism = jaxhil.load("rig-300kg", {"contact.law": "quadratic"})
+    run = jaxhil.simulate(mechanism, "difference")
+    slope = jaxhil.jacobian(mechanism, "difference", of="restitution", by=["gains.share"])
+    assert run.status == "ok" and slope["gains.share"][0] < 0
+    result = tuning.tune(mechanism, "difference", **SMALL)
+    assert result.gains["share"] > 2 and result.figures["tuned"].rms < result.figures["literature"].rms
+    result.save(tmp_path / "gains.json")
+    study = tuning.sweep(tmp_path / "gains.json", scenarios=32, chunk=32)
+    assert study.table.num_rows == 32
+    board = tuning.compare(mechanism, ["difference"], scenarios=4, judged=8)
+    figures = board.figures["difference"]
+    assert figures["tuned"].rms < figures["literature"].rms.low
+    for refused in (lambda: tuning.export(result, tmp_path / "bundle"), lambda: tuning.verify(result)):
+        with pytest.raises(jaxhil.InputError, match="difference: found no runtime class"):
+            refused()
+    jaxhil.register(Difference(), runtime=DifferenceOnTheRig)
+    exported = tuning.export(tmp_path / "gains.json", tmp_path / "bundle", sweep=study)
+    assert exported.good and "c99" not in exported.document["formats"]
+    assert tuning.verify(tmp_path / "bundle").good
+
+
+def test_an_objective_of_the_users_own_gets_contacts_and_scenarios():
+    shapes = []
+
+    def largest(metrics):
+        shapes.append({leaf.shape for leaf in metrics})
+        return jnp.abs(metrics.error).max()
+
+    result = tuning.tune("varying", "phase_lead", objective=largest, **SMALL)
+    assert all(shape == {(3, 4)} for shape in shapes)
+    worst = result.found.starts[0].history[0]
+    assert min(start.rms for start in result.found.starts) <= worst
+
+
+@pytest.mark.parametrize(
+    ("objective", "words"),
+    [
+        (lambda metrics: metrics.error, "shape"),
+        (lambda metrics: -2.0 + 0 * jnp.max(metrics.error), "found -2,"),
+        (lambda metrics: jnp.nan * jnp.max(metrics.error), "nan"),
+        (lambda metrics: jnp.max(metrics.speed), "AttributeError"),
+        (lambda metrics: None, "NoneType"),
+        ("least", "rms, cvar, worst"),
+    ],
+)
+def test_an_objective_that_will_not_do_is_refused(objective, words):
+    with pytest.raises(jaxhil.InputError, match="objective: found") as refused:
+        tuning.tune("rig-300kg", "phase_lead", objective=objective, **SMALL)
+    assert words in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: tuning.tune("nowhere", "phase_lead"), "nowhere"),
+        (lambda: tuning.tune([], "phase_lead"), "mechanism: found an empty list"),
+        (lambda: tuning.tune(3, "phase_lead"), "mechanism: found 3"),
+        (lambda: tuning.tune("varying", "lead"), "compensator: found 'lead', allowed none,"),
+        (lambda: tuning.tune("varying", starts="2"), "starts: found '2', allowed an integer >= 1"),
+        (lambda: tuning.tune("varying", scenarios=0), "scenarios: found 0, allowed an integer >= 1"),
+        (lambda: tuning.tune("varying", setting="soft"), "setting: found 'soft'"),
+        (lambda: tuning.tune("varying", start="nowhere.json"), "nowhere.json: cannot be read"),
+        (lambda: tuning.tune("varying", limit=-1), "limit: found -1, allowed a number >= 0"),
+        (lambda: tuning.sweep("nowhere.json"), "nowhere.json: cannot be read"),
+        (lambda: tuning.sweep(7), "gains: found 7, allowed a path"),
+        (lambda: tuning.sweep("x", sampling="grid"), "sampling: found 'grid', allowed random, sobol"),
+        (lambda: tuning.sweep("x", resume=True), "resume: found without a folder"),
+        (lambda: tuning.compare("varying", ["none", "lead"]), "compensators: found 'lead'"),
+        (lambda: tuning.compare("varying", 3), "compensators: found 3"),
+        (lambda: tuning.export("nowhere.json", "x"), "nowhere.json: cannot be read"),
+        (lambda: tuning.export("x", "y", limits={"speed": 1}), "limits: found 'speed', allowed one of"),
+        (lambda: tuning.verify("nowhere"), "nowhere: cannot be read"),
+        (lambda: tuning.verify("nowhere", scenarios=0), "scenarios: found 0"),
+    ],
+)
+def test_what_will_not_do_is_refused_in_one_line(call, words):
+    with pytest.raises(jaxhil.InputError) as refused:
+        call()
+    assert words in str(refused.value) and "\n" not in str(refused.value)
