@@ -21,27 +21,17 @@ SEED = 0xFA1  # of the scenarios to judge on: tuning and its own validation neve
 
 @dataclass(frozen=True)
 class CompareSettings:
-    """Settings of a comparison.
+    """Settings of a comparison."""
 
-    scenarios: to tune on.
-    starts, steps: of the solver.
-    polish: evaluations without derivatives, for each gain.
-    scanned: points of a scan for starts.
-    judged: scenarios to judge on.
-    limit: error beyond which a contact counts as a failure [1].
-    seed: of scenarios, starts and resampling.
-    tuned: whether to tune at all.
-    """
-
-    scenarios: int = 32
-    starts: int = 3
-    steps: int = 16
-    polish: int = 20
-    scanned: int = 64
-    judged: int = 256
-    limit: float = 0.01
-    seed: int = 0
-    tuned: bool = True
+    scenarios: int = 32  # to tune on
+    starts: int = 3  # of the solver
+    steps: int = 16  # of the solver, at most
+    polish: int = 20  # evaluations without derivatives, for each gain
+    scanned: int = 64  # points of a scan for starts
+    judged: int = 256  # scenarios to judge on
+    limit: float = 0.01  # error beyond which a contact counts as a failure [1]
+    seed: int = 0  # of scenarios, starts and resampling
+    tuned: bool = True  # whether to tune at all
 
 
 class LawFigures(NamedTuple):

@@ -57,22 +57,22 @@ class Inputs(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One line of vectors.csv; `force_simulated` is nan where there is nothing to compare with."""
+    """One line of vectors.csv, in SI units."""
 
-    run: int
+    run: int  # as in `Inputs`, and so the next six
     event: int
     force_measured: float
     position_desired: float
     velocity_desired: float
     position_measured: float
     time: float | None
-    position: float
+    position: float  # the numerical model's at the next tick
     velocity: float
     acceleration: float
-    force_command: float
-    position_command: float
-    faults: int
-    force_simulated: float
+    force_command: float  # of the runtime
+    position_command: float  # of the runtime
+    faults: int  # their bits
+    force_simulated: float  # nan where there is nothing to compare with
 
 
 class Recorded(NamedTuple):

@@ -21,17 +21,12 @@ _MAT_HEADER = b"MATLAB 5.0 MAT-file, made by jaxhil export"
 
 
 class Entry(NamedTuple):
-    """A gain or a limit.
+    """A gain or a limit."""
 
-    value: [SI].
-    unit: of the value.
-    lower, upper: bounds; None for a limit, which has none.
-    """
-
-    value: float
-    unit: str
-    lower: float | None = None
-    upper: float | None = None
+    value: float  # [SI]
+    unit: str  # of the value
+    lower: float | None = None  # bound; None for a limit, which has none
+    upper: float | None = None  # likewise
 
 
 def gain_entries(document: Mapping[str, Any]) -> dict[str, Entry]:

@@ -36,23 +36,15 @@ _APART = ("integrator", "hold", "latency", "is_two_sided")
 
 @dataclass(frozen=True)
 class CommonProgram:
-    """What mechanisms that share a program have in common.
+    """What mechanisms that share a program have in common."""
 
-    laws: contact laws by name.
-    segments, slots: numbers of segments, and of result slots.
-    parts: names of the optional parts of the loop that some mechanism has.
-    first_break: the first derivative that breaks at a tick.
-    ring: samples in the delay lines.
-    beforehand: whether integrated references are computed beforehand, as every first contact's can be.
-    """
-
-    laws: tuple[str, ...]
-    segments: int
-    slots: int
-    parts: tuple[str, ...]
-    first_break: int
-    ring: int
-    beforehand: bool
+    laws: tuple[str, ...]  # contact laws by name
+    segments: int  # of a contact law, at most
+    slots: int  # result slots
+    parts: tuple[str, ...]  # names of the optional parts of the loop that some mechanism has
+    first_break: int  # the first derivative that breaks at a tick
+    ring: int  # samples in the delay lines
+    beforehand: bool  # whether integrated references are computed beforehand, as every first contact's can be
 
     def law(self, beforehand: bool | None = None) -> AnyOf:
         """The laws' mixture; with references that are integrated, unless they come `beforehand`."""

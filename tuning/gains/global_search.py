@@ -17,12 +17,10 @@ LANES = 8192  # side by side, which is quicker than few at a time
 
 
 class GlobalComparison(NamedTuple):
-    """Tuned gains beside the best found anywhere.
+    """Tuned gains beside the best found anywhere."""
 
-    tuned, best: values of the objective [1]."""
-
-    tuned: float
-    best: float
+    tuned: float  # value of the objective [1]
+    best: float  # that of the best [1]
     above: float  # by what share of the best value the tuned one lies above it; negative: below
     spent: int  # evaluations of tuning, a Jacobian over P gains counted as 1 + P
     evaluations: int  # those of the search

@@ -62,24 +62,19 @@ class Objective:
         N  max(0, A - 1) [1], A the amplification of the force sensor's white noise, from the gains alone
            (`Compensator.noise_amplification`); a command quieter than the measured force earns nothing
 
-    name: of the figure, one of `OBJECTIVES`.
-    function: a function of the user's own in its place, of the metrics of all scenarios but the probes;
-        divergence_weight has no part in it.
-    divergence_weight: how much more a squared divergence (e > e*) counts than a squared convergence [1].
-    command_weight: restitution error that weighs as much as a command one reference peak too high [1].
-    noise_weight: as much as an amplification one too large [1].
-    chatter_weight: as much as one swing over the reference's peak too many [1].
-    transparency_weight: with 1, the probes' errors count as much as those of the scenarios [1].
-
     Raises `InputError` for another name or a weight that is negative or not finite, or 0 for divergence.
     """
 
-    name: str = "rms"
+    name: str = "rms"  # of the figure, one of `OBJECTIVES`
+    # how much more a squared divergence (e > e*) counts than a squared convergence [1]
     divergence_weight: float = 1.0
+    # restitution error that weighs as much as a command one reference peak too high [1]
     command_weight: float = 0.0
-    noise_weight: float = 0.0
-    chatter_weight: float = 0.0
-    transparency_weight: float = 0.0
+    noise_weight: float = 0.0  # as much as an amplification one too large [1]
+    chatter_weight: float = 0.0  # as much as one swing over the reference's peak too many [1]
+    transparency_weight: float = 0.0  # with 1, probes' errors count as much as those of the scenarios [1]
+    # a function of the user's own in the figure's place, of the metrics of all scenarios but the probes;
+    # divergence_weight has no part in it
     function: MetricsFunction | None = None
 
     def __post_init__(self):
@@ -101,31 +96,25 @@ RMS = Objective()
 
 
 class Terms(NamedTuple):
-    """What of an objective shapes the compiled program.
+    """What of an objective shapes the compiled program."""
 
-    name: its figure.
-    command, noise, chatter: whether these have a part.
-    transparency: whether the scenarios come with probes.
-    function, contacts: the user's function in the place of the figure, if any, and how many contacts it gets.
-    """
-
-    name: str
-    command: bool
-    noise: bool
-    chatter: bool
-    transparency: bool = False
-    function: MetricsFunction | None = None
-    contacts: int = 0
+    name: str  # of its figure
+    command: bool  # whether the command has a part
+    noise: bool  # whether the noise has one
+    chatter: bool  # whether the chatter has one
+    transparency: bool = False  # whether the scenarios come with probes
+    function: MetricsFunction | None = None  # the user's, in the place of the figure, if any
+    contacts: int = 0  # how many the user's function gets
 
 
 class Weights(NamedTuple):
     """The weights of an objective (`Objective`): numbers that one program takes, each problem its own."""
 
-    divergence: Float[Array, "*problems"]
-    command: Float[Array, "*problems"]
-    noise: Float[Array, "*problems"]
-    chatter: Float[Array, "*problems"]
-    transparency: Float[Array, "*problems"]
+    divergence: Float[Array, "*problems"]  # of a squared divergence over a squared convergence [1]
+    command: Float[Array, "*problems"]  # of the command's excess [1]
+    noise: Float[Array, "*problems"]  # of the amplification beyond 1 [1]
+    chatter: Float[Array, "*problems"]  # of the chatter [1]
+    transparency: Float[Array, "*problems"]  # of the probes' errors [1]
 
 
 class Problem(NamedTuple):

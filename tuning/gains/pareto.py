@@ -28,28 +28,19 @@ DIGITS = 4  # significant ones, in which points are compared
 
 
 class Point(NamedTuple):
-    """Gains on the way between accuracy and the axis's cost, judged on fresh scenarios.
+    """Gains on the way between accuracy and the axis's cost, judged on fresh scenarios."""
 
-    gains: all of the compensator's.
-    weight: of the axis [1], that they were tuned with; None: tuned otherwise.
-    cost: on the axis [1]: the amplification A of the force sensor's noise, the 99th percentile of the peak
-        command over the reference's, or the rms error of the transparency probes.
-    error: the objective without the axis's term [1].
-    figures, nominal: figures of fresh scenarios and of the nominal run.
-    intervals: 95 % intervals of `figures`.
-    on_front: whether no other point beats it (`dominated`).
-    transparency: transparency, slope and peak, where scenarios are probed.
-    """
-
-    gains: dict[str, float]
-    weight: float | None
+    gains: dict[str, float]  # all of the compensator's
+    weight: float | None  # of the axis [1], that they were tuned with; None: tuned otherwise
+    # on the axis [1]: the amplification A of the force sensor's noise, the 99th percentile of the peak
+    # command over the reference's, or the rms error of the transparency probes
     cost: float
-    error: float
-    figures: ErrorFigures
-    nominal: ErrorFigures
-    intervals: ErrorIntervals
-    on_front: bool
-    transparency: dict[str, Estimate] | None = None
+    error: float  # the objective without the axis's term [1]
+    figures: ErrorFigures  # of fresh scenarios
+    nominal: ErrorFigures  # those of the nominal run
+    intervals: ErrorIntervals  # 95 % intervals of `figures`
+    on_front: bool  # whether no other point beats it (`dominated`)
+    transparency: dict[str, Estimate] | None = None  # transparency, slope and peak, if probed
 
     @property
     def place(self) -> tuple[float, float]:
@@ -58,17 +49,12 @@ class Point(NamedTuple):
 
 
 class Front(NamedTuple):
-    """What can be had of accuracy and of the axis's cost.
+    """What can be had of accuracy and of the axis's cost."""
 
-    points: in the order of their weights, the first without.
-    literature, tuned: the literature's gains, and those tuned before.
-    axis: what accuracy is traded against.
-    """
-
-    points: list[Point]
-    literature: Point
-    tuned: Point
-    axis: Axis = NOISE
+    points: list[Point]  # in the order of their weights, the first without
+    literature: Point  # the literature's gains
+    tuned: Point  # those tuned before
+    axis: Axis = NOISE  # what accuracy is traded against
 
 
 def dominated(places: Sequence[tuple[float, float]]) -> list[bool]:

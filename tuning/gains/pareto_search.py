@@ -35,19 +35,13 @@ IMPROVED = 1e-3  # by which a point gets better in a pass that is not the last
 
 
 class Axis(NamedTuple):
-    """What the error is traded against.
+    """What the error is traded against."""
 
-    name: as commands call it.
-    weight: the field of `Objective` that weighs it.
-    cost, words: the cost's name in JSON, and in words.
-    least: what the ladder of weights is made for where there is next to nothing to trade.
-    """
-
-    name: str
-    weight: str
-    cost: str
-    words: str
-    least: float
+    name: str  # as commands call it
+    weight: str  # the field of `Objective` that weighs it
+    cost: str  # its name in JSON
+    words: str  # its name in a sentence
+    least: float  # what the ladder of weights is made for where there is next to nothing to trade
 
 
 NOISE = Axis("noise", "noise_weight", "noise_amplification", "amplification of sensor noise", LEAST_EXCESS)

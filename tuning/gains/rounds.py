@@ -50,19 +50,13 @@ class Start(NamedTuple):
 
 @dataclasses.dataclass
 class _Problem:
-    """A start on its way.
+    """A start on its way."""
 
-    task: index of its task.
-    coordinates, curvature: unit coordinates now, and J^T J there.
-    status: index into `STATUSES`, or why it was given up.
-    history: loss after every step so far.
-    """
-
-    task: int
-    coordinates: np.ndarray
-    curvature: np.ndarray
-    status: int | str = STEP_LIMIT
-    history: list[float] = dataclasses.field(default_factory=list)
+    task: int  # index of its task
+    coordinates: np.ndarray  # unit coordinates now
+    curvature: np.ndarray  # J^T J there
+    status: int | str = STEP_LIMIT  # index into `STATUSES`, or why it was given up
+    history: list[float] = dataclasses.field(default_factory=list)  # loss after every step
 
     @property
     def loss(self) -> float:

@@ -33,22 +33,15 @@ SCENARIOS, NOISY_SCENARIOS = 32, 128  # to tune on, without and with sensor nois
 
 @dataclass(frozen=True)
 class TuneTask:
-    """A mechanism to tune.
+    """A mechanism to tune."""
 
-    mechanism, compensator: what is tuned for what.
-    literature: the compensator's gains by the literature's rule, or those of a setting.
-    scenarios, loop: scenarios to tune on, and the loop that runs them.
-    common: the program it shares with unlike mechanisms, if it does.
-    probed: whether each scenario comes with its transparency probes (`tuning.transparency.probes`).
-    """
-
-    mechanism: Mechanism
-    compensator: str
-    literature: dict[str, float]
-    scenarios: Scenario
-    loop: Loop
-    common: CommonProgram | None = None
-    probed: bool = False
+    mechanism: Mechanism  # what is tuned for
+    compensator: str  # what is tuned
+    literature: dict[str, float]  # the compensator's gains by the literature's rule, or those of a setting
+    scenarios: Scenario  # to tune on
+    loop: Loop  # that runs them
+    common: CommonProgram | None = None  # the program it shares with unlike mechanisms, if it does
+    probed: bool = False  # whether each scenario comes with its transparency probes
 
     @property
     def number(self) -> int:

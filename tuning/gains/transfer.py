@@ -19,12 +19,10 @@ from tuning.gain_file import validity_envelope
 
 
 class Traits(NamedTuple):
-    """What a mechanism's restitution without compensation depends on, nominally.
+    """What a mechanism's restitution without compensation depends on, nominally."""
 
-    slowest, fastest: contact omega [rad/s]."""
-
-    slowest: float
-    fastest: float
+    slowest: float  # omega of the slowest contact [rad/s]
+    fastest: float  # of the fastest [rad/s]
     force_delay: float  # delay and lag of the force sensor [s]
     simulator_delay: float  # those of the motion simulator with its command [s]
     control_period: float  # [s]

@@ -29,13 +29,11 @@ BLOCK = 16  # mechanisms tuned and judged together: what is done when work is in
 
 
 class ErrorFigures(NamedTuple):
-    """What is said of the restitution errors e - e* of all contacts of a batch.
+    """What is said of the restitution errors e - e* of all contacts of a batch."""
 
-    rms, p99, max: root mean square, 99th percentile and maximum of |e - e*| [1]."""
-
-    rms: float
-    p99: float
-    max: float
+    rms: float  # root mean square of |e - e*| [1]
+    p99: float  # 99th percentile of it [1]
+    max: float  # maximum of it [1]
     mean: float  # of e - e* [1]
     diverging: float  # share of contacts with e > e* [1]
     peak_ratio: float  # largest |F_c| over the reference's peak force [1]
@@ -52,38 +50,24 @@ class Freedom(NamedTuple):
 
 @dataclass(frozen=True)
 class TuneResult:
-    """What tuning found for one mechanism; "before" is no compensation.
+    """What tuning found for one mechanism; "before" is no compensation."""
 
-    compensator, mechanism, settings: what was tuned, for what, and how.
-    gains, literature: all of the compensator's gains, as tuned and by the literature's rule.
-    figures: of "before", "literature" and "tuned" on the same fresh scenarios.
-    nominal: the same figures of the nominal run.
-    starts: every start of the solver.
-    outcomes, scenarios: on the fresh scenarios, for plots.
-    timings: seconds by stage.
-    intervals: 95 % intervals of the tuned figures.
-    first: what the last starts of the first batch took their gains from.
-    freedom: how far each tuned gain may move (`tuning.optimisation.sensitivity`).
-    global_comparison: how far from the best anywhere, if that was searched.
-    transparency: transparency, slope and peak of each on the fresh scenarios, where they are probed
-        (`tuning.transparency.probes`).
-    """
-
-    compensator: str
-    mechanism: Mechanism
-    gains: dict[str, float]
-    literature: dict[str, float]
-    figures: dict[str, ErrorFigures]
-    nominal: dict[str, ErrorFigures]
-    starts: list[Start]
-    outcomes: dict[str, Outcome]
-    scenarios: Scenario
-    settings: TuneSettings
-    timings: dict[str, float] = field(default_factory=dict)
-    intervals: ErrorIntervals | None = None
-    first: tuple[Tuned, ...] = ()
-    freedom: dict[str, Freedom] = field(default_factory=dict)
-    global_comparison: GlobalComparison | None = None
+    compensator: str  # what was tuned
+    mechanism: Mechanism  # for what it was
+    gains: dict[str, float]  # all of the compensator's, as tuned
+    literature: dict[str, float]  # by the literature's rule
+    figures: dict[str, ErrorFigures]  # of "before", "literature" and "tuned" on the same fresh scenarios
+    nominal: dict[str, ErrorFigures]  # the same figures of the nominal run
+    starts: list[Start]  # every start of the solver
+    outcomes: dict[str, Outcome]  # on the fresh scenarios, for plots
+    scenarios: Scenario  # the fresh ones, for plots
+    settings: TuneSettings  # how it was tuned
+    timings: dict[str, float] = field(default_factory=dict)  # seconds by stage
+    intervals: ErrorIntervals | None = None  # 95 % intervals of the tuned figures
+    first: tuple[Tuned, ...] = ()  # what the last starts of the first batch took their gains from
+    freedom: dict[str, Freedom] = field(default_factory=dict)  # how far each tuned gain may move
+    global_comparison: GlobalComparison | None = None  # how far from the best anywhere, if that was searched
+    # transparency, slope and peak of each, where the scenarios are probed
     transparency: dict[str, dict[str, Estimate]] = field(default_factory=dict)
 
     @property

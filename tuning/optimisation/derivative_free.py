@@ -145,40 +145,28 @@ def mirror(points: Float[np.ndarray, "*points"]) -> Float[np.ndarray, "*points"]
 
 
 class _Generation(NamedTuple):
-    """The normal distribution that candidates are drawn from, of every start.
+    """The normal distribution that candidates are drawn from, of every start."""
 
-    mean, step, covariance: its mean, and its covariance step^2 C.
-    root, inverse_root: of C.
-    step_path, shape_path: evolution paths, of the step and of C.
-    """
-
-    mean: np.ndarray
-    step: np.ndarray
-    covariance: np.ndarray
-    root: np.ndarray
-    inverse_root: np.ndarray
-    step_path: np.ndarray
-    shape_path: np.ndarray
+    mean: np.ndarray  # its mean
+    step: np.ndarray  # sigma
+    covariance: np.ndarray  # C: that of the distribution is sigma^2 C
+    root: np.ndarray  # of C
+    inverse_root: np.ndarray  # of C
+    step_path: np.ndarray  # evolution path of the step
+    shape_path: np.ndarray  # evolution path of C
 
 
 class _Constants(NamedTuple):
-    """Constants of the evolution; in brackets the tutorial's names.
+    """Constants of the evolution; in brackets the tutorial's names."""
 
-    weights: of the better half of the candidates.
-    step_rate, damping: of the step (c_sigma, d_sigma).
-    path_rate, rank_one, rank_mu: of the covariance (c_c, c_1, c_mu).
-    effective: number of candidates (mu_eff).
-    length: of a path of random steps, expected (E|N(0, I)|).
-    """
-
-    weights: np.ndarray
-    step_rate: float
-    damping: float
-    path_rate: float
-    rank_one: float
-    rank_mu: float
-    effective: float
-    length: float
+    weights: np.ndarray  # of the better half of the candidates
+    step_rate: float  # of the step (c_sigma)
+    damping: float  # of the step (d_sigma)
+    path_rate: float  # of the covariance's path (c_c)
+    rank_one: float  # of the covariance (c_1)
+    rank_mu: float  # of the covariance (c_mu)
+    effective: float  # number of candidates (mu_eff)
+    length: float  # of a path of random steps, expected (E|N(0, I)|)
 
 
 def _constants(gains: int, candidates: int) -> _Constants:

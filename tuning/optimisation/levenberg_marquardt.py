@@ -227,15 +227,14 @@ class _BoxedLevenbergMarquardt(optx.AbstractGaussNewton):
 
 
 class _Recording(optx.AbstractLeastSquaresSolver):
-    """A solver that keeps the loss of every accepted iterate, and ends after `steps` of them, a number that
-    is no part of the program."""
+    """A solver that keeps the loss of every accepted iterate."""
 
     rtol: float
     atol: float
     norm: Callable[[Any], Array]
     inner: optx.AbstractLeastSquaresSolver
-    steps: Int[Array, ""]
-    longest: int = eqx.field(static=True)
+    steps: Int[Array, ""]  # after which it ends: a number that is no part of the program
+    longest: int = eqx.field(static=True)  # the most there can be, which is
 
     def __init__(self, inner: optx.AbstractLeastSquaresSolver, steps: Int[Array, ""], longest: int):
         self.rtol, self.atol, self.norm = inner.rtol, inner.atol, inner.norm

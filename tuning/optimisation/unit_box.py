@@ -9,11 +9,11 @@ from jaxtyping import Array, Float
 
 
 class Bounds(NamedTuple):
-    """Of each gain: lower and upper bound, and whether its scale is logarithmic (1) or not (0)."""
+    """The range of each gain."""
 
-    lower: Float[Array | np.ndarray, "*problems gains"]
-    upper: Float[Array | np.ndarray, "*problems gains"]
-    logarithmic: Float[Array | np.ndarray, "*problems gains"]
+    lower: Float[Array | np.ndarray, "*problems gains"]  # lower bound
+    upper: Float[Array | np.ndarray, "*problems gains"]  # upper bound
+    logarithmic: Float[Array | np.ndarray, "*problems gains"]  # 1 where the scale is logarithmic, else 0
 
 
 def to_gains(coordinates: Float[Any, "*points gains"], bounds: Bounds) -> Float[Any, "*points gains"]:

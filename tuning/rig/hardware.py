@@ -23,12 +23,10 @@ STALLED = "stalled"  # a contact that the machine left without new commands
 
 
 class Commanded(NamedTuple):
-    """What the controller has commanded.
+    """What the controller has commanded."""
 
-    lowest, highest: position commands [m]."""
-
-    lowest: float
-    highest: float
+    lowest: float  # position command [m]
+    highest: float  # likewise [m]
     not_finite: int  # how many were not finite; these do not reach the drives
     beyond_limits: int  # how many were beyond the drives' stroke; neither do these
     largest_force: float  # the largest |F_c| [N]

@@ -26,23 +26,15 @@ class Place(NamedTuple):
 
 
 class Propagation(NamedTuple):
-    """The response over one period: rows of numbers, see the module's text.
+    """The response over one period: rows of numbers, see the module's text."""
 
-    transition: the state one period later.
-    start, end: of an interval, from within.
-    sample: where the force is read.
-    measured: where the position is read.
-    steady_command: the state of a uniform motion, per command now [m].
-    steady_step: the same, per growth of the command in a period [m].
-    """
-
-    transition: tuple[Row, ...]
-    start: Place
-    sample: Place
-    end: Place
-    measured: Row
-    steady_command: Row
-    steady_step: Row
+    transition: tuple[Row, ...]  # the state one period later
+    start: Place  # of an interval, from within
+    sample: Place  # where the force is read
+    end: Place  # of an interval, from within
+    measured: Row  # where the position is read
+    steady_command: Row  # the state of a uniform motion, per command now [m]
+    steady_step: Row  # the same, per growth of the command in a period [m]
 
 
 def split_delay(delay: float, period: float) -> tuple[int, float]:

@@ -39,36 +39,26 @@ LAST = Reading(STOP, 0xFFFFFFFF, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Quantiles(NamedTuple):
-    """Of a time [s]: median, 99.9th percentile, maximum."""
+    """Of a time [s]."""
 
     median: float
-    p999: float
+    p999: float  # 99.9th percentile
     maximum: float
 
 
 class LoopFigures(NamedTuple):
-    """One loop in figures.
+    """One loop in figures."""
 
-    ticks: played.
-    missed: of these.
-    missed_by_controller, missed_by_injection, missed_by_machine: of the missed, by whose fault.
-    stood_still: for how long the rig's clock stood still [s].
-    tick_time: the controller's own time per tick [s].
-    tick_cpu: the CPU time in it [s].
-    round_trip: from a packet to its answer [s].
-    lateness: by how much packets left late [s].
-    """
-
-    ticks: int
-    missed: int
-    missed_by_controller: int
-    missed_by_injection: int
-    missed_by_machine: int
-    stood_still: float
-    tick_time: Quantiles
-    tick_cpu: Quantiles
-    round_trip: Quantiles
-    lateness: Quantiles
+    ticks: int  # played
+    missed: int  # of these
+    missed_by_controller: int  # of the missed, by whose fault
+    missed_by_injection: int  # likewise
+    missed_by_machine: int  # likewise
+    stood_still: float  # for how long the rig's clock stood still [s]
+    tick_time: Quantiles  # the controller's own time per tick [s]
+    tick_cpu: Quantiles  # the CPU time in it [s]
+    round_trip: Quantiles  # from a packet to its answer [s]
+    lateness: Quantiles  # by how much packets left late [s]
 
 
 class LoopTimes(NamedTuple):

@@ -51,30 +51,19 @@ class Reading(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """To the rig, about one reading.
+    """To the rig, about one reading."""
 
-    flags: any of `FLAGS`.
-    sequence, run, tick: the reading's.
-    position_command: position [m] to command at the next tick; while preparing, at tick 0.
-    command_rate: its rate [m/s].
-    position: the numerical model's position [m] at this tick.
-    velocity: its velocity [m/s].
-    force_command: the force F_c [N] that it feels.
-    faults: the bits of the controller's faults.
-    words: why the controller has tripped; empty if it has not.
-    """
-
-    flags: int
-    sequence: int
-    run: int
-    tick: int
-    position_command: float
-    command_rate: float
-    position: float
-    velocity: float
-    force_command: float
-    faults: int
-    words: str
+    flags: int  # any of `FLAGS`
+    sequence: int  # the reading's
+    run: int  # the reading's
+    tick: int  # the reading's
+    position_command: float  # position [m] to command at the next tick; while preparing, at tick 0
+    command_rate: float  # its rate [m/s]
+    position: float  # the numerical model's position [m] at this tick
+    velocity: float  # its velocity [m/s]
+    force_command: float  # the force F_c [N] that it feels
+    faults: int  # the bits of the controller's faults
+    words: str  # why the controller has tripped; empty if it has not
 
 
 def encode_reading(reading: Reading) -> bytes:

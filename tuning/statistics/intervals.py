@@ -28,15 +28,11 @@ _STEPS = 62  # of bisection, from a bracket of 1500 down to rounding
 
 
 class Estimate(NamedTuple):
-    """An estimate and its interval, all in one unit: numbers, or arrays of one shape.
+    """An estimate and its interval, all in one unit: numbers, or arrays of one shape."""
 
-    value: the estimate itself.
-    low, high: ends of the interval; NaN where there is none.
-    """
-
-    value: Any
-    low: Any
-    high: Any
+    value: Any  # the estimate itself
+    low: Any  # lower end of the interval, NaN where there is none
+    high: Any  # upper end
 
     @property
     def width(self) -> np.ndarray:
@@ -44,13 +40,13 @@ class Estimate(NamedTuple):
 
 
 class Running(NamedTuple):
-    """What a sweep under way knows: failures among scenarios so far, ends of the interval, its level."""
+    """What a sweep under way knows."""
 
-    failures: int = 0
-    number: int = 0
-    low: float = 0.0
-    high: float = 1.0
-    level: float = LEVEL
+    failures: int = 0  # among the scenarios so far
+    number: int = 0  # of scenarios so far
+    low: float = 0.0  # lower end of the interval
+    high: float = 1.0  # upper end
+    level: float = LEVEL  # of the interval
 
 
 def binomial_interval(failures: ArrayLike, number: ArrayLike, level: float = LEVEL) -> Estimate:

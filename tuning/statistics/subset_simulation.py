@@ -39,29 +39,19 @@ WORST = 10
 
 
 class SubsetSimulation(NamedTuple):
-    """What subset simulation found.
+    """What subset simulation found."""
 
-    probability, low, high: of failing, and the ends of its interval.
-    coefficient_of_variation: of `probability`, from the spread of the replicates' estimates.
-    formula_coefficient_of_variation: the same by the formula for single runs.
-    estimates, formula_coefficients: (replicates,) estimates, and their coefficients by that formula.
-    thresholds: (levels, replicates), the last one the limit; nan where a replicate needed fewer levels.
-    evaluations: of the performance.
-    worst_points: (worst, inputs) normals of the worst distinct scenarios met, worst first.
-    worst_values: (worst,) their performance, infinite where not finite.
-    """
-
-    probability: float
-    low: float
-    high: float
-    coefficient_of_variation: float
-    formula_coefficient_of_variation: float
-    estimates: np.ndarray
-    formula_coefficients: np.ndarray
-    thresholds: np.ndarray
-    evaluations: int
-    worst_points: np.ndarray
-    worst_values: np.ndarray
+    probability: float  # of failing
+    low: float  # end of its interval
+    high: float  # end of its interval
+    coefficient_of_variation: float  # of `probability`, from the spread of the replicates' estimates
+    formula_coefficient_of_variation: float  # the same by the formula for single runs
+    estimates: np.ndarray  # of each, (replicates,)
+    formula_coefficients: np.ndarray  # of variation of each by that formula, (replicates,)
+    thresholds: np.ndarray  # (levels, replicates), the last one the limit; nan where fewer levels were needed
+    evaluations: int  # of the performance
+    worst_points: np.ndarray  # normals of the worst distinct scenarios met, worst first, (worst, inputs)
+    worst_values: np.ndarray  # their performance, infinite where not finite, (worst,)
 
 
 class _State(NamedTuple):
@@ -77,9 +67,11 @@ class _State(NamedTuple):
 
 
 class _Worst(NamedTuple):
-    points: np.ndarray
-    values: np.ndarray
-    evaluations: int
+    """The worst distinct scenarios met so far."""
+
+    points: np.ndarray  # (worst, inputs)
+    values: np.ndarray  # (worst,)
+    evaluations: int  # so far
 
 
 def subset_simulation(

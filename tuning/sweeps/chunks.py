@@ -29,16 +29,16 @@ class Sweep(NamedTuple):
     """What a manifest asks for, ready to run."""
 
     manifest: Manifest
-    mechanism: Mechanism
-    loop: Loop
-    gains: dict[str, float]
+    mechanism: Mechanism  # of the gain file
+    loop: Loop  # serves whatever can be drawn (`widest_loop`)
+    gains: dict[str, float]  # of the gain file
 
 
 class _Batch(NamedTuple):
-    """Scenarios to run and what they are made of."""
+    """Scenarios to run."""
 
-    first: int
-    draws: dict[str, np.ndarray]
+    first: int  # index of the first
+    draws: dict[str, np.ndarray]  # what they are made of, by dotted path
     scenarios: Scenario
 
 

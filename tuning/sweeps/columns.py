@@ -26,22 +26,19 @@ Kind = Literal["integer", "input", "number", "flag", "text"]
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A column's name, kind, SI unit ("" for none, "1" for a ratio) and meaning.
-
-    Inputs are in float64, numbers in the sweep's precision.
-    """
+    """A column of the store."""
 
     name: str
-    kind: Kind
-    unit: str
+    kind: Kind  # inputs are in float64, numbers in the sweep's precision
+    unit: str  # SI; "" for none, "1" for a ratio
     meaning: str
 
 
 class PerContact(NamedTuple):
-    """A number that every contact has: its column's name without the contact's number, unit, meaning."""
+    """A number that every contact has."""
 
-    name: str
-    unit: str
+    name: str  # of its column, without the contact's number
+    unit: str  # as a column's
     meaning: str
 
 

@@ -31,29 +31,26 @@ Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 
 
 class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
-    """scenarios, chunk [scenarios], seed, sampling, Sobol replicates (1 for random), precision, limit of the
-    restitution error (None: no limit), whether works are audited; columns; gain file with its digest and its
-    mechanism file's; versions, flags of the compiler, date, digest of all but the
-    date. Where there is `until_width`, `scenarios` is the most: the sweep ends with the first part after
-    which the confidence sequence is that narrow, and the rows say which one it is."""
+    """What a sweep's rows follow from."""
 
     schema: Literal["jaxhil/sweep/1"]
-    scenarios: Annotated[int, Meta(ge=1, le=MOST)]
-    chunk: Annotated[int, Meta(ge=1, le=LARGEST_CHUNK)]
+    scenarios: Annotated[int, Meta(ge=1, le=MOST)]  # the most there can be, where there is `until_width`
+    chunk: Annotated[int, Meta(ge=1, le=LARGEST_CHUNK)]  # scenarios a part
     seed: Annotated[int, Meta(ge=0, le=LARGEST_SEED)]
     sampling: Literal["random", "sobol"]
-    replicates: Annotated[int, Meta(ge=1)]
+    replicates: Annotated[int, Meta(ge=1)]  # Sobol sequences; 1 for random sampling
     precision: Literal["float64", "float32"]
-    limit: Annotated[float, Meta(ge=0)] | None
-    works: bool
+    limit: Annotated[float, Meta(ge=0)] | None  # of the restitution error; None: no limit
+    works: bool  # whether works are audited
     columns: list[Column]
-    gains_sha256: Digest
-    mechanism_sha256: Digest
-    gain_file: dict[str, Any]
-    versions: dict[str, str]
-    xla_flags: str
-    created: str
-    sha256: Digest
+    gains_sha256: Digest  # digest of the gain file
+    mechanism_sha256: Digest  # of its mechanism's file
+    gain_file: dict[str, Any]  # the gain file itself
+    versions: dict[str, str]  # of the packages that computed it
+    xla_flags: str  # of the compiler, as far as they may change a last bit
+    created: str  # date
+    sha256: Digest  # digest of all but the date
+    # the sweep ends with the first part after which the confidence sequence is that narrow
     until_width: Annotated[float, Meta(gt=0, le=1)] | None = None
 
     @property
@@ -73,9 +70,9 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 class Choices(NamedTuple):
-    """What a sweep's caller chooses; see `Manifest`."""
+    """What a sweep's caller chooses."""
 
-    scenarios: int
+    scenarios: int  # these and all that follow: see `Manifest`
     seed: int = 0
     sampling: str = "random"
     precision: str = "float64"

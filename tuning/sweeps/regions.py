@@ -32,15 +32,14 @@ LOOKS = 200  # numbers of scenarios at which the failures are counted
 
 
 class Input(NamedTuple):
-    """An input as an axis: its name and unit, the column of each contact, what makes displayed values of
-    theirs, the ends of the axis (displayed), and whether it is logarithmic."""
+    """An input as an axis."""
 
-    name: str
-    unit: str
-    columns: tuple[str, ...]
-    factor: float
-    low: float
-    high: float
+    name: str  # as displayed
+    unit: str  # as displayed
+    columns: tuple[str, ...]  # that of each contact
+    factor: float  # displayed value over the column's
+    low: float  # end of the axis, displayed
+    high: float  # the other end
     logarithmic: bool
 
     @property
@@ -58,35 +57,32 @@ class Input(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """What to accumulate: inputs (one or two, or none where nothing varies) as every contact has them and as
-    a scenario has them, cells along an axis, numbers of scenarios to look at, contacts, replicates."""
+    """What to accumulate."""
 
-    per_contact: tuple[Input, ...]
-    per_scenario: tuple[Input, ...]
-    cells: int
-    looks: np.ndarray
+    per_contact: tuple[Input, ...]  # one or two inputs, as every contact has them; none where nothing varies
+    per_scenario: tuple[Input, ...]  # the same as a scenario has them
+    cells: int  # along an axis
+    looks: np.ndarray  # numbers of scenarios to look at
     contacts: int
     replicates: int
 
 
 class Points(NamedTuple):
-    """Scenarios as points, by index: each input (inputs, points), size of the worst error (infinite where a
-    contact did not end), whether failed; (points,)."""
+    """Scenarios as points, by index."""
 
-    index: np.ndarray
-    inputs: np.ndarray
-    size: np.ndarray
-    failed: np.ndarray
+    index: np.ndarray  # (points,)
+    inputs: np.ndarray  # (inputs, points)
+    size: np.ndarray  # of the worst error, infinite where a contact did not end (points,)
+    failed: np.ndarray  # whether it counts as failed (points,)
 
 
 class Regions(NamedTuple):
-    """Contacts per cell and bin of |error| (cells, ..., bins), the last bin infinite too; points; scenarios
-    and failures between looks, per replicate, (looks + 1, replicates)."""
+    """What was accumulated."""
 
-    sizes: np.ndarray
+    sizes: np.ndarray  # contacts per cell and bin of |error| (cells, ..., bins), the last bin infinite too
     points: Points
-    seen: np.ndarray
-    failures: np.ndarray
+    seen: np.ndarray  # scenarios between looks, per replicate (looks + 1, replicates)
+    failures: np.ndarray  # failed ones among them
 
     @property
     def scenarios(self) -> int:

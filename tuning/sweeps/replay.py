@@ -13,12 +13,12 @@ from tuning.sweeps.store import Store, read_row, same_rows
 
 
 class Replay(NamedTuple):
-    """The stored row, the row made again (arrays of length 1), and the names of the columns that differ."""
+    """A scenario of a store, run again."""
 
     sweep: Sweep
-    stored: dict[str, np.ndarray]
-    again: dict[str, np.ndarray]
-    different: list[str]
+    stored: dict[str, np.ndarray]  # its row, arrays of length 1
+    again: dict[str, np.ndarray]  # the row made again
+    different: list[str]  # names of the columns that differ
 
 
 def replay(store: Store, index: int) -> Replay:

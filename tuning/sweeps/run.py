@@ -33,13 +33,12 @@ Computer = Callable[[Sweep, Iterable[int]], Generator[tuple[int, Rows], None, No
 
 
 class Precision(NamedTuple):
-    """The first `scenarios` in float64 beside float32: largest and median difference of a contact's error
-    where both ended (None if none did), scenarios with another outcome, and failures in either."""
+    """The first scenarios of a sweep in float64 beside float32."""
 
-    scenarios: int
-    largest_difference: float | None
-    median_difference: float | None
-    changed_outcomes: int
+    scenarios: int  # how many
+    largest_difference: float | None  # of a contact's error where both ended; None if none did
+    median_difference: float | None  # of the same
+    changed_outcomes: int  # scenarios with another outcome
     failed_float32: int
     failed_float64: int
 

@@ -38,9 +38,9 @@ class IndicesRequest(NamedTuple):
 class RareRequest(NamedTuple):
     """Arguments of `tuning.sweeps.studies.rare_failure`."""
 
-    limit: float
-    samples: int = SAMPLES
-    replicates: int = REPLICATES
+    limit: float  # of the restitution error
+    samples: int = SAMPLES  # per level and replicate
+    replicates: int = REPLICATES  # how often it runs
 
 
 Request = IndicesRequest | RareRequest

@@ -29,26 +29,24 @@ Done = Callable[[int], None]  # called with the number of scenarios that were ru
 
 
 class InputIndices(NamedTuple):
-    """An uncertain input's first-order and total Sobol index, with intervals of 95 %; nan where nothing
-    varies."""
+    """The Sobol indices of an uncertain input, with intervals of 95 %; nan where nothing varies."""
 
-    input: str
-    first_order: float
-    first_order_low: float
-    first_order_high: float
-    total: float
-    total_low: float
-    total_high: float
+    input: str  # its key
+    first_order: float  # its own share of the variance
+    first_order_low: float  # end of the interval
+    first_order_high: float  # end of the interval
+    total: float  # its share with all interactions
+    total_low: float  # end of the interval
+    total_high: float  # end of the interval
 
 
 class ErrorIndices(NamedTuple):
-    """Inputs, those of largest total index first, of the worst |error| cut at `cap`; scenarios that were run,
-    and how many of them reached the cap or had no error."""
+    """Sobol indices of the worst |error| cut at `cap`."""
 
-    inputs: tuple[InputIndices, ...]
+    inputs: tuple[InputIndices, ...]  # those of largest total index first
     cap: float
-    evaluations: int
-    capped: int
+    evaluations: int  # scenarios that were run
+    capped: int  # how many of them reached the cap or had no error
 
 
 def error_indices(sweep: Sweep, number: int, done: Done = lambda _: None) -> ErrorIndices:

@@ -25,17 +25,14 @@ ORDERS = (0.5, 0.95, 0.99, 0.999)
 
 
 class Tally(NamedTuple):
-    """Scenarios of each of `OUTCOMES`; number of scenarios, counted from 0, that make whole replicates; per
-    replicate of those scenarios, failures, and bins of the errors (`tuning.statistics.quantiles.counts`); the
-    worst scenarios, the worst first: how bad the outcome is, |error|, index; the looks taken, if it is looked
-    at part by part."""
+    """What is known of the scenarios so far."""
 
-    outcomes: tuple[int, ...]
-    whole: int
-    replicates: tuple[tuple[int, int], ...]
-    errors: tuple[tuple[int, ...], ...]
-    worst: tuple[tuple[int, float, int], ...]
-    looks: Running | None = None
+    outcomes: tuple[int, ...]  # scenarios of each of `OUTCOMES`
+    whole: int  # number of scenarios, counted from 0, that make whole replicates
+    replicates: tuple[tuple[int, int], ...]  # scenarios and failures of each, of whole replicates
+    errors: tuple[tuple[int, ...], ...]  # bins of the errors of each (`tuning.statistics.quantiles.counts`)
+    worst: tuple[tuple[int, float, int], ...]  # the worst first: how bad the outcome is, |error|, index
+    looks: Running | None = None  # those taken, if it is looked at part by part
 
     @property
     def scenarios(self) -> int:
@@ -52,21 +49,21 @@ class Tally(NamedTuple):
 
 
 class Probability(NamedTuple):
-    """An estimate with an interval of 95 %, and how that was made."""
+    """An estimate with an interval of 95 %."""
 
-    value: float
-    low: float
-    high: float
-    method: str
+    value: float  # the estimate [1]
+    low: float  # end of the interval
+    high: float  # end of the interval
+    method: str  # how the interval was made
 
 
 class Quantile(NamedTuple):
     """The |error| that a share `order` of the scenarios does not exceed, with an interval of 95 %."""
 
-    order: float
-    value: float
-    low: float
-    high: float
+    order: float  # share of the scenarios [1]
+    value: float  # the estimate [1]
+    low: float  # end of the interval
+    high: float  # end of the interval
 
 
 def empty_tally(replicates: int, scenarios: int = MOST, looked_at: bool = False) -> Tally:

@@ -30,13 +30,12 @@ CLOSER_TO_1 = ("early", "late", "slope")
 
 
 class Runs(NamedTuple):
-    """What runs of one law with one set of gains say: outcome (slots, scenarios) of the plain runs, e of the
-    first contact under an early and a late push, outcome of the damped twins."""
+    """What runs of one law with one set of gains say."""
 
-    plain: Outcome
-    early: Outcome
-    late: Outcome
-    twins: Outcome
+    plain: Outcome  # of the plain runs, (slots, scenarios)
+    early: Outcome  # of the first contact under an early push
+    late: Outcome  # under a late one
+    twins: Outcome  # of the damped twins
 
 
 def judge(

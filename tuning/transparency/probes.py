@@ -40,16 +40,12 @@ ANTICIPATING = {"transparency_weight": 1.0, "command_weight": 0.003}
 
 
 class ProbedScenarios(NamedTuple):
-    """A batch of scenarios with their transparency probes.
+    """A batch of scenarios with their transparency probes."""
 
-    scenarios: (..., scenarios * `LANES_PER_SCENARIO`).
-    plain, early, late: restitution in space without and with either push, (scenarios,), integrated alike.
-    """
-
-    scenarios: Scenario
-    plain: Any
-    early: Any
-    late: Any
+    scenarios: Scenario  # (..., scenarios * `LANES_PER_SCENARIO`)
+    plain: Any  # restitution in space without a push (scenarios,)
+    early: Any  # under an early push, integrated alike
+    late: Any  # under a late one
 
 
 def default_weights(compensator: str) -> dict[str, float]:

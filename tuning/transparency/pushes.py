@@ -30,21 +30,14 @@ LANES = 256  # integrated in one call
 
 
 class Space(NamedTuple):
-    """Contacts in space, (slots, scenarios).
+    """Contacts in space."""
 
-    restitution: e* [1].
-    peak_force: [N].
-    duration: [s].
-    depth: penetration [m] at `SAMPLES` times, (slots, samples, scenarios).
-    early, late: restitution under an early and under a late push [1].
-    """
-
-    restitution: Float[np.ndarray, "slots scenarios"]
-    peak_force: Float[np.ndarray, "slots scenarios"]
-    duration: Float[np.ndarray, "slots scenarios"]
-    depth: Float[np.ndarray, "slots samples scenarios"]
-    early: Float[np.ndarray, "scenarios"]
-    late: Float[np.ndarray, "scenarios"]
+    restitution: Float[np.ndarray, "slots scenarios"]  # e* [1]
+    peak_force: Float[np.ndarray, "slots scenarios"]  # [N]
+    duration: Float[np.ndarray, "slots scenarios"]  # [s]
+    depth: Float[np.ndarray, "slots samples scenarios"]  # penetration [m] at `SAMPLES` times
+    early: Float[np.ndarray, "scenarios"]  # restitution of the first contact under an early push [1]
+    late: Float[np.ndarray, "scenarios"]  # under a late one [1]
 
 
 def in_space(
@@ -110,6 +103,8 @@ def probed(scenarios: Scenario, space: Any, share: float | None = None, duration
 
 
 class _ReferencePath(NamedTuple):
+    """A batch of contacts in space; the position at `SAMPLES` times."""
+
     restitution: Array
     peak_force: Array
     duration: Array

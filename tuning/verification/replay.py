@@ -36,44 +36,28 @@ LANES = 6
 
 
 class LaneReplay(msgspec.Struct, frozen=True):
-    """One recorded lane through the runtime.
+    """One recorded lane through the runtime."""
 
-    ticks: recorded.
-    compared: of these.
-    near: of those, near a threshold.
-    command_range: of the force command, 0 included [N].
-    difference: the largest away from thresholds, as a fraction of that range.
-    near_difference: the largest near them, likewise.
-    worst_tick: the tick of `difference`.
-    found, expected: what runtime and simulation commanded there [N].
-    parted: the tick at which a decision at a threshold fell differently, which ended the comparison.
-    status: the runtime's.
-    position_difference: the largest of the position commands, as a fraction of their range.
-    """
-
-    ticks: int
-    compared: int
-    near: int
-    command_range: float
-    difference: float
-    near_difference: float
-    worst_tick: int
-    found: float
-    expected: float
+    ticks: int  # recorded
+    compared: int  # of these
+    near: int  # of those, near a threshold
+    command_range: float  # of the force command, 0 included [N]
+    difference: float  # the largest away from thresholds, as a fraction of that range
+    near_difference: float  # the largest near them, likewise
+    worst_tick: int  # the tick of `difference`
+    found: float  # what the runtime commanded there [N]
+    expected: float  # what the simulation did [N]
+    # the tick at which a decision at a threshold fell differently; the comparison ends there
     parted: int | None
-    status: str
-    position_difference: float = 0.0
+    status: str  # the runtime's
+    position_difference: float = 0.0  # the largest of the position commands, as a fraction of their range
 
 
 class ContactComparison(msgspec.Struct, frozen=True):
-    """One nominal contact.
+    """One nominal contact."""
 
-    restitution, status: with the runtime in the loop.
-    simulated_restitution, simulated_status: simulated as a whole.
-    """
-
-    restitution: float | None
-    simulated_restitution: float | None
+    restitution: float | None  # with the runtime in the loop
+    simulated_restitution: float | None  # simulated as a whole
     status: str
     simulated_status: str
 

@@ -27,15 +27,13 @@ class Rules(NamedTuple):
 
 
 class Audited(NamedTuple):
-    """Contact by contact, what the audit sees.
+    """Contact by contact, what the audit sees."""
 
-    approach, rebound: speed before and after [m/s].
-    stiffness, damping: identified [N/m, N s/m]; 0 where there is nothing to identify them from."""
-
-    approach: Float[np.ndarray, "slots lanes"]
-    rebound: Float[np.ndarray, "slots lanes"]
+    approach: Float[np.ndarray, "slots lanes"]  # speed before [m/s]
+    rebound: Float[np.ndarray, "slots lanes"]  # speed after [m/s]
+    # identified [N/m]; 0 where there is nothing to identify it from
     stiffness: Float[np.ndarray, "slots lanes"]
-    damping: Float[np.ndarray, "slots lanes"]
+    damping: Float[np.ndarray, "slots lanes"]  # likewise [N s/m]
     imbalance: Float[np.ndarray, "slots lanes"]  # energy out of balance, over the approach's
     duration: Float[np.ndarray, "slots lanes"]  # until the audit [s]
     tick: Float[np.ndarray, "slots lanes"]  # on which the contact began

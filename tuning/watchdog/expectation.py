@@ -21,19 +21,14 @@ SINGULAR = 1e-9
 
 
 class Expectation(NamedTuple):
-    """The fitted polynomial.
+    """The fitted polynomial."""
 
-    coefficients: by term.
-    stiffness, velocity: those of reference, k_0 [N/m] and v_0 [m/s].
-    softness, speed, loss: the ranges of p, w and z that it was fitted over.
-    """
-
-    coefficients: dict[str, float]
-    stiffness: float
-    velocity: float
-    softness: tuple[float, float]
-    speed: tuple[float, float]
-    loss: tuple[float, float]
+    coefficients: dict[str, float]  # by term
+    stiffness: float  # of reference, k_0 [N/m]
+    velocity: float  # of reference, v_0 [m/s]
+    softness: tuple[float, float]  # range of p that it was fitted over
+    speed: tuple[float, float]  # range of w
+    loss: tuple[float, float]  # range of z
 
     def limits(self) -> dict[str, float]:
         """As limits of a gain file."""

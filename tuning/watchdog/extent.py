@@ -9,36 +9,22 @@ from tuning.watchdog.recorded import Signals
 
 
 class Extent(NamedTuple):
-    """Of every run; all at least 0 but the positions.
+    """How far the signals of every run went; all at least 0 but the positions."""
 
-    reading: largest |force reading| [N].
-    measured_lowest, measured_highest: measured position [m].
-    sent_lowest, sent_highest: position command [m].
-    command: largest |F_c| [N].
-    slew: its fastest change [N/s].
-    sent_speed: fastest change of the position command [m/s].
-    speed: fastest change of the desired position [m/s].
-    acceleration: fastest change of the desired velocity [m/s^2].
-    force_stuck: longest travel of the measured position in contact under one force reading [m].
-    position_stuck: longest travel of the desired position under one position reading [m].
-    flight_force: largest |force reading| in flight [N].
-    flight_spread: the most by which two of these differ [N].
-    """
-
-    reading: Float[np.ndarray, "lanes"]
-    measured_lowest: Float[np.ndarray, "lanes"]
-    measured_highest: Float[np.ndarray, "lanes"]
-    sent_lowest: Float[np.ndarray, "lanes"]
-    sent_highest: Float[np.ndarray, "lanes"]
-    command: Float[np.ndarray, "lanes"]
-    slew: Float[np.ndarray, "lanes"]
-    sent_speed: Float[np.ndarray, "lanes"]
-    speed: Float[np.ndarray, "lanes"]
-    acceleration: Float[np.ndarray, "lanes"]
-    force_stuck: Float[np.ndarray, "lanes"]
-    position_stuck: Float[np.ndarray, "lanes"]
-    flight_force: Float[np.ndarray, "lanes"]
-    flight_spread: Float[np.ndarray, "lanes"]
+    reading: Float[np.ndarray, "lanes"]  # largest |force reading| [N]
+    measured_lowest: Float[np.ndarray, "lanes"]  # measured position [m]
+    measured_highest: Float[np.ndarray, "lanes"]  # measured position [m]
+    sent_lowest: Float[np.ndarray, "lanes"]  # position command [m]
+    sent_highest: Float[np.ndarray, "lanes"]  # position command [m]
+    command: Float[np.ndarray, "lanes"]  # largest |F_c| [N]
+    slew: Float[np.ndarray, "lanes"]  # its fastest change [N/s]
+    sent_speed: Float[np.ndarray, "lanes"]  # fastest change of the position command [m/s]
+    speed: Float[np.ndarray, "lanes"]  # fastest change of the desired position [m/s]
+    acceleration: Float[np.ndarray, "lanes"]  # fastest change of the desired velocity [m/s^2]
+    force_stuck: Float[np.ndarray, "lanes"]  # longest travel in contact under one force reading [m]
+    position_stuck: Float[np.ndarray, "lanes"]  # longest desired travel under one position reading [m]
+    flight_force: Float[np.ndarray, "lanes"]  # largest |force reading| in flight [N]
+    flight_spread: Float[np.ndarray, "lanes"]  # the most by which two of these differ [N]
 
 
 def extent_of(

@@ -34,25 +34,16 @@ class Scenarios(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """Ticks of many runs. Between two surfaces all contacts are one run.
+    """Ticks of many runs. Between two surfaces all contacts are one run."""
 
-    force: measured [N].
-    position, velocity: of the numerical model [m, m/s].
-    measured: position [m].
-    command: F_c [N].
-    sent: position command sent to the drives [m].
-    live: whether a run of the lane is under way.
-    begins: whether one begins.
-    """
-
-    force: Float[np.ndarray, "ticks lanes"]
-    position: Float[np.ndarray, "ticks lanes"]
-    velocity: Float[np.ndarray, "ticks lanes"]
-    measured: Float[np.ndarray, "ticks lanes"]
-    command: Float[np.ndarray, "ticks lanes"]
-    sent: Float[np.ndarray, "ticks lanes"]
-    live: Bool[np.ndarray, "ticks lanes"]
-    begins: Bool[np.ndarray, "ticks lanes"]
+    force: Float[np.ndarray, "ticks lanes"]  # measured [N]
+    position: Float[np.ndarray, "ticks lanes"]  # of the numerical model [m]
+    velocity: Float[np.ndarray, "ticks lanes"]  # of the numerical model [m/s]
+    measured: Float[np.ndarray, "ticks lanes"]  # position [m]
+    command: Float[np.ndarray, "ticks lanes"]  # F_c [N]
+    sent: Float[np.ndarray, "ticks lanes"]  # position command sent to the drives [m]
+    live: Bool[np.ndarray, "ticks lanes"]  # whether a run of the lane is under way
+    begins: Bool[np.ndarray, "ticks lanes"]  # whether one begins
 
 
 class Contacts(NamedTuple):
@@ -69,12 +60,12 @@ class Contacts(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """Some scenarios, recorded; `first` is the index of the first lane's."""
+    """Some scenarios, recorded."""
 
-    first: int
+    first: int  # index of the first lane's scenario
     scenarios: Scenario
-    signals: Signals
-    contacts: Contacts
+    signals: Signals  # what the controller read and commanded
+    contacts: Contacts  # what became of them
 
 
 def recorded_chunks(
