@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from jaxhil.runtime import Controller, digest
-from tuning.gain_file import LoadedGains
+from jaxhil.simulation.gain_file import LoadedGains
 from tuning.watchdog.recorded import Signals
 
 

@@ -49,21 +49,20 @@ def closed_loop(
     zeroed = sensor.noise_std != 0 or sensor.bias != 0
     (position, velocity), results, shortfalls = model.start, [], {}
     while len(results) < mechanism.approach.contacts:
-        number, tick = len(results), 0
+        number, tick, shortfall = len(results), 0, []
         model.place(position, velocity)
         plant.begin(position, velocity, law.position_command(position, velocity, 0.0), number)
         watch.begin(number)
         while len(results) < mechanism.approach.contacts:
             force = law.step(plant.read()[0], model.position, model.velocity, plant.read()[1])
             force = 0.0 if zeroed and tick == 0 else force
-            shortfalls.setdefault(len(results), 0.0)
             over = watch.observe(model.position, model.velocity, force, plant.force)
-            if watch.in_contact or over:
-                shortfalls[len(results)] = max(shortfalls[len(results)], plant.shortfall)
+            shortfall.append(plant.shortfall)
             model.integrate(force)
             plant.move(law.position_command(model.position, model.velocity, model.acceleration))
             tick += 1
             if over is not None:
+                shortfalls[len(results)] = max(shortfall[over.begun :])
                 results.append(over)
                 if over.status != "ok" or math.isinf(mechanism.contact.clearance):
                     break

@@ -5,7 +5,8 @@ from typing import Any
 
 from cases import SECOND_ORDER, mechanism, nominal_gains, validated
 
-from tuning.gain_file import build_document, check_document
+from jaxhil.simulation.gain_file import check_document
+from tuning.gain_file import build_document
 from tuning.sweeps.manifest import Choices, Manifest, build_manifest
 
 UNCERTAIN = {

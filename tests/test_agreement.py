@@ -27,8 +27,9 @@ from jaxhil.compensators import COMPENSATORS, Constants, Signals
 from jaxhil.mechanism.file import builtin_names, load
 from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
 from jaxhil.runtime.gain_file import GainFile
+from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.recording import Lane, nominal_and_draws, record_lanes
-from tuning.gain_file import build_document, check_document
+from tuning.gain_file import build_document
 from tuning.verification.replay import REPLAY_LIMIT, LaneReplay, replay
 
 pytestmark = pytest.mark.users_options

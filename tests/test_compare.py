@@ -10,12 +10,12 @@ from math import inf, nan
 
 import pytest
 
+from jaxhil.simulation.contact_plot import save
 from tuning import terminal
 from tuning.benchmark.cost import microseconds_per_tick
 from tuning.benchmark.plots import errors_plot, transparency_plot
 from tuning.benchmark.study import LawFigures
 from tuning.benchmark.tables import HEADINGS, leaderboard, mechanism_table, winners
-from tuning.pictures.plots import save
 from tuning.statistics.intervals import Estimate
 
 COMMAND = [sys.executable, "-m", "tuning", "compare"]

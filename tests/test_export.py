@@ -10,10 +10,11 @@ from bundles import document, run_selftest, signed, small_files
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
 from jaxhil.runtime.faults import FAULTS
+from jaxhil.simulation.gain_file import load_gain_file
 from tuning.bundle.bundle import build_bundle, check_target, with_limits, write_bundle
 from tuning.bundle.writers import WRITERS
 from tuning.files import TEMPORARY
-from tuning.gain_file import load_gain_file, write_gain_file
+from tuning.gain_file import write_gain_file
 
 pytestmark = pytest.mark.users_options
 

@@ -18,15 +18,9 @@ from jaxhil.compensators.response_error import typical_stiffness
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import builtin_names, load
 from jaxhil.runtime import Controller, digest
+from jaxhil.simulation.gain_file import check_document, load_gain_file
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.gain_file import (
-    build_document,
-    check_document,
-    load_gain_file,
-    plain,
-    validity_envelope,
-    write_gain_file,
-)
+from tuning.gain_file import build_document, plain, validity_envelope, write_gain_file
 
 ENVELOPE = {"delay": {"low": 0.01, "high": 0.012, "unit": "s"}}
 

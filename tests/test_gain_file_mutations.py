@@ -12,7 +12,7 @@ from jaxhil.errors import InputError
 from jaxhil.runtime import GainFileError
 from jaxhil.runtime.gain_file import GainFile, check_gain_document, read_gain_document
 from jaxhil.runtime.limits import LIMITS
-from tuning.gain_file import load_gain_file
+from jaxhil.simulation.gain_file import load_gain_file
 
 ALPHABET = b'0123456789.-+eE,:{}[]" \n\ttruefalsnINaity\\/\x00\xff'
 

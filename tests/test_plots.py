@@ -10,6 +10,7 @@ from matplotlib.colors import to_hex
 from jaxhil.contact.laws import LAWS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation.contact_plot import STYLES, contact_plot, save
 from jaxhil.simulation.evaluation import Outcome, parameters_by_slot
 from jaxhil.simulation.metrics import Metrics
 from jaxhil.simulation.motion import Curve, Piece, _space
@@ -18,7 +19,7 @@ from tuning.gains.pareto import Front, Point
 from tuning.gains.rounds import Start
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tune import TuneResult, figures
-from tuning.pictures.plots import STYLES, contact_plot, errors_plot, front_plot, loss_plot, save
+from tuning.pictures.plots import errors_plot, front_plot, loss_plot
 
 LANES = 40
 

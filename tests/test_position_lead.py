@@ -28,9 +28,10 @@ from jaxhil.compensators.estimates import simulator_inverse
 from jaxhil.mechanism.file import builtin_names, load
 from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
 from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.recording import nominal_and_draws, record_lanes
 from tuning.bundle.vectors import make_vectors
-from tuning.gain_file import build_document, check_document
+from tuning.gain_file import build_document
 from tuning.verification.replay import verify
 from tuning.watchdog.calibration import calibrate
 from tuning.watchdog.recorded import Scenarios, recorded_chunks

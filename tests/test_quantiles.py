@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from exact_quantile import quantile
 from scipy import stats
 
 from tuning.statistics.quantiles import (
@@ -10,7 +11,6 @@ from tuning.statistics.quantiles import (
     RESOLUTION,
     binned_quantile,
     counts,
-    quantile,
     ranks,
     replicate_quantile,
 )

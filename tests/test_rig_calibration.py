@@ -16,9 +16,10 @@ from jaxhil.mechanism.file import load
 from jaxhil.runtime.law_status import UNSTATED
 from jaxhil.runtime.limits import LIMITS, complete
 from jaxhil.runtime.watchdog import Watchdog
+from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.metrics import OK
 from tuning.bundle.bundle import limits_section
-from tuning.gain_file import build_document, check_document
+from tuning.gain_file import build_document
 from tuning.sweeps.run import run_sweep
 from tuning.sweeps.store import open_store, read_part
 from tuning.watchdog.alarms import good_runs, judge_chunk

@@ -6,9 +6,9 @@ from sweep_cases import case
 
 from jaxhil.mechanism.file import load
 from jaxhil.simulation.evaluation import Outcome
+from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.metrics import DIVERGED, NON_FINITE, NOT_REACHED, OK, TIMEOUT, Metrics
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.gain_file import check_document
 from tuning.sweeps.columns import OUTCOMES, STATUSES, rows_of, sweep_columns, unit_of
 
 LIMIT = 0.01

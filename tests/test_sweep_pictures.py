@@ -8,8 +8,9 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from sweep_cases import case, manifest
 
+from jaxhil.simulation.gain_file import check_document
 from tuning.__main__ import main
-from tuning.gain_file import check_document, write_gain_file
+from tuning.gain_file import write_gain_file
 from tuning.statistics.intervals import binomial_interval, replicate_interval
 from tuning.statistics.quantiles import EDGES
 from tuning.sweeps import pictures, regions

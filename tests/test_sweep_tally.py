@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from exact_quantile import quantile
 
 from tuning.statistics.intervals import Running, confidence_sequence, replicate_interval, updated
-from tuning.statistics.quantiles import quantile
 from tuning.sweeps.columns import GOOD, OUTCOMES
 from tuning.sweeps.tally import (
     ORDERS,

@@ -13,11 +13,11 @@ from bundles import document
 from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
 from jaxhil.runtime import Controller
 from jaxhil.runtime.gain_file import check_gain_document
+from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.recording import nominal_and_draws, record_lanes
 from tuning.bundle import selftest
 from tuning.bundle.bundle import with_limits
 from tuning.bundle.vectors import BEGINS, NEXT_CONTACT, Row, as_csv, make_vectors, one_rig
-from tuning.gain_file import check_document
 
 pytestmark = pytest.mark.users_options
 

@@ -10,9 +10,10 @@ from jaxhil.mechanism.file import load
 from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
 from jaxhil.runtime import Controller
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
+from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.recording import Lane, nominal_and_draws, record_lanes
-from tuning.gain_file import build_document, check_document
+from tuning.gain_file import build_document
 from tuning.verification.replay import near_threshold, replay, replayed, verify
 
 pytestmark = pytest.mark.users_options

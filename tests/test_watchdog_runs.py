@@ -35,10 +35,11 @@ from jaxhil.mechanism.structs import Mechanism
 from jaxhil.runtime import digest
 from jaxhil.runtime.faults import RESTITUTION, names
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
+from jaxhil.simulation.gain_file import LoadedGains, check_document
 from jaxhil.simulation.integrators import INTEGRATORS
 from jaxhil.simulation.metrics import OK
 from tuning.bundle.bundle import limits_section
-from tuning.gain_file import LoadedGains, build_document, check_document
+from tuning.gain_file import build_document
 from tuning.statistics.intervals import binomial_interval
 from tuning.watchdog.calibration import LIMIT, WITHOUT_STORE, calibrate
 from tuning.watchdog.recorded import Chunk, Scenarios, recorded_chunks

@@ -23,27 +23,9 @@ from jaxhil.mechanism.file import to_builtins
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.runtime import digest
 from jaxhil.runtime.gain_file import SCHEMA
-from jaxhil.simulation.gain_file import (
-    LoadedGains,
-    bounds_of,
-    check_document,
-    check_names,
-    load_gain_file,
-    look_up,
-)
+from jaxhil.simulation.gain_file import bounds_of, check_names, look_up
 from jaxhil.simulation.scenario import Scenario
 from tuning.files import write_whole, writing
-
-__all__ = [
-    "LoadedGains",
-    "build_document",
-    "check_document",
-    "load_gain_file",
-    "plain",
-    "validity_envelope",
-    "versions",
-    "write_gain_file",
-]
 
 VERSIONED = ("jaxhil", "jax", "numpy", "optimistix")
 

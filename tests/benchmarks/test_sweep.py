@@ -16,8 +16,9 @@ from baseline import compile_baseline
 
 from jaxhil.compensators import literature_gains
 from jaxhil.mechanism.file import load
+from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.loop import build_rig_constants
-from tuning.gain_file import build_document, check_document, write_gain_file
+from tuning.gain_file import build_document, write_gain_file
 from tuning.sweeps.chunks import build_sweep, run_parts
 from tuning.sweeps.draws import drawn_scenarios
 from tuning.sweeps.manifest import CHUNK, Choices, build_manifest

@@ -6,9 +6,10 @@ import numpy as np
 from matplotlib.figure import Figure as Picture
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
+from jaxhil.simulation.contact_plot import GREEN, LABELS, STYLES, new_figure
 from tuning.benchmark.study import LITERATURE, TUNED, LawFigures
 from tuning.benchmark.tables import best
-from tuning.pictures.plots import GREEN, LABELS, MARKERS, STYLES, new_figure
+from tuning.pictures.plots import MARKERS
 
 COLUMNS = 4  # of panels
 TRANSPARENCY = {

@@ -48,12 +48,12 @@ def build_bundle(
     `rates`, plain data, say what is known of the watchdog's alarms under these limits. `progress` is given
     what begins. Raises `InputError` for limits that the runtime refuses or a compensator that a format lacks.
     """
+    from jaxhil.simulation.gain_file import check_document
     from tuning.bundle.readme import readme_text
     from tuning.bundle.single_file import runtime_source
     from tuning.bundle.summary import summary_html
     from tuning.bundle.vectors import as_csv, make_vectors
     from tuning.bundle.writers import WRITERS
-    from tuning.gain_file import check_document
 
     exported = with_limits(document, limits, rates)
     loaded = check_document(exported)

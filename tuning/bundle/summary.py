@@ -14,8 +14,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from jaxhil.errors import one_line
+from jaxhil.simulation.contact_plot import BLACK, BLUE, LABELS, ORANGE, VERMILION, finish
 from tuning.bundle.writers import Entry, gain_entries, limit_entries
-from tuning.pictures.plots import BLACK, BLUE, LABELS, ORANGE, VERMILION, finish
 
 COLOURS = {"before": VERMILION, "literature": ORANGE, "tuned": BLUE}
 HATCHES = {"before": "///", "literature": "...", "tuned": ""}

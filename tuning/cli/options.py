@@ -1,7 +1,7 @@
 """The options of each command of `jaxhil`, as tyro reads them."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
@@ -10,48 +10,44 @@ DEFAULT_PLOT = "jaxhil-out/simulate.png"
 DEFAULT_REPLAY_PLOT = "jaxhil-out/replay.png"
 DEFAULT_DRIVERS = 1024
 
+
+def number(meaning: str):
+    return arg(metavar="NUMBER", help=meaning)
+
+
+def folder(meaning: str):
+    return arg(aliases=("-o",), metavar="DIR", help=meaning)
+
+
+def text(metavar: str | None, meaning: str, **more: Any):
+    """An option whose help says itself what holds by default."""
+    return arg(metavar=metavar, help=meaning, help_behavior_hint="", **more)
+
+
 OptionalFile = Annotated[
     Positional[str | None],
-    arg(
-        metavar="[FILE]",
-        help="Mechanism file, or the name of a built-in one; by default 'varying'.",
-        help_behavior_hint="",
-    ),
+    text("[FILE]", "Mechanism file, or the name of a built-in one; by default 'varying'."),
 ]
 Files = Annotated[
     Positional[tuple[str, ...]],
-    arg(
-        metavar="[FILE ...]",
-        help="Mechanism files, or names of built-in ones; by default 'varying'.",
-        help_behavior_hint="",
-    ),
+    text("[FILE ...]", "Mechanism files, or names of built-in ones; by default 'varying'."),
 ]
 Overrides = Annotated[
     UseAppendAction[tuple[str, ...]],
-    arg(
+    text(
+        "PATH=VALUE",
+        "Any key of the mechanism file by its dotted path, as approach.velocity=0.01; repeatable.",
         name="set",
-        metavar="PATH=VALUE",
-        help="Any key of the mechanism file by its dotted path, as approach.velocity=0.01; repeatable.",
-        help_behavior_hint="",
     ),
 ]
 Limit = Annotated[float, arg(metavar="NUMBER", help="Restitution error beyond which the verdict is bad.")]
 Json = Annotated[
-    FlagCreatePairsOff[bool],
-    arg(help="One JSON document on standard output, nothing else there.", help_behavior_hint=""),
+    FlagCreatePairsOff[bool], text(None, "One JSON document on standard output, nothing else there.")
 ]
-
-
-def number(text: str):
-    return arg(metavar="NUMBER", help=text)
-
-
 Setting = Annotated[
     str | None,
-    arg(
-        metavar="NAME",
-        help="Take the compensator's gains for any mechanism: gentle or sharp, of retrospective_reference.",
-        help_behavior_hint="",
+    text(
+        "NAME", "Take the compensator's gains for any mechanism: gentle or sharp, of retrospective_reference."
     ),
 ]
 
@@ -67,8 +63,7 @@ class Simulate:
 
     file: OptionalFile = None
     compensator: Annotated[
-        str | None,
-        arg(metavar="NAME", help="Compensator, at the literature's gains; 'none' by default."),
+        str | None, arg(metavar="NAME", help="Compensator, at the literature's gains; 'none' by default.")
     ] = None
     setting: Setting = None
     gains: Annotated[
@@ -77,8 +72,7 @@ class Simulate:
     ] = None
     overrides: Overrides = ()
     plot: Annotated[
-        str | None,
-        arg(metavar="[PICTURE]", help=f"Plot to a .png, .pdf or .svg file; bare: {DEFAULT_PLOT}."),
+        str | None, arg(metavar="[PICTURE]", help=f"Plot to a .png, .pdf or .svg file; bare: {DEFAULT_PLOT}.")
     ] = None
     limit: Limit = 0.01
     seed: Annotated[int, number("Seed of the sensor noise.")] = 0
@@ -97,46 +91,34 @@ class Tune:
     files: Files = ()
     compensator: Annotated[str, arg(metavar="NAME", help="Compensator to tune.")] = "response_error"
     setting: Setting = None
-    output: Annotated[str, arg(aliases=("-o",), metavar="DIR", help="Folder for what is written.")] = (
-        "jaxhil-out"
-    )
+    output: Annotated[str, folder("Folder for what is written.")] = "jaxhil-out"
     scenarios: Annotated[
-        int | None,
-        arg(
-            metavar="NUMBER",
-            help="Scenarios to tune on; by default 32, or 128 where sensors are noisy.",
-            help_behavior_hint="",
-        ),
+        int | None, text("NUMBER", "Scenarios to tune on; by default 32, or 128 where sensors are noisy.")
     ] = None
     starts: Annotated[int, number("Starts of the solver, and of each further lot where they disagree.")] = 4
     start: Annotated[
         tuple[str, ...],
-        arg(
-            metavar="GAINS [GAINS ...]",
-            help="Gain files of the same compensator: each mechanism is tuned from the gains of the nearest "
+        text(
+            "GAINS [GAINS ...]",
+            "Gain files of the same compensator: each mechanism is tuned from the gains of the nearest "
             "of their mechanisms too.",
-            help_behavior_hint="",
         ),
     ] = ()
     steps: Annotated[int, number("Most solver steps from each start.")] = 25
     validation: Annotated[int, number("Fresh scenarios to judge on.")] = 511
     objective: Annotated[
         str,
-        arg(
-            metavar="NAME",
-            help="Of the errors e - e*: rms, cvar (mean of the worst 5 percent) or worst.",
-        ),
+        arg(metavar="NAME", help="Of the errors e - e*: rms, cvar (mean of the worst 5 percent) or worst."),
     ] = "rms"
     divergence_weight: Annotated[
         float, number("How much more a squared divergence (e > e*) counts than a squared convergence.")
     ] = 1.0
     command_weight: Annotated[
         float | None,
-        arg(
-            metavar="NUMBER",
-            help="Restitution error that weighs as much as a command one reference peak too high; by default "
+        text(
+            "NUMBER",
+            "Restitution error that weighs as much as a command one reference peak too high; by default "
             "0.003 for retrospective_reference, 0 for others.",
-            help_behavior_hint="",
         ),
     ] = None
     noise_weight: Annotated[
@@ -147,22 +129,20 @@ class Tune:
     ] = 0.0
     transparency_weight: Annotated[
         float | None,
-        arg(
-            aliases=("--honesty-weight",),
-            metavar="NUMBER",
-            help="How much errors of the same scenarios count with a push on the hardware, and damped; by "
+        text(
+            "NUMBER",
+            "How much errors of the same scenarios count with a push on the hardware, and damped; by "
             "default 1 for retrospective_reference, 0 for others.",
-            help_behavior_hint="",
+            aliases=("--honesty-weight",),
         ),
     ] = None
     pareto: Annotated[int, number("Points of a trade-off of restitution error, each a gain file.")] = 0
     pareto_against: Annotated[
         str | None,
-        arg(
-            metavar="NAME",
-            help="What --pareto trades the error against: noise, peak (of the command) or honesty; by "
+        text(
+            "NAME",
+            "What --pareto trades the error against: noise, peak (of the command) or honesty; by "
             "default noise, or peak for retrospective_reference.",
-            help_behavior_hint="",
         ),
     ] = None
     global_search: Annotated[
@@ -204,39 +184,26 @@ class Sweep:
     limit: Limit = 0.01
     until_width: Annotated[
         float | None,
-        arg(
-            metavar="WIDTH",
-            help="Stop once the probability's interval is so narrow; --scenarios is then the most.",
-            help_behavior_hint="",
-        ),
+        text("WIDTH", "Stop once the probability's interval is so narrow; --scenarios is then the most."),
     ] = None
     drivers: Annotated[
         int | None,
-        arg(
-            metavar="[NUMBER]",
-            help=f"Also Sobol indices: what drives the error. A power of two; bare: {DEFAULT_DRIVERS}.",
-            help_behavior_hint="",
+        text(
+            "[NUMBER]", f"Also Sobol indices: what drives the error. A power of two; bare: {DEFAULT_DRIVERS}."
         ),
     ] = None
     rare: Annotated[
         float | None,
-        arg(
-            metavar="[LIMIT]",
-            help="Also subset simulation of an error beyond this, however rare; bare, or 0: --limit.",
-            help_behavior_hint="",
-        ),
+        text("[LIMIT]", "Also subset simulation of an error beyond this, however rare; bare, or 0: --limit."),
     ] = None
     acceptable: Annotated[
         float | None,
-        arg(
-            metavar="PROBABILITY",
-            help="Failure probability that the interval's upper end may reach; by default no run may fail.",
-            help_behavior_hint="",
+        text(
+            "PROBABILITY",
+            "Failure probability that the interval's upper end may reach; by default no run may fail.",
         ),
     ] = None
-    output: Annotated[str, arg(aliases=("-o",), metavar="DIR", help="Folder of the store.")] = (
-        "jaxhil-out/sweep"
-    )
+    output: Annotated[str, folder("Folder of the store.")] = "jaxhil-out/sweep"
     resume: Annotated[
         bool, arg(name="resume", metavar="", help="Go on with a sweep that was interrupted.")
     ] = False
@@ -277,26 +244,16 @@ class Compare:
 
     files: Files = ()
     suites: Annotated[
-        FlagCreatePairsOff[bool],
-        arg(help="The standard suites, besides what files are given.", help_behavior_hint=""),
+        FlagCreatePairsOff[bool], text(None, "The standard suites, besides what files are given.")
     ] = False
     compensators: Annotated[
         tuple[str, ...],
-        arg(
-            metavar="NAME [NAME ...]",
-            help="Compensators to compare; by default all that are published.",
-            help_behavior_hint="",
-        ),
+        text("NAME [NAME ...]", "Compensators to compare; by default all that are published."),
     ] = ()
-    output: Annotated[str, arg(aliases=("-o",), metavar="DIR", help="Folder for what is written.")] = (
-        "jaxhil-out/compare"
-    )
+    output: Annotated[str, folder("Folder for what is written.")] = "jaxhil-out/compare"
     untuned: Annotated[
         FlagCreatePairsOff[bool],
-        arg(
-            help="Tune nothing: judge the literature's gains, and a compensator's settings, as they are.",
-            help_behavior_hint="",
-        ),
+        text(None, "Tune nothing: judge the literature's gains, and a compensator's settings, as they are."),
     ] = False
     scenarios: Annotated[int, number("Scenarios to tune on.")] = 32
     judged: Annotated[int, number("Fresh scenarios to judge on.")] = 256

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
-from tuning.cli.options import Json, Limit, number
+from tuning.cli.options import Json, Limit, folder, number, text
 
 DEFAULT_RIG_PLOT = "jaxhil-out/rig.png"
 
@@ -20,33 +20,25 @@ class Export:
     """
 
     gains: Annotated[Positional[str], arg(metavar="GAINS", help="Gain file, or its folder.")]
-    output: Annotated[str, arg(aliases=("-o",), metavar="DIR", help="Folder of the bundle.")] = (
-        "jaxhil-out/bundle"
-    )
+    output: Annotated[str, folder("Folder of the bundle.")] = "jaxhil-out/bundle"
     sweep: Annotated[
         str | None,
-        arg(
-            metavar="STORE",
-            help="Folder of a sweep of these gains: limits and the watchdog's rates come from it.",
-            help_behavior_hint="",
-        ),
+        text("STORE", "Folder of a sweep of these gains: limits and the watchdog's rates come from it."),
     ] = None
     formats: Annotated[
         UseAppendAction[tuple[str, ...]],
-        arg(
+        text(
+            "NAME[,NAME]",
+            "Also the gains for ros2, matlab, csv, c99; repeatable; by default all.",
             name="format",
-            metavar="NAME[,NAME]",
-            help="Also the gains for ros2, matlab, csv, c99; repeatable; by default all.",
-            help_behavior_hint="",
         ),
     ] = ()
     limits: Annotated[
         UseAppendAction[tuple[str, ...]],
-        arg(
+        text(
+            "LIMIT=VALUE",
+            "A limit of the rig's own, as command_lowest=-0.05 (SI), or none; repeatable.",
             name="set",
-            metavar="LIMIT=VALUE",
-            help="A limit of the rig's own, as command_lowest=-0.05 (SI), or none; repeatable.",
-            help_behavior_hint="",
         ),
     ] = ()
     seed: Annotated[int, number("Seed of the test vectors.")] = 0
@@ -92,8 +84,7 @@ class RigOptions:
         float, arg(metavar="SECONDS", help="Injected: constant delay of every packet, either way.")
     ] = 0.0
     realtime: Annotated[
-        FlagCreatePairsOff[bool],
-        arg(help="Ask the system for a real-time priority for both processes.", help_behavior_hint=""),
+        FlagCreatePairsOff[bool], text(None, "Ask the system for a real-time priority for both processes.")
     ] = False
     seed: Annotated[int, number("Seed of sensor noise, contact phases and injected faults.")] = 0
     plot: Annotated[

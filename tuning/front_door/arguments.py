@@ -18,7 +18,7 @@ from jaxhil.mechanism.structs import Mechanism
 from jaxhil.runtime.laws import LAWS
 
 if TYPE_CHECKING:
-    from tuning.gain_file import LoadedGains
+    from jaxhil.simulation.gain_file import LoadedGains
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -138,7 +138,7 @@ def mechanisms(given: Any) -> tuple[list[LoadedMechanism], bool]:
 
 def gain_file(given: Any, argument: str = "gains") -> "LoadedGains":
     """The gains given: a gain file's path, or its folder's, or what has a gain file's `document`."""
-    from tuning.gain_file import check_document, load_gain_file
+    from jaxhil.simulation.gain_file import check_document, load_gain_file
 
     document = getattr(given, "document", None)
     if isinstance(document, Mapping):

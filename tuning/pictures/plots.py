@@ -15,37 +15,13 @@ from jaxhil.simulation.contact_plot import (
     GREEN,
     LABELS,
     ORANGE,
-    SKY,
     STYLES,
-    VERMILION,
-    contact_plot,
     finish,
     new_figure,
-    save,
 )
 from tuning.gains.objective import Objective
 from tuning.gains.pareto import Front
 from tuning.gains.tune import TuneResult
-
-__all__ = [
-    "BLACK",
-    "BLUE",
-    "GREEN",
-    "LABELS",
-    "MARKERS",
-    "ORANGE",
-    "SKY",
-    "STYLES",
-    "VERMILION",
-    "contact_plot",
-    "errors_plot",
-    "finish",
-    "front_plot",
-    "loss_plot",
-    "new_figure",
-    "overview_plot",
-    "save",
-]
 
 MARKERS = {"before": "^", "literature": "s", "tuned": "o"}
 

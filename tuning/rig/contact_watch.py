@@ -55,11 +55,6 @@ class ContactWatch:
         self._approach = self._rebound = 0.0
         self._clear()
 
-    @property
-    def in_contact(self) -> bool:
-        """Whether a contact is under way."""
-        return self._begun >= 0
-
     def observe(self, position: float, velocity: float, command: float, force: float) -> ContactResult | None:
         """One tick: the model's position [m] and velocity [m/s], the force F_c [N] it feels, the real force
         [N]. The contact that is over with this tick, if one is; the next of the run may follow."""

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tuning.pictures.plots import BLACK, BLUE, ORANGE, finish, new_figure
+from jaxhil.simulation.contact_plot import BLACK, BLUE, ORANGE, finish, new_figure
 from tuning.rig.loop import ANSWER_SHARE
 from tuning.rig.session import SessionReport
 

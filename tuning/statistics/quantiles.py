@@ -55,20 +55,6 @@ def ranks(number: int, order: float, level: float = LEVEL, sequential: bool = Fa
     return _last(inside, middle, -1), _last(inside, middle, number + 1) + 1
 
 
-def quantile(values: ArrayLike, order: float, level: float = LEVEL, sequential: bool = False) -> Estimate:
-    """The quantile of order `order` of |values| and its interval, from all the values, in their unit.
-
-    Ends beyond the least or greatest value are 0 and infinity. A non-finite value (a run without a result)
-    counts as infinite. The estimate is the order statistic of rank ceil(order n); nan without values. Raises
-    ValueError as `ranks` does.
-    """
-    ordered = np.sort(np.nan_to_num(np.abs(np.asarray(values, float)).ravel(), nan=np.inf, posinf=np.inf))
-    bounded = np.concatenate([[0.0], ordered, [np.inf]])
-    low, high = ranks(len(ordered), order, level, sequential)
-    estimate = bounded[_rank(len(ordered), order)] if len(ordered) else np.nan
-    return Estimate(np.asarray(estimate), bounded[low], bounded[high])
-
-
 def counts(values: ArrayLike) -> np.ndarray:
     """How many of |values| lie in each bin, (BINS,) of int64: add those of parts. Non-finite: the last bin.
 
@@ -82,11 +68,12 @@ def counts(values: ArrayLike) -> np.ndarray:
 def binned_quantile(
     counted: np.ndarray, order: float, level: float = LEVEL, sequential: bool = False
 ) -> Estimate:
-    """As `quantile`, from the `counts` of the values: each end is moved outward, to the edge of its bin.
+    """The quantile of order `order` of |values| and its interval, from their `counts`, in their unit.
 
-    So it covers as `quantile` does, and either end is off by less than `RESOLUTION` of itself (between the
-    first edge and the last one). The estimate is the geometric middle of its bin, off by half of that; 0 in
-    the first bin, infinite in the last one. Raises ValueError as `ranks` does.
+    Its ends are the order statistics of `ranks`, 0 and infinity beyond the least and the greatest value, each
+    moved outward, to the edge of its bin: off by less than `RESOLUTION` of itself (between the first edge and
+    the last one). The estimate, the order statistic of rank ceil(order n), is the geometric middle of its
+    bin, off by half of that; 0 in the first bin, infinite in the last one. Raises ValueError as `ranks` does.
     """
     number = int(np.sum(counted))
     below = np.cumsum(counted)

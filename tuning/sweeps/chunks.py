@@ -14,9 +14,9 @@ from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import extremes
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import begin_evaluation
+from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.scenario import Scenario, build_scenarios
-from tuning.gain_file import LoadedGains
 from tuning.sweeps.columns import rows_of
 from tuning.sweeps.draws import drawn_scenarios
 from tuning.sweeps.manifest import Manifest, loaded_gains

@@ -17,7 +17,8 @@ from msgspec import Meta
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.runtime import digest
 from jaxhil.simulation.environment import xla_flags
-from tuning.gain_file import LoadedGains, check_document, versions
+from jaxhil.simulation.gain_file import LoadedGains, check_document
+from tuning.gain_file import versions
 from tuning.sweeps import LARGEST_CHUNK, LARGEST_SEED, MOST
 from tuning.sweeps.columns import Column, sweep_columns
 from tuning.sweeps.draws import REPLICATES

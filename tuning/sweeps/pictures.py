@@ -15,8 +15,18 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
+from jaxhil.simulation.contact_plot import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    SKY,
+    VERMILION,
+    finish,
+    new_figure,
+    save,
+)
 from tuning.files import writing
-from tuning.pictures.plots import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION, finish, new_figure, save
 from tuning.statistics.intervals import binomial_interval, confidence_sequence, replicate_interval
 from tuning.sweeps.manifest import Manifest, loaded_gains
 from tuning.sweeps.regions import Input, Plan, Points, Regions, add_rows, empty_regions, make_plan, quantile

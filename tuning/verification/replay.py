@@ -22,9 +22,9 @@ from jaxhil.compensators import Signals
 from jaxhil.runtime import Controller
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
 from jaxhil.runtime.limits import NO_LIMITS
+from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.metrics import OK, STATUS_NAMES, Metrics
 from jaxhil.simulation.recording import Lane, nominal_and_draws, record_lanes
-from tuning.gain_file import LoadedGains
 from tuning.verification.closed_loop import run_closed_loop
 
 REPLAY_LIMIT = 1e-11  # of the command's range

@@ -15,9 +15,9 @@ from jaxtyping import Bool
 from jaxhil.errors import InputError
 from jaxhil.mechanism.uncertainty import extremes
 from jaxhil.runtime.limits import LIMITS
+from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.gain_file import LoadedGains
 from tuning.sweeps.store import Store, read_part
 from tuning.watchdog.alarms import JudgedRuns, features_of, good_runs, judge_chunk, reached, watchdog_rates
 from tuning.watchdog.audited import Rules

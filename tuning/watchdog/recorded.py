@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxhil.simulation.evaluation import compare_with_reference
+from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.recording import record_ticks
 from jaxhil.simulation.scenario import Scenario
-from tuning.gain_file import LoadedGains
 from tuning.sweeps.chunks import widest_loop
 from tuning.sweeps.draws import drawn_scenarios
 

@@ -84,8 +84,8 @@ def _costs(loaded: LoadedMechanism, ordered: Mapping[str, Sequence[Any]]) -> dic
 
 
 def _draw(options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence[Any]]) -> None:
+    from jaxhil.simulation.contact_plot import save
     from tuning.benchmark.plots import errors_plot, transparency_plot
-    from tuning.pictures.plots import save
 
     save(errors_plot(names, ordered, options.limit), Path(options.output) / "errors.png")
     save(transparency_plot(names, ordered), Path(options.output) / "honesty.png")

@@ -27,7 +27,7 @@ def run(options: Replay) -> int:
     document = _document(options, store, found)
     document["unlike"] = unlike_here(store.manifest)
     if options.plot is not None:
-        from tuning.pictures.plots import contact_plot, save
+        from jaxhil.simulation.contact_plot import contact_plot, save
 
         title = f"{document['mechanism']}, scenario {options.index} of {store.folder.resolve().name}"
         save(contact_plot(motion_of(found.sweep, options.index), title, sensors="rig"), options.plot)

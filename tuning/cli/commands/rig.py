@@ -60,7 +60,7 @@ def run(options: RigOptions) -> int:
     references = reference_restitutions(mechanism, session.contacts)
     found = judge(setup, session, references, options.limit, document["compensator"])
     if options.plot is not None:
-        from tuning.pictures.plots import save
+        from jaxhil.simulation.contact_plot import save
         from tuning.rig.plot import latency_plot
 
         title = f"{mechanism.name}, {document['compensator']}: latencies at {1 / period:g} Hz over UDP"
@@ -141,6 +141,10 @@ def _check_injection(options: RigOptions) -> None:
 def _print(found: dict[str, Any]) -> None:
     loops = {"empty loop": found["empty_loop"], "controller": found["run"]}
     reached = {name: loop for name, loop in loops.items() if loop is not None}
+    terminal.emit(*_tables(found, reached), *_remarks(found, reached))
+
+
+def _tables(found: dict[str, Any], reached: dict[str, Any]) -> list[Any]:
     ticks = terminal.table(
         f"{found['mechanism']}, {found['compensator']}, {1 / found['control_period']:g} Hz over UDP: ticks",
         ["loop", "ticks", "missed", "controller's fault", "injected", "the machine's"],
@@ -159,20 +163,23 @@ def _print(found: dict[str, Any]) -> None:
         ],
         texts=(0, 1),
     )
-    shown = found["contacts"][:MOST_ROWS]
     rows = [
         (
             *(number, one["number"] + 1, terminal.figure(one["restitution"], 5)),
             *(terminal.figure(one["reference_restitution"], 5), terminal.signed(one["error"])),
             *(one["peak_force"], 1e3 * one["duration"], one["status"]),
         )
-        for number, one in enumerate(shown, start=1)
+        for number, one in enumerate(found["contacts"][:MOST_ROWS], start=1)
     ]
     headings = ["contact", "entry", "e", "e*", "error", "peak force [N]", "duration [ms]", "status"]
     contacts = terminal.table(f"Contacts: {len(found['contacts'])}", headings, rows, texts=(7,))
+    return [ticks, times, *([contacts] if rows else [])]
+
+
+def _remarks(found: dict[str, Any], reached: dict[str, Any]) -> list[str]:
     lines = []
-    if len(found["contacts"]) > len(shown):
-        lines.append(f"... and {len(found['contacts']) - len(shown)} more contacts.")
+    if len(found["contacts"]) > MOST_ROWS:
+        lines.append(f"... and {len(found['contacts']) - MOST_ROWS} more contacts.")
     if found["largest_error"] is not None:
         lines.append(f"Largest error of {found['judged']} contacts: {found['largest_error']:+.5f}.")
     lines += [
@@ -201,8 +208,7 @@ def _print(found: dict[str, Any]) -> None:
         lines.append(f"The controller {found['tripped']}.")
     if found["interrupted"]:
         lines.append("Interrupted: this is what was measured.")
-    lines += [f"Bad: {reason}" for reason in found["reasons"]] or [f"Good: {found['good']}"]
-    terminal.emit(ticks, times, *([contacts] if rows else []), *lines)
+    return lines + ([f"Bad: {reason}" for reason in found["reasons"]] or [f"Good: {found['good']}"])
 
 
 _CAUSES = ("controller", "injection", "machine")

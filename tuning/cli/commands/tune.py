@@ -146,7 +146,8 @@ def _tune_all(
 def _overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], drawn: bool) -> None:
     """All mechanisms in one table and, where none has pictures of its own, in one picture."""
     if not drawn:
-        from tuning.pictures.plots import overview_plot, save
+        from jaxhil.simulation.contact_plot import save
+        from tuning.pictures.plots import overview_plot
 
         save(overview_plot(results, options.limit), Path(options.output) / "overview.png")
     if not options.json:
@@ -231,9 +232,10 @@ def is_better(figures, other) -> bool:
 
 
 def _draw(result, options: Tune, folder: Path) -> list[str]:
+    from jaxhil.simulation.contact_plot import contact_plot, save
     from jaxhil.simulation.motion import nominal_motion
     from tuning.gains.tune import uncompensated
-    from tuning.pictures.plots import contact_plot, errors_plot, loss_plot, save
+    from tuning.pictures.plots import errors_plot, loss_plot
 
     name, compensator = result.mechanism.name, options.compensator
     before, tuned = uncompensated(compensator, result.literature), (compensator, result.gains)

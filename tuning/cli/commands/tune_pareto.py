@@ -80,7 +80,8 @@ def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -
 
 def _write(options: Tune, points: Sequence[TradedGains], folder: Path) -> dict[str, Any]:
     """Write a gain file for each point and the picture of all; what `--json` says of them."""
-    from tuning.pictures.plots import front_plot, save
+    from jaxhil.simulation.contact_plot import save
+    from tuning.pictures.plots import front_plot
 
     front, result, entries = points[0].front, points[0].tuned.found, []
     for number, point in enumerate(points, start=1):

@@ -37,14 +37,22 @@ def print_overview(options: Tune, results: list[Any], entries: list[dict[str, An
 
 def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
     """Errors, gains and starts of one mechanism, and the verdict."""
-    from jaxhil.compensators import COMPENSATORS
+    tables = [_errors(options, result, entry["better_than_literature"])]
+    tables += [_transparency(result)] if result.transparency else []
+    tables += [*_gains(options, result), *([_starts(options, result)] if result.starts else [])]
+    closing = [f"wrote {path}" for path in (entry["gain_file"], *entry["plots"])]
+    if not entry["sensor_noise"]:
+        closing.append("No sensor noise in the mechanism; with it: --set rig.force_sensor.noise_std=2.67")
+    closing.append("took: " + ", ".join(f"{stage} {time:.1f} s" for stage, time in result.timings.items()))
+    terminal.emit(*tables, *_how_sure(result), *closing, _verdict(options, result, entry["verdict"]), "")
 
-    law, mechanism = COMPENSATORS[options.compensator].gains, result.mechanism
+
+def _errors(options: Tune, result: Any, better: bool) -> Any:
     names = {"before": "before (uncompensated)", "literature": "literature's rule", "tuned": "tuned"}
     rows = []
     for key, label in names.items():
         one = result.figures[key]
-        if key == "tuned" and not entry["better_than_literature"]:
+        if key == "tuned" and not better:
             label = "tuned (NOT better than the literature's)"
         rows.append(
             (
@@ -53,41 +61,44 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
             )
         )
     count = int(result.outcomes["tuned"].wanted.sum())
-    errors = terminal.table(
-        f"{mechanism.name}: errors e - e* of {count} contacts in {options.validation} fresh scenarios",
+    return terminal.table(
+        f"{result.mechanism.name}: errors e - e* of {count} contacts in {options.validation} fresh scenarios",
         ["gains", "rms", "99th pct", "max", "mean", "e > e*", "peak ratio", "chatter", "not ended"],
         rows,
     )
-    gains = terminal.table(
-        f"Gains of {options.compensator}",
-        ["gain", "unit", "lower", "upper", "literature", "tuned", "free alone", "together"],
-        [
-            (
-                *(gain.name, gain.unit, float(gain.lower(mechanism)), float(gain.upper(mechanism))),
-                result.literature[gain.name],
-                result.gains[gain.name] if gain.tuned(mechanism) else "(not tuned)",
-                *(f"{100 * share:.1f} %" for share in result.freedom.get(gain.name, ())),
-                *([""] * (0 if gain.name in result.freedom else 2)),
-            )
-            for gain in law
-        ],
-        texts=(0, 1),
-    )
-    starts = _starts(options, result)
+
+
+def _gains(options: Tune, result: Any) -> list[Any]:
+    """The table of gains; none of a law without any."""
+    from jaxhil.compensators import COMPENSATORS
+
+    mechanism = result.mechanism
+    rows = [
+        (
+            *(gain.name, gain.unit, float(gain.lower(mechanism)), float(gain.upper(mechanism))),
+            result.literature[gain.name],
+            result.gains[gain.name] if gain.tuned(mechanism) else "(not tuned)",
+            *([f"{100 * share:.1f} %" for share in result.freedom.get(gain.name, ())] or ["", ""]),
+        )
+        for gain in COMPENSATORS[options.compensator].gains
+    ]
+    headings = ["gain", "unit", "lower", "upper", "literature", "tuned", "free alone", "together"]
+    return [terminal.table(f"Gains of {options.compensator}", headings, rows, texts=(0, 1))] if rows else []
+
+
+def _verdict(options: Tune, result: Any, verdict: str) -> str:
     tuned = result.figures["tuned"]
     low, high = result.intervals.rms
     sure = f" (95 %: {low:.2g} to {high:.2g})" if math.isfinite(low + high) else ""
-    if entry["verdict"] == "good":
-        verdict = f"Good: the tuned rms error {tuned.rms:.2g}{sure} is within {options.limit:g}."
-    elif tuned.failed:
-        verdict = f"Bad: {tuned.failed} contacts did not end with the tuned gains."
-    else:
-        verdict = f"Bad: the tuned rms error {tuned.rms:.2g}{sure} exceeds {options.limit:g}."
-    seconds = ", ".join(f"{stage} {time:.1f} s" for stage, time in result.timings.items())
-    closing = [f"took: {seconds}", verdict]
-    if not entry["sensor_noise"]:
-        closing.insert(0, "No sensor noise in the mechanism; with it: --set rig.force_sensor.noise_std=2.67")
-    written = [entry["gain_file"], *entry["plots"]]
+    if verdict == "good":
+        return f"Good: the tuned rms error {tuned.rms:.2g}{sure} is within {options.limit:g}."
+    if tuned.failed:
+        return f"Bad: {tuned.failed} contacts did not end with the tuned gains."
+    return f"Bad: the tuned rms error {tuned.rms:.2g}{sure} exceeds {options.limit:g}."
+
+
+def _how_sure(result: Any) -> list[str]:
+    """What there is to say of how sure the optimum is."""
     sure_of = []
     if result.freedom:
         sure_of.append(
@@ -106,9 +117,7 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
             f"Best of {one.evaluations} evaluations anywhere: {one.best:.4g}; tuned, with {one.spent}: "
             f"{one.tuned:.4g}, {100 * abs(one.above):.1f} % {'above' if one.above > 0 else 'below'} it."
         )
-    tables = [errors] + ([_transparency(result)] if result.transparency else [])
-    tables += ([gains] if law else []) + ([starts] if result.starts else [])
-    terminal.emit(*tables, *sure_of, *(f"wrote {path}" for path in written), *closing, "")
+    return sure_of
 
 
 def _transparency(result: Any) -> Any:
