@@ -7,6 +7,7 @@ from jaxhil.simulation.environment import prepare
 from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options import Replay
+from tuning.front_door import arguments
 
 KEYS = ("restitution", "reference_restitution", "error", "peak_force", "peak_command", "duration")
 KEYS = (*KEYS, "position_shortfall", "approach_velocity", "energy_in", "energy_out")
@@ -14,7 +15,7 @@ KEYS = (*KEYS, "position_shortfall", "approach_velocity", "energy_in", "energy_o
 
 def run(options: Replay) -> int:
     """Run the scenario, print its contacts; 0 if all numbers are the stored ones, else 1."""
-    checks.at_least(0, index=options.index)
+    arguments.integers(0, index=options.index)
     if options.plot is not None:
         checks.picture(options.plot)
     prepare()

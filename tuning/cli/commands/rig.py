@@ -10,6 +10,7 @@ from jaxhil.errors import InputError, one_line
 from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options_rig import RigOptions
+from tuning.front_door import arguments
 
 LONGEST_EMPTY = 30.0  # s of empty loop at most
 EMPTY_SHARE = 0.2  # of the run's duration
@@ -19,12 +20,12 @@ MOST_ROWS = 12  # contacts shown one by one
 
 def run(options: RigOptions) -> int:
     """Play an empty loop and the run; 0 if all is good, 1 if not, 130 if interrupted."""
-    checks.limit(options.limit)
-    checks.at_least(0, seed=options.seed)
+    arguments.limit(options.limit)
+    arguments.integers(0, seed=options.seed)
     _check_injection(options)
     if options.plot is not None:
         checks.picture(options.plot)
-    gains = checks.gain_file(options.path)
+    gains = arguments.readable_gain_file(options.path)
     document, mechanism = load(gains)
     period = mechanism.rig.control_period
     if not period <= options.duration <= MOST_TICKS * period:

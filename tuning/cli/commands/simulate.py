@@ -12,6 +12,7 @@ from jaxhil.simulation.environment import prepare
 from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options import Simulate
+from tuning.front_door import arguments
 
 if TYPE_CHECKING:
     from jaxhil.simulation.run import ContactResult, Run
@@ -19,12 +20,12 @@ if TYPE_CHECKING:
 
 def run(options: Simulate) -> int:
     """Run the contacts, report each; 0 if every error is within the limit, else 1."""
-    checks.limit(options.limit)
-    checks.at_least(0, seed=options.seed)
+    arguments.limit(options.limit)
+    arguments.integers(0, seed=options.seed)
     if options.plot is not None:
         checks.picture(options.plot)
     if options.compensator is not None:
-        checks.compensator(options.compensator)
+        arguments.compensators([options.compensator])
     mechanism = None
     if options.gains is None or options.file is not None:
         mechanism = load(options.file, options.overrides).mechanism
@@ -65,7 +66,7 @@ def _chosen(options: Simulate, mechanism: Mechanism | None) -> tuple[Mechanism, 
     if options.gains is None:
         assert mechanism is not None
         compensator = options.compensator or "none"
-        checks.setting(compensator, options.setting)
+        arguments.setting(compensator, options.setting)
         return mechanism, compensator, options.setting
 
     from jaxhil.simulation.gain_file import load_gain_file
