@@ -115,5 +115,5 @@ def restitution_errors_of(task, gains):
 
 def test_every_device_has_as_many_of_the_long_ones():
     """Places of a call are cut into one stretch for each of the two devices."""
-    np.testing.assert_array_equal(rounds._dealt(8), [0, 2, 4, 6, 1, 3, 5, 7])
-    np.testing.assert_array_equal(rounds._dealt(3), [0, 1, 2])
+    np.testing.assert_array_equal(rounds.sharded(8), [0, 2, 4, 6, 1, 3, 5, 7])
+    np.testing.assert_array_equal(rounds.sharded(3), [0, 1, 2])

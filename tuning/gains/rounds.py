@@ -170,7 +170,7 @@ def _stepper(tasks, names, bounds, objectives, number) -> Callable[[list[_Proble
             solution = jax.device_get(
                 program_cache.run(_advance, static, call(some, limit), program_folder())
             )
-            for place, i in enumerate(_sharded(size)):
+            for place, i in enumerate(sharded(size)):
                 if i < len(some):
                     _take(some[i], solution, place)
 
@@ -182,7 +182,7 @@ def _size(number: int) -> int:
     return FEW if number <= FEW else MANY
 
 
-def _sharded(size: int) -> np.ndarray:
+def sharded(size: int) -> np.ndarray:
     """Which problem is in each place of a call: in turn for each device, whose places are side by side, so
     that all of them have as many of the long ones."""
     devices = math.gcd(jax.device_count(), size)
@@ -202,10 +202,10 @@ def _calls(tasks, names, bounds, objectives, number):
     static = (loop, names, terms), LONGEST, max(1, TILE // lanes)
 
     def call(some: list[_Problem], limit: int):
-        sharded = _sharded(size)
+        places = sharded(size)
         # Nothing runs in the places that only fill the call.
-        filled = [some[i] if i < len(some) else some[0] for i in sharded]
-        idle = sharded[:, None] >= len(some)
+        filled = [some[i] if i < len(some) else some[0] for i in places]
+        idle = places[:, None] >= len(some)
         index = np.array([p.task for p in filled])
         starts = np.stack([p.coordinates for p in filled])
         scenarios, others, weighed, limits = jax.tree.map(itemgetter(index), table)
