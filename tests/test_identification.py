@@ -25,8 +25,7 @@ def rig(readings, weights, forgetting):
     state = ContactIdentification(*INITIAL, *VARIANCES, forgetting)
     for (depth, rate, force), weight in zip(readings, weights, strict=True):
         state.update(float(force), float(depth), float(rate), float(weight))
-    kk, kb, bb = state.covariance
-    return [state.stiffness, state.damping, kb / bb, kk - kb * kb / bb, bb]
+    return [getattr(state, name) for name in Identified._fields]
 
 
 def batch(readings, weights, forgetting):

@@ -22,27 +22,19 @@ Gains = dict[str, Array]
 
 
 class Gain(NamedTuple):
-    """One tunable number of a compensator.
+    """One tunable number of a compensator."""
 
-    name: of the gain.
-    unit: "1" if it has none.
-    lower: bound, a function of the mechanism.
-    upper: bound, likewise.
-    nominal: the literature's own rule, likewise.
-    logarithmic: whether it is searched on a logarithmic scale.
-    neutral: value at which it does nothing, if any; with all of them neutral the law passes the force on.
-    tuned: whether tuning moves it for this mechanism; if not, it stays at the nominal value.
-    begins: where all starts of tuning but the literature's have it, if not anywhere.
-    """
-
-    name: str
-    unit: str
-    lower: Callable[[Mechanism], float]
-    upper: Callable[[Mechanism], float]
-    nominal: Callable[[Mechanism], float]
-    logarithmic: bool = False
+    name: str  # of the gain
+    unit: str  # "1" if it has none
+    lower: Callable[[Mechanism], float]  # bound, a function of the mechanism
+    upper: Callable[[Mechanism], float]  # bound, likewise
+    nominal: Callable[[Mechanism], float]  # the literature's own rule, likewise
+    logarithmic: bool = False  # whether it is searched on a logarithmic scale
+    # value at which it does nothing, if any; with all of them neutral the law passes the force on
     neutral: float | None = None
+    # whether tuning moves it for this mechanism; if not, it stays at the nominal value
     tuned: Callable[[Mechanism], bool] = lambda mechanism: True
+    # where all starts of tuning but the literature's have it, if not anywhere
     begins: Callable[[Mechanism], float] | None = None
 
 
@@ -64,31 +56,20 @@ def rig_gain(
 
 
 class Signals(NamedTuple):
-    """What the controller knows at a tick.
+    """What the controller knows at a tick."""
 
-    force_measured: [N].
-    position_desired: x_d of the numerical model [m].
-    velocity_desired: v_d of the numerical model [m/s].
-    position_measured: x_a of the motion simulator [m].
-    age: ticks since this run began, 0 at its first.
-    """
-
-    force_measured: Float[Array, "*batch"]
-    position_desired: Float[Array, "*batch"]
-    velocity_desired: Float[Array, "*batch"]
-    position_measured: Float[Array, "*batch"]
-    age: Int[Array, "*batch"]
+    force_measured: Float[Array, "*batch"]  # [N]
+    position_desired: Float[Array, "*batch"]  # x_d of the numerical model [m]
+    velocity_desired: Float[Array, "*batch"]  # v_d of the numerical model [m/s]
+    position_measured: Float[Array, "*batch"]  # x_a of the motion simulator [m]
+    age: Int[Array, "*batch"]  # ticks since this run began, 0 at its first
 
 
 class Constants(NamedTuple):
-    """What the controller knows of the rig.
+    """What the controller knows of the rig."""
 
-    control_period: T [s].
-    clearance: between two surfaces [m]; infinite for one.
-    """
-
-    control_period: Float[Array, "*batch"]
-    clearance: Float[Array, "*batch"]
+    control_period: Float[Array, "*batch"]  # T [s]
+    clearance: Float[Array, "*batch"]  # between two surfaces [m]; infinite for one
 
 
 def cleared(state: Any, begins: Array) -> Any:

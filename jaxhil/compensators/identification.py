@@ -49,10 +49,7 @@ def update(
     alpha_2 = alpha_1 + f_2 * g_2
     inverse_1, inverse_2 = 1 / alpha_1, 1 / alpha_2
     step = (force - (old.stiffness * deflection + old.damping * rate)) * inverse_2
-    variances = (
-        old.stiffness_variance * inverse_1,
-        old.damping_variance * alpha_1 * inverse_2 / kept,
-    )
+    variances = (old.stiffness_variance * inverse_1, old.damping_variance * alpha_1 * inverse_2 / kept)
     bounded = [jnp.where(d < most, d, most) for d, most in zip(variances, initial_variances, strict=True)]
     return Identified(
         stiffness=old.stiffness + (g_1 + g_2 * old.coupling) * step,

@@ -20,9 +20,7 @@ import cmath
 import math
 from typing import ClassVar
 
-import jax.numpy as jnp
-
-from jaxhil.compensators.base import Compensator, Constants, Gain, Gains, rig_gain
+from jaxhil.compensators.base import Constants, Gain, Gains, rig_gain
 from jaxhil.compensators.estimates import (
     CONTACT_FREQUENCY,
     FORCE_DELAY,
@@ -31,13 +29,7 @@ from jaxhil.compensators.estimates import (
     force_delay,
     simulator_lag,
 )
-from jaxhil.compensators.phase_lead import (
-    LEAD_FILTER,
-    LeadFilter,
-    LeadState,
-    lead,
-    lead_amplification,
-)
+from jaxhil.compensators.phase_lead import LEAD_FILTER, LeadFilter, PhaseLead
 from jaxhil.errors import InputError
 from jaxhil.mechanism.structs import Mechanism
 
@@ -81,7 +73,7 @@ def multi_parameter_filter(gains: Gains, constants: Constants) -> LeadFilter:
     )
 
 
-class MultiParameterLead(Compensator):
+class MultiParameterLead(PhaseLead):
     """F_c = a F + b dF/dt, filtered."""
 
     name: ClassVar[str] = "multi_parameter_lead"
@@ -107,13 +99,3 @@ class MultiParameterLead(Compensator):
 
     def prepare(self, gains, constants):
         return multi_parameter_filter(gains, constants)
-
-    def noise_amplification(self, gains, constants):
-        return lead_amplification(multi_parameter_filter(gains, constants))
-
-    def init(self, gains, constants, ring):
-        zeros = jnp.zeros_like(constants.control_period)
-        return LeadState(zeros, zeros)
-
-    def step(self, prepared, state, signals, tick):
-        return lead(prepared, state, signals.force_measured)

@@ -79,7 +79,7 @@ class PhaseLead(Compensator):
         return lead_filter(gains, constants)
 
     def noise_amplification(self, gains, constants):
-        return lead_amplification(lead_filter(gains, constants))
+        return lead_amplification(self.prepare(gains, constants))
 
     def init(self, gains, constants, ring):
         zeros = jnp.zeros_like(constants.control_period)

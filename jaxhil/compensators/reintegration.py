@@ -95,11 +95,7 @@ def remember(history: History, tick: Array, sample: Array) -> Float[Array, "samp
 
 
 def follow(
-    old: Reintegration,
-    curve: Curve,
-    measured: Measured,
-    first: Array,
-    present: Int[Array, "*batch"],
+    old: Reintegration, curve: Curve, measured: Measured, first: Array, present: Int[Array, "*batch"]
 ) -> Reintegration:
     """One tick of the live motion, to the sample `present` (0 at the first tick in contact, where all starts
     afresh), and of the pass.
@@ -131,12 +127,7 @@ def follow(
     behind = _choose(held, old.behind, behind)
     reached = jnp.where(held, old.reached, reached)
     done = reached == present
-    return Reintegration(
-        _choose(done, behind, live),
-        behind,
-        jnp.where(done, -1, reached),
-        curve_behind,
-    )
+    return Reintegration(_choose(done, behind, live), behind, jnp.where(done, -1, reached), curve_behind)
 
 
 def _advance(

@@ -140,23 +140,15 @@ class ResponseError(Compensator):
 
     def init(self, gains, constants, ring):
         zeros = jnp.zeros_like(constants.control_period)
-        return ResponseErrorState(
-            lead=LeadState(zeros, zeros),
-            position=zeros,
-            velocity=zeros,
-            aligned=zeros,
-            aligned_velocity=zeros,
-            contact_share=zeros,
-            force_share=zeros,
-            identified=Identified(
-                zeros + gains["initial_stiffness"],
-                zeros + gains["initial_damping"],
-                zeros,
-                zeros + gains["stiffness_covariance"],
-                zeros + gains["damping_covariance"],
-            ),
-            line=empty(ring, zeros),
+        identified = Identified(
+            zeros + gains["initial_stiffness"],
+            zeros + gains["initial_damping"],
+            zeros,
+            zeros + gains["stiffness_covariance"],
+            zeros + gains["damping_covariance"],
         )
+        led, line = LeadState(zeros, zeros), empty(ring, zeros)
+        return ResponseErrorState(led, zeros, zeros, zeros, zeros, zeros, zeros, identified, line)
 
     def restart(self, gains, state, begins, fresh):
         old = state.identified

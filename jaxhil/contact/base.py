@@ -16,26 +16,17 @@ from jaxhil.contact.reference_motion import integrate_contact
 
 
 class ContactParameters(NamedTuple):
-    """What a law needs of one contact; a leading axis of contacts, where there is one, comes first.
+    """What a law needs of one contact; a leading axis of contacts, where there is one, comes first."""
 
-    stiffness: [N/m], or [N/m^n] with an exponent n; (segments, ...) for piecewise-linear.
-    damping: [N s/m], or chi [s/m] for Hunt-Crossley.
-    exponent: n [1].
-    depths: between segments [m], (segments - 1, ...).
-    tension: whether the contact may pull.
-    reference_depth: d_0 [m].
-    unloading_ratio: r [1].
-    kind: number of the law for `jaxhil.contact.mixture`, else None.
-    """
-
+    # [N/m], or [N/m^n] with an exponent n; (segments, ...) for piecewise-linear
     stiffness: Float[Array, "..."]
-    damping: Float[Array, "..."]
-    exponent: Float[Array, "..."]
-    depths: Float[Array, "..."]
-    tension: Bool[Array, "..."]
-    reference_depth: Float[Array, "..."]
-    unloading_ratio: Float[Array, "..."]
-    kind: Int[Array, "..."] | None = None
+    damping: Float[Array, "..."]  # [N s/m], or chi [s/m] for Hunt-Crossley
+    exponent: Float[Array, "..."]  # n [1]
+    depths: Float[Array, "..."]  # between segments [m], (segments - 1, ...)
+    tension: Bool[Array, "..."]  # whether the contact may pull
+    reference_depth: Float[Array, "..."]  # d_0 [m]
+    unloading_ratio: Float[Array, "..."]  # r [1]
+    kind: Int[Array, "..."] | None = None  # number of the law for `jaxhil.contact.mixture`, else None
 
 
 class ContactLaw(eqx.Module):
@@ -62,11 +53,7 @@ class ContactLaw(eqx.Module):
 
     @abc.abstractmethod
     def step(
-        self,
-        parameters: ContactParameters,
-        state: tuple[Array, ...],
-        penetration: Array,
-        rate: Array,
+        self, parameters: ContactParameters, state: tuple[Array, ...], penetration: Array, rate: Array
     ) -> tuple[Array, tuple[Array, ...]]:
         """Force [N] at `penetration` [m] and `rate` [m/s], and the next state."""
 

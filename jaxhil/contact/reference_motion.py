@@ -92,13 +92,15 @@ def integrate_contact(
 
 
 class _Problem(NamedTuple):
-    law: Any
-    parameters: Any
-    mass: Array
-    approach: Array
-    push: Any
-    until: Array
-    tolerance: Float[Array, ""] | float
+    """What `integrate_contact` is asked for."""
+
+    law: Any  # contact law
+    parameters: Any  # its parameters
+    mass: Array  # M [kg]
+    approach: Array  # v [m/s]
+    push: Any  # p, or None
+    until: Array  # end of the push [s]
+    tolerance: Float[Array, ""] | float  # of a step's error, relative
 
 
 class _State(NamedTuple):

@@ -49,18 +49,12 @@ _NAMES = tuple(status.name for status in STATUSES)
 
 
 class ContactRecord(NamedTuple):
-    """What the law said of one contact.
+    """What the law said of one contact."""
 
-    number: of the contact; 0 before the first.
-    status: what counts, one of `STATUSES` by name.
-    ticks: on which the law acted.
-    unsure, saturated, too_short, displaced, noisy: of these, the ticks with that status.
-    """
-
-    number: int = 0
-    status: str = _NAMES[UNSTATED]
-    ticks: int = 0
-    unsure: int = 0
+    number: int = 0  # of the contact; 0 before the first
+    status: str = _NAMES[UNSTATED]  # what counts, one of `STATUSES` by name
+    ticks: int = 0  # on which the law acted
+    unsure: int = 0  # of these, the ticks with that status; so with the others
     saturated: int = 0
     too_short: int = 0
     displaced: int = 0

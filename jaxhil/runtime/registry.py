@@ -12,17 +12,13 @@ from .law_status import UNSTATED
 
 
 class GainSpecification(NamedTuple):
-    """One gain of a compensator: its unit, and the values for which the law is defined.
+    """One gain of a compensator: its unit, and the values for which the law is defined; the narrower bounds
+    used in tuning stand in the gain file itself."""
 
-    unit: "1" if it has none.
-    lowest, highest: the ends of its range; the narrower bounds used in tuning stand in the gain file itself.
-    exclusive: whether `lowest` itself is not in the range.
-    """
-
-    unit: str
-    lowest: float = -inf
-    highest: float = inf
-    exclusive: bool = False
+    unit: str  # "1" if it has none
+    lowest: float = -inf  # least value
+    highest: float = inf  # largest value
+    exclusive: bool = False  # whether `lowest` itself is not in the range
 
     def admits(self, value: float) -> bool:
         """Whether the law is defined for this value."""

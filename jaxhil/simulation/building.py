@@ -16,11 +16,7 @@ SHORTEST_RING = 16
 
 
 def build_loop(
-    mechanism: Mechanism,
-    compensator: str,
-    scenarios: Scenario,
-    energies: bool = False,
-    chatter: bool = False,
+    mechanism: Mechanism, compensator: str, scenarios: Scenario, energies: bool = False, chatter: bool = False
 ) -> Loop:
     """The loop of `mechanism` under the compensator called `compensator`, for all `scenarios` at once.
 

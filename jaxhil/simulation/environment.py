@@ -1,4 +1,4 @@
-"""What jax is told: devices, quick compilation, precision, and where compiled programs are kept.
+"""The settings of jax: devices, quick compilation, precision, and where compiled programs are kept.
 
 A command has its process to itself: it calls `prepare` before anything that imports jax. A function called
 from Python is a guest in its caller's process: it computes within `computing`, after which jax's settings and
@@ -18,10 +18,7 @@ DEVICES = "--xla_force_host_platform_device_count"
 # a short command.
 RARELY = 100_000, 50, 50
 # What compiled programs are kept under: all that takes longer to compile than to read.
-KEEPING = {
-    "jax_persistent_cache_min_compile_time_secs": 0.1,
-    "jax_persistent_cache_min_entry_size_bytes": 0,
-}
+KEEPING = {"jax_persistent_cache_min_compile_time_secs": 0.1, "jax_persistent_cache_min_entry_size_bytes": 0}
 _started_with: list[str] = []  # XLA_FLAGS that jax was started with, once `start` did it
 
 

@@ -150,10 +150,7 @@ def enter(
     start = drive - stride
     end = drive if loop.hold == "linear" else start
     first_position = read(
-        rig.propagation.measured_position,
-        steady_state(rig.propagation, start, stride),
-        start,
-        end,
+        rig.propagation.measured_position, steady_state(rig.propagation, start, stride), start, end
     )
     return state._replace(
         position=position,

@@ -24,25 +24,23 @@ Laws = Mapping[str, tuple[str, Mapping[str, float]]]  # by name, a compensator a
 
 
 class Curve(NamedTuple):
-    """Over `time` [s]: force [N] on the numerical model and its position [m]; on a rig, measured force [N]
-    and position [m] too. It entered at `velocity` [m/s]."""
+    """A motion over time."""
 
-    velocity: float
-    time: np.ndarray
-    force: np.ndarray
-    position: np.ndarray
-    force_measured: np.ndarray | None
-    position_measured: np.ndarray | None
+    velocity: float  # at which it entered [m/s]
+    time: np.ndarray  # [s]
+    force: np.ndarray  # on the numerical model [N]
+    position: np.ndarray  # of the numerical model [m]
+    force_measured: np.ndarray | None  # [N]; None in space
+    position_measured: np.ndarray | None  # [m]; None in space
 
 
 class Piece(NamedTuple):
     """One run of the schedule: a contact, or with two surfaces all of them. Time 0 is the first touch of
-    uniform motion. `surfaces` are the positions [m] of the mechanism's surfaces; `curves` by name, "in space"
-    among them."""
+    uniform motion."""
 
-    name: str
-    surfaces: tuple[float, ...]
-    curves: dict[str, Curve]
+    name: str  # of the run
+    surfaces: tuple[float, ...]  # positions of the mechanism's surfaces [m]
+    curves: dict[str, Curve]  # by name, "in space" among them
 
 
 def nominal_motion(mechanism: Mechanism, laws: Laws, seed: int = 0) -> list[Piece]:

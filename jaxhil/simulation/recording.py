@@ -29,18 +29,16 @@ CHUNK = 512  # ticks recorded by one call of the compiled program
 
 
 class Lane(NamedTuple):
-    """What the controller read and commanded [N] in one lane, (ticks,), up to the end of its last contact.
+    """What the controller read and commanded in one lane, (ticks,), up to the end of its last contact."""
 
-    `sent` is the position command [m] that it made of the numerical model's motion after each tick.
-    `identified` is what it made of stiffness [N/m] and damping [N s/m], where it identifies them. With
-    `zeroed`, the loop takes F_c = 0 at the first tick of a run, whatever the controller says: before t = 0
-    there is no force, though a noisy or biased sensor reads some.
-    """
-
-    signals: Signals
-    command: np.ndarray | Array
+    signals: Signals  # what it read
+    command: np.ndarray | Array  # F_c [N]
+    # stiffness [N/m] and damping [N s/m], by a controller that identifies them
     identified: tuple[np.ndarray | Array, np.ndarray | Array] | None
+    # whether the loop takes F_c = 0 at the first tick of a run, whatever the controller says: before t = 0
+    # there is no force, though a noisy or biased sensor reads some
     zeroed: bool
+    # position command [m] made of the numerical model's motion after each tick
     sent: np.ndarray | Array | None = None
     contact: np.ndarray | Array | None = None  # index of the contact of each tick
 

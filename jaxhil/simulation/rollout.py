@@ -249,9 +249,7 @@ def _skip_flight(loop, rig, gains, state, watch, tick):
 def _restart(loop, gains, state, entered, begins, fresh):
     """Take over the entered run on the lanes where it `begins`; rings and the law's parameters stay."""
     rings = state.sensed._replace(
-        last=entered.sensed.last,
-        lagged=entered.sensed.lagged,
-        first_position=entered.sensed.first_position,
+        last=entered.sensed.last, lagged=entered.sensed.lagged, first_position=entered.sensed.first_position
     )
     chosen = _choose(
         begins,

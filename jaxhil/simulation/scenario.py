@@ -80,10 +80,7 @@ def contact_slots(contacts: int) -> int:
 
 
 def build_scenarios(
-    mechanism: Mechanism,
-    draws: Mapping[str, Any] | None = None,
-    seed: int = 0,
-    first: int = 0,
+    mechanism: Mechanism, draws: Mapping[str, Any] | None = None, seed: int = 0, first: int = 0
 ) -> Scenario:
     """Batch of scenarios of a mechanism, as NumPy arrays; as jax arrays where draws are such.
 

@@ -73,10 +73,7 @@ def lag_decay(duration: Array, time_constant: Array) -> Array:
 
 
 def sample_force(
-    force: Float[Array, "*batch"],
-    quantum: Array,
-    dead_zone: Array,
-    range_: Array,
+    force: Float[Array, "*batch"], quantum: Array, dead_zone: Array, range_: Array
 ) -> Float[Array, "*batch"]:
     """A sample [N] of a noisy force: quantum, dead zone and range, in that order."""
     force = quantise(force, quantum)

@@ -34,12 +34,7 @@ _0, _1 = np.zeros(HYPOTHESES), np.ones(HYPOTHESES)
 
 
 class DelayBank:
-    """The bank, made of how far [s] the farthest hypotheses lie from the given delay, and of the map's prior.
-
-    curve: the mean of the maps.
-    shift: the mean of the hypotheses' delays [s].
-    variance: of the force that each expects where it was read last [1/s^2].
-    """
+    """The bank, made of how far [s] the farthest hypotheses lie from the given delay, and the map's prior."""
 
     __slots__ = (
         "_carried", "_covariance", "_damping", "_deepest", "_estimate", "_known", "_learning", "_likelihood",
@@ -53,7 +48,7 @@ class DelayBank:
         estimate, covariance = prior.moments()
         self._prior_estimate = np.repeat(np.array(estimate)[:, None], HYPOTHESES, axis=1)
         self._prior_covariance = np.repeat(np.array(covariance)[:, :, None], HYPOTHESES, axis=2)
-        self.curve = Curve()
+        self.curve = Curve()  # the mean of the maps
         self.reset()
 
     def reset(self) -> None:
@@ -63,7 +58,7 @@ class DelayBank:
         self._precision = np.zeros(HYPOTHESES)
         self._weighted = np.zeros(HYPOTHESES)
         self._met = 0.0
-        self.shift = 0.0
+        self.shift = 0.0  # the mean of the hypotheses' delays [s]
 
     @np.errstate(all="ignore")
     def begin(self) -> None:
@@ -97,7 +92,7 @@ class DelayBank:
         self._covariance = self._prior_covariance.copy()
         self._deepest = np.zeros(HYPOTHESES)
         self._known = np.zeros(HYPOTHESES)
-        self.variance = 0.0
+        self.variance = 0.0  # of the force that each expects where it was read last [1/s^2]
         self._likelihood = np.ones(HYPOTHESES)
 
     def _read(

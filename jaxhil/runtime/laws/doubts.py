@@ -32,12 +32,7 @@ SHAKING = 0.0005  # s, over the approach speed
 
 
 class Doubts:
-    """What is counted of one contact.
-
-    readings: in contact.
-    late: by how much [s] the hardware enters after the numerical model.
-    early: readings that stood out of the noise before the hardware should be in contact.
-    """
+    """What is counted of one contact."""
 
     __slots__ = (
         "_depth", "_force", "_position", "_shallow", "_step", "_swings", "_swung", "_variance", "early",
@@ -55,9 +50,9 @@ class Doubts:
 
     def restart(self) -> None:
         """Another contact."""
-        self.early = 0
-        self.readings = 0
-        self.late = 0.0
+        self.early = 0  # readings that stood out of the noise before the hardware should be in contact
+        self.readings = 0  # in contact
+        self.late = 0.0  # by how much [s] the hardware enters after the numerical model
         self._swings = 0.0
         self._swung = 0.0
         self._shallow = 0

@@ -52,22 +52,16 @@ class Prior(NamedTuple):
 
 
 class Curve:
-    """What counts of a map.
-
-    slopes: [1/s^2].
-    at_knots: force there [1/s].
-    damping, depth_damping: [1/s].
-    unloading: [1/s^2].
-    """
+    """What counts of a map."""
 
     __slots__ = ("at_knots", "damping", "depth_damping", "slopes", "unloading")
 
     def __init__(self) -> None:
-        self.slopes = [0.0] * SEGMENTS
-        self.at_knots = [0.0] * SEGMENTS
-        self.damping = 0.0
-        self.depth_damping = 0.0
-        self.unloading = 0.0
+        self.slopes = [0.0] * SEGMENTS  # [1/s^2]
+        self.at_knots = [0.0] * SEGMENTS  # force there [1/s]
+        self.damping = 0.0  # [1/s]
+        self.depth_damping = 0.0  # [1/s]
+        self.unloading = 0.0  # [1/s^2]
 
     def take(self, other: "Curve") -> None:
         """Become equal to the other, whose lists are never changed."""

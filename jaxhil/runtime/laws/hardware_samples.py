@@ -11,10 +11,7 @@ from .reintegration import ReferenceMotion
 
 
 class HardwareSamples:
-    """The samples of one contact, moved into the history of `reference`.
-
-    first: time [s] of the first tick after the numerical model's entry.
-    """
+    """The samples of one contact, moved into the history of `reference`."""
 
     __slots__ = (
         "_deepest", "_depth", "_force", "_fraction", "_impulse", "_moved", "_moved_shown", "_offset",
@@ -39,7 +36,7 @@ class HardwareSamples:
 
     def begin(self, first: float, force: float, shown: bool, depth: float, speed: float) -> None:
         """The numerical model has entered `first` [s] ago; the sample before this tick's."""
-        self.first = first
+        self.first = first  # time of the first tick after the numerical model's entry [s]
         self._force = force
         self._shown = shown
         self._depth = depth

@@ -24,35 +24,24 @@ HISTORY = 1024  # samples kept; a longer contact is not integrated over again
 
 
 class Path:
-    """A motion, at one sample.
-
-    curve: the map that it moves under.
-    depth: [s].
-    speed: as a fraction of the approach speed.
-    deepest: point so far [s].
-    force: without damping [1/s].
-    impulse: of the measured sample there, the force's integral since the entry [ticks/s].
-    read: over how many ticks that is.
-    expected: the map's force at the measured sample [1/s].
-    free: whether it has separated.
-    """
+    """A motion, at one sample."""
 
     __slots__ = ("curve", "deepest", "depth", "expected", "force", "free", "impulse", "read", "speed")
 
     def __init__(self) -> None:
-        self.curve = Curve()
+        self.curve = Curve()  # the map that it moves under
         self.enter()
 
     def enter(self) -> None:
         """Begin at depth 0 with speed 1."""
-        self.depth = 0.0
-        self.speed = 1.0
-        self.deepest = 0.0
-        self.force = 0.0
-        self.impulse = 0.0
-        self.read = 0.0
-        self.expected = 0.0
-        self.free = False
+        self.depth = 0.0  # [s]
+        self.speed = 1.0  # as a fraction of the approach speed
+        self.deepest = 0.0  # point so far [s]
+        self.force = 0.0  # without damping [1/s]
+        self.impulse = 0.0  # integral of the measured force since the entry, at its sample there [ticks/s]
+        self.read = 0.0  # over how many ticks that is
+        self.expected = 0.0  # the map's force at the measured sample [1/s]
+        self.free = False  # whether it has separated
 
     def take(self, other: "Path") -> None:
         """Go on from where the other is."""
@@ -67,13 +56,7 @@ class Path:
 
 
 class ReferenceMotion:
-    """The live motion and the pass behind it.
-
-    live: where the numerical model should be by now, and how fast.
-    replay: rho.
-    shift: by how much [s] the force is older than it was taken for when samples were remembered: it belongs
-        to X - shift V.
-    """
+    """The live motion and the pass behind it."""
 
     __slots__ = (
         "_behind", "_coarse", "_deepest", "_depths", "_first", "_impulses", "_number", "_period", "_present",
@@ -81,7 +64,9 @@ class ReferenceMotion:
     )  # fmt: skip
 
     def __init__(self, period: float) -> None:
-        self.replay = 0.0
+        self.replay = 0.0  # rho
+        # By how much [s] the force is older than it was taken for when samples were remembered: it belongs to
+        # X - shift V.
         self.shift = 0.0
         self._period = period
         steps = COARSE / period
@@ -91,7 +76,7 @@ class ReferenceMotion:
         self._depths = [0.0] * HISTORY
         self._speeds = [0.0] * HISTORY
         self._deepest = [0.0] * HISTORY
-        self.live = Path()
+        self.live = Path()  # where the numerical model should be by now, and how fast
         self._behind = Path()
         self.restart(0.0)
 
