@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import jax
@@ -9,13 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from compiling import QUICK
 
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.compensators import COMPENSATORS, Gains
 from jaxhil.mechanism.file import from_builtins
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.metrics import OK
-from jaxhil.simulation.rollout import record, rollout
+from jaxhil.simulation.loop import Loop, build_rig_constants
+from jaxhil.simulation.metrics import OK, Metrics
+from jaxhil.simulation.rollout import rollout, start, stretch, stretch_length, turn_over
 from jaxhil.simulation.scenario import Scenario, build_scenarios
+from jaxhil.simulation.tick import Tick
 
 PERIOD = 2e-3  # coarse: errors of arithmetic show, and the oracle is quick
 MASS, VELOCITY, STIFFNESS = 350.0, 0.005, 124355.0
@@ -23,7 +26,21 @@ IDEAL = {"model": "ideal"}
 SECOND_ORDER = {"model": "second_order", "natural_frequency": 12.0, "damping_ratio": 0.8, "delay": 0.0037}
 
 run_rollout = jax.jit(rollout, static_argnums=0, compiler_options=QUICK)
-run_record = jax.jit(record, static_argnums=(0, 3), compiler_options=QUICK)
+
+
+@partial(jax.jit, static_argnums=(0, 3), compiler_options=QUICK)
+def run_record(loop: Loop, gains: Gains, scenario: Scenario, ticks: int) -> tuple[Metrics, Tick]:
+    """Metrics and every tick, (ticks, *batch), of so many ticks or a few more, up to a whole number of
+    stretches; free flight is not skipped."""
+    rig = build_rig_constants(loop, scenario)
+
+    def body(run, _):
+        run, seen = stretch(loop, rig, gains, run, record=True)
+        return turn_over(loop, rig, gains, run, skip_flight=False), seen
+
+    stretches = -(-ticks // stretch_length(loop))
+    run, seen = jax.lax.scan(body, start(loop, rig, gains), None, length=stretches)
+    return run.metrics, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), seen)
 
 
 def mechanism(

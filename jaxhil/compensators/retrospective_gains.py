@@ -22,13 +22,10 @@ SHARP = {
     "correction_limit": 0.9,
     "replay_noise": 0.7679,
 }
-GENTLE = {
-    "prior_stiffness": 9.563,
+GENTLE = SHARP | {
     "prior_stiffness_spread": 23.9,
-    "prior_slope_spread": 29.17,
     "prior_damping_spread": 6.5,
     "prior_depth_damping_spread": 0.05,
-    "prior_unloading_spread": 0.1607,
     "force_noise_floor": 0.02,
     "velocity_gain": 200.0,
     "correction_limit": 0.48,

@@ -38,15 +38,12 @@ class SamplingInterval(NamedTuple):
 
 
 class PlantSignals(NamedTuple):
-    """The contact in a sampling interval, as it is without the sensors.
+    """The contact in a sampling interval, as it is without the sensors."""
 
-    force: of the contact, where it is sampled [N].
-    works: done on the mechanism and returned by it [J]; None unless energies are followed.
-    peak: of the force in the interval [N]; None unless the force has corners between samples.
-    """
-
-    force: Float[Array, "*batch"]
+    force: Float[Array, "*batch"]  # of the contact, where it is sampled [N]
+    # done on the mechanism and returned by it [J]; None unless energies are followed
     works: tuple[Array, Array] | None
+    # of the force in the interval [N]; None unless the force has corners between samples
     peak: Float[Array, "*batch"] | None
 
 

@@ -24,21 +24,6 @@ RUNAWAY = 1e3  # of the first approach speed: no rig survives it
 class Metrics(NamedTuple):
     """Figures of every contact, (slots, *batch).
 
-    restitution: rebound speed over approach speed [1].
-    approach_velocity: speed of the numerical model before the contact [m/s].
-    peak_force: largest real contact force [N].
-    peak_command: largest |F_c| [N].
-    excess_variation: of F_c [N], see below; 0 unless followed.
-    position_shortfall: how far the motion simulator's limits held the command back [m], see below.
-    duration: time with a real force [s].
-    work_in: done on the mechanism by the real force along x_a [J]; 0 unless followed.
-    work_out: returned by it [J]; 0 unless followed.
-    trajectory_error: root mean square of x_d's depth off that of the same contact in space, as long as that
-        lasts, each since it touched [m]; 0 unless probed.
-    force_delay: of the force measurement as the compensator estimates it by then [s]; 0 unless it does.
-    status: one of `STATUS_NAMES`.
-    ticks: run by then.
-
     excess_variation is V / 2 - (max F_c - min F_c), V the total variation sum |F_c(n+1) - F_c(n)| of the
     command, which counts as 0 before the contact and after it. The least V / 2 there is, max - min, is that
     of a command that swings but once: up to its maximum, down to its minimum and back to 0. What is beyond
@@ -49,19 +34,24 @@ class Metrics(NamedTuple):
     0, to the bit, where neither limit binds or there is none.
     """
 
-    restitution: Float[Array, "slots *batch"]
-    approach_velocity: Float[Array, "slots *batch"]
-    peak_force: Float[Array, "slots *batch"]
-    peak_command: Float[Array, "slots *batch"]
-    excess_variation: Float[Array, "slots *batch"]
+    restitution: Float[Array, "slots *batch"]  # rebound speed over approach speed [1]
+    approach_velocity: Float[Array, "slots *batch"]  # of the numerical model before the contact [m/s]
+    peak_force: Float[Array, "slots *batch"]  # largest real contact force [N]
+    peak_command: Float[Array, "slots *batch"]  # largest |F_c| [N]
+    excess_variation: Float[Array, "slots *batch"]  # of F_c [N], see above; 0 unless followed
+    # how far the motion simulator's limits held the command back [m], see above
     position_shortfall: Float[Array, "slots *batch"]
-    duration: Float[Array, "slots *batch"]
+    duration: Float[Array, "slots *batch"]  # time with a real force [s]
+    # done on the mechanism by the real force along x_a [J]; 0 unless followed
     work_in: Float[Array, "slots *batch"]
-    work_out: Float[Array, "slots *batch"]
+    work_out: Float[Array, "slots *batch"]  # returned by it [J]; 0 unless followed
+    # root mean square of x_d's depth off that of the same contact in space, as long as that lasts, each since
+    # it touched [m]; 0 unless probed
     trajectory_error: Float[Array, "slots *batch"]
+    # of the force measurement as the compensator estimates it by then [s]; 0 unless it does
     force_delay: Float[Array, "slots *batch"]
-    status: Int[Array, "slots *batch"]
-    ticks: Int[Array, "slots *batch"]
+    status: Int[Array, "slots *batch"]  # one of `STATUS_NAMES`
+    ticks: Int[Array, "slots *batch"]  # run by then
 
 
 def empty_metrics(loop: Loop, slots: int, like: Array) -> Metrics:

@@ -54,20 +54,6 @@ def run_contacts(loop: Loop, gains: Gains, rig: RigConstants) -> Metrics:
     return lax.while_loop(lambda run: jnp.any(run.active), body, run).metrics
 
 
-def record(loop: Loop, gains: Gains, scenario: Scenario, ticks: int) -> tuple[Metrics, Tick]:
-    """Metrics and every tick, (ticks, *batch), of so many ticks or a few more, up to a whole number of
-    stretches; free flight is not skipped."""
-    rig = build_rig_constants(loop, scenario)
-
-    def body(run, _):
-        run, seen = stretch(loop, rig, gains, run, record=True)
-        return turn_over(loop, rig, gains, run, skip_flight=False), seen
-
-    stretches = -(-ticks // stretch_length(loop))
-    run, seen = lax.scan(body, start(loop, rig, gains), None, length=stretches)
-    return run.metrics, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), seen)
-
-
 def stretch_length(loop: Loop) -> int:
     """Ticks between turn-overs. Between two surfaces the next contact may begin at once."""
     return 1 if loop.is_two_sided else 16

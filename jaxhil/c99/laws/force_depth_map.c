@@ -25,20 +25,9 @@ typedef struct {
     double variance; /* [1/s^2] of the force that it expects where it was read last */
 } jaxhil_force_depth_map;
 
-/* With the gains' prior. */
-void jaxhil_force_depth_map_init(jaxhil_force_depth_map *map, const jaxhil_gains *gains);
-void jaxhil_force_depth_map_restart(jaxhil_force_depth_map *map);
-
 /* One reading in contact, with noise of a `variance` [1/s^2]. */
 void jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, double speed, double deepest,
                                    double force, double variance);
-
-/* Force [1/s] that does not depend on how the contact came there, and all of it; 0 out of contact. */
-double jaxhil_curve_elastic(const jaxhil_curve *curve, double depth);
-double jaxhil_curve_force(const jaxhil_curve *curve, double depth, double speed, double deepest);
-
-/* Force [1/s] where a contact entered at speed 1 comes to rest without dissipation. */
-double jaxhil_curve_peak_force(const jaxhil_curve *curve);
 
 /* == Definitions == */
 
@@ -104,17 +93,7 @@ static void jaxhil_force_depth_map_conclude(jaxhil_force_depth_map *map) {
     curve->unloading = jaxhil_positive_mean(map->estimate[14], map->covariance[14][14]);
 }
 
-void jaxhil_force_depth_map_init(jaxhil_force_depth_map *map, const jaxhil_gains *gains) {
-    map->stiffness = gains->prior_stiffness;
-    map->common = gains->prior_stiffness_spread * gains->prior_stiffness_spread;
-    map->wandering = gains->prior_slope_spread * gains->prior_slope_spread;
-    map->damping = gains->prior_damping_spread * gains->prior_damping_spread;
-    map->depth_damping = gains->prior_depth_damping_spread * gains->prior_depth_damping_spread;
-    map->unloading = gains->prior_unloading_spread * gains->prior_unloading_spread;
-    jaxhil_force_depth_map_restart(map);
-}
-
-void jaxhil_force_depth_map_restart(jaxhil_force_depth_map *map) {
+static void jaxhil_force_depth_map_restart(jaxhil_force_depth_map *map) {
     for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
         for (int j = 0; j < JAXHIL_PARAMETERS; j++) {
             map->covariance[i][j] = 0.0;
@@ -133,6 +112,17 @@ void jaxhil_force_depth_map_restart(jaxhil_force_depth_map *map) {
     map->covariance[13][13] = map->depth_damping;
     map->covariance[14][14] = map->unloading;
     jaxhil_force_depth_map_conclude(map);
+}
+
+/* With the gains' prior. */
+static void jaxhil_force_depth_map_init(jaxhil_force_depth_map *map, const jaxhil_gains *gains) {
+    map->stiffness = gains->prior_stiffness;
+    map->common = gains->prior_stiffness_spread * gains->prior_stiffness_spread;
+    map->wandering = gains->prior_slope_spread * gains->prior_slope_spread;
+    map->damping = gains->prior_damping_spread * gains->prior_damping_spread;
+    map->depth_damping = gains->prior_depth_damping_spread * gains->prior_depth_damping_spread;
+    map->unloading = gains->prior_unloading_spread * gains->prior_unloading_spread;
+    jaxhil_force_depth_map_restart(map);
 }
 
 void jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, double speed, double deepest,
@@ -182,7 +172,8 @@ void jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, do
     jaxhil_force_depth_map_conclude(map);
 }
 
-double jaxhil_curve_elastic(const jaxhil_curve *curve, double depth) {
+/* Force [1/s] that does not depend on how the contact came there, 0 out of contact. */
+static double jaxhil_curve_elastic(const jaxhil_curve *curve, double depth) {
     const int segment = jaxhil_segment_of(depth);
     if (segment < 0) {
         return 0.0;
@@ -190,7 +181,8 @@ double jaxhil_curve_elastic(const jaxhil_curve *curve, double depth) {
     return curve->at_knots[segment] + curve->slopes[segment] * (depth - jaxhil_knots[segment]);
 }
 
-double jaxhil_curve_force(const jaxhil_curve *curve, double depth, double speed, double deepest) {
+/* Force [1/s], 0 out of contact. */
+static double jaxhil_curve_force(const jaxhil_curve *curve, double depth, double speed, double deepest) {
     if (!(depth > 0.0)) {
         return 0.0;
     }
@@ -199,7 +191,8 @@ double jaxhil_curve_force(const jaxhil_curve *curve, double depth, double speed,
     return jaxhil_curve_elastic(curve, depth) + (drag - curve->unloading * back);
 }
 
-double jaxhil_curve_peak_force(const jaxhil_curve *curve) {
+/* Force [1/s] where a contact entered at speed 1 comes to rest without dissipation. */
+static double jaxhil_curve_peak_force(const jaxhil_curve *curve) {
     double energy = 0.0;
     int segment = 0;
     while (segment < JAXHIL_SEGMENTS - 1) {

@@ -13,20 +13,23 @@ typedef struct {
     double initial_stiffness, initial_damping, most1, most2, forgetting;
 } jaxhil_identification;
 
-void jaxhil_identification_init(jaxhil_identification *identification, double stiffness, double damping,
-                                double stiffness_covariance, double damping_covariance, double forgetting);
-void jaxhil_identification_reset(jaxhil_identification *identification);
-void jaxhil_identification_restart_covariance(jaxhil_identification *identification);
-
-/* Take in one reading: force [N], signed deflection [m], its rate [m/s] and its weight. False, with the rest
- * left undone, where a divisor is 0. */
-bool jaxhil_identification_update(jaxhil_identification *identification, double force, double deflection,
-                                  double rate, double weight);
-
 /* == Definitions == */
 
-void jaxhil_identification_init(jaxhil_identification *identification, double stiffness, double damping,
-                                double stiffness_covariance, double damping_covariance, double forgetting) {
+static void jaxhil_identification_restart_covariance(jaxhil_identification *identification) {
+    identification->u = 0.0;
+    identification->d1 = identification->most1;
+    identification->d2 = identification->most2;
+}
+
+static void jaxhil_identification_reset(jaxhil_identification *identification) {
+    identification->stiffness = identification->initial_stiffness;
+    identification->damping = identification->initial_damping;
+    jaxhil_identification_restart_covariance(identification);
+}
+
+static void jaxhil_identification_init(jaxhil_identification *identification, double stiffness, double damping,
+                                       double stiffness_covariance, double damping_covariance,
+                                       double forgetting) {
     identification->initial_stiffness = stiffness;
     identification->initial_damping = damping;
     identification->most1 = stiffness_covariance;
@@ -35,20 +38,10 @@ void jaxhil_identification_init(jaxhil_identification *identification, double st
     jaxhil_identification_reset(identification);
 }
 
-void jaxhil_identification_reset(jaxhil_identification *identification) {
-    identification->stiffness = identification->initial_stiffness;
-    identification->damping = identification->initial_damping;
-    jaxhil_identification_restart_covariance(identification);
-}
-
-void jaxhil_identification_restart_covariance(jaxhil_identification *identification) {
-    identification->u = 0.0;
-    identification->d1 = identification->most1;
-    identification->d2 = identification->most2;
-}
-
-bool jaxhil_identification_update(jaxhil_identification *identification, double force, double deflection,
-                                  double rate, double weight) {
+/* Take in one reading: force [N], signed deflection [m], its rate [m/s] and its weight. False, with the rest
+ * left undone, where a divisor is 0. */
+static bool jaxhil_identification_update(jaxhil_identification *identification, double force, double deflection,
+                                         double rate, double weight) {
     const double u = identification->u;
     double d1 = identification->d1;
     double d2 = identification->d2;

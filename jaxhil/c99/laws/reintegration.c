@@ -33,17 +33,6 @@ typedef struct {
     double deepest[JAXHIL_HISTORY];
 } jaxhil_reference_motion;
 
-void jaxhil_reference_motion_init(jaxhil_reference_motion *reference, double period);
-
-/* A contact whose sample 0, the next tick's, comes `first` [s] after its entry. */
-void jaxhil_reference_motion_restart(jaxhil_reference_motion *reference, double first);
-
-/* A measured sample: the integral since the entry [ticks/s] of the force that could be read, over how many ticks that
- * is, depth [s], speed, deepest point [s]. */
-void jaxhil_reference_motion_remember(jaxhil_reference_motion *reference, long index, double impulse, double read,
-                                      double depth, double speed, double deepest);
-void jaxhil_reference_motion_tick(jaxhil_reference_motion *reference, const jaxhil_curve *curve);
-
 /* == Definitions == */
 
 static const double jaxhil_reference_coarse = 0.002; /* s, the longest step of a pass, at least a tick */
@@ -59,7 +48,16 @@ static void jaxhil_path_enter(jaxhil_path *path) {
     path->free = false;
 }
 
-void jaxhil_reference_motion_init(jaxhil_reference_motion *reference, double period) {
+/* A contact whose sample 0, the next tick's, comes `first` [s] after its entry. */
+static void jaxhil_reference_motion_restart(jaxhil_reference_motion *reference, double first) {
+    reference->first = first;
+    reference->number = 0;
+    reference->present = -1;
+    reference->reached = -1;
+    jaxhil_path_enter(&reference->behind);
+}
+
+static void jaxhil_reference_motion_init(jaxhil_reference_motion *reference, double period) {
     const double steps = jaxhil_reference_coarse / period;
     reference->replay = 0.0;
     reference->shift = 0.0;
@@ -80,16 +78,10 @@ void jaxhil_reference_motion_init(jaxhil_reference_motion *reference, double per
     jaxhil_reference_motion_restart(reference, 0.0);
 }
 
-void jaxhil_reference_motion_restart(jaxhil_reference_motion *reference, double first) {
-    reference->first = first;
-    reference->number = 0;
-    reference->present = -1;
-    reference->reached = -1;
-    jaxhil_path_enter(&reference->behind);
-}
-
-void jaxhil_reference_motion_remember(jaxhil_reference_motion *reference, long index, double impulse, double read,
-                                      double depth, double speed, double deepest) {
+/* A measured sample: the integral since the entry [ticks/s] of the force that could be read, over how many ticks that
+ * is, depth [s], speed, deepest point [s]. */
+static void jaxhil_reference_motion_remember(jaxhil_reference_motion *reference, long index, double impulse,
+                                             double read, double depth, double speed, double deepest) {
     const long slot = index % JAXHIL_HISTORY;
     reference->impulses[slot] = impulse;
     reference->reads[slot] = read;
@@ -158,7 +150,7 @@ static void jaxhil_reference_pass(jaxhil_reference_motion *reference) {
     }
 }
 
-void jaxhil_reference_motion_tick(jaxhil_reference_motion *reference, const jaxhil_curve *curve) {
+static void jaxhil_reference_motion_tick(jaxhil_reference_motion *reference, const jaxhil_curve *curve) {
     jaxhil_path *live = &reference->live;
     reference->present++;
     if (reference->reached >= 0 || reference->number <= JAXHIL_HISTORY) {
