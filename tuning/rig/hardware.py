@@ -40,6 +40,7 @@ class RigTask:
     again; after the first round, each run meets its first surface at a phase of its own. `stroke`: the lowest
     and highest position [m] that the drives take. With `resets`, a controller that trips by one of the
     faults `EXPLAINED` where a command was older than `BRIDGED` periods is reset, and the session goes on.
+    `tripped` says why the controller has; it is empty as long as it has not.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class RigTask:
         self._not_finite = self._beyond = 0
         self._stroke = stroke
         self._newest: Answer | None = None
-        self._words, self._first, self._oldest = "", 0, 0
+        self.tripped, self._first, self._oldest = "", 0, 0
         self._resets, self._forgiven, self._resetting = resets, [], False
         self._next_run(0)
 
@@ -67,11 +68,6 @@ class RigTask:
     def contacts(self) -> tuple[ContactResult, ...]:
         """Contacts that are over."""
         return tuple(self._contacts)
-
-    @property
-    def tripped(self) -> str:
-        """Why the controller has tripped; empty as long as it has not."""
-        return self._words
 
     @property
     def forgiven(self) -> tuple[str, ...]:
@@ -88,18 +84,16 @@ class RigTask:
         self._sequence += 1
         force, position = self._plant.read()
         time = self._sequence * self._period
-        if self._tick < 0:
-            start = self._start
-            event = RESET if self._resetting else PREPARE
-            return Reading(event, self._sequence, self._run, 0, time, force, position, *start)
-        return Reading(TICK, self._sequence, self._run, self._tick, time, force, position, *self._start)
+        event = TICK if self._tick >= 0 else RESET if self._resetting else PREPARE
+        tick = max(self._tick, 0)
+        return Reading(event, self._sequence, self._run, tick, time, force, position, *self._start)
 
     def take(self, answer: Answer) -> bool:
         """Take in an answer; whether it is the one to this tick."""
         if answer.run != self._run:
             return False
         if answer.flags & TRIPPED:
-            self._words = answer.words or "tripped"
+            self.tripped = answer.words or "tripped"
         if self._tick < 0:
             if answer.flags & READY and math.isfinite(answer.position_command):
                 self._newest = answer._replace(tick=-1)
@@ -118,7 +112,7 @@ class RigTask:
 
     def advance(self) -> None:
         """The tick is over: its command, or what stands for it, moves the rig one period."""
-        explained = self._resets and self._words.startswith(EXPLAINED)
+        explained = self._resets and self.tripped.startswith(EXPLAINED)
         if explained and self._last_oldest() > BRIDGED:
             self._reset()
         if self._tick < 0:
@@ -144,7 +138,7 @@ class RigTask:
 
     def finish(self) -> None:
         """No tick follows. A contact that a trip has cut short is one of the contacts."""
-        if self._tick >= 0 and self._words and all(one.status != "tripped" for one in self._contacts):
+        if self._tick >= 0 and self.tripped and all(one.status != "tripped" for one in self._contacts):
             cut = self._watch.cut("tripped")
             if cut is not None:
                 self._contacts.append(cut)
@@ -157,8 +151,8 @@ class RigTask:
 
     def _reset(self) -> None:
         """Another run instead of this one, with a controller that starts anew."""
-        self._forgiven.append(self._words)
-        self._words = ""
+        self._forgiven.append(self.tripped)
+        self.tripped = ""
         number = self._number
         if self._tick >= 0:
             cut = self._watch.cut(STALLED)
@@ -172,14 +166,14 @@ class RigTask:
         """Between runs the mechanism is held, free, at the start of the next one."""
         self._pause -= 1
         newest = self._newest
-        if newest is None or self._pause > 0 or self._words:
+        if newest is None or self._pause > 0 or self.tripped:
             return
         self._plant.begin(*self._start, newest.position_command, self._number)
         self._watch.begin(self._number)
         self._tick = 0
 
     def _over(self, over: ContactResult) -> None:
-        if self._words:
+        if self.tripped:
             # Once tripped, the rig plays on, and what becomes of the contact says nothing.
             if all(one.status != "tripped" for one in self._contacts):
                 self._keep(over._replace(status="tripped", restitution=math.nan))

@@ -65,14 +65,18 @@ class Network:
         if held is None:
             return
         if held <= 0:
-            self._put(packet)
+            self.send_plainly(packet)
         else:
             self._count += 1
             heapq.heappush(self._going, (time.monotonic_ns() + held, self._count, packet))
 
     def send_plainly(self, packet: bytes) -> None:
         """Send a packet past all injection."""
-        self._put(packet)
+        try:
+            self._socket.send(packet)
+        except OSError:
+            # Nobody listens: the tick will be a missed one.
+            pass
 
     def receive(self) -> list[tuple[int, bytes]]:
         """What has arrived by now: when [ns], and the packet."""
@@ -87,7 +91,7 @@ class Network:
         """Wait until something may have arrived, at the longest until `until` [ns]; send what is due."""
         now = time.monotonic_ns()
         while self._going and self._going[0][0] <= now:
-            self._put(heapq.heappop(self._going)[2])
+            self.send_plainly(heapq.heappop(self._going)[2])
         if self._going:
             until = min(until, self._going[0][0])
         if self._coming and for_arrivals:
@@ -125,10 +129,3 @@ class Network:
         if known:
             self.held_back[number] += held
         return held
-
-    def _put(self, packet: bytes) -> None:
-        try:
-            self._socket.send(packet)
-        except OSError:
-            # Nobody listens: the tick will be a missed one.
-            pass

@@ -148,17 +148,18 @@ class ControllerTask:
 
     `bridged`: how many missing ticks in a row are made up. Counts `made_up` and `stale`, packets of no
     use, and in `doubts` the contacts of which the law said that it did not know them, by what it said.
+    `period` is the control period [s].
     """
 
     __slots__ = (
-        *("_bridged", "_command", "_controller", "_force", "_last", "_model", "_period", "_run"),
-        *("_sequence", "_tared", "_words", "_zeroed", "doubts", "made_up", "stale"),
+        *("_bridged", "_command", "_controller", "_force", "_last", "_model", "_run"),
+        *("_sequence", "_tared", "_words", "_zeroed", "doubts", "made_up", "period", "stale"),
     )
 
     def __init__(self, controller: Any, mechanism: dict[str, Any], bridged: float = MOST_MADE_UP) -> None:
         self._controller = controller
         self._model, self._bridged = NumericalModel(mechanism), min(bridged, MOST_MADE_UP)
-        self._period = float(mechanism["rig"]["control_period"])
+        self.period = float(mechanism["rig"]["control_period"])
         sensor = mechanism["rig"].get("force_sensor", {})
         # Before tick 0 there is no force, though a noisy sensor reads some.
         self._zeroed = sensor.get("noise_std", 0.0) != 0.0 or sensor.get("bias", 0.0) != 0.0
@@ -168,11 +169,6 @@ class ControllerTask:
         self._words = ""
         self.stale = self.made_up = 0
         self.doubts: dict[str, int] = {}
-
-    @property
-    def period(self) -> float:
-        """The control period [s]."""
-        return self._period
 
     @property
     def status(self) -> str:
@@ -236,7 +232,7 @@ class ControllerTask:
         faults |= self._tick(reading.tick, reading.force, reading.position, reading.time)
         self._last = reading
         # After a trip the command goes its own way.
-        rate = (self._command - before) / self._period if self._controller.tripped else model.velocity
+        rate = (self._command - before) / self.period if self._controller.tripped else model.velocity
         return self._reply(reading, 0, rate, position, velocity, self._force, faults)
 
     def _make_up(self, missed: int, reading: Reading) -> int:
@@ -250,7 +246,7 @@ class ControllerTask:
             force = before.force + share * (reading.force - before.force)
             position = before.position + share * (reading.position - before.position)
             tick = reading.tick - missed + number
-            time_then = reading.time - (missed - number) * self._period
+            time_then = reading.time - (missed - number) * self.period
             faults |= self._tick(tick, force, position, time_then)
         return faults
 

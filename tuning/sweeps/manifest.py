@@ -154,22 +154,13 @@ def loaded_gains(manifest: Manifest, source: str = "sweep") -> LoadedGains:
 
 def differences(old: Manifest, new: Manifest) -> list[str]:
     """What of the inputs is not the same, each as "key: found OLD, asked for NEW"."""
-    found_differences = []
-    for key in (
-        "gains_sha256",
-        "scenarios",
-        "seed",
-        "sampling",
-        "precision",
-        "limit",
-        "works",
-        "chunk",
-        "until_width",
-        "xla_flags",
-    ):
-        before, now = getattr(old, key), getattr(new, key)
-        if before != now:
-            found_differences.append(f"{key}: found {_short(before)}, asked for {_short(now)}")
+    keys = ("gains_sha256", *Choices._fields, "xla_flags")
+    values = ((key, getattr(old, key), getattr(new, key)) for key in keys)
+    found_differences = [
+        f"{key}: found {_short(before)}, asked for {_short(now)}"
+        for key, before, now in values
+        if before != now
+    ]
     found_differences += _other_versions(old.versions, new.versions)
     if old.columns != new.columns:
         found_differences.append(OTHER_COLUMNS)

@@ -122,26 +122,22 @@ def alarms(
 def guard_trips(extent: Extent, limits: Mapping[str, float | None]) -> Bool[np.ndarray, "lanes"]:
     """Runs that a guard other than the watchdog would stop, or flag readings of."""
 
-    def most(name: str) -> float:
+    def limit(name: str, unlimited: float = np.inf) -> float:
         value = limits[name]
-        return np.inf if value is None else value
-
-    def least(name: str) -> float:
-        value = limits[name]
-        return -np.inf if value is None else value
+        return unlimited if value is None else value
 
     return (
-        (extent.reading >= most("force_range"))
-        | (extent.measured_lowest < least("measured_lowest"))
-        | (extent.measured_highest > most("measured_highest"))
-        | (extent.sent_lowest < least("command_lowest"))
-        | (extent.sent_highest > most("command_highest"))
-        | (extent.force_stuck > most("force_stuck_travel"))
-        | (extent.position_stuck > most("position_stuck_travel"))
-        | (extent.flight_force > most("free_force"))
-        | (extent.command > most("force_limit"))
-        | (extent.slew > most("force_slew"))
-        | (extent.sent_speed > most("velocity_limit"))
+        (extent.reading >= limit("force_range"))
+        | (extent.measured_lowest < limit("measured_lowest", -np.inf))
+        | (extent.measured_highest > limit("measured_highest"))
+        | (extent.sent_lowest < limit("command_lowest", -np.inf))
+        | (extent.sent_highest > limit("command_highest"))
+        | (extent.force_stuck > limit("force_stuck_travel"))
+        | (extent.position_stuck > limit("position_stuck_travel"))
+        | (extent.flight_force > limit("free_force"))
+        | (extent.command > limit("force_limit"))
+        | (extent.slew > limit("force_slew"))
+        | (extent.sent_speed > limit("velocity_limit"))
     )
 
 
