@@ -12,13 +12,7 @@ from typing import Any
 import rich.progress
 from rich import box
 from rich.console import Console, RenderableType
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-)
+from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -98,56 +92,47 @@ def finite(value: Any) -> Any:
 class Stages:
     """Progress through a known number of stages, shown on standard error, unless `quiet`."""
 
-    def __init__(self, progress: rich.progress.Progress | None, task: Any, quiet: bool = False):
-        self._progress, self._task, self._begun = progress, task, False
+    def __init__(self, total: int, bar: rich.progress.Progress | None, quiet: bool):
+        self._bar, self._begun = bar, False
+        self._task: Any = None if bar is None else bar.add_task("", total=total)
         self._note = (lambda text: None) if quiet else note
 
     def begin(self, text: str) -> None:
         """The stage before, if any, is over and `text` begins."""
-        if self._progress is None:
+        if self._bar is None:
             self._note(text)
             return
-        self._progress.update(self._task, advance=int(self._begun), description=text)
+        self._bar.update(self._task, advance=int(self._begun), description=text)
         self._begun = True
 
     def say(self, text: str) -> None:
         """What is going on; no stage is over by it."""
-        if self._progress is None:
+        if self._bar is None:
             self._note(text)
         else:
-            self._progress.update(self._task, description=text)
+            self._bar.update(self._task, description=text)
 
     def finish(self) -> None:
         """One stage is over, whatever comes next."""
-        if self._progress is not None:
-            self._progress.update(self._task, advance=1)
+        if self._bar is not None:
+            self._bar.update(self._task, advance=1)
 
 
 @contextmanager
 def stages(total: int, shown: bool = True) -> Iterator[Stages]:
     """A bar on a terminal, a plain line per stage elsewhere; nothing if it is not to be shown."""
-    console = _console(sys.stderr)
-    if not shown or not console.is_terminal:
-        yield Stages(None, None, quiet=not shown)
-        return
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=20),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    with rich.progress.Progress(*columns, console=console, transient=True) as bar:
-        yield Stages(bar, bar.add_task("", total=total))
+    columns = SpinnerColumn(), _text(), BarColumn(bar_width=20), MofNCompleteColumn(), TimeElapsedColumn()
+    with _bar(shown, *columns) as bar:
+        yield Stages(total, bar, quiet=not shown)
 
 
 class Progress:
     """Progress through a known number of equal pieces of work, shown on standard error, unless `quiet`."""
 
-    def __init__(
-        self, total: int, unit: str, bar: rich.progress.Progress | None, task: Any, quiet: bool = False
-    ):
-        self._total, self._unit, self._bar, self._task, self._quiet = total, unit, bar, task, quiet
+    def __init__(self, total: int, unit: str, bar: rich.progress.Progress | None, quiet: bool):
+        self._total, self._unit, self._bar = total, unit, bar
+        self._note = (lambda text: None) if quiet else note
+        self._task: Any = None if bar is None else bar.add_task("", total=total)
         self._done, self._skipped = 0, 0
         self._begun = self._shown = time.monotonic()
 
@@ -171,23 +156,31 @@ class Progress:
         pace = f"{figure(rate, 3)} {self._unit}/s, {_span(left)} left"
         if self._bar is not None:
             self._bar.update(self._task, completed=self._done, description=f"{pace}, {text}")
-        elif self._quiet:
-            return
         elif time.monotonic() - self._shown >= SECONDS_BETWEEN_LINES and self._done < self._total:
             self._shown = time.monotonic()
-            note(f"{self._done} of {self._total} {self._unit}, {pace}, {text}")
+            self._note(f"{self._done} of {self._total} {self._unit}, {pace}, {text}")
 
 
 @contextmanager
 def progress(total: int, unit: str, shown: bool = True) -> Iterator[Progress]:
     """A bar on a terminal, a plain line now and then elsewhere; nothing if it is not to be shown."""
+    with _bar(shown, BarColumn(bar_width=20), MofNCompleteColumn(), _text()) as bar:
+        yield Progress(total, unit, bar, quiet=not shown)
+
+
+@contextmanager
+def _bar(shown: bool, *columns: rich.progress.ProgressColumn) -> Iterator[rich.progress.Progress | None]:
+    """A bar if it is to be shown and there is a terminal, else none."""
     console = _console(sys.stderr)
     if not shown or not console.is_terminal:
-        yield Progress(total, unit, None, None, quiet=not shown)
+        yield None
         return
-    columns = (BarColumn(bar_width=20), MofNCompleteColumn(), TextColumn("{task.description}", markup=False))
     with rich.progress.Progress(*columns, console=console, transient=True) as bar:
-        yield Progress(total, unit, bar, bar.add_task("", total=total))
+        yield bar
+
+
+def _text() -> TextColumn:
+    return TextColumn("{task.description}", markup=False)
 
 
 def _span(seconds: float | None) -> str:

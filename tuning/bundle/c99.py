@@ -19,12 +19,8 @@ from jaxhil.runtime.controller import Controller
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
 from tuning.bundle.c99_tables import Table, constants, faults_table, gains_table, limits_table, statuses_table
 
-HEADER, SOURCE, GAINS, TEST = (
-    "jaxhil_controller.h",
-    "jaxhil_controller.c",
-    "jaxhil_gains.h",
-    "test_vectors.c",
-)
+HEADER, SOURCE = "jaxhil_controller.h", "jaxhil_controller.c"
+GAINS, TEST = "jaxhil_gains.h", "test_vectors.c"
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 DECLARATIONS = "/* == Declarations == */\n"
 DEFINITIONS = "/* == Definitions == */\n"

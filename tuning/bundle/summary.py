@@ -27,13 +27,8 @@ QUANTITIES = {
     "force": ("contact force", "N", 1.0),
 }
 
-FITTED = (
-    "expected_",
-    "softness_",
-    "speed_",
-    "loss_",
-    "reference_",
-)  # what the watchdog's expectation is made of
+# What the watchdog's expectation is made of.
+FITTED = ("expected_", "softness_", "speed_", "loss_", "reference_")
 
 STYLE = """
 @page { size: A4; margin: 11mm 12mm; }

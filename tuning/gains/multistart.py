@@ -27,7 +27,6 @@ from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import spread_points
 from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import apart, polish
-from tuning.optimisation.unit_box import to_coordinates
 
 SCAN_SCENARIOS = 32  # on which the points of a scan are tried
 KINKED = 3  # times as many evaluations without derivatives for a user's function
@@ -140,9 +139,9 @@ def choose_starts(
     that lie apart from each other. `first` has, of each task, gains that take the places of the last of
     these, never of the literature's."""
     tasks = range(len(validation.tasks))
-    given = [_coordinates(validation, i, first[i] if first else ()) for i in tasks]
+    given = [validation.coordinates(i, first[i] if first else ()) for i in tasks]
     usual = [max(starts - len(own), 1) for own in given]
-    literature = [_coordinates(validation, i, [validation.tasks[i].literature]) for i in tasks]
+    literature = [validation.coordinates(i, [validation.tasks[i].literature]) for i in tasks]
     if max(usual) > 1:
         further = _scan(validation, list(tasks), max(usual) - 1, seed, objective, scanned, literature)
         literature = [np.concatenate(both) for both in zip(literature, further, strict=True)]
@@ -183,7 +182,7 @@ def _check_function(validation: Validation, objective: Objective) -> None:
         return
     tasks = range(len(validation.tasks))
     objective.function.check(validation.tasks[0].contacts, validation.tasks[0].number)
-    literature = [_coordinates(validation, i, [validation.tasks[i].literature]) for i in tasks]
+    literature = [validation.coordinates(i, [validation.tasks[i].literature]) for i in tasks]
     for value in validation.losses(objective, list(tasks), np.stack(literature))[:, 0]:
         if not np.isfinite(value):
             raise InputError(f"objective: found {value:g} for the literature's gains, allowed {ALLOWED}")
@@ -251,14 +250,14 @@ def _scan(
     beside: list[np.ndarray] | None = None,
 ) -> list[Float[np.ndarray, "number gains"]]:
     """The best points of a scan of the tasks `which`, so many that lie apart, and from those `beside`."""
-    around = [_coordinates(validation, i, [validation.tasks[i].literature])[0] for i in which]
+    around = [validation.coordinates(i, [validation.tasks[i].literature])[0] for i in which]
     points = np.stack([spread_points(own, max(scanned, 2 * number), seed)[1:] for own in around])
     for own, i in zip(points, which, strict=True):
         task = validation.tasks[i]
         for gain in task.tuned:
             if gain.begins is not None:
                 place, begins = validation.names.index(gain.name), {gain.name: gain.begins(task.mechanism)}
-                own[:, place] = _coordinates(validation, i, [{**task.literature, **begins}])[0, place]
+                own[:, place] = validation.coordinates(i, [{**task.literature, **begins}])[0, place]
     values = validation.losses(objective, which, points, SCAN_SCENARIOS)
     order = np.argsort(np.where(np.isfinite(values), values, np.inf), axis=1, kind="stable")
     best = []
@@ -271,13 +270,6 @@ def _scan(
 def _scan_evaluations(validation: Validation, number: int, scanned: int) -> int:
     scenarios = len(validation.tasks[0].scenarios.velocity)
     return -(-max(scanned, 2 * number) * min(SCAN_SCENARIOS, scenarios) // scenarios)
-
-
-def _coordinates(
-    validation: Validation, task: int, several: Sequence[Mapping[str, float]]
-) -> Float[np.ndarray, "several gains"]:
-    gains = np.array([[gains[name] for name in validation.names] for gains in several])
-    return to_coordinates(gains.reshape(len(several), len(validation.names)), validation.bounds[task])
 
 
 def _moved(validation: Validation, task: int, start: Start, point: np.ndarray, loss: float) -> Start:

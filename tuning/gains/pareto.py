@@ -72,7 +72,7 @@ def fronts(
     axis: Axis = NOISE,
 ) -> Iterator[tuple[int, Front]]:
     """(index, front of `number` points) of mechanisms that were tuned by one compensator with the same
-    settings, as they are done. Honesty is traded by those whose settings judge it."""
+    settings, as they are done. Transparency is traded by those whose settings judge it."""
     settings = results[0].settings if results else TuneSettings()
     tasks = [
         build_task(r.mechanism, r.compensator, settings.scenarios, settings.seed, probed=settings.probed)

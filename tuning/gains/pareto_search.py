@@ -23,7 +23,6 @@ from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import TuneTask
 from tuning.gains.tune import TuneResult
 from tuning.gains.validation import Validation
-from tuning.optimisation.unit_box import to_coordinates
 
 # The ladder's ends: how many times the noise of accurate gains weighs what their error does. The first one
 # reaches further: what is quiet without being accurate is a start that the solver does not come by itself.
@@ -163,13 +162,8 @@ def _anywhere(
 def _around(validation: Validation, picked: list[list[_Found]]) -> list[list[np.ndarray]]:
     """Coordinates that every point of each task begins at: what it and its neighbours found."""
     return [
-        [
-            to_coordinates(
-                np.array([[gains[name] for name in validation.names] for gains in several]), bounds
-            )
-            for several in _neighbourhoods(own)
-        ]
-        for own, bounds in zip(picked, validation.bounds, strict=True)
+        [validation.coordinates(task, several) for several in _neighbourhoods(own)]
+        for task, own in enumerate(picked)
     ]
 
 
@@ -198,8 +192,7 @@ def _reached(
     kept = [start for start in starts if math.isfinite(start.rms)]
     if not kept:
         return [_Found(task.literature, FAILED, 0.0)]
-    gains = np.array([[start.gains[name] for name in validation.names] for start in kept])
-    coordinates = to_coordinates(gains, validation.bounds[index])[None]
+    coordinates = validation.coordinates(index, [start.gains for start in kept])[None]
     without, beside = (
         validation.losses(weighed(objective, axis, w), [index], coordinates)[0] for w in (0.0, 1.0)
     )

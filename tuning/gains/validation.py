@@ -5,7 +5,7 @@ call.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +24,7 @@ from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.batches import cut, join
 from tuning.gains.objective import Objective, contact_terms, metrics_of, objective_value, one_each
 from tuning.gains.tasks import TuneTask, common_loop, gain_bounds, gains_at, tuned_names
-from tuning.optimisation.unit_box import Bounds
+from tuning.optimisation.unit_box import Bounds, to_coordinates
 from tuning.transparency.probes import LANES_PER_SCENARIO, ProbedScenarios, are_probes, probed_scenarios
 
 # Draws of the validation come from another seed than those of training.
@@ -144,6 +144,13 @@ class Validation:
     def gains(self, task: int, coordinates: Float[np.ndarray, "gains"]) -> dict[str, float]:
         """All of the compensator's gains at a point of the unit box."""
         return gains_at(self.tasks[task], self.names, self.bounds[task], coordinates)
+
+    def coordinates(
+        self, task: int, several: Sequence[Mapping[str, float]]
+    ) -> Float[np.ndarray, "several gains"]:
+        """The points of the unit box where several sets of gains are."""
+        gains = np.array([[one[name] for name in self.names] for one in several])
+        return to_coordinates(gains.reshape(len(several), len(self.names)), self.bounds[task])
 
 
 def build_validation(tasks: list[TuneTask], scenarios: int, seed: int) -> Validation:

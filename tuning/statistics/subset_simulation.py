@@ -1,4 +1,4 @@
-"""SubsetSimulation failures: probabilities down to 1e-6 by subset simulation, with an interval that covers.
+"""Probabilities of rare failures, down to 1e-6, by subset simulation, with an interval that covers.
 
 A probability of 1e-6 is a product of six of 0.1: of failing the worst tenth, of failing the worst tenth of
 those, and so on. Each level's scenarios come from Markov chains that start at the worst of the level before
