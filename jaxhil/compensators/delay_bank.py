@@ -3,19 +3,11 @@
 Hypothesis h takes the force to be d_h [s] older than assumed: it belongs to the depth X - d_h V, to first
 order. Each identifies a `force_depth_map` of its own and says beforehand what it expects to read, f_h with a
 variance s_h (0 with the noise's own variance r out of contact, and where what it expects while the contact
-opens is not positive). Its weight is the product of
-
-- the likelihood of the readings of this contact and of those before it, in every one
-  (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), the root of the normal density, as no map is quite the contact;
-- how well the damping that it identified goes with what is known of contacts: either there is none, with
-  probability `ELASTIC`, or it is not negative. With its mean B and variance s^2, of prior variance s_0^2:
-  ELASTIC (s_0/s) exp(-t^2/2) + (1 - ELASTIC) 2 Phi(t), t = B/s. To be wrong by d means to see a damping that
-  is wrong by the stiffness times d, so that this is what tells a delay from damping; what else does are the
-  few readings between the two entries. Several contacts are one and the same device: their B are averaged.
-  s^2 counts five times, as the delay lies between two hypotheses.
-
-The exponentials are (1 + u/n)^-n: algebraic, the same on every machine. What counts is the mean over all
-hypotheses, of their maps and of their delays.
+opens is not positive). Its weight is the product of the likelihood of all readings y of this contact and of
+those before, in each (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), and of how well its damping goes with what is
+known of contacts (`plausibility`): see notebooks/guide/retrospective_reference.md section 7. The exponentials
+are (1 + u/n)^-n: algebraic, the same on every machine. What counts is the mean over all hypotheses, of their
+maps and of their delays.
 """
 
 import math
@@ -41,7 +33,7 @@ from jaxhil.compensators.force_depth_map import (
 
 HYPOTHESES = 9
 OFFSETS = np.linspace(-1, 1, HYPOTHESES)  # of their delays, in terms of the farthest
-ELASTIC = 0.25
+ELASTIC = 0.25  # probability that a contact has no damping
 BROADENING = 5.0  # of the variance of the damping
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
 LEAST, LEAST_CARRIED = 1e-200, 1e-12

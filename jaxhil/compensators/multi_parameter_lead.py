@@ -1,19 +1,12 @@
 """Multi-parameter phase lead (Osaki, Konno): a F + b dF/dt, by pole placement at the contact frequency.
 
-Realised as a + b s/(1 + T_2 s) by Tustin's rule at the control period; phase lead is a = 1, b = T_lead.
+Realised as a + b s/(1 + T_2 s) by Tustin's rule at the control period; phase lead is a = 1, b = T_lead. The
+literature's rule puts a root of s^2 + omega^2 (a + b s) e^(-s tau) = 0, the contact delayed by tau, where the
+damped oscillation of the desired restitution has its own (notebooks/guide/model.md section 6, item 16).
 
-The literature's rule takes the contact for M x'' = -k (a + b d/dt) x(t - tau), undamped, omega^2 = k/M, and
-puts a root of its characteristic equation s^2 + omega^2 (a + b s) e^(-s tau) = 0 where the damped
-oscillation of the desired restitution has its own:
-
-    s_d = omega (-zeta + j sqrt(1 - zeta^2)),  e = exp(-pi zeta/sqrt(1 - zeta^2)).
-
-That is one complex equation, a + b s_d = R with R = -(s_d^2/omega^2) e^(s_d tau), for two real gains:
-b = Im R/Im s_d, a = Re R - b Re s_d. For e = 1 they are a = cos(omega tau), b = sin(omega tau)/omega, and the
-loop passes the force on at omega with neither delay nor gain: (a + j omega b) e^(-j omega tau) = 1.
-
-Nominal is that one, tau the delay of the force measurement and the lag of the motion simulator together: what
-the loop adds is undone, and the mechanism's own damping, of which the model has none, is left to act.
+Nominal is a restitution of 1, tau the delay of the force measurement and the lag of the motion simulator
+together: what the loop adds is undone, and the mechanism's own damping, of which the model has none, is left
+to act.
 """
 
 import cmath
@@ -36,7 +29,7 @@ from jaxhil.mechanism.structs import Mechanism
 
 def pole_placement(frequency: float, delay: float, restitution: float) -> tuple[float, float]:
     """Gains a [1] and b [s] that give a contact of angular frequency omega [rad/s] behind a delay tau [s] the
-    desired restitution [1]: see the module's text.
+    desired restitution [1]: a + b s_d = -(s_d^2/omega^2) e^(s_d tau), s_d the damped oscillation's root.
 
     Raises InputError unless omega and e are above 0 and all are finite.
     """

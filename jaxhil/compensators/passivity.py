@@ -3,14 +3,10 @@
     E(n) = E(n-1) + T F(n) v_d(n),     where E < 0:  F_c = F + alpha v_d,  alpha = -E/(T v_d^2)
 
 E is the energy that the numerical model has given to the contact; what the virtual damping alpha dissipates
-counts in it, so that it comes back to 0, which makes F_c = -E(n-1)/(T v_d). As E(n-1) >= 0 > E, F_c lies
-between 0 and F however small v_d is, and at v_d = 0 nothing is to be corrected. No gain, no knowledge of
-the rig: but what a damped contact has truly dissipated is a reserve that later contacts of the run may spend.
-
-With M v' = -F_c over one period the model's kinetic energy rises by -T F_c v_d + (T F_c)^2/(2 M): the second
-term, the sampling's, is not observed. With E back at 0 a contact leaves at
-sqrt(1 + sum (T F_c/(M v))^2) of its approach speed v: 1 + pi omega T/4 for the arc of a linear contact of
-frequency omega, somewhat more for a delayed one, which is longer.
+counts in it, so that it comes back to 0, which makes F_c = -E(n-1)/(T v_d), between 0 and F however small v_d
+is. No gain, no knowledge of the rig: but what a damped contact has truly dissipated is a reserve that later
+contacts of the run may spend, and the energy that sampling adds is not observed (notebooks/guide/model.md
+section 6, item 17).
 """
 
 from typing import ClassVar

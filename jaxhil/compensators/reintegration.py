@@ -9,12 +9,8 @@ f <= 0; x_m and X_m are the deepest points so far. It is stepped by the velocity
 implicit in the first half of a step and explicit in the second (order 2), the bracket constant within a step:
 the mean of y less that of F at its ends, over as much of the step as y could be read. Samples are counted in
 ticks from the reference's entry; measured ones are moved to that grid by straight lines, such that the
-hardware's own entry falls on the reference's.
-
-A pass from the entry makes up to `STRIDE` steps of up to `COARSE` per tick, under the map that it started
-with. When it has caught up with the present it becomes the live reference, which goes on tick by tick under
-the newest map, and the next pass starts. So the effort per tick is bounded, and the live reference rests on a
-map that at 1 ms is at most 1/23 of the contact's duration old.
+hardware's own entry falls on the reference's. Passes from the entry take turns with a live motion, which goes
+on tick by tick under the newest map (notebooks/guide/retrospective_reference.md section 3).
 """
 
 from typing import NamedTuple

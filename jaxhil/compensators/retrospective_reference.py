@@ -13,17 +13,9 @@ predicts:
     in contact:  F_c = f_0 + (y - F(X, V)) + f_e
     separated:   F_c = f_e  until the hardware has left the surface for 6 ms, then 0
 
-It is the momentum that is paid back: what the numerical model was late by stays as an offset of its position,
-which no force has to make up for. Every contact starts afresh; so does one with the other surface. Without
-f_e it is the published law with the map in the place of k_hat and b_hat: that is what remains while nothing
-is identified. A run that begins in contact has no approach speed to scale by: there F_c is the measured
-force, as it is.
-
-A sensor's known dead zone is added to what it reads. What it hides (a reading of 0 in contact) counts as
-half of it, with the variance of a uniform distribution, and only where the map expects more; nothing of it
-is replayed. Where forces stand out of the noise before the hardware was to touch, its surface is nearer than
-expected: it is taken to be where the first of them was read. Where the noise's standard deviation s is not
-small, less of the bracket of `reintegration` is replayed: rho = force_replay/(1 + (s/replay_noise)^2).
+Every contact starts afresh; so does one with the other surface. A run that begins in contact has no approach
+speed to scale by: there F_c is the measured force, as it is. How noise, a dead zone and a surface that is
+nearer than expected are met: notebooks/guide/retrospective_reference.md.
 """
 
 from collections.abc import Mapping

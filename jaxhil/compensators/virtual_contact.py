@@ -3,12 +3,8 @@
     F_c = F + k_v d + b_v d',     d the deflection by x_d, d' = v_d, while x_d is in contact
 
 The numerical model feels them without delay. The rigs' operators chose both by experiment. The nominal b_v
-is the stability limit: with the real contact k delayed by tau, M s^2 + b_v s + k e^(-s tau) = 0 has the root
-j omega_c where, with omega^2 = k/M,
-
-    cos(omega_c tau) = (omega_c/omega)^2     (real part),     b_v = k sin(omega_c tau)/omega_c     (imaginary)
-
-so that the contact neither gains nor loses. The damping of a damped mechanism is not reckoned with.
+is the stability limit (notebooks/guide/model.md section 6, item 15), at which the contact neither gains nor
+loses; the damping of a damped mechanism is not reckoned with.
 """
 
 import math

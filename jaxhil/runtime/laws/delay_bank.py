@@ -1,14 +1,10 @@
 """Hypotheses of the force delay side by side, each with a force-depth map, weighed by what they explain.
 
 Hypothesis h takes the force to be d_h [s] older than given: it belongs to the depth X - d_h V. Each
-identifies a force-depth map (`force_depth_map`) and says beforehand what it expects to read, f_h with a
-variance s_h (0 with the noise's own variance r out of contact, and where what it expects while the contact
-opens is not positive). Its weight is the product of the likelihoods of all readings of this contact and of
-those before, (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), and of how well its damping, of mean B and variance
-s^2, goes with what is known of contacts: ELASTIC (s_0/s) exp(-t^2/2) + (1 - ELASTIC) 2 Phi(t), t = B/s. The
-exponentials are (1 + u/n)^-n. What counts is the mean over all hypotheses, of their maps and of their delays.
-
-In NumPy, all hypotheses at a time; sums are taken one term after another.
+identifies a force-depth map (`force_depth_map`); its weight is the product of the likelihoods of all readings
+of this contact and of those before and of how well its damping goes with what is known of contacts
+(notebooks/guide/retrospective_reference.md section 7). What counts is the mean over all hypotheses, of their
+maps and of their delays. In NumPy, all hypotheses at a time; sums are taken one term after another.
 """
 
 from math import pi, sqrt

@@ -1,17 +1,11 @@
 """The reference motion: what a contact should have made of the numerical model, had nothing been late.
 
-It follows from the force-depth map (`force_depth_map`), which improves while the contact lasts: so the motion
-is integrated over again from the entry.
-
 From depth 0 at speed 1: x' = v, v' = -f, f = F(x, v, x_m) + rho [y - F(X, V, X_m)], the bracket only as far
 as the hardware has been measured, until it separates: x <= 0, or v < 0 and f <= 0; x_m and X_m are the
-deepest points so far. Velocity Verlet with the damping implicit in the first half of a step and explicit in
-the second; the bracket is constant within a step: the mean of y less that of F at its ends, over as much of
-the step as y could be read. Samples are counted in ticks from the entry.
-
-A pass from the entry makes up to `STRIDE` steps of up to `COARSE` per tick under the map that it started
-with. When it has caught up with the present it becomes the live motion, which goes on tick by tick under the
-newest map, and the next pass starts.
+deepest points so far. The force-depth map F improves while the contact lasts: so the motion is integrated
+over again from the entry, in passes of up to `STRIDE` steps per tick. One that has caught up with the present
+becomes the live motion, which goes on tick by tick under the newest map, and the next pass starts. How it is
+stepped: `jaxhil/compensators/reintegration.py`.
 """
 
 from math import floor

@@ -6,20 +6,15 @@ force; they integrate the motion that it should have had since its entry, the re
 force a correction that brings the model's speed back to the reference's.
 
 Scaled by approach speed v0 and equivalent mass M, F the force-depth map identified on delay-aligned readings
-(X, V, y), p the peak force that it predicts, v_r the speed of the motion that the contact should have had
-since its entry:
+(X, V, y), p the peak force that it predicts, v_r the reference's speed:
 
     f_0 = max(F(x_d, v_d), 0)
     f_e = clip(c (v_d - T f_0/2 - v_r), -limit p, limit p)
     in contact:  F_c = f_0 + (y - F(X, V)) + f_e
     separated:   F_c = f_e  until the hardware has left the surface for 6 ms, then 0
 
-No model of the motion simulator is used. Without f_e it is the published law with the map in the place of
-k_hat and b_hat: that is what remains while nothing is identified. A known dead zone is added to what the
-sensor reads; what it hides counts as half of it, where the map expects more than the dead zone, and nothing
-of it is replayed. The noisier the force, the less of what the map does not explain is replayed in the
-motion. Where forces stand out of the noise before the hardware should be in contact, its surface is nearer
-than it was taken to be: it is then taken to be where the first of them was read.
+How noise, a dead zone and a surface that is nearer than expected are met:
+notebooks/guide/retrospective_reference.md.
 """
 
 from collections.abc import Mapping

@@ -1,10 +1,4 @@
-"""The retrospective reference with one force-depth map: the force is as old as the given delay says.
-
-See `retrospective`. With F the map, (X, V, y) the delay-aligned readings, f_0 = max(F(x_d, v_d), 0):
-
-    in contact:  F_c = f_0 + (y - F(X, V)) + f_e
-    separated:   F_c = f_e  until the hardware has left the surface for 6 ms, then 0
-"""
+"""The retrospective reference with one force-depth map: the force is as old as the given delay says."""
 
 from collections.abc import Mapping
 
