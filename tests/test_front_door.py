@@ -7,13 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import equinox as eqx
 import hypothesis
 import hypothesis.strategies as st
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from laws_from_elsewhere import ScaledLead, ScaledLeadOnTheRig, SquaredSpring
 
 import jaxhil
 from jaxhil.mechanism.structs import value_at
@@ -366,113 +363,3 @@ def test_figures_without_a_derivative_are_refused():
 
 
 # Laws from elsewhere.
-
-
-@pytest.fixture(scope="module")
-def registered():
-    for law in (ScaledLead(), SquaredSpring()):
-        jaxhil.register(law)
-        jaxhil.register(law)  # as a notebook's cell that runs twice
-
-
-def test_a_compensator_from_elsewhere_is_simulated(registered):
-    """Its lead is that of the built-in phase lead, without a filter: they differ by little."""
-    mechanism = jaxhil.load("varying", TWO)
-    plain, none = jaxhil.simulate(mechanism, "scaled_lead", {"toy_lead": 0.0}), jaxhil.simulate(mechanism)
-    assert [c.restitution for c in plain.contacts] == [c.restitution for c in none.contacts]
-    run = jaxhil.simulate(mechanism, "scaled_lead")
-    assert run.gains == {"toy_lead": mechanism.rig.force_sensor.delay}
-    filtered = jaxhil.simulate(mechanism, "phase_lead").contacts[0].error
-    assert run.contacts[0].error == pytest.approx(filtered, abs=2e-3)
-    assert run.contacts[0].error < none.contacts[0].error - 0.1
-    slope = jaxhil.jacobian(mechanism, "scaled_lead", by="gains.toy_lead")["gains.toy_lead"]
-    step = 1e-6
-    high, low = (
-        np.array(
-            [c.restitution for c in jaxhil.simulate(mechanism, "scaled_lead", {"toy_lead": value}).contacts]
-        )
-        for value in (run.gains["toy_lead"] + step, run.gains["toy_lead"] - step)
-    )
-    np.testing.assert_allclose(slope, (high - low) / (2 * step), rtol=1e-5)
-
-
-def test_a_contact_law_from_elsewhere_is_simulated_against_its_integrated_reference(registered):
-    own = {"contact": {"law": "squared_spring", "stiffness": [1e8]}, "approach.contacts": 1}
-    prompt = {"rig.simulator": {"model": "ideal"}, "rig.force_sensor.delay": 0.0, "uncertainty": {}}
-    mechanism = jaxhil.load("rig-300kg", own | prompt)
-    [contact] = jaxhil.simulate(mechanism, "phase_lead").contacts
-    # M v^2/2 = k d^3/3 at the deepest point, and nothing is lost.
-    mass, speed = mechanism.bodies.mass, mechanism.approach.velocity
-    deepest = (1.5 * mass * speed**2 / 1e8) ** (1 / 3)
-    assert contact.reference_restitution == pytest.approx(1.0, abs=1e-8)
-    assert contact.reference_peak_force == pytest.approx(1e8 * deepest**2, rel=1e-8)
-    assert contact.status == "ok" and contact.restitution == pytest.approx(1.0, abs=0.01)
-    by = "contact.stiffness"
-    slope = jaxhil.jacobian(mechanism, "phase_lead", of="reference_peak_force", by=by)[by]
-    # F = k (1.5 M v^2/k)^(2/3), hence dF/dk = F/(3 k).
-    np.testing.assert_allclose(slope, contact.reference_peak_force / 3e8, rtol=1e-6)
-
-
-def test_what_cannot_be_registered_is_refused(registered):
-    class Unnamed(SquaredSpring):
-        name = ""
-
-    class Taken(ScaledLead):
-        name = "phase_lead"
-
-    class Boundless(ScaledLead):
-        name = "boundless"
-        gains = (jaxhil.Gain("toy_lead", "s", lambda m: 0.0, lambda m: math.inf, lambda m: 1.0),)
-
-    class Broken(ScaledLead):
-        name = "broken"
-        gains = (jaxhil.Gain("toy_lead", "s", lambda m: m.nothing, lambda m: 1.0, lambda m: 1.0),)
-
-    class Unitless(ScaledLead):
-        name = "unitless"
-        gains = (jaxhil.Gain("toy_lead", "", lambda m: 0.0, lambda m: 1.0, lambda m: 1.0),)
-
-    class Holding(ScaledLead):
-        name = "holding"
-        table: jnp.ndarray = eqx.field(default_factory=lambda: jnp.ones(3))
-
-    for law, said in (
-        (ScaledLead, "found the class ScaledLead, allowed an instance of"),
-        (3, "found 3, allowed an instance of"),
-        (Unnamed(), "Unnamed.name: found"),
-        (Taken(), "register phase_lead: name: found the name of another law"),
-        (Boundless(), "gains.toy_lead: found 0, 1, inf, allowed lower <= nominal <= upper"),
-        (Broken(), "gains.toy_lead.lower: found AttributeError"),
-        (Unitless(), "gains.toy_lead.unit: found ''"),
-        (Holding(), "a law holds no arrays"),
-    ):
-        assert said in refusal(jaxhil.register, law)
-    assert "allowed one of none" in refusal(jaxhil.simulate, "varying", "holding")
-    assert "a contact law runs in the simulation alone" in refusal(
-        jaxhil.register, SquaredSpring(), runtime=ScaledLeadOnTheRig
-    )
-    assert "allowed a class" in refusal(
-        jaxhil.register, ScaledLead(), runtime=ScaledLeadOnTheRig({"toy_lead": 0}, 1, 1)
-    )
-    assert "runtime: found object without step" in refusal(jaxhil.register, ScaledLead(), runtime=object)
-    jaxhil.register(ScaledLead(), runtime=ScaledLeadOnTheRig)
-    jaxhil.register(ScaledLead())
-
-
-def test_a_law_that_is_defined_anew_is_the_one_that_runs():
-    """No compiled program of the first is served for the second."""
-
-    def defined(share):
-        class Share(ScaledLead):
-            name = "share"
-
-            def step(self, prepared, state, signals, tick):
-                return share * signals.force_measured, state
-
-        return Share()
-
-    restitutions = []
-    for share in (1.0, 0.98):
-        jaxhil.register(defined(share))
-        restitutions.append(jaxhil.simulate(jaxhil.load("varying", TWO), "share").contacts[0].restitution)
-    assert abs(restitutions[0] - restitutions[1]) > 1e-3

@@ -85,24 +85,31 @@ def export(
             bundle = build_bundle(loaded.document, chosen, found.limits, found.rates, seed, stages.begin)
             if not bundle.reasons:
                 write_bundle(target, bundle.files)
+    document = _document(loaded, bundle, chosen, found.rates)
+    document["bundle"] = None if bundle.reasons else str(target)
+    return Exported(document, {name: len(content) for name, content in bundle.files.items()})
+
+
+def _document(loaded, bundle, chosen, rates) -> dict[str, Any]:
+    """What `jaxhil export --json` prints, but for where the bundle is."""
     # A run that ends early in the bundle itself does so on the rig.
     stopped = bundle.ended[0] if bundle.ended else None
-    document: dict[str, Any] = {
-        "bundle": None if bundle.reasons else str(target),
+    reasons = [*bundle.reasons, *([f"the nominal run, {stopped}"] if stopped else [])]
+    return {
+        "bundle": None,
         "mechanism": loaded.mechanism.name,
         "compensator": loaded.compensator,
         "gains_sha256": bundle.document["sha256"],
         "formats": chosen,
         "files": sorted(bundle.files),
         "limits": bundle.document.get("limits"),
-        "rates": found.rates,
+        "rates": rates,
         "ticks": bundle.ticks,
         "runs": bundle.runs,
         "ended": bundle.ended,
-        "reasons": [*bundle.reasons, *([f"the nominal run, {stopped}"] if stopped else [])],
+        "reasons": reasons,
+        "verdict": "bad" if reasons else "good",
     }
-    document["verdict"] = "bad" if document["reasons"] else "good"
-    return Exported(document, {name: len(content) for name, content in bundle.files.items()})
 
 
 def _calibrated(loaded, sweep: Any, replaced: dict[str, float | None], progress: bool):

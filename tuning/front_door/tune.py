@@ -183,6 +183,7 @@ class TunedGains:
         write_gain_file(arguments.folder("path", path), self.document)
 
 
+# Longer than a screen for its arguments alone, each stated with its meaning.
 @arguments.entry
 def tune(
     mechanism: Any,
