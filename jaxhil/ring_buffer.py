@@ -1,4 +1,4 @@
-"""Delay lines: a ring of past samples, written in place, read back by a different number per lane.
+"""Delay lines: a ring of past samples, written in place; each lane reads back by a number of its own.
 
 The first axis counts samples and is a power of two long. `tick` is common to all lanes. The compiler updates
 a ring in place only if it sees that the reading comes first: the sample written is tied to what was read.

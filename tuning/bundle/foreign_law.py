@@ -1,6 +1,6 @@
-"""The source of a law's runtime class from outside the package, as a module of the runtime in one file.
+"""A law from outside the package on the rig: the source of its runtime class, for the runtime in one file.
 
-It is the class with what of its own module it names: imports of the standard library, of NumPy and of
+It is the class with what it uses of its own module: imports of the standard library, of NumPy and of
 `jaxhil.runtime`, and the statements at the module's top that bind the other names.
 """
 

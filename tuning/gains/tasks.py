@@ -1,4 +1,8 @@
-"""What there is to solve: mechanisms with their training scenarios, and which of them share a program."""
+"""What there is to solve: one task a mechanism, with the scenarios that its gains are tuned on.
+
+Tasks whose loops have the same shape (law, sensors, limits, lengths of delay lines) share one compiled
+program, and are solved in one batch.
+"""
 
 import dataclasses
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Weighted recursive identification of contact stiffness and damping from F = k p + b p'."""
+"""Weighted recursive identification of contact stiffness k and damping b from F = k p + b p', p the depth."""
 
 
 class ContactIdentification:

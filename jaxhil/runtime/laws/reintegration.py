@@ -1,11 +1,15 @@
 """The reference motion: what a contact should have made of the numerical model, had nothing been late.
 
-From depth 0 at speed 1: x' = v, v' = -f, f = F(x, v, x_m) + rho [y - F(X, V, X_m)], the bracket only as far
-as the hardware has been measured, until it separates: x <= 0, or v < 0 and f <= 0; x_m and X_m are the
-deepest points so far. The force-depth map F improves while the contact lasts: so the motion is integrated
-over again from the entry, in passes of up to `STRIDE` steps per tick. One that has caught up with the present
-becomes the live motion, which goes on tick by tick under the newest map, and the next pass starts. How it is
-stepped: `jaxhil/compensators/reintegration.py`.
+From depth 0 at speed 1 (speeds over the approach speed, forces over mass times approach speed):
+
+    x' = v,   v' = -f,   f = F(x, v, x_m) + rho [y - F(X, V, X_m)]
+
+F is the force-depth map; y is the measured force, X and V are the hardware's depth and speed at that force,
+x_m and X_m the deepest points so far. The bracket counts only as far as the hardware has been measured. The
+motion ends where it separates: x <= 0, or v < 0 and f <= 0. The map improves while the contact lasts: so the
+motion is integrated over again from the entry, in passes of up to `STRIDE` steps per tick. One that has
+caught up with the present becomes the live motion, which goes on tick by tick under the newest map, and the
+next pass starts. How it is stepped: `jaxhil/compensators/reintegration.py`.
 """
 
 from math import floor
