@@ -61,6 +61,23 @@ def pytest_collection_modifyitems(items):
 
 
 @pytest.fixture(scope="module", autouse=True)
+def _laws_of_the_package_alone():
+    """What a module registers is gone when it is done."""
+    import jaxhil.runtime
+    from jaxhil.compensators import COMPENSATORS
+    from jaxhil.contact.laws import LAWS
+    from jaxhil.mechanism.structs import CONTACT_LAWS
+
+    tables = (COMPENSATORS, LAWS, jaxhil.runtime.COMPENSATORS)
+    before, names = [dict(table) for table in tables], list(CONTACT_LAWS)
+    yield
+    for table, entries in zip(tables, before, strict=True):
+        table.clear()
+        table.update(entries)
+    CONTACT_LAWS[:] = names
+
+
+@pytest.fixture(scope="module", autouse=True)
 def _compiled(request):
     everyday = "not slow" in request.config.option.markexpr
     compile_quickly(everyday and request.node.get_closest_marker("users_options") is None)
