@@ -213,9 +213,11 @@ def random_readings(name: str, lanes: int, ticks: int, seed: int) -> Readings:
     )
 
 
-@pytest.mark.parametrize("name", COMPENSATORS)
-def test_random_ticks(name):
-    lanes = 510 if name == "response_error" else 60
+@pytest.mark.parametrize(
+    "name, lanes",
+    [*((name, 60) for name in COMPENSATORS), pytest.param("response_error", 510, marks=pytest.mark.slow)],
+)
+def test_random_ticks(name, lanes):
     count = compare(name, random_readings(name, lanes, 2000, seed=1))
     print(name, count)
     assert count.ticks == 2000 * lanes
