@@ -106,8 +106,6 @@ class SweepOptions:
 
     def check(self) -> None:
         """Raises `InputError` for what will not do."""
-        arguments.integers(1, scenarios=self.scenarios, chunk=self.chunk)
-        arguments.integers(0, seed=self.seed)
         arguments.integers(1, MOST, scenarios=self.scenarios)
         arguments.integers(1, LARGEST_CHUNK, chunk=self.chunk)
         arguments.integers(0, LARGEST_SEED, seed=self.seed)
