@@ -1,16 +1,29 @@
-"""Files are written whole or not at all, and what cannot be written is one line."""
+"""Files are written whole or not at all, sealed ones are as written or none, nobody else's are touched."""
 
 import os
+import signal
+import subprocess
+import sys
 
+import numpy as np
 import pytest
 
 from jaxhil.errors import InputError
-from tuning.files import write_whole, writing
+from jaxhil.files import (
+    follow,
+    make_folder,
+    open_plain,
+    read_sealed,
+    remove_stale,
+    write_sealed,
+    write_whole,
+    writing,
+)
 
 
 def test_a_file_is_replaced(tmp_path):
     path = tmp_path / "file"
-    for content in (b"old", bytearray(b"new")):
+    for content in (b"old", bytearray(b"new"), memoryview(b"newer")):
         write_whole(path, content)
         assert path.read_bytes() == content and list(tmp_path.iterdir()) == [path]
 
@@ -33,3 +46,95 @@ def test_what_fails_midway_leaves_the_file_as_it_was(tmp_path, monkeypatch, step
 def test_a_line_about_something_else_stays(tmp_path):
     with pytest.raises(InputError, match=r"^something else$"), writing(tmp_path):
         raise InputError("something else")
+
+
+def not_plain(folder):
+    """What may stand where a file of ours belongs, by name, and the file that a link leads to."""
+    target = folder / "thesis"
+    target.write_bytes(b"years")
+    (folder / "link").symlink_to(target)
+    (folder / "dangling").symlink_to(folder / "nowhere")
+    (folder / "device").symlink_to("/dev/zero")
+    os.mkfifo(folder / "pipe")
+    (folder / "folder").mkdir()
+    return ["link", "dangling", "device", "pipe", "folder"], target
+
+
+def test_nothing_but_a_plain_file_is_read_or_replaced(tmp_path):
+    names, target = not_plain(tmp_path)
+    before = sorted(os.listdir(tmp_path))
+    for name in names:
+        path = tmp_path / name
+        kind = os.lstat(path).st_mode
+        with pytest.raises(InputError, match=r"cannot be written: found a .*, allowed a plain file"):
+            with writing(path):
+                write_whole(path, b"ours")
+        assert read_sealed(path) is None
+        with pytest.raises(OSError):
+            open_plain(path)
+        assert os.lstat(path).st_mode == kind
+    assert target.read_bytes() == b"years" and sorted(os.listdir(tmp_path)) == before
+
+
+def test_a_folder_of_ours_is_no_link(tmp_path):
+    for name in ("new/inner", "new"):
+        make_folder(tmp_path / name)
+    assert (tmp_path / "new/inner").is_dir()
+    names, _ = not_plain(tmp_path)
+    (tmp_path / "elsewhere").symlink_to(tmp_path / "folder")
+    for name in ("elsewhere", *(name for name in names if name != "folder")):
+        with pytest.raises(InputError, match=r"found a .*, allowed a folder"), writing(tmp_path / name):
+            make_folder(tmp_path / name)
+
+
+def test_a_link_that_the_user_names_stands_for_its_file(tmp_path):
+    _, target = not_plain(tmp_path)
+    write_whole(follow(tmp_path / "link"), b"picture")
+    assert (tmp_path / "link").is_symlink() and target.read_bytes() == b"picture"
+    assert follow(tmp_path / "new.png") == tmp_path / "new.png"
+    with pytest.raises(OSError, match="a device"):
+        write_whole(follow(tmp_path / "device"), b"picture")
+
+
+def test_a_sealed_file_is_as_written_or_none(tmp_path):
+    path = tmp_path / "file"
+    generator = np.random.default_rng(0)
+    assert read_sealed(path) is None
+    for size in (0, 1, 5000):
+        content = generator.bytes(size)
+        write_sealed(path, content)
+        assert read_sealed(path) == content
+        whole = path.read_bytes()
+        for bit in generator.integers(0, 8 * len(whole), 300):
+            harmed = bytearray(whole)
+            harmed[bit // 8] ^= 1 << int(bit % 8)
+            path.write_bytes(harmed)
+            assert read_sealed(path) is None
+        for cut in (0, 64, 65, len(whole) - 1):
+            if cut < len(whole):
+                path.write_bytes(whole[:cut])
+                assert read_sealed(path) is None
+
+
+def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path):
+    killed = """
+import os, signal, sys
+from pathlib import Path
+from jaxhil import files
+os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+files.write_whole(Path(sys.argv[1]) / "file", b"new")
+"""
+    ended = subprocess.run([sys.executable, "-c", killed, tmp_path], timeout=60)
+    assert ended.returncode == -signal.SIGKILL
+    (left,) = tmp_path.iterdir()
+    users = [".thesis.docx.tmp", ".jaxhil.tmp", ".jaxhil-12-cafe.tmp", f"{left.name}.tmp", f"a{left.name}"]
+    for name in users:
+        (tmp_path / name).write_text("years")
+    # One that a process writes right now, and a link by such a name.
+    writes = left.name.replace(left.name.split("-")[1], str(os.getppid()))
+    (tmp_path / writes).write_text("half")
+    linked = left.name.replace("-0.tmp", "-1.tmp")
+    (tmp_path / linked).symlink_to(tmp_path / users[0])
+    remove_stale(tmp_path)
+    assert sorted(os.listdir(tmp_path)) == sorted([*users, writes, linked])
+    assert (tmp_path / users[0]).read_text() == "years"

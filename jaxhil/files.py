@@ -1,0 +1,149 @@
+"""Files of ours: written whole or not at all, sealed where a flipped bit would count, nobody else's touched.
+
+What we write is a plain file. A link, a pipe or a device that stands in its place is neither followed, nor
+opened, nor replaced. A sealed file begins with the SHA-256 of what follows, as a line of hexadecimal digits;
+it is checked before anything looks at the content.
+"""
+
+import errno
+import hashlib
+import os
+import re
+import secrets
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from itertools import count
+from pathlib import Path
+from typing import BinaryIO
+
+from jaxhil.errors import InputError, one_line
+
+TEMPORARY = ".tmp"  # end of the name under which a file is written first
+SEAL = 65  # bytes before the content of a sealed file
+
+_PLAIN = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+_THIS_PROCESS = secrets.token_hex(4)  # numbers of processes come again
+_OURS = re.compile(rf"\.jaxhil-(\d+)-([0-9a-f]{{8}})-\d+{re.escape(TEMPORARY)}")
+_numbers = count()
+
+
+@contextmanager
+def writing(path: str | os.PathLike[str]) -> Iterator[None]:
+    """What cannot be written there is an `InputError`, one line."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{one_line(os.fspath(path))}: cannot be written: {one_line(reason, 100)}") from None
+
+
+def write_whole(path: Path, content: bytes | bytearray | memoryview) -> None:
+    """The file is there as a whole, on disk, or as it was.
+
+    Raises OSError when it cannot be written, or when what is there is no plain file.
+    """
+    with suppress(FileNotFoundError):
+        _check_plain(os.lstat(path).st_mode)
+    temporary = path.with_name(temporary_name())
+    with open(temporary, "xb") as file:
+        try:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+            os.replace(temporary, path)
+        except BaseException:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
+    sync_folder(path.parent)
+
+
+def write_sealed(path: Path, content: bytes | bytearray | memoryview) -> None:
+    """`write_whole` of the content under its seal."""
+    write_whole(path, hashlib.sha256(content).hexdigest().encode("ascii") + b"\n" + bytes(content))
+
+
+def read_sealed(path: Path) -> bytes | None:
+    """What `write_sealed` wrote; None if there is nothing, or anything else, down to the last bit."""
+    try:
+        with open_plain(path) as file:
+            found = file.read()
+    except (OSError, ValueError):
+        return None
+    content = found[SEAL:]
+    return content if found[:SEAL] == hashlib.sha256(content).hexdigest().encode("ascii") + b"\n" else None
+
+
+def open_plain(path: str | os.PathLike[str]) -> BinaryIO:
+    """A plain file, to read. Raises OSError for a link, a pipe or a device, and waits for none."""
+    _check_plain(os.lstat(path).st_mode)
+    descriptor = os.open(path, _PLAIN)
+    try:
+        _check_plain(os.fstat(descriptor).st_mode)
+        return open(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def follow(path: str | os.PathLike[str]) -> Path:
+    """Where a path leads that the user names for output: a link to a file stands for the file."""
+    return Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
+
+
+def make_folder(folder: Path) -> None:
+    """A folder of ours within one that the user named, made if need be. Raises OSError, for a link too."""
+    with suppress(FileExistsError):
+        folder.mkdir(parents=True)
+    mode = os.lstat(folder).st_mode
+    if not stat.S_ISDIR(mode):
+        raise OSError(errno.EEXIST, f"found {_kind(mode)}, allowed a folder", os.fspath(folder))
+
+
+def remove_stale(folder: Path) -> None:
+    """Remove what processes that were killed while they wrote left there. Raises OSError."""
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            name = _OURS.fullmatch(entry.name)
+            if name and entry.is_file(follow_symlinks=False) and not _is_writing(int(name[1]), name[2]):
+                with suppress(FileNotFoundError):
+                    os.unlink(entry)
+
+
+def temporary_name() -> str:
+    """A name for a file or folder until it is whole: of this process, used once."""
+    return f".jaxhil-{os.getpid()}-{_THIS_PROCESS}-{next(_numbers)}{TEMPORARY}"
+
+
+def sync_folder(folder: Path) -> None:
+    """Names given in the folder so far survive a power cut. Raises OSError."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _is_writing(process: int, token: str) -> bool:
+    if process == os.getpid():
+        return token == _THIS_PROCESS
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass
+    return True
+
+
+def _check_plain(mode: int) -> None:
+    if not stat.S_ISREG(mode):
+        raise OSError(errno.EEXIST, f"found {_kind(mode)}, allowed a plain file")
+
+
+def _kind(mode: int) -> str:
+    kinds = {stat.S_IFLNK: "a link", stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFREG: "a file"}
+    return kinds.get(stat.S_IFMT(mode), "a device")
