@@ -1,6 +1,7 @@
 """Programs kept in files: the same numbers, traced once, remade when anything they depend on changes."""
 
 import os
+import sys
 from typing import NamedTuple
 
 import equinox as eqx
@@ -93,7 +94,7 @@ def test_changed_sources_are_another_program(tmp_path, monkeypatch):
     package = tmp_path / "package"
     package.mkdir()
     (package / "__init__.py").write_text("changed = True\n")
-    monkeypatch.setattr(program_cache.sys.modules["tuning"], "__file__", str(package / "__init__.py"))
+    monkeypatch.setattr(sys.modules["tuning"], "__file__", str(package / "__init__.py"))
     run(tmp_path)
     assert len(traced) == 2
 

@@ -1,17 +1,16 @@
 """Programs kept between calls: what tracing made of a function, beside what the compiler made of it.
 
 Tracing a solve takes longer than running it. `run` keeps the traced program in a file whose name is made of
-all it depends on: the sources, the versions of what they stand on, static arguments, shapes.
+all it depends on: the sources, the versions of what they stand on, static arguments, shapes. The file is
+sealed: a bit that flipped in it could crash the process that reads it, or change what it computes.
 """
 
 import dataclasses
 import hashlib
 import os
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +19,9 @@ import jax.numpy as jnp
 from jax import export
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
-from tuning.files import write_whole
+from jaxhil.files import read_sealed, remove_stale, write_sealed
+from tuning.sources import PACKAGES, sources_sha256, versions
 
-PACKAGES = ("jaxhil", "tuning")
-STANDS_ON = ("jax", "jaxlib", "optimistix", "equinox", "lineax", "numpy")
 # Calls into LAPACK have no promise to mean the same in other versions; the name has the version in it.
 LAPACK = ("lapack_dpotrf_ffi", "lapack_dtrsm_ffi")
 
@@ -90,28 +88,25 @@ def _is_foreign(value: Any) -> bool:
 
 
 def _name(function, static, structure, shapes) -> str:
-    digest = hashlib.sha256()
-    for package in PACKAGES:
-        root = Path(str(sys.modules[package].__file__)).parent
-        for source in sorted(root.rglob("*.py")):
-            digest.update(str(source.relative_to(root)).encode() + source.read_bytes())
-    versions = [f"{name} {version(name)}" for name in STANDS_ON]
     wide = jnp.result_type(float).name
     flags = wide, jax.default_backend(), jax.device_count()
-    text = repr((function.__module__, function.__qualname__, static, structure, shapes, versions, flags))
-    return hashlib.sha256(digest.digest() + text.encode()).hexdigest()
+    made_of = static, structure, shapes, versions(), flags
+    text = repr((function.__module__, function.__qualname__, sources_sha256(), *made_of))
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _read(path: Path) -> export.Exported | None:
     """The program kept in a file; None if there is none, or none that can be read."""
+    content = read_sealed(path)
     try:
-        return export.deserialize(bytearray(path.read_bytes()))
+        return None if content is None else export.deserialize(bytearray(content))
     except Exception:
-        # A file cut short can fail in any way; it is then made anew.
+        # Written whole, but by something else.
         return None
 
 
 def _write(path: Path, content: bytes | bytearray) -> None:
     """All or nothing; a folder that has become full or read-only costs only the next call's time."""
     with suppress(OSError):
-        write_whole(path, content)
+        remove_stale(path.parent)
+        write_sealed(path, content)

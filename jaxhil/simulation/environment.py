@@ -12,6 +12,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from jaxhil.simulation.compile_cache import keep_sealed
+
 CACHE = "JAXHIL_CACHE"
 DEVICES = "--xla_force_host_platform_device_count"
 # Tracing makes objects by the million, few of them in cycles: looking for those takes a tenth of the time of
@@ -35,7 +37,7 @@ def prepare() -> None:
     gc.set_threshold(*RARELY)
     jax.config.update("jax_enable_x64", True)
     folder = cache_folder()
-    if folder is not None and not program_folder():
+    if folder is not None and not program_folder() and keep_sealed(folder):
         jax.config.update("jax_compilation_cache_dir", str(folder))
         for name, value in KEEPING.items():
             jax.config.update(name, value)
@@ -94,7 +96,7 @@ def _programs_kept() -> Iterator[None]:
     from jax.experimental.compilation_cache import compilation_cache
 
     folder = None if program_folder() else cache_folder()
-    if folder is None:
+    if folder is None or not keep_sealed(folder):
         yield
         return
     ours = {"jax_compilation_cache_dir": str(folder), **KEEPING}
