@@ -89,6 +89,22 @@ def open_plain(path: str | os.PathLike[str]) -> BinaryIO:
         raise
 
 
+@contextmanager
+def lock(path: Path) -> Iterator[None]:
+    """Nobody else holds the lock meanwhile. Raises BlockingIOError if somebody does, or another OSError."""
+    import fcntl
+
+    with suppress(FileNotFoundError):
+        _check_plain(os.lstat(path).st_mode)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+    try:
+        _check_plain(os.fstat(descriptor).st_mode)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def follow(path: str | os.PathLike[str]) -> Path:
     """Where a path leads that the user names for output: a link to a file stands for the file."""
     return Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
@@ -111,6 +127,11 @@ def remove_stale(folder: Path) -> None:
             if name and entry.is_file(follow_symlinks=False) and not _is_writing(int(name[1]), name[2]):
                 with suppress(FileNotFoundError):
                     os.unlink(entry)
+
+
+def is_temporary(name: str) -> bool:
+    """Whether a file of that name was left when writing was interrupted."""
+    return _OURS.fullmatch(name) is not None
 
 
 def temporary_name() -> str:

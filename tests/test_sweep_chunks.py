@@ -6,8 +6,9 @@ from sweep_cases import NOISY, case, manifest
 
 from tuning.sweeps.chunks import build_sweep, run_chunk, run_parts
 from tuning.sweeps.columns import OUTCOMES
+from tuning.sweeps.parts import same_rows
 from tuning.sweeps.replay import replay
-from tuning.sweeps.store import open_store, same_rows, write_part
+from tuning.sweeps.store import open_store, write_part
 
 pytestmark = pytest.mark.users_options
 

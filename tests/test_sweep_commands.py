@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from sweep_cases import case
 
+from jaxhil.runtime import digest
 from tuning.__main__ import main
 from tuning.gain_file import write_gain_file
 from tuning.sweeps.store import read_part, read_store, write_part
@@ -159,7 +160,9 @@ def test_the_verdict_is_kept_as_it_was_printed(jaxhil, own):
     (folder / "verdict.json").unlink()
     assert jaxhil(*again, "--acceptable", "1")[0] == 0
     found = json.loads((folder / "verdict.json").read_text())
-    assert found["verdict"] == "good" and found == {**document(ran), "acceptable": 1.0, "verdict": "good"}
+    assert found["sha256"] == digest(found) and document(ran)["sha256"] == digest(document(ran))
+    changed = {"acceptable": 1.0, "verdict": "good", "sha256": found["sha256"]}
+    assert found == {**document(ran), **changed}
     assert jaxhil("replay", folder, 5)[0] == 0
 
 
@@ -273,10 +276,13 @@ def test_replay_finds_out_what_was_changed(jaxhil, gains, tmp_path):
     jaxhil("sweep", gains, *TINY, "-o", folder)
     opened = read_store(folder)
     rows = dict(read_part(opened, 0))
-    rows["error_1"] = rows["error_1"] * (1 + 1e-15)
+    rows["duration_1"] = rows["duration_1"] * (1 + 1e-15)
     write_part(opened, 0, rows)
     code, out, _ = jaxhil("replay", folder, 3)
-    assert code == 1 and "Bad: differs" in out and "error_1" in out
+    assert code == 1 and "Bad: differs" in out and "duration_1" in out
+    rows["error_1"] = rows["error_1"] * (1 + 1e-15)
+    write_part(opened, 0, rows)
+    refused(jaxhil("replay", folder, 3), "parts/part-000000.parquet: found damage, or a part of something")
 
 
 def test_what_cannot_be_is_refused(jaxhil, gains, store, tmp_path):

@@ -3,6 +3,7 @@
 import json
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,7 +11,7 @@ from sweep_cases import case, manifest
 
 from jaxhil.errors import InputError
 from jaxhil.runtime import digest
-from tuning.sweeps.manifest import decode, differences, encode, rounding_flags
+from tuning.sweeps.manifest import decode, differences, encode, other_code, rounding_flags, unlike_here
 
 GOOD = manifest()
 DOCUMENT = json.loads(encode(GOOD))
@@ -70,7 +71,7 @@ def test_any_other_value_is_refused_or_taken_as_signed(key, value, signed):
 def test_missing_and_unknown_keys_are_named():
     assert "seed" in refusal(json.dumps({k: v for k, v in DOCUMENT.items() if k != "seed"}).encode())
     assert "speed" in refusal(json.dumps({**DOCUMENT, "speed": 1}).encode())
-    assert "jaxhil/sweep/1" in refusal(b"[]")
+    assert "jaxhil/sweep/2" in refusal(b"[]")
     assert "NaN" in refusal(encode(GOOD).replace(b'"seed": 0', b'"seed": NaN'))
 
 
@@ -88,13 +89,33 @@ def test_what_differs_is_named(key, value):
     assert difference.startswith(f"{key}: found ")
 
 
-def test_other_gains_and_versions_differ():
+def test_a_manifest_of_an_earlier_schema_says_what_to_do():
+    old = json.dumps({**DOCUMENT, "schema": "jaxhil/sweep/1"}).encode()
+    assert "allowed jaxhil/sweep/2: sweep again into a new folder, or use the version" in refusal(old)
+
+
+def test_a_flipped_bit_is_refused_or_changes_nothing_but_the_date():
+    content = encode(GOOD)
+    for bit in np.random.default_rng(0).integers(0, 8 * len(content), 1000):
+        harmed = bytearray(content)
+        harmed[bit // 8] ^= 1 << int(bit % 8)
+        try:
+            found = decode(bytes(harmed), "store/manifest.json")
+        except InputError as error:
+            assert str(error).startswith("store/manifest.json: ") and str(error).isprintable()
+        else:
+            assert msgspec.structs.replace(found, created=GOOD.created) == GOOD
+
+
+def test_other_gains_and_other_code_differ():
     (difference,) = differences(GOOD, manifest(case(compensator="phase_lead")))
     assert difference.startswith("gains_sha256: ")
-    newer = msgspec.structs.replace(GOOD, versions={**GOOD.versions, "jax": "9.9"})
-    (difference,) = differences(GOOD, newer)
-    assert difference.startswith("versions.jax: ") and "9.9" in difference
-    assert not differences(GOOD, manifest())
+    newer = msgspec.structs.replace(GOOD, versions={**GOOD.versions, "jax": "9.9"}, sources_sha256="0" * 64)
+    sources, version = other_code(GOOD, newer)
+    assert sources.startswith("sources_sha256: found ") and sources.endswith("here 000000000000...")
+    assert version.startswith("versions.jax: ") and "9.9" in version
+    assert unlike_here(newer)[0].startswith("sources_sha256: found 000000000000..., here ")
+    assert not differences(GOOD, manifest()) and not other_code(GOOD, manifest()) and not unlike_here(GOOD)
 
 
 def test_only_flags_that_may_change_a_result_count():

@@ -18,14 +18,16 @@ from jaxhil.errors import InputError
 from tuning.gain_file import write_gain_file
 from tuning.statistics.intervals import Running, enough, updated
 from tuning.sweeps.chunks import run_chunk
+from tuning.sweeps.parts import same_rows
 from tuning.sweeps.replay import motion_of, replay
 from tuning.sweeps.run import compare_precisions, describe_outcomes, on_cluster, run_sweep
-from tuning.sweeps.store import open_store, read_part, read_store, same_rows, write_part
+from tuning.sweeps.store import open_store, read_part, read_store, write_part
 
 pytestmark = pytest.mark.users_options
 
 MANIFEST = manifest(case(), scenarios=300, limit=1.5)
 HERE = Path(__file__).parent
+UNFINISHED = f".jaxhil-{2**22 + 1}-0123abcd-0.tmp"  # no process has such a number
 
 
 class Log(list):
@@ -75,7 +77,7 @@ def test_what_is_missing_or_damaged_is_made_again(whole, tmp_path):
     store.part_path(9).unlink()
     content = store.part_path(4).read_bytes()
     store.part_path(4).write_bytes(content[: len(content) // 2])
-    (tmp_path / "store" / "parts" / ".part-000004.parquet.1.tmp").write_bytes(content[:100])
+    (tmp_path / "store" / "parts" / UNFINISHED).write_bytes(content[:100])
     log = Log()
     store, _, again = log.sweep(tmp_path / "store")
     assert (log.found, log.computed) == (300 - 32 - 32 - 12, 32 + 32 + 12)

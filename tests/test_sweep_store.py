@@ -10,11 +10,25 @@ from sweep_cases import case, manifest
 
 from jaxhil.errors import InputError
 from jaxhil.runtime import digest
-from tuning.sweeps.columns import OUTCOMES, STATUSES
+from tuning.sweeps.columns import OUTCOMES, STATUSES, judge
 from tuning.sweeps.manifest import unlike_here
-from tuning.sweeps.store import locked, open_store, read_part, read_row, read_store, same_rows, write_part
+from tuning.sweeps.parts import decode_part, encode_part, same_rows
+from tuning.sweeps.store import (
+    kept_part,
+    locked,
+    open_store,
+    read_part,
+    read_row,
+    read_store,
+    remove_parts,
+    write_part,
+    write_verdict,
+)
+from tuning.sweeps.stored_studies import IndicesRequest, write_study
+from tuning.sweeps.studies import ErrorIndices
 
 MANIFEST = manifest(case(2))
+UNFINISHED = f".jaxhil-{2**22 + 1}-0123abcd-0.tmp"  # no process has such a number
 
 
 def made_up(part, label=MANIFEST, seed=0):
@@ -34,7 +48,7 @@ def made_up(part, label=MANIFEST, seed=0):
             rows[column.name] = generator.integers(0, len(texts), number).astype(np.int8)
         else:
             rows[column.name] = values
-    return rows
+    return {**rows, **judge(rows, 2, np.array(np.inf), label.largest_error)}
 
 
 @pytest.fixture
@@ -94,15 +108,40 @@ def test_a_damaged_or_foreign_part_is_not_taken(store, tmp_path, harm):
         read_row(store, 40)
 
 
-def test_no_bit_of_a_part_can_change_unseen(store):
-    path, expected = store.part_path(0), made_up(0)
-    content = path.read_bytes()
-    for place in np.random.default_rng(0).integers(0, len(content), 60):
+def test_no_bit_of_a_part_can_change_unseen():
+    content = encode_part(MANIFEST, made_up(0))
+    assert decode_part(MANIFEST, 0, content) is not None
+    for bit in np.random.default_rng(0).integers(0, 8 * len(content), 1000):
         harmed = bytearray(content)
-        harmed[place] ^= 1 << int(place % 8)
-        path.write_bytes(harmed)
-        found = read_part(store, 0)
-        assert found is None or same_rows(found, expected) == []
+        harmed[bit // 8] ^= 1 << int(bit % 8)
+        assert decode_part(MANIFEST, 0, bytes(harmed)) is None
+
+
+def test_a_part_written_anew_by_something_else_is_not_taken(store):
+    from pyarrow import parquet
+
+    path = store.part_path(0)
+    table = parquet.read_table(path)
+    parquet.write_table(table, path)
+    assert table.schema.metadata.keys() == parquet.read_table(path).schema.metadata.keys()
+    with refused("part-000000.parquet: found damage, or a part of something else", "--resume"):
+        kept_part(store, 0)
+
+
+@pytest.mark.parametrize("column", ["outcome", "failed", "worst_error", "error_2", "status_1"])
+def test_outcomes_follow_from_errors(store, column):
+    good = {"status": 1, "error": 0.25, "position_shortfall": 0.0}
+    rows = made_up(0)
+    for name, value in good.items():
+        rows[f"{name}_1"][5] = rows[f"{name}_2"][5] = value
+    rows = {**rows, **judge(rows, 2, np.array(np.inf), MANIFEST.largest_error)}
+    assert OUTCOMES[rows["outcome"][5]] == "good" and not rows["failed"][5] and rows["worst_error"][5] == 0.25
+    write_part(store, 0, rows)
+    assert read_part(store, 0) is not None
+    other = {"outcome": 3, "failed": True, "worst_error": 0.5, "error_2": 7.0, "status_1": 2}
+    rows[column][5] = other[column]
+    write_part(store, 0, rows)
+    assert read_part(store, 0) is None
 
 
 def test_an_index_beyond_the_end_is_refused(store):
@@ -132,27 +171,21 @@ def test_a_store_without_a_column_is_refused_by_name(tmp_path):
     old = msgspec.structs.replace(old, sha256=digest(msgspec.to_builtins(old)))
     folder = open_store(tmp_path / "store", old, resume=False).folder
     difference = "columns: found others than this version writes"
-    with refused("other inputs", difference):
+    with refused("other code", difference):
         open_store(folder, MANIFEST, resume=True)
     # It can still be read, with a word of warning.
     assert unlike_here(read_store(folder).manifest) == [difference] and not unlike_here(MANIFEST)
 
 
 def test_resuming_removes_what_was_left_unfinished(store):
-    stale = store.folder / "parts" / ".part-000002.parquet.123.tmp"
-    stale.write_bytes(b"PAR1")
-    assert open_store(store.folder, MANIFEST, resume=True).manifest == MANIFEST
-    assert not stale.exists()
-
-
-def test_nothing_unfinished_is_left_beside_the_rows(store):
     (store.folder / "studies").mkdir()
-    left = [store.folder / ".verdict.json.1.tmp", store.folder / "studies" / ".drivers-2.json.1.tmp"]
-    kept = [store.folder / "verdict.json", store.folder / "studies" / "drivers-2.json"]
+    left = [store.folder / place / UNFINISHED for place in ("", "parts", "studies")]
+    kept = ["verdict.json", "studies/drivers-2.json", ".thesis.docx.tmp", "parts/.thesis.docx.1.tmp"]
+    kept = [store.folder / name for name in kept]
     for path in (*left, *kept):
         path.write_text("{}")
-    open_store(store.folder, MANIFEST, resume=True)
-    assert [path.exists() for path in (*left, *kept)] == [False, False, True, True]
+    assert open_store(store.folder, MANIFEST, resume=True).manifest == MANIFEST
+    assert [path.exists() for path in (*left, *kept)] == [False] * 3 + [True] * 4
 
 
 def test_a_new_store_takes_over_no_study_and_no_verdict(store):
@@ -161,13 +194,16 @@ def test_a_new_store_takes_over_no_study_and_no_verdict(store):
         store.part_path(part).unlink()
     (store.folder / "studies").mkdir()
     for resume in (False, True):
-        with refused("store: found a folder with something in it"):
+        with refused("store: found 'studies' and no sweep"):
             open_store(store.folder, MANIFEST, resume)
     (store.folder / "studies").rmdir()
-    (store.folder / "verdict.json").touch()
-    for resume in (False, True):
-        with refused("store: found a folder with something in it"):
-            open_store(store.folder, MANIFEST, resume)
+    for name in ("verdict.json", "errors.png"):
+        (store.folder / name).touch()
+        for resume in (False, True):
+            with refused(f"store: found '{name}' and no sweep"):
+                open_store(store.folder, MANIFEST, resume)
+        (store.folder / name).unlink()
+    open_store(store.folder, MANIFEST, resume=False)
 
 
 def test_a_full_disk_is_one_line_and_keeps_what_is_there(store):
@@ -194,6 +230,67 @@ def test_a_read_only_folder_is_one_line(store):
     (store.folder / "parts").chmod(0o500)
     with refused("part-000000.parquet: cannot be written: Permission denied"):
         write_part(store, 0, made_up(0))
+
+
+def test_the_code_that_made_a_store_goes_on_with_it(tmp_path):
+    old = msgspec.structs.replace(MANIFEST, sources_sha256="0" * 64)
+    old = msgspec.structs.replace(old, sha256=digest(msgspec.to_builtins(old)))
+    folder = open_store(tmp_path / "store", old, resume=False).folder
+    what_to_do = "allowed a new folder, or --resume with the version that made this one"
+    with refused("store: was made by other code: sources_sha256: found 000000000000...", what_to_do):
+        open_store(folder, MANIFEST, resume=True)
+
+
+def test_nothing_of_the_users_is_touched(tmp_path):
+    thesis = tmp_path / "thesis"
+    thesis.mkdir()
+    for name in (".thesis.docx.tmp", ".thesis.docx.1.tmp", "thesis.docx", ".lock"):
+        (thesis / name).write_text("years")
+    before = {path: (path.read_text(), path.stat().st_mtime_ns) for path in thesis.iterdir()}
+    for resume in (False, True):
+        with refused("thesis: found '.thesis.docx.1.tmp' and no sweep, allowed an empty folder"):
+            with locked(thesis):
+                open_store(thesis, MANIFEST, resume)
+    assert {path: (path.read_text(), path.stat().st_mtime_ns) for path in thesis.iterdir()} == before
+
+
+@pytest.mark.parametrize("name", [".lock", "manifest.json", "parts", "verdict.json", "studies"])
+@pytest.mark.parametrize("kind", ["link", "pipe", "folder link"])
+def test_no_link_is_followed_and_no_pipe_waited_for(store, tmp_path, name, kind):
+    place = store.folder / name
+    if place.is_dir():
+        place.rename(tmp_path / "away")
+    place.unlink(missing_ok=True)
+    (tmp_path / "precious").write_text("years")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / UNFINISHED).write_text("years")
+    if kind == "pipe":
+        os.mkfifo(place)
+    else:
+        place.symlink_to(tmp_path / ("precious" if kind == "link" else "elsewhere"))
+    before = os.lstat(place).st_ino
+    with refused(name, "found a (link|pipe), allowed a (plain file|folder)"), locked(store.folder):
+        opened = open_store(store.folder, MANIFEST, resume=True)
+        write_verdict(opened, {"verdict": "good"})
+        write_study(opened, IndicesRequest(2), ErrorIndices((), 1.0, 4, 0))
+    assert os.lstat(place).st_ino == before
+    assert (tmp_path / "precious").read_text() == "years"
+    assert os.listdir(tmp_path / "elsewhere") == [UNFINISHED]
+
+
+@pytest.mark.parametrize("kind", ["link", "pipe"])
+def test_a_part_is_a_plain_file(store, tmp_path, kind):
+    path = store.part_path(2)
+    path.rename(tmp_path / "part")
+    if kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to(tmp_path / "part")
+    assert read_part(store, 2) is None
+    with refused("part-000002.parquet: cannot be written: found a"):
+        write_part(store, 2, made_up(2))
+    remove_parts(store, 1)
+    assert sorted(os.listdir(path.parent)) == ["part-000000.parquet", path.name]
 
 
 def test_two_sweeps_do_not_write_to_one_store(tmp_path):

@@ -235,13 +235,13 @@ def test_a_damaged_study_is_none(store, harm):
         write_study(store, IndicesRequest(128), SOME_DRIVERS)
         assert path.read_bytes() == content
     else:
-        with unwritten("drivers-128.json: ", "directory"):
+        with unwritten("drivers-128.json: ", "found a folder, allowed a plain file"):
             write_study(store, IndicesRequest(128), SOME_DRIVERS)
 
 
 def test_a_full_disk_is_one_line_and_keeps_what_is_there(store):
     write_study(store, IndicesRequest(128), SOME_DRIVERS)
-    write_verdict(store, '{"verdict": "good"}\n')
+    write_verdict(store, {"verdict": "good"})
     before = study_path(store, IndicesRequest(128)).read_bytes()
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
@@ -249,11 +249,11 @@ def test_a_full_disk_is_one_line_and_keeps_what_is_there(store):
         with unwritten("drivers-128.json: ", ""):
             write_study(store, IndicesRequest(128), SOME_DRIVERS._replace(capped=4))
         with unwritten("verdict.json: ", ""):
-            write_verdict(store, '{"verdict": "bad"}\n')
+            write_verdict(store, {"verdict": "bad"})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert study_path(store, IndicesRequest(128)).read_bytes() == before
-    assert (store.folder / "verdict.json").read_text() == '{"verdict": "good"}\n'
+    assert json.loads((store.folder / "verdict.json").read_text()) == {"verdict": "good"}
     assert {path.name for path in store.folder.rglob("*.tmp")} == set()
 
 

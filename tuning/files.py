@@ -3,6 +3,8 @@
 from jaxhil.files import (
     TEMPORARY,
     follow,
+    is_temporary,
+    lock,
     make_folder,
     open_plain,
     read_sealed,
@@ -15,6 +17,8 @@ from jaxhil.files import (
 __all__ = [
     "TEMPORARY",
     "follow",
+    "is_temporary",
+    "lock",
     "make_folder",
     "open_plain",
     "read_sealed",

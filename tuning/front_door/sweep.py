@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jaxhil.errors import InputError, shown
+from jaxhil.runtime import digest
 from jaxhil.simulation.environment import computing
 from tuning import terminal
 from tuning.front_door import arguments, sweep_studies
@@ -73,7 +74,8 @@ class SweepStudy:
     @contextmanager
     def store(self) -> Iterator["Store"]:
         """The rows in a store: the folder's, or one that is there within the context alone."""
-        from tuning.sweeps.store import from_table, open_store, read_store, write_part
+        from tuning.sweeps.parts import from_table
+        from tuning.sweeps.store import open_store, read_store, write_part
 
         if self.folder is not None:
             yield read_store(self.folder)
@@ -256,9 +258,10 @@ def _complete(
         return []
 
     def write() -> None:
+        document["sha256"] = digest(terminal.finite(document))
         with sweep_studies.put_off(unwritten):
             if keep:
-                write_verdict(store, terminal.as_json(document))
+                write_verdict(store, document)
 
     steps: dict[str, Callable[[], Any]] = {"plots": plots}
     if store.manifest.precision == "float32":
@@ -286,6 +289,7 @@ def _document(options: SweepOptions, store: "Store", done, tally, rate: float | 
         good = probability.high <= options.acceptable
     return {
         "store": str(store.folder),
+        "sweep_sha256": manifest.sha256,
         "gains_sha256": manifest.gains_sha256,
         "mechanism": done.mechanism.name,
         "compensator": done.loop.compensator.name,
@@ -328,9 +332,10 @@ def _table(store: "Store") -> "pyarrow.Table":
     """All rows of the store, in the order of their indices."""
     import pyarrow
 
-    from tuning.sweeps.store import read_part, schema, to_table
+    from tuning.sweeps.parts import schema, to_table
+    from tuning.sweeps.store import kept_part
 
-    parts = (read_part(store, part) for part in range(store.manifest.parts))
+    parts = (kept_part(store, part) for part in range(store.manifest.parts))
     tables = [to_table(store.manifest, rows) for rows in parts if rows is not None]
     return pyarrow.concat_tables(tables) if tables else schema(store.manifest).empty_table()
 

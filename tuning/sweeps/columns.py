@@ -167,16 +167,28 @@ def rows_of(
             known = reached[contact] if name in KNOWN_UNENDED else ended[contact]
             rows[f"{name}_{contact + 1}"] = np.where(known, values[name][contact], np.nan)
         rows[f"status_{contact + 1}"] = codes[contact]
-    error = np.where(ended, outcome.error[:made], np.nan)
-    size = np.where(ended, np.abs(error), -1)
+    return {**rows, **judge(rows, made, np.asarray(scenarios.force_sensor.range), limit)}
+
+
+def judge(
+    rows: Mapping[str, np.ndarray], contacts: int, force_range: np.ndarray, limit: float
+) -> dict[str, np.ndarray]:
+    """`worst_error`, `outcome` and `failed`, which follow from the columns of every contact.
+
+    `force_range` [N] is the force sensor's, of every row or of all; `limit` [1] that of the error.
+    """
+
+    def each(name: str) -> np.ndarray:
+        return np.stack([rows[f"{name}_{contact + 1}"] for contact in range(contacts)])
+
+    status, error, peak = np.array(sorted(STATUS_NAMES))[each("status")], each("error"), each("peak_force")
+    size = np.where(status == OK, np.abs(error), -1)
     worst = np.take_along_axis(error, np.argmax(size, axis=0)[None], axis=0)[0]
-    rows["worst_error"] = worst
-    force_range = np.asarray(scenarios.force_sensor.range)
-    beyond_range = metrics.peak_force[:made] > force_range
-    saturated = np.any(reached & (beyond_range | (metrics.position_shortfall[:made] > 0)), axis=0)
-    rows["outcome"] = _outcomes(status, ~(np.abs(worst) <= limit), saturated)
-    rows["failed"] = rows["outcome"] != OUTCOMES.index(GOOD)
-    return rows
+    # What was not reached has no peak and no shortfall: they are beyond nothing.
+    beyond_range = peak > force_range.astype(peak.dtype)
+    saturated = np.any(beyond_range | (each("position_shortfall") > 0), axis=0)
+    outcome = _outcomes(status, ~(np.abs(worst) <= limit), saturated)
+    return {"worst_error": worst, "outcome": outcome, "failed": outcome != OUTCOMES.index(GOOD)}
 
 
 def _outcomes(status: np.ndarray, beyond: np.ndarray, saturated: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The manifest of a sweep: everything that its rows follow from (`schema = "jaxhil/sweep/1"`), as JSON.
+"""The manifest of a sweep: everything that its rows follow from (`schema = "jaxhil/sweep/2"`), as JSON.
 
 It is the plan before the sweep and the label of the store afterwards. `digest` of its content is in every
 part of the store, so that no part of another sweep is taken for one of this.
@@ -18,12 +18,13 @@ from jaxhil.errors import InputError, one_line, shown
 from jaxhil.runtime import digest
 from jaxhil.simulation.environment import xla_flags
 from jaxhil.simulation.gain_file import LoadedGains, check_document
-from tuning.gain_file import versions
+from tuning.files import open_plain
+from tuning.sources import sources_sha256, versions
 from tuning.sweeps import LARGEST_CHUNK, LARGEST_SEED, MOST
 from tuning.sweeps.columns import Column, sweep_columns
 from tuning.sweeps.draws import REPLICATES
 
-SCHEMA = "jaxhil/sweep/1"
+SCHEMA = "jaxhil/sweep/2"
 NAME = "manifest.json"
 CHUNK = 16384  # scenarios
 LARGEST = 8 * 1024 * 1024  # bytes
@@ -34,7 +35,7 @@ Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
     """What a sweep's rows follow from."""
 
-    schema: Literal["jaxhil/sweep/1"]
+    schema: Literal["jaxhil/sweep/2"]
     scenarios: Annotated[int, Meta(ge=1, le=MOST)]  # the most there can be, where there is `until_width`
     chunk: Annotated[int, Meta(ge=1, le=LARGEST_CHUNK)]  # scenarios a part
     seed: Annotated[int, Meta(ge=0, le=LARGEST_SEED)]
@@ -47,7 +48,8 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     gains_sha256: Digest  # digest of the gain file
     mechanism_sha256: Digest  # of its mechanism's file
     gain_file: dict[str, Any]  # the gain file itself
-    versions: dict[str, str]  # of the packages that computed it
+    sources_sha256: Digest  # of the code that computed it
+    versions: dict[str, str]  # of the packages that it stands on
     xla_flags: str  # of the compiler, as far as they may change a last bit
     created: str  # date
     sha256: Digest  # digest of all but the date
@@ -97,6 +99,7 @@ def build_manifest(loaded: LoadedGains, choices: Choices) -> Manifest:
         "gains_sha256": loaded.document["sha256"],
         "mechanism_sha256": loaded.document["mechanism_sha256"],
         "gain_file": loaded.document,
+        "sources_sha256": sources_sha256(),
         "versions": versions(),
         "xla_flags": rounding_flags(xla_flags()),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -133,7 +136,7 @@ def read_manifest(folder: Path) -> Manifest:
     path = folder / NAME
     source = one_line(str(path))
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             content = file.read(LARGEST + 1)
     except FileNotFoundError:
         raise InputError(
@@ -161,16 +164,19 @@ def differences(old: Manifest, new: Manifest) -> list[str]:
         for key, before, now in values
         if before != now
     ]
-    found_differences += _other_versions(old.versions, new.versions)
-    if old.columns != new.columns:
-        found_differences.append(OTHER_COLUMNS)
     return found_differences
+
+
+def other_code(old: Manifest, new: Manifest) -> list[str]:
+    """What of the code that computes the rows is not the same, likewise."""
+    found_differences = _other_versions(old, new.sources_sha256, new.versions)
+    return found_differences + ([OTHER_COLUMNS] if old.columns != new.columns else [])
 
 
 def unlike_here(manifest: Manifest) -> list[str]:
     """What of this process is not as the manifest says, so that its rows may differ in their last bits."""
     flags = rounding_flags(xla_flags())
-    found_differences = _other_versions(manifest.versions, versions())
+    found_differences = _other_versions(manifest, sources_sha256(), versions())
     if flags != manifest.xla_flags:
         found_differences.append(f"xla_flags: found {_short(manifest.xla_flags)}, here {_short(flags)}")
     if manifest.columns != sweep_columns(loaded_gains(manifest).mechanism, manifest.works):
@@ -178,15 +184,25 @@ def unlike_here(manifest: Manifest) -> list[str]:
     return found_differences
 
 
-def _other_versions(old: Mapping[str, str], new: Mapping[str, str]) -> list[str]:
+def _other_versions(manifest: Manifest, sources: str, here: Mapping[str, str]) -> list[str]:
+    old = {"sources_sha256": manifest.sources_sha256, **_prefixed(manifest.versions)}
+    new = {"sources_sha256": sources, **_prefixed(here)}
     return [
-        f"versions.{name}: found {_short(old.get(name))}, here {_short(new.get(name))}"
-        for name in sorted(old.keys() | new.keys())
-        if old.get(name) != new.get(name)
+        f"{key}: found {_short(old.get(key))}, here {_short(new.get(key))}"
+        for key in sorted(old.keys() | new.keys())
+        if old.get(key) != new.get(key)
     ]
 
 
+def _prefixed(found: Mapping[str, str]) -> dict[str, str]:
+    return {f"versions.{name}": number for name, number in found.items()}
+
+
 def _decode(document: Mapping[str, Any], source: str) -> Manifest:
+    schema = document.get("schema")
+    if isinstance(schema, str) and schema.startswith("jaxhil/sweep/") and schema != SCHEMA:
+        allowed = f"{SCHEMA}: sweep again into a new folder, or use the version that made it"
+        raise InputError(f"{source}: schema: found {shown(schema)}, allowed {allowed}")
     try:
         manifest = msgspec.convert(document, Manifest)
     except (msgspec.ValidationError, RecursionError) as error:

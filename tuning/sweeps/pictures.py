@@ -30,7 +30,7 @@ from tuning.files import writing
 from tuning.statistics.intervals import binomial_interval, confidence_sequence, replicate_interval
 from tuning.sweeps.manifest import Manifest, loaded_gains
 from tuning.sweeps.regions import Input, Plan, Points, Regions, add_rows, empty_regions, make_plan, quantile
-from tuning.sweeps.store import PICTURES, Store, read_part
+from tuning.sweeps.store import PICTURES, Store, kept_part
 
 FEW = 20  # contacts of a cell below which it has no quantile: a 95th percentile needs as many
 FAILED, UNENDED = "failed", "failed, a contact did not end: drawn at the top"
@@ -50,7 +50,7 @@ def draw_store(store: Store, acceptable: float | None = None) -> dict[str, Figur
     manifest, mechanism = store.manifest, loaded_gains(store.manifest).mechanism
     plan = regions = None
     for part in range(manifest.parts):
-        rows = read_part(store, part)
+        rows = kept_part(store, part)
         if rows is None:
             break
         plan = plan or make_plan(manifest, mechanism, rows)

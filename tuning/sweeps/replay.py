@@ -9,7 +9,8 @@ from jaxhil.simulation.motion import Piece, scenario_motion
 from tuning.sweeps.chunks import Sweep, build_sweep, run_chunk
 from tuning.sweeps.draws import drawn_scenarios
 from tuning.sweeps.manifest import loaded_gains
-from tuning.sweeps.store import Store, read_row, same_rows
+from tuning.sweeps.parts import same_rows
+from tuning.sweeps.store import Store, read_row
 
 
 class Replay(NamedTuple):

@@ -7,30 +7,34 @@
     DIR/studies/drivers-1024.json, ... (`tuning.sweeps.stored_studies`)
 
 `DIR/parts` is a Parquet dataset, for pandas, DuckDB or Arrow; units are in the fields' metadata. A part is
-there as a whole or not at all: it is written under another name, forced to disk, then renamed. It carries the
-manifest's digest and checksums of its pages. Whatever interrupts a sweep, what is missing can be computed
-later, and the store is the same, row for row.
+there as a whole or not at all: it is written under another name, forced to disk, then renamed. It shows
+whether it is as it was written (`tuning.sweeps.parts`). Whatever interrupts a sweep, what is missing can be
+computed later, by the same code, and the store is the same, row for row.
+
+Nothing is touched in a folder that holds anything but a store.
 """
 
-import fcntl
+import os
+import re
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxhil.errors import InputError, one_line
-from tuning.files import TEMPORARY, write_whole, writing
-from tuning.sweeps.columns import Column, texts_of
-from tuning.sweeps.manifest import NAME, Manifest, differences, encode, read_manifest
+from jaxhil.errors import InputError, one_line, shown
+from tuning import terminal
+from tuning.files import is_temporary, lock, make_folder, open_plain, remove_stale, write_whole, writing
+from tuning.sweeps.manifest import NAME, Manifest, differences, encode, other_code, read_manifest
+from tuning.sweeps.parts import decode_part, encode_part
 
 PARTS = "parts"
 PICTURES = ("errors.png", "failures.png", "convergence.png")  # made of the rows, not part of them
 STUDIES = "studies"
 VERDICT = "verdict.json"
 LOCK = ".lock"
-DIGEST = b"jaxhil.sweep.sha256"
+PART = re.compile(r"part-(\d{6,})\.parquet")
 
 
 class Store(NamedTuple):
@@ -47,27 +51,30 @@ def open_store(folder: Path, manifest: Manifest, resume: bool) -> Store:
     """A store for the sweep of `manifest`: a new one or, to `resume`, the one that is there, if any.
 
     What an interruption left unfinished is removed. Raises `InputError` when the folder holds something
-    and is not to be resumed, when its store was made with other inputs, or when it cannot be written.
+    and is not to be resumed, when its store was made with other inputs or by other code, or when it cannot
+    be written.
     """
-    shown = one_line(str(folder))
+    where = one_line(str(folder))
+    there = _is_store(folder)
+    if there and not resume:
+        raise InputError(f"{where}: found a sweep, allowed an empty folder, or --resume")
+    old = read_manifest(folder) if there else None
+    if old and (differing := differences(old, manifest)):
+        raise InputError(f"{where}: was made with other inputs: {'; '.join(differing[:3])}")
+    if old and (differing := other_code(old, manifest)):
+        allowed = "a new folder, or --resume with the version that made this one"
+        raise InputError(f"{where}: was made by other code: {'; '.join(differing[:2])}: allowed {allowed}")
     with writing(folder):
-        (folder / PARTS).mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
+    with writing(folder / PARTS):
+        make_folder(folder / PARTS)
         for place in (folder, folder / PARTS, folder / STUDIES):
-            for stale in place.glob(f".*{TEMPORARY}"):
-                stale.unlink(missing_ok=True)
-        held = {entry.name for entry in folder.iterdir()} - {LOCK, PARTS, *PICTURES}
-        parts = any((folder / PARTS).iterdir())
-    if NAME in held and resume:
-        old = read_manifest(folder)
-        if differing := differences(old, manifest):
-            raise InputError(f"{shown}: was made with other inputs: {'; '.join(differing[:3])}")
-        return Store(folder, old)
-    if held or parts:
-        allowed = "an empty folder, or a store and --resume" if not resume else "a store with its manifest"
-        raise InputError(f"{shown}: found a folder with something in it, allowed {allowed}")
-    with writing(folder / NAME):
-        write_whole(folder / NAME, encode(manifest))
-    return Store(folder, manifest)
+            if place.is_dir() and (place == folder or not place.is_symlink()):
+                remove_stale(place)
+    if old is None:
+        with writing(folder / NAME):
+            write_whole(folder / NAME, encode(manifest))
+    return Store(folder, old or manifest)
 
 
 def read_store(folder: Path) -> Store:
@@ -77,149 +84,102 @@ def read_store(folder: Path) -> Store:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Nobody else writes to the store meanwhile. Raises `InputError` if somebody does."""
+    """Nobody else writes to the store meanwhile. Raises `InputError` if somebody does, or if the folder holds
+    anything but a store."""
+    _is_store(folder)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        file = (folder / LOCK).open("wb")
-    with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise InputError(f"{one_line(str(folder))}: another sweep is writing to this store") from None
+    with ExitStack() as held:
+        with writing(folder / LOCK):
+            try:
+                held.enter_context(lock(folder / LOCK))
+            except BlockingIOError:
+                reason = "another sweep is writing to this store"
+                raise InputError(f"{one_line(str(folder))}: {reason}") from None
         yield
 
 
 def write_part(store: Store, part: int, rows: Mapping[str, np.ndarray]) -> None:
     """Write a part, whole or not at all. Raises `InputError` when it cannot be written."""
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    buffer = pa.BufferOutputStream()
-    texts = [column.name for column in store.manifest.columns if column.kind == "text"]
-    parquet.write_table(
-        to_table(store.manifest, rows),
-        buffer,
-        compression="zstd",
-        compression_level=1,
-        # Numbers hardly repeat.
-        use_dictionary=texts,  # pyright: ignore[reportArgumentType]
-        write_page_checksum=True,
-    )
     path = store.part_path(part)
+    content = encode_part(store.manifest, rows)
     with writing(path):
-        write_whole(path, buffer.getvalue())
+        write_whole(path, content)
 
 
 def read_part(store: Store, part: int) -> dict[str, np.ndarray] | None:
     """A part's rows, as `write_part` got them; None if it is missing, damaged, or not of this sweep."""
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    path = store.part_path(part)
     try:
-        with path.open("rb") as file:
-            table = parquet.ParquetFile(file, page_checksum_verification=True).read()
-    except FileNotFoundError:
+        with open_plain(store.part_path(part)) as file:
+            content = file.read()
+    except OSError:
         return None
-    except (pa.ArrowException, OSError, ValueError):
-        # A file cut short or overwritten can fail in several ways; it is then made anew.
-        return None
-    manifest = store.manifest
-    first, number = manifest.part_rows(part)
-    metadata = table.schema.metadata or {}
-    if metadata.get(DIGEST) != manifest.sha256.encode() or table.num_rows != number:
-        return None
-    if not table.schema.equals(schema(manifest)):
-        return None
-    rows = from_table(manifest, table)
-    return rows if np.array_equal(rows["index"], np.arange(first, first + number)) else None
+    return decode_part(store.manifest, part, content)
 
 
-def write_verdict(store: Store, text: str) -> None:
+def kept_part(store: Store, part: int) -> dict[str, np.ndarray] | None:
+    """A part's rows, where nothing is to be made anew: None if there is none.
+
+    Raises `InputError` for one that is damaged or not of this sweep.
+    """
+    rows, path = read_part(store, part), store.part_path(part)
+    if rows is None and os.path.lexists(path):
+        found = "found damage, or a part of something else, allowed as it was written"
+        raise InputError(
+            f"{one_line(str(store.folder))}: {PARTS}/{path.name}: {found} (`jaxhil sweep --resume` makes it)"
+        )
+    return rows
+
+
+def write_verdict(store: Store, document: Mapping[str, Any]) -> None:
     """Write the verdict, whole or not at all. Raises `InputError` when it cannot be written."""
     path = store.folder / VERDICT
     with writing(path):
-        write_whole(path, text.encode("ascii"))
+        write_whole(path, terminal.as_json(document).encode("ascii"))
 
 
 def remove_parts(store: Store, first: int) -> None:
     """Remove the parts from number `first` on. Raises `InputError` when they cannot be."""
-    with writing(store.folder / PARTS):
-        for path in (store.folder / PARTS).glob("part-*.parquet"):
-            number = path.stem.removeprefix("part-")
-            if number.isdigit() and int(number) >= first:
-                path.unlink(missing_ok=True)
+    with writing(store.folder / PARTS), os.scandir(store.folder / PARTS) as entries:
+        for entry in entries:
+            name = PART.fullmatch(entry.name)
+            if name and int(name[1]) >= first and entry.is_file(follow_symlinks=False):
+                os.unlink(entry)
 
 
 def read_row(store: Store, index: int) -> dict[str, Any]:
     """One row, arrays of length 1. Raises `InputError` for an index that the store does not hold."""
     manifest = store.manifest
-    shown = one_line(str(store.folder))
+    where = one_line(str(store.folder))
     if not 0 <= index < manifest.scenarios:
-        raise InputError(f"{shown}: index: found {index}, allowed 0 to {manifest.scenarios - 1}")
+        raise InputError(f"{where}: index: found {index}, allowed 0 to {manifest.scenarios - 1}")
     part, place = divmod(index, manifest.chunk)
-    rows = read_part(store, part)
+    rows = kept_part(store, part)
     if rows is None:
+        if manifest.until_width is not None:
+            raise InputError(f"{where}: index: found {index}, allowed those before the sweep stopped")
         name = store.part_path(part).name
-        if manifest.until_width is not None and not store.part_path(part).exists():
-            raise InputError(f"{shown}: index: found {index}, allowed those before the sweep stopped")
-        raise InputError(f"{shown}: {PARTS}/{name}: missing or damaged (`jaxhil sweep --resume` makes it)")
+        raise InputError(f"{where}: {PARTS}/{name}: missing (`jaxhil sweep --resume` makes it)")
     return {name: values[place : place + 1] for name, values in rows.items()}
 
 
-def same_rows(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -> list[str]:
-    """Names of the columns that differ, to the bit but for which NaN it is."""
-    return [
-        name
-        for name in one
-        if one[name].dtype != other[name].dtype
-        or not np.array_equal(one[name], other[name], equal_nan=one[name].dtype.kind == "f")
-    ]
+def _is_store(folder: Path) -> bool:
+    """Whether a sweep's manifest is there; False where there is nothing, or the beginning of a store.
 
-
-def schema(manifest: Manifest) -> Any:
-    """The Arrow schema of every part; units and meanings are metadata of the fields."""
-    import pyarrow as pa
-
-    kinds = {
-        "integer": pa.int64(),
-        "input": pa.float64(),
-        "number": pa.float64() if manifest.precision == "float64" else pa.float32(),
-        "flag": pa.bool_(),
-        "text": pa.dictionary(pa.int8(), pa.string()),
-    }
-
-    def field(column: Column):
-        metadata = {"unit": column.unit, "meaning": column.meaning}
-        return pa.field(column.name, kinds[column.kind], metadata=metadata)
-
-    return pa.schema([field(column) for column in manifest.columns], metadata={DIGEST: manifest.sha256})
-
-
-def to_table(manifest: Manifest, rows: Mapping[str, np.ndarray]) -> Any:
-    """Rows as an Arrow table: NaN is null, texts are spelled out."""
-    import pyarrow as pa
-
-    arrays = []
-    for column, field in zip(manifest.columns, target := schema(manifest), strict=True):
-        values = rows[column.name]
-        if column.kind == "text":
-            arrays.append(pa.DictionaryArray.from_arrays(pa.array(values), list(texts_of(column.name))))
-        else:
-            arrays.append(pa.array(values, field.type, from_pandas=True))
-    return pa.Table.from_arrays(arrays, schema=target)
-
-
-def from_table(manifest: Manifest, table: Any) -> dict[str, np.ndarray]:
-    """The rows that `to_table` made a table of."""
-    rows = {}
-    for column in manifest.columns:
-        array = table.column(column.name).combine_chunks()
-        if column.kind == "text":
-            # A dictionary that was read holds the texts in another order.
-            places = {text: place for place, text in enumerate(texts_of(column.name))}
-            translated = np.array([places[text.as_py()] for text in array.dictionary], np.int8)
-            rows[column.name] = translated[array.indices.to_numpy(zero_copy_only=False)]
-        else:
-            rows[column.name] = array.to_numpy(zero_copy_only=False)
-    return rows
+    Raises `InputError` for a folder that holds anything else, or cannot be read.
+    """
+    try:
+        found = set(os.listdir(folder)) if os.path.lexists(folder) else set()
+        if NAME in found:
+            return True
+        other = found - {LOCK, PARTS} or (set(os.listdir(folder / PARTS)) if PARTS in found else set())
+        other = {name for name in other if not is_temporary(name)}
+    except OSError as error:
+        reason = one_line(error.strerror or str(error), 100)
+        raise InputError(f"{one_line(str(folder))}: cannot be read: {reason}") from None
+    if other:
+        allowed = "an empty folder, or a sweep's and --resume"
+        raise InputError(
+            f"{one_line(str(folder))}: found {shown(min(other))} and no sweep, allowed {allowed}"
+        )
+    return False

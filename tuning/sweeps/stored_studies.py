@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from jaxhil.runtime import digest
-from tuning.files import write_whole, writing
+from tuning.files import make_folder, open_plain, write_whole, writing
 from tuning.statistics.subset_simulation import SubsetSimulation
 from tuning.sweeps.manifest import LARGEST, Manifest
 from tuning.sweeps.store import STUDIES, Store
@@ -60,14 +60,14 @@ def write_study(store: Store, request: Request, found: Found) -> None:
     path = study_path(store, request)
     with writing(path):
         content = encode(store.manifest, request, found)
-        path.parent.mkdir(exist_ok=True)
+        make_folder(path.parent)
         write_whole(path, content)
 
 
 def read_study(store: Store, request: Request) -> Any:
     """What `write_study` wrote; None if it is missing, damaged, or not of this sweep."""
     try:
-        with study_path(store, request).open("rb") as file:
+        with open_plain(study_path(store, request)) as file:
             content = file.read(LARGEST + 1)
     except OSError:
         return None

@@ -18,7 +18,7 @@ from jaxhil.runtime.limits import LIMITS
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.sweeps.store import Store, read_part
+from tuning.sweeps.store import Store, kept_part
 from tuning.watchdog.alarms import JudgedRuns, features_of, good_runs, judge_chunk, reached, watchdog_rates
 from tuning.watchdog.audited import Rules
 from tuning.watchdog.expectation import Expectation, Features, expected_restitution, fit_expectation
@@ -244,17 +244,18 @@ def _chosen(loaded: LoadedGains, store: Store | None, scenarios: int | None) -> 
     if manifest.gains_sha256 != loaded.document["sha256"]:
         found, allowed = manifest.gains_sha256[:12], loaded.document["sha256"][:12]
         raise InputError(f"{store.folder}: gains_sha256: found {found}..., allowed {allowed}...")
-    held = manifest.scenarios if manifest.until_width is None else _held(store)
+    made = _held(store)
+    held = manifest.scenarios if manifest.until_width is None else made
     if scenarios is not None and scenarios > held:
         raise InputError(f"--scenarios: found {scenarios}, allowed at most the store's {held}")
     return Scenarios(manifest.sampling, manifest.seed, scenarios or held)
 
 
 def _held(store: Store) -> int:
-    """Scenarios that a sweep made which stopped when enough was known."""
+    """Scenarios of the parts up to the first that is missing. Raises `InputError` for one that is damaged."""
     held = 0
     for part in range(store.manifest.parts):
-        if read_part(store, part) is None:
+        if kept_part(store, part) is None:
             break
         held += store.manifest.part_rows(part)[1]
     return held
