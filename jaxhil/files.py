@@ -5,11 +5,13 @@ opened, nor replaced. A sealed file begins with the SHA-256 of what follows, as 
 it is checked before anything looks at the content.
 """
 
+import ctypes
 import errno
 import hashlib
 import os
 import re
 import secrets
+import shutil
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -22,6 +24,7 @@ from jaxhil.errors import InputError, one_line
 TEMPORARY = ".tmp"  # end of the name under which a file is written first
 SEAL = 65  # bytes before the content of a sealed file
 
+_HERE, _EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
 _PLAIN = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _THIS_PROCESS = secrets.token_hex(4)  # numbers of processes come again
 _OURS = re.compile(rf"\.jaxhil-(\d+)-([0-9a-f]{{8}})-\d+{re.escape(TEMPORARY)}")
@@ -106,8 +109,27 @@ def lock(path: Path) -> Iterator[None]:
 
 
 def follow(path: str | os.PathLike[str]) -> Path:
-    """Where a path leads that the user names for output: a link to a file stands for the file."""
-    return Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
+    """Where a path leads that the user names for output: a link stands for its file, which may be replaced.
+
+    Raises OSError for what is no plain file.
+    """
+    target = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
+    with suppress(FileNotFoundError):
+        _check_plain(os.lstat(target).st_mode)
+    return target
+
+
+def exchange(one: Path, other: Path) -> None:
+    """Each has the other's name, from one moment to the next. Raises OSError: ENOSYS or EINVAL where the
+    system cannot do that."""
+    try:
+        rename = ctypes.CDLL(None, use_errno=True).renameat2
+    except (AttributeError, OSError, TypeError):
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS)) from None
+    rename.argtypes = ctypes.c_int, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_uint
+    if rename(_HERE, os.fsencode(one), _HERE, os.fsencode(other), _EXCHANGE) != 0:
+        reason = ctypes.get_errno()
+        raise OSError(reason, os.strerror(reason), os.fspath(other))
 
 
 def make_folder(folder: Path) -> None:
@@ -124,9 +146,13 @@ def remove_stale(folder: Path) -> None:
     with os.scandir(folder) as entries:
         for entry in entries:
             name = _OURS.fullmatch(entry.name)
-            if name and entry.is_file(follow_symlinks=False) and not _is_writing(int(name[1]), name[2]):
+            if not name or _is_writing(int(name[1]), name[2]):
+                continue
+            if entry.is_file(follow_symlinks=False):
                 with suppress(FileNotFoundError):
                     os.unlink(entry)
+            elif entry.is_dir(follow_symlinks=False):
+                shutil.rmtree(entry, ignore_errors=True)
 
 
 def is_temporary(name: str) -> bool:

@@ -3,9 +3,11 @@
 import json
 
 import pytest
+from sweep_cases import case
 
 from jaxhil.mechanism.file import builtin_path
 from tuning.__main__ import main
+from tuning.gain_file import write_gain_file
 
 TINY = ["--scenarios", "4", "--starts", "2", "--steps", "2", "--validation", "16"]
 CONTACT_KEYS = {
@@ -177,14 +179,17 @@ def test_a_front_is_a_gain_file_for_each_point(jaxhil, tmp_path):
     folder = tmp_path / "rig-300kg"
     # Of a longer front that was here before.
     (folder / "pareto" / "07").mkdir(parents=True)
-    (folder / "pareto" / "07" / "gains.json").write_text("{}")
+    write_gain_file(folder / "pareto" / "07" / "gains.json", case())
+    # Of somebody else.
+    (folder / "pareto" / "08").mkdir(parents=True)
+    (folder / "pareto" / "08" / "gains.json").write_text("{}")
     arguments = ["tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY]
     ran = jaxhil(*arguments, "--pareto", "3", "--json", "--limit", "inf")
     assert ran.code == 0
     front = ran.document["mechanisms"][0]["pareto"]
     assert [point["noise_weight"] == 0 for point in front["points"]] == [True, False, False]
     paths = [folder / "pareto" / f"0{number}" / "gains.json" for number in (1, 2, 3)]
-    assert sorted((folder / "pareto").rglob("*.*")) == paths
+    assert sorted((folder / "pareto").rglob("*.*")) == [*paths, folder / "pareto" / "08" / "gains.json"]
     for point, path in zip(front["points"], paths, strict=True):
         written = json.loads(path.read_text())
         assert point["gain_file"] == str(path)

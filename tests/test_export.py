@@ -1,5 +1,6 @@
 """`jaxhil export` writes a bundle as a whole or not at all; `jaxhil verify` knows a corrupt one."""
 
+import errno
 import json
 import os
 import shutil
@@ -206,11 +207,25 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch, before)
             raise KeyboardInterrupt
         move(source, target)
 
+    def cannot(*_):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr("tuning.bundle.bundle.exchange", cannot)
     monkeypatch.setattr(os, "replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_bundle(folder, small_files())
     assert {name: (folder / name).read_bytes() for name in files_of(folder)} == there
     assert {*os.listdir(tmp_path)} - {"file"} == ({"bundle"} if before else set())
+    monkeypatch.setattr(os, "replace", move)
+    write_bundle(folder, small_files())
+    assert {*os.listdir(tmp_path)} - {"file"} == {"bundle"} and (folder / "manifest.json").exists()
+
+
+def test_a_bundle_is_replaced_in_one_step(tmp_path, monkeypatch):
+    folder = placed(tmp_path / "bundle")
+    monkeypatch.setattr(os, "replace", lambda *_: pytest.fail("a moment without a bundle"))
+    write_bundle(folder, {**small_files(), "new": b"new"})
+    assert (folder / "new").read_bytes() == b"new" and os.listdir(tmp_path) == ["bundle"]
 
 
 def test_a_link_to_a_folder_stays_one(tmp_path):

@@ -2,6 +2,7 @@
 
 from jaxhil.files import (
     TEMPORARY,
+    exchange,
     follow,
     is_temporary,
     lock,
@@ -9,6 +10,8 @@ from jaxhil.files import (
     open_plain,
     read_sealed,
     remove_stale,
+    sync_folder,
+    temporary_name,
     write_sealed,
     write_whole,
     writing,
@@ -16,6 +19,7 @@ from jaxhil.files import (
 
 __all__ = [
     "TEMPORARY",
+    "exchange",
     "follow",
     "is_temporary",
     "lock",
@@ -23,6 +27,8 @@ __all__ = [
     "open_plain",
     "read_sealed",
     "remove_stale",
+    "sync_folder",
+    "temporary_name",
     "write_sealed",
     "write_whole",
     "writing",

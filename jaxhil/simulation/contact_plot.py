@@ -5,6 +5,7 @@ Figures are made without pyplot: nothing is shown, nothing stays open, and equal
 
 import os
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from jaxhil.errors import one_line
+from jaxhil.files import write_whole
 from jaxhil.simulation.motion import Curve, Piece
 
 # Okabe and Ito's colours, which every kind of sight distinguishes; line styles distinguish them in print.
@@ -107,8 +109,9 @@ def finish(axes: Axes, legend: Any) -> None:
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Write a figure, folders on the way included. Raises OSError when that is not possible."""
-    target = Path(path)
+    """Write a figure, whole or not at all, folders on the way included. Raises OSError when that is not
+    possible, or what is there is no plain file."""
+    target, content = Path(path), BytesIO()
     target.parent.mkdir(parents=True, exist_ok=True)
     FigureCanvasAgg(figure)
     # Dates and versions would make equal figures differ.
@@ -116,7 +119,8 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     fields = {"Date": None} if target.suffix.lower() == ".svg" else fields
     fields = {"Software": None} if target.suffix.lower() == ".png" else fields
     with rc_context({"svg.hashsalt": "jaxhil"}):
-        figure.savefig(target, dpi=120, metadata=fields)
+        figure.savefig(content, dpi=120, metadata=fields, format=target.suffix[1:].lower())
+    write_whole(target, content.getvalue())
 
 
 def _entered(piece: Piece) -> str:

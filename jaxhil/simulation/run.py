@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.errors import InputError, one_line, shown
+from jaxhil.files import follow, write_whole
 from jaxhil.mechanism.loading import as_mechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.building import build_loop
@@ -129,7 +130,7 @@ class Run:
         rows = [",".join(map(repr, row)) for row in zip(*columns, strict=True)]
         target = _target(path)
         try:
-            target.write_text("\n".join([",".join(Ticks._fields), *rows, ""]), encoding="ascii")
+            write_whole(follow(target), "\n".join([",".join(Ticks._fields), *rows, ""]).encode("ascii"))
         except (OSError, ValueError) as error:
             raise _unwritable(target, error) from None
 
@@ -150,7 +151,7 @@ class Run:
             motion = nominal_motion(self.mechanism, {"rig": (self.compensator, self.gains)}, self.seed)
         title = f"{self.mechanism.name}, compensation: {self.compensator}"
         try:
-            save(contact_plot(motion, title, sensors="rig"), target)
+            save(contact_plot(motion, title, sensors="rig"), follow(target))
         except (OSError, ValueError) as error:
             raise _unwritable(target, error) from None
 

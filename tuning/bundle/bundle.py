@@ -4,6 +4,7 @@
 equal files. `write_bundle` puts them in place as a whole or not at all.
 """
 
+import errno
 import json
 import os
 import shutil
@@ -16,7 +17,7 @@ from jaxhil.runtime import digest
 from jaxhil.runtime.limits import LIMITS
 from tuning.bundle import selftest
 from tuning.bundle.manifest import is_bundle, manifest_text
-from tuning.files import TEMPORARY, writing
+from tuning.files import TEMPORARY, exchange, remove_stale, sync_folder, temporary_name, writing
 
 TUNING = Path(__file__).parents[1]
 # Files that a bundle holds as they are here.
@@ -127,32 +128,46 @@ def write_bundle(folder: Path, files: Mapping[str, bytes]) -> None:
     """The bundle is there as a whole or, after an error, what was there before. Raises `InputError`."""
     check_target(folder)
     target = folder.resolve()
-    new, old = (target.with_name(f".{target.name}.{os.getpid()}.{end}{TEMPORARY}") for end in ("new", "old"))
+    new = target.with_name(temporary_name())
     try:
         with writing(folder):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            remove_stale(target.parent)
             for name, content in files.items():
                 path = new / name
                 path.parent.mkdir(parents=True, exist_ok=True)
-                with path.open("wb") as file:
+                with path.open("xb") as file:
                     file.write(content)
                     file.flush()
                     os.fsync(file.fileno())
-            _put(new, target, old)
+            for place in {(new / name).parent for name in files}:
+                sync_folder(place)
+            _put(new, target)
+            sync_folder(target.parent)
     finally:
         shutil.rmtree(new, ignore_errors=True)
 
 
-def _put(new: Path, target: Path, old: Path) -> None:
+def _put(new: Path, target: Path) -> None:
+    """The new folder in the place of the old one, which is then where the new one was."""
     if not target.exists():
         os.replace(new, target)
         return
+    try:
+        exchange(new, target)
+        return
+    except OSError as error:
+        if error.errno not in (errno.ENOSYS, errno.EINVAL):
+            raise
+    # Here a power cut between the two leaves the old one under its other name, which nothing removes.
+    old = target.with_name(f".{target.name}.{os.getpid()}.old{TEMPORARY}")
     os.replace(target, old)
     try:
         os.replace(new, target)
     except BaseException:
         os.replace(old, target)
         raise
-    shutil.rmtree(old, ignore_errors=True)
+    os.replace(old, new)
 
 
 def _files_of(folder: Path) -> Mapping[str, Any] | None:

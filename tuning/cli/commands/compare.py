@@ -9,6 +9,7 @@ from jaxhil.mechanism.file import LoadedMechanism, load, suite_names
 from jaxhil.simulation.environment import prepare, usable_cores
 from tuning import terminal
 from tuning.cli.options import Compare
+from tuning.files import write_whole, writing
 from tuning.front_door.compare import CompareOptions, board, check_names, compare_each
 
 
@@ -45,7 +46,9 @@ def run(options: Compare) -> int:
         "problems": problems,
         "interrupted": interrupted,
     }
-    (Path(options.output) / "compare.json").write_text(terminal.as_json(document), encoding="utf-8")
+    path = Path(options.output) / "compare.json"
+    with writing(path):
+        write_whole(path, terminal.as_json(document).encode("ascii"))
     if done and not interrupted:
         _draw(options, done, ordered)
     if options.json:

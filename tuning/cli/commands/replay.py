@@ -7,6 +7,7 @@ from jaxhil.simulation.environment import prepare
 from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options import Replay
+from tuning.files import follow
 from tuning.front_door import arguments
 
 KEYS = ("restitution", "reference_restitution", "error", "peak_force", "peak_command", "duration")
@@ -31,7 +32,7 @@ def run(options: Replay) -> int:
         from jaxhil.simulation.contact_plot import contact_plot, save
 
         title = f"{document['mechanism']}, scenario {options.index} of {store.folder.resolve().name}"
-        save(contact_plot(motion_of(found.sweep, options.index), title, sensors="rig"), options.plot)
+        save(contact_plot(motion_of(found.sweep, options.index), title, sensors="rig"), follow(options.plot))
         terminal.note(f"wrote {options.plot}")
     if options.json:
         terminal.emit_json(document)

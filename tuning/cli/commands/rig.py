@@ -10,6 +10,7 @@ from jaxhil.errors import InputError, one_line
 from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options_rig import RigOptions
+from tuning.files import follow
 from tuning.front_door import arguments
 
 LONGEST_EMPTY = 30.0  # s of empty loop at most
@@ -65,7 +66,7 @@ def run(options: RigOptions) -> int:
         from tuning.rig.plot import latency_plot
 
         title = f"{mechanism.name}, {document['compensator']}: latencies at {1 / period:g} Hz over UDP"
-        save(latency_plot(session, title, period), options.plot)
+        save(latency_plot(session, title, period), follow(options.plot))
         terminal.note(f"wrote {options.plot}")
     if options.json:
         terminal.emit_json(found)

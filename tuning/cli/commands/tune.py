@@ -14,6 +14,7 @@ from tuning import terminal
 from tuning.cli.commands import tune_pareto
 from tuning.cli.commands.tune_tables import print_one, print_overview
 from tuning.cli.options import Tune
+from tuning.files import make_folder, writing
 from tuning.front_door.tune import TunedGains, TuneOptions, tune_each
 
 MOST_DRAWN = 4  # mechanisms whose plots are drawn; of more there is one picture of all
@@ -165,7 +166,8 @@ def _finish(
     from tuning.gains.tasks import has_sensor_noise
 
     folder = Path(options.output) / folder_name(loaded.mechanism.name)
-    folder.mkdir(exist_ok=True)
+    with writing(folder):
+        make_folder(folder)
     result.save(folder / "gains.json")
     found, plots = result.found, []
     if drawn:

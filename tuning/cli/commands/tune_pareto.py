@@ -5,8 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError
+from jaxhil.simulation.gain_file import load_gain_file
 from tuning import terminal
 from tuning.cli.options import Tune
+from tuning.files import make_folder, open_plain, writing
 from tuning.front_door import tune_pareto
 from tuning.front_door.tune import TunedGains
 from tuning.front_door.tune_pareto import TradedGains
@@ -86,7 +88,9 @@ def _write(options: Tune, points: Sequence[TradedGains], folder: Path) -> dict[s
     front, result, entries = points[0].front, points[0].tuned.found, []
     for number, point in enumerate(points, start=1):
         place = folder / FOLDER / f"{number:02d}"
-        place.mkdir(parents=True, exist_ok=True)
+        for one in (folder / FOLDER, place):
+            with writing(one):
+                make_folder(one)
         point.save(place / "gains.json")
         gains = {"gain_file": str(place / "gains.json"), "gains": point.document["gains"]}
         entries.append({**point.traded, **gains, "figures": point.figures, "nominal": point.point.nominal})
@@ -103,12 +107,22 @@ def _write(options: Tune, points: Sequence[TradedGains], folder: Path) -> dict[s
 
 def _remove_others(folder: Path, number: int) -> None:
     """Gain files of a longer front that was written here before do not belong to this one."""
-    for path in folder.glob("*/gains.json"):
-        name = path.parent.name
-        if name.isdigit() and int(name) > number:
-            path.unlink()
-            if not any(path.parent.iterdir()):
-                path.parent.rmdir()
+    for place in folder.iterdir():
+        name = place.name
+        ours = name.isdecimal() and int(name) > number and name == f"{int(name):02d}"
+        if ours and not place.is_symlink() and _is_gain_file(place / "gains.json"):
+            (place / "gains.json").unlink()
+            if not any(place.iterdir()):
+                place.rmdir()
+
+
+def _is_gain_file(path: Path) -> bool:
+    try:
+        open_plain(path).close()
+        load_gain_file(path)
+    except (InputError, OSError):
+        return False
+    return True
 
 
 def _is_rms(result: Any) -> bool:
