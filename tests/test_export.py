@@ -7,12 +7,17 @@ import shutil
 
 import pytest
 from bundles import document, run_selftest, signed, small_files
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
 from jaxhil.runtime.faults import FAULTS
+from jaxhil.runtime.laws import NEED_NUMPY
 from jaxhil.simulation.gain_file import load_gain_file
 from tuning.bundle.bundle import build_bundle, check_target, with_limits, write_bundle
+from tuning.bundle.checking import check_bundle
+from tuning.bundle.checking import run_selftest as run_selftest_alone
 from tuning.bundle.writers import WRITERS
 from tuning.files import TEMPORARY
 from tuning.gain_file import write_gain_file
@@ -49,26 +54,35 @@ def files_of(folder):
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_bundle_is_exported_and_verified(jaxhil, gains, tmp_path):
-    folder = tmp_path / "new" / "bundle"
-    ran = jaxhil("export", gains, "-o", folder, "--format", "csv,ros2", "--json")
+def test_a_bundle_is_exported_signed_and_verified(jaxhil, gains, tmp_path):
+    folder, private, public = tmp_path / "new" / "bundle", tmp_path / "key.pem", tmp_path / "public.pem"
+    pair = Ed25519PrivateKey.generate()
+    private.write_bytes(pair.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    public.write_bytes(pair.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
+    ran = jaxhil("export", gains, "-o", folder, "--format", "csv,ros2", "--sign", private, "--json")
     assert ran.code == 0, ran
     said = ran.document
     assert said["verdict"] == "good" and said["bundle"] == str(folder) and said["formats"] == ["ros2", "csv"]
+    assert said["signed"] is True
     assert (
         files_of(folder)
         == {*said["files"]}
-        == ALWAYS | {"ros2.yaml", "gains.csv"} | {"udp_controller.py", "udp_protocol.py"}
+        == ALWAYS | {"ros2.yaml", "gains.csv", "udp_controller.py", "udp_protocol.py", "manifest.sig"}
     )
     written, given = (load_gain_file(path).document for path in (folder / "gains.json", gains))
     assert {name for name in written if written[name] != given.get(name)} == {"limits", "figures", "sha256"}
     assert os.listdir(tmp_path / "new") == ["bundle"]
-    ran = jaxhil("verify", folder, "--scenarios", "4")
+    ran = jaxhil("verify", folder, "--scenarios", "4", "--key", public)
     assert ran.code == 0 and "Good: commands agree" in ran.out and "\nPASSED\n" in ran.out
-    # Once more onto itself.
+    assert "Signature: by the key given." in ran.out
+    # Once more onto itself, and not signed.
     ran = jaxhil("export", folder, "-o", folder, "--format", "matlab")
     assert ran.code == 0 and "Good: " in ran.out and "selftest.py" in ran.out
-    assert "gains.mat" in files_of(folder) and "gains.csv" not in files_of(folder)
+    assert "gains.mat" in files_of(folder) and not {"gains.csv", "manifest.sig"} & files_of(folder)
+    ran = jaxhil("verify", folder, "--key", public, "--json")
+    assert ran.code == 1 and ran.document["signature"] == "not signed" and ran.document["self_test"] == []
+    [reason] = ran.document["reasons"]
+    assert reason == "manifest.sig: found none, allowed the manifest's by the key given"
 
 
 @pytest.mark.parametrize("compensator", COMPENSATORS)
@@ -77,6 +91,9 @@ def test_every_compensator_that_can_be_tuned_can_be_exported(compensator, tmp_pa
     write_bundle(tmp_path / "bundle", made.files)
     good, output = run_selftest(tmp_path / "bundle", *(["--c"] if shutil.which("cc") else []))
     assert good and made.ticks > 300 and not made.reasons, output
+    if compensator in NEED_NUMPY:
+        # Its self-test, of all, is not run without what is installed.
+        assert run_selftest_alone(check_bundle(tmp_path / "bundle"), "bundle")[1] == []
 
 
 def test_equal_gains_and_seed_make_equal_bundles():
@@ -171,12 +188,16 @@ def test_a_folder_that_is_no_bundle_is_left_alone(jaxhil, gains, tmp_path):
     refused(jaxhil("export", gains, "-o", folder), "mine", "'thesis.txt' and no bundle")
     refused(jaxhil("export", gains, "-o", folder / "thesis.txt"), "thesis.txt", "found a file")
     placed(folder)
-    refused(jaxhil("export", gains, "-o", folder), "'thesis.txt' beside a bundle")
+    refused(jaxhil("export", gains, "-o", folder), "thesis.txt: is no file of this bundle")
     (folder / "thesis.txt").unlink()
     check_target(folder)
-    (folder / "manifest.json").write_text("{")
-    refused(jaxhil("export", gains, "-o", folder), "no bundle")
-    assert (folder / "gains.json").exists()
+    for name in ("manifest.json", "README.md"):
+        own = (folder / name).read_bytes()
+        (folder / name).write_bytes(own + b"my notes")
+        refused(jaxhil("export", gains, "-o", folder), name, "allowed a new or empty folder, or a bundle as")
+        assert (folder / name).read_bytes() == own + b"my notes"
+        (folder / name).write_bytes(own)
+    check_target(folder)
 
 
 @pytest.mark.parametrize("before", [False, True])

@@ -95,6 +95,13 @@ def test_laws_from_outside_go_all_the_way(tmp_path):
     assert exported.good and "c99" not in exported.document["formats"]
     assert tuning.verify(tmp_path / "bundle").good
 
+    class Other(DifferenceOnTheRig):
+        """The same, by another source."""
+
+    jaxhil.register(Difference(), runtime=Other)
+    found = tuning.verify(tmp_path / "bundle")
+    assert not found.good and found.reasons[0] == "jaxhil_runtime.py: is not what this version exports"
+
 
 def test_an_objective_of_the_users_own_gets_contacts_and_scenarios():
     shapes = []

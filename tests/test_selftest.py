@@ -256,7 +256,8 @@ def test_files_too_many_and_too_few_are_named(files, folder):
     os.unlink(folder / "summary.html")
     good, out = run_selftest(folder)
     assert not good and out.count("FAIL  ") == 2
-    assert "FAIL  other/notes.txt: is no file of this bundle" in out
+    assert "FAIL  other/: is no file of this bundle" in out
+    assert "note  __pycache__/: holds compiled code, which is not checked" in out
     assert "FAIL  summary.html: cannot be read: No such file or directory" in out
 
 

@@ -11,15 +11,16 @@ from collections import deque
 from pathlib import Path
 
 import pytest
+from bundles import document, signed
 from gain_documents import gain_document, sign
 from rig_lock_step import a_reading
 
 from jaxhil.compensators import literature_gains
 from jaxhil.mechanism.file import load
+from tuning.bundle.bundle import build_bundle, write_bundle
 from tuning.gain_file import build_document, write_gain_file
 from tuning.rig import udp_controller
 from tuning.rig.session import (
-    PROCESS,
     SOURCE,
     listening_port,
     start_controller,
@@ -75,21 +76,22 @@ def test_the_controllers_process_answers_its_rig_and_nobody_else(tmp_path):
     assert all(value > 0 for value in ticks["wall"] + ticks["cpu"])
 
 
-def test_the_controllers_process_of_a_bundle_runs_the_bundles_runtime(jaxhil, tmp_path):
-    gain_file(tmp_path)
-    for name in PROCESS:
-        (tmp_path / name).write_bytes((SOURCE / name).read_bytes())
-    stand_in = (
-        "import sys\n"
-        f"open({str(tmp_path / 'used')!r}, 'w').write(str(sys.flags.isolated))\n"
-        f"sys.path.insert(0, {str(ROOT)!r})\n"
-        "from jaxhil.runtime import Controller\n"
-    )
-    (tmp_path / "jaxhil_runtime.py").write_text(stand_in)
-    ran = jaxhil("rig", tmp_path, "--duration", 0.5, "--json", "--limit", "inf")
-    assert ran.document["run"]["ticks"] == 500
-    assert (tmp_path / "used").read_text() == "1"
-    assert not (tmp_path / "__pycache__").exists()
+def test_a_bundle_with_another_controller_is_not_rehearsed(jaxhil, tmp_path):
+    """What runs is what this version exports, or nothing."""
+    made = build_bundle(document(), [])
+    trap = b"open(%r, 'w')\n" % str(tmp_path / "ran")
+    folder = tmp_path / "bundle"
+    write_bundle(folder, made.files)
+    (folder / "__pycache__").mkdir()
+    (folder / "__pycache__" / "jaxhil_runtime.cpython-311.pyc").write_bytes(b"of Python's own making")
+    arguments = ("rig", folder, "--duration", 0.2, "--json", "--limit", "inf")
+    assert jaxhil(*arguments).document["run"]["ticks"] == 200
+    for name in ("jaxhil_runtime.py", "udp_controller.py", "udp_protocol.py", "selftest.py"):
+        for other, content in signed({**made.files, name: made.files[name] + trap}, made.document).items():
+            (folder / other).write_bytes(content)
+        ran = jaxhil(*arguments)
+        assert (ran.code, ran.out) == (2, "") and f"{name}: is not what this version exports" in ran.err
+    assert not (tmp_path / "ran").exists()
 
 
 @pytest.mark.parametrize("options", [("--wait", "0.1"), ("--wait", "20", "--silence", "0.1")])

@@ -5,10 +5,10 @@ equal files. `write_bundle` puts them in place as a whole or not at all.
 """
 
 import errno
-import json
 import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,12 +16,9 @@ from jaxhil.errors import InputError, one_line, shown
 from jaxhil.runtime import digest
 from jaxhil.runtime.limits import LIMITS
 from tuning.bundle import selftest
-from tuning.bundle.manifest import is_bundle, manifest_text
+from tuning.bundle.content import bundle_files
+from tuning.bundle.manifest import is_bundle
 from tuning.files import TEMPORARY, exchange, remove_stale, sync_folder, temporary_name, writing
-
-TUNING = Path(__file__).parents[1]
-# Files that a bundle holds as they are here.
-COPIED = ("bundle/selftest.py", "rig/udp_controller.py", "rig/udp_protocol.py")
 
 
 class Bundle(NamedTuple):
@@ -43,37 +40,25 @@ def build_bundle(
     rates: Mapping[str, Any] | None = None,
     seed: int = 0,
     progress: Callable[[str], None] = lambda message: None,
+    sign: Callable[[bytes], bytes] | None = None,
 ) -> Bundle:
     """The bundle of a checked gain document, with `limits` for the rig [SI units] if there are any.
 
     `rates`, plain data, say what is known of the watchdog's alarms under these limits. `progress` is given
-    what begins. Raises `InputError` for limits that the runtime refuses or a compensator that a format lacks.
+    what begins. `sign` makes the signature of the manifest's bytes; None: the bundle is not signed. Raises
+    `InputError` for limits that the runtime refuses or a compensator that a format lacks.
     """
     from jaxhil.simulation.gain_file import check_document
-    from tuning.bundle.readme import readme_text
-    from tuning.bundle.single_file import runtime_source
-    from tuning.bundle.summary import summary_html
     from tuning.bundle.vectors import as_csv, make_vectors
-    from tuning.bundle.writers import WRITERS
 
     exported = with_limits(document, limits, rates)
     loaded = check_document(exported)
     progress("recording test vectors")
     vectors = make_vectors(loaded, seed)
     progress("writing the bundle")
-    files = {
-        "gains.json": (json.dumps(exported, indent=2, sort_keys=True, allow_nan=False) + "\n").encode(
-            "ascii"
-        ),
-        "jaxhil_runtime.py": runtime_source(loaded.compensator).encode(),
-        "vectors.csv": as_csv(vectors.rows).encode("ascii"),
-        "summary.html": summary_html(exported),
-        **{Path(name).name: (TUNING / name).read_bytes() for name in COPIED},
-    }
-    for name in formats:
-        files.update(WRITERS[name](exported))
-    files["README.md"] = readme_text(exported, files).encode()
-    files[selftest.MANIFEST] = manifest_text(files, exported)
+    files = bundle_files(exported, formats, as_csv(vectors.rows).encode("ascii"))
+    if sign is not None:
+        files[selftest.SIGNATURE] = sign(files[selftest.MANIFEST])
     runs = len({row.run for row in vectors.rows})
     return Bundle(exported, files, len(vectors.rows), runs, vectors.ended, vectors.reasons)
 
@@ -100,9 +85,9 @@ def limits_section(limits: Mapping[str, float | None]) -> dict[str, dict[str, An
 
 
 def check_target(folder: Path) -> None:
-    """A bundle may be written there: there is nothing, an empty folder, or a bundle without other files.
+    """A bundle may be written there: there is nothing, an empty folder, or a bundle as it was exported.
 
-    Raises `InputError` otherwise.
+    Raises `InputError` otherwise: what someone has changed or added is not to be lost.
     """
     where = one_line(str(folder))
     try:
@@ -110,18 +95,9 @@ def check_target(folder: Path) -> None:
             return
         if not folder.is_dir():
             raise InputError(f"{where}: found a file, allowed a folder for the bundle")
-        inside = sorted(os.listdir(folder))
-        if not inside:
-            return
-        files = _files_of(folder)
+        _own_files(folder)
     except OSError as error:
         raise InputError(f"{where}: cannot be read: {one_line(error.strerror or str(error))}") from None
-    if files is None:
-        found = shown(inside[0])
-        raise InputError(f"{where}: found {found} and no bundle, allowed a new or empty folder, or a bundle")
-    other = next(iter(selftest.unknown_files(str(folder), files)), None)
-    if other is not None:
-        raise InputError(f"{where}: found {shown(other)} beside a bundle, allowed a bundle's own files")
 
 
 def write_bundle(folder: Path, files: Mapping[str, bytes]) -> None:
@@ -129,10 +105,11 @@ def write_bundle(folder: Path, files: Mapping[str, bytes]) -> None:
     check_target(folder)
     target = folder.resolve()
     new = target.with_name(temporary_name())
-    try:
-        with writing(folder):
-            target.parent.mkdir(parents=True, exist_ok=True)
-            remove_stale(target.parent)
+    with writing(folder):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        remove_stale(target.parent)
+        new.mkdir()
+        try:
             for name, content in files.items():
                 path = new / name
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -143,16 +120,33 @@ def write_bundle(folder: Path, files: Mapping[str, bytes]) -> None:
             for place in {(new / name).parent for name in files}:
                 sync_folder(place)
             _put(new, target)
-            sync_folder(target.parent)
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
+        except BaseException:
+            shutil.rmtree(new, ignore_errors=True)
+            raise
+        sync_folder(target.parent)
 
 
 def _put(new: Path, target: Path) -> None:
-    """The new folder in the place of the old one, which is then where the new one was."""
+    """The new folder in the place of the old one, which is removed."""
     if not target.exists():
         os.replace(new, target)
         return
+    _swap(new, target)
+    old = new
+    try:
+        # Looked at once more where nobody writes any longer: what was put there in between stays.
+        own = _own_files(old)
+    except BaseException:
+        _swap(old, target)
+        raise
+    with suppress(OSError):
+        for name in own:
+            (old / name).rmdir() if name.endswith("/") else (old / name).unlink()
+        old.rmdir()
+
+
+def _swap(new: Path, target: Path) -> None:
+    """Each of two folders gets the other's name."""
     try:
         exchange(new, target)
         return
@@ -170,12 +164,27 @@ def _put(new: Path, target: Path) -> None:
     os.replace(old, new)
 
 
-def _files_of(folder: Path) -> Mapping[str, Any] | None:
-    """The files that the folder's manifest names; None where there is no manifest of a bundle."""
+def _own_files(folder: Path) -> list[str]:
+    """The paths of an intact bundle's files, then of the folders within it, which end with a stroke, the
+    innermost first; none in an empty folder.
+
+    Raises `InputError` for a folder in which there is anything else.
+    """
+    where, allowed = one_line(str(folder)), "allowed a new or empty folder, or a bundle as it was exported"
+    inside = sorted(os.listdir(folder))
+    if not inside:
+        return []
     if not is_bundle(folder):
-        return None
-    try:
-        manifest = json.loads((folder / selftest.MANIFEST).read_bytes())
-        return manifest["files"] if manifest["schema"] == selftest.SCHEMA else None
-    except (FileNotFoundError, ValueError, KeyError, TypeError, RecursionError):
-        return None
+        raise InputError(f"{where}: found {shown(inside[0])} and no bundle, {allowed}")
+    found, problems = selftest.differences(str(folder))
+    files = [*found]
+    for name, text in problems:
+        if not name.endswith(selftest.CACHE):
+            raise InputError(f"{where}: {one_line(name, 80)}: {text}; {allowed}")
+        for entry in list(os.scandir(folder / name)):
+            # Of Python's own making, and nothing but that.
+            if not (entry.is_file(follow_symlinks=False) and entry.name.endswith(".pyc")):
+                raise InputError(f"{where}: {name}{one_line(entry.name, 80)}: no file of a bundle; {allowed}")
+            files.append(name + entry.name)
+    folders = {f"{name[:place]}/" for name in files for place, sign in enumerate(name) if sign == "/"}
+    return [*files, *sorted(folders, key=len, reverse=True)]

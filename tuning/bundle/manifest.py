@@ -1,20 +1,22 @@
 """A bundle's manifest: what every file must be, in enough detail to say where one differs.
 
-SHA-256 of each file, a check of every line of those that are text, the values of the gain file, and at its
-end checks of the manifest itself. The bundle's own self-test reads it; `verify` does so from here, too.
+SHA-256 of each file, a check of every line of those that are text, the values of the gain file, the version
+that wrote it, and at its end checks of the manifest itself. The bundle's own self-test reads it; `verify`
+does so from here, too.
 """
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from jaxhil.errors import one_line
 from tuning.bundle import selftest
 
 # Of a folder that is meant as a bundle.
-MARKS = (selftest.MANIFEST, "selftest.py", "jaxhil_runtime.py")
+MARKS = (selftest.MANIFEST, selftest.SIGNATURE, "selftest.py", "jaxhil_runtime.py")
 
 
 def manifest_text(files: Mapping[str, bytes], document: Mapping[str, Any]) -> bytes:
@@ -28,15 +30,24 @@ def manifest_text(files: Mapping[str, bytes], document: Mapping[str, Any]) -> by
     body = json.dumps(
         {
             "schema": selftest.SCHEMA,
+            "version": version(),
             "compensator": document["compensator"],
             "gains_sha256": document["sha256"],
-            "values": dict(selftest.leaves(document, "")),
+            "values": dict(sorted(selftest.leaves(document, ""))),
             "files": entries,
         },
         indent=1,
     ).encode("ascii")
     body = body.removesuffix(b"\n}")
     return body + selftest.own_seal(body)
+
+
+def version() -> str:
+    """The version of this package, as it writes it into manifests."""
+    try:
+        return f"jaxhil {metadata.version('jaxhil')}"
+    except metadata.PackageNotFoundError:
+        return "jaxhil, not installed"
 
 
 def is_text(content: bytes) -> bool:
@@ -49,11 +60,5 @@ def is_text(content: bytes) -> bool:
 
 
 def is_bundle(folder: Path) -> bool:
-    """Whether a folder is one, or the remains of one."""
-    return folder.is_dir() and any((folder / name).is_file() for name in MARKS)
-
-
-def damage(folder: Path) -> list[str]:
-    """What differs from the manifest, a line each, found without running anything of the bundle."""
-    _, problems = selftest.differences(str(folder))
-    return [one_line(f"{name}: {text}", 300) for name, text in problems]
+    """Whether a folder is one, or the remains of one, whatever stands there under the names of its files."""
+    return folder.is_dir() and any(os.path.lexists(folder / name) for name in MARKS)

@@ -3,25 +3,30 @@
     python selftest.py          the files, the gains, and every test vector through jaxhil_runtime.py
     python selftest.py --c      also the C controller, with the C compiler that is here (cc, or $CC)
 
-Python 3.11 or later alone. One line a check; exit code 0 if all are good, else 1.
+Python 3.11 or later alone. One line a check; exit code 0 if all are good, else 1. Who exported the bundle it
+cannot say: where it is signed, `jaxhil verify --key` proves that on a workstation.
 """
 
 import hashlib
 import json
 import math
 import os
+import re
 import shutil
+import stat
 import struct
 import subprocess
 import sys
 import tempfile
 import zlib
 
-MANIFEST = "manifest.json"
+MANIFEST, SIGNATURE, CACHE = "manifest.json", "manifest.sig", "__pycache__/"
+PATH = re.compile(r"(?:\w[\w.-]{0,99}/){0,3}\w[\w.-]{0,99}", re.ASCII)  # of a file in the manifest
+MOST_FILES, MOST_BYTES, MOST_TEXT = 1000, 1 << 26, 1 << 23  # of a bundle, of a text in it: more than any has
 SCHEMA = "jaxhil/bundle/1"
 SIMULATED_LIMIT = 1e-11  # of the range of a run's commands: the simulation rounds in another order
 MOST_SHOWN = 8  # differences of one kind that are reported one by one
-C_SOURCES = ("test_vectors.c", "jaxhil_controller.c")
+C_SOURCES = ("c99/test_vectors.c", "c99/jaxhil_controller.c")
 C_FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 COLUMNS = (
     "run,event,force_measured,position_desired,velocity_desired,position_measured,time,position,velocity,"
@@ -32,65 +37,79 @@ COLUMNS = (
 def main(arguments, folder):
     """Run the checks on the bundle in `folder`; True if all are good."""
     print(f"self-test of {plain(os.path.basename(os.path.abspath(folder)))}, Python {sys.version.split()[0]}")
-    damaged = check_files(folder)
-    good = not damaged
-    runtime = check_runtime(folder, damaged)
-    if runtime is None or not check_gains(folder, runtime) or not check_vectors(folder, runtime):
-        good = False
-    if "--c" in arguments and not check_c(folder, damaged):
-        good = False
+    found, damaged = check_files(folder)
+    runtime = check_runtime(folder, found, damaged)
+    runs = runtime is not None and "gains.json" in found
+    agrees = runs and check_gains(folder, runtime) and check_vectors(folder, found, runtime)
+    agrees_in_c = "--c" not in arguments or check_c(folder, found, damaged)
+    good = not damaged and agrees is agrees_in_c is True
     print("PASSED" if good else "FAILED: this bundle is not to be used on a rig")
     return good
 
 
 def check_files(folder):
-    """Every file against the manifest; the names of those that differ, all of them reported."""
-    files, problems = differences(folder)
+    """Every file against the manifest: their contents, and the names of those that differ, all reported."""
+    found, problems = differences(folder)
     reported = {}
     for name, text in problems:
+        if name.endswith(CACHE):
+            print(f"note  {plain(name)}: {text}")  # of Python's own making, where the controller has run
+            continue
         reported[name] = reported.get(name, 0) + 1
         if reported[name] <= MOST_SHOWN:
             fail(name, text)
     for name, number in reported.items():
         if number > MOST_SHOWN:
             fail(name, f"and {number - MOST_SHOWN} more")
-    if not problems:
-        passed(MANIFEST, f"{len(files)} files are as they were exported")
-    return set(reported)
+    if not reported:
+        passed(MANIFEST, f"{len({*found} - {MANIFEST, SIGNATURE})} files are as they were exported")
+        signed = "is signed; only `jaxhil verify --key` proves by whom"
+        print(f"note  {MANIFEST}: {signed if SIGNATURE in found else 'is not signed'}")
+    return found, {*reported}
 
 
 def differences(folder):
-    """The manifest's files, and (name, what differs) of each difference from it."""
-    problems = []
+    """The content of each file that is here, by its path, and (path, what differs) of each difference."""
+    found, problems, wrong, left = {}, [], [], MOST_BYTES
+    if os.path.lexists(os.path.join(folder, SIGNATURE)):
+        problems += take(found, folder, SIGNATURE, 64)  # bytes, of Ed25519
     try:
-        content = read(os.path.join(folder, MANIFEST))
-        problems = [(MANIFEST, text) for text in manifest_differences(content)]
-        document = json.loads(content)
-        if document["schema"] != SCHEMA:
-            raise ValueError(f"schema: found {shown(document['schema'])}, expected '{SCHEMA}'")
-        files, values = document["files"], document["values"]
-        kinds = [
-            (type(name), type(entry["sha256"]), type(entry.get("lines", ""))) for name, entry in files.items()
-        ]
-        if {*kinds} - {(str, str, str)} or not isinstance(values, dict):
-            raise ValueError("not the entries of a manifest")
+        found[MANIFEST] = read(folder, MANIFEST, MOST_TEXT)
+        wrong = [(MANIFEST, text) for text in manifest_differences(found[MANIFEST])]
+        files, values = entries(found[MANIFEST])
     except Exception as error:
-        return {}, [*problems, (MANIFEST, f"cannot be read: {describe(error)}")]
-    if problems:
-        return files, problems  # nothing is to be learnt from it about others
+        return found, [*problems, *wrong, (MANIFEST, f"cannot be read: {describe(error)}")]
+    if wrong:
+        return found, problems + wrong  # nothing is to be learnt from it about others
     for name, entry in files.items():
-        try:
-            found = read(os.path.join(folder, *name.split("/")))
-        except (OSError, ValueError) as error:
-            problems.append((name, f"cannot be read: {getattr(error, 'strerror', None) or 'no such file'}"))
-            continue
-        if hashlib.sha256(found).hexdigest() != entry["sha256"]:
-            lines = lines_that_differ(found, entry.get("lines"))
-            problems += [(name, text) for text in lines]
+        problems += take(found, folder, name, left)
+        content = found.get(name, b"")
+        left -= len(content)
+        same = len(content) == entry["bytes"] and hashlib.sha256(content).hexdigest() == entry["sha256"]
+        if name in found and not same:
+            problems += [(name, text) for text in lines_that_differ(content, entry.get("lines"))]
             if name == "gains.json":
-                problems += [(name, text) for text in value_differences(found, values)]
-    problems += [(name, "is no file of this bundle") for name in unknown_files(folder, files)]
-    return files, problems
+                problems += [(name, text) for text in value_differences(content, values)]
+    for name in others(folder, files):
+        compiled = "holds compiled code, which is not checked: take it out before use"
+        problems.append((name, compiled if name.endswith(CACHE) else "is no file of this bundle"))
+    return found, problems
+
+
+def entries(manifest):
+    """The entry of each file, and the values of the gain file; an exception where the manifest has none."""
+    document = json.loads(manifest)
+    if document["schema"] != SCHEMA:
+        raise ValueError(f"schema: found {shown(document['schema'])}, expected '{SCHEMA}'")
+    files, values = document["files"], document["values"]
+    for name, entry in files.items():
+        if not PATH.fullmatch(name) or name in (MANIFEST, SIGNATURE):
+            raise ValueError(f"'{shown(name)}' is no path of a file of a bundle")
+        if (type(entry["sha256"]), type(entry["bytes"]), type(entry.get("lines", ""))) != (str, int, str):
+            raise ValueError("not the entries of a manifest")
+    if len(files) > MOST_FILES or sum(entry["bytes"] for entry in files.values()) > MOST_BYTES:
+        raise ValueError(f"more than {MOST_FILES} files or {MOST_BYTES} bytes")
+    return files, dict(values)
 
 
 def manifest_differences(content):
@@ -122,7 +141,7 @@ def line_checks(content):
 
 def lines_that_differ(found, checks):
     """In words, where a file's content differs from the lines whose checks these are."""
-    if checks is None:
+    if checks is None or len(found) > MOST_TEXT:
         return [f"differs from what was exported ({len(found)} bytes are here)"]
     here, expected = line_checks(found).split(), checks.split()
     if here == expected:
@@ -130,8 +149,8 @@ def lines_that_differ(found, checks):
     if len(here) == len(expected):
         pairs = enumerate(zip(here, expected, strict=True), start=1)
         return [f"line {number}: differs from what was exported" for number, (a, b) in pairs if a != b]
-    first = next((i for i, (a, b) in enumerate(zip(here, expected, strict=False)) if a != b), None)
-    first = min(len(here), len(expected)) if first is None else first
+    shorter = min(len(here), len(expected))
+    first = next((place for place in range(shorter) if here[place] != expected[place]), shorter)
     return [f"line {first + 1}: differs from what was exported; {len(here)} lines, expected {len(expected)}"]
 
 
@@ -142,12 +161,9 @@ def value_differences(content, expected):
     except Exception:
         return
     for key in sorted({*expected, *found}):
-        if key not in expected:
-            yield f"{plain(key)}: found {shown(found[key])}, expected nothing"
-        elif key not in found:
-            yield f"{key}: found nothing, expected {shown(expected[key])}"
-        elif found[key] != expected[key]:
-            yield f"{key}: found {shown(found[key])}, expected {shown(expected[key])}"
+        here, there = (shown(values.get(key, "nothing")) for values in (found, expected))
+        if found.get(key) != expected.get(key):
+            yield f"{plain(key)}: found {here}, expected {there}"
 
 
 def leaves(value, key):
@@ -160,25 +176,24 @@ def leaves(value, key):
         yield key, json.dumps(value)
 
 
-def unknown_files(folder, files):
-    """Files that the manifest does not name, but for Python's own caches."""
-    for place, inner, names in os.walk(folder):
-        inner[:] = sorted(name for name in inner if name != "__pycache__")
-        for name in sorted(names):
-            path = os.path.relpath(os.path.join(place, name), folder).replace(os.sep, "/")
-            if path not in files and path != MANIFEST:
-                yield path
+def others(folder, files, within=""):
+    """Whatever is there that the manifest does not name; a folder of others ends with a stroke."""
+    for entry in sorted(os.scandir(os.path.join(folder, within)), key=lambda one: one.name):
+        path, is_folder = within + entry.name, entry.is_dir(follow_symlinks=False)
+        if is_folder and any(name.startswith(f"{path}/") for name in files):
+            yield from others(folder, files, f"{path}/")
+        elif is_folder or path not in {*files, MANIFEST, SIGNATURE}:
+            yield f"{path}/" if is_folder else path
 
 
-def check_runtime(folder, damaged):
-    """The runtime's names, from the source that is here and nothing else; None if it does not run."""
+def check_runtime(folder, found, damaged):
+    """The runtime's names, from the source that was checked and nothing else; None if it does not run."""
     if {"jaxhil_runtime.py", MANIFEST} & damaged:
         return fail("jaxhil_runtime.py", "is not run: it, or the manifest, differs from what was exported")
-    path = os.path.join(folder, "jaxhil_runtime.py")
-    runtime = {"__name__": "jaxhil_runtime", "__file__": path}
+    runtime = {"__name__": "jaxhil_runtime", "__file__": os.path.join(folder, "jaxhil_runtime.py")}
     try:
         # Not by import: a cache of an older source may lie about, and the folder is on no path with -I.
-        exec(compile(read(path), "jaxhil_runtime.py", "exec"), runtime)
+        exec(compile(found["jaxhil_runtime.py"], "jaxhil_runtime.py", "exec"), runtime)
         if not {"Controller", "GainFileError"} <= {*runtime}:
             raise NameError("it has no Controller or no GainFileError")
     except BaseException as error:
@@ -198,10 +213,10 @@ def check_gains(folder, runtime):
     return passed("gains.json", f"loads: {law}, control period {controller.control_period!r} s")
 
 
-def check_vectors(folder, runtime):
+def check_vectors(folder, found, runtime):
     """Every tick commands what was recorded, to the bit; the simulation's forces are met closely."""
     try:
-        rows = list(read_vectors(read(os.path.join(folder, "vectors.csv")).decode("ascii")))
+        rows = list(read_vectors(found["vectors.csv"].decode("ascii")))
     except Exception as error:
         return fail("vectors.csv", f"cannot be read: {describe(error)}")
     if not rows:
@@ -222,12 +237,10 @@ def check_simulated(runs):
     """The forces commanded against those that the simulation commanded, run by run."""
     largest, compared = 0.0, 0
     for run, ticks in runs.items():
-        expected = [simulated for _, _, simulated in ticks if not math.isnan(simulated)]
-        compared += len(expected)
-        span = max(0.0, *expected) - min(0.0, *expected) if expected else 0.0
-        for number, force, simulated in ticks:
-            if math.isnan(simulated):
-                continue
+        stated = [tick for tick in ticks if not math.isnan(tick[2])]
+        expected = [0.0, *(simulated for _, _, simulated in stated)]
+        compared, span = compared + len(stated), max(expected) - min(expected)
+        for number, force, simulated in stated:
             error = abs(force - simulated)
             if not error <= SIMULATED_LIMIT * span:
                 text = f"run {run}: force {force!r} N, simulated {simulated!r} N"
@@ -250,7 +263,7 @@ def read_vectors(text):
         try:
             row = [float(field) if field else None for field in fields]
         except ValueError:
-            raise ValueError(f"line {number}: not a row of numbers") from None
+            row = []
         if len(row) != width or any(one is None for place, one in enumerate(row) if place != 6):
             raise ValueError(f"line {number}: not a row of {width} numbers")
         yield number, row
@@ -267,38 +280,31 @@ def replay(rows, gains, runtime):
             raise ValueError(f"line {number}: event {event!r}, expected 0, 1 or 2, the first tick's 1")
         elif event == 2:
             controller.next_contact()
+        command = controller.step(force, position, velocity, measured, time)
         # An integer in the file stands for the bits of the faults; all else are floats.
-        found_force = controller.step(force, position, velocity, measured, time)
-        found_position = controller.position_command(*motion)
-        found_faults = float(controller.faults)
-        pairs = zip(
-            ("force_command", "position_command", "faults"),
-            (found_force, found_position, found_faults),
-            row[10:13],
-            strict=True,
-        )
+        found = command, controller.position_command(*motion), float(controller.faults)
         texts = [
-            f"{name}: found {found!r}, expected {expected!r}"
-            for name, found, expected in pairs
-            if not same_bits(found, expected)
+            f"{name}: found {one!r}, expected {expected!r}"
+            for name, one, expected in zip(COLUMNS.split(",")[10:13], found, row[10:13], strict=True)
+            if not same_bits(one, expected)
         ]
         if texts:
             different.append(f"line {number}, run {int(run)}: {', '.join(texts)}")
-        runs.setdefault(int(run), []).append((number, found_force, row[13]))
+        runs.setdefault(int(run), []).append((number, command, row[13]))
     return runs, different
 
 
 def same_bits(found, expected):
     """Whether two floats are the same, signs of zero included; any NaN is as another."""
-    if found != found and expected != expected:
-        return True
-    return struct.pack("<d", found) == struct.pack("<d", expected)
+    both_nan = found != found and expected != expected
+    return both_nan or struct.pack("<d", found) == struct.pack("<d", expected)
 
 
-def check_c(folder, damaged):
+def check_c(folder, found, damaged):
     """The C controller, compiled here, meets the vectors too."""
-    sources = [os.path.join(folder, "c99", name) for name in C_SOURCES]
-    if any(name.startswith("c99/") for name in damaged) or not all(map(os.path.isfile, sources)):
+    sources = [os.path.join(folder, name) for name in C_SOURCES]
+    differs = any(name == MANIFEST or name.startswith("c99/") for name in damaged)
+    if differs or not {*C_SOURCES} <= {*found}:
         return fail("c99", "differs or is not here, so it is not compiled")
     compiler = shutil.which(os.environ.get("CC") or "cc") or shutil.which("gcc") or shutil.which("clang")
     if compiler is None:
@@ -318,9 +324,28 @@ def check_c(folder, damaged):
     return passed("c99", plain(lines[-1]))
 
 
-def read(path):
-    with open(path, "rb") as file:
-        return file.read()
+def read(folder, name, most=MOST_BYTES):
+    """The content of a plain file in the folder: no link is followed, no pipe or device waited for."""
+    path, parts = folder, name.split("/")
+    for place, part in enumerate(parts, start=1 - len(parts)):
+        path = os.path.join(path, part)
+        if not (stat.S_ISDIR if place else stat.S_ISREG)(os.lstat(path).st_mode):
+            raise ValueError("it is no plain file in folders of the bundle")
+    flags = (getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
+    with open(os.open(path, os.O_RDONLY | sum(flags)), "rb") as file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode) or status.st_size > most:
+            raise ValueError(f"it is no plain file of at most {most} bytes")
+        return file.read(status.st_size)
+
+
+def take(found, folder, name, most):
+    """Read a file into `found`; (path, why not) where that cannot be done."""
+    try:
+        found[name] = read(folder, name, most)
+    except (OSError, ValueError) as error:
+        return [(name, f"cannot be read: {getattr(error, 'strerror', None) or error}")]
+    return []
 
 
 def passed(name, text):
@@ -351,10 +376,10 @@ def look_again():
     """This file against the manifest once more, apart from all the above: it may be what is damaged."""
     here = os.path.dirname(os.path.abspath(__file__))
     try:
-        own = json.loads(read(os.path.join(here, "manifest.json")))["files"]["selftest.py"]["sha256"]
+        own = json.loads(read(here, "manifest.json", MOST_TEXT))["files"]["selftest.py"]["sha256"]
     except (OSError, ValueError, KeyError, TypeError):
         return  # the checks above have reported
-    if hashlib.sha256(read(os.path.abspath(__file__))).hexdigest() != own:
+    if hashlib.sha256(read(here, os.path.basename(__file__))).hexdigest() != own:
         sys.exit("FAIL  selftest.py: differs from what the manifest says, and is not to be believed")
 
 

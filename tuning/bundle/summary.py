@@ -45,11 +45,11 @@ td, th { white-space: nowrap; } img { width: 100%; margin-top: 2mm; } .note { co
 """
 
 
-def summary_html(document: Mapping[str, Any]) -> bytes:
-    """The page of a checked gain document."""
+def summary_html(document: Mapping[str, Any], drawn: bytes | None = None) -> bytes:
+    """The page of a checked gain document, with its picture, a PNG, as it is already `drawn`, if it is."""
     mechanism = document["mechanism"]
     name = escape(one_line(mechanism["name"], 80))
-    picture = base64.b64encode(picture_png(document)).decode("ascii")
+    picture = base64.b64encode(picture_png(document) if drawn is None else drawn).decode("ascii")
     versions = ", ".join(f"{key} {value}" for key, value in document["versions"].items())
     parts = [
         "<!DOCTYPE html>",

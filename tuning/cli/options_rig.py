@@ -42,6 +42,10 @@ class Export:
         ),
     ] = ()
     seed: Annotated[int, number("Seed of the test vectors.")] = 0
+    sign: Annotated[
+        str | None,
+        text("KEY", "Sign the bundle with this private key (Ed25519, PEM); needs jaxhil[sign]."),
+    ] = None
     json: Json = False
 
 
@@ -51,12 +55,17 @@ class Verify:
 
     Example: jaxhil verify jaxhil-out/varying/gains.json
 
-    Of a bundle, its self-test first. Exit code 1 also for what is corrupt or was tampered with.
+    Of a bundle, its self-test first. Exit code 1 also for what is corrupt, was tampered with, or is not what
+    this version exports: nothing of that is run.
     """
 
     path: Annotated[
         Positional[str], arg(metavar="BUNDLE_OR_GAINS", help="Bundle, or gain file, or its folder.")
     ]
+    key: Annotated[
+        str | None,
+        text("KEY", "The bundle must be signed by this public key (Ed25519, PEM); needs jaxhil[sign]."),
+    ] = None
     scenarios: Annotated[int, number("Runs to replay: the nominal one, then draws.")] = 6
     seed: Annotated[int, number("Seed of the draws.")] = 0
     json: Json = False

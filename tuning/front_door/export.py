@@ -11,6 +11,7 @@ from jaxhil.errors import shown
 from jaxhil.runtime.limits import LIMITS
 from jaxhil.simulation.environment import computing
 from tuning import terminal
+from tuning.bundle.selftest import SIGNATURE
 from tuning.front_door import arguments
 from tuning.front_door.arguments import ArgumentError
 
@@ -49,6 +50,7 @@ def export(
     formats: Sequence[str] | None = None,
     limits: Mapping[str, float | None] | None = None,
     seed: int = 0,
+    sign: str | os.PathLike[str] | None = None,
     progress: bool = False,
 ) -> Exported:
     """Write a bundle for the rig: gains, controller, test vectors, self-test; nothing to install there.
@@ -61,6 +63,7 @@ def export(
         formats: also the gains for "ros2", "matlab", "csv", "c99"; None: all that there are for the law.
         limits: limits of the rig's own by name [SI units], None for no limit, instead of those worked out.
         seed: of the test vectors.
+        sign: file of the private key (Ed25519, PEM) to sign the bundle with; None: it is not signed.
         progress: say on standard error what is going on.
 
     Raises:
@@ -70,19 +73,21 @@ def export(
     arguments.integers(0, seed=seed)
     arguments.flags(progress=progress)
     from tuning.bundle.bundle import build_bundle, check_target, write_bundle
+    from tuning.bundle.signing import signer
 
     target = arguments.folder("folder", folder)
     replaced = _replaced({} if limits is None else limits)
     path = gains if hasattr(gains, "document") else arguments.readable_gain_file(gains)
     _check_formats(formats)
     check_target(target)
+    key = None if sign is None else signer(arguments.folder("sign", sign))
     with computing():
         loaded = arguments.gain_file(path)
         arguments.runtime(loaded.compensator)
         chosen = _formats(formats, loaded.compensator)
         found = _calibrated(loaded, sweep, replaced, progress)
         with terminal.stages(2, progress) as stages:
-            bundle = build_bundle(loaded.document, chosen, found.limits, found.rates, seed, stages.begin)
+            bundle = build_bundle(loaded.document, chosen, found.limits, found.rates, seed, stages.begin, key)
             if not bundle.reasons:
                 write_bundle(target, bundle.files)
     document = _document(loaded, bundle, chosen, found.rates)
@@ -102,6 +107,7 @@ def _document(loaded, bundle, chosen, rates) -> dict[str, Any]:
         "gains_sha256": bundle.document["sha256"],
         "formats": chosen,
         "files": sorted(bundle.files),
+        "signed": SIGNATURE in bundle.files,
         "limits": bundle.document.get("limits"),
         "rates": rates,
         "ticks": bundle.ticks,

@@ -1,17 +1,19 @@
 """`tuning.verify`: does the runtime on the rig do what was simulated and tuned?
 
-A bundle is checked against its manifest from here, then by its own self-test in a bare interpreter, and then
-as its gain file is.
+A bundle is checked from here, file by file, then by its own self-test in a bare interpreter, and then as its
+gain file is.
 """
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jaxhil.errors import InputError
+from jaxhil.errors import InputError, shown
 from jaxhil.simulation.environment import computing
 from tuning import terminal
 from tuning.front_door import arguments
+from tuning.front_door.arguments import ArgumentError
 
 
 @dataclass(frozen=True)
@@ -32,13 +34,22 @@ class Verification:
 
 
 @arguments.entry
-def verify(path: Any, *, scenarios: int = 6, seed: int = 0, progress: bool = False) -> Verification:
+def verify(
+    path: Any,
+    *,
+    key: str | os.PathLike[str] | None = None,
+    scenarios: int = 6,
+    seed: int = 0,
+    progress: bool = False,
+) -> Verification:
     """Replay recorded signals through the rig's runtime.
 
-    Of a bundle, its self-test comes first; nothing of one that was tampered with is run.
+    Of a bundle, its self-test comes first; nothing is run of one that is not, byte for byte, what this
+    version exports for its gains.
 
     Args:
         path: of a bundle, a gain file, or the folder of one; or what `tuning.tune` returned.
+        key: file of the public key (Ed25519, PEM) that a bundle must be signed by; None: by none.
         scenarios: runs to replay: the nominal one, then draws.
         seed: of the draws.
         progress: say on standard error what is going on.
@@ -49,24 +60,34 @@ def verify(path: Any, *, scenarios: int = 6, seed: int = 0, progress: bool = Fal
     arguments.integers(1, scenarios=scenarios)
     arguments.integers(0, seed=seed)
     arguments.flags(progress=progress)
-    if hasattr(path, "document"):
-        return Verification(_verified(path, {}, scenarios, seed, progress))
-    folder = arguments.folder("path", path)
     from tuning.bundle.manifest import is_bundle
 
-    if not _is_folder(folder) or not is_bundle(folder):
-        file = arguments.readable_gain_file(path, "path")
-        return Verification(_verified(file, {"file": str(file)}, scenarios, seed, progress))
-    from tuning.bundle.checking import check_bundle
+    given = hasattr(path, "document")
+    folder = None if given else arguments.folder("path", path)
+    if folder is not None and _is_folder(folder) and is_bundle(folder):
+        return Verification(_verified_bundle(folder, key, scenarios, seed, progress))
+    file = path if given else arguments.readable_gain_file(path, "path")
+    if key is not None:
+        raise ArgumentError("key", shown(str(key)), "only with a bundle: gain files are not signed")
+    named = {} if given else {"file": str(file)}
+    return Verification(_verified(file, named, scenarios, seed, progress))
 
-    checked = check_bundle(folder)
-    document: dict[str, Any] = {"bundle": str(folder), "self_test": checked.lines}
-    if checked.reasons:
-        document.update(verdict=False, reasons=checked.reasons)
-    else:
-        file = folder / "gains.json"
-        document.update(_verified(file, {"file": str(file)}, scenarios, seed, progress))
-    return Verification(document)
+
+def _verified_bundle(folder: Path, key: Any, scenarios: int, seed: int, progress: bool) -> dict[str, Any]:
+    """What verification finds of a bundle."""
+    from tuning.bundle.checking import check_bundle, run_selftest
+    from tuning.bundle.signing import verifier
+
+    signed_by = None if key is None else verifier(arguments.folder("key", key))
+    with computing():
+        checked = check_bundle(folder, signed_by)
+    document = {"bundle": str(folder), "signature": checked.signature, "self_test": []}
+    reasons = checked.reasons
+    if not reasons:
+        document["self_test"], reasons = run_selftest(checked, os.path.basename(os.path.abspath(folder)))
+    if reasons:
+        return {**document, "verdict": False, "reasons": reasons}
+    return _verified(checked, {**document, "file": str(folder / "gains.json")}, scenarios, seed, progress)
 
 
 def _verified(given: Any, document: dict[str, Any], scenarios: int, seed: int, progress: bool):

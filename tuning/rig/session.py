@@ -34,7 +34,6 @@ ENDING = 120.0  # s in which it has to end, going through its packets again incl
 SILENCE = 2.0  # s without a packet, after which it ends by itself
 
 SOURCE = Path(__file__).parent
-PROCESS = ("udp_controller.py", "udp_protocol.py")  # what the controller's process is, beside its runtime
 LAST = Reading(STOP, 0xFFFFFFFF, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -93,7 +92,7 @@ class SessionReport(NamedTuple):
 class Setup(NamedTuple):
     """What a session is to be."""
 
-    folder: Path  # with the controller's process: a bundle, or `SOURCE`
+    folder: Path  # with the controller's process, as in a bundle, or `SOURCE`
     gains: Path  # its gain file
     mechanism: Mechanism  # the one in that
     stroke: tuple[float, float]  # lowest and highest position that the drives take [m]

@@ -21,6 +21,7 @@ def run(options: Export) -> int:
         formats=formats or None,
         limits=_replaced(options.limits),
         seed=options.seed,
+        sign=options.sign,
         progress=True,
     )
     if options.json:
@@ -72,6 +73,7 @@ def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
     if document["bundle"]:
         lines += [
             f"wrote {len(sizes)} files, {sum(sizes.values()) / 1e6:.2g} MB, to {document['bundle']}",
+            *(["Signed: `jaxhil verify --key` with the public key proves it."] if document["signed"] else []),
             f"On the rig: python {Path(document['bundle']).name}/selftest.py",
         ]
     if document["reasons"]:

@@ -28,6 +28,7 @@ def run(options: RigOptions) -> int:
         checks.picture(options.plot)
     gains = arguments.readable_gain_file(options.path)
     document, mechanism = load(gains)
+    check_bundle_code(Path(options.path), document["compensator"])
     period = mechanism.rig.control_period
     if not period <= options.duration <= MOST_TICKS * period:
         allowed = f"{period:g} to {MOST_TICKS * period:g} s, {MOST_TICKS} control periods"
@@ -47,7 +48,7 @@ def run(options: RigOptions) -> int:
     with tempfile.TemporaryDirectory(prefix="jaxhil-rig-") as temporary:
         scratch = Path(temporary)
         setup = Setup(
-            folder=controller_folder(options.path, document["compensator"], scratch),
+            folder=controller_folder(document["compensator"], scratch),
             gains=gains,
             mechanism=mechanism,
             stroke=stroke(document),
@@ -77,18 +78,22 @@ def run(options: RigOptions) -> int:
     return 0 if found["verdict"] == "good" else 1
 
 
-def controller_folder(given: str, compensator: str, scratch: Path) -> Path:
-    """The folder in which the controller's process is to run: the bundle itself or, for a bare gain file,
-    what such a process needs of a bundle, made in the folder `scratch`."""
-    from tuning.bundle.single_file import runtime_source
-    from tuning.rig.session import PROCESS, SOURCE
+def check_bundle_code(folder: Path, compensator: str) -> None:
+    """If the folder is a bundle, it is intact and its code what is run here. Raises `InputError`."""
+    from tuning.bundle.checking import check_code
+    from tuning.bundle.manifest import is_bundle
 
-    folder = Path(given)
-    if folder.is_dir() and (folder / PROCESS[0]).is_file():
-        return folder
-    (scratch / "jaxhil_runtime.py").write_text(runtime_source(compensator), encoding="utf-8")
-    for name in PROCESS:
-        (scratch / name).write_bytes((SOURCE / name).read_bytes())
+    reasons = check_code(folder, compensator) if is_bundle(folder) else []
+    if reasons:
+        raise InputError(f"{one_line(str(folder))}: {reasons[0]}; jaxhil verify says more")
+
+
+def controller_folder(compensator: str, scratch: Path) -> Path:
+    """The folder `scratch`, with what the controller's process is in every bundle of a compensator."""
+    from tuning.bundle.content import code_files
+
+    for name, content in code_files(compensator).items():
+        (scratch / name).write_bytes(content)
     return scratch
 
 

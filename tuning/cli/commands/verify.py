@@ -9,7 +9,9 @@ from tuning.front_door.verify import verify
 
 def run(options: Verify) -> int:
     """0 if the runtime agrees; 1 if not, or if the file is corrupt; 2 if there is nothing to read."""
-    found = verify(options.path, scenarios=options.scenarios, seed=options.seed, progress=True)
+    found = verify(
+        options.path, key=options.key, scenarios=options.scenarios, seed=options.seed, progress=True
+    )
     document = found.document
     if options.json:
         terminal.emit_json(document)
@@ -25,6 +27,8 @@ def _exponential(value: float | None) -> str:
 
 def _print(document: dict[str, Any]) -> None:
     tables: list[Any] = list(document.get("self_test", ()))
+    if "signature" in document:
+        tables.append(f"Signature: {document['signature']}.")
     if "replay" in document:
         tables += [
             terminal.table(

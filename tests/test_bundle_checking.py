@@ -1,0 +1,286 @@
+"""Nothing of a bundle is run that this version does not export, whatever the bundle says of itself; nothing
+in its folder is waited for, or followed out of it."""
+
+import hashlib
+import json
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+from bundles import run_selftest, signed, small_files
+
+import tuning
+from jaxhil.errors import InputError
+from tuning.bundle import selftest
+from tuning.bundle.bundle import write_bundle
+from tuning.bundle.checking import check_bundle, check_code
+from tuning.bundle.checking import run_selftest as run_checked
+
+CODE = ("selftest.py", "jaxhil_runtime.py", "udp_controller.py", "udp_protocol.py")
+SHORT = 10  # s, far more than any check takes
+
+
+@pytest.fixture(scope="module")
+def files():
+    return small_files()
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "bundle"
+
+
+@pytest.fixture(autouse=True)
+def _in_time():
+    """What hangs fails."""
+
+    def too_long(number, frame):
+        raise TimeoutError(f"longer than {SHORT} s")
+
+    before = signal.signal(signal.SIGALRM, too_long)
+    signal.alarm(6 * SHORT)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def placed(folder, files):
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+    return folder
+
+
+def document_of(files):
+    return json.loads(files["gains.json"])
+
+
+def resealed(manifest):
+    """A manifest's content, of any form, with checks of itself that fit."""
+    body = json.dumps(manifest, indent=1).encode().removesuffix(b"\n}")
+    return body + selftest.own_seal(body)
+
+
+def entry(content, **changes):
+    return {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content), **changes}
+
+
+def plain_manifest(files, **others):
+    """The manifest's content as data, with other entries of files beside."""
+    made = json.loads(files["manifest.json"])
+    made = {name: value for name, value in made.items() if not name.startswith("own_")}
+    return {**made, "files": {**made["files"], **others}}
+
+
+def test_what_was_exported_is_what_this_version_exports(files, folder):
+    checked = check_bundle(placed(folder, files))
+    assert (checked.reasons, checked.signature) == ([], "not signed")
+    assert checked.files == files and checked.document == document_of(files)
+    assert check_code(folder, "phase_lead") == []
+
+
+@pytest.mark.parametrize("name", [*CODE, "c99/jaxhil_controller.c", "README.md", "ros2.yaml", "gains.mat"])
+def test_a_bundle_that_vouches_for_itself_is_not_run(files, folder, tmp_path, name):
+    """Its manifest fits all files, one of which leaves a mark where it is run."""
+    trap = b"\nopen(%r, 'w')\n" % str(tmp_path / "ran").encode()
+    own = signed({**files, name: files[name] + trap}, document_of(files))
+    found = tuning.verify(placed(folder, own))
+    assert not found.good and found.document["self_test"] == []
+    first, last = found.reasons
+    assert first == f"{name}: is not what this version exports"
+    assert last.startswith("nothing of it was run: it says that this version, jaxhil ")
+    assert (check_code(folder, "phase_lead") == []) is (name not in CODE)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_files_too_many_and_too_few_are_not_of_this_version(files, folder):
+    some = {name: content for name, content in files.items() if name != "udp_controller.py"}
+    own = signed({**some, "sitecustomize.py": b"open('ran', 'w')"}, document_of(files))
+    reasons = check_bundle(placed(folder, own)).reasons
+    assert reasons[:2] == [
+        "sitecustomize.py: is no file that this version exports",
+        "udp_controller.py: is not here",
+    ]
+    assert check_code(folder, "phase_lead") == reasons
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"<h1>", b"<script>fetch('/')</script><h1>"),
+        (b"base64,iVBOR", b'x" onerror="fetch(1)" alt="base64,iVBOR'),
+        (b"base64,iVBOR", b"base64,iVBO="),
+    ],
+)
+def test_a_summary_with_a_script_is_not_of_this_version(files, folder, old, new):
+    assert old in files["summary.html"]
+    page = files["summary.html"].replace(old, new)
+    own = signed({**files, "summary.html": page}, document_of(files))
+    reason = check_bundle(placed(folder, own)).reasons[0]
+    assert reason.startswith(("summary.html: is not", "gains.json: this version cannot export it")), reason
+
+
+def test_a_bundle_of_another_version_names_it(files, folder):
+    for stated, said in [("jaxhil 0.0.9", "'jaxhil 0.0.9' wrote it"), (None, "does not say"), ([1], "[1]")]:
+        other = plain_manifest(files)
+        other.update(version=stated)
+        if stated is None:
+            del other["version"]
+        placed(folder, {**files, "manifest.json": resealed(other)})
+        first, last = check_bundle(folder).reasons
+        assert first == "manifest.json: is not what this version writes of these files" and said in last
+    assert run_selftest(folder)[0]  # with what a rig has, it is consistent
+
+
+def test_a_gain_file_written_in_another_way_is_not_of_this_version(files, folder):
+    for text in (
+        files["gains.json"].replace(b": ", b":  ", 1),
+        files["gains.json"].replace(b"{\n", b'{\n  "seed": 7,\n', 1),
+        b"[]",
+        b"[" * 100_000,
+        b"\xff",
+    ):
+        own = signed({**files, "gains.json": text}, document_of(files))
+        reasons = check_bundle(placed(folder, own)).reasons
+        assert reasons[0].startswith("gains.json: "), reasons
+
+
+def test_what_is_run_is_what_was_checked(files, folder, tmp_path):
+    checked = check_bundle(placed(folder, files))
+    for name in ("selftest.py", "jaxhil_runtime.py"):
+        (folder / name).write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    lines, reasons = run_checked(checked, "bundle")
+    assert reasons == [] and lines[0].startswith("self-test of bundle,") and lines[-1] == "PASSED"
+    assert not (tmp_path / "ran").exists()
+
+
+def test_compiled_code_beside_the_sources_is_not_passed_over(files, folder):
+    placed(folder, files)
+    (folder / "__pycache__").mkdir()
+    (folder / "__pycache__" / "jaxhil_runtime.cpython-311.pyc").write_bytes(b"who knows")
+    [reason] = check_bundle(folder).reasons
+    assert reason.startswith("__pycache__/: holds compiled code, which is not checked")
+    good, out = run_selftest(folder)
+    assert good and "note  __pycache__/: holds compiled code" in out
+
+
+HOSTILE_PATHS = [
+    *("../../../dev/zero", "/dev/zero", "../secret", "a/../../secret", "a/../b", "./gains.json", "a//b", ""),
+    *(".", "..", "c99", "c99/..", "c99/", "c99\\b", "..\\secret", "C:/secret", "a\0b", "gains.json\n"),
+    *("\u00e9", "a" * 300, "a/" * 40 + "b", "manifest.json", "manifest.sig", "~/secret", "-rf"),
+]
+
+
+@pytest.mark.parametrize("path", HOSTILE_PATHS)
+def test_paths_of_a_manifest_stay_within_the_folder(files, folder, path):
+    (folder.parent / "secret").write_bytes(b"secret")
+    own = {**files, "manifest.json": resealed(plain_manifest(files, **{path: entry(b"secret")}))}
+    begun = time.monotonic()
+    checked = check_bundle(placed(folder, own))
+    good, out = run_selftest(folder)
+    assert time.monotonic() - begun < SHORT
+    assert not good and f"FAIL  {'c99' if path == 'c99' else 'manifest.json'}: cannot be read: " in out
+    assert checked.reasons and all(reason.isprintable() and len(reason) <= 300 for reason in checked.reasons)
+    assert b"secret" not in checked.files.values()
+
+
+@pytest.mark.parametrize("name", ["gains.json", "manifest.json", "manifest.sig", "selftest.py", "c99"])
+@pytest.mark.parametrize("kind", ["pipe", "link", "link to a device", "loop", "folder", "socket", "vast"])
+def test_what_is_no_plain_file_is_refused_at_once(files, folder, monkeypatch, name, kind):
+    placed(folder, files)
+    path = folder / name
+    elsewhere = folder.parent / "elsewhere"
+    path.rename(elsewhere) if path.exists() else elsewhere.write_bytes(bytes(64))
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind.startswith("link"):
+        path.symlink_to("/dev/zero" if "device" in kind else elsewhere)
+    elif kind == "loop":
+        path.symlink_to(path)
+    elif kind == "folder":
+        (path / "inner").mkdir(parents=True)
+    elif kind == "socket":
+        monkeypatch.chdir(folder)  # such a name must be short
+        with socket.socket(socket.AF_UNIX) as opened:
+            opened.bind(name)
+    else:
+        with path.open("wb") as file:
+            file.truncate(1 << 40)
+    begun = time.monotonic()
+    found = tuning.verify(folder)
+    program = str(elsewhere if name == "selftest.py" else folder / "selftest.py")
+    command = [sys.executable, "-I", "-S", "-B", program]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=SHORT, check=False)
+    assert time.monotonic() - begun < SHORT
+    assert not found.good and found.document["self_test"] == []
+    assert any(reason.startswith(name) for reason in found.reasons), found.reasons
+    assert ran.returncode == 1 and "Traceback" not in ran.stderr
+    assert name == "selftest.py" or f"FAIL  {name}" in ran.stdout
+
+
+def test_more_than_a_bundle_ever_has_is_refused(files, folder):
+    many = {f"f{number}": entry(b"") for number in range(selftest.MOST_FILES + 1)}
+    for others in (many, {"vast": entry(b"", bytes=1 << 60)}, {"odd": entry(b"", bytes=True)}):
+        placed(folder, {**files, "manifest.json": resealed(plain_manifest(files, **others))})
+        [reason] = check_bundle(folder).reasons
+        assert reason.startswith("manifest.json: cannot be read: ValueError: ")
+    # A file that has another size than is stated, with the stated digest.
+    wrong = plain_manifest(files, **{"ros2.yaml": entry(files["ros2.yaml"], bytes=3)})
+    placed(folder, {**files, "manifest.json": resealed(wrong)})
+    [reason] = check_bundle(folder).reasons
+    assert reason == f"ros2.yaml: differs from what was exported ({len(files['ros2.yaml'])} bytes are here)"
+
+
+def flipped(source, content):
+    place, bit = source.randrange(len(content)), source.randrange(8)
+    return content[:place] + bytes([content[place] ^ 1 << bit]) + content[place + 1 :]
+
+
+@pytest.mark.parametrize("flips", [100, pytest.param(1000, marks=pytest.mark.slow)])
+def test_no_flipped_bit_passes(files, folder, flips):
+    source, names = random.Random(flips), sorted(files)
+    placed(folder, files)
+    for turn in range(flips):
+        name = names[turn % len(names)]
+        (folder / name).write_bytes(flipped(source, files[name]))
+        reasons = check_bundle(folder).reasons
+        assert reasons and all(reason.startswith(f"{name}: ") for reason in reasons), (name, reasons)
+        (folder / name).write_bytes(files[name])
+    assert check_bundle(folder).reasons == []
+
+
+def test_a_bundle_is_replaced_as_a_whole_and_nothing_else_is_touched(files, folder, tmp_path):
+    placed(folder, files)
+    secret = tmp_path / "secret"
+    secret.mkdir()
+    (secret / "thesis.txt").write_text("years of work")
+
+    def refused():
+        with pytest.raises(InputError, match="allowed a new or empty folder, or a bundle as it was exported"):
+            write_bundle(folder, files)
+        assert (secret / "thesis.txt").read_text() == "years of work"
+        assert sorted(os.listdir(tmp_path)) == ["bundle", "secret"]
+
+    (folder / "empty").mkdir()
+    refused()
+    (folder / "empty").rmdir()
+    (folder / "__pycache__").mkdir()
+    (folder / "__pycache__" / "thesis.txt").write_text("years of work")
+    refused()
+    (folder / "__pycache__" / "thesis.txt").rename(folder / "__pycache__" / "selftest.cpython-311.pyc")
+    (folder / "c99" / "link").symlink_to(secret)
+    refused()
+    (folder / "c99" / "link").unlink()
+    (folder / "gains.mat").unlink()
+    (folder / "gains.mat").symlink_to(secret / "thesis.txt")
+    refused()
+    (folder / "gains.mat").unlink()
+    (folder / "gains.mat").write_bytes(files["gains.mat"])
+    write_bundle(folder, {"manifest.json": b"another"})
+    assert os.listdir(folder) == ["manifest.json"]
+    assert sorted(os.listdir(tmp_path)) == ["bundle", "secret"]

@@ -1,0 +1,78 @@
+"""Signatures of bundles: Ed25519 (RFC 8032) over the manifest's bytes, which name every other file's SHA-256.
+
+The signature is 64 bytes, `manifest.sig`; keys are PEM files, as `openssl genpkey -algorithm ed25519` makes
+them. The package `cryptography` does the work, and is imported when it is needed: it is the extra
+`jaxhil[sign]`.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from jaxhil.errors import InputError, one_line
+
+LARGEST = 65536  # bytes of a key's file
+
+
+def signer(path: Path) -> Callable[[bytes], bytes]:
+    """What makes the signature of bytes with the private key in a file. Raises `InputError`."""
+    ed25519, serialization = _library()
+    allowed = "an Ed25519 private key without a passphrase, as PEM"
+    key = _key(path, allowed, lambda text: serialization.load_pem_private_key(text, password=None))
+    if not isinstance(key, ed25519.Ed25519PrivateKey):
+        raise _refusal(path, "another kind of key", allowed)
+    return key.sign
+
+
+def verifier(path: Path) -> Callable[[bytes, bytes], bool]:
+    """What tells whether a signature is of these bytes, by the public key in a file. Raises `InputError`."""
+    ed25519, serialization = _library()
+    from cryptography.exceptions import InvalidSignature
+
+    allowed = "an Ed25519 public key as PEM"
+    key = _key(path, allowed, serialization.load_pem_public_key)
+    if not isinstance(key, ed25519.Ed25519PublicKey):
+        raise _refusal(path, "another kind of key", allowed)
+
+    def is_signature(signature: bytes, content: bytes) -> bool:
+        try:
+            key.verify(signature, content)
+        except InvalidSignature:
+            return False
+        return True
+
+    return is_signature
+
+
+def _library() -> tuple[Any, Any]:
+    try:
+        from cryptography.hazmat.primitives import serialization
+        from cryptography.hazmat.primitives.asymmetric import ed25519
+    except ImportError:
+        raise InputError(
+            "signing: found no package cryptography, allowed with it: pip install 'jaxhil[sign]'"
+        ) from None
+    return ed25519, serialization
+
+
+def _key(path: Path, allowed: str, load: Callable[[bytes], Any]) -> Any:
+    from cryptography.exceptions import UnsupportedAlgorithm
+
+    try:
+        with path.open("rb") as file:
+            text = file.read(LARGEST + 1)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{one_line(str(path))}: cannot be read: {one_line(reason)}") from None
+    if len(text) > LARGEST:
+        raise _refusal(path, "a larger file", allowed)
+    try:
+        return load(text)
+    except TypeError:
+        raise _refusal(path, "an encrypted key", allowed) from None
+    except (ValueError, UnsupportedAlgorithm):
+        raise _refusal(path, "no such key", allowed) from None
+
+
+def _refusal(path: Path, found: str, allowed: str) -> InputError:
+    return InputError(f"{one_line(str(path))}: found {found}, allowed {allowed}")
