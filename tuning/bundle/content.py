@@ -46,8 +46,8 @@ def bundle_files(
     gains = json.dumps(document, indent=2, sort_keys=True, allow_nan=False) + "\n"
     # In what order a caller put keys is not known from the file.
     document = json.loads(gains)
-    if "limits" in document:
-        document["limits"] = {name: document["limits"][name] for name in LIMITS if name in document["limits"]}
+    if limits := document.get("limits"):
+        document = {**document, "limits": {name: limits[name] for name in LIMITS if name in limits}}
     files = {
         "gains.json": gains.encode("ascii"),
         "vectors.csv": vectors,
