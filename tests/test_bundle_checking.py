@@ -20,6 +20,7 @@ from tuning.bundle import selftest
 from tuning.bundle.bundle import write_bundle
 from tuning.bundle.checking import check_bundle, check_code
 from tuning.bundle.checking import run_selftest as run_checked
+from tuning.files import exchange
 
 CODE = ("selftest.py", "jaxhil_runtime.py", "udp_controller.py", "udp_protocol.py")
 SHORT = 10  # s, far more than any check takes
@@ -284,3 +285,19 @@ def test_a_bundle_is_replaced_as_a_whole_and_nothing_else_is_touched(files, fold
     write_bundle(folder, {"manifest.json": b"another"})
     assert os.listdir(folder) == ["manifest.json"]
     assert sorted(os.listdir(tmp_path)) == ["bundle", "secret"]
+
+
+def test_what_comes_into_an_old_bundle_at_the_last_moment_stays(files, folder, monkeypatch):
+    placed(folder, files)
+
+    def late(new, target):
+        if not (new / "thesis.txt").exists():
+            (target / "thesis.txt").write_text("years of work")
+        exchange(new, target)
+
+    monkeypatch.setattr("tuning.bundle.bundle.exchange", late)
+    with pytest.raises(InputError, match=r"thesis\.txt: is no file of this bundle"):
+        write_bundle(folder, {"manifest.json": b"another"})
+    assert (folder / "thesis.txt").read_text() == "years of work"
+    assert (folder / "manifest.json").read_bytes() == files["manifest.json"]
+    assert os.listdir(folder.parent) == ["bundle"]
