@@ -14,9 +14,9 @@ os.environ["NPROC"] = settings(os.environ)["NPROC"]
 
 import hypothesis
 import jax
+import jaxtyping
 import pytest
 from compiling import compile_quickly, forget_oldest
-from jaxtyping import install_import_hook
 
 # Compiled programs are kept: for the next run, for other workers, for kernels and commands that tests start.
 FOLDER = "tests"
@@ -27,18 +27,19 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# Shapes are checked where there are shapes: the modules that compute with arrays.
-ARRAY_MODULES = ("compensators", "contact", "ring_buffer")
+# Shapes are checked in the modules that compute with arrays; every day, in their own tests alone: checked
+# programs take a quarter longer to trace.
+PACKAGES = ("compensators", "contact", "simulation")
 # What a caller gives them, these check themselves.
 FRONT_DOOR = ("gain_choice", "gain_file", "jacobian", "registration", "run")
-simulation = sorted(
-    path.stem for path in (Path(__file__).parent.parent / "jaxhil/simulation").glob("[a-z]*.py")
-)
-install_import_hook(
-    [f"jaxhil.{name}" for name in ARRAY_MODULES]
-    + [f"jaxhil.simulation.{name}" for name in simulation if name not in FRONT_DOOR],
-    "beartype.beartype",
-)
+CHECKED = [
+    f"{package}.{path.stem}"
+    for package in PACKAGES
+    for path in sorted((Path(__file__).parent.parent / "jaxhil" / package).glob("[a-z]*.py"))
+    if path.stem not in FRONT_DOOR
+]
+OWN_TESTS = {"test_compensators", "test_contacts", *(f"test_{name.split('.')[1]}" for name in CHECKED)}
+jaxtyping.install_import_hook([f"jaxhil.{name}" for name in ("ring_buffer", *CHECKED)], "beartype.beartype")
 
 # A shared machine has no deadlines to keep, and a test that fails must fail again.
 hypothesis.settings.register_profile("jaxhil", deadline=None, derandomize=True)
@@ -75,6 +76,12 @@ def _laws_of_the_package_alone():
         table.clear()
         table.update(entries)
     CONTACT_LAWS[:] = names
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _shapes_checked(request):
+    everyday = "not slow" in request.config.option.markexpr
+    jaxtyping.config.update("jaxtyping_disable", everyday and request.node.path.stem not in OWN_TESTS)
 
 
 @pytest.fixture(scope="module", autouse=True)

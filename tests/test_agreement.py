@@ -215,7 +215,11 @@ def random_readings(name: str, lanes: int, ticks: int, seed: int) -> Readings:
 
 @pytest.mark.parametrize(
     "name, lanes",
-    [*((name, 60) for name in COMPENSATORS), pytest.param("response_error", 510, marks=pytest.mark.slow)],
+    [
+        *((name, 20 if name == "retrospective_delay_bank" else 60) for name in COMPENSATORS),
+        pytest.param("response_error", 510, marks=pytest.mark.slow),
+        pytest.param("retrospective_delay_bank", 60, marks=pytest.mark.slow),
+    ],
 )
 def test_random_ticks(name, lanes):
     count = compare(name, random_readings(name, lanes, 2000, seed=1))

@@ -24,6 +24,7 @@ def tuned():
     return tuning.tune("rig-300kg", "phase_lead", **SMALL)
 
 
+@pytest.mark.slow
 @pytest.mark.users_options
 def test_the_script_of_the_interface_runs(tmp_path):
     """In a process of its own, whose jax computes in float32 and stays so."""
@@ -72,6 +73,7 @@ def test_a_study_that_keeps_nothing_is_the_stored_one(tuned, tmp_path, monkeypat
         assert one.manifest.sha256 == other.manifest.sha256
 
 
+@pytest.mark.slow
 def test_laws_from_outside_go_all_the_way(tmp_path):
     jaxhil.register(Quadratic())
     jaxhil.register(Difference())

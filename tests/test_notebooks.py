@@ -1,6 +1,6 @@
 """Every notebook runs from top to bottom on a copy, and is committed as it ran: clean, with its outputs.
 
-Half of them run every day, those that take longest with `-m slow`; `.ci/run` runs both.
+One of them runs every day, the others with `-m slow`; `.ci/run` runs all.
 """
 
 import os
@@ -17,7 +17,7 @@ from jaxhil.simulation.environment import cache_folder
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 LARGEST = 500_000  # bytes
-LONG = {"01_divergence", "02_batch_tuning", "06_retrospective_reference"}
+EVERYDAY = "05_leaderboard"
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
 SOLVER = re.compile(r"\btune\(")
 IMPORTED = re.compile(r"^(?:import|from)\s+([\w.]+)", re.M)
@@ -39,7 +39,7 @@ def test_there_are_notebooks():
 @pytest.mark.filterwarnings("default")
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(one, marks=pytest.mark.slow if one.stem in LONG else ()) for one in NOTEBOOKS],
+    [pytest.param(one, marks=() if one.stem == EVERYDAY else pytest.mark.slow) for one in NOTEBOOKS],
     ids=lambda path: path.stem,
 )
 def test_every_cell_runs(path, tmp_path, monkeypatch):

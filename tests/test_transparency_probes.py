@@ -140,6 +140,7 @@ def result():
     return tune(DAMPED, "phase_lead", SMALL)
 
 
+@pytest.mark.slow
 def test_honesty_is_judged_of_literature_and_tuned_gains(result):
     assert list(result.transparency) == ["before", "literature", "tuned"]
     for key, own in result.transparency.items():
@@ -156,6 +157,7 @@ def test_without_the_weight_there_are_no_copies():
     assert len(build_task(DAMPED, "phase_lead", 4, 0).scenarios.velocity) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [PEAK, TRANSPARENCY])
 def test_the_error_is_traded_against_peak_or_honesty(result, axis):
     ((_, front),) = fronts([result], 2, axis=axis)

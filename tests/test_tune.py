@@ -51,6 +51,7 @@ def test_every_start_has_a_status_and_a_falling_history(result):
         assert start.history[-1] == start.rms
 
 
+@pytest.mark.slow
 def test_gains_tuned_with_sensor_noise_are_better_where_there_is_noise(result):
     """Three times the published noise, on scenarios that neither of the two has seen."""
     noisy = load("varying", ["rig.force_sensor.noise_std=8"]).mechanism
