@@ -62,7 +62,8 @@ def test_a_bundle_is_exported_signed_and_verified(jaxhil, gains, tmp_path):
     ran = jaxhil("export", gains, "-o", folder, "--format", "csv,ros2", "--sign", private, "--json")
     assert ran.code == 0, ran
     said = ran.document
-    assert said["verdict"] == "good" and said["bundle"] == str(folder) and said["formats"] == ["ros2", "csv"]
+    assert said["verdict"] == "unknown" and not said["reasons"] and "a sweep of " in said["unknown"][0]
+    assert said["bundle"] == str(folder) and said["formats"] == ["ros2", "csv"]
     assert said["signed"] is True
     assert (
         files_of(folder)
@@ -77,7 +78,7 @@ def test_a_bundle_is_exported_signed_and_verified(jaxhil, gains, tmp_path):
     assert "Signature: by the key given." in ran.out
     # Once more onto itself, and not signed.
     ran = jaxhil("export", folder, "-o", folder, "--format", "matlab")
-    assert ran.code == 0 and "Good: " in ran.out and "selftest.py" in ran.out
+    assert ran.code == 0 and "\nNot known to be good: " in ran.out and "selftest.py" in ran.out
     assert "gains.mat" in files_of(folder) and not {"gains.csv", "manifest.sig"} & files_of(folder)
     ran = jaxhil("verify", folder, "--key", public, "--json")
     assert ran.code == 1 and ran.document["signature"] == "not signed" and ran.document["self_test"] == []
@@ -149,15 +150,31 @@ def test_limits_come_from_the_sweep_that_is_named(jaxhil, gains, tmp_path):
     assert rates["calibrated_on"]["scenarios"] == 40 and rates["calibrated_on"]["sweep_sha256"]
     alarms, runs = (rates["false_alarms"][name] for name in ("alarms", "runs"))
     assert 0 < runs < 40 and f"false alarms {alarms} of {runs} good runs (95 %: " in ran.out
+    assert rates["verdict"] == "unknown" and "\nUnknown: missed alarms: 95 % interval " in ran.out
     limits = written["limits"]
     assert limits["command_lowest"] == {"value": -0.05, "unit": "m"}
     assert limits["force_range"] == {"value": None, "unit": "N"}
     assert limits["force_limit"]["value"] > 0 and "force_limit" in ran.out
 
 
+def test_a_watchdog_that_stops_good_runs_is_bad(jaxhil, gains, tmp_path):
+    store, folder = tmp_path / "store", tmp_path / "bundle"
+    assert jaxhil("sweep", gains, "--scenarios", "40", "--limit", "5", "-o", store).code == 0
+    command = ["export", gains, "-o", folder, "--sweep", store, "--format", "csv"]
+    ran = jaxhil(*command, "--false-alarms", "1", "--missed", "1")
+    assert ran.code == 0 and "\nGood: " in ran.out and "nknown" not in ran.out
+    assert load_gain_file(folder / "gains.json").document["figures"]["watchdog"]["verdict"] == "good"
+    ran = jaxhil(*command, "--set", "restitution_margin=0")
+    assert ran.code == 1 and "\nBad: false alarms: 95 % interval " in ran.out and "\nGood" not in ran.out
+    page = (folder / "summary.html").read_text()
+    assert "<b>Bad: false alarms: 95 % interval " in page and ", allowed 0.01)" in page
+
+
 @pytest.mark.parametrize(
     "arguments, words",
     [
+        (["--false-alarms", "1.5"], ["--false-alarms", "1.5", "0 to 1"]),
+        (["--missed", "nan"], ["--missed", "nan", "0 to 1"]),
         (["--format", "xml"], ["--format", "'xml'", "ros2, matlab, csv"]),
         (["--format", "csv,"], ["--format", "''"]),
         (["--seed", "-1"], ["--seed", "-1"]),

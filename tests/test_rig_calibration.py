@@ -189,16 +189,27 @@ def test_known_damping_needs_no_identified_one(calibrated):
     rates = calibrated[0].rates
     assert rates["terms"] == ["1", "p", "pp", "ppp"]
     assert rates["expectation_largest"] < 2e-3 and rates["restitution_margin"] == 0.75 * LIMIT
+    assert rates["widened_from"] is None and rates["noticed_from"]["error"] < LIMIT
 
 
 def test_unknown_damping_is_distinguished_from_delay_by_nothing():
-    rates = calibrate(
-        gains(uncertainty={**UNCERTAIN, **DAMPING}), scenarios=2 * LANES, limit=LIMIT, lanes=LANES
-    ).rates
+    """The margin is widened until good runs pass, at a price that is stated."""
+    loaded = gains(uncertainty={**UNCERTAIN, **DAMPING})
+    rates = calibrate(loaded, scenarios=8 * LANES, limit=LIMIT, lanes=LANES).rates
     assert "z" in rates["terms"]
     # pi omega sd(delay) / 2, of a delay of 0.5 ms more or less at 3 Hz.
     assert rates["expectation_rms"] == pytest.approx(math.pi * 2 * math.pi * 3 * 0.0005 / 2, rel=0.3)
-    assert rates["restitution_margin"] < 0.75 * LIMIT
+    narrow = rates["widened_from"]
+    assert narrow < 0.75 * LIMIT < LIMIT < rates["restitution_margin"]
+    assert rates["false_alarms"]["alarms"] == 0 < rates["false_alarms"]["runs"]
+    assert rates["verdict"] == "bad" and rates["reasons"][0].startswith("missed alarms: 95 % interval ")
+    noticed = rates["noticed_from"]["error"]
+    assert noticed is None or noticed > rates["restitution_margin"]
+    # Without the wider margin most good runs would be stopped.
+    replaced = {"restitution_margin": narrow}
+    rates = calibrate(loaded, scenarios=8 * LANES, limit=LIMIT, lanes=LANES, replaced=replaced).rates
+    assert rates["false_alarms"]["low"] > 0.3 and rates["missed_alarms"]["rate"] < 0.02
+    assert rates["widened_from"] is None and rates["reasons"][0].startswith("false alarms: ")
 
 
 def test_an_undamped_contact_is_to_return_all():

@@ -18,11 +18,17 @@ FIGURES = {
     "rms": 0.5, "p99": 1.25, "max": 1.5, "mean": 0.375, "diverging": 1.0, "peak_ratio": 1.75,
     "chatter": 0.0, "failed": 3,
 }  # fmt: skip
-RATE = {"runs": 5000, "alarms": 0, "rate": 0.0, "low": 0.0, "high": 0.00073}
+RATE = {"runs": 5000, "alarms": 0, "rate": 0.0, "low": 0.0, "high": 0.00073, "allowed": 0.01}
 RATES = {
     "limit": 0.01,
+    "restitution_margin": 0.0125,
     "false_alarms": RATE,
-    "missed_alarms": {**RATE, "runs": 40, "alarms": 2, "high": 0.17},
+    "missed_alarms": {**RATE, "runs": 40, "alarms": 2, "high": 0.17, "allowed": 0.02},
+    "noticed_from": {"error": 0.0175, "contacts": 25, "largest": 0.03},
+    "widened_from": 0.0025,
+    "verdict": "unknown",
+    "reasons": [],
+    "unknown": ["missed alarms: <0 to 0.17>"],
 }
 
 
@@ -107,8 +113,11 @@ def test_says_what_for_how_good_and_how_sure(made, page):
             "numpy",
             "350 kg at 5 mm/s",
         ),
-        "False alarms 0 of 5000 good runs (95 %: 0 to 0.00073)",
-        "missed alarms 2 of 40 runs to be stopped",
+        "False alarms 0 of 5000 good runs (95 %: 0 to 0.00073, allowed 0.01)",
+        "missed alarms 2 of 40 runs to be stopped (95 %: 0 to 0.17, allowed 0.02)",
+        "Unknown: missed alarms: <0 to 0.17>.",
+        "restitution_margin widened from 0.0025 to 0.013, or too many good runs would be stopped",
+        "errors from 0.018 on are noticed in 95 % of contacts",
     ):
         assert part in text, part
     rows = {row[0]: row for row in page.rows if row}

@@ -210,8 +210,11 @@ def _watchdog(document: Mapping[str, Any]) -> Iterator[str]:
         return
     yield "<h2>Watchdog</h2>"
     rates = document["figures"].get("watchdog")
-    rates_text = "; ".join(alarm_rates(rates)) if isinstance(rates, Mapping) else ""
-    rates_text = one_line(rates_text, 600) or "Rates of false and missed alarms are not known"
+    rates = rates if isinstance(rates, Mapping) else {}
+    if rates.get("verdict"):
+        yield f"<p><b>{escape(_verdict(rates))}</b></p>"
+    rates_text = one_line("; ".join(alarm_rates(rates)), 800)
+    rates_text = rates_text or "Rates of false and missed alarms are not known"
     yield f"<p>{escape(rates_text[0].upper() + rates_text[1:])}.</p>"
     fitted = sum(not is_shown(name) for name in given)
     if fitted:
@@ -219,6 +222,15 @@ def _watchdog(document: Mapping[str, Any]) -> Iterator[str]:
     unset = [name for name in document["limits"] if name not in given]
     if unset:
         yield f'<p class="note">Not limited: {escape(", ".join(unset))}.</p>'
+
+
+def _verdict(rates: Mapping[str, Any]) -> str:
+    """The verdict on the rates, and what speaks against them."""
+    why = [text for key in ("reasons", "unknown") for text in rates.get(key, ()) if isinstance(text, str)]
+    return one_line(
+        f"{str(rates['verdict']).capitalize()}: {'; '.join(why) or 'wrong alarms are as rare as allowed'}.",
+        500,
+    )
 
 
 def _given(document: Mapping[str, Any]) -> dict[str, Entry]:
@@ -233,15 +245,29 @@ def is_shown(limit: str) -> bool:
 
 
 def alarm_rates(rates: Mapping[str, Any]) -> Iterator[str]:
-    """In words, how often the watchdog stops a good run and misses a bad one."""
+    """In words, how often the watchdog stops a good run and misses a bad one, and what it notices."""
     for name, runs in (("false_alarms", "good runs"), ("missed_alarms", "runs to be stopped")):
         one = rates.get(name)
         if isinstance(one, Mapping) and {"runs", "alarms", "low", "high"} <= one.keys():
-            interval = f"95 %: {_number(one['low'], 2)} to {_number(one['high'], 2)}"
+            allowed = f", allowed {_number(one['allowed'], 2)}" if "allowed" in one else ""
+            interval = f"95 %: {_number(one['low'], 2)} to {_number(one['high'], 2)}{allowed}"
             yield f"{name.replace('_', ' ')} {one['alarms']} of {one['runs']} {runs} ({interval})"
+    noticed = rates.get("noticed_from")
+    if isinstance(noticed, Mapping):
+        yield from _noticed(noticed, rates)
     calibrated = rates.get("calibrated_on")
     if isinstance(calibrated, Mapping) and calibrated.get("runs") not in (None, "good"):
         yield "no run was good: the limits come from runs with errors beyond the limit"
+
+
+def _noticed(noticed: Mapping[str, Any], rates: Mapping[str, Any]) -> Iterator[str]:
+    if rates.get("widened_from") is not None:
+        widened = f"{_number(rates['widened_from'], 2)} to {_number(rates['restitution_margin'], 2)}"
+        yield f"restitution_margin widened from {widened}, or too many good runs would be stopped"
+    if noticed.get("error") is not None:
+        yield f"errors from {_number(noticed['error'], 2)} on are noticed in 95 % of contacts"
+    elif noticed.get("largest") is not None:
+        yield f"of no errors, up to the largest of {_number(noticed['largest'], 2)}, are 95 % noticed"
 
 
 def _table(

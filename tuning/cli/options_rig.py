@@ -16,7 +16,8 @@ class Export:
 
     Example: jaxhil export jaxhil-out/varying/gains.json -o bundle --sweep jaxhil-out/sweep
 
-    Exit code 1 if the controller on the rig does not do what was simulated.
+    Exit code 1 if the controller on the rig does not do what was simulated, or is known to stop good runs or
+    to miss bad ones more often than allowed.
     """
 
     gains: Annotated[Positional[str], arg(metavar="GAINS", help="Gain file, or its folder.")]
@@ -41,6 +42,16 @@ class Export:
             name="set",
         ),
     ] = ()
+    false_alarms: Annotated[
+        float,
+        arg(
+            metavar="PROBABILITY", help="Acceptable share of good runs (error up to half the limit) stopped."
+        ),
+    ] = 0.01
+    missed: Annotated[
+        float,
+        arg(metavar="PROBABILITY", help="Acceptable share of runs to be stopped that the watchdog misses."),
+    ] = 0.02
     seed: Annotated[int, number("Seed of the test vectors.")] = 0
     sign: Annotated[
         str | None,

@@ -31,14 +31,25 @@ class Exported:
     sizes: dict[str, int]
 
     @property
+    def verdict(self) -> str:
+        """ "good"; "bad" if the controller on the rig does not do what was simulated, or raises wrong alarms
+        more often than allowed; "unknown" if nothing is bad, but too few runs say how often it does."""
+        return self.document["verdict"]
+
+    @property
     def good(self) -> bool:
-        """Whether the controller on the rig does what was simulated; else no bundle may have been written."""
-        return not self.document["reasons"]
+        """Whether nothing was found to be bad: the exit code 0 of `jaxhil export`."""
+        return self.verdict != "bad"
 
     @property
     def reasons(self) -> list[str]:
-        """Why it is bad; none if it is good."""
+        """Why it is bad; none if it is not."""
         return list(self.document["reasons"])
+
+    @property
+    def unknown(self) -> list[str]:
+        """What is not known, and which sweep would tell; nothing if it is good."""
+        return list(self.document["unknown"])
 
 
 @arguments.entry
@@ -49,6 +60,8 @@ def export(
     sweep: Any = None,
     formats: Sequence[str] | None = None,
     limits: Mapping[str, float | None] | None = None,
+    false_alarms: float = 0.01,
+    missed: float = 0.02,
     seed: int = 0,
     sign: str | os.PathLike[str] | None = None,
     progress: bool = False,
@@ -62,6 +75,8 @@ def export(
             rates come from it.
         formats: also the gains for "ros2", "matlab", "csv", "c99"; None: all that there are for the law.
         limits: limits of the rig's own by name [SI units], None for no limit, instead of those worked out.
+        false_alarms: the share of good runs [1] that the controller may stop.
+        missed: the share of runs to be stopped [1] that its watchdog may miss.
         seed: of the test vectors.
         sign: file of the private key (Ed25519, PEM) to sign the bundle with; None: it is not signed.
         progress: say on standard error what is going on.
@@ -72,6 +87,7 @@ def export(
     """
     arguments.integers(0, seed=seed)
     arguments.flags(progress=progress)
+    arguments.probabilities(false_alarms=false_alarms, missed=missed)
     from tuning.bundle.bundle import build_bundle, check_target, write_bundle
     from tuning.bundle.signing import signer
 
@@ -85,7 +101,7 @@ def export(
         loaded = arguments.gain_file(path)
         arguments.runtime(loaded.compensator)
         chosen = _formats(formats, loaded.compensator)
-        found = _calibrated(loaded, sweep, replaced, progress)
+        found = _calibrated(loaded, sweep, replaced, (false_alarms, missed), progress)
         with terminal.stages(2, progress) as stages:
             bundle = build_bundle(loaded.document, chosen, found.limits, found.rates, seed, stages.begin, key)
             if not bundle.reasons:
@@ -99,7 +115,8 @@ def _document(loaded, bundle, chosen, rates) -> dict[str, Any]:
     """What `jaxhil export --json` prints, but for where the bundle is."""
     # A run that ends early in the bundle itself does so on the rig.
     stopped = bundle.ended[0] if bundle.ended else None
-    reasons = [*bundle.reasons, *([f"the nominal run, {stopped}"] if stopped else [])]
+    stops = [f"the nominal run, {stopped}"] if stopped else []
+    reasons = [*bundle.reasons, *stops, *rates["reasons"]]
     return {
         "bundle": None,
         "mechanism": loaded.mechanism.name,
@@ -114,13 +131,17 @@ def _document(loaded, bundle, chosen, rates) -> dict[str, Any]:
         "runs": bundle.runs,
         "ended": bundle.ended,
         "reasons": reasons,
-        "verdict": "bad" if reasons else "good",
+        "unknown": rates["unknown"],
+        "verdict": "bad" if reasons else rates["verdict"],
     }
 
 
-def _calibrated(loaded, sweep: Any, replaced: dict[str, float | None], progress: bool):
+def _calibrated(
+    loaded, sweep: Any, replaced: dict[str, float | None], allowed: tuple[float, float], progress: bool
+):
     """The limits for the rig, and what is known of the watchdog's alarms."""
     from tuning.watchdog.calibration import WITHOUT_STORE, calibrate
+    from tuning.watchdog.verdict import Allowed
 
     with _store(sweep) as store:
         runs = WITHOUT_STORE if store is None else store.manifest.scenarios
@@ -129,6 +150,7 @@ def _calibrated(loaded, sweep: Any, replaced: dict[str, float | None], progress:
                 loaded,
                 store,
                 replaced=replaced,
+                allowed=Allowed(*allowed),
                 progress=lambda number: bar.advance(number, "working out the limits"),
             )
 

@@ -131,6 +131,22 @@ def scenarios_needed(probability: float, width: float, level: float = LEVEL) -> 
     return int(numbers[min(np.max(np.nonzero(~narrow)[0], initial=-1) + 1, len(numbers) - 1)])
 
 
+def number_to_decide(failures: int, number: int, allowed: float, level: float = LEVEL) -> int | None:
+    """About how many scenarios it takes, at the share of failures seen so far, until `binomial_interval` lies
+    below `allowed`, or above it if that is where the share lies; None if a billion do not do.
+
+    Without scenarios so far the share is taken for 0. Raises ValueError as `binomial_interval` does.
+    """
+    _counts(failures, number, level)
+    share = failures / number if number else 0.0
+    numbers = np.unique(np.ceil(1.01 ** np.arange(2083)))
+    _, low, high = binomial_interval(np.round(share * numbers), numbers, level)
+    decided = high <= allowed if share <= allowed else low > allowed
+    # Rounding makes the ends waver: the last number too few counts.
+    enough = np.max(np.nonzero(~decided)[0], initial=-1) + 1
+    return int(numbers[enough]) if enough < len(numbers) else None
+
+
 def replicate_interval(failures: ArrayLike, number: int, level: float = LEVEL) -> Estimate:
     """Interval of the probability from independent scramblings of a Sobol sequence.
 

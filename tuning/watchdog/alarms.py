@@ -19,6 +19,8 @@ from tuning.watchdog.recorded import Chunk
 
 # Of the limit: up to the first a run is good, beyond the second it has to be stopped.
 GOOD_ERROR, BAD_ERROR = 0.5, 1.0
+NOTICED = 0.95  # share of the contacts that are noticed from the stated error on
+FEW = 20  # contacts of which such a share says something
 
 
 class JudgedRuns(NamedTuple):
@@ -72,11 +74,13 @@ def watchdog_rates(
     mass: float,
     chosen: Bool[np.ndarray, "lanes"],
 ) -> dict[str, Any]:
-    """False and missed alarms among the chosen runs, with exact intervals of 95 %.
+    """False and missed alarms among the chosen runs, with exact intervals of 95 %, and from which error on
+    contacts are noticed.
 
     A run is good if no error exceeds half the limit, and a false alarm if the watchdog or another guard stops
     it. It has to be stopped if some contact does not end or has an error beyond the limit, and is missed if
-    the watchdog has not tripped by the end of that contact.
+    the watchdog has not tripped by the end of that contact. The intervals hold for independent scenarios,
+    whose number may follow from how many of them fail; those of Sobol sequences are spread more evenly.
     """
     alarmed = alarms(runs, expectation, limits, mass)
     first_alarm = first_reached(alarmed)
@@ -96,6 +100,7 @@ def watchdog_rates(
         "expectation_largest": float(np.max(apart)) if len(apart) else None,
         "false_alarms": _rate(stopped_anyhow[good]),
         "missed_alarms": _rate(first_alarm[stopped] > first_bad[stopped]),
+        "noticed_from": noticed_from(runs.error[use], alarmed[use]),
         "held_out_runs": int(np.sum(chosen)),
     }
 
@@ -139,6 +144,23 @@ def guard_trips(extent: Extent, limits: Mapping[str, float | None]) -> Bool[np.n
         | (extent.slew > limit("force_slew"))
         | (extent.sent_speed > limit("velocity_limit"))
     )
+
+
+def noticed_from(
+    error: Float[np.ndarray, "contacts"], alarmed: Bool[np.ndarray, "contacts"]
+) -> dict[str, Any]:
+    """The least |error| such that of the contacts with one as large or larger 95 % are `alarmed` about; None
+    where there is none, or only with fewer than 20 such contacts. `contacts`: how many these are; `largest`:
+    the largest |error| of all."""
+    size = np.abs(error)
+    order = np.argsort(-size)
+    number = np.arange(1, len(size) + 1)
+    enough = (np.cumsum(alarmed[order]) >= NOTICED * number) & (number >= FEW)
+    largest = float(size[order[0]]) if len(size) else None
+    if not np.any(enough):
+        return {"error": None, "contacts": 0, "largest": largest}
+    last = int(np.max(np.nonzero(enough)[0]))
+    return {"error": float(size[order[last]]), "contacts": last + 1, "largest": largest}
 
 
 def _rate(alarmed: Bool[np.ndarray, "runs"]) -> dict[str, Any]:

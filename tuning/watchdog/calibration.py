@@ -3,7 +3,7 @@
 The scenarios of a sweep's store are run again, recorded, and judged: a run is good if no contact's error
 exceeds the sweep's limit. To some of the runs the watchdog's expected restitution is fitted, and limits are
 margins on what the good ones among them needed; what shares of the other runs are stopped for nothing, or
-missed, is stated with exact intervals.
+missed, is stated with exact intervals, and with a verdict on them.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,9 +21,11 @@ from jaxhil.simulation.scenario import build_scenarios
 from tuning.sweeps.store import Store, kept_part
 from tuning.watchdog.alarms import JudgedRuns, features_of, good_runs, judge_chunk, reached, watchdog_rates
 from tuning.watchdog.audited import Rules
-from tuning.watchdog.expectation import Expectation, Features, expected_restitution, fit_expectation
+from tuning.watchdog.expectation import Expectation, Features, fit_expectation
 from tuning.watchdog.extent import Extent
+from tuning.watchdog.margin import restitution_margin
 from tuning.watchdog.recorded import LANES, Scenarios, recorded_chunks
+from tuning.watchdog.verdict import ALLOWED, Allowed, judged
 
 MARGIN = 1.5  # on what good runs did
 FITTED = 2048  # runs that are enough to fit to: all others judge, at least 3 of 4 and at most 15 of 16
@@ -34,9 +36,6 @@ BRIDGED = 3  # ticks: bad readings, missed ticks, cut rates in a row
 TARE = 0.1  # s
 RETREAT = 0.005  # s of free approach: what counts as out of contact besides what the sensor may err
 BALANCE = 1e-6  # of the approach's energy: what rounding leaves is far below, one wrong force far above
-BEYOND = 1.25  # times the expectation's largest error among the fitted runs: what others may have
-# Of the limit: the least margin of the restitution, and the one that a good expectation has.
-LEAST, PLACE = 0.25, 0.75
 ENOUGH = 0.01  # of the limit: rms error of an expectation that need not be better
 
 
@@ -55,9 +54,10 @@ def calibrate(
     limit: float | None = None,
     lanes: int = LANES,
     replaced: Mapping[str, float | None] | None = None,
+    allowed: Allowed = ALLOWED,
     progress: Callable[[int], None] = lambda runs: None,
 ) -> Calibration:
-    """Limits for the rig, and the watchdog's rates of false and missed alarms.
+    """Limits for the rig, and the watchdog's rates of false and missed alarms, judged by what is `allowed`.
 
     Args: `loaded`, the gain file; `store`, a sweep's of that gain file, whose scenarios are run again, all of
     them or the first so many `scenarios`; without a store so many draws of the file's own uncertainty (512).
@@ -84,14 +84,17 @@ def calibrate(
     if not np.any(used):
         raise InputError("limits: found no run all of whose contacts end, allowed gains with which they do")
     expectation = fit_reached(runs, limit, rules.mass, fitted)
-    margin = restitution_margin(runs, expectation, limit, rules.mass, fitted)
+    margin = restitution_margin(runs, expectation, limit, rules.mass, fitted, allowed.false_alarms)
     limits = {
         **guard_limits(loaded, runs, used, rules, free_distance),
         **expectation.limits(),
-        "restitution_margin": margin,
+        "restitution_margin": margin.value,
     }
-    found = {name: limits.get(name) for name in LIMITS} | dict(replaced or {})
-    rates = watchdog_rates(runs, expectation, found, limit, rules.mass, ~fitted)
+    replaced = replaced or {}
+    found = {name: limits.get(name) for name in LIMITS} | dict(replaced)
+    rates = watchdog_rates(runs, expectation, found, limit, rules.mass, ~(fitted | margin.runs))
+    rates = judged(rates, allowed, chosen.number)
+    rates["widened_from"] = None if "restitution_margin" in replaced else margin.widened_from
     rates["calibrated_on"] = {
         "scenarios": chosen.number,
         "sampling": chosen.sampling,
@@ -133,23 +136,6 @@ def fit_reached(
     place = np.broadcast_to(np.cumsum(chosen), use.shape)[use]
     features = Features(*(leaf[use] for leaf in features_of(runs.audited)))
     return fit_expectation(features, runs.reference[use], place, mass, ENOUGH * limit)
-
-
-def restitution_margin(
-    runs: JudgedRuns, expectation: Expectation, limit: float, mass: float, chosen: Bool[np.ndarray, "lanes"]
-) -> float:
-    """Where to trip: at `PLACE` of the limit, nearer to 0 if the expectation errs by more than the rest.
-
-    An error e - e* beyond the limit is seen if the expectation errs by less than limit - margin; it comes
-    first that none is missed, then that few are alarmed about for nothing.
-    """
-    use = reached(runs, limit) & (runs.status == OK) & chosen
-    expected = expected_restitution(expectation, features_of(runs.audited), mass)
-    # Together with what the audit's own restitution differs from the loop's.
-    apart = runs.audited.restitution - expected - runs.error
-    apart = np.abs(apart[use])
-    largest = float(np.max(apart, initial=0.0))
-    return float(np.clip(limit - BEYOND * largest, LEAST * limit, PLACE * limit))
 
 
 def guard_limits(

@@ -12,7 +12,7 @@ from tuning.front_door.export import export
 
 
 def run(options: Export) -> int:
-    """0 if the runtime does what was simulated; 1 if not: nothing is written if the forces differ."""
+    """1 if something is bad, else 0: nothing is written if the runtime's forces are not those simulated."""
     formats = [name.strip() for given in options.formats for name in given.split(",")]
     found = export(
         options.gains,
@@ -20,6 +20,8 @@ def run(options: Export) -> int:
         sweep=options.sweep,
         formats=formats or None,
         limits=_replaced(options.limits),
+        false_alarms=options.false_alarms,
+        missed=options.missed,
         seed=options.seed,
         sign=options.sign,
         progress=True,
@@ -76,11 +78,13 @@ def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
             *(["Signed: `jaxhil verify --key` with the public key proves it."] if document["signed"] else []),
             f"On the rig: python {Path(document['bundle']).name}/selftest.py",
         ]
-    if document["reasons"]:
-        lines += [f"Bad: {reason}" for reason in document["reasons"]]
-    else:
+    lines += [f"Bad: {reason}" for reason in document["reasons"]]
+    lines += [f"Unknown: {text}." for text in document["unknown"]]
+    if document["verdict"] != "bad":
+        good = document["verdict"] == "good"
         lines.append(
-            f"Good: {document['ticks']} ticks of {document['runs']} runs recorded; the controller's forces "
-            "are those simulated."
+            f"{'Good' if good else 'Not known to be good'}: {document['ticks']} ticks of {document['runs']} "
+            "runs recorded; the controller's forces are those simulated, "
+            f"{'wrong alarms as rare as' if good else 'wrong alarms perhaps not as rare as'} allowed."
         )
     terminal.emit(*tables, *lines)
