@@ -1,0 +1,215 @@
+"""Fresh scenarios through the controller in C with every guard on and its limits as exported.
+
+Scenarios of a seed that calibration does not know are recorded and put through the compiled controller, tick
+by tick with its clock. A run is bad if some contact's restitution error exceeds the limit, or a contact does
+not end: it is missed unless the controller has tripped before the tick on which the next contact begins
+(after the last one: once the next run is announced). It is good if no error exceeds half the limit: a false
+alarm if any fault is raised at all, whether it trips or not, but for a law's word that it is in doubt.
+"""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from c99_cases import (
+    NEXT_CONTACT,
+    RESULT,
+    ROW,
+    Batch,
+    assert_same,
+    compiled,
+    controller_in_python,
+    packed,
+    write_sources,
+)
+
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.runtime import digest
+from jaxhil.runtime.faults import LAW_IN_DOUBT, names
+from jaxhil.runtime.gain_file import GainFile, check_gain_document
+from jaxhil.simulation.gain_file import LoadedGains, check_document
+from jaxhil.simulation.integrators import INTEGRATORS
+from jaxhil.simulation.metrics import OK
+from tuning.bundle.bundle import limits_section
+from tuning.gain_file import build_document
+from tuning.statistics.intervals import binomial_interval
+from tuning.watchdog.calibration import WITHOUT_STORE, calibrate
+from tuning.watchdog.recorded import Chunk, Scenarios, recorded_chunks
+
+FRESH = 20_000  # seed; limits are calibrated on draws of seed 0
+SEEN, CAUSE, TRIPPED = (RESULT.index(name) for name in ("seen", "cause", "tripped"))
+
+
+class Exported(NamedTuple):
+    """A controller with the limits for a restitution error, in C and as its gain file says."""
+
+    name: str
+    limit: float
+    batch: Batch
+    parameters: np.ndarray
+    gain_file: GainFile
+
+
+class Record(NamedTuple):
+    """A lane: what the controller is given, row by row; restitution errors of its contacts, NaN for one
+    that did not end; the row on which each begins."""
+
+    rows: np.ndarray
+    error: np.ndarray
+    begins: np.ndarray
+
+
+class Verdict(NamedTuple):
+    """What the controller made of a lane: the row on which it tripped, or None; the first row with a fault;
+    the bits that tripped it, and all that were raised."""
+
+    row: int | None
+    faulty: int | None
+    cause: int
+    seen: int
+
+
+class Counts:
+    """Runs of either kind, and what was found wrong: (lane, row, names of faults)."""
+
+    def __init__(self) -> None:
+        self.lanes = self.good = self.bad = self.between = self.between_stopped = 0
+        self.missed: list[tuple[int, int, str]] = []
+        self.false: list[tuple[int, int, str]] = []
+        self.causes: Counter[str] = Counter()
+        self.early = 0
+
+    def add(self, record: Record, verdict: Verdict, limit: float) -> None:
+        lane, error = self.lanes, np.abs(record.error)
+        self.lanes += 1
+        beyond = ~(error <= limit)
+        if beyond.any():
+            self.bad += 1
+            first = int(np.argmax(beyond))
+            assert first < len(record.begins), "a contact that was judged but not made"
+            due = record.begins[first + 1] if first + 1 < len(record.begins) else len(record.rows)
+            if verdict.row is None or verdict.row >= due:
+                self.missed.append((lane, -1 if verdict.row is None else verdict.row, _text(verdict.seen)))
+            else:
+                self.early += verdict.row < record.begins[first]
+                self.causes[_text(verdict.cause)] += 1
+        elif np.all(error <= 0.5 * limit):
+            self.good += 1
+            if verdict.seen & ~LAW_IN_DOUBT or verdict.row is not None:
+                row = verdict.faulty if verdict.faulty is not None else verdict.row
+                self.false.append((lane, -1 if row is None else row, _text(verdict.seen)))
+        else:
+            self.between += 1
+            self.between_stopped += verdict.row is not None
+
+    def __str__(self) -> str:
+        lines = [
+            f"  bad {self.bad}, missed {_share(len(self.missed), self.bad)}; stopped by {dict(self.causes)}",
+            f"  bad and not stopped before the first bad contact {self.bad - self.early}, "
+            f"missed {_share(len(self.missed), self.bad - self.early)}",
+            f"  good {self.good}, false alarms {_share(len(self.false), self.good)}",
+            f"  between {self.between}, stopped {self.between_stopped}",
+            *(f"  missed: lane {lane}, row {row}, {text}" for lane, row, text in self.missed[:10]),
+            *(f"  false alarm: lane {lane}, row {row}, {text}" for lane, row, text in self.false[:10]),
+        ]
+        return "\n".join(lines)
+
+
+def _text(bits: int) -> str:
+    return ", ".join(names(bits)) or "nothing"
+
+
+def _share(count: int, number: int) -> str:
+    _, low, high = binomial_interval(count, number)
+    return f"{count} ({low:.2g} to {high:.2g})"
+
+
+def gains(parsed: Mechanism, values: dict[str, float], compensator: str = "response_error") -> LoadedGains:
+    return check_document(build_document(compensator, values, parsed, "0" * 64, {}, {}, 0, {}))
+
+
+def export(
+    loaded: LoadedGains, limit: float, folder: Path, scenarios: int = WITHOUT_STORE, lanes: int = 1024
+) -> tuple[Exported, dict[str, Any]]:
+    """The gains with limits calibrated on so many draws, compiled; the rates that calibration states."""
+    limits, rates = calibrate(loaded, scenarios=scenarios, limit=limit, lanes=lanes)
+    document = {**loaded.document, "limits": limits_section(limits)}
+    document["sha256"] = digest(document)
+    gain_file = check_gain_document(document)
+    sources = write_sources(folder / f"{limit}-{scenarios}", document)
+    library = compiled(sources, "c99_driver.c", "driver.so", "-O2", "-shared", "-fPIC")
+    batch = Batch(library, gain_file.compensator)
+    parameters = batch.exported()
+    assert parameters.tolist() == packed(gain_file.compensator, gain_file).tolist()
+    return Exported(f"limit {limit}, calibrated on {scenarios}", limit, batch, parameters, gain_file), rates
+
+
+def records(chunk: Chunk, parsed: Mechanism):
+    """Every lane of a chunk, as `Record`."""
+    signals, period = chunk.signals, parsed.rig.control_period
+    lengths = signals.live.sum(axis=0)
+    assert all(signals.live[:length, lane].all() for lane, length in enumerate(lengths))
+    ticks, lanes = signals.force.shape
+    time = np.broadcast_to(period * np.arange(ticks)[:, None], (ticks, lanes))
+    mass = np.broadcast_to(chunk.scenarios.equivalent_mass, (lanes,))
+    acceleration = -signals.command / mass
+    motion = (jnp.asarray(leaf) for leaf in (signals.position, signals.velocity, acceleration))
+    moved = INTEGRATORS[parsed.rig.integrator](*motion, jnp.asarray(period))
+    columns = (
+        *(np.where(signals.begins, NEXT_CONTACT, 0.0), signals.force, signals.position, signals.velocity),
+        *(signals.measured, time, np.ones_like(time), *map(np.asarray, moved), acceleration),
+    )
+    for lane, length in enumerate(lengths):
+        rows = np.empty((length + 1, len(ROW)))
+        for place, column in enumerate(columns):
+            rows[:-1, place] = column[:length, lane]
+        # A further run is announced, which audits the last contact, and begins as the first did.
+        rows[-1] = rows[0]
+        rows[-1, 5] = length * period
+        rows[0, 0] = 0.0
+        yield Record(rows, chunk.contacts.error[:, lane], _contact_rows(rows, parsed.contact.clearance))
+
+
+def _contact_rows(rows: np.ndarray, clearance: float) -> np.ndarray:
+    """The rows on which contacts begin: the first beyond a surface, by the model's or the measured position,
+    in each run, and the first beyond the other surface."""
+    position, measured = rows[:-1, 2], rows[:-1, 4]
+    near = (position > 0) | (measured > 0)
+    far = (position < -clearance) | (measured < -clearance)
+    run = np.cumsum(rows[:-1, 0] == NEXT_CONTACT)
+    touching = np.flatnonzero(near | far)
+    place = 2 * run[touching] + far[touching]
+    return touching[np.diff(place, prepend=-1) != 0]
+
+
+def verdict_of(results: np.ndarray) -> Verdict:
+    """From a lane's results, of either controller."""
+    tripped, faulty = (np.flatnonzero(results[:, column]) for column in (TRIPPED, SEEN))
+    return Verdict(
+        int(tripped[0]) if len(tripped) else None,
+        int(faulty[0]) if len(faulty) else None,
+        *(int(results[-1, column]) for column in (CAUSE, SEEN)),
+    )
+
+
+def counted(
+    loaded: LoadedGains, exported: list[Exported], number: int, lanes: int, in_python: int
+) -> list[Counts]:
+    """So many fresh scenarios through each of the controllers, a few of them through Python's as well."""
+    counts = [Counts() for _ in exported]
+    for chunk in recorded_chunks(loaded, Scenarios("random", FRESH, number), lanes):
+        assert np.all(np.isfinite(chunk.contacts.error) == (chunk.contacts.status == OK))
+        for lane, record in enumerate(records(chunk, loaded.mechanism)):
+            for one, count in zip(exported, counts, strict=True):
+                # A fresh controller, as the rig's program begins.
+                assert one.batch.begin(one.parameters)
+                results = one.batch.run(record.rows, guarded=True)
+                count.add(record, verdict_of(results), one.limit)
+                if chunk.first + lane < in_python:
+                    with np.errstate(all="ignore"):
+                        other = controller_in_python(one.gain_file, record.rows)
+                    assert_same(results, other, record.rows)
+                    assert verdict_of(other) == verdict_of(results)
+    return counts

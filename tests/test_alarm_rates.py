@@ -1,0 +1,68 @@
+"""The watchdog's rates of alarm on fresh scenarios are within what the verdict of `jaxhil export` says.
+
+Every built-in mechanism, and one whose damping and delay are both uncertain, at the literature's gains. The
+limit of the error is one that a third of the runs exceed: good and bad runs are then frequent enough to tell
+rates apart. Limits and verdict come from draws of one seed, the fresh rates from draws of another, through
+the controller in C. Run with `pytest -m slow -s tests/test_alarm_rates.py`.
+"""
+
+import numpy as np
+import pytest
+from c99_cases import COMPILER
+from fresh_runs import counted, export, gains
+
+from jaxhil.compensators import literature_gains
+from jaxhil.mechanism.file import builtin_names, load, suite_names
+from jaxhil.simulation.metrics import OK
+from tuning.statistics.intervals import binomial_interval
+from tuning.watchdog.recorded import Scenarios, recorded_chunks
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(COMPILER is None, reason="no C compiler (cc) on this machine"),
+]
+LANES, CALIBRATED, FRESH = 512, 2048, 1024
+DOUBTFUL = (
+    'uncertainty."contact.damping"={distribution = "loguniform", factor = [0.5, 2.0]}',
+    'uncertainty."rig.force_sensor.delay"={distribution = "normal", std = 0.0005}',
+)
+CASES = {
+    **{name: (name, (), "response_error") for name in (*builtin_names(), *suite_names())},
+    "damping and delay": ("claw-350kg", DOUBTFUL, "response_error"),
+    "our law": ("varying", (), "retrospective_reference"),
+}
+
+
+def third(loaded):
+    """An error that about a third of the runs exceed, to two digits."""
+    (chunk,) = recorded_chunks(loaded, Scenarios("random", 1, LANES))
+    error = np.where(chunk.contacts.status == OK, np.abs(chunk.contacts.error), np.inf)
+    return float(f"{np.quantile(np.max(error, axis=0), 2 / 3):.1e}")
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_fresh_rates_are_within_what_the_verdict_says(case, tmp_path):
+    name, overrides, compensator = CASES[case]
+    parsed = load(name, overrides).mechanism
+    loaded = gains(parsed, literature_gains(parsed, compensator), compensator)
+    limit = third(loaded)
+    one, rates = export(loaded, limit, tmp_path, CALIBRATED, LANES)
+    (count,) = counted(loaded, [one], FRESH, LANES, in_python=2)
+    print(f"\n{case}, {compensator}: limit {limit:g}, margin {rates['restitution_margin']:.2g}", end="")
+    print(f" widened from {rates['widened_from']:.2g}" if rates["widened_from"] else "", end="")
+    noticed = rates["noticed_from"]["error"]
+    print(f", 95 % noticed from {noticed:.2g}" if noticed else ", no error noticed", rates["verdict"])
+    found = {"false_alarms": (len(count.false), count.good), "missed_alarms": (len(count.missed), count.bad)}
+    for kind, (alarms, runs) in found.items():
+        stated = rates[kind]
+        _, low, high = binomial_interval(alarms, runs)
+        print(
+            f"  {kind}: stated {stated['alarms']} of {stated['runs']} ({stated['low']:.2g} to "
+            f"{stated['high']:.2g}), fresh {alarms} of {runs} ({low:.2g} to {high:.2g})",
+            flush=True,
+        )
+        assert low <= stated["high"] and high >= stated["low"], f"{kind}: {stated}\n{count}"
+        if stated["high"] <= stated["allowed"]:
+            assert low <= stated["allowed"], f"{kind}: {stated}\n{count}"
+        if stated["low"] > stated["allowed"]:
+            assert high > stated["allowed"], f"{kind}: {stated}\n{count}"
