@@ -5,6 +5,7 @@ import copy
 import re
 from html.parser import HTMLParser
 
+import matplotlib
 import numpy as np
 import pytest
 from bundles import document
@@ -143,6 +144,12 @@ def test_the_picture_is_one(made, page, tmp_path):
     # Nothing touches the picture's edge.
     edges = [pixels[:3], pixels[-3:], pixels[:, :3], pixels[:, -3:]]
     assert all(np.all(edge == 1.0) for edge in edges)
+
+
+def test_the_callers_settings_of_matplotlib_are_not_the_pictures(made):
+    with matplotlib.rc_context({"figure.constrained_layout.use": True, "font.size": 20}):
+        inside = picture_png(made)
+    assert inside == picture_png(made)
 
 
 def test_rows_fit_on_one_sheet(page):

@@ -2,12 +2,14 @@
 
 import json
 
+import matplotlib
 import msgspec
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from sweep_cases import case, manifest
 
+from jaxhil.simulation.contact_plot import save
 from jaxhil.simulation.gain_file import check_document
 from tuning.__main__ import main
 from tuning.gain_file import write_gain_file
@@ -180,6 +182,39 @@ def test_convergence_ends_at_the_verdict(swept):
         interval = replicate_interval(each, number // plan.replicates)
     assert ends.min() == pytest.approx(float(interval.low))
     assert ends.max() == pytest.approx(float(interval.high))
+
+
+@pytest.mark.parametrize("acceptable", [None, 0.5])
+def test_convergence_shows_its_end_when_nothing_failed(usual, acceptable):
+    made, mechanism, rows = usual
+    rows = {**rows, "failed": np.zeros(NUMBER, bool)}
+    plan = make_plan(made, mechanism, rows)
+    found = accumulated(plan, rows, [(0, NUMBER)])
+    axes = pictures.convergence(plan, found, made, "name", acceptable).axes[0]
+    last = float(binomial_interval(0, NUMBER).high)
+    low, high = axes.get_ylim()
+    assert low < 0.9 * last and last < 0.9 * high
+    labels = [one.get_label() for one in axes.collections]
+    assert f"95 % at a number fixed beforehand, last 0 to {last:.3g}" in labels
+
+
+def test_pictures_are_the_same_whatever_the_callers_settings(usual, tmp_path):
+    made, mechanism, rows = usual
+    plan = make_plan(made, mechanism, rows)
+    found = accumulated(plan, rows, [(0, NUMBER)])
+
+    def drawn(name):
+        figures = [draw(plan, found, made, "n") for draw in (pictures.error_map, pictures.failure_region)]
+        paths = [tmp_path / f"{name}-{place}.png" for place in range(2)]
+        for figure, path in zip(figures, paths, strict=True):
+            save(figure, path)
+        return [path.read_bytes() for path in paths]
+
+    usually = drawn("usual")
+    settings = {"figure.constrained_layout.use": True, "font.size": 20, "axes.facecolor": "red"}
+    with matplotlib.rc_context({**settings, "savefig.dpi": 30, "lines.linewidth": 9}):
+        assert drawn("other") == usually
+        assert matplotlib.rcParams["font.size"] == 20
 
 
 @pytest.fixture(scope="module")

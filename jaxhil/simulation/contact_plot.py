@@ -1,6 +1,7 @@
 """The picture of a run: force and position over time, contact by contact, beside the same contacts in space.
 
-Figures are made without pyplot: nothing is shown, nothing stays open, and equal data gives equal files.
+Figures are made without pyplot and whatever the caller's settings of matplotlib: nothing is shown, nothing
+stays open, and equal data gives equal files.
 """
 
 import os
@@ -9,6 +10,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import matplotlib.style
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -38,6 +40,7 @@ LABELS = {
 MOST_PANELS = 4  # contacts drawn side by side
 
 
+@matplotlib.style.context("default")
 def contact_plot(pieces: Sequence[Piece], title: str, sensors: str | None = None) -> Figure:
     """Force and position over time, contact by contact, beside the same contact in space.
 
@@ -108,6 +111,7 @@ def finish(axes: Axes, legend: Any) -> None:
         axes.legend(loc=legend, fontsize=8, framealpha=0.9)
 
 
+@matplotlib.style.context("default")
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     """Write a figure, whole or not at all, folders on the way included. Raises OSError when that is not
     possible, or what is there is no plain file."""

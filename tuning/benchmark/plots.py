@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
+import matplotlib.style
 import numpy as np
 from matplotlib.figure import Figure as Picture
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
@@ -20,6 +21,7 @@ TRANSPARENCY = {
 }
 
 
+@matplotlib.style.context("default")
 def errors_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]], limit: float) -> Picture:
     """The rms error of every law with its interval, a panel for every mechanism."""
     keys = _keys(names, found)
@@ -65,6 +67,7 @@ def errors_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]],
     return picture
 
 
+@matplotlib.style.context("default")
 def transparency_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> Picture:
     """Transparency, slope and peak force of every law, tuned: a point for every mechanism."""
     laws = list(dict.fromkeys(one.law for name in names for one in found[name]))

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from typing import Any
 
+import matplotlib.style
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -91,6 +92,7 @@ def about(mechanism: Mapping[str, Any]) -> str:
     )
 
 
+@matplotlib.style.context("default")
 def picture_png(document: Mapping[str, Any]) -> bytes:
     """Restitution error before and after, beside what the gains were tuned over."""
     figure = Figure(figsize=(9.3, 3.1))

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -26,6 +27,7 @@ from tuning.gains.tune import TuneResult
 MARKERS = {"before": "^", "literature": "s", "tuned": "o"}
 
 
+@matplotlib.style.context("default")
 def errors_plot(result: TuneResult, limit: float) -> Figure:
     """How large errors are and how often, and at which contact frequency, before and after tuning."""
     figure = new_figure(
@@ -82,6 +84,7 @@ def errors_plot(result: TuneResult, limit: float) -> Figure:
     return figure
 
 
+@matplotlib.style.context("default")
 def loss_plot(result: TuneResult) -> Figure:
     """The objective that each start of the solver had reached after each step."""
     figure = new_figure((7, 4.6), f"{result.mechanism.name}: tuning from {len(result.starts)} starts")
@@ -111,6 +114,7 @@ def loss_plot(result: TuneResult) -> Figure:
     return figure
 
 
+@matplotlib.style.context("default")
 def overview_plot(results: Sequence[TuneResult], limit: float) -> Figure:
     """The rms restitution error of every mechanism before tuning, with the literature's gains, and tuned."""
     height = 1.6 + 0.2 * len(results)
@@ -134,6 +138,7 @@ def overview_plot(results: Sequence[TuneResult], limit: float) -> Figure:
     return figure
 
 
+@matplotlib.style.context("default")
 def front_plot(front: Front, result: TuneResult, limit: float) -> Figure:
     """Restitution error against what it is traded for: numbered points, the front as a line of what
     is reached, the literature's gains and those tuned beside."""

@@ -1,5 +1,6 @@
 """Histograms of the latencies of a session: what the controller takes, and what the rig sees."""
 
+import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -12,6 +13,7 @@ STYLES = {"empty loop": (ORANGE, "--"), "controller": (BLUE, "-")}
 BINS_PER_DECADE = 20
 
 
+@matplotlib.style.context("default")
 def latency_plot(session: SessionReport, title: str, period: float) -> Figure:
     """Share of ticks by the controller's own time per tick, and by round trip; both axes logarithmic.
 

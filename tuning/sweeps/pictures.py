@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -76,6 +77,7 @@ def write_pictures(store: Store, acceptable: float | None = None) -> list[str]:
     return paths
 
 
+@matplotlib.style.context("default")
 def error_map(plan: Plan, regions: Regions, manifest: Manifest, name: str) -> Figure:
     """Quantiles of |e - e*| over the first input and, as a map, over both."""
     figure = new_figure((8.6, 7.4), f"{name}: restitution error of {regions.scenarios} scenarios", below=0.85)
@@ -96,6 +98,7 @@ def error_map(plan: Plan, regions: Regions, manifest: Manifest, name: str) -> Fi
     return figure
 
 
+@matplotlib.style.context("default")
 def failure_region(plan: Plan, regions: Regions, manifest: Manifest, name: str) -> Figure:
     """Scenarios as points: which failed, over both inputs, and the worst error over each."""
     number = len(plan.per_scenario)
@@ -135,6 +138,7 @@ def failure_region(plan: Plan, regions: Regions, manifest: Manifest, name: str) 
     return figure
 
 
+@matplotlib.style.context("default")
 def convergence(
     plan: Plan, regions: Regions, manifest: Manifest, name: str, acceptable: float | None = None
 ) -> Figure:
@@ -153,13 +157,14 @@ def convergence(
     if plan.replicates == 1:
         _, low, high = binomial_interval(total, looks)
         _, wide_low, wide_high = confidence_sequence(total, looks)
-        said = "95 % interval at a number fixed beforehand"
+        said = "95 % at a number fixed beforehand"
     else:
         each = [replicate_interval(k, n // plan.replicates) for k, n in zip(failures, looks, strict=True)]
         low, high = np.array([one.low for one in each]), np.array([one.high for one in each])
         wide_low = wide_high = None
-        said = f"95 % interval from {plan.replicates} scrambled Sobol replicates"
+        said = f"95 % from {plan.replicates} scrambled Sobol replicates"
     axes.set_xscale("log")
+    said += f", last {low[-1]:.3g} to {high[-1]:.3g}"
     axes.fill_between(looks, low, high, color=SKY, alpha=0.4, linewidth=0, label=said)
     if wide_low is not None and wide_high is not None:
         label = "95 % at all numbers at once: stop wherever you like"
@@ -176,6 +181,7 @@ def convergence(
     _limit_probability(axes, looks, share, low, high, acceptable)
     finish(axes, None)
     axes.set_xlim(looks[0] / 1.05, looks[-1] * 1.05)
+    _plain_ticks(axes.xaxis, looks[0], looks[-1])
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}".replace(",", " ")))
     figure.legend(loc="lower center", fontsize=9, frameon=False, ncols=2)
     return figure
@@ -291,10 +297,8 @@ def _bar_ticks(axis: Axis, low: float, high: float) -> None:
 def _limit_probability(axes: Axes, looks, share, low, high, acceptable: float | None) -> None:
     """Show the later part of the way: at first the interval is wide, whatever the end."""
     late = looks >= looks[-1] / 100
-    top = max(*high[late], *share[late], acceptable or 0.0)
-    least = min(
-        [value for value in (*low[late], *share[late], acceptable or 0.0) if value > 0] or [top / 100]
-    )
+    ends = [*low[late], *high[late], *share[late], acceptable or 0.0]
+    top, least = max(ends), min(value for value in ends if value > 0)
     if share[-1] > 0 and top < 20 * least:
         axes.set_ylim(max(0.0, least - 0.25 * (top - least)), min(1.0, top + 0.25 * (top - least)))
     else:
