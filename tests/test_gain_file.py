@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from laws_from_elsewhere import SquaredSpring
 from scipy import optimize
 
+import jaxhil
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.compensators.response_error import typical_stiffness
 from jaxhil.errors import InputError
@@ -287,6 +289,21 @@ def test_envelope_of_hunt_crossley_is_that_of_the_typical_stiffness():
     envelope = validity_envelope(mechanism, build_scenarios(mechanism))
     omega = math.sqrt(typical_stiffness(mechanism) / 350)
     np.testing.assert_allclose(envelope["contact_frequency"]["low"], omega / (2 * math.pi), rtol=1e-12)
+
+
+def test_envelope_of_a_law_from_elsewhere():
+    """F = k d^2: M v^2/2 = k d^3/3, and F = k^(1/3) (3 M v^2/2)^(2/3); damping is none of its."""
+    jaxhil.register(SquaredSpring())
+    stiffness, velocity = np.array([[4e8, 1e9], [2e8, 5e8]]), np.array([0.004, 0.006])
+    overrides = ["contact.law=squared_spring", "contact.stiffness=[1e9, 5e8]", "approach.contacts=2"]
+    mechanism = load("rig-300kg", overrides).mechanism
+    draws = {"contact.stiffness": stiffness.T, "approach.velocity": velocity}
+    envelope = validity_envelope(mechanism, build_scenarios(mechanism, draws))
+    force = np.cbrt(stiffness) * np.cbrt((1.5 * 300 * velocity**2) ** 2)
+    frequency = force / (velocity * 300) / (2 * math.pi)
+    for name, values in (("force", force), ("contact_frequency", frequency)):
+        found = [envelope[name]["low"], envelope[name]["high"]]
+        np.testing.assert_allclose(found, [np.min(values), np.max(values)], rtol=1e-6)
 
 
 @pytest.mark.parametrize("velocity", [0.002, 0.005, 0.01, 0.05])

@@ -15,9 +15,13 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxhil.compensators import Gain
+from jaxhil.contact.laws import LAWS
+from jaxhil.contact.reference_motion import integrate_contact
 from jaxhil.errors import InputError, shown
 from jaxhil.mechanism.file import to_builtins
 from jaxhil.mechanism.structs import Mechanism
@@ -148,8 +152,10 @@ def _peak_forces(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
         exponent = np.asarray(contact.exponent)
         depth = ((exponent + 1) * energy / stiffness) ** (1 / (exponent + 1))
         return stiffness * depth**exponent
-    if law != "piecewise_linear":
+    if law in ("linear", "kelvin_voigt", "elastoplastic"):
         return np.sqrt(2 * energy * stiffness)
+    if law != "piecewise_linear":
+        return _integrated_peaks(mechanism, scenarios)
     # Segment by segment: the force F at its beginning becomes sqrt(F^2 + 2 k E) if the energy E ends in it.
     depths = np.asarray(contact.depths)
     slots, segments = stiffness.shape[:2]
@@ -163,6 +169,16 @@ def _peak_forces(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
         force = np.sqrt(force**2 + 2 * slope * spent)
         energy, begin = energy - spent, begin + width
     return force
+
+
+def _integrated_peaks(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
+    """The same for a law from elsewhere, whose motion is integrated."""
+    contact, shape = scenarios.contact, np.shape(scenarios.contact.stiffness)
+    parameters = jax.tree.map(jnp.asarray, contact._replace(damping=np.zeros_like(contact.damping)))
+    motion = scenarios.equivalent_mass, scenarios.velocity
+    mass, velocity = (jnp.broadcast_to(jnp.asarray(one), shape) for one in motion)
+    law = LAWS[mechanism.contact.law]
+    return np.asarray(integrate_contact(law, parameters, mass, velocity).peak_force)
 
 
 def _span(values: np.ndarray, unit: str) -> dict[str, Any]:

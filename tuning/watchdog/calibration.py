@@ -15,6 +15,7 @@ from jaxtyping import Bool
 from jaxhil.errors import InputError
 from jaxhil.mechanism.uncertainty import extremes
 from jaxhil.runtime.limits import LIMITS
+from jaxhil.runtime.watchdog import FADED, PATIENCE
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.scenario import build_scenarios
@@ -115,13 +116,17 @@ def watchdog_rules(loaded: LoadedGains) -> tuple[Rules, float]:
     drawn = _largest(loaded)
     # The loop's own wait for the force to die out, with a margin that a drawn delay cannot use up.
     wait = drawn["force_delay"] + 20 * drawn["force_lag"] + 2 * period
+    mass = mechanism.bodies.mass
+    # A force that could not change the velocity in all of that time has died out, however slowly it goes.
+    unfelt = FADED * mass * mechanism.approach.velocity / PATIENCE
+    noise = 3 * drawn["force_noise"] + drawn["force_bias"] + drawn["force_quantum"]
     rules = Rules(
         period=period,
         clearance=mechanism.contact.clearance,
-        mass=mechanism.bodies.mass,
+        mass=mass,
         alignment=max(0.0, force.delay + force.time_constant - position.delay),
         settling=MARGIN * wait,
-        fading=3 * drawn["force_noise"] + drawn["force_bias"] + drawn["force_quantum"],
+        fading=max(noise, unfelt),
     )
     error = 6 * drawn["position_noise"] + drawn["position_quantum"]
     free_distance = error + drawn["velocity"] * (RETREAT + drawn["position_delay"])
