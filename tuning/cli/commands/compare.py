@@ -8,9 +8,12 @@ from typing import Any
 from jaxhil.mechanism.file import LoadedMechanism, load, suite_names
 from jaxhil.simulation.environment import prepare, usable_cores
 from tuning import terminal
+from tuning.cli.commands import checks
 from tuning.cli.options import Compare
 from tuning.files import write_whole, writing
 from tuning.front_door.compare import CompareOptions, board, check_names, compare_each
+
+PICTURES = ("errors.png", "honesty.png")
 
 
 def run(options: Compare) -> int:
@@ -19,7 +22,9 @@ def run(options: Compare) -> int:
     asked = CompareOptions(**{field.name: getattr(options, field.name) for field in fields(CompareOptions)})
     asked.check()
     loaded = _load(options)
-    Path(options.output).mkdir(parents=True, exist_ok=True)
+    folder = Path(options.output)
+    checks.output(folder)
+    checks.own_results(folder / "compare.json", "mechanisms", PICTURES)
     prepare()
     from tuning.benchmark.study import Failed
 
@@ -90,8 +95,9 @@ def _draw(options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence
     from jaxhil.simulation.contact_plot import save
     from tuning.benchmark.plots import errors_plot, transparency_plot
 
-    save(errors_plot(names, ordered, options.limit), Path(options.output) / "errors.png")
-    save(transparency_plot(names, ordered), Path(options.output) / "honesty.png")
+    drawn = errors_plot(names, ordered, options.limit), transparency_plot(names, ordered)
+    for name, figure in zip(PICTURES, drawn, strict=True):
+        save(figure, Path(options.output) / name)
 
 
 def _print(

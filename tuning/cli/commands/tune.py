@@ -11,12 +11,13 @@ from jaxhil.errors import InputError, one_line
 from jaxhil.mechanism.file import LoadedMechanism, load
 from jaxhil.simulation.environment import prepare, program_folder
 from tuning import terminal
-from tuning.cli.commands import tune_pareto
+from tuning.cli.commands import checks, tune_pareto
 from tuning.cli.commands.tune_tables import print_one, print_overview
 from tuning.cli.options import Tune
-from tuning.files import make_folder, writing
+from tuning.files import make_folder, remove_stale, writing
 from tuning.front_door.tune import TunedGains, TuneOptions, tune_each
 
+PICTURES = ("errors.png", "contact.png", "loss.png", "pareto.png")
 MOST_DRAWN = 4  # mechanisms whose plots are drawn; of more there is one picture of all
 
 
@@ -35,7 +36,10 @@ def run(options: Tune) -> int:
     entries, interrupted = [], False
     if loaded:
         # Before jax starts: a folder that cannot be written costs no tuning.
-        Path(options.output).mkdir(parents=True, exist_ok=True)
+        checks.output(Path(options.output))
+        for one in loaded:
+            folder = Path(options.output) / folder_name(one.mechanism.name)
+            checks.own_results(folder / "gains.json", "compensator", PICTURES)
         try:
             entries = _tune_all(options, asked, loaded, problems)
         except _Interrupted as stop:
@@ -168,6 +172,7 @@ def _finish(
     folder = Path(options.output) / folder_name(loaded.mechanism.name)
     with writing(folder):
         make_folder(folder)
+        remove_stale(folder)
     result.save(folder / "gains.json")
     found, plots = result.found, []
     if drawn:

@@ -8,7 +8,7 @@ from jaxhil.errors import InputError
 from jaxhil.simulation.gain_file import load_gain_file
 from tuning import terminal
 from tuning.cli.options import Tune
-from tuning.files import make_folder, open_plain, writing
+from tuning.files import make_folder, open_plain, remove_stale, writing
 from tuning.front_door import tune_pareto
 from tuning.front_door.tune import TunedGains
 from tuning.front_door.tune_pareto import TradedGains
@@ -91,6 +91,7 @@ def _write(options: Tune, points: Sequence[TradedGains], folder: Path) -> dict[s
         for one in (folder / FOLDER, place):
             with writing(one):
                 make_folder(one)
+                remove_stale(one)
         point.save(place / "gains.json")
         gains = {"gain_file": str(place / "gains.json"), "gains": point.document["gains"]}
         entries.append({**point.traded, **gains, "figures": point.figures, "nominal": point.point.nominal})

@@ -1,0 +1,198 @@
+"""Whatever call of the system fails, wherever a command is killed: nothing wrong is left, nothing is lost.
+
+As SQLite is tested: every call that concerns the folders of output and of kept programs fails once, in turn,
+and the process is killed there once, in turn. What is there afterwards is what was there before or what the
+command writes, file by file, whole. The user's files are as they were. The command run again gives what it
+gives undisturbed.
+"""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from faults import COMPILER, HANGS, Ran, Runner, without_times
+from sweep_cases import case
+
+from jaxhil.files import is_temporary
+from jaxhil.runtime import digest
+from tuning.gain_file import write_gain_file
+
+pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler")
+
+USERS = {".thesis.docx.tmp": b"years", ".thesis.docx.1.tmp": b"of", "notes.txt": b"work"}
+
+
+class Command(NamedTuple):
+    """A command that writes. Its arguments are given the folder to write to, and that of the gain files."""
+
+    arguments: Callable[[Path, Path], list[Any]]
+    again: tuple[str, ...] = ()  # added when it is run again
+    before: tuple[tuple[str, ...], ...] = ()  # run before with each of these instead, undisturbed
+    one_piece: str | None = None  # a folder that is replaced as a whole
+
+
+TUNED = ["--compensator", "phase_lead", "--scenarios", 2, "--starts", 1, "--steps", 1, "--validation", 4]
+
+
+def _sweep(out: Path, gains: Path) -> list[Any]:
+    few = ["--scenarios", 6, "--chunk", 2, "--limit", 1.5]
+    return ["sweep", gains / "none.json", *few, "--json", "-o", out / "store"]
+
+
+def _export(out: Path, gains: Path) -> list[Any]:
+    return ["export", gains / "lead.json", "--json", "--format", "csv", "-o", out / "bundle"]
+
+
+def _compare(out: Path, gains: Path) -> list[Any]:
+    few = ["--scenarios", 2, "--judged", 4, "--untuned", "--compensators", "phase_lead"]
+    return ["compare", "rig-300kg", *few, "--json", "-o", out]
+
+
+COMMANDS = {
+    "simulate": Command(lambda out, _: ["simulate", "rig-300kg", "--json", "--plot", out / "plot.png"]),
+    "tune": Command(lambda out, _: ["tune", "rig-300kg", *TUNED, "--json", "-o", out]),
+    "sweep": Command(_sweep, again=("--resume",)),
+    "export": Command(_export, before=(("--seed", "1"),), one_piece="bundle"),
+    "compare": Command(_compare),
+}
+
+
+@pytest.fixture(scope="module")
+def runner(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("faults")
+    for name in ("cache", "scratch", "gains"):
+        (folder / name).mkdir()
+    for name, law in (("none", "none"), ("lead", "phase_lead")):
+        write_gain_file(folder / "gains" / f"{name}.json", case(compensator=law))
+    runner = Runner(folder / "cache", folder / "scratch")
+    for name, content in USERS.items():
+        (runner.cache / name).write_bytes(content)
+    yield runner
+    runner.close()
+
+
+class Bench:
+    """A command, what was there before it, and what it does undisturbed."""
+
+    def __init__(self, runner: Runner, folder: Path, name: str) -> None:
+        self.runner, self.command = runner, COMMANDS[name]
+        self.out, self.kept = folder / "out", folder / "kept"
+        self.gains = runner.scratch.parent / "gains"
+        self.kept.mkdir()
+        for name, content in USERS.items():
+            (self.kept / name).write_bytes(content)
+        self.restore()
+        for other in self.command.before:
+            self.run(*other)
+            shutil.rmtree(self.kept)
+            shutil.copytree(self.out, self.kept)
+        self.before = self.tree()
+        self.run()
+        self.restore()
+        self.undisturbed = self.run()
+        assert self.undisturbed.code in (0, 1), self.undisturbed
+        self.after = self.tree()
+
+    def restore(self) -> None:
+        """What was there before."""
+        shutil.rmtree(self.out, ignore_errors=True)
+        shutil.copytree(self.kept, self.out)
+
+    def run(self, *more: str, **fault: Any) -> Ran:
+        arguments = self.command.arguments(self.out, self.gains)
+        return self.runner.run(*arguments, *more, folders=(self.out, self.runner.cache), **fault)
+
+    def tree(self) -> dict[str, Any]:
+        """Every file but those that were not finished, without dates and times."""
+        names = [str(path.relative_to(self.out)) for path in self.out.rglob("*") if path.is_file()]
+        finished = [name for name in names if not any(map(is_temporary, Path(name).parts))]
+        return {name: _content(self.out / name) for name in finished}
+
+    def everything(self) -> dict[str, bytes]:
+        """Every file below the folder of output, and below that of kept programs, to the bit."""
+        files = [
+            path for folder in (self.out, self.runner.cache) for path in folder.rglob("*") if path.is_file()
+        ]
+        return {os.path.relpath(path, self.out): path.read_bytes() for path in files}
+
+    def disturb(self, at: int, kill: bool, *more: str) -> bool:
+        """Run it with a fault, and look at what is there: whether anything is another than before."""
+        there, everything = self.tree(), self.everything()
+        ran = self.run(*more, at=at, kill=kill)
+        what = f"{'killed' if kill else 'failed'} at call {at}, {ran.calls[-1:]}: {ran.code} {ran.err[-400:]}"
+        assert ran.code != HANGS and "internal error" not in ran.err and "Traceback" not in ran.err, what
+        found = self.tree()
+        if not kill and ran.code == self.undisturbed.code:
+            assert found == self.after, f"{what}: {_differing(found, self.after)}"
+            assert ran.document == self.undisturbed.document, what
+        elif not kill:
+            assert ran.code == 2 and ran.err.splitlines()[-1].startswith("jaxhil: "), what
+        for name, content in found.items():
+            # A verdict grows with what is known.
+            whole = content in (there.get(name), self.after.get(name)) or _is_signed(content)
+            assert whole, f"{what}: {name}"
+        assert there.keys() <= found.keys(), f"{what}: {there.keys() - found.keys()}"
+        for name, content in USERS.items():
+            assert found[name] == (self.runner.cache / name).read_bytes() == content, f"{what}: {name}"
+        if (piece := self.command.one_piece) is not None:
+            now, old, new = (_below(tree, piece) for tree in (found, there, self.after))
+            assert now in (old, new), what
+        return self.everything() != everything
+
+    def run_again(self) -> None:
+        """Undisturbed, after all that."""
+        ran = self.run(*self.command.again)
+        assert ran.code == self.undisturbed.code, ran
+        assert ran.document == self.undisturbed.document
+        assert self.tree() == self.after, _differing(self.tree(), self.after)
+        assert not [path for path in self.out.rglob("*") if is_temporary(path.name)]
+
+
+def _content(path: Path) -> Any:
+    content = path.read_bytes()
+    if path.suffix != ".json":
+        return content
+    document = json.loads(content)
+    if path.name == "verdict.json":
+        assert document["sha256"] == digest(document)
+    return without_times(document)
+
+
+def _is_signed(content: Any) -> bool:
+    """Whether it is a verdict; `_content` has looked at its digest."""
+    return isinstance(content, dict) and "sweep_sha256" in content and "verdict" in content
+
+
+def _below(tree: dict[str, Any], folder: str) -> dict[str, Any]:
+    return {name: content for name, content in tree.items() if name.startswith(f"{folder}/")}
+
+
+def _differing(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
+    return [name for name in one.keys() | other.keys() if one.get(name) != other.get(name)]
+
+
+def test_a_sweep_survives_one_fault_after_another(runner, tmp_path):
+    bench = Bench(runner, tmp_path, "sweep")
+    bench.restore()
+    calls = bench.undisturbed.calls
+    writes = [number for number, call in enumerate(calls) if call.startswith(("write", "rename", "fsync"))]
+    assert len(writes) > 20
+    bench.disturb(writes[1], True)
+    bench.disturb(writes[4], False, "--resume")
+    bench.disturb(writes[-2], True, "--resume")
+    bench.run_again()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kill", [False, True], ids=["fails", "killed"])
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_every_call_fails_once_and_is_the_last_once(runner, tmp_path, name, kill):
+    bench = Bench(runner, tmp_path, name)
+    for at in range(len(bench.undisturbed.calls)):
+        bench.restore()
+        if bench.disturb(at, kill):
+            bench.run_again()

@@ -1,0 +1,88 @@
+"""Commands replace what they wrote, and touch nothing else: no file of the user's, no link, no pipe."""
+
+import json
+import os
+
+import pytest
+from sweep_cases import case
+
+from tuning.gain_file import write_gain_file
+
+COMPARE = ("compare", "rig-300kg", "--untuned", "--compensators", "none", "--scenarios", "1", "--judged", "2")
+
+
+@pytest.fixture
+def thesis(tmp_path):
+    """A folder of the user's."""
+    folder = tmp_path / "thesis"
+    folder.mkdir()
+    for name in (".thesis.docx.tmp", ".thesis.docx.1.tmp", "errors.png", "loss.png", ".lock"):
+        (folder / name).write_text("years")
+    return folder
+
+
+@pytest.fixture
+def untouched(thesis):
+    """Everything below the folder is as it was in the end."""
+
+    def everything():
+        files = sorted(thesis.rglob("*"))
+        return [(path, os.lstat(path).st_mode, path.is_file() and path.read_bytes()) for path in files]
+
+    before = everything()
+    yield
+    assert everything() == before
+
+
+def refused(ran, *words):
+    assert ran.code == 2 and ran.err.count("\n") == 1, ran
+    for word in words:
+        assert word in ran.err
+
+
+def test_results_do_not_replace_files_of_something_else(jaxhil, thesis, untouched):
+    refused(jaxhil(*COMPARE, "-o", thesis), "errors.png: found a file of something else")
+    tune = ("tune", "rig-300kg", "-o", thesis.parent, "--set", "name='thesis'")
+    refused(jaxhil(*tune), "thesis/errors.png: found a file of something else")
+
+
+@pytest.mark.parametrize("content", ["{}", "years", "[1]", ""])
+def test_a_document_of_something_else_is_not_replaced(jaxhil, tmp_path, content):
+    for name in ("compare.json", "gains.json"):
+        (tmp_path / name).write_text(content)
+    refused(jaxhil(*COMPARE, "-o", tmp_path), "compare.json: found a file of something else")
+    tune = ("tune", "rig-300kg", "-o", tmp_path.parent, "--set", f"name='{tmp_path.name}'")
+    refused(jaxhil(*tune), "gains.json: found a file of something else")
+    assert [(tmp_path / name).read_text() for name in ("compare.json", "gains.json")] == [content] * 2
+
+
+def test_a_sweep_takes_no_folder_of_the_users(jaxhil, thesis, untouched, tmp_path):
+    write_gain_file(tmp_path / "gains.json", case())
+    for more in ((), ("--resume",)):
+        ran = jaxhil("sweep", tmp_path / "gains.json", "--scenarios", "2", "-o", thesis, *more)
+        refused(ran, "thesis: found '.thesis.docx.1.tmp' and no sweep, allowed an empty folder, or a sweep")
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
+def test_a_picture_replaces_only_a_plain_file(jaxhil, tmp_path, kind):
+    place = tmp_path / "plot.png"
+    if kind == "pipe":
+        os.mkfifo(place)
+    elif kind == "folder":
+        place.mkdir()
+    else:
+        place.symlink_to("/dev/full")
+    before = os.lstat(place).st_ino, os.stat("/dev/full").st_ino
+    ran = jaxhil("simulate", "rig-300kg", "--plot", place)
+    refused(ran, f"plot.png: cannot be written: found a {kind}, allowed a plain file")
+    assert (os.lstat(place).st_ino, os.stat("/dev/full").st_ino) == before
+
+
+def test_a_link_that_is_named_stands_for_its_file(jaxhil, tmp_path):
+    (tmp_path / "there.png").write_bytes(b"an older picture")
+    (tmp_path / "plot.png").symlink_to("there.png")
+    ran = jaxhil("simulate", "rig-300kg", "--plot", tmp_path / "plot.png", "--json")
+    assert json.loads(ran.out)["mechanism"] == "rig-300kg"
+    assert os.readlink(tmp_path / "plot.png") == "there.png"
+    assert (tmp_path / "there.png").read_bytes().startswith(b"\x89PNG")
+    assert sorted(os.listdir(tmp_path)) == ["plot.png", "there.png"]
