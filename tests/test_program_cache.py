@@ -13,6 +13,7 @@ from compiling import is_quick
 from jax.sharding import AxisType, PartitionSpec
 
 from jaxhil.contact.laws import HuntCrossley, KelvinVoigt
+from jaxhil.files import read_sealed
 from tuning import program_cache
 
 pytestmark = pytest.mark.users_options
@@ -79,6 +80,30 @@ def test_a_spoilt_file_is_made_anew(tmp_path, spoil):
     file.write_bytes(spoil(whole))
     assert run(tmp_path)[0] == 31.0
     assert len(traced) == 2 and file.stat().st_size == len(whole)
+
+
+def check_flips(folder, number, seed):
+    run(folder)
+    (file,) = folder.iterdir()
+    whole = file.read_bytes()
+    for bit in np.random.default_rng(seed).integers(0, 8 * len(whole), number):
+        traced.clear()
+        harmed = bytearray(whole)
+        harmed[bit // 8] ^= 1 << int(bit % 8)
+        file.write_bytes(harmed)
+        total, parts = run(folder)
+        assert total == 31.0 and traced
+        np.testing.assert_array_equal(parts, 2 * VALUES["values"])
+        assert read_sealed(file) is not None
+
+
+def test_a_flipped_bit_costs_only_the_time_to_trace(tmp_path):
+    check_flips(tmp_path, 10, seed=0)
+
+
+@pytest.mark.slow
+def test_a_thousand_flipped_bits_cost_only_the_time_to_trace(tmp_path):
+    check_flips(tmp_path, 1000, seed=1)
 
 
 def test_other_statics_and_shapes_are_other_programs(tmp_path):

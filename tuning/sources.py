@@ -1,8 +1,10 @@
 """What results follow from besides the input: the sources of these packages, and what they stand on."""
 
 import hashlib
+import inspect
 import platform
 import sys
+from contextlib import suppress
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -11,9 +13,18 @@ PACKAGES = ("jaxhil", "tuning")
 STANDS_ON = ("jax", "jaxlib", "optimistix", "equinox", "lineax", "numpy", "scipy")
 
 
-def sources_sha256() -> str:
-    """SHA-256 of the names and contents of the packages' Python files, as they were when first asked for."""
-    return _digest(tuple(Path(str(sys.modules[name].__file__)).parent for name in PACKAGES))
+def sources_sha256(*laws: object) -> str:
+    """SHA-256 of the names and contents of the packages' Python files, as they were when first asked for.
+
+    With `laws`, compensators and contact laws, also of those among them that are from elsewhere: their fields
+    and the module that they are in, as far as it has a source.
+    """
+    own = _digest(tuple(Path(str(sys.modules[name].__file__)).parent for name in PACKAGES))
+    foreign = [law for law in laws if type(law).__module__.partition(".")[0] not in PACKAGES]
+    if not foreign:
+        return own
+    told = [(type(law).__qualname__, repr(law), _source(type(law))) for law in foreign]
+    return hashlib.sha256(repr((own, told)).encode()).hexdigest()
 
 
 @cache
@@ -26,6 +37,13 @@ def versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             found[name] = "not installed"
     return found
+
+
+def _source(kind: type) -> str:
+    for one in (sys.modules.get(kind.__module__), kind):
+        with suppress(OSError, TypeError):
+            return inspect.getsource(one)  # pyright: ignore[reportArgumentType]
+    return ""
 
 
 @cache

@@ -14,6 +14,8 @@ from typing import Annotated, Any, Literal, NamedTuple
 import msgspec
 from msgspec import Meta
 
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.contact.laws import LAWS
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.runtime import digest
 from jaxhil.simulation.environment import xla_flags
@@ -99,7 +101,7 @@ def build_manifest(loaded: LoadedGains, choices: Choices) -> Manifest:
         "gains_sha256": loaded.document["sha256"],
         "mechanism_sha256": loaded.document["mechanism_sha256"],
         "gain_file": loaded.document,
-        "sources_sha256": sources_sha256(),
+        "sources_sha256": _sources(loaded),
         "versions": versions(),
         "xla_flags": rounding_flags(xla_flags()),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -176,12 +178,17 @@ def other_code(old: Manifest, new: Manifest) -> list[str]:
 def unlike_here(manifest: Manifest) -> list[str]:
     """What of this process is not as the manifest says, so that its rows may differ in their last bits."""
     flags = rounding_flags(xla_flags())
-    found_differences = _other_versions(manifest, sources_sha256(), versions())
+    loaded = loaded_gains(manifest)
+    found_differences = _other_versions(manifest, _sources(loaded), versions())
     if flags != manifest.xla_flags:
         found_differences.append(f"xla_flags: found {_short(manifest.xla_flags)}, here {_short(flags)}")
-    if manifest.columns != sweep_columns(loaded_gains(manifest).mechanism, manifest.works):
+    if manifest.columns != sweep_columns(loaded.mechanism, manifest.works):
         found_differences.append(OTHER_COLUMNS)
     return found_differences
+
+
+def _sources(loaded: LoadedGains) -> str:
+    return sources_sha256(COMPENSATORS[loaded.compensator], LAWS[loaded.mechanism.contact.law])
 
 
 def _other_versions(manifest: Manifest, sources: str, here: Mapping[str, str]) -> list[str]:

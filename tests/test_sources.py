@@ -1,0 +1,54 @@
+"""What results follow from besides the input: it changes when code does, that of a law from elsewhere too."""
+
+import importlib
+import sys
+
+import jax
+import numpy
+
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.contact.laws import LAWS
+from tuning.sources import sources_sha256, versions
+
+LAW = """
+import dataclasses
+
+@dataclasses.dataclass(frozen=True)
+class Mine:
+    factor: float = 1.0
+
+    def force(self, depth):
+        return {} * depth
+"""
+
+
+def test_every_source_counts(tmp_path, monkeypatch):
+    digests = [sources_sha256()]
+    for text in ("one = 1", "one = 2"):
+        package = tmp_path / text.replace(" ", "")
+        package.mkdir()
+        (package / "__init__.py").write_text("")
+        (package / "inner.py").write_text(text)
+        monkeypatch.setattr(sys.modules["tuning"], "__file__", str(package / "__init__.py"))
+        digests.append(sources_sha256())
+    monkeypatch.undo()
+    assert len(set(digests)) == 3 and sources_sha256() == digests[0]
+
+
+def test_a_law_from_elsewhere_counts_with_its_fields(tmp_path, monkeypatch):
+    assert sources_sha256(*COMPENSATORS.values(), *LAWS.values()) == sources_sha256()
+    monkeypatch.syspath_prepend(tmp_path)
+    digests = [sources_sha256()]
+    for number in ("2", "30"):
+        (tmp_path / "law_of_mine.py").write_text(LAW.format(number))
+        sys.modules.pop("law_of_mine", None)
+        importlib.invalidate_caches()
+        mine = importlib.import_module("law_of_mine").Mine
+        digests += [sources_sha256(mine()), sources_sha256(LAWS["linear"], mine(2.0))]
+        assert sources_sha256(mine()) == digests[-2]
+    assert len(set(digests)) == 5
+
+
+def test_versions_are_those_that_run():
+    assert versions()["jax"] == jax.__version__ and versions()["numpy"] == numpy.__version__
+    assert versions()["python"] == ".".join(map(str, sys.version_info[:3]))
