@@ -7,7 +7,7 @@ import pytest
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import from_builtins
 
-# Every key of the schema, apart from those that exclude each other.
+# Every key of the schema, apart from those of other laws and models, and those that exclude each other.
 FULL = {
     "schema": "jaxhil/mechanism/1",
     "name": "full",
@@ -21,7 +21,6 @@ FULL = {
         "tension": False,
         "clearance": 0.02,
         "exponent": 1.5,
-        "depths": [0.001, 0.002],
     },
     "rig": {
         "control_period": 0.001,
@@ -32,10 +31,6 @@ FULL = {
             "model": "second_order",
             "natural_frequency": 12.0,
             "damping_ratio": 0.8,
-            "time_constant": 0.01,
-            "coefficients": [0.1, 0.1, 0.001],
-            "numerator": [1.0],
-            "denominator": [1.0, 1.0],
             "delay": 0.004,
             "velocity_limit": 0.5,
             "acceleration_limit": 2.0,
@@ -60,8 +55,39 @@ FULL = {
 }
 
 
-# Refused beside the law of the full table.
-OF_ONE_LAW = ("contact.reference_depth", "contact.unloading_ratio")
+# The models of the motion simulator: each with its keys, the others' taken out.
+SECOND_ORDER = {"rig.simulator.natural_frequency": 12.0, "rig.simulator.damping_ratio": 0.8}
+_OTHERS = {"uncertainty": {}, **dict.fromkeys(SECOND_ORDER, ...)}
+IDEAL = {"rig.simulator.model": "ideal", **_OTHERS}
+FIRST_ORDER = {"rig.simulator.model": "first_order", "rig.simulator.time_constant": 0.01, **_OTHERS}
+THIRD_ORDER = {
+    "rig.simulator.model": "third_order",
+    "rig.simulator.coefficients": [0.1, 0.1, 0.001],
+    **_OTHERS,
+}
+TRANSFER_FUNCTION = {
+    "rig.simulator.model": "transfer_function",
+    "rig.simulator.numerator": [1.0],
+    "rig.simulator.denominator": [1.0, 1.0],
+    **_OTHERS,
+}
+LAYERED = {
+    "contact.law": "piecewise_linear",
+    "contact.tension": False,
+    "contact.depths": [0.001, 0.002],
+    "contact.stiffness": [[1e5, 2e5, 3e5]],
+}
+
+# Refused beside the law and the model of the full table: values with which they are otherwise right.
+OF_OTHERS = {
+    "contact.depths": [0.001, 0.002],
+    "contact.reference_depth": 2e-4,
+    "contact.unloading_ratio": 2.0,
+    "rig.simulator.time_constant": 0.01,
+    "rig.simulator.coefficients": [0.1, 0.1, 0.001],
+    "rig.simulator.numerator": [1.0],
+    "rig.simulator.denominator": [1.0, 1.0],
+}
 
 
 def changed(changes=(), base=FULL):

@@ -28,15 +28,16 @@ ON_THE_FORCE = tuple(
     name for name in WITH_GAINS if type(COMPENSATORS[name]).position_command is Compensator.position_command
 )
 PERIOD, TICKS, RING, GAP = 1e-3, 200, 64, 2e-4
+IDEAL = ("uncertainty={}", 'rig.simulator={model="ideal", delay=0.004}')
 HOSTILE = {
-    "no delay, ideal": ["rig.force_sensor.delay=0", "rig.simulator.model=ideal", "rig.simulator.delay=0"],
+    "no delay, ideal": ["rig.force_sensor.delay=0", *IDEAL, "rig.simulator.delay=0"],
     "long delay": ["rig.force_sensor.delay=0.09", "rig.simulator.delay=0.05"],
     "lagging sensor": ["rig.force_sensor.delay=0", "rig.force_sensor.time_constant=0.02"],
     "dead zone": ["rig.force_sensor.dead_zone=12", "rig.force_sensor.noise_std=2.7"],
     "fast": ["rig.control_period=0.00025", "contact.stiffness=[1e7]"],
     "slow": ["rig.control_period=0.02", "contact.stiffness=[10]", "approach.velocity=0.0001"],
     "late in jumps": ["rig.command_hold=zoh", "rig.command_latency=1"],
-    "at once": ["rig.command_hold=zoh", "rig.simulator.model=ideal", "rig.force_sensor.delay=0"],
+    "at once": ["rig.command_hold=zoh", *IDEAL, "rig.force_sensor.delay=0"],
     "light": ["bodies.equivalent_mass=0.01", "approach.velocity=3"],
 }
 WORDS = {value for name, value in vars(known).items() if name.isupper()}

@@ -5,7 +5,7 @@ import math
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mechanism_table import FULL, OF_ONE_LAW, changed, leaves, refusal, tables
+from mechanism_table import FULL, LAYERED, OF_OTHERS, changed, leaves, refusal, tables
 
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.mechanism.file import from_builtins, to_builtins
@@ -33,11 +33,9 @@ POSITIVE = [
     "approach.velocity",
     "contact.stiffness",
     "contact.clearance",
-    "contact.depths",
     "rig.control_period",
     "rig.simulator.natural_frequency",
     "rig.simulator.damping_ratio",
-    "rig.simulator.coefficients",
     "rig.simulator.velocity_limit",
     "rig.simulator.acceleration_limit",
     "rig.force_sensor.range",
@@ -59,7 +57,7 @@ def test_full_table_is_read_value_by_value():
                 node = node[part]
             assert value_at(mechanism, path) == node
     for path in numeric_keys():
-        if not path.startswith("bodies.") and path not in OF_ONE_LAW:
+        if not path.startswith("bodies.") and path not in OF_OTHERS:
             assert path in set(leaves())
     assert mechanism.uncertainty["contact.stiffness"].factor == [0.3, 3.0]
     assert mechanism.uncertainty["rig.force_sensor.delay"].independent
@@ -134,7 +132,7 @@ def test_misspelt_key_gets_a_hint():
 @pytest.mark.parametrize("path", [*numeric_keys()])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 10**400, -(10**400)])
 def test_numbers_are_finite_unless_the_key_allows(path, value):
-    listed = [value, 1.0, 1.0] if isinstance(dict(flat(FULL)).get(path), list) else value
+    listed = [value, 1.0, 1.0] if isinstance((OF_OTHERS | dict(flat(FULL))).get(path), list) else value
     base = changed()
     if path in ("bodies.chaser_mass", "bodies.target_mass"):
         base["bodies"] = {"chaser_mass": 1.0, "target_mass": 1.0}
@@ -156,7 +154,7 @@ def flat(node, path=""):
 @pytest.mark.parametrize("path", sorted(set(numeric_keys()) & set(leaves())))
 def test_zero_and_negative(path):
     nominal = dict(flat(FULL))[path]
-    signed = ("contact_plane", "force_sensor.bias", "simulator.numerator", "simulator.denominator")
+    signed = ("contact_plane", "force_sensor.bias")
     may_be_negative = path.removeprefix("rig.") in signed
     for value in (0.0, -1e-9):
         listed = [value, *nominal[1:]] if isinstance(nominal, list) else value
@@ -174,7 +172,6 @@ def test_zero_and_negative(path):
         ("approach.contacts", 1000, 1001),
         ("approach.contacts", 1, 0),
         ("approach.contacts", 1, 1.0),
-        ("contact.exponent", 1.0, 0.99),
         ("rig.control_period", 0.1, 0.11),
         ("rig.command_latency", 1, 2),
         ("rig.command_latency", 0, -1),
@@ -184,7 +181,6 @@ def test_zero_and_negative(path):
         ("contact.stiffness", [1.0] * 1000, [1.0] * 1001),
         ("contact.stiffness", [1.0], []),
         ("contact.damping", 0, []),
-        ("contact.depths", [0.001, 0.002], [0.001, 0.001]),
         ("contact.law", "hunt_crossley", "elastic"),
         ("rig.integrator", "explicit_euler", "rk4"),
         ("rig.command_hold", "linear", "foh"),
@@ -198,6 +194,33 @@ def test_edges_of_ranges(path, inside, outside):
     assert isinstance(from_builtins(changed({path: inside}), "f"), Mechanism)
     message = refusal(changed({path: outside}))
     assert f": {path}" in message and ", allowed " in message
+
+
+@pytest.mark.parametrize(
+    ("path", "inside", "outside"),
+    [
+        ("contact.exponent", 1.0, 0.99),
+        ("contact.exponent", 1e100, 1.1e100),
+        ("contact.damping", 1e-100, 0.9e-100),
+        ("bodies.equivalent_mass", 1e-100, 1e-320),
+    ],
+)
+def test_edges_of_ranges_of_another_law(path, inside, outside):
+    base = changed({"contact.law": "hunt_crossley"})
+    assert value_at(from_builtins(changed({path: inside}, base), "f"), path) in (inside, [inside])
+    assert f": {path}" in refusal(changed({path: outside}, base))
+
+
+def test_depths_grow():
+    assert from_builtins(changed(LAYERED), "f").contact.depths == LAYERED["contact.depths"]
+    for wrong in ([0.001, 0.001], [0.0, 0.001], [0.001, -0.1]):
+        assert ": contact.depths[" in refusal(changed({**LAYERED, "contact.depths": wrong}))
+
+
+@pytest.mark.parametrize("value", [1e-320, -1e-320, 1e-101, 1.1e100, -1.7e308])
+def test_numbers_that_overflow_or_vanish_in_products_are_refused(value):
+    message = refusal(changed({"rig.force_sensor.bias": value}))
+    assert f": found {value}, allowed a finite number of N, of a magnitude from 1e-100 to 1e+100" in message
 
 
 @settings(deadline=None)

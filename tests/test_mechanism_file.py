@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec.inspect import ListType, Metadata, StructType, UnionType
 
+import jaxhil
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import (
     DEFAULT,
@@ -30,10 +31,10 @@ from jaxhil.mechanism.structs import numeric_keys, schema_type
 TEXT = builtin_path("claw-350kg").read_text()
 
 
-def refusal(path, overrides=()):
+def refusal(path, overrides=(), unset=()):
     """The message of a refused file: one printable line that starts with the file's name."""
     with pytest.raises(InputError) as caught:
-        load(path, overrides)
+        load(path, overrides, unset)
     message = str(caught.value)
     assert message.isprintable() and len(message) < 700
     return message
@@ -230,16 +231,17 @@ def test_override(override, path, value):
 
 def test_override_reaches_quoted_keys_tables_and_nested_lists():
     overrides = [
-        'uncertainty."contact.stiffness".factor[0]=0.5',
+        "uncertainty={}",
         'rig.simulator={model="first_order", time_constant=0.01}',
-        "uncertainty.'rig.simulator.natural_frequency'={distribution='normal', std=1}",
-        "rig.simulator.natural_frequency=3",
+        "uncertainty.'rig.simulator.time_constant'={distribution='normal', std=1}",
+        "rig.simulator.time_constant=3",
     ]
     mechanism = load("varying", overrides).mechanism
-    assert mechanism.uncertainty["contact.stiffness"].factor == [0.5, 1.6]
+    assert mechanism.uncertainty["rig.simulator.time_constant"].std == 1.0
+    other = load("varying", ['uncertainty."contact.stiffness".factor[0]=0.5']).mechanism
+    assert other.uncertainty["contact.stiffness"].factor == [0.5, 1.6]
     assert mechanism.rig.simulator.model == "first_order"
     assert mechanism.rig.simulator.damping_ratio is None
-    assert mechanism.uncertainty["rig.simulator.natural_frequency"].std == 1.0
     layered = load("layered", ["contact.stiffness[1][2]=1"]).mechanism
     assert layered.contact.stiffness[1] == [60000.0, 120000.0, 1.0]
 
@@ -255,9 +257,62 @@ def test_override_of_a_bare_number_in_the_file(written):
     assert load(path, ["contact.stiffness[0]=5"]).mechanism.contact.stiffness == [5.0]
 
 
-@pytest.mark.parametrize("model", ["ideal", "second_order"])
-def test_models_can_be_switched_with_unused_keys_left(model):
-    assert load("varying", [f"rig.simulator.model={model}"]).mechanism.rig.simulator.model == model
+SECOND_ORDER = ["rig.simulator.natural_frequency", "rig.simulator.damping_ratio"]
+
+
+def test_another_model_takes_its_keys_and_no_others():
+    first_order = ["rig.simulator.model=first_order", "rig.simulator.time_constant=0.01"]
+    message = refusal("varying", first_order)
+    assert message.startswith(f"varying: --set {' '.join(first_order)}: rig.simulator.")
+    assert ", allowed nothing (first_order does not use it: unset it)" in message
+    mechanism = load("varying", first_order, SECOND_ORDER).mechanism
+    simulator = mechanism.rig.simulator
+    assert (simulator.model, simulator.time_constant, simulator.delay) == ("first_order", 0.01, 0.001)
+    assert simulator.natural_frequency is None
+    # What is no longer there is not uncertain either.
+    assert set(load("varying").mechanism.uncertainty) - set(mechanism.uncertainty) == {SECOND_ORDER[0]}
+    ideal = load("varying", ["rig.simulator.model=ideal"], SECOND_ORDER).mechanism
+    changes = {"rig.simulator.model": "ideal", **dict.fromkeys(SECOND_ORDER)}
+    assert ideal == load("varying", changes).mechanism == jaxhil.load("varying", changes)
+
+
+def test_unset_takes_out_keys_tables_and_uncertainty():
+    mechanism = load("varying", (), ["contact.damping", "rig.force_sensor", "approach.contacts"]).mechanism
+    assert mechanism.contact.damping == [0.0] and mechanism.rig.force_sensor.delay == 0.0
+    assert mechanism.approach.contacts == 1 and "rig.force_sensor.delay" not in mechanism.uncertainty
+    assert load("varying", (), ["uncertainty"]).mechanism.uncertainty == {}
+    left = load("varying", (), ["uncertainty.'contact.stiffness'"]).mechanism
+    assert left.contact == load("varying").mechanism.contact
+    assert "contact.stiffness" not in left.uncertainty and "approach.velocity" in left.uncertainty
+    masses = ["bodies.chaser_mass=700", "bodies.target_mass=700"]
+    assert load("varying", masses, ["bodies.equivalent_mass"]).mechanism.bodies.mass == 350.0
+
+
+@pytest.mark.parametrize(
+    ("path", "reason"),
+    [
+        ("approach.velocity", "approach.velocity: found nothing, allowed a number > 0 m/s"),
+        ("rig", "rig: found nothing, allowed a table"),
+        ("rig.simulator.model", "rig.simulator.model: found nothing, allowed one of first_order, ideal"),
+        ("approach.velosity", "approach.velosity: found an unknown key"),
+        ("approach.velosity", "did you mean velocity?"),
+        ("rig.force_sensor.range", "rig.force_sensor.range: found no such key there, allowed a key that"),
+        ("rig.position_sensor.delay", "rig.position_sensor.delay: found no such key there"),
+        ("contact.stiffness[1]", "contact.stiffness[1]: found an entry of a list, allowed a key"),
+        ("uncertainty.'contact.damping'", "found no such key there"),
+        ("approach.velocity=1", "'approach.velocity=1', allowed a dotted path"),
+        ("", "allowed a dotted path"),
+        ("a..b", "allowed a dotted path"),
+    ],
+)
+def test_unusable_unset_is_named(path, reason):
+    message = refusal("varying", (), [path])
+    assert message.startswith("varying: --unset ") and reason in message
+
+
+def test_what_is_uncertain_has_a_value():
+    message = refusal("varying", ["uncertainty.'rig.simulator.time_constant'={distribution='normal', std=1}"])
+    assert "found nothing as its value, allowed a key with a value" in message
 
 
 @pytest.mark.parametrize(

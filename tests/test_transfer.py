@@ -26,6 +26,11 @@ def claw(*overrides):
     return load("claw-350kg", overrides).mechanism
 
 
+def behind(simulator):
+    """The claw behind another motion simulator with the delay of its own."""
+    return claw(f"rig.simulator={{delay=0.004, model={simulator}}}", "uncertainty={}")
+
+
 def anywhere(mechanism, compensator, seed=0):
     """Gains anywhere within their bounds."""
     generator, gains = np.random.default_rng(seed), {}
@@ -78,19 +83,13 @@ def test_each_trait_counts_by_what_it_does_to_the_restitution(override, expected
 def test_traits_do_not_hang_on_how_a_simulator_is_written():
     second = traits(claw("rig.simulator.natural_frequency=10.0", "rig.simulator.damping_ratio=0.7"))
     omega = 2 * math.pi * 10
-    written = claw(
-        "rig.simulator.model='transfer_function'",
-        f"rig.simulator.numerator=[{omega**2}]",
-        f"rig.simulator.denominator=[1.0, {1.4 * omega}, {omega**2}]",
+    written = behind(
+        f"'transfer_function', numerator=[{omega**2}], denominator=[1.0, {1.4 * omega}, {omega**2}]"
     )
     assert traits(written).simulator_delay == pytest.approx(second.simulator_delay, rel=1e-12)
-    leading = claw(
-        "rig.simulator.model='transfer_function'",
-        "rig.simulator.numerator=[0.01, 1.0]",
-        "rig.simulator.denominator=[0.0001, 0.03, 1.0]",
-    )
+    leading = behind("'transfer_function', numerator=[0.01, 1.0], denominator=[0.0001, 0.03, 1.0]")
     assert traits(leading).simulator_delay == pytest.approx(0.004 + 0.02, rel=1e-12)
-    assert traits(claw("rig.simulator.model='ideal'")).simulator_delay == 0.004
+    assert traits(behind("'ideal'")).simulator_delay == 0.004
 
 
 def test_damping_of_every_law_is_that_of_its_restitution():

@@ -34,8 +34,8 @@ def test_the_limit_has_an_imaginary_root(mass, frequency, angle):
 def test_nominal_damping_is_the_limit_of_all_delay():
     """That of the force measurement, and of the motion simulator as it follows a uniform motion."""
     overrides = ["rig.force_sensor.delay=0.003", "rig.force_sensor.time_constant=0.002"]
-    simulator = ["rig.simulator.model=first_order", "rig.simulator.time_constant=0.01"]
-    mechanism = load("rod-100n-mm", [*overrides, *simulator, "rig.simulator.delay=0.004"]).mechanism
+    simulator = 'rig.simulator={model="first_order", time_constant=0.01, delay=0.004}'
+    mechanism = load("rod-100n-mm", [*overrides, simulator, "uncertainty={}"]).mechanism
     gains = literature_gains(mechanism, "virtual_contact")
     [stiffness], mass = mechanism.contact.stiffness, mechanism.bodies.mass
     damping, _ = damping_at_the_limit(stiffness, math.sqrt(stiffness / mass), 0.003 + 0.002 + 0.01 + 0.004)

@@ -5,7 +5,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -20,15 +20,20 @@ WIDTH = 110  # where there is no terminal to ask
 SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal for a bar
 
 
-def emit(*things: RenderableType) -> None:
-    """Print on standard output. A reader that has gone away is no error."""
+def emit(*things: RenderableType, wrap: bool = True) -> None:
+    """Print on standard output, long texts on several lines. A reader that has gone away is no error."""
     try:
         console = _console(sys.stdout)
         for thing in things:
-            console.print(thing)
+            console.print(thing, soft_wrap=not wrap)
         sys.stdout.flush()
     except BrokenPipeError:
         _detach()
+
+
+def emit_line(text: str) -> None:
+    """Print one line on standard output, however long it is."""
+    emit(text, wrap=False)
 
 
 def emit_json(document: Mapping[str, Any]) -> None:
@@ -42,6 +47,12 @@ def emit_json(document: Mapping[str, Any]) -> None:
 def as_json(document: Mapping[str, Any]) -> str:
     """A document as lines of JSON, in ASCII; what is not finite as null."""
     return json.dumps(finite(document), indent=2, allow_nan=False) + "\n"
+
+
+def warn(texts: Iterable[str]) -> None:
+    """Say on standard error what may be wrong, a line each."""
+    for text in texts:
+        note(f"warning: {text}")
 
 
 def note(text: str) -> None:

@@ -17,12 +17,20 @@ import msgspec
 from msgspec import inspect
 
 from jaxhil.errors import one_line, shown
-from jaxhil.mechanism.structs import PLAIN, Mechanism, range_of, schema_type
+from jaxhil.mechanism.structs import (
+    MAGNITUDES,
+    PLAIN,
+    Mechanism,
+    is_computable,
+    range_of,
+    schema_type,
+)
 
 __all__ = [
     "KeyProblem",
     "Path",
     "close_match",
+    "computable",
     "dotted",
     "entry_count",
     "step_into",
@@ -74,6 +82,11 @@ def close_match(word: str, known: Iterable[str]) -> str:
 def entry_count(entries: Sequence[object]) -> str:
     """`a list of N entries`."""
     return f"a list of {len(entries)} entr{'y' if len(entries) == 1 else 'ies'}"
+
+
+def computable(allowed: object) -> str:
+    """The numbers that are `allowed`, with the magnitudes that arithmetic bears."""
+    return f"{allowed}, of a magnitude from {MAGNITUDES[0]:g} to {MAGNITUDES[1]:g}"
 
 
 def to_mechanism(raw: Mapping[str, Any]) -> Mechanism:
@@ -151,6 +164,8 @@ def _clean(kind: inspect.Type, value: Any, path: Path, extra: Extra) -> Any:
             except OverflowError:
                 number = math.nan
             if range_of(kind, extra).allows(number):
+                if not is_computable(number):
+                    raise KeyProblem(path, shown(value), computable(range_of(kind, extra)))
                 return number
         case inspect.IntType() if isinstance(value, int) and not isinstance(value, bool):
             if range_of(kind, PLAIN).allows(value):

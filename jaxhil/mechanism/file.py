@@ -1,7 +1,8 @@
 """Reading a mechanism file: bytes, TOML, overrides, validation.
 
-`load` turns a file (or the name of a built-in one or suite) and the ``PATH=VALUE`` overrides of ``--set``
-into a validated `Mechanism`. Whatever is wrong with them raises `InputError` with one line.
+`load` turns a file (or the name of a built-in one or suite), the ``PATH=VALUE`` overrides of ``--set`` and
+the keys that ``--unset`` takes out into a validated `Mechanism`. Whatever is wrong with them raises
+`InputError` with one line.
 """
 
 from __future__ import annotations
@@ -65,13 +66,16 @@ class LoadedMechanism(NamedTuple):
     label: str
 
 
-def load(path_or_name: str | os.PathLike[str] | None = None, overrides: Overrides = ()) -> LoadedMechanism:
+def load(
+    path_or_name: str | os.PathLike[str] | None = None, overrides: Overrides = (), unset: Sequence[str] = ()
+) -> LoadedMechanism:
     """The mechanism of a TOML file or of a built-in's name (`None`: the default built-in).
 
     `overrides` are ``PATH=VALUE`` texts as given to ``--set``, applied in order before validation:
     PATH a dotted TOML key, possibly with an index (``contact.stiffness[1]``), VALUE a TOML value; a
     bare word is a string. A table given as VALUE replaces the one there. A mapping of PATH to the value
-    itself does the same.
+    itself does the same, and takes out the key whose value is None. `unset` are PATHs as given to
+    ``--unset``, keys that are then taken out.
 
     Raises `InputError`, one line, for whatever is wrong.
     """
@@ -81,7 +85,8 @@ def load(path_or_name: str | os.PathLike[str] | None = None, overrides: Override
     else:
         path, label = Path(name), one_line(str(name)) or "''"
     data = _read(path, label)
-    mechanism, sha256 = _resolve(_parse(data, label), label, overrides), hashlib.sha256(data).hexdigest()
+    mechanism = from_builtins(_parse(data, label), label, overrides, unset)
+    sha256 = hashlib.sha256(data).hexdigest()
     _sources[_content_sha256(mechanism)] = sha256
     return LoadedMechanism(mechanism, sha256, label)
 
@@ -93,12 +98,26 @@ def source_sha256(mechanism: Mechanism) -> str:
     return _sources.get(content, content)
 
 
-def from_builtins(raw: Mapping[str, Any], label: str) -> Mechanism:
-    """The validated mechanism of plain data, such as a parsed TOML or JSON table.
+def from_builtins(
+    raw: Mapping[str, Any], label: str, overrides: Overrides = (), unset: Sequence[str] = ()
+) -> Mechanism:
+    """The validated mechanism of plain data, such as a parsed TOML or JSON table, changed as by `load`.
 
     `label` is what an error calls its source. Raises `InputError`.
     """
-    return _resolve(raw, one_line(label), ())
+    changed, label = raw, one_line(label)
+    given = _given(overrides, unset)
+    for option, changes in given.items():
+        for change in changes:
+            try:
+                changed = apply_override(changed, *parse_override(change))
+            except KeyProblem as problem:
+                raise InputError(f"{label}: {option} {_short(change)}: {problem}") from None
+    try:
+        return _validated(changed)
+    except KeyProblem as problem:
+        blamed = "" if str(problem) == _problem_of(raw) else _listed(given)
+        raise InputError(f"{label}{blamed}: {problem}") from None
 
 
 def to_builtins(mechanism: Mechanism) -> dict[str, Any]:
@@ -197,21 +216,6 @@ def _longest_key(text: str) -> int:
     return longest
 
 
-def _resolve(raw: Mapping[str, Any], label: str, overrides: Overrides) -> Mechanism:
-    changed = raw
-    for override in overrides.items() if isinstance(overrides, Mapping) else overrides:
-        try:
-            changed = apply_override(changed, *parse_override(override))
-        except KeyProblem as problem:
-            given = override if isinstance(override, str) else override[0]
-            raise InputError(f"{label}: {_option(overrides)} {_short(given)}: {problem}") from None
-    try:
-        return _validated(changed)
-    except KeyProblem as problem:
-        blamed = "" if str(problem) == _problem_of(raw) else _listed(overrides)
-        raise InputError(f"{label}{blamed}: {problem}") from None
-
-
 def _validated(raw: Mapping[str, Any]) -> Mechanism:
     mechanism = to_mechanism(raw)
     mechanism_rules.check(mechanism)
@@ -226,17 +230,28 @@ def _problem_of(raw: Mapping[str, Any]) -> str:
     return ""
 
 
-def _listed(overrides: Overrides) -> str:
-    shortened = " ".join(_short(given) for given in list(overrides)[:3])
-    return f": {_option(overrides)} {shortened}{' ...' if len(overrides) > 3 else ''}" if overrides else ""
+def _given(overrides: Overrides, unset: Sequence[str]) -> dict[str, list[Any]]:
+    """The changes that are asked for, by what they are called where they are given: on the command line, or
+    as an argument."""
+    named = isinstance(overrides, Mapping)
+    return {
+        "overrides" if named else "--set": list(overrides.items() if named else overrides),
+        "--unset": [(path, None) for path in unset],
+    }
 
 
-def _option(overrides: Overrides) -> str:
-    """What overrides are called where they are given: on the command line, or as an argument."""
-    return "overrides" if isinstance(overrides, Mapping) else "--set"
+def _listed(given: Mapping[str, Sequence[Any]]) -> str:
+    options = [
+        " ".join([option, *map(_short, changes[:3]), *["..."][: len(changes) > 3]])
+        for option, changes in given.items()
+        if changes
+    ]
+    return f": {' '.join(options)}" if options else ""
 
 
 def _short(given: object) -> str:
+    """A change by its text, or by its key."""
+    given = given[0] if isinstance(given, tuple) else given
     return one_line(given, 60) if isinstance(given, str) else shown(given)
 
 

@@ -19,8 +19,8 @@ def load(
     """The mechanism of a built-in's name, or of a TOML file.
 
     `overrides` maps keys to values, in SI units, which replace those of the file: a key is a dotted path,
-    such as ``rig.force_sensor.delay``, possibly with an index (``contact.stiffness[1]``); None takes a value
-    away.
+    such as ``rig.force_sensor.delay``, possibly with an index (``contact.stiffness[1]``). The value None
+    takes the key out, as ``--unset`` does, and with it what ``[uncertainty]`` says of it.
 
     Raises `InputError`, one line, for whatever is wrong: file, key, what was found and what is allowed.
     """

@@ -1,7 +1,8 @@
-"""Overrides of a mechanism file: ``PATH=VALUE``, as given to ``--set``.
+"""Overrides of a mechanism file: ``PATH=VALUE``, as given to ``--set``, and ``PATH`` as given to ``--unset``.
 
 PATH is a dotted key as TOML writes it, possibly with indices into lists; VALUE is a TOML value, and
-a bare word is a string, so that ``contact.law=linear`` needs no quotes within a shell's quotes.
+a bare word is a string, so that ``contact.law=linear`` needs no quotes within a shell's quotes. TOML has no
+word for nothing: the value None takes a key out.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any
 
 from jaxhil.errors import shown
 from jaxhil.mechanism.conversion import KeyProblem, Path, close_match, dotted, entry_count, step_into
-from jaxhil.mechanism.structs import numeric_keys, schema_type
+from jaxhil.mechanism.structs import MAX_CONTACTS, numeric_keys, schema_type
 
 __all__ = ["apply_override", "parse_key", "parse_override"]
 
@@ -45,6 +46,8 @@ def parse_key(key: object) -> Path:
 def _plain(value: Any) -> Any:
     """Numbers and arrays of NumPy and jax as those of Python."""
     if isinstance(value, (list, tuple)):
+        if len(value) > MAX_CONTACTS:
+            return value  # refused for its length, whatever is in it
         return [_plain(entry) for entry in value]
     if isinstance(value, Mapping):
         return {key: _plain(entry) for key, entry in value.items()}
@@ -73,9 +76,11 @@ def _parse_text(text: str) -> tuple[Path, Any]:
 
 
 def apply_override(raw: Mapping[str, Any], path: Path, value: Any) -> dict[str, Any]:
-    """A copy of a raw table with the value at `path` replaced; tables on the way are made.
+    """A copy of a raw table with the value at `path` replaced; tables on the way are made. None takes the key
+    out, and with it what ``[uncertainty]`` says of it and of the keys below it.
 
-    Raises `KeyProblem` when the schema has no such path, or a list no such entry.
+    Raises `KeyProblem` when the schema has no such path, a list no such entry, or where there is no such key
+    to take out.
     """
     kind = schema_type()
     for depth, part in enumerate(path):
@@ -86,7 +91,7 @@ def apply_override(raw: Mapping[str, Any], path: Path, value: Any) -> dict[str, 
             if hint and "did you mean" not in problem.allowed:
                 problem = KeyProblem(problem.path, problem.found, problem.allowed + hint)
             raise problem from None
-    return _replaced(raw, path, 0, value)
+    return _removed(raw, path) if value is None else _replaced(raw, path, 0, value)
 
 
 def _parse_path(text: str, key: str | None = None) -> tuple[Path, int]:
@@ -130,3 +135,21 @@ def _replaced(node: Any, path: Path, depth: int, value: Any) -> Any:
         raise KeyProblem(path[:depth], shown(node), "a table")
     missing = {} if depth + 1 < len(path) and isinstance(path[depth + 1], str) else None
     return {**node, part: _replaced(node.get(part, missing), path, depth + 1, value)}
+
+
+def _removed(raw: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    left, key = _without(raw, path, 0), dotted(path)
+    if isinstance(uncertain := left.get("uncertainty"), Mapping):
+        kept = {name: one for name, one in uncertain.items() if not f"{name}.".startswith(f"{key}.")}
+        left["uncertainty"] = kept
+    return left
+
+
+def _without(node: Any, path: Path, depth: int) -> dict[str, Any]:
+    part = path[depth]
+    if isinstance(path[-1], int):
+        raise KeyProblem(path, "an entry of a list", "a key: a list is replaced as a whole")
+    if not isinstance(node, Mapping) or part not in node:
+        raise KeyProblem(path, "no such key there", "a key that is there")
+    others = {name: value for name, value in node.items() if name != part}
+    return others | ({str(part): _without(node[part], path, depth + 1)} if depth + 1 < len(path) else {})

@@ -1,9 +1,8 @@
 """Rules of a mechanism file that join several keys.
 
 Each rule raises a `KeyProblem` that names the key to change. Types and single ranges are checked
-before, in `jaxhil.mechanism.conversion`. A key that the chosen law or model does not use need not fit
-any rule, so that one file serves a study over laws and models; but for `reference_depth` and
-`unloading_ratio`, which say nothing beside another law.
+before, in `jaxhil.mechanism.conversion`. A key that the chosen law or model does not use is refused where
+it says anything: who wrote it means something by it. What a law from elsewhere uses, only that law knows.
 """
 
 from __future__ import annotations
@@ -16,19 +15,21 @@ from typing import Any
 import numpy as np
 
 from jaxhil.errors import shown
-from jaxhil.mechanism.conversion import KeyProblem, close_match
+from jaxhil.mechanism.conversion import KeyProblem, close_match, computable
 from jaxhil.mechanism.structs import (
     BUILT_IN_LAWS,
     Contact,
     Mechanism,
     Simulator,
     Uncertainty,
+    is_computable,
     numeric_keys,
     value_at,
 )
 
 __all__ = ["check", "is_hurwitz"]
 
+# Keys of each model of the motion simulator.
 _NEEDED = {
     "ideal": (),
     "first_order": ("time_constant",),
@@ -36,8 +37,16 @@ _NEEDED = {
     "third_order": ("coefficients",),
     "transfer_function": ("numerator", "denominator"),
 }
-# Keys of some contact laws alone.
-_LAWS_OF = {"reference_depth": ("hardening", "depth_damped"), "unloading_ratio": ("elastoplastic",)}
+_OF_SOME_MODEL = sorted({key for keys in _NEEDED.values() for key in keys})
+# Keys of some contact laws alone; all others are at their defaults in a contact that states none of them.
+_LAWS_OF = {
+    "tension": ("kelvin_voigt",),
+    "exponent": ("hunt_crossley", "depth_damped"),
+    "depths": ("piecewise_linear",),
+    "reference_depth": ("hardening", "depth_damped"),
+    "unloading_ratio": ("elastoplastic",),
+}
+_PLAIN = Contact(law="linear", stiffness=[1.0])
 _Span = tuple[np.ndarray, np.ndarray]
 _FIXED = ("rig.simulator.numerator", "rig.simulator.denominator")
 
@@ -47,7 +56,7 @@ def check(mechanism: Mechanism) -> None:
     _check_texts(mechanism)
     _check_bodies(mechanism)
     _check_contact(mechanism.contact)
-    _check_dissipation(mechanism)
+    _check_keys_of_laws(mechanism)
     _check_simulator(mechanism.rig.simulator)
     _check_hold(mechanism)
     spans = {
@@ -119,16 +128,19 @@ def _check_contact(contact: Contact) -> None:
             raise KeyProblem(path, shown(entry), f"a number > 0 (law {contact.law})")
 
 
-def _check_dissipation(mechanism: Mechanism) -> None:
+def _check_keys_of_laws(mechanism: Mechanism) -> None:
     contact = mechanism.contact
     for key, laws in _LAWS_OF.items():
-        value = getattr(contact, key)
+        path, value, default = f"contact.{key}", getattr(contact, key), getattr(_PLAIN, key)
         if contact.law in laws and value is None:
-            allowed = f"{numeric_keys()[f'contact.{key}']} (law {contact.law} needs it)"
+            allowed = f"{numeric_keys()[path]} (law {contact.law} needs it)"
             raise KeyProblem(("contact", key), "nothing", allowed)
-        # What a law from elsewhere makes of it, only that law knows.
-        if contact.law not in laws and contact.law in BUILT_IN_LAWS and value is not None:
-            raise KeyProblem(("contact", key), shown(value), f"nothing (only for law {' or '.join(laws)})")
+        if contact.law not in laws and contact.law in BUILT_IN_LAWS:
+            only = f"only for law {' or '.join(laws)}"
+            if value != default:
+                raise KeyProblem(("contact", key), shown(value), f"nothing ({only})")
+            if path in mechanism.uncertainty and value not in (None, []):
+                raise KeyProblem(("uncertainty", path), f"a key {only}", "keys that the law uses")
     if contact.law == "elastoplastic" and _is_damped(mechanism):
         damping = shown(contact.damping) if any(contact.damping) else "an uncertain damping"
         raise KeyProblem(("contact", "damping"), damping, "0 (law elastoplastic dissipates by yielding)")
@@ -146,6 +158,11 @@ def _check_simulator(simulator: Simulator) -> None:
             lists = ("coefficients", "numerator", "denominator")
             allowed = "a list of numbers" if key in lists else "a number > 0"
             raise KeyProblem((*path, key), "nothing", f"{allowed} ({simulator.model} needs it)")
+    for key in _OF_SOME_MODEL:
+        value = getattr(simulator, key)
+        if value is not None and key not in _NEEDED[simulator.model]:
+            allowed = f"nothing ({simulator.model} does not use it: unset it)"
+            raise KeyProblem((*path, key), shown(value), allowed)
     if simulator.model == "first_order" and simulator.time_constant == 0.0:
         raise KeyProblem((*path, "time_constant"), "0.0", "a number > 0 (first_order), or ideal")
     if simulator.model == "third_order" and simulator.coefficients is not None:
@@ -233,7 +250,8 @@ def _check_uncertainty(mechanism: Mechanism, path: str, uncertainty: Uncertainty
         raise KeyProblem(where, "no such uncertain key", allowed)
     value = value_at(mechanism, path)
     if value is None or value == [] or value == math.inf:
-        raise KeyProblem(where, f"{shown(value)} as its value", f"a key with a value: set {path}")
+        allowed = f"a key with a value: set {path}, or unset its uncertainty"
+        raise KeyProblem(where, f"{shown(value)} as its value", allowed)
     nominal = np.asarray(value, dtype=float)
     low, high = _span(where, path, uncertainty, nominal)
     ends = [float(end) for end in np.concatenate((low.ravel(), high.ravel()))]
@@ -241,6 +259,9 @@ def _check_uncertainty(mechanism: Mechanism, path: str, uncertainty: Uncertainty
         outside = [end for end in ends if not (known[path].allows(end) and math.isfinite(end))]
         if outside:
             raise KeyProblem(where, f"values as far as {outside[0]:g}", str(known[path]))
+        beyond = [end for end in ends if not is_computable(end)]
+        if beyond:
+            raise KeyProblem(where, f"values as far as {beyond[0]:g}", computable(known[path]))
     if path == "contact.depths" and uncertainty.independent and np.any(high[:-1] >= low[1:]):
         raise KeyProblem((*where, "independent"), "true", "false, or depths that keep their order")
     if path == "rig.simulator.coefficients" and mechanism.rig.simulator.model == "third_order":

@@ -21,6 +21,7 @@ from msgspec import Meta, Struct, field
 __all__ = [
     "BUILT_IN_LAWS",
     "CONTACT_LAWS",
+    "MAGNITUDES",
     "MAX_CONTACTS",
     "SCHEMA",
     "Approach",
@@ -33,6 +34,7 @@ __all__ = [
     "Rig",
     "Simulator",
     "Uncertainty",
+    "is_computable",
     "numeric_keys",
     "range_of",
     "schema_type",
@@ -41,6 +43,7 @@ __all__ = [
 
 SCHEMA = "jaxhil/mechanism/1"
 MAX_CONTACTS = 1000
+MAGNITUDES = 1e-100, 1e100  # of numbers other than 0: a product of three neither overflows nor vanishes
 PLAIN: Mapping[str, Any] = {}  # what a type without metadata says
 
 BUILT_IN_LAWS = (
@@ -257,6 +260,12 @@ class Range(NamedTuple):
         if self.low_open:
             return f"a number > {self.low:g}{unit} and <= {self.high:g}{unit}"
         return f"a number from {self.low:g} to {self.high:g}{unit}"
+
+
+def is_computable(value: float) -> bool:
+    """Whether arithmetic bears a number of an allowed range: its magnitude is in `MAGNITUDES`, or it is 0 or
+    infinite."""
+    return value == 0.0 or math.isinf(value) or MAGNITUDES[0] <= abs(value) <= MAGNITUDES[1]
 
 
 def range_of(kind: msgspec.inspect.FloatType | msgspec.inspect.IntType, extra: Mapping[str, Any]) -> Range:

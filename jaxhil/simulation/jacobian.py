@@ -27,6 +27,7 @@ from jaxhil.simulation.evaluation import Outcome, compare_with_reference
 from jaxhil.simulation.gain_choice import choose_gains
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.metrics import OK
+from jaxhil.simulation.plausibility import check_run
 from jaxhil.simulation.rollout import rollout
 from jaxhil.simulation.run import ContactResult, check_seed
 from jaxhil.simulation.scenario import Scenario, build_scenarios
@@ -83,6 +84,7 @@ def jacobian(
         raise InputError(f"by: found {shown(by)}, allowed {allowed}")
     keys = [_key(checked, law, path) for path in paths]
     _check_rounding(checked)
+    check_run(checked)
     with computing():
         slopes, status = _slopes(
             of, _loop(checked, name, keys, number), *_moving(checked, keys, values, number)

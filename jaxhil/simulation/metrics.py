@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.probe import root_mean_square
-from jaxhil.simulation.scenario import Scenario
+from jaxhil.simulation.scenario import LONGEST_CONTACT, Scenario
 from jaxhil.simulation.watch import Watch
 
 NOT_REACHED, OK, TIMEOUT, DIVERGED, NON_FINITE = -1, 0, 1, 2, 3
@@ -19,6 +19,12 @@ STATUS_NAMES = {
     NON_FINITE: "non-finite",
 }
 RUNAWAY = 1e3  # of the first approach speed: no rig survives it
+# What a status says in a sentence, of those with which a run ends badly.
+STATUS_REASONS = {
+    "timeout": f"a contact was not over within {LONGEST_CONTACT:g} s, the limit of a contact",
+    "diverged": f"the speed grew beyond {RUNAWAY:g} times that of the first approach",
+    "non-finite": "a number was no longer finite",
+}
 
 
 class Metrics(NamedTuple):

@@ -20,6 +20,7 @@ from jaxhil.simulation.evaluation import Outcome, evaluate
 from jaxhil.simulation.gain_choice import choose_gains
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.metrics import NOT_REACHED, OK, STATUS_NAMES
+from jaxhil.simulation.plausibility import Meaning, check_run, meaning
 from jaxhil.simulation.recording import record_lanes
 from jaxhil.simulation.scenario import build_scenarios
 
@@ -39,7 +40,9 @@ class ContactResult(NamedTuple):
     duration: float  # time in contact [s]
     approach_velocity: float  # of the numerical model, on the tick before the contact [m/s]
     force_delay: float | None  # of the measurement, as the compensator estimates it [s]; None if it does not
-    status: str  # "ok", or why it has no restitution: "timeout", "diverged", "non-finite", "not reached"
+    # "ok", or why it has no restitution: "timeout" (not over within 10 s), "diverged", "non-finite", "not
+    # reached"
+    status: str
 
 
 class Ticks(NamedTuple):
@@ -67,6 +70,11 @@ class Run:
     seed: int  # of the sensors' noise
     contacts: tuple[ContactResult, ...]  # one for every contact of the schedule
     status: str  # "ok", or the status of the first contact that is not
+
+    @cached_property
+    def meaning(self) -> Meaning:
+        """What the mechanism means: mass, contacts in space, rates; `warnings` of what cannot be meant."""
+        return meaning(self.mechanism)
 
     @cached_property
     def ticks(self) -> Ticks:
@@ -175,6 +183,7 @@ def simulate(
     checked = as_mechanism(mechanism)
     number = check_seed(seed)
     name, values = choose_gains(checked, compensator, gains)
+    check_run(checked)
     with computing():
         scenarios = build_scenarios(checked, seed=number)
         outcome = evaluate(build_loop(checked, name, scenarios), values, scenarios)

@@ -40,6 +40,15 @@ Overrides = Annotated[
         name="set",
     ),
 ]
+Unset = Annotated[
+    UseAppendAction[tuple[str, ...]],
+    text(
+        "PATH",
+        "A key to take out of the mechanism file, and what [uncertainty] says of it, after all --set; "
+        "repeatable.",
+        name="unset",
+    ),
+]
 Limit = Annotated[float, arg(metavar="NUMBER", help="Restitution error beyond which the verdict is bad.")]
 Json = Annotated[
     FlagCreatePairsOff[bool], text(None, "One JSON document on standard output, nothing else there.")
@@ -71,6 +80,7 @@ class Simulate:
         arg(metavar="GAINS", help="Gain file: its compensator and gains and, without FILE, its mechanism."),
     ] = None
     overrides: Overrides = ()
+    unset: Unset = ()
     plot: Annotated[
         str | None, arg(metavar="[PICTURE]", help=f"Plot to a .png, .pdf or .svg file; bare: {DEFAULT_PLOT}.")
     ] = None
@@ -156,6 +166,7 @@ class Tune:
     ] = False
     seed: Annotated[int, number("Seed of scenarios and starts.")] = 0
     overrides: Overrides = ()
+    unset: Unset = ()
     limit: Limit = 0.01
     json: Json = False
 
@@ -258,6 +269,7 @@ class Compare:
     scenarios: Annotated[int, number("Scenarios to tune on.")] = 32
     judged: Annotated[int, number("Fresh scenarios to judge on.")] = 256
     overrides: Overrides = ()
+    unset: Unset = ()
     limit: Annotated[float, arg(metavar="NUMBER", help="Restitution error that counts as a failure.")] = 0.01
     seed: Annotated[int, number("Seed of scenarios, starts and resampling.")] = 0
     json: Json = False

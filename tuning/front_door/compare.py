@@ -10,7 +10,7 @@ from jaxhil.mechanism.file import LoadedMechanism
 from jaxhil.runtime.laws import PUBLISHED
 from jaxhil.simulation.environment import computing
 from tuning import terminal
-from tuning.front_door import arguments
+from tuning.front_door import arguments, meaning
 
 if TYPE_CHECKING:
     from tuning.benchmark.study import LawFigures
@@ -136,6 +136,8 @@ def compare_each(
         seed=options.seed,
         tuned=not options.untuned,
     )
+    for one in loaded:
+        meaning.check(one.mechanism, one.label)
     mechanisms = [one.mechanism for one in loaded]
     for one in compare(mechanisms, options.laws, settings, processes, stages.say):
         yield one

@@ -17,7 +17,7 @@ from jaxhil.errors import InputError, shown
 from jaxhil.runtime import digest
 from jaxhil.simulation.environment import computing
 from tuning import terminal
-from tuning.front_door import arguments, sweep_studies
+from tuning.front_door import arguments, meaning, sweep_studies
 from tuning.front_door.arguments import ArgumentError
 from tuning.sweeps import LARGEST_CHUNK, LARGEST_SEED, MOST, PRECISIONS, SAMPLINGS
 
@@ -213,7 +213,9 @@ def run_study(
         from tuning.sweeps.tally import failure_probability
 
         choices = Choices(**{name: getattr(options, name) for name in Choices._fields})
-        manifest = build_manifest(arguments.gain_file(path), choices)
+        loaded = arguments.gain_file(path)
+        meaning.check(loaded.mechanism)
+        manifest = build_manifest(loaded, choices)
         with locked(folder):
             store = open_store(folder, manifest, options.resume)
             with terminal.progress(manifest.scenarios, "scenarios", progress) as bar:

@@ -12,11 +12,12 @@ from jaxhil.mechanism.file import LoadedMechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.environment import computing
 from tuning import terminal
-from tuning.front_door import arguments, tune_pareto
+from tuning.front_door import arguments, meaning, tune_pareto
 from tuning.front_door.arguments import ArgumentError
 from tuning.front_door.tune_pareto import TradedGains
 
 if TYPE_CHECKING:
+    from jaxhil.simulation.plausibility import Meaning
     from tuning.gains.objective import Objective
     from tuning.gains.settings import TuneSettings
     from tuning.gains.transfer import Tuned
@@ -155,6 +156,13 @@ class TunedGains:
         return "good" if tuned.failed == 0 and tuned.rms <= self.limit else "bad"
 
     @functools.cached_property
+    def meaning(self) -> "Meaning":
+        """What the mechanism means: mass, contacts in space, rates; `warnings` of what cannot be meant."""
+        from jaxhil.simulation import plausibility
+
+        return plausibility.meaning(self.mechanism)
+
+    @functools.cached_property
     def document(self) -> dict[str, Any]:
         """The content of the gain file."""
         from tuning.gain_file import build_document, validity_envelope
@@ -246,6 +254,11 @@ def tune(
     arguments.flags(progress=progress)
     loaded, several = arguments.mechanisms(mechanism)
     options.check()
+    with computing():
+        for one in loaded:
+            meaning.check(one.mechanism, one.label)
+        for one in loaded if progress else ():
+            meaning.say(one.mechanism, terminal.note)
     with computing(), terminal.stages(len(loaded), progress) as stages:
         found = dict(tune_each(loaded, options, stages.say))
         results = [found[index] for index in range(len(loaded))]

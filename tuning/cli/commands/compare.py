@@ -71,7 +71,7 @@ def run(options: Compare) -> int:
 
 def _load(options: Compare) -> list[LoadedMechanism]:
     files: list[str | None] = [*options.files, *(suite_names() if options.suites else [])]
-    loaded = [load(file, options.overrides) for file in files or [None]]
+    loaded = [load(file, options.overrides, options.unset) for file in files or [None]]
     check_names(loaded)
     return loaded
 

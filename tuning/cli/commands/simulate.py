@@ -4,15 +4,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxhil.errors import InputError, one_line, shown
-from jaxhil.mechanism.conversion import KeyProblem
 from jaxhil.mechanism.file import from_builtins, load, to_builtins
-from jaxhil.mechanism.overrides import apply_override, parse_override
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.environment import prepare
 from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options import Simulate
-from tuning.front_door import arguments
+from tuning.front_door import arguments, meaning
 
 if TYPE_CHECKING:
     from jaxhil.simulation.run import ContactResult, Run
@@ -28,11 +26,13 @@ def run(options: Simulate) -> int:
         arguments.compensators([options.compensator])
     mechanism = None
     if options.gains is None or options.file is not None:
-        mechanism = load(options.file, options.overrides).mechanism
+        mechanism = load(options.file, options.overrides, options.unset).mechanism
     prepare()
     from jaxhil.simulation.run import simulate
 
     mechanism, compensator, gains = _chosen(options, mechanism)
+    _check(mechanism, compensator, gains)
+    meaning.say(mechanism, None if options.json else terminal.emit_line)
     done = simulate(mechanism, compensator, gains, seed=options.seed)
     good = done.status == "ok" and all(abs(contact.error) <= options.limit for contact in done.contacts)
     if options.plot is not None:
@@ -47,6 +47,8 @@ def run(options: Simulate) -> int:
                 "gains": done.gains,
                 "contacts": contacts,
                 "status": done.status,
+                "reason": _reason(done.status),
+                "meaning": done.meaning,
                 "limit": options.limit,
                 "verdict": "good" if good else "bad",
             }
@@ -54,6 +56,22 @@ def run(options: Simulate) -> int:
     else:
         _print(options, done, contacts, good)
     return 0 if good else 1
+
+
+def _check(mechanism: Mechanism, compensator: str, gains: str | Path | None) -> None:
+    """It can be run: until that is known nothing is said of it. Raises `InputError`."""
+    from jaxhil.simulation.gain_choice import choose_gains
+    from jaxhil.simulation.plausibility import check_run
+
+    choose_gains(mechanism, compensator, gains)
+    check_run(mechanism)
+
+
+def _reason(status: str) -> str | None:
+    """What the status of a run that ended badly says."""
+    from jaxhil.simulation.metrics import STATUS_REASONS
+
+    return STATUS_REASONS.get(status)
 
 
 def _entry(contact: "ContactResult") -> dict[str, Any]:
@@ -80,18 +98,9 @@ def _chosen(options: Simulate, mechanism: Mechanism | None) -> tuple[Mechanism, 
             f"--compensator: found {options.compensator}, allowed {loaded.compensator}, which {label} is for"
         )
     if mechanism is None:
-        mechanism = _overridden(loaded.mechanism, options.overrides, label)
+        raw = to_builtins(loaded.mechanism)
+        mechanism = from_builtins(raw, label, options.overrides, options.unset)
     return mechanism, loaded.compensator, Path(options.gains)
-
-
-def _overridden(mechanism: Mechanism, overrides: tuple[str, ...], label: str) -> Mechanism:
-    raw = to_builtins(mechanism)
-    for text in overrides:
-        try:
-            raw = apply_override(raw, *parse_override(text))
-        except KeyProblem as problem:
-            raise InputError(f"{label}: --set {one_line(text, 60)}: {problem}") from None
-    return from_builtins(raw, label) if overrides else mechanism
 
 
 def _print(options: Simulate, done: "Run", contacts: list[dict[str, Any]], good: bool) -> None:
@@ -124,7 +133,7 @@ def _print(options: Simulate, done: "Run", contacts: list[dict[str, Any]], good:
     if good:
         lines.append(f"Good: every error is within {options.limit:g}.")
     elif done.status != "ok":
-        lines.append(f"Bad: the run ended with status '{done.status}'.")
+        lines.append(f"Bad: the run ended with status '{done.status}': {_reason(done.status)}.")
     else:
         worst = max((contact["error"] for contact in contacts), key=abs)
         kind = "divergence" if worst > 0 else "convergence"

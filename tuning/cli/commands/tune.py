@@ -15,6 +15,7 @@ from tuning.cli.commands import checks, tune_pareto
 from tuning.cli.commands.tune_tables import print_one, print_overview
 from tuning.cli.options import Tune
 from tuning.files import make_folder, remove_stale, writing
+from tuning.front_door import meaning
 from tuning.front_door.tune import TunedGains, TuneOptions, tune_each
 
 PICTURES = ("errors.png", "contact.png", "loss.png", "pareto.png")
@@ -40,6 +41,8 @@ def run(options: Tune) -> int:
         for one in loaded:
             folder = Path(options.output) / folder_name(one.mechanism.name)
             checks.own_results(folder / "gains.json", "compensator", PICTURES)
+        loaded = _understood(options, asked, loaded, problems)
+    if loaded:
         try:
             entries = _tune_all(options, asked, loaded, problems)
         except _Interrupted as stop:
@@ -73,7 +76,7 @@ def _load(options: Tune) -> tuple[list[LoadedMechanism], list[str]]:
     loaded, problems, folders = [], [], {}
     for file in _expand(options.files, problems):
         try:
-            one = load(file, options.overrides)
+            one = load(file, options.overrides, options.unset)
             folder = folder_name(one.mechanism.name)
             if folder in folders:
                 raise InputError(
@@ -86,6 +89,25 @@ def _load(options: Tune) -> tuple[list[LoadedMechanism], list[str]]:
             problems.append(str(error))
             terminal.note(f"jaxhil: {error}")
     return loaded, problems
+
+
+def _understood(
+    options: Tune, asked: TuneOptions, loaded: list[LoadedMechanism], problems: list[str]
+) -> list[LoadedMechanism]:
+    """The mechanisms that can be run; of each it is said what it means."""
+    prepare()
+    asked.settings()
+    kept = []
+    for one in loaded:
+        try:
+            meaning.check(one.mechanism, one.label)
+        except InputError as error:
+            problems.append(str(error))
+            terminal.note(f"jaxhil: {error}")
+        else:
+            meaning.say(one.mechanism, None if options.json else terminal.emit_line)
+            kept.append(one)
+    return kept
 
 
 def _expand(files: tuple[str, ...], problems: list[str]) -> list[str | None]:
@@ -182,6 +204,7 @@ def _finish(
         "mechanism": loaded.mechanism.name,
         "file": loaded.label,
         "compensator": options.compensator,
+        "meaning": result.meaning,
         "gain_file": str(folder / "gains.json"),
         "plots": plots,
         "gains": result.document["gains"],

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError
-from jaxhil.simulation.gain_file import load_gain_file
 from tuning import terminal
 from tuning.cli.options import Tune
 from tuning.files import make_folder, open_plain, remove_stale, writing
@@ -118,6 +117,9 @@ def _remove_others(folder: Path, number: int) -> None:
 
 
 def _is_gain_file(path: Path) -> bool:
+    # Takes jax, which refusals do without.
+    from jaxhil.simulation.gain_file import load_gain_file
+
     try:
         open_plain(path).close()
         load_gain_file(path)

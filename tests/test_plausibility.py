@@ -1,0 +1,355 @@
+"""What a mechanism file means, which meanings are warned of, and which runs are refused before they begin."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from laws_from_elsewhere import SquaredSpring
+from scipy.linalg import expm
+from scipy.special import beta
+
+import jaxhil
+import tuning
+from jaxhil.mechanism.file import builtin_names, suite_names
+from jaxhil.simulation.motion_simulator import exponential
+from jaxhil.simulation.plausibility import FASTEST_POLE, bandwidth, check_run, meaning
+from jaxhil.simulation.scenario import build_scenarios
+
+MASS, STIFFNESS, SPEED = 300.0, 106592.0, 0.005  # of rig-300kg
+
+
+def rig(overrides=(), **others):
+    """rig-300kg with dotted paths replaced; `a__b` stands for a.b."""
+    named = {path.replace("__", "."): value for path, value in others.items()}
+    return jaxhil.load("rig-300kg", {**dict(overrides), **named})
+
+
+def behind(**simulator):
+    return rig({"rig.simulator": simulator, "uncertainty": {}})
+
+
+@pytest.mark.parametrize("name", [*builtin_names(), *suite_names()])
+def test_no_built_in_mechanism_is_warned_of(name):
+    mechanism = jaxhil.load(name)
+    found = meaning(mechanism)
+    assert found.warnings == ()
+    assert found.equivalent_mass == mechanism.bodies.mass and found.control_rate == 1000.0
+    assert all(1.5 < one.frequency < 10 for one in found.contacts)
+    check_run(mechanism, drawn=True)
+
+
+def test_the_line_says_what_the_file_means():
+    assert meaning(rig(rig__force_sensor__range=200.0)).line("mine") == (
+        "mine: equivalent mass 300 kg; contact at 3 Hz, 1/333 of the control rate (1000 Hz) and 0.29 of the "
+        "motion simulator's bandwidth (10.5 Hz); peak force 28.3 N (0.14 of the sensor's range (200 N)); "
+        "about 0.197 s"
+    )
+    line = meaning(jaxhil.load("varying")).line("varying")
+    assert "contact at 3, 5.2, 2.12 Hz, at most 1/192 of the control rate" in line
+    assert "(the sensor has no range)" in line
+    many = jaxhil.load(
+        "varying", {"contact.stiffness": [1e5 * n for n in range(1, 8)], "approach.contacts": 7}
+    )
+    assert "contact at 2.69 to 7.12 Hz, " in meaning(many).line("many")
+    assert "motion simulator" not in meaning(behind(model="ideal")).line("ideal")
+
+
+# Figures.
+
+
+def test_contacts_that_differ_are_listed_once_in_order():
+    found = meaning(
+        jaxhil.load("varying", {"contact.stiffness": [2e5, 1e5, 2e5, 3e5], "approach.contacts": 9})
+    )
+    assert [one.number for one in found.contacts] == [1, 2, 4]
+    omega = np.sqrt(np.array([2e5, 1e5, 3e5]) / 350.0)
+    np.testing.assert_allclose([one.frequency for one in found.contacts], omega / (2 * np.pi), rtol=1e-12)
+
+
+def power_law(stiffness, exponent):
+    """Peak force and duration of M d'' = -k d^n, in closed form."""
+    order = exponent + 1
+    deepest = (order * MASS * SPEED**2 / (2 * stiffness)) ** (1 / order)
+    # 2 int_0^d_m dd / sqrt(v^2 - ...), with d = d_m s^(1/(n+1)).
+    duration = 2 * deepest / SPEED / order * beta(1 / order, 0.5)
+    return stiffness * deepest**exponent, duration
+
+
+def test_figures_of_every_kind_of_law_are_those_of_its_contact_in_space():
+    jaxhil.register(SquaredSpring())
+    spring = SPEED * math.sqrt(STIFFNESS * MASS), math.pi * math.sqrt(MASS / STIFFNESS)
+    laws = {
+        "linear": ({}, *spring),
+        "kelvin_voigt": ({}, *spring),
+        # As deep as it goes one slope is as good as three equal ones.
+        "piecewise_linear": ({"stiffness": [[STIFFNESS] * 3], "depths": [1e-5, 2e-4]}, *spring),
+        "hunt_crossley": ({"stiffness": [6e6]}, *power_law(6e6, 1.5)),
+        "depth_damped": (
+            {"stiffness": [4e8], "exponent": 2.0, "reference_depth": 1e-4},
+            *power_law(4e8, 2.0),
+        ),
+        "squared_spring": ({"stiffness": [4e8]}, *power_law(4e8, 2.0)),
+        # With so large a depth it does not stiffen.
+        "hardening": ({"reference_depth": 10.0}, *spring),
+        "elastoplastic": ({"unloading_ratio": 4.0}, spring[0], 0.75 * spring[1]),
+    }
+    for law, (keys, peak, duration) in laws.items():
+        [contact] = meaning(rig({"contact": {"law": law, "stiffness": [STIFFNESS], **keys}})).contacts
+        assert contact.peak_force == pytest.approx(peak, rel=1e-6), law
+        assert contact.duration == pytest.approx(duration, rel=1e-6), law
+        assert contact.frequency == pytest.approx(1 / (2 * duration), rel=1e-6), law
+
+
+def test_a_damped_spring_has_the_frequency_of_the_spring():
+    damped = {"contact.damping": [3 * math.sqrt(STIFFNESS * MASS)]}
+    for tension in (False, True):
+        [contact] = meaning(rig(damped, contact__tension=tension)).contacts
+        assert contact.frequency == pytest.approx(math.sqrt(STIFFNESS / MASS) / (2 * math.pi))
+        # Overdamped, and pulled back as well: they never part.
+        assert math.isinf(contact.duration) == tension
+
+
+def test_about_how_long_a_run_takes():
+    run = jaxhil.simulate("varying", "phase_lead")
+    assert run.meaning == meaning(run.mechanism)
+    assert run.meaning.duration == pytest.approx(run.time[-1], rel=0.25)
+
+
+SIMULATORS = [
+    {"model": "first_order", "time_constant": 0.01},
+    {"model": "second_order", "natural_frequency": 12.0, "damping_ratio": 0.8},
+    {"model": "second_order", "natural_frequency": 12.0, "damping_ratio": 0.1},
+    {"model": "third_order", "coefficients": [0.02, 1.6e-4, 5e-7]},
+    {"model": "transfer_function", "numerator": [0.004, 1.0], "denominator": [1.5e-4, 0.02, 1.0]},
+    {
+        "model": "transfer_function",
+        "numerator": [1.0],
+        "denominator": np.poly(np.full(20, -30.0)).tolist(),
+    },
+]
+
+
+@pytest.mark.parametrize("simulator", SIMULATORS, ids=lambda one: one["model"])
+def test_bandwidth_is_where_the_gain_has_fallen_by_3_db(simulator):
+    if len(simulator.get("denominator", ())) > 20:
+        simulator = simulator | {"numerator": [simulator["denominator"][-1]]}
+    made = build_scenarios(behind(**simulator)).simulator
+    frequency = bandwidth(made)
+
+    def gain(at):
+        return abs(
+            np.polyval(made.numerator[:, 0], 2j * np.pi * at)
+            / np.polyval(made.denominator[:, 0], 2j * np.pi * at)
+        )
+
+    assert gain(frequency) == pytest.approx(math.sqrt(0.5), rel=1e-5)
+    assert all(gain(share * frequency) > math.sqrt(0.5) for share in np.linspace(0, 0.99, 100))
+
+
+def test_an_ideal_simulator_has_no_bandwidth():
+    assert bandwidth(build_scenarios(behind(model="ideal")).simulator) == math.inf
+
+
+# Warnings.
+
+
+@pytest.mark.parametrize(
+    ("key", "plausible", "implausible", "said"),
+    [
+        # Contact at 5 Hz and the like of 300 kg.
+        ("rig.control_period", 0.03333, 0.03334, "contact.stiffness: found a contact frequency of 3 Hz"),
+        (
+            "contact.stiffness",
+            [2.9608e7],
+            [2.9609e7],
+            "frequency of 50 Hz (contact 1), expected at most 50 Hz",
+        ),
+        (
+            "contact.stiffness",
+            [29.61],
+            [29.60],
+            "frequency of 0.05 Hz (contact 1), expected at least 0.05 Hz",
+        ),
+        ("approach.velocity", 1.0, 1.001, "approach.velocity: found 1.001 m/s, expected at most 1 m/s"),
+        (
+            "rig.force_sensor.range",
+            28.3,
+            28.2,
+            "range: found 28.2 N, expected beyond the 28.3 N of contact 1",
+        ),
+        (
+            "rig.simulator.delay",
+            0.162,
+            0.167,
+            "rig.simulator.delay: found 0.167 s, expected less than contact",
+        ),
+        (
+            "rig.force_sensor.delay",
+            0.162,
+            0.163,
+            "rig.force_sensor.delay: found 0.167 s with its lag and the",
+        ),
+        ("rig.force_sensor.time_constant", 0.158, 0.159, "rig.force_sensor.delay: found 0.167 s with its"),
+        (
+            "rig.position_sensor.delay",
+            0.162,
+            0.163,
+            "rig.position_sensor.delay: found 0.167 s with the motion",
+        ),
+    ],
+)
+def test_what_can_hardly_be_meant_is_warned_of(key, plausible, implausible, said):
+    others = {"rig.force_sensor.delay": 0.0} if key == "rig.simulator.delay" else {}
+    assert meaning(rig(others, **{key: plausible})).warnings == ()
+    [warning] = meaning(rig(others, **{key: implausible})).warnings
+    assert said in warning and ", expected " in warning and warning.isprintable()
+
+
+def test_the_contact_that_is_implausible_is_named():
+    stiffness = {"contact.stiffness": [1e5, 1e9, 1.0], "approach.contacts": 3}
+    fast, slow, late = meaning(rig(stiffness)).warnings
+    assert "291 Hz (contact 2), expected at most 100 Hz, 1/10 of the control rate" in fast
+    assert "0.00919 Hz (contact 3)" in slow and "less than contact 2 lasts" in late
+
+
+def test_damping_of_a_law_without_damping_is_warned_of():
+    [warning] = meaning(rig(contact__law="linear", contact__damping=[0.0, 4.0])).warnings
+    assert warning == "contact.damping: found 4 N s/m, expected 0: law linear has no damping"
+
+
+# Refusals.
+
+
+def refusal(mechanism, **options):
+    with pytest.raises(jaxhil.InputError) as refused:
+        check_run(mechanism, **options)
+    message = str(refused.value)
+    assert message.isprintable() and message.startswith(f"{mechanism.name}: ")
+    return message
+
+
+def test_runs_of_too_many_ticks_are_refused():
+    said = (
+        "found 1e-09 s, allowed at most 1e+07 ticks a contact and 1e+09 a run: contact 1 takes about 0.195 s"
+    )
+    assert f"rig.control_period: {said}, 1.9e+08 ticks" in refusal(rig(rig__control_period=1e-9))
+    check_run(rig(rig__control_period=2e-8))
+    assert "contact 1 takes" in refusal(rig(rig__control_period=1.9e-8))
+    # A contact that never ends takes 10 s.
+    endless = {"contact.stiffness": [1e-9]}
+    check_run(rig(endless, rig__control_period=1.01e-6))
+    assert "contact 1 takes about 10 s" in refusal(rig(endless, rig__control_period=0.99e-6))
+    many = {"approach.contacts": 1000, "rig.control_period": 1e-7}
+    assert "contact 1 takes about 0.195 s, 1.9e+06 ticks" in refusal(rig(many))
+
+
+def test_a_flight_that_never_ends_is_refused():
+    gap = {"contact.clearance": 40.0, "approach.contacts": 2}
+    check_run(rig(gap))
+    said = refusal(rig(gap, contact__clearance=100.0))
+    assert "contact.clearance: found 100 m, allowed at most 1e+07 ticks a contact" in said
+    assert "contact 2 takes about 2e+04 s, 2e+07 ticks" in said
+    assert "contact.clearance: found 1e+30 m" in refusal(rig(gap, contact__clearance=1e30))
+    # Nobody flies after the last contact.
+    check_run(rig(contact__clearance=1e30))
+
+
+def test_draws_count_where_they_are_drawn():
+    wide = {"distribution": "loguniform", "factor": [1e-6, 1.0]}
+    uncertain = rig({"uncertainty": {"rig.control_period": wide}})
+    check_run(uncertain)
+    assert "found 1e-09 s" in refusal(uncertain, drawn=True)
+    speeds = {"contact.clearance": 1.0, "approach.contacts": 2}
+    slow = rig({**speeds, "uncertainty": {"approach.velocity": {**wide, "factor": [1e-3, 1.0]}}})
+    check_run(slow)
+    assert "contact 2 takes about 2e+05 s" in refusal(slow, drawn=True)
+    normal = {"distribution": "normal", "std": 2e-4}
+    check_run(rig({"uncertainty": {"rig.control_period": normal}}), drawn=True)
+
+
+@pytest.mark.parametrize(
+    "simulator",
+    [
+        {"model": "first_order", "time_constant": 1.5e-5},
+        {"model": "second_order", "natural_frequency": 1.02e4, "damping_ratio": 0.8},
+        {"model": "second_order", "natural_frequency": 1e100, "damping_ratio": 1e-100},
+        {"model": "third_order", "coefficients": [1e-5, 1e-9, 1e-15]},
+        {"model": "transfer_function", "numerator": [1e100], "denominator": [1e-100, 1.0, 1e100]},
+    ],
+    ids=str,
+)
+def test_simulators_too_fast_for_the_control_period_are_refused(simulator):
+    said = refusal(behind(**simulator))
+    assert ": rig.simulator: found a pole of " in said and "allowed at most 64 / control_period" in said
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.6, np.pi / 2])
+def test_poles_that_are_allowed_are_propagated_exactly(angle):
+    """Two poles of the magnitude 64 / T, at some angle to the negative axis."""
+    damping = 2 * FASTEST_POLE * math.cos(angle)
+    matrix = np.array([[0.0, FASTEST_POLE], [-FASTEST_POLE, -damping]])
+    np.testing.assert_allclose(exponential(jnp.asarray(matrix)), expm(matrix), rtol=0, atol=2e-9)
+
+
+def test_poles_count_where_they_are_drawn():
+    drawn = {"rig.simulator.natural_frequency": {"distribution": "uniform", "factor": [1.0, 1e3]}}
+    check_run(rig(uncertainty=drawn))
+    assert "rig.simulator: found a pole of " in refusal(rig(uncertainty=drawn), drawn=True)
+
+
+def test_every_function_refuses_what_would_not_end():
+    endless = rig(rig__control_period=1e-9)
+    for function in (jaxhil.simulate, tuning.tune, tuning.compare):
+        with pytest.raises(jaxhil.InputError, match="at most 1e\\+07 ticks a contact"):
+            function(endless)
+    with pytest.raises(jaxhil.InputError, match="at most 1e\\+07 ticks a contact"):
+        jaxhil.jacobian(endless, by="approach.velocity")
+
+
+# The commands.
+
+
+def test_simulate_begins_with_the_line(jaxhil):
+    ran = jaxhil("simulate", "rig-300kg", "--set", "rig.force_sensor.range=10")
+    assert ran.out.startswith("rig-300kg: equivalent mass 300 kg; contact at 3 Hz, ")
+    assert ran.err == (
+        "warning: rig-300kg: rig.force_sensor.range: found 10 N, expected beyond the 28.3 N of contact 1 in "
+        "space\n"
+    )
+    found = jaxhil("simulate", "rig-300kg", "--json", "--set", "rig.force_sensor.range=1e9").document[
+        "meaning"
+    ]
+    assert found["contacts"] == [
+        {
+            "number": 1,
+            "frequency": pytest.approx(3.0, rel=1e-5),
+            "duration": pytest.approx(1 / 6, rel=1e-5),
+            "peak_force": pytest.approx(28.27, rel=1e-3),
+        }
+    ]
+    assert found["force_range"] == 1e9 and found["warnings"] == []
+
+
+@pytest.mark.parametrize("command", ["simulate", "tune", "compare"])
+def test_commands_refuse_what_would_not_end_in_one_line(jaxhil, command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ran = jaxhil(command, "rig-300kg", "--set", "rig.control_period=1e-9")
+    assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1
+    assert ran.err.startswith("jaxhil: rig-300kg: rig.control_period: found 1e-09 s, allowed at most")
+
+
+@pytest.mark.parametrize("command", ["simulate", "tune", "compare"])
+def test_commands_take_keys_out(jaxhil, command):
+    ran = jaxhil(command, "rig-300kg", "--set", "name=x", "--unset", "approach.velocity", "--unset", "rig")
+    assert ran.code == 2 and ran.err.startswith(
+        "jaxhil: rig-300kg: --set name=x --unset approach.velocity rig: approach.velocity: found nothing"
+    )
+
+
+def test_a_timeout_says_its_limit(jaxhil):
+    ran = jaxhil("simulate", "rig-300kg", "--set", "rig.force_sensor.range=1e-6", "--json")
+    assert ran.document["status"] == "timeout"
+    assert ran.document["reason"] == "a contact was not over within 10 s, the limit of a contact"
+    out = jaxhil("simulate", "rig-300kg", "--set", "rig.force_sensor.range=1e-6").out
+    assert "Bad: the run ended with status 'timeout': a contact was not over within 10 s" in out
