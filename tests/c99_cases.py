@@ -198,10 +198,8 @@ def drawn_gains(law: str, rng: np.random.Generator, hostile: bool) -> GainFile:
             value = float(rng.choice(HOSTILE)) if rng.random() < 0.5 else float(10 ** rng.uniform(-320, 300))
         if name in delays(law):
             value = float(rng.choice([0.0, 1.0, 7.0, rng.uniform(0, CAPACITY)])) * period
-        value = min(max(value, specification.lowest), specification.highest)
-        if not (math.isfinite(value) and specification.admits(value)):
-            value = GAINS[law][name]["value"]
-        gains[name] = value
+        # What is not a number goes to an end.
+        gains[name] = max(min(specification.highest, value), specification.lowest)
     clearance = float(rng.choice([math.inf, 0.0, 1e-4, 0.02]))
     return GainFile(law, gains, period, clearance, drawn_limits(law, rng, hostile, period))
 
@@ -219,7 +217,7 @@ def drawn_limits(law: str, rng: np.random.Generator, hostile: bool, period: floa
             value = float(rng.choice(HOSTILE)) if rng.random() < 0.5 else float(10 ** rng.uniform(-320, 300))
         if name in delays(law):
             value = float(rng.choice([0.0, 1.0, 7.0, rng.uniform(0, CAPACITY)])) * period
-        if math.isfinite(value) and value >= specification.lowest:
+        if specification.admits(value):
             limits[name] = value
     try:
         return complete(limits)
@@ -275,9 +273,10 @@ def drawn_rows(kind: str, count: int, rng: np.random.Generator, period: float) -
 
 
 def drawn_exactly(law: str, count: int, rng: np.random.Generator) -> tuple[GainFile, np.ndarray]:
-    """Gains, limits and rows of small whole numbers, so that much is equal which is compared."""
+    """Gains, limits and rows of few small numbers, so that much is equal which is compared; positions are
+    whole numbers of what 1 m/s takes in a period."""
     period = 2.0**-10
-    per_period = {"N/s": 1 / period, "m/s": 1 / period, "m/s^2": 1 / period**2, "s": period}
+    per_period = {"N/s": 1 / period, "m": period, "m/s^2": 1 / period, "s": period}
     limits = {}
     only_expected = rng.random() < 0.5  # so that contacts come to the expected restitution
     for name, specification in LIMITS.items():
@@ -294,12 +293,14 @@ def drawn_exactly(law: str, count: int, rng: np.random.Generator) -> tuple[GainF
         limits = complete(limits)
     except ValueError:
         limits = NO_LIMITS
-    clearance = float(rng.choice([math.inf, 1.0, 2.0, 4.0]))
+    clearance = float(rng.choice([math.inf, 1.0, 2.0, 4.0])) * period
     gain_file = drawn_gains(law, rng, hostile=False)._replace(
         control_period=period, clearance=clearance, limits=limits
     )
-    whole = {name: float(rng.integers(1, 4)) for name in gain_file.gains}
-    whole |= {name: whole[name] * period for name in delays(law) & whole.keys()}
+    whole = {}
+    for name, specification in COMPENSATORS[law].gains.items():
+        value = float(rng.integers(1, 4)) * per_period.get(specification.unit, 1.0)
+        whole[name] = value if specification.admits(value) else specification.highest
     whole |= {"forgetting": 0.5} if "forgetting" in whole else {}
     gain_file = gain_file._replace(gains=whole)
     rows = np.zeros((count, len(ROW)))
@@ -307,6 +308,7 @@ def drawn_exactly(law: str, count: int, rng: np.random.Generator) -> tuple[GainF
     if rng.random() < 0.7:  # walks, which stay on one side for a while
         rows[:, 1:] = np.clip(np.cumsum(rng.integers(-1, 2, (count, 9)), axis=0), -4, 4)
         rows[:, 4] = np.where(rng.random(count) < 0.5, rows[:, 2], rows[:, 4])
+    rows[:, [2, 4, 7]] *= period
     gaps = rng.choice([1.0, 1.25, 1.5, 2.0, 3.0, 5.0, 1e6 - 0.5], count, p=[0.9, 0.03, 0.03, *[0.01] * 4])
     rows[:, 5] = period * np.cumsum(gaps)
     rows[:, 6] = 1.0

@@ -27,6 +27,7 @@ from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 
 from jaxhil.runtime import COMPENSATORS, GainFileError
+from jaxhil.runtime.bounds import DISTANCES
 from jaxhil.runtime.faults import FAULTS, LAW_IN_DOUBT, names
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
 from jaxhil.runtime.law_status import STATUSES
@@ -130,15 +131,16 @@ def test_gains_are_admitted_where_python_admits_them(law, batch):
     sane = drawn_gains(law, np.random.default_rng(3), hostile=False)
     assert made.begin(packed(law, sane))
     for name, specification in COMPENSATORS[law].gains.items():
-        for value in (*c99_cases.HOSTILE.tolist(), 0.5, 1.0 + 2**-52):
+        ends = specification.lowest, specification.highest
+        beyond = math.nextafter(ends[0], -math.inf), math.nextafter(ends[1], math.inf)
+        for value in (*c99_cases.HOSTILE.tolist(), *ends, *beyond):
             if name in c99_cases.delays(law) and not value <= CAPACITY * sane.control_period:
                 continue
             changed = sane._replace(gains={**sane.gains, name: value})
-            allowed = math.isfinite(value) and specification.admits(value)
-            assert made.begin(packed(law, changed)) == allowed, (name, value)
-    for period in (0.0, -1.0, math.nan, math.inf):
+            assert made.begin(packed(law, changed)) == specification.admits(value), (name, value)
+    for period in (0.0, -1.0, 9.9e-6, 0.11, math.nan, math.inf):
         assert not made.begin(packed(law, sane._replace(control_period=period)))
-    for clearance in (-1.0, math.nan, -math.inf):
+    for clearance in (-1.0, 10.1, math.nan, -math.inf):
         assert not made.begin(packed(law, sane._replace(clearance=clearance)))
 
 
@@ -171,12 +173,12 @@ def test_limits_are_admitted_where_python_admits_them(batch):
     assert made.begin(packed("none", plain))
     admitted = 0
     for name, specification in LIMITS.items():
-        for value in (*c99_cases.HOSTILE.tolist(), 0.01):
+        ends = specification.lowest, specification.highest
+        beyond = math.nextafter(ends[0], -math.inf), math.nextafter(ends[1], math.inf)
+        for value in (*c99_cases.HOSTILE.tolist(), *ends, *beyond, 0.01):
             if name in c99_cases.delays("none") and not value <= CAPACITY * PERIOD:
                 continue
-            allowed = value == specification.default or (
-                math.isfinite(value) and value >= specification.lowest
-            )
+            allowed = specification.admits(value)
             try:
                 limits = complete({name: value})
             except ValueError:
@@ -200,7 +202,7 @@ def test_limits_that_clash_are_refused_as_in_python(low, high, batch):
         limits = dict(zip(names_of, (low, high), strict=True))
         try:
             complete(limits)
-            allowed = all(value >= LIMITS[name].lowest for name, value in limits.items())
+            allowed = all(LIMITS[name].admits(value) for name, value in limits.items())
         except ValueError:
             allowed = False
         changed = plain._replace(limits={**plain.limits, **limits})
@@ -224,7 +226,7 @@ def compare(made: Batch, gain_file: GainFile, rows: np.ndarray) -> None:
 def test_retreat_of_a_command_from_one_end_of_the_range_to_the_other_is_finite(batch):
     gain_file = GainFile("none", {}, PERIOD, math.inf, complete({"deceleration": 1.0}))
     rows = np.zeros((6, len(c99_cases.ROW)))
-    rows[:2, 7] = 1e308, -1e308
+    rows[:2, 7] = 10.0, -10.0
     rows[3, 0] = c99_cases.STOP
     compare(batch("none"), gain_file, rows)
 
@@ -268,15 +270,9 @@ def cases(draw):
     any_float = st.one_of(st.floats(), st.sampled_from(c99_cases.HOSTILE.tolist()), st.floats(-1e3, 1e3))
     gains = {}
     for name, specification in COMPENSATORS[law].gains.items():
-        finite = st.floats(
-            specification.lowest if math.isfinite(specification.lowest) else None,
-            specification.highest if math.isfinite(specification.highest) else None,
-            allow_nan=False,
-            allow_infinity=False,
-            exclude_min=specification.exclusive,
-        )
+        finite = st.floats(specification.lowest, specification.highest)
         gains[name] = draw(st.floats(0.0, CAPACITY * PERIOD) if name in c99_cases.delays(law) else finite)
-    clearance = draw(st.one_of(st.just(math.inf), st.floats(0.0, allow_nan=False)))
+    clearance = draw(st.one_of(st.just(math.inf), st.floats(*DISTANCES)))
     number = st.tuples(
         st.sampled_from([0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0]),
         *[any_float] * 5,
@@ -295,12 +291,9 @@ def cases(draw):
 def limit_values(law, name):
     if name in c99_cases.delays(law):
         return st.floats(0.0, CAPACITY * PERIOD)
-    lowest = LIMITS[name].lowest
-    # Halves of the drawn limits are of a size that binds.
-    return st.one_of(
-        st.floats(max(lowest, -1e3), 1e3),
-        st.floats(lowest if math.isfinite(lowest) else None, allow_nan=False, allow_infinity=False),
-    )
+    lowest, highest = LIMITS[name].lowest, LIMITS[name].highest
+    # Half of the drawn limits are of a size that binds.
+    return st.one_of(st.floats(max(lowest, -1e3), min(highest, 1e3)), st.floats(lowest, highest))
 
 
 @settings(max_examples=150)

@@ -139,11 +139,9 @@ def test_jax_and_runtime_agree_on_contacts_and_on_noise(name):
 @pytest.mark.parametrize("name", WITH_GAINS)
 def test_bad_gains_are_refused_with_one_line(name):
     for gain, specification in ON_THE_RIG[name].gains.items():
-        bad = [10**400, None, "1", True]
-        bad += [specification.lowest] * specification.exclusive
-        bad += [specification.lowest - 1.0] * (specification.lowest > -math.inf)
-        bad += [specification.highest + 1.0] * (specification.highest < math.inf)
-        for value in bad:
+        below = math.nextafter(specification.lowest, -math.inf)
+        above = math.nextafter(specification.highest, math.inf)
+        for value in (10**400, None, "1", True, below, above):
             document = gain_document(name)
             document["gains"][gain] |= {"value": value, "lower": -1e300, "upper": 1e300}
             with pytest.raises(GainFileError) as caught:

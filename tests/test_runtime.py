@@ -90,8 +90,8 @@ def test_input_that_is_no_number_trips():
 
 
 def test_force_that_overflows_trips():
-    controller = Controller.from_dict(gain_document("phase_lead"))
-    assert controller.step(1.7e308, 0.0, 0.0, 0.0) == 0.0
+    controller = Controller.from_dict(gain_document("virtual_contact"))
+    assert controller.step(0.0, 1e-3, 1.7e308, 0.0) == 0.0
     assert controller.status == "tripped: command_not_finite"
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from gain_documents import gain_document, sign
-from guarded import PERIOD, limited
+from guarded import LIMITED, PERIOD, limited
 
 from jaxhil.runtime import Controller, GainFileError
 from jaxhil.runtime.faults import (
@@ -29,6 +29,7 @@ from jaxhil.runtime.faults import (
     VELOCITY_LIMIT,
     names,
 )
+from jaxhil.runtime.limits import LIMITS
 
 
 def fly(controller: Controller, ticks: int, start: float = -0.02) -> float:
@@ -269,18 +270,45 @@ def test_next_contact_begins_where_the_model_begins_but_not_after_a_trip():
     assert abs(controller.position_command(-0.01, 5e-3, 0.0) + 0.03) < 1e-4
 
 
-def test_without_limits_a_gain_file_gives_the_bare_law():
-    controller = Controller.from_dict(gain_document("none"))
-    for n in range(200):
-        assert controller.step(1e9 * (-1) ** n, 1e3 * n, 5.0, 0.0, 10.0**n / 1e200) == 1e9 * (-1) ** n
-        assert controller.position_command(1e3 * n, 5.0, 0.0) == 1e3 * n
-    assert controller.status == "ok"
+def test_without_limits_a_gain_file_gives_the_law_within_the_outermost_limits():
+    for values in (None, {}, dict.fromkeys(LIMITED)):
+        document = gain_document("none")
+        if values is not None:
+            document["limits"] = {name: {"value": None, "unit": LIMITS[name].unit} for name in values}
+        controller = Controller.from_dict(sign(document))
+        for n in range(200):
+            position = 9.9e-3 * n * (-1) ** (n // 100)
+            controller.next_contact()
+            assert controller.step(9.9e5 * (-1) ** n, 1e3, 5.0, 0.0, 10.0**n / 1e200) == 9.9e5 * (-1) ** n
+            assert controller.position_command(position, 5.0, 0.0) == position
+        assert controller.status == "ok"
+
+
+@pytest.mark.parametrize(
+    ("reading", "moved", "cause"),
+    [
+        ((1.1e6, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), FORCE_OUT_OF_RANGE),
+        ((0.0, 0.0, 0.0, -10.1), (0.0, 0.0, 0.0), POSITION_OUT_OF_RANGE),
+        ((9e5, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), FORCE_LIMIT),
+        ((0.0, 0.0, 0.0, 0.0), (10.1, 0.0, 0.0), STROKE),
+        ((0.0, 0.0, 0.0, 0.0), (0.011, 0.0, 0.0), VELOCITY_LIMIT),
+    ],
+)
+def test_without_limits_what_is_beyond_the_outermost_trips(reading, moved, cause):
+    controller = Controller.from_dict(gain_document("phase_lead"))
+    controller.step(0.0, 0.0, 0.0, 0.0)
+    assert controller.position_command(0.0, 0.0, 0.0) == 0.0
+    force = controller.step(*reading)
+    position = controller.position_command(*moved)
+    assert (force, position, controller.cause) == (0.0, 0.0, cause)
 
 
 @pytest.mark.parametrize(
     ("limits", "words"),
     [
-        ({"force_limit": {"value": -1.0, "unit": "N"}}, ["limits.force_limit.value", "-1.0", ">= 0.0"]),
+        ({"force_limit": {"value": -1.0, "unit": "N"}}, ["limits.force_limit.value", "-1.0", "0.0 to"]),
+        ({"force_limit": {"value": 2e6, "unit": "N"}}, ["force_limit.value", "2000000.0", "to 1000000.0"]),
+        ({"command_lowest": {"value": -11, "unit": "m"}}, ["command_lowest.value", "-11", "-10.0 to 10.0"]),
         ({"force_limit": {"value": 1.0, "unit": "kN"}}, ["limits.force_limit.unit", "'kN'", "'N'"]),
         ({"force_limit": {"value": math.inf, "unit": "N"}}, ["JSON"]),
         ({"force_limit": {"unit": "N"}}, ["limits.force_limit.value", "nothing"]),

@@ -1,8 +1,9 @@
 """Reading a gain file: JSON in, checked numbers out, or a `GainFileError` of one line.
 
 A file is refused as a whole: first its form (JSON, schema, digest), then what the digest cannot
-know (compensator, gains, units, bounds, control period). The digest is the SHA-256 of the
-document's canonical JSON without the date, the timings and the digest itself.
+know (compensator, gains, units, bounds, control period). Whoever changes a file can sign it anew: gains and
+limits have to be within the file's bounds and within those of the code too (`bounds`). The digest is the
+SHA-256 of the document's canonical JSON without the date, the timings and the digest itself.
 """
 
 import hashlib
@@ -12,6 +13,7 @@ from collections.abc import Mapping
 from math import inf, isfinite
 from typing import Any, NamedTuple
 
+from .bounds import CONTROL_PERIODS, DISTANCES, span
 from .errors import GainFileError, printable, refusal, shown
 from .limits import LIMITS, NO_LIMITS, complete
 from .registry import COMPENSATORS, GainSpecification
@@ -85,8 +87,7 @@ def check_gain_document(
         raise refusal(source, "compensator", shown(name), f"one of {', '.join(known)}")
     gains = _gains(document, known[name], source)
     period = _number(_entry(document, "control_period", source, ""), "control_period", source)
-    if period <= 0.0:
-        raise refusal(source, "control_period", shown(period), "> 0")
+    _check_within(period, *CONTROL_PERIODS, "control_period", source)
     mechanism = _object(document, "mechanism", source, "")
     rig = _object(mechanism, "rig", source, "mechanism.")
     key = "mechanism.rig.control_period"
@@ -97,8 +98,7 @@ def check_gain_document(
     clearance = inf
     if "clearance" in contact:
         clearance = _number(contact["clearance"], "mechanism.contact.clearance", source)
-        if clearance < 0.0:
-            raise refusal(source, "mechanism.contact.clearance", shown(clearance), ">= 0")
+        _check_within(clearance, *DISTANCES, "mechanism.contact.clearance", source)
     return GainFile(name, gains, period, clearance, _limits(document, source))
 
 
@@ -139,11 +139,8 @@ def _gains(
             _number(_entry(entry, key, source, prefix), prefix + key, source)
             for key in ("value", "lower", "upper")
         )
-        if not lower <= value <= upper:
-            allowed = f"{lower!r} to {upper!r}"
-            raise refusal(source, f"{prefix}value", shown(value), allowed)
-        if not specification.admits(value):
-            raise refusal(source, f"{prefix}value", shown(value), specification.description())
+        _check_within(value, lower, upper, f"{prefix}value", source)
+        _check_within(value, specification.lowest, specification.highest, f"{prefix}value", source)
         gains[name] = value
     return gains
 
@@ -166,8 +163,7 @@ def _limits(document: Mapping[str, Any], source: str) -> dict[str, float]:
         if value is None:
             continue
         limits[name] = _number(value, f"{prefix}value", source)
-        if limits[name] < specification.lowest:
-            raise refusal(source, f"{prefix}value", shown(value), f">= {specification.lowest!r}")
+        _check_within(limits[name], specification.lowest, specification.highest, f"{prefix}value", source)
     try:
         return complete(limits)
     except ValueError as error:
@@ -197,6 +193,11 @@ def _number(value: object, key: str, source: str) -> float:
         if isfinite(number):
             return number
     raise refusal(source, key, shown(value), "a finite number")
+
+
+def _check_within(value: float, lowest: float, highest: float, key: str, source: str) -> None:
+    if not lowest <= value <= highest:
+        raise refusal(source, key, shown(value), span(lowest, highest))
 
 
 def _is_shallow(document: Mapping[str, Any]) -> bool:

@@ -12,27 +12,16 @@ from .law_status import UNSTATED
 
 
 class GainSpecification(NamedTuple):
-    """One gain of a compensator: its unit, and the values for which the law is defined; the narrower bounds
-    used in tuning stand in the gain file itself."""
+    """One gain of a compensator: its unit, and the bounds that no gain file can move (`bounds`); the narrower
+    ones used in tuning stand in the gain file itself."""
 
     unit: str  # "1" if it has none
     lowest: float = -inf  # least value
     highest: float = inf  # largest value
-    exclusive: bool = False  # whether `lowest` itself is not in the range
 
     def admits(self, value: float) -> bool:
-        """Whether the law is defined for this value."""
-        above = value > self.lowest if self.exclusive else value >= self.lowest
-        return above and value <= self.highest
-
-    def description(self) -> str:
-        """The range in words, for an error message."""
-        parts = []
-        if self.lowest > -inf:
-            parts.append(f"{'>' if self.exclusive else '>='} {self.lowest!r}")
-        if self.highest < inf:
-            parts.append(f"<= {self.highest!r}")
-        return " and ".join(parts) or "any finite number"
+        """Whether the value is within the bounds."""
+        return self.lowest <= value <= self.highest
 
 
 class Compensator(Protocol):

@@ -10,6 +10,7 @@ import textwrap
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
+from jaxhil.runtime.bounds import CONTROL_PERIODS, DISTANCES, span
 from jaxhil.runtime.faults import FAULTS
 from jaxhil.runtime.gain_file import GainFile
 from jaxhil.runtime.law_status import STATUSES
@@ -38,21 +39,17 @@ def decimal(value: float) -> str:
 
 def gains_table(law: str) -> Table:
     """The struct `jaxhil_gains` of a law, and what is admitted in it."""
+    clearance = f"(({_within('clearance', *DISTANCES)}) || gains->clearance == INFINITY)"
     entries = [
-        ("control_period", "s, > 0"),
-        ("clearance", "m, of a contact with two sides; infinite with one"),
+        ("control_period", f"s, {span(*CONTROL_PERIODS)}"),
+        ("clearance", f"m, {span(*DISTANCES)}, of a contact with two sides; infinite with one"),
     ]
-    checks = ["isfinite(gains->control_period)", "gains->control_period > 0.0", "gains->clearance >= 0.0"]
+    checks = [_within("control_period", *CONTROL_PERIODS), clearance]
     for name, gain in COMPENSATORS[law].gains.items():
-        limited = gain.lowest > -math.inf or gain.highest < math.inf
-        entries.append((name, f"{gain.unit}, {gain.description()}" if limited else gain.unit))
-        checks.append(f"isfinite(gains->{name})")
-        if gain.lowest > -math.inf:
-            checks.append(f"gains->{name} {'>' if gain.exclusive else '>='} {decimal(gain.lowest)}")
-        if gain.highest < math.inf:
-            checks.append(f"gains->{name} <= {decimal(gain.highest)}")
+        entries.append((name, f"{gain.unit}, {span(gain.lowest, gain.highest)}"))
+        checks.append(_within(name, gain.lowest, gain.highest))
     return Table(
-        f"/* The gains of the compensator `{law}`. */\n",
+        f"/* The gains of the compensator `{law}`, within bounds that no gain file can move. */\n",
         _struct("jaxhil_gains", entries),
         _check("jaxhil_gains_admitted", "jaxhil_gains", "gains", checks),
     )
@@ -60,20 +57,15 @@ def gains_table(law: str) -> Table:
 
 def limits_table() -> Table:
     """The struct `jaxhil_limits`, what is admitted in it, and the limits of a gain file without any."""
-    checks = []
-    for name, limit in LIMITS.items():
-        if math.isinf(limit.default):
-            checks.append(f"(isfinite(limits->{name}) || limits->{name} == {decimal(limit.default)})")
-        else:
-            checks.append(f"isfinite(limits->{name})")
-        if limit.lowest > -math.inf:
-            checks.append(f"limits->{name} >= {decimal(limit.lowest)}")
+    entries = [
+        (name, f"{limit.unit}, {span(limit.lowest, limit.highest)}: {limit.meaning}")
+        for name, limit in LIMITS.items()
+    ]
+    checks = [_within(name, limit.lowest, limit.highest, "limits") for name, limit in LIMITS.items()]
     defaults = "".join(f"    .{name} = {decimal(limit.default)},\n" for name, limit in LIMITS.items())
     return Table(
-        "/* The limits within which the controller works; infinite where there is none. */\n",
-        _struct(
-            "jaxhil_limits", [(name, f"{limit.unit}: {limit.meaning}") for name, limit in LIMITS.items()]
-        ),
+        "/* The limits of the controller, each within bounds that no gain file can move. */\n",
+        _struct("jaxhil_limits", entries),
         f"static const jaxhil_limits jaxhil_no_limits = {{\n{defaults}}};\n\n"
         + _check("jaxhil_limits_admitted", "jaxhil_limits", "limits", checks),
     )
@@ -144,6 +136,15 @@ def _values(values: Mapping[str, float], units: Mapping[str, str]) -> str:
 def _struct(name: str, entries: Iterable[tuple[str, str]]) -> str:
     lines = "".join(f"{_comment(meaning, '    ')}    double {entry};\n" for entry, meaning in entries)
     return f"typedef struct {{\n{lines}}} {name};\n"
+
+
+def _within(name: str, lowest: float, highest: float, struct: str = "gains") -> str:
+    """A condition in C, false of what is not a number; of a law of one's own without bounds: finite."""
+    open_below, open_above = math.isinf(lowest), math.isinf(highest)
+    conditions = [f"isfinite({struct}->{name})"] * (open_below or open_above)
+    conditions += [] if open_below else [f"{struct}->{name} >= {decimal(lowest)}"]
+    conditions += [] if open_above else [f"{struct}->{name} <= {decimal(highest)}"]
+    return " && ".join(conditions)
 
 
 def _check(function: str, struct: str, argument: str, checks: Iterable[str]) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from math import pi
 from typing import ClassVar
 
+from ..bounds import FILTER_TIMES, FORCES, STIFFNESSES, TIMES
 from ..filters import DelayLine, LeadFilter
 from ..registry import Compensator, GainSpecification, register
 from ..surfaces import deflection
@@ -27,12 +28,12 @@ class DeadZoneObserver(Compensator):
     )  # fmt: skip
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
-        "phase_lead": GainSpecification("s"),
-        "lead_filter": GainSpecification("s", lowest=0.0, exclusive=True),
-        "observer_stiffness": GainSpecification("N/m", lowest=0.0),
-        "observer_bandwidth": GainSpecification("Hz", lowest=0.0, exclusive=True),
-        "observer_limit": GainSpecification("N", lowest=0.0),
-        "identification_delay": GainSpecification("s", lowest=0.0),
+        "phase_lead": GainSpecification("s", *TIMES),
+        "lead_filter": GainSpecification("s", *FILTER_TIMES),
+        "observer_stiffness": GainSpecification("N/m", *STIFFNESSES),
+        "observer_bandwidth": GainSpecification("Hz", 0.1, 1e5),
+        "observer_limit": GainSpecification("N", *FORCES),
+        "identification_delay": GainSpecification("s", *TIMES),
     }
 
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:

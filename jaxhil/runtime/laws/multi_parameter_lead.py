@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import ClassVar
 
+from ..bounds import FILTER_TIMES, TIMES
 from ..filters import VelocityFilter
 from ..registry import Compensator, GainSpecification, register
 
@@ -18,9 +19,9 @@ class MultiParameterLead(Compensator):
     __slots__ = ("_force_gain", "_force_rate_gain", "_rate")
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
-        "force_gain": GainSpecification("1"),
-        "force_rate_gain": GainSpecification("s"),
-        "lead_filter": GainSpecification("s", lowest=0.0, exclusive=True),
+        "force_gain": GainSpecification("1", -2.1, 2.1),
+        "force_rate_gain": GainSpecification("s", -2.0 * TIMES[1], 2.0 * TIMES[1]),
+        "lead_filter": GainSpecification("s", *FILTER_TIMES),
     }
 
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import ClassVar
 
+from ..bounds import FILTER_TIMES, TIMES
 from ..filters import LeadFilter
 from ..registry import Compensator, GainSpecification, register
 
@@ -18,8 +19,8 @@ class PhaseLead(Compensator):
     __slots__ = ("_lead",)
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
-        "phase_lead": GainSpecification("s"),
-        "lead_filter": GainSpecification("s", lowest=0.0, exclusive=True),
+        "phase_lead": GainSpecification("s", *TIMES),
+        "lead_filter": GainSpecification("s", *FILTER_TIMES),
     }
 
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import ClassVar
 
+from ..bounds import TIMES
 from ..registry import Compensator, GainSpecification, register
 
 
@@ -16,8 +17,8 @@ class PositionLead(Compensator):
     __slots__ = ("_of_acceleration", "_of_velocity")
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
-        "position_lead": GainSpecification("s"),
-        "acceleration_lead": GainSpecification("s^2"),
+        "position_lead": GainSpecification("s", -TIMES[1], TIMES[1]),
+        "acceleration_lead": GainSpecification("s^2", -TIMES[1], TIMES[1]),
     }
 
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:

@@ -14,6 +14,7 @@ group.
 from collections.abc import Mapping
 from typing import ClassVar
 
+from ..bounds import DAMPINGS, FILTER_TIMES, FORCES, STIFFNESSES, TIMES
 from ..filters import DelayLine, LeadFilter, VelocityFilter
 from ..registry import Compensator, GainSpecification, register
 from ..surfaces import deflection
@@ -39,18 +40,18 @@ class ResponseError(Compensator):
     )  # fmt: skip
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
-        "phase_lead": GainSpecification("s"),
-        "lead_filter": GainSpecification("s", lowest=0.0, exclusive=True),
-        "response_error": GainSpecification("1"),
-        "response_error_damping": GainSpecification("1"),
-        "initial_stiffness": GainSpecification("N/m"),
-        "initial_damping": GainSpecification("N s/m"),
-        "stiffness_covariance": GainSpecification("1/m^2", lowest=0.0),
-        "damping_covariance": GainSpecification("s^2/m^2", lowest=0.0),
-        "forgetting": GainSpecification("1", lowest=0.0, highest=1.0, exclusive=True),
-        "contact_threshold": GainSpecification("N", lowest=0.0),
-        "identification_delay": GainSpecification("s", lowest=0.0),
-        "velocity_filter": GainSpecification("s", lowest=0.0),
+        "phase_lead": GainSpecification("s", *TIMES),
+        "lead_filter": GainSpecification("s", *FILTER_TIMES),
+        "response_error": GainSpecification("1", 0.0, 2.0),
+        "response_error_damping": GainSpecification("1", 0.0, 2.0),
+        "initial_stiffness": GainSpecification("N/m", *STIFFNESSES),
+        "initial_damping": GainSpecification("N s/m", *DAMPINGS),
+        "stiffness_covariance": GainSpecification("1/m^2", 0.0, 1e20),
+        "damping_covariance": GainSpecification("s^2/m^2", 0.0, 1e12),
+        "forgetting": GainSpecification("1", 0.5, 1.0),
+        "contact_threshold": GainSpecification("N", *FORCES),
+        "identification_delay": GainSpecification("s", *TIMES),
+        "velocity_filter": GainSpecification("s", *FILTER_TIMES),
     }
 
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:

@@ -20,6 +20,7 @@ notebooks/guide/retrospective_reference.md.
 from collections.abc import Mapping
 from typing import ClassVar
 
+from ..bounds import FORCES, MASSES, TIMES
 from ..filters import DelayLine
 from ..law_status import IDENTIFIED, OUT_OF_CONTACT, SATURATED, UNSURE
 from ..registry import Compensator, GainSpecification
@@ -61,21 +62,21 @@ class Retrospective(Compensator):
     )  # fmt: skip
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
-        "equivalent_mass": GainSpecification("kg", lowest=0.0, exclusive=True),
-        "identification_delay": GainSpecification("s", lowest=0.0),
-        "force_noise": GainSpecification("N", lowest=0.0),
-        "dead_zone": GainSpecification("N", lowest=0.0),
-        "prior_stiffness": GainSpecification("1/s^2", lowest=0.0),
-        "prior_stiffness_spread": GainSpecification("1/s^2", lowest=0.0),
-        "prior_slope_spread": GainSpecification("1/s^2", lowest=0.0),
-        "prior_damping_spread": GainSpecification("1/s", lowest=0.0),
-        "prior_depth_damping_spread": GainSpecification("1/s", lowest=0.0),
-        "prior_unloading_spread": GainSpecification("1/s^2", lowest=0.0),
-        "force_noise_floor": GainSpecification("1/s", lowest=0.0, exclusive=True),
-        "velocity_gain": GainSpecification("1/s", lowest=0.0),
-        "correction_limit": GainSpecification("1", lowest=0.0),
-        "force_replay": GainSpecification("1", lowest=0.0),
-        "replay_noise": GainSpecification("1/s", lowest=0.0, exclusive=True),
+        "equivalent_mass": GainSpecification("kg", *MASSES),
+        "identification_delay": GainSpecification("s", *TIMES),
+        "force_noise": GainSpecification("N", *FORCES),
+        "dead_zone": GainSpecification("N", *FORCES),
+        "prior_stiffness": GainSpecification("1/s^2", 0.0, 5e3),
+        "prior_stiffness_spread": GainSpecification("1/s^2", 0.0, 5e3),
+        "prior_slope_spread": GainSpecification("1/s^2", 0.0, 5e3),
+        "prior_damping_spread": GainSpecification("1/s", 0.0, 50.0),
+        "prior_depth_damping_spread": GainSpecification("1/s", 0.0, 50.0),
+        "prior_unloading_spread": GainSpecification("1/s^2", 0.0, 5e3),
+        "force_noise_floor": GainSpecification("1/s", 1e-4, 10.0),
+        "velocity_gain": GainSpecification("1/s", 0.0, 1e5),
+        "correction_limit": GainSpecification("1", 0.0, 20.0),
+        "force_replay": GainSpecification("1", 0.0, 1.0),
+        "replay_noise": GainSpecification("1/s", 0.01, 100.0),
     }
 
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:

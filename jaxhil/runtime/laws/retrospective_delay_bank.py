@@ -23,7 +23,7 @@ class RetrospectiveDelayBank(Retrospective):
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
         **Retrospective.gains,
-        "delay_spread": GainSpecification("s", lowest=0.0),
+        "delay_spread": GainSpecification("s", 0.0, 0.004),
     }
 
     @property

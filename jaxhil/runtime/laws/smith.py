@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import ClassVar
 
+from ..bounds import FILTER_TIMES, TIMES
 from ..filters import LeadFilter
 from ..registry import Compensator, GainSpecification
 
@@ -16,9 +17,9 @@ class Smith(Compensator):
     __slots__ = ("_lead", "_predictor")
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
-        "phase_lead": GainSpecification("s"),
-        "lead_filter": GainSpecification("s", lowest=0.0, exclusive=True),
-        "simulator_lag": GainSpecification("s", lowest=0.0),
+        "phase_lead": GainSpecification("s", *TIMES),
+        "lead_filter": GainSpecification("s", *FILTER_TIMES),
+        "simulator_lag": GainSpecification("s", *TIMES),
     }
 
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:

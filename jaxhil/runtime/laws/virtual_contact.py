@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import ClassVar
 
+from ..bounds import DAMPINGS, STIFFNESSES
 from ..registry import Compensator, GainSpecification, register
 from ..surfaces import deflection
 
@@ -14,8 +15,8 @@ class VirtualContact(Compensator):
     __slots__ = ("_clearance", "_damping", "_stiffness")
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
-        "virtual_stiffness": GainSpecification("N/m"),
-        "virtual_damping": GainSpecification("N s/m"),
+        "virtual_stiffness": GainSpecification("N/m", -STIFFNESSES[1], STIFFNESSES[1]),
+        "virtual_damping": GainSpecification("N s/m", *DAMPINGS),
     }
 
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
