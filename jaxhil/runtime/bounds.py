@@ -1,7 +1,7 @@
 """What no gain file can move, however it is signed: the outermost values that the controller works with.
 
-It is for any rig with a control period of 10 us to 0.1 s and an equivalent mass of 1 kg to 1000 t, whose
-contact has 0.05 to 50 Hz and is entered at 10 um/s to 1 m/s. Force measurement and motion simulator are each
+It is for any rig with a control period of 10 us to 0.1 s and an equivalent mass of 10 g to 1000 t, whose
+contact has 0.05 to 50 Hz and is entered at 10 um/s to 10 m/s. Force measurement and motion simulator are each
 late by at most 1 s; contact force, noise and dead zone together stay below 1 MN, positions within 10 m of the
 surface, position commands below 10 m/s. The bounds of gains admit whatever the literature's rules, tuning and
 the shipped settings make of such a rig (`jaxhil/compensators` has their own, for a given one), and little
@@ -22,7 +22,7 @@ FILTER_TIMES = 1e-6, 2.1  # of filters that would divide by 0 or ring without on
 FORCES = 0.0, 1e6  # [N]
 STIFFNESSES = 0.0, 1e12  # [N/m]
 DAMPINGS = 0.0, 1e10  # [N s/m]
-MASSES = 0.1, 1e7  # [kg]
+MASSES = 1e-3, 1e7  # [kg]
 DISTANCES = 0.0, 10.0  # [m]
 POSITIONS = -10.0, 10.0  # [m]
 SPEEDS = 0.0, 10.0  # [m/s]

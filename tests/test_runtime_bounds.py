@@ -1,0 +1,96 @@
+"""The bounds in code admit whatever tuning, the literature and the settings make of any sane rig."""
+
+import math
+
+import pytest
+from family import family
+from hypothesis import given
+from hypothesis import strategies as st
+from mechanism_table import changed
+
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.mechanism.file import builtin_names, from_builtins, load, suite_names
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
+from jaxhil.runtime.bounds import CONTROL_PERIODS, FORCES
+from jaxhil.runtime.limits import LIMITS
+
+
+def beyond(mechanism: Mechanism) -> list[tuple]:
+    """What is not admitted of each gain's bounds and nominal value."""
+    found = []
+    for name, law in COMPENSATORS.items():
+        for gain in law.gains:
+            admits = ON_THE_RIG[name].gains[gain.name].admits
+            values = [bound(mechanism) for bound in (gain.lower, gain.nominal, gain.upper)]
+            found += [(name, gain.name, value) for value in values if not admits(value)]
+    return found
+
+
+@pytest.mark.parametrize("mechanism", [*builtin_names(), *suite_names()])
+def test_gains_of_every_mechanism_are_admitted(mechanism):
+    assert beyond(load(mechanism).mechanism) == []
+
+
+def test_gains_of_the_family_are_admitted():
+    assert [beyond(mechanism) for mechanism in family()] == [[]] * len(family())
+
+
+def test_settings_are_admitted():
+    for name, law in COMPENSATORS.items():
+        for values in law.settings.values():
+            assert all(ON_THE_RIG[name].gains[gain].admits(value) for gain, value in values.items())
+
+
+def log(low: float, high: float) -> st.SearchStrategy[float]:
+    """Numbers of every order from `low` to `high`."""
+    return st.floats(math.log(low), math.log(high)).map(lambda value: min(max(math.exp(value), low), high))
+
+
+@given(
+    log(*CONTROL_PERIODS),
+    log(1e-2, 1e6),
+    log(0.05, 50.0),
+    log(1e-5, 10.0),
+    st.floats(0.0, 1.0),
+    log(1e-4, 1.0),
+    log(1e-3, 1.0),
+    st.sampled_from(["linear", "zoh"]),
+)
+def test_gains_of_any_sane_rig_are_admitted(period, mass, frequency, speed, delay, lag, share, hold):
+    omega = 2.0 * math.pi * frequency
+    left = 0.99 * FORCES[1] - mass * omega * speed
+    if left < 0.0:
+        speed, left = 0.99 * FORCES[1] / (mass * omega), 0.0
+    raw = changed(
+        {
+            "bodies": {"equivalent_mass": mass},
+            "approach": {"velocity": speed},
+            "contact": {"law": "kelvin_voigt", "stiffness": [mass * omega**2], "damping": [mass * omega]},
+            "rig.control_period": period,
+            "rig.command_latency": 0,
+            "rig.command_hold": hold,
+            "rig.simulator": {
+                "model": "second_order",
+                "natural_frequency": 0.8 / (math.pi * share * lag),
+                "damping_ratio": 0.8,
+                "delay": lag - share * lag,
+            },
+            "rig.force_sensor": {
+                "delay": delay - share * delay,
+                "time_constant": share * delay,
+                "dead_zone": 0.4 * share * left,
+                "noise_std": 0.04 * left,
+            },
+            "uncertainty": {},
+        }
+    )
+    assert beyond(from_builtins(raw, "rig")) == []
+
+
+def test_every_bound_is_finite_and_every_limit_has_one_by_default():
+    for law in ON_THE_RIG.values():
+        for gain in law.gains.values():
+            assert math.isfinite(gain.lowest) and math.isfinite(gain.highest) and gain.lowest < gain.highest
+    for limit in LIMITS.values():
+        assert math.isfinite(limit.lowest) and math.isfinite(limit.highest) and limit.admits(limit.default)
