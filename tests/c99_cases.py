@@ -18,6 +18,8 @@ import numpy as np
 from gain_documents import GAINS, gain_document, sign
 
 from jaxhil.runtime import COMPENSATORS, Controller
+from jaxhil.runtime.bounds import CONTROL_PERIODS
+from jaxhil.runtime.filters import DelayLine
 from jaxhil.runtime.gain_file import GainFile
 from jaxhil.runtime.law_status import STATUSES
 from jaxhil.runtime.limits import LIMITS, NO_LIMITS, complete
@@ -37,7 +39,8 @@ RESULT = (
 STATUS_NAMES = tuple(status.name for status in STATUSES)
 TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE = (float(code) for code in range(6))
 PERIOD = 0.001
-CAPACITY = 64  # periods of delay that the compiled laws hold
+CAPACITY = 64  # periods of delay, of those drawn
+LINES = DelayLine.LONGEST  # periods of delay that the compiled laws hold
 SANITIZED = ("-fsanitize=undefined,address,float-cast-overflow", "-fno-sanitize-recover=all", "-g")
 SANE_LIMITS = {
     "force_range": 2000.0,
@@ -131,7 +134,7 @@ class Batch:
 
 @functools.cache
 def loaded(law: str) -> Batch:
-    """The law, compiled for delays as long as the tests need and loaded: once for all modules."""
+    """The law, compiled for any delay that the runtime admits and loaded: once for all modules."""
     folder = write_sources(Path(_BUILT.name) / law, long_document(law))
     return Batch(compiled(folder, "c99_driver.c", "driver.so", "-O2", "-shared", "-fPIC"), law)
 
@@ -163,14 +166,15 @@ def compiled(folder: Path, source: str, output: str, *options: str) -> Path:
 
 
 def long_document(law: str) -> dict[str, Any]:
-    """A document of `law` whose delays are as long as the tests need."""
-    document = gain_document(law)
+    """A document of `law` whose delays are as long as any that the runtime admits."""
+    period = CONTROL_PERIODS[0]
+    document = gain_document(law, control_period=period)
     document["limits"] = {}
     for name in delays(law):
         if name in document["gains"]:
-            document["gains"][name] |= {"value": CAPACITY * PERIOD, "upper": 1.0}
+            document["gains"][name] |= {"value": LINES * period, "upper": LINES * period}
         else:
-            document["limits"][name] = {"value": CAPACITY * PERIOD, "unit": LIMITS[name].unit}
+            document["limits"][name] = {"value": LINES * period, "unit": LIMITS[name].unit}
     return sign(document)
 
 
@@ -188,10 +192,10 @@ def packed(law: str, gain_file: GainFile) -> np.ndarray:
     return np.array([gain_file.control_period, gain_file.clearance, *gains, *limits])
 
 
-def drawn_gains(law: str, rng: np.random.Generator, hostile: bool) -> GainFile:
-    """Admissible gains: about the nominal ones, or from the whole range of doubles."""
+def drawn_gains(law: str, rng: np.random.Generator, hostile: bool, period: float | None = None) -> GainFile:
+    """Admissible gains: about the nominal ones, or from the whole range that is admitted."""
     gains = {}
-    period = PERIOD * float(rng.choice([0.25, 1.0, 1.7]))
+    period = period or PERIOD * float(rng.choice([0.25, 1.0, 1.7]))
     for name, specification in COMPENSATORS[law].gains.items():
         value = GAINS[law][name]["value"] * float(np.exp(0.5 * rng.standard_normal()))
         if hostile and rng.random() < 0.5:

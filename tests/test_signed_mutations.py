@@ -1,0 +1,162 @@
+"""Gain files that were changed and signed anew: refused with one line, or good within the bounds of the code.
+
+What loads is driven by whatever sensors and models may give, in Python and in C, which agree to the bit.
+"""
+
+import hashlib
+import json
+import math
+import random
+from collections.abc import Collection
+from pathlib import Path
+
+import c99_cases
+import numpy as np
+import pytest
+from c99_cases import NEXT_CONTACT, assert_same, controller_in_python, drawn_rows, packed
+from gain_documents import gain_document, sign
+from gain_mutations import anything_changed, numbers_changed, text_of
+from guarded import LIMITED
+
+from jaxhil.runtime import COMPENSATORS, GainFileError, digest
+from jaxhil.runtime.bounds import CONTROL_PERIODS, FORCES, POSITIONS, SPEEDS
+from jaxhil.runtime.controller import Controller
+from jaxhil.runtime.gain_file import GainFile, check_gain_document, read_gain_document
+from jaxhil.runtime.limits import LIMITS, NO_LIMITS
+
+TICKS = 12
+COMPILED = "phase_lead", "response_error", "retrospective_reference"  # every day: compiling takes its time
+
+
+def load(path: Path) -> GainFile | None:
+    """What the runtime makes of a file; None if it refuses it."""
+    try:
+        gain_file = check_gain_document(read_gain_document(path), str(path))
+        Controller(gain_file, str(path))
+    except GainFileError as error:
+        assert str(error).isprintable() and len(str(error)) < 1500
+        return None
+    return gain_file
+
+
+def is_within_bounds(gain_file: GainFile) -> bool:
+    """Whether the code's bounds admit every number."""
+    gains, limits = COMPENSATORS[gain_file.compensator].gains, gain_file.limits
+    return (
+        CONTROL_PERIODS[0] <= gain_file.control_period <= CONTROL_PERIODS[1]
+        and (0.0 <= gain_file.clearance <= 10.0 or gain_file.clearance == math.inf)
+        and gains.keys() == gain_file.gains.keys()
+        and all(gains[name].admits(value) for name, value in gain_file.gains.items())
+        and LIMITS.keys() == limits.keys()
+        and all(LIMITS[name].admits(value) for name, value in limits.items())
+        and limits["measured_lowest"] < limits["measured_highest"]
+        and limits["command_lowest"] < limits["command_highest"]
+        and limits["retreat_velocity"] <= limits["velocity_limit"]
+    )
+
+
+def drive(gain_file: GainFile, rows: np.ndarray, in_c: Collection[str]) -> None:
+    """Its commands stay within its limits, and so within the code's; C does what Python does."""
+    results = controller_in_python(gain_file, rows)
+    limits, period = gain_file.limits, gain_file.control_period
+    force, position = results[:, 0], results[:, 1]
+    assert np.all(np.abs(force) <= min(limits["force_limit"], FORCES[1]))
+    assert np.all((position >= limits["command_lowest"]) & (position <= limits["command_highest"]))
+    assert np.all((position >= POSITIONS[0]) & (position <= POSITIONS[1]))
+    moved = np.abs(np.diff(position))[rows[1:, 0] != NEXT_CONTACT]
+    most = min(limits["velocity_limit"], SPEEDS[1]) * period
+    assert np.all(moved <= most * (1 + 1e-9) + 1e-14)
+    if gain_file.compensator in in_c:
+        made = c99_cases.loaded(gain_file.compensator)
+        assert made.begin(packed(gain_file.compensator, gain_file))
+        assert_same(made.run(rows, True), results, rows)
+
+
+def as_numbers(document: dict) -> GainFile:
+    """The numbers of a document whose form is good, whatever they are."""
+
+    def number(value: float) -> float:
+        try:
+            return float(value)
+        except OverflowError:
+            return math.nan
+
+    limits = {
+        name: number(one["value"])
+        for name, one in document.get("limits", {}).items()
+        if one["value"] is not None
+    }
+    return GainFile(
+        document["compensator"],
+        {name: number(one["value"]) for name, one in document["gains"].items()},
+        number(document["control_period"]),
+        number(document["mechanism"]["contact"].get("clearance", math.inf)),
+        {**NO_LIMITS, **limits},
+    )
+
+
+def fits_its_lines(gain_file: GainFile) -> bool:
+    """Whether no delay is about as long as a line may be, or longer: there C counts whole periods alone."""
+    numbers = {**gain_file.limits, **gain_file.gains}
+    delays = c99_cases.delays(gain_file.compensator)
+    return all(numbers[name] / gain_file.control_period <= 99_999.0 for name in delays)
+
+
+def check(count: int, seed: int, path: Path, laws: Collection[str]) -> dict[str, int]:
+    """Change and sign `count` files; how many loaded and were refused. These `laws` are driven in C too."""
+    in_c = laws if c99_cases.COMPILER is not None else ()
+    rng = random.Random(seed)
+    source = np.random.default_rng(seed)
+    pool = [drawn_rows("hostile", TICKS, source, period) for period in (1e-5, 1e-3, 0.1) for _ in range(60)]
+    counts = {"loaded": 0, "refused": 0}
+    for number in range(count):
+        only_numbers = number % 2 == 0
+        document = (numbers_changed if only_numbers else anything_changed)(rng)
+        text = text_of(document, rng)
+        path.write_bytes(text.encode("ascii"))
+        gain_file = load(path)
+        counts["refused" if gain_file is None else "loaded"] += 1
+        if gain_file is not None:
+            assert is_within_bounds(gain_file), text
+            drive(gain_file, rng.choice(pool), in_c)
+        elif only_numbers:
+            # Where form and digest are good, it is refused for its numbers: C refuses them too.
+            numbers = as_numbers(document)
+            if numbers.compensator in in_c and text == json.dumps(document) and fits_its_lines(numbers):
+                made = c99_cases.loaded(numbers.compensator)
+                assert not is_within_bounds(numbers), text
+                assert not made.begin(packed(numbers.compensator, numbers)), text
+    return counts
+
+
+def test_signed_mutations_are_refused_or_stay_within_the_code_s_bounds(tmp_path):
+    counts = check(500, 0, tmp_path / "gains.json", COMPILED)
+    assert counts["loaded"] > 50 and counts["refused"] > 200, counts
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_signed_mutations(tmp_path):
+    counts = check(100_000, 1, tmp_path / "gains.json", COMPENSATORS)
+    print(counts)
+    assert counts["loaded"] > 10_000 and counts["refused"] > 40_000
+
+
+def test_a_thousand_bits_that_fall_over_load_no_other_content(tmp_path):
+    path = tmp_path / "gains.json"
+    document = gain_document()
+    document["limits"] = {name: {"value": one, "unit": LIMITS[name].unit} for name, one in LIMITED.items()}
+    whole = json.dumps(sign(document), indent=2, sort_keys=True).encode()
+    path.write_bytes(whole)
+    expected = load(path)
+    rng = random.Random(int(hashlib.sha256(whole).hexdigest(), 16))
+    loaded = 0
+    for place in rng.sample(range(8 * len(whole)), 1000):
+        flipped = bytearray(whole)
+        flipped[place // 8] ^= 1 << place % 8
+        path.write_bytes(flipped)
+        found = load(path)
+        if found is not None:
+            loaded += 1
+            assert found == expected and digest(read_gain_document(path)) == document["sha256"]
+    # Of date and timings, which the digest does not cover, and of blanks.
+    assert loaded < 200
