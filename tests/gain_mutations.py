@@ -101,7 +101,7 @@ def wild(rng: random.Random, usual: float, lowest: float, highest: float) -> flo
         return rng.choice((end, math.nextafter(end, math.inf), math.nextafter(end, -math.inf), 2.0 * end))
     if kind == 3:
         return rng.uniform(lowest, highest)
-    return usual * 10 ** rng.uniform(-3.0, 3.0)
+    return (usual if abs(usual) < 1e300 else 1.0) * 10 ** rng.uniform(-3.0, 3.0)
 
 
 _BASES: dict[tuple, str] = {}

@@ -90,9 +90,9 @@ def test_ticks_that_overspent_are_gone_through_again(varying):
     mechanism, _ = varying
     record = TickRecord(4)
     for tick, cpu in enumerate((10, 2_000_000_000, 30, 40)):
-        record.keep(encode_reading(a_reading(tick)))
+        record.keep(encode_reading(a_reading(tick), 3))
         record.add(tick + 10, cpu, cpu)
-    record.keep(encode_reading(a_reading(5)))
+    record.keep(encode_reading(a_reading(5), 3))
     record.add(15, 1, 3_000_000_000)
     assert record.count == record.kept == 4  # what does not fit is not kept
     again = replayed(lambda: prepared(mechanism), record, 1e9)
@@ -146,7 +146,7 @@ def test_a_rig_that_was_held_up_goes_on_from_there():
         timing = Timing(100)
         network = Network(nobody.getsockname(), Injection(), 0, 100, answered_by)
         begun = time.monotonic()
-        play(Sleepy(), network, 0.001, timing, lambda done: None)
+        play(Sleepy(), network, 0, 0.001, timing, lambda done: None)
         took = time.monotonic() - begun
         network.close()
     assert timing.ticks == 100 and not any(timing.met)

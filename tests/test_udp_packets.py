@@ -2,6 +2,7 @@
 
 import math
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rig_lock_step import ANY, FINITE, same
@@ -13,11 +14,16 @@ from tuning.rig.udp_protocol import (
     RESET,
     STOP,
     TICK,
+    WINDOW,
     Answer,
     PacketError,
     Reading,
+    Sequence,
+    Sessions,
+    ask_for_session,
     decode_answer,
     decode_reading,
+    decode_session,
     encode_answer,
     encode_reading,
 )
@@ -29,7 +35,7 @@ WORD = st.integers(0, 2**32 - 1)
     st.builds(Reading, st.sampled_from([PREPARE, TICK, STOP, RESET]), WORD, WORD, WORD, FINITE, *[ANY] * 4)
 )
 def test_readings_come_back(reading):
-    assert same(decode_reading(encode_reading(reading)), reading)
+    assert same(decode_reading(encode_reading(reading, 7), 7), reading)
 
 
 printable = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=96)
@@ -39,11 +45,12 @@ printable = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size
     st.builds(Answer, st.integers(0, FLAGS), *[WORD] * 3, *[ANY] * 5, st.integers(0, 2**64 - 1), printable)
 )
 def test_answers_come_back(answer):
-    assert same(decode_answer(encode_answer(answer)), answer)
+    assert same(decode_answer(encode_answer(answer, 7), 7), answer)
 
 
-READING = encode_reading(Reading(TICK, 1, 2, 3, 4.0, 5.0, 6.0, 7.0, 8.0))
-ANSWER = encode_answer(Answer(READY, 1, 2, 3, *[4.0] * 5, 5, "ok"))
+SESSION = 2**64 - 2
+READING = encode_reading(Reading(TICK, 1, 2, 3, 4.0, 5.0, 6.0, 7.0, 8.0), SESSION)
+ANSWER = encode_answer(Answer(READY, 1, 2, 3, *[4.0] * 5, 5, "ok"), SESSION)
 
 
 def mutated(packet):
@@ -68,17 +75,77 @@ def mutated(packet):
 @given(mutated(READING))
 def test_any_bytes_are_refused_or_a_reading(packet):
     try:
-        reading = decode_reading(packet)
+        reading = decode_reading(packet, SESSION)
     except PacketError:
         return
     assert len(packet) == len(READING) and math.isfinite(reading.time)
-    assert same(decode_reading(encode_reading(reading)), reading)
+    assert same(decode_reading(encode_reading(reading, SESSION), SESSION), reading)
 
 
 @given(mutated(ANSWER))
 def test_any_bytes_are_refused_or_an_answer(packet):
     try:
-        answer = decode_answer(packet)
+        answer = decode_answer(packet, SESSION)
     except PacketError:
         return
-    assert answer.words.isprintable() and same(decode_answer(encode_answer(answer)), answer)
+    assert answer.words.isprintable()
+    assert same(decode_answer(encode_answer(answer, SESSION), SESSION), answer)
+
+
+def test_packets_of_another_session_are_refused():
+    for decode, packet in ((decode_reading, READING), (decode_answer, ANSWER)):
+        assert decode(packet, SESSION) == decode(packet, None)
+        for other in (0, SESSION + 1, SESSION - 1):
+            with pytest.raises(PacketError, match="another session"):
+                decode(packet, other)
+
+
+def test_a_session_s_number_goes_to_who_asked_and_is_its_own_at_every_address():
+    sessions, rig, number = Sessions(), ("127.0.0.1", 4000), 2**63 + 5
+    answer = sessions.answer(ask_for_session(number), rig)
+    assert answer is not None and len(answer) == len(ask_for_session(number))
+    assert decode_session(answer, number) == sessions.number(rig)
+    with pytest.raises(PacketError):
+        decode_session(answer, number + 1)
+    others = [("127.0.0.1", 4001), ("127.0.0.2", 4000), ("127.0.0.1", 400)]
+    assert len({sessions.number(one) for one in (rig, *others)}) == 4
+    assert Sessions().number(rig) != sessions.number(rig)
+
+
+@given(st.one_of(st.binary(max_size=40), mutated(ask_for_session(3)), mutated(READING)))
+def test_nothing_but_a_question_opens_a_session(packet):
+    answer = Sessions().answer(packet, ("127.0.0.1", 4000))
+    assert (answer is not None) == (len(packet) == 24 and packet[:5] == ask_for_session(3)[:5])
+
+
+def newer(sequence: Sequence, *numbers: int) -> list[bool]:
+    return [sequence.is_newer(number & 0xFFFFFFFF) for number in numbers]
+
+
+@pytest.mark.parametrize("start", [0, 2**31 - 5, 2**32 - 5, 12345])
+def test_packets_are_newer_by_their_numbers_also_where_these_begin_again(start):
+    sequence = Sequence(start - 1)
+    assert newer(sequence, start, start + 1, start + 4) == [True] * 3
+    assert newer(sequence, start + 4, start + 3, start, start - 1) == [False] * 4
+    assert newer(sequence, start + 5, start + 5 + WINDOW, start + 10 + WINDOW) == [True] * 3
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1))
+def test_one_packet_of_any_number_makes_no_more_than_a_window_of_others_old(newest, wild):
+    sequence = Sequence(newest)
+    sequence.is_newer(wild)
+    following = newer(sequence, *range(newest + 1, newest + WINDOW + 3))
+    first = following.index(True)
+    # Right after the packet, or where that was ahead within the window, from there.
+    assert first <= WINDOW and all(following[first:])
+    assert first in (0, (wild - newest) & 0xFFFFFFFF)
+
+
+def test_after_many_lost_packets_one_more_is():
+    for gap in (WINDOW + 1, 10**6, 2**31 - 10):
+        sequence = Sequence(5)
+        assert newer(sequence, 5 + gap, 6 + gap, 7 + gap) == [False, True, True]
+    # A wild one, and another: neither follows the other.
+    assert newer(Sequence(5), 2**30, 2**29, 2**28, 6) == [False, False, False, True]
+    # From behind, never: that may be a record of what was sent before.
+    assert not any(newer(Sequence(2**31), *range(1000)))

@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -13,25 +12,12 @@ from pathlib import Path
 import pytest
 from bundles import document, signed
 from gain_documents import gain_document, sign
-from rig_lock_step import a_reading
 
 from jaxhil.compensators import literature_gains
 from jaxhil.mechanism.file import load
 from tuning.bundle.bundle import build_bundle, write_bundle
 from tuning.gain_file import build_document, write_gain_file
 from tuning.rig import udp_controller
-from tuning.rig.session import (
-    SOURCE,
-    listening_port,
-    start_controller,
-)
-from tuning.rig.udp_protocol import (
-    PREPARE,
-    READY,
-    STOP,
-    decode_answer,
-    encode_reading,
-)
 
 ROOT = Path(__file__).parents[1]
 
@@ -45,35 +31,6 @@ def gain_file(folder, compensator="response_error", limits=None, **values):
     path = folder / "gains.json"
     path.write_text(json.dumps(sign(document)))
     return path
-
-
-def test_the_controllers_process_answers_its_rig_and_nobody_else(tmp_path):
-    record = tmp_path / "ticks.json"
-    arguments = ["--gains", str(gain_file(tmp_path)), "--record", str(record), "--ticks", "100"]
-    process = start_controller(SOURCE, arguments)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as rig:
-        address = ("127.0.0.1", listening_port(process))
-        rig.settimeout(10)
-
-        def ask(reading):
-            rig.sendto(encode_reading(reading), address)
-            return decode_answer(rig.recv(1000))
-
-        rig.sendto(b"no packet at all", address)
-        assert ask(a_reading(0, 1, event=PREPARE)).flags == READY
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            stranger.sendto(encode_reading(a_reading(50)), address)
-        for tick in range(5):
-            answer = ask(a_reading(tick))
-            assert (answer.tick, answer.sequence, answer.words) == (tick, tick + 10, "")
-        rig.sendto(encode_reading(a_reading(0, 99, event=STOP)), address)
-    assert process.wait(20) == 0
-    process.stdout.close()
-    found = json.loads(record.read_text())
-    assert found["ended"] == "stopped" and found["jax"] is False and found["made_up"] == found["stale"] == 0
-    ticks = found["ticks"]
-    assert ticks["sequence"] == [10, 11, 12, 13, 14]
-    assert all(value > 0 for value in ticks["wall"] + ticks["cpu"])
 
 
 def test_a_bundle_with_another_controller_is_not_rehearsed(jaxhil, tmp_path):
@@ -92,22 +49,6 @@ def test_a_bundle_with_another_controller_is_not_rehearsed(jaxhil, tmp_path):
         ran = jaxhil(*arguments)
         assert (ran.code, ran.out) == (2, "") and f"{name}: is not what this version exports" in ran.err
     assert not (tmp_path / "ran").exists()
-
-
-@pytest.mark.parametrize("options", [("--wait", "0.1"), ("--wait", "20", "--silence", "0.1")])
-def test_a_silent_rig_ends_the_controllers_process(tmp_path, options):
-    record = tmp_path / "ticks.json"
-    process = start_controller(SOURCE, ["--empty", "--record", str(record), *options])
-    port = listening_port(process)
-    if "20" in options:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as rig:
-            rig.settimeout(10)
-            rig.sendto(encode_reading(a_reading(0, 1)), ("127.0.0.1", port))
-            assert decode_answer(rig.recv(1000)).sequence == 1
-            assert process.wait(20) == 1
-    assert process.wait(20) == 1
-    process.stdout.close()
-    assert json.loads(record.read_text())["ended"] == "silent"
 
 
 def test_a_controllers_process_without_a_gain_file(capfd):

@@ -67,9 +67,14 @@ class Timing:
 
 
 def play(
-    task: RealTimeTask, network: Network, period: float, timing: Timing, tell: Callable[[int], None]
+    task: RealTimeTask,
+    network: Network,
+    session: int,
+    period: float,
+    timing: Timing,
+    tell: Callable[[int], None],
 ) -> None:
-    """Play `len(timing.met)` ticks of `period` [s], or until 1 s after a trip.
+    """Play `len(timing.met)` ticks of `period` [s] in the session of that number, or until 1 s after a trip.
 
     `tell` is called once a second with how many are done.
 
@@ -87,14 +92,14 @@ def play(
         for number in range(total):
             due = began + timing.stood + number * step
             _until(network, due)
-            packet = encode_reading(task.reading())
+            packet = encode_reading(task.reading(), session)
             left[number] = time.monotonic_ns()
             network.send(number, packet)
             late = timing.late[number] = left[number] - due
             if late > MOST_BEHIND * step:
                 timing.stood += late
                 due += late
-            met = _answered(task, network, due + allowance, left, timing)
+            met = _answered(task, network, session, due + allowance, left, timing)
             timing.met[number] = met and late <= step
             task.advance()
             timing.ticks = number + 1
@@ -109,13 +114,15 @@ def play(
         gc.unfreeze()
 
 
-def _answered(task: RealTimeTask, network: Network, deadline: int, left: array, timing: Timing) -> bool:
+def _answered(
+    task: RealTimeTask, network: Network, session: int, deadline: int, left: array, timing: Timing
+) -> bool:
     """Take in what arrives, until this tick's answer does or the deadline has passed."""
     while True:
         met = False
         for arrived, packet in network.receive():
             try:
-                answer = decode_answer(packet)
+                answer = decode_answer(packet, session)
             except PacketError:
                 continue
             number = answer.sequence
@@ -140,6 +147,6 @@ def _until(network: Network, due: int) -> None:
 def answered_by(packet: bytes) -> int | None:
     """The number of the packet that this one answers; None if it answers none."""
     try:
-        return decode_answer(packet).sequence
+        return decode_answer(packet, None).sequence
     except PacketError:
         return None

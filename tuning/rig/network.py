@@ -78,6 +78,16 @@ class Network:
             # Nobody listens: the tick will be a missed one.
             pass
 
+    def ask(self, packet: bytes, wait: float) -> bytes | None:
+        """What comes back within `wait` [s] after a packet, past all injection; None if nothing does."""
+        self.send_plainly(packet)
+        if not select.select([self._socket], [], [], wait)[0]:
+            return None
+        try:
+            return self._socket.recv(LONGEST_PACKET)
+        except OSError:
+            return None
+
     def receive(self) -> list[tuple[int, bytes]]:
         """What has arrived by now: when [ns], and the packet."""
         self._drain()

@@ -10,9 +10,11 @@ the machine's: the operating system, or another machine on the same processor, r
 import json
 import math
 import os
+import secrets
 import select
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,9 +29,17 @@ from tuning.rig.hardware import Commanded, RigTask
 from tuning.rig.loop import ANSWER_SHARE, EmptyTask, Timing, answered_by, play
 from tuning.rig.network import Injection, Network
 from tuning.rig.udp_controller import CPU_SHARE, realtime
-from tuning.rig.udp_protocol import STOP, Reading, encode_reading
+from tuning.rig.udp_protocol import (
+    STOP,
+    PacketError,
+    Reading,
+    ask_for_session,
+    decode_session,
+    encode_reading,
+)
 
-STARTING = 30.0  # s in which the controller's process has to listen
+STARTING = 30.0  # s in which the controller's process has to listen, and to answer
+ASKING = 0.1  # s to wait for an answer, before asking again
 ENDING = 120.0  # s in which it has to end, going through its packets again included
 SILENCE = 2.0  # s without a packet, after which it ends by itself
 
@@ -146,15 +156,16 @@ def _play(
     try:
         port = listening_port(process)
         network = Network(("127.0.0.1", port), injection, setup.seed, ticks, answered_by)
+        session = open_session(network)
         try:
             with real_time(setup.priority):
-                play(task, network, period, timing, lambda done: progress(done, ticks))
+                play(task, network, session, period, timing, lambda done: progress(done, ticks))
         except KeyboardInterrupt:
             interrupted = True
         finally:
             # Past all injection; twice, as a full buffer may swallow one.
             for _ in range(2):
-                network.send_plainly(encode_reading(LAST))
+                network.send_plainly(encode_reading(LAST, session))
             network.close()
         process.wait(ENDING)
         document = json.loads(record.read_text(encoding="utf-8"))
@@ -204,6 +215,21 @@ def listening_port(process: subprocess.Popen) -> int:
     if len(line) != 2 or line[0] != "port":
         raise InputError("udp_controller.py: found no process that listens, allowed one that says its port")
     return int(line[1])
+
+
+def open_session(network: Network) -> int:
+    """The number of a session with the controller's process, asked for until it answers. Raises InputError if
+    it does not."""
+    number = secrets.randbits(64)
+    until = time.monotonic() + STARTING
+    while time.monotonic() < until:
+        packet = network.ask(ask_for_session(number), ASKING)
+        try:
+            return decode_session(packet or b"", number)
+        except PacketError:
+            continue
+    network.close()
+    raise InputError("udp_controller.py: found no answer, allowed one to who asks for a session")
 
 
 def loop_report(timing: Timing, network: Network, controller: dict[str, Any], period: float) -> LoopReport:

@@ -4,15 +4,17 @@
 
 It runs from a bundle's folder with that bundle's `gains.json`, `jaxhil_runtime.py` and `udp_protocol.py`,
 which says what is in a packet; nothing else is needed. Standard output says `port NUMBER` once it listens.
-Whoever plays the rig sends
+Whoever plays the rig asks for a session (`ask_for_session`) until the answer is there, then sends
 
     PREPARE  the mechanism is free: tare, then stand ready at the start of a run; repeated until READY
     RESET    as PREPARE, after a reset of a controller that has tripped
     TICK     what the sensors read at tick n = 0, 1, ... of the run; answered by the command for tick n + 1
     STOP     the session is over
 
-and a silent rig (`--silence`) ends it too. This process holds the numerical model: M x'' = -F_c, integrated
-once per period.
+and a silent rig (`--silence`) ends it too. This process serves one session, which belongs to the address and
+port that its first packet came from. Packets from elsewhere or without the session's number are ignored and
+counted; neither they nor packets that came before break the silence. A rig that begins anew starts another
+process. This one holds the numerical model: M x'' = -F_c, integrated once per period.
 
 Its own time per tick (from the return of recv to that of send) and the CPU time in it are kept in arrays
 allocated beforehand and written at the end. Where a tick took more CPU time than its share of the period, all
@@ -32,7 +34,7 @@ import time
 from array import array
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 HERE = Path(__file__).resolve().parent
 # An isolated interpreter (-I) does not look beside the script.
@@ -94,7 +96,8 @@ class TickRecord:
     def readings(self) -> Iterator[udp.Reading]:
         """The readings of the packets kept."""
         for place in range(self.kept):
-            yield udp.decode_reading(bytes(self._packets[place * self._size : (place + 1) * self._size]))
+            packet = self._packets[place * self._size : (place + 1) * self._size]
+            yield udp.decode_reading(packet, None)
 
     def above(self, limit: float) -> dict[int, int]:
         """CPU time [ns] of the ticks that took more than `limit` [ns], by their sequence number."""
@@ -119,47 +122,69 @@ def replayed(make: Callable[[], udp.ControllerTask], record: TickRecord, limit: 
     return found
 
 
+class Ended(NamedTuple):
+    """How a session ended."""
+
+    why: str  # "stopped", "silent" or "interrupted"
+    ignored: int  # packets that were not of it
+
+
 def serve(
     receiver: socket.socket, task: udp.ControllerTask | Empty, record: TickRecord, wait: float, silence: float
-) -> str:
-    """Answer packets until the rig stops or has been silent; returns which. Times in s.
-
-    Only the first peer that sends a packet of this protocol is answered.
-    """
+) -> Ended:
+    """Answer the packets of one session until the rig stops it, or `silence` [s] have passed without one;
+    `wait` [s] for its first."""
     packet = bytearray(udp.READING.size + 1)
-    now, cpu_now, add, keep = time.monotonic_ns, time.thread_time_ns, record.add, record.keep
-    decode, encode = udp.decode_reading, udp.encode_answer
-    peer: Any = None
+    now, cpu_now, clock = time.monotonic_ns, time.thread_time_ns, time.monotonic
+    sessions, peer, session, ignored = udp.Sessions(), None, 0, 0
+    until = clock() + wait
     while True:
-        if not select.select([receiver], [], [], wait)[0]:
-            return "silent"
+        # Not the time since the last packet: anyone may send some.
+        left = until - clock()
+        if left <= 0.0 or not select.select([receiver], [], [], left)[0]:
+            return Ended("silent", ignored)
         try:
             size, sender = receiver.recvfrom_into(packet)
         except OSError:
             # A refusal that an earlier answer met: its addressee is gone.
             continue
         begun, cpu_begun = now(), cpu_now()
-        if peer is not None and sender != peer:
-            continue
-        try:
-            reading = decode(packet[:size])
-        except udp.PacketError:
+        if peer is None:
+            session = sessions.number(sender)
+            opening = sessions.answer(packet[:size], sender)
+            if opening is not None:
+                _send(receiver, opening, sender)
+                continue
+        reading = None
+        if peer is None or sender == peer:
+            try:
+                reading = udp.decode_reading(packet[:size], session)
+            except udp.PacketError:
+                pass
+        if reading is None:
+            ignored += 1
             continue
         if peer is None:
-            peer, wait = sender, silence
+            peer, until = sender, clock() + silence
         if reading.event == udp.STOP:
-            return "stopped"
-        answer = task.answer(reading)
+            return Ended("stopped", ignored)
+        answer, sent = task.answer(reading), False
         if answer is not None:
-            try:
-                receiver.sendto(encode(answer), peer)
-            except OSError:
-                # The rig does not listen, or the network is full: a tick without an answer.
-                answer = None
+            until = clock() + silence
+            sent = _send(receiver, udp.encode_answer(answer, session), peer)
         took, cpu_took = now() - begun, cpu_now() - cpu_begun
-        keep(packet[:size])
-        if answer is not None and reading.event == udp.TICK:
-            add(reading.sequence, took, cpu_took)
+        record.keep(packet[:size])
+        if sent and reading.event == udp.TICK:
+            record.add(reading.sequence, took, cpu_took)
+
+
+def _send(receiver: socket.socket, packet: bytes, peer: Any) -> bool:
+    """Whether a packet left: not where the rig does not listen, or the network is full."""
+    try:
+        receiver.sendto(packet, peer)
+    except OSError:
+        return False
+    return True
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -170,7 +195,9 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--record", default=None, help="file for the time of every tick, as JSON")
     parser.add_argument("--ticks", type=int, default=1_000_000, help="ticks to keep the time of")
     parser.add_argument("--wait", type=float, default=30.0, help="s to wait for the first packet")
-    parser.add_argument("--silence", type=float, default=2.0, help="s without a packet that end the session")
+    parser.add_argument(
+        "--silence", type=float, default=2.0, help="s without a new packet that end the session"
+    )
     parser.add_argument("--realtime", action="store_true", help="ask for a real-time priority")
     parser.add_argument("--empty", action="store_true", help="answer at once, compute nothing")
     return parser.parse_args(arguments)
@@ -202,10 +229,11 @@ def main(arguments: list[str] | None = None) -> int:
         try:
             ended = serve(receiver, task, record, options.wait, options.silence)
         except KeyboardInterrupt:
-            ended = "interrupted"
+            ended = Ended("interrupted", 0)
     again = replayed(lambda: load(options.gains), record, limit)
     document = {
-        "ended": ended,
+        "ended": ended.why,
+        "ignored": ended.ignored,
         "status": task.status,
         "stale": task.stale,
         "made_up": task.made_up,
@@ -216,7 +244,7 @@ def main(arguments: list[str] | None = None) -> int:
     }
     if options.record is not None:
         Path(options.record).write_text(json.dumps(document), encoding="utf-8")
-    return 0 if ended == "stopped" else 1
+    return 0 if ended.why == "stopped" else 1
 
 
 def load(path: str) -> udp.ControllerTask:

@@ -4,14 +4,20 @@ The rig sends a `Reading`, what its sensors read at a tick; the controller's pro
 the command for the next one. Both are packets of fixed size. `ControllerTask` makes the one of the other: it
 holds the controller and the numerical model of the docking, and knows nothing of networks and clocks.
 
-Packets may be lost, late or out of order: one that is no newer than the last is dropped and counted. Ticks
-that no packet came for are made up once the next one is there, from readings on the straight line between,
-and answered with the fault `missed_tick`. Where more are missing than the gain file's limit
-`missed_in_a_row` (without one, `MOST_MADE_UP`), the controller sees the gap in the rig's time and judges it,
-and the model goes on under the last F_c: its time stays the rig's.
+First the rig asks for a session, with a number drawn at random, until it is answered: by that number and the
+session's, which every later packet carries, either way. It is one that only who receives at the rig's address
+and port can know, and begins with the first packet from there that has it (`Sessions`).
+
+Packets may be lost, late or out of order: one that is not newer than the last is dropped and counted
+(`Sequence`). Ticks that no packet came for are made up once the next one is there, from readings on the
+straight line between, and answered with the fault `missed_tick`. Where more are missing than the gain file's
+limit `missed_in_a_row` (without one, `MOST_MADE_UP`), the controller sees the gap in the rig's time and
+judges it, and the model goes on under the last F_c: its time stays the rig's.
 """
 
+import hmac
 import math
+import secrets
 import struct
 from typing import Any, NamedTuple
 
@@ -20,12 +26,18 @@ EVENTS = (PREPARE, TICK, STOP, RESET)
 READY, TRIPPED, TARING, EMPTY = 1, 2, 4, 8  # flags of an answer
 FLAGS = READY | TRIPPED | TARING | EMPTY
 
-# Little-endian: mark, version, kind, sequence, run, tick; time [s], force [N], position [m], start [m, m/s].
-READING = struct.Struct("<4sBBxxIIIxxxx5d")
-# Mark, version, flags, sequence, run, tick; positions, velocity, forces; faults; words on a trip.
-ANSWER = struct.Struct("<4sBBxxIII4xdddddQ96s")
-MARK_IN, MARK_OUT, VERSION = b"JHrd", b"JHan", 1
+# Little-endian: mark, version, kind, session, sequence, run, tick; time [s], force [N], position [m],
+# start [m, m/s].
+READING = struct.Struct("<4sBBxxQIIIxxxx5d")
+# Mark, version, flags, session, sequence, run, tick; positions, velocity, forces; faults; words on a trip.
+ANSWER = struct.Struct("<4sBBxxQIII4xdddddQ96s")
+# Mark, version, the rig's number, the session's: 0 in the question.
+OPENING = struct.Struct("<4sBxxxQQ")
+MARK_IN, MARK_OUT, VERSION = b"JHrd", b"JHan", 2
+MARK_ASK, MARK_OPEN = b"JHas", b"JHop"
 
+NUMBERS = 0xFFFFFFFF  # the largest number of a packet: 0 follows it
+WINDOW = 100  # packets in a row that may be lost without costing one more
 APPROACH = 0.02  # s of free approach before a contact
 MOST_MADE_UP = 10  # ticks in a row, without a limit in the gain file
 MOST_PASSED = 10_000  # periods that the model goes on under the last force
@@ -66,41 +78,113 @@ class Answer(NamedTuple):
     words: str  # why the controller has tripped; empty if it has not
 
 
-def encode_reading(reading: Reading) -> bytes:
+def encode_reading(reading: Reading, session: int) -> bytes:
     """The packet of a reading."""
-    return READING.pack(MARK_IN, VERSION, *reading)
+    return READING.pack(MARK_IN, VERSION, reading.event, session, *reading[1:])
 
 
-def decode_reading(packet: bytes | bytearray) -> Reading:
-    """The reading in a packet; sensor values may be anything, NaN included. Raises PacketError."""
+def decode_reading(packet: bytes | bytearray, session: int | None) -> Reading:
+    """The reading in a packet of the session, or of any; sensor values may be anything, NaN included.
+
+    Raises PacketError.
+    """
     if len(packet) != READING.size:
         raise PacketError(f"{len(packet)} bytes, allowed {READING.size}")
-    mark, version, *fields = READING.unpack(packet)
-    reading = Reading(*fields)
-    if mark != MARK_IN or version != VERSION or reading.event not in EVENTS:
+    mark, version, event, own, *fields = READING.unpack(packet)
+    reading = Reading(event, *fields)
+    if mark != MARK_IN or version != VERSION or event not in EVENTS:
         raise PacketError("not a packet from the rig of this version")
+    if session is not None and own != session:
+        raise PacketError("a packet of another session")
     if not math.isfinite(reading.time):
         raise PacketError("a time that is not finite")
     return reading
 
 
-def encode_answer(answer: Answer) -> bytes:
+def encode_answer(answer: Answer, session: int) -> bytes:
     """The packet of an answer; words are cut to 96 ASCII characters."""
     words = answer.words.encode("ascii", "replace")
-    return ANSWER.pack(MARK_OUT, VERSION, *answer[:-1], words)
+    return ANSWER.pack(MARK_OUT, VERSION, answer.flags, session, *answer[1:-1], words)
 
 
-def decode_answer(packet: bytes) -> Answer:
-    """The answer in a packet. Raises PacketError."""
+def decode_answer(packet: bytes, session: int | None) -> Answer:
+    """The answer in a packet of the session, or of any. Raises PacketError."""
     if len(packet) != ANSWER.size:
         raise PacketError(f"{len(packet)} bytes, allowed {ANSWER.size}")
-    mark, version, *fields, words = ANSWER.unpack(packet)
-    if mark != MARK_OUT or version != VERSION or fields[0] & ~FLAGS:
+    mark, version, flags, own, *fields, words = ANSWER.unpack(packet)
+    if mark != MARK_OUT or version != VERSION or flags & ~FLAGS:
         raise PacketError("not an answer of this version")
+    if session is not None and own != session:
+        raise PacketError("an answer of another session")
     text = words.rstrip(b"\0")
     if not all(32 <= byte < 127 for byte in text):
         raise PacketError("words that are not printable")
-    return Answer._make((*fields, text.decode("ascii")))
+    return Answer._make((flags, *fields, text.decode("ascii")))
+
+
+def ask_for_session(number: int) -> bytes:
+    """The rig's question for a session, with a number of 64 bits drawn at random."""
+    return OPENING.pack(MARK_ASK, VERSION, number, 0)
+
+
+def decode_session(packet: bytes, number: int) -> int:
+    """The session's number, from the answer to the question with this number. Raises PacketError."""
+    if len(packet) == OPENING.size:
+        mark, version, asked, session = OPENING.unpack(packet)
+        if (mark, version, asked) == (MARK_OPEN, VERSION, number):
+            return session
+    raise PacketError("not the answer to that question for a session")
+
+
+class Sessions:
+    """Session numbers, for each address and port its own: what a secret hash makes of them.
+
+    Nothing is kept of those who ask, so that asking costs nothing, and the answer is no longer than the
+    question. Who cannot receive at an address cannot know its number.
+    """
+
+    def __init__(self) -> None:
+        self._secret = secrets.token_bytes(32)
+
+    def number(self, sender: tuple[str, int]) -> int:
+        """The session's number of an address and port."""
+        code = hmac.digest(self._secret, repr(sender).encode(), "sha256")
+        return int.from_bytes(code[:8], "little")
+
+    def answer(self, packet: bytes | bytearray, sender: tuple[str, int]) -> bytes | None:
+        """The answer to who asks for a session; None for any other packet."""
+        if len(packet) != OPENING.size:
+            return None
+        mark, version, asked, _ = OPENING.unpack(packet)
+        if mark != MARK_ASK or version != VERSION:
+            return None
+        return OPENING.pack(MARK_OPEN, VERSION, asked, self.number(sender))
+
+
+class Sequence:
+    """Which packets are newer than all before, by their numbers of 32 bits (RFC 1982).
+
+    One packet with a wild number must not make all that follow it old: a number further ahead than `WINDOW`
+    counts only once another one has come that follows it (as RFC 3550, A.1).
+    """
+
+    __slots__ = ("_awaited", "_newest")
+
+    def __init__(self, newest: int = -1) -> None:
+        self._newest = newest & NUMBERS
+        self._awaited: int | None = None
+
+    def is_newer(self, number: int) -> bool:
+        """Whether a packet is; the newest then."""
+        ahead = number - self._newest & NUMBERS
+        if not 0 < ahead <= NUMBERS // 2:
+            return False
+        awaited = self._awaited
+        if ahead > WINDOW and (awaited is None or number - awaited & NUMBERS > WINDOW):
+            self._awaited = number + 1 & NUMBERS
+            return False
+        self._newest, self._awaited = number, None
+        return True
 
 
 class NumericalModel:
@@ -163,7 +247,7 @@ class ControllerTask:
         sensor = mechanism["rig"].get("force_sensor", {})
         # Before tick 0 there is no force, though a noisy sensor reads some.
         self._zeroed = sensor.get("noise_std", 0.0) != 0.0 or sensor.get("bias", 0.0) != 0.0
-        self._sequence, self._run, self._tared = -1, -1, False
+        self._sequence, self._run, self._tared = Sequence(), -1, False
         self._command = self._force = 0.0
         self._last: Reading | None = None
         self._words = ""
@@ -176,11 +260,12 @@ class ControllerTask:
         return str(self._controller.status)
 
     def answer(self, reading: Reading) -> Answer | None:
-        """The answer to a reading, or None for one that comes too late to be of use."""
-        if reading.sequence <= self._sequence or (reading.event == TICK and reading.run != self._run):
+        """The answer to a reading, or None for one that is of no use: not newer than the last, or of a run
+        that was not prepared."""
+        unknown = reading.event == TICK and reading.run != self._run
+        if unknown or not self._sequence.is_newer(reading.sequence):
             self.stale += 1
             return None
-        self._sequence = reading.sequence
         if reading.event == RESET and reading.run != self._run and self._controller.reset():
             self._words = ""
         return self._step(reading) if reading.event == TICK else self._prepare(reading)

@@ -1,0 +1,257 @@
+"""The controller's process and its session: to whom it belongs, what breaks in, and what ends it."""
+
+import json
+import socket
+import time
+from contextlib import ExitStack, contextmanager
+
+import pytest
+from gain_documents import gain_document
+from rig_lock_step import a_reading
+
+from tuning.rig.session import SOURCE, listening_port, start_controller
+from tuning.rig.udp_protocol import (
+    PREPARE,
+    READY,
+    STOP,
+    VERSION,
+    PacketError,
+    ask_for_session,
+    decode_answer,
+    decode_session,
+    encode_reading,
+)
+
+SILENCE = 0.5  # s
+
+
+class Rig:
+    """One that plays to the process at `address`."""
+
+    def __init__(self, stack, address, number=1):
+        self.socket = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        self.socket.settimeout(10)
+        self.socket.bind(("127.0.0.1", 0))
+        self.address, self.session, self.number = address, 0, number
+
+    def send(self, packet):
+        self.socket.sendto(packet, self.address)
+
+    def open(self):
+        self.send(ask_for_session(self.number))
+        self.session = decode_session(self.socket.recv(1000), self.number)
+
+    def tell(self, reading):
+        self.send(encode_reading(reading, self.session))
+
+    def ask(self, reading):
+        self.tell(reading)
+        return decode_answer(self.socket.recv(1000), self.session)
+
+    def prepare(self):
+        self.open()
+        assert self.ask(a_reading(0, 1, event=PREPARE)).flags == READY
+
+    def hears_nothing(self):
+        self.socket.settimeout(0.1)
+        with pytest.raises(TimeoutError):
+            self.socket.recv(1000)
+        self.socket.settimeout(10)
+        return True
+
+
+class Process:
+    """The controller's process, its record once it has ended, and rigs for it."""
+
+    def __init__(self, folder, stack, *options):
+        gains, self._record = folder / "gains.json", folder / "ticks.json"
+        gains.write_text(json.dumps(gain_document("none")))
+        arguments = ["--gains", str(gains), "--record", str(self._record), "--ticks", "100"]
+        self._process, self._stack = start_controller(SOURCE, [*arguments, *options]), stack
+        self._address = ("127.0.0.1", listening_port(self._process))
+
+    def rig(self):
+        return Rig(self._stack, self._address)
+
+    def ended(self):
+        """Exit code and record."""
+        code = self._process.wait(20)
+        return code, json.loads(self._record.read_text())
+
+    def close(self):
+        if self._process.poll() is None:
+            self._process.kill()
+            self._process.wait()
+        self._process.stdout.close()
+
+
+@pytest.fixture
+def process(tmp_path):
+    """`process(*options)`: a controller's process."""
+    with ExitStack() as stack:
+
+        def made(*options):
+            one = Process(tmp_path, stack, *options)
+            stack.callback(one.close)
+            return one
+
+        yield made
+
+
+@contextmanager
+def flood(*senders):
+    """Packets that are sent while something is waited for: `next` sends one of each."""
+
+    def once():
+        for rig, packet in senders:
+            rig.send(packet)
+        time.sleep(0.02)
+
+    yield once
+
+
+def test_the_controllers_process_answers_its_rig_and_nobody_else(process):
+    served = process()
+    rig, stranger, guesser = served.rig(), served.rig(), served.rig()
+    rig.send(b"no packet at all")
+    stranger.open()  # who asks has no session yet
+    rig.prepare()
+    stranger.tell(a_reading(50))
+    # One packet with the largest number, with the rig's session even: it is not from there.
+    guesser.session = rig.session
+    guesser.tell(a_reading(0, 2**32 - 1))
+    guesser.tell(a_reading(0, 99, event=STOP))
+    guesser.send(ask_for_session(5))
+    for tick in range(5):
+        answer = rig.ask(a_reading(tick))
+        assert (answer.tick, answer.sequence, answer.words) == (tick, tick + 10, "")
+    assert stranger.hears_nothing() and guesser.hears_nothing()
+    rig.tell(a_reading(0, 99, event=STOP))
+    code, found = served.ended()
+    assert code == 0 and found["ended"] == "stopped" and found["jax"] is False
+    assert found["made_up"] == found["stale"] == 0 and found["ignored"] == 5
+    ticks = found["ticks"]
+    assert ticks["sequence"] == [10, 11, 12, 13, 14]
+    assert all(value > 0 for value in ticks["wall"] + ticks["cpu"])
+
+
+def test_a_packet_from_the_rig_s_address_without_the_session_s_number_is_ignored(process):
+    """What somebody sends who can write the rig's address, but does not receive there."""
+    served = process()
+    rig = served.rig()
+    rig.prepare()
+    own, rig.session = rig.session, rig.session ^ 1
+    rig.tell(a_reading(0, 99, event=STOP))
+    rig.tell(a_reading(0, 2**31 - 1))
+    rig.session = own
+    assert rig.ask(a_reading(0)).tick == 0
+    rig.tell(a_reading(0, 99, event=STOP))
+    code, found = served.ended()
+    assert code == 0 and found["ignored"] == 2 and found["stale"] == 0
+
+
+def test_a_wild_number_does_not_make_the_controller_deaf(process):
+    served = process()
+    rig = served.rig()
+    rig.prepare()
+    for number in (2**32 - 1, 2**31, 2**31 - 1, 5000, 0):
+        rig.tell(a_reading(0, number))
+    assert [rig.ask(a_reading(tick)).tick for tick in range(3)] == [0, 1, 2]
+    # Rig and network were away for long: one packet more is lost.
+    rig.tell(a_reading(3, 5000))
+    assert rig.ask(a_reading(4, 5001)).tick == 4
+    rig.tell(a_reading(0, 99, event=STOP))
+    code, found = served.ended()
+    assert code == 0 and found["stale"] == 6
+
+
+def test_a_packet_that_is_played_again_is_dropped(process):
+    served = process("--silence", str(SILENCE))
+    rig = served.rig()
+    rig.prepare()
+    before = [rig.ask(a_reading(tick)) for tick in range(4)]
+    for tick in range(4):
+        rig.tell(a_reading(tick))
+    assert rig.hears_nothing()
+    assert rig.ask(a_reading(4)).position > before[-1].position
+    # Nor do such packets keep the session alive.
+    begun = time.monotonic()
+    with flood((rig, encode_reading(a_reading(4), rig.session))) as once:
+        while time.monotonic() < begun + 2 * SILENCE:
+            once()
+    code, found = served.ended()
+    assert code == 1 and found["ended"] == "silent" and found["stale"] > 10
+
+
+def test_strangers_do_not_keep_a_session_alive(process):
+    served = process("--silence", str(SILENCE))
+    rig, stranger = served.rig(), served.rig()
+    rig.prepare()
+    begun = time.monotonic()
+    garbage = ((stranger, b"garbage"), (stranger, ask_for_session(3)), (rig, b"garbage"))
+    with flood(*garbage, (stranger, encode_reading(a_reading(1), rig.session))) as once:
+        while time.monotonic() < begun + 2 * SILENCE:
+            once()
+    code, found = served.ended()
+    assert code == 1 and found["ended"] == "silent" and found["ignored"] > 40
+
+
+@pytest.mark.parametrize("opened", [False, True])
+def test_without_a_session_the_process_ends_whoever_asks_for_one(process, opened):
+    served = process("--wait", "0.3")
+    rig = served.rig()
+    begun = time.monotonic()
+    while time.monotonic() < begun + 0.6:
+        rig.send(ask_for_session(3) if opened else b"garbage")
+        time.sleep(0.02)
+    code, found = served.ended()
+    assert code == 1 and found["ended"] == "silent"
+
+
+def test_a_silent_rig_ends_an_empty_loop(process):
+    served = process("--empty", "--silence", "0.1")
+    rig = served.rig()
+    rig.open()
+    assert rig.ask(a_reading(0, 1)).sequence == 1
+    code, found = served.ended()
+    assert code == 1 and found["ended"] == "silent"
+
+
+def test_a_rig_that_begins_anew_does_not_go_on_with_the_old_session(process):
+    served = process("--silence", str(SILENCE))
+    rig = served.rig()
+    rig.prepare()
+    assert rig.ask(a_reading(0)).tick == 0
+    again = served.rig()
+    for one in (again, rig):  # from another port, and from the same
+        one.send(ask_for_session(77))
+        assert one.hears_nothing()
+    code, found = served.ended()
+    assert code == 1 and found["ended"] == "silent" and found["ignored"] == 2
+
+
+def test_a_lost_question_or_answer_is_asked_for_again(process):
+    served = process()
+    rig = served.rig()
+    rig.send(ask_for_session(1)[:-1])
+    rig.send(ask_for_session(1))  # whose answer the rig does not wait for
+    first = rig.socket.recv(1000)
+    rig.prepare()
+    assert decode_session(first, 1) == rig.session
+    with pytest.raises(PacketError):
+        decode_session(first, 2)
+    rig.tell(a_reading(0, 99, event=STOP))
+    code, found = served.ended()
+    assert code == 0 and found["ignored"] == 1
+
+
+def test_a_rig_of_another_version_is_ignored(process):
+    served = process()
+    rig = served.rig()
+    packet = bytearray(ask_for_session(1))
+    packet[4] = VERSION - 1
+    rig.send(bytes(packet))
+    assert rig.hears_nothing()
+    rig.prepare()
+    rig.tell(a_reading(0, 99, event=STOP))
+    assert served.ended()[1]["ignored"] == 1
