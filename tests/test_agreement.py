@@ -27,6 +27,7 @@ from jaxhil.compensators import COMPENSATORS, Constants, Signals
 from jaxhil.mechanism.file import builtin_names, load
 from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
 from jaxhil.runtime.gain_file import GainFile
+from jaxhil.runtime.limits import LIMITS
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.recording import Lane, nominal_and_draws, record_lanes
 from tuning.gain_file import build_document
@@ -36,6 +37,11 @@ pytestmark = pytest.mark.users_options
 
 RING = 256  # samples, more than any identification delay at the shortest period
 RECORD = 3072  # ticks, more than any record has: its programs serve every mechanism
+# It is the laws that are compared, also beyond what a rig's controller lets out.
+UNLIMITED = {
+    name: limit.default if limit.default in (0.0, 0.5, 1.0) else math.copysign(math.inf, limit.default)
+    for name, limit in LIMITS.items()
+}
 MECHANISMS = [
     load(name, [f"rig.control_period={period}"]).mechanism
     for name, period in (("varying", 0.00025), ("rattling", 0.001), ("claw-350kg", 0.004))
@@ -90,7 +96,7 @@ def lane_replays(name: str, readings: Readings, ticks: list[int] | None = None) 
         gains = {gain: float(values[lane]) for gain, values in readings.gains.items()}
         constants = readings.constants
         period, clearance = float(constants.control_period[lane]), float(constants.clearance[lane])
-        gain_file = GainFile(name, gains, period, clearance)
+        gain_file = GainFile(name, gains, period, clearance, UNLIMITED)
         lanes.append(replay(Lane(signals, command[:end, lane], seen, False), gain_file))
     return lanes
 

@@ -6,6 +6,7 @@ from string import Template
 from typing import Any
 
 from jaxhil.errors import one_line
+from jaxhil.runtime.bounds import FORCES, POSITIONS, SPEEDS
 from jaxhil.runtime.faults import FAULTS
 from jaxhil.runtime.law_status import STATUSES
 
@@ -40,6 +41,8 @@ def readme_text(document: Mapping[str, Any], files: Collection[str]) -> str:
         content="\n".join(("| file | is |", "|---|---|", *listed)),
         statuses=status_table(),
         faults=fault_table(),
+        outermost=f"forces to {FORCES[1]:g} N, positions to {POSITIONS[1]:g} m either way, position commands "
+        f"that change by up to {SPEEDS[1]:g} m/s",
     )
 
 

@@ -1,6 +1,5 @@
 """`tuning.export`: gains as a bundle that a rig computer can check and run by itself."""
 
-import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -175,11 +174,10 @@ def _replaced(given: Any) -> dict[str, float | None]:
     for name, value in given.items():
         if name not in LIMITS:
             raise ArgumentError("limits", shown(name), f"one of {', '.join(LIMITS)}")
-        lowest = LIMITS[name].lowest
-        usable = value is None or (arguments.is_number(value) and math.isfinite(value) and value >= lowest)
-        if not usable:
-            at_least = "" if math.isinf(lowest) else f" of at least {lowest:g}"
-            raise ArgumentError("limits", shown(value), f"a finite number{at_least}, or none", name)
+        limit = LIMITS[name]
+        if value is not None and not (arguments.is_number(value) and limit.admits(value)):
+            allowed = f"{limit.lowest:g} to {limit.highest:g} {limit.unit}, or none"
+            raise ArgumentError("limits", shown(value), allowed, name)
     return {name: None if value is None else float(value) for name, value in given.items()}
 
 

@@ -46,10 +46,10 @@ def _replaced(given: tuple[str, ...]) -> dict[str, float | None]:
             value = None if text == "none" else float(text)
         except ValueError:
             value = math.nan
-        lowest = LIMITS[name].lowest
-        if value is not None and not (math.isfinite(value) and value >= lowest):
-            at_least = "" if math.isinf(lowest) else f" of at least {lowest:g}"
-            raise InputError(f"--set: found {shown(words)}, allowed a finite number{at_least}, or none")
+        limit = LIMITS[name]
+        if value is not None and not limit.admits(value):
+            allowed = f"{limit.lowest:g} to {limit.highest:g} {limit.unit}, or none"
+            raise InputError(f"--set: found {shown(words)}, allowed {allowed}")
         replaced[name] = value
     return replaced
 
