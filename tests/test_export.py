@@ -180,7 +180,7 @@ def test_a_watchdog_that_stops_good_runs_is_bad(jaxhil, gains, tmp_path):
         (["--seed", "-1"], ["--seed", "-1"]),
         (["--sweep", "no-such-store"], ["no-such-store"]),
         (["--set", "stroke=1"], ["--set", "'stroke=1'", "command_lowest"]),
-        (["--set", "force_limit=-1"], ["--set", "'force_limit=-1'", "at least 0"]),
+        (["--set", "force_limit=-1"], ["--set", "'force_limit=-1'", "from 0 to 1e+06 N, or none"]),
         (["--set", "command_lowest=inf"], ["--set", "'command_lowest=inf'", "finite"]),
         (["--set", "command_lowest"], ["--set", "'command_lowest'", "none"]),
     ],

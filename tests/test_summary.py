@@ -93,7 +93,7 @@ def test_every_gain_has_a_row_with_its_unit(made, page):
 def test_every_limit_is_there_or_said_not_to_be(made, page):
     rows = {row[0]: row for row in page.rows if row}
     text = " ".join(page.texts)
-    unset = re.search(r"outermost alone: ([^.]*)\.", text)[1].split(", ")
+    unset = re.search(r"by the code alone: ([^.]*)\.", text)[1].split(", ")
     for name, one in made["limits"].items():
         if one["value"] is None:
             assert name in unset
@@ -170,7 +170,7 @@ def test_what_is_not_known_is_not_made_up():
     bare = document("rattling", "none")
     text = " ".join(Page(summary_html(bare)).texts)
     assert "None: the measured force is passed on." in text
-    assert "None: the controller's own outermost ones hold." in text
+    assert "None in the gain file: those of the code hold." in text
     assert "holds no figures" in text
     unknown = with_limits(bare, {"force_limit": 1.0})
     assert "Rates of false and missed alarms are not known." in " ".join(Page(summary_html(unknown)).texts)

@@ -199,7 +199,7 @@ def _gains(document: Mapping[str, Any]) -> Iterator[str]:
 def _limits(document: Mapping[str, Any]) -> Iterator[str]:
     given = _given(document)
     if not given:
-        yield "<h2>Limits</h2><p>None: the controller's own outermost ones hold.</p>"
+        yield "<h2>Limits</h2><p>None in the gain file: those of the code hold.</p>"
         return
     rows = [(name, _number(one.value, 5), one.unit) for name, one in given.items() if is_shown(name)]
     yield from _table("Limits", ("limit", "value", "unit"), rows, (1,))
@@ -223,7 +223,7 @@ def _watchdog(document: Mapping[str, Any]) -> Iterator[str]:
         yield f"<p>Its expected restitution: {fitted} fitted numbers in the gain file.</p>"
     unset = [name for name in document["limits"] if name not in given]
     if unset:
-        yield f'<p class="note">Limited by the controller's outermost alone: {escape(", ".join(unset))}.</p>'
+        yield f'<p class="note">Limited by the code alone: {escape(", ".join(unset))}.</p>'
 
 
 def _verdict(rates: Mapping[str, Any]) -> str:

@@ -176,7 +176,7 @@ def _replaced(given: Any) -> dict[str, float | None]:
             raise ArgumentError("limits", shown(name), f"one of {', '.join(LIMITS)}")
         limit = LIMITS[name]
         if value is not None and not (arguments.is_number(value) and limit.admits(value)):
-            allowed = f"{limit.lowest:g} to {limit.highest:g} {limit.unit}, or none"
+            allowed = f"a finite number from {limit.lowest:g} to {limit.highest:g} {limit.unit}, or none"
             raise ArgumentError("limits", shown(value), allowed, name)
     return {name: None if value is None else float(value) for name, value in given.items()}
 

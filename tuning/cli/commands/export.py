@@ -48,7 +48,7 @@ def _replaced(given: tuple[str, ...]) -> dict[str, float | None]:
             value = math.nan
         limit = LIMITS[name]
         if value is not None and not limit.admits(value):
-            allowed = f"{limit.lowest:g} to {limit.highest:g} {limit.unit}, or none"
+            allowed = f"a finite number from {limit.lowest:g} to {limit.highest:g} {limit.unit}, or none"
             raise InputError(f"--set: found {shown(words)}, allowed {allowed}")
         replaced[name] = value
     return replaced
