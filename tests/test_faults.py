@@ -33,6 +33,7 @@ class Command(NamedTuple):
     again: tuple[str, ...] = ()  # added when it is run again
     before: tuple[tuple[str, ...], ...] = ()  # run before with each of these instead, undisturbed
     one_piece: str | None = None  # a folder that is replaced as a whole
+    cold: bool = False  # whether no programs are kept from before
 
 
 TUNED = ["--compensator", "phase_lead", "--scenarios", 2, "--starts", 1, "--steps", 1, "--validation", 4]
@@ -54,6 +55,7 @@ def _compare(out: Path, gains: Path) -> list[Any]:
 
 COMMANDS = {
     "simulate": Command(lambda out, _: ["simulate", "rig-300kg", "--json", "--plot", out / "plot.png"]),
+    "simulate, cold": Command(lambda out, _: ["simulate", "rig-300kg", "--json"], cold=True),
     "tune": Command(lambda out, _: ["tune", "rig-300kg", *TUNED, "--json", "-o", out]),
     "sweep": Command(_sweep, again=("--resume",)),
     "export": Command(_export, before=(("--seed", "1"),), one_piece="bundle"),
@@ -90,7 +92,6 @@ class Bench:
             self.run(*other)
             shutil.rmtree(self.kept)
             shutil.copytree(self.out, self.kept)
-        self.before = self.tree()
         self.run()
         self.restore()
         self.undisturbed = self.run()
@@ -101,6 +102,9 @@ class Bench:
         """What was there before."""
         shutil.rmtree(self.out, ignore_errors=True)
         shutil.copytree(self.kept, self.out)
+        for path in self.runner.cache.iterdir() if self.command.cold else ():
+            if path.name not in USERS:
+                path.unlink()
 
     def run(self, *more: str, **fault: Any) -> Ran:
         arguments = self.command.arguments(self.out, self.gains)
