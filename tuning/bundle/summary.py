@@ -269,7 +269,7 @@ def _noticed(noticed: Mapping[str, Any], rates: Mapping[str, Any]) -> Iterator[s
     if noticed.get("error") is not None:
         yield f"errors from {_number(noticed['error'], 2)} on are noticed in 95 % of contacts"
     elif noticed.get("largest") is not None:
-        yield f"of no errors, up to the largest of {_number(noticed['largest'], 2)}, are 95 % noticed"
+        yield f"no error that occurred, up to {_number(noticed['largest'], 2)}, is noticed in 95 %"
 
 
 def _table(

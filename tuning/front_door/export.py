@@ -139,11 +139,11 @@ def _calibrated(
     loaded, sweep: Any, replaced: dict[str, float | None], allowed: tuple[float, float], progress: bool
 ):
     """The limits for the rig, and what is known of the watchdog's alarms."""
-    from tuning.watchdog.calibration import WITHOUT_STORE, calibrate
+    from tuning.watchdog.calibration import WITHOUT_STORE, calibrate, held_scenarios
     from tuning.watchdog.verdict import Allowed
 
     with _store(sweep) as store:
-        runs = WITHOUT_STORE if store is None else store.manifest.scenarios
+        runs = WITHOUT_STORE if store is None else held_scenarios(store)
         with terminal.progress(runs, "runs", progress) as bar:
             return calibrate(
                 loaded,

@@ -235,21 +235,21 @@ def _chosen(loaded: LoadedGains, store: Store | None, scenarios: int | None) -> 
     if manifest.gains_sha256 != loaded.document["sha256"]:
         found, allowed = manifest.gains_sha256[:12], loaded.document["sha256"][:12]
         raise InputError(f"{store.folder}: gains_sha256: found {found}..., allowed {allowed}...")
-    made = _held(store)
-    held = manifest.scenarios if manifest.until_width is None else made
+    held = held_scenarios(store)
     if scenarios is not None and scenarios > held:
         raise InputError(f"--scenarios: found {scenarios}, allowed at most the store's {held}")
     return Scenarios(manifest.sampling, manifest.seed, scenarios or held)
 
 
-def _held(store: Store) -> int:
-    """Scenarios of the parts up to the first that is missing. Raises `InputError` for one that is damaged."""
+def held_scenarios(store: Store) -> int:
+    """How many scenarios a sweep is of, which may have stopped when enough was known. Raises `InputError` for
+    a part that is damaged."""
     held = 0
     for part in range(store.manifest.parts):
         if kept_part(store, part) is None:
             break
         held += store.manifest.part_rows(part)[1]
-    return held
+    return store.manifest.scenarios if store.manifest.until_width is None else held
 
 
 def _joined(parts: list[JudgedRuns]) -> JudgedRuns:
