@@ -9,7 +9,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
-from front_door_laws import Difference, DifferenceOnTheRig, Quadratic
+from laws_from_elsewhere import ScaledLead, ScaledLeadOnTheRig, SquaredSpring
 
 import jaxhil
 import tuning
@@ -75,32 +75,34 @@ def test_a_study_that_keeps_nothing_is_the_stored_one(tuned, tmp_path, monkeypat
 
 @pytest.mark.slow
 def test_laws_from_outside_go_all_the_way(tmp_path):
-    jaxhil.register(Quadratic())
-    jaxhil.register(Difference())
-    mechanism = jaxhil.load("rig-300kg", {"contact.law": "quadratic"})
-    run = jaxhil.simulate(mechanism, "difference")
-    slope = jaxhil.jacobian(mechanism, "difference", of="restitution", by=["gains.share"])
-    assert run.status == "ok" and slope["gains.share"][0] < 0
-    result = tuning.tune(mechanism, "difference", **SMALL)
-    assert result.gains["share"] > 2 and result.figures["tuned"].rms < result.figures["literature"].rms
+    jaxhil.register(SquaredSpring())
+    jaxhil.register(ScaledLead())
+    contact = {"law": "squared_spring", "stiffness": [1e8]}
+    mechanism = jaxhil.load("rig-300kg", {"contact": contact, "approach.contacts": 2})
+    run = jaxhil.simulate(mechanism, "scaled_lead")
+    slope = jaxhil.jacobian(mechanism, "scaled_lead", of="restitution", by=["gains.toy_lead"])
+    assert run.status == "ok" and slope["gains.toy_lead"][0] < 0
+    result = tuning.tune(mechanism, "scaled_lead", **SMALL)
+    assert result.gains["toy_lead"] > 0 and result.figures["tuned"].rms < result.figures["literature"].rms
     result.save(tmp_path / "gains.json")
     study = tuning.sweep(tmp_path / "gains.json", scenarios=32, chunk=32)
     assert study.table.num_rows == 32
-    board = tuning.compare(mechanism, ["difference"], scenarios=4, judged=8)
-    figures = board.figures["difference"]
+    board = tuning.compare(mechanism, ["scaled_lead"], scenarios=4, judged=8)
+    figures = board.figures["scaled_lead"]
     assert figures["tuned"].rms < figures["literature"].rms.low
     for refused in (lambda: tuning.export(result, tmp_path / "bundle"), lambda: tuning.verify(result)):
-        with pytest.raises(jaxhil.InputError, match="difference: found no runtime class"):
+        with pytest.raises(jaxhil.InputError, match="scaled_lead: found no runtime class"):
             refused()
-    jaxhil.register(Difference(), runtime=DifferenceOnTheRig)
+    jaxhil.register(ScaledLead(), runtime=ScaledLeadOnTheRig)
     exported = tuning.export(tmp_path / "gains.json", tmp_path / "bundle", sweep=study)
-    assert exported.good and "c99" not in exported.document["formats"]
+    assert exported.good, exported.reasons
+    assert "c99" not in exported.document["formats"]
     assert tuning.verify(tmp_path / "bundle").good
 
-    class Other(DifferenceOnTheRig):
+    class Other(ScaledLeadOnTheRig):
         """The same, by another source."""
 
-    jaxhil.register(Difference(), runtime=Other)
+    jaxhil.register(ScaledLead(), runtime=Other)
     found = tuning.verify(tmp_path / "bundle")
     assert not found.good and found.reasons[0] == "jaxhil_runtime.py: is not what this version exports"
 

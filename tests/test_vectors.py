@@ -135,6 +135,18 @@ def test_where_a_guard_acts_nothing_is_compared(loaded):
     assert not any(math.isnan(row.force_simulated) for row in found.rows[:end])
 
 
+def test_a_trip_between_two_contacts_ends_the_comparison_too(loaded):
+    """The audit waits for the force to die out; here it comes with the next contact."""
+    limits = {"equivalent_mass": 300.0, "settling": 10.0, "restitution_margin": 1e-9}
+    found = make_vectors(check_document(with_limits(loaded.document, limits)), seed=3, draws=1)
+    assert found.reasons == []
+    for run, ended in enumerate(found.ended):
+        rows = [row for row in found.rows if row.run == run]
+        begins = next(tick for tick, row in enumerate(rows) if row.event == NEXT_CONTACT)
+        assert ended == f"tick {begins}: the controller acts on restitution"
+        assert [math.isnan(row.force_simulated) for row in rows[begins - 1 : begins + 1]] == [False, True]
+
+
 def test_a_runtime_that_differs_is_reported(loaded, monkeypatch):
     class Wrong(ON_THE_RIG[loaded.compensator]):
         def step(self, *readings):

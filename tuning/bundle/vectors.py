@@ -94,8 +94,8 @@ def recorded(loaded: LoadedGains, gain_file: GainFile, seed: int, draws: int = D
         mass = float(batch.equivalent_mass[run])
         controller = Controller(gain_file)
         inputs = list(_of_lane(run, lane, gain_file.control_period))
-        made, identified = _through(controller, inputs, mechanism.rig.integrator, mass, gain_file)
-        made, end, reason = _compared(made, inputs, identified, lane, gain_file)
+        made, identified, acting = _through(controller, inputs, mechanism.rig.integrator, mass, gain_file)
+        made, end, reason = _compared(made, inputs, identified, acting, lane, gain_file)
         rows += made
         ended.append(end)
         if reason:
@@ -190,9 +190,9 @@ def _extreme(source: random.Random, value: float) -> float:
 
 def _through(
     controller: Controller, inputs: Sequence[Inputs], integrator: str, mass: float, gain_file: GainFile
-) -> tuple[list[Row], list[tuple[float, float]]]:
-    """The runtime's rows, and the stiffness and damping identified at each."""
-    rows, identified = [], []
+) -> tuple[list[Row], list[tuple[float, float]], list[int]]:
+    """The runtime's rows, at each the stiffness and damping identified, and the faults on which it acts."""
+    rows, identified, acting = [], [], []
     move = INTEGRATORS[integrator]
     inverse_mass, period = 1.0 / mass, gain_file.control_period
     for one in inputs:
@@ -210,13 +210,16 @@ def _through(
         faults = controller.faults
         rows.append(Row(*one[:7], *motion, force, command, faults, one.force_simulated))
         identified.append(controller.identified)
-    return rows, identified
+        # That the law is in doubt changes no command; a trip between two contacts is no tick's fault.
+        acting.append(faults & ~LAW_IN_DOUBT | controller.cause)
+    return rows, identified, acting
 
 
 def _compared(
     rows: list[Row],
     inputs: Sequence[Inputs],
     identified: Sequence[tuple[float, float]],
+    acting: Sequence[int],
     lane: Lane,
     gain_file: GainFile,
 ) -> tuple[list[Row], str | None, str | None]:
@@ -228,8 +231,7 @@ def _compared(
     number = len(rows)
     if not number:
         return rows, None, None
-    # That the law is in doubt changes no command.
-    faulty = np.flatnonzero([row.faults & ~LAW_IN_DOUBT for row in rows])
+    faulty = np.flatnonzero(acting)
     found = np.array([row.force_command for row in rows])
     sent = np.array([row.position_command for row in rows])
     expected = np.array([one.force_simulated for one in inputs])
@@ -238,7 +240,7 @@ def _compared(
     end, why = number, None
     if len(faulty):
         end = int(faulty[0])
-        why = f"tick {end}: the controller acts on {', '.join(names(rows[end].faults))}"
+        why = f"tick {end}: the controller acts on {', '.join(names(acting[end]))}"
     parted = parting(error, list(np.array(identified).T), lane.identified, near)
     if parted is not None and parted < end:
         end = parted
