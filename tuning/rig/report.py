@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxhil.mechanism.structs import Mechanism
-from tuning.rig.contact_watch import ContactResult
+from tuning.rig.contact_watch import LONGEST_CONTACT, ContactResult
 from tuning.rig.hardware import BRIDGED, STALLED
 from tuning.rig.session import CONTROLLER, LoopReport, SessionReport, Setup
 
@@ -135,6 +135,8 @@ def _reasons(
     failed = [status for status in statuses if status not in ("ok", "tripped", STALLED)]
     if failed:
         reasons.append(f"{len(failed)} contacts did not end well: {', '.join(sorted(set(failed)))}.")
+    if "timeout" in failed:
+        reasons.append(f"timeout: not over after {LONGEST_CONTACT:g} s, the limit of a contact.")
     if session.tripped and not setup.injection.any:
         reasons.append("it tripped though no faults were injected.")
     if commanded is not None and commanded.not_finite:

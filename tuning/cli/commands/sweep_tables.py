@@ -8,6 +8,8 @@ from tuning import terminal
 
 def emit(document: dict[str, Any]) -> None:
     """Tables and the verdict, on standard output."""
+    from jaxhil.simulation.metrics import STATUS_REASONS
+
     probability, number = document["failure_probability"], document["scenarios"]
     limit = document["limit"]
     title = f"{document['mechanism']}, compensation: {document['compensator']}, {number} scenarios"
@@ -43,6 +45,7 @@ def emit(document: dict[str, Any]) -> None:
         f"restitution error allowed {within}."
     ]
     lines += _sequential(document)
+    lines += [f"{name}: {STATUS_REASONS[name]}." for name in document["outcomes"] if name in STATUS_REASONS]
     if left_out := document["left_out_of_replicates"]:
         lines.append(
             f"The last {left_out} scenarios, in no whole replicate, are in neither probability nor quantiles."

@@ -93,7 +93,10 @@ def _verdict(options: Tune, result: Any, verdict: str) -> str:
     if verdict == "good":
         return f"Good: the tuned rms error {tuned.rms:.2g}{sure} is within {options.limit:g}."
     if tuned.failed:
-        return f"Bad: {tuned.failed} contacts did not end with the tuned gains."
+        from jaxhil.simulation.scenario import LONGEST_CONTACT
+
+        ended = f"did not end well, at the latest after {LONGEST_CONTACT:g} s,"
+        return f"Bad: {tuned.failed} contacts {ended} with the tuned gains."
     return f"Bad: the tuned rms error {tuned.rms:.2g}{sure} exceeds {options.limit:g}."
 
 
