@@ -5,7 +5,6 @@ Limits are calibrated on some draws, and judged on draws of another seed (`tests
 
 from typing import Any
 
-import numpy as np
 import pytest
 from c99_cases import COMPILER
 from cases import SECOND_ORDER, mechanism, nominal_gains, validated
@@ -15,6 +14,7 @@ from sweep_cases import NOISY, UNCERTAIN
 from jaxhil.compensators import literature_gains
 from jaxhil.mechanism.file import DEFAULT, load
 from jaxhil.runtime.faults import RESTITUTION, names
+from jaxhil.runtime.limits import LIMITS
 from jaxhil.simulation.gain_file import LoadedGains
 from tuning.statistics.intervals import binomial_interval
 from tuning.watchdog.calibration import LIMIT, WITHOUT_STORE
@@ -72,7 +72,7 @@ def test_a_run_that_is_not_stopped_in_time_is_counted(tmp_path):
     one, _ = export(loaded, 0.02, tmp_path, scenarios=256, lanes=128)
     margin = list(one.parameters).index(one.gain_file.limits["restitution_margin"])
     blind, strict = (one.parameters.copy() for _ in range(2))
-    blind[margin], strict[margin] = np.inf, 0.0
+    blind[margin], strict[margin] = LIMITS["restitution_margin"].highest, 0.0
     both = [one._replace(parameters=values) for values in (blind, strict)]
     seeing_nothing, seeing_all = counted(loaded, both, 128, lanes=128, in_python=0)
     assert len(seeing_nothing.missed) == seeing_nothing.bad > 10 and not seeing_nothing.false

@@ -10,6 +10,7 @@ more:
     times       2 x 1 s + 0.02 s, the largest lead and alignment that tuning tries
     stiffness   5 M omega^2 = 5e11 N/m for 1000 t at 50 Hz
     damping     4 M omega = 1.3e9 N s/m there
+    by mass     omega^2 = 1e5/s^2 and 2 omega = 630/s at 50 Hz
     mass        a tenth of the rig's to ten times as much
 
 Where a gain file limits nothing, the outermost limits hold: a force beyond 1 MN, a position command beyond
@@ -22,6 +23,8 @@ FILTER_TIMES = 1e-6, 2.1  # of filters that would divide by 0 or ring without on
 FORCES = 0.0, 1e6  # [N]
 STIFFNESSES = 0.0, 1e12  # [N/m]
 DAMPINGS = 0.0, 1e10  # [N s/m]
+STIFFNESSES_BY_MASS = 0.0, 1e5  # [1/s^2]
+DAMPINGS_BY_MASS = 0.0, 1e3  # [1/s]
 MASSES = 1e-3, 1e7  # [kg]
 DISTANCES = 0.0, 10.0  # [m]
 POSITIONS = -10.0, 10.0  # [m]

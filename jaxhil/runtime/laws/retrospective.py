@@ -20,7 +20,7 @@ notebooks/guide/retrospective_reference.md.
 from collections.abc import Mapping
 from typing import ClassVar
 
-from ..bounds import FORCES, MASSES, TIMES
+from ..bounds import DAMPINGS_BY_MASS, FORCES, MASSES, STIFFNESSES_BY_MASS, TIMES
 from ..filters import DelayLine
 from ..law_status import IDENTIFIED, OUT_OF_CONTACT, SATURATED, UNSURE
 from ..registry import Compensator, GainSpecification
@@ -66,12 +66,12 @@ class Retrospective(Compensator):
         "identification_delay": GainSpecification("s", *TIMES),
         "force_noise": GainSpecification("N", *FORCES),
         "dead_zone": GainSpecification("N", *FORCES),
-        "prior_stiffness": GainSpecification("1/s^2", 0.0, 5e3),
-        "prior_stiffness_spread": GainSpecification("1/s^2", 0.0, 5e3),
-        "prior_slope_spread": GainSpecification("1/s^2", 0.0, 5e3),
-        "prior_damping_spread": GainSpecification("1/s", 0.0, 50.0),
-        "prior_depth_damping_spread": GainSpecification("1/s", 0.0, 50.0),
-        "prior_unloading_spread": GainSpecification("1/s^2", 0.0, 5e3),
+        "prior_stiffness": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
+        "prior_stiffness_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
+        "prior_slope_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
+        "prior_damping_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
+        "prior_depth_damping_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
+        "prior_unloading_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
         "force_noise_floor": GainSpecification("1/s", 1e-4, 10.0),
         "velocity_gain": GainSpecification("1/s", 0.0, 1e5),
         "correction_limit": GainSpecification("1", 0.0, 20.0),
