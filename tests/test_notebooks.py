@@ -12,8 +12,6 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-from jaxhil.simulation.environment import cache_folder
-
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 LARGEST = 500_000  # bytes
@@ -46,10 +44,6 @@ def test_every_cell_runs(path, tmp_path, monkeypatch):
     copy = Path(shutil.copy(path, tmp_path))
     inherited = os.environ.get("PYTHONPATH")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *([inherited] if inherited else [])]))
-    if (folder := cache_folder()) is not None:
-        # Kernels of later runs, and of other notebooks, need not compile again.
-        monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(folder))
-        monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
     notebook = nbformat.read(copy, as_version=4)
     client = NotebookClient(
         notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}

@@ -36,8 +36,9 @@ def prepare() -> None:
 
     gc.set_threshold(*RARELY)
     jax.config.update("jax_enable_x64", True)
-    folder = cache_folder()
-    if folder is not None and not program_folder() and keep_sealed(folder):
+    named = program_folder()
+    folder = named or cache_folder()
+    if folder is not None and keep_sealed(folder) and not named:
         jax.config.update("jax_compilation_cache_dir", str(folder))
         for name, value in KEEPING.items():
             jax.config.update(name, value)
