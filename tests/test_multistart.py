@@ -13,6 +13,7 @@ from tuning.gains.rounds import Start, solve_tasks
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import spread_points
 from tuning.gains.validation import build_validation
+from tuning.gains.work import Work
 
 SCANNED = TuneSettings().scanned
 
@@ -83,7 +84,7 @@ def test_batches_follow_until_starts_agree(tasks, validation, monkeypatch):
     """One task's starts never agree, whatever they end at; the others' do at once."""
     asked = []
 
-    def solve(tasks, starts, steps, objective, report):
+    def solve(tasks, starts, steps, objective, work):
         asked.append([len(own) for own in starts])
         ended = solve_tasks(tasks, starts, 1, objective)
         batch = len(asked)
@@ -93,11 +94,18 @@ def test_batches_follow_until_starts_agree(tasks, validation, monkeypatch):
         ]
 
     monkeypatch.setattr(multistart, "solve_tasks", solve)
-    heard = []
-    found = find_gains(validation, searched(3, 9, 16), report=heard.append)
+    heard, shares = [], []
+
+    def tell(text, share, kept):
+        heard.append(text)
+        shares.append(share)
+
+    told = build_validation(tasks, 15, 0, Work(tell))
+    found = find_gains(told, searched(3, 9, 16))
     assert asked == [[3, 3, 3]] + [[0, 3, 0]] * (BATCHES - 1)
     assert [len(one.starts) for one in found] == [3, 3 * BATCHES, 3]
-    assert sum("batch" in text for text in heard) == BATCHES - 1
+    assert len({text for text in heard if "batch" in text}) == BATCHES - 1
+    assert all(0 <= share <= 1 for share in shares) and shares[-1] == 1
     points = np.stack([start.coordinates for start in found[1].starts])
     assert len(np.unique(points, axis=0)) == len(points)
     # Steps of 1 + 2 evaluations, the scan at full cost on no more than 32 scenarios, the polish of 2 gains.

@@ -186,7 +186,7 @@ def test_what_a_start_reached_is_distinguished_from_its_noise():
 def test_settings_other_than_the_weight_stay(results, monkeypatch):
     seen = []
 
-    def solve(tasks, starts, steps, objectives, report):
+    def solve(tasks, starts, steps, objectives, work):
         seen.append(objectives)
         return [[pareto_search.Start("made up", 1, 0.1, [0.1], task.literature)] for task in tasks]
 
@@ -196,7 +196,7 @@ def test_settings_other_than_the_weight_stay(results, monkeypatch):
     validation = build_validation(
         [build_task(MECHANISMS[0], "phase_lead", 8, 0)], settings.validation, settings.seed
     )
-    pareto_search.solve_ladders(validation, results[:1], 3, settings, print)
+    pareto_search.solve_ladders(validation, results[:1], 3, settings)
     for objectives in seen:
         assert [dataclasses.replace(one, noise_weight=0.5) for one in objectives] == [objective] * 3
     assert len(seen) == 2  # the second found nothing better

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-import warnings
 from pathlib import Path
 
 import msgspec
@@ -20,7 +19,7 @@ from tuning.statistics.intervals import Running, enough, updated
 from tuning.sweeps.chunks import run_chunk
 from tuning.sweeps.parts import same_rows
 from tuning.sweeps.replay import motion_of, replay
-from tuning.sweeps.run import compare_precisions, describe_outcomes, on_cluster, run_sweep
+from tuning.sweeps.run import compare_precisions, describe_outcomes, run_sweep
 from tuning.sweeps.store import open_store, read_part, read_store, write_part
 
 pytestmark = pytest.mark.users_options
@@ -227,42 +226,3 @@ def test_the_most_is_the_most(whole, tmp_path):
     wide = read_store(store.folder)._replace(manifest=msgspec.structs.replace(label, until_width=WIDE))
     _, tally = run_sweep(wide, lambda *_: None, lambda *_: None)
     assert tally.scenarios < 300 and len(parts_of(store)) == -(-tally.scenarios // 32)
-
-
-def test_a_scheduler_that_is_not_there_is_one_line(tmp_path):
-    pytest.importorskip("distributed")
-    with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
-        Log().sweep(tmp_path / "store", computer=on_cluster("nowhere://x"))
-
-
-@pytest.mark.slow
-def test_a_cluster_makes_the_same_rows_though_a_worker_is_killed(whole, tmp_path):
-    distributed = pytest.importorskip("distributed")
-    _, rows, _, tally = whole
-    killed = []
-
-    def kill_one(number, tally):
-        # Midway: the other worker takes over.
-        if not killed and tally.scenarios >= 64:
-            killed.append(next(iter(cluster.workers.values())).process.pid)
-            os.kill(killed[0], signal.SIGKILL)
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with distributed.LocalCluster(n_workers=2, threads_per_worker=2, dashboard_address=None) as cluster:
-            store = open_store(tmp_path / "store", MANIFEST, resume=False)
-            _, again = run_sweep(store, lambda *_: None, kill_one, on_cluster(cluster.scheduler_address))
-    assert killed
-    assert same_rows(all_rows(store), rows) == [] and again == tally
-
-
-@pytest.mark.slow
-def test_a_cluster_stops_at_the_same_look(stopped, tmp_path):
-    distributed = pytest.importorskip("distributed")
-    _, parts, tally = stopped
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-            address = cluster.scheduler_address
-            store, _, again = Log().sweep(tmp_path / "store", False, UNTIL, scheduler=address)
-    assert again == tally and parts_of(store) == parts

@@ -202,7 +202,7 @@ def in_blocks(monkeypatch):
     """Where starts come from when mechanisms of 1e5, 3e5 and 2.9e5 N/m are tuned two at a time."""
     monkeypatch.setattr(tune, "BLOCK", 2)
 
-    def block(tasks, settings, report, near):
+    def block(tasks, settings, work, near):
         return [
             SimpleNamespace(mechanism=t.mechanism, gains={}, near=own)
             for t, own in zip(tasks, near, strict=True)

@@ -4,20 +4,23 @@ import json
 import math
 import os
 import sys
+import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 import rich.progress
 from rich import box
 from rich.console import Console, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TextColumn
 from rich.table import Table
 from rich.text import Text
 
 WIDTH = 110  # where there is no terminal to ask
 SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal for a bar
+SECONDS_OF_SILENCE = 20.0  # after which the last line is said again, with the time left by then
+KNOWN_FROM = 0.02  # share of the work that has to be done before a rate is known
 
 
 def emit(*things: RenderableType, wrap: bool = True) -> None:
@@ -100,83 +103,114 @@ def finite(value: Any) -> Any:
     return value
 
 
-class Stages:
-    """Progress through a known number of stages, shown on standard error, unless `quiet`."""
-
-    def __init__(self, total: int, bar: rich.progress.Progress | None, quiet: bool):
-        self._bar, self._begun = bar, False
-        self._task: Any = None if bar is None else bar.add_task("", total=total)
-        self._note = (lambda text: None) if quiet else note
-
-    def begin(self, text: str) -> None:
-        """The stage before, if any, is over and `text` begins."""
-        if self._bar is None:
-            self._note(text)
-            return
-        self._bar.update(self._task, advance=int(self._begun), description=text)
-        self._begun = True
-
-    def say(self, text: str) -> None:
-        """What is going on; no stage is over by it."""
-        if self._bar is None:
-            self._note(text)
-        else:
-            self._bar.update(self._task, description=text)
-
-    def finish(self) -> None:
-        """One stage is over, whatever comes next."""
-        if self._bar is not None:
-            self._bar.update(self._task, advance=1)
-
-
-@contextmanager
-def stages(total: int, shown: bool = True) -> Iterator[Stages]:
-    """A bar on a terminal, a plain line per stage elsewhere; nothing if it is not to be shown."""
-    columns = SpinnerColumn(), _text(), BarColumn(bar_width=20), MofNCompleteColumn(), TimeElapsedColumn()
-    with _bar(shown, *columns) as bar:
-        yield Stages(total, bar, quiet=not shown)
-
-
 class Progress:
-    """Progress through a known number of equal pieces of work, shown on standard error, unless `quiet`."""
+    """How far a known amount of work is, shown on standard error, unless `quiet`: what is done, the rate, the
+    time left, what is going on. A bar on a terminal; elsewhere a line when something else begins, and now and
+    then."""
 
-    def __init__(self, total: int, unit: str, bar: rich.progress.Progress | None, quiet: bool):
+    def __init__(self, total: float, unit: str, bar: rich.progress.Progress | None, quiet: bool):
         self._total, self._unit, self._bar = total, unit, bar
         self._note = (lambda text: None) if quiet else note
-        self._task: Any = None if bar is None else bar.add_task("", total=total)
-        self._done, self._skipped = 0, 0
+        self._task: Any = None if bar is None else bar.add_task("", total=total, pace="")
+        self._done, self._skipped, self._begun_stage, self._text = 0.0, 0.0, False, ""
         self._begun = self._shown = time.monotonic()
+        self._lock = threading.RLock()
 
     @property
     def rate(self) -> float | None:
-        """Pieces per second, of those that were worked on."""
+        """Units per second, of those that were worked on."""
         worked, took = self._done - self._skipped, time.monotonic() - self._begun
         return worked / took if worked > 0 and took > 0 else None
 
-    def skip(self, number: int) -> None:
-        """So many pieces were done before."""
+    def skip(self, number: float) -> None:
+        """So many units were done before."""
         self._done += number
         self._skipped += number
         self._begun = time.monotonic()
 
-    def advance(self, number: int, text: str) -> None:
-        """So many pieces more are done; `text` says what is known by now."""
-        self._done += number
-        rate = self.rate
-        left = (self._total - self._done) / rate if rate else None
-        pace = f"{figure(rate, 3)} {self._unit}/s, {_span(left)} left"
+    def advance(self, number: float, text: str | None = None) -> None:
+        """So many units more are done; `text` says what is known by now."""
+        self.reach(self._done + number, text)
+
+    def reach(self, done: float, text: str | None = None) -> None:
+        """So many units are done in all."""
+        with self._lock:
+            self._done = max(self._done, done)
+            self._text = self._text if text is None else text
+            self._show(due=SECONDS_BETWEEN_LINES)
+
+    def say(self, text: str) -> None:
+        """What is going on."""
+        with self._lock:
+            new, self._text = text != self._text, text
+            self._show(due=0.0 if new else SECONDS_BETWEEN_LINES)
+
+    def tell(self, text: str, done: float, skipped: float = 0.0) -> None:
+        """What is going on, how many units are done in all, and how many of those were done before."""
+        with self._lock:
+            self._done, self._skipped = max(self._done, done), skipped
+            self.say(text)
+
+    def begin(self, text: str) -> None:
+        """The unit before, if any, is done and `text` begins."""
+        with self._lock:
+            self._done += self._begun_stage
+            self._begun_stage = True
+            self.say(text)
+
+    def remind(self) -> None:
+        """Say again how far it is, if nothing was said for long."""
+        with self._lock:
+            self._show(due=SECONDS_OF_SILENCE)
+
+    def _show(self, due: float) -> None:
         if self._bar is not None:
-            self._bar.update(self._task, completed=self._done, description=f"{pace}, {text}")
-        elif time.monotonic() - self._shown >= SECONDS_BETWEEN_LINES and self._done < self._total:
+            self._bar.update(self._task, completed=self._done, description=self._text, pace=self._pace())
+        elif time.monotonic() - self._shown >= due and (self._done < self._total or due == 0.0):
             self._shown = time.monotonic()
-            self._note(f"{self._done} of {self._total} {self._unit}, {pace}, {text}")
+            self._note(", ".join(filter(None, [self._how_far(), self._pace(), self._text])))
+
+    def _how_far(self) -> str:
+        if self._done <= 0:
+            return ""
+        if self._total == 1:
+            return f"{100 * self._done:.0f} %"
+        return f"{math.floor(self._done)} of {self._total} {self._unit}"
+
+    def _pace(self) -> str:
+        if (rate := self.rate) is None or self._done < KNOWN_FROM * self._total:
+            return f"{_span(time.monotonic() - self._begun)} so far" if self._text else ""
+        each = next(((r, per) for r, per in ((rate, "s"), (60 * rate, "min")) if r >= 1), (3600 * rate, "h"))
+        left = max(self._total - self._done, 0.0) / rate
+        return f"{figure(each[0], 3)} {self._unit}/{each[1]}, {_span(left)} left"
 
 
 @contextmanager
-def progress(total: int, unit: str, shown: bool = True) -> Iterator[Progress]:
+def progress(total: float, unit: str, shown: bool = True) -> Iterator[Progress]:
     """A bar on a terminal, a plain line now and then elsewhere; nothing if it is not to be shown."""
-    with _bar(shown, BarColumn(bar_width=20), MofNCompleteColumn(), _text()) as bar:
-        yield Progress(total, unit, bar, quiet=not shown)
+    texts = [TextColumn(f"{{task.{name}}}", markup=False) for name in ("fields[pace]", "description")]
+    with _bar(shown, SpinnerColumn(), BarColumn(bar_width=20), TaskProgressColumn(), *texts) as bar:
+        made = Progress(total, unit, bar, quiet=not shown)
+        over = threading.Event()
+
+        def remind() -> None:
+            while not over.wait(SECONDS_BETWEEN_LINES):
+                made.remind()
+
+        reminding = threading.Thread(target=remind, daemon=True)
+        if shown and bar is None:
+            reminding.start()
+        try:
+            yield made
+        finally:
+            over.set()
+            if reminding.is_alive():
+                reminding.join()
+
+
+def stages(total: int, shown: bool = True) -> AbstractContextManager[Progress]:
+    """Progress through so many stages."""
+    return progress(total, "stages", shown)
 
 
 @contextmanager
@@ -190,13 +224,7 @@ def _bar(shown: bool, *columns: rich.progress.ProgressColumn) -> Iterator[rich.p
         yield bar
 
 
-def _text() -> TextColumn:
-    return TextColumn("{task.description}", markup=False)
-
-
-def _span(seconds: float | None) -> str:
-    if seconds is None:
-        return "-"
+def _span(seconds: float) -> str:
     whole = round(seconds)
     return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
 

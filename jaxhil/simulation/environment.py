@@ -135,6 +135,11 @@ def xla_flags() -> str:
     return _started_with[0] if _started_with else os.environ.get("XLA_FLAGS", "")
 
 
+def rounding_flags(flags: str) -> str:
+    """What of XLA_FLAGS may change the last bits of a result: all but the number of devices."""
+    return " ".join(sorted(flag for flag in flags.split() if "device_count" not in flag))
+
+
 def flags(given: str) -> str:
     """XLA_FLAGS: what the user gave, and what of ours it does not settle."""
     ours = {

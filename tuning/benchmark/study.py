@@ -2,21 +2,29 @@
 
 Laws, and groups of mechanisms that share a program, go to as many processes as there are cores, each with
 one device: compiling takes most of the time, and one process compiles on one core. No figure depends on
-which process computes it.
+which process computes it. What is found of a law on a group is kept at once, where there is a place for it
+(`tuning.pieces`).
 """
 
 import multiprocessing
+import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from jaxhil.errors import one_line
+from jaxhil.mechanism.file import to_builtins
 from jaxhil.mechanism.structs import Mechanism
+from tuning.pieces import NOTHING_KEPT, Pieces
 from tuning.statistics.intervals import Estimate
 
 LITERATURE, TUNED = "literature", "tuned"
 SEED = 0xFA1  # of the scenarios to judge on: tuning and its own validation never see them
+JUDGED = 6  # runs of each of those that figures take
+SECONDS = 1.0  # between two messages of a process
+
+Tell = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
@@ -50,46 +58,111 @@ class Failed(NamedTuple):
     reason: str
 
 
+Judged = tuple[list[Any], str, list[LawFigures] | Failed]  # a group's scenes, a law, what was found
+
+
 def compare(
     mechanisms: Sequence[Mechanism],
     laws: Sequence[str],
     settings: CompareSettings,
     processes: int,
-    report: Callable[[str], None] = lambda text: None,
+    tell: Callable[[str, float, float], None] = lambda text, done, kept: None,
+    pieces: Pieces = NOTHING_KEPT,
 ) -> Iterator[LawFigures | Failed]:
     """What is found of each law on every mechanism, as it is done: in so many processes or, with 0 of them,
-    one after the other in this one, where an error ends all."""
-    if processes == 0:
-        report("contacts in space")
-        for group in build_scenes(list(mechanisms), settings):
-            for law in laws:
-                report(_progress(law, group))
-                yield from judge_law(group, law, settings)
+    one after the other in this one, where an error ends all. `tell` is called with what is going on, how many
+    results are there, shares of those under way counted, and how many were kept from before."""
+    kept = _kept(mechanisms, laws, settings, pieces) if pieces.resumes else []
+    yield from kept
+    there = {(one.mechanism, one.law) for one in kept}
+    # Of a group and a law all mechanisms are kept or none.
+    left = [m for m in mechanisms if any((m.name, law) not in there for law in laws)]
+    if not left:
         return
+
+    def told(text: str, done: float) -> None:
+        tell(text, len(kept) + done, len(kept))
+
+    told(f"{len(kept)} results as kept, contacts in space" if kept else "contacts in space", 0)
+
+    def missing(scenes: list[list[Any]]) -> list[tuple[list[Any], str]]:
+        """Those with the most to compile first, so that no process is left with one of them at the end."""
+        order = sorted(laws, key=_gains, reverse=True) if processes else laws
+        return [(own, law) for own in scenes for law in order if (own[0].mechanism.name, law) not in there]
+
+    if processes == 0:
+        computed = _one_by_one(missing(build_scenes(left, settings)), settings, told)
+    else:
+        computed = _in_processes(processes, left, settings, missing, told)
+    for group, law, found in computed:
+        if isinstance(found, Failed):
+            yield found
+            continue
+        pieces.write(*_piece([scene.mechanism for scene in group], law, settings), found)
+        yield from found
+
+
+def _kept(
+    mechanisms: Sequence[Mechanism], laws: Sequence[str], settings: CompareSettings, pieces: Pieces
+) -> list[LawFigures]:
+    """What an earlier comparison kept."""
+    from tuning.gains.common_program import common_programs
+
+    groups = [[mechanisms[i] for i in group] for group, _ in common_programs(mechanisms)]
+    read = (pieces.read(*_piece(own, law, settings), list[LawFigures]) for own in groups for law in laws)
+    return [one for found in read for one in found or ()]
+
+
+def _piece(group: list[Mechanism], law: str, settings: CompareSettings) -> tuple[str, Any]:
+    """Name and inputs of what is found of a law on mechanisms that share a program."""
+    return f"compare {law} {group[0].name}", ("compare", law, [to_builtins(one) for one in group], settings)
+
+
+def _one_by_one(
+    tasks: list[tuple[list[Any], str]], settings: CompareSettings, tell: Tell
+) -> Iterator[Judged]:
+    done = 0
+    for group, law in tasks:
+
+        def told(text: str, share: float, group=group, done=done) -> None:
+            tell(text, done + share * len(group))
+
+        yield group, law, judge_law(group, law, settings, told)
+        done += len(group)
+
+
+def _in_processes(
+    processes: int,
+    mechanisms: list[Mechanism],
+    settings: CompareSettings,
+    missing: Callable[[list[list[Any]]], list[tuple[list[Any], str]]],
+    tell: Tell,
+) -> Iterator[Judged]:
     # A fresh interpreter each: jax does not survive a fork.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, context, _begin) as pool:
+    heard = context.SimpleQueue()
+    with ProcessPoolExecutor(processes, context, _begin, (heard,)) as pool:
         try:
-            report("contacts in space")
-            scenes = pool.submit(build_scenes, list(mechanisms), settings).result()
-            tasks = [(group, law) for group in scenes for law in sorted(laws, key=_gains, reverse=True)]
-            # Those with the most to compile first, so that no process is left with one of them at the end.
-            running = {pool.submit(judge_law, group, law, settings): (group, law) for group, law in tasks}
-            for done in as_completed(running):
-                group, law = running[done]
-                report(_progress(law, group))
-                error = done.exception()
-                if error is None:
-                    yield from done.result()
-                else:
-                    yield Failed(law, one_line(f"{type(error).__name__}: {error}", 200))
+            tasks = missing(pool.submit(build_scenes, mechanisms, settings).result())
+            running = {pool.submit(_judge, i, *task, settings): i for i, task in enumerate(tasks)}
+            shares = [0.0 for _ in tasks]
+            while running:
+                ended, _ = wait(running, SECONDS, return_when=FIRST_COMPLETED)
+                while not heard.empty():
+                    i, text, shares[i] = heard.get()
+                    tell(text, sum(one * len(tasks[k][0]) for k, one in enumerate(shares)))
+                for future in ended:
+                    i = running.pop(future)
+                    error = future.exception()
+                    reason = error and one_line(f"{type(error).__name__}: {error}", 200)
+                    shares[i] = 1.0
+                    yield *tasks[i], Failed(tasks[i][1], reason) if reason else future.result()
         except BaseException:
+            # What they compute nobody waits for.
+            for child in multiprocessing.active_children():
+                child.terminate()
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-
-
-def _progress(law: str, scenes: Sequence[Any]) -> str:
-    return f"{law}, {len(scenes)} mechanism{'s' if len(scenes) > 1 else ''}"
 
 
 def _gains(law: str) -> int:
@@ -111,12 +184,16 @@ def build_scenes(mechanisms: list[Mechanism], settings: CompareSettings) -> list
     ]
 
 
-def judge_law(scenes: list[Any], law: str, settings: CompareSettings) -> list[LawFigures]:
-    """All figures of one law on mechanisms of one program, tuned together."""
+def judge_law(
+    scenes: list[Any], law: str, settings: CompareSettings, tell: Tell = lambda text, share: None
+) -> list[LawFigures]:
+    """All figures of one law on mechanisms of one program, tuned together. `tell` is called with what is
+    going on and the share that is done."""
     from jaxhil.compensators import COMPENSATORS, literature_gains
     from tuning.benchmark.runs import judge_gains
     from tuning.gains.settings import TuneSettings
     from tuning.gains.tune import tune_all
+    from tuning.gains.work import Work
 
     mechanisms = [scene.mechanism for scene in scenes]
     others = [
@@ -128,8 +205,12 @@ def judge_law(scenes: list[Any], law: str, settings: CompareSettings) -> list[La
         {which or LITERATURE: literature_gains(mechanism, law, which) for which in (None, *others)}
         for mechanism in mechanisms
     ]
-    moved = any(gain.tuned(mechanism) for gain in COMPENSATORS[law].gains for mechanism in mechanisms)
-    if settings.tuned and moved:
+    tuned = settings.tuned and any(
+        gain.tuned(mechanism) for gain in COMPENSATORS[law].gains for mechanism in mechanisms
+    )
+    work = Work(lambda text, share, _: tell(f"{law}, {text}", share))
+    work.later = len(scenes) * (1 + len(others) + tuned) * JUDGED * settings.judged
+    if tuned:
         tuning = TuneSettings(
             settings.scenarios,
             settings.starts,
@@ -139,22 +220,42 @@ def judge_law(scenes: list[Any], law: str, settings: CompareSettings) -> list[La
             polish=settings.polish,
             scanned=settings.scanned,
         )
-        for index, result in tune_all(mechanisms, law, tuning, common=scenes[0].common):
+        for index, result in tune_all(mechanisms, law, tuning, work, common=scenes[0].common):
             gains[index][TUNED] = result.gains
     found = []
     for scene, own in zip(scenes, gains, strict=True):
-        figures = {
-            which: judge_gains(scene, law, one, settings.limit, settings.seed) for which, one in own.items()
-        }
+        figures = {}
+        for which, one in own.items():
+            work.say(f"{scene.mechanism.name}: judging {which} gains")
+            figures[which] = judge_gains(scene, law, one, settings.limit, settings.seed)
+            work.ran(JUDGED * settings.judged)
         found.append(LawFigures(law, scene.mechanism.name, own, figures))
     return found
 
 
-def _begin() -> None:
+def _judge(number: int, scenes: list[Any], law: str, settings: CompareSettings) -> list[LawFigures]:
+    """`judge_law` in a worker, which tells the parent of it, once in a while."""
+    last = 0.0
+
+    def tell(text: str, share: float) -> None:
+        nonlocal last
+        if (now := time.monotonic()) - last >= SECONDS:
+            last = now
+            _heard.put((number, text, share))
+
+    return judge_law(scenes, law, settings, tell)
+
+
+_heard: Any = None  # the parent's queue, in a worker
+
+
+def _begin(heard: Any) -> None:
     """A worker: one device, so that as many workers as there are cores share the machine."""
     import os
     import signal
 
+    global _heard
+    _heard = heard
     # The parent hears of an interruption, and ends the workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     given = os.environ.get("XLA_FLAGS", "")

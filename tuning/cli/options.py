@@ -53,6 +53,10 @@ Limit = Annotated[float, arg(metavar="NUMBER", help="Restitution error beyond wh
 Json = Annotated[
     FlagCreatePairsOff[bool], text(None, "One JSON document on standard output, nothing else there.")
 ]
+Resume = Annotated[
+    bool,
+    arg(name="resume", metavar="", help="Go on after an interruption: what is finished is not done again."),
+]
 Setting = Annotated[
     str | None,
     text(
@@ -168,6 +172,7 @@ class Tune:
     overrides: Overrides = ()
     unset: Unset = ()
     limit: Limit = 0.01
+    resume: Resume = False
     json: Json = False
 
 
@@ -214,10 +219,15 @@ class Sweep:
             "Failure probability that the interval's upper end may reach; by default no run may fail.",
         ),
     ] = None
-    output: Annotated[str, folder("Folder of the store.")] = "jaxhil-out/sweep"
-    resume: Annotated[
-        bool, arg(name="resume", metavar="", help="Go on with a sweep that was interrupted.")
-    ] = False
+    output: Annotated[
+        str | None,
+        text(
+            "DIR",
+            "Folder of the store; by default beside the gain file and named by it: NAME-sweep for NAME.json.",
+            aliases=("-o",),
+        ),
+    ] = None
+    resume: Resume = False
     chunk: Annotated[int, number("Scenarios computed at a time, and rows of each part.")] = 16384
     scheduler: Annotated[
         str | None,
@@ -230,7 +240,7 @@ class Sweep:
 class Replay:
     """Run one scenario of a sweep again, and see whether it does the same, to the bit.
 
-    Example: jaxhil replay jaxhil-out/sweep 1234 --plot worst.png
+    Example: jaxhil replay jaxhil-out/varying/gains-sweep 1234 --plot worst.png
 
     Exit code 1 if any number differs from the stored one.
     """
@@ -271,6 +281,7 @@ class Compare:
     overrides: Overrides = ()
     unset: Unset = ()
     limit: Annotated[float, arg(metavar="NUMBER", help="Restitution error that counts as a failure.")] = 0.01
+    resume: Resume = False
     seed: Annotated[int, number("Seed of scenarios, starts and resampling.")] = 0
     json: Json = False
 

@@ -14,7 +14,7 @@ DEFAULT_RIG_PLOT = "jaxhil-out/rig.png"
 class Export:
     """A bundle for the rig: gains, controller, test vectors, self-test; nothing to install there.
 
-    Example: jaxhil export jaxhil-out/varying/gains.json -o bundle --sweep jaxhil-out/sweep
+    Example: jaxhil export jaxhil-out/varying/gains.json -o bundle --sweep jaxhil-out/varying/gains-sweep
 
     Exit code 1 if the controller on the rig does not do what was simulated, or is known to stop good runs or
     to miss bad ones more often than allowed.

@@ -14,6 +14,7 @@ from tuning.front_door import arguments, meaning
 
 if TYPE_CHECKING:
     from tuning.benchmark.study import LawFigures
+    from tuning.pieces import Pieces
 
 
 class Estimated(float):
@@ -116,18 +117,24 @@ def compare(
     arguments.flags(progress=progress)
     check_names(loaded)
     found: dict[str, dict[str, LawFigures]] = {one.mechanism.name: {} for one in loaded}
-    with computing(), terminal.stages(len(loaded) * len(options.laws), progress) as stages:
-        for one in compare_each(loaded, options, 0, stages):
+    with computing(), terminal.progress(len(loaded) * len(options.laws), "results", progress) as bar:
+        for one in compare_each(loaded, options, 0, bar):
             found[one.mechanism][one.law] = one
         boards = [board(one, options, found[one.mechanism.name]) for one in loaded]
     return boards if several else boards[0]
 
 
 def compare_each(
-    loaded: Sequence[LoadedMechanism], options: CompareOptions, processes: int, stages: terminal.Stages
+    loaded: Sequence[LoadedMechanism],
+    options: CompareOptions,
+    processes: int,
+    bar: terminal.Progress,
+    pieces: "Pieces | None" = None,
 ) -> Iterator[Any]:
-    """What `tuning.benchmark.study.compare` finds, as it is done."""
-    from tuning.benchmark.study import CompareSettings, Failed, compare
+    """What `tuning.benchmark.study.compare` finds, as it is done. What is among the `pieces` is taken from
+    there, and the rest kept there."""
+    from tuning.benchmark.study import CompareSettings, compare
+    from tuning.pieces import NOTHING_KEPT
 
     settings = CompareSettings(
         options.scenarios,
@@ -139,10 +146,7 @@ def compare_each(
     for one in loaded:
         meaning.check(one.mechanism, one.label)
     mechanisms = [one.mechanism for one in loaded]
-    for one in compare(mechanisms, options.laws, settings, processes, stages.say):
-        yield one
-        if not isinstance(one, Failed):
-            stages.finish()
+    yield from compare(mechanisms, options.laws, settings, processes, bar.tell, pieces or NOTHING_KEPT)
 
 
 def check_names(loaded: Sequence[LoadedMechanism]) -> None:

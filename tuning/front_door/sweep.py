@@ -207,8 +207,9 @@ def run_study(
     path = gains if hasattr(gains, "document") else arguments.readable_gain_file(gains)
     with computing():
         from tuning.statistics.intervals import scenarios_needed
+        from tuning.sweeps.cluster import on_cluster
         from tuning.sweeps.manifest import Choices, build_manifest
-        from tuning.sweeps.run import on_cluster, run_parts, run_sweep
+        from tuning.sweeps.run import run_parts, run_sweep
         from tuning.sweeps.store import locked, open_store
         from tuning.sweeps.tally import failure_probability
 

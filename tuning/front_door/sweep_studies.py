@@ -8,8 +8,6 @@ from typing import Any
 from jaxhil.errors import InputError, one_line
 from tuning import terminal
 
-STAGE = 10_000  # scenarios between two lines of progress
-
 
 def drivers(options: Any, store, sweep, unwritten: list[InputError], progress: bool) -> dict[str, Any]:
     """What of the document says which input drives the error. `unwritten`: see `put_off`."""
@@ -36,7 +34,7 @@ def drivers(options: Any, store, sweep, unwritten: list[InputError], progress: b
 def rare(options: Any, store, sweep, unwritten: list[InputError], progress: bool) -> dict[str, Any]:
     """What of the document says how probable an error beyond a limit is. `unwritten`: see `put_off`."""
     from tuning.sweeps.stored_studies import RareRequest, read_study, study_path, write_study
-    from tuning.sweeps.studies import rare_failure
+    from tuning.sweeps.studies import most_scenarios, rare_failure
 
     limit = float(options.rare or options.limit)
     request = RareRequest(limit)
@@ -44,17 +42,9 @@ def rare(options: Any, store, sweep, unwritten: list[InputError], progress: bool
     if found is not None:
         _say_kept("subset simulation", study_path(store, request), progress)
         return _rare_document(limit, found)
-    ran = 0
-    with terminal.stages(1, progress) as stages:
-        stages.begin("subset simulation")
-
-        def done(more: int) -> None:
-            nonlocal ran
-            ran += more
-            if ran % STAGE == 0:
-                stages.say(f"subset simulation: {ran} scenarios")
-
-        found = rare_failure(sweep, limit, done)
+    with terminal.progress(most_scenarios(), "scenarios at most", progress) as bar:
+        bar.say("subset simulation")
+        found = rare_failure(sweep, limit, lambda more: bar.advance(more))
     with put_off(unwritten):
         write_study(store, request, found)
     return _rare_document(limit, found)

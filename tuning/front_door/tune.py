@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from tuning.gains.settings import TuneSettings
     from tuning.gains.transfer import Tuned
     from tuning.gains.tune import ErrorFigures, TuneResult
+    from tuning.pieces import Pieces
 
 
 @dataclass(frozen=True)
@@ -259,22 +260,32 @@ def tune(
             meaning.check(one.mechanism, one.label)
         for one in loaded if progress else ():
             meaning.say(one.mechanism, terminal.note)
-    with computing(), terminal.stages(len(loaded), progress) as stages:
-        found = dict(tune_each(loaded, options, stages.say))
+    with computing(), terminal.progress(len(loaded), "mechanisms", progress) as bar:
+        found = dict(tune_each(loaded, options, bar))
         results = [found[index] for index in range(len(loaded))]
-        if pareto:
-            for place, front in tune_pareto.trade(results, pareto, pareto_against, stages.say):
+    if pareto:
+        with computing(), terminal.progress(len(loaded), "fronts", progress) as bar:
+            for place, front in tune_pareto.trade(results, pareto, pareto_against, bar):
                 results[place] = dataclasses.replace(results[place], pareto=tuple(front))
     return results if several else results[0]
 
 
 def tune_each(
-    loaded: Sequence[LoadedMechanism], options: TuneOptions, say: Callable[[str], None]
+    loaded: Sequence[LoadedMechanism],
+    options: TuneOptions,
+    bar: terminal.Progress,
+    pieces: "Pieces | None" = None,
 ) -> Iterator[tuple[int, TunedGains]]:
-    """Index and result of every mechanism, as they are done; `say` hears what is going on."""
+    """Index and result of every mechanism, as they are done; the `bar` shows how far it is. What is among the
+    `pieces` is taken from there, and the rest kept there."""
     from tuning.gains.tune import tune_all
+    from tuning.gains.work import Work
+    from tuning.pieces import NOTHING_KEPT
 
     settings, known = options.settings(), options.known()
     mechanisms = [one.mechanism for one in loaded]
-    for index, found in tune_all(mechanisms, options.compensator, settings, say, known):
+    number = len(loaded)
+    work = Work(lambda text, share, before: bar.tell(text, share * number, before * number))
+    kept = pieces or NOTHING_KEPT
+    for index, found in tune_all(mechanisms, options.compensator, settings, work, known, pieces=kept):
         yield index, TunedGains(found, loaded[index].sha256, options.limit)

@@ -2,18 +2,20 @@
 
 import functools
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from tuning.front_door import arguments
 from tuning.front_door.arguments import ArgumentError
+from tuning.terminal import Progress
 
 if TYPE_CHECKING:
     from tuning.front_door.tune import TunedGains
     from tuning.gains.pareto import Front, Point
     from tuning.gains.pareto_search import Axis
     from tuning.gains.tune import ErrorFigures
+    from tuning.pieces import Pieces
 
 # Names in files that stand for those that the objective uses.
 IN_FILES = {"transparency_weight": "honesty_weight"}
@@ -111,12 +113,20 @@ def axis_of(against: str | None, compensator: str) -> "Axis | None":
 
 
 def trade(
-    tuned: "Sequence[TunedGains]", number: int, against: str | None, say: Callable[[str], None]
+    tuned: "Sequence[TunedGains]",
+    number: int,
+    against: str | None,
+    bar: Progress,
+    pieces: "Pieces | None" = None,
 ) -> "Iterator[tuple[int, list[TradedGains]]]":
-    """Place and front of every result, as they are done; `say` hears what is going on."""
+    """Place and front of every result, as they are done; the `bar` shows how far it is. What is among the
+    `pieces` is taken from there, and the rest kept there."""
     from tuning.gains.pareto import fronts
+    from tuning.gains.work import Work
+    from tuning.pieces import NOTHING_KEPT
 
     found = [one.found for one in tuned]
     axis: Any = axis_of(against, tuned[0].compensator) if tuned else None
-    for place, front in fronts(found, number, say, axis):
+    work = Work(lambda text, share, before: bar.tell(text, share * len(found), before * len(found)))
+    for place, front in fronts(found, number, work, axis, pieces or NOTHING_KEPT):
         yield place, [TradedGains(tuned[place], front, point) for point in front.points]

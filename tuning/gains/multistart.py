@@ -22,9 +22,9 @@ from jaxhil.errors import InputError
 from jaxhil.simulation.environment import float64, program_folder
 from tuning.gains.metrics_function import ALLOWED
 from tuning.gains.objective import RMS, Objective
-from tuning.gains.rounds import Start, inverse_hessian, prepare_solver, solve_tasks
+from tuning.gains.rounds import Start, inverse_hessian, prepare_solver, solve_tasks, step_runs
 from tuning.gains.settings import TuneSettings
-from tuning.gains.tasks import spread_points
+from tuning.gains.tasks import TuneTask, spread_points, tuned_names
 from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import apart, polish
 
@@ -63,7 +63,6 @@ def find_gains(
     validation: Validation,
     settings: TuneSettings,
     first: Sequence[Sequence[Mapping[str, float]]] | None = None,
-    report: Callable[[str], None] = lambda text: None,
 ) -> list[MultistartResult]:
     """The best gains of every task of `validation`.
 
@@ -75,7 +74,7 @@ def find_gains(
     agreed = PROBED_AGREED if probed else AGREED
     searches = [_Search() for _ in tasks]
     _check_function(validation, objective)
-    going = _solve_batches(validation, settings, first, agreed, searches, report)
+    going = _solve_batches(validation, settings, first, agreed, searches)
     if probed or objective.function is not None:
         for i, own in enumerate(searches):
             own.starts, more = _freed(validation, i, own.starts, agreed, settings.seed, objective)
@@ -86,7 +85,8 @@ def find_gains(
         # It may have kinks everywhere, as a largest magnitude has.
         polishing *= KINKED
     if polishing:
-        report("searching on without derivatives")
+        runs = polishing * len(tasks) * tasks[0].lanes
+        validation.work.begin("searching on without derivatives", runs)
     best = finish(validation, [own.starts for own in searches], polishing, settings.seed, objective)
     return [
         MultistartResult(top, own.starts, own.evaluations + (polishing if top else 0))
@@ -94,9 +94,17 @@ def find_gains(
     ]
 
 
-def _solve_batches(validation, settings, first, agreed, searches: list[_Search], report) -> list[int]:
+def expected_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
+    """Simulated runs that a search takes, of tasks that are alike, where starts agree and none ends early."""
+    names, lanes = tuned_names(tasks), tasks[0].lanes
+    scan = settings.scanned * min(SCAN_SCENARIOS, lanes) if settings.starts > 1 else 0
+    solve = settings.starts * settings.steps * step_runs(tasks, names)
+    return len(tasks) * (scan + solve + settings.polish * len(names) * lanes)
+
+
+def _solve_batches(validation, settings, first, agreed, searches: list[_Search]) -> list[int]:
     """Solve batch after batch of starts; the tasks whose starts do not agree even so."""
-    tasks, objective = validation.tasks, settings.objective
+    tasks, objective, work = validation.tasks, settings.objective, validation.work
     given = [len(own) for own in first] if first else [0 for _ in tasks]
     number = max(settings.starts, 1 + max(given))
     chosen = _while_compiling(
@@ -108,13 +116,14 @@ def _solve_batches(validation, settings, first, agreed, searches: list[_Search],
     going = list(range(len(tasks)))
     for batch in range(BATCHES if number > 1 else 1):
         if batch > 0:
-            report(f"batch {batch + 1} of starts, {len(going)} of {len(tasks)} mechanisms")
+            text = f"batch {batch + 1} of starts, {len(going)} of {len(tasks)} mechanisms"
+            work.begin(text, expected_runs([tasks[i] for i in going], settings))
             seed = settings.seed, batch
             chosen = [np.empty((0, len(validation.names)))] * len(tasks)
             scans = _scan(validation, going, number, seed, objective, settings.scanned)
             for i, points in zip(going, scans, strict=True):
                 chosen[i] = points
-        ended = solve_tasks(tasks, chosen, settings.steps, objective, report)
+        ended = solve_tasks(tasks, chosen, settings.steps, objective, work)
         for i in going:
             own = searches[i]
             own.starts += _exactly(validation, i, ended[i], objective)

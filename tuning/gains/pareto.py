@@ -7,19 +7,31 @@ accuracy and transparency (`Objective.transparency_weight`).
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
+from jaxhil.mechanism.file import to_builtins
 from jaxhil.simulation.evaluation import Outcome
 from tuning.gains.objective import Objective, contact_terms, objective_value
-from tuning.gains.pareto_search import NOISE, PEAK, TRANSPARENCY, Axis, amplification, solve_ladders, weighed
+from tuning.gains.pareto_search import (
+    NOISE,
+    PEAK,
+    TRANSPARENCY,
+    Axis,
+    amplification,
+    ladder_runs,
+    solve_ladders,
+    weighed,
+)
 from tuning.gains.settings import TuneSettings
-from tuning.gains.tasks import alike, build_task
+from tuning.gains.tasks import TuneTask, alike, build_task
 from tuning.gains.tune import BLOCK, ErrorFigures, TuneResult, block_name, figures
-from tuning.gains.validation import Validation, build_validation, split_nominal
+from tuning.gains.validation import Validation, build_validation, judged_runs, split_nominal
+from tuning.gains.work import Work
+from tuning.pieces import NOTHING_KEPT, Pieces
 from tuning.statistics.bootstrap import ErrorIntervals, error_intervals
 from tuning.statistics.intervals import Estimate
 from tuning.transparency.probes import probe_figures
@@ -68,28 +80,81 @@ def dominated(places: Sequence[tuple[float, float]]) -> list[bool]:
 def fronts(
     results: Sequence[TuneResult],
     number: int,
-    report: Callable[[str], None] = lambda text: None,
+    work: Work | None = None,
     axis: Axis = NOISE,
+    pieces: Pieces = NOTHING_KEPT,
 ) -> Iterator[tuple[int, Front]]:
     """(index, front of `number` points) of mechanisms that were tuned by one compensator with the same
-    settings, as they are done. Transparency is traded by those whose settings judge it."""
+    settings, as they are done. Transparency is traded by those whose settings judge it. Each front is a piece
+    of those kept."""
+    work = work or Work()
     settings = results[0].settings if results else TuneSettings()
     tasks = [
         build_task(r.mechanism, r.compensator, settings.scenarios, settings.seed, probed=settings.probed)
         for r in results
     ]
-    for group in alike([task.loop for task in tasks], [task.scenarios for task in tasks]):
-        for begin in range(0, len(group), BLOCK):
-            block = group[begin : begin + BLOCK]
-            some, tuned = [tasks[index] for index in block], [results[index] for index in block]
-            name = block_name(some)
-            report(f"{name}: accuracy against {axis.name}, {number} points")
-            validation = build_validation(some, settings.validation, settings.seed)
-            points = solve_ladders(
-                validation, tuned, number, settings, lambda text, name=name: report(f"{name}: {text}"), axis
-            )
-            report(f"{name}: judging {number} points")
-            yield from zip(block, _judge(validation, tuned, points, settings, axis), strict=True)
+    groups = alike([task.loop for task in tasks], [task.scenarios for task in tasks])
+    blocks = [group[begin : begin + BLOCK] for group in groups for begin in range(0, len(group), BLOCK)]
+    expected = [_expected_runs([tasks[index] for index in block], settings, number) for block in blocks]
+    for place, block in enumerate(blocks):
+        work.later = sum(expected[place + 1 :])
+        some, tuned = [tasks[index] for index in block], [results[index] for index in block]
+        work.name = block_name(some)
+        made = _kept_or_made(some, tuned, number, settings, work, axis, pieces)
+        yield from zip(block, made, strict=True)
+
+
+def _kept_or_made(
+    tasks: list[TuneTask],
+    tuned: list[TuneResult],
+    number: int,
+    settings: TuneSettings,
+    work: Work,
+    axis: Axis,
+    pieces: Pieces,
+) -> list[Front]:
+    """The fronts of mechanisms of one program, kept from before or made now."""
+    if not pieces.keeps:
+        return _fronts_of(tasks, tuned, number, settings, work, axis)
+    inputs = [
+        *("pareto", number, axis, settings, tuned[0].compensator),
+        [(to_builtins(one.mechanism), one.gains, one.starts) for one in tuned],
+    ]
+    names = [f"pareto {one.mechanism.name}" for one in tuned]
+    kept = [pieces.read(name, (inputs, i), Front) for i, name in enumerate(names)]
+    if all(kept):
+        work.keep("front as kept", _expected_runs(tasks, settings, number))
+        return kept
+    work.journal = pieces.journal(names[0], inputs)
+    made = _fronts_of(tasks, tuned, number, settings, work, axis)
+    for i, (name, front) in enumerate(zip(names, made, strict=True)):
+        pieces.write(name, (inputs, i), front)
+    work.journal.finish()
+    return made
+
+
+def _fronts_of(
+    tasks: list[TuneTask],
+    tuned: list[TuneResult],
+    number: int,
+    settings: TuneSettings,
+    work: Work,
+    axis: Axis,
+) -> list[Front]:
+    work.begin(f"accuracy against {axis.name}, {number} points", _expected_runs(tasks, settings, number))
+    validation = build_validation(tasks, settings.validation, settings.seed, work)
+    points = solve_ladders(validation, tuned, number, settings, axis)
+    work.begin(f"judging {number} points", _judging_runs(tasks, settings, number))
+    return _judge(validation, tuned, points, settings, axis)
+
+
+def _expected_runs(tasks: list[TuneTask], settings: TuneSettings, number: int) -> int:
+    return ladder_runs(tasks, number, settings) + _judging_runs(tasks, settings, number)
+
+
+def _judging_runs(tasks: list[TuneTask], settings: TuneSettings, number: int) -> int:
+    """The literature's gains and those tuned before are judged too."""
+    return (number + 2) * len(tasks) * judged_runs(settings.validation, tasks[0].probed)
 
 
 def _judge(

@@ -7,7 +7,7 @@ until none gets better.
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from itertools import chain
 from typing import NamedTuple
 
@@ -18,9 +18,9 @@ from jaxhil.compensators import COMPENSATORS, Compensator, Constants
 from jaxhil.mechanism.structs import Mechanism
 from tuning.gains.multistart import choose_starts
 from tuning.gains.objective import FAILED, Objective
-from tuning.gains.rounds import Start, solve_tasks
+from tuning.gains.rounds import Start, solve_tasks, step_runs
 from tuning.gains.settings import TuneSettings
-from tuning.gains.tasks import TuneTask
+from tuning.gains.tasks import TuneTask, tuned_names
 from tuning.gains.tune import TuneResult
 from tuning.gains.validation import Validation
 
@@ -106,7 +106,6 @@ def solve_ladders(
     tuned: list[TuneResult],
     number: int,
     settings: TuneSettings,
-    report: Callable[[str], None],
     axis: Axis = NOISE,
 ) -> list[list[tuple[float, dict[str, float]]]]:
     """Weight and gains of every point of every task."""
@@ -126,7 +125,7 @@ def solve_ladders(
         starts = (
             _around(validation, before) if turn > 0 else _anywhere(validation, tuned, objectives, settings)
         )
-        found = _search(validation, starts, objectives, settings, report, axis)
+        found = _search(validation, starts, objectives, settings, axis)
         pools = [pool + new for pool, new in zip(pools, found, strict=True)]
         after = [_picked(pool, weights) for pool, weights in zip(pools, ladders, strict=True)]
         if turn > 0 and not _improved(before, after, ladders):
@@ -135,6 +134,12 @@ def solve_ladders(
         [(float(weight), one.gains) for weight, one in zip(weights, _picked(pool, weights), strict=True)]
         for pool, weights in zip(pools, ladders, strict=True)
     ]
+
+
+def ladder_runs(tasks: list[TuneTask], number: int, settings: TuneSettings) -> int:
+    """Simulated runs that `solve_ladders` takes, about, where points get better in every pass."""
+    starts = max(settings.starts, 2) + PASSES * 2
+    return len(tasks) * number * starts * settings.steps * step_runs(tasks, tuned_names(tasks))
 
 
 def _fitting_ladder(pool: list[_Found], number: int, ends: tuple[float, float], axis: Axis) -> np.ndarray:
@@ -167,12 +172,12 @@ def _around(validation: Validation, picked: list[list[_Found]]) -> list[list[np.
     ]
 
 
-def _search(validation: Validation, starts, objectives, settings, report, axis: Axis) -> list[list[_Found]]:
+def _search(validation: Validation, starts, objectives, settings, axis: Axis) -> list[list[_Found]]:
     """What all starts of all points of each task end with."""
     number = len(objectives[0])
     every = [task for task in validation.tasks for _ in range(number)]
     own = list(chain(*objectives))
-    solved = solve_tasks(every, list(chain(*starts)), settings.steps, own, report)
+    solved = solve_tasks(every, list(chain(*starts)), settings.steps, own, validation.work)
     found = [
         _reached(
             validation, place // number, axis, settings.objective, getattr(objective, axis.weight), ended

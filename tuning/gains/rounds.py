@@ -7,7 +7,7 @@ most promising starts of a task go on.
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -22,6 +22,7 @@ from jaxhil.simulation.scenario import Scenario
 from tuning import program_cache
 from tuning.gains.objective import RMS, SCALE, Objective, Problem, common_terms, one_each, residuals
 from tuning.gains.tasks import TuneTask, common_loop, gain_bounds, gains_at, tuned_names
+from tuning.gains.work import Work
 from tuning.optimisation.levenberg_marquardt import STATUSES, Solution, solve
 from tuning.optimisation.unit_box import Bounds
 from tuning.transparency.probes import LANES_PER_SCENARIO
@@ -48,6 +49,16 @@ class Start(NamedTuple):
     curvature: np.ndarray = np.empty((0, 0))  # J^T J by those, J the residuals' Jacobian
 
 
+class _Advanced(NamedTuple):
+    """What a round made of a start."""
+
+    coordinates: np.ndarray  # unit coordinates
+    curvature: np.ndarray  # J^T J there
+    loss: float  # there
+    history: np.ndarray  # loss after every step
+    status: int  # index into `STATUSES`
+
+
 @dataclasses.dataclass
 class _Problem:
     """A start on its way."""
@@ -68,14 +79,15 @@ def solve_tasks(
     starts: list[Float[np.ndarray, "starts gains"]],
     steps: int,
     objective: Objective | Sequence[Objective] = RMS,
-    report: Callable[[str], None] = lambda text: None,
+    work: Work | None = None,
 ) -> list[list[Start]]:
     """Every start of every task; the tasks are alike (`tuning.gains.tasks.alike`). `starts` are coordinates
     of the ranges of those gains that are tuned for any of the tasks; none ends worse than it began.
 
     `objective` is that of all tasks, or one of each, which differ by their weights alone: tasks may be the
-    same but for it.
+    same but for it. Every round is a step of the `work`.
     """
+    work = work or Work()
     names = tuned_names(tasks)
     bounds = [gain_bounds(task, names) for task in tasks]
     nothing = np.zeros((len(names), len(names)))
@@ -84,7 +96,7 @@ def solve_tasks(
     ]
     objectives = one_each(objective, len(tasks))
     # As many as if every task had as many starts: where few go on, the same program serves.
-    advance = _stepper(tasks, names, bounds, objectives, len(tasks) * max(map(len, starts)))
+    advance = _stepper(tasks, names, bounds, objectives, len(tasks) * max(map(len, starts)), work)
     # Neighbours in a call take about as long.
     order = np.argsort([-float(np.max(expected_duration(task.scenarios))) for task in tasks], kind="stable")
     rank = {int(task): place for place, task in enumerate(order)}
@@ -96,9 +108,11 @@ def solve_tasks(
             break
         several = probed or (done == 0 and max(map(len, starts)) > PROMISING)
         limit = min(steps - done, FIRST_ROUND if several else LONGEST)
-        report(f"{len(going)} of {len(problems)} starts, {limit} steps")
+        work.say(f"{len(going)} of {len(problems)} starts, {limit} steps")
         before = [problem.loss for problem in going]
-        advance(going, limit)
+        advanced = work.step("round", list[_Advanced], lambda going=going, limit=limit: advance(going, limit))
+        for problem, one in zip(going, advanced, strict=True):
+            _take(problem, one)
         done += limit
         if probed and done > FIRST_ROUND:
             _settle(going, before)
@@ -159,22 +173,29 @@ def prepare_solver(
     program_cache.prepare(_advance, static, call(some, 1), program_folder())
 
 
-def _stepper(tasks, names, bounds, objectives, number) -> Callable[[list[_Problem], int], None]:
-    """A function that takes problems up to so many steps further."""
+def _stepper(tasks, names, bounds, objectives, number, work: Work):
+    """A function that tells of problems where up to so many steps further lead."""
     static, call = _calls(tasks, names, bounds, objectives, number)
-    size = _size(number)
+    size, runs = _size(number), step_runs(tasks, names)
 
-    def advance(problems: list[_Problem], limit: int) -> None:
+    def advance(problems: list[_Problem], limit: int) -> list[_Advanced]:
+        advanced = []
         for begin in range(0, len(problems), size):
             some = problems[begin : begin + size]
             solution = jax.device_get(
                 program_cache.run(_advance, static, call(some, limit), program_folder())
             )
-            for place, i in enumerate(sharded(size)):
-                if i < len(some):
-                    _take(some[i], solution, place)
+            places = np.argsort(sharded(size))[: len(some)]
+            advanced += [_advanced(solution, int(place)) for place in places]
+            work.ran(runs * sum(len(one.history) for one in advanced[begin:]))
+        return advanced
 
     return advance
+
+
+def step_runs(tasks: list[TuneTask], names: tuple[str, ...]) -> int:
+    """Simulated runs that a step of one start takes."""
+    return (1 + len(names)) * tasks[0].lanes
 
 
 def _size(number: int) -> int:
@@ -226,16 +247,23 @@ def _in_order(task: TuneTask) -> Scenario:
     return jax.tree.map(lambda leaf: np.asarray(leaf)[..., lanes], task.scenarios)
 
 
-def _take(problem: _Problem, solution: Solution, i: int) -> None:
-    taken = int(solution.steps[i])
+def _advanced(solution: Solution, i: int) -> _Advanced:
+    return _Advanced(
+        np.asarray(solution.coordinates[i]),
+        np.asarray(solution.curvature[i]),
+        float(solution.loss[i]),
+        np.asarray(solution.history[i])[: max(int(solution.steps[i]), 1)],
+        int(solution.status[i]),
+    )
+
+
+def _take(problem: _Problem, one: _Advanced) -> None:
     before = problem.history[-1] if problem.history else np.inf
-    losses = np.minimum.accumulate(np.append(before, np.asarray(solution.history[i])[: max(taken, 1)]))[1:]
-    problem.history.extend(float(loss) for loss in losses)
-    problem.status = int(solution.status[i])
+    problem.history.extend(np.minimum.accumulate(np.append(before, one.history))[1:].tolist())
+    problem.status = one.status
     # A round begins anew with cautious steps; none of them is worse than where it began.
-    if np.isfinite(solution.loss[i]):
-        problem.coordinates = np.clip(np.asarray(solution.coordinates[i]), 0, 1)
-        problem.curvature = np.asarray(solution.curvature[i])
+    if np.isfinite(one.loss):
+        problem.coordinates, problem.curvature = np.clip(one.coordinates, 0, 1), one.curvature
 
 
 def _advance(static: tuple[Any, int, int], arguments: Any) -> Solution:

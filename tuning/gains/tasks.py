@@ -50,7 +50,12 @@ class TuneTask:
     @property
     def number(self) -> int:
         """Scenarios, probes not counted."""
-        return len(self.scenarios.velocity) // (LANES_PER_SCENARIO if self.probed else 1)
+        return self.lanes // (LANES_PER_SCENARIO if self.probed else 1)
+
+    @property
+    def lanes(self) -> int:
+        """Scenarios, probes counted."""
+        return len(self.scenarios.velocity)
 
     @property
     def contacts(self) -> int:

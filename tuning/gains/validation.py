@@ -24,6 +24,7 @@ from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.batches import cut, join
 from tuning.gains.objective import Objective, contact_terms, metrics_of, objective_value, one_each
 from tuning.gains.tasks import TuneTask, common_loop, gain_bounds, gains_at, tuned_names
+from tuning.gains.work import Work
 from tuning.optimisation.unit_box import Bounds, to_coordinates
 from tuning.transparency.probes import LANES_PER_SCENARIO, ProbedScenarios, are_probes, probed_scenarios
 
@@ -46,6 +47,7 @@ class Validation:
     judged: Scenario
     training: Any  # training scenarios, (tasks, ..., scenarios)
     lanes: int  # of `judged` that belong to a task
+    work: Work  # hears of every run
 
     def judge(
         self, gains: list[dict[str, float]], compensator: str | None = None
@@ -58,6 +60,7 @@ class Validation:
             loop = dataclasses.replace(loop, compensator=COMPENSATORS[compensator])
         values = {name: np.repeat([one[name] for one in gains], self.lanes) for name in gains[0]}
         every = cut(evaluate(loop, values, self.judged), self.lanes)
+        self.work.ran(self.lanes * len(self.tasks))
         if not self.tasks[0].probed:
             return [(own, None) for own in every]
 
@@ -94,6 +97,7 @@ class Validation:
         running = [self._begin(noise, which, coordinates, some, number, lanes) for some in parts]
         for some, ended in zip(parts, running, strict=True):
             outcome, amplification = ended()
+            self.work.ran(len(some) * number)
             # (slots, pairs, scenarios)
             terms = [np.asarray(term).reshape(-1, len(some), number) for term in contact_terms(outcome)]
             wanted = outcome.wanted.reshape(terms[0].shape)
@@ -153,7 +157,9 @@ class Validation:
         return to_coordinates(gains.reshape(len(several), len(self.names)), self.bounds[task])
 
 
-def build_validation(tasks: list[TuneTask], scenarios: int, seed: int) -> Validation:
+def build_validation(
+    tasks: list[TuneTask], scenarios: int, seed: int, work: Work | None = None
+) -> Validation:
     """So many fresh scenarios of each of the tasks, which are alike (`tuning.gains.tasks.alike`)."""
     drawn = [_fresh(task, scenarios, seed + VALIDATION_SEED) for task in tasks]
     fresh, probed, judged, loops = (list(each) for each in zip(*drawn, strict=True))
@@ -170,8 +176,14 @@ def build_validation(tasks: list[TuneTask], scenarios: int, seed: int) -> Valida
             lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]),
             *[task.scenarios for task in tasks],
         ),
-        lanes=scenarios * (LANES_PER_SCENARIO if tasks[0].probed else 1) + 1,
+        lanes=judged_runs(scenarios, tasks[0].probed),
+        work=work or Work(),
     )
+
+
+def judged_runs(scenarios: int, probed: bool) -> int:
+    """Runs of a task under one set of gains, with its nominal one."""
+    return scenarios * (LANES_PER_SCENARIO if probed else 1) + 1
 
 
 def split_nominal(outcome: Outcome) -> tuple[Any, Any]:
@@ -181,6 +193,12 @@ def split_nominal(outcome: Outcome) -> tuple[Any, Any]:
         for part in (slice(-1), slice(-1, None))
     )
     return fresh, nominal
+
+
+def fresh_scenarios(task: TuneTask, number: int, seed: int) -> Scenario:
+    """Scenarios of a task that its tuning with that seed never saw."""
+    seed += VALIDATION_SEED
+    return build_scenarios(task.mechanism, draw(task.mechanism, number, seed), seed)
 
 
 def _fresh(task: TuneTask, number: int, seed: int) -> tuple[Scenario, ProbedScenarios | None, Scenario, Loop]:

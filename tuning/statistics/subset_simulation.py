@@ -35,6 +35,7 @@ SHARE = 0.1  # conditional probability of each level: the optimum is flat betwee
 STEPS = round(1.0 / SHARE)  # scenarios of each chain, its start included
 ACCEPTANCE = 0.44
 FIRST_SIGMA, LEAST_SIGMA = 0.6, 1e-4
+LEVELS = 12  # at most
 WORST = 10
 
 
@@ -82,7 +83,7 @@ def subset_simulation(
     samples: int = 1000,
     replicates: int = 10,
     level: float = LEVEL,
-    levels: int = 12,
+    levels: int = LEVELS,
 ) -> SubsetSimulation:
     """Probability that performance(u) > limit, for u of `inputs` independent standard normals.
 

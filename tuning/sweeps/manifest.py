@@ -18,7 +18,7 @@ from jaxhil.compensators import COMPENSATORS
 from jaxhil.contact.laws import LAWS
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.runtime import digest
-from jaxhil.simulation.environment import xla_flags
+from jaxhil.simulation.environment import rounding_flags, xla_flags
 from jaxhil.simulation.gain_file import LoadedGains, check_document
 from tuning.files import open_plain
 from tuning.sources import sources_sha256, versions
@@ -109,11 +109,6 @@ def build_manifest(loaded: LoadedGains, choices: Choices) -> Manifest:
     if choices.until_width is None:
         del document["until_width"]
     return _decode({**document, "sha256": digest(document)}, "sweep")
-
-
-def rounding_flags(flags: str) -> str:
-    """What of XLA_FLAGS may change the last bits of a result: all but the number of devices."""
-    return " ".join(sorted(flag for flag in flags.split() if "device_count" not in flag))
 
 
 def encode(manifest: Manifest) -> bytes:

@@ -8,19 +8,15 @@ order they come in, and ends at the first after which it is: where, follows from
 beyond are removed.
 """
 
-import threading
 from collections.abc import Callable, Generator, Iterable
 from contextlib import closing
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxhil.errors import InputError, one_line, shown
 from tuning.statistics.intervals import enough
 from tuning.sweeps.chunks import Rows, Sweep, build_sweep, run_chunk, run_parts
 from tuning.sweeps.columns import OUTCOMES
-from tuning.sweeps.manifest import Manifest, decode, encode, unlike_here
 from tuning.sweeps.store import Store, read_part, remove_parts, write_part
 from tuning.sweeps.tally import Tally, add_rows, empty_tally
 
@@ -86,11 +82,6 @@ def compare_precisions(sweep: Sweep, number: int = COMPARED) -> Precision:
     )
 
 
-def on_cluster(address: str) -> Computer:
-    """Parts computed by the workers of the `dask.distributed` scheduler at this address."""
-    return lambda sweep, parts: _run_on_cluster(sweep.manifest, parts, address)
-
-
 def describe_outcomes(tally: Tally) -> dict[str, int]:
     """Number of scenarios of each outcome that was met."""
     return {name: count for name, count in zip(OUTCOMES, tally.outcomes, strict=True) if count}
@@ -131,63 +122,3 @@ def _run_until(store: Store, sweep: Sweep, found: Progress, computed: Progress, 
                     break
     remove_parts(store, following)
     return tally
-
-
-def _run_on_cluster(
-    manifest: Manifest, parts: Iterable[int], address: str
-) -> Generator[tuple[int, Rows], None, None]:
-    """The parts in the order in which workers finish them; a few are under way per worker."""
-    try:
-        from distributed import Client, KilledWorker, as_completed  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        missing = "nothing installed for it, allowed once `pip install jaxhil[distributed]` was done"
-        raise InputError(f"--scheduler: found {missing}") from None
-    try:
-        client = Client(address, timeout=10, set_as_default=False)
-    except (OSError, ValueError, TimeoutError) as error:
-        reason = one_line(str(error), 100)
-        raise InputError(f"--scheduler: found {shown(address)}, allowed a scheduler's: {reason}") from None
-    with client:
-        content = encode(manifest)
-        waiting = iter(parts)
-
-        def submit() -> list[Any]:
-            part = next(waiting, None)
-            if part is None:
-                return []
-            key = f"jaxhil-{manifest.sha256[:16]}-{part}"
-            return [client.submit(_remote_part, content, part, key=key, pure=False)]
-
-        at_once = max(2, 2 * len(client.scheduler_info(n_workers=-1)["workers"]))
-        first = [future for _ in range(at_once) for future in submit()]
-        futures = as_completed(first, loop=client.loop)
-        for future in futures:
-            try:
-                part, rows = future.result()
-            except KilledWorker:
-                raise InputError(f"--scheduler: {address}: several workers died of one part") from None
-            future.release()
-            for more in submit():
-                futures.add(more)
-            yield part, rows
-
-
-# A worker may have several threads, and no two programs may run at a time.
-_one_at_a_time = threading.Lock()
-
-
-def _remote_part(content: bytes, part: int) -> tuple[int, Rows]:
-    """A part's rows, on a worker."""
-    with _one_at_a_time:
-        from jaxhil.simulation.environment import prepare
-
-        prepare()
-        sweep = _remote_sweep(content)
-        if differing := unlike_here(sweep.manifest):
-            raise InputError(f"--scheduler: a worker: {differing[0]}: its rows would differ")
-        return part, run_chunk(sweep, *sweep.manifest.part_rows(part))
-
-
-@lru_cache(maxsize=2)
-def _remote_sweep(content: bytes) -> Sweep:
-    return build_sweep(decode(content, "sweep"))

@@ -14,7 +14,13 @@ from jaxhil.mechanism.uncertainty import at_points, dimensions
 from jaxhil.simulation.evaluation import evaluate
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.statistics.sobol_indices import saltelli_design, sobol_indices
-from tuning.statistics.subset_simulation import SubsetSimulation, subset_simulation, to_uniform
+from tuning.statistics.subset_simulation import (
+    LEVELS,
+    STEPS,
+    SubsetSimulation,
+    subset_simulation,
+    to_uniform,
+)
 from tuning.sweeps.chunks import Rows, Sweep, in_precision
 from tuning.sweeps.columns import OUTCOMES, SATURATED, rows_of
 from tuning.sweeps.tally import error_sizes
@@ -73,6 +79,11 @@ def error_indices(sweep: Sweep, number: int, done: Done = lambda _: None) -> Err
     found = [InputIndices(name, *row.tolist()) for name, row in zip(names, numbers, strict=True)]
     found.sort(key=lambda one: -np.nan_to_num(one.total))
     return ErrorIndices(tuple(found), cap, len(points), int(np.sum(sizes >= cap)))
+
+
+def most_scenarios(samples: int = SAMPLES, replicates: int = REPLICATES) -> int:
+    """That `rare_failure` runs: each level but the first begins with a part of those of the last."""
+    return replicates * (samples + (LEVELS - 1) * (samples - samples // STEPS))
 
 
 def rare_failure(

@@ -9,6 +9,7 @@ from jaxhil.mechanism.file import LoadedMechanism, load, suite_names
 from jaxhil.simulation.environment import prepare, usable_cores
 from tuning import terminal
 from tuning.cli.commands import checks
+from tuning.cli.commands.resuming import pieces_in, say_of_pieces
 from tuning.cli.options import Compare
 from tuning.files import write_whole, writing
 from tuning.front_door.compare import CompareOptions, board, check_names, compare_each
@@ -17,8 +18,8 @@ PICTURES = ("errors.png", "honesty.png")
 
 
 def run(options: Compare) -> int:
-    """Compare; what is finished is reported and written, also when interrupted. 0, 1 if a law failed, or
-    130."""
+    """Compare; what is finished is reported and written, also when interrupted; to resume, it is not computed
+    again. 0, 1 if a law failed, or 130."""
     asked = CompareOptions(**{field.name: getattr(options, field.name) for field in fields(CompareOptions)})
     asked.check()
     loaded = _load(options)
@@ -31,9 +32,10 @@ def run(options: Compare) -> int:
     laws, names = asked.laws, [one.mechanism.name for one in loaded]
     found: dict[str, dict[str, Any]] = {name: {} for name in names}
     interrupted, problems = False, []
-    with terminal.stages(len(names) * len(laws)) as stages:
+    pieces = pieces_in(options.output, options.resume)
+    with terminal.progress(len(names) * len(laws), "results") as bar:
         try:
-            for one in compare_each(loaded, asked, usable_cores(), stages):
+            for one in compare_each(loaded, asked, usable_cores(), bar, pieces):
                 if isinstance(one, Failed):
                     problems.append(f"{one.law}: {one.reason}")
                     terminal.note(f"jaxhil: {problems[-1]}")
@@ -60,11 +62,11 @@ def run(options: Compare) -> int:
         terminal.emit_json(document)
     else:
         _print(options, done, ordered, document)
+    say_of_pieces(pieces)
     if interrupted:
         finished = sum(len(own) for own in ordered.values())
-        terminal.note(
-            f"jaxhil: interrupted, {finished} of {len(names) * len(laws)} results finished and kept"
-        )
+        kept = f"{finished} of {len(names) * len(laws)} results finished and kept"
+        terminal.note(f"jaxhil: interrupted, {kept}; the same with --resume goes on")
         return 130
     return 1 if problems else 0
 

@@ -17,7 +17,8 @@ def run(options: Sweep) -> int:
     asked.check()
     path = readable_gain_file(options.gains)
     prepare()
-    study = run_study(path, asked, Path(options.output), progress=True)
+    folder = path.with_name(f"{path.stem}-sweep") if options.output is None else Path(options.output)
+    study = run_study(path, asked, folder, progress=True)
     if options.json:
         terminal.emit_json(study.document)
     else:

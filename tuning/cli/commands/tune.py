@@ -5,25 +5,30 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxhil.errors import InputError, one_line
 from jaxhil.mechanism.file import LoadedMechanism, load
 from jaxhil.simulation.environment import prepare, program_folder
 from tuning import terminal
 from tuning.cli.commands import checks, tune_pareto
+from tuning.cli.commands.resuming import pieces_in, say_of_pieces
 from tuning.cli.commands.tune_tables import print_one, print_overview
 from tuning.cli.options import Tune
 from tuning.files import make_folder, remove_stale, writing
 from tuning.front_door import meaning
 from tuning.front_door.tune import TunedGains, TuneOptions, tune_each
 
+if TYPE_CHECKING:
+    from tuning.pieces import Pieces
+
 PICTURES = ("errors.png", "contact.png", "loss.png", "pareto.png")
 MOST_DRAWN = 4  # mechanisms whose plots are drawn; of more there is one picture of all
 
 
 def run(options: Tune) -> int:
-    """Tune file by file. What is finished is written at once and stays, whatever happens to the rest."""
+    """Tune file by file. What is finished is written at once and stays, whatever happens to the rest; to
+    resume, it is not tuned again."""
     asked = TuneOptions(**{field.name: getattr(options, field.name) for field in fields(TuneOptions)})
     if options.pareto:
         prepare()
@@ -43,10 +48,12 @@ def run(options: Tune) -> int:
             checks.own_results(folder / "gains.json", "compensator", PICTURES)
         loaded = _understood(options, asked, loaded, problems)
     if loaded:
+        pieces = pieces_in(options.output, options.resume)
         try:
-            entries = _tune_all(options, asked, loaded, problems)
+            entries = _tune_all(options, asked, loaded, problems, pieces)
         except _Interrupted as stop:
             entries, interrupted = stop.entries, True
+        say_of_pieces(pieces)
     if options.json:
         terminal.emit_json(
             {
@@ -59,9 +66,15 @@ def run(options: Tune) -> int:
             }
         )
     if interrupted:
-        terminal.note(f"jaxhil: interrupted, {len(entries)} of {len(loaded)} mechanisms finished and kept")
+        finished = f"{len(entries)} of {len(loaded)} mechanisms finished and kept"
+        terminal.note(f"jaxhil: interrupted, {finished}; the same with --resume goes on")
         return 130
     if problems:
+        if entries:
+            # What was said of them at once has scrolled away.
+            terminal.note(f"jaxhil: {len(problems)} could not be done:")
+            for problem in problems:
+                terminal.note(f"jaxhil: {problem}")
         return 2
     return 0 if all(entry["verdict"] == "good" for entry in entries) else 1
 
@@ -131,33 +144,34 @@ def folder_name(name: str) -> str:
 
 
 def _tune_all(
-    options: Tune, asked: TuneOptions, loaded: list[LoadedMechanism], problems: list[str]
+    options: Tune,
+    asked: TuneOptions,
+    loaded: list[LoadedMechanism],
+    problems: list[str],
+    pieces: "Pieces",
 ) -> list[dict[str, Any]]:
     prepare()
     entries, done, fronts = {}, {}, {}
     drawn = len(loaded) <= MOST_DRAWN
-    with (
-        terminal.stages(len(loaded) * (2 if options.pareto else 1)) as stages,
-        ThreadPoolExecutor(1) as meanwhile,
-    ):
-        if drawn and program_folder() is not None:
-            meanwhile.submit(_prepare_drawing, loaded[0].mechanism, options.compensator)
-        try:
-            for index, result in tune_each(loaded, asked, stages.say):
+    try:
+        with terminal.progress(len(loaded), "mechanisms") as bar, ThreadPoolExecutor(1) as meanwhile:
+            if drawn and program_folder() is not None:
+                meanwhile.submit(_prepare_drawing, loaded[0].mechanism, options.compensator)
+            for index, result in tune_each(loaded, asked, bar, pieces):
                 try:
-                    entries[index] = _finish(options, loaded[index], result, drawn, stages.say)
+                    entries[index] = _finish(options, loaded[index], result, drawn, bar.say)
                 except InputError as error:
                     problems.append(str(error))
                     terminal.note(f"jaxhil: {error}")
                     continue
                 done[index] = result
-                stages.finish()
                 if not options.json and drawn:
                     print_one(options, result.found, entries[index])
-            if options.pareto and done:
-                fronts = tune_pareto.trade(options, done, entries, problems, stages)
-        except KeyboardInterrupt:
-            raise _Interrupted(_in_order(entries)) from None
+        if options.pareto and done:
+            with terminal.progress(len(done), "fronts") as bar:
+                fronts = tune_pareto.trade(options, done, entries, problems, bar, pieces)
+    except KeyboardInterrupt:
+        raise _Interrupted(_in_order(entries)) from None
     if len(loaded) > 1 and done:
         _overview(options, [one.found for one in _in_order(done)], _in_order(entries), drawn)
     if not options.json and drawn:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxhil.errors import InputError
 from tuning import terminal
@@ -12,6 +12,9 @@ from tuning.front_door import tune_pareto
 from tuning.front_door.tune import TunedGains
 from tuning.front_door.tune_pareto import TradedGains
 
+if TYPE_CHECKING:
+    from tuning.pieces import Pieces
+
 FOLDER = "pareto"
 
 
@@ -20,12 +23,13 @@ def trade(
     done: Mapping[int, TunedGains],
     entries: Mapping[int, dict[str, Any]],
     problems: list[str],
-    stages: terminal.Stages,
+    bar: terminal.Progress,
+    pieces: "Pieces",
 ) -> dict[int, Any]:
     """Fronts of the mechanisms that are `done`, written beside their gains and added to their entries."""
     order, made = sorted(done), {}
     results = [done[index] for index in order]
-    for place, points in tune_pareto.trade(results, options.pareto, options.pareto_against, stages.say):
+    for place, points in tune_pareto.trade(results, options.pareto, options.pareto_against, bar, pieces):
         index = order[place]
         folder = Path(entries[index]["gain_file"]).parent
         try:
@@ -35,7 +39,6 @@ def trade(
             terminal.note(f"jaxhil: {error}")
             continue
         entries[index]["pareto"], made[index] = entry, points[0].front
-        stages.finish()
     return made
 
 

@@ -1,0 +1,126 @@
+"""Finished pieces: as they were to the bit, or none; of other inputs, other code, or damaged ones nothing."""
+
+import math
+import struct
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from tuning import pieces
+from tuning.pieces import Pieces, decode, encode
+
+
+class Point(NamedTuple):
+    name: str
+    gains: dict[str, float]
+    curvature: np.ndarray
+    weight: float | None = None
+
+
+NUMBERS = [0.1, -0.0, 5e-324, math.inf, -math.inf, math.nan, 1.7976931348623157e308]
+POINT = Point("a", {"z": 1.5, "a": math.nan}, np.array([[1.0, np.nan], [-0.0, 3.0]]), None)
+
+
+def test_every_bit_comes_back():
+    found = decode(encode(NUMBERS), list[float])
+    assert [struct.pack("d", one) for one in found] == [struct.pack("d", one) for one in NUMBERS]
+    point = decode(encode(POINT), Point)
+    assert type(point) is Point and point.curvature.tobytes() == POINT.curvature.tobytes()
+    # The order of what a table shows is the order in which it was found.
+    assert list(point.gains) == ["z", "a"] and point.weight is None
+    for array in (np.arange(6, dtype=np.int32).reshape(2, 3), np.array([True, False]), np.empty((0, 2))):
+        again = decode(encode(array), np.ndarray)
+        assert again.dtype == array.dtype and again.shape == array.shape and (again == array).all()
+    assert decode(encode(np.float64(0.1)), float) == 0.1
+
+
+@pytest.mark.parametrize("thing", [print, object(), np.array([print]), {"a": lambda: 1}])
+def test_what_is_no_data_is_not_kept(thing):
+    with pytest.raises(TypeError):
+        encode(thing)
+
+
+def test_a_piece_is_read_by_those_who_would_compute_the_same(tmp_path, monkeypatch):
+    inputs = {"seed": 1, "limit": math.inf, "gains": POINT}
+    Pieces(tmp_path).write("one", inputs, POINT)
+    reader = Pieces(tmp_path, resume=True)
+    assert reader.read("one", dict(reversed(inputs.items())), Point).name == "a"
+    assert reader.read("other", inputs, Point) is None and reader.other == []
+    assert Pieces(tmp_path).read("one", inputs, Point) is None
+    assert Pieces().read("one", inputs, Point) is None
+    for changed in ({**inputs, "seed": 2}, {**inputs, "limit": 1.0}, {**inputs, "gains": POINT[:3]}):
+        assert reader.read("one", changed, Point) is None
+    assert reader.other == ["one"] * 3
+    # Another type than it was written with.
+    assert reader.read("one", inputs, int) is None
+    for name in ("sources_sha256", "versions", "xla_flags"):
+        with monkeypatch.context() as patched:
+            patched.setattr(pieces, name, lambda: "others")
+            assert reader.read("one", inputs, Point) is None
+    assert reader.read("one", inputs, Point) is not None
+
+
+def test_no_flipped_bit_is_taken(tmp_path):
+    Pieces(tmp_path).write("one", 1, POINT)
+    (path,) = tmp_path.iterdir()
+    content = path.read_bytes()
+    places = np.random.default_rng(0).integers(0, 8 * len(content), 1000)
+    for place in places:
+        flipped = bytearray(content)
+        flipped[place // 8] ^= 1 << place % 8
+        path.write_bytes(flipped)
+        assert Pieces(tmp_path, resume=True).read("one", 1, Point) is None
+    for length in (0, 1, 64, 65, 66, len(content) - 1):
+        path.write_bytes(content[:length])
+        assert Pieces(tmp_path, resume=True).read("one", 1, Point) is None
+
+
+def test_steps_are_made_once_and_removed_when_the_whole_is_kept(tmp_path):
+    made = []
+
+    def run(stop, resume=True):
+        journal = Pieces(tmp_path, resume).journal("work", "inputs")
+        for number in range(4):
+            if number == stop:
+                return None
+            journal.step("round", int, lambda number=number: made.append(number) or number)
+        journal.step("end", int, lambda: 7)
+        return journal
+
+    run(stop=2)
+    assert made == [0, 1]
+    journal = run(stop=None)
+    assert made == [0, 1, 2, 3]
+    # Not to resume: all is made again.
+    run(stop=2, resume=False)
+    assert made == [0, 1, 2, 3, 0, 1]
+    (folder,) = tmp_path.iterdir()
+    (folder / "notes.txt").write_text("a user's")
+    journal.finish()
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+
+
+def test_what_cannot_be_kept_costs_nothing_else(tmp_path):
+    (tmp_path / "taken").touch()
+    for place in (tmp_path / "taken", tmp_path / "link"):
+        kept = Pieces(place)
+        (tmp_path / "elsewhere").mkdir(exist_ok=True)
+        if place.name == "link":
+            place.symlink_to(tmp_path / "elsewhere")
+        kept.write("one", 1, 2)
+        journal = kept.journal("work", 1)
+        assert journal.step("round", int, lambda: 5) == 5
+        journal.finish()
+        assert kept.unwritten and all("\n" not in str(error) for error in kept.unwritten)
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_names_that_look_alike_are_told_apart(tmp_path):
+    written = Pieces(tmp_path)
+    names = ["a b", "a-b", "../a", "A" * 300, "A" * 301, "ä", "ö"]
+    for number, name in enumerate(names):
+        written.write(name, 0, number)
+    assert written.unwritten == [] and len(list(tmp_path.iterdir())) == len(names)
+    reader = Pieces(tmp_path, resume=True)
+    assert [reader.read(name, 0, int) for name in names] == list(range(len(names)))

@@ -1,0 +1,233 @@
+"""`jaxhil tune` and `compare` stopped at any moment: resumed, they end as if nothing had happened."""
+
+import json
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from jaxhil.mechanism.file import builtin_path, load
+from jaxhil.mechanism.structs import Mechanism
+from tuning import pieces
+from tuning.benchmark import study
+from tuning.benchmark.study import CompareSettings, LawFigures, compare
+from tuning.gains.common_program import common_programs
+from tuning.gains.settings import TuneSettings
+from tuning.gains.tune import tune_all
+from tuning.pieces import FOLDER, Pieces
+from tuning.statistics.intervals import Estimate
+
+HERE = Path(__file__).parent
+FILES = 5  # more than have pictures of their own
+TINY = ["--compensator", "phase_lead", "--scenarios", "4", "--starts", "2", "--steps", "2"]
+TINY += ["--validation", "16", "--limit", "inf", "--json"]
+SETTINGS = TuneSettings(scenarios=4, starts=2, steps=2, validation=16)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Mechanisms of one program."""
+    folder, text = tmp_path_factory.mktemp("files"), builtin_path("rig-300kg").read_text()
+    for number in range(FILES):
+        (folder / f"m{number}.toml").write_text(text.replace('"rig-300kg"', f'"m{number}"'))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(files, tmp_path_factory):
+    """A run without an interruption: what it made, and how many pieces it wrote."""
+    from tuning import terminal
+    from tuning.__main__ import main
+
+    folder, printed = tmp_path_factory.mktemp("whole") / "out", []
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(terminal, "emit_json", printed.append)
+        writes = Writes(patched)
+        assert main(["tune", str(files), "-o", str(folder), *TINY]) == 0
+    return outputs(terminal.as_json(printed[0]), folder), writes.number
+
+
+def outputs(said, folder):
+    """What a run said and wrote, but for times of day and timings, and for where it wrote."""
+    document = json.loads(said.replace(str(folder), "DIR"))
+    for entry in document["mechanisms"]:
+        entry.pop("timings")
+    gains = {}
+    for path in sorted(folder.glob("*/gains.json")):
+        content = json.loads(path.read_text())
+        content.pop("created")
+        content.pop("timings")
+        gains[path.parent.name] = content
+    return json.dumps(document), gains
+
+
+class Writes:
+    """Interrupts at the write of a piece number `stop`, before it or after."""
+
+    def __init__(self, monkeypatch, stop=None, after=False):
+        self.number, self.stop, self.after = 0, stop, after
+        self.write = pieces.write_sealed
+        monkeypatch.setattr(pieces, "write_sealed", self)
+
+    def __call__(self, path, content):
+        self.number += 1
+        if self.number == self.stop and not self.after:
+            raise KeyboardInterrupt
+        self.write(path, content)
+        if self.number == self.stop:
+            raise KeyboardInterrupt
+
+
+def interrupted_and_resumed(jaxhil, files, folder, stop, after):
+    with pytest.MonkeyPatch.context() as patched:
+        Writes(patched, stop, after)
+        ran = jaxhil("tune", files, "-o", folder, *TINY)
+    assert ran.code == 130 and "--resume goes on" in ran.err
+    with pytest.MonkeyPatch.context() as patched:
+        writes = Writes(patched)
+        again = jaxhil("tune", files, "-o", folder, *TINY, "--resume")
+    assert again.code == 0 and "warning" not in again.err
+    return outputs(again.out, folder), writes.number
+
+
+def test_a_run_resumed_ends_as_if_nothing_had_happened(jaxhil, files, whole, tmp_path):
+    expected, every = whole
+    # Rounds of the search, the search, and a result each.
+    assert every >= 2 + FILES
+    for stop in (2, every):
+        found, made = interrupted_and_resumed(jaxhil, files, tmp_path / str(stop), stop, after=stop > 2)
+        assert found == expected
+        # What was kept is not made again.
+        assert made == (every - 1 if stop == 2 else 0)
+    # Steps are gone, results stay.
+    assert len(list((tmp_path / "2" / FOLDER).iterdir())) == FILES
+
+
+@pytest.mark.slow
+def test_wherever_it_is_interrupted(jaxhil, files, whole, tmp_path):
+    expected, every = whole
+    for stop in range(1, every + 1):
+        for after in (False, True):
+            folder = tmp_path / f"{stop} {after}"
+            found, _ = interrupted_and_resumed(jaxhil, files, folder, stop, after)
+            assert found == expected, (stop, after)
+
+
+@pytest.mark.slow
+def test_pieces_of_other_files_and_options_are_not_used(jaxhil, files, tmp_path):
+    out = tmp_path / "out"
+    jaxhil("tune", files, "-o", out, *TINY)
+    some = [files / f"m{number}.toml" for number in range(FILES - 1)]
+    for change in ([files, "--seed", "1"], some):
+        ran = jaxhil("tune", *change, "-o", out, *TINY, "--resume")
+        assert ran.code == 0 and "kept by other files, options or code" in ran.err
+        fresh = jaxhil("tune", *change, "-o", tmp_path / "fresh", *TINY)
+        assert outputs(ran.out, out)[0] == outputs(fresh.out, tmp_path / "fresh")[0]
+        shutil.rmtree(tmp_path / "fresh")
+
+
+def test_a_result_kept_is_the_result(tmp_path):
+    """All of it, to the bit, what pictures are made of too."""
+    mechanisms = [load("rig-300kg", [f"name=m{i}"]).mechanism for i in range(FILES)]
+    made = dict(tune_all(mechanisms, "phase_lead", SETTINGS, pieces=Pieces(tmp_path)))
+    read = dict(tune_all(mechanisms, "phase_lead", SETTINGS, pieces=Pieces(tmp_path, resume=True)))
+    assert made.keys() == read.keys()
+    for index, one in made.items():
+        assert_same(vars(one), vars(read[index]))
+
+
+def assert_same(one, other):
+    assert type(one) is type(other)
+    if isinstance(one, dict):
+        assert list(one) == list(other)
+        for key in one:
+            assert_same(one[key], other[key])
+    elif isinstance(one, (list, tuple)):
+        assert len(one) == len(other)
+        for pair in zip(one, other, strict=True):
+            assert_same(*pair)
+    elif isinstance(one, np.ndarray):
+        assert one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
+    else:
+        assert one == other or (one != one and other != other)
+
+
+@pytest.mark.slow
+def test_a_front_is_kept_too(jaxhil, tmp_path):
+    arguments = ["tune", "rig-300kg", "-o", tmp_path, *TINY, "--pareto", "2"]
+    with pytest.MonkeyPatch.context() as patched:
+        Writes(patched, stop=8)
+        assert jaxhil(*arguments).code == 130
+    resumed = jaxhil(*arguments, "--resume")
+    again = jaxhil(*arguments, "--resume")
+    assert "front as kept" in again.err and "steps" not in again.err
+    shutil.rmtree(tmp_path)
+    fresh = jaxhil(*arguments)
+    expected = outputs(fresh.out, tmp_path)
+    assert outputs(resumed.out, tmp_path) == outputs(again.out, tmp_path) == expected
+
+
+class Scene(NamedTuple):
+    """As much of one as names what it is for."""
+
+    mechanism: Mechanism
+
+
+def test_a_comparison_goes_on_with_what_is_missing(tmp_path, monkeypatch):
+    """Figures are made up here; grouping, keeping and reading them are not."""
+    names = ["rig-300kg", "suite-noisy", "varying"]
+    mechanisms = [load(name).mechanism for name in names]
+    groups = [[mechanisms[i] for i in group] for group, _ in common_programs(mechanisms)]
+    judged = []
+
+    def judge(scenes, law, settings, tell):
+        judged.append((law, len(scenes)))
+        if law == "smith":
+            raise KeyboardInterrupt
+        figures = {"literature": {"rms": Estimate(0.1, math.nan, 1 / 3)}}
+        return [LawFigures(law, one.mechanism.name, {"literature": {"g": 0.1}}, figures) for one in scenes]
+
+    def build(mechanisms, settings):
+        return [[Scene(one) for one in group] for group in groups if group[0] in mechanisms]
+
+    monkeypatch.setattr(study, "judge_law", judge)
+    monkeypatch.setattr(study, "build_scenes", build)
+
+    def run(*laws, resume=True, **settings):
+        judged.clear()
+        kept = Pieces(tmp_path, resume)
+        found = list(compare(mechanisms, laws, CompareSettings(**settings), 0, pieces=kept))
+        return sorted(map(repr, found)), [law for law, _ in judged]
+
+    with pytest.raises(KeyboardInterrupt):
+        run("none", "smith", resume=False)
+    assert run("none", "passivity")[1] == ["none"] * (len(groups) - 1) + ["passivity"] * len(groups)
+    found, computed = run("passivity", "none")
+    assert len(found) == 2 * len(names) and computed == []
+    assert run("none", "passivity", resume=False) == (found, ["none", "passivity"] * len(groups))
+    assert len(run("none", seed=1)[1]) == len(groups)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGINT])
+def test_a_process_that_is_killed_loses_nothing(jaxhil, files, whole, tmp_path, signal_number):
+    program = "import conftest, sys; from tuning.__main__ import main; sys.exit(main())"
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", program, "tune", str(files), "-o", str(out), *TINY, "--resume"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE.parent), str(HERE)])}
+    for pieces_there in (1, 3, 4):
+        with subprocess.Popen(command, env=environment, cwd=HERE, stdout=subprocess.DEVNULL) as process:
+            while process.poll() is None and len(list(out.glob(f"{FOLDER}/**/*.piece"))) < pieces_there:
+                time.sleep(0.002)
+            process.send_signal(signal_number)
+    ran = jaxhil("tune", files, "-o", out, *TINY, "--resume")
+    assert ran.code == 0 and outputs(ran.out, out) == whole[0]
+    assert not [path for path in out.rglob("*") if path.name.endswith(".tmp")]

@@ -1,0 +1,185 @@
+"""Sweeps on a dask.distributed cluster whose workers were started by hand: the same rows, whoever dies."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sweep_cases import case, manifest
+
+from jaxhil.errors import InputError
+from tuning.sweeps import worker
+from tuning.sweeps.cluster import on_cluster
+from tuning.sweeps.manifest import encode
+from tuning.sweeps.parts import same_rows
+from tuning.sweeps.run import run_sweep
+from tuning.sweeps.store import open_store, read_part
+
+pytestmark = pytest.mark.users_options
+
+ROOT = Path(__file__).parent.parent
+MANIFEST = manifest(case(), scenarios=300, limit=1.5)
+
+
+def rows_of(folder, computer=None, label=MANIFEST, each=lambda tally: None):
+    """Rows and tally of a sweep."""
+    store = open_store(folder, label, resume=True)
+    more = {} if computer is None else {"computer": computer}
+    _, tally = run_sweep(store, lambda *_: None, lambda number, tally: each(tally), **more)
+    parts = [read_part(store, part) for part in range(-(-tally.scenarios // label.chunk))]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, tally
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Computed here."""
+    return rows_of(tmp_path_factory.mktemp("whole") / "store")
+
+
+class Cluster:
+    """A scheduler and plain workers, each a process of its own, as a user starts them."""
+
+    def __init__(self, folder):
+        self.file, self.processes = folder / "scheduler.json", []
+        self._start("scheduler", "--host", "127.0.0.1", "--port", "0")
+        while not self.file.exists() or not self.file.read_text().endswith("}"):
+            time.sleep(0.05)
+        self.address = json.loads(self.file.read_text())["address"]
+
+    def _start(self, kind, *arguments, **environment):
+        """With nothing in the environment but where the packages are."""
+        ours = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "NPROC")}
+        path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+        command = [sys.executable, "-m", "dask", kind, "--scheduler-file", str(self.file), "--no-dashboard"]
+        self.processes.append(
+            subprocess.Popen(
+                [*command, *arguments],
+                env={**ours, "PYTHONPATH": path, **environment},
+                cwd=self.file.parent,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+        )
+        return self.processes[-1]
+
+    def worker(self, *arguments, **environment):
+        return self._start("worker", *arguments, **environment)
+
+    def kill(self, process):
+        """The worker and the process that watches over it."""
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+@contextmanager
+def started(folder):
+    pytest.importorskip("distributed")
+    cluster = Cluster(folder)
+    try:
+        yield cluster
+    finally:
+        for process in cluster.processes:
+            if process.poll() is None:
+                cluster.kill(process)
+
+
+def test_a_scheduler_that_is_not_there_is_one_line(tmp_path):
+    pytest.importorskip("distributed")
+    with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
+        rows_of(tmp_path / "store", on_cluster("nowhere://x"))
+
+
+def test_a_worker_imports_no_jax_before_its_flags_are_set():
+    code = "import sys, tuning.sweeps.worker as w; assert 'jax' not in sys.modules; w.dask_setup(None);"
+    code += "import os; assert '--xla_backend_optimization_level=1' in os.environ['XLA_FLAGS']"
+    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    subprocess.run([sys.executable, "-c", code], check=True, env={**environment, "PYTHONPATH": str(ROOT)})
+
+
+def test_a_worker_of_other_flags_says_how_to_start_it(monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr("tuning.sweeps.manifest.xla_flags", lambda: "--others")
+        asked = encode(manifest(case()))
+    with pytest.raises(InputError, match=r"start workers by: dask worker ADDRESS --preload"):
+        worker.run_part(asked, 0)
+
+
+@pytest.mark.slow
+def test_plain_workers_make_the_same_rows_though_one_is_killed(whole, tmp_path):
+    with started(tmp_path) as cluster:
+        first, _ = cluster.worker(), cluster.worker("--nthreads", "2")
+
+        def kill_one(tally):
+            if first.poll() is None and tally.scenarios >= 64:
+                cluster.kill(first)
+
+        rows, tally = rows_of(tmp_path / "store", on_cluster(cluster.address), each=kill_one)
+        assert first.poll() is not None
+    assert same_rows(rows, whole[0]) == [] and tally == whole[1]
+
+
+@pytest.mark.slow
+def test_a_worker_on_which_jax_runs_already_is_refused_or_preloaded(whole, tmp_path):
+    (tmp_path / "early.py").write_text("def dask_setup(worker):\n    import jax\n    jax.devices()\n")
+    with started(tmp_path) as cluster:
+        wrong = cluster.worker("--preload", str(tmp_path / "early.py"))
+        with pytest.raises(InputError, match=r"dask worker ADDRESS --preload tuning\.sweeps\.worker"):
+            rows_of(tmp_path / "refused", on_cluster(cluster.address))
+        cluster.kill(wrong)
+        cluster.worker("--preload", "tuning.sweeps.worker", "--preload", str(tmp_path / "early.py"))
+        rows, _ = rows_of(tmp_path / "store", on_cluster(cluster.address))
+    assert same_rows(rows, whole[0]) == []
+
+
+@pytest.mark.slow
+def test_a_part_that_kills_its_workers_is_computed_here(tmp_path):
+    """Every worker dies of its first part, and is started anew."""
+    few = manifest(case(), scenarios=64, limit=1.5)
+    code = "import os, signal, tuning.sweeps.worker as w\n"
+    (tmp_path / "deadly.py").write_text(code + "w.prepare = lambda: os.kill(os.getpid(), signal.SIGKILL)\n")
+    with started(tmp_path) as cluster:
+        cluster.worker("--preload", str(tmp_path / "deadly.py"))
+        rows, tally = rows_of(tmp_path / "store", on_cluster(cluster.address), few)
+    here, again = rows_of(tmp_path / "here", label=few)
+    assert same_rows(rows, here) == [] and tally == again
+
+
+@pytest.mark.slow
+def test_without_workers_parts_are_computed_here(tmp_path, monkeypatch):
+    monkeypatch.setattr("tuning.sweeps.cluster.PATIENCE", 1.0)
+    few = manifest(case(), scenarios=64, limit=1.5)
+    with started(tmp_path) as cluster:
+        rows, _ = rows_of(tmp_path / "store", on_cluster(cluster.address), few)
+    assert same_rows(rows, rows_of(tmp_path / "here", label=few)[0]) == []
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_dies_is_one_line_and_what_is_there_is_kept(whole, tmp_path):
+    with started(tmp_path) as cluster:
+        cluster.worker()
+
+        def kill_scheduler(tally):
+            if cluster.processes[0].poll() is None:
+                cluster.kill(cluster.processes[0])
+
+        with pytest.raises(InputError, match="--resume goes on"):
+            rows_of(tmp_path / "store", on_cluster(cluster.address), each=kill_scheduler)
+    assert len(list((tmp_path / "store").glob("parts/part-*"))) >= 1
+    assert same_rows(rows_of(tmp_path / "store")[0], whole[0]) == []
+
+
+@pytest.mark.slow
+def test_a_sweep_stops_at_the_same_look(tmp_path):
+    until = manifest(case(), scenarios=300, limit=1.5, until_width=0.25)
+    here, tally = rows_of(tmp_path / "here", label=until)
+    with started(tmp_path) as cluster:
+        cluster.worker("--nworkers", "2", "--nthreads", "1")
+        rows, again = rows_of(tmp_path / "store", on_cluster(cluster.address), label=until)
+    assert 64 < tally.scenarios < 300 and again == tally and same_rows(rows, here) == []
