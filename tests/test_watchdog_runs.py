@@ -52,18 +52,21 @@ def test_the_controller_in_c_misses_nothing_and_stops_nothing_in_vain(tmp_path):
 @pytest.mark.slow
 def test_between_two_surfaces_with_noise_it_does_what_calibration_states(tmp_path):
     """In flight, noise goes on to change the model's velocity: where by more than the limit leaves room for,
-    calibration chooses to miss nothing, and states what is stopped for nothing."""
+    the margin is widened until good runs pass; here still nothing is missed."""
     loaded = coarse({"clearance": 0.001}, contacts=3, force_sensor=NOISY)
     both = [export(loaded, limit, tmp_path, scenarios=1024, lanes=128) for limit in (0.05, 0.1)]
     narrow, wide = counted(loaded, [one for one, _ in both], 1024, lanes=128, in_python=12)
-    assert not narrow.missed and not wide.missed, f"{narrow}\n{wide}"
     assert narrow.bad > 100 and wide.bad > 4
     for (_, rates), count in zip(both, (narrow, wide), strict=True):
-        _, low, high = binomial_interval(len(count.false), count.good)
-        stated = rates["false_alarms"]
-        assert low <= stated["high"] and high >= stated["low"], f"{stated}\n{count}"
-        assert count.good > 300 and {text for _, _, text in count.false} <= {"restitution"}
-    assert narrow.false and not wide.false
+        found = {"false_alarms": (count.false, count.good), "missed_alarms": (count.missed, count.bad)}
+        for kind, (alarms, runs) in found.items():
+            _, low, high = binomial_interval(len(alarms), runs)
+            stated = rates[kind]
+            assert low <= stated["high"] and high >= stated["low"], f"{stated}\n{count}"
+        assert count.good > 300 and len(count.false) <= 0.01 * count.good, str(count)
+    (_, widened), (_, usual) = both
+    assert widened["widened_from"] and usual["widened_from"] is None
+    assert not narrow.missed and not wide.missed
 
 
 def test_a_run_that_is_not_stopped_in_time_is_counted(tmp_path):

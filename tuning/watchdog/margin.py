@@ -56,16 +56,17 @@ def restitution_margin(
     if _passing(furthest[good & fitted], false_alarms) <= narrow:
         return Margin(narrow, None, fitted)
     placed = fitted | (runs.index % 2 == 1)
-    wide = _passing(furthest[good & placed], false_alarms, BEYOND)
-    return Margin(wide, narrow, placed) if wide > narrow else Margin(narrow, None, placed)
+    wide = furthest[good & placed]
+    # Of n runs the largest is exceeded by one in n + 1 others.
+    few = (len(wide) + 1) * false_alarms < 1
+    margin = max(narrow, (BEYOND if few else 1.0) * _passing(wide, false_alarms))
+    return Margin(margin, narrow if margin > narrow else None, placed)
 
 
-def _passing(furthest: Float[np.ndarray, "runs"], share: float, beyond: float = 1.0) -> float:
+def _passing(furthest: Float[np.ndarray, "runs"], share: float) -> float:
     """The least margin that so few of these runs exceed that, with confidence, no more than the `share` of
-    others does; `beyond` times the largest that was needed, where there are too few runs to say."""
+    others does; the largest that one needs, where there are too few to say."""
     if not len(furthest):
         return 0.0
-    stopped = np.arange(len(furthest))
-    high = binomial_interval(stopped, len(furthest)).high
-    needed = np.sort(furthest)[::-1]
-    return float(needed[np.sum(high <= share) - 1] if high[0] <= share else beyond * needed[0])
+    high = binomial_interval(np.arange(len(furthest)), len(furthest)).high
+    return float(np.sort(furthest)[::-1][max(0, np.sum(high <= share) - 1)])
