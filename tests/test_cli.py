@@ -99,7 +99,7 @@ def test_tune_writes_gains_and_plots(jaxhil, tuned):
 def test_tune_reports_tables_or_json(jaxhil, tuned, tmp_path):
     arguments = ["tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY]
     table = jaxhil(*arguments)
-    assert table.code == 1
+    assert table.code == 1 and table.out.startswith("rig-300kg: equivalent mass 300 kg; contact at 3 Hz, ")
     words = ("before", "literature", "tuned", "rms", "99th", "chatter", "lead_filter", "step limit")
     for word in (*words, "exceeds 0.01", "No sensor noise"):
         assert word in table.out
@@ -108,6 +108,7 @@ def test_tune_reports_tables_or_json(jaxhil, tuned, tmp_path):
     assert ran.code == 0
     assert ran.document["verdict"] == "good"
     (entry,) = ran.document["mechanisms"]
+    assert entry["meaning"]["equivalent_mass"] == 300.0 and entry["meaning"]["warnings"] == []
     assert entry["sensor_noise"] is False and entry["figures"]["tuned"]["chatter"] >= 0
     again = json.loads((tuned / "gains.json").read_text())
     assert entry["gains"] == again["gains"]

@@ -43,7 +43,7 @@ def test_the_line_says_what_the_file_means():
     assert meaning(rig(rig__force_sensor__range=200.0)).line("mine") == (
         "mine: equivalent mass 300 kg; contact at 3 Hz, 1/333 of the control rate (1000 Hz) and 0.29 of the "
         "motion simulator's bandwidth (10.5 Hz); peak force 28.3 N (0.14 of the sensor's range (200 N)); "
-        "about 0.197 s"
+        "the run lasts about 0.197 s"
     )
     line = meaning(jaxhil.load("varying")).line("varying")
     assert "contact at 3, 5.2, 2.12 Hz, at most 1/192 of the control rate" in line
@@ -305,6 +305,18 @@ def test_every_function_refuses_what_would_not_end():
             function(endless)
     with pytest.raises(jaxhil.InputError, match="at most 1e\\+07 ticks a contact"):
         jaxhil.jacobian(endless, by="approach.velocity")
+
+
+def test_tune_says_what_a_mechanism_means_when_asked_to(capsys):
+    sensor = rig(rig__force_sensor__range=10.0)
+    for progress in (False, True):
+        with pytest.raises(jaxhil.InputError, match="objective"):
+            tuning.tune([sensor, sensor], "phase_lead", objective="mean", progress=progress)
+        said = capsys.readouterr()
+        assert said.out == "" and len(said.err.splitlines()) == 4 * progress
+    line, warning, *_ = said.err.splitlines()
+    assert line == meaning(sensor).line("rig-300kg")
+    assert warning == f"warning: rig-300kg: {meaning(sensor).warnings[0]}"
 
 
 # The commands.

@@ -73,7 +73,7 @@ class Meaning(NamedTuple):
         return (
             f"{name}: equivalent mass {self.equivalent_mass:.4g} kg; contact at {_listed(frequencies)} Hz, "
             f"{'at most ' * (len(frequencies) > 1)}{rates}; peak force {peak:.3g} N ({part}); "
-            f"about {self.duration:.3g} s"
+            f"the run lasts about {self.duration:.3g} s"
         )
 
 
