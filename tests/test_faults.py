@@ -17,9 +17,10 @@ import pytest
 from faults import COMPILER, HANGS, Ran, Runner, without_times
 from sweep_cases import case
 
-from jaxhil.files import is_temporary
+from jaxhil.files import is_temporary, read_sealed
 from jaxhil.runtime import digest
 from tuning.gain_file import write_gain_file
+from tuning.pieces import FOLDER as PIECES
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler")
 
@@ -55,11 +56,11 @@ def _compare(out: Path, gains: Path) -> list[Any]:
 
 COMMANDS = {
     "simulate": Command(lambda out, _: ["simulate", "rig-300kg", "--json", "--plot", out / "plot.png"]),
-    "simulate, cold": Command(lambda out, _: ["simulate", "rig-300kg", "--json"], cold=True),
-    "tune": Command(lambda out, _: ["tune", "rig-300kg", *TUNED, "--json", "-o", out]),
+    "simulate-cold": Command(lambda out, _: ["simulate", "rig-300kg", "--json"], cold=True),
+    "tune": Command(lambda out, _: ["tune", "rig-300kg", *TUNED, "--json", "-o", out], again=("--resume",)),
     "sweep": Command(_sweep, again=("--resume",)),
     "export": Command(_export, before=(("--seed", "1"),), one_piece="bundle"),
-    "compare": Command(_compare),
+    "compare": Command(_compare, again=("--resume",)),
 }
 
 
@@ -111,10 +112,11 @@ class Bench:
         return self.runner.run(*arguments, *more, folders=(self.out, self.runner.cache), **fault)
 
     def tree(self) -> dict[str, Any]:
-        """Every file but those that were not finished, without dates and times."""
-        names = [str(path.relative_to(self.out)) for path in self.out.rglob("*") if path.is_file()]
-        finished = [name for name in names if not any(map(is_temporary, Path(name).parts))]
-        return {name: _content(self.out / name) for name in finished}
+        """Every finished file without dates and times; pieces of work apart, which have to be sealed."""
+        paths = [path.relative_to(self.out) for path in self.out.rglob("*") if path.is_file()]
+        finished = [path for path in paths if not any(map(is_temporary, path.parts))]
+        assert all(read_sealed(self.out / path) is not None for path in finished if PIECES in path.parts)
+        return {str(path): _content(self.out / path) for path in finished if PIECES not in path.parts}
 
     def everything(self) -> dict[str, bytes]:
         """Every file below the folder of output, and below that of kept programs, to the bit."""
