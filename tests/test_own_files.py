@@ -46,6 +46,13 @@ def test_results_do_not_replace_files_of_something_else(jaxhil, thesis, untouche
     refused(jaxhil(*tune), "thesis/errors.png: found a file of something else")
 
 
+def test_an_overview_does_not_replace_a_picture_of_something_else(jaxhil, thesis):
+    (thesis / "overview.png").write_text("years")
+    names = ("rig-300kg", "varying", "layered", "rattling", "claw-350kg")
+    refused(jaxhil("tune", *names, "-o", thesis), "overview.png: found a file of something else")
+    assert (thesis / "overview.png").read_text() == "years"
+
+
 @pytest.mark.parametrize("content", ["{}", "years", "[1]", ""])
 def test_a_document_of_something_else_is_not_replaced(jaxhil, tmp_path, content):
     for name in ("compare.json", "gains.json"):

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from tuning.pieces import Pieces
 
 PICTURES = ("errors.png", "contact.png", "loss.png", "pareto.png")
+OVERVIEW = "overview.png"
 MOST_DRAWN = 4  # mechanisms whose plots are drawn; of more there is one picture of all
 
 
@@ -42,10 +43,7 @@ def run(options: Tune) -> int:
     entries, interrupted = [], False
     if loaded:
         # Before jax starts: a folder that cannot be written costs no tuning.
-        checks.output(Path(options.output))
-        for one in loaded:
-            folder = Path(options.output) / folder_name(one.mechanism.name)
-            checks.own_results(folder / "gains.json", "compensator", PICTURES)
+        _check_output(Path(options.output), [folder_name(one.mechanism.name) for one in loaded])
         loaded = _understood(options, asked, loaded, problems)
     if loaded:
         pieces = pieces_in(options.output, options.resume)
@@ -77,6 +75,15 @@ def run(options: Tune) -> int:
                 terminal.note(f"jaxhil: {problem}")
         return 2
     return 0 if all(entry["verdict"] == "good" for entry in entries) else 1
+
+
+def _check_output(output: Path, names: list[str]) -> None:
+    """What is to be replaced there is of an earlier run. Raises `InputError`."""
+    checks.output(output)
+    for name in names:
+        checks.own_results(output / name / "gains.json", "compensator", PICTURES)
+    if len(names) > MOST_DRAWN and not any(output.glob("*/gains.json")):
+        checks.own_results(output / "gains.json", "compensator", [OVERVIEW])
 
 
 class _Interrupted(Exception):
@@ -190,7 +197,7 @@ def _overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], 
         from jaxhil.simulation.contact_plot import save
         from tuning.pictures.plots import overview_plot
 
-        save(overview_plot(results, options.limit), Path(options.output) / "overview.png")
+        save(overview_plot(results, options.limit), Path(options.output) / OVERVIEW)
     if not options.json:
         print_overview(options, results, entries, drawn)
 
