@@ -101,7 +101,7 @@ def _figures(loop: LoopReport | None) -> dict[str, Any] | None:
     figures = loop.figures._asdict()
     for name in ("tick_time", "tick_cpu", "round_trip", "lateness"):
         figures[name] = figures[name]._asdict()
-    said = {key: loop.controller[key] for key in ("ended", "status", "stale", "made_up", "jax")}
+    said = {key: loop.controller[key] for key in ("ended", "status", "ignored", "stale", "made_up", "jax")}
     # A bundle brings the process that it was exported with, which may be too old to tell.
     said["doubts"] = loop.controller.get("doubts", {})
     again = loop.controller["replayed"]["cpu"]

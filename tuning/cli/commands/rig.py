@@ -1,6 +1,5 @@
 """`jaxhil rig`: the controller as a process of its own, against a rig played in real time over UDP."""
 
-import math
 import sys
 import tempfile
 from pathlib import Path
@@ -113,10 +112,11 @@ def load(gains: Path) -> tuple[dict[str, Any], Any]:
 
 
 def stroke(document: dict[str, Any]) -> tuple[float, float]:
-    """The least and largest position command [m] that a gain document allows; infinite where it has none."""
-    limits = document.get("limits", {})
-    low, high = (limits.get(f"command_{end}", {}).get("value") for end in ("lowest", "highest"))
-    return (-math.inf if low is None else low), (math.inf if high is None else high)
+    """The least and largest position command [m] that a gain document allows."""
+    from jaxhil.runtime.gain_file import check_gain_document
+
+    limits = check_gain_document(document).limits
+    return limits["command_lowest"], limits["command_highest"]
 
 
 class _Progress:
