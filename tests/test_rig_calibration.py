@@ -224,8 +224,8 @@ def test_unknown_damping_is_distinguished_from_delay_by_nothing():
     assert noticed is None or noticed > rates["restitution_margin"]
     # Without the wider margin most good runs would be stopped.
     replaced = {"restitution_margin": narrow}
-    rates = calibrate(loaded, scenarios=8 * LANES, limit=LIMIT, lanes=LANES, replaced=replaced).rates
-    assert rates["false_alarms"]["low"] > 0.3 and rates["missed_alarms"]["rate"] < 0.02
+    rates = calibrate(loaded, scenarios=4 * LANES, limit=LIMIT, lanes=LANES, replaced=replaced).rates
+    assert rates["false_alarms"]["low"] > 0.1 and rates["missed_alarms"]["rate"] < 0.05
     assert rates["widened_from"] is None and rates["reasons"][0].startswith("false alarms: ")
 
 
