@@ -75,8 +75,11 @@ def test_the_acceptable_probability_decides(jaxhil, gains, store):
 
 
 def test_no_failure_is_good(jaxhil, gains, tmp_path):
-    code, out, _ = jaxhil("sweep", gains, *TINY, "-o", tmp_path / "new", "--limit", "inf")
+    """The store is beside the gain file unless a folder is named."""
+    shutil.copy(gains, tmp_path / "best.json")
+    code, out, _ = jaxhil("sweep", tmp_path / "best.json", *TINY, "--limit", "inf")
     assert code == 0 and "Good" in out and "Failure probability 0," in out
+    assert (tmp_path / "best-sweep" / "manifest.json").is_file()
     # A title stays in one line above a table that is narrower.
     assert "case, compensation: none, 100 scenarios (random, float64)\n" in out
 

@@ -1,0 +1,82 @@
+"""Progress of long work, where there is no terminal: what is done, the rate, the time left, now and then."""
+
+import re
+import time
+
+import pytest
+
+from tuning import terminal
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Seconds that pass as the test says."""
+    now = [1000.0]
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
+    return now
+
+
+def lines(capsys):
+    return capsys.readouterr().err.splitlines()
+
+
+def test_a_line_says_what_is_done_the_rate_and_the_time_left(clock, capsys):
+    with terminal.progress(64, "mechanisms") as bar:
+        bar.tell("first", 0)
+        clock[0] += 60
+        bar.tell("second", 16)
+        bar.tell("second", 17)
+        clock[0] += 60
+        bar.tell("second", 32)
+        clock[0] += 1
+        bar.tell("second", 33)
+    first, second, third = lines(capsys)
+    assert first == "0:00:00 so far, first"
+    assert second == "16 of 64 mechanisms, 16 mechanisms/min, 0:03:00 left, second"
+    assert third == "32 of 64 mechanisms, 16 mechanisms/min, 0:02:00 left, second"
+
+
+def test_what_was_done_before_is_no_part_of_the_rate(clock, capsys):
+    with terminal.progress(40, "results") as bar:
+        bar.tell("as kept", 20, 20)
+        clock[0] += 100
+        bar.tell("more", 30, 20)
+    assert lines(capsys)[1] == "30 of 40 results, 6 results/min, 0:01:40 left, more"
+
+
+def test_of_one_thing_the_share_is_said(clock, capsys):
+    with terminal.progress(1, "fronts") as bar:
+        clock[0] += 36
+        bar.tell("searching", 0.25)
+    assert lines(capsys) == ["25 %, 25 fronts/h, 0:01:48 left, searching"]
+
+
+def test_stages_are_counted_as_they_begin(clock, capsys):
+    with terminal.stages(3) as stages:
+        for text in ("one", "two", "three"):
+            stages.begin(text)
+            clock[0] += 2
+    assert [line.split(", ")[0] for line in lines(capsys)] == [
+        "0:00:00 so far",
+        "1 of 3 stages",
+        "2 of 3 stages",
+    ]
+
+
+def test_silence_is_broken_with_the_time_by_then(monkeypatch, capsys):
+    monkeypatch.setattr(terminal, "SECONDS_BETWEEN_LINES", 0.02)
+    monkeypatch.setattr(terminal, "SECONDS_OF_SILENCE", 0.03)
+    with terminal.progress(10, "scenarios") as bar:
+        bar.tell("compiling", 1)
+        time.sleep(0.5)
+    found = lines(capsys)
+    assert len(found) >= 3 and all(line.endswith("compiling") for line in found)
+    assert all(re.match(r"1 of 10 scenarios, .* left, compiling", line) for line in found)
+
+
+def test_unless_it_is_to_be_shown_there_is_nothing(clock, capsys):
+    with terminal.progress(2, "parts", shown=False) as bar:
+        bar.advance(1, "one")
+        clock[0] += 100
+        bar.advance(1, "two")
+    assert capsys.readouterr() == ("", "")
