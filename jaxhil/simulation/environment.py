@@ -15,6 +15,9 @@ from pathlib import Path
 from jaxhil.simulation.compile_cache import keep_sealed
 
 CACHE = "JAXHIL_CACHE"
+# From which level on the compiler writes to standard error. That it takes long is an error to it;
+# what goes wrong in it comes as an exception anyway.
+LOG, FATAL = "TF_CPP_MIN_LOG_LEVEL", "3"
 DEVICES = "--xla_force_host_platform_device_count"
 # Tracing makes objects by the million, few of them in cycles: looking for those takes a tenth of the time of
 # a short command.
@@ -60,12 +63,12 @@ def computing() -> Iterator[None]:
 
 def start() -> None:
     """Start jax as for a command, unless it runs already; the environment is then as it was."""
-    import jax
-
     ours = settings(os.environ)
     before = {name: os.environ.get(name) for name in ours}
     os.environ.update(ours)
     try:
+        import jax
+
         # The flags are read when the first device is asked for. Nothing happens if that was before, and then
         # there are as many devices as there were.
         count, named = jax.device_count(), ours["XLA_FLAGS"]
@@ -127,7 +130,7 @@ def settings(given: Mapping[str, str]) -> dict[str, str]:
     to be free, and with no thread to spare all of them wait for ever.
     """
     threads = given.get("NPROC", str(4 * usable_cores()))
-    return {"XLA_FLAGS": flags(given.get("XLA_FLAGS", "")), "NPROC": threads}
+    return {"XLA_FLAGS": flags(given.get("XLA_FLAGS", "")), "NPROC": threads, LOG: given.get(LOG, FATAL)}
 
 
 def xla_flags() -> str:
