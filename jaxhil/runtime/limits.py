@@ -22,7 +22,7 @@ from .bounds import (
 
 BRIDGED = 0.0, 1000.0  # ticks in a row
 COUNTED = 0.0, 1e6  # ticks, beyond the longest gap that the clock counts
-RATIOS = 0.0, 1e12  # of energies or restitutions, the highest beyond all that occurs
+RATIOS = 0.0, 1e300  # of energies or restitutions, the highest beyond all that occurs, however slow an entry
 FEATURES = -1e3, 1e3  # p, w and z of the expected restitution
 COEFFICIENTS = -1e9, 1e9  # of it, by powers of those
 
