@@ -16,11 +16,11 @@ from bundles import run_selftest, signed, small_files
 
 import tuning
 from jaxhil.errors import InputError
+from jaxhil.files import exchange
 from tuning.bundle import selftest
 from tuning.bundle.bundle import write_bundle
 from tuning.bundle.checking import check_bundle, check_code
 from tuning.bundle.checking import run_selftest as run_checked
-from tuning.files import exchange
 
 CODE = ("selftest.py", "jaxhil_runtime.py", "udp_controller.py", "udp_protocol.py")
 SHORT = 10  # s, far more than any check takes

@@ -11,6 +11,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
 from jaxhil.compensators import COMPENSATORS
+from jaxhil.files import TEMPORARY
 from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
 from jaxhil.runtime.faults import FAULTS
 from jaxhil.runtime.laws import NEED_NUMPY
@@ -19,7 +20,6 @@ from tuning.bundle.bundle import build_bundle, check_target, with_limits, write_
 from tuning.bundle.checking import check_bundle
 from tuning.bundle.checking import run_selftest as run_selftest_alone
 from tuning.bundle.writers import WRITERS
-from tuning.files import TEMPORARY
 from tuning.gain_file import write_gain_file
 
 pytestmark = pytest.mark.users_options

@@ -288,9 +288,9 @@ def test_without_limits_a_gain_file_gives_the_law_within_the_outermost_limits():
     ("reading", "moved", "cause"),
     [
         ((1.1e6, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), FORCE_OUT_OF_RANGE),
-        ((0.0, 0.0, 0.0, -10.1), (0.0, 0.0, 0.0), POSITION_OUT_OF_RANGE),
+        ((0.0, 0.0, 0.0, -50.1), (0.0, 0.0, 0.0), POSITION_OUT_OF_RANGE),
         ((9e5, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), FORCE_LIMIT),
-        ((0.0, 0.0, 0.0, 0.0), (10.1, 0.0, 0.0), STROKE),
+        ((0.0, 0.0, 0.0, 0.0), (50.1, 0.0, 0.0), STROKE),
         ((0.0, 0.0, 0.0, 0.0), (0.011, 0.0, 0.0), VELOCITY_LIMIT),
     ],
 )
@@ -308,7 +308,7 @@ def test_without_limits_what_is_beyond_the_outermost_trips(reading, moved, cause
     [
         ({"force_limit": {"value": -1.0, "unit": "N"}}, ["limits.force_limit.value", "-1.0", "0.0 to"]),
         ({"force_limit": {"value": 2e6, "unit": "N"}}, ["force_limit.value", "2000000.0", "to 1000000.0"]),
-        ({"command_lowest": {"value": -11, "unit": "m"}}, ["command_lowest.value", "-11", "-10.0 to 10.0"]),
+        ({"command_lowest": {"value": -51, "unit": "m"}}, ["command_lowest.value", "-51", "-50.0 to 50.0"]),
         ({"force_limit": {"value": 1.0, "unit": "kN"}}, ["limits.force_limit.unit", "'kN'", "'N'"]),
         ({"force_limit": {"value": math.inf, "unit": "N"}}, ["JSON"]),
         ({"force_limit": {"unit": "N"}}, ["limits.force_limit.value", "nothing"]),

@@ -23,13 +23,13 @@ from jaxhil.compensators import Gain
 from jaxhil.contact.laws import LAWS
 from jaxhil.contact.reference_motion import integrate_contact
 from jaxhil.errors import InputError, shown
+from jaxhil.files import write_whole, writing
 from jaxhil.mechanism.file import to_builtins
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.runtime import digest
 from jaxhil.runtime.gain_file import SCHEMA
 from jaxhil.simulation.gain_file import bounds_of, check_names, look_up
 from jaxhil.simulation.scenario import Scenario
-from tuning.files import write_whole, writing
 
 VERSIONED = ("jaxhil", "jax", "numpy", "optimistix")
 

@@ -20,8 +20,8 @@ import msgspec
 import numpy as np
 
 from jaxhil.errors import InputError
+from jaxhil.files import make_folder, read_sealed, remove_stale, write_sealed, writing
 from jaxhil.simulation.environment import rounding_flags, xla_flags
-from tuning.files import make_folder, read_sealed, remove_stale, write_sealed, writing
 from tuning.sources import sources_sha256, versions
 
 FOLDER = ".pieces"  # beside the results of a command

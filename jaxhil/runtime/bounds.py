@@ -2,10 +2,10 @@
 
 It is for any rig with a control period of 10 us to 0.1 s and an equivalent mass of 10 g to 1000 t, whose
 contact has 0.05 to 50 Hz and is entered at 10 um/s to 10 m/s. Force measurement and motion simulator are each
-late by at most 1 s; contact force, noise and dead zone together stay below 1 MN, positions within 10 m of the
-surface, position commands below 10 m/s. The bounds of gains admit whatever the literature's rules, tuning and
-the shipped settings make of such a rig (`jaxhil/compensators` has their own, for a given one), and little
-more:
+late by at most 1 s; contact force, noise and dead zone together stay below 1 MN, positions within 50 m of the
+surface (rails of rendezvous rigs have half of that), position commands below 10 m/s. Bounds of gains admit
+whatever the literature's rules, tuning and the shipped settings make of such a rig (`jaxhil/compensators` has
+their own, for a given one), and little more:
 
     times       2 x 1 s + 0.02 s, the largest lead and alignment that tuning tries
     stiffness   5 M omega^2 = 5e11 N/m for 1000 t at 50 Hz
@@ -14,7 +14,7 @@ more:
     mass        a tenth of the rig's to ten times as much
 
 Where a gain file limits nothing, the outermost limits hold: a force beyond 1 MN, a position command beyond
-10 m or one that changes faster than 10 m/s trips the controller.
+50 m or one that changes faster than 10 m/s trips the controller.
 """
 
 CONTROL_PERIODS = 1e-5, 0.1  # lowest and highest, and so on [s]
@@ -27,7 +27,7 @@ STIFFNESSES_BY_MASS = 0.0, 1e5  # [1/s^2]
 DAMPINGS_BY_MASS = 0.0, 1e3  # [1/s]
 MASSES = 1e-3, 1e7  # [kg]
 DISTANCES = 0.0, 10.0  # [m]
-POSITIONS = -10.0, 10.0  # [m]
+POSITIONS = -50.0, 50.0  # [m]
 SPEEDS = 0.0, 10.0  # [m/s]
 # The highest of these leads from one end to the other within the shortest period: it limits nothing.
 FORCE_SLEWS = 0.0, 1e12  # [N/s]

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxhil.errors import InputError, one_line, shown
+from jaxhil.files import TEMPORARY, exchange, remove_stale, sync_folder, temporary_name, writing
 from jaxhil.runtime import digest
 from jaxhil.runtime.limits import LIMITS
 from tuning.bundle import selftest
 from tuning.bundle.content import bundle_files
 from tuning.bundle.manifest import is_bundle
-from tuning.files import TEMPORARY, exchange, remove_stale, sync_folder, temporary_name, writing
 
 
 class Bundle(NamedTuple):

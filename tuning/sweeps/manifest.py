@@ -17,10 +17,10 @@ from msgspec import Meta
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.contact.laws import LAWS
 from jaxhil.errors import InputError, one_line, shown
+from jaxhil.files import open_plain
 from jaxhil.runtime import digest
 from jaxhil.simulation.environment import rounding_flags, xla_flags
 from jaxhil.simulation.gain_file import LoadedGains, check_document
-from tuning.files import open_plain
 from tuning.sources import sources_sha256, versions
 from tuning.sweeps import LARGEST_CHUNK, LARGEST_SEED, MOST
 from tuning.sweeps.columns import Column, sweep_columns

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
+from jaxhil.files import writing
 from jaxhil.simulation.contact_plot import (
     BLACK,
     BLUE,
@@ -27,7 +28,6 @@ from jaxhil.simulation.contact_plot import (
     new_figure,
     save,
 )
-from tuning.files import writing
 from tuning.statistics.intervals import binomial_interval, confidence_sequence, replicate_interval
 from tuning.sweeps.manifest import Manifest, loaded_gains
 from tuning.sweeps.regions import Input, Plan, Points, Regions, add_rows, empty_regions, make_plan, quantile

@@ -24,8 +24,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxhil.errors import InputError, one_line, shown
+from jaxhil.files import is_temporary, lock, make_folder, open_plain, remove_stale, write_whole, writing
 from tuning import terminal
-from tuning.files import is_temporary, lock, make_folder, open_plain, remove_stale, write_whole, writing
 from tuning.sweeps.manifest import NAME, Manifest, differences, encode, other_code, read_manifest
 from tuning.sweeps.parts import decode_part, encode_part
 

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 import msgspec
 import numpy as np
 
+from jaxhil.files import make_folder, open_plain, write_whole, writing
 from jaxhil.runtime import digest
-from tuning.files import make_folder, open_plain, write_whole, writing
 from tuning.statistics.subset_simulation import SubsetSimulation
 from tuning.sweeps.manifest import LARGEST, Manifest
 from tuning.sweeps.store import STUDIES, Store

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxhil.errors import InputError, one_line, shown
+from jaxhil.files import follow, open_plain, remove_stale, writing
 from tuning.cli.options import PICTURES
-from tuning.files import follow, open_plain, remove_stale, writing
 
 
 def picture(path: str) -> None:

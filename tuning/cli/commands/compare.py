@@ -5,13 +5,13 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from jaxhil.files import write_whole, writing
 from jaxhil.mechanism.file import LoadedMechanism, load, suite_names
 from jaxhil.simulation.environment import prepare, usable_cores
 from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.commands.resuming import pieces_in, say_of_pieces
 from tuning.cli.options import Compare
-from tuning.files import write_whole, writing
 from tuning.front_door.compare import CompareOptions, board, check_names, compare_each
 
 PICTURES = ("errors.png", "honesty.png")

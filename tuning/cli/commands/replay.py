@@ -3,11 +3,11 @@
 from pathlib import Path
 from typing import Any
 
+from jaxhil.files import follow
 from jaxhil.simulation.environment import prepare
 from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options import Replay
-from tuning.files import follow
 from tuning.front_door import arguments
 
 KEYS = ("restitution", "reference_restitution", "error", "peak_force", "peak_command", "duration")

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError, one_line
+from jaxhil.files import follow
 from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.options_rig import RigOptions
-from tuning.files import follow
 from tuning.front_door import arguments
 
 LONGEST_EMPTY = 30.0  # s of empty loop at most

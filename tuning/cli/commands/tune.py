@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxhil.errors import InputError, one_line
+from jaxhil.files import make_folder, remove_stale, writing
 from jaxhil.mechanism.file import LoadedMechanism, load
 from jaxhil.simulation.environment import prepare, program_folder
 from tuning import terminal
@@ -15,7 +16,6 @@ from tuning.cli.commands import checks, tune_pareto
 from tuning.cli.commands.resuming import pieces_in, say_of_pieces
 from tuning.cli.commands.tune_tables import print_one, print_overview
 from tuning.cli.options import Tune
-from tuning.files import make_folder, remove_stale, writing
 from tuning.front_door import meaning
 from tuning.front_door.tune import TunedGains, TuneOptions, tune_each
 

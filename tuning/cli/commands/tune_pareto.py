@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxhil.errors import InputError
+from jaxhil.files import make_folder, open_plain, remove_stale, writing
 from tuning import terminal
 from tuning.cli.options import Tune
-from tuning.files import make_folder, open_plain, remove_stale, writing
 from tuning.front_door import tune_pareto
 from tuning.front_door.tune import TunedGains
 from tuning.front_door.tune_pareto import TradedGains
