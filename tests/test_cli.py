@@ -179,6 +179,7 @@ def test_a_start_at_gains_tuned_before_never_ends_worse(jaxhil, tuned, tmp_path)
     assert "begins at" in table and "literature" in table and "gains of" in table
 
 
+@pytest.mark.slow
 def test_a_front_is_a_gain_file_for_each_point(jaxhil, tmp_path):
     folder = tmp_path / "rig-300kg"
     # Of a longer front that was here before.

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from lanes import IDEAL, SECOND_ORDER, as_arrays, mechanism, run_rollout, validated
 
 from jaxhil.contact.laws import LAWS
@@ -63,6 +64,7 @@ def test_two_surfaces_and_other_orders_stay_apart():
     assert groups == [[0], [1], [2], [3], [4]]
 
 
+@pytest.mark.slow
 def test_the_same_as_alone():
     some = [MEMBERS[name] for name in ALONE]
     [(_, common)] = common_programs(some)

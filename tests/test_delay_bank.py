@@ -159,6 +159,7 @@ def repeated():
     return drawn["rig.force_sensor.delay"], evaluate(loop, gains, scenarios)
 
 
+@pytest.mark.slow
 def test_an_unknown_delay_is_found_and_leaves_little(repeated):
     delays, outcome = repeated
     assert np.all(outcome.good)

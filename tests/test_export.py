@@ -28,6 +28,7 @@ ALWAYS = {
     *("gains.json", "jaxhil_runtime.py", "vectors.csv", "selftest.py", "manifest.json", "README.md"),
     "summary.html",
 }
+EVERYDAY = {"response_error", "position_lead", "retrospective_reference"}  # the others with `-m slow`
 
 
 @pytest.fixture
@@ -86,7 +87,10 @@ def test_a_bundle_is_exported_signed_and_verified(jaxhil, gains, tmp_path):
     assert reason == "manifest.sig: found none, allowed the manifest's by the key given"
 
 
-@pytest.mark.parametrize("compensator", COMPENSATORS)
+@pytest.mark.parametrize(
+    "compensator",
+    [pytest.param(one, marks=() if one in EVERYDAY else pytest.mark.slow) for one in COMPENSATORS],
+)
 def test_every_compensator_that_can_be_tuned_can_be_exported(compensator, tmp_path):
     made = build_bundle(document(compensator=compensator), list(WRITERS))
     write_bundle(tmp_path / "bundle", made.files)

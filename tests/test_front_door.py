@@ -255,6 +255,7 @@ def as_by_default():
     return plain_process(GUEST.format(flags="", dtype="'float32'"))
 
 
+@pytest.mark.slow
 def test_in_a_process_of_float32_figures_are_the_command_s(as_by_default, command):
     *contacts, slope = json.loads(as_by_default)
     document = command("simulate", "varying", "--compensator", "phase_lead", "--json").document

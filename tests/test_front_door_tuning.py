@@ -107,6 +107,7 @@ def test_laws_from_outside_go_all_the_way(tmp_path):
     assert not found.good and found.reasons[0] == "jaxhil_runtime.py: is not what this version exports"
 
 
+@pytest.mark.slow
 def test_an_objective_of_the_users_own_gets_contacts_and_scenarios():
     shapes = []
 

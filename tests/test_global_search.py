@@ -17,6 +17,7 @@ def validation():
     return build_validation([lead_task()], 255, 0)
 
 
+@pytest.mark.slow
 def test_a_gradient_optimum_is_confirmed_and_a_bad_one_exposed(validation):
     (found,) = find_gains(validation, SETTINGS)
     assert found.best is not None

@@ -36,6 +36,7 @@ def value(validation, index, start, objective=RMS):
     return validation.losses(objective, [index], start.coordinates[None, None])[0, 0]
 
 
+@pytest.mark.slow
 def test_every_task_is_found_under_its_own_objective(tasks, validation):
     """Starts and ends of tasks together are those that each has alone under its objective."""
     several = [Objective(divergence_weight=weight) for weight in (1.0, 4.0, 16.0)]

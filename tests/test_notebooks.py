@@ -1,6 +1,6 @@
 """Every notebook runs from top to bottom on a copy, and is committed as it ran: clean, with its outputs.
 
-One of them runs every day, the others with `-m slow`; `.ci/run` runs all.
+They run with `-m slow`, as `.ci/run` does; what is committed is checked every day.
 """
 
 import os
@@ -15,7 +15,6 @@ from nbclient import NotebookClient
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 LARGEST = 500_000  # bytes
-EVERYDAY = "05_leaderboard"
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
 SOLVER = re.compile(r"\btune\(")
 IMPORTED = re.compile(r"^(?:import|from)\s+([\w.]+)", re.M)
@@ -35,11 +34,7 @@ def test_there_are_notebooks():
 
 # Event loop and messaging of the notebook client are not ours to warn about.
 @pytest.mark.filterwarnings("default")
-@pytest.mark.parametrize(
-    "path",
-    [pytest.param(one, marks=() if one.stem == EVERYDAY else pytest.mark.slow) for one in NOTEBOOKS],
-    ids=lambda path: path.stem,
-)
+@pytest.mark.slow
 def test_every_cell_runs(path, tmp_path, monkeypatch):
     copy = Path(shutil.copy(path, tmp_path))
     inherited = os.environ.get("PYTHONPATH")

@@ -110,6 +110,7 @@ def of_training(task, gains):
     return error[~copies], error[copies], excess
 
 
+@pytest.mark.slow
 def test_solver_and_search_minimise_the_stated_objective(task):
     assert task.number == 4 and len(task.scenarios.velocity) == 4 * LANES_PER_SCENARIO
     validation = build_validation([task], 3, 0)
