@@ -40,7 +40,7 @@ CHECKED = [
 ]
 OWN_TESTS = {"test_compensators", "test_contacts", *(f"test_{name.split('.')[1]}" for name in CHECKED)}
 OWN_TESTS -= {"test_rollout", "test_retrospective_reference"}  # the longest; others run the same modules
-jaxtyping.install_import_hook([f"jaxhil.{name}" for name in ("ring_buffer", *CHECKED)], "beartype.beartype")
+jaxtyping.install_import_hook([f"jaxhil.{name}" for name in CHECKED], "beartype.beartype")
 
 # A shared machine has no deadlines to keep, and a test that fails must fail again.
 hypothesis.settings.register_profile("jaxhil", deadline=None, derandomize=True)

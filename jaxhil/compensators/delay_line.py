@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxhil.compensators.base import Signals
-from jaxhil.ring_buffer import look_back, write
+from jaxhil.compensators.ring_buffer import look_back, write
 
 
 class Delay(NamedTuple):

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxhil.compensators.force_depth_map import REACH, Curve, elastic
 from jaxhil.compensators.force_depth_map import force as force_of
-from jaxhil.ring_buffer import write
+from jaxhil.compensators.ring_buffer import write
 
 STRIDE = 24  # steps per tick of the pass from the entry
 COARSE = 0.002  # s, the longest step of that pass, at least a tick

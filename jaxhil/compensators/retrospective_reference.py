@@ -61,7 +61,7 @@ from jaxhil.compensators.retrospective_episode import (
     sort_out,
 )
 from jaxhil.compensators.retrospective_gains import GAINS, GENTLE, SHARP
-from jaxhil.ring_buffer import depend_on
+from jaxhil.compensators.ring_buffer import depend_on
 
 FAREWELL = 0.006  # s for which it goes on after the hardware has left the surface
 LONGEST_LAG = 0.1  # s for which it waits for hardware that has not come into contact

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.compensators.base import Gains, Signals
-from jaxhil.ring_buffer import depend_on, look_back, write_in_turn
+from jaxhil.compensators.ring_buffer import depend_on, look_back, write_in_turn
 from jaxhil.simulation.contact_force import (
     Contact,
     Motion,
