@@ -8,10 +8,11 @@ from tuning import terminal
 
 def emit(document: dict[str, Any]) -> None:
     """Tables and the verdict, on standard output."""
-    from jaxhil.simulation.metrics import STATUS_REASONS
+    terminal.emit(*_tables(document), *_lines(document))
 
-    probability, number = document["failure_probability"], document["scenarios"]
-    limit = document["limit"]
+
+def _tables(document: dict[str, Any]) -> list[Any]:
+    number = document["scenarios"]
     title = f"{document['mechanism']}, compensation: {document['compensator']}, {number} scenarios"
     outcomes = terminal.table(
         f"{title} ({document['sampling']}, {document['precision']})",
@@ -38,6 +39,13 @@ def emit(document: dict[str, Any]) -> None:
         tables.append(_drivers(document["drivers"]))
     if "rare" in document:
         tables.append(_rare(document["rare"]))
+    return tables
+
+
+def _lines(document: dict[str, Any]) -> list[str]:
+    from jaxhil.simulation.metrics import STATUS_REASONS
+
+    probability, number, limit = (document[key] for key in ("failure_probability", "scenarios", "limit"))
     within = "nothing" if limit is None else f"{limit:g}"
     lines = [
         f"Failure probability {probability['value']:.4g}, 95 % interval {probability['low']:.3g} to "
@@ -67,7 +75,7 @@ def emit(document: dict[str, Any]) -> None:
     wanted = "no scenario may fail" if acceptable is None else f"acceptable up to {acceptable:g}"
     lines.append(f"{document['verdict'].capitalize()}: {wanted}. Wrote {one_line(document['store'])}")
     lines += [f"Wrote {one_line(path)}" for path in document["plots"]]
-    terminal.emit(*tables, *lines)
+    return lines
 
 
 def _quantiles(document: dict[str, Any]):
