@@ -43,8 +43,8 @@ def writing(path: str | os.PathLike[str]) -> Iterator[None]:
         raise InputError(f"{one_line(os.fspath(path))}: cannot be written: {one_line(reason, 100)}") from None
 
 
-def write_whole(path: Path, content: bytes | bytearray | memoryview) -> None:
-    """The file is there as a whole, on disk, or as it was.
+def write_whole(path: Path, content: bytes | bytearray | memoryview, lasting: bool = True) -> None:
+    """The file is there as a whole, or as it was; if it is to be `lasting`, after a power cut too.
 
     Raises OSError when it cannot be written, or when what is there is no plain file.
     """
@@ -55,18 +55,21 @@ def write_whole(path: Path, content: bytes | bytearray | memoryview) -> None:
         try:
             file.write(content)
             file.flush()
-            os.fsync(file.fileno())
+            if lasting:
+                os.fsync(file.fileno())
             os.replace(temporary, path)
         except BaseException:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
             raise
-    sync_folder(path.parent)
+    if lasting:
+        sync_folder(path.parent)
 
 
-def write_sealed(path: Path, content: bytes | bytearray | memoryview) -> None:
-    """`write_whole` of the content under its seal."""
-    write_whole(path, hashlib.sha256(content).hexdigest().encode("ascii") + b"\n" + bytes(content))
+def write_sealed(path: Path, content: bytes | bytearray | memoryview, lasting: bool = True) -> None:
+    """`write_whole` of the content under its seal, which shows what a power cut took of it."""
+    seal = hashlib.sha256(content).hexdigest().encode("ascii") + b"\n"
+    write_whole(path, seal + bytes(content), lasting)
 
 
 def read_sealed(path: Path) -> bytes | None:

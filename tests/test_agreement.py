@@ -222,9 +222,10 @@ def random_readings(name: str, lanes: int, ticks: int, seed: int) -> Readings:
 @pytest.mark.parametrize(
     "name, lanes",
     [
-        *((name, 20 if name == "retrospective_delay_bank" else 60) for name in COMPENSATORS),
+        *((name, 20 if "retrospective" in name else 60) for name in COMPENSATORS),
         pytest.param("response_error", 510, marks=pytest.mark.slow),
         pytest.param("retrospective_delay_bank", 60, marks=pytest.mark.slow),
+        pytest.param("retrospective_reference", 60, marks=pytest.mark.slow),
     ],
 )
 def test_random_ticks(name, lanes):
@@ -235,7 +236,13 @@ def test_random_ticks(name, lanes):
     assert count.magnified <= 0.02 * lanes
 
 
-@pytest.mark.parametrize("mechanism_name", builtin_names())
+@pytest.mark.parametrize(
+    "mechanism_name",
+    [
+        pytest.param(name, marks=() if number % 2 else pytest.mark.slow)
+        for number, name in enumerate(builtin_names())
+    ],
+)
 def test_recorded_ticks(mechanism_name):
     mechanism, sha256, _ = load(mechanism_name)
     law = COMPENSATORS["response_error"]

@@ -165,6 +165,7 @@ def test_a_folder_stands_for_its_files(jaxhil, tmp_path):
     assert all(one == gains[0] for one in gains)
 
 
+@pytest.mark.slow
 def test_a_start_at_gains_tuned_before_never_ends_worse(jaxhil, tuned, tmp_path):
     arguments = ["tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY]
     cold = jaxhil(*arguments, "--json").document["mechanisms"][0]

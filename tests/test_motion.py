@@ -24,6 +24,7 @@ def pieces():
     return nominal_motion(MECHANISM, LAWS)
 
 
+@pytest.mark.slow
 def test_laws_side_by_side_are_each_as_alone(pieces):
     assert [list(piece.curves) for piece in pieces] == [["in space", *LAWS]] * 2
     for name in ("before", "literature", "tuned"):

@@ -123,6 +123,7 @@ def test_a_start_alone_is_the_literature_s_and_polished(tasks, validation):
         assert one.best.rms == pytest.approx(value(validation, index, one.best), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_best_is_the_best_by_the_objective_itself(tasks, validation):
     """The solver lowers a norm in place of the mean of the worst contacts; what counts is that mean."""
     objective = Objective("cvar")

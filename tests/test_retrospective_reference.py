@@ -297,6 +297,7 @@ def test_settings_are_gains_within_bounds_and_gentle_commands_less():
         literature_gains(mechanism, "phase_lead", "gentle")
 
 
+@pytest.mark.slow
 def test_derivatives_against_differences():
     """By every gain that tuning moves, of every scenario's restitution error."""
     mechanism = load("suite-damped").mechanism

@@ -109,4 +109,4 @@ def _write(path: Path, content: bytes | bytearray) -> None:
     """All or nothing; a folder that has become full or read-only costs only the next call's time."""
     with suppress(OSError):
         remove_stale(path.parent)
-        write_sealed(path, content)
+        write_sealed(path, content, lasting=False)

@@ -30,6 +30,8 @@ def keep_sealed(folder: str | os.PathLike[str]) -> bool:
     class SealedCache(CacheInterface):
         def __init__(self, path: str) -> None:
             self._path = Path(path)
+            with suppress(OSError):
+                remove_stale(self._path)
 
         def get(self, key: str) -> bytes | None:
             return read_sealed(self._path / f"{key}{ENDING}")
@@ -37,8 +39,7 @@ def keep_sealed(folder: str | os.PathLike[str]) -> bool:
         def put(self, key: str, value: bytes) -> None:
             # A folder that has become full or read-only costs only the next call's time.
             with suppress(OSError):
-                remove_stale(self._path)
-                write_sealed(self._path / f"{key}{ENDING}", value)
+                write_sealed(self._path / f"{key}{ENDING}", value, lasting=False)
 
     def get_file_cache(path: str):
         return (SealedCache(path), path) if path in _folders else of_jax(path)
