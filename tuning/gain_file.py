@@ -8,10 +8,8 @@ it; `load_gain_file`, of `jaxhil.simulation.gain_file`, reads it back.
 import json
 import math
 import os
-import platform
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +28,7 @@ from jaxhil.runtime import digest
 from jaxhil.runtime.gain_file import SCHEMA
 from jaxhil.simulation.gain_file import bounds_of, check_names, look_up
 from jaxhil.simulation.scenario import Scenario
+from tuning.sources import versions
 
 VERSIONED = ("jaxhil", "jax", "numpy", "optimistix")
 
@@ -63,7 +62,7 @@ def build_document(
         "envelope": plain(envelope),
         "figures": plain(figures),
         "seed": int(seed),
-        "versions": versions(),
+        "versions": versions(VERSIONED),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "timings": plain(timings),
     }
@@ -103,17 +102,6 @@ def validity_envelope(mechanism: Mechanism, scenarios: Scenario) -> dict[str, di
         "approach_velocity": _span(velocity, "m/s"),
         "force": _span(peak[made], "N"),
     }
-
-
-def versions() -> dict[str, str]:
-    """Versions of what the numbers depend on, and of Python."""
-    found = {"python": platform.python_version()}
-    for name in VERSIONED:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
 
 
 def plain(value: Any) -> Any:

@@ -28,10 +28,10 @@ def sources_sha256(*laws: object) -> str:
 
 
 @cache
-def versions() -> dict[str, str]:
-    """Versions of Python, of `jaxhil` and of the packages that the numbers depend on."""
+def versions(packages: tuple[str, ...] = ("jaxhil", *STANDS_ON)) -> dict[str, str]:
+    """Versions of Python and of packages, by default of all that the numbers depend on."""
     found = {"python": platform.python_version()}
-    for name in ("jaxhil", *STANDS_ON):
+    for name in packages:
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
