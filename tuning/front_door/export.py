@@ -174,11 +174,15 @@ def _replaced(given: Any) -> dict[str, float | None]:
     for name, value in given.items():
         if name not in LIMITS:
             raise ArgumentError("limits", shown(name), f"one of {', '.join(LIMITS)}")
-        limit = LIMITS[name]
-        if value is not None and not (arguments.is_number(value) and limit.admits(value)):
-            allowed = f"a finite number from {limit.lowest:g} to {limit.highest:g} {limit.unit}, or none"
-            raise ArgumentError("limits", shown(value), allowed, name)
+        if value is not None and not (arguments.is_number(value) and LIMITS[name].admits(value)):
+            raise ArgumentError("limits", shown(value), allowed_values(name), name)
     return {name: None if value is None else float(value) for name, value in given.items()}
+
+
+def allowed_values(name: str) -> str:
+    """What a limit may be set to, in words."""
+    limit = LIMITS[name]
+    return f"a finite number from {limit.lowest:g} to {limit.highest:g} {limit.unit}, or none"
 
 
 def _check_formats(formats: Any) -> None:

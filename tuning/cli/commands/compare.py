@@ -53,7 +53,7 @@ def run(options: Compare) -> int:
         "problems": problems,
         "interrupted": interrupted,
     }
-    path = Path(options.output) / "compare.json"
+    path = folder / "compare.json"
     with writing(path):
         write_whole(path, terminal.as_json(document).encode("ascii"))
     if done and not interrupted:

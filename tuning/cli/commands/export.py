@@ -8,7 +8,7 @@ from jaxhil.errors import InputError, shown
 from jaxhil.runtime.limits import LIMITS
 from tuning import terminal
 from tuning.cli.options_rig import Export
-from tuning.front_door.export import export
+from tuning.front_door.export import allowed_values, export
 
 
 def run(options: Export) -> int:
@@ -46,10 +46,8 @@ def _replaced(given: tuple[str, ...]) -> dict[str, float | None]:
             value = None if text == "none" else float(text)
         except ValueError:
             value = math.nan
-        limit = LIMITS[name]
-        if value is not None and not limit.admits(value):
-            allowed = f"a finite number from {limit.lowest:g} to {limit.highest:g} {limit.unit}, or none"
-            raise InputError(f"--set: found {shown(words)}, allowed {allowed}")
+        if value is not None and not LIMITS[name].admits(value):
+            raise InputError(f"--set: found {shown(words)}, allowed {allowed_values(name)}")
         replaced[name] = value
     return replaced
 
