@@ -37,6 +37,10 @@ PRIOR = {
 }
 
 
+# Slopes of a map that pulls down to 10 ms and pushes from there on [1/s^2].
+LATE = np.where(np.array(KNOTS) < 0.01, -50.0, 400.0)
+
+
 def features(depth, speed, deepest):
     """The regressor, as the equation has it."""
     widths = np.append(np.diff(KNOTS), np.inf)
@@ -123,16 +127,26 @@ def test_map_is_the_posterior_of_all_readings():
         (np.full(12, 400.0), 20.0),
         # 100 up to 32 ms, 500 beyond: the energy left at 32 ms is 1/2 - 0.0512.
         (np.where(np.array(KNOTS) < 0.032, 100.0, 500.0), math.sqrt(3.2**2 + 1000 * (0.5 - 0.0512))),
-        # It begins to pull before the energy is spent: the force at the last knot where it pushes.
-        (np.where(np.array(KNOTS) < 0.01, 1000.0, -900.0), 10.0 - 0.006 * 900),
+        # It pulls down to 10 ms, where it would be at -0.5, and stands at 1.9 at 16 ms.
+        (LATE, math.sqrt(1.9**2 + 2 * 400 * (0.5 - 0.006 * 1.9 / 2))),
+        # It pulls from 22 ms on, and never again pushes.
+        (np.where(np.array(KNOTS) < 0.01, 1000.0, -900.0), 1.0),
         (np.full(12, -5.0), 1.0),
     ],
-    ids=["linear", "two slopes", "pulls", "only pulls"],
+    ids=["linear", "two slopes", "pulls first", "pulls then", "only pulls"],
 )
 def test_predicted_peak_force(slopes, peak):
     assert curve_of(slopes).peak_force() == pytest.approx(peak, rel=1e-12)
     both = jnp.stack([jnp.asarray(slopes), jnp.full(12, 400.0)], axis=-1)
     np.testing.assert_allclose(in_jax.peak_force(both), [peak, 20.0], rtol=1e-12)
+
+
+def test_derivative_of_the_predicted_peak_force_beyond_knots_that_pull():
+    found = jax.grad(in_jax.peak_force)(jnp.asarray(LATE))
+    each = 1e-4 * np.eye(12)
+    steps = [curve_of(LATE + step).peak_force() - curve_of(LATE - step).peak_force() for step in each]
+    np.testing.assert_allclose(found, np.array(steps) / 2e-4, rtol=1e-6, atol=1e-9)
+    assert np.count_nonzero(found) == 9  # up to 62 ms
 
 
 @pytest.mark.parametrize("ratio", [-30.0, -3.0, -0.5, 0.0, 0.3, 1.0, 2.5, 8.0])

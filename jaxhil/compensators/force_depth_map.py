@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
 # Depth over approach speed [s] at which a segment begins; the last goes on.
@@ -146,23 +145,22 @@ def force(now: Curve, depth: Array, speed: Array, deepest: Array) -> Float[Array
 
 def peak_force(slopes: Float[Array, "segments *batch"]) -> Float[Array, "*batch"]:
     """Force [1/s] where a contact entered at speed 1 comes to rest without dissipation: that up to which
-    int f dx = 1/2. Where the map pulls instead, the force before it does, at least 1."""
+    int f dx = 1/2, at least 1. At knots where the map pulls the force counts as 0."""
     widths = _column(WIDTHS[:-1], slopes[0])
-    gained = slopes[:-1] * widths
-    forces = jnp.concatenate([jnp.zeros_like(slopes[:1]), jnp.cumsum(gained, axis=0)])
-    energies = jnp.cumsum((forces[:-1] + 0.5 * gained) * widths, axis=0)
-    passed = lax.cummin(((energies < 0.5) & (forces[1:] >= 0)).astype(jnp.int32), axis=0)
-    energies = jnp.concatenate([jnp.zeros_like(slopes[:1]), energies])
-    place = jnp.sum(passed, axis=0)[None]
+    first = jnp.zeros_like(slopes[:1])
+    at_knots = jnp.cumsum(slopes[:-1] * widths, axis=0)
+    forces = jnp.concatenate([first, jnp.where(at_knots > 0, at_knots, 0)])
+    energies = jnp.cumsum(0.5 * (forces[:-1] + forces[1:]) * widths, axis=0)
+    rises = jnp.concatenate([(forces[1:] - forces[:-1]) / widths, slopes[-1:]])
+    place = jnp.sum(energies < 0.5, axis=0)[None]
 
     def there(values):
         return jnp.take_along_axis(values, place, axis=0)[0]
 
-    reached, slope, left = there(forces), there(slopes), 0.5 - there(energies)
-    reached = jnp.where(reached > 0, reached, 0)
-    more = slope * left > 0
-    further = jnp.sqrt(jnp.where(more, reached**2 + 2 * slope * left, 1))
-    return jnp.where(more, further, jnp.where(reached > 1, reached, 1))
+    left = 0.5 - there(jnp.concatenate([first, energies]))
+    rise = there(rises)
+    square = there(forces) ** 2 + 2 * jnp.where(rise > 0, rise, 0) * left
+    return jnp.sqrt(jnp.where(square > 1, square, 1))
 
 
 def positive_mean(mean: Float[Array, "*batch"], variance: Float[Array, "*batch"]) -> Float[Array, "*batch"]:

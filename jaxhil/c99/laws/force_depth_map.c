@@ -191,27 +191,24 @@ static double jaxhil_curve_force(const jaxhil_curve *curve, double depth, double
     return jaxhil_curve_elastic(curve, depth) + (drag - curve->unloading * back);
 }
 
-/* Force [1/s] where a contact entered at speed 1 comes to rest without dissipation. */
+/* Force [1/s] where a contact entered at speed 1 comes to rest without dissipation, at least 1. At knots where the
+ * map pulls the force counts as 0. */
 static double jaxhil_curve_peak_force(const jaxhil_curve *curve) {
-    double energy = 0.0;
-    int segment = 0;
-    while (segment < JAXHIL_SEGMENTS - 1) {
-        const double width = jaxhil_knots[segment + 1] - jaxhil_knots[segment];
-        const double more =
-            energy + (curve->at_knots[segment] + 0.5 * (curve->slopes[segment] * width)) * width;
-        if (!(more < 0.5 && curve->at_knots[segment + 1] >= 0.0)) {
+    double reached = 0.0, energy = 0.0, rise = curve->slopes[JAXHIL_SEGMENTS - 1];
+    for (int j = 0; j < JAXHIL_SEGMENTS - 1; j++) {
+        const double width = jaxhil_knots[j + 1] - jaxhil_knots[j];
+        const double force = curve->at_knots[j + 1] > 0.0 ? curve->at_knots[j + 1] : 0.0;
+        const double more = energy + 0.5 * (reached + force) * width;
+        if (!(more < 0.5)) {
+            rise = (force - reached) / width;
             break;
         }
+        reached = force;
         energy = more;
-        segment++;
     }
-    double reached = curve->at_knots[segment];
-    if (!(reached > 0.0)) {
-        reached = 0.0;
-    }
-    const double rise = curve->slopes[segment] * (0.5 - energy);
+    double square = reached * reached;
     if (rise > 0.0) {
-        return sqrt(reached * reached + 2.0 * rise);
+        square += 2.0 * rise * (0.5 - energy);
     }
-    return reached > 1.0 ? reached : 1.0;
+    return square > 1.0 ? sqrt(square) : 1.0;
 }

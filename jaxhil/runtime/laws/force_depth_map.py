@@ -88,25 +88,25 @@ class Curve:
 
     def peak_force(self) -> float:
         """Force [1/s] where a contact entered at speed 1 comes to rest without dissipation: that up to which
-        int f dx = 1/2. Where the map pulls instead, the force before it does, at least 1."""
-        slopes = self.slopes
-        forces = self.at_knots
+        int f dx = 1/2, at least 1. At knots where the map pulls the force counts as 0."""
+        reached = 0.0
         energy = 0.0
-        segment = 0
-        while segment < SEGMENTS - 1:
-            width = KNOTS[segment + 1] - KNOTS[segment]
-            more = energy + (forces[segment] + 0.5 * (slopes[segment] * width)) * width
-            if not (more < 0.5 and forces[segment + 1] >= 0.0):
+        rise = self.slopes[SEGMENTS - 1]
+        for j in range(SEGMENTS - 1):
+            width = KNOTS[j + 1] - KNOTS[j]
+            force = self.at_knots[j + 1]
+            if not force > 0.0:
+                force = 0.0
+            more = energy + 0.5 * (reached + force) * width
+            if not more < 0.5:
+                rise = (force - reached) / width
                 break
+            reached = force
             energy = more
-            segment += 1
-        reached = forces[segment]
-        if not reached > 0.0:
-            reached = 0.0
-        rise = slopes[segment] * (0.5 - energy)
+        square = reached * reached
         if rise > 0.0:
-            return sqrt(reached * reached + 2.0 * rise)
-        return reached if reached > 1.0 else 1.0
+            square += 2.0 * rise * (0.5 - energy)
+        return sqrt(square) if square > 1.0 else 1.0
 
 
 class ForceDepthMap:
