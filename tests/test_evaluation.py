@@ -51,7 +51,9 @@ def test_gains_per_lane_equal_common_gains():
     np.testing.assert_allclose(each.error[each.wanted], common.error[each.wanted], rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
+@pytest.mark.parametrize(
+    "compensator", [pytest.param("phase_lead", marks=pytest.mark.slow), "response_error"]
+)
 def test_neutral_gains_are_no_compensation(compensator):
     loop, gains, scenarios = setting(compensator)
     plain, _, _ = setting("none")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import hypothesis
 import hypothesis.strategies as st
+import jax
 import numpy as np
 import pytest
 
@@ -265,6 +266,13 @@ def test_in_a_process_of_float32_figures_are_the_command_s(as_by_default, comman
     np.testing.assert_allclose(slope, here, rtol=1e-10)
 
 
+def test_the_caller_s_flags_are_as_before(run):
+    before = dict(jax.config.values)
+    assert jaxhil.simulate(run.mechanism, "phase_lead").contacts == run.contacts
+    assert dict(jax.config.values) == before
+
+
+@pytest.mark.slow
 def test_the_caller_s_flags_neither_matter_nor_change(as_by_default):
     flags = "\n".join(
         f"jax.config.update({name!r}, {value!r})"
@@ -311,7 +319,13 @@ def central_difference(law, of, key, step):
     return (figures[0] - figures[1]) / (2 * step)
 
 
-@pytest.mark.parametrize(("law", "of"), [("phase_lead", "restitution"), ("response_error", "peak_force")])
+@pytest.mark.parametrize(
+    ("law", "of"),
+    [
+        ("phase_lead", "restitution"),
+        pytest.param("response_error", "peak_force", marks=pytest.mark.slow),
+    ],
+)
 def test_derivatives_are_those_of_differences(law, of):
     slopes = jaxhil.jacobian(jaxhil.load("varying", TWO), law, of=of, by=list(KEYS))
     assert list(slopes) == list(KEYS)

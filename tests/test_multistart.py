@@ -63,6 +63,7 @@ def test_starts_are_the_literature_and_the_best_of_a_scan(tasks, validation):
         assert (apart >= 0.1 * np.sqrt(points.shape[1]) - 1e-12).all()
 
 
+@pytest.mark.slow
 def test_the_best_start_is_polished(tasks, validation):
     """Stopped far too early, none is at its minimum yet; where all starts failed there is none to polish."""
     early = solve_tasks(tasks, choose_starts(validation, 3, 0), 1)

@@ -166,7 +166,10 @@ def test_trajectory_of_linear_contact():
 
 
 # Of each quantity over itself, by stiffness, damping (of a tenth of the critical one), mass and velocity.
-@pytest.mark.parametrize("case, tolerance", [("kelvin_voigt", 1e-3), ("piecewise_linear", 1e-3)])
+@pytest.mark.parametrize(
+    "case, tolerance",
+    [("kelvin_voigt", 1e-3), pytest.param("piecewise_linear", 1e-3, marks=pytest.mark.slow)],
+)
 def test_derivatives_of_the_closed_forms(case, tolerance):
     """Where a step has a kink inside, its derivative is that of a force a bit off: short as it is."""
     name, values = CASES[case]

@@ -275,7 +275,12 @@ SUITES = {
 }
 
 
-@pytest.mark.parametrize("case", SUITES)
+SELDOM = ("hertz", "elastoplastic")  # each a program of its own
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=pytest.mark.slow if case in SELDOM else ()) for case in SUITES]
+)
 def test_errors_of_the_standard_suites(case):
     suite, changes, rms, worst = SUITES[case]
     mechanism = load(f"suite-{suite}", changes).mechanism

@@ -49,7 +49,13 @@ WORK_ACCURACY = {
 # The oracle does not know that a quantum is a level below which a command has died out.
 ORACLE = {"quantum": {"noise_level": 0.5}}
 
-every_case = pytest.mark.parametrize("name", CASES)
+# Each of these is the first of a program of its own; what they add is tested elsewhere, one by one.
+SELDOM = ("rattling, elastoplastic", "rattling against layers", "depth-damped", "layers", "damped layers")
+SELDOM += ("transfer function with latency", "third order with latency", "position lead, late drives")
+slow_if_seldom = [
+    pytest.param(name, marks=pytest.mark.slow if name.startswith(SELDOM) else ()) for name in CASES
+]
+every_case = pytest.mark.parametrize("name", slow_if_seldom)
 
 
 def both(name):

@@ -17,7 +17,13 @@ def joined(pieces):
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
 
-@pytest.fixture(scope="module", params=[("random", None), ("sobol", NOISY)], ids=["random", "sobol-noisy"])
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(("random", None), id="random", marks=pytest.mark.slow),
+        pytest.param(("sobol", NOISY), id="sobol-noisy"),
+    ],
+)
 def sweep(request):
     sampling, sensor = request.param
     return build_sweep(manifest(case(2, "phase_lead", sensor), 112, sampling=sampling))

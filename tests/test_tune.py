@@ -107,6 +107,7 @@ def test_a_setting_is_judged_as_it_is(monkeypatch):
     assert result.figures["literature"] == result.figures["tuned"] != result.figures["before"]
 
 
+@pytest.mark.slow
 def test_before_is_no_compensation_of_any_law():
     mechanism, quiet = load().mechanism, dataclasses.replace(SMALL, setting="sharp")
     without = tune(mechanism, "none", SMALL).outcomes["tuned"]
