@@ -12,7 +12,7 @@ from math import inf, isfinite
 from typing import Any
 
 import numpy as np
-from numpy.polynomial.polynomial import polyval
+from oracle_motion import polynomial
 from scipy.integrate import quad
 from scipy.optimize import brentq, minimize_scalar
 
@@ -123,7 +123,7 @@ class Piece:
         return self.origin + self.theta[1] * self.length
 
     def motion(self, theta):
-        return polyval(theta, self.position), polyval(theta, self.velocity)
+        return polynomial(self.position)(theta), polynomial(self.velocity)(theta)
 
     def force(self, theta):
         """Force along +x's reaction: positive on the surface at 0, negative on the one at -clearance."""
@@ -198,11 +198,7 @@ def cut(position, velocity, a, b, law, index):
     `deepest` is the law's when the piece begins; by the end of the pieces the law has that of the last.
     """
 
-    def x(s):
-        return float(polyval(s, position))
-
-    def v(s):
-        return float(polyval(s, velocity))
+    x, v = polynomial(position), polynomial(velocity)
 
     turning = [a, *_roots(v, a, b), b]
     cuts = {a, b, *turning}
@@ -240,7 +236,7 @@ def cut(position, velocity, a, b, law, index):
 
 def _roots(function, a, b, samples=8):
     """Sign changes of a smooth function in (a, b), each refined to rounding."""
-    grid = np.linspace(a, b, samples + 1)
+    grid = [*(a + k * ((b - a) / samples) for k in range(samples)), b]
     values = [function(s) for s in grid]
     found = []
     for low, high, f_low, f_high in zip(grid[:-1], grid[1:], values[:-1], values[1:], strict=True):

@@ -10,7 +10,6 @@ from math import ceil, floor
 from typing import Any
 
 import numpy as np
-from numpy.polynomial.polynomial import polyval
 from scipy.linalg import expm
 
 TIME_TOLERANCE = 1e-9  # ticks: closer than this, two times are the same
@@ -130,7 +129,7 @@ class Motion:
 
     def at_left(self, time):
         j, i, theta = self.locate_left(time)
-        return float(polyval(theta, self.segment(j, i)))
+        return polynomial(self.segment(j, i))(theta)
 
     def segments_between(self, start, end):
         """(polynomial, origin, theta_a, theta_b) covering (start, end], in order."""
@@ -145,3 +144,16 @@ class Motion:
             if theta_b > theta_a:
                 yield self.segment(j, q - j * self.substeps), origin, theta_a, theta_b
             q += 1
+
+
+def polynomial(coefficients):
+    """The polynomial as a function of a number or an array: Horner's rule as NumPy's, less its checks."""
+    last, *others = reversed(coefficients.tolist())
+
+    def value(s):
+        total = last + 0.0 * s
+        for coefficient in others:
+            total = coefficient + total * s
+        return total
+
+    return value
