@@ -222,7 +222,7 @@ def random_readings(name: str, lanes: int, ticks: int, seed: int) -> Readings:
 @pytest.mark.parametrize(
     "name, lanes",
     [
-        *((name, 20 if "retrospective" in name else 60) for name in COMPENSATORS),
+        *((name, 8 if "retrospective" in name else 60) for name in COMPENSATORS),
         pytest.param("response_error", 510, marks=pytest.mark.slow),
         pytest.param("retrospective_delay_bank", 60, marks=pytest.mark.slow),
         pytest.param("retrospective_reference", 60, marks=pytest.mark.slow),

@@ -38,6 +38,8 @@ from tuning.bundle.c99_tables import UNUSABLE, decimal
 
 pytestmark = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
 LAWS = tuple(COMPENSATORS)
+# Most of the C code between them.
+LONG_CODE = ("response_error", "retrospective_delay_bank", "retrospective_reference", "virtual_contact")
 KINDS = ("contact", "random", "hostile")
 
 
@@ -300,7 +302,9 @@ def test_same_bits_whatever_comes(case, batch):
     compare(batch(gain_file.compensator), gain_file, rows)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(
+    "law", [pytest.param(law, marks=() if law in LONG_CODE else pytest.mark.slow) for law in LAWS]
+)
 def test_no_undefined_behaviour(law, tmp_path):
     """Address and undefined-behaviour sanitizers, float conversions included, on hostile rows."""
     program = sanitized(tmp_path, law)

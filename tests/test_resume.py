@@ -98,6 +98,7 @@ def interrupted_and_resumed(jaxhil, files, folder, stop, after):
     return outputs(again.out, folder), writes.number
 
 
+@pytest.mark.slow
 def test_a_run_resumed_ends_as_if_nothing_had_happened(jaxhil, files, whole, tmp_path):
     expected, every = whole
     # Rounds of the search, the search, and a result each.

@@ -122,6 +122,7 @@ def copied(tmp_path):
     return folder
 
 
+@pytest.mark.slow
 def test_a_law_of_three_files_and_two_entries_is_tested_and_exported(copied):
     """By the tests named `...[toy...]`, in a process that sees the copy alone."""
     command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "-k", "toy", *RUN]

@@ -86,6 +86,7 @@ def test_gains_lie_within_their_bounds(result):
         assert gain.lower(result.mechanism) <= result.gains[gain.name] <= gain.upper(result.mechanism)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_gains(result):
     assert tune(load().mechanism, "phase_lead", SMALL).gains == result.gains
 

@@ -57,6 +57,7 @@ def test_a_controllers_process_without_a_gain_file(capfd):
     assert "nowhere.json" in error and error.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_rig_reports_a_short_run(jaxhil, tmp_path):
     path = gain_file(tmp_path)
     # One contact of this gain file's takes most of a second.
