@@ -14,7 +14,7 @@ from jaxhil.compensators.base import Constants
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import Outcome, evaluate
+from jaxhil.simulation.evaluation import evaluate
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.batches import cut, join
 from tuning.gains.common_program import CommonProgram
@@ -49,24 +49,16 @@ def judge_gains(
     scene: Scene, law: str, gains: Mapping[str, float], limit: float, seed: int
 ) -> dict[str, Estimate]:
     """All figures of a law under these gains; `limit` and `seed` of `tuning.transparency.figures.judge`."""
-    number = len(scene.plain.velocity)
-    contacts = scene.mechanism.approach.contacts
-    space = scene.space
-
-    def run(batches: list[Scenario]) -> list[Any]:
-        return cut(_run(scene, law, gains, join(batches)), number)
-
-    # As many batches as in the second call, so that one program serves.
-    plain, twins, _ = run([probed(batch, space) for batch in (scene.plain, scene.twins, scene.plain)])
+    contacts, space = scene.mechanism.approach.contacts, scene.space
+    runs = _runs(scene, law, gains, space)
     if contacts > 1:
         # Later contacts are entered at the speed that the law left them.
+        plain: Any = runs.plain
         entered = np.where(plain.good, plain.metrics.approach_velocity, _nominal(scene.plain))
         space = in_space(scene.common.law(beforehand=False), scene.plain, entered, contacts)
-    duration = np.where(plain.good[0], plain.metrics.duration[0], space.duration[0])
-    pushed = [probed(scene.plain, space, share, duration) for share in (EARLY, LATE)]
-    plain, early, late = run([probed(scene.plain, space), *pushed])
+        runs = _runs(scene, law, gains, space)
     return judge(
-        Runs(plain, early, late, twins),
+        runs,
         (space.early, space.late),
         space.restitution[0],
         np.max(space.depth, axis=1),
@@ -76,10 +68,18 @@ def judge_gains(
     )
 
 
-def _run(scene: Scene, law: str, gains: Mapping[str, float], scenarios: Scenario) -> Outcome:
+def lanes_judged(scene: Scene) -> int:
+    """How many lanes are run for the figures of one set of gains."""
+    return len(Runs._fields) * len(scene.plain.velocity) * (1 + (scene.mechanism.approach.contacts > 1))
+
+
+def _runs(scene: Scene, law: str, gains: Mapping[str, float], space: Space) -> Runs:
+    """All runs that figures take, as one batch, beside these contacts in space."""
+    pushed = [probed(scene.plain, space, share) for share in (EARLY, LATE)]
+    scenarios = join([probed(scene.plain, space), *pushed, probed(scene.twins, space)])
     loop = scene.common.loop(build_loop(scene.mechanism, law, scenarios))
-    lanes = len(scenarios.velocity)
-    return evaluate(loop, {name: np.full(lanes, value) for name, value in gains.items()}, scenarios)
+    every = {name: np.full(len(scenarios.velocity), value) for name, value in gains.items()}
+    return Runs(*cut(evaluate(loop, every, scenarios), len(scene.plain.velocity)))
 
 
 def _nominal(scenarios: Scenario) -> Any:

@@ -27,12 +27,11 @@ from jaxhil.contact.laws import LAWS
 from jaxhil.contact.reference import Reference
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.evaluation import Outcome
-from jaxhil.simulation.probe import Probe, Push
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.statistics.intervals import Estimate
 from tuning.transparency.damped_twins import damped_twins
 from tuning.transparency.figures import Runs, transparency_figures
-from tuning.transparency.pushes import EARLY, LATE, SIZE, WIDTH, in_space
+from tuning.transparency.pushes import EARLY, LATE, in_space, probed
 
 LANES_PER_SCENARIO = 4  # lanes of a scenario: plain, early, late, damped
 # Weights of the objective of a law that anticipates, unless others are given.
@@ -86,19 +85,14 @@ def probed_scenarios(
 def _pushed(scenarios: Scenario, space: Any, share: float | None = None, restitution: Any = None) -> Scenario:
     """The scenarios with a push at a share of the first contact's duration in space, where one is given, and
     what the contact's `restitution` then is."""
-    size = np.zeros_like(space.peak_force)
-    known = np.full((3, *size.shape), np.nan)
-    centre, contacts = size.copy(), scenarios.contacts
+    known = np.full((3, *space.peak_force.shape), np.nan)
     if share is not None:
-        size[0] = SIZE * space.peak_force[0]
-        centre[0] = share * space.duration[0]
         known[:, 0] = restitution, space.peak_force[0], space.duration[0]
-        contacts = np.minimum(contacts, 1)
-    push: Any = Push(size, centre, np.full_like(size, WIDTH))
+        scenarios = scenarios._replace(contacts=np.minimum(scenarios.contacts, 1))
     # Nobody asks how far the model is off the motion in space: its two ends will do.
-    probe: Any = Probe(push, space.depth[:, [0, -1]], space.duration)
+    own = probed(scenarios, space._replace(depth=space.depth[:, [0, -1]]), share)
     reference: Any = Reference(*known)
-    return scenarios._replace(contacts=contacts, probe=probe, reference=reference)
+    return own._replace(reference=reference)
 
 
 def probe_figures(probed: ProbedScenarios, outcome: Outcome, seed: int = 0) -> dict[str, Estimate]:

@@ -1,9 +1,9 @@
 """What a comparison probes the laws with: pushes on the hardware, and the same contacts in space.
 
     Transparency: a half-sine push that no model knows of, `WIDTH` long, `SIZE` of the reference's peak force,
-    centred at a quarter and at three quarters of the contact's duration, acts on the hardware and, at the
-    same fraction of its own contact, in space. What it changes in e, over what it changes in space, is 1 for
-    a test of the hardware, and 0 for a law that plays back what it expects.
+    centred at a quarter and at three quarters of the contact's duration in space, acts on the hardware and,
+    as long after the first touch, in space. What it changes in e, over what it changes in space, is 1 for a
+    test of the hardware, and 0 for a law that plays back what it expects.
 
 The push is on the first contact alone: what follows a contact differs by its rebound already.
 """
@@ -90,15 +90,15 @@ def in_space(
     )
 
 
-def probed(scenarios: Scenario, space: Any, share: float | None = None, duration: Any = None) -> Scenario:
+def probed(scenarios: Scenario, space: Any, share: float | None = None) -> Scenario:
     """The scenarios with the reference beside each contact; with a push at a `share` of the first contact's
-    `duration` [s, (scenarios,)], if one is given."""
+    duration in space, if one is given."""
     size: Any = np.zeros_like(space.peak_force)
     centre: Any = np.zeros_like(space.peak_force)
     width: Any = np.full_like(size, WIDTH)
     if share is not None:
         size[0] = SIZE * space.peak_force[0]
-        centre[0] = share * duration
+        centre[0] = share * space.duration[0]
     return scenarios._replace(probe=Probe(Push(size, centre, width), space.depth, space.duration))
 
 
