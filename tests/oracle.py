@@ -149,7 +149,8 @@ class _Run:
         if isfinite(simulator.get("acceleration_limit", inf)):
             raise NotImplementedError("acceleration_limit is not part of the oracle")
         self.velocity_limit = simulator.get("velocity_limit", inf)
-        self.x = -velocity * (0.02 + approach.get("phase", 1.0 / 3.0) * T)
+        self.x = min(rig.get("contact_plane", 0.0), 0.0)
+        self.x -= velocity * (0.02 + approach.get("phase", 1.0 / 3.0) * T)
         self.v = velocity
         if self.x <= -self.law.clearance:
             raise ValueError("the start must lie inside the gap")

@@ -54,9 +54,10 @@ def closed_loop(
         plant.begin(position, velocity, law.position_command(position, velocity, 0.0), number)
         watch.begin(number)
         while len(results) < mechanism.approach.contacts:
-            force = law.step(plant.read()[0], model.position, model.velocity, plant.read()[1])
+            reading, measured = plant.read()[0], plant.read()[1]
+            force = law.step(reading, model.position, model.velocity, measured)
             force = 0.0 if zeroed and tick == 0 else force
-            over = watch.observe(model.position, model.velocity, force, plant.force)
+            over = watch.observe(model.position, model.velocity, force, plant.force, reading)
             shortfall.append(plant.shortfall)
             model.integrate(force)
             plant.move(law.position_command(model.position, model.velocity, model.acceleration))
@@ -70,7 +71,8 @@ def closed_loop(
         if results[-1].status != "ok":
             break
         velocity = results[-1].restitution * results[-1].approach_velocity
-        position = -velocity * (APPROACH + mechanism.approach.phase * mechanism.rig.control_period)
+        position = min(mechanism.rig.contact_plane, 0.0)
+        position -= velocity * (APPROACH + mechanism.approach.phase * mechanism.rig.control_period)
         law.next_contact()
     return results, shortfalls
 

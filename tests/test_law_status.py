@@ -168,6 +168,40 @@ def test_c_says_the_same_of_every_kind_of_contact(in_c):
     assert contacts == {*range(len(STATUSES))}
 
 
+@pytest.mark.parametrize("law", [LAW, "retrospective_delay_bank"])
+def test_without_a_measured_force_a_contact_is_not_reached(law):
+    """Whatever the law does: the model passes the surface and comes back, with hardware that never touches,
+    with a dead zone that hides its contact, and with a contact of a single reading."""
+    mechanism = load("suite-noise-free").mechanism
+    time = 1e-3 * np.arange(260)
+    motion = 2e-4 * np.sin(25.0 * (time - 0.0203))
+    never, touching = np.full(len(time), -1e-4), 2e-4 * np.sin(25.0 * (time - 0.0303))
+    none = np.zeros(len(time))
+    single = np.where(np.arange(len(time)) == 90, 3.0, 0.0)
+    for measured, force, reached in (
+        (never, none, False),
+        (touching, none, False),
+        (touching, single, True),
+        (touching, -0.01 * np.cos(time), False),
+    ):
+        one = controller(mechanism, law, literature_gains(mechanism, law), settling=0.02, fading=0.01)
+        velocity = 5e-3 * np.cos(25.0 * (time - 0.0203))
+        rows = np.zeros((len(time), len(ROW)))
+        rows[:, :5] = np.stack([none, force, motion, velocity, measured], axis=1)
+        for row in rows:
+            one.step(*row[1:5])
+        record = one.last_contact
+        assert record.number == 1 and (record.status == "not_reached") != reached, record
+        assert one.seen == LAW_IN_DOUBT
+        if law == LAW and c99_cases.COMPILER is not None:
+            limits = {**NO_LIMITS, "settling": 0.02, "fading": 0.01}
+            period, clearance = mechanism.rig.control_period, mechanism.contact.clearance
+            made = GainFile(law, literature_gains(mechanism, law), period, clearance)._replace(limits=limits)
+            in_c = c99_cases.loaded(law)
+            assert in_c.begin(packed(law, made))
+            assert_same(in_c.run(rows, True), controller_in_python(made, rows), rows)
+
+
 def test_the_record_stays_until_the_next_contact_is_audited():
     mechanism, made = gain_file(KINDS["8 Hz"], {})
     law = Controller(made)
@@ -241,7 +275,7 @@ def test_the_status_that_counts(counts, status):
     for one, number in counts.items():
         for _ in range(number):
             made.take(one)
-    record = made.record(7)
+    record = made.record(7, measured=True)
     assert (record.number, record.status) == (7, STATUSES[status].name)
     assert record.ticks == sum(counts.values()) - counts.get(OUT_OF_CONTACT, 0)
     assert record.in_doubt == (status in (UNSURE, SATURATED, TOO_SHORT, DISPLACED, NOISY))

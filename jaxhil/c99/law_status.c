@@ -1,5 +1,5 @@
-/* What a law says of its own command: its status after each tick, counted over a contact. The contact is
- * unsure, too short, displaced or noisy, by the most frequent, where the law was any of them on more than two
+/* What a law says of its own command: its status after each tick, counted over a contact. The contact is not
+ * reached where no force was measured; else unsure, too short, displaced or noisy, by the most frequent, where the law was any of them on more than two
  * fifths of the ticks on which it acted; else saturated, where its correction was at its limit on more than half
  * of them; else identified.
  */
@@ -38,8 +38,9 @@ static void jaxhil_contact_record_take(jaxhil_contact_record *record, int status
     record->noisy += status == JAXHIL_NOISY;
 }
 
-/* The contact is over: the status that counts. Whether the law is in doubt of it. */
-static bool jaxhil_contact_record_end(jaxhil_contact_record *record) {
+/* The contact is over, a force was measured in it or not: the status that counts. Whether the law is in doubt of
+ * it. */
+static bool jaxhil_contact_record_end(jaxhil_contact_record *record, bool measured) {
     const int64_t doubts[] = {record->unsure, record->too_short, record->displaced, record->noisy};
     const int statuses[] = {JAXHIL_UNSURE, JAXHIL_TOO_SHORT, JAXHIL_DISPLACED, JAXHIL_NOISY};
     int64_t all = 0;
@@ -49,7 +50,9 @@ static bool jaxhil_contact_record_end(jaxhil_contact_record *record) {
         most = doubts[i] > doubts[most] ? i : most;
     }
     record->status = JAXHIL_IDENTIFIED;
-    if (record->ticks == 0) {
+    if (!measured) {
+        record->status = JAXHIL_NOT_REACHED;
+    } else if (record->ticks == 0) {
         record->status = JAXHIL_OUT_OF_CONTACT;
     } else if ((double)all > jaxhil_doubtful * (double)record->ticks) {
         record->status = statuses[most];

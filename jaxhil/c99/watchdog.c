@@ -25,7 +25,7 @@ typedef struct {
     double restitution, expected, balance;
     int64_t contacts;
     jaxhil_contact_record record;
-    bool on, stated, known, open;
+    bool on, stated, known, open, measured;
     double clearance, middle, period, mass, quiet_ticks, faded, longest, fading, margin, tolerance;
     double entry, side, velocity, force, aligned, peak, work;
     double sxx, sxv, svv, sxf, svf;
@@ -46,6 +46,7 @@ static void jaxhil_watchdog_clear(jaxhil_watchdog *watchdog) {
     watchdog->ticks = 0;
     watchdog->peak = 0.0;
     watchdog->work = 0.0;
+    watchdog->measured = false;
     watchdog->statuses = jaxhil_contact_record_begin(0, JAXHIL_UNSTATED);
     watchdog->sxx = 0.0;
     watchdog->sxv = 0.0;
@@ -153,7 +154,7 @@ static uint32_t jaxhil_watchdog_audit(jaxhil_watchdog *watchdog, double velocity
     watchdog->contacts++;
     if (watchdog->stated) {
         watchdog->statuses.number = watchdog->contacts;
-        doubt = jaxhil_contact_record_end(&watchdog->statuses) ? JAXHIL_LAW_IN_DOUBT : 0;
+        doubt = jaxhil_contact_record_end(&watchdog->statuses, watchdog->measured) ? JAXHIL_LAW_IN_DOUBT : 0;
         watchdog->record = watchdog->statuses;
     }
     return doubt | (watchdog->mass > 0.0 ? jaxhil_watchdog_energies(watchdog, velocity) : 0);
@@ -238,6 +239,7 @@ static uint32_t jaxhil_watchdog_tick(jaxhil_watchdog *watchdog, double given, in
     }
     if (watchdog->open) {
         jaxhil_contact_record_take(&watchdog->statuses, status);
+        watchdog->measured = watchdog->measured || fabs(force) > watchdog->fading;
         jaxhil_watchdog_regress(watchdog, force, deflection);
         fault = jaxhil_watchdog_follow(watchdog, given, before, velocity, side, in_contact);
     }

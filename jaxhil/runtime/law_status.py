@@ -3,9 +3,10 @@
 Every status is one number, the same in the C controller. `STATUSES` is the table that documentation and
 exports are made from. Over a contact they are counted, and the contact is
 
+    not reached    where no force was measured, whatever the law did,
     unsure, too short, displaced or noisy
-                   by the most frequent, where the law was any of them on more than `DOUBTFUL` of the ticks on
-                   which it acted,
+                   else by the most frequent, where the law was any of them on more than `DOUBTFUL` of the
+                   ticks on which it acted,
     saturated      else, where its correction was at its limit on more than `SATURATING` of them,
     identified     else.
 
@@ -31,7 +32,7 @@ class Status(NamedTuple):
     meaning: str
 
 
-OUT_OF_CONTACT, IDENTIFIED, UNSURE, SATURATED, TOO_SHORT, UNSTATED, DISPLACED, NOISY = range(8)
+OUT_OF_CONTACT, IDENTIFIED, UNSURE, SATURATED, TOO_SHORT, UNSTATED, DISPLACED, NOISY, NOT_REACHED = range(9)
 DOUBTS = UNSURE, TOO_SHORT, DISPLACED, NOISY
 
 STATUSES = (
@@ -43,6 +44,7 @@ STATUSES = (
     Status("unstated", "the law says nothing of itself"),
     Status("displaced", "the hardware enters contact elsewhere than given: the contact plane is wrong"),
     Status("noisy", "noise of force or position, or a dead zone, leaves the contact uncertain"),
+    Status("not_reached", "said of a whole contact: no force was measured, so that there was none"),
 )
 
 _NAMES = tuple(status.name for status in STATUSES)
@@ -82,13 +84,15 @@ class StatusCount:
         """One tick's status."""
         self._counts[status] += 1
 
-    def record(self, number: int) -> ContactRecord:
-        """Contact `number`, now that it is over."""
+    def record(self, number: int, measured: bool) -> ContactRecord:
+        """Contact `number`, now that it is over, and whether a force was `measured` in it."""
         counts = self._counts
         doubts = [counts[status] for status in DOUBTS]
         ticks = counts[IDENTIFIED] + counts[SATURATED] + sum(doubts)
         status = IDENTIFIED
-        if ticks == 0:
+        if not measured:
+            status = NOT_REACHED
+        elif ticks == 0:
             status = OUT_OF_CONTACT
         elif sum(doubts) > DOUBTFUL * ticks:
             status = DOUBTS[doubts.index(max(doubts))]

@@ -9,6 +9,7 @@ With v_in the model's velocity on the tick before the contact and v now, the aud
   that the controller gave, an identity for every integrator with v(n+1) = v(n) - T F_c(n)/M.
 - Is the restitution |v|/|v_in| the expected one, within `restitution_margin`?
 - Did the law, by its own word, know the contact (`law_status`)? This alone it asks without `equivalent_mass`.
+  A contact in which no reading of the force is beyond `fading` counts as not reached.
 
 The expected restitution is that of the contact's own stiffness: k and b are the least squares of the
 measured force on the measured position, delayed by `alignment`, and its rate, over the whole contact. An
@@ -45,9 +46,10 @@ class Watchdog:
 
     __slots__ = (
         "_aligned", "_alignment", "_clearance", "_entry", "_expectation", "_faded", "_fading", "_force",
-        "_known", "_longest", "_margin", "_mass", "_middle", "_open", "_peak", "_period", "_quiet",
-        "_quiet_ticks", "_side", "_stated", "_statuses", "_svf", "_svv", "_sxf", "_sxv", "_sxx", "_ticks",
-        "_tolerance", "_velocity", "_work", "balance", "contacts", "expected", "on", "record", "restitution",
+        "_known", "_longest", "_margin", "_mass", "_measured", "_middle", "_open", "_peak", "_period",
+        "_quiet", "_quiet_ticks", "_side", "_stated", "_statuses", "_svf", "_svv", "_sxf", "_sxv", "_sxx",
+        "_ticks", "_tolerance", "_velocity", "_work", "balance", "contacts", "expected", "on", "record",
+        "restitution",
     )  # fmt: skip
 
     def __init__(
@@ -85,6 +87,7 @@ class Watchdog:
         self._aligned = 0.0
         self._peak = 0.0
         self._work = 0.0
+        self._measured = False
         self._statuses.restart()
         self._sxx = self._sxv = self._svv = self._sxf = self._svf = 0.0
         self.balance = 0.0
@@ -120,6 +123,7 @@ class Watchdog:
                 self._quiet += 1
             self._ticks += 1
             self._statuses.take(status)
+            self._measured = self._measured or abs(force) > self._fading
             self._work += self._period * given * 0.5 * (before + velocity)
             size = abs(given)
             if size > self._peak:
@@ -163,6 +167,7 @@ class Watchdog:
         self._ticks = 0
         self._peak = 0.0
         self._work = 0.0
+        self._measured = False
         self._statuses.restart()
         self._sxx = self._sxv = self._svv = self._sxf = self._svf = 0.0
 
@@ -186,7 +191,7 @@ class Watchdog:
         self.contacts += 1
         doubt = 0
         if self._stated:
-            self.record = self._statuses.record(self.contacts)
+            self.record = self._statuses.record(self.contacts, self._measured)
             doubt = LAW_IN_DOUBT if self.record.in_doubt else 0
         return doubt | (self._energies(velocity) if self._mass > 0.0 else 0)
 

@@ -21,6 +21,8 @@ STATUS_NAMES = {
 RUNAWAY = 1e3  # of the first approach speed: no rig survives it
 # What a status says in a sentence, of those with which a run ends badly.
 STATUS_REASONS = {
+    "not reached": "the numerical model turned back without a measured force: the hardware did not touch, or "
+    "the force sensor did not show it",
     "timeout": f"a contact was not over within {LONGEST_CONTACT:g} s, the limit of a contact",
     "diverged": f"the speed grew beyond {RUNAWAY:g} times that of the first approach",
     "non-finite": "a number was no longer finite",
@@ -84,11 +86,15 @@ def empty_metrics(loop: Loop, slots: int, like: Array) -> Metrics:
 def judge(scenario: Scenario, watch: Watch, age: Array) -> Array:
     """Status of the contact under way, `age` ticks into its run: OK, also while it goes on."""
     period = scenario.control_period
-    crossing = jnp.where(jnp.isfinite(scenario.clearance), 10 * scenario.clearance / scenario.velocity, 0)
+    way = jnp.where(
+        jnp.isfinite(scenario.clearance), scenario.clearance, -jnp.minimum(scenario.contact_plane, 0)
+    )
     limit = scenario.time_limit / period
-    waiting = (watch.elapsed == 0) & (age.astype(period.dtype) > limit + crossing / period)
+    patience = limit + 10 * way / scenario.velocity / period
+    waiting = (watch.elapsed == 0) & (age.astype(period.dtype) > patience)
     late = (watch.elapsed > limit) | waiting
-    status = jnp.where(late & ~watch.over, TIMEOUT, OK)
+    # Without a measured force there is no contact, whatever made the numerical model turn back.
+    status = jnp.where(watch.over, jnp.where(watch.measured, OK, NOT_REACHED), jnp.where(late, TIMEOUT, OK))
     status = jnp.where(watch.rebound > RUNAWAY * scenario.velocity, DIVERGED, status)
     finite = jnp.isfinite(watch.rebound) & jnp.isfinite(watch.peak_command)
     return jnp.where(finite, status, NON_FINITE).astype(jnp.int32)
@@ -104,8 +110,8 @@ def collect(
     ticks: Array,
     force_delay: Array | None = None,
 ) -> Metrics:
-    """Enter the contacts that are `over` at their `index`; `ticks` have run by now, and the law estimates a
-    `force_delay` [s], or none."""
+    """Enter the contacts that are `over`, and were reached, at their `index`; `ticks` have run by now, and
+    the law estimates a `force_delay` [s], or none."""
     period = scenario.control_period
     none = jnp.zeros_like(period)
     work_in, work_out = watch.works or (none, none)
@@ -129,7 +135,7 @@ def collect(
     )
     slots = metrics.restitution.shape[0]
     slot = jnp.arange(slots, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
-    here = (slot == index[None]) & over[None]
+    here = (slot == index[None]) & (over & (status != NOT_REACHED))[None]
     entered = Metrics(*(jnp.where(here, v[None], m) for v, m in zip(values, metrics, strict=True)))
     # What is not followed still is what it was before any contact: no work in every turn-over.
     if watch.shortfall is None:

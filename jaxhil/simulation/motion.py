@@ -101,8 +101,8 @@ def _split(lane: Lane, scenarios: Scenario) -> list[Curve]:
     ends = np.append(begins[1:], len(signals.age))
     period = float(scenarios.control_period[0])
     pieces = []
-    for number, (begin, end) in enumerate(zip(begins, ends, strict=True)):
-        touch = APPROACH + float(scenarios.phase[number, 0]) * period
+    for begin, end in zip(begins, ends, strict=True):
+        touch = -float(signals.position_desired[begin] / signals.velocity_desired[begin])
         part = slice(begin, end)
         curve = Curve(
             float(signals.velocity_desired[begin]),

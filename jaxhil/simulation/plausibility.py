@@ -209,7 +209,9 @@ def _seconds(scenarios: Scenario, reference: Reference) -> tuple[np.ndarray, np.
     duration = np.nan_to_num(reference.duration, nan=math.inf, posinf=math.inf)
     way = APPROACH + scenarios.phase[:contacts] * scenarios.control_period
     with np.errstate(all="ignore"):
-        way = way + np.clip(scenarios.contact_plane / velocity, 0, LONGEST_CONTACT)
+        way = way + np.clip(
+            np.abs(scenarios.contact_plane) / velocity, 0, LONGEST_CONTACT + _patience(scenarios)
+        )
         left = np.cumprod(np.nan_to_num(reference.restitution, nan=1.0), axis=0)
         crossing = scenarios.clearance / (velocity * np.concatenate([np.ones_like(left[:1]), left[:-1]]))
         flight = np.minimum(np.nan_to_num(crossing, nan=math.inf, posinf=math.inf), _patience(scenarios))
@@ -219,10 +221,12 @@ def _seconds(scenarios: Scenario, reference: Reference) -> tuple[np.ndarray, np.
 
 
 def _patience(scenarios: Scenario) -> np.ndarray:
-    """For how long [s] the next touch is waited for between two surfaces; 0 where there is but one."""
+    """For how long [s] the next touch is waited for between two surfaces, and by how much longer than for a
+    contact where there is but one."""
     with np.errstate(all="ignore"):
         crossing = 10 * scenarios.clearance / scenarios.velocity
-    return np.where(np.isfinite(scenarios.clearance), LONGEST_CONTACT + crossing, 0.0)
+        nearer = 10 * np.maximum(-scenarios.contact_plane, 0.0) / scenarios.velocity
+    return np.where(np.isfinite(scenarios.clearance), LONGEST_CONTACT + crossing, nearer)
 
 
 def _corners(mechanism: Mechanism, prefixes: tuple[str, ...]) -> dict[str, np.ndarray]:

@@ -204,9 +204,10 @@ def _first_tick(loop):
 
 
 def _approach(rig, index, velocity):
-    """Where a run of the schedule starts: x_d(0) = -v (0.02 s + phi T)."""
+    """Where a run of the schedule starts: x_d(0) = min(plane, 0) - v (0.02 s + phi T)."""
     phase = _entry(rig.scenario.phase, _slot(rig, index))
-    return -velocity * (APPROACH + phase * rig.constants.control_period), velocity
+    nearer = jnp.minimum(rig.scenario.contact_plane, 0)
+    return nearer - velocity * (APPROACH + phase * rig.constants.control_period), velocity
 
 
 def _skip_flight(loop, rig, gains, state, watch, tick):
@@ -215,7 +216,7 @@ def _skip_flight(loop, rig, gains, state, watch, tick):
     velocity, position = state.velocity, state.position
     stride = period * velocity
     left = jnp.where(velocity > 0, -position, position + scenario.clearance)
-    spare = left - APPROACH * jnp.abs(velocity)
+    spare = left - APPROACH * jnp.abs(velocity) - jnp.abs(scenario.contact_plane)
     strides = spare / jnp.where(stride != 0, jnp.abs(stride), 1)
     periods = lax.stop_gradient(jnp.floor(jnp.where(stride != 0, strides, 0)))
     arrived = enter(loop, rig, gains, state, position + periods * stride, velocity, tick)

@@ -41,7 +41,7 @@ class ContactResult(NamedTuple):
     approach_velocity: float  # of the numerical model, on the tick before the contact [m/s]
     force_delay: float | None  # of the measurement, as the compensator estimates it [s]; None if it does not
     # "ok", or why it has no restitution: "timeout" (not over within 10 s), "diverged", "non-finite", "not
-    # reached"
+    # reached" (the run ended before it, or no force of it was measured)
     status: str
 
 

@@ -40,7 +40,8 @@ class Watch(NamedTuple):
     peak_command: Float[Array, "*batch"]  # of |F_c| [N]
     recent: tuple[Array, Array]  # real force at the last two ticks [N]
     in_contact: Float[Array, "*batch"]  # ticks with a real force
-    quiet: Float[Array, "*batch"]  # ticks since the last real force
+    measured: Bool[Array, "*batch"]  # whether the force sensor has read any of it
+    quiet: Float[Array, "*batch"]  # ticks since the last real force, or since a contact began without one
     works: tuple[Array, ...]  # done on the mechanism and returned by it [J], where energies are followed
     swings: Swings | None  # of the command, where they are followed
     shortfall: Float[Array, "*batch"] | None  # largest of the position command [m], where it has limits
@@ -81,6 +82,7 @@ def fresh_watch(loop: Loop, like: Array) -> Watch:
         peak_command=zeros,
         recent=(zeros, zeros),
         in_contact=zeros,
+        measured=jnp.zeros(like.shape, bool),
         quiet=zeros + 1e6,
         works=(zeros, zeros) if loop.energies else (),
         swings=Swings(zeros, zeros, zeros, zeros) if loop.chatter else None,
@@ -108,7 +110,9 @@ def record_contact(
     begun = _has_begun(loop, rules, watch, signals, touching, magnitude)
     side = _side(rules, watch, signals)
     peak_command = jnp.maximum(watch.peak_command, magnitude)
-    quiet = jnp.where(touching, 0, watch.quiet + 1)
+    # The hardware may follow the numerical model late.
+    quiet = jnp.where(touching | (begun & (watch.elapsed == 0)), 0, watch.quiet + 1)
+    in_contact = jnp.where(touching, watch.in_contact + 1, watch.in_contact)
     ends = _ends(rules, begun, signals, side, quiet, magnitude, peak_command)
     lasts = begun & ~watch.over
     return Watch(
@@ -120,7 +124,8 @@ def record_contact(
         peak_force=jnp.maximum(watch.peak_force, _peak_force(loop, watch, plant_signals, force)),
         peak_command=peak_command,
         recent=(watch.recent[1], force),
-        in_contact=jnp.where(touching, watch.in_contact + 1, watch.in_contact),
+        in_contact=in_contact,
+        measured=watch.measured | ((in_contact > 0) & (signals.force_measured != 0)),
         quiet=quiet,
         works=tuple(total + work for total, work in zip(watch.works, plant_signals.works or (), strict=True)),
         swings=watch.swings and _swing(watch.swings, command, lasts, ends),

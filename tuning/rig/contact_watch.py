@@ -55,9 +55,12 @@ class ContactWatch:
         self._approach = self._rebound = 0.0
         self._clear()
 
-    def observe(self, position: float, velocity: float, command: float, force: float) -> ContactResult | None:
+    def observe(
+        self, position: float, velocity: float, command: float, force: float, reading: float
+    ) -> ContactResult | None:
         """One tick: the model's position [m] and velocity [m/s], the force F_c [N] it feels, the real force
-        [N]. The contact that is over with this tick, if one is; the next of the run may follow."""
+        and what the sensor reads [N]. The contact that is over with this tick, if one is; the next of the run
+        may follow."""
         magnitude, speed, size = abs(command), abs(velocity), abs(force)
         in_contact = size > 0.0
         if self._begun < 0:
@@ -67,6 +70,8 @@ class ContactWatch:
                 begins = in_contact or magnitude > self._left
             if begins:
                 self._begun = self._tick
+                # The hardware may follow the numerical model late.
+                self._quiet = -1
                 self._side = 1.0 if position > -self._clearance / 2 else -1.0
         if self._begun < 0:
             self._approach = speed
@@ -74,13 +79,14 @@ class ContactWatch:
         self._peak_command = max(self._peak_command, magnitude)
         self._peak_force = max(self._peak_force, size)
         self._contact_ticks += in_contact
+        self._measured = self._measured or (self._contact_ticks > 0 and reading != 0.0)
         self._quiet = 0 if in_contact else self._quiet + 1
         self._tick += 1
         faded = magnitude <= max(FADED * self._peak_command, self._level)
         quiet = self._quiet >= self._quiet_ticks and (faded or self._quiet >= self._patience)
         if self._begun >= 0 and self._side * velocity < 0.0 and quiet:
             left = max(FADED * self._peak_command, magnitude)
-            return self._end("ok", left)
+            return self._end("ok" if self._measured else "not reached", left)
         return self._failed(magnitude)
 
     def cut(self, status: str) -> ContactResult | None:
@@ -116,5 +122,5 @@ class ContactWatch:
         return result
 
     def _clear(self) -> None:
-        self._begun, self._side, self._contact_ticks = -1, 1.0, 0
+        self._begun, self._side, self._contact_ticks, self._measured = -1, 1.0, 0, False
         self._peak_force = self._peak_command = 0.0

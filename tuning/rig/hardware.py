@@ -60,6 +60,7 @@ class RigTask:
         self._not_finite = self._beyond = 0
         self._stroke = stroke
         self._newest: Answer | None = None
+        self._force = 0.0
         self.tripped, self._first, self._oldest = "", 0, 0
         self._resets, self._forgiven, self._resetting = resets, [], False
         self._next_run(0)
@@ -82,11 +83,11 @@ class RigTask:
     def reading(self) -> Reading:
         """What to send at this tick; every call is another packet."""
         self._sequence += 1
-        force, position = self._plant.read()
+        self._force, position = self._plant.read()
         time = self._sequence * self._period
         event = TICK if self._tick >= 0 else RESET if self._resetting else PREPARE
         tick = max(self._tick, 0)
-        return Reading(event, self._sequence, self._run, tick, time, force, position, *self._start)
+        return Reading(event, self._sequence, self._run, tick, time, self._force, position, *self._start)
 
     def take(self, answer: Answer) -> bool:
         """Take in an answer; whether it is the one to this tick."""
@@ -128,9 +129,10 @@ class RigTask:
         command = min(max(command, self._stroke[0]), self._stroke[1])
         plant, watch = self._plant, self._watch
         if newest.tick >= 0:
-            over = watch.observe(newest.position, newest.velocity, newest.force_command, plant.force)
+            felt = newest.position, newest.velocity, newest.force_command
         else:
-            over = watch.observe(*self._start, 0.0, plant.force)
+            felt = *self._start, 0.0
+        over = watch.observe(*felt, plant.force, self._force)
         plant.move(command)
         self._tick += 1
         if over is not None:
@@ -196,7 +198,8 @@ class RigTask:
         self._run += 1
         first_round = self._run <= (1 if self._two_sided else approach.contacts)
         phase = approach.phase if first_round else self._phases.random()
-        position = -approach.velocity * (APPROACH + phase * self._period)
+        nearer = min(self._mechanism.rig.contact_plane, 0.0)
+        position = nearer - approach.velocity * (APPROACH + phase * self._period)
         self._start, self._number = (position, approach.velocity), number
         self._tick, self._pause, self._newest = -1, PAUSE, None
         self._oldest, self._resetting = 0, False

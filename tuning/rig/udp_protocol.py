@@ -191,7 +191,7 @@ class NumericalModel:
     """M x'' = -F_c of the relative motion of two free bodies, once per control period.
 
     Mass [kg], period [s] and integrator are the mechanism's, which the gain file holds, and so is the first
-    start: in uniform motion at x(0) = -v (0.02 s + phase T).
+    start: in uniform motion at x(0) = min(plane, 0) - v (0.02 s + phase T).
     """
 
     __slots__ = ("_integrator", "_mass", "_period", "acceleration", "position", "start", "velocity")
@@ -206,7 +206,8 @@ class NumericalModel:
         self._integrator = rig.get("integrator", "semi_implicit_euler")
         velocity = float(approach["velocity"])
         phase = float(approach.get("phase", 1.0 / 3.0))
-        self.start = -velocity * (APPROACH + phase * self._period), velocity
+        nearer = min(float(rig.get("contact_plane", 0.0)), 0.0)
+        self.start = nearer - velocity * (APPROACH + phase * self._period), velocity
         self.place(*self.start)
 
     def place(self, position: float, velocity: float) -> None:

@@ -1,0 +1,73 @@
+"""Without a measured force there is no contact, whatever turns the numerical model back.
+
+A virtual spring on the numerical model's own motion stands for a law that does not wait for the hardware.
+"""
+
+import math
+
+import numpy as np
+import pytest
+from lanes import STIFFNESS, mechanism, validated
+from rig_lock_step import closed_loop
+
+import jaxhil
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.gain_choice import choose_gains
+
+MASS, SPEED, VIRTUAL = 350.0, 5e-3, 1.2e5  # kg, m/s, N/m
+DEEPEST = SPEED * math.sqrt(MASS / VIRTUAL)  # m, where the virtual spring alone turns the model back
+
+
+def rig(plane: float = 0.0, simulator: dict | None = None, **sensor: float) -> Mechanism:
+    """A contact whose surface lies deeper by `plane` [m]."""
+    made = mechanism(
+        {}, simulator or {"model": "ideal"}, 0.004, 2, force_sensor=sensor, period=1e-3, contact_plane=plane
+    )
+    return validated(made)
+
+
+def run(made: Mechanism, seed: int = 0):
+    """Statuses and peak forces of the contacts, as simulated and as the rig's own watch has them."""
+    _, gains = choose_gains(made, "virtual_contact", {"virtual_stiffness": VIRTUAL, "virtual_damping": 0.0})
+    simulated = jaxhil.simulate(made, "virtual_contact", gains, seed=seed)
+    watched, _ = closed_loop(made, "virtual_contact", gains)
+    assert watched[0].status == simulated.contacts[0].status
+    return simulated
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_hardware_that_never_touches_is_not_reached(noise):
+    found = run(rig(1.2 * DEEPEST, noise_std=noise))
+    assert found.status == "not reached"
+    for contact in found.contacts:
+        assert contact.status == "not reached"
+        assert all(math.isnan(number) for number in contact[:9])
+
+
+def test_a_dead_zone_that_hides_the_whole_contact_hides_it():
+    largest = STIFFNESS * 0.5 * DEEPEST
+    hidden = run(rig(0.5 * DEEPEST, dead_zone=1.01 * largest))
+    assert hidden.contacts[0].status == "not reached"
+    almost = run(rig(0.5 * DEEPEST, dead_zone=0.99 * largest))
+    assert almost.contacts[0].status == "ok"
+
+
+def test_a_single_reading_is_a_contact():
+    found = run(rig(0.99996 * DEEPEST))
+    assert found.contacts[0].status == "ok" and found.contacts[0].duration == pytest.approx(1e-3)
+    assert np.count_nonzero(found.force_measured[found.contact == 0]) == 1
+
+
+def test_hardware_that_touches_late_is_waited_for():
+    """The virtual spring turns the model back after 85 ms; the hardware touches after 91 ms."""
+    found = run(rig(0.3 * DEEPEST, {"model": "ideal", "delay": 0.075}))
+    assert found.contacts[0].status == "ok" and found.contacts[0].peak_force > 0
+
+
+@pytest.mark.parametrize("compensator", ["retrospective_reference", "retrospective_delay_bank"])
+@pytest.mark.parametrize("setting", ["sharp", "gentle"])
+def test_our_laws_make_no_contact_of_their_own(compensator, setting):
+    """In front of a surface that a run does not reach."""
+    made = jaxhil.load("suite-noisy", {"rig.contact_plane": 0.1})
+    found = jaxhil.simulate(made, compensator, setting)
+    assert found.status in ("not reached", "timeout") and math.isnan(found.contacts[0].restitution)
