@@ -15,7 +15,7 @@ from tuning import terminal
 from tuning.benchmark.cost import microseconds_per_tick
 from tuning.benchmark.plots import errors_plot, transparency_plot
 from tuning.benchmark.study import LawFigures
-from tuning.benchmark.tables import HEADINGS, leaderboard, mechanism_table, winners
+from tuning.benchmark.tables import HEADINGS, leaderboard, least, mechanism_table, winners
 from tuning.statistics.intervals import Estimate
 
 COMMAND = [sys.executable, "-m", "tuning", "compare"]
@@ -78,6 +78,22 @@ def test_tables_mark_what_wins(capsys):
     assert ["tuned", "10*", "100", "-"] in [row[:4] for row in rows]
     assert ["m", "50", "10*"] in rows and ["n", "50", "-"] in rows
     assert winners(FOUND)["rms"] == "phase_lead" and winners(FOUND)["late"] is None
+
+
+def test_one_table_has_all_laws_and_their_settings(capsys):
+    """Wider than a page, in whole lines; a law's settings do not compete with it."""
+    ours = LawFigures(
+        "retrospective_reference", "m", {}, {"literature": figures(0.05), "gentle": figures(0.06)}
+    )
+    many = [*FOUND, ours, *(LawFigures(f"law_{n}", "m", {}, {"literature": figures(0.5)}) for n in range(12))]
+    better = [*FOUND, LawFigures("retrospective_reference", "n", {}, {"literature": figures(0.2)})]
+    board = {"m": many, "n": better}
+    terminal.emit(leaderboard(["m", "n"], board), wrap=False)
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["m", "50", "10", "5*", "6", *["50"] * 12] in rows
+    assert ["n", "50", "10*", "20", "-", *["-"] * 12] in rows
+    assert least(["m", "n"], board) == "Least rms error: retrospective_reference (m); phase_lead (n)."
+    assert least(["m"], {"m": FOUND[:1]}) == ""
 
 
 def test_tables_of_what_is_not_tuned_do_not_say_so(capsys):

@@ -21,7 +21,6 @@ from tuning.statistics.intervals import Estimate
 
 LITERATURE, TUNED = "literature", "tuned"
 SEED = 0xFA1  # of the scenarios to judge on: tuning and its own validation never see them
-JUDGED = 6  # runs of each of those that figures take
 SECONDS = 1.0  # between two messages of a process
 
 Tell = Callable[[str, float], None]
@@ -43,12 +42,18 @@ class CompareSettings:
 
 
 class LawFigures(NamedTuple):
-    """Of one law on one mechanism; a law without gains to tune is only there with the literature's."""
+    """Of one law on one mechanism; a law without gains to tune, or with settings for any mechanism, is not
+    there with tuned gains."""
 
     law: str
     mechanism: str
     gains: dict[str, dict[str, float]]  # by "literature", names of settings and "tuned"
     figures: dict[str, dict[str, Estimate]]  # what is said of each (`tuning.transparency.figures`)
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """Names of the settings that it was judged with beside its nominal gains."""
+        return tuple(which for which in self.figures if which not in (LITERATURE, TUNED))
 
 
 class Failed(NamedTuple):
@@ -190,7 +195,7 @@ def judge_law(
     """All figures of one law on mechanisms of one program, tuned together. `tell` is called with what is
     going on and the share that is done."""
     from jaxhil.compensators import COMPENSATORS, literature_gains
-    from tuning.benchmark.runs import judge_gains
+    from tuning.benchmark.runs import judge_gains, lanes_judged
     from tuning.gains.settings import TuneSettings
     from tuning.gains.tune import tune_all
     from tuning.gains.work import Work
@@ -205,11 +210,14 @@ def judge_law(
         {which or LITERATURE: literature_gains(mechanism, law, which) for which in (None, *others)}
         for mechanism in mechanisms
     ]
-    tuned = settings.tuned and any(
+    # Settings are for any mechanism: what they leave is what such a law leaves.
+    tuned = settings.tuned and not COMPENSATORS[law].settings
+    tuned = tuned and any(
         gain.tuned(mechanism) for gain in COMPENSATORS[law].gains for mechanism in mechanisms
     )
     work = Work(lambda text, share, _: tell(f"{law}, {text}", share))
-    work.later = len(scenes) * (1 + len(others) + tuned) * JUDGED * settings.judged
+    lanes = {scene.mechanism.name: lanes_judged(scene) for scene in scenes}
+    work.later = (1 + len(others) + tuned) * sum(lanes.values())
     if tuned:
         tuning = TuneSettings(
             settings.scenarios,
@@ -228,7 +236,7 @@ def judge_law(
         for which, one in own.items():
             work.say(f"{scene.mechanism.name}: judging {which} gains")
             figures[which] = judge_gains(scene, law, one, settings.limit, settings.seed)
-            work.ran(JUDGED * settings.judged)
+            work.ran(lanes[scene.mechanism.name])
         found.append(LawFigures(law, scene.mechanism.name, own, figures))
     return found
 

@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+from rich.console import Console
 from rich.table import Table
 
 from tuning import terminal
@@ -22,6 +24,7 @@ HEADINGS = {
     "trajectory": "path %",
     "noise": "noise",
 }
+UNBOUNDED = 10_000  # characters
 MARK = "*"  # of what is better than all others by more than its interval
 
 
@@ -49,23 +52,48 @@ def mechanism_table(name: str, found: Sequence[LawFigures]) -> Table:
                     *(shown(key, figures[key], own and won[key] == one.law) for key in HEADINGS),
                 ]
             )
-    title = f"{name}: each law with the literature's gains{', then tuned' if _tuned(found) else ''}"
+    tuned = ", then tuned, but for those with settings" * _tuned(found)
+    title = f"{name}: each law with the literature's gains{tuned}"
     return _unfolded(terminal.table(title, ["law", *HEADINGS.values()], rows))
 
 
 def leaderboard(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> Table:
-    """rms error [%] of every law, tuned if any is, on every mechanism."""
-    laws = list(dict.fromkeys(one.law for name in names for one in found[name]))
+    """rms error [%] of every law, tuned if any is, on every mechanism; a column for each of its settings."""
+    every = [one for name in names for one in found[name]]
+    laws = list(dict.fromkeys(one.law for one in every))
+    columns = dict.fromkeys((one.law, which) for one in every for which in ("", *one.settings))
+    columns = sorted(columns, key=lambda column: laws.index(column[0]))
     won = {name: winners(found[name])["rms"] for name in names}
     rows = []
     for name in names:
-        by_law = {one.law: best(one)["rms"] for one in found[name]}
-        cells = [shown("rms", by_law[law], won[name] == law) if law in by_law else "-" for law in laws]
+        cells = []
+        by_law = {one.law: one for one in found[name]}
+        for law, which in columns:
+            own = by_law.get(law)
+            figures = own and (own.figures.get(which) if which else best(own))
+            cells.append(shown("rms", figures["rms"], won[name] == law and not which) if figures else "-")
         rows.append([name.removeprefix("suite-"), *cells])
-    headings = ["", *(law.replace("_", "\n") for law in laws)]
-    tuned = any(_tuned(found[name]) for name in names)
-    how = "each law tuned" if tuned else "each law with the literature's gains"
-    return _unfolded(terminal.table(f"Leaderboard: restitution error, rms [%], {how}", headings, rows))
+    headings = ["", *("\n".join(filter(None, [*law.split("_"), which])) for law, which in columns)]
+    tuned = any(map(_tuned, found.values()))
+    how = "each law tuned, but for those with settings" if tuned else "each law with the literature's gains"
+    made = _unfolded(terminal.table(f"Leaderboard: restitution error, rms [%], {how}", headings, rows))
+    made.padding = (0, 0)
+    made.width = Console(width=UNBOUNDED).measure(made).maximum
+    return made
+
+
+def least(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> str:
+    """Which law has the least rms error, mechanism by mechanism, by more than the intervals or not."""
+    led: dict[str, list[str]] = {}
+    for name in names:
+        errors = {one.law: best(one)["rms"].value for one in found[name]}
+        known = {law: value for law, value in errors.items() if np.isfinite(value)}
+        if len(known) > 1:
+            led.setdefault(min(known, key=lambda law: known[law]), []).append(name.removeprefix("suite-"))
+    texts = (
+        f"{law} ({', '.join(names)})" for law, names in sorted(led.items(), key=lambda one: -len(one[1]))
+    )
+    return f"Least rms error: {'; '.join(texts)}." if led else ""
 
 
 def _tuned(found: Sequence[LawFigures]) -> bool:

@@ -256,7 +256,9 @@ class Replay:
 
 @dataclass(frozen=True)
 class Compare:
-    """Every published compensator, each tuned to its best, on the same fresh scenarios, with intervals.
+    """Compensators, each tuned to its best, on the same fresh scenarios, with intervals.
+
+    Those with settings for any mechanism are judged with these, untuned.
 
     Example: jaxhil compare rig-300kg varying --compensators phase_lead response_error
 
@@ -269,7 +271,7 @@ class Compare:
     ] = False
     compensators: Annotated[
         tuple[str, ...],
-        text("NAME [NAME ...]", "Compensators to compare; by default all that are published."),
+        text("NAME [NAME ...]", "Compensators to compare; by default all that are published and our own."),
     ] = ()
     output: Annotated[str, folder("Folder for what is written.")] = "jaxhil-out/compare"
     untuned: Annotated[

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from tuning.pieces import Pieces
 
 
+OURS = "retrospective_reference"
+
+
 class Estimated(float):
     """A number with an interval of 95 %, from `low` to `high`."""
 
@@ -73,9 +76,9 @@ class CompareOptions:
 
     @property
     def laws(self) -> tuple[str, ...]:
-        """The compensators to compare, each once; all that are published if none is named."""
+        """The compensators to compare, each once; if none is named, all that are published and our own."""
         named = [self.compensators] if isinstance(self.compensators, str) else self.compensators
-        return tuple(dict.fromkeys(named or PUBLISHED))
+        return tuple(dict.fromkeys(named or (*PUBLISHED, OURS)))
 
 
 @arguments.entry
@@ -97,7 +100,8 @@ def compare(
 
     Args:
         mechanism: what `jaxhil.load` returns, or a name or path for it; or a list of those.
-        compensators: names of laws, built in or registered; by default all that are published.
+        compensators: names of laws, built in or registered; by default all that are published and
+            `retrospective_reference`. Laws with settings are judged with these, the others tuned.
         untuned: tune nothing: judge the literature's gains, and a law's settings, as they are.
         scenarios: how many to tune on.
         judged: how many fresh scenarios to judge on.

@@ -106,12 +106,14 @@ def _print(
     options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence[Any]], document: dict[str, Any]
 ) -> None:
     from jaxhil.compensators import COMPENSATORS
-    from tuning.benchmark.tables import leaderboard, mechanism_table
+    from tuning.benchmark.tables import leaderboard, least, mechanism_table
 
     for name in names:
         terminal.emit(mechanism_table(name, ordered[name]))
     if len(names) > 1:
-        terminal.emit(leaderboard(names, ordered))
+        terminal.emit(leaderboard(names, ordered), wrap=False)
+    if text := least(names, ordered):
+        terminal.emit(text)
     costs = document["timings"]["microseconds_per_tick"]
     rows = [[law, ", ".join(COMPENSATORS[law].knows) or "nothing", cost] for law, cost in costs.items()]
     terminal.emit(
@@ -122,8 +124,8 @@ def _print(
             texts=(0, 1),
         ),
         f"rms, p99, worst: |e - e*|. fail: scenarios beyond {100 * options.limit:g} %, or that do not end.",
-        "early, late: transparency to a push on the hardware at 25 and 75 % of the contact (1: perfect, 0: "
-        "blind).",
+        "early, late: transparency to a push on the hardware at 25 and 75 % of the contact's duration in "
+        "space (1: perfect, 0: blind).",
         "slope: of e against e* over damped twins. peak: command over the reference, 99th percentile.",
         "path: x_d off the reference. noise: amplification. *: better than every other law, tuned, by more",
         "than the 95 % intervals.",
