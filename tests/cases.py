@@ -143,6 +143,7 @@ LAYERS = {
 HERTZ = {"law": "hunt_crossley", "stiffness": [1e7, 2e7]}
 HARDENING = {"law": "hardening", "stiffness": [STIFFNESS, 0.4 * STIFFNESS], "reference_depth": 5e-4}
 DEPTH_DAMPED = {"law": "depth_damped", "stiffness": [1e7, 2e7], "reference_depth": 2e-4}
+PRELOADED = {"law": "preloaded", "stiffness": [STIFFNESS, 2 * STIFFNESS], "preload": 7.0, "friction": 3.0}
 ELASTOPLASTIC = {"law": "elastoplastic", "stiffness": [STIFFNESS, 2 * STIFFNESS], "unloading_ratio": 1.6}
 FIRST_ORDER = {"model": "first_order", "time_constant": 0.009, "delay": 0.0013}
 THIRD_ORDER = {"model": "third_order", "coefficients": [0.02, 1.6e-4, 5e-7], "delay": 0.0029}
@@ -216,6 +217,8 @@ CASES: dict[str, Case] = {
     "rattling, elastoplastic": Case(
         mechanism({**ELASTOPLASTIC, "clearance": 0.002}, RATTLING, 0.003, 3, velocity=0.01), "phase_lead"
     ),
+    "preloaded": Case(mechanism(PRELOADED, contacts=2), "phase_lead"),
+    "more friction than preload": Case(mechanism({**PRELOADED, "preload": 1.0}), "phase_lead"),
     # The paper's compensation, with the sensors' faults and the simulator's limit.
     "response error": Case(mechanism(LIST, contacts=3), "response_error"),
     "response error, gains off nominal": Case(

@@ -83,6 +83,8 @@ OF_OTHERS = {
     "contact.depths": [0.001, 0.002],
     "contact.reference_depth": 2e-4,
     "contact.unloading_ratio": 2.0,
+    "contact.preload": 2.0,
+    "contact.friction": 2.0,
     "rig.simulator.time_constant": 0.01,
     "rig.simulator.coefficients": [0.1, 0.1, 0.001],
     "rig.simulator.numerator": [1.0],

@@ -29,11 +29,12 @@ class Law:
     def __init__(self, contact, plane=0.0):
         self.kind, self.plane = contact["law"], plane
         kinds = ("linear", "kelvin_voigt", "hunt_crossley", "piecewise_linear")
-        if self.kind not in (*kinds, "hardening", "depth_damped", "elastoplastic"):
+        if self.kind not in (*kinds, "hardening", "depth_damped", "elastoplastic", "preloaded"):
             raise ValueError(f"unknown contact law {self.kind!r}")
         self.stiffness = _as_list(contact["stiffness"])
         self.damping = [0.0] if self.kind == "linear" else _as_list(contact.get("damping", 0.0))
         self.scale, self.ratio = contact.get("reference_depth"), contact.get("unloading_ratio")
+        self.preload, self.friction = contact.get("preload", 0.0), contact.get("friction", 0.0)
         self.deepest = 0.0  # of the surface in touch, so far; elastoplastic remembers it
         self.exponent = contact.get("exponent", 1.5)
         self.depths = _as_list(contact.get("depths", [])) if self.kind == "piecewise_linear" else []
@@ -48,12 +49,12 @@ class Law:
         )
 
     def clamped(self, index):
-        if self.kind == "elastoplastic":
+        if self.kind in ("elastoplastic", "preloaded"):
             return True
         return self.parameters(index)[1] != 0.0 and not self.tension
 
     def damped(self):
-        return any(self.damping)
+        return any(self.damping) or self.friction > 0.0
 
     def levels(self):
         """Positions at which the formula may change."""
@@ -88,7 +89,7 @@ class Law:
             # Two lines through the point at the deepest penetration; the virgin one is met by way of max.
             peak = np.maximum(depth, deepest)
             return stiffness * (peak - self.ratio * (peak - depth))
-        return stiffness * depth + damping * rate
+        return self.preload + stiffness * depth + damping * rate + self.friction * np.sign(rate)
 
     def sign_of(self, depth, rate, index, deepest=0.0):
         """A function with the sign of the unclamped force, without its d^n (which hides the root)."""

@@ -28,6 +28,7 @@ CONTACTS = {
         "law": "depth_damped", "stiffness": [3e6], "damping": [900.0], "reference_depth": 2e-4,
     },
     "elastoplastic": {"law": "elastoplastic", "unloading_ratio": 1.5},
+    "preloaded": {"law": "preloaded", "preload": 6.0, "friction": 3.0},
 }  # fmt: skip
 
 

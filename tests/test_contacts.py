@@ -18,7 +18,7 @@ PERIODS = np.array([4e-3, 2e-3, 1e-3, 5e-4])
 def contact(**values):
     """Parameters of every lane, by name; what is not named is nominal."""
     numbers = {"stiffness": STIFFNESS, "damping": 0.0, "exponent": 1.5}
-    numbers |= {"reference_depth": 2e-4, "unloading_ratio": 1.0}
+    numbers |= {"reference_depth": 2e-4, "unloading_ratio": 1.0, "preload": 0.0, "friction": 0.0}
     lanes = {
         name: jnp.broadcast_to(jnp.asarray(values.get(name, n), float), (LANES,))
         for name, n in numbers.items()
@@ -64,6 +64,31 @@ def test_elastoplastic_in_closed_form_and_integrated():
     run = jax.jit(lambda c: integrate_contact(law, c, mass, velocity), compiler_options=QUICK)
     for got, wanted in zip(run(contact(unloading_ratio=ratio))[:3], found, strict=True):
         np.testing.assert_allclose(got, wanted, rtol=1e-8)
+
+
+# Preload and friction [N]: a spring alone, either, both, and more friction than preload.
+PRELOADS = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 6.0], [10.0, 6.0], [3.0, 6.0], [200.0, 1.0]]).T
+
+
+def test_preloaded_in_closed_form_and_integrated():
+    """The energy: M v^2/2 = k d^2/2 + (F_0 + F_r) d in, k d^2/2 + (F_0 - F_r) d out, but for what is left in
+    the spring where friction holds the mechanism back."""
+    preload, friction = PRELOADS
+    found = reference("preloaded", preload=preload, friction=friction)
+    energy, inward = MASS * VELOCITY**2 / 2, preload + friction
+    deepest = 2 * energy / (inward + np.sqrt(inward**2 + 2 * STIFFNESS * energy))
+    left = np.maximum(friction - preload, 0) ** 2 / (2 * STIFFNESS)
+    out = STIFFNESS * deepest**2 / 2 + (preload - friction) * deepest + left
+    np.testing.assert_allclose(found.restitution, np.sqrt(out / energy), rtol=1e-12)
+    np.testing.assert_allclose(found.peak_force, inward + STIFFNESS * deepest, rtol=1e-12)
+    np.testing.assert_allclose(found.duration[0], np.pi * np.sqrt(MASS / STIFFNESS), rtol=1e-12)
+    mass, velocity = (jnp.full((LANES,), value) for value in (MASS, VELOCITY))
+    law = LAWS["preloaded"]
+    run = jax.jit(lambda c: integrate_contact(law, c, mass, velocity), compiler_options=QUICK)
+    for got, wanted in zip(run(contact(preload=preload, friction=friction))[:3], found, strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=1e-7)
+    stuck = reference("preloaded", preload=0.0, friction=1e4)
+    assert np.all(stuck.restitution == 0) and np.all(np.isinf(stuck.duration))
 
 
 def test_elastoplastic_loads_unloads_reloads_and_forgets():
@@ -115,6 +140,7 @@ LAWS_ALONE = {
         "law": "depth_damped", "stiffness": [1e7], "reference_depth": 2e-4, "damping": [900.0]
     },
     "elastoplastic": {"law": "elastoplastic", "stiffness": [STIFFNESS], "unloading_ratio": 1.6},
+    "preloaded": {"law": "preloaded", "stiffness": [STIFFNESS], "preload": 5.0, "friction": 2.0},
 }  # fmt: skip
 
 
@@ -124,6 +150,9 @@ def limit(name):
     unit = values.get("reference_depth", 1.0)
     if name == "elastoplastic":
         return 1.6**-0.5, VELOCITY * np.sqrt(stiffness * MASS)
+    if name == "preloaded":
+        found = reference(name, stiffness=stiffness, preload=5.0, friction=2.0)
+        return float(found.restitution[0]), float(found.peak_force[0])
     laws = {
         "hardening": lambda d, r: stiffness * d * (1 + (d / unit) ** 2) + damping * r,
         "depth_damped": lambda d, r: stiffness * max(d, 0.0) ** 1.5 + damping * r * d / unit,
@@ -131,7 +160,7 @@ def limit(name):
     return continuous.contact(MASS, VELOCITY, laws[values["law"]])
 
 
-@pytest.mark.parametrize("name, order", list(zip(LAWS_ALONE, [2, 1, 1, 2], strict=True)))
+@pytest.mark.parametrize("name, order", list(zip(LAWS_ALONE, [2, 1, 1, 2, 1], strict=True)))
 def test_contact_without_delay_converges_to_the_reference(name, order):
     """Restitution to that of SciPy's or the closed form, which is also the law's own; W_out/W_in to e^2."""
     expected, expected_peak = limit(name)

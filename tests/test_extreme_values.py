@@ -22,6 +22,7 @@ OTHERS = {
     "hardening": ("suite-hardening", []),
     "depth-damped": ("suite-depth-damped", []),
     "elastoplastic": ("suite-elastoplastic", []),
+    "preloaded": ("suite-friction", []),
     "two masses": ("rig-300kg", ["bodies={chaser_mass=700, target_mass=500}"]),
     "first order": ("rig-300kg", ["rig.simulator={model='first_order', time_constant=0.01}"]),
     "third order": ("rig-300kg", ["rig.simulator={model='third_order', coefficients=[0.02, 1.6e-4, 5e-7]}"]),

@@ -39,6 +39,7 @@ def undelayed(members, damped: bool) -> Any:
             "depths": np.moveaxis(np.array([c.depths for c in contacts]), 0, -1),
             "tension": np.zeros(len(own), bool),
             **dict.fromkeys(("reference_depth", "unloading_ratio"), np.ones(len(own))),
+            **dict.fromkeys(("preload", "friction"), np.zeros(len(own))),
         }
         mass = np.array([members[i].bodies.mass for i in own])
         velocity = np.array([members[i].approach.velocity for i in own])

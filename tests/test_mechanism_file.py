@@ -58,8 +58,8 @@ def test_builtins_are_those_promised():
     assert load() == load(DEFAULT) == load("varying")
 
 
-SUITES = "damped dead-zone depth-damped elastoplastic fast hardening hertz layered"
-SUITES += " mixed noise-free noisy rattling repeated"
+SUITES = "damped dead-zone depth-damped elastoplastic fast friction hardening hertz lag layered long"
+SUITES += " mixed noise-free noisy plane preload rattling repeated"
 
 
 def test_suites_are_those_promised():

@@ -26,6 +26,7 @@ AGAINST_THE_ORACLE = (
     *("response error, gains off nominal", "late position", "dead zone", "quantum", "range"),
     *("velocity limit", "damped, lag", "rattling, lag", "rattling against layers"),
     *("rattling behind a long transport delay", "damped hardening", "depth-damped", "elastoplastic"),
+    *("preloaded", "more friction than preload"),
     *("depth-damped, linear spring, lag", "elastoplastic, lag", "rattling, elastoplastic"),
     *("contact plane deeper", "rattling, contact plane nearer", "elastoplastic, contact plane nearer"),
 )

@@ -44,7 +44,7 @@ def contact(dtype=float, **values):
         return jnp.broadcast_to(jnp.asarray(value, dtype), (*np.shape(value)[:-1], LANES))
 
     defaults = {"stiffness": STIFFNESS, "damping": 0.0, "exponent": 1.5, "depths": np.zeros((0, 1))}
-    defaults |= {"reference_depth": 1.0, "unloading_ratio": 1.0}
+    defaults |= {"reference_depth": 1.0, "unloading_ratio": 1.0, "preload": 0.0, "friction": 0.0}
     numbers = {name: values.get(name, default) for name, default in defaults.items()}
     tension = jnp.full((LANES,), values.get("tension", False))
     return ContactParameters(**{n: lanes(v) for n, v in numbers.items()}, tension=tension)

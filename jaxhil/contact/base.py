@@ -26,6 +26,8 @@ class ContactParameters(NamedTuple):
     tension: Bool[Array, "..."]  # whether the contact may pull
     reference_depth: Float[Array, "..."]  # d_0 [m]
     unloading_ratio: Float[Array, "..."]  # r [1]
+    preload: Float[Array, "..."]  # F_0 [N]
+    friction: Float[Array, "..."]  # F_r [N]
     kind: Int[Array, "..."] | None = None  # number of the law for `jaxhil.contact.mixture`, else None
 
 
@@ -40,6 +42,11 @@ class ContactLaw(eqx.Module):
         """Whether the force depends on how deep the mechanism has been: state and motion are then followed
         between samples too. Where there is no penetration the state is that before the first touch: a
         surface that has been left is as new. Of the way between two penetrations only the deepest counts."""
+        return False
+
+    @property
+    def jumps(self) -> bool:
+        """Whether the force jumps where the motion turns: its peak is then looked for between samples."""
         return False
 
     @property

@@ -14,6 +14,7 @@ from jaxhil.contact.hardening import Hardening
 from jaxhil.contact.hunt_crossley import HuntCrossley
 from jaxhil.contact.kelvin_voigt import KelvinVoigt
 from jaxhil.contact.piecewise_linear import PiecewiseLinear
+from jaxhil.contact.preloaded import Preloaded
 
 __all__ = [
     "LAWS",
@@ -25,6 +26,7 @@ __all__ = [
     "HuntCrossley",
     "KelvinVoigt",
     "PiecewiseLinear",
+    "Preloaded",
     "deflection",
     "two_sided",
 ]
@@ -38,6 +40,7 @@ LAWS: dict[str, ContactLaw] = {
     "hardening": Hardening(),
     "depth_damped": DepthDamped(),
     "elastoplastic": Elastoplastic(),
+    "preloaded": Preloaded(),
 }
 
 

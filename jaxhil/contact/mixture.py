@@ -37,6 +37,10 @@ class AnyOf(ContactLaw):
     def remembers(self):
         return any(law.remembers for law in self.laws)
 
+    @property
+    def jumps(self):
+        return any(law.jumps for law in self.laws)
+
     def init(self, penetration):
         return tuple(law.init(penetration) for law in self.laws)
 

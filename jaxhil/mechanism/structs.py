@@ -54,6 +54,7 @@ BUILT_IN_LAWS = (
     "hardening",
     "depth_damped",
     "elastoplastic",
+    "preloaded",
 )
 CONTACT_LAWS = [*BUILT_IN_LAWS]  # and those that `jaxhil.register` enters
 
@@ -129,7 +130,7 @@ class Contact(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         Meta(
             min_length=1,
             max_length=MAX_CONTACTS,
-            description="of each contact; in s/m for hunt_crossley, none for elastoplastic",
+            description="of each contact; in s/m for hunt_crossley, none for elastoplastic and preloaded",
         ),
     ] = field(default_factory=_only(0.0))
     tension: Annotated[bool, says("whether kelvin_voigt may pull")] = False
@@ -147,6 +148,8 @@ class Contact(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     unloading_ratio: (
         Annotated[float, says("slope of unloading over that of loading, for elastoplastic", ge=1.0)] | None
     ) = None
+    preload: Annotated[float, says("of the spring at the touch, for preloaded", "N", ge=0.0)] = 0.0
+    friction: Annotated[float, says("dry friction against the motion, for preloaded", "N", ge=0.0)] = 0.0
 
 
 class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

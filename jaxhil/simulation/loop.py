@@ -60,8 +60,8 @@ class Loop(eqx.Module):
 
     @property
     def has_corners(self) -> bool:
-        """Whether the real force's peak may be a corner at a tick."""
-        return self.first_break in (1, 2)
+        """Whether the real force's peak may be a corner, at a tick or where the motion turns."""
+        return self.first_break in (1, 2) or (self.first_break > 0 and self.law.jumps)
 
     @property
     def follows_intervals(self) -> bool:

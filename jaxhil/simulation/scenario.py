@@ -106,6 +106,8 @@ def build_scenarios(
             tension=table.repeated(np.full(number, contact.tension and contact.law not in _PUSH_ONLY)),
             reference_depth=table.repeated(table.scalar("contact.reference_depth", 1.0)),
             unloading_ratio=table.repeated(table.scalar("contact.unloading_ratio", 1.0)),
+            preload=table.repeated(table.scalar("contact.preload")),
+            friction=table.repeated(table.scalar("contact.friction")),
         ),
         control_period=table.scalar("rig.control_period"),
         contact_plane=table.scalar("rig.contact_plane"),

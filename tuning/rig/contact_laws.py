@@ -35,6 +35,8 @@ def contact_law(contact: Contact, number: int) -> ContactLaw:
         return _depth_damped(stiffness, damping, contact.exponent, contact.reference_depth)
     if contact.law == "elastoplastic" and contact.unloading_ratio is not None:
         return _elastoplastic(stiffness, contact.unloading_ratio, 0.0)
+    if contact.law == "preloaded":
+        return _preloaded(contact.preload, stiffness, contact.friction)
     if contact.law == "linear":
         return _kelvin_voigt(stiffness, 0.0, False)
     return _kelvin_voigt(stiffness, damping, contact.tension)
@@ -116,6 +118,18 @@ def _elastoplastic(stiffness: float, unloading_ratio: float, deepest: float) -> 
         return _elastoplastic(stiffness, unloading_ratio, depth)
 
     return _clamped(spring, lambda rate: 0.0)._replace(loaded=loaded)
+
+
+def _preloaded(preload: float, stiffness: float, friction: float) -> ContactLaw:
+    """F = F_0 + k d + F_r sign(d') >= 0."""
+
+    def constant(rate: float) -> float:
+        return preload + friction * ((rate > 0.0) - (rate < 0.0))
+
+    def spring(depth: float, rate: float) -> float:
+        return constant(rate) + stiffness * depth
+
+    return _clamped(spring, constant)
 
 
 def _clamped(spring: Formula, edge: Callable[[float], float]) -> ContactLaw:

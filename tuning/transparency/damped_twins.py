@@ -23,7 +23,8 @@ def damped_twins(
 
     kelvin_voigt, piecewise_linear, hardening: b + 2 zeta sqrt(k M), k the first slope. hunt_crossley:
     chi + pi zeta/v, as e* is about 1 - chi v. depth_damped: the b of the same dissipation at the deepest
-    point. elastoplastic: unloading_ratio exp(2 pi zeta), as e* = unloading_ratio^(-1/2).
+    point. elastoplastic: unloading_ratio exp(2 pi zeta), as e* = unloading_ratio^(-1/2). preloaded: the
+    friction that takes 1 - e*^2 of the energy on the way to its deepest point without it, and back.
     """
     number = len(next(iter(draws.values())))
     # Neighbouring draws get ratios far apart, so that nothing that goes with their order goes with the ratio.
@@ -42,6 +43,15 @@ def damped_twins(
         path = "contact.unloading_ratio"
         steeper = drawn(path, getattr(contact, "unloading_ratio", 1.0)) * np.exp(2 * np.pi * ratio[:, 0])
         return mechanism, {**draws, path: steeper}
+    if contact.law == "preloaded":
+        preload, friction = (
+            drawn(f"contact.{key}", getattr(contact, key)) for key in ("preload", "friction")
+        )
+        stiffness = drawn("contact.stiffness", contact.stiffness)[:, 0]
+        energy = (mass * velocity**2)[:, 0] / 2
+        deepest = 2 * energy / (preload + np.sqrt(preload**2 + 2 * stiffness * energy))
+        lost = energy * -np.expm1(-2 * np.pi * ratio[:, 0])
+        return mechanism, {**draws, "contact.friction": friction + lost / (2 * deepest)}
     stiffness = drawn("contact.stiffness", contact.stiffness)
     stiffness = stiffness.reshape(number, stiffness.shape[1], -1)[:, :, 0]
     entries = max(stiffness.shape[1], len(contact.damping))
