@@ -31,10 +31,10 @@ from jaxhil.compensators.force_depth_map import (
     tells,
 )
 
-HYPOTHESES = 9
+HYPOTHESES = 17
 OFFSETS = np.linspace(-1, 1, HYPOTHESES)  # of their delays, in terms of the farthest
-ELASTIC = 0.25  # probability that a contact has no damping
-BROADENING = 5.0  # of the variance of the damping
+ELASTIC = 1 / 3  # probability that a contact has no damping
+BROADENING = 2.0  # of the variance of the damping
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
 LEAST, LEAST_CARRIED = 1e-200, 1e-12
 NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, some do not

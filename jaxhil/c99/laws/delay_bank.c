@@ -3,7 +3,7 @@
  * f_h with a variance s_h (0 with the noise's own variance r out of contact, and where what it expects while the
  * contact opens is not positive). Its weight is the product of the likelihoods of all readings of this contact and
  * of those before, (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), and of how well its damping, of mean B and variance s^2,
- * goes with what is known of contacts: p (s_0/s) exp(-t^2/2) + (1 - p) 2 Phi(t), t = B/s, p = 1/4. The exponentials
+ * goes with what is known of contacts: p (s_0/s) exp(-t^2/2) + (1 - p) 2 Phi(t), t = B/s, p = 1/3. The exponentials
  * are (1 + u/n)^-n. What counts is the mean over all hypotheses, of their maps and of their delays.
  */
 #include <math.h>
@@ -14,7 +14,7 @@
 
 /* == Declarations == */
 
-enum { JAXHIL_HYPOTHESES = 9 };
+enum { JAXHIL_HYPOTHESES = 17 };
 
 /* Of each hypothesis its delay, map, deepest point, the likelihoods of this contact and of those before; sums over
  * these of the damping's precision and of precision times mean, their number `met`; whether this contact is to be
@@ -34,8 +34,8 @@ typedef struct {
 
 /* == Definitions == */
 
-static const double jaxhil_bank_elastic = 0.25;
-static const double jaxhil_bank_broadening = 5.0;
+static const double jaxhil_bank_elastic = 1.0 / 3.0;
+static const double jaxhil_bank_broadening = 2.0;
 static const double jaxhil_bank_least = 1e-200;
 static const double jaxhil_bank_nothing = 1e-300; /* a smaller product is none: some machines keep such numbers */
 static const double jaxhil_bank_least_carried = 1e-12;
@@ -95,7 +95,7 @@ static void jaxhil_learnt_init(jaxhil_learnt *bank, const jaxhil_gains *gains) {
     bank->given = gains->identification_delay;
     jaxhil_force_depth_map_init(&bank->prior, gains);
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
-        bank->offsets[h] = (0.25 * (double)h - 1.0) * gains->delay_spread;
+        bank->offsets[h] = (0.125 * (double)h - 1.0) * gains->delay_spread;
     }
     for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
         bank->curve.slopes[j] = 0.0;

@@ -13,9 +13,9 @@ import numpy as np
 
 from .force_depth_map import KNOTS, OUTLYING, PARAMETERS, REACH, SEGMENTS, SURFACE, Curve, Prior
 
-HYPOTHESES = 9
-ELASTIC = 0.25  # probability that a contact has no damping
-BROADENING = 5.0  # of the variance of the damping, as the delay lies between two hypotheses
+HYPOTHESES = 17
+ELASTIC = 1 / 3  # probability that a contact has no damping
+BROADENING = 2.0  # of the variance of the damping, as the delay lies between two hypotheses
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
 LEAST, LEAST_CARRIED = 1e-200, 1e-12
 NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, some do not
@@ -39,7 +39,7 @@ class DelayBank:
     )  # fmt: skip
 
     def __init__(self, spread: float, prior: Prior) -> None:
-        self._offsets = np.array([0.25 * step - 1.0 for step in range(HYPOTHESES)]) * spread
+        self._offsets = np.array([0.125 * step - 1.0 for step in range(HYPOTHESES)]) * spread
         self._damping = prior.damping * prior.damping
         estimate, covariance = prior.moments()
         self._prior_estimate = np.repeat(np.array(estimate)[:, None], HYPOTHESES, axis=1)
