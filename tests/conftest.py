@@ -118,3 +118,15 @@ def jaxhil(capsys):
         return Ran(code, *capsys.readouterr())
 
     return call
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Writes bytes or text to a mechanism file and returns its path."""
+
+    def write(content):
+        path = tmp_path / "rig.toml"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return write

@@ -5,7 +5,7 @@ import copy
 import pytest
 
 from jaxhil.errors import InputError
-from jaxhil.mechanism.file import from_builtins
+from jaxhil.mechanism.file import from_builtins, load
 
 # Every key of the schema, apart from those of other laws and models, and those that exclude each other.
 FULL = {
@@ -129,3 +129,12 @@ def tables(node=FULL, path=""):
     for key, value in node.items():
         if isinstance(value, dict) and key != "uncertainty":
             yield from tables(value, f"{path}{key}.")
+
+
+def file_refusal(path, overrides=(), unset=()):
+    """The message of a refused file: one printable line that starts with the file's name."""
+    with pytest.raises(InputError) as caught:
+        load(path, overrides, unset)
+    message = str(caught.value)
+    assert message.isprintable() and len(message) < 700
+    return message

@@ -1,4 +1,4 @@
-"""Reading mechanism files: built-ins, unreadable files, `--set`, round trips."""
+"""Reading mechanism files: built-ins, unreadable files, round trips, what each key means."""
 
 import hashlib
 import json
@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mechanism_table import file_refusal
 from msgspec.inspect import ListType, Metadata, StructType, UnionType
 
-import jaxhil
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import (
     DEFAULT,
@@ -26,30 +26,9 @@ from jaxhil.mechanism.file import (
     suite_names,
     to_builtins,
 )
-from jaxhil.mechanism.structs import numeric_keys, schema_type
+from jaxhil.mechanism.structs import schema_type
 
 TEXT = builtin_path("claw-350kg").read_text()
-
-
-def refusal(path, overrides=(), unset=()):
-    """The message of a refused file: one printable line that starts with the file's name."""
-    with pytest.raises(InputError) as caught:
-        load(path, overrides, unset)
-    message = str(caught.value)
-    assert message.isprintable() and len(message) < 700
-    return message
-
-
-@pytest.fixture
-def written(tmp_path):
-    """Writes bytes or text to a file and returns its path."""
-
-    def write(content):
-        path = tmp_path / "rig.toml"
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return path
-
-    return write
 
 
 def test_builtins_are_those_promised():
@@ -106,7 +85,7 @@ def test_file_is_read_like_the_builtin(written):
 
 def test_a_path_is_never_a_builtin(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert "no such file" in refusal(Path("varying"))
+    assert "no such file" in file_refusal(Path("varying"))
 
 
 @pytest.mark.parametrize(
@@ -132,7 +111,7 @@ def test_a_path_is_never_a_builtin(tmp_path, monkeypatch):
 )
 def test_unusable_content(written, content, reason):
     path = written(content)
-    message = refusal(path)
+    message = file_refusal(path)
     assert message.startswith(f"{path}: ") and reason in message
 
 
@@ -148,13 +127,13 @@ def test_long_texts_and_lists_are_no_long_keys(written):
 
 
 def test_unreadable_files(tmp_path):
-    assert "found a directory" in refusal(tmp_path)
-    assert "found a directory" in refusal("")
-    assert "no such file" in refusal(tmp_path / "absent.toml")
-    assert "did you mean varying?" in refusal("varyng")
-    assert "cannot be read" in refusal("a\0b")
-    assert "cannot be read: File name too long" in refusal("a" * 500)
-    assert "line\\nbreak" in refusal(tmp_path / "line\nbreak")
+    assert "found a directory" in file_refusal(tmp_path)
+    assert "found a directory" in file_refusal("")
+    assert "no such file" in file_refusal(tmp_path / "absent.toml")
+    assert "did you mean varying?" in file_refusal("varyng")
+    assert "cannot be read" in file_refusal("a\0b")
+    assert "cannot be read: File name too long" in file_refusal("a" * 500)
+    assert "line\\nbreak" in file_refusal(tmp_path / "line\nbreak")
     with pytest.raises(InputError, match="did you mean varying"):
         builtin_path("varyin")
 
@@ -163,7 +142,7 @@ def test_unreadable_files(tmp_path):
 def test_file_without_permission(written):
     path = written(TEXT)
     path.chmod(0)
-    assert "Permission denied" in refusal(path)
+    assert "Permission denied" in file_refusal(path)
 
 
 @settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -174,7 +153,7 @@ def test_truncated_file_is_refused_or_still_a_mechanism(written, cut):
     try:
         mechanism = load(path).mechanism
     except InputError:
-        assert refusal(path).startswith(f"{path}: ")
+        assert file_refusal(path).startswith(f"{path}: ")
     else:
         assert mechanism.contact == load("claw-350kg").mechanism.contact
 
@@ -187,7 +166,7 @@ def test_damaged_file_is_read_or_refused_in_one_line(written, noise, position):
     try:
         load(path)
     except InputError:
-        assert refusal(path).startswith(f"{path}: ")
+        assert file_refusal(path).startswith(f"{path}: ")
 
 
 @pytest.mark.parametrize("name", builtin_names())
@@ -201,189 +180,6 @@ def test_round_trip_through_json(name):
 def test_from_builtins_refuses_what_is_no_table():
     with pytest.raises(InputError, match=r"^a\\nfile: found \[1\], allowed a table$"):
         from_builtins([1], "a\nfile")  # pyright: ignore[reportArgumentType]
-
-
-@pytest.mark.parametrize(
-    ("override", "path", "value"),
-    [
-        ("contact.law=linear", "contact.law", "linear"),
-        ("contact.law = 'linear'", "contact.law", "linear"),
-        ("contact . 'law'=linear", "contact.law", "linear"),
-        ("approach.velocity=1e-2", "approach.velocity", 0.01),
-        ("approach.contacts=7", "approach.contacts", 7),
-        ("contact.tension=true", "contact.tension", True),
-        ("contact.stiffness=2e5", "contact.stiffness", [2e5]),
-        ("contact.stiffness[1]=2e5", "contact.stiffness", [124355.0, 2e5, 62177.5]),
-        ("contact.damping[0]=5", "contact.damping", [5.0]),
-        ("rig.force_sensor.range=100", "rig.force_sensor.range", 100.0),
-        ("rig.force_sensor.range=inf", "rig.force_sensor.range", math.inf),
-        ("rig.position_sensor.delay=0.002", "rig.position_sensor.delay", 0.002),
-        ("name=other-name", "name", "other-name"),
-        ("uncertainty={}", "uncertainty", {}),
-    ],
-)
-def test_override(override, path, value):
-    node = to_builtins(load("varying", [override]).mechanism)
-    for part in path.split(".")[:-1]:
-        node = node[part]
-    assert node.get(path.split(".")[-1], math.inf) == value
-
-
-def test_override_reaches_quoted_keys_tables_and_nested_lists():
-    overrides = [
-        "uncertainty={}",
-        'rig.simulator={model="first_order", time_constant=0.01}',
-        "uncertainty.'rig.simulator.time_constant'={distribution='normal', std=1}",
-        "rig.simulator.time_constant=3",
-    ]
-    mechanism = load("varying", overrides).mechanism
-    assert mechanism.uncertainty["rig.simulator.time_constant"].std == 1.0
-    other = load("varying", ['uncertainty."contact.stiffness".factor[0]=0.5']).mechanism
-    assert other.uncertainty["contact.stiffness"].factor == [0.5, 1.6]
-    assert mechanism.rig.simulator.model == "first_order"
-    assert mechanism.rig.simulator.damping_ratio is None
-    layered = load("layered", ["contact.stiffness[1][2]=1"]).mechanism
-    assert layered.contact.stiffness[1] == [60000.0, 120000.0, 1.0]
-
-
-def test_overrides_apply_in_order_and_leave_the_digest():
-    loaded = load("varying", ["approach.velocity=1", "approach.velocity=2"])
-    assert loaded.mechanism.approach.velocity == 2.0
-    assert loaded.sha256 == load("varying").sha256
-
-
-def test_override_of_a_bare_number_in_the_file(written):
-    path = written(TEXT.replace("[124355.0]", "124355"))
-    assert load(path, ["contact.stiffness[0]=5"]).mechanism.contact.stiffness == [5.0]
-
-
-SECOND_ORDER = ["rig.simulator.natural_frequency", "rig.simulator.damping_ratio"]
-
-
-def test_another_model_takes_its_keys_and_no_others():
-    first_order = ["rig.simulator.model=first_order", "rig.simulator.time_constant=0.01"]
-    message = refusal("varying", first_order)
-    assert message.startswith(f"varying: --set {' '.join(first_order)}: rig.simulator.")
-    assert ", allowed nothing (first_order does not use it: unset it)" in message
-    mechanism = load("varying", first_order, SECOND_ORDER).mechanism
-    simulator = mechanism.rig.simulator
-    assert (simulator.model, simulator.time_constant, simulator.delay) == ("first_order", 0.01, 0.001)
-    assert simulator.natural_frequency is None
-    # What is no longer there is not uncertain either.
-    assert set(load("varying").mechanism.uncertainty) - set(mechanism.uncertainty) == {SECOND_ORDER[0]}
-    ideal = load("varying", ["rig.simulator.model=ideal"], SECOND_ORDER).mechanism
-    changes = {"rig.simulator.model": "ideal", **dict.fromkeys(SECOND_ORDER)}
-    assert ideal == load("varying", changes).mechanism == jaxhil.load("varying", changes)
-
-
-def test_unset_takes_out_keys_tables_and_uncertainty():
-    mechanism = load("varying", (), ["contact.damping", "rig.force_sensor", "approach.contacts"]).mechanism
-    assert mechanism.contact.damping == [0.0] and mechanism.rig.force_sensor.delay == 0.0
-    assert mechanism.approach.contacts == 1 and "rig.force_sensor.delay" not in mechanism.uncertainty
-    assert load("varying", (), ["uncertainty"]).mechanism.uncertainty == {}
-    left = load("varying", (), ["uncertainty.'contact.stiffness'"]).mechanism
-    assert left.contact == load("varying").mechanism.contact
-    assert "contact.stiffness" not in left.uncertainty and "approach.velocity" in left.uncertainty
-    masses = ["bodies.chaser_mass=700", "bodies.target_mass=700"]
-    assert load("varying", masses, ["bodies.equivalent_mass"]).mechanism.bodies.mass == 350.0
-
-
-@pytest.mark.parametrize(
-    ("path", "reason"),
-    [
-        ("approach.velocity", "approach.velocity: found nothing, allowed a number > 0 m/s"),
-        ("rig", "rig: found nothing, allowed a table"),
-        ("rig.simulator.model", "rig.simulator.model: found nothing, allowed one of first_order, ideal"),
-        ("approach.velosity", "approach.velosity: found an unknown key"),
-        ("approach.velosity", "did you mean velocity?"),
-        ("rig.force_sensor.range", "rig.force_sensor.range: found no such key there, allowed a key that"),
-        ("rig.position_sensor.delay", "rig.position_sensor.delay: found no such key there"),
-        ("contact.stiffness[1]", "contact.stiffness[1]: found an entry of a list, allowed a key"),
-        ("uncertainty.'contact.damping'", "found no such key there"),
-        ("approach.velocity=1", "'approach.velocity=1', allowed a dotted path"),
-        ("", "allowed a dotted path"),
-        ("a..b", "allowed a dotted path"),
-    ],
-)
-def test_unusable_unset_is_named(path, reason):
-    message = refusal("varying", (), [path])
-    assert message.startswith("varying: --unset ") and reason in message
-
-
-def test_what_is_uncertain_has_a_value():
-    message = refusal("varying", ["uncertainty.'rig.simulator.time_constant'={distribution='normal', std=1}"])
-    assert "found nothing as its value, allowed a key with a value" in message
-
-
-@pytest.mark.parametrize(
-    ("override", "reason"),
-    [
-        ("", "allowed PATH=VALUE"),
-        ("=1", "allowed PATH=VALUE"),
-        ("contact.law", "allowed PATH=VALUE"),
-        ("contact.=1", "allowed PATH=VALUE"),
-        ("a" + ".a" * 10_000 + "=1", "allowed PATH=VALUE"),
-        ('"\\q"=1', "allowed PATH=VALUE"),
-        ("contact.law=", "contact.law: found nothing after ="),
-        ("approach.velocity=.5", "approach.velocity: found '.5', allowed a TOML value"),
-        ("approach.velocity=fast", "approach.velocity: found 'fast', allowed a number > 0"),
-        ("approach.velocity=1\nname='x'", "approach.velocity: found "),
-        ("approach.velocity=-1", "approach.velocity: found -1, allowed a number > 0"),
-        ("approach.velocity=nan", "approach.velocity: found nan, allowed a number > 0"),
-        ("approach.velocity=2020-01-01", "approach.velocity: found datetime"),
-        ("approach.velocity=" + "[" * 5000, "approach.velocity: found values nested too deeply"),
-        ("approach.velocity=" + "1" * 200_000, "approach.velocity: found 200000 characters"),
-        ("approach.velosity=1", "approach.velosity: found an unknown key"),
-        ("approach.velosity=1", "did you mean velocity?"),
-        ("velocity=1", "did you mean approach.velocity?"),
-        ("approach.velocity.x=1", "approach.velocity.x: found no such key"),
-        ("approach.velocity[0]=1", "approach.velocity[0]: found no such key"),
-        ("contact.damping[2]=1", "contact.damping[2]: found a list of 1 entry"),
-        ("contact.depths[0]=1", "contact.depths[0]: found no list to change"),
-        ("contact.stiffness[0][0][0]=1", "contact.stiffness[0][0][0]: found no such key"),
-        ('uncertainty."a\nb".std=1', "allowed "),
-        ("bodies.chaser_mass=1", "bodies.equivalent_mass: found a body's mass beside it"),
-        ("contact.law=piecewise_linear", "contact.depths: found no entries"),
-    ],
-)
-def test_unusable_override_is_named(override, reason):
-    message = refusal("varying", [override])
-    assert message.startswith("varying: --set ") and reason in message
-
-
-def test_override_below_a_value_that_is_no_table(written):
-    path = written("rig = 5")
-    message = refusal(path, ["rig.simulator.model=ideal"])
-    assert "--set rig.simulator.model=ideal: rig: found 5, allowed a table" in message
-
-
-def test_fault_of_the_file_is_not_put_on_an_override(written):
-    path = written(TEXT.replace("velocity = 0.005", "velocity = -1"))
-    assert refusal(path, ["name=x"]).startswith(f"{path}: approach.velocity: found -1")
-    assert load(path, ["approach.velocity=1"]).mechanism.approach.velocity == 1.0
-
-
-@settings(deadline=None)
-@given(st.text(max_size=60) | st.from_regex(r"(contact|rig\.simulator)\.[a-z_.\[\]0-9]*=.*"))
-def test_any_override_is_applied_or_refused_in_one_line(text):
-    try:
-        load("varying", [text])
-    except InputError:
-        assert "--set" in refusal("varying", [text])
-
-
-@pytest.mark.parametrize("path", [*numeric_keys()])
-def test_every_numeric_key_can_be_overridden_or_says_why(path):
-    """`--set PATH=1` reaches its key: the value is taken, or a message is about that very path."""
-    try:
-        mechanism = load("varying", [f"{path}=1"]).mechanism
-    except InputError as error:
-        assert f": --set {path}=1: " in str(error)
-    else:
-        node = mechanism
-        for part in path.split("."):
-            node = getattr(node, part)
-        assert node in (1.0, [1.0])
 
 
 def test_reading_needs_no_jax():
@@ -419,4 +215,4 @@ def test_every_key_says_what_it_is_and_every_number_its_unit():
         ("rig.force_sensor.bias=x", "found 'x', allowed a finite number of N"),
         ("contact.damping=[-1]", "found -1, allowed a number >= 0 N s/m"),
     ):
-        assert message in refusal("varying", [path])
+        assert message in file_refusal("varying", [path])
