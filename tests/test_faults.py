@@ -19,8 +19,8 @@ from sweep_cases import case
 
 from jaxhil.files import is_temporary, read_sealed
 from jaxhil.runtime import digest
+from tuning.caches.pieces import FOLDER as PIECES
 from tuning.gain_file import write_gain_file
-from tuning.pieces import FOLDER as PIECES
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler")
 

@@ -14,7 +14,7 @@ from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import evaluate
 from jaxhil.simulation.scenario import build_scenarios
-from tuning import program_cache
+from tuning.caches import program_cache
 from tuning.gains import pareto_search
 from tuning.gains.objective import Objective, objective_value
 from tuning.gains.pareto import dominated, fronts

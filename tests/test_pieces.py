@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from tuning import pieces
-from tuning.pieces import Pieces, decode, encode
+from tuning.caches import pieces
+from tuning.caches.pieces import Pieces, decode, encode
 
 
 class Point(NamedTuple):

@@ -14,7 +14,7 @@ from jax.sharding import AxisType, PartitionSpec
 
 from jaxhil.contact.laws import HuntCrossley, KelvinVoigt
 from jaxhil.files import read_sealed
-from tuning import program_cache
+from tuning.caches import program_cache
 
 pytestmark = pytest.mark.users_options
 

@@ -16,13 +16,13 @@ import pytest
 
 from jaxhil.mechanism.file import builtin_path, load
 from jaxhil.mechanism.structs import Mechanism
-from tuning import pieces
 from tuning.benchmark import study
 from tuning.benchmark.study import CompareSettings, LawFigures, compare
+from tuning.caches import pieces
+from tuning.caches.pieces import FOLDER, Pieces
 from tuning.gains.common_program import common_programs
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tune import tune_all
-from tuning.pieces import FOLDER, Pieces
 from tuning.statistics.intervals import Estimate
 
 HERE = Path(__file__).parent

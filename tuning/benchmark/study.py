@@ -3,7 +3,7 @@
 Laws, and groups of mechanisms that share a program, go to as many processes as there are cores, each with
 one device: compiling takes most of the time, and one process compiles on one core. No figure depends on
 which process computes it. What is found of a law on a group is kept at once, where there is a place for it
-(`tuning.pieces`).
+(`tuning.caches.pieces`).
 """
 
 import multiprocessing
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from jaxhil.errors import one_line
 from jaxhil.mechanism.file import to_builtins
 from jaxhil.mechanism.structs import Mechanism
-from tuning.pieces import NOTHING_KEPT, Pieces
+from tuning.caches.pieces import NOTHING_KEPT, Pieces
 from tuning.statistics.intervals import Estimate
 
 LITERATURE, TUNED = "literature", "tuned"

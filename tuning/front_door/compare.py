@@ -14,7 +14,7 @@ from tuning.front_door import arguments, meaning
 
 if TYPE_CHECKING:
     from tuning.benchmark.study import LawFigures
-    from tuning.pieces import Pieces
+    from tuning.caches.pieces import Pieces
 
 
 OURS = "retrospective_reference"
@@ -138,7 +138,7 @@ def compare_each(
     """What `tuning.benchmark.study.compare` finds, as it is done. What is among the `pieces` is taken from
     there, and the rest kept there."""
     from tuning.benchmark.study import CompareSettings, compare
-    from tuning.pieces import NOTHING_KEPT
+    from tuning.caches.pieces import NOTHING_KEPT
 
     settings = CompareSettings(
         options.scenarios,

@@ -18,11 +18,11 @@ from tuning.front_door.tune_pareto import TradedGains
 
 if TYPE_CHECKING:
     from jaxhil.simulation.plausibility import Meaning
+    from tuning.caches.pieces import Pieces
     from tuning.gains.objective import Objective
     from tuning.gains.settings import TuneSettings
     from tuning.gains.transfer import Tuned
     from tuning.gains.tune import ErrorFigures, TuneResult
-    from tuning.pieces import Pieces
 
 
 @dataclass(frozen=True)
@@ -278,9 +278,9 @@ def tune_each(
 ) -> Iterator[tuple[int, TunedGains]]:
     """Index and result of every mechanism, as they are done; the `bar` shows how far it is. What is among the
     `pieces` is taken from there, and the rest kept there."""
+    from tuning.caches.pieces import NOTHING_KEPT
     from tuning.gains.tune import tune_all
     from tuning.gains.work import Work
-    from tuning.pieces import NOTHING_KEPT
 
     settings, known = options.settings(), options.known()
     mechanisms = [one.mechanism for one in loaded]

@@ -11,11 +11,11 @@ from tuning.front_door.arguments import ArgumentError
 from tuning.terminal import Progress
 
 if TYPE_CHECKING:
+    from tuning.caches.pieces import Pieces
     from tuning.front_door.tune import TunedGains
     from tuning.gains.pareto import Front, Point
     from tuning.gains.pareto_search import Axis
     from tuning.gains.tune import ErrorFigures
-    from tuning.pieces import Pieces
 
 # Names in files that stand for those that the objective uses.
 IN_FILES = {"transparency_weight": "honesty_weight"}
@@ -121,9 +121,9 @@ def trade(
 ) -> "Iterator[tuple[int, list[TradedGains]]]":
     """Place and front of every result, as they are done; the `bar` shows how far it is. What is among the
     `pieces` is taken from there, and the rest kept there."""
+    from tuning.caches.pieces import NOTHING_KEPT
     from tuning.gains.pareto import fronts
     from tuning.gains.work import Work
-    from tuning.pieces import NOTHING_KEPT
 
     found = [one.found for one in tuned]
     axis: Any = axis_of(against, tuned[0].compensator) if tuned else None

@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxhil.mechanism.file import to_builtins
 from jaxhil.simulation.evaluation import Outcome
+from tuning.caches.pieces import NOTHING_KEPT, Pieces
 from tuning.gains.objective import Objective, contact_terms, objective_value
 from tuning.gains.pareto_search import (
     NOISE,
@@ -31,7 +32,6 @@ from tuning.gains.tasks import TuneTask, alike, build_task
 from tuning.gains.tune import BLOCK, ErrorFigures, TuneResult, block_name, figures
 from tuning.gains.validation import Validation, build_validation, judged_runs, split_nominal
 from tuning.gains.work import Work
-from tuning.pieces import NOTHING_KEPT, Pieces
 from tuning.statistics.bootstrap import ErrorIntervals, error_intervals
 from tuning.statistics.intervals import Estimate
 from tuning.transparency.probes import probe_figures

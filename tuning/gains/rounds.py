@@ -19,7 +19,7 @@ from jaxhil.simulation.environment import program_folder
 from jaxhil.simulation.evaluation import expected_duration
 from jaxhil.simulation.loop import build_rig_constants
 from jaxhil.simulation.scenario import Scenario
-from tuning import program_cache
+from tuning.caches import program_cache
 from tuning.gains.objective import RMS, SCALE, Objective, Problem, common_terms, one_each, residuals
 from tuning.gains.tasks import TuneTask, common_loop, gain_bounds, gains_at, tuned_names
 from tuning.gains.work import Work

@@ -1,7 +1,7 @@
 """Tuning of mechanisms: scenarios, starts, solve, and judgement on scenarios that tuning never saw.
 
 What is found of each is kept at once, and until then every step of the search, where there is a place for it
-(`tuning.pieces`).
+(`tuning.caches.pieces`).
 """
 
 import time
@@ -17,6 +17,7 @@ from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.evaluation import Outcome
 from jaxhil.simulation.metrics import Metrics
 from jaxhil.simulation.scenario import Scenario
+from tuning.caches.pieces import NOTHING_KEPT, Pieces
 from tuning.gains.common_program import CommonProgram
 from tuning.gains.global_search import FACTOR, GlobalComparison, compare_with_global_search
 from tuning.gains.multistart import MultistartResult, expected_runs, find_gains
@@ -34,7 +35,6 @@ from tuning.gains.validation import (
 )
 from tuning.gains.work import Work
 from tuning.optimisation.sensitivity import sensitivity
-from tuning.pieces import NOTHING_KEPT, Pieces
 from tuning.statistics.bootstrap import ErrorIntervals, error_intervals
 from tuning.statistics.intervals import Estimate
 from tuning.transparency.probes import probe_figures

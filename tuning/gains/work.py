@@ -8,7 +8,7 @@ how soon it converges.
 from collections.abc import Callable
 from typing import Any
 
-from tuning.pieces import NOTHING_KEPT, Journal
+from tuning.caches.pieces import NOTHING_KEPT, Journal
 
 # Called with what is going on, the share of all the work that is done, 0 to 1, and the share that was kept
 # from before.

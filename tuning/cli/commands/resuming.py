@@ -1,9 +1,9 @@
-"""What commands that keep their finished pieces (`tuning.pieces`) make and say of them."""
+"""What commands that keep their finished pieces (`tuning.caches.pieces`) make and say of them."""
 
 from pathlib import Path
 
 from tuning import terminal
-from tuning.pieces import FOLDER, Pieces
+from tuning.caches.pieces import FOLDER, Pieces
 
 
 def pieces_in(output: str, resume: bool) -> Pieces:

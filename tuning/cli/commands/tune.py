@@ -20,7 +20,7 @@ from tuning.front_door import meaning
 from tuning.front_door.tune import TunedGains, TuneOptions, tune_each
 
 if TYPE_CHECKING:
-    from tuning.pieces import Pieces
+    from tuning.caches.pieces import Pieces
 
 PICTURES = ("errors.png", "contact.png", "loss.png", "pareto.png")
 OVERVIEW = "overview.png"

@@ -13,7 +13,7 @@ from tuning.front_door.tune import TunedGains
 from tuning.front_door.tune_pareto import TradedGains
 
 if TYPE_CHECKING:
-    from tuning.pieces import Pieces
+    from tuning.caches.pieces import Pieces
 
 FOLDER = "pareto"
 

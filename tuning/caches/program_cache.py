@@ -20,7 +20,7 @@ from jax import export
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from jaxhil.files import read_sealed, remove_stale, write_sealed
-from tuning.sources import PACKAGES, sources_sha256, versions
+from tuning.caches.sources import PACKAGES, sources_sha256, versions
 
 # Calls into LAPACK have no promise to mean the same in other versions; the name has the version in it.
 LAPACK = ("lapack_dpotrf_ffi", "lapack_dtrsm_ffi")
