@@ -18,7 +18,6 @@ from msgspec.inspect import ListType, Metadata, StructType, UnionType
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import (
     DEFAULT,
-    MAX_BYTES,
     builtin_names,
     builtin_path,
     from_builtins,
@@ -27,6 +26,7 @@ from jaxhil.mechanism.file import (
     to_builtins,
 )
 from jaxhil.mechanism.structs import schema_type
+from jaxhil.mechanism.toml_table import MAX_BYTES
 
 TEXT = builtin_path("claw-350kg").read_text()
 

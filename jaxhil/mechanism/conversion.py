@@ -11,7 +11,7 @@ import difflib
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 from msgspec import inspect
@@ -35,8 +35,10 @@ __all__ = [
     "entry_count",
     "step_into",
     "to_mechanism",
+    "to_struct",
 ]
 
+AnyStruct = TypeVar("AnyStruct", bound=msgspec.Struct)
 Path = tuple[str | int, ...]
 Extra = Mapping[str, Any]  # what `jaxhil.mechanism.structs.says` puts beside a type
 
@@ -97,6 +99,11 @@ def to_mechanism(raw: Mapping[str, Any]) -> Mechanism:
     `KeyProblem` for the first key that is not usable.
     """
     return msgspec.convert(_clean(schema_type(), raw, (), PLAIN), Mechanism)
+
+
+def to_struct(kind: type[AnyStruct], raw: Mapping[str, Any]) -> AnyStruct:
+    """The raw table as a struct whose fields say what is allowed, as `Mechanism`. Raises `KeyProblem`."""
+    return msgspec.convert(_clean(inspect.type_info(kind), raw, (), PLAIN), kind)
 
 
 def step_into(kind: inspect.Type, part: str | int, path: Path) -> inspect.Type:

@@ -11,8 +11,6 @@ import hashlib
 import json
 import math
 import os
-import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +22,7 @@ from jaxhil.mechanism import rules as mechanism_rules
 from jaxhil.mechanism.conversion import KeyProblem, close_match, to_mechanism
 from jaxhil.mechanism.overrides import apply_override, parse_override
 from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.toml_table import parse_toml, read_bytes
 
 __all__ = [
     "DEFAULT",
@@ -38,8 +37,6 @@ __all__ = [
 ]
 
 DEFAULT = "varying"
-MAX_BYTES = 1 << 20
-MAX_KEY_PARTS = 64
 
 Overrides = Sequence[str] | Mapping[str, Any]
 
@@ -48,14 +45,6 @@ SUITE = "suite-"  # begins the names of the standard suites
 _sources: dict[str, str] = {}  # digests of the files read, by those of what was read
 
 _FOLDER = Path(__file__).parent / "builtin"
-# The pieces of a TOML text that matter for where a dotted key begins and ends. An unclosed string
-# is taken to where it would have to end, so that the scan stays linear.
-_TOKENS = re.compile(
-    r'(?P<long>"""(?:[^"\\]|\\.|"(?!""))*(?:""")?' + r"|'''(?:[^']|'(?!''))*(?:''')?)"
-    r"|(?P<part>\"(?:[^\"\\\n]|\\[^\n])*\"?|'[^'\n]*'?|[A-Za-z0-9_-]+)"
-    r"|(?P<dot>\.)|(?P<space>[ \t]+)|(?P<comment>#[^\n]*)|(?P<other>.)",
-    re.DOTALL,
-)
 
 
 class LoadedMechanism(NamedTuple):
@@ -84,8 +73,11 @@ def load(
         path, label = builtin_path(name), name
     else:
         path, label = Path(name), one_line(str(name)) or "''"
-    data = _read(path, label)
-    mechanism = from_builtins(_parse(data, label), label, overrides, unset)
+    try:
+        data = read_bytes(path, label, "a mechanism")
+    except FileNotFoundError:
+        raise _missing(label) from None
+    mechanism = from_builtins(parse_toml(data, label, "a mechanism"), label, overrides, unset)
     sha256 = hashlib.sha256(data).hexdigest()
     _sources[_content_sha256(mechanism)] = sha256
     return LoadedMechanism(mechanism, sha256, label)
@@ -159,61 +151,10 @@ def _names() -> list[str]:
     return sorted(path.stem for path in _FOLDER.glob("*.toml"))
 
 
-def _read(path: Path, label: str) -> bytes:
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except FileNotFoundError:
-        names = builtin_names()
-        hint = close_match(label, [*names, *suite_names()]) or f" (built-in: {', '.join(names)})"
-        raise InputError(f"{label}: found no such file, allowed a mechanism file{hint}") from None
-    except IsADirectoryError:
-        raise InputError(f"{label}: found a directory, allowed a mechanism file") from None
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{label}: cannot be read: {one_line(str(reason), 100)}") from None
-    if len(data) > MAX_BYTES:
-        raise InputError(f"{label}: found more than {MAX_BYTES} bytes, allowed a file of at most 1 MiB")
-    return data
-
-
-def _parse(data: bytes, label: str) -> dict[str, Any]:
-    if not data.strip():
-        raise InputError(f"{label}: found an empty file, allowed a mechanism in TOML")
-    try:
-        # Some editors put a byte-order mark in front.
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{label}: found bytes that are not UTF-8 at byte {error.start}, allowed a mechanism in TOML"
-        ) from None
-    if _longest_key(text) > MAX_KEY_PARTS:
-        # The parser's memory grows with the square of a dotted key's length.
-        raise InputError(f"{label}: found a key of more than {MAX_KEY_PARTS} parts, allowed TOML keys")
-    try:
-        return tomllib.loads(text)
-    except RecursionError:
-        raise InputError(f"{label}: found values nested too deeply, allowed plain TOML") from None
-    except ValueError as error:
-        # Also an integer of thousands of digits, which is no TOMLDecodeError.
-        reason = one_line(str(error).split(";")[0], 120)
-        raise InputError(f"{label}: not valid TOML: {reason}") from None
-
-
-def _longest_key(text: str) -> int:
-    """The number of parts of the longest run ``a.b.c`` outside comments and long strings."""
-    longest = parts = 0
-    joined = False
-    for token in _TOKENS.finditer(text):
-        if token.lastgroup == "part":
-            parts = parts + 1 if joined else 1
-            longest = max(longest, parts)
-            joined = False
-        elif token.lastgroup == "dot":
-            joined = parts > 0
-        elif token.lastgroup != "space":
-            parts, joined = 0, False
-    return longest
+def _missing(label: str) -> InputError:
+    names = builtin_names()
+    hint = close_match(label, [*names, *suite_names()]) or f" (built-in: {', '.join(names)})"
+    return InputError(f"{label}: found no such file, allowed a mechanism file{hint}")
 
 
 def _validated(raw: Mapping[str, Any]) -> Mechanism:

@@ -1,0 +1,81 @@
+"""TOML files of ours: bytes within bounds, then a table; whatever is wrong is one line."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from jaxhil.errors import InputError, one_line
+
+__all__ = ["parse_toml", "read_bytes"]
+
+MAX_BYTES = 1 << 20
+MAX_KEY_PARTS = 64
+
+# The pieces of a TOML text that matter for where a dotted key begins and ends. An unclosed string
+# is taken to where it would have to end, so that the scan stays linear.
+_TOKENS = re.compile(
+    r'(?P<long>"""(?:[^"\\]|\\.|"(?!""))*(?:""")?' + r"|'''(?:[^']|'(?!''))*(?:''')?)"
+    r"|(?P<part>\"(?:[^\"\\\n]|\\[^\n])*\"?|'[^'\n]*'?|[A-Za-z0-9_-]+)"
+    r"|(?P<dot>\.)|(?P<space>[ \t]+)|(?P<comment>#[^\n]*)|(?P<other>.)",
+    re.DOTALL,
+)
+
+
+def read_bytes(path: Path, label: str, what: str) -> bytes:
+    """The bytes of a file that says `what`, "a mechanism" say. Raises FileNotFoundError, or `InputError`."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise
+    except IsADirectoryError:
+        raise InputError(f"{label}: found a directory, allowed {what} file") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{label}: cannot be read: {one_line(str(reason), 100)}") from None
+    if len(data) > MAX_BYTES:
+        raise InputError(f"{label}: found more than {MAX_BYTES} bytes, allowed a file of at most 1 MiB")
+    return data
+
+
+def parse_toml(data: bytes, label: str, what: str) -> dict[str, Any]:
+    """The table of a file's bytes, which say `what`. Raises `InputError`."""
+    if not data.strip():
+        raise InputError(f"{label}: found an empty file, allowed {what} in TOML")
+    try:
+        # Some editors put a byte-order mark in front.
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{label}: found bytes that are not UTF-8 at byte {error.start}, allowed {what} in TOML"
+        ) from None
+    if _longest_key(text) > MAX_KEY_PARTS:
+        # The parser's memory grows with the square of a dotted key's length.
+        raise InputError(f"{label}: found a key of more than {MAX_KEY_PARTS} parts, allowed TOML keys")
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise InputError(f"{label}: found values nested too deeply, allowed plain TOML") from None
+    except ValueError as error:
+        # Also an integer of thousands of digits, which is no TOMLDecodeError.
+        reason = one_line(str(error).split(";")[0], 120)
+        raise InputError(f"{label}: not valid TOML: {reason}") from None
+
+
+def _longest_key(text: str) -> int:
+    """The number of parts of the longest run ``a.b.c`` outside comments and long strings."""
+    longest = parts = 0
+    joined = False
+    for token in _TOKENS.finditer(text):
+        if token.lastgroup == "part":
+            parts = parts + 1 if joined else 1
+            longest = max(longest, parts)
+            joined = False
+        elif token.lastgroup == "dot":
+            joined = parts > 0
+        elif token.lastgroup != "space":
+            parts, joined = 0, False
+    return longest
