@@ -21,11 +21,12 @@ def case(
     compensator: str = "none",
     force_sensor: Any = None,
     uncertainty: Any = UNCERTAIN,
+    correlation: Any = None,
     **simulator: float,
 ) -> dict[str, Any]:
     """A gain document for a mechanism of some contacts."""
     raw = mechanism({}, {**SECOND_ORDER, **simulator}, contacts=contacts, force_sensor=force_sensor)
-    parsed = validated({**raw, "uncertainty": uncertainty})
+    parsed = validated({**raw, "uncertainty": uncertainty, "correlation": correlation})
     gains = nominal_gains(parsed, compensator)
     return build_document(compensator, gains, parsed, "0" * 64, {}, {}, 0, {})
 

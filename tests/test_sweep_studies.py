@@ -7,7 +7,14 @@ from sweep_cases import NOISY, UNCERTAIN, case, manifest
 from jaxhil.mechanism.uncertainty import dimensions
 from tuning.statistics.sobol_indices import evaluations
 from tuning.sweeps.chunks import build_sweep, run_chunk
-from tuning.sweeps.studies import NOISE, error_indices, rare_failure, run_points, spread_beyond_formula
+from tuning.sweeps.studies import (
+    NOISE,
+    error_indices,
+    independent_inputs,
+    rare_failure,
+    run_points,
+    spread_beyond_formula,
+)
 from tuning.sweeps.tally import add_rows, empty_tally, error_sizes, failure_probability
 
 pytestmark = pytest.mark.users_options
@@ -55,6 +62,23 @@ def test_the_variance_of_one_input_is_all_its_own():
     stiffness, phase = found["contact.stiffness"], found["approach.phase"]
     assert stiffness.first_order_low < share < stiffness.first_order_high
     assert phase.total_low < 1 - share < phase.total_high
+
+
+def test_inputs_that_are_correlated_are_one():
+    table = {"keys": ["rig.force_sensor.delay", "approach.velocity"], "matrix": [[1.0], [0.9, 1.0]]}
+    apart = sweep_of(case(uncertainty=UNCERTAIN | IDLE))
+    together = sweep_of(case(uncertainty=UNCERTAIN | IDLE, correlation=table))
+    inputs = independent_inputs(together.mechanism)
+    assert {name: columns.tolist() for name, columns in inputs.items()} == {
+        "rig.force_sensor.delay + approach.velocity": [2, 0],
+        "contact.stiffness": [1],
+        "approach.phase": [3],
+    }
+    # The velocity of a linear contact does nothing: what it comes with has the delay's share.
+    joint, *others = sorted(error_indices(together, 128).inputs, key=lambda one: "delay" not in one.input)
+    assert joint.input == "rig.force_sensor.delay + approach.velocity" and len(others) == 2
+    alone = next(one for one in error_indices(apart, 128).inputs if "delay" in one.input)
+    assert alone.total_low < joint.total < alone.total_high
 
 
 def test_noise_is_an_input():

@@ -14,6 +14,7 @@ from typing import Any
 
 from jaxhil.errors import shown
 from jaxhil.mechanism.conversion import KeyProblem, Path, close_match, dotted, entry_count, step_into
+from jaxhil.mechanism.correlation import remaining
 from jaxhil.mechanism.structs import MAX_CONTACTS, numeric_keys, schema_type
 
 __all__ = ["apply_override", "parse_key", "parse_override"]
@@ -77,7 +78,7 @@ def _parse_text(text: str) -> tuple[Path, Any]:
 
 def apply_override(raw: Mapping[str, Any], path: Path, value: Any) -> dict[str, Any]:
     """A copy of a raw table with the value at `path` replaced; tables on the way are made. None takes the key
-    out, and with it what ``[uncertainty]`` says of it and of the keys below it.
+    out, and with it what ``[uncertainty]`` and ``[correlation]`` say of it and of the keys below it.
 
     Raises `KeyProblem` when the schema has no such path, a list no such entry, or where there is no such key
     to take out.
@@ -142,7 +143,21 @@ def _removed(raw: Mapping[str, Any], path: Path) -> dict[str, Any]:
     if isinstance(uncertain := left.get("uncertainty"), Mapping):
         kept = {name: one for name, one in uncertain.items() if not f"{name}.".startswith(f"{key}.")}
         left["uncertainty"] = kept
-    return left
+    gone = [name for name in raw.get("uncertainty") or () if name not in (left.get("uncertainty") or ())]
+    return _uncorrelated(left, gone)
+
+
+def _uncorrelated(raw: dict[str, Any], gone: list[str]) -> dict[str, Any]:
+    """Without what ``[correlation]`` says of the keys that are gone."""
+    table = raw.get("correlation")
+    if not gone or table is None:
+        return raw
+    try:
+        left = remaining(table["keys"], table["matrix"], gone)
+    except (TypeError, LookupError):
+        return raw  # no such table, which is refused when all is read
+    rest = {name: value for name, value in raw.items() if name != "correlation"}
+    return rest | ({"correlation": {**table, "keys": left[0], "matrix": left[1]}} if left else {})
 
 
 def _without(node: Any, path: Path, depth: int) -> dict[str, Any]:

@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxhil.errors import shown
 from jaxhil.mechanism.conversion import KeyProblem, close_match, computable
+from jaxhil.mechanism.correlation import check_correlation
 from jaxhil.mechanism.structs import (
     BUILT_IN_LAWS,
     Contact,
@@ -67,6 +68,7 @@ def check(mechanism: Mechanism) -> None:
         path: _check_uncertainty(mechanism, path, uncertainty)
         for path, uncertainty in mechanism.uncertainty.items()
     }
+    check_correlation(mechanism)
     _check_gap(mechanism, spans)
 
 

@@ -27,6 +27,7 @@ __all__ = [
     "Approach",
     "Bodies",
     "Contact",
+    "Correlation",
     "ForceSensor",
     "Mechanism",
     "PositionSensor",
@@ -79,6 +80,11 @@ Depth = Annotated[float, says("where the slope changes", "m", gt=0.0)]
 Factor = Annotated[float, says("share of the nominal value", gt=0.0)]
 Coefficient = Annotated[float, says("a power's coefficient, the n-th has the unit s^n", gt=0.0)]
 Polynomial = Annotated[list[float], Meta(min_length=1, max_length=21)]
+UncertainKey = Annotated[str, Meta(min_length=1, max_length=100)]
+CorrelationRow = Annotated[
+    list[Annotated[float, says("of two keys' underlying normal numbers", ge=-1.0, le=1.0)]],
+    Meta(min_length=1, max_length=100),
+]
 
 
 def _only(value: float) -> Callable[[], list[float]]:
@@ -223,6 +229,18 @@ class Uncertainty(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     independent: Annotated[bool, says("whether each entry of a list is drawn apart")] = False
 
 
+class Correlation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Which uncertain numbers vary together: see `jaxhil.mechanism.correlation`."""
+
+    keys: Annotated[
+        list[UncertainKey], Meta(min_length=1, max_length=100, description="what varies together")
+    ]
+    matrix: Annotated[
+        list[CorrelationRow],
+        Meta(min_length=1, max_length=100, description="lower triangle, a row for a key"),
+    ]
+
+
 class Mechanism(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One docking mechanism on one rig."""
 
@@ -236,6 +254,7 @@ class Mechanism(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     uncertainty: Annotated[
         dict[str, Uncertainty], says("how uncertain the number of each dotted path is")
     ] = field(default_factory=dict)
+    correlation: Annotated[Correlation, says("which of these vary together")] | None = None
 
 
 class Range(NamedTuple):
@@ -301,7 +320,8 @@ def numeric_keys() -> dict[str, Range]:
         match kind:
             case msgspec.inspect.StructType(fields=fields):
                 for entry in fields:
-                    visit(entry.type, f"{path}.{entry.name}".lstrip("."))
+                    if entry.name != "correlation":  # its numbers speak of other keys
+                        visit(entry.type, f"{path}.{entry.name}".lstrip("."))
             case msgspec.inspect.Metadata(type=inner):
                 visit(inner, path, kind.extra or PLAIN)
             case msgspec.inspect.UnionType(types=members):

@@ -12,9 +12,9 @@ common value). With ``independent = true`` every entry has a draw of its own. Th
 contact within a control period is drawn as well, each contact its own, uniform on 0..1 unless the
 table says otherwise: the phase alone moves the restitution, and nobody controls it.
 
-Draw number i depends on the seed, on i, and on its own entry of the table alone: neither on how
-many draws are made at once, nor on the other uncertain numbers, nor (for phases) on the number of
-contacts. Needs NumPy and SciPy, not jax.
+Draw number i depends on the seed, on i, on its own entry of the table, and on the keys that ``[correlation]``
+names before it (`jaxhil.mechanism.correlation`): neither on how many draws are made at once, nor on the other
+uncertain numbers, nor (for phases) on the number of contacts. Needs NumPy and SciPy, not jax.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy import special
 
+from jaxhil.mechanism.correlation import correlated
 from jaxhil.mechanism.structs import Mechanism, Range, Uncertainty, numeric_keys, value_at
 
-__all__ = ["PHASE", "at_points", "dimensions", "draw", "extremes", "quasi_random"]
+__all__ = ["PHASE", "at_points", "dimensions", "draw", "extremes", "quantiles", "quasi_random"]
 
 PHASE = "approach.phase"
 BLOCK = 1024
@@ -49,10 +50,8 @@ def draw(mechanism: Mechanism, number: int, seed: int, first: int = 0) -> dict[s
     if number < 0 or seed < 0 or first < 0:
         raise ValueError(f"number, seed, first: found {number}, {seed}, {first}, allowed >= 0")
     columns = dimensions(mechanism)
-    return _values(
-        mechanism,
-        {path: _uniform(path, count, number, seed, first) for path, count in columns.items()},
-    )
+    uniform = {path: _uniform(path, count, number, seed, first) for path, count in columns.items()}
+    return _values(mechanism, correlated(mechanism, uniform))
 
 
 def quasi_random(mechanism: Mechanism, number: int, seed: int) -> dict[str, np.ndarray]:
@@ -76,17 +75,21 @@ def quasi_random(mechanism: Mechanism, number: int, seed: int) -> dict[str, np.n
 def at_points(mechanism: Mechanism, points: np.ndarray) -> dict[str, np.ndarray]:
     """The draws that belong to points of the unit box, (number, sum of `dimensions`), as `draw` returns them.
 
-    Each coordinate goes through the inverse of its distribution function; 0 stands for the least draw.
+    Coordinates that vary together are made to, and each goes through the inverse of its distribution
+    function; 0 stands for the least draw.
     """
-    columns = dimensions(mechanism)
-    edges = np.cumsum(list(columns.values()))[:-1]
-    return _values(mechanism, dict(zip(columns, np.split(points, edges, axis=1), strict=True)))
+    return _values(mechanism, correlated(mechanism, _by_key(mechanism, points)))
+
+
+def quantiles(mechanism: Mechanism, points: np.ndarray) -> dict[str, np.ndarray]:
+    """Like `at_points`, each key by itself: its quantile at its coordinates, whatever it varies with."""
+    return _values(mechanism, _by_key(mechanism, points))
 
 
 def extremes(mechanism: Mechanism) -> dict[str, np.ndarray]:
-    """Two draws: every uncertain number at one end of what can be drawn, then at the other."""
+    """Every uncertain number at one end of what can be drawn, then at the other, whatever it varies with."""
     ends = np.array([[0.0], [_LARGEST]])
-    return at_points(mechanism, np.repeat(ends, sum(dimensions(mechanism).values()), axis=1))
+    return quantiles(mechanism, np.repeat(ends, sum(dimensions(mechanism).values()), axis=1))
 
 
 def dimensions(mechanism: Mechanism) -> dict[str, int]:
@@ -97,6 +100,12 @@ def dimensions(mechanism: Mechanism) -> dict[str, int]:
         columns[path] = np.size(value_at(mechanism, path)) if independent else 1
     columns[PHASE] = mechanism.approach.contacts
     return columns
+
+
+def _by_key(mechanism: Mechanism, points: np.ndarray) -> dict[str, np.ndarray]:
+    columns = dimensions(mechanism)
+    edges = np.cumsum(list(columns.values()))[:-1]
+    return dict(zip(columns, np.split(points, edges, axis=1), strict=True))
 
 
 def _uniform(path: str, count: int, number: int, seed: int, first: int) -> np.ndarray:

@@ -16,7 +16,7 @@ from jaxhil.contact.laws import LAWS, ContactLaw, ContactParameters
 from jaxhil.contact.reference import Reference
 from jaxhil.errors import InputError
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.mechanism.uncertainty import at_points, dimensions
+from jaxhil.mechanism.uncertainty import dimensions, quantiles
 from jaxhil.simulation.environment import computing
 from jaxhil.simulation.evaluation import parameters_by_slot
 from jaxhil.simulation.rollout import APPROACH
@@ -240,7 +240,7 @@ def _corners(mechanism: Mechanism, prefixes: tuple[str, ...]) -> dict[str, np.nd
         else np.repeat([[corner[paths.index(path)]] for corner in corners], count, axis=1)
         for path, count in columns.items()
     ]
-    return at_points(mechanism, np.concatenate(points, axis=1))
+    return quantiles(mechanism, np.concatenate(points, axis=1))
 
 
 def _warnings(mechanism: Mechanism, contacts: tuple[ContactFigures, ...]) -> list[str]:

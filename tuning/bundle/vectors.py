@@ -13,9 +13,9 @@ from collections.abc import Iterator, Sequence
 from math import inf, nan
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 
+from jaxhil.mechanism.correlation import certain
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.runtime import Controller
 from jaxhil.runtime.faults import LAW_IN_DOUBT, names
@@ -138,8 +138,7 @@ def as_csv(rows: Sequence[Row]) -> str:
 
 def one_rig(mechanism: Mechanism) -> Mechanism:
     """The mechanism without uncertainty of what the gain file tells the controller."""
-    kept = {path: one for path, one in mechanism.uncertainty.items() if path not in OF_ONE_RIG}
-    return msgspec.structs.replace(mechanism, uncertainty=kept)
+    return certain(mechanism, OF_ONE_RIG)
 
 
 def _of_lane(run: int, lane: Lane, period: float) -> Iterator[Inputs]:

@@ -11,10 +11,9 @@ from tuning import terminal
 
 def drivers(options: Any, store, sweep, unwritten: list[InputError], progress: bool) -> dict[str, Any]:
     """What of the document says which input drives the error. `unwritten`: see `put_off`."""
-    from jaxhil.mechanism.uncertainty import dimensions
     from tuning.statistics.sobol_indices import evaluations
     from tuning.sweeps.stored_studies import IndicesRequest, read_study, study_path, write_study
-    from tuning.sweeps.studies import error_indices
+    from tuning.sweeps.studies import error_indices, independent_inputs
 
     number: int = options.drivers
     request = IndicesRequest(number)
@@ -23,7 +22,7 @@ def drivers(options: Any, store, sweep, unwritten: list[InputError], progress: b
         _say_kept("drivers", study_path(store, request), progress)
         return found._asdict()
     # Noise, if there is any, adds an input; the bar need not know.
-    total = evaluations(len(dimensions(sweep.mechanism)), number)
+    total = evaluations(len(independent_inputs(sweep.mechanism)), number)
     with terminal.progress(total, "scenarios", progress) as bar:
         found = error_indices(sweep, number, lambda more: bar.advance(more, "drivers"))
     with put_off(unwritten):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxhil.mechanism.structs import Mechanism, value_at
-from jaxhil.mechanism.uncertainty import PHASE, at_points, dimensions
+from jaxhil.mechanism.uncertainty import PHASE, dimensions, quantiles
 from jaxhil.simulation.metrics import OK, STATUS_NAMES
 from tuning.statistics.quantiles import BINS, EDGES, binned_estimate
 from tuning.sweeps.columns import STATUSES, input_names, unit_of
@@ -199,7 +199,7 @@ def _strengths(mechanism: Mechanism, path: str, rows: Rows, size: np.ndarray) ->
 def _ends(mechanism: Mechanism, path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Nominal value, low end and high end of each entry of an input."""
     points = np.repeat(np.array(ENDS)[:, None], sum(dimensions(mechanism).values()), axis=1)
-    low, high = at_points(mechanism, points)[path].reshape(2, -1)
+    low, high = quantiles(mechanism, points)[path].reshape(2, -1)
     nominal = value_at(mechanism, path) if path != PHASE else np.zeros(len(low))
     return np.broadcast_to(np.ravel(nominal), low.shape).astype(float), low, high
 

@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxhil.mechanism.correlation import correlated_groups
+from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import at_points, dimensions
 from jaxhil.simulation.evaluation import evaluate
 from jaxhil.simulation.scenario import build_scenarios
@@ -26,6 +28,7 @@ from tuning.sweeps.columns import OUTCOMES, SATURATED, rows_of
 from tuning.sweeps.tally import error_sizes
 
 NOISE = "sensor noise"
+TOGETHER = " + "  # between keys that are one input
 CAP_LIMITS = 10.0  # largest error that drivers look at, over the limit
 CAP_UNLIMITED = 10.0  # the same where there is no limit
 SAMPLES, REPLICATES = 1000, 10  # of subset simulation: per level and replicate, and how often it runs
@@ -37,7 +40,7 @@ Done = Callable[[int], None]  # called with the number of scenarios that were ru
 class InputIndices(NamedTuple):
     """The Sobol indices of an uncertain input, with intervals of 95 %; nan where nothing varies."""
 
-    input: str  # its key
+    input: str  # its key, or the keys of numbers that vary together, joined by `TOGETHER`
     first_order: float  # its own share of the variance
     first_order_low: float  # end of the interval
     first_order_high: float  # end of the interval
@@ -58,17 +61,19 @@ class ErrorIndices(NamedTuple):
 def error_indices(sweep: Sweep, number: int, done: Done = lambda _: None) -> ErrorIndices:
     """Sobol indices of the worst |error|, from `number` (a power of two) times inputs + 2 scenarios.
 
-    An input is a key of the mechanism's uncertainty, with all its entries; the phases of all contacts are
-    one, and so is noise where sensors have any: the scenarios of A have one realisation each, those of B
-    another. An error beyond `CAP_LIMITS` limits, or a run without one, counts as that, lest a few runs that
-    diverge make up all of the variance.
+    An input is a key of the mechanism's uncertainty, with all its entries; keys that are correlated are one,
+    since the indices presume independent inputs; the phases of all contacts are one, and so is noise where
+    sensors have any: the scenarios of A have one realisation each, those of B another. An error beyond
+    `CAP_LIMITS` limits, or a run without one, counts as that, lest a few runs that diverge make up all of the
+    variance.
     """
-    columns = dimensions(sweep.mechanism)
-    names, entries = list(columns), list(columns.values())
+    inputs = independent_inputs(sweep.mechanism)
+    names, entries = list(inputs), [len(columns) for columns in inputs.values()]
     if _noisy(sweep):
         # A column of the design that stands for nothing but which realisation it is.
         names, entries = [*names, NOISE], [*entries, 1]
-    points = saltelli_design(entries, number, sweep.manifest.seed)[:, : sum(columns.values())]
+    order = np.argsort(np.concatenate(list(inputs.values())))
+    points = saltelli_design(entries, number, sweep.manifest.seed)[:, order]
     block, row = np.divmod(np.arange(len(points)), number)
     of_b = (block == 1) | ((block == len(points) // number - 1) & _noisy(sweep))
     sizes = error_sizes(run_points(sweep, points, row + number * of_b, done))
@@ -79,6 +84,18 @@ def error_indices(sweep: Sweep, number: int, done: Done = lambda _: None) -> Err
     found = [InputIndices(name, *row.tolist()) for name, row in zip(names, numbers, strict=True)]
     found.sort(key=lambda one: -np.nan_to_num(one.total))
     return ErrorIndices(tuple(found), cap, len(points), int(np.sum(sizes >= cap)))
+
+
+def independent_inputs(mechanism: Mechanism) -> dict[str, np.ndarray]:
+    """The columns that each input has among those of `dimensions`: a key's, or those of all keys that are
+    correlated."""
+    columns = dimensions(mechanism)
+    ends = dict(zip(columns, np.cumsum(list(columns.values())), strict=True))
+    group = {key: keys for keys in correlated_groups(mechanism) for key in keys}
+    return {
+        TOGETHER.join(keys): np.concatenate([np.arange(ends[key] - columns[key], ends[key]) for key in keys])
+        for keys in dict.fromkeys(group.get(key, (key,)) for key in columns)
+    }
 
 
 def most_scenarios(samples: int = SAMPLES, replicates: int = REPLICATES) -> int:

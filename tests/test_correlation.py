@@ -1,0 +1,174 @@
+"""Uncertain numbers that vary together: closed forms of the Gaussian copula, and what a draw depends on."""
+
+import numpy as np
+import pytest
+from mechanism_table import FULL
+from scipy import special, stats
+
+from jaxhil.errors import InputError
+from jaxhil.mechanism.correlation import certain, correlated_groups
+from jaxhil.mechanism.file import from_builtins, load, to_builtins
+from jaxhil.mechanism.uncertainty import at_points, dimensions, draw, extremes, quantiles, quasi_random
+
+DELAY, DAMPING, SPEED = "rig.force_sensor.delay", "contact.damping", "approach.velocity"
+FREQUENCY, STIFFNESS = "rig.simulator.natural_frequency", "contact.stiffness"
+UNCERTAIN = {
+    DELAY: {"distribution": "normal", "std": 0.0001},
+    DAMPING: {"distribution": "normal", "std": 12.0},
+    SPEED: {"distribution": "uniform", "factor": [0.8, 1.2]},
+    FREQUENCY: {"distribution": "uniform", "factor": [0.9, 1.1]},
+    STIFFNESS: {"distribution": "loguniform", "factor": [0.5, 2.0]},
+}
+KEYS = [DELAY, STIFFNESS, DAMPING, FREQUENCY]
+MATRIX = [[1.0], [0.0, 1.0], [0.98, 0.1, 1.0], [0.0, 0.0, 0.0, 1.0]]
+
+
+def mechanism(keys=KEYS, matrix=MATRIX, changes=(), unset=()):
+    raw = to_builtins(load("varying").mechanism) | {"uncertainty": UNCERTAIN}
+    table = {} if keys is None else {"correlation": {"keys": keys, "matrix": matrix}}
+    return from_builtins(raw | table, "some file", changes, unset)
+
+
+def normals(values, one):
+    """The standard normal numbers behind each key's draws, by the distribution functions of SciPy."""
+    m = np.ravel(one.contact.stiffness)[0]
+    return {
+        DELAY: (values[DELAY] - one.rig.force_sensor.delay) / 0.0001,
+        DAMPING: (values[DAMPING][:, 0] - one.contact.damping[0]) / 12.0,
+        SPEED: special.ndtri(stats.uniform(0.004, 0.002).cdf(values[SPEED])),
+        FREQUENCY: special.ndtri(stats.uniform(27.0, 6.0).cdf(values[FREQUENCY])),
+        STIFFNESS: special.ndtri(stats.loguniform(0.5 * m, 2 * m).cdf(values[STIFFNESS][:, 0])),
+    }
+
+
+@pytest.mark.parametrize("draws", [draw, quasi_random])
+def test_each_keeps_its_distribution_and_what_is_behind_is_correlated(draws):
+    one, number = mechanism(), 4096
+    behind = normals(draws(one, number, 5), one)
+    for key, values in behind.items():
+        assert stats.kstest(values, stats.norm.cdf).pvalue > 0.01, key
+    found, wanted = np.corrcoef([behind[key] for key in [*KEYS, SPEED]]), np.eye(5)
+    wanted[2, :2] = wanted[:2, 2] = 0.98, 0.1
+    # Fisher 1915: atanh of a correlation is normal, with variance 1 / (n - 3).
+    beyond = np.abs(np.arctanh(np.tril(found, -1)) - np.arctanh(np.tril(wanted, -1))) * np.sqrt(number - 3)
+    assert np.max(beyond) < 3.5
+    assert draws is draw or np.max(beyond) < 1
+
+
+def test_a_well_known_combination_of_two_badly_known_numbers_stays_well_known():
+    one = mechanism(keys=[DELAY, DAMPING], matrix=[[1.0], [0.98, 1.0]])
+    values = draw(one, 4096, 0)
+    stiffness = 120e3
+    combined = values[DAMPING][:, 0] - stiffness * values[DELAY]
+    variance = 12.0**2 + (stiffness * 1e-4) ** 2 - 2 * 0.98 * 12.0 * stiffness * 1e-4
+    assert abs(np.std(combined) / np.sqrt(variance) - 1) < 4 / np.sqrt(2 * 4096)
+
+
+def test_what_is_correlated_with_nothing_before_it_keeps_its_bits():
+    apart, together = draw(mechanism(keys=None), 500, 3), draw(mechanism(), 500, 3)
+    assert together.keys() == apart.keys()
+    for key in set(apart) - {DAMPING}:
+        np.testing.assert_array_equal(together[key], apart[key])
+    assert not np.any(together[DAMPING] == apart[DAMPING])
+    identity = draw(mechanism(matrix=[[1.0], [0, 1], [0, 0, 1], [0, 0, 0, 1]]), 500, 3)
+    for key in apart:
+        np.testing.assert_array_equal(identity[key], apart[key])
+
+
+def test_a_draw_depends_on_its_own_group_and_number_alone():
+    one = mechanism()
+    whole = draw(one, 1500, 7)
+    changed = mechanism(
+        keys=KEYS[:3], matrix=MATRIX[:3], changes=[f"uncertainty.'{FREQUENCY}'.factor=[0.5, 2]"]
+    )
+    for key, values in draw(one, 3, 7, first=1022).items():
+        np.testing.assert_array_equal(values, whole[key][1022:1025])
+        if key != FREQUENCY:
+            np.testing.assert_array_equal(draw(changed, 3, 7, first=1022)[key], values)
+    assert all(len(values) == 0 for values in draw(one, 0, 7).values())
+
+
+def test_quantiles_and_extremes_are_those_of_each_key_alone():
+    opposed = mechanism(keys=[DELAY, DAMPING], matrix=[[1.0], [-0.98, 1.0]])
+    apart = mechanism(keys=None)
+    for key, ends in extremes(opposed).items():
+        np.testing.assert_array_equal(ends, extremes(apart)[key])
+    points = np.repeat([[0.001], [0.5], [0.999]], sum(dimensions(apart).values()), axis=1)
+    for key, values in quantiles(opposed, points).items():
+        np.testing.assert_array_equal(values, at_points(apart, points)[key])
+    damping = at_points(opposed, points)[DAMPING][:, 0]
+    np.testing.assert_allclose(
+        (damping - apart.contact.damping[0]) / 12.0,
+        special.ndtri(points[:, 0]) * (np.sqrt(1 - 0.98**2) - 0.98),
+        atol=1e-9,
+    )
+    # Even where a coordinate is at an end of the box.
+    box = at_points(mechanism(), np.array([np.zeros(points.shape[1]), np.full(points.shape[1], 1 - 2**-53)]))
+    assert all(np.all(np.isfinite(values)) for values in box.values())
+
+
+def test_groups():
+    assert correlated_groups(mechanism()) == [(DELAY, STIFFNESS, DAMPING), (FREQUENCY,)]
+    assert correlated_groups(mechanism(keys=None)) == []
+
+
+def test_what_is_taken_out_is_taken_out_of_the_table():
+    left = mechanism(unset=[f"uncertainty.'{STIFFNESS}'"])
+    assert left.correlation.keys == [DELAY, DAMPING, FREQUENCY]
+    assert left.correlation.matrix == [[1.0], [0.98, 1.0], [0.0, 0.0, 1.0]]
+    assert to_builtins(left) == to_builtins(certain(mechanism(), [STIFFNESS]))
+    assert mechanism(unset=["contact.damping"]).correlation.keys == [DELAY, STIFFNESS, FREQUENCY]
+    for none in (
+        mechanism(unset=["uncertainty"]),
+        mechanism(unset=["correlation"]),
+        certain(mechanism(), KEYS),
+    ):
+        assert none.correlation is None
+    assert from_builtins(to_builtins(left), "again") == left
+
+
+@pytest.mark.parametrize(
+    ("keys", "matrix", "reason"),
+    [
+        (
+            [DELAY, "contact.dampin"],
+            [[1], [0, 1]],
+            "keys[1]: found 'contact.dampin', allowed a key of [uncert",
+        ),
+        (
+            [DELAY, "rig.simulator.delay"],
+            [[1], [0, 1]],
+            "keys[1]: found 'rig.simulator.delay', allowed a key",
+        ),
+        ([DELAY, DELAY], [[1], [0, 1]], f"keys[1]: found '{DELAY}' once more, allowed each key once"),
+        ([], [], "correlation.keys: found a list of 0 entries"),
+        ("a", [[1]], "correlation.keys: found 'a'"),
+        ([DELAY, SPEED], [[1]], "matrix: found 1 rows, allowed 2, one a key"),
+        (
+            [DELAY, SPEED],
+            [[1], [0.1]],
+            "matrix[1]: found 1 entries, allowed 2: the matrix up to its diagonal",
+        ),
+        ([DELAY, SPEED], [[1, 0], [0, 1]], "matrix[0]: found 2 entries, allowed 1"),
+        ([DELAY, SPEED], [[1], [0, 0.9]], "matrix[1][1]: found 0.9, allowed 1 on the diagonal"),
+        ([DELAY, SPEED], [[1], [1.5, 1]], "matrix[1][0]: found 1.5, allowed a number from -1 to 1"),
+        ([DELAY, SPEED], [[1], [float("nan"), 1]], "matrix[1][0]: found nan"),
+        ([DELAY, SPEED], [[1], [1, 1]], "matrix: found a least eigenvalue of"),
+        ([DELAY, SPEED, DAMPING], [[1], [0.9, 1], [0.9, -0.9, 1]], "allowed a positive definite matrix"),
+        (
+            ["approach.phase", DELAY],
+            [[1], [0, 1]],
+            "keys[0]: found 'approach.phase', allowed a key of one number",
+        ),
+        ([FREQUENCY, STIFFNESS], [[1], [0, 1]], f"keys[1]: found '{STIFFNESS}', allowed a key of one number"),
+    ],
+)
+def test_unusable_tables(keys, matrix, reason):
+    uncertain = {**UNCERTAIN, "approach.phase": {"distribution": "uniform", "low": 0.0, "high": 0.5}}
+    if keys == [FREQUENCY, STIFFNESS]:
+        uncertain[STIFFNESS] = uncertain[STIFFNESS] | {"independent": True}
+    raw = FULL | {"uncertainty": uncertain, "correlation": {"keys": keys, "matrix": matrix}}
+    with pytest.raises(InputError) as caught:
+        from_builtins(raw, "some file")
+    assert str(caught.value).startswith("some file: correlation.") and reason in str(caught.value)
+    assert str(caught.value).isprintable()
