@@ -66,6 +66,26 @@ def write_whole(path: Path, content: bytes | bytearray | memoryview, lasting: bo
         sync_folder(path.parent)
 
 
+def write_new(path: Path, content: bytes | bytearray | memoryview) -> None:
+    """The file is there as a whole, where nothing was before.
+
+    Raises FileExistsError if something was, or another OSError when it cannot be written.
+    """
+    temporary = path.with_name(temporary_name())
+    write_whole(temporary, content)
+    try:
+        os.link(temporary, path)
+    except OSError as error:
+        if error.errno not in (errno.EPERM, errno.ENOTSUP, errno.ENOSYS):
+            raise
+        # A file system without links.
+        if os.path.lexists(path):
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), os.fspath(path)) from None
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
 def write_sealed(path: Path, content: bytes | bytearray | memoryview, lasting: bool = True) -> None:
     """`write_whole` of the content under its seal, which shows what a power cut took of it."""
     seal = hashlib.sha256(content).hexdigest().encode("ascii") + b"\n"

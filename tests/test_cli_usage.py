@@ -3,11 +3,15 @@
 import os
 import subprocess
 import sys
+from importlib import metadata
+from pathlib import Path
 
+import msgspec
 import pytest
 from conftest import Ran
 
-from jaxhil.mechanism.file import builtin_names, suite_names
+from jaxhil.mechanism.file import builtin_names, load, suite_names
+from jaxhil.mechanism.json_schema import json_schema
 from jaxhil.simulation import environment
 from tuning.cli.commands.tune import folder_name, is_better
 from tuning.cli.options import DEFAULT_DRIVERS, DEFAULT_PLOT
@@ -55,6 +59,7 @@ def test_interrupt_anywhere_is_130(jaxhil, monkeypatch):
         (["tune", "--compensator", "magic"], ["magic", "response_error"]),
         (["verify", "nowhere.json"], ["nowhere.json", "No such file"]),
         (["verify", "x", "--scenarios", "0"], ["--scenarios"]),
+        (["init", "rig-300"], ["rig-300", "did you mean rig-300kg"]),
     ],
 )
 def test_unusable_input_is_reported_in_one_line(jaxhil, arguments, words):
@@ -86,7 +91,7 @@ def test_wrong_usage_is_2(jaxhil, arguments):
     assert ran.code == 2 and ran.out == "" and ran.err != ""
 
 
-@pytest.mark.parametrize("command", ["simulate", "tune", "export", "verify", "rig", "mechanisms"])
+@pytest.mark.parametrize("command", ["init", "simulate", "tune", "export", "verify", "rig", "mechanisms"])
 def test_help_has_an_example(jaxhil, command):
     ran = jaxhil(command, "--help")
     assert ran.code == 0
@@ -126,6 +131,48 @@ def test_mechanisms_lists_the_built_in_files(jaxhil):
     assert rig["contact_frequencies"] == [pytest.approx(3.0, rel=1e-5)]
     listed = jaxhil("mechanisms").out
     assert all(entry["source"][:20] in listed for entry in [*entries, *document["suites"]])
+    assert str(Path(rig["path"]).parent) in "".join(listed.split("\n"))
+    assert jaxhil("mechanisms", "--schema").document == json_schema()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "written", "source"),
+    [
+        ([], "mechanism.toml", "varying"),
+        (["my-rig.toml"], "my-rig.toml", "varying"),
+        (["suite-hertz", "-o", "study/my rig.toml"], "study/my rig.toml", "suite-hertz"),
+    ],
+)
+def test_init_writes_a_mechanism_file(jaxhil, monkeypatch, tmp_path, arguments, written, source):
+    monkeypatch.chdir(tmp_path)
+    ran = jaxhil("init", *arguments, "--json")
+    assert ran.code == 0
+    mechanism = load(written).mechanism
+    assert mechanism.name == ran.document["name"] == Path(written).stem
+    assert msgspec.structs.replace(mechanism, name=source) == load(source).mechanism
+    assert [path.name for path in (tmp_path / written).parent.iterdir()] == [Path(written).name]
+
+
+@pytest.mark.parametrize("taken", [Path.touch, Path.mkdir, lambda path: path.symlink_to("nowhere")])
+def test_init_overwrites_nothing(jaxhil, tmp_path, taken):
+    path = tmp_path / "rig.toml"
+    taken(path)
+    before = os.lstat(path)
+    refused(jaxhil("init", "-o", path), str(path), "nothing is overwritten")
+    assert os.lstat(path) == before and list(tmp_path.iterdir()) == [path]
+
+
+def test_init_lists_names(jaxhil):
+    names = [*builtin_names(), *suite_names()]
+    assert (
+        jaxhil("init", "--list").out.split() == jaxhil("init", "--list", "--json").document["names"] == names
+    )
+
+
+def test_version_and_completion(jaxhil):
+    assert jaxhil("--version") == Ran(0, f"jaxhil {metadata.version('jaxhil')}\n", "")
+    assert "--tyro-write-completion bash" in jaxhil("--help").out
+    assert "jaxhil" in jaxhil("--tyro-print-completion", "bash").out
 
 
 def test_plot_without_a_name_gets_one():

@@ -1,5 +1,6 @@
 """Files are written whole or not at all, sealed ones are as written or none, nobody else's are touched."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -15,6 +16,7 @@ from jaxhil.files import (
     open_plain,
     read_sealed,
     remove_stale,
+    write_new,
     write_sealed,
     write_whole,
     writing,
@@ -26,6 +28,20 @@ def test_a_file_is_replaced(tmp_path):
     for content in (b"old", bytearray(b"new"), memoryview(b"newer")):
         write_whole(path, content)
         assert path.read_bytes() == content and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("has_links", [True, False])
+def test_a_new_file_takes_nobody_s_place(tmp_path, monkeypatch, has_links):
+    def refuse(*_):
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    if not has_links:
+        monkeypatch.setattr(os, "link", refuse)
+    path = tmp_path / "file"
+    write_new(path, b"first")
+    with pytest.raises(FileExistsError):
+        write_new(path, b"second")
+    assert path.read_bytes() == b"first" and list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace"])

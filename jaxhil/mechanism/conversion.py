@@ -27,8 +27,10 @@ from jaxhil.mechanism.structs import (
 )
 
 __all__ = [
+    "NUMBER_FOR_LIST",
     "KeyProblem",
     "Path",
+    "allowed_of",
     "close_match",
     "computable",
     "dotted",
@@ -43,7 +45,7 @@ Path = tuple[str | int, ...]
 Extra = Mapping[str, Any]  # what `jaxhil.mechanism.structs.says` puts beside a type
 
 # Lists for which a bare number stands for a list of one entry.
-_NUMBER_FOR_LIST = {("contact", "stiffness"), ("contact", "damping")}
+NUMBER_FOR_LIST = ("contact", "stiffness"), ("contact", "damping")
 # Polynomials, whose leading zeros say nothing.
 _POLYNOMIALS = {("rig", "simulator", "numerator"), ("rig", "simulator", "denominator")}
 
@@ -126,7 +128,35 @@ def step_into(kind: inspect.Type, part: str | int, path: Path) -> inspect.Type:
             return item
         case _:
             pass
-    raise KeyProblem((*path, part), "no such key", _allowed(kind, PLAIN) + f" at {dotted(path)}")
+    raise KeyProblem((*path, part), "no such key", allowed_of(kind, PLAIN) + f" at {dotted(path)}")
+
+
+def allowed_of(kind: inspect.Type, extra: Extra = PLAIN) -> str:
+    """The values of a type, in words."""
+    match kind:
+        case inspect.Metadata(extra={"one_of": names}):
+            return f"one of {', '.join(names)}"
+        case inspect.Metadata(type=inner):
+            return allowed_of(inner, kind.extra or PLAIN)
+        case inspect.UnionType(types=members):
+            kinds = [allowed_of(m, extra) for m in members if not isinstance(m, inspect.NoneType)]
+            return " or ".join(kinds)
+        case inspect.FloatType():
+            return str(range_of(kind, extra))
+        case inspect.IntType():
+            return f"an integer from {kind.ge} to {kind.le}"
+        case inspect.BoolType():
+            return "true or false"
+        case inspect.StrType():
+            return f"a text of {kind.min_length or 0} to {kind.max_length} characters"
+        case inspect.LiteralType(values=values):
+            return "one of " * (len(values) > 1) + ", ".join(map(str, values))
+        case inspect.ListType(item_type=item):
+            shortest, longest = kind.min_length or 0, kind.max_length
+            length = f"{shortest}" if shortest == longest else f"{shortest} to {longest}"
+            return f"a list of {length} entries, each {allowed_of(item, PLAIN)}"
+        case _:
+            return "a table"
 
 
 def _bare(kind: inspect.Type) -> inspect.Type:
@@ -141,7 +171,7 @@ def _unknown_key(kind: inspect.StructType, key: str, path: Path) -> KeyProblem:
 
 def _clean(kind: inspect.Type, value: Any, path: Path, extra: Extra) -> Any:
     """`value` as plain data of type `kind`, numbers as floats; raises `KeyProblem`."""
-    if path in _NUMBER_FOR_LIST and isinstance(value, (int, float)) and not isinstance(value, bool):
+    if path in NUMBER_FOR_LIST and isinstance(value, (int, float)) and not isinstance(value, bool):
         value = [value]
     match kind:
         case inspect.Metadata(extra={"one_of": names}):
@@ -160,7 +190,7 @@ def _clean(kind: inspect.Type, value: Any, path: Path, extra: Extra) -> Any:
         case inspect.ListType(item_type=item) if isinstance(value, (list, tuple)):
             shortest, longest = kind.min_length or 0, kind.max_length
             if len(value) < shortest or (longest is not None and len(value) > longest):
-                raise KeyProblem(path, entry_count(value), _allowed(kind, PLAIN))
+                raise KeyProblem(path, entry_count(value), allowed_of(kind, PLAIN))
             cleaned = [_clean(item, entry, (*path, i), PLAIN) for i, entry in enumerate(value)]
             while path in _POLYNOMIALS and len(cleaned) > 1 and cleaned[0] == 0.0:
                 del cleaned[0]
@@ -187,7 +217,7 @@ def _clean(kind: inspect.Type, value: Any, path: Path, extra: Extra) -> Any:
             return value
         case _:
             pass
-    raise KeyProblem(path, shown(value), _allowed(kind, extra))
+    raise KeyProblem(path, shown(value), allowed_of(kind, extra))
 
 
 def _clean_struct(kind: inspect.StructType, value: Mapping[Any, Any], path: Path) -> dict[str, Any]:
@@ -201,7 +231,7 @@ def _clean_struct(kind: inspect.StructType, value: Mapping[Any, Any], path: Path
         if entry.name in value:
             cleaned[entry.name] = _clean(entry.type, value[entry.name], (*path, entry.name), PLAIN)
         elif entry.required:
-            raise KeyProblem((*path, entry.name), "nothing", _allowed(entry.type, PLAIN))
+            raise KeyProblem((*path, entry.name), "nothing", allowed_of(entry.type, PLAIN))
     return cleaned
 
 
@@ -215,30 +245,3 @@ def _member(members: Iterable[inspect.Type], value: Any) -> inspect.Type:
     others = [kind for kind in kinds if kind not in nothing and kind not in lists]
     wanted = lists or others if isinstance(value, (list, tuple)) else others or lists
     return wanted[0]
-
-
-def _allowed(kind: inspect.Type, extra: Extra) -> str:
-    match kind:
-        case inspect.Metadata(extra={"one_of": names}):
-            return f"one of {', '.join(names)}"
-        case inspect.Metadata(type=inner):
-            return _allowed(inner, kind.extra or PLAIN)
-        case inspect.UnionType(types=members):
-            kinds = [_allowed(m, extra) for m in members if not isinstance(m, inspect.NoneType)]
-            return " or ".join(kinds)
-        case inspect.FloatType():
-            return str(range_of(kind, extra))
-        case inspect.IntType():
-            return f"an integer from {kind.ge} to {kind.le}"
-        case inspect.BoolType():
-            return "true or false"
-        case inspect.StrType():
-            return f"a text of {kind.min_length or 0} to {kind.max_length} characters"
-        case inspect.LiteralType(values=values):
-            return "one of " * (len(values) > 1) + ", ".join(map(str, values))
-        case inspect.ListType(item_type=item):
-            shortest, longest = kind.min_length or 0, kind.max_length
-            length = f"{shortest}" if shortest == longest else f"{shortest} to {longest}"
-            return f"a list of {length} entries, each {_allowed(item, PLAIN)}"
-        case _:
-            return "a table"

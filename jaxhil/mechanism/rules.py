@@ -28,19 +28,19 @@ from jaxhil.mechanism.structs import (
     value_at,
 )
 
-__all__ = ["check", "is_hurwitz"]
+__all__ = ["KEYS_OF_MODELS", "LAWS_OF_KEYS", "UNDAMPED", "check", "is_hurwitz"]
 
 # Keys of each model of the motion simulator.
-_NEEDED = {
+KEYS_OF_MODELS = {
     "ideal": (),
     "first_order": ("time_constant",),
     "second_order": ("natural_frequency", "damping_ratio"),
     "third_order": ("coefficients",),
     "transfer_function": ("numerator", "denominator"),
 }
-_OF_SOME_MODEL = sorted({key for keys in _NEEDED.values() for key in keys})
+_OF_SOME_MODEL = sorted({key for keys in KEYS_OF_MODELS.values() for key in keys})
 # Keys of some contact laws alone; all others are at their defaults in a contact that states none of them.
-_LAWS_OF = {
+LAWS_OF_KEYS = {
     "tension": ("kelvin_voigt",),
     "exponent": ("hunt_crossley", "depth_damped"),
     "depths": ("piecewise_linear",),
@@ -50,7 +50,7 @@ _LAWS_OF = {
     "friction": ("preloaded",),
 }
 # Laws without damping, and what they dissipate by.
-_UNDAMPED = {"elastoplastic": "yielding", "preloaded": "friction"}
+UNDAMPED = {"elastoplastic": "yielding", "preloaded": "friction"}
 _PLAIN = Contact(law="linear", stiffness=[1.0])
 _Span = tuple[np.ndarray, np.ndarray]
 _FIXED = ("rig.simulator.numerator", "rig.simulator.denominator")
@@ -136,7 +136,7 @@ def _check_contact(contact: Contact) -> None:
 
 def _check_keys_of_laws(mechanism: Mechanism) -> None:
     contact = mechanism.contact
-    for key, laws in _LAWS_OF.items():
+    for key, laws in LAWS_OF_KEYS.items():
         path, value, default = f"contact.{key}", getattr(contact, key), getattr(_PLAIN, key)
         if contact.law in laws and value is None:
             allowed = f"{numeric_keys()[path]} (law {contact.law} needs it)"
@@ -147,9 +147,9 @@ def _check_keys_of_laws(mechanism: Mechanism) -> None:
                 raise KeyProblem(("contact", key), shown(value), f"nothing ({only})")
             if path in mechanism.uncertainty and value not in (None, []):
                 raise KeyProblem(("uncertainty", path), f"a key {only}", "keys that the law uses")
-    if contact.law in _UNDAMPED and _is_damped(mechanism):
+    if contact.law in UNDAMPED and _is_damped(mechanism):
         damping = shown(contact.damping) if any(contact.damping) else "an uncertain damping"
-        allowed = f"0 (law {contact.law} dissipates by {_UNDAMPED[contact.law]})"
+        allowed = f"0 (law {contact.law} dissipates by {UNDAMPED[contact.law]})"
         raise KeyProblem(("contact", "damping"), damping, allowed)
 
 
@@ -162,14 +162,14 @@ def _is_damped(mechanism: Mechanism, *, by: str = "damping") -> bool:
 
 def _check_simulator(simulator: Simulator) -> None:
     path = ("rig", "simulator")
-    for key in _NEEDED[simulator.model]:
+    for key in KEYS_OF_MODELS[simulator.model]:
         if getattr(simulator, key) is None:
             lists = ("coefficients", "numerator", "denominator")
             allowed = "a list of numbers" if key in lists else "a number > 0"
             raise KeyProblem((*path, key), "nothing", f"{allowed} ({simulator.model} needs it)")
     for key in _OF_SOME_MODEL:
         value = getattr(simulator, key)
-        if value is not None and key not in _NEEDED[simulator.model]:
+        if value is not None and key not in KEYS_OF_MODELS[simulator.model]:
             allowed = f"nothing ({simulator.model} does not use it: unset it)"
             raise KeyProblem((*path, key), shown(value), allowed)
     if simulator.model == "first_order" and simulator.time_constant == 0.0:

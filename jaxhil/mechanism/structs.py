@@ -60,10 +60,12 @@ BUILT_IN_LAWS = (
 CONTACT_LAWS = [*BUILT_IN_LAWS]  # and those that `jaxhil.register` enters
 
 
-def says(meaning: str, unit: str = "1", **limits: Any) -> Meta:
-    """What a key's type says of it: a line of meaning, the unit, and the allowed values."""
-    infinite = limits.pop("infinite", False)
-    return Meta(description=meaning, extra={"unit": unit, "infinite": infinite}, **limits)
+def says(meaning: str, unit: str | None = None, **limits: Any) -> Meta:
+    """What a key's type says of it: a line of meaning, a number's unit ("1" if it has none), and the allowed
+    values."""
+    stated = {} if unit is None else {"unit": unit}
+    extra = {"infinite": limits.pop("infinite", False), **stated}
+    return Meta(description=meaning, extra=extra, extra_json_schema=stated, **limits)
 
 
 Law = Annotated[str, Meta(description="which force the mechanism gives", extra={"one_of": CONTACT_LAWS})]
@@ -77,12 +79,14 @@ Stiffness = Annotated[float, says("slope of the force", "N/m", gt=0.0)]
 Slopes = Annotated[list[Stiffness], Meta(min_length=1, max_length=21)]
 Damping = Annotated[float, says("damping of the contact", "N s/m", ge=0.0)]
 Depth = Annotated[float, says("where the slope changes", "m", gt=0.0)]
-Factor = Annotated[float, says("share of the nominal value", gt=0.0)]
-Coefficient = Annotated[float, says("a power's coefficient, the n-th has the unit s^n", gt=0.0)]
-Polynomial = Annotated[list[float], Meta(min_length=1, max_length=21)]
+Factor = Annotated[float, says("share of the nominal value", "1", gt=0.0)]
+Coefficient = Annotated[float, says("of the n-th power of s", "s^n", gt=0.0)]
+Polynomial = Annotated[
+    list[Annotated[float, says("of the n-th power of s", "s^n")]], Meta(min_length=1, max_length=21)
+]
 UncertainKey = Annotated[str, Meta(min_length=1, max_length=100)]
 CorrelationRow = Annotated[
-    list[Annotated[float, says("of two keys' underlying normal numbers", ge=-1.0, le=1.0)]],
+    list[Annotated[float, says("of two keys' underlying normal numbers", "1", ge=-1.0, le=1.0)]],
     Meta(min_length=1, max_length=100),
 ]
 
@@ -112,8 +116,10 @@ class Approach(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How the bodies meet."""
 
     velocity: Annotated[float, says("speed of the first approach", "m/s", gt=0.0)]
-    contacts: Annotated[int, says("how many successive contacts a run makes", ge=1, le=MAX_CONTACTS)] = 1
-    phase: Annotated[float, says("of the first contact within a control period", ge=0.0, le=1.0)] = 1.0 / 3.0
+    contacts: Annotated[int, says("how many successive contacts a run makes", "1", ge=1, le=MAX_CONTACTS)] = 1
+    phase: Annotated[float, says("of the first contact within a control period", "1", ge=0.0, le=1.0)] = (
+        1.0 / 3.0
+    )
 
 
 class Contact(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -143,7 +149,7 @@ class Contact(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     clearance: Annotated[
         float, says("between two surfaces; infinite where there is one", "m", gt=0.0, infinite=True)
     ] = math.inf
-    exponent: Annotated[float, says("of the depth, for hunt_crossley and depth_damped", ge=1.0)] = 1.5
+    exponent: Annotated[float, says("of the depth, for hunt_crossley and depth_damped", "1", ge=1.0)] = 1.5
     depths: Annotated[
         list[Depth], Meta(max_length=20, description="where the slope changes, for piecewise_linear")
     ] = field(default_factory=list)
@@ -152,7 +158,8 @@ class Contact(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
                               "damping", "m", gt=0.0)] | None
     ) = None  # fmt: skip
     unloading_ratio: (
-        Annotated[float, says("slope of unloading over that of loading, for elastoplastic", ge=1.0)] | None
+        Annotated[float, says("slope of unloading over that of loading, for elastoplastic", "1", ge=1.0)]
+        | None
     ) = None
     preload: Annotated[float, says("of the spring at the touch, for preloaded", "N", ge=0.0)] = 0.0
     friction: Annotated[float, says("dry friction against the motion, for preloaded", "N", ge=0.0)] = 0.0
@@ -163,7 +170,7 @@ class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     model: Annotated[SimulatorModel, says("what G(s) is")]
     natural_frequency: Annotated[float, says("of second_order", "Hz", gt=0.0)] | None = None
-    damping_ratio: Annotated[float, says("of second_order", gt=0.0)] | None = None
+    damping_ratio: Annotated[float, says("of second_order", "1", gt=0.0)] | None = None
     time_constant: Annotated[float, says("of first_order", "s", ge=0.0)] | None = None
     coefficients: (
         Annotated[
@@ -206,7 +213,7 @@ class Rig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     control_period: Annotated[float, says("time from tick to tick", "s", gt=0.0, le=0.1)]
     integrator: Annotated[Integrator, says("of the numerical model")] = "semi_implicit_euler"
-    command_latency: Annotated[int, says("periods until a command reaches the drives", ge=0, le=1)] = 0
+    command_latency: Annotated[int, says("periods until a command reaches the drives", "1", ge=0, le=1)] = 0
     command_hold: Annotated[CommandHold, says("of the command within a period")] = "linear"
     contact_plane: Annotated[
         float, says("where the hardware touches; the controller takes it to be at 0", "m")

@@ -66,6 +66,24 @@ Setting = Annotated[
 
 
 @dataclass(frozen=True)
+class Init:
+    """Write a mechanism file to start from: every key with its meaning, unit, range and default.
+
+    Example: jaxhil init rig-300kg --output my-rig.toml
+
+    It is never written over a file that is there.
+    """
+
+    name: Annotated[
+        Positional[str | None],
+        text("[NAME]", "Built-in mechanism whose values it has; by default 'varying'."),
+    ] = None
+    output: Annotated[str, arg(aliases=("-o",), metavar="FILE", help="The file.")] = "mechanism.toml"
+    list: Annotated[FlagCreatePairsOff[bool], text(None, "Only list the names, writing nothing.")] = False
+    json: Json = False
+
+
+@dataclass(frozen=True)
 class Simulate:
     """Run the contacts once; per contact restitution, reference, error, peak force, duration.
 
@@ -290,9 +308,12 @@ class Compare:
 
 @dataclass(frozen=True)
 class Mechanisms:
-    """The built-in mechanism files, with their sources.
+    """The built-in mechanism files, with their sources and paths.
 
     Example: jaxhil mechanisms --json
     """
 
+    schema: Annotated[
+        FlagCreatePairsOff[bool], text(None, "Instead the JSON Schema of mechanism files, for editors.")
+    ] = False
     json: Json = False

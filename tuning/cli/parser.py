@@ -6,6 +6,7 @@ Neither `--help` nor a wrong argument imports jax: the commands' modules are imp
 import importlib
 import sys
 from collections.abc import Callable, Sequence
+from importlib import metadata
 from typing import Annotated
 
 import tyro
@@ -17,6 +18,7 @@ from tuning.cli.options import (
     DEFAULT_REPLAY_PLOT,
     PICTURES,
     Compare,
+    Init,
     Mechanisms,
     Replay,
     Simulate,
@@ -25,8 +27,14 @@ from tuning.cli.options import (
 )
 from tuning.cli.options_rig import DEFAULT_RIG_PLOT, Export, RigOptions, Verify
 
+DESCRIPTION = """Gains that keep hardware-in-the-loop docking tests from diverging.
+
+jaxhil --version says which version this is. Completion by the Tab key, for bash (or zsh, tcsh):
+jaxhil --tyro-write-completion bash ~/.local/share/bash-completion/completions/jaxhil"""
+
 Command = (
-    Annotated[Simulate, subcommand("simulate")]
+    Annotated[Init, subcommand("init")]
+    | Annotated[Simulate, subcommand("simulate")]
     | Annotated[Tune, subcommand("tune")]
     | Annotated[Sweep, subcommand("sweep")]
     | Annotated[Replay, subcommand("replay")]
@@ -41,10 +49,12 @@ Command = (
 def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
     """The command that the arguments ask for, ready to run; it returns the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    if given == ["--version"]:
+        return _print_version
     options = tyro.cli(
         Command,  # pyright: ignore[reportArgumentType]
         prog="jaxhil",
-        description="Gains that keep hardware-in-the-loop docking tests from diverging.",
+        description=DESCRIPTION,
         args=complete_bare(given),
     )
 
@@ -53,6 +63,11 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
         return importlib.import_module(f"tuning.cli.commands.{command}").run(options)
 
     return run
+
+
+def _print_version() -> int:
+    print(f"jaxhil {metadata.version('jaxhil')}")
+    return 0
 
 
 def complete_bare(arguments: list[str]) -> list[str]:

@@ -1,9 +1,10 @@
-"""`jaxhil mechanisms`: the built-in mechanism files and the standard suites, with their sources."""
+"""`jaxhil mechanisms`: the built-in mechanism files and the standard suites, and the schema of such files."""
 
 import math
 from typing import Any
 
-from jaxhil.mechanism.file import builtin_names, builtin_path, load, suite_names
+from jaxhil.mechanism.file import DEFAULT, builtin_names, builtin_path, load, suite_names
+from jaxhil.mechanism.json_schema import json_schema
 from jaxhil.mechanism.structs import Mechanism
 from tuning import terminal
 from tuning.cli.options import Mechanisms
@@ -11,6 +12,9 @@ from tuning.cli.options import Mechanisms
 
 def run(options: Mechanisms) -> int:
     """List them; always 0."""
+    if options.schema:
+        terminal.emit_json(json_schema())
+        return 0
     titles = {"Built-in mechanisms": builtin_names(), "Standard suites": suite_names()}
     tables = {
         title: [_entry(name, load(name).mechanism) for name in names] for title, names in titles.items()
@@ -25,6 +29,7 @@ def run(options: Mechanisms) -> int:
             terminal.table(title, headings, [_row(entry) for entry in entries], texts=(0, 1, 4)),
             *(f"{entry['name']}: {entry['source']}\n" for entry in entries),
         )
+    terminal.emit(f"The files are in {builtin_path(DEFAULT).parent}; `jaxhil init NAME` copies one.")
     return 0
 
 

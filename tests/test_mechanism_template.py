@@ -1,0 +1,132 @@
+"""A new mechanism file, the JSON Schema of such files, and the descriptions of keys that both are made of."""
+
+import re
+import tomllib
+from typing import Annotated
+
+import jsonschema
+import msgspec
+import pytest
+
+from jaxhil.mechanism.file import builtin_names, builtin_path, load, suite_names, to_builtins
+from jaxhil.mechanism.json_schema import json_schema
+from jaxhil.mechanism.keys import tables
+from jaxhil.mechanism.structs import MAX_CONTACTS, numeric_keys, says
+from jaxhil.mechanism.template import commented
+
+NAMES = [*builtin_names(), *suite_names()]
+
+
+@pytest.fixture(scope="module")
+def validator():
+    schema = json_schema()
+    jsonschema.Draft202012Validator.check_schema(schema)
+    return jsonschema.Draft202012Validator(schema)
+
+
+CORRELATED = {
+    "correlation": {
+        "keys": ["approach.velocity", "rig.force_sensor.delay"],
+        "matrix": [[1.0], [-0.25, 1.0]],
+    }
+}
+
+
+@pytest.mark.parametrize("name", [*NAMES, "correlated"])
+def test_a_new_file_says_the_same(name, written):
+    mechanism = load("varying", CORRELATED).mechanism if name == "correlated" else load(name).mechanism
+    text = commented(mechanism)
+    assert load(written(text)).mechanism == mechanism
+    assert max(map(len, text.splitlines())) <= 110 or max(map(len, mechanism.source.splitlines())) > 90
+
+
+def test_a_new_file_has_every_key_at_its_default(written):
+    """Without the sign of a comment, what it states as a default is the default."""
+    text = commented(load("rig-300kg").mechanism)
+    defaults = {
+        f"{table.path}.{key.name}".lstrip("."): key.default for table in tables() for key in table.keys
+    }
+    shown, path = {}, ""
+    for line in text.splitlines():
+        if found := re.fullmatch(r"#?\[([\w.]+)\].*", line):
+            path = found[1] + "."
+        elif found := re.match(r"(#?)(\w+) =(.*)", line):
+            value = tomllib.loads("value =" + found[3]) if found[3].split("#")[0].strip() else {}
+            shown[path + found[2]] = (found[1], value.get("value"))
+    assert set(shown) == {name for name in defaults if '"' not in name}
+    assert all(value == defaults[name] for name, (sign, value) in shown.items() if sign)
+    # As the file is read with none of the signs, where the law uses the keys.
+    of_laws = {key.name for table in tables() for key in table.keys if key.users}
+    live = re.sub(
+        r"^#(\w+)( = )", lambda line: line[0] if line[1] in of_laws else line[1] + line[2], text, flags=re.M
+    )
+    live = "\n".join(line for line in live.splitlines() if not re.match(r"\w+ = +# ", line))
+    assert load(written(live)).mechanism == load("rig-300kg").mechanism
+
+
+def test_a_new_file_explains_itself():
+    text = commented(load("varying").mechanism)
+    assert re.search(r"^velocity = 0\.005 +# speed of the first approach: a number > 0 m/s$", text, re.M)
+    assert re.search(r"^#tension = false +# whether kelvin_voigt may pull: true or false$", text, re.M)
+
+
+def test_every_key_is_described():
+    keys = {f"{table.path}.{key.name}": key for table in tables() for key in table.keys}
+    numbers = {path for path in keys if '"' not in path and keys[path].unit is not None}
+    others = {"approach.contacts", "rig.command_latency", "correlation.matrix"}  # whole ones, and of keys
+    assert numbers - others == set(numeric_keys())
+    assert all(keys[path].unit == numeric_keys()[path].unit for path in numbers - others)
+    assert keys["approach.contacts"].allowed == f"an integer from 1 to {MAX_CONTACTS}"
+    assert keys["contact.preload"].users == ("preloaded",)
+    assert keys["rig.simulator.coefficients"].users == ("third_order",)
+    assert "elastoplastic" not in keys["contact.damping"].users
+    assert keys["approach.velocity"].required and not keys["approach.contacts"].required
+
+
+class _Silent(msgspec.Struct):
+    drag: Annotated[float, msgspec.Meta(ge=0.0)]
+
+
+class _Unitless(msgspec.Struct):
+    drag: Annotated[float, says("of the air", ge=0.0)] | None = None
+
+
+@pytest.mark.parametrize(
+    ("kind", "reason"),
+    [(_Silent, "drag: its type does not say what it means"), (_Unitless, "drag: .* the number's unit")],
+)
+def test_a_key_without_meaning_or_unit_is_refused(kind, reason):
+    with pytest.raises(ValueError, match=reason):
+        tables(kind)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_schema_takes_what_is_built_in(validator, name):
+    validator.validate(tomllib.loads(builtin_path(name).read_text(encoding="utf-8")))
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "value"),
+    [
+        ("approach", "velocity", -1.0),
+        ("approach", "speed", 1.0),
+        ("contact", "law", "magic"),
+        ("contact", "damping", "much"),
+        ("rig", "control_period", 0.5),
+        ("uncertainty", "contact.hardness", {"distribution": "uniform", "factor": [0.5, 2.0]}),
+        ("uncertainty", "contact.stiffness", {"distribution": "uniform", "factor": [0.5]}),
+    ],
+)
+def test_the_schema_refuses_what_the_reader_refuses(validator, table, key, value):
+    document = to_builtins(load("varying").mechanism)
+    document[table][key] = value
+    assert not validator.is_valid(document)
+
+
+def test_the_schema_knows_units_and_numbers_for_lists(validator):
+    document = to_builtins(load("varying").mechanism)
+    document["contact"]["stiffness"] = 1e5
+    validator.validate(document)
+    sensor = validator.schema["$defs"]["ForceSensor"]["properties"]
+    assert sensor["delay"]["description"] == "transport delay of the reading [s]"
+    assert "default" not in sensor["range"]  # JSON has no infinity
