@@ -1,0 +1,111 @@
+"""Channels that are not what they are said to be are found, by the numerical model's own motion."""
+
+import numpy as np
+import pytest
+from log_cases import LAG, MASS, PERIOD, STIFFNESS, read, sway, touches, write_csv
+
+from jaxhil.errors import InputError
+
+LOG = touches(2, noise=0.0)
+
+
+def message(path, kind="contact", **said):
+    with pytest.raises(InputError) as caught:
+        read(path, kind, **said)
+    assert str(caught.value).isprintable() and str(caught.value).startswith(f"{path}: ")
+    return str(caught.value)
+
+
+def model(integrator, row, sign=1):
+    """Commands of a model under a given force, and the rows in which a logger puts them."""
+    times = PERIOD * np.arange(900)
+    force = 40 * np.sin(np.pi * times / 0.25) ** 2 * ((times > 0.1) & (times < 0.6))
+    x, v, found = -5e-3, 0.02, []
+    for one in force:
+        found.append((x, v))
+        a = -one / MASS
+        if integrator == "semi_implicit_euler":
+            v += PERIOD * a
+            x += PERIOD * v
+        elif integrator == "zoh":
+            x, v = x + PERIOD * v + PERIOD**2 * a / 2, v + PERIOD * a
+        else:
+            x, v = x + PERIOD * v, v + PERIOD * a
+    x, v = np.array(found).T
+    shift = 1 if row == "sent" else 0
+    xd, vd, force = x[shift:], v[shift:], force[: len(x) - shift]
+    xm = np.concatenate([x[0] - 2e-5 * np.arange(LAG, 0, -1), x[:-LAG]])[: len(xd)]
+    return {"t": times[: len(xd)], "xd": xd, "xm": xm, "F": force, "vd": vd, "Fc": sign * force}
+
+
+@pytest.mark.parametrize("integrator", ["semi_implicit_euler", "zoh", "explicit_euler"])
+@pytest.mark.parametrize("row", ["tick", "sent"])
+def test_rows_of_another_tick_are_found_whatever_the_integrator(tmp_path, integrator, row):
+    path = write_csv(tmp_path / "a.csv", model(integrator, row))
+    assert read(path, timing={"row": row}).runs[0].kind == "contact"
+    other = "tick" if row == "sent" else "sent"
+    assert f'timing.row: found "{other}"' in (found := message(path, timing={"row": other}))
+    assert f'({integrator}) in rows that are "{row}"' in found
+    if row == "tick":
+        assert read(path, timing={"row": "after"}).notes == ()
+
+
+def test_a_wrong_sign_or_mass_of_the_force_command_is_found(tmp_path):
+    path = write_csv(tmp_path / "a.csv", model("zoh", "tick", sign=-1))
+    assert "force_command: found one that pulls the model forward" in message(path)
+    assert read(path, force_command={"column": "Fc", "sign": -1}).notes == ()
+    assert "of 350 kg (nearest: 175 kg)" in message(
+        path, force_command={"column": "Fc", "sign": -1, "scale": 0.5}
+    )
+    coarse = model("zoh", "tick")
+    coarse["xd"] = np.round(coarse["xd"], 6)
+    (note,) = read(write_csv(tmp_path / "b.csv", coarse)).notes
+    assert "steps of 1e-06 m are too coarse" in note
+
+
+@pytest.mark.parametrize(
+    ("channels", "reason"),
+    [
+        ({"force_measured": {"column": "F", "sign": -1}}, "found one that pulls where"),
+        ({"force_measured": {"column": "F", "unit": "kN"}}, "times the impulse that there was"),
+        ({"force_measured": {"column": "F", "unit": "mN"}}, "found 0.001 times the impulse"),
+        ({"position_measured": {"column": "xm", "unit": "mm"}}, "found a stroke of 1.3e-06 m"),
+        ({"position_measured": {"column": "xm", "sign": -1}}, "found one that moves against"),
+        ({"position_desired": "xm", "position_measured": "xd"}, "one that follows (are the two swapped?)"),
+        ({"position_desired": {"column": "xd", "unit": "mm"}}, "found a stroke of 1.27e-06"),
+        ({"position_desired": {"column": "xd", "scale": 1e3}}, "found a stroke of 1.27 m, allowed"),
+        ({"position_measured": "still"}, "found 0 m in every row, allowed"),
+        ({"force_measured": "still"}, "force_measured: found 0 N in every row"),
+        ({"position_desired": "still"}, "nothing excites the motion"),
+    ],
+)  # fmt: skip
+def test_units_signs_and_swapped_channels(tmp_path, channels, reason):
+    path = write_csv(tmp_path / "a.csv", LOG | {"still": np.zeros(1200)})
+    assert reason in message(path, force_command=None, velocity_desired=None, **channels)
+
+
+def test_of_a_free_run_too(tmp_path):
+    path = write_csv(tmp_path / "a.csv", sway() | {"slow": 1e-3 * sway()["xm"]})
+    assert read(path, "free").notes == ()
+    assert "leads position_desired" in message(path, "free", position_desired="xm", position_measured="xd")
+    assert "a stroke 0.01 times that" in message(
+        path, "free", position_measured={"column": "slow", "scale": 10}
+    )
+    fast = write_csv(tmp_path / "b.csv", sway(amplitude=0.3))
+    assert "found speeds of" in message(fast, "free")
+    noise = sway() | {"xm": 1e-3 * np.random.default_rng(0).standard_normal(800)}
+    (note,) = read(write_csv(tmp_path / "c.csv", noise), "free").notes
+    assert "hardly follows position_desired" in note
+    assert read(write_csv(tmp_path / "d.csv", sway(amplitude=0.0)), "rest").runs[0].kind == "rest"
+
+
+def test_a_press_by_what_raises_its_force_and_clipping(tmp_path):
+    press = sway()
+    press["F"] = STIFFNESS * np.maximum(press["xm"] + 5e-4, 0.0)
+    path = write_csv(tmp_path / "a.csv", press)
+    assert read(path, "press").runs[0].kind == "press"
+    wrong = {"column": "F", "sign": -1}
+    assert "force_measured: found one that falls where" in message(path, "press", force_measured=wrong)
+    clipped = LOG | {"F": np.minimum(LOG["F"], 20.0)}
+    notes = read(write_csv(tmp_path / "b.csv", clipped), force_command=None).notes
+    assert any("rows at the largest reading" in note for note in notes)

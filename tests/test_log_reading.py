@@ -1,0 +1,184 @@
+"""Logs as files: text in its dialects and Parquet give the same campaign; what is wrong is one line."""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from log_cases import CHANNELS, MASS, PERIOD, read, sway, touches, write_csv
+from pyarrow import parquet
+
+import jaxhil
+from jaxhil.errors import InputError
+from jaxhil.mechanism.file import load
+from tuning.identification.logs.campaign import read_campaign
+
+LOG = touches(2)
+
+
+def same(one, other):
+    assert len(one.runs) == len(other.runs)
+    for a, b in zip(one.runs, other.runs, strict=True):
+        for name in ("tick", "position_desired", "position_measured", "force_measured", "force_command"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_what_is_read_is_what_was_written(tmp_path):
+    path = write_csv(tmp_path / "a.csv", LOG)
+    found = read(path)
+    (run,) = found.runs
+    assert (run.kind, run.source, run.time_stamp_error) == ("contact", "a.csv", pytest.approx(0.0, abs=1e-12))
+    np.testing.assert_array_equal(run.tick, np.arange(1200))
+    np.testing.assert_array_equal(run.position_desired, LOG["xd"])
+    np.testing.assert_array_equal(run.velocity_desired, LOG["vd"])
+    np.testing.assert_array_equal(run.force_measured, LOG["F"])
+    assert run.valid.all() and run.speed is None
+    assert found.equivalent_mass == MASS and found.timing.control_period == PERIOD
+    assert found.sources == {"a.csv": hashlib.sha256(path.read_bytes()).hexdigest()}
+    assert found.notes == ()
+    # Each touch is padded by 50 ms on either side of where the force is beyond its noise.
+    for touch in (0, 1):
+        rows, touched = np.flatnonzero(run.contact_index == touch), np.flatnonzero(LOG["Fc"] != 0)
+        touched = touched[touched // 600 == touch]
+        assert abs(rows[0] - (touched[0] - 50)) <= 5 and abs(rows[-1] - (touched[-1] + 50)) <= 5
+    assert set(run.contact_index) == {-1, 0, 1}
+
+
+def test_dialects_of_text_and_parquet_read_alike(tmp_path):
+    plain = read(write_csv(tmp_path / "a.csv", LOG))
+    same(plain, read(write_csv(tmp_path / "b.txt", LOG, delimiter="\t")))
+    head = "Logger 3.1\nstarted 06/29/2022, 04:05\n"
+    same(plain, read(write_csv(tmp_path / "c.dat", LOG, head=head), text={"skip_rows": 2}))
+    german = write_csv(tmp_path / "d.csv", LOG, delimiter=";")
+    german.write_bytes(b"\xef\xbb\xbf" + german.read_bytes().replace(b".", b",").replace(b"\n", b"\r\n"))
+    same(plain, read(german, text={"decimal": ","}))
+    bare = write_csv(tmp_path / "e.csv", LOG)
+    bare.write_text(bare.read_text().partition("\n")[2])
+    same(plain, read(bare, **{name: str(place + 1) for place, name in enumerate(CHANNELS)}))
+    more = LOG | {"note": np.array(["x"] * 1200), "xd2": LOG["xd"]}
+    parquet.write_table(
+        pa.table(more | {"t": pa.array(LOG["t"] * 1e3).cast(pa.float64())}), tmp_path / "f.parquet"
+    )
+    same(plain, read(tmp_path / "f.parquet", time={"column": "t", "unit": "ms"}))
+    stamps = pa.array((1.7e18 + LOG["t"] * 1e9).astype(np.int64)).cast(pa.timestamp("ns"))
+    parquet.write_table(pa.table(more | {"t": stamps}), tmp_path / "g.parquet")
+    same(plain, read(tmp_path / "g.parquet"))
+    named = write_csv(
+        tmp_path / "h.csv", LOG | {"t": np.array([f"06/29/2022 04:05:{s:09.6f} PM" for s in LOG["t"]])}
+    )
+    named.write_text(named.read_text().replace("'", ""))
+    same(plain, read(named, time={"column": "t", "time_format": "%m/%d/%Y %I:%M:%S.%f %p"}))
+
+
+def test_units_signs_and_offsets(tmp_path):
+    shown = LOG | {"xd": -1e3 * LOG["xd"] - 7.0, "F": LOG["F"] / 4.4482216152605 * 10}
+    path = write_csv(tmp_path / "a.csv", shown)
+    (run,) = read(
+        path,
+        position_desired={"column": "xd", "unit": "mm", "sign": -1, "offset": 7.0},
+        force_measured={"column": "F", "unit": "lbf", "scale": 0.1},
+    ).runs
+    np.testing.assert_allclose(run.position_desired, LOG["xd"], atol=1e-17)
+    np.testing.assert_allclose(run.force_measured, LOG["F"], rtol=1e-14, atol=1e-14)
+
+
+def test_runs_by_begin_and_end_by_mode_and_by_index(tmp_path):
+    path = write_csv(
+        tmp_path / "a.csv", LOG | {"state": np.repeat([0, 7], 600), "touch": np.repeat([4, 2], 600)}
+    )
+    by_mode = read(path, mode={"column": "state", "values": {"0": "contact", "7": "contact"}})
+    assert [run.kind for run in by_mode.runs] == ["contact"]
+    pair = read(
+        path, mode={"column": "state", "values": {"0": "contact", "7": "free"}}, contact_index="touch"
+    ).runs
+    assert [(run.kind, len(run.tick), run.tick[0]) for run in pair] == [
+        ("contact", 600, 0),
+        ("free", 600, 600),
+    ]
+    assert set(pair[0].contact_index) == {4}
+    assert pair[0].speed == pytest.approx(5e-3, rel=1e-6)
+    with pytest.raises(InputError, match=r"a.csv: row 601: mode: found '7', allowed one of 0, free, press"):
+        read(path, mode={"column": "state", "values": {"0": "contact"}})
+
+
+def test_a_simulated_run_is_read_as_it_was(tmp_path):
+    mechanism = load("varying").mechanism
+    run = jaxhil.simulate(mechanism)
+    run.to_csv(tmp_path / "run.csv")
+    found = read_campaign([tmp_path / "run.csv"], prior=mechanism)
+    assert [list(set(one.contact_index)) for one in found.runs] == [[0], [1], [2]]
+    assert (found.equivalent_mass, found.timing.command_hold) == (350.0, "linear")
+    for one, contact in zip(found.runs, run.contacts, strict=True):
+        assert one.speed == pytest.approx(contact.approach_velocity, rel=1e-9)
+        np.testing.assert_array_equal(
+            one.position_desired, run.position_desired[run.contact == one.contact_index[0]]
+        )
+
+
+def edit(path: Path, row: int, cell: int, text: str) -> Path:
+    lines = path.read_text().split("\n")
+    cells = lines[row].split(",")
+    cells[cell] = text
+    lines[row] = ",".join(cells)
+    path.write_text("\n".join(lines))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("row", "cell", "text", "reason"),
+    [
+        (30, 1, "nan", "row 30: position_desired: found nan, allowed a finite number"),
+        (30, 1, "inf", "row 30: position_desired: found inf"),
+        (30, 0, "nan", "row 30: time: found nan"),
+        (30, 1, "", "row 30: position_desired: found nan"),
+        (30, 1, "12,5", "Row #31: Expected 6 columns, got 7"),
+        (30, 1, "abc", "Row #31: CSV conversion error to double: invalid value 'abc'"),
+        (1, 1, "abc", "column 'xd': found 'abc', allowed numbers"),
+        (30, 0, "0.001", "row 30: time: found 0.001 s after 0.028 s, allowed time that increases"),
+        (30, 0, "0.028", "row 30: time: found 0.028 s after 0.028 s"),
+        (0, 1, "xdd", "found none of this name, allowed t, xdd, xm, F, vd, Fc (did you mean xdd?)"),
+        (0, 2, "xd", "column 'xd': found 2, allowed one"),
+    ],
+)  # fmt: skip
+def test_unusable_cells(tmp_path, row, cell, text, reason):
+    path = edit(write_csv(tmp_path / "a.csv", LOG), row, cell, text)
+    with pytest.raises(InputError) as caught:
+        read(path)
+    assert reason in str(caught.value) and str(caught.value).startswith(f"{path}: ")
+    assert str(caught.value).isprintable()
+
+
+def test_unusable_files(tmp_path):
+    short = {name: one[:100] for name, one in LOG.items()}
+    cases = {
+        "none.csv": "found no such file",
+        "folder": "found a name that ends in ''",
+        "a.docx": "found a name that ends in '.docx', allowed .csv",
+        "empty.csv": "found no line of columns' names",
+        "names.csv": "found 0 rows, allowed at least 200",
+        "short.csv": "found 100 rows, allowed at least 200",
+        "torn.parquet": "cannot be read",
+        "torn.csv": "cannot be read",
+    }
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "a.docx").touch()
+    (tmp_path / "empty.csv").touch()
+    (tmp_path / "names.csv").write_text(",".join(LOG) + "\n")
+    write_csv(tmp_path / "short.csv", short)
+    (tmp_path / "torn.parquet").write_bytes(b"PAR1 and then nothing")
+    (tmp_path / "torn.csv").write_bytes(b"t,xd,xm,F,vd,Fc\n" + bytes(range(256)) * 4)
+    for name, reason in cases.items():
+        with pytest.raises(InputError) as caught:
+            read(tmp_path / name)
+        assert reason in str(caught.value) and name in str(caught.value) and str(caught.value).isprintable()
+    with pytest.raises(InputError, match="logs: found none"):
+        read_campaign([])
+
+
+def test_a_contact_needs_its_force_and_a_free_run_none(tmp_path):
+    path = write_csv(tmp_path / "a.csv", sway())
+    (run,) = read(path, "free").runs
+    assert run.force_measured is None and run.contact_index is None and run.kind == "free"
+    with pytest.raises(InputError, match="force_measured: found no such channel"):
+        read(path)

@@ -1,0 +1,56 @@
+"""Rows that were lost: commands put back as the model made them, nothing that a sensor read made up; cuts."""
+
+import numpy as np
+import pytest
+from log_cases import MASS, PERIOD, touches
+
+from tuning.identification.logs.rows import SHORT, stretches
+
+LOG = touches(2, noise=2.0)
+CHANNELS = {
+    "position_desired": "xd",
+    "position_measured": "xm",
+    "force_measured": "F",
+    "velocity_desired": "vd",
+    "force_command": "Fc",
+}
+TOUCH = 260  # a row in the middle of the first touch
+
+
+def cut(lost, without=(), cuts=()):
+    kept = np.setdiff1d(np.arange(1200), lost)
+    channels = {name: None if name in without else LOG[column][kept] for name, column in CHANNELS.items()}
+    channels["contact_index"] = np.repeat([0, 1], 600)[kept]
+    return stretches(kept, channels, np.array(cuts, int), PERIOD, MASS)
+
+
+@pytest.mark.parametrize(("lost", "error"), [(1, 1e-17), (2, 1e-17), (3, 1e-8)])
+def test_commands_are_those_that_the_model_made(lost, error):
+    gone = np.arange(TOUCH, TOUCH + lost)
+    (found,) = cut(gone)
+    np.testing.assert_array_equal(found.tick, np.arange(1200))
+    assert np.flatnonzero(~found.valid).tolist() == gone.tolist()
+    assert np.max(np.abs(found.channels["position_desired"] - LOG["xd"])) <= error
+    for name in ("position_measured", "force_measured", "force_command"):
+        np.testing.assert_array_equal(np.isnan(found.channels[name]), ~found.valid)
+        np.testing.assert_array_equal(found.channels[name][found.valid], LOG[CHANNELS[name]][found.valid])
+    assert set(found.channels["contact_index"]) == {0, 1}
+
+
+def test_without_the_model_a_cubic_tells_most():
+    (found,) = cut([TOUCH, TOUCH + 1], without=["force_command"])
+    assert np.max(np.abs(found.channels["position_desired"] - LOG["xd"])) < 1e-7
+    (many,) = cut([TOUCH, TOUCH + 4, TOUCH + 6, TOUCH + 7, 1198], without=["velocity_desired"])
+    assert np.max(np.abs(many.channels["position_desired"] - LOG["xd"])) < 1e-6
+    assert len(many.tick) == 1200
+
+
+def test_longer_gaps_and_cuts_divide_a_log():
+    first, second, third = cut(np.arange(300, 300 + SHORT + 1), cuts=[700 - SHORT - 1])
+    assert [(one.tick[0], one.tick[-1]) for one in (first, second, third)] == [
+        (0, 299),
+        (304, 699),
+        (700, 1199),
+    ]
+    assert all(one.valid.all() for one in (first, second, third))
+    np.testing.assert_array_equal(third.channels["position_desired"], LOG["xd"][700:])

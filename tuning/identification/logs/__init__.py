@@ -1,0 +1,1 @@
+"""A rig's log files, read, checked and put on the grid of ticks. Needs no jax."""

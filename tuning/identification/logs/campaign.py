@@ -1,0 +1,268 @@
+"""Log files and their mapping, read, checked and put on the grid of ticks: a campaign."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxhil.errors import InputError, one_line, shown
+from jaxhil.mechanism.structs import Mechanism
+from tuning.identification.logs import checks, clock, segments
+from tuning.identification.logs.mapping import (
+    KINDS,
+    Channel,
+    LogMapping,
+    RunFiles,
+    masses_of,
+    own_mapping,
+    si,
+)
+from tuning.identification.logs.readers import Columns, open_log
+from tuning.identification.logs.rows import Stretch, stretches
+from tuning.identification.records import Campaign, Kind, Run, Timing
+
+NUMBERS = (
+    "position_desired",
+    "position_measured",
+    "force_measured",
+    "velocity_desired",
+    "force_command",
+    "contact_index",
+)
+SCRAP = 50  # rows, fewer of which between two gaps say nothing
+JUMP = 0.5  # of the fastest motion, by which the velocity changes from a run to the next one in the same log
+
+
+def read_campaign(
+    logs: Sequence[Path], mapping: LogMapping | None = None, prior: Mechanism | None = None
+) -> Campaign:
+    """All runs of the log files, in the order of the mapping's runs and, in each, in that of the files.
+
+    Without a mapping the columns have our own names, and every file is a run of contacts. What a mapping does
+    not say of timing and masses is the prior's. Raises `InputError`, one line: file, row or column, what was
+    found and what is allowed.
+    """
+    mapping = mapping or own_mapping()
+    if not logs:
+        raise InputError("logs: found none, allowed one or more files")
+    timing, mass = _timing(mapping, prior), masses_of(mapping, prior)
+    if mass is None:
+        raise InputError("bodies.equivalent_mass: found nothing, allowed a number > 0 kg, here or in a prior")
+    for path in logs:
+        if not any(entry.names(path) for entry in mapping.runs):
+            patterns = ", ".join(shown(pattern) for entry in mapping.runs for pattern in entry.files)
+            raise InputError(f"{one_line(str(path))}: found a log that no run names, allowed {patterns}")
+    integrator = "semi_implicit_euler" if prior is None else prior.rig.integrator
+    runs: list[Run] = []
+    notes: list[str] = []
+    clocks = []
+    for entry in mapping.runs:
+        for path in logs:
+            if entry.names(path):
+                reading = _Reading(path, entry, mapping, timing, mass, integrator)
+                runs += reading.runs
+                notes += reading.notes
+                clocks.append(reading.ticks.clock)
+    worst = max(clocks, key=lambda one: one.jitter)
+    sources = {path.name: _sha256(path) for path in logs}
+    timing = Timing(timing.control_period, timing.command_hold, timing.command_latency, timing.row, worst)
+    return Campaign(tuple(runs), timing, mass, sources, tuple(dict.fromkeys(notes)))
+
+
+class _Reading:
+    """One file's runs, under one entry of the mapping."""
+
+    def __init__(
+        self, path: Path, entry: RunFiles, mapping: LogMapping, timing: Timing, mass: float, integrator: str
+    ):
+        self.label, self.kind, self.notes = one_line(str(path)) or "''", entry.kind, list[str]()
+        self._path, self._timing, self._mass, self._integrator = path, timing, mass, integrator
+        log = open_log(path, mapping.text)
+        columns, stamps = _columns(log, mapping)
+        kept = _kept(stamps, entry, timing.control_period)
+        stamps, columns = None if stamps is None else stamps[kept], {n: c[kept] for n, c in columns.items()}
+        rows = len(next(iter(columns.values())))
+        if rows < checks.FEWEST_ROWS:
+            allowed = f"at least {checks.FEWEST_ROWS}"
+            raise InputError(f"{self.label}: found {rows} row{'s' * (rows != 1)}, allowed {allowed}")
+        period = timing.control_period
+        if stamps is None or mapping.timing.clock == "index":
+            self.ticks = clock.counted(rows, period)
+        else:
+            self.ticks = clock.ticks_of(stamps, period, self.label)
+        modes = _modes(columns.pop("mode", None), mapping, entry.kind, self.label)
+        channels = {name: columns.get(name) for name in NUMBERS}
+        for name, values in channels.items():
+            if values is not None:
+                checks.check_rows(self.label, name, values)
+        if (index := channels["contact_index"]) is not None:
+            channels["contact_index"] = index.astype(np.int64)
+        self.runs = self._cut(channels, modes)
+
+    def _cut(self, channels: dict[str, np.ndarray | None], modes: np.ndarray | None) -> list[Run]:
+        """The runs: between longer gaps, changes of mode, and jumps from one run to the next."""
+        tick, period = self.ticks.tick, self._timing.control_period
+        x = channels["position_desired"]
+        assert x is not None
+        cuts = _jumps(x, channels["contact_index"])
+        if modes is not None:
+            cuts = np.union1d(cuts, np.flatnonzero(modes[1:] != modes[:-1]) + 1)
+        runs, counted = [], 0
+        for stretch in stretches(tick, channels, cuts, period, self._mass):
+            if len(stretch.tick) < SCRAP:
+                self.notes.append(f"{self.label}: {len(stretch.tick)} rows between gaps are left out")
+                continue
+            kind: Kind = self.kind
+            if modes is not None:
+                kind = KINDS[int(modes[np.searchsorted(tick, stretch.tick[0])])]
+            run, contacts = self._run(stretch, kind, counted)
+            counted += contacts
+            runs.append(run)
+        if not runs:
+            allowed = f"at least {SCRAP} without a gap of more than 3"
+            raise InputError(f"{self.label}: found {len(tick)} rows in pieces, allowed {allowed}")
+        return runs
+
+    def _run(self, stretch: Stretch, kind: Kind, counted: int) -> tuple[Run, int]:
+        """The run of a stretch, checked, and how many contacts are in it; `counted` were before it."""
+        period, channels = self._timing.control_period, stretch.channels
+        force, index = channels["force_measured"], channels["contact_index"]
+        self.notes += checks.check_motion(self.label, kind, stretch, period)
+        touched: list[tuple[int, int]] = []
+        if kind in ("press", "tap", "contact"):
+            if force is None:
+                raise InputError(
+                    f"{self.label}: force_measured: found no such channel, allowed one where there is contact"
+                )
+            found, touched = segments.contacts(force, period)
+            if index is None and kind != "press":
+                index = np.where(found >= 0, found + counted, -1)
+            self.notes += checks.check_force(self.label, kind, stretch, touched, period, self._mass)
+        if kind == "contact" and channels["force_command"] is not None:
+            row = self._timing.row
+            self.notes += checks.check_command(self.label, stretch, period, self._mass, row, self._integrator)
+        x, measured = channels["position_desired"], channels["position_measured"]
+        assert x is not None and measured is not None
+        run = Run(
+            kind, self._path.name, stretch.tick, self.ticks.clock.jitter, x, measured, force,
+            channels["velocity_desired"], channels["force_command"], stretch.valid, index,
+            _speed(x, touched, period),
+        )  # fmt: skip
+        return run, len(touched)
+
+
+def _timing(mapping: LogMapping, prior: Mechanism | None) -> Timing:
+    said, rig = mapping.timing, None if prior is None else prior.rig
+    period = said.control_period or (rig and rig.control_period)
+    if period is None and mapping.channels.time.rate is not None:
+        period = 1.0 / mapping.channels.time.rate
+    if period is None:
+        raise InputError("timing.control_period: found nothing, allowed a number > 0 s, here or in a prior")
+    rate = mapping.channels.time.rate
+    if rate is not None and abs(rate * period - 1.0) > 1e-6:
+        raise InputError(
+            f"channels.time.rate: found {rate:g} Hz, allowed 1 / control_period, {1 / period:g} Hz"
+        )
+    hold = said.command_hold or (rig.command_hold if rig else "linear")
+    latency = said.command_latency if said.command_latency is not None else rig.command_latency if rig else 0
+    return Timing(period, hold, latency, said.row)
+
+
+def _columns(log, mapping: LogMapping) -> tuple[Columns, np.ndarray | None]:
+    """The channels that are there, in SI units, and the stamps [s]."""
+    channels = mapping.channels
+    wanted: dict[str, str] = {}
+    for name in (*NUMBERS, "mode"):
+        channel = getattr(channels, name)
+        required = name in ("position_desired", "position_measured")
+        if channel is not None and (required or channel.column in log.names):
+            wanted[name] = channel.column
+    time = channels.time
+    read = log.read(list(dict.fromkeys([*wanted.values(), *([time.column] if time.column else [])])))
+    columns: Columns = {}
+    for name, column in wanted.items():
+        values = read[column]
+        if name != "mode":
+            channel: Channel = getattr(channels, name)
+            if values.dtype == object:
+                raise InputError(
+                    f"{log.label}: column {shown(column)}: found {shown(values[0])}, allowed numbers"
+                )
+            factor, offset = si(channel, name)
+            values = values if (factor, offset) == (1.0, 0.0) else factor * values + offset
+        columns[name] = values
+    return columns, _stamps(log.label, read, mapping)
+
+
+def _stamps(label: str, read: Columns, mapping: LogMapping) -> np.ndarray | None:
+    time = mapping.channels.time
+    if time.column is None:
+        return None
+    stamps = read[time.column]
+    if time.time_format is not None:
+        return clock.parsed(stamps, time.time_format, label)
+    if stamps.dtype == object:
+        allowed = "numbers, or a time_format beside the column"
+        raise InputError(f"{label}: column {shown(time.column)}: found {shown(stamps[0])}, allowed {allowed}")
+    # The first stamp may count from an epoch: what is left has digits to spare.
+    factor = si(Channel(column=time.column, unit=time.unit), "time")[0]
+    return factor * (stamps - stamps[:1])
+
+
+def _kept(stamps: np.ndarray | None, entry: RunFiles, period: float) -> slice:
+    """Rows from begin to end."""
+    if stamps is None:
+        return slice(round(entry.begin / period), None if entry.end is None else round(entry.end / period))
+    first = int(np.searchsorted(stamps, entry.begin)) if entry.begin else 0
+    return slice(first, None if entry.end is None else int(np.searchsorted(stamps, entry.end)))
+
+
+def _modes(values: np.ndarray | None, mapping: LogMapping, kind: Kind, label: str) -> np.ndarray | None:
+    """What was done, row by row, as places in `KINDS`."""
+    channel = mapping.channels.mode
+    if values is None or channel is None:
+        return None
+    named, inverse = np.unique(np.asarray(values, dtype=str), return_inverse=True)
+    kinds = []
+    for name in named.tolist():
+        word = name[:-2] if name.endswith(".0") else name
+        found = channel.values.get(word, word)
+        if found not in KINDS:
+            row = int(np.flatnonzero(inverse == len(kinds))[0]) + 1
+            allowed = f"one of {', '.join([*channel.values, *KINDS])}"
+            raise InputError(f"{label}: row {row}: mode: found {shown(word)}, allowed {allowed}")
+        kinds.append(KINDS.index(found))
+    return np.array(kinds)[inverse]
+
+
+def _jumps(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
+    """Rows at which another contact begins somewhere else, as the runs of a simulation follow one another."""
+    if index is None:
+        return np.empty(0, int)
+    rows = np.flatnonzero(index[1:] != index[:-1]) + 1
+    rows = rows[(rows >= 2) & (rows < len(x) - 1)]
+    step = np.diff(x)
+    return rows[np.abs(step[rows] - step[rows - 2]) > JUMP * np.percentile(np.abs(step), 95)]
+
+
+def _speed(x: np.ndarray, touched: list[tuple[int, int]], period: float) -> float | None:
+    """Of the approach to the only contact [m/s]."""
+    # The force was there for some ticks before it was beyond the noise.
+    before = touched[0][0] - checks.SMOOTH if len(touched) == 1 else -1
+    if before < checks.SMOOTH:
+        return None
+    return float(x[before] - x[before - checks.SMOOTH]) / (checks.SMOOTH * period)
+
+
+def _sha256(path: Path) -> str:
+    """Of a file; of a folder, of its files' names and contents."""
+    if path.is_file():
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    whole = hashlib.sha256()
+    for part in sorted(one for one in path.rglob("*") if one.is_file()):
+        whole.update(f"{_sha256(part)} {part.relative_to(path).as_posix()}\n".encode())
+    return whole.hexdigest()

@@ -1,0 +1,124 @@
+"""Which control period each row belongs to, from stamps that are not exact.
+
+The samples were taken at ticks; what scatters is when each was stamped. A stamp t is taken to be
+
+    t = t_0 + phase(t) + n T + error,
+
+with the tick n wanted, T the control period as told, and a phase that drifts slowly, where the clock of the
+stamps runs faster or slower. The phase is the angle of the mean of e^(2 pi i t / T) over some rows, unwrapped
+from one lot of rows to the next; a stamp less its phase, in periods, is rounded.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxhil.errors import InputError, shown
+from tuning.identification.records import Clock
+
+LOT = 256  # rows that share a phase
+RATE = 0.1  # share by which the rows' rate may differ from the control rate
+SCATTER = 0.25  # of the stamps, in periods, beyond which ticks cannot be told from them
+
+
+class Ticks(NamedTuple):
+    """The ticks of rows, the first one 0."""
+
+    tick: np.ndarray  # int64
+    clock: Clock
+
+
+def ticks_of(stamps: np.ndarray, period: float, label: str, column: str = "time") -> Ticks:
+    """The tick of every stamp [s]. Raises `InputError` unless they increase, at the control rate."""
+    bad = np.flatnonzero(~np.isfinite(stamps))
+    if len(bad):
+        raise InputError(
+            f"{label}: row {bad[0] + 1}: {column}: found {stamps[bad[0]]}, allowed a finite number"
+        )
+    steps = np.diff(stamps)
+    bad = np.flatnonzero(~(steps > 0))
+    if len(bad):
+        row, found = int(bad[0]) + 2, f"{stamps[bad[0] + 1]:.9g} s after {stamps[bad[0]]:.9g} s"
+        raise InputError(f"{label}: row {row}: {column}: found {found}, allowed time that increases")
+    _check_rate(steps, period, label, column)
+    stamps = stamps - stamps[0]
+    phase = _phase(stamps, period)
+    tick = np.rint((stamps - phase) / period).astype(np.int64)
+    tick = _increasing(tick)
+    error = stamps - phase - period * tick
+    error -= np.mean(error)
+    jitter = float(np.std(error))
+    if jitter > SCATTER * period:
+        found = f"stamps that scatter by {1e3 * jitter:.3g} ms about the ticks"
+        allowed = f'at most {SCATTER:g} control periods, or timing.clock = "index"'
+        raise InputError(f"{label}: {column}: found {found}, allowed {allowed}")
+    slope = float(np.polynomial.polynomial.polyfit(tick.astype(float), stamps, 1)[1])
+    clock = Clock(slope, 1e6 * (slope / period - 1.0), jitter, int(tick[-1] - tick[0] + 1 - len(tick)))
+    return Ticks(tick - tick[0], clock)
+
+
+def counted(rows: int, period: float) -> Ticks:
+    """One row a tick, none lost."""
+    return Ticks(np.arange(rows, dtype=np.int64), Clock(period, 0.0, 0.0, 0))
+
+
+def parsed(stamps: np.ndarray, time_format: str, label: str) -> np.ndarray:
+    """Seconds from the first stamp, of texts as `datetime.strptime` reads them."""
+    found = []
+    for row, stamp in enumerate(stamps):
+        try:
+            found.append(datetime.strptime(str(stamp).strip(), time_format))
+        except ValueError:
+            allowed = f"a time as time_format says, {shown(time_format)}"
+            raise InputError(
+                f"{label}: row {row + 1}: time: found {shown(stamp)}, allowed {allowed}"
+            ) from None
+    return np.array([(one - found[0]).total_seconds() for one in found])
+
+
+def _check_rate(steps: np.ndarray, period: float, label: str, column: str) -> None:
+    """The rows come at the control rate, all along."""
+    usual = float(np.median(steps))
+    if abs(usual / period - 1.0) > RATE:
+        found = f"rows {usual:.4g} s apart"
+        allowed = f"the control period, {period:g} s (is the unit of {column} right?)"
+        raise InputError(f"{label}: {column}: found {found}, allowed {allowed}")
+    lots = len(steps) // LOT
+    medians = np.median(steps[: lots * LOT].reshape(lots, LOT), axis=1) if lots else np.empty(0)
+    other = np.flatnonzero(np.abs(medians / period - 1.0) > RATE)
+    if len(other):
+        row, found = int(other[0]) * LOT + 1, f"rows {medians[other[0]]:.4g} s apart"
+        raise InputError(
+            f"{label}: row {row}: {column}: found {found}, allowed one rate, {period:g} s, all along"
+        )
+
+
+def _phase(stamps: np.ndarray, period: float) -> np.ndarray:
+    """Of every stamp [s]: the slowly changing part by which stamps are off multiples of the period."""
+    starts = np.arange(0, len(stamps), LOT)
+    if len(stamps) % LOT and len(starts) > 1:
+        starts = starts[:-1]  # the last lot has the rest as well
+    turns = stamps / period
+    # The whole turns say nothing, and would cost digits.
+    unit = np.exp(2j * np.pi * (turns - np.rint(turns)))
+    sizes = np.diff([*starts, len(stamps)])
+    angle = np.unwrap(np.angle(np.add.reduceat(unit, starts)))
+    middle = np.add.reduceat(stamps, starts) / sizes
+    if len(middle) > 1:
+        # On to the outer rows of the outer lots.
+        middle, angle = (np.array([2 * c[0] - c[1], *c, 2 * c[-1] - c[-2]]) for c in (middle, angle))
+    return np.interp(stamps, middle, period * angle / (2 * np.pi))
+
+
+def _increasing(tick: np.ndarray) -> np.ndarray:
+    """With rows that scatter put a tick aside put back: rows are in order, no two of one tick."""
+    lost = tick - np.arange(len(tick))
+    if np.all(np.diff(lost) >= 0):
+        return tick
+    from scipy.ndimage import median_filter
+
+    lost = median_filter(lost, size=9, mode="nearest")
+    return np.maximum.accumulate(lost) + np.arange(len(tick))

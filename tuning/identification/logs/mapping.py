@@ -1,0 +1,219 @@
+"""The mapping file of logs, `jaxhil/log/1`: which column is which channel, in which unit, and what was done.
+
+    schema = "jaxhil/log/1"
+    [channels]                  # a column's name, or a table: column, unit, scale, sign, offset
+    [timing]                    # control_period, command_hold, command_latency, row, clock
+    [bodies]                    # masses of the numerical model
+    [text]                      # skip_rows, delimiter, decimal, of text files
+    [[runs]]                    # files (patterns), kind
+
+What timing and bodies leave out is that of the mechanism file that is given beside it. A number of a column
+means sign (scale number + offset), in the unit that is named.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePath
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta, Struct, field
+
+from jaxhil.errors import InputError, one_line, shown
+from jaxhil.mechanism.conversion import KeyProblem, close_match, to_struct
+from jaxhil.mechanism.structs import Bodies, CommandHold, Mechanism, says
+from jaxhil.mechanism.toml_table import parse_toml, read_bytes
+from tuning.identification.logs.units import COUNTS, OF_CHANNEL
+from tuning.identification.records import Kind, Row
+
+SCHEMA = "jaxhil/log/1"
+KINDS = ("free", "press", "tap", "contact", "rest")
+
+Name = Annotated[str, Meta(min_length=1, max_length=200)]
+Pattern = Annotated[str, Meta(min_length=1, max_length=1000)]
+
+
+class Channel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A column of numbers, and what they mean."""
+
+    column: Name  # its name
+    unit: Annotated[str, Meta(min_length=1, max_length=20)] | None = None  # SI where none is named
+    scale: Annotated[float, says("of the column's number", "")] = 1.0  # in the unit; of counts, in SI units
+    sign: Annotated[int, says("of the whole", "", ge=-1, le=1)] = 1
+    offset: Annotated[float, says("added to the scaled number", "")] = 0.0  # in the unit
+
+
+class TimeChannel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The stamps of the rows, or that there are none."""
+
+    column: Name | None = None  # its name
+    unit: Annotated[str, Meta(min_length=1, max_length=20)] | None = None  # s where none is named
+    rate: Annotated[float, says("of rows without stamps", "Hz", gt=0.0)] | None = None
+    time_format: Annotated[str, Meta(min_length=1, max_length=100)] | None = None  # as strptime has it
+
+
+class ModeChannel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A column that says what was done, row by row."""
+
+    column: Name  # its name
+    values: dict[str, Kind] = field(default_factory=dict)  # what its entries mean, where they are other words
+
+
+class Channels(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Which column is which channel."""
+
+    time: TimeChannel
+    position_desired: Channel
+    position_measured: Channel
+    force_measured: Channel | None = None
+    velocity_desired: Channel | None = None
+    force_command: Channel | None = None
+    mode: ModeChannel | None = None
+    contact_index: Channel | None = None
+
+
+class LogTiming(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """When a command acts and when a row was read."""
+
+    control_period: Annotated[float, says("time from tick to tick", "s", gt=0.0, le=0.1)] | None = None
+    command_hold: CommandHold | None = None
+    command_latency: Annotated[int, says("periods until a command reaches the drives", ge=0, le=1)] | None = (
+        None
+    )
+    row: Row = "tick"
+    clock: Literal["stamps", "index"] = "stamps"  # index: stamps only order the rows
+
+
+class Text(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How text files are written."""
+
+    skip_rows: Annotated[int, says("lines above that of the columns' names", ge=0, le=10_000)] = 0
+    delimiter: Annotated[str, Meta(min_length=1, max_length=1)] | None = (
+        None  # told from the names if not given
+    )
+    decimal: Literal[".", ","] = "."
+
+
+class RunFiles(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What was done in some of the files."""
+
+    files: Annotated[list[Pattern], Meta(min_length=1, max_length=1000)]  # patterns of their names
+    kind: Kind
+    begin: Annotated[float, says("of the run, from the first row", "s", ge=0.0)] = 0.0
+    end: Annotated[float, says("of the run, from the first row", "s", gt=0.0)] | None = None
+
+    def names(self, path: Path) -> bool:
+        """Whether a file is one of these."""
+        return any(PurePath(path).match(pattern) for pattern in self.files)
+
+
+class LogMapping(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the columns of some logs mean."""
+
+    schema: Literal["jaxhil/log/1"]
+    channels: Channels
+    timing: LogTiming = LogTiming()
+    bodies: Bodies | None = None
+    text: Text = Text()
+    runs: Annotated[list[RunFiles], Meta(min_length=1, max_length=1000)]
+
+
+def load_mapping(path: str | os.PathLike[str]) -> LogMapping:
+    """The mapping of a TOML file. Raises `InputError`, one line, for whatever is wrong."""
+    label = one_line(os.fspath(path)) or "''"
+    try:
+        data = read_bytes(Path(path), label, "a mapping")
+    except FileNotFoundError:
+        raise InputError(f"{label}: found no such file, allowed a mapping file ({SCHEMA})") from None
+    return mapping_of(parse_toml(data, label, "a mapping"), label)
+
+
+def mapping_of(raw: Mapping[str, Any], label: str) -> LogMapping:
+    """The mapping of a parsed table; `label` is what an error calls it. Raises `InputError`."""
+    try:
+        mapping = to_struct(LogMapping, _spelled_out(raw))
+        _check(mapping)
+    except KeyProblem as problem:
+        raise InputError(f"{label}: {problem}") from None
+    return mapping
+
+
+def own_mapping(kind: Kind = "contact") -> LogMapping:
+    """The mapping of logs with our names of columns, as `jaxhil simulate --log` writes them."""
+    names = ("position_desired", "position_measured", "force_measured", "velocity_desired", "force_command")
+    channels = {"time": "time", **{name: name for name in names}, "contact_index": "contact"}
+    return mapping_of(
+        {"schema": SCHEMA, "channels": channels, "runs": [{"files": "*", "kind": kind}]}, "own logs"
+    )
+
+
+def si(channel: Channel, name: str) -> tuple[float, float]:
+    """Factor and offset that make SI units of the column's numbers."""
+    if channel.unit == COUNTS or name not in OF_CHANNEL:
+        unit = 1.0
+    else:
+        units = OF_CHANNEL[name]
+        unit = units[channel.unit or next(iter(units))]
+    return channel.sign * unit * channel.scale, channel.sign * unit * channel.offset
+
+
+def _spelled_out(raw: Mapping[str, Any]) -> dict[str, Any]:
+    """With tables in the place of bare names, and lists in that of single patterns."""
+    whole = dict(raw)
+    if isinstance(channels := whole.get("channels"), Mapping):
+        named = {key: {"column": one} if isinstance(one, str) else one for key, one in channels.items()}
+        if "time" not in named and "rate" in named:
+            named["time"] = {"rate": named.pop("rate")}
+        whole["channels"] = named
+    if isinstance(runs := whole.get("runs"), Sequence) and not isinstance(runs, str):
+        whole["runs"] = [
+            {**run, "files": [run["files"]]} if isinstance(run, Mapping) and isinstance(run.get("files"), str)
+            else run
+            for run in runs
+        ]  # fmt: skip
+    return whole
+
+
+def _check(mapping: LogMapping) -> None:
+    channels = mapping.channels
+    for name, units in OF_CHANNEL.items():
+        channel = getattr(channels, name)
+        if channel is None or channel.unit is None:
+            continue
+        allowed = [*units, *([COUNTS] if name != "time" else [])]
+        if channel.unit not in allowed:
+            said = f"one of {', '.join(allowed)}{close_match(channel.unit, allowed)}"
+            raise KeyProblem(("channels", name, "unit"), shown(channel.unit), said)
+        if channel.unit == COUNTS and channel.scale == 1.0:
+            raise KeyProblem(("channels", name, "scale"), "none", "how much a count is, in SI units")
+    for name in channels.__struct_fields__:
+        channel = getattr(channels, name)
+        if isinstance(channel, Channel) and channel.sign == 0:
+            raise KeyProblem(("channels", name, "sign"), "0", "1 or -1")
+        if isinstance(channel, Channel) and channel.scale == 0.0:
+            raise KeyProblem(("channels", name, "scale"), "0.0", "another number")
+    time = channels.time
+    if (time.column is None) == (time.rate is None):
+        found = "neither" if time.rate is None else "both"
+        raise KeyProblem(("channels", "time"), found, "either a column of stamps or the rate of the rows")
+    _check_rest(mapping)
+
+
+def _check_rest(mapping: LogMapping) -> None:
+    for place, run in enumerate(mapping.runs):
+        if run.end is not None and run.end <= run.begin:
+            raise KeyProblem(("runs", place, "end"), shown(run.end), f"a number > begin, {run.begin:g} s")
+    bodies = mapping.bodies
+    if bodies is not None:
+        given = {key for key in bodies.__struct_fields__ if getattr(bodies, key) is not None}
+        if given not in ({"equivalent_mass"}, {"chaser_mass", "target_mass"}):
+            either = "either equivalent_mass, or both chaser_mass and target_mass"
+            raise KeyProblem(("bodies",), " and ".join(sorted(given)) or "neither", either)
+
+
+def masses_of(mapping: LogMapping, prior: Mechanism | None) -> float | None:
+    """Equivalent mass [kg] of the numerical model, by the mapping or else by the prior."""
+    if mapping.bodies is not None:
+        return mapping.bodies.mass
+    return None if prior is None else prior.bodies.mass

@@ -1,0 +1,223 @@
+"""Columns of numbers out of a log file, by its format; only those that are asked for are read.
+
+Text and Parquet need nothing more. MAT, HDF5, ROS 2 bags, MDF4 and TDMS are read by `foreign`, with libraries
+that `jaxhil[logs]` installs.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import io
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+from pyarrow import csv as arrow_csv
+from pyarrow import parquet
+
+from jaxhil.errors import InputError, one_line, shown
+from jaxhil.mechanism.conversion import close_match
+from tuning.identification.logs.mapping import Text
+
+Columns = dict[str, np.ndarray]  # numbers in float64, texts as objects, stamps in s from the first
+
+PLAIN = Text()
+DELIMITERS = "\t;,"  # that are looked for in the line of names, in this order
+LONGEST_LINE = 1 << 20
+SHOWN = 12  # columns in a message
+
+_TEXT = (".csv", ".tsv", ".txt", ".dat", ".log")
+_PARQUET = (".parquet", ".pq")
+_FOREIGN = {
+    ".mat": ("mat", ("pymatreader", "h5py")),
+    ".h5": ("hdf5", ("h5py",)),
+    ".hdf5": ("hdf5", ("h5py",)),
+    ".mcap": ("bag", ("rosbags",)),
+    ".db3": ("bag", ("rosbags",)),
+    ".mf4": ("mdf", ("asammdf",)),
+    ".mdf": ("mdf", ("asammdf",)),
+    ".tdms": ("tdms", ("nptdms",)),
+}
+
+
+class Log(NamedTuple):
+    """A log file: the names of its columns, and how to read some of them."""
+
+    label: str  # what errors call it
+    names: list[str]
+    read: Callable[[Sequence[str]], Columns]
+
+
+def open_log(path: Path, text: Text = PLAIN) -> Log:
+    """The log of a file, or of a folder that is a ROS 2 bag. Raises `InputError`, one line."""
+    label = one_line(os.fspath(path)) or "''"
+    if not path.exists():
+        raise InputError(f"{label}: found no such file, allowed a log")
+    suffix = ".db3" if (path / "metadata.yaml").is_file() else path.suffix.lower()
+    known = (*_TEXT, *_PARQUET, *_FOREIGN)
+    if suffix not in known:
+        raise InputError(f"{label}: found a name that ends in {shown(suffix)}, allowed {', '.join(known)}")
+    if path.is_dir() and suffix != ".db3":
+        raise InputError(f"{label}: found a directory, allowed a log")
+    with reading(label):
+        if suffix in _TEXT:
+            return _text_log(path, label, text)
+        if suffix in _PARQUET:
+            return _parquet_log(path, label)
+        format, packages = _FOREIGN[suffix]
+        for package in packages:
+            try:
+                importlib.import_module(package)
+            except ImportError:
+                needs = f"{package}, which is not installed: python3 -m pip install 'jaxhil[logs]'"
+                raise InputError(f"{label}: a {suffix} file is read with {needs}") from None
+        names, read = getattr(importlib.import_module("tuning.identification.logs.foreign"), format)(path)
+        return Log(label, names, _checked(label, names, read))
+
+
+@contextmanager
+def reading(label: str) -> Iterator[None]:
+    """What cannot be read is an `InputError`, one line. Readers of other formats raise whatever they like."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        raise InputError(f"{label}: cannot be read: {one_line(reason.splitlines()[0], 200)}") from None
+
+
+def _checked(label: str, names: Sequence[str], read: Callable[[Sequence[str]], Columns]):
+    """Reading of columns that are there once, each as long as the others."""
+
+    def checked(wanted: Sequence[str]) -> Columns:
+        for name in wanted:
+            if name not in names:
+                some = ", ".join(one_line(one, 40) for one in names[:SHOWN]) + ", ..." * (len(names) > SHOWN)
+                hint = close_match(name, names)
+                raise InputError(
+                    f"{label}: column {shown(name)}: found none of this name, allowed {some}{hint}"
+                )
+            if names.count(name) > 1:
+                raise InputError(f"{label}: column {shown(name)}: found {names.count(name)}, allowed one")
+        with reading(label):
+            columns = read(wanted)
+        lengths = {len(column) for column in columns.values()}
+        if len(lengths) > 1:
+            found = ", ".join(f"{len(column)} in {shown(name)}" for name, column in columns.items())
+            raise InputError(f"{label}: found columns of unlike length ({found}), allowed one row a tick")
+        return columns
+
+    return checked
+
+
+def _text_log(path: Path, label: str, text: Text) -> Log:
+    with path.open("rb") as file:
+        for _ in range(text.skip_rows):
+            file.readline(LONGEST_LINE)
+        raw = file.readline(LONGEST_LINE)
+        second = file.readline(LONGEST_LINE)
+    if not raw.strip():
+        raise InputError(
+            f"{label}: found no line of columns' names, allowed one after {text.skip_rows} lines"
+        )
+    line, following = (_decoded(one, text.skip_rows == 0).strip("\r\n") for one in (raw, second))
+    delimiter = text.delimiter or next((one for one in DELIMITERS if one in line), ",")
+    names = [name.strip() for name in next(csv.reader(io.StringIO(line), delimiter=delimiter))]
+    headless = all(_is_number(name, text.decimal) for name in names)
+    if headless:
+        names = [str(place + 1) for place in range(len(names))]
+    skipped = text.skip_rows + (not headless)
+
+    def read(wanted: Sequence[str]) -> Columns:
+        texts = [
+            n for n in wanted if not _numeric(following if not headless else line, names, n, delimiter, text)
+        ]
+        return _read_text(path, names, wanted, texts, skipped, delimiter, text.decimal)
+
+    return Log(label, names, _checked(label, names, read))
+
+
+def _numeric(line: str, names: Sequence[str], name: str, delimiter: str, text: Text) -> bool:
+    """Whether the column holds a number in this line."""
+    cells = next(csv.reader(io.StringIO(line), delimiter=delimiter), [])
+    place = list(names).index(name)
+    return place >= len(cells) or not cells[place].strip() or _is_number(cells[place], text.decimal)
+
+
+def _read_text(
+    path: Path, names: list[str], wanted: Sequence[str], texts: Sequence[str], skipped: int, delimiter: str,
+    decimal: str,
+) -> Columns:  # fmt: skip
+    unique = [f"{place} {name}" for place, name in enumerate(names)]
+    chosen = {name: unique[names.index(name)] for name in wanted}
+    kinds = {chosen[name]: pa.string() if name in texts else pa.float64() for name in wanted}
+
+    def table(threads: bool) -> pa.Table:
+        return arrow_csv.read_csv(
+            path,
+            arrow_csv.ReadOptions(
+                column_names=unique, skip_rows=skipped, use_threads=threads, block_size=1 << 22
+            ),
+            arrow_csv.ParseOptions(delimiter=delimiter),
+            arrow_csv.ConvertOptions(
+                column_types=kinds,
+                include_columns=list(kinds),
+                decimal_point=decimal,
+                strings_can_be_null=False,
+            ),
+        )
+
+    try:
+        found = table(threads=True)
+    except pa.ArrowInvalid:
+        # Only a single thread counts the rows, so that the message names the bad one.
+        found = table(threads=False)
+    return {name: _array(found.column(place), name) for name, place in chosen.items()}
+
+
+def _parquet_log(path: Path, label: str) -> Log:
+    names = list(parquet.read_schema(path).names)
+
+    def read(wanted: Sequence[str]) -> Columns:
+        found = parquet.read_table(path, columns=list(wanted))
+        return {name: _array(found.column(name), name) for name in wanted}
+
+    return Log(label, names, _checked(label, names, read))
+
+
+def _array(column: pa.ChunkedArray, name: str) -> np.ndarray:
+    kind = column.type
+    if pa.types.is_dictionary(kind):
+        column, kind = column.cast(kind.value_type), kind.value_type
+    if pa.types.is_string(kind) or pa.types.is_large_string(kind):
+        return np.array(column.to_pylist(), dtype=object)
+    if pa.types.is_timestamp(kind) or pa.types.is_duration(kind) or pa.types.is_time(kind):
+        if column.null_count:
+            raise ValueError(f"column {shown(name)}: found {column.null_count} empty cells, allowed none")
+        unit = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[kind.unit]
+        whole = column.cast(pa.int64() if kind.bit_width == 64 else pa.int32()).to_numpy().astype(np.int64)
+        return unit * (whole - whole[:1]).astype(float)
+    if pa.types.is_boolean(kind):
+        column = column.cast(pa.int8())
+    return np.asarray(column.cast(pa.float64(), safe=False).to_numpy())
+
+
+def _decoded(line: bytes, first: bool) -> str:
+    try:
+        return line.decode("utf-8-sig" if first else "utf-8")
+    except UnicodeDecodeError:
+        return line.decode("latin-1")
+
+
+def _is_number(cell: str, decimal: str) -> bool:
+    try:
+        float(cell.strip().replace(decimal, "."))
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,55 @@
+"""Where in a run the hardware is touched, told by the force where no channel says so."""
+
+from __future__ import annotations
+
+import numpy as np
+
+SIGMAS = 5.0  # of the force's noise, beyond which there is contact
+TICKS = 3  # for so many in a row
+PADDING = 0.05  # s, by which a contact is widened on either side; what is nearer than twice that is one
+FIRST = 200  # rows at most, from which the force at rest is taken
+
+
+def contacts(force: np.ndarray, period: float) -> tuple[np.ndarray, list[tuple[int, int]]]:
+    """The contact of every row, counted from 0, -1 for none; and first row and end of each, not widened.
+
+    `force` [N] begins without contact; NaN where a row was lost.
+    """
+    rows = len(force)
+    touched = np.abs(force - resting(force)) > threshold(force)
+    long = touched.copy()
+    for ticks in range(1, TICKS):
+        long[: rows - ticks] &= touched[ticks:]
+        long[rows - ticks :] = False
+    starts = np.flatnonzero(long)
+    last = np.flatnonzero(touched)
+    found: list[tuple[int, int]] = []
+    gap = round(2 * PADDING / period)
+    if len(starts):
+        # Single rows beyond the threshold belong to a contact only beside one.
+        inside = last[last >= starts[0]]
+        breaks = np.flatnonzero(np.diff(inside) > gap)
+        begins, ends = inside[[0, *(breaks + 1)]], inside[[*breaks, len(inside) - 1]] + 1
+        has = np.searchsorted(starts, begins) < np.searchsorted(starts, ends)
+        found = [(int(a), int(b)) for a, b, good in zip(begins, ends, has, strict=True) if good]
+    index = np.full(rows, -1, np.int64)
+    pad = round(PADDING / period)
+    for number, (begin, end) in enumerate(found):
+        index[max(0, begin - pad) : end + pad] = number
+    return index, found
+
+
+def resting(force: np.ndarray) -> float:
+    """What the sensor reads at first, without contact [N]."""
+    return float(np.nanmedian(_first(force)))
+
+
+def threshold(force: np.ndarray) -> float:
+    """Beyond what the sensor's noise reaches [N]: by the scatter from row to row, and of the first rows."""
+    steps = np.diff(force[np.isfinite(force)])
+    sigma = max(1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2), float(np.nanstd(_first(force))))
+    return max(SIGMAS * sigma, 1e-6 * float(np.nanmax(np.abs(force))))
+
+
+def _first(force: np.ndarray) -> np.ndarray:
+    return force[: max(10, min(FIRST, len(force) // 20))]
