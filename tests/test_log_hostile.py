@@ -1,4 +1,4 @@
-"""Logs that were cut, torn, mistyped or shuffled: a campaign of finite numbers, or one line; never anything else."""
+"""Logs that were cut, torn, mistyped or shuffled: a campaign of finite numbers, or one line; nothing else."""
 
 import tempfile
 from pathlib import Path
@@ -11,7 +11,23 @@ from log_cases import read, sway, touches, write_csv
 
 from jaxhil.errors import InputError
 
-CELLS = ["", "nan", "-inf", "1e999", "1e-320", "0", "-0", "abc", '"', "1,2", "\x00", "\ufeff", "9" * 400, "\n\n", "#"]
+CELLS = [
+    "",
+    "nan",
+    "-inf",
+    "1e999",
+    "1e-320",
+    "0",
+    "-0",
+    "abc",
+    '"',
+    "1,2",
+    "\x00",
+    "\ufeff",
+    "9" * 400,
+    "\n\n",
+    "#",
+]
 LOGS = {"contact": touches(1, noise=0.5), "free": sway(400)}
 
 mutations = st.lists(

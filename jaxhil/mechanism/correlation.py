@@ -7,6 +7,10 @@ Gaussian copula (Nelsen, "An Introduction to Copulas", 2006, 2.3.6). A uniform n
 
 over the named keys in their order, which is uniform as well, and u' then goes through the key's own quantile
 function. A key that is correlated with none before it keeps its numbers to the last bit.
+
+Keys with numbers of their own for each entry of a list (``independent = true``) come last in that order. The
+matrix holds for each entry: entry i goes with entry i of another such list, the last one repeating, and with
+all that is drawn once. Given the latter, entries are independent of one another.
 """
 
 from __future__ import annotations
@@ -35,14 +39,20 @@ def correlated(mechanism: Mechanism, uniform: Mapping[str, np.ndarray]) -> dict[
         return dict(uniform)
     from scipy import special  # takes long to import, and reading a file needs none
 
-    normal = special.ndtri([np.clip(uniform[key][:, 0], _LEAST, _LARGEST) for key in table.keys])
-    factor = _factor(_matrix(table))
+    order = sorted(range(len(table.keys)), key=lambda place: uniform[table.keys[place]].shape[1] > 1)
+    keys = [table.keys[place] for place in order]
+    factor = _factor(_matrix(table)[np.ix_(order, order)])
+    normal = [special.ndtri(np.clip(uniform[key], _LEAST, _LARGEST)) for key in keys]
     together = {}
-    for place, key in enumerate(table.keys):
+    for place, key in enumerate(keys):
         if np.any(factor[place, :place]):
+            columns = np.arange(normal[place].shape[1])
             # A sum of its own for each draw: a matrix product may round by how many there are.
-            mixed = sum(factor[place, other] * normal[other] for other in range(place + 1))
-            together[key] = np.clip(special.ndtr(mixed), 0.0, _LARGEST)[:, None]
+            mixed = sum(
+                factor[place, other] * normal[other][:, np.minimum(columns, normal[other].shape[1] - 1)]
+                for other in range(place + 1)
+            )
+            together[key] = np.clip(special.ndtr(mixed), 0.0, _LARGEST)
     return {**uniform, **together}
 
 
@@ -80,8 +90,8 @@ def remaining(
 
 
 def check_correlation(mechanism: Mechanism) -> None:
-    """Raises `KeyProblem` unless the table names uncertain keys of one number each, once, and its matrix is
-    one of correlations."""
+    """Raises `KeyProblem` unless the table names uncertain keys, each once, and its matrix is one of
+    correlations."""
     table = mechanism.correlation
     if table is None:
         return
@@ -93,9 +103,6 @@ def check_correlation(mechanism: Mechanism) -> None:
             raise KeyProblem(where, shown(key), allowed)
         if key in table.keys[:place]:
             raise KeyProblem(where, f"{shown(key)} once more", "each key once")
-        if key == "approach.phase" or uncertain[key].independent:
-            allowed = "a key of one number, or a list that scales as one (independent = false)"
-            raise KeyProblem(where, shown(key), allowed)
     if len(table.matrix) != len(table.keys):
         raise KeyProblem(
             ("correlation", "matrix"), f"{len(table.matrix)} rows", f"{len(table.keys)}, one a key"

@@ -99,7 +99,7 @@ def _checked(label: str, names: Sequence[str], read: Callable[[Sequence[str]], C
         for name in wanted:
             if name not in names:
                 some = ", ".join(one_line(one, 40) for one in names[:SHOWN]) + ", ..." * (len(names) > SHOWN)
-                hint = close_match(name, names)
+                hint = one_line(close_match(name, names))
                 raise InputError(
                     f"{label}: column {shown(name)}: found none of this name, allowed {some}{hint}"
                 )

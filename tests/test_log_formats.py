@@ -1,0 +1,136 @@
+"""Logs in other tools' formats: each written by that format's own library, and read as the same as text."""
+
+import numpy as np
+import pytest
+from log_cases import CHANNELS, read, touches, write_csv
+
+from jaxhil.errors import InputError
+from tuning.identification.logs.readers import open_log
+
+LOG = touches(1)
+
+
+def mat_5(path):
+    from scipy.io import savemat
+
+    matrix = np.stack([LOG["xd"], LOG["xm"]], axis=1)
+    savemat(path, {"log": {"t": LOG["t"], "F": LOG["F"], "x": matrix}, "gain": 3.0, "note": "none"})
+    return path, {
+        "time": "log.t",
+        "position_desired": "log.x_1",
+        "position_measured": "log.x_2",
+        "force_measured": "log.F",
+    }
+
+
+def mat_73(path):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w", userblock_size=512) as file:
+        group = file.create_group("log")
+        for name, column in LOG.items():
+            group.create_dataset(name, data=column[None]).attrs["MATLAB_class"] = np.bytes_("double")
+    with open(path, "r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
+    return path, {name: f"log.{column}" for name, column in CHANNELS.items()}
+
+
+def hdf5(path):
+    h5py = pytest.importorskip("h5py")
+    table = np.rec.fromarrays([LOG["vd"], LOG["Fc"]], names="vd,Fc")
+    with h5py.File(path, "w") as file:
+        file["rig/t"], file["rig/F"] = LOG["t"], LOG["F"]
+        file["rig/x"] = np.stack([LOG["xd"], LOG["xm"]], axis=1)
+        file["rig/model"], file["rig/name"] = table, "a rig"
+    columns = ("rig/t", "rig/x_1", "rig/x_2", "rig/F", "rig/model.vd", "rig/model.Fc")
+    return path, dict(zip(CHANNELS, columns, strict=True))
+
+
+def bag(path):
+    pytest.importorskip("rosbags")
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.LATEST)
+    plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
+    folder = path.with_suffix("")
+    state, header = store.types["sensor_msgs/msg/JointState"], store.types["std_msgs/msg/Header"]
+    stamp = store.types["builtin_interfaces/msg/Time"]
+    with Writer(folder, version=9, storage_plugin=plugin) as writer:
+        connection = writer.add_connection("/rig", state.__msgtype__, typestore=store)
+        for t, x, xm, force in zip(LOG["t"], LOG["xd"], LOG["xm"], LOG["F"], strict=True):
+            nanoseconds = 1_700_000_000_000_000_000 + round(1e9 * t)
+            message = state(
+                header=header(stamp=stamp(sec=0, nanosec=0), frame_id="rig"),
+                name=["x"],
+                position=np.array([x, xm]),
+                velocity=np.array([]),
+                effort=np.array([force]),
+            )
+            writer.write(connection, nanoseconds, store.serialize_cdr(message, state.__msgtype__))
+    columns = ("/rig.time", "/rig.position_1", "/rig.position_2", "/rig.effort_1")
+    return folder, dict(zip(CHANNELS, columns, strict=False))
+
+
+def mdf(path):
+    asammdf = pytest.importorskip("asammdf")
+    signals = [
+        asammdf.Signal(samples=column, timestamps=LOG["t"], name=name)
+        for name, column in LOG.items()
+        if name != "t"
+    ]
+    with asammdf.MDF() as file:
+        file.append(signals)
+        file.save(path)
+    return path, CHANNELS | {"time": "time"}
+
+
+def tdms(path):
+    nptdms = pytest.importorskip("nptdms")
+    properties = {"wf_increment": 1e-3, "wf_start_offset": 0.0, "wf_samples": 600}
+    with nptdms.TdmsWriter(path) as writer:
+        writer.write_segment(
+            [nptdms.ChannelObject("rig", name, LOG[name], properties) for name in LOG if name != "t"]
+        )
+    return path, {name: f"rig/{column}" for name, column in CHANNELS.items()} | {"time": "rig/xd.time"}
+
+
+FORMATS = [
+    ("a.mat", mat_5),
+    ("b.mat", mat_73),
+    ("a.h5", hdf5),
+    ("a.db3", bag),
+    ("a.mcap", bag),
+    ("a.mf4", mdf),
+    ("a.tdms", tdms),
+]
+
+
+@pytest.mark.filterwarnings("ignore")  # other libraries' own
+@pytest.mark.parametrize(("name", "write"), FORMATS)
+def test_every_format_says_the_same(tmp_path, name, write):
+    if write is mat_5:
+        pytest.importorskip("pymatreader")
+    path, columns = write(tmp_path / name)
+    absent = dict.fromkeys(set(CHANNELS) - set(columns))
+    (found,) = read(path, **columns, **absent).runs
+    (text,) = read(write_csv(tmp_path / "text.csv", LOG), **absent).runs
+    np.testing.assert_array_equal(found.tick, text.tick)
+    for channel in set(columns) - {"time"}:
+        np.testing.assert_array_equal(getattr(found, channel), getattr(text, channel))
+    with pytest.raises(InputError, match="column 'nothing': found none of this name, allowed"):
+        read(path, **columns | {"position_desired": "nothing"}, **absent)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("suffix", [".mat", ".h5", ".mcap", ".mf4", ".tdms"])
+def test_what_is_torn_or_needs_a_library_is_one_line(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(b"torn" * 100)
+    with pytest.raises(InputError) as caught:
+        open_log(path).read(["t"])
+    found = str(caught.value)
+    assert found.startswith(f"{path}: ") and found.isprintable()
+    assert (
+        "cannot be read: " in found
+        or "which is not installed: python3 -m pip install 'jaxhil[logs]'" in found
+    )
