@@ -78,7 +78,8 @@ class _Reading:
     def __init__(
         self, path: Path, entry: RunFiles, mapping: LogMapping, timing: Timing, mass: float, integrator: str
     ):
-        self.label, self.kind, self.notes = one_line(str(path)) or "''", entry.kind, list[str]()
+        self.label, self.notes = one_line(str(path)) or "''", list[str]()
+        self.kind: Kind = entry.kind
         self._path, self._timing, self._mass, self._integrator = path, timing, mass, integrator
         log = open_log(path, mapping.text)
         columns, stamps = _columns(log, mapping)
@@ -117,7 +118,7 @@ class _Reading:
                 continue
             kind: Kind = self.kind
             if modes is not None:
-                kind = KINDS[int(modes[np.searchsorted(tick, stretch.tick[0])])]
+                kind = KINDS[int(modes[np.searchsorted(tick, stretch.tick[:1])][0])]
             run, contacts = self._run(stretch, kind, counted)
             counted += contacts
             runs.append(run)
@@ -207,6 +208,7 @@ def _stamps(label: str, read: Columns, mapping: LogMapping) -> np.ndarray | None
     if stamps.dtype == object:
         allowed = "numbers, or a time_format beside the column"
         raise InputError(f"{label}: column {shown(time.column)}: found {shown(stamps[0])}, allowed {allowed}")
+    checks.check_rows(label, "time", stamps)
     # The first stamp may count from an epoch: what is left has digits to spare.
     factor = si(Channel(column=time.column, unit=time.unit), "time")[0]
     return factor * (stamps - stamps[:1])

@@ -15,6 +15,7 @@ from jaxhil.errors import InputError
 from tuning.identification.logs.rows import Stretch, integrator_of
 
 FEWEST_ROWS = 200
+LARGEST_NUMBER = 1e30  # nanoseconds since an epoch are 1e18
 LARGEST_STROKE = 1.0  # m
 SMALLEST_STROKE = 1e-5  # m
 FASTEST = 5.0  # m/s
@@ -26,12 +27,12 @@ SAMPLE = 200_000  # rows looked at, where some say as much as all
 
 
 def check_rows(label: str, name: str, values: np.ndarray) -> None:
-    """All are finite numbers."""
-    bad = np.flatnonzero(~np.isfinite(values))
+    """All are numbers that can be read from a sensor or a clock."""
+    bad = np.flatnonzero(~(np.abs(values) <= LARGEST_NUMBER))
     if len(bad):
-        raise InputError(
-            f"{label}: row {bad[0] + 1}: {name}: found {values[bad[0]]}, allowed a finite number"
-        )
+        row, found = int(bad[0]) + 1, float(values[bad[0]])
+        allowed = f"a finite number of at most {LARGEST_NUMBER:g}"
+        raise InputError(f"{label}: row {row}: {name}: found {found:g}, allowed {allowed}")
 
 
 def check_motion(label: str, kind: str, stretch: Stretch, period: float) -> list[str]:

@@ -33,11 +33,6 @@ class Ticks(NamedTuple):
 
 def ticks_of(stamps: np.ndarray, period: float, label: str, column: str = "time") -> Ticks:
     """The tick of every stamp [s]. Raises `InputError` unless they increase, at the control rate."""
-    bad = np.flatnonzero(~np.isfinite(stamps))
-    if len(bad):
-        raise InputError(
-            f"{label}: row {bad[0] + 1}: {column}: found {stamps[bad[0]]}, allowed a finite number"
-        )
     steps = np.diff(stamps)
     bad = np.flatnonzero(~(steps > 0))
     if len(bad):
@@ -104,7 +99,7 @@ def _phase(stamps: np.ndarray, period: float) -> np.ndarray:
     turns = stamps / period
     # The whole turns say nothing, and would cost digits.
     unit = np.exp(2j * np.pi * (turns - np.rint(turns)))
-    sizes = np.diff([*starts, len(stamps)])
+    sizes = np.diff(np.append(starts, len(stamps)))
     angle = np.unwrap(np.angle(np.add.reduceat(unit, starts)))
     middle = np.add.reduceat(stamps, starts) / sizes
     if len(middle) > 1:

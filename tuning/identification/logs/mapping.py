@@ -28,7 +28,7 @@ from tuning.identification.logs.units import COUNTS, OF_CHANNEL
 from tuning.identification.records import Kind, Row
 
 SCHEMA = "jaxhil/log/1"
-KINDS = ("free", "press", "tap", "contact", "rest")
+KINDS: tuple[Kind, ...] = ("free", "press", "tap", "contact", "rest")
 
 Name = Annotated[str, Meta(min_length=1, max_length=200)]
 Pattern = Annotated[str, Meta(min_length=1, max_length=1000)]
