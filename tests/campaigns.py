@@ -1,0 +1,397 @@
+"""Campaigns with known truth: 60 s of multisine and 15 touches, of the oracle's physics, not of the JAX loop.
+
+All touches advance together, one lane each. The motion simulator's output is exact at any time (matrix
+exponentials of the oracle's state space); contact force is the oracle's law, evaluated when the sensor sees
+it; a lagging sensor integrates it by quadrature. `test_campaigns.py` holds lanes against `oracle.simulate`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from oracle_contact import Law
+from oracle_motion import simulator_matrices
+from scipy.linalg import expm
+from scipy.signal import lfilter
+
+from tuning.identification.records import Campaign, Run, Timing
+
+SPEEDS = tuple(np.repeat([0.003, 0.006, 0.012], 5))
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(12)
+NODES, WEIGHTS = (NODES + 1.0) / 2.0, WEIGHTS / 2.0
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A rig and how it is logged."""
+
+    rig: dict[str, Any]
+    contact: dict[str, Any]
+    colour: float = 0.0  # pole of the noise
+    jitter: float = 0.0  # s, of the stamps
+    lost: float = 0.0  # share of rows
+    block: int = 0  # rows lost at once in the middle of the free motion
+    amplitude: float = 0.0008  # m, rms of the multisine
+    drift: float = 0.0  # share by which stiffness grows over the touches
+    mass: float = 350.0
+
+
+def _rig(noise=0.5, position_noise=5e-6, **changes):
+    rig = {
+        "control_period": 0.001,
+        "simulator": {
+            "model": "second_order",
+            "natural_frequency": 12.0,
+            "damping_ratio": 0.8,
+            "delay": 0.0043,
+        },
+        "force_sensor": {"delay": 0.0037, "noise_std": noise},
+        "position_sensor": {"noise_std": position_noise},
+    }
+    for path, value in changes.items():
+        target, *keys = path.split("__")
+        if keys:
+            rig[target] = {**rig.get(target, {}), keys[0]: value}
+        else:
+            rig[target] = value
+    return rig
+
+
+def _voigt(stiffness=(1.2e5,), damping=(650.0,)):
+    return {"law": "kelvin_voigt", "stiffness": list(stiffness), "damping": list(damping)}
+
+
+THIRD = {"model": "third_order", "coefficients": [0.018, 1.6e-4, 7e-7], "delay": 0.0031}
+# Two pairs of poles, one of them a structural resonance with its antiresonance.
+RESONANT = {
+    "model": "transfer_function",
+    "numerator": [1.0 / 235.0**2, 2 * 0.02 / 235.0, 1.0],
+    "denominator": list(
+        np.polymul([1.0 / 75.0**2, 2 * 0.8 / 75.0, 1.0], [1.0 / 220.0**2, 2 * 0.03 / 220.0, 1.0])
+    ),
+    "delay": 0.0043,
+}
+PUBLISHED = {"force_sensor__bias": 1.3, "force_sensor__quantum": 0.5, "position_sensor__quantum": 1e-6}
+HERTZ = {"law": "hunt_crossley", "stiffness": [6e6], "damping": [2.0], "exponent": 1.5}
+
+KINDS = {
+    "clean": Kind(_rig(), _voigt()),
+    "noisy": Kind(_rig(noise=2.67, **PUBLISHED), _voigt()),
+    "coloured": Kind(_rig(), _voigt(), colour=0.6),
+    "jitter": Kind(_rig(), _voigt(), jitter=2e-4, lost=0.002, block=400),
+    "dead_zone": Kind(_rig(force_sensor__dead_zone=4.0), _voigt()),
+    "lagging": Kind(_rig(force_sensor__time_constant=0.0016, position_sensor__delay=0.0012), _voigt()),
+    "third_order": Kind(_rig(simulator=THIRD, command_hold="zoh", command_latency=1), _voigt()),
+    "resonance": Kind(_rig(simulator=RESONANT), _voigt()),
+    "hertz": Kind(_rig(), HERTZ),
+    "stiffnesses": Kind(_rig(contact_plane=2e-4), _voigt((1.2e5, 2.4e5, 7e4))),
+    "drifting": Kind(_rig(), _voigt(), drift=0.15),
+}
+
+
+def multisine(period=0.001, length=5.0, highest=45.0, rms=0.0008, seed=0):
+    """One period [m]: odd lines to `highest` [Hz], every fourth odd one left out, random phases."""
+    rows = round(length / period)
+    odd = np.arange(1, int(highest * length) + 1, 2)
+    lines = odd[(np.arange(len(odd)) + 1) % 4 != 0]
+    phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, len(lines))
+    spectrum = np.zeros(rows // 2 + 1, complex)
+    spectrum[lines] = np.exp(1j * phases)
+    wave = np.fft.irfft(spectrum, rows)
+    return wave * rms / np.sqrt(np.mean(wave**2))
+
+
+class Plant:
+    """The motion simulator in discrete time: rows for any place within a period."""
+
+    def __init__(self, rig):
+        self.T, self.hold = rig["control_period"], rig.get("command_hold", "linear")
+        self.latency = rig.get("command_latency", 0)
+        self.A, self.B, self.C = simulator_matrices(rig["simulator"])
+        self.state, self.start, self.end = self.after(1.0)
+
+    def after(self, part):
+        """State after a part of a period from state, input at its start and at its end."""
+        n = len(self.B)
+        system = np.zeros((n + 2, n + 2))
+        system[:n, :n], system[:n, n], system[n, n + 1] = self.A * self.T, self.B * self.T, 1.0
+        full = expm(system * part)[:n]
+        return full[:, :n], full[:, n] - full[:, n + 1], full[:, n + 1]
+
+    def rows(self, part):
+        """Position and velocity there, as rows for (state, input at start, input at end)."""
+        state, start, end = self.after(part)
+        position = np.array([*(self.C @ state), self.C @ start, self.C @ end])
+        rate = self.C @ self.A
+        velocity = np.array([*(rate @ state), rate @ start, rate @ end])
+        through = self.C @ self.B  # 0 unless G has a relative degree of 1
+        velocity[-2] += through * (1.0 - part)
+        velocity[-1] += through * part
+        return position, velocity
+
+    def uniform(self, position, velocity):
+        """State of a uniform motion: input `position` now, which grows by `velocity` a period."""
+        closed = np.eye(len(self.B)) - self.state
+        both = self.start + self.end
+        ahead = both if self.hold == "zoh" else self.end
+        slope = np.linalg.solve(closed, np.outer(both, velocity))
+        return np.linalg.solve(closed, np.outer(both, position) + np.outer(ahead, velocity) - slope)
+
+
+def free(kind, seed, seconds=60.0):
+    """Command and actual position [m] as the position sensor sees it, of the multisine from rest."""
+    rig, rng = kind.rig, np.random.default_rng(seed)
+    T = rig["control_period"]
+    one = multisine(T, rms=kind.amplitude, seed=int(rng.integers(1 << 30)))
+    command = np.tile(one, round(seconds / T / len(one)))
+    return command, _position(Plant(rig), command, _total_delay(rig) / T)
+
+
+def _total_delay(rig):
+    return rig["simulator"].get("delay", 0.0) + rig.get("position_sensor", {}).get("delay", 0.0)
+
+
+def _position(plant, command, lag):
+    """Response at the ticks less `lag` ticks; the command stood still before."""
+    history = int(np.ceil(lag)) + plant.latency + 3
+    c = np.concatenate([np.full(history, command[0]), command])
+    # Input at the ends of interval `latency` of `c` and those after it.
+    end = c[1 : len(c) - plant.latency]
+    start = end if plant.hold == "zoh" else c[: len(c) - 1 - plant.latency]
+    poles, vectors = np.linalg.eig(plant.state)
+    drive = np.linalg.solve(vectors, np.outer(plant.start, start) + np.outer(plant.end, end))
+    first = np.linalg.solve(vectors, plant.uniform(c[:1], np.zeros(1))[:, 0])
+    states = np.empty((len(poles), len(end) + 1), complex)
+    states[:, 0] = first
+    for i, pole in enumerate(poles):
+        states[i, 1:], _ = lfilter([1.0], [1.0, -pole], drive[i], zi=[pole * first[i]])
+    state = (vectors @ states).real
+    whole = np.floor(lag + 1e-9)
+    row, _ = plant.rows(1.0 - (lag - whole) if lag - whole > 1e-9 else 1.0)
+    k = np.arange(len(command)) - 1 - int(whole) + history - plant.latency
+    return row[:-2] @ state[:, k] + row[-2] * start[k] + row[-1] * end[k]
+
+
+def touches(kind, speeds, indices, phases, rng, seconds=0.42, lead=0.05, damping=0.35, noise=True):
+    """Per-tick signals of touches, each (ticks, lanes).
+
+    The compensation under which they run is a filtered force plus what damps the numerical model's motion in
+    contact: whatever keeps the rebound small enough; the estimates never see it."""
+    rig, T, mass = kind.rig, kind.rig["control_period"], kind.mass
+    plant, law = Plant(rig), Law(kind.contact, rig.get("contact_plane", 0.0))
+    sensor, lanes = rig["force_sensor"], len(speeds)
+    v = np.array(speeds, float)
+    x = -v * (lead + np.asarray(phases) * T)
+    position_lag = _total_delay(rig) / T
+    force_lag = (rig["simulator"].get("delay", 0.0) + sensor.get("delay", 0.0)) / T
+    time_constant = sensor.get("time_constant", 0.0) / T
+    history = int(np.ceil(max(position_lag, force_lag))) + plant.latency + 4
+    ticks = round(seconds / T)
+    c = np.empty((history + ticks + 1, lanes))
+    c[: history + 1] = x + v * T * np.arange(-history, 1)[:, None]
+    states = np.empty((history + ticks + 1, len(plant.B), lanes))
+    first = plant.latency + 2
+
+    def ends(k):
+        """The input at both ends of interval k (of the rows of `c`)."""
+        end = c[k + 1 - plant.latency]
+        return (end if plant.hold == "zoh" else c[k - plant.latency]), end
+
+    states[first] = plant.uniform(ends(first - 1)[1], v * T)
+
+    def advance(k):
+        start, end = ends(k)
+        states[k + 1] = plant.state @ states[k] + np.outer(plant.start, start) + np.outer(plant.end, end)
+
+    for k in range(first, history):
+        advance(k)
+
+    def reader(lag):
+        whole = np.floor(lag + 1e-9)
+        part = 1.0 - (lag - whole) if lag - whole > 1e-9 else 1.0
+        rows = plant.rows(part)
+
+        def read(k):
+            k = k - 1 - int(whole)
+            start, end = ends(k)
+            return [row[:-2] @ states[k] + row[-2] * start + row[-1] * end for row in rows]
+
+        return read
+
+    read_position = reader(position_lag)
+    back = [force_lag] if time_constant == 0.0 else [force_lag + 1.0 - node for node in NODES]
+    kernels = (
+        None if time_constant == 0.0 else WEIGHTS * np.exp((NODES - 1.0) / time_constant) / time_constant
+    )
+    read_force = [reader(lag) for lag in back]
+    groups = [(index, np.flatnonzero(np.asarray(indices) == index)) for index in np.unique(indices)]
+    grown = 1.0 + kind.drift * np.arange(lanes) / max(lanes - 1, 1)
+
+    def force_of(position, velocity):
+        depth, total = position - law.plane, np.zeros(lanes)
+        for index, members in groups:
+            raw = law.raw(depth[members], velocity[members], int(index))
+            raw = np.maximum(raw, 0.0) if law.clamped(int(index)) else raw
+            total[members] = np.where(depth[members] > 0.0, raw, 0.0)
+        return total * grown
+
+    colour, std = kind.colour, sensor.get("noise_std", 0.0) * noise
+    force_noise = _coloured(rng, (ticks, lanes), std, colour)
+    std = rig["position_sensor"].get("noise_std", 0.0) * noise
+    position_noise = _coloured(rng, (ticks, lanes), std, colour)
+    names = ("position_desired", "velocity_desired", "position_measured", "force_measured", "force_command")
+    log = {name: np.empty((ticks, lanes)) for name in names}
+    lagged, filtered = np.zeros(lanes), np.zeros(lanes)
+    viscous = 2.0 * damping * np.sqrt(mass * np.max(np.asarray(kind.contact["stiffness"]).clip(max=4e5)))
+    for n in range(ticks):
+        k = n + history
+        actual, _ = read_position(k)
+        forces = [force_of(*read(k)) for read in read_force]
+        if kernels is None:
+            force = forces[0]
+        else:
+            lagged = np.exp(-1.0 / time_constant) * lagged + kernels @ np.array(forces)
+            force = lagged
+        measured = sense(force + force_noise[n], sensor)
+        position = _rounded(actual + position_noise[n], rig["position_sensor"].get("quantum", 0.0))
+        filtered = filtered + (measured - filtered) * min(1.0, T / 0.002)
+        command = filtered + viscous * v * (x > law.plane) if damping else measured
+        if n == 0:
+            command = np.zeros(lanes)
+        for name, value in zip(names, (x, v, position, measured, command), strict=True):
+            log[name][n] = value
+        v = v - T * command / mass
+        x = x + T * v
+        c[k + 1] = x
+        advance(k)
+    return log
+
+
+def sense(force, sensor):
+    """Bias, quantum, dead zone, range, in that order (noise is in `force`)."""
+    force = _rounded(force + sensor.get("bias", 0.0), sensor.get("quantum", 0.0))
+    force = np.sign(force) * np.maximum(0.0, np.abs(force) - sensor.get("dead_zone", 0.0))
+    limit = sensor.get("range", np.inf)
+    return np.clip(force, -limit, limit)
+
+
+def _rounded(value, quantum):
+    return quantum * np.round(value / quantum) if quantum > 0.0 else value
+
+
+def _coloured(rng, shape, std, pole):
+    """Noise of that standard deviation along axis 0, white or of one pole."""
+    white = rng.standard_normal(shape)
+    if pole == 0.0:
+        return std * white
+    drive = white * np.sqrt(1.0 - pole**2)
+    drive[0] = white[0]
+    return std * lfilter([1.0], [1.0, -pole], drive, axis=0)
+
+
+def campaign(name, seed, speeds=SPEEDS, seconds=60.0, rest=5.0, press=False) -> Campaign:
+    """A day on a rig of that kind: rest, free motion, touches, where asked a press."""
+    kind = KINDS[name]
+    rng = np.random.default_rng([seed, len(name)])
+    runs = []
+    if rest:
+        runs.append(_rest_run(kind, rng, rest))
+    if seconds:
+        runs.append(_free_run(kind, rng, seconds))
+    if len(speeds):
+        runs += _touch_runs(kind, rng, speeds)
+    if press:
+        runs.append(_press_run(kind, rng))
+    timing = Timing(
+        kind.rig["control_period"],
+        kind.rig.get("command_hold", "linear"),
+        kind.rig.get("command_latency", 0),
+        "tick",
+        None,
+    )
+    return Campaign(tuple(runs), timing, kind.mass, {})
+
+
+def _rest_run(kind, rng, seconds):
+    rig, rows = kind.rig, round(seconds / kind.rig["control_period"])
+    held = np.full(rows, -0.02)
+    force = sense(_coloured(rng, rows, rig["force_sensor"]["noise_std"], kind.colour), rig["force_sensor"])
+    return _run(kind, "rest", held, _measured(kind, rng, held), force)
+
+
+def _free_run(kind, rng, seconds):
+    command, actual = free(kind, int(rng.integers(1 << 30)), seconds)
+    rig = kind.rig
+    offset = -0.05  # clear of the mechanism
+    force = _coloured(rng, len(command), rig["force_sensor"]["noise_std"], kind.colour)
+    force = sense(force, rig["force_sensor"])
+    run = _run(kind, "free", command + offset, _measured(kind, rng, actual + offset), force)
+    return _lose(kind, run, rng)
+
+
+def _touch_runs(kind, rng, speeds):
+    count = len(kind.contact["stiffness"])
+    indices = np.arange(len(speeds)) % count
+    log = touches(kind, speeds, indices, rng.uniform(size=len(speeds)), rng)
+    runs = []
+    for lane, speed in enumerate(speeds):
+        signals = {name: value[:, lane] for name, value in log.items()}
+        rows = len(signals["force_measured"])
+        run = _run(kind, "contact", signals["position_desired"], signals["position_measured"],
+                   signals["force_measured"])  # fmt: skip
+        run = replace(
+            run,
+            source=f"touch_{lane}.csv",
+            velocity_desired=signals["velocity_desired"],
+            force_command=signals["force_command"],
+            contact_index=np.full(rows, indices[lane]),
+            speed=float(speed),
+        )
+        runs.append(_lose(replace(kind, block=0), run, rng))
+    return runs
+
+
+def _press_run(kind, rng, seconds=30.0, depth=0.0008, rms=5e-5):
+    rig, T = kind.rig, kind.rig["control_period"]
+    one = multisine(T, rms=rms, seed=int(rng.integers(1 << 30)))
+    command = depth + np.tile(one, round(seconds / T / len(one)))
+    plant = Plant(rig)
+    sensor = rig["force_sensor"]
+    actual = _position(plant, command, _total_delay(rig) / T)
+    lag = (rig["simulator"].get("delay", 0.0) + sensor.get("delay", 0.0)) / T
+    # Dense enough for its own velocity: the press never leaves the contact.
+    near = 1e-3
+    at = [_position(plant, command, lag + shift) for shift in (near, 0.0, -near)]
+    law = Law(kind.contact, rig.get("contact_plane", 0.0))
+    force = law.raw(at[1] - law.plane, (at[2] - at[0]) / (2.0 * near * T), 0)
+    force = force + _coloured(rng, len(command), sensor["noise_std"], kind.colour)
+    return _run(kind, "press", command, _measured(kind, rng, actual), sense(force, sensor))
+
+
+def _measured(kind, rng, actual):
+    sensor = kind.rig["position_sensor"]
+    noisy = actual + _coloured(rng, len(actual), sensor["noise_std"], kind.colour)
+    return _rounded(noisy, sensor.get("quantum", 0.0))
+
+
+def _run(kind, what, command, measured, force):
+    rows = len(command)
+    return Run(what, f"{what}.csv", np.arange(rows), kind.jitter, command, measured, force, None, None,
+               np.ones(rows, bool), None, None)  # fmt: skip
+
+
+def _lose(kind, run, rng):
+    """Rows lost here and there, and a block of them; a touch keeps its rebuilt command, as readers do."""
+    rows = len(run.tick)
+    valid = rng.uniform(size=rows) >= kind.lost
+    valid[:3] = True
+    if kind.block:
+        middle = int(rng.integers(rows // 4, rows // 2))
+        valid[middle : middle + kind.block] = False
+    if valid.all():
+        return run
+    position = np.where(valid, run.position_measured, np.nan)
+    force = None if run.force_measured is None else np.where(valid, run.force_measured, np.nan)
+    return replace(run, valid=valid, position_measured=position, force_measured=force)

@@ -1,0 +1,148 @@
+"""Whole campaigns: the numbers, the verdict, the mechanism file."""
+
+from dataclasses import replace
+
+import campaigns
+import numpy as np
+import pytest
+
+import jaxhil
+from jaxhil.mechanism.uncertainty import draw
+from tuning.identification.estimate import Options, held_out, identify
+from tuning.identification.mechanism_file import to_toml, uncertainty_tables
+
+FEW = (0.003, 0.006, 0.012) * 3
+
+
+def known(name, seed=0, options=None, **changes):
+    law = campaigns.KINDS[name].contact["law"]
+    return identify(campaigns.campaign(name, seed, **changes), options=options or Options(law=law, seed=seed))
+
+
+@pytest.fixture(scope="module")
+def clean():
+    return known("clean", speeds=FEW, seconds=30.0)
+
+
+def test_a_clean_campaign_gives_the_rig_back(clean):
+    assert clean["rig.simulator.natural_frequency"].value == pytest.approx(12.0, rel=0.003)
+    assert clean["rig.simulator.delay"].value == pytest.approx(0.0043, abs=2e-5)
+    assert clean["rig.force_sensor.delay"].value == pytest.approx(0.0037, abs=2.5e-4)
+    critical = 2.0 * np.sqrt(1.2e5 * 350.0)
+    assert clean["apparent damping"].value == pytest.approx(650.0 - 444.0, abs=0.01 * critical)
+    assert clean["contact.stiffness.0"].value == pytest.approx(1.2e5, rel=0.003)
+    assert clean["rig.contact_plane"].value == pytest.approx(0.0, abs=5e-6)
+    assert clean["rig.force_sensor.noise_std"].value == pytest.approx(0.5, rel=0.04)
+    for one in clean.estimates:
+        assert one.low <= one.value <= one.high
+    assert clean.good and clean.verdict.startswith("Good") and clean.effect < 0.01
+
+
+def test_its_mechanism_file_loads_with_what_is_uncertain_and_correlated(clean, tmp_path):
+    path = tmp_path / "mechanism.toml"
+    path.write_text(to_toml(clean.mechanism, "identified"))
+    mechanism = jaxhil.load(str(path))
+    assert mechanism.contact.law == "kelvin_voigt"
+    assert mechanism.contact.stiffness[0] == pytest.approx(clean["contact.stiffness.0"].value, rel=1e-9)
+    assert mechanism.rig.force_sensor.noise_std == pytest.approx(clean["rig.force_sensor.noise_std"].value)
+    assert "rig.force_sensor.delay" in mechanism.uncertainty
+    draws = draw(mechanism, 4000, 0)
+    apparent = (
+        draws["contact.damping"][:, 0] - draws["contact.stiffness"][:, 0] * draws["rig.force_sensor.delay"]
+    )
+    # The floors of the delay and of the stiffness alone: 2e-5 s and 0.1 %.
+    floor = np.hypot(1.2e5 * 2e-5, 0.001 * 1.2e5 * 0.0037)
+    assert apparent.std() < 1.3 * np.hypot(clean["apparent damping"].std, floor)
+
+
+@pytest.mark.parametrize("wrong, worst", (
+    ("hold", "command hold"), ("order", "motion model"), ("sign", "sign of the force"), ("scale", "scale"),
+))  # fmt: skip
+def test_a_defect_is_named_and_the_verdict_bad(wrong, worst):
+    campaign = campaigns.campaign("resonance" if wrong == "order" else "clean", 1, speeds=FEW)
+    options = Options(law="kelvin_voigt", order=2 if wrong == "order" else None)
+    runs = campaign.runs
+    if wrong == "hold":
+        campaign = replace(campaign, timing=replace(campaign.timing, command_hold="zoh"))
+    elif wrong == "sign":
+        runs = [
+            run if run.kind != "contact" else replace(run, force_measured=-run.force_measured) for run in runs
+        ]
+    elif wrong == "scale":
+        runs = [replace(run, position_measured=1.02 * run.position_measured) for run in runs]
+    found = identify(replace(campaign, runs=tuple(runs)), options=options)
+    assert not found.good and found.verdict.startswith("Bad")
+    assert any(line.name.startswith(worst) and line.there for line in found.lines)
+
+
+def test_a_contact_that_stiffens_from_touch_to_touch_is_a_drift():
+    found = known("drifting", speeds=FEW)
+    assert not found.good
+    assert next(line for line in found.lines if line.name.startswith("drift")).there
+
+
+def test_a_dead_zone_is_told_from_a_bias_and_the_pair_it_confounds_named():
+    found = known("dead_zone", speeds=FEW)
+    dead = found["rig.force_sensor.dead_zone"]
+    assert dead.value == pytest.approx(4.0, rel=0.03) and dead.low < 4.0 < dead.high
+    assert any({"rig.force_sensor.delay", "contact.damping.0"} == {*pair[:2]} for pair in found.confounded)
+    assert found.mechanism["rig"]["force_sensor"]["dead_zone"] == dead.value
+
+
+def test_without_free_motion_the_prior_tells_the_motion_and_without_contact_the_contact():
+    prior = jaxhil.load("varying")
+    campaign = campaigns.campaign("clean", 2, speeds=FEW, seconds=0)
+    with pytest.raises(jaxhil.InputError, match="found no free motion"):
+        identify(campaign)
+    told = {"rig.simulator.natural_frequency": 12.0, "rig.simulator.delay": 0.0043}
+    found = identify(campaign, jaxhil.load("varying", told), Options(law="kelvin_voigt"))
+    assert found["contact.stiffness.0"].value == pytest.approx(1.2e5, rel=0.005)
+    assert found.mechanism["rig"]["simulator"]["delay"] == 0.0043 and "prior" in found.notes[0]
+    free = campaigns.campaign("clean", 2, speeds=(), seconds=30.0)
+    with pytest.raises(jaxhil.InputError, match="found no contact"):
+        identify(free)
+    found = identify(free, prior)
+    assert found.mechanism["contact"]["stiffness"] == [124355.0, 373065.0, 62177.5]
+    assert found["rig.simulator.natural_frequency"].value == pytest.approx(12.0, rel=0.003)
+
+
+def test_what_is_told_is_taken_as_told(clean):
+    fixed = {"rig.contact_plane": 0.0, "rig.position_sensor.delay": 0.001}
+    found = known("clean", speeds=FEW, seconds=30.0, options=Options(law="kelvin_voigt", fixed=fixed))
+    assert found["rig.contact_plane"].told and "rig.contact_plane" not in found.mechanism["uncertainty"]
+    assert found["rig.simulator.delay"].value == pytest.approx(
+        clean["rig.simulator.delay"].value - 0.001, abs=1e-6
+    )
+    shift = found["rig.force_sensor.delay"].value - clean["rig.force_sensor.delay"].value
+    assert shift == pytest.approx(0.001, abs=1e-4)
+    assert found.mechanism["rig"]["position_sensor"]["delay"] == 0.001
+    with pytest.raises(jaxhil.InputError, match=r"fix: found rig\.range"):
+        identify(
+            campaigns.campaign("clean", 0, speeds=(), seconds=5.0), options=Options(fixed={"rig.range": 1.0})
+        )
+
+
+def test_of_every_speed_some_touches_are_held_out():
+    runs = campaigns.campaign("clean", 0, seconds=0, rest=0).runs
+    held = held_out(runs, 0.2)
+    assert held.sum() == 3 and {run.speed for run, out in zip(runs, held, strict=True) if out} == {
+        0.003,
+        0.006,
+        0.012,
+    }
+    assert not held_out(runs, 0.0).any() and not held_out(runs[:2], 0.2).any()
+
+
+def test_standard_deviations_have_floors_and_the_correlation_stays_positive_definite():
+    rng = np.random.default_rng(0)
+    one = rng.standard_normal(3000)
+    draws = np.column_stack([one, one, 1e-9 * rng.standard_normal(3000), rng.standard_normal(3000)])
+    tables = uncertainty_tables(["a.x.0", "a.x.1", "b", "c"], draws, np.array([0.0, 0.0, 0.5, 0.0]))
+    assert (
+        tables["uncertainty"]["b"]["std"] == pytest.approx(0.5)
+        and tables["uncertainty"]["a.x"]["independent"]
+    )
+    matrix = np.zeros((3, 3))
+    for i, row in enumerate(tables["correlation"]["matrix"]):
+        matrix[i, : i + 1] = matrix[: i + 1, i] = row
+    assert np.linalg.eigvalsh(matrix).min() > 1e-7 and np.all(np.diag(matrix) == 1.0)

@@ -1,0 +1,146 @@
+"""The motion simulator from free motion: spectra, hold, orders, and errors against the Cramer-Rao bound."""
+
+import campaigns
+import numpy as np
+import pytest
+
+from tuning.identification import free_motion, frf, hold
+from tuning.identification.order import choose
+from tuning.identification.rational import STRUCTURES, Lines, Model, fit
+
+BY_NAME = {structure.name: structure for structure in STRUCTURES}
+SECOND = Model(BY_NAME["second_order"], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
+THIRD = Model(BY_NAME["third_order"], np.array([np.log(0.008), np.log(110.0), np.log(0.5), 0.0031]))
+
+
+def lines_of(model, hold="linear", latency=0, period=0.001, row="tick", std=5e-7):
+    """Exact spectra at 85 lines to 45 Hz."""
+    frequency = np.delete(np.arange(1, 226, 2), np.s_[3::4]) / 5.0
+    rng = np.random.default_rng(0)
+    command = 1e-4 * np.exp(2j * np.pi * rng.uniform(size=len(frequency)))
+    empty = Lines(frequency, command, command, np.full(len(frequency), std), period, hold, latency, row)
+    return Lines(frequency, command, model.predict(empty), empty.std, period, hold, latency, row)
+
+
+@pytest.mark.parametrize("name", ("clean", "third_order", "resonance"))
+def test_the_model_gives_what_the_exactly_sampled_simulator_gives(name):
+    """One period of the multisine in the steady state, by the oracle's matrices and by the lines."""
+    kind = campaigns.KINDS[name]
+    T = kind.rig["control_period"]
+    one = campaigns.multisine(T)
+    plant = campaigns.Plant(kind.rig)
+    command = np.tile(one, 3)
+    response = campaigns._position(plant, command, kind.rig["simulator"]["delay"] / T)[-len(one) :]
+    U, Y = np.fft.rfft(one), np.fft.rfft(response)
+    number = np.flatnonzero(np.abs(U) > 1e-6 * np.abs(U).max())
+    hold_of = kind.rig.get("command_hold", "linear"), kind.rig.get("command_latency", 0)
+    lines = Lines(number / (len(one) * T), U[number], Y[number], np.ones(len(number)), T, *hold_of)
+    found = fit(BY_NAME[{"clean": "second_order"}.get(name, name)], lines)
+    np.testing.assert_allclose(found.model.predict(lines), Y[number], rtol=2e-6)
+    assert found.model.delay == pytest.approx(kind.rig["simulator"]["delay"], abs=2e-9)
+    if name == "clean":
+        np.testing.assert_allclose(np.exp(found.model.parameters[:2]), [2 * np.pi * 12.0, 0.8], rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind, latency, row, periods", (
+    ("linear", 0, "tick", 0.0), ("zoh", 0, "tick", -0.5), ("zoh", 1, "tick", 0.5), ("linear", 1, "sent", 2.0),
+    ("linear", 0, "after", -1.0),
+))  # fmt: skip
+def test_hold_latency_and_row_are_a_delay_of_whole_and_half_periods(kind, latency, row, periods):
+    frequency = np.array([0.1, 1.0, 10.0])
+    response = hold.response(frequency, 0.002, kind, latency, row)
+    np.testing.assert_allclose(np.angle(response), -2.0 * np.pi * frequency * periods * 0.002, atol=1e-12)
+    assert np.all(np.diff(np.abs(response)) < 0.0) and abs(response[0]) > 0.9999
+
+
+@pytest.mark.parametrize("model", (SECOND, THIRD), ids=("second", "third"))
+def test_slopes_are_those_of_differences(model):
+    s = 2j * np.pi * np.array([0.3, 3.0, 30.0])
+    for i, slope in enumerate(model.slopes(s)):
+        step = np.zeros(len(model.parameters))
+        step[i] = 1e-6
+        up, down = (np.log(Model(model.structure, model.parameters + d).response(s)) for d in (step, -step))
+        np.testing.assert_allclose(slope, (up - down) / 2e-6, rtol=1e-6, atol=1e-8)
+
+
+def test_the_bandwidth_is_that_of_the_closed_form():
+    zeta = 0.8
+    ratio = np.sqrt(1.0 - 2.0 * zeta**2 + np.sqrt((1.0 - 2.0 * zeta**2) ** 2 + 1.0))
+    assert SECOND.bandwidth() == pytest.approx(12.0 * ratio, rel=1e-9)
+    assert Model(BY_NAME["ideal"], np.array([0.01])).bandwidth() == np.inf
+
+
+@pytest.mark.parametrize("name", ("ideal", "first_order", "second_order", "third_order"))
+def test_the_smallest_order_that_explains_the_lines_is_taken(name):
+    numbers = {"ideal": [], "first_order": [np.log(0.022)], "second_order": [np.log(75.0), np.log(0.8)],
+               "third_order": [np.log(0.008), np.log(110.0), np.log(0.5)]}[name]  # fmt: skip
+    exact = lines_of(Model(BY_NAME[name], np.array([*numbers, 0.0044])))
+    rng = np.random.default_rng(1)
+    noise = rng.standard_normal((2, len(exact))) * exact.std / np.sqrt(2.0)
+    noisy = Lines(exact.frequency, exact.command, exact.output + noise[0] + 1j * noise[1], exact.std, 0.001,
+                  "linear", 0)  # fmt: skip
+    chosen, candidates = choose(noisy)
+    assert chosen.fit.model.structure.name == name
+    assert chosen.fit.chi2 / chosen.fit.freedom == pytest.approx(1.0, abs=0.35)
+    for larger in candidates:
+        assert larger.fault or larger.criterion > chosen.criterion - 2.0
+
+
+def errors(repeats, first=0):
+    """Errors over their standard deviations of frequency, damping ratio and delay; the share covered."""
+    scores = []
+    truth = SECOND.parameters
+    for seed in range(first, first + repeats):
+        campaign = campaigns.campaign("clean", seed, speeds=(), rest=0)
+        found = free_motion.estimate(campaign.runs, campaign.timing, order=2)
+        scores.append((found.model.parameters - truth) / np.sqrt(np.diag(found.covariance)))
+    return np.sqrt(np.mean(np.square(scores), axis=0)), np.mean(np.abs(scores) < 1.96, axis=0)
+
+
+def test_errors_are_those_of_the_cramer_rao_bound():
+    ratio, covered = errors(12)
+    # Of 12 draws the rms of a standard normal number is below 1.5 in 999 of 1000 cases.
+    assert np.all(ratio < 1.5) and np.all(covered > 0.7)
+
+
+@pytest.mark.slow
+def test_errors_are_those_of_the_cramer_rao_bound_over_400_repeats():
+    ratio, covered = errors(400, 1000)
+    print("rms error / bound", ratio, "covered", covered)
+    assert np.all(ratio < 1.1) and np.all(np.abs(covered - 0.95) < 0.03)
+
+
+def test_a_local_polynomial_finds_the_response_from_a_chirp():
+    kind, T = campaigns.KINDS["clean"], 0.001
+    time = np.arange(20_000) * T
+    command = 1e-3 * np.sin(2.0 * np.pi * (0.3 * time + (20.0 - 0.3) * time**2 / (2.0 * time[-1])))
+    actual = campaigns._position(campaigns.Plant(kind.rig), command, 4.3)
+    noisy = actual + 1e-6 * np.random.default_rng(0).standard_normal(len(actual))
+    found = frf.spectrum(command, noisy, np.ones(len(command), bool), T, 500)
+    assert found.periods == 0 and found.frequency.min() < 3.0 and found.frequency.max() > 17.0
+    lines = Lines(found.frequency, found.command, found.output, found.std, T, "linear", 0)
+    assert np.sqrt(np.mean(np.abs(SECOND.predict(lines) / found.output - 1.0) ** 2)) < 4e-3
+    best = fit(BY_NAME["second_order"], lines).model
+    assert best.delay == pytest.approx(0.0043, abs=2e-5)
+    assert np.exp(best.parameters[0]) / (2.0 * np.pi) == pytest.approx(12.0, rel=3e-3)
+
+
+def test_rows_lost_here_and_there_and_in_a_block_change_nothing_but_the_noise():
+    campaign = campaigns.campaign("jitter", 2, speeds=(), rest=0)
+    (run,) = campaign.runs
+    assert 0.98 < run.valid.mean() < 1.0
+    found = free_motion.estimate([run], campaign.timing)
+    assert found.model.structure.name == "second_order" and found.left < 1.5
+    assert abs(found.model.delay - 0.0043) < 2e-5
+    assert found.noise_std == pytest.approx(5e-6, rel=0.02)
+
+
+def test_nonlinearity_shows_at_lines_that_were_not_excited():
+    campaign = campaigns.campaign("clean", 3, speeds=(), rest=0)
+    (run,) = campaign.runs
+    depth = run.position_measured - run.position_measured.mean()
+    for power, which in ((3, "odd"), (2, "even")):
+        bent = run.position_measured + 0.02 * depth**power / np.std(depth) ** (power - 1)
+        found = frf.spectrum(run.position_desired, bent, run.valid, 0.001, 500)
+        flagged, other = (found.excess[0], found.excess[1]) if which == "odd" else found.excess[::-1]
+        assert flagged > 20.0 and other < 2.0

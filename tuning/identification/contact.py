@@ -1,0 +1,135 @@
+"""The contact from runs in contact: law, stiffness, damping, plane, and the force sensor's delay.
+
+Where a dead zone hides small forces, only rows count whose predicted force is well beyond it; what the
+readings lack there is the dead zone, and the plane has to be told, since a spring that begins later lacks as
+much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tuning.identification.contact_laws import Law, kelvin_voigt
+from tuning.identification.contact_problem import Problem, Readings
+from tuning.identification.contact_profile import LONGEST, Posterior, profile
+from tuning.identification.law_choice import Judged, judge, quick
+from tuning.identification.motion import Motion
+from tuning.identification.noise import Noise
+from tuning.identification.rational import Model
+from tuning.identification.records import Run, Timing
+from tuning.identification.sensor_lag import sensor_lag
+
+BEYOND = 4.0  # standard deviations beyond the dead zone from which a reading counts
+ROUGH = 21, 5  # delays and planes of the grid for the fit that is only judged
+UNEXPLAINED = 1.3  # chi-squared per degree of freedom above which intervals are widened by it
+
+
+@dataclass(frozen=True)
+class ContactFit:
+    """What runs in contact say, the motion given."""
+
+    law: Law
+    judged: tuple[Judged, ...]  # all laws tried, the one taken first; empty where it was told
+    problem: Problem
+    posterior: Posterior
+    freedom: int  # readings less parameters
+    dead_zone: bool  # whether readings are those of a dead zone: "bias" is then less by it
+
+    @property
+    def readings(self) -> Readings:
+        return self.problem.readings
+
+    @property
+    def left(self) -> float:
+        """Chi-squared per degree of freedom."""
+        return self.posterior.best[2].misfit / self.freedom
+
+    def draws(self) -> np.ndarray:
+        """Draws of the posterior; spread out where the law leaves more than noise."""
+        values = self.posterior.draws
+        if self.left <= UNEXPLAINED:
+            return values
+        return values.mean(axis=0) + (values - values.mean(axis=0)) * np.sqrt(self.left)
+
+
+def estimate(
+    runs: Sequence[Run],
+    model: Model,
+    timing: Timing,
+    noise: Noise | None,
+    law: Law | str | None = None,
+    plane: float | None = None,
+    seed: int = 0,
+) -> ContactFit:
+    """From runs with contact together; `noise` is the force sensor's at rest, where it is known.
+
+    A law as a string is the name of one whose shape is searched; None lets the touches choose.
+    """
+    motion = Motion(model, runs, timing, LONGEST + timing.control_period)
+    hidden = noise is not None and noise.silent
+    if noise is None or hidden:
+        readings = Readings.of(runs, 1.0, threshold=1.0 if hidden else 0.0)
+        plane = 0.0 if hidden and plane is None else plane
+        readings = _noise_from_contact(motion, readings, plane)
+    else:
+        spread = float(np.hypot(noise.innovation, noise.quantum / np.sqrt(12.0)))
+        readings = Readings.of(runs, spread, noise.filter)
+    judged: tuple[Judged, ...] = ()
+    if law is None or isinstance(law, str):
+        judged = tuple(judge(motion, readings, plane, None if law is None else (law,)))
+        law = judged[0].law
+    problem = Problem(motion, readings, law, plane)
+    posterior = profile(problem, seed)
+    lag = None if hidden else sensor_lag(problem, posterior)
+    if lag is not None:
+        problem = Problem(motion, readings, law, plane, lag.value)
+        posterior = profile(problem, seed, lag.near)
+        posterior = lag.spread(posterior, seed)
+    freedom = len(problem.kept) - len(posterior.names)
+    return ContactFit(law, judged, problem, posterior, freedom, bool(hidden))
+
+
+def _noise_from_contact(motion: Motion, readings: Readings, plane: float | None) -> Readings:
+    """The noise is what the laws leave; under a dead zone, of the readings well beyond it."""
+    counts = readings.counts & (readings.force != 0.0) if readings.threshold else readings.counts
+    peak = np.abs(readings.force[counts]).max()
+    found = replace(
+        readings, counts=counts, std=0.01 * peak, threshold=0.02 * peak * (readings.threshold > 0)
+    )
+    for _ in range(3):
+        problem = Problem(motion, found, kelvin_voigt(), plane)
+        delay, at, misfit = quick(problem)
+        std = found.std * np.sqrt(misfit / max(len(problem.kept) - 5, 1))
+        counts = readings.counts
+        if readings.threshold:
+            predicted = problem.force(delay, at, problem.at(delay, at).coefficients)
+            counts = counts & (predicted > BEYOND * std)
+        found = replace(
+            found, counts=counts, std=float(std), threshold=float(std) if readings.threshold else 0.0
+        )
+    return found
+
+
+def frequency(contact: ContactFit, mass: float) -> float:
+    """Of the stiffest contact [Hz]: that of the mass on the secant stiffness at the greatest depth."""
+    delay, plane, inner = contact.posterior.best
+    position, _ = contact.problem.motion.at(delay)
+    depth = np.where(contact.readings.counts, position - plane, 0.0)
+    force = np.where(contact.readings.counts, contact.problem.force(delay, plane, inner.coefficients), 0.0)
+    deepest, lanes = np.argmax(depth, axis=0), np.arange(depth.shape[1])
+    peak = force[deepest, lanes]
+    # Of a touch that hardly pressed the quotient says nothing.
+    secant = np.where(peak > 0.2 * peak.max(), peak / np.maximum(depth[deepest, lanes], 1e-9), 0.0)
+    return float(np.sqrt(max(secant.max(), 1e-9) / mass) / (2.0 * np.pi))
+
+
+def without(fit: ContactFit, held: np.ndarray, seed: int = 0) -> ContactFit:
+    """The same law fitted to the touches that are not `held`; its readings are still those of all."""
+    readings, problem = fit.readings, fit.problem
+    taught = replace(readings, counts=readings.counts & ~held)
+    taught = Problem(problem.motion, taught, fit.law, problem.plane, problem.time_constant)
+    freedom = len(taught.kept) - len(fit.posterior.names)
+    return replace(fit, posterior=profile(taught, seed, fit.posterior.best[:2], ROUGH), freedom=freedom)

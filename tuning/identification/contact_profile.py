@@ -1,0 +1,158 @@
+"""The force delay and the plane on a grid, all else of a contact by linear least squares.
+
+The delay is not differentiated: while damped contact lasts, first-order information on it is the damping's,
+and what remains is at the onset, where the likelihood has kinks. So the grid carries the posterior itself
+(flat prior on delay and plane, no negative damping), and draws from it are what everything after reckons
+with: means, standard deviations, intervals, correlations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import special
+
+from tuning.identification.contact_problem import Inner, Problem
+
+LONGEST = 0.02  # s, of the delays that are looked at
+COARSE = 0.0005  # s, between the first delays that are looked at
+FINE = 1e-5  # s, between the next: damped touches begin with a jump, and a row on its other side costs much
+REGION = 25.0  # of twice the log posterior below its best: what the final grid covers
+ROUGH_REGION = 400.0  # of the coarse grid
+DELAYS, PLANES = 61, 13  # of the final grid
+PLANE_REACH = 3.2  # standard deviations of the plane at a given delay, on each side
+DRAWS = 4000
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Draws of delay, plane and coefficients, and the profile they come from."""
+
+    names: list[str]  # "delay", "plane", then the coefficients
+    draws: np.ndarray  # (draws, names)
+    delays: np.ndarray  # s, the final grid
+    log_posterior: np.ndarray  # of the delay there, less its largest
+    best: tuple[float, float, Inner]  # delay, plane and fit of greatest posterior density
+
+    @property
+    def mean(self) -> np.ndarray:
+        return self.draws.mean(axis=0)
+
+    @property
+    def covariance(self) -> np.ndarray:
+        return np.cov(self.draws.T)
+
+
+def profile(
+    problem: Problem,
+    seed: int = 0,
+    near: tuple[float, float] | None = None,
+    size: tuple[int, int] = (DELAYS, PLANES),
+) -> Posterior:
+    """The posterior of the force delay, the plane and the coefficients.
+
+    `near`: a delay [s] and the plane there [m] within a millisecond of the best, where they are known; else
+    all delays are looked at. `size`: of the final grid, delays and planes."""
+    if near is None:
+        delays = np.arange(0.0, LONGEST + COARSE / 2.0, COARSE)
+        start = first_plane(problem, LONGEST / 4.0) if problem.plane is None else problem.plane
+    else:
+        delays, start = np.clip(near[0] + COARSE * np.linspace(-2.0, 2.0, 9), 0.0, LONGEST), near[1]
+        delays = np.unique(delays)
+    planes, heights = _scan(problem, delays, start)
+    for step in (FINE, None):
+        low, high = _region(delays, heights)
+        count = size[0] if step is None else int(np.clip((high - low) / step, 21, 151))
+        finer = np.linspace(low, high, count)
+        planes, heights = _scan(problem, finer, np.interp(finer, delays, planes))
+        delays = finer
+    return _sample(problem, delays, planes, seed, size[1])
+
+
+def first_plane(problem: Problem, delay: float) -> float:
+    """Where the mechanism was when the force first rose above its noise, the median of the runs [m]."""
+    position, _ = problem.motion.at(delay)
+    readings = problem.readings
+    level = np.median(readings.force[readings.counts])
+    loud = readings.counts & (np.abs(readings.force - level) > 5.0 * readings.std + readings.threshold)
+    sustained = loud & np.roll(loud, -1, axis=0) & np.roll(loud, -2, axis=0)
+    found = [position[np.argmax(lane), i] for i, lane in enumerate(sustained.T) if lane.any()]
+    return float(np.median(found)) if found else 0.0
+
+
+def _scan(problem: Problem, delays: np.ndarray, starts) -> tuple[np.ndarray, np.ndarray]:
+    """At each delay the best plane, and the log posterior with the plane integrated out."""
+    starts = np.broadcast_to(np.asarray(starts, float), delays.shape)
+    planes, heights = [], []
+    for delay, start in zip(delays, starts, strict=True):
+        plane, inner, gain = problem.settled(delay, start)
+        width = 0.0 if problem.plane is not None else -0.5 * np.log(max(inner.curvature, 1e-300))
+        planes.append(plane)
+        heights.append(inner.evidence + gain + width)
+    return np.array(planes), np.array(heights)
+
+
+def _region(delays: np.ndarray, heights: np.ndarray) -> tuple[float, float]:
+    """The delays around the best whose posterior is worth a grid, one step wider on each side."""
+    step = delays[1] - delays[0]
+    # Between delays far apart the rows at the onsets change sides, which a coarse grid's heights are full of.
+    reach = REGION if step < COARSE / 2.0 else ROUGH_REGION
+    inside = np.flatnonzero(2.0 * (heights.max() - heights) <= reach)
+    return max(0.0, delays[inside[0]] - step), min(LONGEST, delays[inside[-1]] + step)
+
+
+def _sample(problem: Problem, delays: np.ndarray, planes: np.ndarray, seed: int, across: int) -> Posterior:
+    """Draws from the grid: a cell by its weight, a place in it, coefficients by their normal distribution."""
+    cells, places = [], []
+    for delay, centre in zip(delays, planes, strict=True):
+        if problem.plane is not None:
+            cells.append(problem.at(delay, centre))
+            places.append((delay, centre, 0.0))
+            continue
+        middle = problem.at(delay, centre)
+        reach = PLANE_REACH / np.sqrt(max(middle.curvature, 1e-300))
+        for plane in np.linspace(centre - reach, centre + reach, across):
+            cells.append(problem.at(delay, plane))
+            places.append((delay, plane, 2.0 * reach / (across - 1)))
+    heights = np.array([cell.evidence for cell in cells])
+    if problem.plane is None:
+        heights = heights + np.log([place[2] for place in places])
+    weights = np.exp(heights - heights.max())
+    weights /= weights.sum()
+    rng = np.random.default_rng(seed)
+    # Spread evenly over the weights: less luck in the draws.
+    picked = np.searchsorted(np.cumsum(weights), (np.arange(DRAWS) + rng.uniform(size=DRAWS)) / DRAWS)
+    picked = np.minimum(picked, len(cells) - 1)
+    step = delays[1] - delays[0]
+    rows = []
+    for index in np.unique(picked):
+        count = int(np.sum(picked == index))
+        delay, plane, width = places[index]
+        spread = rng.uniform(-0.5, 0.5, (count, 2)) * [step, width]
+        values = _coefficients(cells[index], problem.rate_like, count, rng)
+        rows.append(np.column_stack([np.clip(delay + spread[:, 0], 0.0, None), plane + spread[:, 1], values]))
+    by_delay = heights.reshape(len(delays), -1)
+    profile: Any = special.logsumexp(by_delay, axis=1)
+    best = int(np.argmax(heights))
+    return Posterior(
+        ["delay", "plane", *problem.names],
+        rng.permutation(np.concatenate(rows)),
+        delays,
+        profile - profile.max(),
+        (*places[best][:2], cells[best]),
+    )
+
+
+def _coefficients(cell: Inner, positive: list[int], count: int, rng) -> np.ndarray:
+    """Normal draws; those with a negative damping are drawn again."""
+    factor = np.linalg.cholesky(cell.covariance + 1e-30 * np.eye(len(cell.coefficients)))
+    draws = cell.coefficients + rng.standard_normal((count, len(factor))) @ factor.T
+    for _ in range(50):
+        bad = np.any(draws[:, positive] < 0.0, axis=1)
+        if not bad.any():
+            return draws
+        draws[bad] = cell.coefficients + rng.standard_normal((int(bad.sum()), len(factor))) @ factor.T
+    draws[:, positive] = np.maximum(draws[:, positive], 0.0)
+    return draws

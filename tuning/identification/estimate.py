@@ -1,0 +1,333 @@
+"""From a campaign to an identification: rest, free motion, contact, validation, in that order.
+
+Each stage takes what the one before it found; a stage without runs takes the prior's numbers. What the logs
+cannot tell is taken as told: the hold, the latency, the way rows are written, the mass, and how the motion's
+delay is shared with the position sensor's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from jaxhil.errors import InputError
+from jaxhil.mechanism.file import to_builtins
+from jaxhil.mechanism.structs import Mechanism, numeric_keys
+from tuning.identification import contact as contacts
+from tuning.identification import free_motion, parameters, validation
+from tuning.identification.contact import ContactFit
+from tuning.identification.contact_profile import DRAWS
+from tuning.identification.free_motion import FreeMotion
+from tuning.identification.mechanism_file import uncertainty_tables
+from tuning.identification.noise import Noise, at_rest
+from tuning.identification.rational import STRUCTURES, Model
+from tuning.identification.records import Campaign, Run
+from tuning.identification.result import Estimate, Identification, confounded
+
+SHORTEST_REST = 200  # rows from which a run at rest says what a sensor's noise is
+USUAL_FREQUENCY = 3.0  # Hz, of contacts, where none was made
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the caller knows or wants."""
+
+    order: int | None = None  # of the motion simulator; None lets the lines choose
+    law: str | None = None  # of the contact; None lets the touches choose
+    fixed: Mapping[str, float] = field(default_factory=dict)  # by key: told, not estimated
+    hold_out: float = 0.2  # share of the touches that judge the fit to the others
+    limit: float = 0.01  # on the restitution, of all that the model does not explain
+    calibration: float = 0.001  # relative uncertainty of the force sensor's scale
+    clock: float = 2e-5  # s, uncertainty of a delay that no log shows
+    seed: int = 0
+
+
+FIXABLE = ("rig.contact_plane", "rig.position_sensor.delay")
+
+
+def identify(
+    campaign: Campaign, prior: Mechanism | None = None, options: Options | None = None
+) -> Identification:
+    """What the runs of a campaign say of the rig and the mechanism.
+
+    `prior` gives what the logs do not tell. Raises `InputError` where neither does for a number that a
+    mechanism file must have."""
+    options = options or Options()
+    _check(options)
+    runs = {kind: [run for run in campaign.runs if run.kind == kind] for kind in ("rest", "free")}
+    touching = [run for run in campaign.runs if run.kind in ("contact", "press", "tap")]
+    force, position = _noise(runs)
+    motion = free_motion.estimate(runs["free"], campaign.timing, options.order)
+    model = motion.model if motion is not None else _told_model(prior)
+    contact = lines = None
+    if touching:
+        contact, lines = _contact(touching, model, campaign, force, options)
+    frequency = USUAL_FREQUENCY if contact is None else contacts.frequency(contact, campaign.equivalent_mass)
+    if motion is not None:
+        lines = [*validation.of_motion(motion, frequency), *(lines or [])]
+    found = _draws(motion, contact, model, frequency, options)
+    estimates, told = _estimates(found, motion, contact, force, position, options)
+    mechanism = _mechanism(campaign, prior, model, contact, (*estimates, *told), found, options)
+    keys = list(found)
+    table = np.array([found[key] for key in keys]).T if keys else np.zeros((DRAWS, 0))
+    return Identification(
+        estimates=(*estimates, *told),
+        draws=table,
+        combinations=_combinations(found, contact),
+        confounded=confounded(keys, table),
+        lines=tuple(lines or ()),
+        mechanism=mechanism,
+        limit=options.limit,
+        notes=tuple(_notes(motion, contact, force)),
+        motion=motion,
+        contact=contact,
+        force_noise=force,
+        position_noise=position,
+    )
+
+
+def _check(options: Options) -> None:
+    for key in options.fixed:
+        if key not in FIXABLE:
+            raise InputError(f"fix: found {key}, allowed {' and '.join(FIXABLE)}")
+
+
+def _told_model(prior: Mechanism | None) -> Model:
+    if prior is None:
+        raise InputError("logs: found no free motion, allowed a run of kind free or a prior mechanism")
+    simulator = prior.rig.simulator
+    by_name = {structure.name: structure for structure in STRUCTURES}
+    delay = simulator.delay + prior.rig.position_sensor.delay
+    if simulator.model == "ideal":
+        return Model(by_name["ideal"], np.array([delay]))
+    if simulator.model == "first_order" and simulator.time_constant:
+        return Model(by_name["first_order"], np.array([np.log(simulator.time_constant), delay]))
+    if simulator.model == "second_order" and simulator.natural_frequency and simulator.damping_ratio:
+        w = 2.0 * np.pi * simulator.natural_frequency
+        return Model(by_name["second_order"], np.array([np.log(w), np.log(simulator.damping_ratio), delay]))
+    raise InputError(
+        f"prior: rig.simulator.model: found {simulator.model}, allowed ideal, first_order or second_order "
+        "where the logs hold no free motion"
+    )
+
+
+def _noise(runs: Mapping[str, Sequence[Run]]) -> tuple[Noise | None, Noise | None]:
+    """Of the force and position sensors at rest; the force sensor's in free motion where it never rested."""
+    force = position = None
+    for run in (*runs["rest"], *runs["free"]):
+        if run.valid.sum() < SHORTEST_REST:
+            continue
+        if force is None and run.force_measured is not None:
+            force = at_rest(_whole(run.force_measured, run.valid))
+        if position is None and run.kind == "rest":
+            position = at_rest(_whole(run.position_measured - run.position_desired[0], run.valid))
+    return force, position
+
+
+def _whole(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    return values[valid & np.isfinite(values)]
+
+
+def _contact(
+    runs: list[Run], model: Model, campaign: Campaign, force: Noise | None, options: Options
+) -> tuple[ContactFit, list[validation.Line]]:
+    """The fit to all touches, and how one to most of them explains the others."""
+    plane = options.fixed.get("rig.contact_plane")
+    fit = contacts.estimate(runs, model, campaign.timing, force, options.law, plane, options.seed)
+    held = held_out(runs, options.hold_out)
+    judged = fit if not held.any() else contacts.without(fit, held, options.seed)
+    frequency = contacts.frequency(fit, campaign.equivalent_mass)
+    s = np.array([2j * np.pi * frequency])
+    lag = -float(np.angle(model.response(s)[0])) / (2.0 * np.pi * frequency) + fit.posterior.best[0]
+    judging = held if held.any() else np.ones(len(runs), bool)
+    return fit, validation.of_contact(judged, runs, campaign.equivalent_mass, frequency, lag, judging)
+
+
+def held_out(runs: Sequence[Run], share: float) -> np.ndarray:
+    """A flag for each run: of each speed `share` of the touches, one at least where there are three."""
+    flags = np.zeros(len(runs), bool)
+    speeds = [round(1e4 * (run.speed or 0.0)) if run.kind == "contact" else -1 for run in runs]
+    for speed in set(speeds) - {-1}:
+        members = [i for i, one in enumerate(speeds) if one == speed]
+        count = max(1, round(share * len(members))) if share > 0.0 and len(members) >= 3 else 0
+        # Every so many, so that a list's entries are all left to fit to.
+        for i in members[1 :: max(1, len(members) // max(count, 1))][:count]:
+            flags[i] = True
+    return flags
+
+
+def _draws(
+    motion: FreeMotion | None, contact: ContactFit | None, model: Model, frequency: float, options: Options
+) -> dict[str, np.ndarray]:
+    """Draws of every number by its key, in the key's unit."""
+    found, lag = {}, np.zeros(DRAWS)
+    if motion is not None:
+        rng = np.random.default_rng([options.seed, 1])
+        found, lag = parameters.simulator_draws(model, motion.covariance, frequency, DRAWS, rng)
+    if contact is not None:
+        # An error of the motion's lag is one of the force delay, the other way round.
+        found |= parameters.contact_draws(contact)
+        found["rig.force_sensor.delay"] = found["rig.force_sensor.delay"] - lag
+    shared = options.fixed.get("rig.position_sensor.delay", 0.0)
+    if shared and motion is not None:
+        found["rig.simulator.delay"] = found["rig.simulator.delay"] - shared
+    if shared and contact is not None:
+        found["rig.force_sensor.delay"] = found["rig.force_sensor.delay"] + shared
+    return found
+
+
+def _estimates(found, motion, contact, force, position, options) -> tuple[list[Estimate], list[Estimate]]:
+    """Estimates of what has draws, then of what the sensors say at rest and of what was told."""
+    estimates = [_of_draws(key, values) for key, values in found.items()]
+    others = []
+    if force is not None and not force.silent:
+        others.append(_plain("rig.force_sensor.noise_std", force.std, force.std_std))
+        others.append(_plain("rig.force_sensor.bias", force.mean, force.mean_std))
+    elif contact is not None:
+        std = contact.readings.std
+        others.append(_plain("rig.force_sensor.noise_std", std, std / np.sqrt(2.0 * contact.freedom)))
+    if force is not None and force.quantum:
+        others.append(_plain("rig.force_sensor.quantum", force.quantum, 0.0))
+    if position is not None:
+        others.append(_plain("rig.position_sensor.noise_std", position.std, position.std_std))
+        if position.quantum:
+            others.append(_plain("rig.position_sensor.quantum", position.quantum, 0.0))
+    elif motion is not None:
+        count = sum(len(one.frequency) for one in motion.spectra)
+        std = motion.noise_std
+        others.append(_plain("rig.position_sensor.noise_std", std, std / np.sqrt(2.0 * max(count, 1))))
+    others += [
+        Estimate(key, value, 0.0, value, value, unit_of(key), told=True)
+        for key, value in options.fixed.items()
+    ]
+    return estimates, others
+
+
+def _of_draws(key: str, values: np.ndarray) -> Estimate:
+    low, high = np.quantile(values, (0.025, 0.975))
+    return Estimate(
+        key, float(values.mean()), float(values.std(ddof=1)), float(low), float(high), unit_of(key)
+    )
+
+
+def _plain(key: str, value: float, std: float) -> Estimate:
+    return Estimate(key, value, std, value - 1.96 * std, value + 1.96 * std, unit_of(key))
+
+
+def unit_of(key: str) -> str:
+    """SI unit of a key, the number of a list's entry behind it or not."""
+    parts = key.split(".")
+    while parts[-1].isdigit():
+        parts.pop()
+    return numeric_keys()[".".join(parts)].unit
+
+
+def _combinations(found: Mapping[str, np.ndarray], contact: ContactFit | None) -> tuple[Estimate, ...]:
+    """What the logs tell better than its parts: delays together, damping less stiffness times delay."""
+    combined = []
+    motion, force = (found.get(key) for key in ("rig.simulator.delay", "rig.force_sensor.delay"))
+    lag = found.get("rig.force_sensor.time_constant")
+    if force is not None and lag is not None:
+        force = force + lag
+        combined.append(replace(_of_draws("rig.force_sensor.delay", force), key="delay and lag of force"))
+    if motion is not None and force is not None:
+        combined.append(
+            replace(_of_draws("rig.force_sensor.delay", motion + force), key="delay of motion and force")
+        )
+    damping, stiffness = found.get("contact.damping.0"), found.get("contact.stiffness.0")
+    if force is not None and contact is not None and contact.law.name == "kelvin_voigt":
+        assert damping is not None and stiffness is not None
+        apparent = replace(_of_draws("contact.damping", damping - stiffness * force), key="apparent damping")
+        combined.append(apparent)
+    return tuple(combined)
+
+
+def _mechanism(
+    campaign: Campaign,
+    prior: Mechanism | None,
+    model: Model,
+    contact: ContactFit | None,
+    estimates: Sequence[Estimate],
+    found: Mapping[str, np.ndarray],
+    options: Options,
+) -> dict[str, Any]:
+    """As a mechanism file has it: what was found over what the prior says."""
+    timing = campaign.timing
+    document: dict[str, Any] = {"schema": "jaxhil/mechanism/1", "name": "identified"}
+    document |= {} if prior is None else to_builtins(prior)
+    speeds = [run.speed for run in campaign.runs if run.speed]
+    values = {one.key: one.value for one in estimates}
+    document["source"] = _source(campaign)
+    document["bodies"] = {"equivalent_mass": campaign.equivalent_mass}
+    document.setdefault("approach", {"velocity": float(np.median(speeds)) if speeds else 0.005})
+    if contact is not None:
+        document["contact"] = parameters.contact_section(contact.law, values)
+        if prior is None:
+            document["approach"]["contacts"] = len(document["contact"]["stiffness"])
+    elif prior is None:
+        raise InputError(
+            "logs: found no contact, allowed a run of kind contact, press or tap, or a prior mechanism"
+        )
+    rig = dict(document.get("rig", {}))
+    rig |= {
+        "control_period": timing.control_period,
+        "command_latency": timing.command_latency,
+        "command_hold": timing.command_hold,
+    }
+    if "rig.simulator.delay" in found:
+        rig["simulator"] = {
+            **{k: v for k, v in rig.get("simulator", {}).items() if k.endswith("_limit")},
+            **parameters.simulator_section(model),
+            "delay": max(values["rig.simulator.delay"], 0.0),
+        }
+    for section in ("force_sensor", "position_sensor"):
+        told = {**rig.get(section, {})}
+        prefix = f"rig.{section}."
+        told |= {key[len(prefix) :]: value for key, value in values.items() if key.startswith(prefix)}
+        rig[section] = {**told, "delay": max(told.get("delay", 0.0), 0.0)}
+    if "rig.contact_plane" in values:
+        rig["contact_plane"] = values["rig.contact_plane"]
+    document["rig"] = rig
+    document |= _uncertainty(document, found, options)
+    return document
+
+
+def _uncertainty(document, found: Mapping[str, np.ndarray], options: Options) -> dict[str, Any]:
+    """The prior's for what was not found, and what was found, with its correlation."""
+    if not found:
+        return {}
+    keys = list(found)
+    floors = np.array([
+        options.clock if key.endswith(".delay")
+        else options.calibration * abs(float(found[key].mean())) if key.startswith("contact.stiffness")
+        else 0.0
+        for key in keys
+    ])  # fmt: skip
+    tables = uncertainty_tables(keys, np.array([found[key] for key in keys]).T, floors)
+    kept = {
+        key: value
+        for key, value in document.get("uncertainty", {}).items()
+        if not key.startswith(tuple(name.rsplit(".", 1)[0] + "." for name in tables["uncertainty"]))
+    }
+    return {**tables, "uncertainty": {**kept, **tables["uncertainty"]}}
+
+
+def _source(campaign: Campaign) -> str:
+    files = ", ".join(f"{name} (SHA-256 {digest[:12]})" for name, digest in campaign.sources.items())
+    return f"identified from {files or 'a campaign in memory'}"[:9_000]
+
+
+def _notes(motion: FreeMotion | None, contact: ContactFit | None, force: Noise | None) -> list[str]:
+    notes = []
+    if motion is None:
+        notes.append("no free motion: the motion simulator is the prior's")
+    if contact is None:
+        notes.append("no contact: the contact and the force delay are the prior's")
+    if force is not None and force.pole > 0.5:
+        notes.append(f"the force's noise is coloured (pole {force.pole:.2f}); tuning weighs it as white")
+    if contact is not None and contact.dead_zone:
+        notes.append("the force has a dead zone: the contact plane was taken as told")
+    return notes

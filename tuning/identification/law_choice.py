@@ -1,0 +1,147 @@
+"""Which contact law a mechanism has: the simplest one that predicts touches it was not fitted to.
+
+Every law is fitted to the odd touches and judged on the even ones, and the other way round, by the log
+likelihood of whole touches. Laws within two standard errors of the best, touch by touch, are as good; the one
+with the fewest coefficients is taken. With fewer than four touches the Bayesian information criterion judges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import optimize
+
+from tuning.identification import contact_laws as laws
+from tuning.identification.contact_laws import Law
+from tuning.identification.contact_problem import Problem, Readings
+from tuning.identification.contact_profile import COARSE, LONGEST, first_plane
+from tuning.identification.motion import Motion
+
+FEWEST = 4  # touches for judging on others than those fitted
+ERRORS = 2.0  # standard errors within which laws are as good
+DEPTH = 1e-3  # m, reference depth that is written for a law which needs some
+COMMON_EXPONENTS = (1.0, 1.5, 2.0, 3.0)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One law, fitted and judged."""
+
+    law: Law
+    delay: float  # s
+    plane: float  # m
+    misfit: float  # of all touches
+    likelihood: np.ndarray  # of each touch by the fit to others, natural logarithm
+    short: tuple[float, float]  # by how much the best law is better in all, and the standard error of that
+
+
+def judge(motion: Motion, readings: Readings, plane: float | None, names=None) -> list[Judged]:
+    """All laws (or those named), the one to take first."""
+    judged = []
+    guess = None
+    for name, build in families(readings):
+        if names is not None and name not in names:
+            continue
+        law, found = build(lambda one, guess=guess: _fit(motion, readings, one, plane, guess), readings)
+        guess = guess or found
+        judged.append((law, found, _by_others(motion, readings, law, plane, found)))
+    totals = [likelihood.sum() for _, _, likelihood in judged]
+    best = judged[int(np.argmax(totals))][2]
+    results = []
+    for law, (delay, at, misfit), likelihood in judged:
+        behind = best - likelihood
+        error = float(np.sqrt(len(behind)) * behind.std(ddof=1)) if len(behind) > 1 else 0.0
+        results.append(Judged(law, delay, at, misfit, likelihood, (float(behind.sum()), error)))
+    good = [one for one in results if one.short[0] <= ERRORS * one.short[1] + 1e-9]
+    taken = min(good, key=lambda one: one.law.size)
+    return [taken, *(one for one in sorted(results, key=lambda one: one.short[0]) if one is not taken)]
+
+
+Fitted = tuple[float, float, float]  # delay, plane, misfit
+Build = Callable[[Callable[[Law], Fitted], Readings], tuple[Law, Fitted]]
+
+
+def families(readings: Readings) -> list[tuple[str, Build]]:
+    """Each law by its name, with the search for its shape."""
+
+    def plain(law: Law) -> Build:
+        return lambda fit, _: (law, fit(law))
+
+    def searched(make: Callable[[float], Law], low: float, high: float, usual=()) -> Build:
+        def build(fit, _):
+            found: Any = optimize.minimize_scalar(
+                lambda shape: fit(make(shape))[2],
+                bounds=(low, high),
+                method="bounded",
+                options={"xatol": 0.01},
+            )
+            shape = float(found.x)
+            # A usual value that explains as much is meant.
+            for value in usual:
+                if fit(make(value))[2] - found.fun < 4.0:
+                    shape = value
+                    break
+            return make(shape), fit(make(shape))
+
+        return build
+
+    found = [
+        ("linear", plain(laws.linear())),
+        ("kelvin_voigt", plain(laws.kelvin_voigt())),
+        ("kelvin_voigt", plain(laws.kelvin_voigt(pulls=True))),
+        ("hunt_crossley", searched(laws.hunt_crossley, 1.05, 3.0, COMMON_EXPONENTS[1:])),
+        ("depth_damped", searched(lambda n: laws.depth_damped(n, DEPTH), 1.0, 3.0, COMMON_EXPONENTS)),
+    ]
+    if readings.entries == 1:
+        found.append(("hardening", plain(laws.hardening())))
+    return found
+
+
+def _fit(motion, readings, law, plane, guess: Fitted | None) -> Fitted:
+    """Delay, plane and misfit of the best fit, without the posterior."""
+    problem = Problem(motion, readings, law, plane)
+    return quick(problem, guess)
+
+
+def quick(problem: Problem, guess: Fitted | None = None) -> Fitted:
+    """The best delay and plane: near a guess, or anywhere."""
+    if guess is None:
+        start = problem.plane if problem.plane is not None else first_plane(problem, LONGEST / 4.0)
+        delays = np.arange(0.0, LONGEST, 2.0 * COARSE)
+    else:
+        start, delays = guess[1], np.clip(guess[0] + COARSE * np.array([-4, -2, -1, 0, 1, 2, 4]), 0.0, None)
+    best = (0.0, start, np.inf)
+    for width in (0.0, COARSE, COARSE / 4.0):
+        if width:
+            delays = np.clip(best[0] + width * np.array([-1.0, -0.5, 0.5, 1.0]), 0.0, LONGEST)
+        for delay in delays:
+            plane, inner, gain = problem.settled(float(delay), best[1])
+            if inner.misfit - 2.0 * gain < best[2]:
+                best = (float(delay), plane, inner.misfit - 2.0 * gain)
+    return best
+
+
+def _by_others(motion, readings, law, plane, found: Fitted) -> np.ndarray:
+    """Log likelihood of each touch under the fit to the touches of the other parity."""
+    lanes = readings.force.shape[1]
+    if lanes < FEWEST:
+        size = law.size * np.log(max(readings.counts.sum(), 2)) / 2.0
+        return np.array([-0.5 * found[2] - size])
+    likelihood = np.empty(lanes)
+    for parity in (0, 1):
+        mine = np.arange(lanes) % 2 == parity
+        taught = replace(readings, counts=readings.counts & ~mine)
+        problem = Problem(motion, taught, law, plane)
+        delay, at, _ = quick(problem, found)
+        coefficients = problem.at(delay, at).coefficients
+        likelihood[mine] = -0.5 * misfits(problem, readings, delay, at, coefficients)[mine]
+    return likelihood
+
+
+def misfits(problem: Problem, readings: Readings, delay, plane, coefficients) -> np.ndarray:
+    """Sum of squared whitened residuals of each touch."""
+    left = problem.whiten(readings.force - problem.force(delay, plane, coefficients)) / readings.std
+    return np.sum(np.where(readings.counts, left, 0.0) ** 2, axis=0)

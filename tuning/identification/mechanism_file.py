@@ -1,0 +1,98 @@
+"""The mechanism file of an identification: TOML text, with what is uncertain and how it hangs together."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+
+LEAST_EIGENVALUE = 1e-6  # of the correlation written: rounding must not make it singular
+FEW_DIGITS = 12  # significant, of numbers in the file
+
+
+def uncertainty_tables(keys: list[str], draws: np.ndarray, floors: np.ndarray) -> dict[str, Any]:
+    """`[uncertainty]` and `[correlation]` from draws, (draws, keys); no standard deviation below its floor.
+
+    The entries of a list have one standard deviation and are drawn apart; in the correlation one number
+    stands for all of them."""
+    covariance = np.atleast_2d(np.cov(draws.T))
+    short = np.maximum(floors**2 - np.diag(covariance), 0.0)
+    covariance = covariance + np.diag(short)
+    names = list(dict.fromkeys(_path(key) for key in keys))
+    groups = [[i for i, key in enumerate(keys) if _path(key) == name] for name in names]
+    std = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(std, std)
+    # Of lists the mean over their entries: one number for all.
+    joined = np.array([[np.mean(correlation[np.ix_(one, other)]) for other in groups] for one in groups])
+    np.fill_diagonal(joined, 1.0)
+    values, vectors = np.linalg.eigh(joined)
+    if values.min() < LEAST_EIGENVALUE:
+        joined = vectors @ np.diag(np.maximum(values, LEAST_EIGENVALUE)) @ vectors.T
+        scale = np.sqrt(np.diag(joined))
+        joined = joined / np.outer(scale, scale)
+    uncertainty = {}
+    for name, group in zip(names, groups, strict=True):
+        entry: dict[str, Any] = {"distribution": "normal", "std": float(np.sqrt(np.mean(std[group] ** 2)))}
+        if len(group) > 1:
+            entry["independent"] = True
+        uncertainty[name] = entry
+    tables: dict[str, Any] = {"uncertainty": uncertainty}
+    if len(names) > 1:
+        rows = [[round(float(joined[i, j]), 9) for j in range(i)] + [1.0] for i in range(len(names))]
+        tables["correlation"] = {"keys": names, "matrix": rows}
+    return tables
+
+
+def _path(key: str) -> str:
+    """The key without the numbers of a list's entry."""
+    parts = key.split(".")
+    while parts[-1].isdigit():
+        parts.pop()
+    return ".".join(parts)
+
+
+def to_toml(document: dict[str, Any], comment: str = "") -> str:
+    """A mechanism, as `jaxhil.mechanism.file.to_builtins` gives it, as TOML."""
+    lines = [f"# {line}" for line in comment.splitlines()]
+    tables: list[tuple[str, dict[str, Any]]] = []
+
+    def collect(path: str, table: dict[str, Any]) -> None:
+        plain = {key: value for key, value in table.items() if not isinstance(value, dict)}
+        if plain and path:
+            tables.append((path, plain))
+        for key, value in table.items():
+            if isinstance(value, dict):
+                collect(f"{path}.{key}".lstrip("."), value)
+
+    inline = {name: document[name] for name in ("uncertainty",) if document.get(name)}
+    rest = {key: value for key, value in document.items() if key not in ("uncertainty",)}
+    lines += [f"{key} = {_value(value)}" for key, value in rest.items() if not isinstance(value, dict)]
+    collect("", rest)
+    for path, table in tables:
+        lines += ["", f"[{path}]"]
+        lines += [f"{key} = {_value(value)}" for key, value in table.items() if value is not None]
+    for path, table in inline.items():
+        lines += ["", f"[{path}]"]
+        for key, entry in table.items():
+            parts = ", ".join(
+                f"{name} = {_value(value)}" for name, value in entry.items() if value is not None
+            )
+            lines.append(f"{json.dumps(key)} = {{ {parts} }}")
+    return "\n".join(lines) + "\n"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_value(one) for one in value) + "]"
+    if isinstance(value, int):
+        return str(value)
+    if math.isinf(value):
+        return "inf" if value > 0 else "-inf"
+    text = f"{value:.{FEW_DIGITS}g}"
+    return text if any(mark in text for mark in ".en") else text + ".0"

@@ -1,0 +1,138 @@
+"""Where the mechanism was while the sensors read it: the model's exact response to the logged commands.
+
+The response of a linear motion simulator to commands held or joined by lines is known at any time, so a
+delay of any fraction of a period is one row of numbers times the state and the command at both ends of a
+period (Van Loan 1978), as in `jaxhil.simulation.motion` within the loop. All runs advance together, a
+lane each; before its first row a run's command moved uniformly. Position and velocity so found carry no
+noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tuning.identification.hold import ROW_SHIFT
+from tuning.identification.rational import Model
+from tuning.identification.records import Run, Timing
+
+TOLERANCE = 1e-9  # periods: nearer to a tick than this is at the tick
+
+
+class Motion:
+    """The response of one model to the commands of several runs."""
+
+    def __init__(self, model: Model, runs: Sequence[Run], timing: Timing, longest: float):
+        """`longest`: greatest delay after the model's own [s] that `at` will be asked for."""
+        self.delay, self.period = model.delay, timing.control_period
+        self.shift = ROW_SHIFT[timing.row]
+        self.rows = max(len(run.tick) for run in runs)
+        numerator, denominator = model.fraction
+        self.order = len(denominator) - 1
+        self.A, self.B, self.C = _companion(numerator, denominator, self.period)
+        self.history = (
+            int(np.ceil((max(self.delay, 0.0) + longest) / self.period)) + timing.command_latency + 4
+        )
+        command = self._commands(runs)
+        latency = timing.command_latency
+        self.end = command[1 : len(command) - latency]
+        self.start = self.end if timing.command_hold == "zoh" else command[: len(command) - 1 - latency]
+        # Interval k of `start` and `end` spans ticks k + latency - history to the next.
+        self.offset = self.history - latency
+        self.states = self._advance(timing.command_hold)
+
+    def at(self, delay: float) -> tuple[np.ndarray, np.ndarray]:
+        """Position [m] and velocity [m/s] that a sensor with this delay [s] sees, (rows, lanes)."""
+        lag = (self.delay + delay) / self.period + self.shift
+        whole = int(np.floor(lag + TOLERANCE))
+        place = min(1.0, 1.0 - (lag - whole))
+        first = self.offset - 1 - whole
+        if first < 0:
+            raise ValueError(f"a delay of {delay:g} s is longer than the history kept")
+        taken = slice(first, first + self.rows)
+        start, end = self.start[taken], self.end[taken]
+        state, one, other = self._after(place)
+        position = np.concatenate([self.C @ state, [self.C @ one, self.C @ other]])
+        rate = np.concatenate([(self.C @ self.A) @ state, [self.C @ self.A @ one, self.C @ self.A @ other]])
+        if self.order == 0:
+            position, rate = np.array([1.0 - place, place]), np.array([-1.0, 1.0])
+        else:
+            rate[-2] += (self.C @ self.B) * (1.0 - place)
+            rate[-1] += (self.C @ self.B) * place
+        return tuple(self._row(row, taken, start, end) for row in (position, rate / self.period))
+
+    def _row(self, row, taken, start, end):
+        states = np.einsum("i,nil->nl", row[: self.order], self.states[taken]) if self.order else 0.0
+        return states + row[-2] * start + row[-1] * end
+
+    def _commands(self, runs: Sequence[Run]) -> np.ndarray:
+        """Commands with their history, (history + rows + 1, lanes); a shorter run holds its last one."""
+        lanes = []
+        for run in runs:
+            x = run.position_desired
+            if run.kind in ("contact", "tap"):
+                step = (
+                    (x[1] - x[0]) if run.velocity_desired is None else run.velocity_desired[0] * self.period
+                )
+            else:
+                step = 0.0
+            before = x[0] + step * np.arange(-self.history, 0)
+            lanes.append(np.concatenate([before, x, np.full(self.rows - len(x) + 1, x[-1])]))
+        # One row more: readings that come after the command are those of the next tick.
+        return np.array(lanes).T
+
+    def _after(self, place: float):
+        """State after a part of a period, as a map of (state, input at its start, input at its end)."""
+        n = self.order
+        system = np.zeros((n + 2, n + 2))
+        system[:n, :n], system[:n, n], system[n, n + 1] = self.A, self.B, 1.0
+        full = exponential(system * place)[:n]
+        return full[:, :n], full[:, n] - full[:, n + 1], full[:, n + 1]
+
+    def _advance(self, hold: str) -> np.ndarray:
+        """States at the start of every interval, (intervals + 1, order, lanes)."""
+        state, one, other = self._after(1.0)
+        lanes = self.end.shape[1]
+        states = np.empty((len(self.end) + 1, self.order, lanes))
+        if not self.order:
+            return states
+        drive = one[:, None] * self.start[:, None] + other[:, None] * self.end[:, None]
+        closed = np.eye(self.order) - state
+        both = one + other
+        # z = alpha + beta n on a uniform motion, whose input grows by a step a period.
+        step = self.end[1] - self.end[0]
+        beta = np.linalg.solve(closed, np.outer(both, step))
+        ahead = both if hold == "zoh" else other
+        now = self.end[0] - step if hold == "zoh" else self.start[0]
+        states[0] = np.linalg.solve(closed, np.outer(both, now) + np.outer(ahead, step) - beta)
+        for n in range(len(self.end)):
+            states[n + 1] = state @ states[n] + drive[n]
+        return states
+
+
+def _companion(numerator: np.ndarray, denominator: np.ndarray, period: float):
+    """(A, B, C) with time in periods, from descending powers of s; strictly proper, order 0 is empty."""
+    order = len(denominator) - 1
+    scale = period ** np.arange(order, -1.0, -1.0)
+    below = denominator / scale
+    above = numerator / period ** np.arange(len(numerator) - 1, -1.0, -1.0)
+    A = np.diag(np.ones(max(order - 1, 0)), 1)[:order, :order] if order else np.zeros((0, 0))
+    B, C = np.zeros(order), np.zeros(order)
+    if order:
+        A[-1] = -below[:0:-1] / below[0]
+        B[-1] = 1.0
+        C[: len(above)] = above[::-1] / below[0]
+    return A, B, C
+
+
+def exponential(matrix: np.ndarray) -> np.ndarray:
+    """Matrix exponential by scaling, Taylor and squaring, to rounding for norms up to 64.
+
+    Small matrices by the hundred: the general one's choice of a method takes longer than the method."""
+    scaled, total = matrix / 64.0, np.eye(len(matrix))
+    for term in range(13, 0, -1):
+        total = np.eye(len(matrix)) + scaled @ total / term
+    for _ in range(6):
+        total = total @ total
+    return total

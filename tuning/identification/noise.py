@@ -1,0 +1,145 @@
+"""Sensors at rest: noise, bias, quantum, dead zone, and the noise's colour.
+
+A reading that is rounded to multiples of a quantum says between which two numbers the signal was; mean and
+standard deviation are those under which the counts of the multiples are most likely, which stays right where
+the noise is smaller than the quantum. Coloured noise is an autoregression (Yule and Walker's equations, the
+order by the Bayesian information criterion); its inverse makes residuals white.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg, optimize, special
+from scipy.signal import lfilter
+
+HIGHEST = 8  # order of the autoregression
+REPEATED = 0.2  # distinct values over readings, below which values come in steps
+SILENT = 0.5  # share of exact zeros from which a reading is that of a dead zone
+
+
+@dataclass(frozen=True)
+class Noise:
+    """One sensor's readings where nothing moves."""
+
+    mean: float  # of the readings, in their unit
+    std: float
+    mean_std: float  # standard error of the mean
+    std_std: float  # and of the standard deviation
+    quantum: float  # 0 where readings come in no steps
+    silent: bool  # readings are exactly 0 most of the time: mean and std are unknown
+    filter: tuple[float, ...]  # makes the noise white, its first coefficient 1
+    number: int  # readings
+
+    @property
+    def pole(self) -> float:
+        """Largest magnitude of the noise's poles; 0 for white noise."""
+        return float(max(np.abs(np.roots(self.filter)), default=0.0))
+
+    @property
+    def innovation(self) -> float:
+        """Standard deviation [their unit] of what the filter leaves."""
+        return self.std * float(np.sqrt(whitened_share(self.filter)))
+
+
+def at_rest(readings: np.ndarray) -> Noise:
+    """Of at least 20 readings on successive ticks, finite."""
+    quantum = steps(readings)
+    number = len(readings)
+    if np.mean(readings == 0.0) > SILENT and (quantum == 0.0 or np.ptp(readings) < 1.5 * quantum):
+        return Noise(0.0, 0.0, np.inf, np.inf, quantum, True, (1.0,), number)
+    mean, std = _binned(readings, quantum) if quantum else (readings.mean(), readings.std(ddof=1))
+    colour = autoregression(readings - mean)
+    # The mean of correlated readings is less certain, by what the noise holds at frequency 0.
+    at_zero = np.sqrt(whitened_share(colour)) / abs(np.sum(colour))
+    effective = 1.0 + 2.0 * np.sum(_correlations(colour) ** 2)
+    # Rounding adds to what has to be told apart.
+    width = np.hypot(std, quantum / np.sqrt(12.0))
+    return Noise(
+        float(mean),
+        float(std),
+        float(width * at_zero / np.sqrt(number)),
+        float(width * np.sqrt(effective / (2.0 * number))),
+        quantum,
+        False,
+        colour,
+        number,
+    )
+
+
+def steps(readings: np.ndarray) -> float:
+    """The quantum to whose multiples readings are rounded, 0 where there is none."""
+    values = np.unique(readings[np.isfinite(readings)])
+    if len(values) < 2 or len(values) > REPEATED * len(readings):
+        return 0.0
+    scale = np.abs(values).max()
+    # A dead zone shifts the multiples on either side of 0 apart.
+    sides = [values[values > 1e-12 * scale], values[values < -1e-12 * scale]]
+    gaps = np.concatenate([np.diff(side) for side in sides])
+    gaps = gaps[gaps > 1e-9 * scale]
+    if not len(gaps):
+        return float(np.diff(values).min())
+    quantum = gaps.min()
+    multiples = np.round(gaps / quantum)
+    quantum = gaps.sum() / multiples.sum()
+    return float(quantum) if np.all(np.abs(gaps / quantum - multiples) < 0.02) else 0.0
+
+
+def _binned(readings: np.ndarray, quantum: float) -> tuple[float, float]:
+    """Mean and standard deviation of greatest likelihood of a rounded normal number."""
+    values, counts = np.unique(np.round(readings / quantum), return_counts=True)
+    middle, spread = np.average(values, weights=counts), readings.std() / quantum
+
+    def cost(parameters):
+        mean, std = parameters[0], np.exp(parameters[1])
+        high, low = (values + 0.5 - mean) / std, (values - 0.5 - mean) / std
+        # The upper tail by symmetry: differences of numbers near 1 lose digits.
+        flip = low > 0.0
+        high, low = np.where(flip, -low, high), np.where(flip, -high, low)
+        log = special.log_ndtr(high) + np.log1p(
+            -np.exp(np.minimum(special.log_ndtr(low) - special.log_ndtr(high), -1e-15))
+        )
+        return -np.sum(counts * log)
+
+    found = optimize.minimize(cost, [middle, np.log(max(spread, 0.2))], method="Nelder-Mead",
+                              options={"xatol": 1e-5, "fatol": 1e-6})  # fmt: skip
+    return float(found.x[0] * quantum), float(np.exp(found.x[1]) * quantum)
+
+
+def autoregression(values: np.ndarray) -> tuple[float, ...]:
+    """Coefficients (1, -a1, -a2, ...) of the filter that makes the values white."""
+    number = len(values)
+    size = 1 << int(np.ceil(np.log2(2 * number)))
+    power = np.abs(np.fft.rfft(values, size)) ** 2
+    covariance = np.fft.irfft(power, size)[: HIGHEST + 1] / number
+    if covariance[0] <= 0.0:
+        return (1.0,)
+    best, chosen = 0.0, (1.0,)
+    for order in range(1, HIGHEST + 1):
+        coefficients = linalg.solve_toeplitz(covariance[:order], covariance[1 : order + 1])
+        variance = 1.0 - coefficients @ covariance[1 : order + 1] / covariance[0]
+        criterion = number * np.log(max(variance, 1e-12)) + order * np.log(number)
+        if criterion < best:
+            best, chosen = criterion, (1.0, *(-coefficients))
+    return tuple(float(value) for value in chosen)
+
+
+def _correlations(colour: tuple[float, ...], longest: int = 200) -> np.ndarray:
+    """Autocorrelation of the noise at lags 1, 2, ... ."""
+    if len(colour) == 1:
+        return np.zeros(1)
+    impulse = np.zeros(4 * longest)
+    impulse[0] = 1.0
+
+    answer = lfilter([1.0], colour, impulse)
+    every = np.correlate(answer, answer, "full")[len(answer) - 1 :]
+    return every[1 : longest + 1] / every[0]
+
+
+def whitened_share(colour: tuple[float, ...]) -> float:
+    """Variance after the whitening filter over that before it."""
+    if len(colour) == 1:
+        return 1.0
+    rho = np.concatenate([[1.0], _correlations(colour)])[: len(colour)]
+    return float(1.0 + np.asarray(colour[1:]) @ rho[1:])

@@ -1,0 +1,120 @@
+"""From a fit's own parameters to the keys of a mechanism file, value by value and draw by draw."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tuning.identification.contact import ContactFit
+from tuning.identification.contact_laws import Law
+from tuning.identification.rational import Model
+
+SIMULATOR = "rig.simulator."
+
+
+def simulator_section(model: Model) -> dict[str, Any]:
+    """`rig.simulator` of a mechanism file."""
+    many, values = model.structure, np.exp(model.parameters[: model.structure.order])
+    delay = {"delay": float(max(model.delay, 0.0))}
+    if many.order == 0:
+        return {"model": "ideal", **delay}
+    if many.name == "first_order":
+        return {"model": "first_order", "time_constant": float(values[0]), **delay}
+    if many.name == "second_order":
+        natural = {"natural_frequency": float(values[0] / (2.0 * np.pi)), "damping_ratio": float(values[1])}
+        return {"model": "second_order", **natural, **delay}
+    numerator, denominator = model.fraction
+    if many.name == "third_order":
+        return {
+            "model": "third_order",
+            "coefficients": [float(value) for value in denominator[-2::-1]],
+            **delay,
+        }
+    above, below = (part / denominator[-1] for part in (numerator, denominator))
+    return {
+        "model": "transfer_function",
+        "numerator": [float(value) for value in above],
+        "denominator": [float(value) for value in below],
+        **delay,
+    }
+
+
+def simulator_draws(model: Model, covariance: np.ndarray, frequency: float, count: int, rng) -> tuple[
+    dict[str, np.ndarray], np.ndarray
+]:  # fmt: skip
+    """Draws by key, and by how much the lag at a frequency [Hz] differs in each draw [s].
+
+    First and second order have keys of their own; of other models the delay takes all that is uncertain, the
+    lag at the contact's frequency."""
+    factor = np.linalg.cholesky(covariance + 1e-30 * np.eye(len(covariance)))
+    off = rng.standard_normal((count, len(factor))) @ factor.T
+    s = np.array([2j * np.pi * frequency])
+    slopes = -np.imag(model.slopes(s)[:, 0]) / (2.0 * np.pi * frequency)
+    lag = off @ slopes
+    values = model.parameters + off
+    name = model.structure.name
+    if name == "first_order":
+        return {SIMULATOR + "time_constant": np.exp(values[:, 0]), SIMULATOR + "delay": values[:, 1]}, lag
+    if name == "second_order":
+        return {
+            SIMULATOR + "natural_frequency": np.exp(values[:, 0]) / (2.0 * np.pi),
+            SIMULATOR + "damping_ratio": np.exp(values[:, 1]),
+            SIMULATOR + "delay": values[:, 2],
+        }, lag
+    return {SIMULATOR + "delay": model.delay + lag}, lag
+
+
+def contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
+    """Draws by key; a list's entries have their number behind the key."""
+    draws = contact.draws()
+    own = dict(zip(contact.posterior.names, draws.T, strict=True))
+    found = {"rig.force_sensor.delay": own["delay"]}
+    if "time_constant" in own:
+        found["rig.force_sensor.time_constant"] = own["time_constant"]
+    if contact.problem.plane is None:
+        found["rig.contact_plane"] = own["plane"]
+    law, entries = contact.law, contact.readings.entries
+    for i in range(entries):
+        if law.name == "piecewise_linear":
+            for name in law.names[:-1]:
+                found[f"contact.stiffness.{i}.{int(name[5:]) - 1}"] = own[f"{name}.{i}"]
+            continue
+        found[f"contact.stiffness.{i}"] = own[f"stiffness.{i}"]
+        if law.name == "hunt_crossley":
+            found[f"contact.damping.{i}"] = own[f"damping.{i}"] / own[f"stiffness.{i}"]
+        if law.name == "hardening":
+            # Where the cubic part is nothing, the depth at which it matters has no end.
+            ratio = own[f"stiffness.{i}"] / np.maximum(own[f"cubic.{i}"], 1e-12)
+            found["contact.reference_depth"] = np.sqrt(np.maximum(ratio, 1e-12))
+    if "damping" in own:
+        found["contact.damping.0"] = own["damping"]
+    if contact.dead_zone:
+        found["rig.force_sensor.dead_zone"] = -own["bias"]
+    return found
+
+
+def contact_section(law: Law, values: dict[str, float]) -> dict[str, Any]:
+    """`contact` of a mechanism file from values by key."""
+    section: dict[str, Any] = {"law": law.name, **law.shape}
+    stiffness = sorted(key for key in values if key.startswith("contact.stiffness."))
+    if law.name == "piecewise_linear":
+        entries: dict[int, dict[int, float]] = {}
+        for key in stiffness:
+            entry, slope = map(int, key.split(".")[2:])
+            entries.setdefault(entry, {})[slope] = values[key]
+        section["stiffness"] = [[slopes[j] for j in sorted(slopes)] for _, slopes in sorted(entries.items())]
+    else:
+        section["stiffness"] = [values[key] for key in sorted(stiffness, key=_number)]
+    damping = [
+        values[key] for key in sorted((k for k in values if k.startswith("contact.damping.")), key=_number)
+    ]
+    if damping:
+        section["damping"] = [max(value, 0.0) for value in damping]
+    if "contact.reference_depth" in values:
+        section["reference_depth"] = values["contact.reference_depth"]
+    return section
+
+
+def _number(key: str) -> int:
+    return int(key.rsplit(".", 1)[1])

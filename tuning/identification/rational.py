@@ -1,0 +1,282 @@
+"""Motion simulators as products of first- and second-order sections with a delay, fitted to spectra.
+
+    H(s) = g N(s) e^{-s tau} / (prod (1 + T s) prod (1 + 2 zeta s/w + s^2/w^2)),  N = 1 + c1 s + c2 s^2
+
+Time constants, natural frequencies and damping ratios enter as logarithms, so that they stay positive and
+the model stays stable. The maximum likelihood fit weighs every line by its noise (Pintelon and Schoukens,
+System Identification: A Frequency Domain Approach, 2012); since the hold is part of the model, a fit's
+covariance is that of the rig's own numbers. Starts are linear fits over a grid of delays (Sanathanan and
+Koerner 1963), so that nobody has to guess. NumPy and SciPy alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.polynomial import polynomial
+from scipy import optimize
+
+from tuning.identification import hold as holds
+
+SHORTEST = 1e-6  # s, of a start's time constants
+
+
+@dataclass(frozen=True)
+class Structure:
+    """How many sections of each kind a model has."""
+
+    name: str
+    first: int  # sections 1 + T s
+    second: int  # sections 1 + 2 zeta s/w + s^2/w^2
+    zeros: int  # degree of N(s)
+
+    @property
+    def order(self) -> int:
+        return self.first + 2 * self.second
+
+    @property
+    def size(self) -> int:
+        """Number of parameters, the delay among them."""
+        return self.order + self.zeros + 1
+
+
+STRUCTURES = (
+    Structure("ideal", 0, 0, 0),
+    Structure("first_order", 1, 0, 0),
+    Structure("second_order", 0, 1, 0),
+    Structure("second_order_zero", 0, 1, 1),
+    Structure("third_order", 1, 1, 0),
+    Structure("fourth_order", 0, 2, 0),
+    Structure("resonance", 0, 2, 2),
+)
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Spectra at the excited lines, and how the command became the drives' input."""
+
+    frequency: np.ndarray  # Hz
+    command: np.ndarray  # complex
+    output: np.ndarray  # complex, in the command's unit
+    std: np.ndarray  # of the output's complex noise: E|n|^2 = std^2
+    period: float  # s, of control
+    hold: str
+    latency: int
+    row: str = "tick"
+
+    @cached_property
+    def copies(self) -> tuple[np.ndarray, np.ndarray]:
+        """s of every copy of each line, and what the hold makes of the command there."""
+        every = holds.frequencies(self.frequency, self.period)
+        return 2j * np.pi * every, self.command * holds.response(
+            every, self.period, self.hold, self.latency, self.row
+        )
+
+    def __len__(self) -> int:
+        return len(self.frequency)
+
+
+@dataclass(frozen=True)
+class Model:
+    """A structure with its numbers: [log T ..., log w, log zeta ..., c ..., delay]."""
+
+    structure: Structure
+    parameters: np.ndarray
+
+    @property
+    def delay(self) -> float:
+        """Transport delay [s]."""
+        return float(self.parameters[-1])
+
+    @property
+    def names(self) -> list[str]:
+        many = self.structure
+        sections = [f"time_constant{i or ''}" for i in range(many.first)]
+        for i in range(many.second):
+            sections += [f"natural_frequency{i or ''}", f"damping_ratio{i or ''}"]
+        return [*sections, *(f"zero{i + 1}" for i in range(many.zeros)), "delay"]
+
+    @cached_property
+    def sections(self) -> tuple[np.ndarray, list[np.ndarray]]:
+        """N and the denominator's sections, coefficients in ascending powers of s."""
+        many, values = self.structure, np.asarray(self.parameters, float)
+        parts = [np.array([1.0, time]) for time in np.exp(values[: many.first])]
+        for w, zeta in np.exp(values[many.first : many.order]).reshape(-1, 2):
+            parts.append(np.array([1.0, 2.0 * zeta / w, 1.0 / w**2]))
+        return np.array([1.0, *values[many.order : -1]]), parts
+
+    @cached_property
+    def fraction(self) -> tuple[np.ndarray, np.ndarray]:
+        """Numerator and denominator in descending powers of s, as mechanism files have them."""
+        numerator, parts = self.sections
+        denominator = np.array([1.0])
+        for part in parts:
+            denominator = polynomial.polymul(denominator, part)
+        return numerator[::-1], denominator[::-1]
+
+    def response(self, s: np.ndarray) -> np.ndarray:
+        """H(s), the delay included."""
+        numerator, denominator = self.fraction
+        return np.polyval(numerator, s) / np.polyval(denominator, s) * np.exp(-s * self.delay)
+
+    def slopes(self, s: np.ndarray) -> np.ndarray:
+        """d log H / d parameter, shape (parameters, *s)."""
+        numerator, parts = self.sections
+        many, rows = self.structure, []
+        for part in parts[: many.first]:
+            rows.append(-part[1] * s / (1.0 + part[1] * s))
+        for part in parts[many.first :]:
+            below = 1.0 + part[1] * s + part[2] * s**2
+            rows += [(part[1] * s + 2.0 * part[2] * s**2) / below, -part[1] * s / below]
+        above = polynomial.polyval(s, numerator)
+        rows += [s**power / above for power in range(1, many.zeros + 1)]
+        return np.array([*rows, -s])
+
+    def predict(self, lines: Lines) -> np.ndarray:
+        """The output's spectrum."""
+        s, command = lines.copies
+        return np.sum(self.response(s) * command, axis=0)
+
+    def bandwidth(self) -> float:
+        """Lowest frequency [Hz] at which |H| has fallen by 3 dB; inf for an ideal simulator."""
+        if self.structure.order == 0:
+            return np.inf
+        poles = np.abs(np.roots(self.fraction[1]))
+        grid = np.geomspace(poles.min() / 30.0, poles.max() * 30.0, 4000)
+        level = np.abs(self.response(1j * grid)) - np.sqrt(0.5)
+        below = np.flatnonzero(level < 0.0)
+        if not len(below) or below[0] == 0:
+            return np.inf
+        low, high = grid[below[0] - 1], grid[below[0]]
+        root: Any = optimize.brentq(
+            lambda w: abs(self.response(1j * np.asarray(w))) - np.sqrt(0.5), low, high
+        )
+        return float(root) / (2.0 * np.pi)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model fitted to lines."""
+
+    model: Model
+    covariance: np.ndarray  # of the parameters, by curvature at the noise the lines state
+    residual: np.ndarray  # complex, whitened: E|r|^2 = 1
+
+    @property
+    def chi2(self) -> float:
+        """Sum of squared residuals over half their variance: as many degrees of freedom as real numbers."""
+        return float(2.0 * np.sum(np.abs(self.residual) ** 2))
+
+    @property
+    def freedom(self) -> int:
+        return 2 * len(self.residual) - self.model.structure.size
+
+    @property
+    def std(self) -> np.ndarray:
+        return np.sqrt(np.diag(self.covariance))
+
+
+def fit(structure: Structure, lines: Lines) -> Fit:
+    """The maximum likelihood fit: the best of the linear starts, then Levenberg-Marquardt."""
+    candidates = sorted((_start(structure, lines, delay) for delay in _delays(lines)), key=lambda c: c[0])
+    # Neighbours on the grid of delays end at the same place; the runner-up far away may not.
+    tried = [_refine(structure, candidates[0][1], lines)]
+    for _, start in candidates[1:]:
+        if structure.order > 1 and abs(start[-1] - candidates[0][1][-1]) > 2.0 * lines.period:
+            tried.append(_refine(structure, start, lines))
+            break
+    return min(tried, key=lambda one: one.chi2)
+
+
+def _refine(structure: Structure, start: np.ndarray, lines: Lines) -> Fit:
+    s, command = lines.copies
+    scale = np.sqrt(2.0) / lines.std
+
+    def split(values):
+        return np.concatenate([values.real, values.imag], axis=-1)
+
+    def residual(parameters):
+        return split((Model(structure, parameters).predict(lines) - lines.output) * scale)
+
+    def jacobian(parameters):
+        model = Model(structure, parameters)
+        slopes = np.sum(model.slopes(s) * model.response(s) * command, axis=1) * scale
+        return split(slopes).T
+
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        solve: Any = optimize.least_squares
+        found = solve(residual, start, jacobian, method="lm", x_scale="jac", max_nfev=200)
+    curvature = found.jac.T @ found.jac
+    scales = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
+    covariance = np.linalg.pinv(curvature / np.outer(scales, scales), hermitian=True) / np.outer(
+        scales, scales
+    )
+    half = len(lines)
+    return Fit(
+        Model(structure, found.x), covariance, (found.fun[:half] + 1j * found.fun[half:]) / np.sqrt(2.0)
+    )
+
+
+def _delays(lines: Lines) -> np.ndarray:
+    """A grid of delays [s] from 0 to what the phase of the lowest lines allows."""
+    s, command = lines.copies
+    middle = len(s) // 2
+    phase = np.unwrap(np.angle(lines.output / command[middle]))
+    few = slice(0, max(3, len(lines) // 8))
+    weight = np.abs(command[middle][few]) / lines.std[few]
+    f = lines.frequency[few]
+    slope = -np.sum(weight**2 * f * phase[few]) / np.sum(weight**2 * f**2) / (2.0 * np.pi)
+    longest = max(slope, lines.period)
+    return np.linspace(0.0, longest, int(np.clip(4.0 * longest / lines.period, 8, 40)))
+
+
+def _start(structure: Structure, lines: Lines, delay: float) -> tuple[float, np.ndarray]:
+    """Chi-squared and parameters of the linear fit with that delay, without the copies."""
+    s, command = lines.copies
+    s, command = s[len(s) // 2], command[len(s) // 2]
+    unit = 1.0 / np.abs(s).mean()
+    p = s * unit
+    target = lines.output / command * np.exp(s * delay)
+    weight = np.abs(command) / lines.std
+    order, zeros = structure.order, structure.zeros
+    if order == 0:
+        parameters = np.array([delay])
+    else:
+        columns = [*(-(p**i) for i in range(1, zeros + 1)), *(target * p**i for i in range(1, order + 1))]
+        basis, below = np.array(columns).T, np.ones_like(p)
+        for _ in range(4):
+            scaled = (weight / np.abs(below))[:, None]
+            left, right = basis * scaled, (1.0 - target)[:, None] * scaled
+            solved = np.linalg.lstsq(
+                np.concatenate([left.real, left.imag]), np.concatenate([right.real, right.imag])[:, 0]
+            )[0]
+            below = 1.0 + sum(solved[zeros + i - 1] * p**i for i in range(1, order + 1))
+        above = solved[:zeros] * unit ** np.arange(1, zeros + 1)
+        polynomial_below = np.array([1.0, *solved[zeros:]])
+        parameters = np.array([*_sections(structure, polynomial_below, unit), *above, delay])
+    misfit = np.abs(Model(structure, parameters).predict(lines) - lines.output) / lines.std
+    return float(np.sum(misfit**2)), parameters
+
+
+def _sections(structure: Structure, denominator: np.ndarray, unit: float) -> list[float]:
+    """Logarithms of the sections' numbers, from a denominator in ascending powers of s `unit`."""
+    roots = polynomial.polyroots(denominator)
+    poles = np.where(roots.real > 0.0, -roots.conj(), roots) / unit
+    poles = np.where(np.abs(poles) > 1.0 / SHORTEST, poles / np.abs(poles) / SHORTEST, poles)
+    real = sorted((-pole.real for pole in poles if abs(pole.imag) <= 1e-9 * abs(pole)), reverse=True)
+    complex_ones = sorted((pole for pole in poles if pole.imag > 1e-9 * abs(pole)), key=abs)
+    values = []
+    for _ in range(structure.first):
+        values.append(-np.log(max(real.pop(), 1e-6) if real else abs(complex_ones[0])))
+    pairs = [(abs(pole), max(-pole.real / abs(pole), 1e-3)) for pole in complex_ones]
+    while len(real) > 1:
+        one, other = max(real.pop(), 1e-6), max(real.pop(), 1e-6)
+        pairs.append((np.sqrt(one * other), (one + other) / (2.0 * np.sqrt(one * other))))
+    while len(pairs) < structure.second:
+        pairs.append((1.0 / unit, 1.0))
+    for w, zeta in sorted(pairs)[: structure.second]:
+        values += [np.log(w), np.log(zeta)]
+    return values

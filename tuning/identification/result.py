@@ -1,0 +1,113 @@
+"""What an identification found: numbers, their uncertainty, how they hang together, whether to trust them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from tuning.identification.contact import ContactFit
+from tuning.identification.free_motion import FreeMotion
+from tuning.identification.noise import Noise
+from tuning.identification.validation import Line
+
+CONFOUNDED = 0.95  # magnitude of a correlation from which two numbers are told apart badly
+
+WIDER = "a multisine to 1.5 times the bandwidth or more"
+# What would separate a pair, by the keys in it.
+EXPERIMENTS = {
+    ("rig.force_sensor.delay", "contact.damping"): "a press run with a multisine to 45 Hz",
+    ("rig.contact_plane", "rig.force_sensor.delay"): "touches at speeds in the ratio 1:2:4, or a slow press",
+    ("contact.stiffness", "rig.contact_plane"): "touches at speeds in the ratio 1:2:4, or a slow press",
+    ("rig.simulator.damping_ratio", "rig.simulator.delay"): WIDER,
+    (
+        "rig.simulator.delay",
+        "rig.simulator.natural_frequency",
+    ): WIDER,
+    ("rig.simulator.delay", "rig.simulator.time_constant"): WIDER,
+}
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One number of the mechanism file."""
+
+    key: str  # dotted path, with the entry's number behind a list's
+    value: float
+    std: float  # in the key's unit; 0 where it was told
+    low: float  # 95 % interval
+    high: float
+    unit: str
+    told: bool = False  # by the prior or the caller, not by the logs
+
+
+@dataclass(frozen=True)
+class Identification:
+    """All that was found."""
+
+    estimates: tuple[Estimate, ...]
+    draws: np.ndarray  # (draws, estimates that were not told), in their order
+    combinations: tuple[Estimate, ...]  # sums and products that the logs tell better than their parts
+    confounded: tuple[tuple[str, str, float, str], ...]  # two keys, correlation, what separates
+    lines: tuple[Line, ...]
+    mechanism: dict[str, Any]  # as a mechanism file has it
+    limit: float  # on e, of all effects together
+    notes: tuple[str, ...] = ()
+    motion: FreeMotion | None = field(default=None, repr=False)
+    contact: ContactFit | None = field(default=None, repr=False)
+    force_noise: Noise | None = field(default=None, repr=False)
+    position_noise: Noise | None = field(default=None, repr=False)
+
+    @property
+    def effect(self) -> float:
+        """On e, of all defects that are there."""
+        return float(sum(line.counted for line in self.lines))
+
+    @property
+    def good(self) -> bool:
+        return self.effect < self.limit
+
+    @property
+    def worst(self) -> Line | None:
+        """The defect with the largest effect, if there is any."""
+        there = [line for line in self.lines if line.there]
+        return max(there, key=lambda line: line.effect, default=None)
+
+    @property
+    def verdict(self) -> str:
+        if self.good:
+            return (
+                f"Good: what the model leaves can change e by {self.effect:.2g}, allowed below {self.limit:g}"
+            )
+        worst = self.worst
+        assert worst is not None
+        place = f" ({worst.where})" if worst.where else ""
+        return (
+            f"Bad: the model does not explain this rig: {worst.name}{place}: {worst.finding}; "
+            f"all defects can change e by {self.effect:.2g}, allowed below {self.limit:g}"
+        )
+
+    def __getitem__(self, key: str) -> Estimate:
+        """The estimate of a key, or of a combination by its name."""
+        for one in (*self.estimates, *self.combinations):
+            if one.key == key:
+                return one
+        raise KeyError(key)
+
+
+def confounded(keys: list[str], draws: np.ndarray) -> tuple[tuple[str, str, float, str], ...]:
+    """The pairs that the logs hardly tell apart, and the experiment that would."""
+    if len(keys) < 2:
+        return ()
+    correlation = np.corrcoef(draws.T)
+    pairs = []
+    for i in range(len(keys)):
+        for j in range(i):
+            if abs(correlation[i, j]) > CONFOUNDED:
+                one, other = (key.rstrip("0123456789").rstrip(".") for key in (keys[i], keys[j]))
+                advice = EXPERIMENTS.get((one, other)) or EXPERIMENTS.get(
+                    (other, one), "longer runs, or wider ones"
+                )
+                pairs.append((keys[j], keys[i], float(correlation[i, j]), advice))
+    return tuple(pairs)

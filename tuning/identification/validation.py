@@ -1,0 +1,250 @@
+"""Whether the model explains the rig, each defect by what it can do to a contact's restitution.
+
+With thousands of readings every model is rejected by some test. So a line states how large the effect on the
+restitution e can be, and the test says only whether the defect is there at all. The effects are first order
+and in closed form: a phase error phi of the motion at the contact's frequency w is a delay of phi/w, and a
+delay tau changes e by (pi/2) w tau; a force r that the law does not explain changes the rebound by
+-(integral of r v dt)/(M v_0 e), the balance of momentum and energy over one touch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import special, stats
+
+from tuning.identification.contact import ContactFit
+from tuning.identification.free_motion import FreeMotion
+from tuning.identification.law_choice import misfits
+from tuning.identification.records import Run
+
+OTHER_HOLD = 1.0  # gain of the information criterion from which the other hold explains more
+RARE = 1e-3  # probability under which a defect is taken to be there
+HARMONICS = 4.0  # of the contact's frequency: up to there the motion decides what a contact does
+CERTAIN_DRAWS = 40  # of the posterior, under all of which a row is in contact or under none
+NEIGHBOURS = 5  # lines over which the motion's misfit is averaged
+
+
+@dataclass(frozen=True)
+class Line:
+    """One check."""
+
+    name: str
+    finding: str  # what was found, in words and numbers
+    there: bool  # whether the defect is more than chance
+    effect: float  # on e, if it is there
+    where: str = ""  # frequency, touch or entry where it is worst
+
+    @property
+    def counted(self) -> float:
+        """Effect on e that the verdict adds up."""
+        return self.effect if self.there else 0.0
+
+
+def of_motion(motion: FreeMotion, frequency: float) -> list[Line]:
+    """Checks of the motion simulator's model; `frequency` of contacts [Hz]."""
+    lines = [_misfit(motion, frequency), _gain(motion), _hold(motion, frequency)]
+    return [*lines, _sign_of_delay(motion, frequency), *_distortion(motion)]
+
+
+def _misfit(motion: FreeMotion, frequency: float) -> Line:
+    error, noise = motion.misfit()
+    order = np.argsort(motion.lines.frequency)
+    at, error, noise = motion.lines.frequency[order], error[order], noise[order]
+    width = min(NEIGHBOURS, len(at))
+    kernel = np.ones(width) / width
+    smooth = np.abs(np.convolve(error, kernel, "valid"))
+    chance = np.sqrt(np.convolve(noise**2, kernel, "valid") / width)
+    beyond = np.sqrt(np.maximum(smooth**2 - chance**2, 0.0))
+    middle = np.convolve(at, kernel, "valid")
+    near = middle <= max(HARMONICS * frequency, middle[0])
+    worst = int(np.argmax(beyond * near))
+    freedom = max(motion.fit.freedom, 1)
+    probability = stats.chi2.sf(motion.fit.chi2, freedom)
+    return Line(
+        "motion model",
+        f"leaves {motion.left:.3g} times the noise's power, {beyond[worst]:.2g} of the motion near contacts",
+        bool(probability < RARE),
+        float(np.pi / 2.0 * beyond[worst]),
+        f"{middle[worst]:.3g} Hz",
+    )
+
+
+def _gain(motion: FreeMotion) -> Line:
+    gain, std = motion.gain
+    std *= max(1.0, np.sqrt(motion.left))
+    return Line(
+        "scale of the measured position",
+        f"{gain:.5f} +- {std:.2g} of the desired one",
+        bool(abs(gain - 1.0) > max(4.0 * std, 0.005)),
+        abs(gain - 1.0),
+    )
+
+
+def _hold(motion: FreeMotion, frequency: float) -> Line:
+    other = "linear" if motion.lines.hold == "zoh" else "zoh"
+    half = 0.5 * motion.lines.period
+    return Line(
+        "command hold",
+        f"the information criterion is {abs(motion.other_hold):.3g} "
+        f"{'less' if motion.other_hold > 0 else 'more'} with {other}",
+        motion.other_hold > OTHER_HOLD,
+        float(np.pi**2 * frequency * half),
+    )
+
+
+def _sign_of_delay(motion: FreeMotion, frequency: float) -> Line:
+    delay, std = motion.model.delay, float(np.sqrt(motion.covariance[-1, -1]))
+    return Line(
+        "sign of the motion's delay",
+        f"{1e3 * delay:.4f} +- {1e3 * std:.2g} ms: negative where latency, hold or row are told wrongly",
+        delay < -4.0 * std - 1e-6,
+        float(np.pi**2 * frequency * abs(delay)),
+    )
+
+
+def _distortion(motion: FreeMotion) -> list[Line]:
+    lines = []
+    for parity, name in ((0, "odd"), (1, "even")):
+        levels = [level for one in motion.spectra if (level := (one.odd, one.even)[parity]) is not None]
+        if levels:
+            excess = max(one.excess[parity] for one in motion.spectra)
+            lines.append(
+                Line(
+                    f"{name} nonlinearity of the motion",
+                    f"{-20 * np.log10(max(levels)):.0f} dB below the motion, {excess:.2g} times the noise",
+                    excess > 2.0,
+                    float(np.pi / 2.0 * max(levels)),
+                )
+            )
+    return lines
+
+
+def of_contact(
+    contact: ContactFit, runs: list[Run], mass: float, frequency: float, lag: float, held: np.ndarray
+) -> list[Line]:
+    """Checks of the contact's model on touches that it was not fitted to (`held`, a flag each)."""
+    lines = [_left(contact, held), _stiffness(contact)]
+    errors, stds = restitution_errors(contact, runs, mass)
+    usable = held & np.isfinite(errors)
+    if usable.any():
+        lines.append(_restitution(errors[usable], stds[usable]))
+    trend = _trend(contact, len(runs), 2.0 * np.pi * frequency * lag)
+    return lines if trend is None else [*lines, trend]
+
+
+def _left(contact: ContactFit, held: np.ndarray) -> Line:
+    delay, plane, inner = contact.posterior.best
+    readings = contact.readings
+    readings = replace(readings, counts=readings.counts & _certain(contact))
+    every = misfits(contact.problem, readings, delay, plane, inner.coefficients)[held]
+    count = readings.counts.sum(axis=0)[held]
+    ratio = float(every.sum() / count.sum())
+    # The force's rms error over the touch, as a share of its rms, is at most what it can do to e.
+    force = np.where(readings.counts, readings.force, 0.0)[:, held]
+    beyond = max(ratio - 1.0, 0.0) * readings.std**2 * count.sum() / max(float(np.sum(force**2)), 1e-300)
+    return Line(
+        "contact law",
+        f"leaves {ratio:.3g} times the noise's power on touches not fitted",
+        bool(stats.chi2.sf(every.sum(), count.sum()) < RARE),
+        float(np.sqrt(beyond)),
+        f"touch {int(np.argmax(every / np.maximum(count, 1)))}",
+    )
+
+
+def _certain(contact: ContactFit) -> np.ndarray:
+    """Rows that are in contact, or out of it, whatever the delay and the plane are within their uncertainty:
+    damped contact begins with a jump, and a row on its other side says nothing of the law."""
+    count = len(contact.problem.names)
+    flags = [
+        contact.problem.touching(draw[0], draw[1], draw[2 : 2 + count])
+        for draw in contact.posterior.draws[:CERTAIN_DRAWS]
+    ]
+    return np.all(flags, axis=0) | ~np.any(flags, axis=0)
+
+
+def _stiffness(contact: ContactFit) -> Line:
+    names = contact.posterior.names
+    values = [
+        contact.posterior.mean[i] for i, name in enumerate(names) if name.startswith(("stiffness", "slope"))
+    ]
+    return Line(
+        "sign of the force",
+        f"least stiffness {min(values):.4g}: negative where the force's sign is told wrongly",
+        min(values) <= 0.0,
+        1.0,
+    )
+
+
+def restitution_errors(contact: ContactFit, runs: list[Run], mass: float) -> tuple[np.ndarray, np.ndarray]:
+    """By how much the force that the law does not explain changes e of each touch, and the noise's part.
+
+    NaN where the numerical model was not a free body, or did not rebound."""
+    delay, plane, inner = contact.posterior.best
+    predicted = contact.problem.force(delay, plane, inner.coefficients)
+    readings, period = contact.readings, contact.problem.motion.period
+    errors, stds = np.full(len(runs), np.nan), np.full(len(runs), np.nan)
+    for lane, run in enumerate(runs):
+        if run.kind != "contact":
+            continue
+        rows = len(run.tick)
+        speed = (
+            np.gradient(run.position_desired, period)
+            if run.velocity_desired is None
+            else run.velocity_desired
+        )
+        counts = readings.counts[:rows, lane]
+        before, after = float(speed[0]), float(speed[-1])
+        if before <= 0.0 or after >= 0.0:
+            continue
+        touching = counts & (run.position_desired > plane - abs(before) * 0.02)
+        left = (readings.force[:rows, lane] - predicted[:rows, lane]) * touching
+        scale = mass * before * abs(after / before)
+        errors[lane] = -float(np.sum(left * speed)) * period / scale / before
+        # Coloured noise adds up by what it holds at low frequencies.
+        slow = readings.std / abs(float(np.sum(readings.whitening)))
+        stds[lane] = slow * period * float(np.sqrt(np.sum((speed * touching) ** 2))) / scale / before
+    return errors, stds
+
+
+def _restitution(errors: np.ndarray, stds: np.ndarray) -> Line:
+    z = errors / stds
+    mean = float(errors.mean())
+    return Line(
+        "restitution of touches not fitted",
+        f"off by {mean:+.2g} on the mean, rms z {np.sqrt(np.mean(z**2)):.2f}",
+        bool(stats.chi2.sf(float(np.sum(z**2)), len(z)) < RARE),
+        float(np.sqrt(np.mean(errors**2))),
+        f"touch {int(np.argmax(np.abs(z)))}",
+    )
+
+
+def _trend(contact: ContactFit, touches: int, angle: float) -> Line | None:
+    """Whether the force over the law's grows or falls from touch to touch."""
+    delay, plane, inner = contact.posterior.best
+    predicted = np.where(
+        contact.readings.counts, contact.problem.force(delay, plane, inner.coefficients), 0.0
+    )
+    force = np.where(contact.readings.counts, contact.readings.force, 0.0)
+    predicted, force = (contact.problem.whiten(value) for value in (predicted, force))
+    power = np.sum(predicted**2, axis=0)
+    used = power > 100.0 * contact.readings.std**2
+    if used.sum() < 4:
+        return None
+    share = np.sum(predicted * force, axis=0)[used] / power[used]
+    weight = power[used] / contact.readings.std**2
+    number = np.flatnonzero(used) / max(touches - 1, 1)
+    centre = np.average(number, weights=weight)
+    spread = np.sum(weight * (number - centre) ** 2)
+    slope = float(np.sum(weight * (number - centre) * share) / spread)
+    # What the law leaves otherwise widens the slope's error too.
+    scatter = share - np.average(share, weights=weight) - slope * (number - centre)
+    inflation = max(1.0, float(np.sum(weight * scatter**2)) / (used.sum() - 2))
+    std = float(np.sqrt(inflation / spread))
+    return Line(
+        "drift from touch to touch",
+        f"force {100 * slope:+.2g} +- {100 * std:.2g} % from the first touch to the last",
+        bool(2.0 * special.ndtr(-abs(slope) / std) < RARE),
+        float(np.pi / 4.0 * angle * abs(slope)),
+    )
