@@ -20,7 +20,8 @@ LONGEST = 0.02  # s, of the delays that are looked at
 COARSE = 0.0005  # s, between the first delays that are looked at
 FINE = 1e-5  # s, between the next: damped touches begin with a jump, and a row on its other side costs much
 REGION = 25.0  # of twice the log posterior below its best: what the final grid covers
-ROUGH_REGION = 400.0  # of the coarse grid
+ROUGH_REGION = 400.0  # the same of the coarse grid, whose heights are full of rows on the wrong side
+FEW_PLANES = 7  # of the grid that finds the region
 DELAYS, PLANES = 61, 13  # of the final grid
 PLANE_REACH = 3.2  # standard deviations of the plane at a given delay, on each side
 DRAWS = 4000
@@ -62,13 +63,14 @@ def profile(
         delays, start = np.clip(near[0] + COARSE * np.linspace(-2.0, 2.0, 9), 0.0, LONGEST), near[1]
         delays = np.unique(delays)
     planes, heights = _scan(problem, delays, start)
-    for step in (FINE, None):
-        low, high = _region(delays, heights)
-        count = size[0] if step is None else int(np.clip((high - low) / step, 21, 151))
-        finer = np.linspace(low, high, count)
-        planes, heights = _scan(problem, finer, np.interp(finer, delays, planes))
-        delays = finer
-    return _sample(problem, delays, planes, seed, size[1])
+    low, high = _region(delays, heights, ROUGH_REGION)
+    finer = np.linspace(low, high, int(np.clip((high - low) / FINE, 21, 151)))
+    places, cells = _grid(problem, finer, np.interp(finer, delays, planes), FEW_PLANES)
+    heights, planes = _by_delay(places, cells, len(finer))
+    low, high = _region(finer, heights, REGION)
+    delays = np.linspace(low, high, size[0])
+    places, cells = _grid(problem, delays, np.interp(delays, finer, planes), size[1])
+    return _sample(problem, places, cells, delays, seed)
 
 
 def first_plane(problem: Problem, delay: float) -> float:
@@ -94,54 +96,75 @@ def _scan(problem: Problem, delays: np.ndarray, starts) -> tuple[np.ndarray, np.
     return np.array(planes), np.array(heights)
 
 
-def _region(delays: np.ndarray, heights: np.ndarray) -> tuple[float, float]:
+def _region(delays: np.ndarray, heights: np.ndarray, reach: float) -> tuple[float, float]:
     """The delays around the best whose posterior is worth a grid, one step wider on each side."""
-    step = delays[1] - delays[0]
-    # Between delays far apart the rows at the onsets change sides, which a coarse grid's heights are full of.
-    reach = REGION if step < COARSE / 2.0 else ROUGH_REGION
     inside = np.flatnonzero(2.0 * (heights.max() - heights) <= reach)
+    step = delays[1] - delays[0]
     return max(0.0, delays[inside[0]] - step), min(LONGEST, delays[inside[-1]] + step)
 
 
-def _sample(problem: Problem, delays: np.ndarray, planes: np.ndarray, seed: int, across: int) -> Posterior:
-    """Draws from the grid: a cell by its weight, a place in it, coefficients by their normal distribution."""
-    cells, places = [], []
-    for delay, centre in zip(delays, planes, strict=True):
-        if problem.plane is not None:
-            cells.append(problem.at(delay, centre))
-            places.append((delay, centre, 0.0))
-            continue
+def _grid(
+    problem: Problem, delays: np.ndarray, centres: np.ndarray, across: int
+) -> tuple[np.ndarray, list[Inner]]:
+    """Fits at each delay and at planes across the plane's uncertainty there.
+
+    The plane alone moves rows to the other side of an onset, so one plane a delay does not tell how good the
+    delay is. Places are rows of (delay, plane, width in the plane)."""
+    places, cells = [], []
+    for delay, centre in zip(delays, centres, strict=True):
         middle = problem.at(delay, centre)
-        reach = PLANE_REACH / np.sqrt(max(middle.curvature, 1e-300))
-        for plane in np.linspace(centre - reach, centre + reach, across):
+        if problem.plane is not None:
+            cells.append(middle)
+            places.append((delay, centre, 1.0))
+            continue
+        std = 1.0 / np.sqrt(max(middle.curvature, 1e-300))
+        # From the parabola's lowest point, unless a row on the wrong side has thrown it far off.
+        centre = centre - np.clip(middle.slope * std, -1.0, 1.0) * std
+        for plane in centre + PLANE_REACH * std * np.linspace(-1.0, 1.0, across):
             cells.append(problem.at(delay, plane))
-            places.append((delay, plane, 2.0 * reach / (across - 1)))
-    heights = np.array([cell.evidence for cell in cells])
-    if problem.plane is None:
-        heights = heights + np.log([place[2] for place in places])
+            places.append((delay, plane, 2.0 * PLANE_REACH * std / (across - 1)))
+    return np.array(places), cells
+
+
+def _by_delay(places: np.ndarray, cells: list[Inner], count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Log posterior of each delay, all planes together, and the mean plane there."""
+    heights = _heights(places, cells).reshape(count, -1)
+    total: Any = special.logsumexp(heights, axis=1)
+    share = np.exp(heights - total[:, None])
+    return total, np.sum(share * places[:, 1].reshape(count, -1), axis=1)
+
+
+def _heights(places: np.ndarray, cells: list[Inner]) -> np.ndarray:
+    """Log posterior of each cell of a grid."""
+    return np.array([cell.evidence for cell in cells]) + np.log(places[:, 2])
+
+
+def _sample(
+    problem: Problem, places: np.ndarray, cells: list[Inner], delays: np.ndarray, seed: int
+) -> Posterior:
+    """Draws from the grid: a cell by its weight, a place in it, coefficients by their normal distribution."""
+    heights = _heights(places, cells)
     weights = np.exp(heights - heights.max())
     weights /= weights.sum()
     rng = np.random.default_rng(seed)
     # Spread evenly over the weights: less luck in the draws.
     picked = np.searchsorted(np.cumsum(weights), (np.arange(DRAWS) + rng.uniform(size=DRAWS)) / DRAWS)
     picked = np.minimum(picked, len(cells) - 1)
-    step = delays[1] - delays[0]
-    rows = []
+    step, rows = delays[1] - delays[0], []
     for index in np.unique(picked):
         count = int(np.sum(picked == index))
         delay, plane, width = places[index]
-        spread = rng.uniform(-0.5, 0.5, (count, 2)) * [step, width]
+        spread = rng.uniform(-0.5, 0.5, (count, 2)) * [step, width * (problem.plane is None)]
         values = _coefficients(cells[index], problem.rate_like, count, rng)
         rows.append(np.column_stack([np.clip(delay + spread[:, 0], 0.0, None), plane + spread[:, 1], values]))
-    by_delay = heights.reshape(len(delays), -1)
-    profile: Any = special.logsumexp(by_delay, axis=1)
+    profile, _ = _by_delay(places, cells, len(delays))
     best = int(np.argmax(heights))
     return Posterior(
         ["delay", "plane", *problem.names],
         rng.permutation(np.concatenate(rows)),
         delays,
         profile - profile.max(),
-        (*places[best][:2], cells[best]),
+        (float(places[best, 0]), float(places[best, 1]), cells[best]),
     )
 
 
