@@ -1,0 +1,80 @@
+"""The page of exit codes and messages, read from the source: every refusal with the module that utters it."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+from tuning.__main__ import BAD, GOOD, INTERRUPTED, UNUSABLE
+
+ROOT = Path(__file__).resolve().parents[2]
+REFUSALS = {"InputError", "KeyProblem", "GainFileError"}
+GAP = "…"
+LEAST = 8  # letters that a message has besides what is filled in
+
+
+def messages() -> str:
+    """Exit codes, and every message of a refusal; `…` stands for what is filled in."""
+    sections = [HEAD]
+    for package in ("jaxhil", "tuning"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            found = sorted(set(_refusals(ast.parse(path.read_text(encoding="utf-8")))))
+            if found:
+                name = str(path.relative_to(ROOT))
+                sections.append(f"### {name}\n\n```text\n" + "\n".join(found) + "\n```")
+    return "\n\n".join(sections) + "\n"
+
+
+def _refusals(tree: ast.Module) -> Iterator[str]:
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    for scope in functions:
+        for node in ast.walk(scope):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in REFUSALS:
+                words = [_words(one, scope) for one in node.args]
+                text = words[0] if len(words) == 1 else f"{GAP}: found {words[1]}, allowed {words[2]}" if len(words) == 3 else ""
+                if sum(map(str.isalpha, text)) >= LEAST:
+                    yield " ".join(text.split())
+
+
+def _words(node: ast.expr, scope: ast.FunctionDef, depth: int = 3) -> str:
+    """The text of an expression, as far as it stands in the source."""
+    match node:
+        case ast.Constant(value=str(text)):
+            return text
+        case ast.JoinedStr(values=parts):
+            return "".join(_words(part, scope, depth) for part in parts)
+        case ast.FormattedValue(value=inner):
+            return _words(inner, scope, depth) if isinstance(inner, ast.Name) else GAP
+        case ast.BinOp(op=ast.Add(), left=left, right=right):
+            return _words(left, scope, depth) + _words(right, scope, depth)
+        case ast.Name(id=name) if depth:
+            texts = [
+                _words(one.value, scope, depth - 1)
+                for one in ast.walk(scope)
+                if isinstance(one, ast.Assign) and any(isinstance(t, ast.Name) and t.id == name for t in one.targets)
+            ]
+            return texts[0] if len(texts) == 1 and texts[0].strip(GAP) else GAP
+        case _:
+            return GAP
+
+
+HEAD = f"""\
+# Exit codes and messages
+
+| exit code | meaning |
+| --- | --- |
+| {GOOD} | done and good |
+| {BAD} | done, and the verdict is bad: an error beyond `--limit`, failed verification, a bundle that is corrupt or was tampered with, an export whose watchdog is wrong too often |
+| {UNUSABLE} | unusable input, or something that cannot be written: one line on standard error says why |
+| {INTERRUPTED} | interrupted; what was finished is kept |
+
+Standard output has the result alone (with `--json` one JSON document); progress, notes and lines that begin
+with `warning:` go to standard error. A refusal is one line, `jaxhil: ` and what was found and what is allowed;
+from Python it is a `jaxhil.InputError` of the same text. `internal error` is a fault of the program: set
+`JAXHIL_TRACEBACK=1` to see where.
+
+## Every refusal
+
+By module; `{GAP}` stands for what is filled in. A key of the mechanism file is refused with the values that its
+[type allows](mechanism_file.md)."""

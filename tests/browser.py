@@ -1,0 +1,167 @@
+"""A headless Chromium that tests open pages in, spoken to over a pipe by the DevTools protocol."""
+
+import fcntl
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+SECONDS = 60.0  # until an answer has to be there
+SETTLED = 200  # milliseconds that scripts of a page get after it has loaded
+# The browser's own descriptors are 3 and 4.
+START = "import os, sys; os.dup2(int(sys.argv[1]), 3); os.dup2(int(sys.argv[2]), 4); os.execv(sys.argv[3], sys.argv[3:])"
+FLAGS = (
+    "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--hide-scrollbars",
+    "--disable-background-networking", "--no-first-run", "--remote-debugging-pipe",
+)  # fmt: skip
+
+# What is wrong with the layout of a page: texts that lie on one another, what sticks out, pictures that are
+# not there. Rectangles of text are cut where a box around them scrolls.
+LAYOUT = """(() => {
+  const faults = [], wide = document.documentElement.clientWidth, boxes = [];
+  if (document.documentElement.scrollWidth > wide + 1)
+    faults.push(`${document.documentElement.scrollWidth} px wide in a window of ${wide}`);
+  for (const picture of document.images)
+    if (!picture.complete || picture.naturalWidth === 0) faults.push(`no picture ${picture.src}`);
+  const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT), range = document.createRange();
+  const shown = { opacityProperty: true, visibilityProperty: true, contentVisibilityAuto: true };
+  for (let node = walker.nextNode(); node; node = walker.nextNode()) {
+    if (!node.data.trim() || !node.parentElement.checkVisibility(shown)) continue;
+    let left = 0, top = -Infinity, right = wide, bottom = Infinity, fixed = false;
+    for (let box = node.parentElement; box && box !== document.body; box = box.parentElement) {
+      const style = getComputedStyle(box), edge = box.getBoundingClientRect();
+      fixed ||= style.position === "fixed";
+      if (style.overflowX !== "visible") { left = Math.max(left, edge.left); right = Math.min(right, edge.right); }
+      if (style.overflowY !== "visible") { top = Math.max(top, edge.top); bottom = Math.min(bottom, edge.bottom); }
+    }
+    if (fixed) continue;
+    range.selectNodeContents(node);
+    for (const edge of range.getClientRects()) {
+      const box = [Math.max(left, edge.left), Math.max(top, edge.top),
+                   Math.min(right, edge.right), Math.min(bottom, edge.bottom)];
+      if (box[2] - box[0] > 3 && box[3] - box[1] > 3) boxes.push([box, node]);
+    }
+  }
+  boxes.sort(([one], [other]) => one[1] - other[1]);
+  for (let i = 0; i < boxes.length; i++)
+    for (let j = i + 1; j < boxes.length && boxes[j][0][1] < boxes[i][0][3] - 4; j++) {
+      const [one, at] = boxes[i], [other, beside] = boxes[j];
+      if (at !== beside && Math.min(one[2], other[2]) - Math.max(one[0], other[0]) > 3)
+        faults.push(`"${at.data.trim().slice(0, 40)}" lies on "${beside.data.trim().slice(0, 40)}"`);
+    }
+  return { faults, texts: boxes.length };
+})()"""
+
+
+class Opened(NamedTuple):
+    """What a page did when it was opened."""
+
+    errors: list[str]  # of its scripts, and on the console
+    elsewhere: list[str]  # addresses asked for that are neither files nor data
+    missing: list[str]  # addresses that could not be had
+
+
+class Browser:
+    """One window; close it when done."""
+
+    def __init__(self, folder: Path) -> None:
+        """`folder` is for the browser's own files."""
+        assert CHROMIUM is not None
+        ends = (*os.pipe(), *os.pipe())
+        # Above 4, so that neither is overwritten on the way.
+        reads, writes = (fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 10) for end in (ends[0], ends[3]))
+        self._out, self._in = os.fdopen(ends[1], "wb"), os.fdopen(ends[2], "rb", 0)
+        flags = (*FLAGS, f"--user-data-dir={folder}")
+        with open(folder / "log", "wb") as log:
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", START, str(reads), str(writes), CHROMIUM, *flags],
+                pass_fds=(reads, writes), stdout=log, stderr=log,
+            )  # fmt: skip
+        for end in (reads, writes, ends[0], ends[3]):
+            os.close(end)
+        os.set_blocking(self._in.fileno(), False)
+        self._rest, self._number, self._events, self._session = b"", 0, [], {}
+        target = self._call("Target.createTarget", url="about:blank")["targetId"]
+        attached = self._call("Target.attachToTarget", targetId=target, flatten=True)
+        self._session = {"sessionId": attached["sessionId"]}
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self._call(f"{domain}.enable")
+        self._call("Page.setLifecycleEventsEnabled", enabled=True)
+
+    def open(self, path: Path, width: int) -> Opened:
+        """Load a file in a window so many pixels wide."""
+        size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
+        self._call("Emulation.setDeviceMetricsOverride", **size)
+        self._events.clear()
+        loader = self._call("Page.navigate", url=path.as_uri())["loaderId"]
+        loaded = {"loaderId": loader, "name": "load"}
+        self._wait(lambda event: loaded.items() <= event["params"].items())
+        self.evaluate(f"new Promise(done => setTimeout(done, {SETTLED}))")
+        return _opened(self._events)
+
+    def evaluate(self, script: str) -> Any:
+        """The value of an expression in the page, waited for if it is a promise."""
+        told = self._call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in told, told
+        return told["result"].get("value")
+
+    def close(self) -> None:
+        """End the browser."""
+        self._session = {}
+        self._call("Browser.close")
+        self._out.close()
+        self._in.close()
+        self._process.wait(SECONDS)
+
+    def _call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": parameters, **self._session}
+        self._out.write(json.dumps(message).encode() + b"\0")
+        self._out.flush()
+        answer = self._read(lambda told: told.get("id") == message["id"])
+        assert "error" not in answer, (method, answer)
+        return answer["result"]
+
+    def _wait(self, wanted) -> None:
+        if not any(map(wanted, self._events)):
+            self._read(lambda told: "method" in told and wanted(told))
+
+    def _read(self, wanted) -> dict[str, Any]:
+        """The first message that is wanted; events on the way are kept."""
+        end = time.monotonic() + SECONDS
+        while time.monotonic() < end:
+            message, found, rest = self._rest.partition(b"\0")
+            if not found:
+                self._rest += self._in.read(1 << 20) or b""
+                time.sleep(0.002)
+                continue
+            self._rest = rest
+            told = json.loads(message)
+            if "method" in told:
+                self._events.append(told)
+            if wanted(told):
+                return told
+        raise TimeoutError("the browser does not answer")
+
+
+def _opened(events: list[dict[str, Any]]) -> Opened:
+    opened = Opened([], [], [])
+    for event in events:
+        said = event["params"]
+        match event["method"]:
+            case "Runtime.exceptionThrown":
+                opened.errors.append(json.dumps(said["exceptionDetails"])[:300])
+            case "Runtime.consoleAPICalled" if said["type"] in ("error", "assert"):
+                opened.errors.append(json.dumps(said["args"])[:300])
+            case "Log.entryAdded" if said["entry"]["level"] == "error":
+                opened.errors.append(json.dumps(said["entry"])[:300])
+            case "Network.requestWillBeSent" if not said["request"]["url"].startswith(("file:", "data:", "blob:")):
+                opened.elsewhere.append(said["request"]["url"])
+            case "Network.loadingFailed" if not said.get("canceled"):
+                opened.missing.append(said["errorText"])
+    return opened
