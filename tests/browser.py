@@ -14,7 +14,10 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 SECONDS = 60.0  # until an answer has to be there
 SETTLED = 200  # milliseconds that scripts of a page get after it has loaded
 # The browser's own descriptors are 3 and 4.
-START = "import os, sys; os.dup2(int(sys.argv[1]), 3); os.dup2(int(sys.argv[2]), 4); os.execv(sys.argv[3], sys.argv[3:])"
+START = """import os, sys
+for number, end in ((3, 1), (4, 2)):
+    os.dup2(int(sys.argv[end]), number)
+os.execv(sys.argv[3], sys.argv[3:])"""
 FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--hide-scrollbars",
     "--disable-background-networking", "--no-first-run", "--remote-debugging-pipe",
@@ -28,7 +31,8 @@ LAYOUT = """(() => {
     faults.push(`${document.documentElement.scrollWidth} px wide in a window of ${wide}`);
   for (const picture of document.images)
     if (!picture.complete || picture.naturalWidth === 0) faults.push(`no picture ${picture.src}`);
-  const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT), range = document.createRange();
+  const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  const range = document.createRange();
   const shown = { opacityProperty: true, visibilityProperty: true, contentVisibilityAuto: true };
   for (let node = walker.nextNode(); node; node = walker.nextNode()) {
     if (!node.data.trim() || !node.parentElement.checkVisibility(shown)) continue;
@@ -36,8 +40,10 @@ LAYOUT = """(() => {
     for (let box = node.parentElement; box && box !== document.body; box = box.parentElement) {
       const style = getComputedStyle(box), edge = box.getBoundingClientRect();
       fixed ||= style.position === "fixed";
-      if (style.overflowX !== "visible") { left = Math.max(left, edge.left); right = Math.min(right, edge.right); }
-      if (style.overflowY !== "visible") { top = Math.max(top, edge.top); bottom = Math.min(bottom, edge.bottom); }
+      if (style.overflowX !== "visible")
+        [left, right] = [Math.max(left, edge.left), Math.min(right, edge.right)];
+      if (style.overflowY !== "visible")
+        [top, bottom] = [Math.max(top, edge.top), Math.min(bottom, edge.bottom)];
     }
     if (fixed) continue;
     range.selectNodeContents(node);
@@ -155,12 +161,14 @@ def _opened(events: list[dict[str, Any]]) -> Opened:
         said = event["params"]
         match event["method"]:
             case "Runtime.exceptionThrown":
-                opened.errors.append(json.dumps(said["exceptionDetails"])[:300])
+                opened.errors.append(said["exceptionDetails"]["exception"].get("description", "an exception"))
             case "Runtime.consoleAPICalled" if said["type"] in ("error", "assert"):
-                opened.errors.append(json.dumps(said["args"])[:300])
+                opened.errors.append(json.dumps(said["args"]))
             case "Log.entryAdded" if said["entry"]["level"] == "error":
-                opened.errors.append(json.dumps(said["entry"])[:300])
-            case "Network.requestWillBeSent" if not said["request"]["url"].startswith(("file:", "data:", "blob:")):
+                opened.errors.append(json.dumps(said["entry"]))
+            case "Network.requestWillBeSent" if not said["request"]["url"].startswith(
+                ("file:", "data:", "blob:")
+            ):
                 opened.elsewhere.append(said["request"]["url"])
             case "Network.loadingFailed" if not said.get("canceled"):
                 opened.missing.append(said["errorText"])

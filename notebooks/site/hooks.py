@@ -1,5 +1,4 @@
-"""What the site has besides the pages of the guide: README and changelog from the top of the repository, and the
-generated reference."""
+"""What the site has besides the pages of the guide: README and changelog, and the generated reference."""
 
 import re
 from pathlib import Path
@@ -23,7 +22,9 @@ def on_files(files, config):
 def on_page_markdown(markdown, page, config, files):
     """Links to the top of the repository lead to those pages."""
     for name, target in TOP.items():
-        markdown = re.sub(rf"\]\((\.\./)*{re.escape(name)}", f"]({'../' * page.file.src_uri.count('/')}{target}", markdown)
+        markdown = re.sub(
+            rf"\]\((\.\./)*{re.escape(name)}", f"]({'../' * page.file.src_uri.count('/')}{target}", markdown
+        )
     return markdown
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from tuning.__main__ import BAD, GOOD, INTERRUPTED, UNUSABLE
 ROOT = Path(__file__).resolve().parents[2]
 REFUSALS = {"InputError", "KeyProblem", "GainFileError"}
 GAP = "…"
-LEAST = 8  # letters that a message has besides what is filled in
+PLAIN = re.compile(r"found|allowed|\W|_")  # what every message has
 
 
 def messages() -> str:
@@ -32,9 +33,11 @@ def _refusals(tree: ast.Module) -> Iterator[str]:
         for node in ast.walk(scope):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in REFUSALS:
                 words = [_words(one, scope) for one in node.args]
-                text = words[0] if len(words) == 1 else f"{GAP}: found {words[1]}, allowed {words[2]}" if len(words) == 3 else ""
-                if sum(map(str.isalpha, text)) >= LEAST:
-                    yield " ".join(text.split())
+                if len(words) == 3:  # a key's path, what was found, what is allowed
+                    words = [f"{GAP}: found {words[1]}, allowed {words[2]}"]
+                text = re.sub(f"{GAP}+", GAP, " ".join("".join(words).split()))
+                if PLAIN.sub("", text):
+                    yield text
 
 
 def _words(node: ast.expr, scope: ast.FunctionDef, depth: int = 3) -> str:
@@ -49,14 +52,19 @@ def _words(node: ast.expr, scope: ast.FunctionDef, depth: int = 3) -> str:
         case ast.BinOp(op=ast.Add(), left=left, right=right):
             return _words(left, scope, depth) + _words(right, scope, depth)
         case ast.Name(id=name) if depth:
-            texts = [
-                _words(one.value, scope, depth - 1)
-                for one in ast.walk(scope)
-                if isinstance(one, ast.Assign) and any(isinstance(t, ast.Name) and t.id == name for t in one.targets)
-            ]
-            return texts[0] if len(texts) == 1 and texts[0].strip(GAP) else GAP
+            texts = [_words(value, scope, depth - 1) for value in _assigned(scope, name)]
+            return texts[0] if len(texts) == 1 else GAP
         case _:
             return GAP
+
+
+def _assigned(scope: ast.FunctionDef, name: str) -> Iterator[ast.expr]:
+    """What a function gives to a name of its own."""
+    for node in ast.walk(scope):
+        if isinstance(node, ast.Assign):
+            for target in node.targets:
+                if isinstance(target, ast.Name) and target.id == name:
+                    yield node.value
 
 
 HEAD = f"""\
@@ -65,16 +73,16 @@ HEAD = f"""\
 | exit code | meaning |
 | --- | --- |
 | {GOOD} | done and good |
-| {BAD} | done, and the verdict is bad: an error beyond `--limit`, failed verification, a bundle that is corrupt or was tampered with, an export whose watchdog is wrong too often |
+| {BAD} | done, and the verdict is bad: an error beyond `--limit`, a corrupt bundle, wrong alarms too often |
 | {UNUSABLE} | unusable input, or something that cannot be written: one line on standard error says why |
 | {INTERRUPTED} | interrupted; what was finished is kept |
 
 Standard output has the result alone (with `--json` one JSON document); progress, notes and lines that begin
-with `warning:` go to standard error. A refusal is one line, `jaxhil: ` and what was found and what is allowed;
-from Python it is a `jaxhil.InputError` of the same text. `internal error` is a fault of the program: set
-`JAXHIL_TRACEBACK=1` to see where.
+with `warning:` go to standard error. A refusal is one line, `jaxhil: ` and what was found and what is
+allowed; from Python it is a `jaxhil.InputError` of the same text. `internal error` is a fault of the program:
+set `JAXHIL_TRACEBACK=1` to see where.
 
 ## Every refusal
 
-By module; `{GAP}` stands for what is filled in. A key of the mechanism file is refused with the values that its
-[type allows](mechanism_file.md)."""
+By module; `{GAP}` stands for what is filled in. A key of the mechanism file is refused with the values that
+its [type allows](mechanism_file.md)."""

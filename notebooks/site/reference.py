@@ -14,14 +14,15 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from messages import messages
-from tyro.conf import Positional
+from tyro.conf import FlagCreatePairsOff, Positional
 
 import jaxhil
 import tuning
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.compensators import COMPENSATORS, Gain
 from jaxhil.mechanism.file import builtin_names, load, suite_names
 from jaxhil.mechanism.json_schema import json_schema
 from jaxhil.mechanism.keys import Key, Table, tables
+from jaxhil.mechanism.structs import Mechanism
 from tuning.cli.parser import DESCRIPTION, Command
 
 DEFAULT = "varying"
@@ -55,13 +56,7 @@ def gains() -> str:
     mechanism = load(DEFAULT).mechanism
     sections = [GAINS]
     for name, law in COMPENSATORS.items():
-        rows = [
-            [f"`{gain.name}`", gain.unit, *(f"{bound(mechanism):.4g}" for bound in (gain.lower, gain.upper, gain.nominal)),
-             "yes" if gain.tuned(mechanism) else "no"]
-            for gain in law.gains
-        ]  # fmt: skip
-        if any(not row[1] for row in rows):
-            raise ValueError(f"{name}: a gain without unit")
+        rows = [_row_of_gain(gain, mechanism) for gain in law.gains]
         text = inspect.getdoc(inspect.getmodule(type(law))) or ""
         known = ", ".join(law.knows) or "nothing"
         sections += [f"### {name}\n\nHas to know beforehand: {known}.\n\n```text\n{text.strip()}\n```"]
@@ -76,7 +71,7 @@ def python() -> str:
     homes = {f"jaxhil.{name}": f"{home}.{name}" for name, home in jaxhil._HOMES.items()}
     homes |= {f"tuning.{name}": f"tuning.front_door.{name}.{name}" for name in tuning.__all__}
     entries = [
-        f"## {name}\n\n::: {home}\n    options:\n      show_root_heading: false\n      heading_level: 3"
+        f"## {name}\n\n::: {home}\n    options:\n      show_root_heading: false\n      show_root_toc_entry: false\n      heading_level: 3"
         for name, home in homes.items()
     ]
     return "\n\n".join([PYTHON, *entries]) + "\n"
@@ -86,6 +81,13 @@ def _table_of_keys(table: Table) -> str:
     title = f"`[{table.path}]`" if table.path else "Head of the file"
     heads = ["key", "meaning", "unit", "allowed", "default", "used by"]
     return f"\n## {title}\n\n{table.meaning}\n\n{_table(heads, map(_row_of_key, table.keys))}\n"
+
+
+def _row_of_gain(gain: Gain, mechanism: Mechanism) -> list[str]:
+    if not gain.unit:
+        raise ValueError(f"{gain.name}: a gain without unit")
+    numbers = [f"{value(mechanism):.4g}" for value in (gain.lower, gain.upper, gain.nominal)]
+    return [f"`{gain.name}`", gain.unit, *numbers, "yes" if gain.tuned(mechanism) else "no"]
 
 
 def _row_of_key(key: Key) -> list[str]:
@@ -115,19 +117,25 @@ def _command(options: type, *about: Any) -> str:
         said = next(mark for mark in marks if hasattr(mark, "metavar"))
         if not said.help:
             raise ValueError(f"{name}: {field.name} has no help")
-        rows.append([_usage(field.name, said, Positional in marks), said.help, _default(field, said)])
+        negated = kind is bool and FlagCreatePairsOff not in marks
+        usage = _usage(field.name, said, Positional in marks, negated)
+        rows.append([usage, said.help, _default(field, said)])
     document = inspect.getdoc(options) or ""
     example = "\n\n".join(
-        f"```sh\n{part.removeprefix('Example: ')}\n```" if part.startswith("Example: ") else " ".join(part.split())
+        f"```sh\n{part.removeprefix('Example: ')}\n```"
+        if part.startswith("Example: ")
+        else " ".join(part.split())
         for part in document.split("\n\n")
     )
     return f"## jaxhil {name}\n\n{example}\n\n{_table(['option', 'meaning', 'default'], rows)}"
 
 
-def _usage(field: str, said: Any, positional: bool) -> str:
+def _usage(field: str, said: Any, positional: bool, negated: bool) -> str:
     if positional:
         return f"`{said.metavar}`"
-    names = [*(said.aliases or ()), f"--{(said.name or field).replace('_', '-')}"]
+    name = (said.name or field).replace("_", "-")
+    names = [*(said.aliases or ()), f"--{name}"]
+    names += [f"--no-{one.removeprefix('--')}" for one in names if negated]
     return f"`{', '.join(sorted(names, key=len))}{f' {said.metavar}' if said.metavar else ''}`"
 
 
@@ -148,11 +156,11 @@ def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 MECHANISM_FILE = """\
 # The mechanism file
 
-TOML, one file for one docking mechanism on one rig: `schema = "jaxhil/mechanism/1"`. `jaxhil init FILE` writes
-one with every key explained. This page is made of the types that read it. Numbers are in SI units, natural
-frequencies in Hz. A key that is not given has its default; an unknown key, a wrong type or a value that is not
-allowed ends in one line that names file, key, what was found and what is allowed, and in exit code 2. A key that
-the chosen law or model does not use is refused where it says anything.
+TOML, one file for one docking mechanism on one rig: `schema = "jaxhil/mechanism/1"`. `jaxhil init FILE`
+writes one with every key explained. This page is made of the types that read it. Numbers are in SI units,
+natural frequencies in Hz. A key that is not given has its default; an unknown key, a wrong type or a value
+that is not allowed ends in one line that names file, key, what was found and what is allowed, and in exit
+code 2. A key that the chosen law or model does not use is refused where it says anything.
 
 Editors complete and check such files by the [JSON Schema](mechanism.schema.json)
 (`jaxhil mechanisms --schema > mechanism.schema.json`); those that go by a line of the file itself want
@@ -170,8 +178,8 @@ GAINS = f"""\
 
 ## The gain file
 
-JSON, `schema = "jaxhil/gains/1"`, written by `jaxhil tune` and read by `sweep`, `verify`, `export` and the rig's
-controller:
+JSON, `schema = "jaxhil/gains/1"`, written by `jaxhil tune` and read by `sweep`, `verify`, `export` and the
+rig's controller:
 
 | key | holds |
 | --- | --- |
@@ -181,7 +189,7 @@ controller:
 | `control_period` | [s], which the rig's has to equal |
 | `mechanism` | the whole mechanism, with what `--set` and `--unset` changed |
 | `mechanism_sha256` | SHA-256 of its file |
-| `envelope` | what it was tuned over: `contact_frequency`, `delay`, `approach_velocity`, `force`, each `low`, `high`, `unit` |
+| `envelope` | `low`, `high` and `unit` of the contact frequency, delay, speed and force it was tuned over |
 | `figures` | what the gains reach, beside the literature's and none |
 | `seed`, `versions`, `created`, `timings` | how it was made |
 | `sha256` | digest of the content, dates and timings apart |

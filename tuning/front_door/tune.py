@@ -234,8 +234,11 @@ def tune(
         validation: how many fresh scenarios to judge on.
         objective: of the errors e - e*: "rms", "cvar" (mean of the worst 5 percent) or "worst"; or a
             function of the metrics of all scenarios, which returns a number >= 0 to be made small.
-        divergence_weight, command_weight, noise_weight, chatter_weight, transparency_weight: of the penalties
-            beside the objective, see `tuning.gains.objective.Objective`; None: what the law calls for.
+        divergence_weight: how much more a squared divergence counts than a squared convergence.
+        command_weight: of commands beyond the reference's peak; None: what the law calls for.
+        noise_weight: of amplified sensor noise.
+        chatter_weight: of commands that swing too often.
+        transparency_weight: of the errors of pushed and damped scenarios; None: what the law calls for.
         global_search: also search all gains' whole ranges, with 50 times the evaluations.
         pareto: also so many gains that trade the error for something else.
         pareto_against: for what: "noise", "peak" (of the command) or "honesty"; by default "noise", or "peak"

@@ -1,0 +1,174 @@
+"""The documentation site: nothing is missing in its generated pages; it is built, and opened in a browser."""
+
+import os
+import re
+import subprocess
+import sys
+import typing
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urldefrag
+
+import pytest
+from browser import CHROMIUM, LAYOUT, Browser
+
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.mechanism.keys import tables
+from tuning.cli.parser import Command
+
+ROOT = Path(__file__).resolve().parents[1]
+SITE = ROOT / "notebooks" / "site"
+WIDTHS = (375, 1440)
+COMMANDS = [typing.get_args(entry)[1].name for entry in typing.get_args(Command)]
+BAD = """<!doctype html><meta name="viewport" content="width=device-width"><body style="margin: 0">
+<p style="margin: 0">One</p>
+<p style="margin: -1.2em 0 0">lies on the other</p><div style="width: 500px">wide</div><img src="nowhere.png">
+<script>console.error("heard"); undefined_name()</script><script src="http://127.0.0.1:9/x.js"></script>"""
+
+
+@pytest.fixture(scope="module")
+def reference():
+    sys.path.insert(0, str(SITE))
+    try:
+        import reference
+
+        yield reference.pages()
+    finally:
+        sys.path.remove(str(SITE))
+
+
+def test_every_key_of_the_mechanism_file_is_there(reference):
+    text = reference["reference/mechanism_file.md"]
+    for table in tables():
+        part = text[text.index(f"## `[{table.path}]`") :] if table.path else text
+        for key in table.keys:
+            row = re.search(rf"^\| `{key.name}` \|.*", part, re.M)[0].split(" | ")
+            assert row[1] == key.meaning and key.allowed.replace("|", "\\|") in row
+            assert row[2] == (key.unit or row[2])
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_is_there(jaxhil, reference, command):
+    text = reference["reference/commands.md"]
+    [part] = re.findall(rf"^## jaxhil {command}$(.*?)(?=^## |\Z)", text, re.M | re.S)
+    options = set(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", jaxhil(command, "--help").out.split("options")[1]))
+    assert options - {"-h", "--help"} <= set(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", part))
+
+
+def test_every_gain_is_there(reference):
+    text = reference["reference/gains.md"]
+    for name, law in COMPENSATORS.items():
+        [part] = re.findall(rf"^### {name}$(.*?)(?=^### |\Z)", text, re.M | re.S)
+        listed = re.findall(r"^\| `(\w+)` \| ([^|]+) \|", part, re.M)
+        assert listed == [(one.name, one.unit) for one in law.gains]
+
+
+def test_messages_are_those_that_users_see(jaxhil, reference):
+    """A refusal that is met stands on the page, `…` where something is filled in."""
+    lines = re.findall(r"^(.*….*)$", reference["reference/messages.md"], re.M)
+    patterns = [re.compile(".*".join(map(re.escape, line.split("…"))) + "$") for line in lines]
+    for arguments in (
+        ["simulate", "no.toml"],
+        ["simulate", "--plot=x.doc"],
+        ["tune", "--set", "rig.noise=1"],
+    ):
+        said = jaxhil(*arguments).err.strip().removeprefix("jaxhil: ")
+        assert any(pattern.match(said) for pattern in patterns), said
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    pytest.importorskip("mkdocs")
+    pytest.importorskip("mkdocs_jupyter")
+    folder = tmp_path_factory.mktemp("site")
+    inherited = os.environ.get("PYTHONPATH")
+    places = os.pathsep.join([str(ROOT), *([inherited] if inherited else [])])
+    command = ["mkdocs", "build", "--quiet", "-f", SITE / "mkdocs.yml", "-d", folder]
+    built = subprocess.run(
+        [sys.executable, "-m", *command], env={**os.environ, "PYTHONPATH": places},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert built.returncode == 0, built.stderr
+    return folder
+
+
+class Page(HTMLParser):
+    """Addresses that a page leads to, what it loads, and the names of its places."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.links, self.loads, self.places = [], [], {""}
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        self.places.add(given.get("id"))
+        if tag == "a" and "href" in given:
+            self.links.append(given["href"])
+        elif tag in ("link", "script", "img", "iframe"):
+            self.loads += [given[name] for name in ("href", "src") if name in given]
+
+
+@pytest.mark.slow
+def test_every_link_leads_somewhere(site):
+    pages = {path: Page(path) for path in sorted(site.rglob("*.html"))}
+    assert len(pages) > 20
+    for path, page in pages.items():
+        assert not [load for load in page.loads if "://" in load or load.startswith("//")], path
+        for link in page.links + [load for load in page.loads if not load.startswith("data:")]:
+            address, place = urldefrag(link)
+            if "://" in address or address.startswith("mailto:"):
+                continue
+            target = (path.parent / unquote(address)).resolve() if address else path
+            assert target.exists(), f"{path.name}: {link}"
+            assert target.suffix != ".html" or unquote(place) in pages[target].places, f"{path.name}: {link}"
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    if CHROMIUM is None:
+        pytest.skip("no Chromium")
+    browser = Browser(tmp_path_factory.mktemp("browser"))
+    yield browser
+    browser.close()
+
+
+@pytest.mark.slow
+def test_the_browser_finds_what_is_wrong(browser, tmp_path):
+    path = tmp_path / "bad.html"
+    path.write_text(BAD)
+    opened = browser.open(path, 375)
+    assert any("heard" in error for error in opened.errors)
+    assert any("undefined_name" in error for error in opened.errors)
+    assert opened.elsewhere == ["http://127.0.0.1:9/x.js"] and len(opened.missing) == 2
+    found = browser.evaluate(LAYOUT)["faults"]
+    assert [" ".join(fault.split()[:2]) for fault in found] == ["500 px", "no picture", '"lies on']
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", WIDTHS)
+def test_every_page_opens_offline(site, browser, width):
+    """No error, nothing from elsewhere, no picture missing, nothing too wide, no text on another."""
+    for path in sorted(site.rglob("*.html")):
+        name = str(path.relative_to(site))
+        assert browser.open(path, width) == ([], [], []), name
+        seen = browser.evaluate(LAYOUT)
+        assert seen["faults"] == [] and seen["texts"] > 10, name
+
+
+@pytest.mark.slow
+def test_the_search_finds_a_key_offline(site, browser):
+    browser.open(site / "index.html", 1440)
+    found = """new Promise(done => {
+      const field = document.querySelector("[data-md-component=search-query]");
+      field.focus();
+      field.value = "unloading_ratio";
+      field.dispatchEvent(new Event("keyup", { bubbles: true }));
+      field.dispatchEvent(new Event("input", { bubbles: true }));
+      const look = left => {
+        const links = [...document.querySelectorAll(".md-search-result__link")].map(link => link.pathname);
+        if (links.length || !left) done(links); else setTimeout(look, 100, left - 1);
+      };
+      look(100);
+    })"""
+    assert any(link.endswith("reference/mechanism_file.html") for link in browser.evaluate(found))
