@@ -70,10 +70,9 @@ def python() -> str:
     """The functions and classes of the two front doors."""
     homes = {f"jaxhil.{name}": f"{home}.{name}" for name, home in jaxhil._HOMES.items()}
     homes |= {f"tuning.{name}": f"tuning.front_door.{name}.{name}" for name in tuning.__all__}
-    entries = [
-        f"## {name}\n\n::: {home}\n    options:\n      show_root_heading: false\n      show_root_toc_entry: false\n      heading_level: 3"
-        for name, home in homes.items()
-    ]
+    options = {"show_root_heading": "false", "show_root_toc_entry": "false", "heading_level": "3"}
+    stated = "".join(f"\n      {option}: {value}" for option, value in options.items())
+    entries = [f"## {name}\n\n::: {home}\n    options:{stated}" for name, home in homes.items()]
     return "\n\n".join([PYTHON, *entries]) + "\n"
 
 
