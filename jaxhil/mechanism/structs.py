@@ -237,7 +237,8 @@ class Uncertainty(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
 
 class Correlation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which uncertain numbers vary together: see `jaxhil.mechanism.correlation`."""
+    """Which uncertain numbers vary together: each keeps its distribution, and the standard normal numbers
+    behind them are correlated (a Gaussian copula)."""
 
     keys: Annotated[
         list[UncertainKey], Meta(min_length=1, max_length=100, description="what varies together")

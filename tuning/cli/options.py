@@ -106,6 +106,9 @@ class Simulate:
     plot: Annotated[
         str | None, arg(metavar="[PICTURE]", help=f"Plot to a .png, .pdf or .svg file; bare: {DEFAULT_PLOT}.")
     ] = None
+    log: Annotated[
+        str | None, text("FILE", "Write every tick to a CSV file, as a rig's log, which identify reads.")
+    ] = None
     limit: Limit = 0.01
     seed: Annotated[int, number("Seed of the sensor noise.")] = 0
     json: Json = False

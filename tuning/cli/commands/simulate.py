@@ -38,6 +38,9 @@ def run(options: Simulate) -> int:
     if options.plot is not None:
         done.plot(options.plot)
         terminal.note(f"wrote {options.plot}")
+    if options.log is not None:
+        done.to_csv(options.log)
+        terminal.note(f"wrote {options.log}")
     contacts = [_entry(contact) for contact in done.contacts]
     if options.json:
         terminal.emit_json(

@@ -1,0 +1,208 @@
+"""A draft of a mapping, from the names of columns and from what is in them: to be read before it is used.
+
+Names tell which channel a column is and, in brackets or behind an underscore, its unit; numbers tell the unit
+where no name does, and the signs: contact is deepest where the force is largest, and a force that pushes back
+is positive.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxhil.errors import InputError, one_line
+from tuning.identification.logs.mapping import KINDS, SCHEMA
+from tuning.identification.logs.readers import Columns, Log, open_log
+from tuning.identification.logs.segments import resting, threshold
+from tuning.identification.logs.units import OF_CHANNEL
+
+# Words of names, the most telling first: a column is what its first match says.
+WORDS = {
+    "time": r"^t$|time|stamp|clock",
+    "velocity_desired": r"^v_?d$|vel\w*_?(des|cmd|com|ref)|(des|cmd|com|ref)\w*_?vel",
+    "force_command": r"^f_?c$|(force|f)_?(cmd|com|ref)|(cmd|com|ref)\w*_?force",
+    "contact_index": r"^contact(_?(index|number|no))?$|touch_?(index|number|no)",
+    "mode": r"^mode$|^state$|^phase$",
+    "force_measured": r"force|load|^f_?m?$|^f_?[xyz]$|newton|cell",
+    "position_desired": r"^x_?d$|cmd|command|desired|demand|set_?point|target|reference|(^|_)ref",
+    "position_measured": r"^x_?m$|^x_?a$|pos|meas|actual|feedback|disp|lvdt|encoder|^x$",
+}
+REQUIRED = ("position_desired", "position_measured")
+TYPICAL = {"position_desired": 0.5, "position_measured": 0.5, "velocity_desired": 1.0}  # largest, in SI units
+LOOK = 200_000  # rows
+SIZES = (("s", 1.0), ("ms", 1e-3), ("us", 1e-6))
+SLOWEST = 0.02  # s, between rows
+
+_UNITS = {unit for units in OF_CHANNEL.values() for unit in units if unit != "m"}
+
+
+class Guess(NamedTuple):
+    """A channel's column, unit and sign, and what they are guessed from."""
+
+    column: str
+    unit: str | None
+    sign: int
+    why: str
+
+
+def draft(paths: Sequence[Path]) -> str:
+    """The text of a mapping file for these logs. Raises `InputError` where not even that can be told."""
+    if not paths:
+        raise InputError("logs: found none, allowed one or more files")
+    logs = {path: open_log(path) for path in paths}
+    first = next(iter(logs.values()))
+    columns = _columns(first.names)
+    for name in REQUIRED:
+        if name not in columns:
+            some = ", ".join(one_line(one, 40) for one in first.names[:12])
+            raise InputError(f"{first.label}: found no column named like {name} among {some}, allowed one")
+    kinds = {path: _kind(path, log, columns) for path, log in logs.items()}
+    # Signs show where there is contact.
+    best = next((path for path, kind in kinds.items() if kind == "contact"), paths[0])
+    guesses = _guesses(logs[best], columns)
+    return "\n".join([*_head(guesses), *_timing(logs[best], guesses), *_runs(paths, kinds), ""])
+
+
+def _columns(names: Sequence[str]) -> dict[str, str]:
+    """The column of each channel that is named like one."""
+    found: dict[str, str] = {}
+    for name in names:
+        bare = _bare(name)
+        for channel, words in WORDS.items():
+            if re.search(words, bare):
+                found.setdefault(channel, name)
+                break
+    return found
+
+
+def _bare(name: str) -> str:
+    """In small letters, without the unit."""
+    bare = re.sub(r"\s*[\[(][^\])]*[\])]\s*$", "", name).strip().lower().replace(" ", "_").replace("-", "_")
+    head, _, tail = bare.rpartition("_")
+    return head if head and any(tail == unit.lower() for unit in _UNITS) else bare
+
+
+def _unit(name: str, channel: str) -> str | None:
+    """That the name ends in: in brackets, or behind an underscore (`x_m` is measured, not in metres)."""
+    found = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$|_([A-Za-z]+)$", name)
+    if found is None or found.group(2) == "m":
+        return None
+    word = (found.group(1) or found.group(2)).replace("\u00b5", "u").lower()
+    return next((unit for unit in OF_CHANNEL.get(channel, {}) if unit.lower() == word), None)
+
+
+def _kind(path: Path, log: Log, columns: Mapping[str, str]) -> str:
+    """What was done, by the file's name, else by its numbers."""
+    named = [kind for kind in KINDS if kind in path.stem.lower()]
+    if named:
+        return named[0]
+    wanted = [columns[name] for name in ("position_desired", "force_measured") if name in columns]
+    read = {name: values[:LOOK] for name, values in log.read(wanted).items()}
+    if np.ptp(read[columns["position_desired"]]) == 0.0:
+        return "rest"
+    force = read.get(columns.get("force_measured", ""))
+    if force is None or len(force) < 100:
+        return "free"
+    return "contact" if np.mean(np.abs(force - resting(force)) > 2 * threshold(force)) > 0.01 else "free"
+
+
+def _guesses(log: Log, columns: Mapping[str, str]) -> dict[str, Guess]:
+    whole = log.read(list(dict.fromkeys(columns.values())))
+    read: Columns = {name: values[:LOOK] for name, values in whole.items()}
+    signs = _signs(read, columns)
+    found = {}
+    for channel, column in columns.items():
+        unit, why = _unit(column, channel), "by its name"
+        values = read[column]
+        if unit is None and channel == "time" and values.dtype != object:
+            step = float(np.median(np.diff(values))) if len(values) > 1 else 0.0
+            unit = next(
+                (one for one, size in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)) if step * size <= 0.02), "ns"
+            )
+            why += f"; rows are {step:.4g} {unit} apart"
+        elif unit is None and channel in TYPICAL and np.ptp(values) > TYPICAL[channel]:
+            size = float(np.ptp(values))
+            unit = "um" if size > 1000 * TYPICAL[channel] else "mm"
+            unit += "/s" * (channel == "velocity_desired")
+            why += f"; {size:.3g} from least to greatest"
+        found[channel] = Guess(column, unit, signs.get(channel, 1), why)
+    return found
+
+
+def _signs(read: Columns, columns: Mapping[str, str]) -> dict[str, int]:
+    """Of positions, such that they grow towards where the force is; of forces, such that these push back."""
+
+    def of(channel: str) -> np.ndarray | None:
+        values = read.get(columns.get(channel, ""))
+        return None if values is None or values.dtype == object else values
+
+    force, x, measured = of("force_measured"), of("position_desired"), of("position_measured")
+    assert x is not None and measured is not None
+    signs = {}
+    towards = 1
+    if force is not None and len(force) > 100:
+        away = force - resting(force)
+        touched = np.abs(away) > threshold(force)
+        if np.any(touched) and not np.all(touched):
+            signs["force_measured"] = int(np.sign(np.median(away[touched])) or 1)
+            towards = int(np.sign(np.mean(x[touched]) - np.mean(x[~touched])) or 1)
+            command = of("force_command")
+            if command is not None and np.any(command[touched]):
+                signs["force_command"] = int(np.sign(np.median(command[touched])) or 1)
+    together = int(np.sign(np.dot(x - np.mean(x), measured - np.mean(measured))) or 1)
+    return signs | {
+        "position_desired": towards,
+        "velocity_desired": towards,
+        "position_measured": towards * together,
+    }
+
+
+def _head(guesses: Mapping[str, Guess]) -> list[str]:
+    lines = ["# A draft: check every line. A number means sign (scale number + offset), in the unit.", ""]
+    lines += [f'schema = "{SCHEMA}"', "", "[channels]"]
+    if "time" not in guesses:
+        lines.append("time = { rate = 1000.0 }  # Hz: no column is named like one of stamps")
+    for channel in [name for name in (*OF_CHANNEL, "mode", "contact_index") if name in guesses]:
+        one = guesses[channel]
+        said = [f"column = {json.dumps(one.column, ensure_ascii=False)}"]
+        said += [f'unit = "{one.unit}"'] if one.unit else []
+        said += [f"sign = {one.sign}"] if one.sign < 0 else []
+        lines.append(f"{channel} = {{ {', '.join(said)} }}  # {one.why}")
+    return lines
+
+
+def _timing(log: Log, guesses: Mapping[str, Guess]) -> list[str]:
+    lines, time, period = ["", "[timing]"], guesses.get("time"), 0.001
+    stamps = np.empty(0) if time is None else log.read([time.column])[time.column][:LOOK]
+    if time is not None and stamps.dtype != object and len(stamps) > 1:
+        step = float(np.median(np.diff(stamps))) * OF_CHANNEL["time"][time.unit or "s"]
+        period = float(f"{step:.3g}")
+    return [
+        *lines,
+        f"control_period = {period:g}",
+        'command_hold = "linear"  # or "zoh": what the drives do between ticks',
+        "command_latency = 0  # periods until a command reaches the drives: 0 or 1",
+        'row = "tick"  # or "sent": with the next tick\'s command; "after": with the next tick\'s readings',
+        "",
+        "# [bodies]  # of the numerical model; needed unless a prior says it",
+        "# equivalent_mass = 350.0",
+    ]
+
+
+def _runs(paths: Sequence[Path], kinds: Mapping[Path, str]) -> list[str]:
+    lines = []
+    for kind in dict.fromkeys(kinds.values()):
+        names = [path.name for path in paths if kinds[path] == kind]
+        suffix = Path(names[0]).suffix
+        pattern = f"{kind}*{suffix}"
+        mine = {path.name for path in paths if fnmatch(path.name, pattern)}
+        files = json.dumps(pattern if mine == set(names) else names, ensure_ascii=False)
+        others = ", ".join(one for one in KINDS if one != kind)
+        lines += ["", "[[runs]]", f"files = {files}", f'kind = "{kind}"  # or {others}']
+    return lines
