@@ -9,7 +9,7 @@ from tuning.identification.logs.campaign import read_campaign
 from tuning.identification.logs.guess import draft
 from tuning.identification.logs.mapping import load_mapping
 
-LOG = touches(2)
+LOG = touches(1)
 NAMES = [
     ("t", "xd", "xm", "F"),
     ("Time [ms]", "Position command [mm]", "Position [mm]", "Force [N]"),
@@ -46,7 +46,7 @@ def test_our_own_columns_and_those_that_are_named_like_none(tmp_path):
         "velocity_desired",
         "position_measured",
     )
-    columns = (LOG["t"], LOG["F"], LOG["Fc"], LOG["xd"], LOG["vd"], LOG["xm"], np.zeros(1200))
+    columns = (LOG["t"], LOG["F"], LOG["Fc"], LOG["xd"], LOG["vd"], LOG["xm"], np.zeros(600))
     path = write_csv(tmp_path / "run.csv", dict(zip((*own, "contact"), columns, strict=True)))
     text = draft([path])
     for name in own:

@@ -1,6 +1,7 @@
 """Logs that were cut, torn, mistyped or shuffled: a campaign of finite numbers, or one line; nothing else."""
 
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 from log_cases import read, sway, touches, write_csv
 
 from jaxhil.errors import InputError
+from tuning.identification.logs.guess import draft
 
 CELLS = [
     "",
@@ -76,6 +78,8 @@ def check(kind, changes, timing):
     with tempfile.TemporaryDirectory() as folder:
         path = write_csv(Path(folder) / "a.csv", LOGS[kind])
         path.write_bytes(mutated(path.read_bytes(), changes))
+        with suppress(InputError):
+            assert draft([path]).startswith("# A draft")
         try:
             found = read(path, kind, timing=timing)
         except InputError as error:

@@ -1,9 +1,15 @@
-"""Log files and their mapping, read, checked and put on the grid of ticks: a campaign."""
+"""Log files and their mapping, read, checked and put on the grid of ticks: a campaign.
+
+A run has at most one contact: a log of several is cut midway between them. A contact that no channel numbers
+is numbered by its place in the file, as the lists of a mechanism file are.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import sys
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +38,7 @@ NUMBERS = (
     "force_command",
     "contact_index",
 )
+TOUCHING = ("tap", "contact")
 SCRAP = 50  # rows, fewer of which between two gaps say nothing
 JUMP = 0.5  # of the fastest motion, by which the velocity changes from a run to the next one in the same log
 
@@ -55,14 +62,13 @@ def read_campaign(
         if not any(entry.names(path) for entry in mapping.runs):
             patterns = ", ".join(shown(pattern) for entry in mapping.runs for pattern in entry.files)
             raise InputError(f"{one_line(str(path))}: found a log that no run names, allowed {patterns}")
-    integrator = "semi_implicit_euler" if prior is None else prior.rig.integrator
     runs: list[Run] = []
     notes: list[str] = []
     clocks = []
     for entry in mapping.runs:
         for path in logs:
             if entry.names(path):
-                reading = _Reading(path, entry, mapping, timing, mass, integrator)
+                reading = _Reading(path, entry, mapping, timing, mass, prior)
                 runs += reading.runs
                 notes += reading.notes
                 clocks.append(reading.ticks.clock)
@@ -76,11 +82,21 @@ class _Reading:
     """One file's runs, under one entry of the mapping."""
 
     def __init__(
-        self, path: Path, entry: RunFiles, mapping: LogMapping, timing: Timing, mass: float, integrator: str
+        self,
+        path: Path,
+        entry: RunFiles,
+        mapping: LogMapping,
+        timing: Timing,
+        mass: float,
+        prior: Mechanism | None,
     ):
         self.label, self.notes = one_line(str(path)) or "''", list[str]()
         self.kind: Kind = entry.kind
-        self._path, self._timing, self._mass, self._integrator = path, timing, mass, integrator
+        self._path, self._timing, self._mass = path, timing, mass
+        self._integrator = "semi_implicit_euler" if prior is None else prior.rig.integrator
+        # Of the contact lists the last entry repeats.
+        lists = () if prior is None else (prior.contact.stiffness, prior.contact.damping)
+        self._last = max(map(len, lists)) - 1 if lists else sys.maxsize
         log = open_log(path, mapping.text)
         columns, stamps = _columns(log, mapping)
         kept = _kept(stamps, entry, timing.control_period)
@@ -104,55 +120,80 @@ class _Reading:
         self.runs = self._cut(channels, modes)
 
     def _cut(self, channels: dict[str, np.ndarray | None], modes: np.ndarray | None) -> list[Run]:
-        """The runs: between longer gaps, changes of mode, and jumps from one run to the next."""
-        tick, period = self.ticks.tick, self._timing.control_period
-        x = channels["position_desired"]
+        """The runs: between longer gaps, changes of mode, jumps from one run to the next, and contacts."""
+        tick, x = self.ticks.tick, channels["position_desired"]
         assert x is not None
         cuts = _jumps(x, channels["contact_index"])
         if modes is not None:
             cuts = np.union1d(cuts, np.flatnonzero(modes[1:] != modes[:-1]) + 1)
-        runs, counted = [], 0
-        for stretch in stretches(tick, channels, cuts, period, self._mass):
+        runs: list[Run] = []
+        contacts = 0
+        for stretch in stretches(tick, channels, cuts, self._timing.control_period, self._mass):
             if len(stretch.tick) < SCRAP:
                 self.notes.append(f"{self.label}: {len(stretch.tick)} rows between gaps are left out")
                 continue
             kind: Kind = self.kind
             if modes is not None:
                 kind = KINDS[int(modes[np.searchsorted(tick, stretch.tick[:1])][0])]
-            run, contacts = self._run(stretch, kind, counted)
-            counted += contacts
-            runs.append(run)
+            found = self._stretch(stretch, kind, contacts)
+            contacts += len(found) * (kind in TOUCHING)
+            runs += found
         if not runs:
-            allowed = f"at least {SCRAP} without a gap of more than 3"
-            raise InputError(f"{self.label}: found {len(tick)} rows in pieces, allowed {allowed}")
+            allowed = (
+                f"at least {SCRAP} without a gap of more than 3, with a contact where there is to be one"
+            )
+            raise InputError(f"{self.label}: found {len(tick)} rows, allowed {allowed}")
         return runs
 
-    def _run(self, stretch: Stretch, kind: Kind, counted: int) -> tuple[Run, int]:
-        """The run of a stretch, checked, and how many contacts are in it; `counted` were before it."""
-        period, channels = self._timing.control_period, stretch.channels
-        force, index = channels["force_measured"], channels["contact_index"]
+    def _stretch(self, stretch: Stretch, kind: Kind, before: int) -> list[Run]:
+        """The runs of a stretch, checked: one for each contact, or the whole; `before` came before it."""
+        period, force = self._timing.control_period, stretch.channels["force_measured"]
         self.notes += checks.check_motion(self.label, kind, stretch, period)
-        touched: list[tuple[int, int]] = []
-        if kind in ("press", "tap", "contact"):
-            if force is None:
-                raise InputError(
-                    f"{self.label}: force_measured: found no such channel, allowed one where there is contact"
-                )
-            found, touched = segments.contacts(force, period)
-            if index is None and kind != "press":
-                index = np.where(found >= 0, found + counted, -1)
-            self.notes += checks.check_force(self.label, kind, stretch, touched, period, self._mass)
-        if kind == "contact" and channels["force_command"] is not None:
+        if kind not in ("press", *TOUCHING):
+            return [self._run(stretch, kind, slice(None), None, None)]
+        if force is None:
+            allowed = "one where there is contact"
+            raise InputError(f"{self.label}: force_measured: found no such channel, allowed {allowed}")
+        touched = segments.contacts(force, period)
+        self.notes += checks.check_force(self.label, kind, stretch, touched, period, self._mass)
+        if kind == "press":
+            return [self._run(stretch, kind, slice(None), None, None)]
+        if kind == "contact" and stretch.channels["force_command"] is not None:
             row = self._timing.row
             self.notes += checks.check_command(self.label, stretch, period, self._mass, row, self._integrator)
-        x, measured = channels["position_desired"], channels["position_measured"]
+        if not touched:
+            self.notes.append(f"{self.label}: {len(stretch.tick)} rows without contact are left out")
+        middles = [(one[1] + two[0]) // 2 for one, two in pairwise(touched)]
+        parts = [slice(*edges) for edges in pairwise([0, *middles, len(stretch.tick)])]
+        return [
+            self._run(stretch, kind, part, one, min(before + number, self._last))
+            for number, (part, one) in enumerate(zip(parts, touched, strict=False))
+        ]
+
+    def _run(
+        self, stretch: Stretch, kind: Kind, part: slice, touched: tuple[int, int] | None, number: int | None
+    ) -> Run:
+        """A part of a stretch, with the contact of that number where no channel tells it."""
+        channels = {name: None if one is None else one[part] for name, one in stretch.channels.items()}
+        tick, index = stretch.tick[part], channels["contact_index"]
+        if index is None and number is not None:
+            index = np.full(len(tick), number, np.int64)
+        x, measured = stretch.channels["position_desired"], channels["position_measured"]
         assert x is not None and measured is not None
-        run = Run(
-            kind, self._path.name, stretch.tick, self.ticks.clock.jitter, x, measured, force,
-            channels["velocity_desired"], channels["force_command"], stretch.valid, index,
-            _speed(x, touched, period),
-        )  # fmt: skip
-        return run, len(touched)
+        return Run(
+            kind=kind,
+            source=self._path.name,
+            tick=tick,
+            time_stamp_error=self.ticks.clock.jitter,
+            position_desired=x[part],
+            position_measured=measured,
+            force_measured=channels["force_measured"],
+            velocity_desired=channels["velocity_desired"],
+            force_command=channels["force_command"],
+            valid=stretch.valid[part],
+            contact_index=index,
+            speed=None if touched is None else _speed(x, touched[0], self._timing.control_period),
+        )
 
 
 def _timing(mapping: LogMapping, prior: Mechanism | None) -> Timing:
@@ -250,10 +291,10 @@ def _jumps(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
     return rows[np.abs(step[rows] - step[rows - 2]) > JUMP * np.percentile(np.abs(step), 95)]
 
 
-def _speed(x: np.ndarray, touched: list[tuple[int, int]], period: float) -> float | None:
-    """Of the approach to the only contact [m/s]."""
+def _speed(x: np.ndarray, begin: int, period: float) -> float | None:
+    """Of the approach to a contact [m/s]."""
     # The force was there for some ticks before it was beyond the noise.
-    before = touched[0][0] - checks.SMOOTH if len(touched) == 1 else -1
+    before = begin - checks.SMOOTH
     if before < checks.SMOOTH:
         return None
     return float(x[before] - x[before - checks.SMOOTH]) / (checks.SMOOTH * period)

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxhil.errors import InputError, one_line
+from tuning.identification.logs import checks
 from tuning.identification.logs.mapping import KINDS, SCHEMA
 from tuning.identification.logs.readers import Columns, Log, open_log
 from tuning.identification.logs.segments import resting, threshold
@@ -103,30 +104,46 @@ def _kind(path: Path, log: Log, columns: Mapping[str, str]) -> str:
     if named:
         return named[0]
     wanted = [columns[name] for name in ("position_desired", "force_measured") if name in columns]
-    read = {name: values[:LOOK] for name, values in log.read(wanted).items()}
-    if np.ptp(read[columns["position_desired"]]) == 0.0:
+    read = _looked_at(log, wanted)
+    if np.all(read[columns["position_desired"]] == read[columns["position_desired"]][0]):
         return "rest"
     force = read.get(columns.get("force_measured", ""))
-    if force is None or len(force) < 100:
+    if force is None or force.dtype == object:
         return "free"
     return "contact" if np.mean(np.abs(force - resting(force)) > 2 * threshold(force)) > 0.01 else "free"
 
 
+def _looked_at(log: Log, names: Sequence[str]) -> Columns:
+    """The first rows that are whole."""
+    read = {name: values[:LOOK] for name, values in log.read(names).items()}
+    whole = [np.abs(one) <= checks.LARGEST_NUMBER for one in read.values() if one.dtype != object]
+    kept = np.all(whole, axis=0) if whole else slice(None)
+    read = {name: values[kept] for name, values in read.items()}
+    rows = len(next(iter(read.values())))
+    if rows < checks.FEWEST_ROWS:
+        raise InputError(f"{log.label}: found {rows} rows of numbers, allowed at least {checks.FEWEST_ROWS}")
+    return read
+
+
 def _guesses(log: Log, columns: Mapping[str, str]) -> dict[str, Guess]:
-    whole = log.read(list(dict.fromkeys(columns.values())))
-    read: Columns = {name: values[:LOOK] for name, values in whole.items()}
+    read = _looked_at(log, list(dict.fromkeys(columns.values())))
     signs = _signs(read, columns)
     found = {}
     for channel, column in columns.items():
         unit, why = _unit(column, channel), "by its name"
         values = read[column]
         if unit is None and channel == "time" and values.dtype != object:
-            step = float(np.median(np.diff(values))) if len(values) > 1 else 0.0
+            step = float(np.median(np.diff(values)))
             unit = next(
                 (one for one, size in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)) if step * size <= 0.02), "ns"
             )
             why += f"; rows are {step:.4g} {unit} apart"
-        elif unit is None and channel in TYPICAL and np.ptp(values) > TYPICAL[channel]:
+        elif (
+            unit is None
+            and channel in TYPICAL
+            and values.dtype != object
+            and np.ptp(values) > TYPICAL[channel]
+        ):
             size = float(np.ptp(values))
             unit = "um" if size > 1000 * TYPICAL[channel] else "mm"
             unit += "/s" * (channel == "velocity_desired")
@@ -143,10 +160,11 @@ def _signs(read: Columns, columns: Mapping[str, str]) -> dict[str, int]:
         return None if values is None or values.dtype == object else values
 
     force, x, measured = of("force_measured"), of("position_desired"), of("position_measured")
-    assert x is not None and measured is not None
+    if x is None or measured is None:
+        return {}  # texts, which are refused when they are read
     signs = {}
     towards = 1
-    if force is not None and len(force) > 100:
+    if force is not None:
         away = force - resting(force)
         touched = np.abs(away) > threshold(force)
         if np.any(touched) and not np.all(touched):
@@ -179,8 +197,8 @@ def _head(guesses: Mapping[str, Guess]) -> list[str]:
 
 def _timing(log: Log, guesses: Mapping[str, Guess]) -> list[str]:
     lines, time, period = ["", "[timing]"], guesses.get("time"), 0.001
-    stamps = np.empty(0) if time is None else log.read([time.column])[time.column][:LOOK]
-    if time is not None and stamps.dtype != object and len(stamps) > 1:
+    stamps = np.empty(0) if time is None else _looked_at(log, [time.column])[time.column]
+    if time is not None and stamps.dtype != object:
         step = float(np.median(np.diff(stamps))) * OF_CHANNEL["time"][time.unit or "s"]
         period = float(f"{step:.3g}")
     return [

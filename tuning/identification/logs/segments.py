@@ -6,37 +6,30 @@ import numpy as np
 
 SIGMAS = 5.0  # of the force's noise, beyond which there is contact
 TICKS = 3  # for so many in a row
-PADDING = 0.05  # s, by which a contact is widened on either side; what is nearer than twice that is one
+APART = 0.1  # s, between two contacts; what is nearer is one
 FIRST = 200  # rows at most, from which the force at rest is taken
 
 
-def contacts(force: np.ndarray, period: float) -> tuple[np.ndarray, list[tuple[int, int]]]:
-    """The contact of every row, counted from 0, -1 for none; and first row and end of each, not widened.
+def contacts(force: np.ndarray, period: float) -> list[tuple[int, int]]:
+    """First row of each contact and the row after its last one.
 
     `force` [N] begins without contact; NaN where a row was lost.
     """
-    rows = len(force)
     touched = np.abs(force - resting(force)) > threshold(force)
     long = touched.copy()
     for ticks in range(1, TICKS):
-        long[: rows - ticks] &= touched[ticks:]
-        long[rows - ticks :] = False
+        long[: len(force) - ticks] &= touched[ticks:]
+        long[len(force) - ticks :] = False
     starts = np.flatnonzero(long)
-    last = np.flatnonzero(touched)
-    found: list[tuple[int, int]] = []
-    gap = round(2 * PADDING / period)
-    if len(starts):
-        # Single rows beyond the threshold belong to a contact only beside one.
-        inside = last[last >= starts[0]]
-        breaks = np.flatnonzero(np.diff(inside) > gap)
-        begins, ends = inside[[0, *(breaks + 1)]], inside[[*breaks, len(inside) - 1]] + 1
-        has = np.searchsorted(starts, begins) < np.searchsorted(starts, ends)
-        found = [(int(a), int(b)) for a, b, good in zip(begins, ends, has, strict=True) if good]
-    index = np.full(rows, -1, np.int64)
-    pad = round(PADDING / period)
-    for number, (begin, end) in enumerate(found):
-        index[max(0, begin - pad) : end + pad] = number
-    return index, found
+    if not len(starts):
+        return []
+    # Single rows beyond the threshold belong to a contact only beside one.
+    inside = np.flatnonzero(touched)
+    inside = inside[inside >= starts[0]]
+    breaks = np.flatnonzero(np.diff(inside) > round(APART / period))
+    begins, ends = inside[[0, *(breaks + 1)]], inside[[*breaks, len(inside) - 1]] + 1
+    has = np.searchsorted(starts, begins) < np.searchsorted(starts, ends)
+    return [(int(a), int(b)) for a, b, good in zip(begins, ends, has, strict=True) if good]
 
 
 def resting(force: np.ndarray) -> float:
