@@ -25,6 +25,7 @@ from tuning.cli.options import (
     Sweep,
     Tune,
 )
+from tuning.cli.options_identify import Identify
 from tuning.cli.options_rig import DEFAULT_RIG_PLOT, Export, RigOptions, Verify
 
 DESCRIPTION = """Gains that keep hardware-in-the-loop docking tests from diverging.
@@ -35,6 +36,7 @@ jaxhil --tyro-write-completion bash ~/.local/share/bash-completion/completions/j
 Command = (
     Annotated[Init, subcommand("init")]
     | Annotated[Simulate, subcommand("simulate")]
+    | Annotated[Identify, subcommand("identify")]
     | Annotated[Tune, subcommand("tune")]
     | Annotated[Sweep, subcommand("sweep")]
     | Annotated[Replay, subcommand("replay")]

@@ -1,0 +1,185 @@
+"""`jaxhil identify`: from a rig's logs to a mechanism file."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+from jaxhil.errors import InputError, one_line, shown
+from jaxhil.files import write_whole, writing
+from jaxhil.mechanism.conversion import KeyProblem, dotted
+from jaxhil.mechanism.file import from_builtins, load
+from jaxhil.mechanism.overrides import parse_override
+from jaxhil.mechanism.structs import Mechanism, value_at
+from jaxhil.runtime import digest
+from tuning import terminal
+from tuning.caches.sources import versions
+from tuning.cli.commands import checks
+from tuning.cli.options_identify import Identify
+from tuning.front_door import arguments
+from tuning.identification.records import Campaign
+
+SCHEMA = "jaxhil/identification/1"
+MECHANISM, DOCUMENT = "mechanism.toml", "identification.json"
+
+
+def run(options: Identify) -> int:
+    """Identify, write and report; 0, or 1 where the model does not explain the rig. Or draft a mapping: 0."""
+    logs = [Path(log) for log in options.logs]
+    if options.guess:
+        return _guess(options, logs)
+    arguments.limit(options.limit)
+    arguments.integers(0, seed=options.seed)
+    if not 0.0 <= options.hold_out < 1.0:
+        raise InputError(f"--hold-out: found {options.hold_out}, allowed a share from 0 to below 1")
+    fixed = _fixed(options)
+    prior = None if options.prior is None else load(options.prior).mechanism
+    folder = Path(options.output)
+    checks.output(folder)
+    checks.own_results(folder / DOCUMENT, "estimates", (MECHANISM,))
+    campaign = _read(options, logs, prior)
+    from tuning.identification.estimate import Options, identify
+    from tuning.identification.mechanism_file import to_toml
+
+    found = identify(
+        campaign,
+        prior,
+        Options(
+            order=options.order,
+            law=options.law,
+            fixed=fixed,
+            hold_out=options.hold_out,
+            limit=options.limit,
+            seed=options.seed,
+        ),
+    )
+    from_builtins(found.mechanism, "identified mechanism")
+    document = _document(options, campaign, prior, found)
+    path = folder / MECHANISM
+    with writing(path):
+        write_whole(path, to_toml(found.mechanism, found.verdict).encode())
+    with writing(folder / DOCUMENT):
+        write_whole(folder / DOCUMENT, terminal.as_json(document).encode("ascii"))
+    terminal.warn([*campaign.notes, *found.notes])
+    if options.json:
+        terminal.emit_json(document)
+    else:
+        _print(document, folder)
+    return 0 if found.good else 1
+
+
+def _guess(options: Identify, logs: list[Path]) -> int:
+    from tuning.identification.logs.guess import draft
+
+    text = draft(logs)
+    if options.json:
+        terminal.emit_json({"mapping": text})
+    else:
+        print(text, end="", flush=True)
+    return 0
+
+
+def _read(options: Identify, logs: list[Path], prior: Mechanism | None) -> Campaign:
+    from tuning.identification.logs.campaign import read_campaign
+    from tuning.identification.logs.mapping import load_mapping
+
+    if options.map is not None:
+        return read_campaign(logs, load_mapping(options.map), prior)
+    try:
+        return read_campaign(logs, None, prior)
+    except InputError as error:
+        raise InputError(f"{error} (--map says what columns mean; --guess drafts one)") from None
+
+
+def _fixed(options: Identify) -> dict[str, float]:
+    fixed = {}
+    for text in options.fix:
+        try:
+            path, value = parse_override(text)
+        except KeyProblem as problem:
+            raise InputError(f"--fix {one_line(text, 60)}: {problem}") from None
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+            raise InputError(f"--fix {one_line(text, 60)}: found {shown(value)}, allowed a number")
+        fixed[dotted(path)] = float(value)
+    return fixed
+
+
+def _document(options: Identify, campaign: Campaign, prior: Mechanism | None, found) -> dict[str, Any]:
+    kinds = [one.kind for one in campaign.runs]
+    clock = campaign.timing.clock
+    content = {
+        "schema": SCHEMA,
+        "estimates": [_entry(one, prior) for one in found.estimates],
+        "combinations": [_entry(one, None) for one in found.combinations],
+        "confounded": [
+            dict(zip(("one", "other", "correlation", "experiment"), pair, strict=True))
+            for pair in found.confounded
+        ],
+        "checks": [
+            {name: getattr(one, name) for name in ("name", "finding", "where", "there", "effect")}
+            for one in found.lines
+        ],
+        "effect": found.effect,
+        "limit": found.limit,
+        "verdict": "good" if found.good else "bad",
+        "reason": found.verdict,
+        "notes": [*campaign.notes, *found.notes],
+        "runs": {kind: kinds.count(kind) for kind in dict.fromkeys(kinds)},
+        "clock": None if clock is None else {**vars(clock)},
+        "sources": campaign.sources,
+        "mechanism": found.mechanism,
+        "seed": options.seed,
+        "versions": versions(),
+    }
+    plain = terminal.finite(content)
+    return {**plain, "sha256": digest(plain)}
+
+
+def _entry(one, prior: Mechanism | None) -> dict[str, Any]:
+    """An estimate, with what the prior says and by how many standard deviations it is off that."""
+    told = _told(prior, one.key)
+    return {
+        "key": one.key,
+        "value": one.value,
+        "std": one.std,
+        "low": one.low,
+        "high": one.high,
+        "unit": one.unit,
+        "known": one.told,
+        "prior": told,
+        "deviation": None if told is None or not one.std else (one.value - told) / one.std,
+    }
+
+
+def _told(prior: Mechanism | None, key: str) -> float | None:
+    """The prior's value of a key; the last entry of a list repeats."""
+    if prior is None:
+        return None
+    path, _, place = key.rpartition(".")
+    try:
+        value = value_at(prior, path if place.isdigit() else key)
+    except AttributeError:
+        return None
+    if isinstance(value, list):
+        value = value[min(int(place or 0), len(value) - 1)] if value and place.isdigit() else None
+    return float(value) if isinstance(value, (int, float)) else None
+
+
+def _print(document: dict[str, Any], folder: Path) -> None:
+    runs = ", ".join(f"{number} {kind}" for kind, number in document["runs"].items())
+    rows = [
+        [one["key"], one["value"], one["low"], one["high"], one["unit"], one["prior"], one["deviation"]]
+        for one in (*document["estimates"], *document["combinations"])
+    ]
+    headings = ["number", "estimate", "95 % from", "to", "unit", "prior", "deviation"]
+    things: list[Any] = [terminal.table(f"Identified from runs: {runs}", headings, rows, texts=(0, 4))]
+    left = [
+        [one["name"], f"{one['finding']} {one['where']}".strip(), one["effect"] if one["there"] else 0.0]
+        for one in document["checks"]
+    ]
+    things.append(terminal.table("What the model leaves", ["check", "found", "effect on e"], left, (0, 1)))
+    things += [
+        f"{pair['one']} and {pair['other']} are hardly told apart (correlation {pair['correlation']:.3f}): "
+        f"{pair['experiment']} would."
+        for pair in document["confounded"]
+    ]
+    terminal.emit(*things, f"{document['reason']}.", f"Wrote {folder / MECHANISM} and {folder / DOCUMENT}")

@@ -1,0 +1,52 @@
+"""The options of `jaxhil identify`, as tyro reads them."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
+
+from tuning.cli.options import Json, folder, number, text
+
+
+@dataclass(frozen=True)
+class Identify:
+    """From a rig's logs to a mechanism file with uncertainty, and whether the model explains the rig.
+
+    Example: jaxhil identify day1/*.csv --map logs.toml --prior rig-300kg
+
+    Writes DIR/mechanism.toml, which tunes as it is, and DIR/identification.json. Exit code 1 if what the
+    model leaves unexplained can change a restitution by the limit or more.
+    """
+
+    logs: Annotated[
+        Positional[tuple[str, ...]],
+        text(
+            "LOG [LOG ...]", "Logs: text, Parquet; with jaxhil[logs] also MAT, HDF5, ROS 2 bags, MDF4, TDMS."
+        ),
+    ] = ()
+    map: Annotated[
+        str | None,
+        text("FILE", "What the columns mean and what was done (TOML); by default those of simulate --log."),
+    ] = None
+    guess: Annotated[
+        FlagCreatePairsOff[bool],
+        text(None, "Print a draft of --map, from the names of columns and what is in them; nothing else."),
+    ] = False
+    prior: Annotated[
+        str | None, text("MECHANISM", "Mechanism file, or a built-in's name, for what the logs do not tell.")
+    ] = None
+    output: Annotated[str, folder("Folder for what is written.")] = "jaxhil-out/identified"
+    order: Annotated[
+        int | None, text("NUMBER", "Order of the motion simulator; by default the logs choose.")
+    ] = None
+    law: Annotated[str | None, text("NAME", "Contact law; by default the contacts choose.")] = None
+    fix: Annotated[
+        UseAppendAction[tuple[str, ...]],
+        text("KEY=VALUE", "A number that is known, as rig.contact_plane=0; repeatable."),
+    ] = ()
+    hold_out: Annotated[float, number("Share of the contacts that judge the fit to the others.")] = 0.2
+    limit: Annotated[
+        float, arg(metavar="NUMBER", help="Restitution error from which the verdict is bad.")
+    ] = 0.01
+    seed: Annotated[int, number("Seed of the draws behind intervals.")] = 0
+    json: Json = False
