@@ -115,7 +115,11 @@ def _document(options: Identify, campaign: Campaign, prior: Mechanism | None, fo
             for pair in found.confounded
         ],
         "checks": [
-            {name: getattr(one, name) for name in ("name", "finding", "where", "there", "effect")}
+            {
+                **{name: getattr(one, name) for name in ("name", "finding", "where")},
+                "there": bool(one.there),
+                "effect": float(one.effect),
+            }
             for one in found.lines
         ],
         "effect": found.effect,
