@@ -170,11 +170,8 @@ def _told(prior: Mechanism | None, key: str) -> float | None:
 
 def _print(document: dict[str, Any], folder: Path) -> None:
     runs = ", ".join(f"{number} {kind}" for kind, number in document["runs"].items())
-    rows = [
-        [one["key"], one["value"], one["low"], one["high"], one["unit"], one["prior"], one["deviation"]]
-        for one in (*document["estimates"], *document["combinations"])
-    ]
-    headings = ["number", "estimate", "95 % from", "to", "unit", "prior", "deviation"]
+    rows = [_row(one) for one in (*document["estimates"], *document["combinations"])]
+    headings = ["number", "estimate", "95 % from", "to", "unit", "prior", "off the prior"]
     things: list[Any] = [terminal.table(f"Identified from runs: {runs}", headings, rows, texts=(0, 4))]
     left = [
         [one["name"], f"{one['finding']} {one['where']}".strip(), one["effect"] if one["there"] else 0.0]
@@ -187,3 +184,18 @@ def _print(document: dict[str, Any], folder: Path) -> None:
         for pair in document["confounded"]
     ]
     terminal.emit(*things, f"{document['reason']}.", f"Wrote {folder / MECHANISM} and {folder / DOCUMENT}")
+
+
+def _row(one: dict[str, Any]) -> list[Any]:
+    """Numbers in so many digits as they are known to; how many standard deviations they are off the prior."""
+    digits = 4
+    if one["std"] and one["value"]:
+        digits = min(max(2 + math.ceil(math.log10(abs(one["value"]) / one["std"])), 2), 9)
+    off = one["deviation"]
+    return [
+        one["key"],
+        *(terminal.figure(float(one[name]), digits) for name in ("value", "low", "high")),
+        one["unit"],
+        one["prior"],
+        "-" if off is None else f"{off:+.1f} std",
+    ]

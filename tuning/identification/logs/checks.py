@@ -119,8 +119,7 @@ def check_command(
         return []
     best = min(fits, key=lambda way: fits[way][0])
     scatter, spread, nearest = fits[best]
-    some = np.unique(x[np.isfinite(x)][:SAMPLE])
-    resolution = float(np.min(np.diff(some), initial=np.inf))
+    resolution = _resolution(x)
     if spread <= 4 * resolution:
         said = f"steps of {resolution:.2g} m are too coarse to check it by force_command"
         return [f"{label}: position_desired: {said}"]
@@ -147,6 +146,13 @@ def _pull(unit: np.ndarray, integrator: str, sent: bool) -> np.ndarray:
     old, new = unit[:-1], unit[1:]
     made = {"semi_implicit_euler": new, "explicit_euler": old, "zoh": (old + new) / 2}[integrator]
     return made[1:] if sent else made[: len(unit) - 2]
+
+
+def _resolution(values: np.ndarray) -> float:
+    """What all steps are multiples of; 0 where there is no such number."""
+    steps = np.diff(np.unique(values[np.isfinite(values)][:SAMPLE]))
+    least = float(np.min(steps, initial=np.inf))
+    return least if np.median(np.abs(steps / least - np.rint(steps / least))) < 0.01 else 0.0
 
 
 def _check_size(label: str, x: np.ndarray, measured: np.ndarray, period: float) -> None:
