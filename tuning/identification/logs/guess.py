@@ -38,6 +38,27 @@ REQUIRED = ("position_desired", "position_measured")
 TYPICAL = {"position_desired": 0.5, "position_measured": 0.5, "velocity_desired": 1.0}  # largest, in SI units
 LOOK = 200_000  # rows
 SIZES = (("s", 1.0), ("ms", 1e-3), ("us", 1e-6))
+RATES = (
+    100,
+    125,
+    200,
+    250,
+    256,
+    400,
+    500,
+    512,
+    800,
+    1000,
+    1024,
+    1250,
+    1600,
+    2000,
+    2048,
+    2500,
+    4000,
+    5000,
+    8000,
+)
 SLOWEST = 0.02  # s, between rows
 
 _UNITS = {unit for units in OF_CHANNEL.values() for unit in units if unit != "m"}
@@ -200,10 +221,11 @@ def _timing(log: Log, guesses: Mapping[str, Guess]) -> list[str]:
     stamps = np.empty(0) if time is None else _looked_at(log, [time.column])[time.column]
     if time is not None and stamps.dtype != object:
         step = float(np.median(np.diff(stamps))) * OF_CHANNEL["time"][time.unit or "s"]
-        period = float(f"{step:.3g}")
+        usual = 1.0 / min(RATES, key=lambda rate: abs(rate * step - 1.0))
+        period = usual if abs(step / usual - 1.0) < 0.05 else float(f"{step:.3g}")
     return [
         *lines,
-        f"control_period = {period:g}",
+        f"control_period = {period!r}",
         'command_hold = "linear"  # or "zoh": what the drives do between ticks',
         "command_latency = 0  # periods until a command reaches the drives: 0 or 1",
         'row = "tick"  # or "sent": with the next tick\'s command; "after": with the next tick\'s readings',
