@@ -29,7 +29,7 @@ SECTIONS = [
     "6 Closed forms",
 ]
 LINK = re.compile(r"\]\(([^)#]+)(#[^)]*)?\)")
-FILE = re.compile(r"(?<![\w/.-])(?:jaxhil|tuning|tests|notebooks|\.ci)/[\w/.-]*\w/?")
+FILE = re.compile(r"(?<!schema = \")(?<![\w/.-])(?:jaxhil|tuning|tests|notebooks|\.ci)/[\w/.-]*\w/?")
 CITED = re.compile(
     r"(model|retrospective_reference)\.md[),]*\s+section\s+(\d+)(?:,\s+items?\s+([\d, and]+))?"
 )

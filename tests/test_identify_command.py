@@ -106,7 +106,7 @@ def test_what_is_told_wrongly_is_a_bad_verdict(jaxhil, day, tmp_path):
         (["LOGS", "--prior", "rig-300"], ["did you mean rig-300kg"]),
         (["LOGS", "--hold-out", "1"], ["--hold-out: found 1.0"]),
         (["LOGS", "--fix", "rig.contact_plane"], ["--fix rig.contact_plane"]),
-        (["LOGS", "--fix", "rig.contact_plane=a"], ["--fix rig.contact_plane=a: found 'a', allowed a number"]),
+        (["LOGS", "--fix", "rig.contact_plane=a"], ["contact_plane=a: found 'a', allowed a number"]),
         (["LOGS", "--limit", "nan"], ["--limit"]),
     ],
 )  # fmt: skip

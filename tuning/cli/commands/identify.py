@@ -174,7 +174,7 @@ def _print(document: dict[str, Any], folder: Path) -> None:
     headings = ["number", "estimate", "95 % from", "to", "unit", "prior", "off the prior"]
     things: list[Any] = [terminal.table(f"Identified from runs: {runs}", headings, rows, texts=(0, 4))]
     left = [
-        [one["name"], f"{one['finding']} {one['where']}".strip(), one["effect"] if one["there"] else 0.0]
+        [one["name"], ", ".join(filter(None, (one["finding"], one["where"]))), one["effect"] if one["there"] else 0.0]
         for one in document["checks"]
     ]
     things.append(terminal.table("What the model leaves", ["check", "found", "effect on e"], left, (0, 1)))
@@ -190,7 +190,7 @@ def _row(one: dict[str, Any]) -> list[Any]:
     """Numbers in so many digits as they are known to; how many standard deviations they are off the prior."""
     digits = 4
     if one["std"] and one["value"]:
-        digits = min(max(2 + math.ceil(math.log10(abs(one["value"]) / one["std"])), 2), 9)
+        digits = min(max(1 + math.ceil(math.log10(abs(one["value"]) / one["std"])), 2), 9)
     off = one["deviation"]
     return [
         one["key"],

@@ -38,27 +38,8 @@ REQUIRED = ("position_desired", "position_measured")
 TYPICAL = {"position_desired": 0.5, "position_measured": 0.5, "velocity_desired": 1.0}  # largest, in SI units
 LOOK = 200_000  # rows
 SIZES = (("s", 1.0), ("ms", 1e-3), ("us", 1e-6))
-RATES = (
-    100,
-    125,
-    200,
-    250,
-    256,
-    400,
-    500,
-    512,
-    800,
-    1000,
-    1024,
-    1250,
-    1600,
-    2000,
-    2048,
-    2500,
-    4000,
-    5000,
-    8000,
-)
+# Hz, that control loops run at.
+RATES = (100, 125, 200, 250, 400, 500, 800, 1000, 1024, 1250, 1600, 2000, 2048, 2500, 4000, 5000, 8000)
 SLOWEST = 0.02  # s, between rows
 
 _UNITS = {unit for units in OF_CHANNEL.values() for unit in units if unit != "m"}
