@@ -174,7 +174,7 @@ def _print(document: dict[str, Any], folder: Path) -> None:
     headings = ["number", "estimate", "95 % from", "to", "unit", "prior", "off the prior"]
     things: list[Any] = [terminal.table(f"Identified from runs: {runs}", headings, rows, texts=(0, 4))]
     left = [
-        [one["name"], ", ".join(filter(None, (one["finding"], one["where"]))), one["effect"] if one["there"] else 0.0]
+        [one["name"], ", ".join(filter(None, (one["finding"], one["where"]))), one["effect"] * one["there"]]
         for one in document["checks"]
     ]
     things.append(terminal.table("What the model leaves", ["check", "found", "effect on e"], left, (0, 1)))
