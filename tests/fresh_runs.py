@@ -27,7 +27,7 @@ from c99_cases import (
 
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.runtime import digest
-from jaxhil.runtime.faults import LAW_IN_DOUBT, names
+from jaxhil.runtime.faults import CONTACT_TOO_LONG, ENERGY_BALANCE, LAW_IN_DOUBT, RESTITUTION, names
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
 from jaxhil.simulation.gain_file import LoadedGains, check_document
 from jaxhil.simulation.integrators import INTEGRATORS
@@ -71,15 +71,21 @@ class Verdict(NamedTuple):
     seen: int
 
 
+WATCHDOG = RESTITUTION | ENERGY_BALANCE | CONTACT_TOO_LONG
+
+
 class Counts:
-    """Runs of either kind, and what was found wrong: (lane, row, names of faults)."""
+    """Runs of either kind, and what was found wrong: (lane, row, names of faults).
+
+    `guarded` of the bad runs were stopped by another guard, before the watchdog had anything to say.
+    """
 
     def __init__(self) -> None:
         self.lanes = self.good = self.bad = self.between = self.between_stopped = 0
         self.missed: list[tuple[int, int, str]] = []
         self.false: list[tuple[int, int, str]] = []
         self.causes: Counter[str] = Counter()
-        self.early = 0
+        self.early = self.guarded = 0
 
     def add(self, record: Record, verdict: Verdict, limit: float) -> None:
         lane, error = self.lanes, np.abs(record.error)
@@ -94,6 +100,7 @@ class Counts:
                 self.missed.append((lane, -1 if verdict.row is None else verdict.row, _text(verdict.seen)))
             else:
                 self.early += verdict.row < record.begins[first]
+                self.guarded += not verdict.cause & WATCHDOG
                 self.causes[_text(verdict.cause)] += 1
         elif np.all(error <= 0.5 * limit):
             self.good += 1
@@ -154,6 +161,7 @@ def records(chunk: Chunk, parsed: Mechanism):
     ticks, lanes = signals.force.shape
     time = np.broadcast_to(period * np.arange(ticks)[:, None], (ticks, lanes))
     mass = np.broadcast_to(chunk.scenarios.equivalent_mass, (lanes,))
+    planes = np.broadcast_to(chunk.scenarios.contact_plane, (lanes,))
     acceleration = -signals.command / mass
     motion = (jnp.asarray(leaf) for leaf in (signals.position, signals.velocity, acceleration))
     moved = INTEGRATORS[parsed.rig.integrator](*motion, jnp.asarray(period))
@@ -169,15 +177,16 @@ def records(chunk: Chunk, parsed: Mechanism):
         rows[-1] = rows[0]
         rows[-1, 5] = length * period
         rows[0, 0] = 0.0
-        yield Record(rows, chunk.contacts.error[:, lane], _contact_rows(rows, parsed.contact.clearance))
+        begins = _contact_rows(rows, parsed.contact.clearance, planes[lane])
+        yield Record(rows, chunk.contacts.error[:, lane], begins)
 
 
-def _contact_rows(rows: np.ndarray, clearance: float) -> np.ndarray:
+def _contact_rows(rows: np.ndarray, clearance: float, plane: float) -> np.ndarray:
     """The rows on which contacts begin: the first beyond a surface, by the model's or the measured position,
-    in each run, and the first beyond the other surface."""
+    in each run, and the first beyond the other surface. The hardware's surfaces lie `plane` deeper."""
     position, measured = rows[:-1, 2], rows[:-1, 4]
-    near = (position > 0) | (measured > 0)
-    far = (position < -clearance) | (measured < -clearance)
+    near = (position > min(plane, 0.0)) | (measured > plane)
+    far = (position < -clearance) | (measured < plane - clearance)
     run = np.cumsum(rows[:-1, 0] == NEXT_CONTACT)
     touching = np.flatnonzero(near | far)
     place = 2 * run[touching] + far[touching]
