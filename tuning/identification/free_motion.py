@@ -83,6 +83,8 @@ def estimate(runs: Sequence[Run], timing: Timing, order: int | None = None) -> F
         return None
     lines = join(spectra, timing)
     chosen, candidates = choose(lines, order)
+    # What a wrong hold leaves, one order more takes up.
+    highest = chosen.fit.model.structure.order + 1
     other = replace(lines, hold="linear" if lines.hold == "zoh" else "zoh")
     return FreeMotion(
         lines,
@@ -90,7 +92,7 @@ def estimate(runs: Sequence[Run], timing: Timing, order: int | None = None) -> F
         chosen,
         tuple(candidates),
         gain_of(chosen.fit, lines),
-        chosen.criterion - criterion(choose(other, order)[0].fit, left(candidates)),
+        chosen.criterion - criterion(choose(other, order, highest)[0].fit, left(candidates)),
     )
 
 

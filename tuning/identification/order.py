@@ -31,11 +31,13 @@ class Candidate:
     fault: str  # why it is out, or empty
 
 
-def choose(lines: Lines, order: int | None = None) -> tuple[Candidate, list[Candidate]]:
-    """The structure to use and all candidates; `order` leaves those of that order alone."""
+def choose(
+    lines: Lines, order: int | None = None, highest: int | None = None
+) -> tuple[Candidate, list[Candidate]]:
+    """The structure to use and all candidates: those of one `order` alone, or up to the `highest`."""
     fits = []
     for structure in STRUCTURES:
-        if order is None or structure.order == order:
+        if structure.order == order or (order is None and (highest is None or structure.order <= highest)):
             fits.append(fit(structure, lines))
             if not fault(fits[-1]) and stats.chi2.sf(fits[-1].chi2, fits[-1].freedom) > EXPLAINED:
                 break

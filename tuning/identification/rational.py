@@ -208,7 +208,7 @@ def _refine(structure: Structure, start: np.ndarray, lines: Lines) -> Fit:
 
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         solve: Any = optimize.least_squares
-        found = solve(residual, start, jacobian, method="lm", x_scale="jac", max_nfev=200)
+        found = solve(residual, start, jacobian, method="lm", x_scale="jac", max_nfev=80)
     curvature = found.jac.T @ found.jac
     scales = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
     covariance = np.linalg.pinv(curvature / np.outer(scales, scales), hermitian=True) / np.outer(
@@ -250,9 +250,11 @@ def _start(structure: Structure, lines: Lines, delay: float) -> tuple[float, np.
         for _ in range(4):
             scaled = (weight / np.abs(below))[:, None]
             left, right = basis * scaled, (1.0 - target)[:, None] * scaled
-            solved = np.linalg.lstsq(
-                np.concatenate([left.real, left.imag]), np.concatenate([right.real, right.imag])[:, 0]
-            )[0]
+            table = np.concatenate([left.real, left.imag])
+            aim = np.concatenate([right.real, right.imag])[:, 0]
+            size = np.linalg.norm(table, axis=0)
+            normal = table.T @ table / np.outer(size, size) + 1e-12 * np.eye(len(size))
+            solved = np.linalg.solve(normal, table.T @ aim / size) / size
             below = 1.0 + sum(solved[zeros + i - 1] * p**i for i in range(1, order + 1))
         above = solved[:zeros] * unit ** np.arange(1, zeros + 1)
         polynomial_below = np.array([1.0, *solved[zeros:]])
