@@ -157,6 +157,21 @@ def test_every_page_opens_offline(site, browser, width):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("width", WIDTHS)
+def test_every_page_is_accessible(site, browser, width):
+    """axe-core finds nothing serious."""
+    package = pytest.importorskip("axe_core_python")
+    axe = (Path(package.__file__).parent / "axe.min.js").read_text(encoding="utf-8")
+    for path in sorted(site.rglob("*.html")):
+        browser.open(path, width)
+        browser.evaluate(f"{axe}; 0")
+        found = browser.evaluate("axe.run({ resultTypes: ['violations'] }).then(told => told.violations.map("
+                                 "one => [one.impact, one.id, one.nodes[0].target.join(' ')]))")  # fmt: skip
+        grave = [one for one in found if one[0] in ("serious", "critical")]
+        assert not grave, f"{path.relative_to(site)}: {grave}"
+
+
+@pytest.mark.slow
 def test_the_search_finds_a_key_offline(site, browser):
     browser.open(site / "index.html", 1440)
     found = """new Promise(done => {

@@ -28,6 +28,11 @@ def on_page_markdown(markdown, page, config, files):
     return markdown
 
 
+def on_post_page(output, page, config):
+    """The search has a name for those who do not see it."""
+    return output.replace('role="dialog"', 'role="dialog" aria-label="Search"')
+
+
 def on_post_build(config):
     """No page for a server's missing addresses: the site is opened from the disk."""
     (Path(config.site_dir) / "404.html").unlink()
