@@ -17,6 +17,7 @@ import numpy as np
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.mechanism.structs import Mechanism
 from tuning.identification.logs import checks, clock, segments
+from tuning.identification.logs.causality import check_rows_of
 from tuning.identification.logs.mapping import (
     KINDS,
     Channel,
@@ -72,6 +73,7 @@ def read_campaign(
                 runs += reading.runs
                 notes += reading.notes
                 clocks.append(reading.ticks.clock)
+    check_rows_of(runs, timing, mapping.timing.computing_delay)
     worst = max(clocks, key=lambda one: one.jitter)
     sources = {path.name: _sha256(path) for path in logs}
     timing = Timing(timing.control_period, timing.command_hold, timing.command_latency, timing.row, worst)
