@@ -1,11 +1,12 @@
 """A force-depth map of unknown contact, identified while it is met: slopes between knots, and dissipation.
 
-    f(x, v, x_m) = sum_j slope_j clip(x - kappa_j, 0, kappa_{j+1} - kappa_j)
-                   + (damping + depth_damping x/REACH) v - unloading (x_m - x)    at x > 0, else 0
+    f(x, v, x_m) = preload + sum_j slope_j clip(x - kappa_j, 0, kappa_{j+1} - kappa_j)
+                   + (damping + depth_damping x/REACH) v - unloading (x_m - x)
+                   + friction v/sqrt(v^2 + SLOW^2)                                at x > 0, else 0
 
 x_m >= x is the deepest point so far. Everything is scaled by the approach speed v0 and the mass M: depth
 x / v0 [s], speed v / v0 [1], force F / (M v0) [1/s], slope k / M [1/s^2], damping b / M [1/s]. Parameters
-theta (slopes, damping, depth damping, unloading) come first, the batch trails. They start from a Gaussian
+theta (slopes, damping, depth damping, unloading, friction, preload) come first, the batch trails. They start from a Gaussian
 prior whose slopes wander with depth, and are identified by recursive least squares (Kalman's update for
 constant parameters). What dissipates counts with its mean given that it is not negative.
 """
@@ -20,11 +21,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 # Depth over approach speed [s] at which a segment begins; the last goes on.
-KNOTS = np.array([0, 2, 5, 10, 16, 24, 32, 40, 50, 62, 76, 92]) * 1e-3
+KNOTS = 1e-3 * np.array([0, 3, 8, 15, 24, 34, 46, 60, 76, 100, 140, 200])
 SEGMENTS = len(KNOTS)
-PARAMETERS = SEGMENTS + 3
+PLACES = range(SEGMENTS, SEGMENTS + 5)
+DAMPING, DEPTH_DAMPING, UNLOADING, FRICTION, PRELOAD = PLACES
+PARAMETERS = SEGMENTS + len(PLACES)
 WIDTHS = np.append(np.diff(KNOTS), np.inf)
 WANDERING = 0.03  # s of depth over which a slope wanders by its spread
+WIDE = 0.092  # s of depth, beyond which slopes wander less and less
+SLOW = 0.03  # speed at which friction turns
 REACH = 0.03  # s of depth at which the depth damping is as strong as its name says
 SURFACE = 1e-12  # s of depth: nearer than that is on the surface, which rounding does not decide
 OUTLYING = 4.0  # times the noise's variance: a force that hardly is noise
@@ -64,25 +69,38 @@ class Curve(NamedTuple):
     damping: Float[Array, "*batch"]  # [1/s]
     depth_damping: Float[Array, "*batch"]  # at the depth `REACH` [1/s]
     unloading: Float[Array, "*batch"]  # [1/s^2]
+    friction: Float[Array, "*batch"]  # [1/s]
+    preload: Float[Array, "*batch"]  # [1/s]
 
 
 def prior(
-    stiffness: Array, common: Array, wandering: Array, damping: Array, depth_damping: Array, unloading: Array
+    stiffness: Array,
+    common: Array,
+    wandering: Array,
+    damping: Array,
+    depth_damping: Array,
+    unloading: Array,
+    friction: Array,
+    preload: Array,
 ) -> Map:
-    """Slopes N(K0, s_K^2 + s_S^2 min(kappa_i, kappa_j)/30 ms), what dissipates N(0, s^2).
+    """Slopes N(K0, s_K^2 + s_S^2 min(kappa_i, kappa_j)/30 ms), what dissipates and the preload N(0, s^2); beyond a
+    depth of 92 ms slopes wander ever less, as (92 ms/kappa)^4.
 
-    stiffness K0, spreads s_K (`common`), s_S (`wandering`) and of `unloading` [1/s^2], of `damping` and
-    `depth_damping` [1/s], of one shape.
+    stiffness K0, spreads s_K (`common`), s_S (`wandering`) and of `unloading` [1/s^2], of `damping`,
+    `depth_damping`, `friction` and `preload` [1/s], of one shape.
     """
-    shared = _column(np.minimum.outer(KNOTS, KNOTS) / WANDERING, stiffness)
+    ratio = WIDE / np.where(KNOTS > WIDE, KNOTS, WIDE)
+    wandered = np.where(KNOTS > WIDE, WIDE * (4 - ratio**3) / 3, KNOTS)
+    shared = _column(np.minimum.outer(wandered, wandered) / WANDERING, stiffness)
     slopes = common[None, None] ** 2 + wandering[None, None] ** 2 * shared
     zeros = jnp.zeros_like(slopes[:, :1])
-    rows = [jnp.concatenate([slopes, zeros, zeros, zeros], axis=1)]
-    for place, spread in enumerate((damping, depth_damping, unloading)):
-        row = [zeros[:1]] * (SEGMENTS + 3)
-        row[SEGMENTS + place] = zeros[:1] + spread[None, None] ** 2
+    rows = [jnp.concatenate([slopes, *[zeros] * len(PLACES)], axis=1)]
+    spreads = (damping, depth_damping, unloading, friction, preload)
+    for place, spread in zip(PLACES, spreads, strict=True):
+        row = [zeros[:1]] * PARAMETERS
+        row[place] = zeros[:1] + spread[None, None] ** 2
         rows.append(jnp.concatenate(row, axis=1))
-    mean = jnp.concatenate([zeros[:, 0] + stiffness[None], *[zeros[:1, 0]] * 3])
+    mean = jnp.concatenate([zeros[:, 0] + stiffness[None], *[zeros[:1, 0]] * len(PLACES)])
     return Map(mean, jnp.concatenate(rows))
 
 
@@ -94,7 +112,10 @@ def ramps(depth: Float[Array, "*batch"]) -> Float[Array, "segments *batch"]:
 
 def features(depth: Array, speed: Array, deepest: Array) -> Float[Array, "parameters *batch"]:
     """phi, of which the force is phi.theta."""
-    return jnp.concatenate([ramps(depth), jnp.stack([speed, depth * speed / REACH, depth - deepest])])
+    others = jnp.stack(
+        [speed, depth * speed / REACH, depth - deepest, turning(speed), jnp.ones_like(depth)]
+    )
+    return jnp.concatenate([ramps(depth), others])
 
 
 def predict(old: Map, phi: Array, variance: Array) -> Prediction:
@@ -118,21 +139,30 @@ def tells(predicted: Prediction, force: Array, variance: Array) -> Bool[Array, "
     return (predicted.force > 0) | (force**2 > OUTLYING * variance)
 
 
-def update(old: Map, phi: Array, force: Array, variance: Array, enabled: Bool[Array, "*batch"]) -> Map:
-    """One reading of `force` [1/s] with noise of a `variance` [1/s^2], where `enabled` and it `tells`."""
+def turning(speed: Array) -> Array:
+    """Which way a speed goes, from -1 to 1."""
+    ratio = speed / SLOW
+    return ratio / jnp.sqrt(1 + ratio * ratio)
+
+
+def update(
+    old: Map, phi: Array, force: Array, variance: Array, enabled: Bool[Array, "*batch"], closes: Bool[Array, "*batch"]
+) -> Map:
+    """One reading of `force` [1/s] with noise of a `variance` [1/s^2], where `enabled` and the contact `closes` or it
+    `tells` of contact."""
     predicted = predict(old, phi, variance)
-    return correct(old, predicted, force, enabled & tells(predicted, force, variance))
+    return correct(old, predicted, force, enabled & (closes | tells(predicted, force, variance)))
 
 
 def curve(old: Map) -> Curve:
     """What counts of the map."""
-    places = range(SEGMENTS, PARAMETERS)
-    return Curve(old.mean[:SEGMENTS], *(positive_mean(old.mean[i], old.covariance[i, i]) for i in places))
+    lost = (positive_mean(old.mean[i], old.covariance[i, i]) for i in PLACES[:-1])
+    return Curve(old.mean[:SEGMENTS], *lost, old.mean[PRELOAD])
 
 
-def elastic(slopes: Float[Array, "segments *batch"], depth: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+def elastic(now: Curve, depth: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Force [1/s] that does not depend on how the contact came there, 0 out of contact."""
-    return _product(slopes, ramps(depth))
+    return jnp.where(depth > 0, now.preload + _product(now.slopes, ramps(depth)), 0)
 
 
 def force(now: Curve, depth: Array, speed: Array, deepest: Array) -> Float[Array, "*batch"]:
@@ -140,18 +170,19 @@ def force(now: Curve, depth: Array, speed: Array, deepest: Array) -> Float[Array
     pressed = jnp.where(depth > 0, depth, 0)
     drag = (now.damping + now.depth_damping * pressed / REACH) * speed
     back = jnp.where(deepest > pressed, deepest - pressed, 0)
-    return elastic(now.slopes, depth) + jnp.where(depth > 0, drag - now.unloading * back, 0)
+    lost = drag + now.friction * turning(speed) - now.unloading * back
+    return elastic(now, depth) + jnp.where(depth > 0, lost, 0)
 
 
-def peak_force(slopes: Float[Array, "segments *batch"]) -> Float[Array, "*batch"]:
+def peak_force(now: Curve) -> Float[Array, "*batch"]:
     """Force [1/s] where a contact entered at speed 1 comes to rest without dissipation: that up to which
     int f dx = 1/2, at least 1. At knots where the map pulls the force counts as 0."""
-    widths = _column(WIDTHS[:-1], slopes[0])
-    first = jnp.zeros_like(slopes[:1])
-    at_knots = jnp.cumsum(slopes[:-1] * widths, axis=0)
-    forces = jnp.concatenate([first, jnp.where(at_knots > 0, at_knots, 0)])
+    widths = _column(WIDTHS[:-1], now.damping)
+    first = jnp.zeros_like(now.slopes[:1])
+    at_knots = now.preload + jnp.concatenate([first, jnp.cumsum(now.slopes[:-1] * widths, axis=0)])
+    forces = jnp.where(at_knots > 0, at_knots, 0)
     energies = jnp.cumsum(0.5 * (forces[:-1] + forces[1:]) * widths, axis=0)
-    rises = jnp.concatenate([(forces[1:] - forces[:-1]) / widths, slopes[-1:]])
+    rises = jnp.concatenate([(forces[1:] - forces[:-1]) / widths, now.slopes[-1:]])
     place = jnp.sum(energies < 0.5, axis=0)[None]
 
     def there(values):

@@ -7,10 +7,9 @@ Scaled as in `force_depth_map`: the reference enters at depth 0 with speed 1 and
 with the bracket only as far as the hardware has been measured, until it separates: x <= 0, or v < 0 and
 f <= 0; x_m and X_m are the deepest points so far. It is stepped by the velocity Verlet scheme, the damping
 implicit in the first half of a step and explicit in the second (order 2), the bracket constant within a step:
-the mean of y less that of F at its ends, over as much of the step as y could be read. Samples are counted in
-ticks from the reference's entry; measured ones are moved to that grid by straight lines, such that the
-hardware's own entry falls on the reference's. Passes from the entry take turns with a live motion, which goes
-on tick by tick under the newest map (notebooks/guide/retrospective_reference.md section 3).
+the mean of y less that of F at its ends, over as much of the step as y could be read. Samples count by the
+hardware's ticks, the present lies between two of them. Passes from the entry take turns with a live motion,
+which goes on tick by tick under the newest map (notebooks/guide/retrospective_reference.md section 3).
 """
 
 from typing import NamedTuple
@@ -18,15 +17,36 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxhil.compensators.force_depth_map import REACH, Curve, elastic
+from jaxhil.compensators.force_depth_map import REACH, SEGMENTS, Curve, elastic, turning
 from jaxhil.compensators.force_depth_map import force as force_of
-from jaxhil.compensators.ring_buffer import write
+from jaxhil.compensators.history import LEVELS, SLOTS, History, Samples, level_of, recall
 
 STRIDE = 24  # steps per tick of the pass from the entry
-COARSE = 0.002  # s, the longest step of that pass, at least a tick
-HISTORY = 1024  # samples kept; a longer contact is not integrated over again
+COARSE = 0.002  # s, the longest step of a pass where every sample is kept, at least a tick
+LONGEST = (SLOTS - 2) * 4 ** (LEVELS - 1)  # ticks of a contact, up to which it is integrated over again
+
+
+class Scales(NamedTuple):
+    """What the signals of a contact are scaled by."""
+
+    side: Float[Array, "*batch"]  # of the surface, 1 or -1; 0 for no contact
+    plane: Float[Array, "*batch"]  # by how much it is deeper than told [m]
+    speed: Float[Array, "*batch"]  # approach speed [m/s]
+    pace: Float[Array, "*batch"]  # seconds on the contact's scale of time in one [1]
+    weight: Float[Array, "*batch"]  # mass times the approach speed times the pace [kg m/s]
+    bias: Float[Array, "*batch"]  # of the force sensor [N]
+
+
+class Entry(NamedTuple):
+    """Where a contact's reference begins, and where it is."""
+
+    start: Float[Array, "2 *batch"]  # impulse and shown at the last sample before the hardware's own entry
+    tick: Int[Array, "*batch"]  # of the run, of that sample
+    since: Float[Array, "*batch"]  # from the entry to the next sample [ticks]
+    beyond: Float[Array, "*batch"]  # from the sample `present` to the present [ticks]
+    present: Int[Array, "*batch"]  # number of the last whole sample
 
 
 class ReferenceState(NamedTuple):
@@ -35,22 +55,12 @@ class ReferenceState(NamedTuple):
     depth: Float[Array, "*batch"]  # [s]
     speed: Float[Array, "*batch"]  # [1]
     deepest: Float[Array, "*batch"]  # point so far [s]
-    force: Float[Array, "*batch"]  # without damping [1/s]
-    # integral of the measured force since the entry, at the measured sample there [ticks/s]
-    impulse: Float[Array, "*batch"]
-    read: Float[Array, "*batch"]  # over how many ticks that is
+    force: Float[Array, "*batch"]  # without damping and friction [1/s]
+    impulse: Float[Array, "*batch"]  # of the hardware's sample there [N ticks]
+    shown: Float[Array, "*batch"]  # over how many ticks that is
+    farthest: Float[Array, "*batch"]  # deepest point of the hardware so far [s]
     expected: Float[Array, "*batch"]  # force of the map at that sample [1/s]
     free: Float[Array, "*batch"]  # whether (1) it has separated
-
-
-class History(NamedTuple):
-    """Measured samples on the reference's grid, by the tick at which each came."""
-
-    # per sample the integral since the entry [ticks/s] of the y that could be read, over how many ticks that
-    # is, depth X [s], speed V [1], deepest point X_m [s]
-    ring: Float[Array, "samples 5 *batch"]
-    origin: Int[Array, "*batch"]  # tick at which sample 0 came
-    number: Int[Array, "*batch"]  # of samples that have come
 
 
 class Reintegration(NamedTuple):
@@ -58,87 +68,137 @@ class Reintegration(NamedTuple):
 
     live: ReferenceState  # motion that goes on tick by tick
     behind: ReferenceState  # motion of the pass from the entry
-    reached: Int[Array, "*batch"]  # sample that the pass has reached; -1 for the entry
+    reached: Int[Array, "*batch"]  # sample that the pass has reached
     curve: Curve  # map of the pass
+    entry: Entry  # of the contact
 
 
 class Measured(NamedTuple):
     """What the reference is integrated with beside the map."""
 
     history: History  # measured samples
+    scales: Scales  # of the contact
+    clearance: Array  # between two surfaces [m]
     replay: Array  # rho, share of the force that the map does not explain
-    period: Array  # control period [s]
-    # by how much the force is older than it was taken for when the samples were remembered [s]; it then
-    # belongs to X - shift V. None for nothing.
+    period: Array  # control period [s], on the contact's scale of time
+    coarse: Array  # ticks of the longest step where every sample is kept
+    # by how much the force is older than it was taken for [s]; it then belongs to X - shift V. None for nothing.
     shift: Array | None
 
 
-def entry(like: Array) -> ReferenceState:
-    """Depth 0, speed 1, no force."""
-    zeros = jnp.zeros_like(like)
-    return ReferenceState(zeros, zeros + 1, zeros, zeros, zeros, zeros, zeros, zeros)
+def depth_of(scales: Scales, clearance: Array, position: Array) -> Array:
+    """Depth [s] at a position [m]."""
+    return (beyond(scales.side, clearance, position) - scales.plane) / (scales.speed / scales.pace)
 
 
-def no_history(like: Array) -> History:
-    """Nothing measured so far."""
-    counts = jnp.zeros(like.shape, jnp.int32)
-    return History(jnp.zeros((HISTORY, 5, *like.shape), like.dtype), counts, counts)
+def beyond(side: Array, clearance: Array, position: Array) -> Array:
+    """By how much [m] a position [m] is beyond the surface of a side as told."""
+    return jnp.where(side < 0, -clearance - position, position)
 
 
-def remember(history: History, tick: Array, sample: Array) -> Float[Array, "samples 5 *batch"]:
-    """The ring with the sample (5, *batch) of this tick in it."""
-    return write(history.ring, tick, sample)
+def unentered(like: Array, curve: Curve) -> Reintegration:
+    """Before the first contact."""
+    zeros, counts = jnp.zeros_like(like), jnp.zeros(like.shape, jnp.int32)
+    entry = Entry(jnp.stack([zeros] * 2), counts - 1, zeros + 0.5, zeros, counts)
+    state = _enter(entry, curve)
+    return Reintegration(state, state, entry.tick, curve, entry)
 
 
-def follow(
-    old: Reintegration, curve: Curve, measured: Measured, first: Array, present: Int[Array, "*batch"]
+def begin(
+    old: Reintegration, found: Bool[Array, "*batch"], index: Int[Array, "*batch"], start: Samples, since: Array, depth: Array, period: Array
 ) -> Reintegration:
-    """One tick of the live motion, to the sample `present` (0 at the first tick in contact, where all starts
-    afresh), and of the pass.
-
-    `first` [s] is the time from the entry to sample 0.
-    """
-    period = measured.period
-    starts = (old.reached < 0) | (present == 0)
-    old = old._replace(
-        behind=_choose(starts, entry(period), old.behind), reached=jnp.where(starts, -1, old.reached)
+    """Before a tick at which it is `found` that the hardware has met the surface `since` [ticks] before the sample
+    after that of the tick `index`, the numerical model `depth` [s] ago: until the first pass is done, it should
+    go on as it does."""
+    ticks = depth / period - since
+    whole = jnp.where(ticks > 0, jnp.floor(ticks), 0)
+    entry = Entry(
+        jnp.stack([start.impulse, start.shown]),
+        index,
+        since,
+        jnp.where(ticks > 0, ticks - whole, 0),
+        index + whole.astype(jnp.int32),
     )
+    entry = _choose(found, entry, old.entry)
+    goes_on = _enter(entry, old.curve)._replace(depth=depth - period, free=jnp.ones_like(depth))
+    live = _choose(found, goes_on, old.live)
+    return old._replace(live=live, reached=jnp.where(found, index, old.reached), entry=entry)
+
+
+def follow(old: Reintegration, curve: Curve, measured: Measured) -> Reintegration:
+    """One tick of the live motion, and of the pass."""
+    period, history = measured.period, measured.history
+    entry = old.entry._replace(present=old.entry.present + 1)
+    present = entry.present
+    starts = old.reached == entry.tick
+    goes = ~starts | (history.age - entry.tick < LONGEST)
     curve_behind = _choose(starts, curve, old.curve)
-    may_start = measured.history.number <= HISTORY
-    coarse = jnp.clip(jnp.floor(COARSE / period + 1e-9), 1, HISTORY).astype(jnp.int32)
+    behind = _choose(starts, _enter(entry, curve), old.behind)
+    coarse = measured.coarse
 
     def one(_, carry):
         motion, reached = carry
-        ahead = reached < present
-        jump = jnp.where((reached >= 0) & (present - reached >= coarse), coarse, 1)
-        index = reached + jump
-        ticks = jnp.where(reached < 0, first / period, jump.astype(period.dtype))
+        ahead = goes & (reached < present)
+        index = _next(history, reached, present, coarse)
+        ticks = (index - reached).astype(period.dtype)
+        ticks = jnp.where(reached == entry.tick, ticks + (entry.since - 1), ticks)
         moved = _advance(curve_behind, motion, measured, index, ticks)
         chosen = jax.tree.map(lambda a, b: jnp.where(ahead, a, b), moved, motion)
         return ReferenceState(*chosen), jnp.where(ahead, index, reached)
 
-    behind, reached = lax.fori_loop(0, STRIDE, one, (old.behind, old.reached))
-    live = _advance(curve, old.live, measured, present, jnp.ones_like(period))
-    held = starts & ~may_start
-    behind = _choose(held, old.behind, behind)
-    reached = jnp.where(held, old.reached, reached)
+    behind, reached = lax.fori_loop(0, STRIDE, one, (behind, old.reached))
     done = reached == present
-    return Reintegration(_choose(done, behind, live), behind, jnp.where(done, -1, reached), curve_behind)
+    arrived = _advance(curve_behind, behind, measured, present, entry.beyond)
+    live = _advance(curve, old.live, measured, present, jnp.ones_like(period))
+    return Reintegration(
+        _choose(done, arrived, live), behind, jnp.where(done, entry.tick, reached), curve_behind, entry
+    )
+
+
+def _enter(entry: Entry, curve: Curve) -> ReferenceState:
+    """Depth 0, speed 1."""
+    zeros = jnp.zeros_like(entry.since)
+    impulse, shown = entry.start
+    jump = curve.preload + (curve.damping + curve.friction)
+    return ReferenceState(zeros, zeros + 1, zeros, curve.preload, impulse, shown, zeros, jump, zeros)
+
+
+def _next(history: History, index: Array, present: Array, coarse: Array) -> Int[Array, "*batch"]:
+    """The sample to go on to: as far as is measured, one that is kept."""
+    stride = jnp.maximum(coarse, 1 << (2 * level_of(history, index)))
+    kept = jnp.minimum(((index + 1) // stride + 1) * stride - 1, history.age)
+    return jnp.minimum(jnp.where(index < history.age, kept, index + coarse), present)
 
 
 def _advance(
     curve: Curve, motion: ReferenceState, measured: Measured, index: Array, ticks: Array
 ) -> ReferenceState:
     """One step of so many `ticks`, to the sample `index`."""
-    (impulse, read, *hardware), known = _recall(measured.history, index)
+    known = (index <= measured.history.age) & (ticks > 0)
+    sample = recall(measured.history, jnp.minimum(index, measured.history.age))
+    scales = measured.scales
+    rate = scales.side * sample.velocity / scales.speed
+    hardware = depth_of(scales, measured.clearance, sample.position)
     if measured.shift is not None:
-        hardware[0] = hardware[0] - measured.shift * hardware[1]
-    known = known & (ticks > 0)
-    expected = force_of(curve, *hardware)
-    modelled = 0.5 * (motion.expected + expected)
-    gap = (impulse - motion.impulse) - (read - motion.read) * modelled
+        hardware = hardware - measured.shift * rate
+    farthest = jnp.where(hardware > motion.farthest, hardware, motion.farthest)
+    expected = force_of(curve, hardware, rate, farthest)
+    shown = sample.shown - motion.shown
+    part = jnp.where(shown < ticks, shown, ticks)
+    impulse = (sample.impulse - motion.impulse) - scales.bias * shown
+    gap = scales.side * impulse / scales.weight - part * (0.5 * (motion.expected + expected))
     missing = jnp.where(known, measured.replay * (gap / jnp.where(known, ticks, 1)), 0)
-    duration = ticks * measured.period
+    moved = _verlet(curve, motion, ticks * measured.period, missing)
+    return moved._replace(
+        impulse=jnp.where(known, sample.impulse, motion.impulse),
+        shown=jnp.where(known, sample.shown, motion.shown),
+        farthest=jnp.where(known, farthest, motion.farthest),
+        expected=jnp.where(known, expected, motion.expected),
+    )
+
+
+def _verlet(curve: Curve, motion: ReferenceState, duration: Array, missing: Array) -> ReferenceState:
+    """One step of this `duration` [s] with so much force [1/s] beside the map's."""
     half = 0.5 * duration
     push = jnp.where(motion.free > 0, 0, 1)
 
@@ -146,32 +206,27 @@ def _advance(
         return curve.damping + curve.depth_damping * jnp.where(depth > 0, depth, 0) / REACH
 
     drag = damping(motion.depth) * half * push
-    middle = (motion.speed - half * push * (motion.force + missing)) / (1 + drag)
+    rubbed = curve.friction * turning(motion.speed)
+    middle = (motion.speed - half * push * (motion.force + rubbed + missing)) / (1 + drag)
     depth = motion.depth + duration * middle
     deeper = (depth > motion.deepest) & (push > 0)
     deepest = jnp.where(deeper, depth, motion.deepest)
-    force = jnp.where(depth > 0, elastic(curve.slopes, depth) - curve.unloading * (deepest - depth), 0)
+    inside = depth > 0
+    force = jnp.where(inside, elastic(curve, depth) - curve.unloading * (deepest - depth), 0)
+    rubbing = jnp.where(inside, curve.friction * turning(middle), 0)
     dragging = damping(depth)
-    speed = middle - push * half * (force + missing + dragging * middle)
-    free = (depth <= 0) | ((speed < 0) & (force + missing + dragging * speed <= 0))
+    speed = middle - push * half * (force + rubbing + missing + dragging * middle)
+    free = ~inside | ((speed < 0) & (force + rubbing + missing + dragging * speed <= 0))
     free = (motion.free > 0) | free
-    return ReferenceState(
-        depth,
-        speed,
-        deepest,
-        force,
-        impulse=jnp.where(known, impulse, motion.impulse),
-        read=jnp.where(known, read, motion.read),
-        expected=jnp.where(known, expected, motion.expected),
-        free=free.astype(depth.dtype),
+    return motion._replace(
+        depth=depth, speed=speed, deepest=deepest, force=force, free=free.astype(depth.dtype)
     )
 
 
-def _recall(history, index):
-    """A measured sample, and whether it has come."""
-    slot = (history.origin + index) & (HISTORY - 1)
-    taken = jnp.take_along_axis(history.ring, slot[None, None], axis=0, mode="promise_in_bounds")[0]
-    return taken, (index >= 0) & (index < history.number)
+def longest_step(period: Array) -> Int[Array, "*batch"]:
+    """The ticks of the longest step of a pass where every sample is kept: a power of two."""
+    most = COARSE * (1 + 1e-9) / period
+    return sum(((most >= 2**power).astype(jnp.int32) << (power - 1) for power in range(1, 8)), jnp.int32(1))
 
 
 def _choose(condition, when_true, when_false):

@@ -17,6 +17,8 @@ SHARP = {
     "prior_damping_spread": 1.912,
     "prior_depth_damping_spread": 0.03103,
     "prior_unloading_spread": 0.1607,
+    "prior_friction_spread": 0.0,
+    "prior_preload_spread": 2.0,
     "force_noise_floor": 0.01091,
     "velocity_gain": 174.6,
     "correction_limit": 0.9,
@@ -28,7 +30,7 @@ GENTLE = SHARP | {
     "prior_depth_damping_spread": 0.05,
     "force_noise_floor": 0.02,
     "velocity_gain": 200.0,
-    "correction_limit": 0.48,
+    "correction_limit": 0.7,
     "replay_noise": 0.6,
 }
 
@@ -69,6 +71,8 @@ GAINS: tuple[Gain, ...] = (
         "dead_zone", lambda m: 0.0, lambda m: 2 * m.rig.force_sensor.dead_zone + peak_force(m),
         lambda m: m.rig.force_sensor.dead_zone, tuned=_fact,
     ),
+    rig_gain("bias_spread", lambda m: 0.0, lambda m: 10 * peak_force(m), lambda m: 5.0, tuned=_fact),
+    rig_gain("plane_spread", lambda m: 1e-6, lambda m: 0.1, lambda m: 0.001, tuned=_fact),
     # Next to its spread it hardly matters.
     _prior("prior_stiffness", 0.1, 1e3, _fact),
     _prior("prior_stiffness_spread", 1.0, 5e3),
@@ -76,6 +80,8 @@ GAINS: tuple[Gain, ...] = (
     _prior("prior_damping_spread", 0.01, 50.0),
     _prior("prior_depth_damping_spread", 1e-4, 50.0, _shows("hunt_crossley", "depth_damped")),
     _prior("prior_unloading_spread", 1e-4, 5e3, _shows("elastoplastic")),
+    rig_gain("prior_friction_spread", lambda m: 0.0, lambda m: 50.0, lambda m: 0.0, tuned=_fact),
+    rig_gain("prior_preload_spread", lambda m: 0.0, lambda m: 50.0, lambda m: SHARP["prior_preload_spread"], tuned=_fact),
     # Where there is noise, which is given and seen, it hardly matters.
     _prior("force_noise_floor", 1e-4, 10.0, lambda m: not m.rig.force_sensor.noise_std),
     rig_gain(

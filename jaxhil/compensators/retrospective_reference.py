@@ -10,24 +10,27 @@ predicts:
 
     f_0 = max(F(x_d, v_d), 0)
     f_e = clip(c (v_d - T f_0/2 - v_r), -limit p, limit p)
+    no contact:  F_c = 0, until the force tells of one, and of where its surface is
     in contact:  F_c = f_0 + (y - F(X, V)) + f_e
     separated:   F_c = f_e  until the hardware has left the surface for 6 ms, then 0
 
-Every contact starts afresh; so does one with the other surface. A run that begins in contact has no approach
-speed to scale by: there F_c is the measured force, as it is. How noise, a dead zone and a surface that is
-nearer than expected are met: notebooks/guide/retrospective_reference.md.
+Every contact starts afresh, but for what is known of where the surfaces are. A run that begins in contact has no
+approach speed to scale by: there F_c is the measured force, as it is. notebooks/guide/retrospective_reference.md
+says more.
 """
 
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.compensators.base import Compensator, Constants, Gain, Gains, cleared
 from jaxhil.compensators.delay_line import Delay, DelayLine, delayed, empty, split
 from jaxhil.compensators.estimates import DEAD_ZONE, EQUIVALENT_MASS, FORCE_DELAY, FORCE_NOISE
 from jaxhil.compensators.force_depth_map import (
+    SURFACE,
     Curve,
     Map,
     Reading,
@@ -38,33 +41,45 @@ from jaxhil.compensators.force_depth_map import (
     prior,
     update,
 )
+from jaxhil.compensators.history import History, no_history, reading_at, recall, take
+from jaxhil.compensators.onset import Onset, no_onset, watch
 from jaxhil.compensators.reintegration import (
-    History,
     Measured,
     Reintegration,
-    entry,
+    Scales,
+    begin,
+    depth_of,
     follow,
-    no_history,
-    remember,
+    longest_step,
+    unentered,
 )
 from jaxhil.compensators.retrospective_episode import (
     Aligned,
-    Episode,
     Noise,
-    Sample,
+    Plane,
     align,
-    enter_grid,
     force_noise,
-    move,
-    no_episode,
-    scaled,
-    sort_out,
+    meet,
+    search,
+    take_noise,
 )
 from jaxhil.compensators.retrospective_gains import GAINS, GENTLE, SHARP
-from jaxhil.compensators.ring_buffer import depend_on
+from jaxhil.contact.laws import deflection
 
 FAREWELL = 0.006  # s for which it goes on after the hardware has left the surface
-LONGEST_LAG = 0.1  # s for which it waits for hardware that has not come into contact
+MOST = 1.2  # of the peak force, that the model is to feel of the map
+MISFIT = 0.003  # of a force, by which the map may be wrong
+
+
+class Episode(NamedTuple):
+    """The contact under way, if the surface's side is not 0; without an approach speed it is of no use."""
+
+    scales: Scales  # what it is scaled by
+    gone: Float[Array, "*batch"]  # ticks since the hardware left
+    deepest: Float[Array, "*batch"]  # point of the numerical model so far [s]
+    hardware_deepest: Float[Array, "*batch"]  # point of the hardware so far [s]
+    learnt_deepest: Float[Array, "*batch"]  # of what has been learnt from [s]
+    next: Int[Array, "*batch"]  # tick of the run, of the reading to learn from next
 
 
 class RetrospectiveState(NamedTuple):
@@ -73,10 +88,12 @@ class RetrospectiveState(NamedTuple):
     line: DelayLine  # delay line of the measured position
     aligned: Aligned  # measured positions as old as the force
     noise: Noise  # of the force
+    history: History  # samples that were measured
+    onset: Onset  # readings of the flight to a surface
+    planes: Plane  # where the surfaces are expected
     episode: Episode  # the contact under way
     learnt: Any  # of that contact: its map, or its bank of them
     reference: Reintegration  # motion that the contact should have had
-    history: History  # samples that were measured
 
 
 class Prepared(NamedTuple):
@@ -113,16 +130,19 @@ class RetrospectiveReference(Compensator):
 
     def init(self, gains, constants, ring):
         zeros = jnp.zeros_like(constants.control_period)
-        nowhere = jnp.full(zeros.shape, -1, jnp.int32)
-        unknown = prior(*[zeros] * 6)
+        counts = jnp.zeros(zeros.shape, jnp.int32)
+        unknown = prior(*[zeros] * 8)
+        spread = jnp.stack([zeros + gains["plane_spread"]] * 2)
         return RetrospectiveState(
             line=empty(ring, zeros),
             aligned=Aligned(zeros, zeros),
             noise=Noise(zeros, zeros),
-            episode=no_episode(zeros),
-            learnt=self.unlearnt(unknown),
-            reference=Reintegration(entry(zeros), entry(zeros), nowhere, curve(unknown)),
             history=no_history(zeros),
+            onset=no_onset(zeros),
+            planes=Plane(0 * spread, spread),
+            episode=Episode(Scales(*[zeros] * 6), zeros, zeros, zeros, zeros, counts),
+            learnt=self.unlearnt(unknown),
+            reference=unentered(zeros, curve(unknown)),
         )
 
     def unlearnt(self, prior: Map) -> Any:
@@ -150,69 +170,159 @@ class RetrospectiveReference(Compensator):
             jnp.where(reading.hidden, 0.5 * reading.zone, reading.force),
             reading.variance + jnp.where(reading.hidden, reading.zone**2 / 12, 0),
             reading.counts & (reading.depth > 0) & (~reading.hidden | more),
+            reading.rate > 0,
         )
         return now, curve(now)
 
     def restart(self, gains, state, begins, fresh):
         episode = state.episode
+        nowhere = episode.scales._replace(side=jnp.where(begins, 0, episode.scales.side))
+        watched = jnp.where(begins, 0, state.onset.watched)
+        sums = jnp.where(begins[None], 0, state.onset.sums)
         return state._replace(
             noise=cleared(state.noise, begins),
-            episode=episode._replace(side=jnp.where(begins, 0, episode.side)),
+            onset=state.onset._replace(watched=watched, sums=sums),
+            episode=episode._replace(scales=nowhere),
         )
 
     def step(self, prepared, state, signals, tick):
-        gains, period = prepared.gains, prepared.constants.control_period
-        old = state.episode
+        gains, constants = prepared.gains, prepared.constants
+        period, clearance = constants.control_period, constants.clearance
         newest, line = delayed(prepared.delay, state.line, signals, tick)
         position, velocity, aligned = align(state.aligned, newest, prepared.share, signals, period)
-        older = self.delay_shift(state.learnt)
-        now = scaled(gains, prepared.constants, old, signals, position, velocity, older)
-        met = enter_grid(old, state.history, now, period, tick)
-        noise, early = sort_out(gains, state.noise, old.early, now, signals.force_measured, met.touched)
+        force_read = signals.force_measured + jnp.sign(signals.force_measured) * gains["dead_zone"]
+        begins = signals.age == 0
+        # A run's first reading counts as none: the sensor's delay line may not have been filled.
+        shown = ~begins & ~((gains["dead_zone"] > 0) & (signals.force_measured == 0))
+        reach = jnp.sign(deflection(signals.position_desired, clearance))
+        side = jnp.where(begins, reach, state.episode.scales.side)
+        before = state.history._replace(reading=jnp.where(begins[None], 0, state.history.reading))
+        noise = take_noise(gains, state.noise, before, force_read, shown, state.episode.scales.side == 0)
+        history = take(state.history, tick, signals.age, force_read, shown, position, velocity)
 
-        deepest = _deepest(old.deepest, now.enters, now.x)
-        hardware_deepest = _deepest(old.hardware_deepest, now.enters, now.depth)
-        zone = gains["dead_zone"] / now.weight
-        spread = force_noise(gains, noise) / now.weight**2
-        variance = gains["force_noise_floor"] ** 2 + spread
-        reading = Reading(now.aligned, now.rate, now.force, variance, now.hidden, zone, now.usable)
-        learnt, known = self.learn(prepared, state.learnt, now.enters, reading, hardware_deepest)
-        expected = force(known, now.depth, now.rate, hardware_deepest)
+        scales = state.episode.scales._replace(side=side, speed=jnp.where(begins, 0, state.episode.scales.speed))
+        way = jnp.where((signals.velocity_desired > 0) | jnp.isinf(clearance), 1, -1)
+        speed = way * signals.velocity_desired
+        flies = (side == 0) & (speed > 0)
+        safe = jnp.where(flies, speed, 1)
+        onset = watch(state.onset, tick, flies, way * force_read / (gains["equivalent_mass"] * safe), shown)
+        variance = force_noise(gains, noise)
+        found = search(gains, constants, state.planes, onset, history, way, safe, variance, tick)
+        found = found._replace(detected=found.detected & flies)
+        meeting = meet(gains, clearance, scales, state.planes, history, way, safe, found)
+        begun = _begun(state.episode, meeting)
+        safe = _safe(meeting.scales, meeting.found)
+        depth = depth_of(safe, clearance, signals.position_desired)
+        since_met = jnp.where(depth > 0, depth, 0)
+        reference = begin(
+            state.reference, meeting.found, meeting.index, meeting.start, meeting.since, since_met, period * safe.pace
+        )
+        read = _Read(position, velocity, force_read, shown, variance)
+        command, episode, learnt, reference = self._contact(
+            prepared, begun, state.learnt, meeting.found, reference, history, signals, read
+        )
+        return command, RetrospectiveState(
+            line, aligned, noise, history, onset, meeting.planes, episode, learnt, reference
+        )
+
+    def _contact(self, prepared, old, learnt, found, reference, history, signals, read):
+        """F_c [N], and the contact under way, what is learnt of it and its reference with one tick more."""
+        gains, constants = prepared.gains, prepared.constants
+        period, clearance = constants.control_period, constants.clearance
+        side, usable = old.scales.side, (old.scales.side != 0) & (old.scales.speed > 0)
+        scales = _safe(old.scales, usable)
+        slow = period * scales.pace
+        older = self.delay_shift(learnt)
+        x = depth_of(scales, clearance, signals.position_desired)
+        v = side * signals.velocity_desired / scales.speed
+        rate = side * read.velocity / scales.speed
+        depth = depth_of(scales, clearance, read.position)
+        depth = depth if older is None else depth - older * rate
+        depth = jnp.where((depth > SURFACE) | (depth < -SURFACE), depth, 0)
+        deepest, hardware_deepest = _deepest(old.deepest, x), _deepest(old.hardware_deepest, depth)
+
+        zone = gains["dead_zone"] / scales.weight
+        spread = read.variance / scales.weight**2
+        teaching = _Teaching(history, scales, clearance, gains["force_noise_floor"] ** 2 + spread, zone, usable)
+        learnt, known, next_, learnt_deepest = self._catch_up(prepared, learnt, found, teaching, old)
+        expected = force(known, depth, rate, hardware_deepest)
         guess = jnp.where(expected > zone, zone, jnp.where(expected > 0, expected, 0))
-        read = jnp.where(now.hidden & now.usable, guess, now.force)
+        seen = jnp.where(read.shown, side * (read.force - scales.bias) / scales.weight, guess)
         strength = gains["replay_noise"] ** 2
         replay = gains["force_replay"] * strength / (strength + spread)
-        measured = Measured(met.history, replay, period, older)
-        reference = follow(state.reference, known, measured, now.first, now.elapsed)
+        reference = follow(reference, known, Measured(history, scales, clearance, replay, slow, longest_step(period), older))
 
-        own = force(known, now.x, now.v, deepest)
-        separated = (now.x <= 0) | (now.usable & (now.v < 0) & (own <= 0))
-        command = _command(gains, now, known, own, separated, read, expected, reference.live.speed, period)
-        gone = jnp.where(now.enters | (now.depth > 0), 0, old.gone + 1)
-        patience = jnp.where(met.touched | ~now.usable, FAREWELL, LONGEST_LAG)
-        over = separated & (gone * period > patience * (1 + 1e-9))
-        command = jnp.where((now.side != 0) & ~over, now.side * now.weight * command, 0)
-
-        sampled = jnp.stack([read, now.aligned, now.rate, hardware_deepest])
-        sample = Sample(sampled, (~now.hidden).astype(period.dtype))
-        moved, hardware, number = move(old, sample, now, met, period, tick)
-        ring = _remembered(met.history, reference, moved, hardware, tick)
+        own = force(known, x, v, deepest)
+        separated = (x <= 0) | ((v < 0) & (own <= 0))
+        command = _command(gains, v, known, own, separated, seen, expected, reference.live.speed, scales.pace, slow)
+        command = side * scales.weight * command
+        bent = side * deflection(read.position, clearance)
+        out = ~(side * deflection(signals.position_desired, clearance) > 0)
+        command = jnp.where(usable, command, jnp.where(out | (bent < 0), 0, read.force))
+        separated = jnp.where(usable, separated, out)
+        gone = jnp.where(jnp.where(usable, depth, bent) > 0, 0, old.gone + 1)
+        over = separated & (gone * period > FAREWELL * (1 + 1e-9))
         episode = Episode(
-            side=jnp.where(over, 0, now.side),
-            velocity=now.speed,
-            first=now.first,
-            elapsed=now.elapsed,
-            touched=met.touched.astype(period.dtype),
-            gone=gone,
-            fraction=met.fraction,
-            deepest=deepest,
-            hardware_deepest=hardware_deepest,
-            sample=sample,
-            moved=moved,
-            early=early,
+            old.scales._replace(side=jnp.where(over, 0, side)),
+            gone,
+            deepest,
+            hardware_deepest,
+            learnt_deepest,
+            next_,
         )
-        history = met.history._replace(ring=ring, number=number)
-        return command, RetrospectiveState(line, aligned, noise, episode, learnt, reference, history)
+        return jnp.where((side != 0) & ~over, command, 0), episode, learnt, reference
+
+    def _catch_up(self, prepared, learnt, found, teaching, old):
+        """What is known with up to two of the readings since the surface was met more, and what counts of it;
+        the reading to learn from next, and the deepest point of those learnt from."""
+        history, scales = teaching.history, teaching.scales
+
+        def read(learnt, index, farthest, found):
+            counts = teaching.usable & (index <= history.age)
+            at = jnp.minimum(index, history.age)
+            sample, (force_then, shown) = recall(history, at), reading_at(history, at)
+            depth = depth_of(scales, teaching.clearance, sample.position)
+            farthest = jnp.where(counts & (depth > farthest), depth, farthest)
+            seen = scales.side * (force_then - scales.bias) / scales.weight
+            reading = Reading(
+                depth,
+                scales.side * sample.velocity / scales.speed,
+                seen,
+                teaching.variance + (MISFIT * seen) ** 2,
+                ~shown,
+                teaching.zone,
+                counts,
+            )
+            learnt, known = self.learn(prepared, learnt, found, reading, farthest)
+            return learnt, known, index + jnp.where(counts, 1, 0), farthest
+
+        first = read(learnt, old.next, old.learnt_deepest, found)
+        behind = jnp.any(teaching.usable & (first[2] <= history.age))
+        # Where no lane has to catch up, the effort is spared.
+        return lax.cond(
+            behind, lambda: read(first[0], first[2], first[3], jnp.zeros_like(found)), lambda: first
+        )
+
+
+class _Read(NamedTuple):
+    """What is read at a tick."""
+
+    position: Array  # of the hardware, as old as the force [m]
+    velocity: Array  # likewise [m/s]
+    force: Array  # [N]
+    shown: Array  # whether the sensor shows it
+    variance: Array  # of its noise [N^2]
+
+
+class _Teaching(NamedTuple):
+    """What there is to learn from."""
+
+    history: History  # of readings
+    scales: Scales  # of the contact
+    clearance: Array  # [m]
+    variance: Array  # of a reading [1/s^2]
+    zone: Array  # dead zone [1/s]
+    usable: Array  # whether there is a contact
 
 
 def map_prior(gains: Gains) -> Map:
@@ -224,27 +334,34 @@ def map_prior(gains: Gains) -> Map:
         damping=gains["prior_damping_spread"],
         depth_damping=gains["prior_depth_damping_spread"],
         unloading=gains["prior_unloading_spread"],
+        friction=gains["prior_friction_spread"],
+        preload=gains["prior_preload_spread"],
     )
 
 
-def _deepest(before, enters, depth):
+def _begun(old: Episode, meeting) -> Episode:
+    """The contact under way, the one that is found where one is."""
+    found = meeting.found
+    fresh = {name: jnp.where(found, 0, getattr(old, name)) for name in Episode._fields[1:-1]}
+    return Episode(meeting.scales, **fresh, next=jnp.where(found, meeting.index + 1, old.next))
+
+
+def _safe(scales: Scales, usable: Array) -> Scales:
+    """1 in the place of what nothing can be scaled by."""
+    by = {name: jnp.where(usable, getattr(scales, name), 1) for name in ("speed", "pace", "weight")}
+    return scales._replace(**by)
+
+
+def _deepest(before, depth):
     """The deepest point of this contact so far [s]."""
-    before = jnp.where(enters, 0, before)
     return jnp.where(depth > before, depth, before)
 
 
-def _command(gains, now, known, own, separated, read, expected, reference_speed, period):
+def _command(gains, v, known, own, separated, read, expected, reference_speed, pace, period):
     """F_c/(M v0) [1/s], of the module's text; `own` is the map's force on the numerical model."""
-    own = jnp.where(own > 0, own, 0)
-    limit = gains["correction_limit"] * peak_force(known.slopes)
-    wanted = gains["velocity_gain"] * (now.v - 0.5 * period * own - reference_speed)
+    peak = peak_force(known)
+    own = jnp.where(own > 0, jnp.where(own > MOST * peak, MOST * peak, own), 0)
+    limit = gains["correction_limit"] * peak
+    wanted = gains["velocity_gain"] / pace * (v - 0.5 * period * own - reference_speed)
     correction = jnp.where(wanted > limit, limit, jnp.where(wanted < -limit, -limit, wanted))
-    command = jnp.where(separated, correction, own + (read - expected) + correction)
-    return jnp.where(now.usable, command, jnp.where(separated, 0, read))
-
-
-def _remembered(history, reference, moved, hardware, tick):
-    """The ring of measured samples with this tick's; written after it is read, it is updated in place."""
-    live = reference.live.depth
-    impulse = depend_on(moved.impulse, jnp.where(jnp.isfinite(live), live, 0))
-    return remember(history, tick, jnp.concatenate([jnp.stack([impulse, moved.read]), hardware]))
+    return jnp.where(separated, correction, own + (read - expected) + correction)

@@ -88,8 +88,7 @@ static int jaxhil_doubts_status(const jaxhil_doubts *doubts, const jaxhil_curve 
     if (doubts->late * peak > jaxhil_too_late * jaxhil_map_pi) {
         return JAXHIL_TOO_SHORT;
     }
-    if (doubts->early > jaxhil_early ||
-        (deepest >= jaxhil_knots[JAXHIL_DEEP] && jaxhil_doubts_deeper(doubts, curve))) {
+    if (deepest >= jaxhil_knots[JAXHIL_DEEP] && jaxhil_doubts_deeper(doubts, curve)) {
         return JAXHIL_DISPLACED;
     }
     if (zone > jaxhil_hiding * peak || variance > wide * wide ||

@@ -6,20 +6,21 @@
 
 /* == Declarations == */
 
-enum { JAXHIL_SEGMENTS = 12, JAXHIL_PARAMETERS = 15 };
+enum { JAXHIL_SEGMENTS = 12, JAXHIL_PARAMETERS = JAXHIL_SEGMENTS + 5 };
+enum { JAXHIL_DAMPING = JAXHIL_SEGMENTS, JAXHIL_DEPTH_DAMPING, JAXHIL_UNLOADING, JAXHIL_FRICTION, JAXHIL_PRELOAD };
 
-/* What counts of a map: slopes [1/s^2], force at the knots [1/s], damping and depth damping [1/s], unloading
- * [1/s^2]. Depth in s (over the approach speed), speed as a fraction of that speed, force in 1/s (over mass and
+/* What counts of a map: slopes [1/s^2], force at the knots [1/s], which begins with the preload, damping and depth
+ * damping [1/s], unloading [1/s^2], friction [1/s]. Depth in s (over the approach speed), speed as a fraction of that speed, force in 1/s (over mass and
  * approach speed). */
 typedef struct {
-    double slopes[JAXHIL_SEGMENTS], at_knots[JAXHIL_SEGMENTS], damping, depth_damping, unloading;
+    double slopes[JAXHIL_SEGMENTS], at_knots[JAXHIL_SEGMENTS], damping, depth_damping, unloading, friction;
 } jaxhil_curve;
 
 /* f(x, v, x_m) = sum_j slope_j clip(x - kappa_j, 0, kappa_{j+1} - kappa_j) + (damping + depth_damping x/reach) v
- * - unloading (x_m - x) at x > 0, else 0, x_m the deepest point so far; from a Gaussian prior by recursive least
+ * - unloading (x_m - x) + friction v/sqrt(v^2 + slow^2) + preload at x > 0, else 0, x_m the deepest point so far; from a Gaussian prior by recursive least
  * squares. What dissipates counts in `curve` with its mean given that it is not negative. */
 typedef struct {
-    double stiffness, common, wandering, damping, depth_damping, unloading;
+    double stiffness, common, wandering, damping, depth_damping, unloading, friction, preload;
     double estimate[JAXHIL_PARAMETERS], covariance[JAXHIL_PARAMETERS][JAXHIL_PARAMETERS];
     jaxhil_curve curve;
     double variance; /* [1/s^2] of the force that it expects where it was read last */
@@ -31,8 +32,10 @@ void jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, do
 
 /* == Definitions == */
 
-static const double jaxhil_knots[JAXHIL_SEGMENTS] = {0.0,  0.002, 0.005, 0.01,  0.016, 0.024,
-                                                     0.032, 0.04,  0.05,  0.062, 0.076, 0.092};
+static const double jaxhil_knots[JAXHIL_SEGMENTS] = {0.0,   0.003, 0.008, 0.015, 0.024, 0.034,
+                                                     0.046, 0.06,  0.076, 0.1,   0.14,  0.2};
+static const double jaxhil_map_wide = 0.092;     /* s of depth, beyond which slopes wander less and less */
+static const double jaxhil_map_slow = 0.03;      /* speed at which friction turns */
 static const double jaxhil_map_wandering = 0.03; /* s of depth over which a slope wanders by its spread */
 static const double jaxhil_map_reach = 0.03;     /* s of depth at which the depth damping is as strong as named */
 static const double jaxhil_map_surface = 1e-12;  /* s of depth: nearer is on the surface, whatever the rounding */
@@ -78,9 +81,13 @@ static int jaxhil_pressed(double depth, double *pressed) {
     return last + 1;
 }
 
+static double jaxhil_force_depth_map_loss(const jaxhil_force_depth_map *map, int place) {
+    return jaxhil_positive_mean(map->estimate[place], map->covariance[place][place]);
+}
+
 static void jaxhil_force_depth_map_conclude(jaxhil_force_depth_map *map) {
     jaxhil_curve *curve = &map->curve;
-    double reached = 0.0;
+    double reached = map->estimate[JAXHIL_PRELOAD];
     for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
         curve->slopes[j] = map->estimate[j];
         if (j > 0) {
@@ -88,9 +95,16 @@ static void jaxhil_force_depth_map_conclude(jaxhil_force_depth_map *map) {
         }
         curve->at_knots[j] = reached;
     }
-    curve->damping = jaxhil_positive_mean(map->estimate[12], map->covariance[12][12]);
-    curve->depth_damping = jaxhil_positive_mean(map->estimate[13], map->covariance[13][13]);
-    curve->unloading = jaxhil_positive_mean(map->estimate[14], map->covariance[14][14]);
+    curve->damping = jaxhil_force_depth_map_loss(map, JAXHIL_DAMPING);
+    curve->depth_damping = jaxhil_force_depth_map_loss(map, JAXHIL_DEPTH_DAMPING);
+    curve->unloading = jaxhil_force_depth_map_loss(map, JAXHIL_UNLOADING);
+    curve->friction = jaxhil_force_depth_map_loss(map, JAXHIL_FRICTION);
+}
+
+/* Over how much depth [s] slopes have wandered at a depth [s]: beyond some, ever less, as (wide/depth)^4. */
+static double jaxhil_map_wandered(double depth) {
+    const double ratio = jaxhil_map_wide / depth;
+    return depth > jaxhil_map_wide ? jaxhil_map_wide * (4.0 - ratio * ratio * ratio) / 3.0 : depth;
 }
 
 static void jaxhil_force_depth_map_restart(jaxhil_force_depth_map *map) {
@@ -103,14 +117,16 @@ static void jaxhil_force_depth_map_restart(jaxhil_force_depth_map *map) {
     map->variance = 0.0;
     for (int i = 0; i < JAXHIL_SEGMENTS; i++) {
         for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
-            const double shared = i < j ? jaxhil_knots[i] : jaxhil_knots[j];
+            const double shared = jaxhil_map_wandered(i < j ? jaxhil_knots[i] : jaxhil_knots[j]);
             map->covariance[i][j] = map->common + map->wandering * (shared / jaxhil_map_wandering);
         }
         map->estimate[i] = map->stiffness;
     }
-    map->covariance[12][12] = map->damping;
-    map->covariance[13][13] = map->depth_damping;
-    map->covariance[14][14] = map->unloading;
+    map->covariance[JAXHIL_DAMPING][JAXHIL_DAMPING] = map->damping;
+    map->covariance[JAXHIL_DEPTH_DAMPING][JAXHIL_DEPTH_DAMPING] = map->depth_damping;
+    map->covariance[JAXHIL_UNLOADING][JAXHIL_UNLOADING] = map->unloading;
+    map->covariance[JAXHIL_FRICTION][JAXHIL_FRICTION] = map->friction;
+    map->covariance[JAXHIL_PRELOAD][JAXHIL_PRELOAD] = map->preload;
     jaxhil_force_depth_map_conclude(map);
 }
 
@@ -122,40 +138,50 @@ static void jaxhil_force_depth_map_init(jaxhil_force_depth_map *map, const jaxhi
     map->damping = gains->prior_damping_spread * gains->prior_damping_spread;
     map->depth_damping = gains->prior_depth_damping_spread * gains->prior_depth_damping_spread;
     map->unloading = gains->prior_unloading_spread * gains->prior_unloading_spread;
+    map->friction = gains->prior_friction_spread * gains->prior_friction_spread;
+    map->preload = gains->prior_preload_spread * gains->prior_preload_spread;
     jaxhil_force_depth_map_restart(map);
+}
+
+/* Which way the speed goes, from -1 to 1. */
+static double jaxhil_turning(double speed) {
+    const double ratio = speed / jaxhil_map_slow;
+    return ratio / sqrt(1.0 + ratio * ratio);
 }
 
 void jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, double speed, double deepest,
                                    double force, double variance) {
     double pressed[JAXHIL_SEGMENTS], g[JAXHIL_PARAMETERS];
     const int number = jaxhil_pressed(depth, pressed);
-    const double deeply = depth * speed / jaxhil_map_reach;
-    const double back = depth - deepest;
+    const double others[] = {speed, depth * speed / jaxhil_map_reach, depth - deepest, jaxhil_turning(speed), 1.0};
     double expected = 0.0;
     for (int j = 0; j < number; j++) {
         expected += pressed[j] * map->estimate[j];
     }
-    expected += speed * map->estimate[12];
-    expected += deeply * map->estimate[13];
-    expected += back * map->estimate[14];
-    if (!(expected > 0.0 || force * force > jaxhil_map_outlying * variance)) {
+    for (int k = 0; k < JAXHIL_PARAMETERS - JAXHIL_SEGMENTS; k++) {
+        expected += others[k] * map->estimate[JAXHIL_SEGMENTS + k];
+    }
+    if (!(speed > 0.0 || expected > 0.0 || force * force > jaxhil_map_outlying * variance)) {
         return;
     }
+    double s = variance;
     for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
         const double *row = map->covariance[i];
         double product = 0.0;
         for (int j = 0; j < number; j++) {
             product += row[j] * pressed[j];
         }
-        g[i] = product + row[12] * speed + row[13] * deeply + row[14] * back;
+        for (int k = 0; k < JAXHIL_PARAMETERS - JAXHIL_SEGMENTS; k++) {
+            product += row[JAXHIL_SEGMENTS + k] * others[k];
+        }
+        g[i] = product;
     }
-    double s = variance;
     for (int j = 0; j < number; j++) {
         s += pressed[j] * g[j];
     }
-    s += speed * g[12];
-    s += deeply * g[13];
-    s += back * g[14];
+    for (int k = 0; k < JAXHIL_PARAMETERS - JAXHIL_SEGMENTS; k++) {
+        s += others[k] * g[JAXHIL_SEGMENTS + k];
+    }
     if (!(s > 0.0)) {
         return;
     }
@@ -188,13 +214,14 @@ static double jaxhil_curve_force(const jaxhil_curve *curve, double depth, double
     }
     const double drag = (curve->damping + curve->depth_damping * depth / jaxhil_map_reach) * speed;
     const double back = deepest > depth ? deepest - depth : 0.0;
-    return jaxhil_curve_elastic(curve, depth) + (drag - curve->unloading * back);
+    return jaxhil_curve_elastic(curve, depth) + (drag + curve->friction * jaxhil_turning(speed) - curve->unloading * back);
 }
 
 /* Force [1/s] where a contact entered at speed 1 comes to rest without dissipation, at least 1. At knots where the
  * map pulls the force counts as 0. */
 static double jaxhil_curve_peak_force(const jaxhil_curve *curve) {
-    double reached = 0.0, energy = 0.0, rise = curve->slopes[JAXHIL_SEGMENTS - 1];
+    double reached = curve->at_knots[0] > 0.0 ? curve->at_knots[0] : 0.0;
+    double energy = 0.0, rise = curve->slopes[JAXHIL_SEGMENTS - 1];
     for (int j = 0; j < JAXHIL_SEGMENTS - 1; j++) {
         const double width = jaxhil_knots[j + 1] - jaxhil_knots[j];
         const double force = curve->at_knots[j + 1] > 0.0 ? curve->at_knots[j + 1] : 0.0;

@@ -1,8 +1,9 @@
-/* What the retrospective references share: identify the contact, work out what should have happened, pay it back.
- * In contact F_c = f_0 + (y - F(X, V)) + f_e, f_0 = max(F(x_d, v_d), 0), F the force-depth map identified on
- * delay-aligned readings (X, V, y); separated F_c = f_e until the hardware has left the surface for 6 ms, then
- * 0. f_e = clip(c (v_d - T f_0/2 - v_r), -limit p, limit p), v_r the speed of the motion that the contact should
- * have had since its entry, p the peak force that the map predicts. Scaled by approach speed and equivalent mass.
+/* What the retrospective references share: find the surface, identify the contact, work out what should have happened,
+ * pay it back. Until the force tells of contact F_c = 0. In contact F_c = f_0 + (y - F(X, V)) + f_e, f_0 = max(F(x_d,
+ * v_d), 0), F the force-depth map identified on delay-aligned readings (X, V, y) since the surface was met; separated
+ * F_c = f_e until the hardware has left the surface for 6 ms, then 0. f_e = clip(c (v_d - T f_0/2 - v_r), -limit p,
+ * limit p), v_r the speed of the motion that the contact should have had since its entry, p the peak force that the map
+ * predicts. Scaled by approach speed and equivalent mass.
  */
 #include <math.h>
 #include <stdbool.h>
@@ -10,22 +11,31 @@
 #include "doubts.c"
 #include "filters.c"
 #include "gains_table.c"
-#include "hardware_samples.c"
+#include "history.c"
+#include "onset.c"
 #include "reintegration.c"
 #include "surfaces.c"
 
 /* == Declarations == */
 
+/* Where a surface is expected: by how much [m] it is deeper than told, and the spread of that. */
+typedef struct {
+    double place, spread;
+} jaxhil_plane;
+
 typedef struct {
     double period, clearance, mass, share, force_noise, dead_zone, floor, velocity_gain, limit, replay, strength;
-    double middle, last, side, speed, gone, squares, count, deepest, hardware_deepest, plane, surface;
+    double plane_spread, bias_spread;
+    jaxhil_plane planes[2]; /* where the surfaces on both sides are expected */
+    double middle, last, pace, side, speed, gone, squares, count, deepest, hardware_deepest, learnt_deepest, before;
+    long next;
     jaxhil_delay_line line;
     jaxhil_learnt learnt;
     jaxhil_reference_motion reference;
-    jaxhil_hardware_samples hardware;
+    jaxhil_history history;
+    jaxhil_onset onset;
     jaxhil_doubts doubts;
-    long elapsed;
-    bool whole, entered, started;
+    bool whole, started, shown_before;
     int status;
     double samples[JAXHIL_IDENTIFICATION_DELAY_SAMPLES];
 } jaxhil_law;
@@ -33,27 +43,39 @@ typedef struct {
 /* == Definitions == */
 
 static const double jaxhil_farewell = 0.006;   /* s for which it goes on after the hardware has left */
-static const double jaxhil_longest_lag = 0.1;  /* s for which it waits for hardware that is not in contact yet */
-static const double jaxhil_seen = 8.0;         /* readings out of contact that show how noisy the force is */
-static const double jaxhil_outstanding = 16.0; /* times the noise's variance: what hardly is noise */
+static const double jaxhil_plane_late = 0.25;  /* how uncertain the surface is, of the ticks until it was found */
+static const double jaxhil_plane_drift = 1e-6; /* m, from contact to contact */
+static const double jaxhil_plane_elsewhere = 25.0; /* times the variance of where it is expected */
+static const double jaxhil_usual_pace = 14.0; /* 1/s: slower contact is followed on a slower scale of time */
+static const double jaxhil_slowest = 0.01;    /* of that */
+static const double jaxhil_most = 1.2;        /* of the peak force, that the model is to feel of the map */
+static const double jaxhil_misfit = 0.003;    /* of a force, by which the map may be wrong */
+static const double jaxhil_seen = 8.0;         /* differences between readings that show how noisy the force is */
+static const double jaxhil_outstanding = 32.0; /* times the noise's variance: what hardly is noise */
+enum { JAXHIL_READINGS = 2 };                  /* per tick that the map learns from, while it has to catch up */
 
 /* All but what was learnt of earlier contacts. */
 static void jaxhil_law_restart(jaxhil_law *law) {
     law->side = 0.0;
     law->speed = 0.0;
-    law->entered = false;
     law->gone = 0.0;
     law->squares = 0.0;
     law->count = 0.0;
-    jaxhil_hardware_samples_reset(&law->hardware);
     law->deepest = 0.0;
     law->hardware_deepest = 0.0;
-    law->elapsed = 0;
-    law->plane = 0.0;
-    law->surface = 0.0;
+    jaxhil_history_restart(&law->history);
+    jaxhil_onset_restart(&law->onset);
     jaxhil_doubts_restart(&law->doubts);
     law->started = false;
+    law->shown_before = false;
     law->status = JAXHIL_OUT_OF_CONTACT;
+}
+
+static void jaxhil_law_forget_planes(jaxhil_law *law) {
+    for (int i = 0; i < 2; i++) {
+        law->planes[i].place = 0.0;
+        law->planes[i].spread = law->plane_spread;
+    }
 }
 
 static bool jaxhil_law_init(jaxhil_law *law, const jaxhil_gains *gains) {
@@ -72,12 +94,16 @@ static bool jaxhil_law_init(jaxhil_law *law, const jaxhil_gains *gains) {
     law->limit = gains->correction_limit;
     law->replay = gains->force_replay;
     law->strength = gains->replay_noise * gains->replay_noise;
+    law->plane_spread = gains->plane_spread;
+    law->bias_spread = gains->bias_spread;
+    jaxhil_law_forget_planes(law);
     law->middle = 0.0;
     law->last = 0.0;
     jaxhil_doubts_start(&law->doubts, 0.0, 0.0);
     jaxhil_learnt_init(&law->learnt, gains);
     jaxhil_reference_motion_init(&law->reference, period);
-    law->hardware.period = period;
+    law->reference.scales.clearance = law->clearance;
+    law->onset.period = period;
     jaxhil_law_restart(law);
     law->whole = whole;
     /* The line delays by less than the capacity allows: a delay is refused like that of the other laws. */
@@ -113,12 +139,6 @@ static void jaxhil_law_align(jaxhil_law *law, double measured, double velocity_d
     law->middle = newest;
 }
 
-/* A reading out of contact: it tells how noisy the force is. */
-static void jaxhil_law_take_noise(jaxhil_law *law, double force) {
-    law->squares += force * force;
-    law->count += 1.0;
-}
-
 /* The force's variance [N^2]: the known one, or what readings out of contact show if that is more. */
 static double jaxhil_law_noise(const jaxhil_law *law) {
     const double known = law->force_noise * law->force_noise;
@@ -126,31 +146,25 @@ static double jaxhil_law_noise(const jaxhil_law *law) {
     return seen > known ? seen : known;
 }
 
-/* A reading [N] out of contact while one is under way: noise, or the hardware, met too early. */
-static void jaxhil_law_sort_out(jaxhil_law *law, double force, double depth, double weight) {
-    const double least = law->floor * weight;
-    const double usual = jaxhil_law_noise(law) + least * least;
-    if (!(law->count >= jaxhil_seen && force * force > jaxhil_outstanding * usual)) {
-        jaxhil_law_take_noise(law, force);
-        return;
+/* A reading [N]: out of contact the difference from the one before tells how noisy the force is. */
+static void jaxhil_law_take_noise(jaxhil_law *law, double force, bool shown) {
+    const double step = force - law->before;
+    if (shown && law->shown_before && law->side == 0.0 &&
+        !(law->count >= jaxhil_seen && step * step > jaxhil_outstanding * jaxhil_law_noise(law))) {
+        law->squares += 0.5 * (step * step);
+        law->count += 1.0;
     }
-    law->doubts.early++;
-    if (law->doubts.early == 1) {
-        law->surface = -depth;
-    }
-    if (law->doubts.early > jaxhil_early) {
-        law->plane = law->surface;
-    }
+    law->before = force;
+    law->shown_before = shown;
 }
 
 /* f_e [1/s], for the speed of the model in the middle of the next period; `status` judges it. */
-static double jaxhil_law_repayment(jaxhil_law *law, const jaxhil_curve *curve, double speed, double deepest,
-                                   double zone) {
+static double jaxhil_law_repayment(jaxhil_law *law, const jaxhil_curve *curve, double speed, double zone) {
     const double peak = jaxhil_curve_peak_force(curve);
     const double limit = law->limit * peak;
-    const double correction = law->velocity_gain * (speed - law->reference.live.speed);
-    law->status = jaxhil_doubts_status(&law->doubts, curve, peak, deepest, jaxhil_learnt_variance(&law->learnt),
-                                       zone, law->speed);
+    const double correction = law->velocity_gain / law->pace * (speed - law->reference.live.speed);
+    law->status = jaxhil_doubts_status(&law->doubts, curve, peak, law->hardware_deepest,
+                                       jaxhil_learnt_variance(&law->learnt), zone, law->speed);
     if (!(correction > limit || correction < -limit)) {
         return correction;
     }
@@ -158,21 +172,35 @@ static double jaxhil_law_repayment(jaxhil_law *law, const jaxhil_curve *curve, d
     return correction > limit ? limit : -limit;
 }
 
-/* The command over M v0 [1/s]; whether the numerical model has separated. */
-static double jaxhil_law_follow(jaxhil_law *law, bool enters, double x, double v, double given, double depth,
-                                double rate, double force, bool hidden, double weight, bool *separated) {
-    const double period = law->period;
-    const jaxhil_curve *curve = jaxhil_learnt_curve(&law->learnt);
-    jaxhil_hardware_samples *hardware = &law->hardware;
-    law->elapsed++;
-    if (enters) {
-        jaxhil_learnt_begin(&law->learnt);
-        jaxhil_reference_motion_restart(&law->reference, x);
-        jaxhil_hardware_samples_begin(hardware, x, force, !hidden, given - period * rate, rate);
-        law->elapsed = 0;
-        law->deepest = 0.0;
-        law->hardware_deepest = 0.0;
+/* The map learns from the readings since the surface was met, one after the other; noise of a `variance` [1/s^2],
+ * the dead zone [1/s]. */
+static void jaxhil_law_learn(jaxhil_law *law, double variance, double zone) {
+    const jaxhil_history *history = &law->history;
+    const jaxhil_scales *scales = &law->reference.scales;
+    for (int i = 0; i < JAXHIL_READINGS && law->next <= history->newest; i++, law->next++) {
+        const jaxhil_sample *sample = jaxhil_history_recall(history, law->next);
+        const long slot = law->next % JAXHIL_SLOTS;
+        const double depth = jaxhil_scales_depth(scales, sample->position);
+        const double rate = jaxhil_scales_rate(scales, sample->velocity);
+        const double force = jaxhil_scales_force(scales, history->forces[slot]);
+        const bool hidden = !history->shows[slot];
+        if (depth > law->learnt_deepest) {
+            law->learnt_deepest = depth;
+        }
+        if (depth > 0.0 && !hidden) {
+            jaxhil_doubts_read(&law->doubts, depth, law->learnt_deepest, force, variance);
+        }
+        const double off = jaxhil_misfit * force;
+        jaxhil_learnt_read(&law->learnt, depth, rate, law->learnt_deepest, force, variance + off * off, hidden, zone);
     }
+}
+
+/* The command over M v0 [1/s]; whether the numerical model has separated. */
+static double jaxhil_law_follow(jaxhil_law *law, double x, double v, double depth, double rate, double force,
+                                bool hidden, bool *separated) {
+    const double period = law->reference.period;
+    const double weight = law->reference.scales.weight;
+    const jaxhil_curve *curve = jaxhil_learnt_curve(&law->learnt);
     if (x > law->deepest) {
         law->deepest = x;
     }
@@ -182,113 +210,166 @@ static double jaxhil_law_follow(jaxhil_law *law, bool enters, double x, double v
     const double deepest = law->hardware_deepest;
 
     const double zone = law->dead_zone / weight;
-    const double square = weight * weight;
-    const double noise = square > 0.0 ? jaxhil_law_noise(law) / square : 0.0;
-    const double variance = law->floor * law->floor + noise;
-    if (depth > 0.0) {
-        if (!law->entered) {
-            law->entered = true;
-            jaxhil_hardware_samples_enter(hardware, depth, rate);
-            law->doubts.late = hardware->first + (double)law->elapsed * period;
-        }
-        if (!hidden) {
-            jaxhil_doubts_read(&law->doubts, depth, deepest, force, variance);
-        }
-    }
+    const double noise = jaxhil_law_noise(law) / (weight * weight);
     law->reference.shift = jaxhil_learnt_shift(&law->learnt);
-    jaxhil_learnt_read(&law->learnt, given, rate, deepest, force, variance, hidden, zone);
+    jaxhil_law_learn(law, law->floor * law->floor + noise, zone);
     const double expected = jaxhil_curve_force(curve, depth, rate, deepest);
     if (hidden) {
         force = expected > zone ? zone : (expected > 0.0 ? expected : 0.0);
     }
     const double whole = law->strength + noise;
     law->reference.replay = whole > 0.0 ? law->replay * law->strength / whole : 0.0;
-    jaxhil_reference_motion_tick(&law->reference, curve);
+    jaxhil_reference_motion_tick(&law->reference, &law->history, curve);
 
     double own = jaxhil_curve_force(curve, x, v, law->deepest);
     *separated = x <= 0.0 || (v < 0.0 && own <= 0.0);
     if (!(own > 0.0)) {
         own = 0.0;
     }
-    const double correction = jaxhil_law_repayment(law, curve, v - 0.5 * period * own, deepest, zone);
-    jaxhil_hardware_samples_take(hardware, &law->reference, law->entered, force, !hidden, given, rate, deepest);
+    const double most = jaxhil_most * jaxhil_curve_peak_force(curve);
+    if (own > most) {
+        own = most;
+    }
+    const double correction = jaxhil_law_repayment(law, curve, v - 0.5 * period * own, zone);
     return *separated ? correction : own + (force - expected) + correction;
 }
 
-/* The numerical model is beyond another surface: a contact begins. */
-static void jaxhil_law_meet(jaxhil_law *law, double side, double depth, double velocity) {
-    const double approach = side * velocity;
-    const bool sound = law->mass * approach > 0.0 && fabs(depth) <= 2.0 * law->period * approach;
+/* A surface was met between two places [m], so many ticks before that was found. Where it is expected now. */
+static double jaxhil_plane_learn(jaxhil_plane *plane, double low, double high, long age) {
+    const double width = high - low;
+    const double spread = jaxhil_plane_late * (double)age;
+    const double found = width * width * (1.0 / 12.0 + spread * spread);
+    const double known = plane->spread * plane->spread;
+    const double middle = 0.5 * (low + high);
+    const double away = middle - plane->place;
+    const bool elsewhere = away * away > jaxhil_plane_elsewhere * (known + found);
+    plane->place = elsewhere ? middle : plane->place + away * (known / (known + found));
+    plane->spread = sqrt((elsewhere ? found : known * found / (known + found)) + jaxhil_plane_drift * jaxhil_plane_drift);
+    return plane->place;
+}
+
+/* A surface is found, met between two samples: between them it lies where it was most expected. */
+static void jaxhil_law_meet(jaxhil_law *law, double side, double reach, double speed, jaxhil_found found) {
+    jaxhil_history *history = &law->history;
+    jaxhil_scales *scales = &law->reference.scales;
+    const long entry = history->newest - found.age;
+    scales->side = side;
+    double pace = sqrt(found.stiffness > 0.0 ? found.stiffness : 0.0) / jaxhil_usual_pace;
+    pace = pace < 1.0 ? (pace > jaxhil_slowest ? pace : jaxhil_slowest) : 1.0;
+    scales->speed = speed;
+    scales->length = speed / pace;
+    law->pace = pace;
+    law->reference.period = law->period * pace;
+    scales->plane = 0.0;
+    scales->bias = side * found.bias * (law->mass * speed);
+    scales->weight = law->mass * speed * pace;
+    const double low = jaxhil_scales_beyond(scales, jaxhil_history_recall(history, entry)->position);
+    const double high = jaxhil_scales_beyond(scales, jaxhil_history_recall(history, entry + 1)->position);
+    const double place = jaxhil_plane_learn(&law->planes[side < 0.0], low, high, found.age);
+    /* Not at the end of the stretch: the reference would not have entered. */
+    const double margin = 0.0625 * (high - low);
+    const double end = high - margin;
+    scales->plane = place < low ? low : (place > end ? end : place);
+    const double since = high > low ? (high - scales->plane) / (high - low) : 0.5;
+    const double depth = (reach - scales->plane) / scales->length;
     law->side = side;
-    law->speed = sound ? approach : 0.0;
-    law->entered = false;
+    law->speed = speed;
     law->gone = 0.0;
-    law->plane = 0.0;
+    law->deepest = 0.0;
+    law->hardware_deepest = 0.0;
+    law->learnt_deepest = 0.0;
+    law->next = entry + 1;
     jaxhil_doubts_restart(&law->doubts);
+    law->doubts.late = depth - (double)found.age * law->reference.period;
+    jaxhil_learnt_begin(&law->learnt);
+    jaxhil_reference_motion_begin(&law->reference, history, entry, since, depth > 0.0 ? depth : 0.0);
+}
+
+/* Flying to the surface on this side with this speed [m/s]: whether the force tells that it was met. */
+static bool jaxhil_law_watch(jaxhil_law *law, double side, double speed, double force, bool shown,
+                             jaxhil_found *found) {
+    const double weight = law->mass * speed;
+    const double noise = law->floor * law->floor + jaxhil_law_noise(law) / (weight * weight);
+    const double spread = law->bias_spread / weight;
+    const jaxhil_plane *plane = &law->planes[side < 0.0];
+    jaxhil_onset_take(&law->onset, side * force / weight, shown);
+    found->evidence = jaxhil_onset_certain;
+    found->age = 0;
+    for (int i = 0; i < JAXHIL_AGES && jaxhil_ages[i] < law->onset.watched; i++) {
+        const long age = jaxhil_ages[i];
+        const double position = jaxhil_history_recall(&law->history, law->history.newest - age)->position;
+        const double place = (side < 0.0 ? -law->clearance - position : position) - plane->place;
+        const double away = place / plane->spread;
+        const double rarity = jaxhil_map_pi * plane->spread * (1.0 + away * away) / (law->period * speed);
+        jaxhil_found one;
+        one.age = age;
+        one.evidence = jaxhil_onset_evidence(&law->onset, age, noise, spread * spread, rarity, &one);
+        if (one.evidence > found->evidence) {
+            *found = one;
+        }
+    }
+    return found->age > 1 && (double)found->age * law->period >= jaxhil_onset_wait * (1.0 - 1e-9);
 }
 
 static double jaxhil_law_step(jaxhil_law *law, double force_measured, double position_desired,
                               double velocity_desired, double position_measured) {
-    const double period = law->period;
-    const double clearance = law->clearance;
+    const double zone = law->dead_zone;
+    const bool begins = !law->started;
     double position, velocity;
     jaxhil_law_align(law, position_measured, velocity_desired, &position, &velocity);
-    const double bent = jaxhil_deflection(position, clearance);
-    const double reach = jaxhil_deflection(position_desired, clearance);
-    const double now = reach > 0.0 ? 1.0 : (reach < 0.0 ? -1.0 : 0.0);
-    const bool enters = now != 0.0 && now != law->side;
-    if (enters) {
-        jaxhil_law_meet(law, now, reach, velocity_desired);
+    /* A run's first reading counts as none: the sensor's delay line may not have been filled. */
+    const bool hidden = begins || (zone > 0.0 && force_measured == 0.0);
+    const double force =
+        force_measured + (force_measured > 0.0 ? zone : (force_measured < 0.0 ? -zone : 0.0));
+    jaxhil_history_take(&law->history, force, !hidden, position, velocity);
+    jaxhil_law_take_noise(law, force, !hidden);
+    const double reach = jaxhil_deflection(position_desired, law->clearance);
+    if (begins && reach != 0.0) {
+        law->side = reach > 0.0 ? 1.0 : -1.0;
+        law->speed = 0.0;
+    }
+    if (law->side == 0.0) {
+        const double side = velocity_desired > 0.0 ? 1.0 : -1.0;
+        const double speed = side * velocity_desired;
+        jaxhil_found found;
+        law->status = JAXHIL_OUT_OF_CONTACT;
+        if (!(law->mass * speed > 0.0) || (side < 0.0 && law->clearance == INFINITY)) {
+            jaxhil_onset_restart(&law->onset);
+            return 0.0;
+        }
+        if (!jaxhil_law_watch(law, side, speed, force, !hidden, &found)) {
+            return 0.0;
+        }
+        const double place = side < 0.0 ? -law->clearance - position_desired : position_desired;
+        jaxhil_law_meet(law, side, place, speed, found);
     }
     const double side = law->side;
-    if (side == 0.0) {
-        if (bent == 0.0) {
-            jaxhil_law_take_noise(law, force_measured);
+    bool separated;
+    double command, weight = 1.0;
+    law->gone += 1.0;
+    if (law->speed > 0.0) {
+        const jaxhil_scales *scales = &law->reference.scales;
+        const double rate = jaxhil_scales_rate(scales, velocity);
+        const double given = jaxhil_scales_depth(scales, position) - jaxhil_learnt_shift(&law->learnt) * rate;
+        const double depth = given >= -jaxhil_map_surface && given <= jaxhil_map_surface ? 0.0 : given;
+        if (depth > 0.0) {
+            law->gone = 0.0;
         }
-        law->status = JAXHIL_OUT_OF_CONTACT;
-        return 0.0;
-    }
-    const double speed = law->speed;
-    const double scale = speed > 0.0 ? speed : 1.0;
-    const double weight = law->mass * scale;
-    const double x = (side < 0.0 ? -clearance - position_desired : position_desired) / scale;
-    const double v = side * velocity_desired / scale;
-    const double given = (side < 0.0 ? -clearance - position : position) / scale + law->plane;
-    const double rate = side * velocity / scale;
-    const double shifted = given - jaxhil_learnt_shift(&law->learnt) * rate;
-    const double depth = shifted >= -jaxhil_map_surface && shifted <= jaxhil_map_surface ? 0.0 : shifted;
-    const double zone = law->dead_zone;
-    bool hidden = false;
-    double force = 0.0;
-    if (!(bent * side < 0.0)) {
-        hidden = zone > 0.0 && force_measured == 0.0;
-        if (force_measured > 0.0) {
-            force = side * (force_measured + zone) / weight;
-        } else if (force_measured < 0.0) {
-            force = side * (force_measured - zone) / weight;
-        }
-    }
-    if (!law->entered && !(speed > 0.0 && depth > 0.0) && bent == 0.0) {
-        jaxhil_law_sort_out(law, force_measured, given, weight);
-    }
-    if (!enters) {
-        law->gone += 1.0;
-    }
-    if (depth > 0.0) {
-        law->gone = 0.0;
-    }
-    bool separated = x <= 0.0;
-    double command = separated ? 0.0 : force;
-    if (speed > 0.0) {
-        command = jaxhil_law_follow(law, enters, x, v, given, depth, rate, force, hidden, weight,
-                                    &separated);
+        weight = scales->weight;
+        command = jaxhil_law_follow(law, jaxhil_scales_depth(scales, position_desired),
+                                    jaxhil_scales_rate(scales, velocity_desired), depth, rate,
+                                    jaxhil_scales_force(scales, force), hidden, &separated);
     } else {
+        const double bent = jaxhil_deflection(position, law->clearance);
+        separated = !(reach * side > 0.0);
+        command = separated || bent * side < 0.0 ? 0.0 : side * force;
+        law->gone = bent * side > 0.0 ? 0.0 : law->gone;
         law->status = JAXHIL_UNSURE;
     }
-    const double patience = law->entered || !(speed > 0.0) ? jaxhil_farewell : jaxhil_longest_lag;
-    if (separated && law->gone * period > patience * (1.0 + 1e-9)) {
+    if (separated && law->gone * law->period > jaxhil_farewell * (1.0 + 1e-9)) {
         law->side = 0.0;
         law->status = JAXHIL_OUT_OF_CONTACT;
+        jaxhil_onset_restart(&law->onset);
         return 0.0;
     }
     return side * weight * command;
@@ -302,10 +383,16 @@ static int jaxhil_law_own_status(const jaxhil_law *law) {
 #define JAXHIL_LAW_HAS_RESET
 static void jaxhil_law_reset(jaxhil_law *law) {
     jaxhil_law_restart(law);
+    jaxhil_law_forget_planes(law);
     jaxhil_learnt_reset(&law->learnt);
 }
 
 #define JAXHIL_LAW_HAS_NEXT_CONTACT
 static void jaxhil_law_next_contact(jaxhil_law *law) {
     jaxhil_law_restart(law);
+}
+
+#define JAXHIL_LAW_HAS_CONTACT_PLANE
+static double jaxhil_law_contact_plane(const jaxhil_law *law) {
+    return law->reference.scales.plane;
 }

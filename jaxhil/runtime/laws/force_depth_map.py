@@ -1,20 +1,25 @@
 """A force-depth map of unknown contact, identified while it lasts: slopes between knots, and dissipation.
 
-f(x, v, x_m) = sum_j slope_j clip(x - kappa_j, 0, kappa_{j+1} - kappa_j) + (damping + depth_damping x/REACH) v
-- unloading (x_m - x) at x > 0, else 0; x_m is the deepest point so far. Depth in s (over the approach speed),
-speed as a fraction of that speed, force in 1/s (over mass and approach speed). All parameters start from a
-Gaussian prior and are identified by recursive least squares; what dissipates counts with its mean given that
-it is not negative. Only segments that are pressed in enter the sums.
+f(x, v, x_m) = preload + sum_j slope_j clip(x - kappa_j, 0, kappa_{j+1} - kappa_j)
++ (damping + depth_damping x/REACH) v - unloading (x_m - x) + friction v/sqrt(v^2 + SLOW^2) at x > 0, else 0; x_m
+is the deepest point so far. Depth in s (over the approach speed), speed as a fraction of that speed, force in
+1/s (over mass and approach speed). All parameters start from a Gaussian prior and are identified by recursive
+least squares; what dissipates counts with its mean given that it is not negative. Only segments that are
+pressed in enter the sums.
 """
 
 from bisect import bisect_left
 from math import pi, sqrt
 from typing import NamedTuple
 
-KNOTS = (0.0, 0.002, 0.005, 0.01, 0.016, 0.024, 0.032, 0.04, 0.05, 0.062, 0.076, 0.092)
-SEGMENTS = 12
-PARAMETERS = 15
+KNOTS = (0.0, 0.003, 0.008, 0.015, 0.024, 0.034, 0.046, 0.06, 0.076, 0.1, 0.14, 0.2)
+SEGMENTS = len(KNOTS)
+DAMPING, DEPTH_DAMPING, UNLOADING, FRICTION, PRELOAD = range(SEGMENTS, SEGMENTS + 5)
+OTHERS = 5
+PARAMETERS = SEGMENTS + OTHERS
 WANDERING = 0.03  # s of depth over which a slope wanders by its spread
+WIDE = 0.092  # s of depth, beyond which slopes wander less and less
+SLOW = 0.03  # speed at which friction turns
 REACH = 0.03  # s of depth at which the depth damping is as strong as its name says
 SURFACE = 1e-12  # s of depth: nearer than that is on the surface, which rounding does not decide
 OUTLYING = 4.0  # times the noise's variance: a force that hardly is noise
@@ -23,8 +28,8 @@ OUTLYING = 4.0  # times the noise's variance: a force that hardly is noise
 class Prior(NamedTuple):
     """What is known before any reading.
 
-    Slopes are N(stiffness, common^2 + wandering^2 min(kappa_i, kappa_j) / 30 ms), what dissipates is
-    N(0, spread^2)."""
+    Slopes are N(stiffness, common^2 + wandering^2 wandered(min(kappa_i, kappa_j)) / 30 ms), what dissipates
+    and the preload are N(0, spread^2)."""
 
     stiffness: float  # mean of the slopes [1/s^2]
     common: float  # how uncertain all slopes are together [1/s^2]
@@ -32,6 +37,8 @@ class Prior(NamedTuple):
     damping: float  # spread of the damping [1/s]
     depth_damping: float  # spread of the damping that grows with depth [1/s]
     unloading: float  # spread of what unloading takes away [1/s^2]
+    friction: float  # spread of the friction [1/s]
+    preload: float  # spread of the preload [1/s]
 
     def moments(self) -> tuple[list[float], list[list[float]]]:
         """Mean and covariance of all parameters."""
@@ -41,27 +48,29 @@ class Prior(NamedTuple):
         for i in range(SEGMENTS):
             row = []
             for j in range(SEGMENTS):
-                shared = KNOTS[i] if i < j else KNOTS[j]
+                shared = wandered(KNOTS[i] if i < j else KNOTS[j])
                 row.append(common + wandering * (shared / WANDERING))
-            rows.append([*row, 0.0, 0.0, 0.0])
-        for place, spread in enumerate((self.damping, self.depth_damping, self.unloading)):
+            rows.append(row + [0.0] * OTHERS)
+        others = (self.damping, self.depth_damping, self.unloading, self.friction, self.preload)
+        for place, spread in enumerate(others):
             row = [0.0] * PARAMETERS
             row[SEGMENTS + place] = spread * spread
             rows.append(row)
-        return [self.stiffness] * SEGMENTS + [0.0, 0.0, 0.0], rows
+        return [self.stiffness] * SEGMENTS + [0.0] * OTHERS, rows
 
 
 class Curve:
     """What counts of a map."""
 
-    __slots__ = ("at_knots", "damping", "depth_damping", "slopes", "unloading")
+    __slots__ = ("at_knots", "damping", "depth_damping", "friction", "slopes", "unloading")
 
     def __init__(self) -> None:
         self.slopes = [0.0] * SEGMENTS  # [1/s^2]
-        self.at_knots = [0.0] * SEGMENTS  # force there [1/s]
+        self.at_knots = [0.0] * SEGMENTS  # force there, at the first the preload [1/s]
         self.damping = 0.0  # [1/s]
         self.depth_damping = 0.0  # [1/s]
         self.unloading = 0.0  # [1/s^2]
+        self.friction = 0.0  # [1/s]
 
     def take(self, other: "Curve") -> None:
         """Become equal to the other, whose lists are never changed."""
@@ -70,6 +79,7 @@ class Curve:
         self.damping = other.damping
         self.depth_damping = other.depth_damping
         self.unloading = other.unloading
+        self.friction = other.friction
 
     def elastic(self, depth: float) -> float:
         """Force [1/s] that does not depend on how the contact came there, 0 out of contact."""
@@ -84,12 +94,12 @@ class Curve:
             return 0.0
         drag = (self.damping + self.depth_damping * depth / REACH) * speed
         back = deepest - depth if deepest > depth else 0.0
-        return self.elastic(depth) + (drag - self.unloading * back)
+        return self.elastic(depth) + (drag + self.friction * turning(speed) - self.unloading * back)
 
     def peak_force(self) -> float:
         """Force [1/s] where a contact entered at speed 1 comes to rest without dissipation: that up to which
         int f dx = 1/2, at least 1. At knots where the map pulls the force counts as 0."""
-        reached = 0.0
+        reached = self.at_knots[0] if self.at_knots[0] > 0.0 else 0.0
         energy = 0.0
         rise = self.slopes[SEGMENTS - 1]
         for j in range(SEGMENTS - 1):
@@ -133,28 +143,27 @@ class ForceDepthMap:
         estimate = self._estimate
         covariance = self._covariance
         pressed = _pressed(depth)
-        deeply = depth * speed / REACH
-        back = depth - deepest
+        others = (speed, depth * speed / REACH, depth - deepest, turning(speed), 1.0)
         expected = 0.0
         for ramp, value in zip(pressed, estimate, strict=False):
             expected += ramp * value
-        expected += speed * estimate[12]
-        expected += deeply * estimate[13]
-        expected += back * estimate[14]
-        if not (expected > 0.0 or force * force > OUTLYING * variance):
+        for other, value in zip(others, estimate[SEGMENTS:], strict=True):
+            expected += other * value
+        if not (speed > 0.0 or expected > 0.0 or force * force > OUTLYING * variance):
             return
         g = []
         for row in covariance:
             product = 0.0
             for entry, ramp in zip(row, pressed, strict=False):
                 product += entry * ramp
-            g.append(product + row[12] * speed + row[13] * deeply + row[14] * back)
+            for entry, other in zip(row[SEGMENTS:], others, strict=True):
+                product += entry * other
+            g.append(product)
         s = variance
         for ramp, value in zip(pressed, g, strict=False):
             s += ramp * value
-        s += speed * g[12]
-        s += deeply * g[13]
-        s += back * g[14]
+        for other, value in zip(others, g[SEGMENTS:], strict=True):
+            s += other * value
         if not s > 0.0:
             return
         share = 1.0 / s
@@ -170,17 +179,34 @@ class ForceDepthMap:
         estimate = self._estimate
         covariance = self._covariance
         slopes = estimate[:SEGMENTS]
-        at_knots = [0.0] * SEGMENTS
-        reached = 0.0
+        reached = estimate[PRELOAD]
+        at_knots = [reached] * SEGMENTS
         for j in range(1, SEGMENTS):
             reached += slopes[j - 1] * (KNOTS[j] - KNOTS[j - 1])
             at_knots[j] = reached
         curve = self.curve
         curve.slopes = slopes
         curve.at_knots = at_knots
-        curve.damping = positive_mean(estimate[12], covariance[12][12])
-        curve.depth_damping = positive_mean(estimate[13], covariance[13][13])
-        curve.unloading = positive_mean(estimate[14], covariance[14][14])
+        curve.damping = positive_mean(estimate[DAMPING], covariance[DAMPING][DAMPING])
+        curve.depth_damping = positive_mean(
+            estimate[DEPTH_DAMPING], covariance[DEPTH_DAMPING][DEPTH_DAMPING]
+        )
+        curve.unloading = positive_mean(estimate[UNLOADING], covariance[UNLOADING][UNLOADING])
+        curve.friction = positive_mean(estimate[FRICTION], covariance[FRICTION][FRICTION])
+
+
+def wandered(depth: float) -> float:
+    """Over how much depth [s] slopes have wandered at a depth [s]: beyond WIDE ever less, as (WIDE/depth)^4."""
+    if not depth > WIDE:
+        return depth
+    ratio = WIDE / depth
+    return WIDE * (4.0 - ratio * ratio * ratio) / 3.0
+
+
+def turning(speed: float) -> float:
+    """Which way a speed goes, from -1 to 1."""
+    ratio = speed / SLOW
+    return ratio / sqrt(1.0 + ratio * ratio)
 
 
 def positive_mean(mean: float, variance: float) -> float:

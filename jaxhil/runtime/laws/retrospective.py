@@ -10,14 +10,15 @@ Scaled by approach speed v0 and equivalent mass M, F the force-depth map identif
 
     f_0 = max(F(x_d, v_d), 0)
     f_e = clip(c (v_d - T f_0/2 - v_r), -limit p, limit p)
+    no contact:  F_c = 0, until the force tells of one, and of where its surface is
     in contact:  F_c = f_0 + (y - F(X, V)) + f_e
     separated:   F_c = f_e  until the hardware has left the surface for 6 ms, then 0
 
-How noise, a dead zone and a surface that is nearer than expected are met:
-notebooks/guide/retrospective_reference.md.
+notebooks/guide/retrospective_reference.md says more.
 """
 
 from collections.abc import Mapping
+from math import inf, sqrt
 from typing import ClassVar
 
 from ..bounds import DAMPINGS_BY_MASS, FORCES, MASSES, STIFFNESSES_BY_MASS, TIMES
@@ -25,15 +26,21 @@ from ..filters import DelayLine
 from ..law_status import IDENTIFIED, OUT_OF_CONTACT, SATURATED, UNSURE
 from ..registry import Compensator, GainSpecification
 from ..surfaces import deflection
-from .doubts import EARLY, Doubts
+from .contact_plane import ContactPlane
+from .doubts import Doubts
 from .force_depth_map import SURFACE, Curve, Prior
-from .hardware_samples import HardwareSamples
-from .reintegration import ReferenceMotion
+from .history import History
+from .onset import CERTAIN, WAIT, Found, Onset, rarity
+from .reintegration import ReferenceMotion, Scales
 
-SEEN = 8  # readings out of contact that show how noisy the force is
-OUTSTANDING = 16.0  # times the noise's variance: what hardly is noise
+SEEN = 8  # differences between readings that show how noisy the force is
+OUTSTANDING = 32.0  # times the noise's variance: what hardly is noise
 FAREWELL = 0.006  # s for which it goes on after the hardware has left the surface
-LONGEST_LAG = 0.1  # s for which it waits for hardware that is not in contact yet
+USUAL_PACE = 14.0  # 1/s: slower contact is followed on a slower scale of time
+SLOWEST = 0.01  # of that
+MOST = 1.2  # of the peak force, that the model is to feel of the map
+MISFIT = 0.003  # of a force, by which the map may be wrong
+READINGS = 2  # per tick that the map learns from, while it has to catch up
 PRIOR = (  # the gains that `Prior` is made of, in its order
     "prior_stiffness",
     "prior_stiffness_spread",
@@ -41,24 +48,28 @@ PRIOR = (  # the gains that `Prior` is made of, in its order
     "prior_damping_spread",
     "prior_depth_damping_spread",
     "prior_unloading_spread",
+    "prior_friction_spread",
+    "prior_preload_spread",
 )
 
 
 class Retrospective(Compensator):
     """Reference and repayment; what identifies the contact is the law's own.
 
-    `_shift` [s] is by how much the force is older than by the given delay. Every contact starts afresh, also
-    with the other surface. A run that begins in contact has no approach speed to scale by: there F_c is the
-    measured force. `status` is what stands behind the last command: `OUT_OF_CONTACT`; `UNSURE`: nothing is
-    identified yet, or there is nothing to scale by, and it goes by the measured force and what the prior says
-    of the contact; `SATURATED`: identified, and the correction is at its limit; else what `doubts` says.
+    `_shift` [s] is by how much the force is older than by the given delay. Every contact starts afresh, but for
+    what is known of where the surfaces are. A run that begins in contact has no approach speed to scale by: there
+    F_c is the measured force. `status` is what stands behind the last command: `OUT_OF_CONTACT`; `UNSURE`:
+    nothing is identified yet, or there is nothing to scale by, and it goes by the measured force and what the
+    prior says of the contact; `SATURATED`: identified, and the correction is at its limit; else what `doubts`
+    says.
     """
 
     __slots__ = (
-        "_clearance", "_count", "_curve", "_dead_zone", "_deepest", "_doubts", "_elapsed", "_entered",
-        "_floor", "_force_noise", "_gone", "_hardware_deepest", "_last", "_limit", "_line", "_mass",
-        "_middle", "_period", "_plane", "_reference", "_replay", "_samples", "_share", "_shift", "_side",
-        "_speed", "_squares", "_started", "_strength", "_surface", "_velocity_gain", "status",
+        "_before", "_bias_spread", "_clearance", "_count", "_curve", "_dead_zone", "_deepest", "_doubts", "_floor",
+        "_force_noise", "_gone", "_hardware_deepest", "_history", "_last", "_learnt_deepest", "_limit", "_line",
+        "_mass", "_middle", "_next", "_onset", "_pace", "_period", "_plane_spread", "_planes", "_reference", "_replay",
+        "_scales", "_share", "_shift", "_shown_before", "_side", "_speed", "_squares", "_started", "_strength",
+        "_velocity_gain", "status",
     )  # fmt: skip
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
@@ -66,12 +77,16 @@ class Retrospective(Compensator):
         "identification_delay": GainSpecification("s", *TIMES),
         "force_noise": GainSpecification("N", *FORCES),
         "dead_zone": GainSpecification("N", *FORCES),
+        "bias_spread": GainSpecification("N", *FORCES),
+        "plane_spread": GainSpecification("m", 1e-6, 0.1),
         "prior_stiffness": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
         "prior_stiffness_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
         "prior_slope_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
         "prior_damping_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
         "prior_depth_damping_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
         "prior_unloading_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
+        "prior_friction_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
+        "prior_preload_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
         "force_noise_floor": GainSpecification("1/s", 1e-4, 10.0),
         "velocity_gain": GainSpecification("1/s", 0.0, 1e5),
         "correction_limit": GainSpecification("1", 0.0, 20.0),
@@ -88,10 +103,14 @@ class Retrospective(Compensator):
         whole = delay > period
         self._line = DelayLine(delay - period, period) if whole else None
         self._share = 1.0 if whole else delay / period
-        self._reference = ReferenceMotion(period)
-        self._samples = HardwareSamples(self._reference, period)
+        self._history = History()
+        self._onset = Onset(period)
+        self._scales = Scales(clearance)
+        self._reference = ReferenceMotion(self._history, self._scales, period)
         self._force_noise = gains["force_noise"]
         self._dead_zone = gains["dead_zone"]
+        self._bias_spread = gains["bias_spread"]
+        self._plane_spread = gains["plane_spread"]
         self._floor = gains["force_noise_floor"]
         self._velocity_gain = gains["velocity_gain"]
         self._limit = gains["correction_limit"]
@@ -106,117 +125,134 @@ class Retrospective(Compensator):
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """The force F_c [N]."""
-        period = self._period
-        clearance = self._clearance
-        position, velocity = self._align(position_measured, velocity_desired)
-        bent = deflection(position, clearance)
-        reach = deflection(position_desired, clearance)
-        now = 1.0 if reach > 0.0 else (-1.0 if reach < 0.0 else 0.0)
-        enters = now != 0.0 and now != self._side
-        if enters:
-            self._meet(now, reach, velocity_desired)
-        side = self._side
-        if side == 0.0:
-            if bent == 0.0:
-                self._take_noise(force_measured)
-            self.status = OUT_OF_CONTACT
-            return 0.0
-        speed = self._speed
-        scale = speed if speed > 0.0 else 1.0
-        weight = self._mass * scale
-        x = (-clearance - position_desired if side < 0.0 else position_desired) / scale
-        v = side * velocity_desired / scale
-        given = (-clearance - position if side < 0.0 else position) / scale + self._plane
-        rate = side * velocity / scale
-        depth = given - self._shift * rate
-        if -SURFACE <= depth <= SURFACE:
-            depth = 0.0
         zone = self._dead_zone
-        hidden = False
-        force = 0.0
-        if not bent * side < 0.0:
-            hidden = zone > 0.0 and force_measured == 0.0
-            if force_measured > 0.0:
-                force = side * (force_measured + zone) / weight
-            elif force_measured < 0.0:
-                force = side * (force_measured - zone) / weight
-        if not self._entered and not (speed > 0.0 and depth > 0.0) and bent == 0.0:
-            self._sort_out(force_measured, given, weight)
-        if not enters:
-            self._gone += 1.0
-        if depth > 0.0:
-            self._gone = 0.0
-        if speed > 0.0:
-            command, separated = self._follow(enters, x, v, given, depth, rate, force, hidden, weight)
-        else:
-            separated = x <= 0.0
-            command = 0.0 if separated else force
-            self.status = UNSURE
-        patience = FAREWELL if self._entered or not speed > 0.0 else LONGEST_LAG
-        if separated and self._gone * period > patience * (1.0 + 1e-9):
-            self._side = 0.0
+        begins = not self._started
+        position, velocity = self._align(position_measured, velocity_desired)
+        # A run's first reading counts as none: the sensor's delay line may not have been filled.
+        shown = not (begins or (zone > 0.0 and force_measured == 0.0))
+        force = force_measured
+        if force_measured > 0.0:
+            force = force_measured + zone
+        elif force_measured < 0.0:
+            force = force_measured - zone
+        self._history.take(force, shown, position, velocity)
+        self._take_noise(force, shown)
+        if begins:
+            reach = deflection(position_desired, self._clearance)
+            self._side = 1.0 if reach > 0.0 else (-1.0 if reach < 0.0 else 0.0)
+        if self._side == 0.0:
             self.status = OUT_OF_CONTACT
+            side = 1.0 if velocity_desired > 0.0 else -1.0
+            speed = side * velocity_desired
+            if not self._mass * speed > 0.0 or (side < 0.0 and self._clearance == inf):
+                self._onset.restart()
+                return 0.0
+            found = self._watch(side, speed, force, shown)
+            if found is None:
+                return 0.0
+            self._meet(side, speed, position_desired, found)
+        self._gone += 1.0
+        if self._speed > 0.0:
+            command, separated = self._follow(force, shown, position_desired, velocity_desired, position, velocity)
+            command = self._side * self._scales.weight * command
+        else:
+            command, separated = self._pass_on(force, position_desired, position)
+        if separated and self._gone * self._period > FAREWELL * (1.0 + 1e-9):
+            self._side = 0.0
+            self._speed = 0.0
+            self.status = OUT_OF_CONTACT
+            self._onset.restart()
             return 0.0
-        return side * weight * command
+        return command
 
-    def _meet(self, side: float, depth: float, velocity: float) -> None:
-        """The numerical model is beyond another surface: a contact begins."""
-        approach = side * velocity
-        sound = self._mass * approach > 0.0 and abs(depth) <= 2.0 * self._period * approach
+    def _watch(self, side: float, speed: float, force: float, shown: bool) -> Found | None:
+        """Flying to the surface on this side: what the force tells of it, if it was met."""
+        scales = self._scales
+        scales.side = side
+        weight = self._mass * speed
+        noise = self._floor * self._floor + self._noise() / (weight * weight)
+        spread = self._bias_spread / weight
+        unknown = spread * spread
+        onset = self._onset
+        history = self._history
+        plane = self._planes[side]
+        width = self._period * speed
+        onset.take(side * force / weight, shown)
+        best = CERTAIN
+        found = None
+        for age in onset.ages():
+            away = scales.beyond(history.recall(history.newest - age).position) - plane.place
+            one = onset.suppose(age, noise, unknown, rarity(away, plane.spread, width))
+            if one.evidence > best:
+                best = one.evidence
+                found = one
+        if found is None or not (found.age > 1 and float(found.age) * self._period >= WAIT * (1.0 - 1e-9)):
+            return None
+        return found
+
+    def _meet(self, side: float, speed: float, position: float, found: Found) -> None:
+        """A surface is found, met between two samples: between them it lies where it was most expected."""
+        history = self._history
+        scales = self._scales
+        entry = history.newest - found.age
+        start = history.recall(entry)
+        scales.side = side
+        pace = sqrt(found.stiffness if found.stiffness > 0.0 else 0.0) / USUAL_PACE
+        pace = (pace if pace > SLOWEST else SLOWEST) if pace < 1.0 else 1.0
+        self._pace = pace
+        self._reference.period = self._period * pace
+        scales.speed = speed
+        scales.length = speed / pace
+        scales.bias = side * found.bias * (self._mass * speed)
+        scales.weight = self._mass * speed * pace
+        low = scales.beyond(start.position)
+        high = scales.beyond(history.recall(entry + 1).position)
+        place = self._planes[side].learn(low, high, found.age)
+        # Not at the end of the stretch: the reference would not have entered.
+        end = high - 0.0625 * (high - low)
+        scales.plane = low if place < low else (end if place > end else place)
+        since = (high - scales.plane) / (high - low) if high > low else 0.5
+        depth = scales.depth(position)
         self._side = side
-        self._speed = approach if sound else 0.0
-        self._entered = False
+        self._speed = speed
         self._gone = 0.0
-        self._plane = 0.0
+        self._deepest = 0.0
+        self._hardware_deepest = 0.0
+        self._learnt_deepest = 0.0
+        self._next = entry + 1
         self._doubts.restart()
+        self._doubts.late = depth - float(found.age) * self._reference.period
+        self._begin()
+        self._reference.begin(entry, start, since, depth if depth > 0.0 else 0.0)
 
     def _follow(
-        self,
-        enters: bool,
-        x: float,
-        v: float,
-        given: float,
-        depth: float,
-        rate: float,
-        force: float,
-        hidden: bool,
-        weight: float,
+        self, force: float, shown: bool, position_desired: float, velocity_desired: float, position: float, velocity: float
     ) -> tuple[float, bool]:
         """The command over M v0 [1/s], and whether the numerical model has separated."""
-        period = self._period
         curve = self._curve
+        scales = self._scales
         reference = self._reference
-        samples = self._samples
-        self._elapsed += 1
-        if enters:
-            self._begin()
-            reference.restart(x)
-            samples.begin(x, force, not hidden, given - period * rate, rate)
-            self._elapsed = 0
-            self._deepest = 0.0
-            self._hardware_deepest = 0.0
+        x = scales.depth(position_desired)
+        v = scales.rate(velocity_desired)
+        rate = scales.rate(velocity)
+        depth = scales.depth(position) - self._shift * rate
+        if -SURFACE <= depth <= SURFACE:
+            depth = 0.0
+        if depth > 0.0:
+            self._gone = 0.0
         if x > self._deepest:
             self._deepest = x
         if depth > self._hardware_deepest:
             self._hardware_deepest = depth
-        deepest = self._hardware_deepest
 
-        zone = self._dead_zone / weight
-        square = weight * weight
-        noise = self._noise() / square if square > 0.0 else 0.0
-        variance = self._floor * self._floor + noise
-        if depth > 0.0:
-            if not self._entered:
-                self._entered = True
-                samples.enter(depth, rate)
-                self._doubts.late = samples.first + self._elapsed * period
-            if not hidden:
-                self._doubts.read(depth, deepest, force, variance)
+        zone = self._dead_zone / scales.weight
+        noise = self._noise() / (scales.weight * scales.weight)
         reference.shift = self._shift
-        self._learn(given, rate, deepest, force, variance, hidden, zone)
-        expected = curve.force(depth, rate, deepest)
-        if hidden:
-            force = zone if expected > zone else (expected if expected > 0.0 else 0.0)
+        self._catch_up(self._floor * self._floor + noise, zone)
+        expected = curve.force(depth, rate, self._hardware_deepest)
+        read = scales.force(force)
+        if not shown:
+            read = zone if expected > zone else (expected if expected > 0.0 else 0.0)
         whole = self._strength + noise
         reference.replay = self._replay * self._strength / whole if whole > 0.0 else 0.0
         reference.tick(curve)
@@ -225,16 +261,51 @@ class Retrospective(Compensator):
         separated = x <= 0.0 or (v < 0.0 and own <= 0.0)
         if not own > 0.0:
             own = 0.0
-        correction = self._repayment(curve, v - 0.5 * period * own, deepest, zone)
-        samples.take(self._entered, force, not hidden, given, rate, deepest)
-        return (correction if separated else own + (force - expected) + correction), separated
+        most = MOST * curve.peak_force()
+        if own > most:
+            own = most
+        correction = self._repayment(curve, v - 0.5 * reference.period * own, zone)
+        return (correction if separated else own + (read - expected) + correction), separated
 
-    def _repayment(self, curve: Curve, speed: float, deepest: float, zone: float) -> float:
+    def _catch_up(self, variance: float, zone: float) -> None:
+        """Learn from the readings since the surface was met, one after the other; noise of a `variance` [1/s^2], the
+        dead zone [1/s]."""
+        history = self._history
+        scales = self._scales
+        for _ in range(READINGS):
+            if self._next > history.newest:
+                break
+            sample = history.recall(self._next)
+            read, shown = history.reading(self._next)
+            depth = scales.depth(sample.position)
+            rate = scales.rate(sample.velocity)
+            force = scales.force(read)
+            if depth > self._learnt_deepest:
+                self._learnt_deepest = depth
+            if depth > 0.0 and shown:
+                self._doubts.read(depth, self._learnt_deepest, force, variance)
+            off = MISFIT * force
+            self._learn(depth, rate, self._learnt_deepest, force, variance + off * off, not shown, zone)
+            self._next += 1
+
+    def _pass_on(self, force: float, position_desired: float, position: float) -> tuple[float, bool]:
+        """The force as it is read [N], in a run that begins in contact, and whether the model has separated."""
+        side = self._side
+        bent = side * deflection(position, self._clearance)
+        separated = not side * deflection(position_desired, self._clearance) > 0.0
+        if bent > 0.0:
+            self._gone = 0.0
+        self.status = UNSURE
+        return 0.0 if separated or bent < 0.0 else force, separated
+
+    def _repayment(self, curve: Curve, speed: float, zone: float) -> float:
         """f_e [1/s], for the speed of the model in the middle of the next period; `status` judges it."""
         peak = curve.peak_force()
         limit = self._limit * peak
-        correction = self._velocity_gain * (speed - self._reference.live.speed)
-        self.status = self._doubts.status(curve, peak, deepest, self._variance(), zone, self._speed)
+        correction = self._velocity_gain / self._pace * (speed - self._reference.live.speed)
+        self.status = self._doubts.status(
+            curve, peak, self._hardware_deepest, self._variance(), zone, self._speed
+        )
         if correction > limit or correction < -limit:
             correction = limit if correction > limit else -limit
             if self.status == IDENTIFIED:
@@ -295,39 +366,41 @@ class Retrospective(Compensator):
         self._middle = newest
         return aligned, rate
 
-    def _sort_out(self, force: float, depth: float, weight: float) -> None:
-        """A reading [N] out of contact while one is under way: noise, or the hardware, met too early."""
-        least = self._floor * weight
-        usual = self._noise() + least * least
-        if not (self._count >= SEEN and force * force > OUTSTANDING * usual):
-            self._take_noise(force)
-            return
-        doubts = self._doubts
-        doubts.early += 1
-        if doubts.early == 1:
-            self._surface = -depth
-        if doubts.early > EARLY:
-            self._plane = self._surface
+    def _take_noise(self, force: float, shown: bool) -> None:
+        """A reading [N]: out of contact the difference from the one before tells how noisy the force is."""
+        step = force - self._before
+        if (
+            shown
+            and self._shown_before
+            and self._side == 0.0
+            and not (self._count >= SEEN and step * step > OUTSTANDING * self._noise())
+        ):
+            self._squares += 0.5 * (step * step)
+            self._count += 1.0
+        self._before = force
+        self._shown_before = shown
 
-    def _take_noise(self, force: float) -> None:
-        """A reading out of contact: it tells how noisy the force is."""
-        self._squares += force * force
-        self._count += 1.0
-
-    def reset(self) -> None:
-        """Forget everything."""
+    def next_contact(self) -> None:
+        """A fresh run: all but where the surfaces are is forgotten."""
         self._side = 0.0
         self._speed = 0.0
-        self._entered = False
         self._gone = 0.0
         self._squares = 0.0
         self._count = 0.0
-        self._samples.reset()
+        self._before = 0.0
+        self._shown_before = False
         self._deepest = 0.0
         self._hardware_deepest = 0.0
-        self._elapsed = 0
-        self._plane = 0.0
-        self._surface = 0.0
+        self._learnt_deepest = 0.0
+        self._next = 0
+        self._pace = 1.0
+        self._history.restart()
+        self._onset.restart()
         self._doubts.restart()
         self._started = False
         self.status = OUT_OF_CONTACT
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._planes = {side: ContactPlane(self._plane_spread) for side in (1.0, -1.0)}
+        self.next_contact()

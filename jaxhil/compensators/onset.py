@@ -1,0 +1,119 @@
+"""Where the hardware's surface is: the tick from which on the force tells of contact.
+
+While the numerical model flies freely, the hardware may have met the surface in any tick. Since then the force
+would be y = b + B + K s, s the time since the middle of that tick, K ~ N(K0, s_K^2), B ~ N(0, s_B^2); before,
+y = b, the sensor's bias. Its evidence against free flight throughout has a closed form in sums over the
+readings; the surface is found when the evidence of the best tick, with how likely a surface is there, exceeds
+e^CERTAIN. The surface is expected at a place with a spread s: of a distance d s from there its density is
+1/(pi s (1 + d^2)). Scaled by approach speed and mass: forces in 1/s, K in 1/s^2.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxhil.compensators.history import SLOTS
+
+# Ticks since the surface was met that are told apart.
+AGES = np.array([1, 2, 3, 4, 5, 6, 8, 11, 16, 24, 36, 56, 88, 140, 224], np.int32)
+STIFFNESS = 300.0  # K0 [1/s^2]
+STIFFNESS_VARIANCE = 160000.0  # s_K^2 [1/s^4]
+JUMP_VARIANCE = 36.0  # s_B^2 [1/s^2]
+CERTAIN = 9.0
+WAIT = 0.004  # s, and a tick, since the surface was met: then its stiffness shows
+LONGEST = 65536  # ticks of a flight up to which the sums are exact enough; then they begin anew
+
+
+class Onset(NamedTuple):
+    """The readings of a flight that the sensor showed."""
+
+    watched: Int[Array, "*batch"]  # ticks of the flight
+    sums: Float[Array, "5 *batch"]  # of 1, the tick m, m^2, y [1/s] and m y
+    ring: Float[Array, "slots 5 *batch"]  # of the sums
+
+
+class Found(NamedTuple):
+    """A surface."""
+
+    detected: Bool[Array, "*batch"]  # whether it is
+    age: Int[Array, "*batch"]  # ticks since it was met
+    bias: Float[Array, "*batch"]  # of the force [1/s]
+    stiffness: Float[Array, "*batch"]  # the most that it may be, by three standard deviations [1/s^2]
+
+
+def no_onset(like: Float[Array, "*batch"]) -> Onset:
+    """Before the first tick."""
+    zeros = jnp.zeros((5, *like.shape), like.dtype)
+    return Onset(jnp.zeros(like.shape, jnp.int32), zeros, jnp.zeros((SLOTS, *zeros.shape), like.dtype))
+
+
+def watch(old: Onset, tick: Int[Array, ""], flies: Bool[Array, "*batch"], force: Array, shown: Array) -> Onset:
+    """A reading [1/s] more where the model `flies` to a surface; elsewhere the next flight is to begin."""
+    starts = old.watched == LONGEST
+    watched = jnp.where(flies, jnp.where(starts, 0, old.watched) + 1, 0)
+    m = watched.astype(force.dtype)
+    terms = jnp.stack([jnp.ones_like(force), m, m * m, force, m * force])
+    sums = jnp.where((starts | ~flies)[None], 0, old.sums)
+    sums = sums + jnp.where((shown & flies)[None], terms, 0)
+    return Onset(watched, sums, lax.dynamic_update_index_in_dim(old.ring, sums, tick & (SLOTS - 1), 0))
+
+
+def find(onset: Onset, tick: Int[Array, ""], period: Array, noise: Array, unknown: Array, rarity: Array) -> Found:
+    """The surface, by the variances of a reading (`noise`) and of the bias (`unknown`) [1/s^2]; one met at each of
+    the `AGES` is 1/`rarity` (ages, *batch) as likely as none."""
+    ages = jnp.asarray(AGES.reshape(-1, *[1] * period.ndim))
+    evidence, bias, stiffness = _suppose(onset, onset.ring[(tick - AGES) & (SLOTS - 1)], ages, period, noise, unknown, rarity)
+    best = jnp.argmax(jnp.where(ages < onset.watched, evidence, -CERTAIN), axis=0)
+    of_best = [jnp.take_along_axis(each, best[None], axis=0)[0] for each in (evidence, bias, stiffness)]
+    age = jnp.asarray(AGES)[best]
+    waited = (age > 1) & (age.astype(period.dtype) * period >= WAIT * (1 - 1e-9))
+    return Found((age < onset.watched) & (of_best[0] > CERTAIN) & waited, age, *of_best[1:])
+
+
+def rarity(away: Array, spread: Array, width: Array) -> Array:
+    """One over the probability of a surface in a stretch of this width, so far `away` from where it is
+    expected."""
+    distance = away / spread
+    return math.pi * spread * (1 + distance * distance) / width
+
+
+def logarithm(z: Array) -> Array:
+    """ln z, of a positive number that is not extreme; by square roots alone, the same on every machine."""
+    for _ in range(10):
+        z = jnp.sqrt(z)
+    return 2048 * (z - 1) / (z + 1)
+
+
+def _suppose(onset, ring, ages, period, noise, unknown, rarity):
+    """ln of the evidence for a surface met `ages` ticks ago against none, the bias [1/s] by it, and the most that its
+    stiffness may be [1/s^2]."""
+    before, ticks_before, squares_before, forces_before, moments_before = jnp.moveaxis(ring, 1, 0)
+    number, all_ticks, all_squares, forces, moments = onset.sums
+    middle = (onset.watched - ages).astype(period.dtype) + 0.5
+    known = before * unknown + noise
+    bias = forces_before * unknown / known
+    left = unknown * noise / known
+    n = number - before
+    ticks = (all_ticks - ticks_before) - middle * n
+    squares = (all_squares - squares_before) - middle * (2 * (all_ticks - ticks_before) - middle * n)
+    force = forces - forces_before
+    moment = (moments - moments_before) - middle * force
+    s = period * ticks
+    y = force - bias * n
+    p = noise / STIFFNESS_VARIANCE + period * period * squares
+    jump = JUMP_VARIANCE + left
+    r = noise / jump + n
+    f = noise * (STIFFNESS / STIFFNESS_VARIANCE) + (period * moment - bias * s)
+    determinant = p * r - s * s
+    explained = (r * f * f - 2 * (s * f * y) + p * y * y) / determinant
+    silence = noise + n * left
+    occam = determinant * (STIFFNESS_VARIANCE * jump) / (noise * silence)
+    prior = STIFFNESS * STIFFNESS / STIFFNESS_VARIANCE
+    silent = y * y * left / (noise * silence)
+    evidence = 0.5 * (explained / noise - prior - silent - logarithm(occam * rarity * rarity))
+    stiffness = ((r * f - s * y) + 3 * jnp.sqrt(r * noise * determinant)) / determinant
+    return jnp.where(y > 0, evidence, -CERTAIN), bias, stiffness

@@ -1,0 +1,115 @@
+"""Where the hardware's surface is: the tick from which on the force tells of contact.
+
+While the numerical model flies freely, the hardware may have met the surface in any tick. Since then the force
+would be y = b + B + K s, s the time since the middle of that tick, K ~ N(K0, s_K^2), B ~ N(0, s_B^2); before,
+y = b, the sensor's bias. Its evidence against free flight throughout has a closed form in sums over the
+readings; the surface is found when the evidence of the best tick, with how likely a surface is there, exceeds
+e^CERTAIN. The surface is expected at a place with a spread s: of a distance d s from there its density is
+1/(pi s (1 + d^2)). Scaled by approach speed and mass: forces in 1/s, K in 1/s^2.
+"""
+
+from math import pi, sqrt
+from typing import NamedTuple
+
+from .history import SLOTS
+
+# Ticks since the surface was met that are told apart.
+AGES = (1, 2, 3, 4, 5, 6, 8, 11, 16, 24, 36, 56, 88, 140, 224)
+STIFFNESS = 300.0  # K0 [1/s^2]
+STIFFNESS_VARIANCE = 160000.0  # s_K^2 [1/s^4]
+JUMP_VARIANCE = 36.0  # s_B^2 [1/s^2]
+CERTAIN = 9.0
+WAIT = 0.004  # s, and a tick, since the surface was met: then its stiffness shows
+LONGEST = 65536  # ticks of a flight up to which the sums are exact enough; then they begin anew
+
+
+class Found(NamedTuple):
+    """A surface."""
+
+    age: int  # ticks since it was met
+    evidence: float  # ln of that for it against none
+    bias: float  # of the force [1/s]
+    stiffness: float  # the most that it may be, by three standard deviations [1/s^2]
+
+
+class Onset:
+    """The readings of a flight."""
+
+    __slots__ = ("_period", "_sums", "_watched")
+
+    def __init__(self, period: float) -> None:
+        self._period = period
+        self._sums = [(0.0, 0.0, 0.0, 0.0, 0.0)] * SLOTS
+        self.restart()
+
+    def restart(self) -> None:
+        """A flight begins."""
+        self._watched = 0
+        self._sums[0] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def take(self, force: float, shown: bool) -> None:
+        """One reading [1/s], and whether the sensor shows it."""
+        if self._watched == LONGEST:
+            self.restart()
+        sums = self._sums[self._watched % SLOTS]
+        self._watched += 1
+        if shown:
+            number, ticks, squares, forces, moments = sums
+            m = float(self._watched)
+            sums = (number + 1.0, ticks + m, squares + m * m, forces + force, moments + m * force)
+        self._sums[self._watched % SLOTS] = sums
+
+    def ages(self) -> tuple[int, ...]:
+        """Those of `AGES` at which this flight had begun."""
+        return tuple(age for age in AGES if age < self._watched)
+
+    def suppose(self, age: int, noise: float, unknown: float, rarity: float) -> Found:
+        """What the readings say of a surface met `age` ticks ago.
+
+        `noise` is the variance of a reading and `unknown` that of the bias [1/s^2]; a surface there is
+        1/`rarity` as likely as none."""
+        period = self._period
+        number, all_ticks, all_squares, forces, moments = self._sums[self._watched % SLOTS]
+        before, ticks_before, squares_before, forces_before, moments_before = self._sums[
+            (self._watched - age) % SLOTS
+        ]
+        middle = float(self._watched - age) + 0.5
+        known = before * unknown + noise
+        bias = forces_before * unknown / known
+        left = unknown * noise / known
+        n = number - before
+        ticks = (all_ticks - ticks_before) - middle * n
+        squares = (all_squares - squares_before) - middle * (2.0 * (all_ticks - ticks_before) - middle * n)
+        force = forces - forces_before
+        moment = (moments - moments_before) - middle * force
+        s = period * ticks
+        y = force - bias * n
+        if not y > 0.0:
+            return Found(age, -CERTAIN, bias, 0.0)
+        p = noise / STIFFNESS_VARIANCE + period * period * squares
+        jump = JUMP_VARIANCE + left
+        r = noise / jump + n
+        f = noise * (STIFFNESS / STIFFNESS_VARIANCE) + (period * moment - bias * s)
+        determinant = p * r - s * s
+        explained = (r * f * f - 2.0 * (s * f * y) + p * y * y) / determinant
+        silence = noise + n * left
+        occam = determinant * (STIFFNESS_VARIANCE * jump) / (noise * silence)
+        prior = STIFFNESS * STIFFNESS / STIFFNESS_VARIANCE
+        silent = y * y * left / (noise * silence)
+        evidence = 0.5 * (explained / noise - prior - silent - logarithm(occam * rarity * rarity))
+        stiffness = ((r * f - s * y) + 3.0 * sqrt(r * noise * determinant)) / determinant
+        return Found(age, evidence, bias, stiffness)
+
+
+def rarity(away: float, spread: float, width: float) -> float:
+    """One over the probability of a surface in a stretch of this width, so far `away` from where it is
+    expected."""
+    distance = away / spread
+    return pi * spread * (1.0 + distance * distance) / width
+
+
+def logarithm(z: float) -> float:
+    """ln z, of a positive number that is not extreme; by square roots alone, the same on every machine."""
+    for _ in range(10):
+        z = sqrt(z)
+    return 2048.0 * (z - 1.0) / (z + 1.0)
