@@ -34,7 +34,7 @@ RESULT = (
     *("contacts", "restitution", "expected", "balance"),
     *("last_contact", "contact_status", "contact_ticks", "unsure", "saturated", "too_short"),
     *("displaced", "noisy"),
-    "force_delay",
+    *("force_delay", "contact_plane"),
 )
 STATUS_NAMES = tuple(status.name for status in STATUSES)
 TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE = (float(code) for code in range(6))
@@ -359,7 +359,7 @@ def controller_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
             *(controller.bias, answer),
             *(watchdog.contacts, watchdog.restitution, watchdog.expected, watchdog.balance),
             *(number, STATUS_NAMES.index(status), *counts),
-            controller.force_delay,
+            *(controller.force_delay, controller.contact_plane),
         )
     return results
 

@@ -10,7 +10,7 @@
 
 /* A row: event, force, desired position and velocity, measured position, time, whether it is given, the
  * model's position, velocity and acceleration. A result: see `result`. */
-enum { ROW = 10, RESULT = 27 };
+enum { ROW = 10, RESULT = 28 };
 enum { TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE };
 enum { GAINS = sizeof(jaxhil_gains) / sizeof(double), LIMITS = sizeof(jaxhil_limits) / sizeof(double) };
 
@@ -102,6 +102,7 @@ void driver_run(jaxhil_controller *controller, size_t count, const double *rows,
         *result++ = (double)record.displaced;
         *result++ = (double)record.noisy;
         *result++ = jaxhil_force_delay(controller);
+        *result++ = jaxhil_contact_plane(controller);
     }
 }
 

@@ -1,7 +1,7 @@
 /* What a law says of its own command: its status after each tick, counted over a contact. The contact is not
- * reached where no force was measured; else unsure, too short, displaced or noisy, by the most frequent, where the law was any of them on more than two
- * fifths of the ticks on which it acted; else saturated, where its correction was at its limit on more than half
- * of them; else identified.
+ * reached where no force was measured; else unsure, too short, displaced or noisy, by the most frequent, where the
+ * law was any of them on more than two fifths of the ticks on which it acted; else saturated, where its correction
+ * was at its limit on more than half of them; else identified.
  */
 #include <stdbool.h>
 #include <stdint.h>

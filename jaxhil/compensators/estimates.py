@@ -6,7 +6,7 @@ is wrong by. A law names what it must know in `Compensator.knows`.
 
 import math
 
-from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.structs import Mechanism, value_at
 
 FORCE_DELAY = "force delay"
 ROUGH_FORCE_DELAY = "force delay, roughly"
@@ -19,6 +19,8 @@ FORCE_NOISE = "force noise"
 EQUIVALENT_MASS = "equivalent mass"
 
 UNKNOWN_DELAY_SPREAD = 0.001  # s
+UNKNOWN_PLANE_SPREAD = 0.001  # m
+UNKNOWN_BIAS_SPREAD = 5.0  # N
 
 
 def force_delay(mechanism: Mechanism) -> float:
@@ -30,17 +32,31 @@ def force_delay(mechanism: Mechanism) -> float:
 def force_delay_spread(mechanism: Mechanism) -> float:
     """How far [s] the force delay may lie from what is known of it: half of the range that the file gives it,
     or two standard deviations; 1 ms where it says nothing of that."""
-    found = mechanism.uncertainty.get("rig.force_sensor.delay")
-    if found is None:
-        return UNKNOWN_DELAY_SPREAD
-    nominal = mechanism.rig.force_sensor.delay
-    if found.std is not None:
-        return 2 * found.std
-    if found.factor is not None:
-        ends = [factor * nominal for factor in found.factor]
-    else:
-        ends = [end for end in (found.low, found.high) if end is not None]
-    return max(abs(end - nominal) for end in ends)
+    told = _spread(mechanism, "rig.force_sensor.delay", deviations=2.0)
+    return UNKNOWN_DELAY_SPREAD if told is None else told
+
+
+def contact_plane_spread(mechanism: Mechanism) -> float:
+    """How far [m] the contact plane lies from where the controller takes it to be, and may: 1 mm where the
+    file says nothing of the latter."""
+    return _size(mechanism, "rig.contact_plane", UNKNOWN_PLANE_SPREAD)
+
+
+def force_bias(mechanism: Mechanism) -> float:
+    """How large [N] the force sensor's bias may be: 5 N beyond its nominal value where the file says
+    nothing."""
+    return _size(mechanism, "rig.force_sensor.bias", UNKNOWN_BIAS_SPREAD)
+
+
+def friction(mechanism: Mechanism) -> float:
+    """How large the contact's dry friction may be, over mass and approach speed [1/s]; 0 where it has
+    none."""
+    return _size(mechanism, "contact.friction") / (mechanism.bodies.mass * mechanism.approach.velocity)
+
+
+def preload(mechanism: Mechanism) -> float:
+    """How large the contact's preload may be, over mass and approach speed [1/s]; 0 where it has none."""
+    return _size(mechanism, "contact.preload") / (mechanism.bodies.mass * mechanism.approach.velocity)
 
 
 def simulator_inverse(mechanism: Mechanism) -> tuple[float, float]:
@@ -123,3 +139,25 @@ def _inverse(simulator) -> tuple[float, float]:
         second = (low[2] - low[0] / num[0] * num[2] - first * num[1]) / num[0]
         return first, second
     return 0.0, 0.0
+
+
+def _spread(mechanism: Mechanism, path: str, deviations: float = 1.0) -> float | None:
+    """How far a number may lie from its nominal value: the farther end of the range that the file gives it,
+    or so many standard deviations; None where it says nothing of that."""
+    found = mechanism.uncertainty.get(path)
+    if found is None:
+        return None
+    if found.std is not None:
+        return deviations * found.std
+    nominal = value_at(mechanism, path)
+    if found.factor is not None:
+        ends = [factor * nominal for factor in found.factor]
+    else:
+        ends = [end for end in (found.low, found.high) if end is not None]
+    return max(abs(end - nominal) for end in ends)
+
+
+def _size(mechanism: Mechanism, path: str, unknown: float = 0.0) -> float:
+    """How far a number may lie from 0, its spread being `unknown` where the file says nothing of that."""
+    told = _spread(mechanism, path)
+    return abs(value_at(mechanism, path)) + (unknown if told is None else told)

@@ -4,11 +4,11 @@
                    + (damping + depth_damping x/REACH) v - unloading (x_m - x)
                    + friction v/sqrt(v^2 + SLOW^2)                                at x > 0, else 0
 
-x_m >= x is the deepest point so far. Everything is scaled by the approach speed v0 and the mass M: depth
-x / v0 [s], speed v / v0 [1], force F / (M v0) [1/s], slope k / M [1/s^2], damping b / M [1/s]. Parameters
-theta (slopes, damping, depth damping, unloading, friction, preload) come first, the batch trails. They start from a Gaussian
-prior whose slopes wander with depth, and are identified by recursive least squares (Kalman's update for
-constant parameters). What dissipates counts with its mean given that it is not negative.
+x_m >= x is the deepest point so far. Everything is scaled by the approach speed v0 and the mass M: depth x /
+v0 [s], speed v / v0 [1], force F / (M v0) [1/s], slope k / M [1/s^2], damping b / M [1/s]. Parameters theta
+(slopes, damping, depth damping, unloading, friction, preload) come first, the batch trails. They start from a
+Gaussian prior whose slopes wander with depth, and are identified by recursive least squares (Kalman's update
+for constant parameters). What dissipates counts with its mean given that it is not negative.
 """
 
 import math
@@ -83,8 +83,8 @@ def prior(
     friction: Array,
     preload: Array,
 ) -> Map:
-    """Slopes N(K0, s_K^2 + s_S^2 min(kappa_i, kappa_j)/30 ms), what dissipates and the preload N(0, s^2); beyond a
-    depth of 92 ms slopes wander ever less, as (92 ms/kappa)^4.
+    """Slopes N(K0, s_K^2 + s_S^2 min(kappa_i, kappa_j)/30 ms), what dissipates and the preload N(0, s^2);
+    beyond a depth of 92 ms slopes wander ever less, as (92 ms/kappa)^4.
 
     stiffness K0, spreads s_K (`common`), s_S (`wandering`) and of `unloading` [1/s^2], of `damping`,
     `depth_damping`, `friction` and `preload` [1/s], of one shape.
@@ -112,9 +112,7 @@ def ramps(depth: Float[Array, "*batch"]) -> Float[Array, "segments *batch"]:
 
 def features(depth: Array, speed: Array, deepest: Array) -> Float[Array, "parameters *batch"]:
     """phi, of which the force is phi.theta."""
-    others = jnp.stack(
-        [speed, depth * speed / REACH, depth - deepest, turning(speed), jnp.ones_like(depth)]
-    )
+    others = jnp.stack([speed, depth * speed / REACH, depth - deepest, turning(speed), jnp.ones_like(depth)])
     return jnp.concatenate([ramps(depth), others])
 
 
@@ -146,10 +144,15 @@ def turning(speed: Array) -> Array:
 
 
 def update(
-    old: Map, phi: Array, force: Array, variance: Array, enabled: Bool[Array, "*batch"], closes: Bool[Array, "*batch"]
+    old: Map,
+    phi: Array,
+    force: Array,
+    variance: Array,
+    enabled: Bool[Array, "*batch"],
+    closes: Bool[Array, "*batch"],
 ) -> Map:
-    """One reading of `force` [1/s] with noise of a `variance` [1/s^2], where `enabled` and the contact `closes` or it
-    `tells` of contact."""
+    """One reading of `force` [1/s] with noise of a `variance` [1/s^2], where `enabled` and the contact
+    `closes` or it `tells` of contact."""
     predicted = predict(old, phi, variance)
     return correct(old, predicted, force, enabled & (closes | tells(predicted, force, variance)))
 

@@ -1,8 +1,8 @@
 """What was measured in a run, by tick.
 
-Of the newest 255 ticks every sample is kept, of the 4 times as many before every 4th, then every 16th, 64th and
-256th: the last of each block of so many ticks of the run. Rings are written in place at a slot that all lanes
-share; as their runs begin at different ticks, what is written is the newest such sample of each lane.
+Of the newest 255 ticks every sample is kept, of the 4 times as many before every 4th, then every 16th, 64th
+and 256th: the last of each block of so many ticks of the run. Rings are written in place at a slot that all
+lanes share; as their runs begin at different ticks, what is written is the newest such sample of each lane.
 """
 
 from typing import NamedTuple
@@ -46,10 +46,16 @@ def no_history(like: Float[Array, "*batch"]) -> History:
 
 
 def take(
-    old: History, tick: Int[Array, ""], age: Int[Array, "*batch"], force: Array, shows: Array, position: Array, velocity: Array
+    old: History,
+    tick: Int[Array, ""],
+    age: Int[Array, "*batch"],
+    force: Array,
+    shows: Array,
+    position: Array,
+    velocity: Array,
 ) -> History:
-    """One more tick, `age` ticks after its run began: force [N], whether the sensor `shows` it, position [m] and
-    velocity [m/s] of the hardware."""
+    """One more tick, `age` ticks after its run began: force [N], whether the sensor `shows` it, position [m]
+    and velocity [m/s] of the hardware."""
     begins = age == 0
     both = jnp.where(shows & ~begins, old.reading[1], 0)
     before = jnp.where(begins[None], 0, old.newest[0, :2])
@@ -84,10 +90,14 @@ def recall(history: History, index: Int[Array, "*batch"]) -> Samples:
 def reading_at(history: History, index: Int[Array, "*batch"]) -> tuple[Array, Bool[Array, "*batch"]]:
     """The force [N] at one of the newest 256 ticks of the run, and whether the sensor showed it."""
     slot = (history.run + index) & (SLOTS - 1)
-    force, shown = jnp.take_along_axis(history.readings, slot[None, None], axis=0, mode="promise_in_bounds")[0]
+    force, shown = jnp.take_along_axis(history.readings, slot[None, None], axis=0, mode="promise_in_bounds")[
+        0
+    ]
     return force, shown > 0
 
 
-def positions_before(history: History, tick: Int[Array, ""], ages: Int[Array, "ages"]) -> Float[Array, "ages *batch"]:
+def positions_before(
+    history: History, tick: Int[Array, ""], ages: Int[Array, "ages"]
+) -> Float[Array, "ages *batch"]:
     """The positions [m] so many ticks ago, less than 256."""
     return history.ring[(tick - ages) & (SLOTS - 1), 2]

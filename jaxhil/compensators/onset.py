@@ -1,11 +1,11 @@
 """Where the hardware's surface is: the tick from which on the force tells of contact.
 
-While the numerical model flies freely, the hardware may have met the surface in any tick. Since then the force
-would be y = b + B + K s, s the time since the middle of that tick, K ~ N(K0, s_K^2), B ~ N(0, s_B^2); before,
-y = b, the sensor's bias. Its evidence against free flight throughout has a closed form in sums over the
-readings; the surface is found when the evidence of the best tick, with how likely a surface is there, exceeds
-e^CERTAIN. The surface is expected at a place with a spread s: of a distance d s from there its density is
-1/(pi s (1 + d^2)). Scaled by approach speed and mass: forces in 1/s, K in 1/s^2.
+While the numerical model flies freely, the hardware may have met the surface in any tick. Since then the
+force would be y = b + B + K s, s the time since the middle of that tick, K ~ N(K0, s_K^2), B ~ N(0, s_B^2);
+before, y = b, the sensor's bias. Its evidence against free flight throughout has a closed form in sums over
+the readings; the surface is found when the evidence of the best tick, with how likely a surface is there,
+exceeds e^CERTAIN. The surface is expected at a place with a spread s: of a distance d s from there its
+density is 1/(pi s (1 + d^2)). Scaled by approach speed and mass: forces in 1/s, K in 1/s^2.
 """
 
 import math
@@ -51,7 +51,9 @@ def no_onset(like: Float[Array, "*batch"]) -> Onset:
     return Onset(jnp.zeros(like.shape, jnp.int32), zeros, jnp.zeros((SLOTS, *zeros.shape), like.dtype))
 
 
-def watch(old: Onset, tick: Int[Array, ""], flies: Bool[Array, "*batch"], force: Array, shown: Array) -> Onset:
+def watch(
+    old: Onset, tick: Int[Array, ""], flies: Bool[Array, "*batch"], force: Array, shown: Array
+) -> Onset:
     """A reading [1/s] more where the model `flies` to a surface; elsewhere the next flight is to begin."""
     starts = old.watched == LONGEST
     watched = jnp.where(flies, jnp.where(starts, 0, old.watched) + 1, 0)
@@ -62,11 +64,15 @@ def watch(old: Onset, tick: Int[Array, ""], flies: Bool[Array, "*batch"], force:
     return Onset(watched, sums, lax.dynamic_update_index_in_dim(old.ring, sums, tick & (SLOTS - 1), 0))
 
 
-def find(onset: Onset, tick: Int[Array, ""], period: Array, noise: Array, unknown: Array, rarity: Array) -> Found:
-    """The surface, by the variances of a reading (`noise`) and of the bias (`unknown`) [1/s^2]; one met at each of
-    the `AGES` is 1/`rarity` (ages, *batch) as likely as none."""
+def find(
+    onset: Onset, tick: Int[Array, ""], period: Array, noise: Array, unknown: Array, rarity: Array
+) -> Found:
+    """The surface, by the variances of a reading (`noise`) and of the bias (`unknown`) [1/s^2]; one met at
+    each of the `AGES` is 1/`rarity` (ages, *batch) as likely as none."""
     ages = jnp.asarray(AGES.reshape(-1, *[1] * period.ndim))
-    evidence, bias, stiffness = _suppose(onset, onset.ring[(tick - AGES) & (SLOTS - 1)], ages, period, noise, unknown, rarity)
+    evidence, bias, stiffness = _suppose(
+        onset, onset.ring[(tick - AGES) & (SLOTS - 1)], ages, period, noise, unknown, rarity
+    )
     best = jnp.argmax(jnp.where(ages < onset.watched, evidence, -CERTAIN), axis=0)
     of_best = [jnp.take_along_axis(each, best[None], axis=0)[0] for each in (evidence, bias, stiffness)]
     age = jnp.asarray(AGES)[best]
@@ -89,8 +95,8 @@ def logarithm(z: Array) -> Array:
 
 
 def _suppose(onset, ring, ages, period, noise, unknown, rarity):
-    """ln of the evidence for a surface met `ages` ticks ago against none, the bias [1/s] by it, and the most that its
-    stiffness may be [1/s^2]."""
+    """ln of the evidence for a surface met `ages` ticks ago against none, the bias [1/s] by it, and the most
+    that its stiffness may be [1/s^2]."""
     before, ticks_before, squares_before, forces_before, moments_before = jnp.moveaxis(ring, 1, 0)
     number, all_ticks, all_squares, forces, moments = onset.sums
     middle = (onset.watched - ages).astype(period.dtype) + 0.5

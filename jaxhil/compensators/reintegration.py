@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxhil.compensators.force_depth_map import REACH, SEGMENTS, Curve, elastic, turning
+from jaxhil.compensators.force_depth_map import REACH, Curve, elastic, turning
 from jaxhil.compensators.force_depth_map import force as force_of
 from jaxhil.compensators.history import LEVELS, SLOTS, History, Samples, level_of, recall
 
@@ -82,7 +82,7 @@ class Measured(NamedTuple):
     replay: Array  # rho, share of the force that the map does not explain
     period: Array  # control period [s], on the contact's scale of time
     coarse: Array  # ticks of the longest step where every sample is kept
-    # by how much the force is older than it was taken for [s]; it then belongs to X - shift V. None for nothing.
+    # by how much the force is older than it was taken for [s], which makes it belong to X - shift V; None: 0
     shift: Array | None
 
 
@@ -105,11 +105,17 @@ def unentered(like: Array, curve: Curve) -> Reintegration:
 
 
 def begin(
-    old: Reintegration, found: Bool[Array, "*batch"], index: Int[Array, "*batch"], start: Samples, since: Array, depth: Array, period: Array
+    old: Reintegration,
+    found: Bool[Array, "*batch"],
+    index: Int[Array, "*batch"],
+    start: Samples,
+    since: Array,
+    depth: Array,
+    period: Array,
 ) -> Reintegration:
-    """Before a tick at which it is `found` that the hardware has met the surface `since` [ticks] before the sample
-    after that of the tick `index`, the numerical model `depth` [s] ago: until the first pass is done, it should
-    go on as it does."""
+    """Before a tick at which it is `found` that the hardware has met the surface `since` [ticks] before the
+    sample after that of the tick `index`, the numerical model `depth` [s] ago: until the first pass is done,
+    it should go on as it does."""
     ticks = depth / period - since
     whole = jnp.where(ticks > 0, jnp.floor(ticks), 0)
     entry = Entry(

@@ -71,29 +71,36 @@ def align(
 
 
 def take_noise(gains: Gains, old: Noise, history: History, force: Array, shown: Array, free: Array) -> Noise:
-    """A reading [N] after those of the history: where the hardware is `free`, the difference tells how noisy the
-    force is."""
+    """A reading [N] after those of the history: where the hardware is `free`, the difference tells how noisy
+    the force is."""
     before, shown_before = history.reading
     step = force - before
     stands = (old.number >= SEEN) & (step * step > OUTSTANDING * force_noise(gains, old))
     taken = free & shown & (shown_before > 0) & ~stands
-    return Noise(
-        old.squares + jnp.where(taken, 0.5 * (step * step), 0), old.number + jnp.where(taken, 1, 0)
-    )
+    return Noise(old.squares + jnp.where(taken, 0.5 * (step * step), 0), old.number + jnp.where(taken, 1, 0))
 
 
 def force_noise(gains: Gains, seen: Noise) -> Float[Array, "*batch"]:
-    """The force's variance [N^2]: what the gains say, or what readings out of contact show if that is more."""
+    """The force's variance [N^2]: what the gains say, or what readings out of contact show if that is
+    more."""
     known = gains["force_noise"] ** 2
     shown = seen.squares / jnp.where(seen.number > 0, seen.number, 1)
     return jnp.where(shown > known, shown, known)
 
 
 def search(
-    gains: Gains, constants: Constants, planes: Plane, onset: Onset, history: History, side: Array, speed: Array, noise: Array, tick: Array
+    gains: Gains,
+    constants: Constants,
+    planes: Plane,
+    onset: Onset,
+    history: History,
+    side: Array,
+    speed: Array,
+    noise: Array,
+    tick: Array,
 ) -> Found:
-    """The surface on this `side`, if the force tells that it was met, at this speed [m/s]; `noise` is the force's
-    variance [N^2]."""
+    """The surface on this `side`, if the force tells that it was met, at this speed [m/s]; `noise` is the
+    force's variance [N^2]."""
     weight = gains["equivalent_mass"] * speed
     variance = gains["force_noise_floor"] ** 2 + noise / (weight * weight)
     unknown = (gains["bias_spread"] / weight) ** 2
@@ -105,7 +112,16 @@ def search(
     return find(*lax.stop_gradient(args))
 
 
-def meet(gains: Gains, clearance: Array, old: Scales, planes: Plane, history: History, side: Array, speed: Array, found: Found) -> Meeting:
+def meet(
+    gains: Gains,
+    clearance: Array,
+    old: Scales,
+    planes: Plane,
+    history: History,
+    side: Array,
+    speed: Array,
+    found: Found,
+) -> Meeting:
     """The surface met between two samples: between them it lies where it was most expected."""
     index = history.age - found.age
     start = recall(history, index)
@@ -130,8 +146,8 @@ def meet(gains: Gains, clearance: Array, old: Scales, planes: Plane, history: Hi
 
 
 def learn_plane(old: Plane, low: Array, high: Array, age: Array) -> Plane:
-    """Where a surface is expected, one with `old.place` and `old.spread` of shape (*batch), that was met between two
-    places [m], so many ticks before that was found."""
+    """Where a surface is expected, one with `old.place` and `old.spread` of shape (*batch), that was met
+    between two places [m], so many ticks before that was found."""
     width = high - low
     late = LATE * age.astype(width.dtype)
     found = width * width * (1 / 12 + late * late)

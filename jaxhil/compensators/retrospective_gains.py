@@ -3,7 +3,14 @@
 from collections.abc import Callable
 
 from jaxhil.compensators.base import Gain, rig_gain
-from jaxhil.compensators.estimates import force_delay, peak_force
+from jaxhil.compensators.estimates import (
+    contact_plane_spread,
+    force_bias,
+    force_delay,
+    friction,
+    peak_force,
+    preload,
+)
 from jaxhil.mechanism.structs import Mechanism
 
 # Two sets of gains for any mechanism, each judged on linear, damped, Hertzian, hardening and layered contact
@@ -17,8 +24,6 @@ SHARP = {
     "prior_damping_spread": 1.912,
     "prior_depth_damping_spread": 0.03103,
     "prior_unloading_spread": 0.1607,
-    "prior_friction_spread": 0.0,
-    "prior_preload_spread": 2.0,
     "force_noise_floor": 0.01091,
     "velocity_gain": 174.6,
     "correction_limit": 0.9,
@@ -33,6 +38,8 @@ GENTLE = SHARP | {
     "correction_limit": 0.7,
     "replay_noise": 0.6,
 }
+USUAL_PRELOAD = 2.0  # 1/s
+LEAST_PLANE_SPREAD, MOST_PLANE_SPREAD = 1e-6, 0.1  # m
 
 
 def _fact(mechanism) -> bool:
@@ -71,8 +78,11 @@ GAINS: tuple[Gain, ...] = (
         "dead_zone", lambda m: 0.0, lambda m: 2 * m.rig.force_sensor.dead_zone + peak_force(m),
         lambda m: m.rig.force_sensor.dead_zone, tuned=_fact,
     ),
-    rig_gain("bias_spread", lambda m: 0.0, lambda m: 10 * peak_force(m), lambda m: 5.0, tuned=_fact),
-    rig_gain("plane_spread", lambda m: 1e-6, lambda m: 0.1, lambda m: 0.001, tuned=_fact),
+    rig_gain("bias_spread", lambda m: 0.0, lambda m: force_bias(m) + peak_force(m), force_bias, tuned=_fact),
+    rig_gain(
+        "plane_spread", lambda m: LEAST_PLANE_SPREAD, lambda m: MOST_PLANE_SPREAD,
+        lambda m: min(max(contact_plane_spread(m), LEAST_PLANE_SPREAD), MOST_PLANE_SPREAD), tuned=_fact,
+    ),
     # Next to its spread it hardly matters.
     _prior("prior_stiffness", 0.1, 1e3, _fact),
     _prior("prior_stiffness_spread", 1.0, 5e3),
@@ -80,8 +90,12 @@ GAINS: tuple[Gain, ...] = (
     _prior("prior_damping_spread", 0.01, 50.0),
     _prior("prior_depth_damping_spread", 1e-4, 50.0, _shows("hunt_crossley", "depth_damped")),
     _prior("prior_unloading_spread", 1e-4, 5e3, _shows("elastoplastic")),
-    rig_gain("prior_friction_spread", lambda m: 0.0, lambda m: 50.0, lambda m: 0.0, tuned=_fact),
-    rig_gain("prior_preload_spread", lambda m: 0.0, lambda m: 50.0, lambda m: SHARP["prior_preload_spread"], tuned=_fact),
+    # Off where there is none: damping and friction are hard to tell apart.
+    rig_gain("prior_friction_spread", lambda m: 0.0, lambda m: 50.0 + friction(m), friction, tuned=_fact),
+    rig_gain(
+        "prior_preload_spread", lambda m: 0.0, lambda m: 50.0 + preload(m),
+        lambda m: max(USUAL_PRELOAD, preload(m)), tuned=_fact,
+    ),
     # Where there is noise, which is given and seen, it hardly matters.
     _prior("force_noise_floor", 1e-4, 10.0, lambda m: not m.rig.force_sensor.noise_std),
     rig_gain(

@@ -14,9 +14,9 @@ predicts:
     in contact:  F_c = f_0 + (y - F(X, V)) + f_e
     separated:   F_c = f_e  until the hardware has left the surface for 6 ms, then 0
 
-Every contact starts afresh, but for what is known of where the surfaces are. A run that begins in contact has no
-approach speed to scale by: there F_c is the measured force, as it is. notebooks/guide/retrospective_reference.md
-says more.
+Every contact starts afresh, but for what is known of where the surfaces are. A run that begins in contact has
+no approach speed to scale by: there F_c is the measured force, as it is.
+notebooks/guide/retrospective_reference.md says more.
 """
 
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxhil.compensators.base import Compensator, Constants, Gain, Gains, cleared
 from jaxhil.compensators.delay_line import Delay, DelayLine, delayed, empty, split
@@ -200,7 +200,9 @@ class RetrospectiveReference(Compensator):
         noise = take_noise(gains, state.noise, before, force_read, shown, state.episode.scales.side == 0)
         history = take(state.history, tick, signals.age, force_read, shown, position, velocity)
 
-        scales = state.episode.scales._replace(side=side, speed=jnp.where(begins, 0, state.episode.scales.speed))
+        scales = state.episode.scales._replace(
+            side=side, speed=jnp.where(begins, 0, state.episode.scales.speed)
+        )
         way = jnp.where((signals.velocity_desired > 0) | jnp.isinf(clearance), 1, -1)
         speed = way * signals.velocity_desired
         flies = (side == 0) & (speed > 0)
@@ -215,7 +217,13 @@ class RetrospectiveReference(Compensator):
         depth = depth_of(safe, clearance, signals.position_desired)
         since_met = jnp.where(depth > 0, depth, 0)
         reference = begin(
-            state.reference, meeting.found, meeting.index, meeting.start, meeting.since, since_met, period * safe.pace
+            state.reference,
+            meeting.found,
+            meeting.index,
+            meeting.start,
+            meeting.since,
+            since_met,
+            period * safe.pace,
         )
         read = _Read(position, velocity, force_read, shown, variance)
         command, episode, learnt, reference = self._contact(
@@ -243,18 +251,24 @@ class RetrospectiveReference(Compensator):
 
         zone = gains["dead_zone"] / scales.weight
         spread = read.variance / scales.weight**2
-        teaching = _Teaching(history, scales, clearance, gains["force_noise_floor"] ** 2 + spread, zone, usable)
+        teaching = _Teaching(
+            history, scales, clearance, gains["force_noise_floor"] ** 2 + spread, zone, usable
+        )
         learnt, known, next_, learnt_deepest = self._catch_up(prepared, learnt, found, teaching, old)
         expected = force(known, depth, rate, hardware_deepest)
         guess = jnp.where(expected > zone, zone, jnp.where(expected > 0, expected, 0))
         seen = jnp.where(read.shown, side * (read.force - scales.bias) / scales.weight, guess)
         strength = gains["replay_noise"] ** 2
         replay = gains["force_replay"] * strength / (strength + spread)
-        reference = follow(reference, known, Measured(history, scales, clearance, replay, slow, longest_step(period), older))
+        reference = follow(
+            reference, known, Measured(history, scales, clearance, replay, slow, longest_step(period), older)
+        )
 
         own = force(known, x, v, deepest)
         separated = (x <= 0) | ((v < 0) & (own <= 0))
-        command = _command(gains, v, known, own, separated, seen, expected, reference.live.speed, scales.pace, slow)
+        command = _command(
+            gains, v, known, own, separated, seen, expected, reference.live.speed, scales.pace, slow
+        )
         command = side * scales.weight * command
         bent = side * deflection(read.position, clearance)
         out = ~(side * deflection(signals.position_desired, clearance) > 0)

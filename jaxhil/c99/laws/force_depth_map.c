@@ -10,15 +10,16 @@ enum { JAXHIL_SEGMENTS = 12, JAXHIL_PARAMETERS = JAXHIL_SEGMENTS + 5 };
 enum { JAXHIL_DAMPING = JAXHIL_SEGMENTS, JAXHIL_DEPTH_DAMPING, JAXHIL_UNLOADING, JAXHIL_FRICTION, JAXHIL_PRELOAD };
 
 /* What counts of a map: slopes [1/s^2], force at the knots [1/s], which begins with the preload, damping and depth
- * damping [1/s], unloading [1/s^2], friction [1/s]. Depth in s (over the approach speed), speed as a fraction of that speed, force in 1/s (over mass and
- * approach speed). */
+ * damping [1/s], unloading [1/s^2], friction [1/s]. Depth in s (over the approach speed), speed as a fraction of
+ * that speed, force in 1/s (over mass and approach speed). */
 typedef struct {
     double slopes[JAXHIL_SEGMENTS], at_knots[JAXHIL_SEGMENTS], damping, depth_damping, unloading, friction;
 } jaxhil_curve;
 
 /* f(x, v, x_m) = sum_j slope_j clip(x - kappa_j, 0, kappa_{j+1} - kappa_j) + (damping + depth_damping x/reach) v
- * - unloading (x_m - x) + friction v/sqrt(v^2 + slow^2) + preload at x > 0, else 0, x_m the deepest point so far; from a Gaussian prior by recursive least
- * squares. What dissipates counts in `curve` with its mean given that it is not negative. */
+ * - unloading (x_m - x) + friction v/sqrt(v^2 + slow^2) + preload at x > 0, else 0, x_m the deepest point so far;
+ * from a Gaussian prior by recursive least squares. What dissipates counts in `curve` with its mean given that it
+ * is not negative. */
 typedef struct {
     double stiffness, common, wandering, damping, depth_damping, unloading, friction, preload;
     double estimate[JAXHIL_PARAMETERS], covariance[JAXHIL_PARAMETERS][JAXHIL_PARAMETERS];
@@ -214,7 +215,8 @@ static double jaxhil_curve_force(const jaxhil_curve *curve, double depth, double
     }
     const double drag = (curve->damping + curve->depth_damping * depth / jaxhil_map_reach) * speed;
     const double back = deepest > depth ? deepest - depth : 0.0;
-    return jaxhil_curve_elastic(curve, depth) + (drag + curve->friction * jaxhil_turning(speed) - curve->unloading * back);
+    const double lost = drag + curve->friction * jaxhil_turning(speed) - curve->unloading * back;
+    return jaxhil_curve_elastic(curve, depth) + lost;
 }
 
 /* Force [1/s] where a contact entered at speed 1 comes to rest without dissipation, at least 1. At knots where the

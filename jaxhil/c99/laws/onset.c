@@ -1,11 +1,11 @@
 /* Where the hardware's surface is: the tick from which on the force tells of contact.
  *
- * While the numerical model flies freely every tick may be the one before which the hardware met the surface. Since
- * then the force would be y = b + B + K s, s the time since the middle of that tick, K ~ N(K0, s_K^2), B ~ N(0, s_B^2);
+ * While the numerical model flies freely every tick may be the one in which the hardware met the surface. Since then
+ * the force would be y = b + B + K s, s the time since the middle of that tick, K ~ N(K0, s_K^2), B ~ N(0, s_B^2);
  * before, y = b, the sensor's bias. Its evidence against free flight throughout has a closed form in sums over the
- * readings; the surface is found when the best tick's, with the prior of a surface there, exceeds e^9. The prior is
- * 1/(pi s (1 + d^2)), d the distance from where the surface is expected over the spread s of that.
- * Scaled by approach speed and mass: forces in 1/s, K in 1/s^2.
+ * readings; the surface is found when the evidence of the best tick, with how likely a surface is there, exceeds
+ * e^9. The surface is expected at a place with a spread s: of a distance d s from there its density is
+ * 1/(pi s (1 + d^2)). Scaled by approach speed and mass: forces in 1/s, K in 1/s^2.
  */
 #include <math.h>
 #include <stdbool.h>
@@ -37,7 +37,7 @@ static const long jaxhil_ages[JAXHIL_AGES] = {1, 2, 3, 4, 5, 6, 8, 11, 16, 24, 3
 static const double jaxhil_onset_stiffness = 300.0, jaxhil_onset_stiffness_variance = 160000.0;
 static const double jaxhil_onset_jump_variance = 36.0;
 static const double jaxhil_onset_certain = 9.0;
-static const double jaxhil_onset_wait = 0.004; /* s, and a tick, since the surface was met: then its stiffness shows */
+static const double jaxhil_onset_wait = 0.004; /* s, and a tick, since then: its stiffness shows */
 static const long jaxhil_onset_longest = 65536; /* ticks of a flight, up to which the sums are exact enough */
 
 static void jaxhil_onset_restart(jaxhil_onset *onset) {

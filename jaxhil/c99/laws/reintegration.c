@@ -9,8 +9,8 @@
 
 enum { JAXHIL_STRIDE = 24 }; /* steps per tick of the pass from the entry */
 
-/* A contact's scales: the surface's side, 1 or -1, and its place [m] beyond where it was told; approach speed
- * [m/s]; mass times it [kg m/s]; the sensor's bias [N]. */
+/* A contact's scales: the clearance of two surfaces [m]; the surface's side, 1 or -1, and its place [m] beyond where
+ * it was told; approach speed [m/s]; that over the pace [m]; mass times it times the pace [N]; the bias [N]. */
 typedef struct {
     double clearance, side, plane, speed, length, weight, bias;
 } jaxhil_scales;
@@ -81,8 +81,8 @@ static void jaxhil_reference_motion_init(jaxhil_reference_motion *reference, dou
     }
 }
 
-/* Before a tick at which the hardware has met the surface `since` [ticks] before the sample after `entry`, the numerical
- * model `depth` [s] ago: until the first pass is done, it should go on as it does. */
+/* Before a tick at which the hardware has met the surface `since` [ticks] before the sample after `entry`, the
+ * numerical model `depth` [s] ago: until the first pass is done, it should go on as it does. */
 static void jaxhil_reference_motion_begin(jaxhil_reference_motion *reference, const jaxhil_history *history,
                                           long entry, double since, double depth) {
     const double ticks = depth / reference->period - since;

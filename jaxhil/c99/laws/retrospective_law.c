@@ -1,73 +1,64 @@
-/* What the retrospective references share: find the surface, identify the contact, work out what should have happened,
- * pay it back. Until the force tells of contact F_c = 0. In contact F_c = f_0 + (y - F(X, V)) + f_e, f_0 = max(F(x_d,
- * v_d), 0), F the force-depth map identified on delay-aligned readings (X, V, y) since the surface was met; separated
- * F_c = f_e until the hardware has left the surface for 6 ms, then 0. f_e = clip(c (v_d - T f_0/2 - v_r), -limit p,
- * limit p), v_r the speed of the motion that the contact should have had since its entry, p the peak force that the map
- * predicts. Scaled by approach speed and equivalent mass.
+/* What the retrospective references share: find the surface, identify the contact, work out what should have
+ * happened, pay it back. Until the force tells of contact F_c = 0. In contact F_c = f_0 + (y - F(X, V)) + f_e,
+ * f_0 = clip(F(x_d, v_d), 0, most p), F the force-depth map identified on delay-aligned readings (X, V, y) since the
+ * surface was met; separated F_c = f_e until the hardware has left the surface for 6 ms, then 0. f_e = clip(c (v_d -
+ * T f_0/2 - v_r), -limit p, limit p), v_r the speed of the motion that the contact should have had since its entry,
+ * p the peak force that the map predicts. Scaled by approach speed and equivalent mass. Slow contact is followed on
+ * a slower scale of time: with T and 1/c times its pace, v0 over it, it is as usual contact.
  */
 #include <math.h>
 #include <stdbool.h>
 
+#include "contact_plane.c"
 #include "doubts.c"
-#include "filters.c"
 #include "gains_table.c"
 #include "history.c"
 #include "onset.c"
+#include "readings.c"
 #include "reintegration.c"
 #include "surfaces.c"
 
 /* == Declarations == */
 
-/* Where a surface is expected: by how much [m] it is deeper than told, and the spread of that. */
 typedef struct {
-    double place, spread;
-} jaxhil_plane;
-
-typedef struct {
-    double period, clearance, mass, share, force_noise, dead_zone, floor, velocity_gain, limit, replay, strength;
+    double period, clearance, mass, dead_zone, floor, velocity_gain, limit, replay, strength;
     double plane_spread, bias_spread;
-    jaxhil_plane planes[2]; /* where the surfaces on both sides are expected */
-    double middle, last, pace, side, speed, gone, squares, count, deepest, hardware_deepest, learnt_deepest, before;
+    double pace, side, speed, gone, deepest, hardware_deepest, learnt_deepest;
     long next;
-    jaxhil_delay_line line;
+    jaxhil_plane planes[2]; /* where the surfaces on both sides are expected */
+    jaxhil_alignment alignment;
+    jaxhil_force_noise noise;
     jaxhil_learnt learnt;
     jaxhil_reference_motion reference;
     jaxhil_history history;
     jaxhil_onset onset;
     jaxhil_doubts doubts;
-    bool whole, started, shown_before;
+    bool started;
     int status;
-    double samples[JAXHIL_IDENTIFICATION_DELAY_SAMPLES];
 } jaxhil_law;
 
 /* == Definitions == */
 
-static const double jaxhil_farewell = 0.006;   /* s for which it goes on after the hardware has left */
-static const double jaxhil_plane_late = 0.25;  /* how uncertain the surface is, of the ticks until it was found */
-static const double jaxhil_plane_drift = 1e-6; /* m, from contact to contact */
-static const double jaxhil_plane_elsewhere = 25.0; /* times the variance of where it is expected */
+static const double jaxhil_farewell = 0.006;  /* s for which it goes on after the hardware has left */
 static const double jaxhil_usual_pace = 14.0; /* 1/s: slower contact is followed on a slower scale of time */
 static const double jaxhil_slowest = 0.01;    /* of that */
 static const double jaxhil_most = 1.2;        /* of the peak force, that the model is to feel of the map */
 static const double jaxhil_misfit = 0.003;    /* of a force, by which the map may be wrong */
-static const double jaxhil_seen = 8.0;         /* differences between readings that show how noisy the force is */
-static const double jaxhil_outstanding = 32.0; /* times the noise's variance: what hardly is noise */
-enum { JAXHIL_READINGS = 2 };                  /* per tick that the map learns from, while it has to catch up */
+static const double jaxhil_margin = 0.0625;   /* of the stretch between two samples, off whose end the surface is */
+enum { JAXHIL_READINGS = 2 };                 /* per tick that the map learns from, while it has to catch up */
 
 /* All but what was learnt of earlier contacts. */
 static void jaxhil_law_restart(jaxhil_law *law) {
     law->side = 0.0;
     law->speed = 0.0;
     law->gone = 0.0;
-    law->squares = 0.0;
-    law->count = 0.0;
     law->deepest = 0.0;
     law->hardware_deepest = 0.0;
+    jaxhil_force_noise_restart(&law->noise);
     jaxhil_history_restart(&law->history);
     jaxhil_onset_restart(&law->onset);
     jaxhil_doubts_restart(&law->doubts);
     law->started = false;
-    law->shown_before = false;
     law->status = JAXHIL_OUT_OF_CONTACT;
 }
 
@@ -76,18 +67,15 @@ static void jaxhil_law_forget_planes(jaxhil_law *law) {
         law->planes[i].place = 0.0;
         law->planes[i].spread = law->plane_spread;
     }
+    law->reference.scales.plane = 0.0;
 }
 
 static bool jaxhil_law_init(jaxhil_law *law, const jaxhil_gains *gains) {
     const double period = gains->control_period;
-    const double delay = gains->identification_delay;
-    /* The line delays by a tick less, so that the speed can be a difference about the middle. */
-    const bool whole = delay > period;
     law->period = period;
     law->clearance = gains->clearance;
     law->mass = gains->equivalent_mass;
-    law->share = whole ? 1.0 : delay / period;
-    law->force_noise = gains->force_noise;
+    law->noise.known = gains->force_noise * gains->force_noise;
     law->dead_zone = gains->dead_zone;
     law->floor = gains->force_noise_floor;
     law->velocity_gain = gains->velocity_gain;
@@ -96,75 +84,23 @@ static bool jaxhil_law_init(jaxhil_law *law, const jaxhil_gains *gains) {
     law->strength = gains->replay_noise * gains->replay_noise;
     law->plane_spread = gains->plane_spread;
     law->bias_spread = gains->bias_spread;
-    jaxhil_law_forget_planes(law);
-    law->middle = 0.0;
-    law->last = 0.0;
     jaxhil_doubts_start(&law->doubts, 0.0, 0.0);
     jaxhil_learnt_init(&law->learnt, gains);
     jaxhil_reference_motion_init(&law->reference, period);
     law->reference.scales.clearance = law->clearance;
     law->onset.period = period;
+    jaxhil_law_forget_planes(law);
     jaxhil_law_restart(law);
-    law->whole = whole;
-    /* The line delays by less than the capacity allows: a delay is refused like that of the other laws. */
-    if (!(floor(delay / period + 1e-9) <= (double)(JAXHIL_IDENTIFICATION_DELAY_SAMPLES - 2))) {
-        return false;
-    }
-    return jaxhil_delay_line_init(&law->line, law->samples, JAXHIL_IDENTIFICATION_DELAY_SAMPLES,
-                                  whole ? delay - period : 0.0, period);
+    return jaxhil_alignment_init(&law->alignment, gains->identification_delay, period);
 }
 
-/* Position [m] and velocity [m/s] of the hardware, as old as the force. */
-static void jaxhil_law_align(jaxhil_law *law, double measured, double velocity_desired, double *position,
-                             double *velocity) {
-    const double period = law->period;
-    double newest = measured;
-    if (law->whole) {
-        if (!law->started) {
-            jaxhil_delay_line_start(&law->line, law->samples, measured, velocity_desired);
-        }
-        newest = jaxhil_delay_line_step(&law->line, law->samples, measured);
-    }
-    if (!law->started) {
-        const double stride = period * velocity_desired;
-        law->middle = newest - stride;
-        law->last = newest - 2.0 * stride;
-        jaxhil_doubts_start(&law->doubts, measured - stride, stride);
-        law->started = true;
-    }
-    jaxhil_doubts_move(&law->doubts, measured);
-    *position = newest + law->share * (law->middle - newest);
-    *velocity = (newest - law->last) / (2.0 * period);
-    law->last = law->middle;
-    law->middle = newest;
-}
-
-/* The force's variance [N^2]: the known one, or what readings out of contact show if that is more. */
-static double jaxhil_law_noise(const jaxhil_law *law) {
-    const double known = law->force_noise * law->force_noise;
-    const double seen = law->squares / (law->count > 0.0 ? law->count : 1.0);
-    return seen > known ? seen : known;
-}
-
-/* A reading [N]: out of contact the difference from the one before tells how noisy the force is. */
-static void jaxhil_law_take_noise(jaxhil_law *law, double force, bool shown) {
-    const double step = force - law->before;
-    if (shown && law->shown_before && law->side == 0.0 &&
-        !(law->count >= jaxhil_seen && step * step > jaxhil_outstanding * jaxhil_law_noise(law))) {
-        law->squares += 0.5 * (step * step);
-        law->count += 1.0;
-    }
-    law->before = force;
-    law->shown_before = shown;
-}
-
-/* f_e [1/s], for the speed of the model in the middle of the next period; `status` judges it. */
-static double jaxhil_law_repayment(jaxhil_law *law, const jaxhil_curve *curve, double speed, double zone) {
-    const double peak = jaxhil_curve_peak_force(curve);
+/* f_e [1/s], by the map's peak force and the speed of the model in the middle of the next period; `status` judges
+ * it. */
+static double jaxhil_law_repayment(jaxhil_law *law, double peak, double speed, double zone) {
     const double limit = law->limit * peak;
     const double correction = law->velocity_gain / law->pace * (speed - law->reference.live.speed);
-    law->status = jaxhil_doubts_status(&law->doubts, curve, peak, law->hardware_deepest,
-                                       jaxhil_learnt_variance(&law->learnt), zone, law->speed);
+    law->status =
+        jaxhil_doubts_status(&law->doubts, peak, jaxhil_learnt_variance(&law->learnt), zone, law->speed);
     if (!(correction > limit || correction < -limit)) {
         return correction;
     }
@@ -187,19 +123,18 @@ static void jaxhil_law_learn(jaxhil_law *law, double variance, double zone) {
         if (depth > law->learnt_deepest) {
             law->learnt_deepest = depth;
         }
-        if (depth > 0.0 && !hidden) {
-            jaxhil_doubts_read(&law->doubts, depth, law->learnt_deepest, force, variance);
-        }
+        law->doubts.readings += depth > 0.0 && !hidden;
         const double off = jaxhil_misfit * force;
-        jaxhil_learnt_read(&law->learnt, depth, rate, law->learnt_deepest, force, variance + off * off, hidden, zone);
+        jaxhil_learnt_read(&law->learnt, depth, rate, law->learnt_deepest, force, variance + off * off,
+                           hidden, zone);
     }
 }
 
 /* The command over M v0 [1/s]; whether the numerical model has separated. */
 static double jaxhil_law_follow(jaxhil_law *law, double x, double v, double depth, double rate, double force,
                                 bool hidden, bool *separated) {
-    const double period = law->reference.period;
-    const double weight = law->reference.scales.weight;
+    jaxhil_reference_motion *reference = &law->reference;
+    const double weight = reference->scales.weight;
     const jaxhil_curve *curve = jaxhil_learnt_curve(&law->learnt);
     if (x > law->deepest) {
         law->deepest = x;
@@ -207,71 +142,55 @@ static double jaxhil_law_follow(jaxhil_law *law, double x, double v, double dept
     if (depth > law->hardware_deepest) {
         law->hardware_deepest = depth;
     }
-    const double deepest = law->hardware_deepest;
-
     const double zone = law->dead_zone / weight;
-    const double noise = jaxhil_law_noise(law) / (weight * weight);
-    law->reference.shift = jaxhil_learnt_shift(&law->learnt);
+    const double noise = jaxhil_force_noise_variance(&law->noise) / (weight * weight);
+    reference->shift = jaxhil_learnt_shift(&law->learnt);
     jaxhil_law_learn(law, law->floor * law->floor + noise, zone);
-    const double expected = jaxhil_curve_force(curve, depth, rate, deepest);
+    const double expected = jaxhil_curve_force(curve, depth, rate, law->hardware_deepest);
     if (hidden) {
         force = expected > zone ? zone : (expected > 0.0 ? expected : 0.0);
     }
     const double whole = law->strength + noise;
-    law->reference.replay = whole > 0.0 ? law->replay * law->strength / whole : 0.0;
-    jaxhil_reference_motion_tick(&law->reference, &law->history, curve);
+    reference->replay = whole > 0.0 ? law->replay * law->strength / whole : 0.0;
+    jaxhil_reference_motion_tick(reference, &law->history, curve);
 
     double own = jaxhil_curve_force(curve, x, v, law->deepest);
     *separated = x <= 0.0 || (v < 0.0 && own <= 0.0);
     if (!(own > 0.0)) {
         own = 0.0;
     }
-    const double most = jaxhil_most * jaxhil_curve_peak_force(curve);
+    const double peak = jaxhil_curve_peak_force(curve);
+    const double most = jaxhil_most * peak;
     if (own > most) {
         own = most;
     }
-    const double correction = jaxhil_law_repayment(law, curve, v - 0.5 * period * own, zone);
+    const double correction = jaxhil_law_repayment(law, peak, v - 0.5 * reference->period * own, zone);
     return *separated ? correction : own + (force - expected) + correction;
-}
-
-/* A surface was met between two places [m], so many ticks before that was found. Where it is expected now. */
-static double jaxhil_plane_learn(jaxhil_plane *plane, double low, double high, long age) {
-    const double width = high - low;
-    const double spread = jaxhil_plane_late * (double)age;
-    const double found = width * width * (1.0 / 12.0 + spread * spread);
-    const double known = plane->spread * plane->spread;
-    const double middle = 0.5 * (low + high);
-    const double away = middle - plane->place;
-    const bool elsewhere = away * away > jaxhil_plane_elsewhere * (known + found);
-    plane->place = elsewhere ? middle : plane->place + away * (known / (known + found));
-    plane->spread = sqrt((elsewhere ? found : known * found / (known + found)) + jaxhil_plane_drift * jaxhil_plane_drift);
-    return plane->place;
 }
 
 /* A surface is found, met between two samples: between them it lies where it was most expected. */
 static void jaxhil_law_meet(jaxhil_law *law, double side, double reach, double speed, jaxhil_found found) {
     jaxhil_history *history = &law->history;
     jaxhil_scales *scales = &law->reference.scales;
+    jaxhil_plane *plane = &law->planes[side < 0.0];
     const long entry = history->newest - found.age;
+    const double pace = sqrt(found.stiffness > 0.0 ? found.stiffness : 0.0) / jaxhil_usual_pace;
+    law->pace = pace < 1.0 ? (pace > jaxhil_slowest ? pace : jaxhil_slowest) : 1.0;
+    law->reference.period = law->period * law->pace;
     scales->side = side;
-    double pace = sqrt(found.stiffness > 0.0 ? found.stiffness : 0.0) / jaxhil_usual_pace;
-    pace = pace < 1.0 ? (pace > jaxhil_slowest ? pace : jaxhil_slowest) : 1.0;
     scales->speed = speed;
-    scales->length = speed / pace;
-    law->pace = pace;
-    law->reference.period = law->period * pace;
-    scales->plane = 0.0;
+    scales->length = speed / law->pace;
     scales->bias = side * found.bias * (law->mass * speed);
-    scales->weight = law->mass * speed * pace;
+    scales->weight = law->mass * speed * law->pace;
     const double low = jaxhil_scales_beyond(scales, jaxhil_history_recall(history, entry)->position);
     const double high = jaxhil_scales_beyond(scales, jaxhil_history_recall(history, entry + 1)->position);
-    const double place = jaxhil_plane_learn(&law->planes[side < 0.0], low, high, found.age);
+    jaxhil_plane_learn(plane, low, high, found.age);
     /* Not at the end of the stretch: the reference would not have entered. */
-    const double margin = 0.0625 * (high - low);
-    const double end = high - margin;
-    scales->plane = place < low ? low : (place > end ? end : place);
+    const double end = high - jaxhil_margin * (high - low);
+    scales->plane = plane->place < low ? low : (plane->place > end ? end : plane->place);
     const double since = high > low ? (high - scales->plane) / (high - low) : 0.5;
     const double depth = (reach - scales->plane) / scales->length;
+    const double far = jaxhil_far * law->plane_spread;
     law->side = side;
     law->speed = speed;
     law->gone = 0.0;
@@ -281,6 +200,7 @@ static void jaxhil_law_meet(jaxhil_law *law, double side, double reach, double s
     law->next = entry + 1;
     jaxhil_doubts_restart(&law->doubts);
     law->doubts.late = depth - (double)found.age * law->reference.period;
+    law->doubts.displaced = scales->plane > far || scales->plane < -far;
     jaxhil_learnt_begin(&law->learnt);
     jaxhil_reference_motion_begin(&law->reference, history, entry, since, depth > 0.0 ? depth : 0.0);
 }
@@ -289,7 +209,8 @@ static void jaxhil_law_meet(jaxhil_law *law, double side, double reach, double s
 static bool jaxhil_law_watch(jaxhil_law *law, double side, double speed, double force, bool shown,
                              jaxhil_found *found) {
     const double weight = law->mass * speed;
-    const double noise = law->floor * law->floor + jaxhil_law_noise(law) / (weight * weight);
+    const double noise =
+        law->floor * law->floor + jaxhil_force_noise_variance(&law->noise) / (weight * weight);
     const double spread = law->bias_spread / weight;
     const jaxhil_plane *plane = &law->planes[side < 0.0];
     jaxhil_onset_take(&law->onset, side * force / weight, shown);
@@ -311,41 +232,62 @@ static bool jaxhil_law_watch(jaxhil_law *law, double side, double speed, double 
     return found->age > 1 && (double)found->age * law->period >= jaxhil_onset_wait * (1.0 - 1e-9);
 }
 
+/* Flying freely: whether the force tells that a surface was met; if so, the contact begins. */
+static bool jaxhil_law_meets(jaxhil_law *law, double force, bool shown, double position_desired,
+                             double velocity_desired) {
+    const double side = velocity_desired > 0.0 ? 1.0 : -1.0;
+    const double speed = side * velocity_desired;
+    jaxhil_found found;
+    law->status = JAXHIL_OUT_OF_CONTACT;
+    if (!(law->mass * speed > 0.0) || (side < 0.0 && law->clearance == INFINITY)) {
+        jaxhil_onset_restart(&law->onset);
+        return false;
+    }
+    if (!jaxhil_law_watch(law, side, speed, force, shown, &found)) {
+        return false;
+    }
+    const double reach = side < 0.0 ? -law->clearance - position_desired : position_desired;
+    jaxhil_law_meet(law, side, reach, speed, found);
+    return true;
+}
+
+/* The force as it is read, in a run that begins in contact; whether the numerical model has separated. */
+static double jaxhil_law_pass_on(jaxhil_law *law, double force, double reach, double position,
+                                 bool *separated) {
+    const double bent = law->side * jaxhil_deflection(position, law->clearance);
+    *separated = !(reach * law->side > 0.0);
+    law->gone = bent > 0.0 ? 0.0 : law->gone;
+    law->status = JAXHIL_UNSURE;
+    return *separated || bent < 0.0 ? 0.0 : force;
+}
+
 static double jaxhil_law_step(jaxhil_law *law, double force_measured, double position_desired,
                               double velocity_desired, double position_measured) {
     const double zone = law->dead_zone;
     const bool begins = !law->started;
     double position, velocity;
-    jaxhil_law_align(law, position_measured, velocity_desired, &position, &velocity);
+    jaxhil_alignment_step(&law->alignment, position_measured, velocity_desired, begins, &position, &velocity);
+    if (begins) {
+        const double stride = law->period * velocity_desired;
+        jaxhil_doubts_start(&law->doubts, position_measured - stride, stride);
+        law->started = true;
+    }
+    jaxhil_doubts_move(&law->doubts, position_measured);
     /* A run's first reading counts as none: the sensor's delay line may not have been filled. */
     const bool hidden = begins || (zone > 0.0 && force_measured == 0.0);
     const double force =
         force_measured + (force_measured > 0.0 ? zone : (force_measured < 0.0 ? -zone : 0.0));
     jaxhil_history_take(&law->history, force, !hidden, position, velocity);
-    jaxhil_law_take_noise(law, force, !hidden);
+    jaxhil_force_noise_take(&law->noise, force, !hidden, law->side == 0.0);
     const double reach = jaxhil_deflection(position_desired, law->clearance);
-    if (begins && reach != 0.0) {
-        law->side = reach > 0.0 ? 1.0 : -1.0;
-        law->speed = 0.0;
+    if (begins) {
+        law->side = reach > 0.0 ? 1.0 : (reach < 0.0 ? -1.0 : 0.0);
     }
-    if (law->side == 0.0) {
-        const double side = velocity_desired > 0.0 ? 1.0 : -1.0;
-        const double speed = side * velocity_desired;
-        jaxhil_found found;
-        law->status = JAXHIL_OUT_OF_CONTACT;
-        if (!(law->mass * speed > 0.0) || (side < 0.0 && law->clearance == INFINITY)) {
-            jaxhil_onset_restart(&law->onset);
-            return 0.0;
-        }
-        if (!jaxhil_law_watch(law, side, speed, force, !hidden, &found)) {
-            return 0.0;
-        }
-        const double place = side < 0.0 ? -law->clearance - position_desired : position_desired;
-        jaxhil_law_meet(law, side, place, speed, found);
+    if (law->side == 0.0 && !jaxhil_law_meets(law, force, !hidden, position_desired, velocity_desired)) {
+        return 0.0;
     }
-    const double side = law->side;
     bool separated;
-    double command, weight = 1.0;
+    double command;
     law->gone += 1.0;
     if (law->speed > 0.0) {
         const jaxhil_scales *scales = &law->reference.scales;
@@ -355,24 +297,21 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
         if (depth > 0.0) {
             law->gone = 0.0;
         }
-        weight = scales->weight;
         command = jaxhil_law_follow(law, jaxhil_scales_depth(scales, position_desired),
                                     jaxhil_scales_rate(scales, velocity_desired), depth, rate,
                                     jaxhil_scales_force(scales, force), hidden, &separated);
+        command = law->side * scales->weight * command;
     } else {
-        const double bent = jaxhil_deflection(position, law->clearance);
-        separated = !(reach * side > 0.0);
-        command = separated || bent * side < 0.0 ? 0.0 : side * force;
-        law->gone = bent * side > 0.0 ? 0.0 : law->gone;
-        law->status = JAXHIL_UNSURE;
+        command = jaxhil_law_pass_on(law, force, reach, position, &separated);
     }
     if (separated && law->gone * law->period > jaxhil_farewell * (1.0 + 1e-9)) {
         law->side = 0.0;
+        law->speed = 0.0;
         law->status = JAXHIL_OUT_OF_CONTACT;
         jaxhil_onset_restart(&law->onset);
         return 0.0;
     }
-    return side * weight * command;
+    return command;
 }
 
 #define JAXHIL_LAW_HAS_STATUS

@@ -16,8 +16,8 @@ class ContactPlane:
         self.place = 0.0  # where it is expected [m]
         self.spread = spread  # of that [m]
 
-    def learn(self, low: float, high: float, age: int) -> float:
-        """It was met between two places [m], so many ticks before that was found. Where it is expected now."""
+    def learn(self, low: float, high: float, age: int) -> None:
+        """It was met between two places [m], so many ticks before that was found."""
         width = high - low
         late = LATE * float(age)
         found = width * width * (1.0 / 12.0 + late * late)
@@ -27,4 +27,3 @@ class ContactPlane:
         elsewhere = away * away > ELSEWHERE * (known + found)
         self.place = middle if elsewhere else self.place + away * (known / (known + found))
         self.spread = sqrt((found if elsewhere else known * found / (known + found)) + DRIFT * DRIFT)
-        return self.place

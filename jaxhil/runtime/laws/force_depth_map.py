@@ -1,11 +1,11 @@
 """A force-depth map of unknown contact, identified while it lasts: slopes between knots, and dissipation.
 
-f(x, v, x_m) = preload + sum_j slope_j clip(x - kappa_j, 0, kappa_{j+1} - kappa_j)
-+ (damping + depth_damping x/REACH) v - unloading (x_m - x) + friction v/sqrt(v^2 + SLOW^2) at x > 0, else 0; x_m
-is the deepest point so far. Depth in s (over the approach speed), speed as a fraction of that speed, force in
-1/s (over mass and approach speed). All parameters start from a Gaussian prior and are identified by recursive
-least squares; what dissipates counts with its mean given that it is not negative. Only segments that are
-pressed in enter the sums.
+f(x, v, x_m) = preload + sum_j slope_j clip(x - kappa_j, 0, kappa_{j+1} - kappa_j) + (damping + depth_damping
+x/REACH) v - unloading (x_m - x) + friction v/sqrt(v^2 + SLOW^2) at x > 0, else 0; x_m is the deepest point so
+far. Depth in s (over the approach speed), speed as a fraction of that speed, force in 1/s (over mass and
+approach speed). All parameters start from a Gaussian prior and are identified by recursive least squares;
+what dissipates counts with its mean given that it is not negative. Only segments that are pressed in enter
+the sums.
 """
 
 from bisect import bisect_left
@@ -188,15 +188,14 @@ class ForceDepthMap:
         curve.slopes = slopes
         curve.at_knots = at_knots
         curve.damping = positive_mean(estimate[DAMPING], covariance[DAMPING][DAMPING])
-        curve.depth_damping = positive_mean(
-            estimate[DEPTH_DAMPING], covariance[DEPTH_DAMPING][DEPTH_DAMPING]
-        )
+        curve.depth_damping = positive_mean(estimate[DEPTH_DAMPING], covariance[DEPTH_DAMPING][DEPTH_DAMPING])
         curve.unloading = positive_mean(estimate[UNLOADING], covariance[UNLOADING][UNLOADING])
         curve.friction = positive_mean(estimate[FRICTION], covariance[FRICTION][FRICTION])
 
 
 def wandered(depth: float) -> float:
-    """Over how much depth [s] slopes have wandered at a depth [s]: beyond WIDE ever less, as (WIDE/depth)^4."""
+    """Over how much depth [s] slopes have wandered at a depth [s]: beyond WIDE ever less, as
+    (WIDE/depth)^4."""
     if not depth > WIDE:
         return depth
     ratio = WIDE / depth

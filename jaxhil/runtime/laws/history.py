@@ -1,7 +1,7 @@
 """What was measured in a run, by tick.
 
-Of the newest 255 ticks every sample is kept, of the 4 times as many before every 4th, then every 16th, 64th and
-256th: the last of each block of so many ticks.
+Of the newest 255 ticks every sample is kept, of the 4 times as many before every 4th, then every 16th, 64th
+and 256th: the last of each block of so many ticks.
 """
 
 from typing import NamedTuple

@@ -1,11 +1,11 @@
 """Where the hardware's surface is: the tick from which on the force tells of contact.
 
-While the numerical model flies freely, the hardware may have met the surface in any tick. Since then the force
-would be y = b + B + K s, s the time since the middle of that tick, K ~ N(K0, s_K^2), B ~ N(0, s_B^2); before,
-y = b, the sensor's bias. Its evidence against free flight throughout has a closed form in sums over the
-readings; the surface is found when the evidence of the best tick, with how likely a surface is there, exceeds
-e^CERTAIN. The surface is expected at a place with a spread s: of a distance d s from there its density is
-1/(pi s (1 + d^2)). Scaled by approach speed and mass: forces in 1/s, K in 1/s^2.
+While the numerical model flies freely, the hardware may have met the surface in any tick. Since then the
+force would be y = b + B + K s, s the time since the middle of that tick, K ~ N(K0, s_K^2), B ~ N(0, s_B^2);
+before, y = b, the sensor's bias. Its evidence against free flight throughout has a closed form in sums over
+the readings; the surface is found when the evidence of the best tick, with how likely a surface is there,
+exceeds e^CERTAIN. The surface is expected at a place with a spread s: of a distance d s from there its
+density is 1/(pi s (1 + d^2)). Scaled by approach speed and mass: forces in 1/s, K in 1/s^2.
 """
 
 from math import pi, sqrt

@@ -1,12 +1,12 @@
 """The motion that a contact should have had, integrated over again from its entry while the map improves.
 
-Scaled as in `force_depth_map`: from depth 0 at speed 1, x' = v, v' = -f, f = F(x, v, x_m) + rho [y - F(X, V, X_m)],
-until it separates: x <= 0, or v < 0 and f <= 0. The bracket is what was measured and the map does not explain,
-as far as the hardware has been measured and y could be read; x_m and X_m are the deepest points so far. By the
-velocity Verlet scheme, the damping implicit in the first half of a step and explicit in the second (order 2),
-the bracket constant within a step. A pass from the entry makes a bounded number of steps per tick; when it has
-caught up with the present it becomes the live motion, which until the next goes on tick by tick under the
-newest map. Samples count by the hardware's ticks, the present lies between two of them.
+Scaled as in `force_depth_map`: from depth 0 at speed 1, x' = v, v' = -f, f = F(x, v, x_m) + rho [y - F(X, V,
+X_m)], until it separates: x <= 0, or v < 0 and f <= 0. The bracket is what was measured and the map does not
+explain, as far as the hardware has been measured and y could be read; x_m and X_m are the deepest points so
+far. By the velocity Verlet scheme, the damping implicit in the first half of a step and explicit in the
+second (order 2), the bracket constant within a step. A pass from the entry makes a bounded number of steps
+per tick; when it has caught up with the present it becomes the live motion, which until the next goes on tick
+by tick under the newest map. Samples count by the hardware's ticks, the present lies between two of them.
 """
 
 from math import floor
@@ -53,7 +53,18 @@ class Scales:
 class Motion:
     """A motion under a `curve` of its own."""
 
-    __slots__ = ("_expected", "_farthest", "_impulse", "_shown", "curve", "deepest", "depth", "force", "free", "speed")
+    __slots__ = (
+        "_expected",
+        "_farthest",
+        "_impulse",
+        "_shown",
+        "curve",
+        "deepest",
+        "depth",
+        "force",
+        "free",
+        "speed",
+    )
 
     def __init__(self) -> None:
         self.curve = Curve()
@@ -139,8 +150,8 @@ class ReferenceMotion:
     """The `live` motion, and the pass behind it that is to take its place."""
 
     __slots__ = (
-        "_behind", "_beyond", "_coarse", "_entry", "_history", "_present", "_reached", "_since", "_start", "live",
-        "period", "replay", "scales", "shift",
+        "_behind", "_beyond", "_coarse", "_entry", "_history", "_present", "_reached", "_since", "_start",
+        "live", "period", "replay", "scales", "shift",
     )  # fmt: skip
 
     def __init__(self, history: History, scales: Scales, period: float) -> None:
@@ -157,9 +168,9 @@ class ReferenceMotion:
         self.begin(-1, NOTHING, 0.5, 0.0)
 
     def begin(self, entry: int, start: Sample, since: float, depth: float) -> None:
-        """Before a tick at which the hardware has met the surface `since` [ticks] before the sample after that of
-        the tick `entry`, the numerical model `depth` [s] ago: until the first pass is done, it should go on as
-        it does."""
+        """Before a tick at which the hardware has met the surface `since` [ticks] before the sample after
+        that of the tick `entry`, the numerical model `depth` [s] ago: until the first pass is done, it should
+        go on as it does."""
         ticks = depth / self.period - since
         whole = float(floor(ticks)) if ticks > 0.0 else 0.0
         self._entry = entry

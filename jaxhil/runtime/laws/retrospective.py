@@ -1,20 +1,21 @@
 """What the retrospective laws share: to work out what should have happened, and to make up for it.
 
 A rig reads the contact force late, and its drives follow late: the numerical model gains or loses energy that
-contact in space would not give it. These laws identify the contact while it lasts, as a map from depth to
-force; they integrate the motion that it should have had since its entry, the reference; and they add to the
-force a correction that brings the model's speed back to the reference's.
+contact in space would not give it. These laws find the surface and identify the contact while it lasts, as a
+map from depth to force; they integrate the motion that it should have had since its entry, the reference; and
+they add to the force a correction that brings the model's speed back to the reference's.
 
 Scaled by approach speed v0 and equivalent mass M, F the force-depth map identified on delay-aligned readings
 (X, V, y), p the peak force that it predicts, v_r the reference's speed:
 
-    f_0 = max(F(x_d, v_d), 0)
+    f_0 = clip(F(x_d, v_d), 0, MOST p)
     f_e = clip(c (v_d - T f_0/2 - v_r), -limit p, limit p)
     no contact:  F_c = 0, until the force tells of one, and of where its surface is
     in contact:  F_c = f_0 + (y - F(X, V)) + f_e
     separated:   F_c = f_e  until the hardware has left the surface for 6 ms, then 0
 
-notebooks/guide/retrospective_reference.md says more.
+Slow contact is followed on a slower scale of time: with T and 1/c times its pace, v0 over it, all that is
+said of usual contact holds of it. notebooks/guide/retrospective_reference.md says more.
 """
 
 from collections.abc import Mapping
@@ -22,24 +23,23 @@ from math import inf, sqrt
 from typing import ClassVar
 
 from ..bounds import DAMPINGS_BY_MASS, FORCES, MASSES, STIFFNESSES_BY_MASS, TIMES
-from ..filters import DelayLine
 from ..law_status import IDENTIFIED, OUT_OF_CONTACT, SATURATED, UNSURE
 from ..registry import Compensator, GainSpecification
 from ..surfaces import deflection
 from .contact_plane import ContactPlane
-from .doubts import Doubts
-from .force_depth_map import SURFACE, Curve, Prior
+from .doubts import FAR, Doubts
+from .force_depth_map import SURFACE, Prior
 from .history import History
 from .onset import CERTAIN, WAIT, Found, Onset, rarity
+from .readings import Alignment, ForceNoise
 from .reintegration import ReferenceMotion, Scales
 
-SEEN = 8  # differences between readings that show how noisy the force is
-OUTSTANDING = 32.0  # times the noise's variance: what hardly is noise
 FAREWELL = 0.006  # s for which it goes on after the hardware has left the surface
 USUAL_PACE = 14.0  # 1/s: slower contact is followed on a slower scale of time
 SLOWEST = 0.01  # of that
 MOST = 1.2  # of the peak force, that the model is to feel of the map
 MISFIT = 0.003  # of a force, by which the map may be wrong
+MARGIN = 0.0625  # of the stretch between two samples, that the surface is off its end
 READINGS = 2  # per tick that the map learns from, while it has to catch up
 PRIOR = (  # the gains that `Prior` is made of, in its order
     "prior_stiffness",
@@ -56,20 +56,19 @@ PRIOR = (  # the gains that `Prior` is made of, in its order
 class Retrospective(Compensator):
     """Reference and repayment; what identifies the contact is the law's own.
 
-    `_shift` [s] is by how much the force is older than by the given delay. Every contact starts afresh, but for
-    what is known of where the surfaces are. A run that begins in contact has no approach speed to scale by: there
-    F_c is the measured force. `status` is what stands behind the last command: `OUT_OF_CONTACT`; `UNSURE`:
-    nothing is identified yet, or there is nothing to scale by, and it goes by the measured force and what the
-    prior says of the contact; `SATURATED`: identified, and the correction is at its limit; else what `doubts`
-    says.
+    `_shift` [s] is by how much the force is older than by the given delay. Every contact starts afresh, but
+    for what is known of where the surfaces are. A run that begins in contact has no approach speed to scale
+    by: there F_c is the measured force. `status` is what stands behind the last command: `OUT_OF_CONTACT`;
+    `UNSURE`: nothing is identified yet, or there is nothing to scale by, and it goes by the measured force
+    and what the prior says of the contact; `SATURATED`: identified, and the correction is at its limit; else
+    what `doubts` says.
     """
 
     __slots__ = (
-        "_before", "_bias_spread", "_clearance", "_count", "_curve", "_dead_zone", "_deepest", "_doubts", "_floor",
-        "_force_noise", "_gone", "_hardware_deepest", "_history", "_last", "_learnt_deepest", "_limit", "_line",
-        "_mass", "_middle", "_next", "_onset", "_pace", "_period", "_plane_spread", "_planes", "_reference", "_replay",
-        "_scales", "_share", "_shift", "_shown_before", "_side", "_speed", "_squares", "_started", "_strength",
-        "_velocity_gain", "status",
+        "_alignment", "_bias_spread", "_clearance", "_curve", "_dead_zone", "_deepest", "_doubts", "_floor",
+        "_gone", "_hardware_deepest", "_history", "_learnt_deepest", "_limit", "_mass", "_next", "_noise",
+        "_onset", "_pace", "_period", "_plane_spread", "_planes", "_reference", "_replay", "_scales",
+        "_shift", "_side", "_speed", "_started", "_strength", "_velocity_gain", "status",
     )  # fmt: skip
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
@@ -95,19 +94,15 @@ class Retrospective(Compensator):
     }
 
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
-        delay = gains["identification_delay"]
         self._period = period
         self._clearance = clearance
         self._mass = gains["equivalent_mass"]
-        # The line delays by a tick less, so that the speed can be a difference about the middle.
-        whole = delay > period
-        self._line = DelayLine(delay - period, period) if whole else None
-        self._share = 1.0 if whole else delay / period
+        self._alignment = Alignment(gains["identification_delay"], period)
+        self._noise = ForceNoise(gains["force_noise"])
         self._history = History()
         self._onset = Onset(period)
         self._scales = Scales(clearance)
         self._reference = ReferenceMotion(self._history, self._scales, period)
-        self._force_noise = gains["force_noise"]
         self._dead_zone = gains["dead_zone"]
         self._bias_spread = gains["bias_spread"]
         self._plane_spread = gains["plane_spread"]
@@ -116,18 +111,26 @@ class Retrospective(Compensator):
         self._limit = gains["correction_limit"]
         self._replay = gains["force_replay"]
         self._strength = gains["replay_noise"] * gains["replay_noise"]
-        self._middle = 0.0
-        self._last = 0.0
         self._doubts = Doubts()
         self._shift = 0.0
         self._prepare(gains, Prior(*(gains[name] for name in PRIOR)))
         self.reset()
 
+    @property
+    def contact_plane(self) -> float:
+        """By how much [m] the surface met last is deeper than told; 0 before the first."""
+        return self._scales.plane
+
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """The force F_c [N]."""
         zone = self._dead_zone
         begins = not self._started
-        position, velocity = self._align(position_measured, velocity_desired)
+        position, velocity = self._alignment.step(position_measured, velocity_desired, begins)
+        if begins:
+            stride = self._period * velocity_desired
+            self._doubts.start(position_measured - stride, stride)
+            self._started = True
+        self._doubts.move(position_measured)
         # A run's first reading counts as none: the sensor's delay line may not have been filled.
         shown = not (begins or (zone > 0.0 and force_measured == 0.0))
         force = force_measured
@@ -136,25 +139,17 @@ class Retrospective(Compensator):
         elif force_measured < 0.0:
             force = force_measured - zone
         self._history.take(force, shown, position, velocity)
-        self._take_noise(force, shown)
+        self._noise.take(force, shown, self._side == 0.0)
         if begins:
             reach = deflection(position_desired, self._clearance)
             self._side = 1.0 if reach > 0.0 else (-1.0 if reach < 0.0 else 0.0)
-        if self._side == 0.0:
-            self.status = OUT_OF_CONTACT
-            side = 1.0 if velocity_desired > 0.0 else -1.0
-            speed = side * velocity_desired
-            if not self._mass * speed > 0.0 or (side < 0.0 and self._clearance == inf):
-                self._onset.restart()
-                return 0.0
-            found = self._watch(side, speed, force, shown)
-            if found is None:
-                return 0.0
-            self._meet(side, speed, position_desired, found)
+        if self._side == 0.0 and not self._meets(force, shown, position_desired, velocity_desired):
+            return 0.0
         self._gone += 1.0
         if self._speed > 0.0:
-            command, separated = self._follow(force, shown, position_desired, velocity_desired, position, velocity)
-            command = self._side * self._scales.weight * command
+            command, separated = self._follow(
+                force, shown, position_desired, velocity_desired, position, velocity
+            )
         else:
             command, separated = self._pass_on(force, position_desired, position)
         if separated and self._gone * self._period > FAREWELL * (1.0 + 1e-9):
@@ -165,12 +160,49 @@ class Retrospective(Compensator):
             return 0.0
         return command
 
+    def next_contact(self) -> None:
+        """A fresh run: all but where the surfaces are is forgotten."""
+        self._side = 0.0
+        self._speed = 0.0
+        self._gone = 0.0
+        self._deepest = 0.0
+        self._hardware_deepest = 0.0
+        self._learnt_deepest = 0.0
+        self._next = 0
+        self._pace = 1.0
+        self._noise.restart()
+        self._history.restart()
+        self._onset.restart()
+        self._doubts.restart()
+        self._started = False
+        self.status = OUT_OF_CONTACT
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._planes = {side: ContactPlane(self._plane_spread) for side in (1.0, -1.0)}
+        self._scales.plane = 0.0
+        self.next_contact()
+
+    def _meets(self, force: float, shown: bool, position_desired: float, velocity_desired: float) -> bool:
+        """Flying freely: whether the force tells that a surface was met; if so, the contact begins."""
+        self.status = OUT_OF_CONTACT
+        side = 1.0 if velocity_desired > 0.0 else -1.0
+        speed = side * velocity_desired
+        if not self._mass * speed > 0.0 or (side < 0.0 and self._clearance == inf):
+            self._onset.restart()
+            return False
+        found = self._watch(side, speed, force, shown)
+        if found is None:
+            return False
+        self._meet(side, speed, position_desired, found)
+        return True
+
     def _watch(self, side: float, speed: float, force: float, shown: bool) -> Found | None:
         """Flying to the surface on this side: what the force tells of it, if it was met."""
         scales = self._scales
         scales.side = side
         weight = self._mass * speed
-        noise = self._floor * self._floor + self._noise() / (weight * weight)
+        noise = self._floor * self._floor + self._noise.variance / (weight * weight)
         spread = self._bias_spread / weight
         unknown = spread * spread
         onset = self._onset
@@ -196,21 +228,22 @@ class Retrospective(Compensator):
         scales = self._scales
         entry = history.newest - found.age
         start = history.recall(entry)
-        scales.side = side
         pace = sqrt(found.stiffness if found.stiffness > 0.0 else 0.0) / USUAL_PACE
         pace = (pace if pace > SLOWEST else SLOWEST) if pace < 1.0 else 1.0
         self._pace = pace
         self._reference.period = self._period * pace
+        scales.side = side
         scales.speed = speed
         scales.length = speed / pace
         scales.bias = side * found.bias * (self._mass * speed)
         scales.weight = self._mass * speed * pace
         low = scales.beyond(start.position)
         high = scales.beyond(history.recall(entry + 1).position)
-        place = self._planes[side].learn(low, high, found.age)
+        plane = self._planes[side]
+        plane.learn(low, high, found.age)
         # Not at the end of the stretch: the reference would not have entered.
-        end = high - 0.0625 * (high - low)
-        scales.plane = low if place < low else (end if place > end else place)
+        end = high - MARGIN * (high - low)
+        scales.plane = low if plane.place < low else (end if plane.place > end else plane.place)
         since = (high - scales.plane) / (high - low) if high > low else 0.5
         depth = scales.depth(position)
         self._side = side
@@ -222,13 +255,20 @@ class Retrospective(Compensator):
         self._next = entry + 1
         self._doubts.restart()
         self._doubts.late = depth - float(found.age) * self._reference.period
+        self._doubts.displaced = abs(scales.plane) > FAR * self._plane_spread
         self._begin()
         self._reference.begin(entry, start, since, depth if depth > 0.0 else 0.0)
 
     def _follow(
-        self, force: float, shown: bool, position_desired: float, velocity_desired: float, position: float, velocity: float
+        self,
+        force: float,
+        shown: bool,
+        position_desired: float,
+        velocity_desired: float,
+        position: float,
+        velocity: float,
     ) -> tuple[float, bool]:
-        """The command over M v0 [1/s], and whether the numerical model has separated."""
+        """The command [N], and whether the numerical model has separated."""
         curve = self._curve
         scales = self._scales
         reference = self._reference
@@ -246,7 +286,7 @@ class Retrospective(Compensator):
             self._hardware_deepest = depth
 
         zone = self._dead_zone / scales.weight
-        noise = self._noise() / (scales.weight * scales.weight)
+        noise = self._noise.variance / (scales.weight * scales.weight)
         reference.shift = self._shift
         self._catch_up(self._floor * self._floor + noise, zone)
         expected = curve.force(depth, rate, self._hardware_deepest)
@@ -261,15 +301,17 @@ class Retrospective(Compensator):
         separated = x <= 0.0 or (v < 0.0 and own <= 0.0)
         if not own > 0.0:
             own = 0.0
-        most = MOST * curve.peak_force()
+        peak = curve.peak_force()
+        most = MOST * peak
         if own > most:
             own = most
-        correction = self._repayment(curve, v - 0.5 * reference.period * own, zone)
-        return (correction if separated else own + (read - expected) + correction), separated
+        correction = self._repayment(peak, v - 0.5 * reference.period * own, zone)
+        command = correction if separated else own + (read - expected) + correction
+        return self._side * scales.weight * command, separated
 
     def _catch_up(self, variance: float, zone: float) -> None:
-        """Learn from the readings since the surface was met, one after the other; noise of a `variance` [1/s^2], the
-        dead zone [1/s]."""
+        """Learn from the readings since the surface was met, one after the other; noise of a `variance`
+        [1/s^2], the dead zone [1/s]."""
         history = self._history
         scales = self._scales
         for _ in range(READINGS):
@@ -283,13 +325,14 @@ class Retrospective(Compensator):
             if depth > self._learnt_deepest:
                 self._learnt_deepest = depth
             if depth > 0.0 and shown:
-                self._doubts.read(depth, self._learnt_deepest, force, variance)
+                self._doubts.readings += 1
             off = MISFIT * force
             self._learn(depth, rate, self._learnt_deepest, force, variance + off * off, not shown, zone)
             self._next += 1
 
     def _pass_on(self, force: float, position_desired: float, position: float) -> tuple[float, bool]:
-        """The force as it is read [N], in a run that begins in contact, and whether the model has separated."""
+        """The force as it is read [N], in a run that begins in contact, and whether the model has
+        separated."""
         side = self._side
         bent = side * deflection(position, self._clearance)
         separated = not side * deflection(position_desired, self._clearance) > 0.0
@@ -298,14 +341,12 @@ class Retrospective(Compensator):
         self.status = UNSURE
         return 0.0 if separated or bent < 0.0 else force, separated
 
-    def _repayment(self, curve: Curve, speed: float, zone: float) -> float:
-        """f_e [1/s], for the speed of the model in the middle of the next period; `status` judges it."""
-        peak = curve.peak_force()
+    def _repayment(self, peak: float, speed: float, zone: float) -> float:
+        """f_e [1/s], by the map's peak force [1/s] and the speed of the model in the middle of the next
+        period; `status` judges it."""
         limit = self._limit * peak
         correction = self._velocity_gain / self._pace * (speed - self._reference.live.speed)
-        self.status = self._doubts.status(
-            curve, peak, self._hardware_deepest, self._variance(), zone, self._speed
-        )
+        self.status = self._doubts.status(peak, self._variance(), zone, self._speed)
         if correction > limit or correction < -limit:
             correction = limit if correction > limit else -limit
             if self.status == IDENTIFIED:
@@ -337,70 +378,3 @@ class Retrospective(Compensator):
     def _variance(self) -> float:
         """Of the force that is expected where it was read last [1/s^2]."""
         raise NotImplementedError
-
-    def _noise(self) -> float:
-        """The force's variance [N^2]: the known one, or what readings out of contact show if that is more."""
-        known = self._force_noise * self._force_noise
-        seen = self._squares / (self._count if self._count > 0.0 else 1.0)
-        return seen if seen > known else known
-
-    def _align(self, position: float, velocity: float) -> tuple[float, float]:
-        """The measured position [m] and velocity [m/s] as old as the force."""
-        period = self._period
-        line = self._line
-        newest = position
-        if line is not None:
-            if not self._started:
-                line.start(position, velocity)
-            newest = line.step(position)
-        if not self._started:
-            stride = period * velocity
-            self._middle = newest - stride
-            self._last = newest - 2.0 * stride
-            self._doubts.start(position - stride, stride)
-            self._started = True
-        self._doubts.move(position)
-        aligned = newest + self._share * (self._middle - newest)
-        rate = (newest - self._last) / (2.0 * period)
-        self._last = self._middle
-        self._middle = newest
-        return aligned, rate
-
-    def _take_noise(self, force: float, shown: bool) -> None:
-        """A reading [N]: out of contact the difference from the one before tells how noisy the force is."""
-        step = force - self._before
-        if (
-            shown
-            and self._shown_before
-            and self._side == 0.0
-            and not (self._count >= SEEN and step * step > OUTSTANDING * self._noise())
-        ):
-            self._squares += 0.5 * (step * step)
-            self._count += 1.0
-        self._before = force
-        self._shown_before = shown
-
-    def next_contact(self) -> None:
-        """A fresh run: all but where the surfaces are is forgotten."""
-        self._side = 0.0
-        self._speed = 0.0
-        self._gone = 0.0
-        self._squares = 0.0
-        self._count = 0.0
-        self._before = 0.0
-        self._shown_before = False
-        self._deepest = 0.0
-        self._hardware_deepest = 0.0
-        self._learnt_deepest = 0.0
-        self._next = 0
-        self._pace = 1.0
-        self._history.restart()
-        self._onset.restart()
-        self._doubts.restart()
-        self._started = False
-        self.status = OUT_OF_CONTACT
-
-    def reset(self) -> None:
-        """Forget everything."""
-        self._planes = {side: ContactPlane(self._plane_spread) for side in (1.0, -1.0)}
-        self.next_contact()
