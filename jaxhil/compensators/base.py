@@ -88,6 +88,8 @@ class Compensator(eqx.Module):
     settings: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType({})
     # Whether it estimates the delay of the force measurement: `force_delay`.
     estimates_delay: ClassVar[bool] = False
+    # Whether it finds where the surface is: `contact_plane`.
+    finds_plane: ClassVar[bool] = False
     # Whether it works out a motion of its own that it could follow whatever the hardware does.
     anticipates: ClassVar[bool] = False
 
@@ -130,3 +132,7 @@ class Compensator(eqx.Module):
     def force_delay(self, gains: Gains, state: Any) -> Float[Array, "*batch"]:
         """Estimated delay [s] of the force measurement; of a law that `estimates_delay`."""
         raise NotImplementedError(f"{self.name} estimates no delay")
+
+    def contact_plane(self, state: Any) -> Float[Array, "*batch"]:
+        """By how much [m] the surface met last is deeper than told; of a law that `finds_plane`."""
+        raise NotImplementedError(f"{self.name} finds no surface")

@@ -182,7 +182,7 @@ def peak_force(now: Curve) -> Float[Array, "*batch"]:
     int f dx = 1/2, at least 1. At knots where the map pulls the force counts as 0."""
     widths = _column(WIDTHS[:-1], now.damping)
     first = jnp.zeros_like(now.slopes[:1])
-    at_knots = now.preload + jnp.concatenate([first, jnp.cumsum(now.slopes[:-1] * widths, axis=0)])
+    at_knots = now.preload[None] + jnp.concatenate([first, jnp.cumsum(now.slopes[:-1] * widths, axis=0)])
     forces = jnp.where(at_knots > 0, at_knots, 0)
     energies = jnp.cumsum(0.5 * (forces[:-1] + forces[1:]) * widths, axis=0)
     rises = jnp.concatenate([(forces[1:] - forces[:-1]) / widths, now.slopes[-1:]])

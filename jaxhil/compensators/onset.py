@@ -70,14 +70,20 @@ def find(
     """The surface, by the variances of a reading (`noise`) and of the bias (`unknown`) [1/s^2]; one met at
     each of the `AGES` is 1/`rarity` (ages, *batch) as likely as none."""
     ages = jnp.asarray(AGES.reshape(-1, *[1] * period.ndim))
-    evidence, bias, stiffness = _suppose(
-        onset, onset.ring[(tick - AGES) & (SLOTS - 1)], ages, period, noise, unknown, rarity
-    )
-    best = jnp.argmax(jnp.where(ages < onset.watched, evidence, -CERTAIN), axis=0)
-    of_best = [jnp.take_along_axis(each, best[None], axis=0)[0] for each in (evidence, bias, stiffness)]
+    before = jnp.moveaxis(onset.ring[(tick - AGES) & (SLOTS - 1)], 1, 0)
+    begun = ages < onset.watched[None]
+    supposed = _suppose(onset, before, ages, period[None], noise[None], unknown[None], rarity)
+    best = jnp.argmax(jnp.where(begun, supposed[0], -CERTAIN), axis=0)
+    evidence, bias, stiffness = (jnp.take_along_axis(each, best[None], axis=0)[0] for each in supposed)
     age = jnp.asarray(AGES)[best]
     waited = (age > 1) & (age.astype(period.dtype) * period >= WAIT * (1 - 1e-9))
-    return Found((age < onset.watched) & (of_best[0] > CERTAIN) & waited, age, *of_best[1:])
+    return Found((age < onset.watched) & (evidence > CERTAIN) & waited, age, bias, stiffness)
+
+
+def nothing_found(like: Float[Array, "*batch"]) -> Found:
+    """No surface."""
+    zeros = jnp.zeros_like(like)
+    return Found(zeros > 0, zeros.astype(jnp.int32) + 1, zeros, zeros)
 
 
 def rarity(away: Array, spread: Array, width: Array) -> Array:
@@ -94,16 +100,16 @@ def logarithm(z: Array) -> Array:
     return 2048 * (z - 1) / (z + 1)
 
 
-def _suppose(onset, ring, ages, period, noise, unknown, rarity):
+def _suppose(onset, before, ages, period, noise, unknown, rarity):
     """ln of the evidence for a surface met `ages` ticks ago against none, the bias [1/s] by it, and the most
-    that its stiffness may be [1/s^2]."""
-    before, ticks_before, squares_before, forces_before, moments_before = jnp.moveaxis(ring, 1, 0)
-    number, all_ticks, all_squares, forces, moments = onset.sums
-    middle = (onset.watched - ages).astype(period.dtype) + 0.5
-    known = before * unknown + noise
+    that its stiffness may be [1/s^2]; the sums as they were `before` (5, ages, *batch)."""
+    number_before, ticks_before, squares_before, forces_before, moments_before = before
+    number, all_ticks, all_squares, forces, moments = onset.sums[:, None]
+    middle = (onset.watched[None] - ages).astype(period.dtype) + 0.5
+    known = number_before * unknown + noise
     bias = forces_before * unknown / known
     left = unknown * noise / known
-    n = number - before
+    n = number - number_before
     ticks = (all_ticks - ticks_before) - middle * n
     squares = (all_squares - squares_before) - middle * (2 * (all_ticks - ticks_before) - middle * n)
     force = forces - forces_before

@@ -27,6 +27,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxhil.compensators.base import Compensator, Constants, Gain, Gains, cleared
+from jaxhil.compensators.contact_plane import Plane
 from jaxhil.compensators.delay_line import Delay, DelayLine, delayed, empty, split
 from jaxhil.compensators.estimates import DEAD_ZONE, EQUIVALENT_MASS, FORCE_DELAY, FORCE_NOISE
 from jaxhil.compensators.force_depth_map import (
@@ -42,7 +43,9 @@ from jaxhil.compensators.force_depth_map import (
     update,
 )
 from jaxhil.compensators.history import History, no_history, reading_at, recall, take
-from jaxhil.compensators.onset import Onset, no_onset, watch
+from jaxhil.compensators.meeting import meet, search
+from jaxhil.compensators.onset import Onset, no_onset, nothing_found, watch
+from jaxhil.compensators.readings import Aligned, Noise, align, force_noise, take_noise
 from jaxhil.compensators.reintegration import (
     Measured,
     Reintegration,
@@ -52,16 +55,6 @@ from jaxhil.compensators.reintegration import (
     follow,
     longest_step,
     unentered,
-)
-from jaxhil.compensators.retrospective_episode import (
-    Aligned,
-    Noise,
-    Plane,
-    align,
-    force_noise,
-    meet,
-    search,
-    take_noise,
 )
 from jaxhil.compensators.retrospective_gains import GAINS, GENTLE, SHARP
 from jaxhil.contact.laws import deflection
@@ -113,6 +106,7 @@ class RetrospectiveReference(Compensator):
     knows: ClassVar[tuple[str, ...]] = (EQUIVALENT_MASS, FORCE_DELAY, FORCE_NOISE, DEAD_ZONE)
     settings: ClassVar[Mapping[str, Mapping[str, float]]] = {"sharp": SHARP, "gentle": GENTLE}
     anticipates: ClassVar[bool] = True
+    finds_plane: ClassVar[bool] = True
     gains: ClassVar[tuple[Gain, ...]] = GAINS
 
     def prepare(self, gains, constants):
@@ -182,56 +176,77 @@ class RetrospectiveReference(Compensator):
         return state._replace(
             noise=cleared(state.noise, begins),
             onset=state.onset._replace(watched=watched, sums=sums),
-            episode=episode._replace(scales=nowhere),
+            episode=episode._replace(scales=nowhere, gone=jnp.where(begins, 0, episode.gone)),
         )
 
     def step(self, prepared, state, signals, tick):
-        gains, constants = prepared.gains, prepared.constants
-        period, clearance = constants.control_period, constants.clearance
+        gains, period = prepared.gains, prepared.constants.control_period
         newest, line = delayed(prepared.delay, state.line, signals, tick)
         position, velocity, aligned = align(state.aligned, newest, prepared.share, signals, period)
         force_read = signals.force_measured + jnp.sign(signals.force_measured) * gains["dead_zone"]
         begins = signals.age == 0
         # A run's first reading counts as none: the sensor's delay line may not have been filled.
         shown = ~begins & ~((gains["dead_zone"] > 0) & (signals.force_measured == 0))
-        reach = jnp.sign(deflection(signals.position_desired, clearance))
-        side = jnp.where(begins, reach, state.episode.scales.side)
         before = state.history._replace(reading=jnp.where(begins[None], 0, state.history.reading))
         noise = take_noise(gains, state.noise, before, force_read, shown, state.episode.scales.side == 0)
         history = take(state.history, tick, signals.age, force_read, shown, position, velocity)
+        read = _Read(position, velocity, force_read, shown, force_noise(gains, noise))
+        onset, found, planes, episode, reference = self._fly(prepared, state, signals, history, read, tick)
 
-        scales = state.episode.scales._replace(
-            side=side, speed=jnp.where(begins, 0, state.episode.scales.speed)
+        def meets():
+            return self._contact(prepared, episode, state.learnt, found, reference, history, signals, read)
+
+        def passes():
+            return jnp.zeros_like(period), episode, state.learnt, reference
+
+        # Where no lane is in contact, the effort is spared.
+        command, episode, learnt, reference = lax.cond(jnp.any(episode.scales.side != 0), meets, passes)
+        return command, RetrospectiveState(
+            line, aligned, noise, history, onset, planes, episode, learnt, reference
         )
+
+    def contact_plane(self, state):
+        return state.episode.scales.plane
+
+    def _fly(self, prepared, state, signals, history, read, tick):
+        """The readings of the flight to a surface, and where one is found the contact that begins with it:
+        whether it is, where surfaces are expected from now on, the contact under way and its reference."""
+        gains, constants = prepared.gains, prepared.constants
+        period, clearance = constants.control_period, constants.clearance
+        begins, old = signals.age == 0, state.episode.scales
+        reach = jnp.sign(deflection(signals.position_desired, clearance))
+        scales = old._replace(side=jnp.where(begins, reach, old.side), speed=jnp.where(begins, 0, old.speed))
         way = jnp.where((signals.velocity_desired > 0) | jnp.isinf(clearance), 1, -1)
         speed = way * signals.velocity_desired
-        flies = (side == 0) & (speed > 0)
-        safe = jnp.where(flies, speed, 1)
-        onset = watch(state.onset, tick, flies, way * force_read / (gains["equivalent_mass"] * safe), shown)
-        variance = force_noise(gains, noise)
-        found = search(gains, constants, state.planes, onset, history, way, safe, variance, tick)
-        found = found._replace(detected=found.detected & flies)
-        meeting = meet(gains, clearance, scales, state.planes, history, way, safe, found)
-        begun = _begun(state.episode, meeting)
-        safe = _safe(meeting.scales, meeting.found)
-        depth = depth_of(safe, clearance, signals.position_desired)
-        since_met = jnp.where(depth > 0, depth, 0)
-        reference = begin(
-            state.reference,
-            meeting.found,
-            meeting.index,
-            meeting.start,
-            meeting.since,
-            since_met,
-            period * safe.pace,
-        )
-        read = _Read(position, velocity, force_read, shown, variance)
-        command, episode, learnt, reference = self._contact(
-            prepared, begun, state.learnt, meeting.found, reference, history, signals, read
-        )
-        return command, RetrospectiveState(
-            line, aligned, noise, history, onset, meeting.planes, episode, learnt, reference
-        )
+        flies = (scales.side == 0) & (speed > 0)
+        speed = jnp.where(flies, speed, 1)
+        # What a decision alone goes by moves nothing that is differentiated.
+        force_then = lax.stop_gradient(way * read.force / (gains["equivalent_mass"] * speed))
+        onset = watch(state.onset, tick, flies, force_then, read.shown)
+        episode = state.episode._replace(scales=scales)
+
+        def finds():
+            found = search(gains, constants, state.planes, onset, history, way, speed, read.variance, tick)
+            return found._replace(detected=found.detected & flies)
+
+        def begun():
+            meeting = meet(gains, clearance, scales, state.planes, history, way, speed, found)
+            safe = _safe(meeting.scales, meeting.found)
+            depth = depth_of(safe, clearance, signals.position_desired)
+            reference = begin(
+                state.reference,
+                meeting.found,
+                meeting.index,
+                meeting.start,
+                meeting.since,
+                jnp.where(depth > 0, depth, 0),
+                period * safe.pace,
+            )
+            return meeting.planes, _begun(state.episode, meeting), reference
+
+        found = lax.cond(jnp.any(flies), finds, lambda: nothing_found(period))
+        met = lax.cond(jnp.any(found.detected), begun, lambda: (state.planes, episode, state.reference))
+        return onset, found.detected, *met
 
     def _contact(self, prepared, old, learnt, found, reference, history, signals, read):
         """F_c [N], and the contact under way, what is learnt of it and its reference with one tick more."""

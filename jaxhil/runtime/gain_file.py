@@ -85,7 +85,7 @@ def check_gain_document(
     known = {**others, **{law: compensator.gains for law, compensator in COMPENSATORS.items()}}
     if not isinstance(name, str) or name not in known:
         raise refusal(source, "compensator", shown(name), f"one of {', '.join(known)}")
-    gains = _gains(document, known[name], source)
+    gains = _gains(document, name, known[name], source)
     period = _number(_entry(document, "control_period", source, ""), "control_period", source)
     _check_within(period, *CONTROL_PERIODS, "control_period", source)
     mechanism = _object(document, "mechanism", source, "")
@@ -121,7 +121,7 @@ def _check_form(document: Mapping[str, Any], source: str) -> None:
 
 
 def _gains(
-    document: Mapping[str, Any], specifications: Mapping[str, GainSpecification], source: str
+    document: Mapping[str, Any], law: str, specifications: Mapping[str, GainSpecification], source: str
 ) -> dict[str, float]:
     entries = _object(document, "gains", source, "")
     for name in entries:
@@ -130,6 +130,9 @@ def _gains(
             raise refusal(source, "gains", f"an extra gain {shown(name)}", allowed)
     gains = {}
     for name, specification in specifications.items():
+        if name not in entries:
+            allowed = f"all gains of {law} (is it of an earlier version? `jaxhil tune` makes a new file)"
+            raise refusal(source, f"gains.{name}", "nothing", allowed)
         entry = _object(entries, name, source, "gains.")
         prefix = f"gains.{name}."
         unit = _entry(entry, "unit", source, prefix)

@@ -58,6 +58,8 @@ class Metrics(NamedTuple):
     trajectory_error: Float[Array, "slots *batch"]
     # of the force measurement as the compensator estimates it by then [s]; 0 unless it does
     force_delay: Float[Array, "slots *batch"]
+    # by how much the surface is deeper than told, as the compensator found it [m]; 0 unless it does
+    contact_plane: Float[Array, "slots *batch"]
     status: Int[Array, "slots *batch"]  # one of `STATUS_NAMES`
     ticks: Int[Array, "slots *batch"]  # run by then
 
@@ -78,6 +80,7 @@ def empty_metrics(loop: Loop, slots: int, like: Array) -> Metrics:
         work_out=numbers,
         trajectory_error=numbers if loop.probed else jnp.zeros_like(numbers),
         force_delay=numbers if loop.compensator.estimates_delay else jnp.zeros_like(numbers),
+        contact_plane=numbers if loop.compensator.finds_plane else jnp.zeros_like(numbers),
         status=counts + NOT_REACHED,
         ticks=counts,
     )
@@ -109,39 +112,40 @@ def collect(
     status: Array,
     ticks: Array,
     force_delay: Array | None = None,
+    contact_plane: Array | None = None,
 ) -> Metrics:
     """Enter the contacts that are `over`, and were reached, at their `index`; `ticks` have run by now, and
-    the law estimates a `force_delay` [s], or none."""
+    the law estimates a `force_delay` [s] and finds the `contact_plane` [m], or does not."""
     period = scenario.control_period
     none = jnp.zeros_like(period)
     work_in, work_out = watch.works or (none, none)
     excess = none
     if watch.swings is not None:
         excess = watch.swings.variation / 2 - (watch.swings.highest - watch.swings.lowest)
+    followed = {
+        "position_shortfall": watch.shortfall,
+        "trajectory_error": None if watch.deviation is None else root_mean_square(watch.deviation),
+        "force_delay": force_delay,
+        "contact_plane": contact_plane,
+    }
     values = Metrics(
         restitution=watch.rebound / jnp.where(watch.approach > 0, watch.approach, jnp.nan),
         approach_velocity=watch.approach,
         peak_force=watch.peak_force,
         peak_command=watch.peak_command,
         excess_variation=excess,
-        position_shortfall=none if watch.shortfall is None else watch.shortfall,
         duration=watch.in_contact * period,
         work_in=work_in,
         work_out=work_out,
-        trajectory_error=none if watch.deviation is None else root_mean_square(watch.deviation),
-        force_delay=none if force_delay is None else force_delay,
         status=status,
         ticks=ticks,
+        **{name: none if value is None else value for name, value in followed.items()},
     )
     slots = metrics.restitution.shape[0]
     slot = jnp.arange(slots, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
     here = (slot == index[None]) & (over & (status != NOT_REACHED))[None]
     entered = Metrics(*(jnp.where(here, v[None], m) for v, m in zip(values, metrics, strict=True)))
     # What is not followed still is what it was before any contact: no work in every turn-over.
-    if watch.shortfall is None:
-        entered = entered._replace(position_shortfall=metrics.position_shortfall)
-    if watch.deviation is None:
-        entered = entered._replace(trajectory_error=metrics.trajectory_error)
-    if force_delay is None:
-        entered = entered._replace(force_delay=metrics.force_delay)
-    return entered
+    return entered._replace(
+        **{name: getattr(metrics, name) for name, value in followed.items() if value is None}
+    )

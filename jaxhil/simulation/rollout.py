@@ -134,10 +134,10 @@ def turn_over(
     status = judge(scenario, watch, run.tick - state.entry_tick)
     over = _pending(rig, run)
     ticks = jnp.broadcast_to(run.tick - _first_tick(loop), run.index.shape)
-    delay = None
-    if loop.compensator.estimates_delay:
-        delay = loop.compensator.force_delay(gains, state.controller)
-    metrics = collect(scenario, run.metrics, watch, run.index, over, status, ticks, delay)
+    law = loop.compensator
+    delay = law.force_delay(gains, state.controller) if law.estimates_delay else None
+    plane = law.contact_plane(state.controller) if law.finds_plane else None
+    metrics = collect(scenario, run.metrics, watch, run.index, over, status, ticks, delay, plane)
     index = run.index + over.astype(jnp.int32)
     active = run.active & ~(over & ((status != OK) | (index >= scenario.contacts)))
     blank = fresh_watch(loop, watch.approach)

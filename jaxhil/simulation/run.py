@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.compensators import COMPENSATORS, Compensator
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.files import follow, write_whole
 from jaxhil.mechanism.loading import as_mechanism
@@ -40,6 +40,8 @@ class ContactResult(NamedTuple):
     duration: float  # time in contact [s]
     approach_velocity: float  # of the numerical model, on the tick before the contact [m/s]
     force_delay: float | None  # of the measurement, as the compensator estimates it [s]; None if it does not
+    # by how much the surface is deeper than told, as the compensator finds it [m]; None if it does not
+    contact_plane: float | None
     # "ok", or why it has no restitution: "timeout" (not over within 10 s), "diverged", "non-finite", "not
     # reached" (the run ended before it, or no force of it was measured)
     status: str
@@ -187,8 +189,8 @@ def simulate(
     with computing():
         scenarios = build_scenarios(checked, seed=number)
         outcome = evaluate(build_loop(checked, name, scenarios), values, scenarios)
-    estimates = COMPENSATORS[name].estimates_delay
-    contacts = tuple(_contact(outcome, slot, estimates) for slot in range(checked.approach.contacts))
+    law = COMPENSATORS[name]
+    contacts = tuple(_contact(outcome, slot, law) for slot in range(checked.approach.contacts))
     status = next((contact.status for contact in contacts if contact.status != STATUS_NAMES[OK]), "ok")
     return Run(checked, name, values, number, contacts, status)
 
@@ -201,7 +203,7 @@ def check_seed(seed: Any) -> int:
     return number
 
 
-def _contact(outcome: Outcome, slot: int, estimates: bool) -> ContactResult:
+def _contact(outcome: Outcome, slot: int, law: Compensator) -> ContactResult:
     metrics = outcome.metrics
     status = int(metrics.status[slot, 0])
     ended = status == OK
@@ -220,7 +222,8 @@ def _contact(outcome: Outcome, slot: int, estimates: bool) -> ContactResult:
         position_shortfall=value(metrics.position_shortfall, reached),
         duration=value(metrics.duration, reached),
         approach_velocity=value(metrics.approach_velocity, reached),
-        force_delay=value(metrics.force_delay, reached) if estimates else None,
+        force_delay=value(metrics.force_delay, reached) if law.estimates_delay else None,
+        contact_plane=value(metrics.contact_plane, reached) if law.finds_plane else None,
         status=STATUS_NAMES[status],
     )
 

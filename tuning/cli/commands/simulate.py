@@ -15,6 +15,9 @@ from tuning.front_door import arguments, meaning
 if TYPE_CHECKING:
     from jaxhil.simulation.run import ContactResult, Run
 
+# What a law may estimate of the rig: its heading, in thousandths of the unit, and how many digits of those.
+ESTIMATES = {"force_delay": ("force delay [ms]", 2), "contact_plane": ("plane [mm]", 3)}
+
 
 def run(options: Simulate) -> int:
     """Run the contacts, report each; 0 if every error is within the limit, else 1."""
@@ -78,7 +81,7 @@ def _reason(status: str) -> str | None:
 
 
 def _entry(contact: "ContactResult") -> dict[str, Any]:
-    """A contact as JSON says it: the estimated delay only of a law that estimates it."""
+    """A contact as JSON says it: delay and plane only of a law that estimates them."""
     return {name: value for name, value in contact._asdict().items() if value is not None}
 
 
@@ -109,7 +112,7 @@ def _chosen(options: Simulate, mechanism: Mechanism | None) -> tuple[Mechanism, 
 def _print(options: Simulate, done: "Run", contacts: list[dict[str, Any]], good: bool) -> None:
     # Contacts that were not reached are told apart, below the table.
     contacts = [contact for contact in contacts if contact["status"] != "not reached"]
-    estimates = any("force_delay" in contact for contact in contacts)
+    estimates = [name for name in ESTIMATES if any(name in contact for contact in contacts)]
     rows = [
         [
             number,
@@ -119,13 +122,13 @@ def _print(options: Simulate, done: "Run", contacts: list[dict[str, Any]], good:
             contact["peak_force"],
             1e3 * contact["duration"],
             1e3 * contact["approach_velocity"],
-            *([f"{1e3 * contact['force_delay']:.2f}"] if estimates else []),
+            *(f"{1e3 * contact[name]:.{ESTIMATES[name][1]}f}" for name in estimates),
             contact["status"],
         ]
         for number, contact in enumerate(contacts, start=1)
     ]
     headings = ["contact", "e", "e*", "error", "peak force [N]", "duration [ms]", "approach [mm/s]"]
-    headings += ["force delay [ms]"] * estimates + ["status"]
+    headings += [*(ESTIMATES[name][0] for name in estimates), "status"]
     rule = "the gain file's gains" if options.gains is not None else "gains by the literature's rule"
     title = f"{done.mechanism.name}, compensation: {done.compensator}"
     title += f", {rule}" if done.compensator != "none" else ""

@@ -1,0 +1,33 @@
+"""Where a surface is expected: carried from contact to contact, as each finds it anew."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+LATE = 0.25  # how uncertain the surface is, of the ticks until it was found
+DRIFT = 1e-6  # m, from contact to contact
+ELSEWHERE = 25.0  # times the variance of where the surface is expected
+
+
+class Plane(NamedTuple):
+    """Where surfaces are expected."""
+
+    place: Float[Array, "*shape"]  # by how much they are deeper than told [m]
+    spread: Float[Array, "*shape"]  # of that [m]
+
+
+def learn_plane(old: Plane, low: Array, high: Array, age: Array) -> Plane:
+    """Where a surface is expected that was met between two places [m], so many ticks before that was
+    found."""
+    width = high - low
+    late = LATE * age.astype(width.dtype)
+    found = width * width * (1 / 12 + late * late)
+    known = old.spread * old.spread
+    middle = 0.5 * (low + high)
+    away = middle - old.place
+    elsewhere = away * away > ELSEWHERE * (known + found)
+    share = known / (known + found)
+    place = jnp.where(elsewhere, middle, old.place + away * share)
+    variance = jnp.where(elsewhere, found, share * found)
+    return Plane(place, jnp.sqrt(variance + DRIFT * DRIFT))
