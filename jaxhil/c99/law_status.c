@@ -1,7 +1,7 @@
 /* What a law says of its own command: its status after each tick, counted over a contact. The contact is not
- * reached where no force was measured; else unsure, too short, displaced or noisy, by the most frequent, where the
- * law was any of them on more than two fifths of the ticks on which it acted; else saturated, where its correction
- * was at its limit on more than half of them; else identified.
+ * reached where no force was measured; unsure where the law did not act; else unsure, too short, displaced or
+ * noisy, by the most frequent, where the law was any of them on more than two fifths of the ticks on which it acted;
+ * else saturated, where its correction was at its limit on more than half of them; else identified.
  */
 #include <stdbool.h>
 #include <stdint.h>
@@ -53,11 +53,11 @@ static bool jaxhil_contact_record_end(jaxhil_contact_record *record, bool measur
     if (!measured) {
         record->status = JAXHIL_NOT_REACHED;
     } else if (record->ticks == 0) {
-        record->status = JAXHIL_OUT_OF_CONTACT;
+        record->status = JAXHIL_UNSURE;
     } else if ((double)all > jaxhil_doubtful * (double)record->ticks) {
         record->status = statuses[most];
     } else if ((double)record->saturated > jaxhil_saturating * (double)record->ticks) {
         record->status = JAXHIL_SATURATED;
     }
-    return record->status != JAXHIL_OUT_OF_CONTACT && record->status != JAXHIL_IDENTIFIED;
+    return record->status != JAXHIL_IDENTIFIED;
 }

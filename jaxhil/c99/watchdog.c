@@ -1,7 +1,8 @@
 /* The watchdog: an energy audit of every contact, from the motion of the numerical model.
  *
- * A contact is audited once both positions have been outside for `settling`, the model moves away and the
- * force on it has died out; at the latest in the middle of the gap or when the next contact is announced.
+ * A contact begins where the model or the hardware is beyond a surface as told, or the law acts. It is audited
+ * once that has not been so for `settling`, the model moves away and the force on it has died out; at the latest
+ * in the middle of the gap or when the next contact is announced.
  * The model's kinetic energy must have changed by the work of the force that the controller gave, and the
  * restitution must be the one expected of a contact of the identified stiffness. A law that has a status says
  * whether it knew the contact; this is asked without the equivalent mass too.
@@ -228,7 +229,8 @@ static uint32_t jaxhil_watchdog_tick(jaxhil_watchdog *watchdog, double given, in
     const double aligned = jaxhil_delay_line_step(&watchdog->alignment, watchdog->samples, measured);
     const double deflection = jaxhil_deflection(aligned, watchdog->clearance);
     const bool in_contact = jaxhil_deflection(position, watchdog->clearance) != 0.0 ||
-                          jaxhil_deflection(measured, watchdog->clearance) != 0.0;
+                          jaxhil_deflection(measured, watchdog->clearance) != 0.0 ||
+                          (status != JAXHIL_UNSTATED && status != JAXHIL_OUT_OF_CONTACT);
     const double side = position > watchdog->middle ? 1.0 : -1.0;
     uint32_t fault = 0;
     if (!watchdog->open && in_contact) {

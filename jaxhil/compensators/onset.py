@@ -128,4 +128,4 @@ def _suppose(onset, before, ages, period, noise, unknown, rarity):
     silent = y * y * left / (noise * silence)
     evidence = 0.5 * (explained / noise - prior - silent - logarithm(occam * rarity * rarity))
     stiffness = ((r * f - s * y) + 3 * jnp.sqrt(r * noise * determinant)) / determinant
-    return jnp.where(y > 0, evidence, -CERTAIN), bias, stiffness
+    return jnp.where((y > 0) & (determinant > 0), evidence, -CERTAIN), bias, stiffness

@@ -117,6 +117,7 @@ def begin(
     sample after that of the tick `index`, the numerical model `depth` [s] ago: until the first pass is done,
     it should go on as it does."""
     ticks = depth / period - since
+    ticks = jnp.where(ticks < LONGEST, ticks, LONGEST)
     whole = jnp.where(ticks > 0, jnp.floor(ticks), 0)
     entry = Entry(
         jnp.stack([start.impulse, start.shown]),

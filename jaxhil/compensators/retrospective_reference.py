@@ -61,6 +61,7 @@ from jaxhil.contact.laws import deflection
 
 FAREWELL = 0.006  # s for which it goes on after the hardware has left the surface
 MOST = 1.2  # of the peak force, that the model is to feel of the map
+LEAST_WEIGHT = 1e-9  # kg m/s, mass times approach speed: at less nothing is scaled by it
 MISFIT = 0.003  # of a force, by which the map may be wrong
 
 
@@ -218,7 +219,7 @@ class RetrospectiveReference(Compensator):
         scales = old._replace(side=jnp.where(begins, reach, old.side), speed=jnp.where(begins, 0, old.speed))
         way = jnp.where((signals.velocity_desired > 0) | jnp.isinf(clearance), 1, -1)
         speed = way * signals.velocity_desired
-        flies = (scales.side == 0) & (speed > 0)
+        flies = (scales.side == 0) & (gains["equivalent_mass"] * speed > LEAST_WEIGHT)
         speed = jnp.where(flies, speed, 1)
         # What a decision alone goes by moves nothing that is differentiated.
         force_then = lax.stop_gradient(way * read.force / (gains["equivalent_mass"] * speed))

@@ -4,6 +4,7 @@ Every status is one number, the same in the C controller. `STATUSES` is the tabl
 exports are made from. Over a contact they are counted, and the contact is
 
     not reached    where no force was measured, whatever the law did,
+    unsure         where the law did not act at all,
     unsure, too short, displaced or noisy
                    else by the most frequent, where the law was any of them on more than `DOUBTFUL` of the
                    ticks on which it acted,
@@ -42,7 +43,7 @@ STATUSES = (
     Status("saturated", "identified, and the correction is at its limit"),
     Status("too_short", "the hardware entered when half of the contact was over: little time is left"),
     Status("unstated", "the law says nothing of itself"),
-    Status("displaced", "the hardware enters contact elsewhere than given: the contact plane is wrong"),
+    Status("displaced", "the surface lies farther from where it was told than it was told to lie at most"),
     Status("noisy", "noise of force or position, or a dead zone, leaves the contact uncertain"),
     Status("not_reached", "said of a whole contact: no force was measured, so that there was none"),
 )
@@ -65,7 +66,7 @@ class ContactRecord(NamedTuple):
     @property
     def in_doubt(self) -> bool:
         """Whether the law could not know the contact, or had too little time or room to correct it."""
-        return self.status not in (_NAMES[UNSTATED], _NAMES[OUT_OF_CONTACT], _NAMES[IDENTIFIED])
+        return self.status not in (_NAMES[UNSTATED], _NAMES[IDENTIFIED])
 
 
 class StatusCount:
@@ -93,7 +94,7 @@ class StatusCount:
         if not measured:
             status = NOT_REACHED
         elif ticks == 0:
-            status = OUT_OF_CONTACT
+            status = UNSURE
         elif sum(doubts) > DOUBTFUL * ticks:
             status = DOUBTS[doubts.index(max(doubts))]
         elif counts[SATURATED] > SATURATING * ticks:

@@ -1,8 +1,9 @@
 """The watchdog: an energy audit of every contact, from the motion of the numerical model.
 
-A contact begins on the tick on which the model's or the measured position is beyond a surface. It is audited
-once both have been outside for `settling`, the model moves away and the force on it has died out; at the
-latest in the middle of the gap or when the next contact is announced, so always before the next begins.
+A contact begins on the tick on which the model's or the measured position is beyond a surface as told, or the
+law acts, which may find it nearer. It is audited once that has not been so for `settling`, the model moves
+away and the force on it has died out; at the latest in the middle of the gap or when the next contact is
+announced, so always before the next begins.
 With v_in the model's velocity on the tick before the contact and v now, the audit asks:
 
 - Is the energy balanced? M (v^2 - v_in^2)/2 must be the work -T sum F_c(n) (v(n) + v(n+1))/2 of the force
@@ -29,7 +30,7 @@ from math import inf, sqrt
 
 from .faults import CONTACT_TOO_LONG, ENERGY_BALANCE, LAW_IN_DOUBT, RESTITUTION
 from .filters import DelayLine
-from .law_status import ContactRecord, StatusCount
+from .law_status import OUT_OF_CONTACT, UNSTATED, ContactRecord, StatusCount
 from .surfaces import deflection
 
 FADED = 1e-6  # of the largest force of the contact
@@ -111,7 +112,11 @@ class Watchdog:
             before, given = velocity, 0.0
         clearance = self._clearance
         aligned = deflection(self._alignment.step(measured), clearance)
-        in_contact = deflection(position, clearance) != 0.0 or deflection(measured, clearance) != 0.0
+        in_contact = (
+            deflection(position, clearance) != 0.0
+            or deflection(measured, clearance) != 0.0
+            or status not in (UNSTATED, OUT_OF_CONTACT)
+        )
         side = 1.0 if position > self._middle else -1.0
         fault = 0
         if not self._open and in_contact:

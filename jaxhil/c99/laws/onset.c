@@ -99,7 +99,7 @@ static double jaxhil_onset_evidence(const jaxhil_onset *onset, long age, double 
     const double occam = determinant * (jaxhil_onset_stiffness_variance * jump) / (noise * silence);
     found->bias = b;
     found->stiffness = ((r * f - s * y) + 3.0 * sqrt(r * noise * determinant)) / determinant;
-    if (!(y > 0.0)) {
+    if (!(y > 0.0 && determinant > 0.0)) {
         return -INFINITY;
     }
     return 0.5 * (explained / noise -

@@ -8,6 +8,8 @@
 /* == Declarations == */
 
 enum { JAXHIL_STRIDE = 24 }; /* steps per tick of the pass from the entry */
+/* ticks of a contact, up to which it is integrated over again */
+enum { JAXHIL_LONGEST = (JAXHIL_SLOTS - 2) * (1 << 2 * (JAXHIL_LEVELS - 1)) };
 
 /* A contact's scales: the clearance of two surfaces [m]; the surface's side, 1 or -1, and its place [m] beyond where
  * it was told; approach speed [m/s]; that over the pace [m]; mass times it times the pace [N]; the bias [N]. */
@@ -85,7 +87,8 @@ static void jaxhil_reference_motion_init(jaxhil_reference_motion *reference, dou
  * numerical model `depth` [s] ago: until the first pass is done, it should go on as it does. */
 static void jaxhil_reference_motion_begin(jaxhil_reference_motion *reference, const jaxhil_history *history,
                                           long entry, double since, double depth) {
-    const double ticks = depth / reference->period - since;
+    const double all = depth / reference->period - since;
+    const double ticks = all < (double)JAXHIL_LONGEST ? all : (double)JAXHIL_LONGEST;
     const double whole = ticks > 0.0 ? floor(ticks) : 0.0;
     reference->entry = entry;
     reference->reached = entry;
@@ -186,7 +189,7 @@ static void jaxhil_reference_motion_tick(jaxhil_reference_motion *reference, con
                                          const jaxhil_curve *curve) {
     jaxhil_path *live = &reference->live;
     reference->present++;
-    const bool whole = history->newest - reference->entry < (JAXHIL_SLOTS - 2) * (1L << 2 * (JAXHIL_LEVELS - 1));
+    const bool whole = history->newest - reference->entry < JAXHIL_LONGEST;
     if (reference->reached > reference->entry || whole) {
         if (reference->reached == reference->entry) {
             reference->behind.curve = *curve;

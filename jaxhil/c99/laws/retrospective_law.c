@@ -45,6 +45,7 @@ static const double jaxhil_slowest = 0.01;    /* of that */
 static const double jaxhil_most = 1.2;        /* of the peak force, that the model is to feel of the map */
 static const double jaxhil_misfit = 0.003;    /* of a force, by which the map may be wrong */
 static const double jaxhil_margin = 0.0625;   /* of the stretch between two samples, off whose end the surface is */
+static const double jaxhil_least_weight = 1e-9; /* kg m/s, mass times approach speed: less does not scale */
 enum { JAXHIL_READINGS = 2 };                 /* per tick that the map learns from, while it has to catch up */
 
 /* All but what was learnt of earlier contacts. */
@@ -239,7 +240,7 @@ static bool jaxhil_law_meets(jaxhil_law *law, double force, bool shown, double p
     const double speed = side * velocity_desired;
     jaxhil_found found;
     law->status = JAXHIL_OUT_OF_CONTACT;
-    if (!(law->mass * speed > 0.0) || (side < 0.0 && law->clearance == INFINITY)) {
+    if (!(law->mass * speed > jaxhil_least_weight) || (side < 0.0 && law->clearance == INFINITY)) {
         jaxhil_onset_restart(&law->onset);
         return false;
     }

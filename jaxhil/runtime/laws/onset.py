@@ -84,13 +84,13 @@ class Onset:
         moment = (moments - moments_before) - middle * force
         s = period * ticks
         y = force - bias * n
-        if not y > 0.0:
-            return Found(age, -CERTAIN, bias, 0.0)
         p = noise / STIFFNESS_VARIANCE + period * period * squares
         jump = JUMP_VARIANCE + left
         r = noise / jump + n
         f = noise * (STIFFNESS / STIFFNESS_VARIANCE) + (period * moment - bias * s)
         determinant = p * r - s * s
+        if not (y > 0.0 and determinant > 0.0):
+            return Found(age, -CERTAIN, bias, 0.0)
         explained = (r * f * f - 2.0 * (s * f * y) + p * y * y) / determinant
         silence = noise + n * left
         occam = determinant * (STIFFNESS_VARIANCE * jump) / (noise * silence)

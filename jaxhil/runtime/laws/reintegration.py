@@ -172,6 +172,7 @@ class ReferenceMotion:
         that of the tick `entry`, the numerical model `depth` [s] ago: until the first pass is done, it should
         go on as it does."""
         ticks = depth / self.period - since
+        ticks = ticks if ticks < LONGEST else float(LONGEST)
         whole = float(floor(ticks)) if ticks > 0.0 else 0.0
         self._entry = entry
         self._start = start

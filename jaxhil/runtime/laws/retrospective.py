@@ -40,6 +40,7 @@ SLOWEST = 0.01  # of that
 MOST = 1.2  # of the peak force, that the model is to feel of the map
 MISFIT = 0.003  # of a force, by which the map may be wrong
 MARGIN = 0.0625  # of the stretch between two samples, that the surface is off its end
+LEAST_WEIGHT = 1e-9  # kg m/s, mass times approach speed: at less nothing is scaled by it
 READINGS = 2  # per tick that the map learns from, while it has to catch up
 PRIOR = (  # the gains that `Prior` is made of, in its order
     "prior_stiffness",
@@ -133,11 +134,7 @@ class Retrospective(Compensator):
         self._doubts.move(position_measured)
         # A run's first reading counts as none: the sensor's delay line may not have been filled.
         shown = not (begins or (zone > 0.0 and force_measured == 0.0))
-        force = force_measured
-        if force_measured > 0.0:
-            force = force_measured + zone
-        elif force_measured < 0.0:
-            force = force_measured - zone
+        force = force_measured + (zone if force_measured > 0.0 else (-zone if force_measured < 0.0 else 0.0))
         self._history.take(force, shown, position, velocity)
         self._noise.take(force, shown, self._side == 0.0)
         if begins:
@@ -188,7 +185,7 @@ class Retrospective(Compensator):
         self.status = OUT_OF_CONTACT
         side = 1.0 if velocity_desired > 0.0 else -1.0
         speed = side * velocity_desired
-        if not self._mass * speed > 0.0 or (side < 0.0 and self._clearance == inf):
+        if not self._mass * speed > LEAST_WEIGHT or (side < 0.0 and self._clearance == inf):
             self._onset.restart()
             return False
         found = self._watch(side, speed, force, shown)
