@@ -8,6 +8,7 @@ lanes share; as their runs begin at different ticks, what is written is the newe
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -97,7 +98,7 @@ def reading_at(history: History, index: Int[Array, "*batch"]) -> tuple[Array, Bo
 
 
 def positions_before(
-    history: History, tick: Int[Array, ""], ages: Int[Array, "ages"]
+    history: History, tick: Int[Array, ""], ages: Int[np.ndarray, "ages"]
 ) -> Float[Array, "ages *batch"]:
     """The positions [m] so many ticks ago, less than 256."""
     return history.ring[(tick - ages) & (SLOTS - 1), 2]

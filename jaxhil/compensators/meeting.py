@@ -6,7 +6,6 @@ Signals are aligned with the force that is read, and scaled by the contact's app
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxhil.compensators.base import Constants, Gains
@@ -51,9 +50,7 @@ def search(
     positions = positions_before(history, tick, AGES)
     away = beyond(side[None], constants.clearance[None], positions) - place
     rare = rarity(away, spread, (period * speed)[None])
-    args = (onset, tick, period, variance, unknown, rare)
-    # What is compared alone moves nothing that is differentiated.
-    return find(*lax.stop_gradient(args))
+    return find(onset, tick, period, variance, unknown, rare)
 
 
 def meet(
@@ -79,10 +76,10 @@ def meet(
     wide = high > low
     since = jnp.where(wide, (high - place) / jnp.where(wide, high - low, 1), 0.5)
     weight = gains["equivalent_mass"] * speed
-    pace = jnp.sqrt(jnp.where(found.stiffness > 0, found.stiffness, 0)) / USUAL_PACE
+    stiff = found.stiffness > 0
+    pace = jnp.where(stiff, jnp.sqrt(jnp.where(stiff, found.stiffness, 1)) / USUAL_PACE, 0)
     pace = jnp.clip(pace, SLOWEST, 1)
-    bias = lax.stop_gradient(side * found.bias * weight)
-    scales = Scales(side, place, speed, pace, weight * pace, bias)
+    scales = Scales(side, place, speed, pace, weight * pace, side * found.bias * weight)
     detected = found.detected
     chosen = Scales(*(jnp.where(detected, new, before) for new, before in zip(scales, old, strict=True)))
     here = detected[None] & (row[None] == jnp.arange(2).reshape(2, *[1] * row.ndim))

@@ -71,11 +71,13 @@ def find(
     each of the `AGES` is 1/`rarity` (ages, *batch) as likely as none."""
     ages = jnp.asarray(AGES.reshape(-1, *[1] * period.ndim))
     before = jnp.moveaxis(onset.ring[(tick - AGES) & (SLOTS - 1)], 1, 0)
-    begun = ages < onset.watched[None]
-    supposed = _suppose(onset, before, ages, period[None], noise[None], unknown[None], rarity)
-    best = jnp.argmax(jnp.where(begun, supposed[0], -CERTAIN), axis=0)
-    evidence, bias, stiffness = (jnp.take_along_axis(each, best[None], axis=0)[0] for each in supposed)
-    age = jnp.asarray(AGES)[best]
+    supposed = (onset, before, ages, period[None], noise[None], unknown[None])
+    # What is compared alone moves nothing that is differentiated.
+    evidence = _suppose(*lax.stop_gradient((*supposed, rarity)))[0]
+    best = jnp.argmax(jnp.where(ages < onset.watched[None], evidence, -CERTAIN), axis=0)[None]
+    evidence = jnp.take_along_axis(evidence, best, axis=0)[0]
+    age = jnp.asarray(AGES)[best[0]]
+    bias, stiffness = (jnp.take_along_axis(each, best, axis=0)[0] for each in _suppose(*supposed, 1.0)[1:])
     waited = (age > 1) & (age.astype(period.dtype) * period >= WAIT * (1 - 1e-9))
     return Found((age < onset.watched) & (evidence > CERTAIN) & waited, age, bias, stiffness)
 

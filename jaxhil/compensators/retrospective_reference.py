@@ -221,8 +221,7 @@ class RetrospectiveReference(Compensator):
         speed = way * signals.velocity_desired
         flies = (scales.side == 0) & (gains["equivalent_mass"] * speed > LEAST_WEIGHT)
         speed = jnp.where(flies, speed, 1)
-        # What a decision alone goes by moves nothing that is differentiated.
-        force_then = lax.stop_gradient(way * read.force / (gains["equivalent_mass"] * speed))
+        force_then = way * read.force / (gains["equivalent_mass"] * speed)
         onset = watch(state.onset, tick, flies, force_then, read.shown)
         episode = state.episode._replace(scales=scales)
 
