@@ -56,6 +56,7 @@ _RETROSPECTIVE = {
     # Off the ticks, where it may be differentiated.
     "identification_delay": {"value": 0.0083, "unit": "s", "lower": 0.0, "upper": 0.05},
     "velocity_gain": {"value": 5.0, "unit": "1/s", "lower": 1.0, "upper": 1e3},
+    "correction_limit": {"value": 0.1, "unit": "1", "lower": 0.01, "upper": 20.0},
     "replay_noise": {"value": 20.0, "unit": "1/s", "lower": 0.01, "upper": 100.0},
     "force_noise_floor": {"value": 0.05, "unit": "1/s", "lower": 1e-4, "upper": 10.0},
     "force_noise": {"value": 3.0, "unit": "N", "lower": 0.0, "upper": 100.0},
