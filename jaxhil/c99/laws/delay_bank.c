@@ -1,14 +1,17 @@
 /* Hypotheses of the force delay side by side, each with a map of its own, weighed by what they explain.
- * Hypothesis h takes the force to be d_h older than given: it belongs to the depth X - d_h V. It expects to read
- * f_h with a variance s_h (0 with the noise's own variance r out of contact, and where what it expects while the
- * contact opens is not positive). Its weight is the product of the likelihoods of all readings of this contact and
- * of those before, (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), and of how well its damping, of mean B and variance s^2,
- * goes with what is known of contacts: p (s_0/s) exp(-t^2/2) + (1 - p) 2 Phi(t), t = B/s, p = 1/3. The exponentials
- * are (1 + u/n)^-n. What counts is the mean over all hypotheses, of their maps and of their delays.
+ * Hypothesis h takes the force to be d_h older than given: it belongs to the depth X - d_h V - p_h. The surface was met
+ * at X_0; by this hypothesis it lies at p_h = g (X_0 - d_h v_0) beyond where it was told, g = spread^2/(spread^2 +
+ * found^2) by how uncertain either is. It expects to read f_h with a variance s_h (0 with the noise's own variance r out
+ * of contact, and where what it expects while the contact opens is not positive). Its weight is the product of the
+ * likelihoods of all readings of this contact and of those before, (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), and of how
+ * well its damping, of mean B and variance s^2, goes with what is known of contacts: p (s_0/s) exp(-t^2/2)
+ * + (1 - p) 2 Phi(t), t = B/s, p = 1/3. The exponentials are (1 + u/n)^-n. What counts is the mean over all hypotheses,
+ * of their maps, delays and surfaces.
  */
 #include <math.h>
 #include <stdbool.h>
 
+#include "contact_plane.c"
 #include "force_depth_map.c"
 #include "gains_table.c"
 
@@ -16,14 +19,15 @@
 
 enum { JAXHIL_HYPOTHESES = 17 };
 
-/* Of each hypothesis its delay, map, deepest point, the likelihoods of this contact and of those before; sums over
- * these of the damping's precision and of precision times mean, their number `met`; whether this contact is to be
- * added to them. The mean of the maps and, `shift` [s], of the delays; the delay that was `given`. */
+/* Of each hypothesis its delay, by how much [s] it has the surface deeper than it was met, map, deepest point, the
+ * likelihoods of this contact and of those before; sums over these of the damping's precision and of precision times
+ * mean, their number `met`; whether this contact is to be added to them. The mean of the maps and, `shift` [s] and
+ * `below` [s], of the delays and of how much deeper; the delay that was `given`. */
 typedef struct {
-    double given, shift, met, variance;
+    double given, shift, below, met, variance, pace, plane_spread;
     double known[JAXHIL_HYPOTHESES];
     jaxhil_force_depth_map prior;
-    double offsets[JAXHIL_HYPOTHESES], deepest[JAXHIL_HYPOTHESES];
+    double offsets[JAXHIL_HYPOTHESES], deeper[JAXHIL_HYPOTHESES], deepest[JAXHIL_HYPOTHESES];
     double likelihood[JAXHIL_HYPOTHESES], carried[JAXHIL_HYPOTHESES];
     double precision[JAXHIL_HYPOTHESES], weighted[JAXHIL_HYPOTHESES];
     double estimate[JAXHIL_HYPOTHESES][JAXHIL_PARAMETERS];
@@ -34,13 +38,16 @@ typedef struct {
 
 /* == Definitions == */
 
+static const double jaxhil_misfit = 0.01; /* of a force, by which a map may be wrong */
 static const double jaxhil_bank_elastic = 1.0 / 3.0;
 static const double jaxhil_bank_broadening = 2.0;
 static const double jaxhil_bank_least = 1e-200;
 static const double jaxhil_bank_nothing = 1e-300; /* a smaller product is none: some machines keep such numbers */
 static const double jaxhil_bank_least_carried = 1e-12;
 static const double jaxhil_bank_least_shift = 1e-12; /* s: where nothing tells delays apart, rounding does not */
-enum { JAXHIL_SQUARINGS = 10, JAXHIL_DENSITY_SQUARINGS = 8, JAXHIL_DAMPING = JAXHIL_SEGMENTS };
+static const double jaxhil_bank_late = 25.0; /* times the variance of where it was met: soft surfaces are found late */
+static const long jaxhil_bank_earlier = 30;  /* ticks before it was met, whose readings count */
+enum { JAXHIL_SQUARINGS = 10, JAXHIL_DENSITY_SQUARINGS = 8 };
 
 /* (1 + u/n)^-n, n = 2^squarings. */
 static double jaxhil_bank_exponential(double u, int squarings) {
@@ -83,12 +90,15 @@ static void jaxhil_bank_restart(jaxhil_learnt *bank) {
 static void jaxhil_learnt_reset(jaxhil_learnt *bank) {
     jaxhil_bank_restart(bank);
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        bank->deeper[h] = 0.0;
         bank->carried[h] = 1.0;
         bank->precision[h] = 0.0;
         bank->weighted[h] = 0.0;
     }
     bank->met = 0.0;
     bank->shift = 0.0;
+    bank->below = 0.0;
+    bank->pace = 1.0;
 }
 
 static void jaxhil_learnt_init(jaxhil_learnt *bank, const jaxhil_gains *gains) {
@@ -97,30 +107,9 @@ static void jaxhil_learnt_init(jaxhil_learnt *bank, const jaxhil_gains *gains) {
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         bank->offsets[h] = (0.125 * (double)h - 1.0) * gains->delay_spread;
     }
-    for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
-        bank->curve.slopes[j] = 0.0;
-        bank->curve.at_knots[j] = 0.0;
-    }
-    bank->curve.damping = 0.0;
-    bank->curve.depth_damping = 0.0;
-    bank->curve.unloading = 0.0;
+    bank->plane_spread = gains->plane_spread;
+    bank->curve = bank->prior.curve;
     jaxhil_learnt_reset(bank);
-}
-
-/* A contact begins: the one before is added to what is carried, and the maps are the prior. */
-static void jaxhil_learnt_begin(jaxhil_learnt *bank) {
-    if (bank->learning) {
-        for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
-            const double variance = bank->covariance[h][JAXHIL_DAMPING][JAXHIL_DAMPING];
-            const double precision = 1.0 / (variance > 0.0 ? variance : 1.0);
-            bank->carried[h] = bank->carried[h] * bank->likelihood[h];
-            bank->precision[h] = bank->precision[h] + precision;
-            bank->weighted[h] = bank->weighted[h] + precision * bank->estimate[h][JAXHIL_DAMPING];
-        }
-        jaxhil_bank_shares(bank->carried, jaxhil_bank_least_carried);
-        bank->met += 1.0;
-    }
-    jaxhil_bank_restart(bank);
 }
 
 /* Variance [1/s^2] of the force that is expected where it was read last. */
@@ -132,8 +121,13 @@ static const jaxhil_curve *jaxhil_learnt_curve(const jaxhil_learnt *bank) {
     return &bank->curve;
 }
 
+/* By how much the force is older than by the given delay, and the surface deeper than it was met [s]. */
 static double jaxhil_learnt_shift(const jaxhil_learnt *bank) {
-    return bank->shift;
+    return bank->shift * bank->pace;
+}
+
+static double jaxhil_learnt_deeper(const jaxhil_learnt *bank) {
+    return bank->below;
 }
 
 /* How much better a damping N(mean, variance) goes with one that is 0 or not negative than one N(0, prior) does. */
@@ -152,16 +146,17 @@ static double jaxhil_bank_plausibility(double mean, double variance, double prio
 
 /* Weights of the hypotheses; their sum is 1. */
 static void jaxhil_bank_weigh(const jaxhil_learnt *bank, double *weights) {
+    const double pace = bank->pace;
     double total = 0.0;
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
-        const double own = bank->covariance[h][JAXHIL_DAMPING][JAXHIL_DAMPING];
+        const double own = bank->covariance[h][JAXHIL_DAMPING][JAXHIL_DAMPING] * (pace * pace);
         const double precision = 1.0 / (own > 0.0 ? own : 1.0);
         const double sum = bank->precision[h] + precision;
-        const double mean = (bank->weighted[h] + precision * bank->estimate[h][JAXHIL_DAMPING]) / sum;
+        const double mean = (bank->weighted[h] + precision * (bank->estimate[h][JAXHIL_DAMPING] * pace)) / sum;
         const double variance = jaxhil_bank_broadening * (bank->met + 1.0) / sum;
         double plausible = 1.0;
         if (own > 0.0) {
-            plausible = jaxhil_bank_plausibility(mean, variance, bank->prior.damping);
+            plausible = jaxhil_bank_plausibility(mean, variance, bank->prior.damping * (pace * pace));
             plausible = plausible > jaxhil_bank_least_carried ? plausible : jaxhil_bank_least_carried;
         }
         weights[h] = bank->likelihood[h] * bank->carried[h] * plausible;
@@ -175,9 +170,12 @@ static void jaxhil_bank_weigh(const jaxhil_learnt *bank, double *weights) {
 /* The mean over the hypotheses, by their weights: the delay, and what counts of the maps. */
 static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
     jaxhil_curve *curve = &bank->curve;
-    double lost[3] = {0.0, 0.0, 0.0};
-    double reached = 0.0;
+    double lost[4] = {0.0, 0.0, 0.0, 0.0};
+    double reached = bank->estimate[0][JAXHIL_PRELOAD] * weights[0];
     double shift = 0.0;
+    for (int h = 1; h < JAXHIL_HYPOTHESES; h++) {
+        reached += bank->estimate[h][JAXHIL_PRELOAD] * weights[h];
+    }
     for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
         double slope = bank->estimate[0][j] * weights[0];
         for (int h = 1; h < JAXHIL_HYPOTHESES; h++) {
@@ -190,7 +188,7 @@ static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
         curve->at_knots[j] = reached;
     }
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
-        for (int k = 0; k < 3; k++) {
+        for (int k = 0; k < 4; k++) {
             const int place = JAXHIL_SEGMENTS + k;
             const double mean =
                 jaxhil_positive_mean(bank->estimate[h][place], bank->covariance[h][place][place]) * weights[h];
@@ -199,12 +197,73 @@ static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
         const double delay = weights[h] * bank->offsets[h];
         const double known = weights[h] * bank->known[h];
         shift = h > 0 ? shift + delay : delay;
+        const double below = weights[h] * bank->deeper[h];
+        bank->below = h > 0 ? bank->below + below : below;
         bank->variance = h > 0 ? bank->variance + known : known;
     }
     bank->shift = shift > jaxhil_bank_least_shift || shift < -jaxhil_bank_least_shift ? shift : 0.0;
     curve->damping = lost[0];
     curve->depth_damping = lost[1];
     curve->unloading = lost[2];
+    curve->friction = lost[3];
+}
+
+/* The contact that is over is added to what is carried. */
+static void jaxhil_bank_finish(jaxhil_learnt *bank) {
+    const double pace = bank->pace;
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        const double variance = bank->covariance[h][JAXHIL_DAMPING][JAXHIL_DAMPING] * (pace * pace);
+        const double precision = 1.0 / (variance > 0.0 ? variance : 1.0);
+        bank->carried[h] = bank->carried[h] * bank->likelihood[h];
+        bank->precision[h] = bank->precision[h] + precision;
+        bank->weighted[h] = bank->weighted[h] + precision * (bank->estimate[h][JAXHIL_DAMPING] * pace);
+    }
+    jaxhil_bank_shares(bank->carried, jaxhil_bank_least_carried);
+    bank->met += 1.0;
+}
+
+/* Each hypothesis has the surface between where it was met and where it was told; how far [s] the hardware was in, by
+ * the first to enter, as it was met. */
+static double jaxhil_bank_place(jaxhil_learnt *bank, const jaxhil_meeting *meeting, double share) {
+    const double length = meeting->speed / meeting->pace;
+    double first = 0.0;
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        const double place = share * (meeting->place - bank->offsets[h] * meeting->speed);
+        const double depth = (meeting->place - place) / length;
+        const double inside = depth - bank->offsets[h] * meeting->pace;
+        bank->deeper[h] = -depth;
+        first = inside > first ? inside : first;
+    }
+    return first;
+}
+
+/* How much where it was met counts beside where it was told: all, if the two disagree whatever the delay. */
+static double jaxhil_bank_share(const jaxhil_learnt *bank, const jaxhil_meeting *meeting) {
+    const double known = bank->plane_spread * bank->plane_spread;
+    const double found = jaxhil_bank_late * meeting->variance;
+    const double away = fabs(meeting->place) - bank->offsets[JAXHIL_HYPOTHESES - 1] * meeting->speed;
+    const bool elsewhere = away > 0.0 && away * away > jaxhil_plane_elsewhere * (known + found);
+    return elsewhere ? 1.0 : known / (known + found);
+}
+
+/* A contact begins: the one before is added to what is carried, and the maps are the prior. How many ticks before the
+ * meeting readings count. */
+static long jaxhil_learnt_begin(jaxhil_learnt *bank, const jaxhil_meeting *meeting) {
+    double weights[JAXHIL_HYPOTHESES];
+    if (bank->learning) {
+        jaxhil_bank_finish(bank);
+    }
+    const double share = jaxhil_bank_share(bank, meeting);
+    const double ticks = ceil(jaxhil_bank_place(bank, meeting, share) / meeting->tick);
+    const double off = share * (meeting->stiffness * meeting->tick);
+    bank->pace = meeting->pace;
+    jaxhil_bank_restart(bank);
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        bank->covariance[h][JAXHIL_PRELOAD][JAXHIL_PRELOAD] += off * off / 12.0;
+    }
+    jaxhil_bank_weigh(bank, weights);
+    jaxhil_bank_conclude(bank, weights);
+    return ticks < (double)jaxhil_bank_earlier ? (long)ticks : jaxhil_bank_earlier;
 }
 
 /* Hypothesis h reads: the square of what it missed, over its variance, times a quarter; how sharply it knew. */
@@ -213,23 +272,25 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
     double(*covariance)[JAXHIL_PARAMETERS] = bank->covariance[h];
     double *estimate = bank->estimate[h];
     double phi[JAXHIL_PARAMETERS], g[JAXHIL_PARAMETERS];
-    const double deeper = depth - bank->offsets[h] * rate;
+    const double x = depth - bank->offsets[h] * bank->pace * rate - bank->deeper[h];
     const double read = hidden ? 0.0 : force;
     const double noise = hidden ? variance + zone * zone / 12.0 : variance;
     const double seen = hidden ? 0.5 * zone : force;
-    if (deeper > bank->deepest[h]) {
-        bank->deepest[h] = deeper;
+    if (x > bank->deepest[h]) {
+        bank->deepest[h] = x;
     }
     for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
-        const double beyond = deeper - jaxhil_knots[j];
+        const double beyond = x - jaxhil_knots[j];
         phi[j] = beyond > 0.0 ? beyond : 0.0;
         if (j < JAXHIL_SEGMENTS - 1 && beyond > jaxhil_knots[j + 1] - jaxhil_knots[j]) {
             phi[j] = jaxhil_knots[j + 1] - jaxhil_knots[j];
         }
     }
-    phi[12] = rate;
-    phi[13] = deeper * rate / jaxhil_map_reach;
-    phi[14] = deeper - bank->deepest[h];
+    phi[JAXHIL_DAMPING] = rate;
+    phi[JAXHIL_DEPTH_DAMPING] = x * rate / jaxhil_map_reach;
+    phi[JAXHIL_UNLOADING] = x - bank->deepest[h];
+    phi[JAXHIL_FRICTION] = jaxhil_turning(rate);
+    phi[JAXHIL_PRELOAD] = 1.0;
     double expected = 0.0;
     double s = 0.0;
     for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
@@ -242,7 +303,7 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
         s += phi[i] * product;
     }
     s = noise + s;
-    const bool inside = deeper > jaxhil_map_surface && (!hidden || expected > zone);
+    const bool inside = x > jaxhil_map_surface && (!hidden || expected > zone);
     const bool closes = rate > 0.0;
     const bool nothing = !inside || (!closes && !(expected > 0.0));
     const double innovation = seen - expected;

@@ -1,6 +1,7 @@
 /* What is learnt of a contact where the delay of the force is known: a force-depth map. */
 #include <stdbool.h>
 
+#include "contact_plane.c"
 #include "force_depth_map.c"
 #include "gains_table.c"
 
@@ -12,6 +13,8 @@ typedef struct {
 
 /* == Definitions == */
 
+static const double jaxhil_misfit = 0.003; /* of a force, by which the map may be wrong */
+
 static void jaxhil_learnt_init(jaxhil_learnt *learnt, const jaxhil_gains *gains) {
     jaxhil_force_depth_map_init(&learnt->map, gains);
 }
@@ -20,8 +23,11 @@ static void jaxhil_learnt_reset(jaxhil_learnt *learnt) {
     (void)learnt;
 }
 
-static void jaxhil_learnt_begin(jaxhil_learnt *learnt) {
+/* A contact begins. How many ticks before the meeting readings count. */
+static long jaxhil_learnt_begin(jaxhil_learnt *learnt, const jaxhil_meeting *meeting) {
+    (void)meeting;
     jaxhil_force_depth_map_restart(&learnt->map);
+    return 0;
 }
 
 static const jaxhil_curve *jaxhil_learnt_curve(const jaxhil_learnt *learnt) {
@@ -33,7 +39,13 @@ static double jaxhil_learnt_variance(const jaxhil_learnt *learnt) {
     return learnt->map.variance;
 }
 
+/* By how much the force is older than by the given delay, and the surface deeper than it was met [s]. */
 static double jaxhil_learnt_shift(const jaxhil_learnt *learnt) {
+    (void)learnt;
+    return 0.0;
+}
+
+static double jaxhil_learnt_deeper(const jaxhil_learnt *learnt) {
     (void)learnt;
     return 0.0;
 }

@@ -31,9 +31,10 @@ typedef struct {
  * makes up to JAXHIL_STRIDE steps per tick, of up to 2 ms, or from one sample of the history to the next; when it
  * has caught up with the present it becomes the `live` motion. Samples count by the hardware's ticks: the last
  * before its own entry, then one `since` that [ticks], and so on; the present lies `beyond` [ticks] such a sample.
- * The force is older by `shift` [s] than it was taken for: it belongs to X - shift V. */
+ * The force is older by `shift` [s] than it was taken for, the surface `deeper` [s] than it was met: it belongs to the depth
+ * X - shift V - deeper. */
 typedef struct {
-    double replay, shift, period, since, beyond;
+    double replay, shift, deeper, period, since, beyond;
     long coarse, entry, present, reached;
     jaxhil_scales scales;
     jaxhil_sample start; /* that at `entry` */
@@ -76,6 +77,7 @@ static void jaxhil_path_enter(jaxhil_path *path, const jaxhil_sample *sample) {
 static void jaxhil_reference_motion_init(jaxhil_reference_motion *reference, double period) {
     reference->replay = 0.0;
     reference->shift = 0.0;
+    reference->deeper = 0.0;
     reference->period = period;
     reference->coarse = 1;
     while (2.0 * (double)reference->coarse * period <= jaxhil_reference_coarse * (1.0 + 1e-9)) {
@@ -109,7 +111,7 @@ static double jaxhil_reference_missing(const jaxhil_reference_motion *reference,
     const jaxhil_sample *sample = jaxhil_history_recall(history, index);
     const jaxhil_scales *scales = &reference->scales;
     const double rate = jaxhil_scales_rate(scales, sample->velocity);
-    const double depth = jaxhil_scales_depth(scales, sample->position) - reference->shift * rate;
+    const double depth = jaxhil_scales_depth(scales, sample->position) - (reference->shift * rate + reference->deeper);
     if (depth > path->farthest) {
         path->farthest = depth;
     }

@@ -43,7 +43,6 @@ static const double jaxhil_farewell = 0.006;  /* s for which it goes on after th
 static const double jaxhil_usual_pace = 14.0; /* 1/s: slower contact is followed on a slower scale of time */
 static const double jaxhil_slowest = 0.01;    /* of that */
 static const double jaxhil_most = 1.2;        /* of the peak force, that the model is to feel of the map */
-static const double jaxhil_misfit = 0.003;    /* of a force, by which the map may be wrong */
 static const double jaxhil_margin = 0.0625;   /* of the stretch between two samples, off whose end the surface is */
 static const double jaxhil_least_weight = 1e-9; /* kg m/s, mass times approach speed: less does not scale */
 enum { JAXHIL_READINGS = 2 };                 /* per tick that the map learns from, while it has to catch up */
@@ -69,6 +68,7 @@ static void jaxhil_law_forget_planes(jaxhil_law *law) {
         law->planes[i].spread = law->plane_spread;
     }
     law->reference.scales.plane = 0.0;
+    law->reference.scales.length = 1.0;
 }
 
 static bool jaxhil_law_init(jaxhil_law *law, const jaxhil_gains *gains) {
@@ -146,6 +146,7 @@ static double jaxhil_law_follow(jaxhil_law *law, double x, double v, double dept
     const double zone = law->dead_zone / weight;
     const double noise = jaxhil_force_noise_variance(&law->noise) / (weight * weight);
     reference->shift = jaxhil_learnt_shift(&law->learnt);
+    reference->deeper = jaxhil_learnt_deeper(&law->learnt);
     jaxhil_law_learn(law, law->floor * law->floor + noise, zone);
     const double expected = jaxhil_curve_force(curve, depth, rate, law->hardware_deepest);
     if (hidden) {
@@ -169,6 +170,13 @@ static double jaxhil_law_follow(jaxhil_law *law, double x, double v, double dept
     return *separated ? correction : own + (force - expected) + correction;
 }
 
+#define JAXHIL_LAW_HAS_CONTACT_PLANE
+/* By how much [m] the surface is deeper than told. */
+static double jaxhil_law_contact_plane(const jaxhil_law *law) {
+    const jaxhil_scales *scales = &law->reference.scales;
+    return scales->plane + jaxhil_learnt_deeper(&law->learnt) * scales->length;
+}
+
 /* A surface is found, met between two samples: between them it lies where it was most expected. */
 static void jaxhil_law_meet(jaxhil_law *law, double side, double reach, double speed, jaxhil_found found) {
     jaxhil_history *history = &law->history;
@@ -185,24 +193,29 @@ static void jaxhil_law_meet(jaxhil_law *law, double side, double reach, double s
     scales->weight = law->mass * speed * law->pace;
     const double low = jaxhil_scales_beyond(scales, jaxhil_history_recall(history, entry)->position);
     const double high = jaxhil_scales_beyond(scales, jaxhil_history_recall(history, entry + 1)->position);
-    jaxhil_plane_learn(plane, low, high, found.age);
+    const double variance = jaxhil_plane_found(high - low, found.age);
+    jaxhil_plane_learn(plane, low, high, variance);
     /* Not at the end of the stretch: the reference would not have entered. */
     const double end = high - jaxhil_margin * (high - low);
     scales->plane = plane->place < low ? low : (plane->place > end ? end : plane->place);
     const double since = high > low ? (high - scales->plane) / (high - low) : 0.5;
-    const double depth = (reach - scales->plane) / scales->length;
+    const double tick = law->reference.period;
+    const double stiffness = found.stiffness / (law->pace * law->pace);
+    const jaxhil_meeting meeting = {side, scales->plane, variance, speed, law->pace, tick, stiffness};
+    const long earlier = jaxhil_learnt_begin(&law->learnt, &meeting);
+    const double depth = (reach - scales->plane) / scales->length - jaxhil_learnt_deeper(&law->learnt);
     const double far = jaxhil_far * law->plane_spread;
+    const double place = jaxhil_law_contact_plane(law);
     law->side = side;
     law->speed = speed;
     law->gone = 0.0;
     law->deepest = 0.0;
     law->hardware_deepest = 0.0;
     law->learnt_deepest = 0.0;
-    law->next = entry + 1;
+    law->next = entry + 1 - (earlier < entry ? earlier : entry);
     jaxhil_doubts_restart(&law->doubts);
     law->doubts.late = depth - (double)found.age * law->reference.period;
-    law->doubts.displaced = scales->plane > far || scales->plane < -far;
-    jaxhil_learnt_begin(&law->learnt);
+    law->doubts.displaced = place > far || place < -far;
     jaxhil_reference_motion_begin(&law->reference, history, entry, since, depth > 0.0 ? depth : 0.0);
 }
 
@@ -238,7 +251,7 @@ static bool jaxhil_law_meets(jaxhil_law *law, double force, bool shown, double p
                              double velocity_desired) {
     const double side = velocity_desired > 0.0 ? 1.0 : -1.0;
     const double speed = side * velocity_desired;
-    jaxhil_found found;
+    jaxhil_found found = {0, 0.0, 0.0, 0.0};
     law->status = JAXHIL_OUT_OF_CONTACT;
     if (!(law->mass * speed > jaxhil_least_weight) || (side < 0.0 && law->clearance == INFINITY)) {
         jaxhil_onset_restart(&law->onset);
@@ -293,12 +306,14 @@ static double jaxhil_law_step(jaxhil_law *law, double force_measured, double pos
     if (law->speed > 0.0) {
         const jaxhil_scales *scales = &law->reference.scales;
         const double rate = jaxhil_scales_rate(scales, velocity);
-        const double given = jaxhil_scales_depth(scales, position) - jaxhil_learnt_shift(&law->learnt) * rate;
+        const double deeper = jaxhil_learnt_deeper(&law->learnt);
+        const double moved = jaxhil_learnt_shift(&law->learnt) * rate + deeper;
+        const double given = jaxhil_scales_depth(scales, position) - moved;
         const double depth = given >= -jaxhil_map_surface && given <= jaxhil_map_surface ? 0.0 : given;
         if (depth > 0.0) {
             law->gone = 0.0;
         }
-        command = jaxhil_law_follow(law, jaxhil_scales_depth(scales, position_desired),
+        command = jaxhil_law_follow(law, jaxhil_scales_depth(scales, position_desired) - deeper,
                                     jaxhil_scales_rate(scales, velocity_desired), depth, rate,
                                     jaxhil_scales_force(scales, force), hidden, &separated);
         command = law->side * scales->weight * command;
@@ -330,9 +345,4 @@ static void jaxhil_law_reset(jaxhil_law *law) {
 #define JAXHIL_LAW_HAS_NEXT_CONTACT
 static void jaxhil_law_next_contact(jaxhil_law *law) {
     jaxhil_law_restart(law);
-}
-
-#define JAXHIL_LAW_HAS_CONTACT_PLANE
-static double jaxhil_law_contact_plane(const jaxhil_law *law) {
-    return law->reference.scales.plane;
 }
