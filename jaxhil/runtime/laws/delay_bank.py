@@ -1,17 +1,35 @@
 """Hypotheses of the force delay side by side, each with a force-depth map, weighed by what they explain.
 
-Hypothesis h takes the force to be d_h [s] older than given: it belongs to the depth X - d_h V. Each
-identifies a force-depth map (`force_depth_map`); its weight is the product of the likelihoods of all readings
-of this contact and of those before and of how well its damping goes with what is known of contacts
+Hypothesis h takes the force to be d_h [s] older than given: it belongs to the depth X - d_h V - p_h. The
+surface was met at X_0; by this hypothesis it lies at p_h = g (X_0 - d_h v_0) beyond where it was told,
+g = spread^2/(spread^2 + found^2) by how uncertain either is. Each identifies a force-depth map
+(`force_depth_map`); its weight is the product of the likelihoods of all readings of this contact and of those
+before and of how well its damping goes with what is known of contacts
 (notebooks/guide/retrospective_reference.md section 7). What counts is the mean over all hypotheses, of their
-maps and of their delays. In NumPy, all hypotheses at a time; sums are taken one term after another.
+maps, delays and surfaces. In NumPy, all hypotheses at a time; sums are taken one term after another.
 """
 
-from math import pi, sqrt
+from math import ceil, pi, sqrt
 
 import numpy as np
 
-from .force_depth_map import KNOTS, OUTLYING, PARAMETERS, REACH, SEGMENTS, SURFACE, Curve, Prior
+from .contact_plane import ELSEWHERE, Meeting
+from .force_depth_map import (
+    DAMPING,
+    DEPTH_DAMPING,
+    FRICTION,
+    KNOTS,
+    OUTLYING,
+    PARAMETERS,
+    PRELOAD,
+    REACH,
+    SEGMENTS,
+    SURFACE,
+    UNLOADING,
+    Curve,
+    Prior,
+    turning,
+)
 
 HYPOTHESES = 17
 ELASTIC = 1 / 3  # probability that a contact has no damping
@@ -21,7 +39,8 @@ LEAST, LEAST_CARRIED = 1e-200, 1e-12
 NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, some do not
 SQUARINGS, DENSITY_SQUARINGS = 10, 8
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
-DAMPING = SEGMENTS
+LATE = 25.0  # times the variance of where a surface was met: soft ones are found late
+EARLIER = 30  # ticks before it was met, whose readings count
 
 _KNOTS = np.array(KNOTS)[:, None]
 _WIDTHS = np.append(np.diff(KNOTS), np.inf)[:, None]
@@ -30,16 +49,18 @@ _0, _1 = np.zeros(HYPOTHESES), np.ones(HYPOTHESES)
 
 
 class DelayBank:
-    """The bank, made of how far [s] the farthest hypotheses lie from the given delay, and the map's prior."""
+    """The bank, made of how far [s] the farthest hypotheses lie from the given delay, of how uncertain it is
+    where the surface was told [m], and of the map's prior."""
 
     __slots__ = (
-        "_carried", "_covariance", "_damping", "_deepest", "_estimate", "_known", "_learning", "_likelihood",
-        "_met", "_offsets", "_precision", "_prior_covariance", "_prior_estimate", "_weighted", "curve",
-        "shift", "variance",
+        "_below", "_carried", "_covariance", "_damping", "_deepest", "_estimate", "_known", "_learning",
+        "_likelihood", "_met", "_offsets", "_pace", "_plane_spread", "_precision", "_prior_covariance",
+        "_prior_estimate", "_weighted", "curve", "deeper", "shift", "variance",
     )  # fmt: skip
 
-    def __init__(self, spread: float, prior: Prior) -> None:
+    def __init__(self, spread: float, plane_spread: float, prior: Prior) -> None:
         self._offsets = np.array([0.125 * step - 1.0 for step in range(HYPOTHESES)]) * spread
+        self._plane_spread = plane_spread
         self._damping = prior.damping * prior.damping
         estimate, covariance = prior.moments()
         self._prior_estimate = np.repeat(np.array(estimate)[:, None], HYPOTHESES, axis=1)
@@ -53,20 +74,35 @@ class DelayBank:
         self._carried = np.ones(HYPOTHESES)
         self._precision = np.zeros(HYPOTHESES)
         self._weighted = np.zeros(HYPOTHESES)
+        self._below = np.zeros(HYPOTHESES)  # by how much deeper each has the surface than it was met [s]
         self._met = 0.0
+        self._pace = 1.0
         self.shift = 0.0  # the mean of the hypotheses' delays [s]
+        self.deeper = 0.0  # and of how much deeper the surface is [s], on the contact's scale of time
 
     @np.errstate(all="ignore")
-    def begin(self) -> None:
-        """A contact begins: the one before is added to what is carried, and the maps are the prior."""
+    def begin(self, meeting: Meeting) -> int:
+        """A contact begins: the one before is added to what is carried, and the maps are the prior. From how
+        many ticks before the meeting on to learn from the readings."""
         if self._learning:
-            variance = self._covariance[DAMPING, DAMPING]
+            pace = self._pace
+            variance = self._covariance[DAMPING, DAMPING] * (pace * pace)
             precision = 1.0 / np.where(variance > 0.0, variance, 1.0)
             self._carried = _shares(self._carried * self._likelihood, LEAST_CARRIED)
             self._precision = self._precision + precision
-            self._weighted = self._weighted + precision * self._estimate[DAMPING]
+            self._weighted = self._weighted + precision * (self._estimate[DAMPING] * pace)
             self._met += 1.0
+        share = self._share(meeting)
+        places = share * (meeting.place - self._offsets * meeting.speed)
+        depths = (meeting.place - places) / (meeting.speed / meeting.pace)
+        first = float(np.maximum.reduce(depths - self._offsets * meeting.pace))
+        off = share * (meeting.stiffness * meeting.tick)
+        self._below = -depths
+        self._pace = meeting.pace
         self._restart()
+        self._covariance[PRELOAD, PRELOAD] += off * off / 12.0
+        self._conclude(self._weigh())
+        return min(ceil((first if first > 0.0 else 0.0) / meeting.tick), EARLIER)
 
     @np.errstate(all="ignore")
     def learn(
@@ -75,11 +111,16 @@ class DelayBank:
         """One reading: depth [s] and speed as old as the force by the given delay, force [1/s], its variance
         [1/s^2], whether the sensor's dead zone hides it, that zone [1/s]."""
         self._read(depth, rate, force, variance, hidden, zone)
-        weights = self._weigh()
-        shift = float(_total(weights * self._offsets))
-        self.shift = shift if shift > LEAST_SHIFT or shift < -LEAST_SHIFT else 0.0
-        self.variance = float(_total(weights * self._known))
-        self._conclude(weights)
+        self._conclude(self._weigh())
+
+    def _share(self, meeting: Meeting) -> float:
+        """How much where the surface was met counts beside where it was told: all, if the two disagree
+        whatever the delay."""
+        known = self._plane_spread * self._plane_spread
+        found = LATE * meeting.variance
+        away = abs(meeting.place) - float(self._offsets[-1]) * meeting.speed
+        elsewhere = away > 0.0 and away * away > ELSEWHERE * (known + found)
+        return 1.0 if elsewhere else known / (known + found)
 
     def _restart(self) -> None:
         """Another contact: the maps are the prior, nothing has been read."""
@@ -95,14 +136,16 @@ class DelayBank:
         self, depth: float, rate: float, force: float, variance: float, hidden: bool, zone: float
     ) -> None:
         estimate = self._estimate
-        depths = depth - self._offsets * rate
+        depths = depth - self._offsets * self._pace * rate - self._below
         deepest = np.fmax(self._deepest, depths)
         beyond = depths - _KNOTS
         phi = np.empty((PARAMETERS, HYPOTHESES))
         phi[:SEGMENTS] = np.fmax(np.minimum(beyond, _WIDTHS), _0)
-        phi[12] = rate
-        phi[13] = depths * rate / REACH
-        phi[14] = depths - deepest
+        phi[DAMPING] = rate
+        phi[DEPTH_DAMPING] = depths * rate / REACH
+        phi[UNLOADING] = depths - deepest
+        phi[FRICTION] = turning(rate)
+        phi[PRELOAD] = 1.0
         read = force
         noise = variance
         if hidden:
@@ -148,31 +191,38 @@ class DelayBank:
 
     def _weigh(self) -> np.ndarray:
         """Weights of the hypotheses; their sum is 1."""
-        own = self._covariance[DAMPING, DAMPING]
+        pace = self._pace
+        own = self._covariance[DAMPING, DAMPING] * (pace * pace)
         precision = _1 / np.where(own > _0, own, _1)
         total = self._precision + precision
-        mean = (self._weighted + precision * self._estimate[DAMPING]) / total
+        mean = (self._weighted + precision * (self._estimate[DAMPING] * pace)) / total
         variance = BROADENING * (self._met + 1.0) / total
-        plausible = _plausibility(mean, variance, self._damping)
+        plausible = _plausibility(mean, variance, self._damping * (pace * pace))
         plausible = np.where(own > _0, np.fmax(plausible, LEAST_CARRIED), _1)
         weights = self._likelihood * self._carried * plausible
         return weights / _total(weights)
 
     def _conclude(self, weights: np.ndarray) -> None:
+        """The mean over the hypotheses, by their weights."""
+        shift = float(_total(weights * self._offsets))
+        self.shift = shift if shift > LEAST_SHIFT or shift < -LEAST_SHIFT else 0.0
+        self.deeper = float(_total(weights * self._below))
+        self.variance = float(_total(weights * self._known))
         estimate = self._estimate
         slopes = np.add.accumulate(estimate[:SEGMENTS] * weights, axis=1)[:, -1].tolist()
-        at_knots = [0.0] * SEGMENTS
-        reached = 0.0
+        reached = float(_total(estimate[PRELOAD] * weights))
+        at_knots = [reached] * SEGMENTS
         for j in range(1, SEGMENTS):
             reached += slopes[j - 1] * (KNOTS[j] - KNOTS[j - 1])
             at_knots[j] = reached
-        # The last of the diagonal, without a copy.
-        variances = self._covariance.reshape(-1, HYPOTHESES)[DAMPING * (PARAMETERS + 1) :: PARAMETERS + 1]
-        lost = _positive_mean(estimate[SEGMENTS:], variances) * weights
+        # Without a copy.
+        diagonal = self._covariance.reshape(-1, HYPOTHESES)[:: PARAMETERS + 1]
+        lost = _positive_mean(estimate[DAMPING:PRELOAD], diagonal[DAMPING:PRELOAD]) * weights
         curve = self.curve
         curve.slopes = slopes
         curve.at_knots = at_knots
-        curve.damping, curve.depth_damping, curve.unloading = np.add.accumulate(lost, axis=1)[:, -1].tolist()
+        losses = np.add.accumulate(lost, axis=1)[:, -1].tolist()
+        curve.damping, curve.depth_damping, curve.unloading, curve.friction = losses
 
 
 def _plausibility(mean: np.ndarray, variance: np.ndarray, prior: float) -> np.ndarray:

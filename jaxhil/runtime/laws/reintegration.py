@@ -101,11 +101,11 @@ class Motion:
         self._expected = other._expected
         self.curve.take(other.curve)
 
-    def missing(self, sample: Sample, scales: Scales, shift: float, ticks: float) -> float:
+    def missing(self, sample: Sample, scales: Scales, shift: float, deeper: float, ticks: float) -> float:
         """What was measured and the map does not explain, on the way to this sample: its mean [1/s] over so
         many ticks."""
         rate = scales.rate(sample.velocity)
-        depth = scales.depth(sample.position) - shift * rate
+        depth = scales.depth(sample.position) - (shift * rate + deeper)
         if depth > self._farthest:
             self._farthest = depth
         expected = self.curve.force(depth, rate, self._farthest)
@@ -151,7 +151,7 @@ class ReferenceMotion:
 
     __slots__ = (
         "_behind", "_beyond", "_coarse", "_entry", "_history", "_present", "_reached", "_since", "_start",
-        "live", "period", "replay", "scales", "shift",
+        "deeper", "live", "period", "replay", "scales", "shift",
     )  # fmt: skip
 
     def __init__(self, history: History, scales: Scales, period: float) -> None:
@@ -164,7 +164,10 @@ class ReferenceMotion:
         self.scales = scales
         self.live = Motion()
         self.replay = 0.0  # rho
-        self.shift = 0.0  # s by which the force is older than it was taken for: it belongs to X - shift V
+        # The force is older by `shift` [s] than it was taken for, the surface `deeper` [s] than it was met: it
+        # belongs to the depth X - shift V - deeper.
+        self.shift = 0.0
+        self.deeper = 0.0
         self.begin(-1, NOTHING, 0.5, 0.0)
 
     def begin(self, entry: int, start: Sample, since: float, depth: float) -> None:
@@ -229,5 +232,5 @@ class ReferenceMotion:
         missing = 0.0
         if index <= self._history.newest and ticks > 0.0:
             sample = self._history.recall(index)
-            missing = self.replay * motion.missing(sample, self.scales, self.shift, ticks)
+            missing = self.replay * motion.missing(sample, self.scales, self.shift, self.deeper, ticks)
         motion.advance(ticks * self.period, missing)

@@ -26,7 +26,7 @@ from ..bounds import DAMPINGS_BY_MASS, FORCES, MASSES, STIFFNESSES_BY_MASS, TIME
 from ..law_status import IDENTIFIED, OUT_OF_CONTACT, SATURATED, UNSURE
 from ..registry import Compensator, GainSpecification
 from ..surfaces import deflection
-from .contact_plane import ContactPlane
+from .contact_plane import ContactPlane, Meeting, found_variance
 from .doubts import FAR, Doubts
 from .force_depth_map import SURFACE, Prior
 from .history import History
@@ -38,7 +38,6 @@ FAREWELL = 0.006  # s for which it goes on after the hardware has left the surfa
 USUAL_PACE = 14.0  # 1/s: slower contact is followed on a slower scale of time
 SLOWEST = 0.01  # of that
 MOST = 1.2  # of the peak force, that the model is to feel of the map
-MISFIT = 0.003  # of a force, by which the map may be wrong
 MARGIN = 0.0625  # of the stretch between two samples, that the surface is off its end
 LEAST_WEIGHT = 1e-9  # kg m/s, mass times approach speed: at less nothing is scaled by it
 READINGS = 2  # per tick that the map learns from, while it has to catch up
@@ -57,7 +56,8 @@ PRIOR = (  # the gains that `Prior` is made of, in its order
 class Retrospective(Compensator):
     """Reference and repayment; what identifies the contact is the law's own.
 
-    `_shift` [s] is by how much the force is older than by the given delay. Every contact starts afresh, but
+    `_shift` [s] is by how much the force is older than by the given delay, `_deeper` [s] by how much the
+    surface is deeper than it was met, on the contact's scale of time. Every contact starts afresh, but
     for what is known of where the surfaces are. A run that begins in contact has no approach speed to scale
     by: there F_c is the measured force. `status` is what stands behind the last command: `OUT_OF_CONTACT`;
     `UNSURE`: nothing is identified yet, or there is nothing to scale by, and it goes by the measured force
@@ -66,12 +66,13 @@ class Retrospective(Compensator):
     """
 
     __slots__ = (
-        "_alignment", "_bias_spread", "_clearance", "_curve", "_dead_zone", "_deepest", "_doubts", "_floor",
+        "_alignment", "_bias_spread", "_clearance", "_curve", "_dead_zone", "_deeper", "_deepest", "_doubts", "_floor",
         "_gone", "_hardware_deepest", "_history", "_learnt_deepest", "_limit", "_mass", "_next", "_noise",
         "_onset", "_pace", "_period", "_plane_spread", "_planes", "_reference", "_replay", "_scales",
         "_shift", "_side", "_speed", "_started", "_strength", "_velocity_gain", "status",
     )  # fmt: skip
 
+    misfit: ClassVar[float] = 0.003  # of a force, by which a map may be wrong
     gains: ClassVar[Mapping[str, GainSpecification]] = {
         "equivalent_mass": GainSpecification("kg", *MASSES),
         "identification_delay": GainSpecification("s", *TIMES),
@@ -114,13 +115,14 @@ class Retrospective(Compensator):
         self._strength = gains["replay_noise"] * gains["replay_noise"]
         self._doubts = Doubts()
         self._shift = 0.0
+        self._deeper = 0.0
         self._prepare(gains, Prior(*(gains[name] for name in PRIOR)))
         self.reset()
 
     @property
     def contact_plane(self) -> float:
         """By how much [m] the surface met last is deeper than told; 0 before the first."""
-        return self._scales.plane
+        return self._scales.plane + self._deeper * self._scales.length
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """The force F_c [N]."""
@@ -237,23 +239,26 @@ class Retrospective(Compensator):
         low = scales.beyond(start.position)
         high = scales.beyond(history.recall(entry + 1).position)
         plane = self._planes[side]
-        plane.learn(low, high, found.age)
+        variance = found_variance(high - low, found.age)
+        plane.learn(low, high, variance)
         # Not at the end of the stretch: the reference would not have entered.
         end = high - MARGIN * (high - low)
         scales.plane = low if plane.place < low else (end if plane.place > end else plane.place)
         since = (high - scales.plane) / (high - low) if high > low else 0.5
-        depth = scales.depth(position)
+        stiffness = found.stiffness / (pace * pace)
+        meeting = Meeting(scales.plane, variance, speed, pace, self._reference.period, stiffness)
+        earlier = self._begin(meeting)
+        depth = scales.depth(position) - self._deeper
         self._side = side
         self._speed = speed
         self._gone = 0.0
         self._deepest = 0.0
         self._hardware_deepest = 0.0
         self._learnt_deepest = 0.0
-        self._next = entry + 1
+        self._next = entry + 1 - min(earlier, entry)
         self._doubts.restart()
         self._doubts.late = depth - float(found.age) * self._reference.period
-        self._doubts.displaced = abs(scales.plane) > FAR * self._plane_spread
-        self._begin()
+        self._doubts.displaced = abs(self.contact_plane) > FAR * self._plane_spread
         self._reference.begin(entry, start, since, depth if depth > 0.0 else 0.0)
 
     def _follow(
@@ -269,10 +274,10 @@ class Retrospective(Compensator):
         curve = self._curve
         scales = self._scales
         reference = self._reference
-        x = scales.depth(position_desired)
+        x = scales.depth(position_desired) - self._deeper
         v = scales.rate(velocity_desired)
         rate = scales.rate(velocity)
-        depth = scales.depth(position) - self._shift * rate
+        depth = scales.depth(position) - (self._shift * rate + self._deeper)
         if -SURFACE <= depth <= SURFACE:
             depth = 0.0
         if depth > 0.0:
@@ -285,6 +290,7 @@ class Retrospective(Compensator):
         zone = self._dead_zone / scales.weight
         noise = self._noise.variance / (scales.weight * scales.weight)
         reference.shift = self._shift
+        reference.deeper = self._deeper
         self._catch_up(self._floor * self._floor + noise, zone)
         expected = curve.force(depth, rate, self._hardware_deepest)
         read = scales.force(force)
@@ -323,7 +329,7 @@ class Retrospective(Compensator):
                 self._learnt_deepest = depth
             if depth > 0.0 and shown:
                 self._doubts.readings += 1
-            off = MISFIT * force
+            off = self.misfit * force
             self._learn(depth, rate, self._learnt_deepest, force, variance + off * off, not shown, zone)
             self._next += 1
 
@@ -354,8 +360,8 @@ class Retrospective(Compensator):
         """What identifies the contact, and the curve that it makes of it, `_curve`."""
         raise NotImplementedError
 
-    def _begin(self) -> None:
-        """A contact begins."""
+    def _begin(self, meeting: Meeting) -> int:
+        """A contact begins. From how many ticks before the meeting on to learn from the readings."""
         raise NotImplementedError
 
     def _learn(

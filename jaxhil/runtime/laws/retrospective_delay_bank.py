@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from ..registry import GainSpecification, register
+from .contact_plane import Meeting
 from .delay_bank import DelayBank
 from .force_depth_map import Prior
 from .retrospective import Retrospective
@@ -21,6 +22,7 @@ class RetrospectiveDelayBank(Retrospective):
 
     __slots__ = ("_bank", "_given_delay")
 
+    misfit: ClassVar[float] = 0.01
     gains: ClassVar[Mapping[str, GainSpecification]] = {
         **Retrospective.gains,
         "delay_spread": GainSpecification("s", 0.0, 0.004),
@@ -29,29 +31,32 @@ class RetrospectiveDelayBank(Retrospective):
     @property
     def force_delay(self) -> float:
         """The estimated delay [s] of the force measurement."""
-        return self._given_delay + self._shift
+        return self._given_delay + self._bank.shift
 
     def reset(self) -> None:
         """Forget everything, what was learnt of the delay as well."""
         super().reset()
         self._bank.reset()
         self._shift = 0.0
-
-    def next_contact(self) -> None:
-        """Restart all but what was learnt of the delay."""
-        super().reset()
+        self._deeper = 0.0
 
     def _prepare(self, gains: Mapping[str, float], prior: Prior) -> None:
         self._given_delay = gains["identification_delay"]
-        self._bank = DelayBank(gains["delay_spread"], prior)
+        self._bank = DelayBank(gains["delay_spread"], gains["plane_spread"], prior)
         self._curve = self._bank.curve
 
-    def _begin(self) -> None:
-        self._bank.begin()
+    def _begin(self, meeting: Meeting) -> int:
+        earlier = self._bank.begin(meeting)
+        self._take_means(meeting.pace)
+        return earlier
 
     def _learn(self, depth, rate, deepest, force, variance, hidden, zone) -> None:
         self._bank.learn(depth, rate, force, variance, hidden, zone)
-        self._shift = self._bank.shift
+        self._take_means(self._pace)
+
+    def _take_means(self, pace: float) -> None:
+        self._shift = self._bank.shift * pace
+        self._deeper = self._bank.deeper
 
     def _variance(self) -> float:
         return self._bank.variance

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from ..registry import register
+from .contact_plane import Meeting
 from .force_depth_map import ForceDepthMap, Prior
 from .retrospective import Retrospective
 
@@ -17,8 +18,9 @@ class RetrospectiveReference(Retrospective):
         self._map = ForceDepthMap(prior)
         self._curve = self._map.curve
 
-    def _begin(self) -> None:
+    def _begin(self, meeting: Meeting) -> int:
         self._map.restart()
+        return 0
 
     def _learn(self, depth, rate, deepest, force, variance, hidden, zone) -> None:
         if depth > 0.0:
