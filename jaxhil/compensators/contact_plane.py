@@ -17,12 +17,14 @@ class Plane(NamedTuple):
     spread: Float[Array, "*shape"]  # of that [m]
 
 
-def learn_plane(old: Plane, low: Array, high: Array, age: Array) -> Plane:
-    """Where a surface is expected that was met between two places [m], so many ticks before that was
-    found."""
-    width = high - low
+def found_variance(width: Array, age: Array) -> Float[Array, "*shape"]:
+    """Of a surface [m^2] that was met so many ticks before that was found, each of this width [m]."""
     late = LATE * age.astype(width.dtype)
-    found = width * width * (1 / 12 + late * late)
+    return width * width * (1 / 12 + late * late)
+
+
+def learn_plane(old: Plane, low: Array, high: Array, found: Array) -> Plane:
+    """Where a surface is expected that was met between two places [m], with the variance `found` [m^2]."""
     known = old.spread * old.spread
     middle = 0.5 * (low + high)
     away = middle - old.place

@@ -1,13 +1,15 @@
 """Hypotheses of the force delay side by side, each with a map of its own, weighed by what they explain.
 
-Hypothesis h takes the force to be d_h [s] older than assumed: it belongs to the depth X - d_h V, to first
-order. Each identifies a `force_depth_map` of its own and says beforehand what it expects to read, f_h with a
-variance s_h (0 with the noise's own variance r out of contact, and where what it expects while the contact
-opens is not positive). Its weight is the product of the likelihood of all readings y of this contact and of
-those before, in each (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), and of how well its damping goes with what is
-known of contacts (`plausibility`): see notebooks/guide/retrospective_reference.md section 7. The exponentials
-are (1 + u/n)^-n: algebraic, the same on every machine. What counts is the mean over all hypotheses, of their
-maps and of their delays.
+Hypothesis h takes the force to be d_h [s] older than assumed: it belongs to the depth X - d_h V - p_h, to
+first order in d_h. The surface was met at X_0; by this hypothesis it lies at p_h = g (X_0 - d_h v_0) beyond
+where it was told, g = spread^2/(spread^2 + found^2) by how uncertain either is. Each identifies a
+`force_depth_map` of its own and says beforehand what it expects to read, f_h with a variance s_h (0 with the
+noise's own variance r out of contact, and where what it expects while the contact opens is not positive). Its
+weight is the product of the likelihood of all readings y of this contact and of those before, in each
+(r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), and of how well its damping goes with what is known of contacts
+(`plausibility`): see notebooks/guide/retrospective_reference.md section 7. The exponentials are (1 + u/n)^-n:
+algebraic, the same on every machine. What counts is the mean over all hypotheses, of their maps, delays and
+surfaces.
 """
 
 import math
@@ -15,10 +17,13 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float, Int
 
+from jaxhil.compensators.contact_plane import ELSEWHERE
 from jaxhil.compensators.force_depth_map import (
-    PARAMETERS,
+    DAMPING,
+    PLACES,
+    PRELOAD,
     SEGMENTS,
     SURFACE,
     Curve,
@@ -30,6 +35,7 @@ from jaxhil.compensators.force_depth_map import (
     predict,
     tells,
 )
+from jaxhil.compensators.meeting import Meeting
 
 HYPOTHESES = 17
 OFFSETS = np.linspace(-1, 1, HYPOTHESES)  # of their delays, in terms of the farthest
@@ -40,7 +46,8 @@ LEAST, LEAST_CARRIED = 1e-200, 1e-12
 NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, some do not
 SQUARINGS, DENSITY_SQUARINGS = 10, 8  # n = 2^10 of the likelihood, 2^8 of what is known of damping
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
-DAMPING = SEGMENTS
+LATE = 25.0  # times the variance of where a surface was met: soft ones are found late
+EARLIER = 30  # ticks before it was met, whose readings count
 
 
 class Bank(NamedTuple):
@@ -54,23 +61,46 @@ class Bank(NamedTuple):
     weighted: Float[Array, "hypotheses *batch"]  # sum of B/s^2 over them [s]
     met: Float[Array, "*batch"]  # how many they are
     learning: Float[Array, "*batch"]  # whether (1) this contact is to be added to them
+    below: Float[Array, "hypotheses *batch"]  # by how much deeper each has the surface than it was met [s]
+    pace: Float[Array, "*batch"]  # seconds on the contact's scale of time in one
     shift: Float[Array, "*batch"]  # mean of d_h [s]
+    deeper: Float[Array, "*batch"]  # mean of `below` [s]
 
 
 def no_bank(prior: Map) -> Bank:
     """Before the first contact."""
     zero = jnp.zeros_like(prior.mean[0])
     each = jnp.stack([zero] * HYPOTHESES)
-    return Bank(_repeated(prior), each, each + 1, each + 1, each, each, zero, zero, zero)
+    return Bank(
+        _repeated(prior), each, each + 1, each + 1, each, each, zero, zero, each, zero + 1, zero, zero
+    )
 
 
-def begin(old: Bank, prior: Map, begins: Bool[Array, "*batch"]) -> Bank:
-    """Where a contact `begins`: the one before is added to what is carried, and the maps are the prior."""
+def begin(
+    old: Bank, prior: Map, meeting: Meeting, period: Array, farthest: Array, plane_spread: Array, damping: Array
+) -> tuple[Bank, Int[Array, "*batch"]]:
+    """Where a contact begins: the one before is added to what is carried, and the maps are the prior; from how
+    many ticks before it was met on to learn from the readings. The control `period` [s], the largest d_h,
+    `farthest` [s], the uncertainty `plane_spread` of where the surface was told [m], the prior variance `damping`
+    of the damping [1/s^2]."""
+    begins = meeting.found
     ends = begins & (old.learning > 0)
-    mean, variance = old.maps.mean[DAMPING], old.maps.covariance[DAMPING, DAMPING]
+    per_second = old.pace * old.pace
+    mean = old.maps.mean[DAMPING] * old.pace[None]
+    variance = old.maps.covariance[DAMPING, DAMPING] * per_second[None]
     precision = 1 / jnp.where(variance > 0, variance, 1)
+    speed, pace = (jnp.where(begins, each, 1) for each in (meeting.scales.speed, meeting.scales.pace))
+    offsets = _offsets(speed) * farthest[None]
+    share = _share(meeting, farthest * speed, plane_spread)
+    place = share[None] * (meeting.scales.plane[None] - offsets * speed[None])
+    depth = (meeting.scales.plane[None] - place) / (speed / pace)[None]
+    first = jnp.max(depth - offsets * pace[None], axis=0)
+    tick = period * pace
+    earlier = jnp.minimum(jnp.ceil(jnp.where(first > 0, first, 0) / tick), EARLIER).astype(jnp.int32)
+    off = share * (meeting.stiffness * tick)
     fresh = _repeated(prior)
-    return old._replace(
+    fresh = fresh._replace(covariance=fresh.covariance.at[PRELOAD, PRELOAD].add((off * off / 12)[None]))
+    now = old._replace(
         maps=Map(
             jnp.where(begins[None, None], fresh.mean, old.maps.mean),
             jnp.where(begins[None, None, None], fresh.covariance, old.maps.covariance),
@@ -82,7 +112,12 @@ def begin(old: Bank, prior: Map, begins: Bool[Array, "*batch"]) -> Bank:
         weighted=old.weighted + jnp.where(ends[None], precision * mean, 0),
         met=old.met + jnp.where(ends, 1, 0),
         learning=jnp.where(begins, 0, old.learning),
+        below=jnp.where(begins[None], -depth, old.below),
+        pace=jnp.where(begins, pace, old.pace),
     )
+    means = _means(now, weigh(now, damping), offsets)
+    shift, deeper = (jnp.where(begins, a, b) for a, b in ((means.shift, old.shift), (means.deeper, old.deeper)))
+    return now._replace(shift=shift, deeper=deeper), jnp.where(begins, earlier, 0)
 
 
 def learn(old: Bank, reading: Reading, farthest: Array, damping: Array) -> tuple[Bank, Curve]:
@@ -92,7 +127,7 @@ def learn(old: Bank, reading: Reading, farthest: Array, damping: Array) -> tuple
     """
     offsets = _offsets(reading.depth) * farthest[None]
     rate = reading.rate[None] + jnp.zeros_like(offsets)
-    depth = reading.depth[None] - offsets * rate
+    depth = reading.depth[None] - offsets * old.pace[None] * rate - old.below
     counts, hidden, zone = reading.counts[None], reading.hidden[None], reading.zone[None]
     deepest = jnp.where(counts & (depth > old.deepest), depth, old.deepest)
     noise = (reading.variance + jnp.where(reading.hidden, reading.zone**2 / 12, 0))[None]
@@ -124,19 +159,18 @@ def learn(old: Bank, reading: Reading, farthest: Array, damping: Array) -> tuple
         learning=jnp.where(reading.counts, 1, old.learning),
     )
     weights = weigh(now, damping)
-    shift = jnp.sum(weights * offsets, axis=0)
-    shift = jnp.where((shift > LEAST_SHIFT) | (shift < -LEAST_SHIFT), shift, 0)
-    return now._replace(shift=shift), average(maps, weights)
+    return _means(now, weights, offsets), average(maps, weights)
 
 
 def weigh(bank: Bank, damping: Array) -> Float[Array, "hypotheses *batch"]:
     """Weights of the hypotheses; their sum is 1."""
-    own = bank.maps.covariance[DAMPING, DAMPING]
+    per_second = (bank.pace * bank.pace)[None]
+    own = bank.maps.covariance[DAMPING, DAMPING] * per_second
     precision = 1 / jnp.where(own > 0, own, 1)
     total = bank.precision + precision
-    mean = (bank.weighted + precision * bank.maps.mean[DAMPING]) / total
+    mean = (bank.weighted + precision * (bank.maps.mean[DAMPING] * bank.pace[None])) / total
     variance = BROADENING * (bank.met[None] + 1) / total
-    plausible = plausibility(mean, variance, damping[None])
+    plausible = plausibility(mean, variance, damping[None] * per_second)
     plausible = jnp.where(own > 0, jnp.where(plausible > LEAST_CARRIED, plausible, LEAST_CARRIED), 1)
     weights = bank.likelihood * bank.carried * plausible
     return weights / jnp.sum(weights, axis=0, keepdims=True)
@@ -161,9 +195,9 @@ def average(maps: Map, weights: Float[Array, "hypotheses *batch"]) -> Curve:
     slopes = jnp.sum(maps.mean[:SEGMENTS] * weights[None], axis=1)
     lost = (
         jnp.sum(positive_mean(maps.mean[i], maps.covariance[i, i]) * weights, axis=0)
-        for i in range(SEGMENTS, PARAMETERS)
+        for i in PLACES[:-1]
     )
-    return Curve(slopes, *lost)
+    return Curve(slopes, *lost, jnp.sum(maps.mean[PRELOAD] * weights, axis=0))
 
 
 def exponential(u: Array, squarings: int) -> Array:
@@ -172,6 +206,22 @@ def exponential(u: Array, squarings: int) -> Array:
     for _ in range(squarings):
         value = value * value
     return value
+
+
+def _means(bank: Bank, weights: Array, offsets: Array) -> Bank:
+    """With the mean delay and surface."""
+    shift = jnp.sum(weights * offsets, axis=0)
+    shift = jnp.where((shift > LEAST_SHIFT) | (shift < -LEAST_SHIFT), shift, 0)
+    return bank._replace(shift=shift, deeper=jnp.sum(weights * bank.below, axis=0))
+
+
+def _share(meeting: Meeting, reach: Array, plane_spread: Array) -> Float[Array, "*batch"]:
+    """How much where the surface was met counts beside where it was told: all, if the two disagree whatever the
+    delay, which moves it by up to `reach` [m]."""
+    known, found = plane_spread**2, LATE * meeting.variance
+    away = jnp.abs(meeting.scales.plane) - reach
+    elsewhere = (away > 0) & (away * away > ELSEWHERE * (known + found))
+    return jnp.where(elsewhere, 1, known / (known + found))
 
 
 def _shares(values: Array, least: float) -> Array:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxhil.compensators.base import Constants, Gains
-from jaxhil.compensators.contact_plane import Plane, learn_plane
+from jaxhil.compensators.contact_plane import Plane, found_variance, learn_plane
 from jaxhil.compensators.history import History, Samples, positions_before, recall
 from jaxhil.compensators.onset import AGES, Found, Onset, find, rarity
 from jaxhil.compensators.reintegration import Scales, beyond
@@ -28,6 +28,8 @@ class Meeting(NamedTuple):
     start: Samples  # last sample before the hardware met it
     index: Array  # tick of the run, of that sample
     since: Float[Array, "*batch"]  # from the meeting to the next sample [ticks]
+    variance: Float[Array, "*batch"]  # of where the surface is [m^2]
+    stiffness: Float[Array, "*batch"]  # the most that it may be, on the contact's scale of time [1/s^2]
 
 
 def search(
@@ -70,7 +72,8 @@ def meet(
     high = beyond(side, clearance, recall(history, index + 1).position)
     row = jnp.where(side < 0, 1, 0)
     expected = Plane(*(jnp.take_along_axis(both, row[None], axis=0)[0] for both in planes))
-    now = learn_plane(expected, low, high, found.age)
+    variance = found_variance(high - low, found.age)
+    now = learn_plane(expected, low, high, variance)
     end = high - MARGIN * (high - low)
     place = jnp.where(now.place < low, low, jnp.where(now.place > end, end, now.place))
     wide = high > low
@@ -84,4 +87,5 @@ def meet(
     chosen = Scales(*(jnp.where(detected, new, before) for new, before in zip(scales, old, strict=True)))
     here = detected[None] & (row[None] == jnp.arange(2).reshape(2, *[1] * row.ndim))
     carried = Plane(*(jnp.where(here, new[None], both) for new, both in zip(now, planes, strict=True)))
-    return Meeting(detected, chosen, carried, start, index, since)
+    stiffness = found.stiffness / (pace * pace)
+    return Meeting(detected, chosen, carried, start, index, since, variance, stiffness)

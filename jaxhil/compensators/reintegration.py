@@ -82,8 +82,9 @@ class Measured(NamedTuple):
     replay: Array  # rho, share of the force that the map does not explain
     period: Array  # control period [s], on the contact's scale of time
     coarse: Array  # ticks of the longest step where every sample is kept
-    # by how much the force is older than it was taken for [s], which makes it belong to X - shift V; None: 0
-    shift: Array | None
+    # by how much the force is older than it was taken for, and the surface deeper than it was met [s], which makes
+    # it belong to X - shift V - deeper; None: 0
+    moved: tuple[Array, Array] | None
 
 
 def depth_of(scales: Scales, clearance: Array, position: Array) -> Array:
@@ -186,8 +187,8 @@ def _advance(
     scales = measured.scales
     rate = scales.side * sample.velocity / scales.speed
     hardware = depth_of(scales, measured.clearance, sample.position)
-    if measured.shift is not None:
-        hardware = hardware - measured.shift * rate
+    if measured.moved is not None:
+        hardware = hardware - (measured.moved[0] * rate + measured.moved[1])
     farthest = jnp.where(hardware > motion.farthest, hardware, motion.farthest)
     expected = force_of(curve, hardware, rate, farthest)
     shown = sample.shown - motion.shown

@@ -30,6 +30,7 @@ class RetrospectiveDelayBank(RetrospectiveReference):
 
     name: ClassVar[str] = "retrospective_delay_bank"
     estimates_delay: ClassVar[bool] = True
+    misfit: ClassVar[float] = 0.01
     knows: ClassVar[tuple[str, ...]] = (EQUIVALENT_MASS, ROUGH_FORCE_DELAY, FORCE_NOISE, DEAD_ZONE)
     gains: ClassVar[tuple[Gain, ...]] = (
         *(
@@ -49,13 +50,17 @@ class RetrospectiveDelayBank(RetrospectiveReference):
     def unlearnt(self, prior):
         return no_bank(prior)
 
-    def delay_shift(self, learnt):
-        return learnt.shift
+    def moved(self, learnt):
+        return learnt.shift * learnt.pace, learnt.deeper
 
-    def learn(self, prepared, learnt, enters, reading, deepest):
+    def begin(self, prepared, learnt, meeting):
+        gains, period = prepared.gains, prepared.constants.control_period
+        known = gains["delay_spread"], gains["plane_spread"], gains["prior_damping_spread"] ** 2
+        return begin(learnt, prepared.prior, meeting, period, *known)
+
+    def learn(self, prepared, learnt, reading, deepest):
         gains = prepared.gains
-        begun = begin(learnt, prepared.prior, enters & reading.counts)
-        return learn(begun, reading, gains["delay_spread"], gains["prior_damping_spread"] ** 2)
+        return learn(learnt, reading, gains["delay_spread"], gains["prior_damping_spread"] ** 2)
 
     def force_delay(self, gains, state):
         return gains["identification_delay"] + state.learnt.shift

@@ -43,7 +43,7 @@ from jaxhil.compensators.force_depth_map import (
     update,
 )
 from jaxhil.compensators.history import History, no_history, reading_at, recall, take
-from jaxhil.compensators.meeting import meet, search
+from jaxhil.compensators.meeting import Meeting, meet, search
 from jaxhil.compensators.onset import Onset, no_onset, nothing_found, watch
 from jaxhil.compensators.readings import Aligned, Noise, align, force_noise, take_noise
 from jaxhil.compensators.reintegration import (
@@ -62,7 +62,6 @@ from jaxhil.contact.laws import deflection
 FAREWELL = 0.006  # s for which it goes on after the hardware has left the surface
 MOST = 1.2  # of the peak force, that the model is to feel of the map
 LEAST_WEIGHT = 1e-9  # kg m/s, mass times approach speed: at less nothing is scaled by it
-MISFIT = 0.003  # of a force, by which the map may be wrong
 
 
 class Episode(NamedTuple):
@@ -108,6 +107,7 @@ class RetrospectiveReference(Compensator):
     settings: ClassVar[Mapping[str, Mapping[str, float]]] = {"sharp": SHARP, "gentle": GENTLE}
     anticipates: ClassVar[bool] = True
     finds_plane: ClassVar[bool] = True
+    misfit: ClassVar[float] = 0.003  # of a force, by which a map may be wrong
     gains: ClassVar[tuple[Gain, ...]] = GAINS
 
     def prepare(self, gains, constants):
@@ -144,23 +144,24 @@ class RetrospectiveReference(Compensator):
         """What is known before the first contact: the map's prior."""
         return prior
 
-    def delay_shift(self, learnt: Any) -> Float[Array, "*batch"] | None:
-        """By how much [s] the force is older than the law assumes; None: as old as that."""
+    def moved(self, learnt: Any) -> tuple[Array, Array] | None:
+        """By how much the force is older than the law assumes, and the surface deeper than it was met [s]; None:
+        neither is."""
         return None
 
-    def learn(
-        self, prepared: Prepared, learnt: Any, enters: Array, reading: Reading, deepest: Array
-    ) -> tuple[Any, Curve]:
-        """What is known with one reading more, and what counts of it; from the prior on where a contact
-        `enters`."""
-        before = Map(
-            jnp.where(enters[None], prepared.prior.mean, learnt.mean),
-            jnp.where(enters[None, None], prepared.prior.covariance, learnt.covariance),
-        )
+    def begin(self, prepared: Prepared, learnt: Any, meeting: Meeting) -> tuple[Any, Int[Array, "*batch"]]:
+        """What is known where a contact begins; from how many ticks before it on to learn from the readings."""
+        found = meeting.found
+        mean = jnp.where(found[None], prepared.prior.mean, learnt.mean)
+        covariance = jnp.where(found[None, None], prepared.prior.covariance, learnt.covariance)
+        return Map(mean, covariance), jnp.zeros_like(meeting.index)
+
+    def learn(self, prepared: Prepared, learnt: Any, reading: Reading, deepest: Array) -> tuple[Any, Curve]:
+        """What is known with one reading more, and what counts of it."""
         hardware = reading.depth, reading.rate, deepest
-        more = force(curve(before), *hardware) > reading.zone
+        more = force(curve(learnt), *hardware) > reading.zone
         now = update(
-            before,
+            learnt,
             features(*hardware),
             jnp.where(reading.hidden, 0.5 * reading.zone, reading.force),
             reading.variance + jnp.where(reading.hidden, reading.zone**2 / 12, 0),
@@ -192,13 +193,13 @@ class RetrospectiveReference(Compensator):
         noise = take_noise(gains, state.noise, before, force_read, shown, state.episode.scales.side == 0)
         history = take(state.history, tick, signals.age, force_read, shown, position, velocity)
         read = _Read(position, velocity, force_read, shown, force_noise(gains, noise))
-        onset, found, planes, episode, reference = self._fly(prepared, state, signals, history, read, tick)
+        onset, learnt, planes, episode, reference = self._fly(prepared, state, signals, history, read, tick)
 
         def meets():
-            return self._contact(prepared, episode, state.learnt, found, reference, history, signals, read)
+            return self._contact(prepared, episode, learnt, reference, history, signals, read)
 
         def passes():
-            return jnp.zeros_like(period), episode, state.learnt, reference
+            return jnp.zeros_like(period), episode, learnt, reference
 
         # Where no lane is in contact, the effort is spared.
         command, episode, learnt, reference = lax.cond(jnp.any(episode.scales.side != 0), meets, passes)
@@ -207,11 +208,15 @@ class RetrospectiveReference(Compensator):
         )
 
     def contact_plane(self, state):
-        return state.episode.scales.plane
+        scales, moved = state.episode.scales, self.moved(state.learnt)
+        if moved is None:
+            return scales.plane
+        met = scales.speed > 0
+        return scales.plane + jnp.where(met, moved[1] * scales.speed / jnp.where(met, scales.pace, 1), 0)
 
     def _fly(self, prepared, state, signals, history, read, tick):
         """The readings of the flight to a surface, and where one is found the contact that begins with it:
-        whether it is, where surfaces are expected from now on, the contact under way and its reference."""
+        what is known of it, where surfaces are expected from now on, the contact under way and its reference."""
         gains, constants = prepared.gains, prepared.constants
         period, clearance = constants.control_period, constants.clearance
         begins, old = signals.age == 0, state.episode.scales
@@ -232,7 +237,10 @@ class RetrospectiveReference(Compensator):
         def begun():
             meeting = meet(gains, clearance, scales, state.planes, history, way, speed, found)
             safe = _safe(meeting.scales, meeting.found)
+            learnt, earlier = self.begin(prepared, state.learnt, meeting)
             depth = depth_of(safe, clearance, signals.position_desired)
+            moved = self.moved(learnt)
+            depth = depth if moved is None else depth - moved[1]
             reference = begin(
                 state.reference,
                 meeting.found,
@@ -242,25 +250,26 @@ class RetrospectiveReference(Compensator):
                 jnp.where(depth > 0, depth, 0),
                 period * safe.pace,
             )
-            return meeting.planes, _begun(state.episode, meeting), reference
+            return learnt, meeting.planes, _begun(state.episode, meeting, earlier), reference
 
         found = lax.cond(jnp.any(flies), finds, lambda: nothing_found(period))
-        met = lax.cond(jnp.any(found.detected), begun, lambda: (state.planes, episode, state.reference))
-        return onset, found.detected, *met
+        met = lax.cond(jnp.any(found.detected), begun, lambda: (state.learnt, state.planes, episode, state.reference))
+        return onset, *met
 
-    def _contact(self, prepared, old, learnt, found, reference, history, signals, read):
+    def _contact(self, prepared, old, learnt, reference, history, signals, read):
         """F_c [N], and the contact under way, what is learnt of it and its reference with one tick more."""
         gains, constants = prepared.gains, prepared.constants
         period, clearance = constants.control_period, constants.clearance
         side, usable = old.scales.side, (old.scales.side != 0) & (old.scales.speed > 0)
         scales = _safe(old.scales, usable)
         slow = period * scales.pace
-        older = self.delay_shift(learnt)
+        moved = self.moved(learnt)
         x = depth_of(scales, clearance, signals.position_desired)
         v = side * signals.velocity_desired / scales.speed
         rate = side * read.velocity / scales.speed
         depth = depth_of(scales, clearance, read.position)
-        depth = depth if older is None else depth - older * rate
+        if moved is not None:
+            x, depth = x - moved[1], depth - (moved[0] * rate + moved[1])
         depth = jnp.where((depth > SURFACE) | (depth < -SURFACE), depth, 0)
         deepest, hardware_deepest = _deepest(old.deepest, x), _deepest(old.hardware_deepest, depth)
 
@@ -269,14 +278,14 @@ class RetrospectiveReference(Compensator):
         teaching = _Teaching(
             history, scales, clearance, gains["force_noise_floor"] ** 2 + spread, zone, usable
         )
-        learnt, known, next_, learnt_deepest = self._catch_up(prepared, learnt, found, teaching, old)
+        learnt, known, next_, learnt_deepest = self._catch_up(prepared, learnt, teaching, old)
         expected = force(known, depth, rate, hardware_deepest)
         guess = jnp.where(expected > zone, zone, jnp.where(expected > 0, expected, 0))
         seen = jnp.where(read.shown, side * (read.force - scales.bias) / scales.weight, guess)
         strength = gains["replay_noise"] ** 2
         replay = gains["force_replay"] * strength / (strength + spread)
         reference = follow(
-            reference, known, Measured(history, scales, clearance, replay, slow, longest_step(period), older)
+            reference, known, Measured(history, scales, clearance, replay, slow, longest_step(period), moved)
         )
 
         own = force(known, x, v, deepest)
@@ -301,12 +310,12 @@ class RetrospectiveReference(Compensator):
         )
         return jnp.where((side != 0) & ~over, command, 0), episode, learnt, reference
 
-    def _catch_up(self, prepared, learnt, found, teaching, old):
+    def _catch_up(self, prepared, learnt, teaching, old):
         """What is known with up to two of the readings since the surface was met more, and what counts of it;
         the reading to learn from next, and the deepest point of those learnt from."""
         history, scales = teaching.history, teaching.scales
 
-        def read(learnt, index, farthest, found):
+        def read(learnt, index, farthest):
             counts = teaching.usable & (index <= history.age)
             at = jnp.minimum(index, history.age)
             sample, (force_then, shown) = recall(history, at), reading_at(history, at)
@@ -317,20 +326,18 @@ class RetrospectiveReference(Compensator):
                 depth,
                 scales.side * sample.velocity / scales.speed,
                 seen,
-                teaching.variance + (MISFIT * seen) ** 2,
+                teaching.variance + (self.misfit * seen) ** 2,
                 ~shown,
                 teaching.zone,
                 counts,
             )
-            learnt, known = self.learn(prepared, learnt, found, reading, farthest)
+            learnt, known = self.learn(prepared, learnt, reading, farthest)
             return learnt, known, index + jnp.where(counts, 1, 0), farthest
 
-        first = read(learnt, old.next, old.learnt_deepest, found)
+        first = read(learnt, old.next, old.learnt_deepest)
         behind = jnp.any(teaching.usable & (first[2] <= history.age))
         # Where no lane has to catch up, the effort is spared.
-        return lax.cond(
-            behind, lambda: read(first[0], first[2], first[3], jnp.zeros_like(found)), lambda: first
-        )
+        return lax.cond(behind, lambda: read(first[0], first[2], first[3]), lambda: first)
 
 
 class _Read(NamedTuple):
@@ -368,11 +375,12 @@ def map_prior(gains: Gains) -> Map:
     )
 
 
-def _begun(old: Episode, meeting) -> Episode:
-    """The contact under way, the one that is found where one is."""
+def _begun(old: Episode, meeting: Meeting, earlier: Array) -> Episode:
+    """The contact under way, the one that is found where one is; learnt from so many ticks earlier on."""
     found = meeting.found
     fresh = {name: jnp.where(found, 0, getattr(old, name)) for name in Episode._fields[1:-1]}
-    return Episode(meeting.scales, **fresh, next=jnp.where(found, meeting.index + 1, old.next))
+    first = meeting.index + 1 - jnp.minimum(earlier, meeting.index)
+    return Episode(meeting.scales, **fresh, next=jnp.where(found, first, old.next))
 
 
 def _safe(scales: Scales, usable: Array) -> Scales:
