@@ -77,12 +77,20 @@ def no_bank(prior: Map) -> Bank:
 
 
 def begin(
-    old: Bank, prior: Map, meeting: Meeting, period: Array, farthest: Array, plane_spread: Array, damping: Array
+    old: Bank,
+    prior: Map,
+    meeting: Meeting,
+    period: Array,
+    farthest: Array,
+    plane_spread: Array,
+    damping: Array,
 ) -> tuple[Bank, Int[Array, "*batch"]]:
-    """Where a contact begins: the one before is added to what is carried, and the maps are the prior; from how
-    many ticks before it was met on to learn from the readings. The control `period` [s], the largest d_h,
-    `farthest` [s], the uncertainty `plane_spread` of where the surface was told [m], the prior variance `damping`
-    of the damping [1/s^2]."""
+    """Where a contact begins: the one before is added to what is carried, and the maps are the prior; from
+    how many ticks before it was met on to learn from the readings.
+
+    `period` [s] is that of control, `farthest` [s] the largest d_h, `plane_spread` [m] how uncertain it is
+    where the surface was told, `damping` [1/s^2] the prior variance s_0^2 of the damping.
+    """
     begins = meeting.found
     ends = begins & (old.learning > 0)
     per_second = old.pace * old.pace
@@ -116,7 +124,9 @@ def begin(
         pace=jnp.where(begins, pace, old.pace),
     )
     means = _means(now, weigh(now, damping), offsets)
-    shift, deeper = (jnp.where(begins, a, b) for a, b in ((means.shift, old.shift), (means.deeper, old.deeper)))
+    shift, deeper = (
+        jnp.where(begins, a, b) for a, b in ((means.shift, old.shift), (means.deeper, old.deeper))
+    )
     return now._replace(shift=shift, deeper=deeper), jnp.where(begins, earlier, 0)
 
 
@@ -194,8 +204,7 @@ def average(maps: Map, weights: Float[Array, "hypotheses *batch"]) -> Curve:
     """What counts of the maps, by their weights."""
     slopes = jnp.sum(maps.mean[:SEGMENTS] * weights[None], axis=1)
     lost = (
-        jnp.sum(positive_mean(maps.mean[i], maps.covariance[i, i]) * weights, axis=0)
-        for i in PLACES[:-1]
+        jnp.sum(positive_mean(maps.mean[i], maps.covariance[i, i]) * weights, axis=0) for i in PLACES[:-1]
     )
     return Curve(slopes, *lost, jnp.sum(maps.mean[PRELOAD] * weights, axis=0))
 
@@ -216,8 +225,8 @@ def _means(bank: Bank, weights: Array, offsets: Array) -> Bank:
 
 
 def _share(meeting: Meeting, reach: Array, plane_spread: Array) -> Float[Array, "*batch"]:
-    """How much where the surface was met counts beside where it was told: all, if the two disagree whatever the
-    delay, which moves it by up to `reach` [m]."""
+    """How much where the surface was met counts beside where it was told: all, if the two disagree whatever
+    the delay, which moves it by up to `reach` [m]."""
     known, found = plane_spread**2, LATE * meeting.variance
     away = jnp.abs(meeting.scales.plane) - reach
     elsewhere = (away > 0) & (away * away > ELSEWHERE * (known + found))

@@ -82,8 +82,8 @@ class Measured(NamedTuple):
     replay: Array  # rho, share of the force that the map does not explain
     period: Array  # control period [s], on the contact's scale of time
     coarse: Array  # ticks of the longest step where every sample is kept
-    # by how much the force is older than it was taken for, and the surface deeper than it was met [s], which makes
-    # it belong to X - shift V - deeper; None: 0
+    # by how much the force is older than it was taken for, and the surface deeper than it was met [s], which
+    # makes it belong to X - older V - deeper; None: 0
     moved: tuple[Array, Array] | None
 
 

@@ -6,8 +6,13 @@ force while a contact closes, from which the bank learns as well. What was learn
 there is any damping, is carried from contact to contact; maps are not. With d the mean of the hypotheses'
 delays on the tick before, the depth as old as the force is X - d V, and the measured samples that the
 reference is integrated over again with are moved alike.
+
+Delays are told apart by how badly maps fit, which a prior that no contact fits would decide: it is wide. The
+instant at which a surface is met where it was told says most of a delay: unless the mechanism file says how
+uncertain that place is, it counts as known.
 """
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 from jaxhil.compensators.base import Gain, rig_gain
@@ -17,12 +22,29 @@ from jaxhil.compensators.estimates import (
     EQUIVALENT_MASS,
     FORCE_NOISE,
     ROUGH_FORCE_DELAY,
+    contact_plane_spread,
     force_delay_spread,
+    preload,
 )
+from jaxhil.compensators.retrospective_gains import LEAST_PLANE_SPREAD
 from jaxhil.compensators.retrospective_reference import RetrospectiveReference
 
 MOST = 0.004  # s: beyond it hypotheses are too far apart, and too far off for the first order in d
 LEAST_FLOOR = 0.005  # 1/s
+WIDE = {"prior_stiffness": 200.0, "prior_stiffness_spread": 250.0, "prior_slope_spread": 250.0}  # 1/s^2
+
+
+def _own(gain: Gain) -> Gain:
+    """One of the retrospective reference's gains, as it is where the delay is hardly known."""
+    if gain.name in WIDE:
+        return gain._replace(nominal=lambda m: WIDE[gain.name])
+    if gain.name == "plane_spread":
+        spread = LEAST_PLANE_SPREAD
+        return gain._replace(nominal=lambda m: max(contact_plane_spread(m, unknown=spread), spread))
+    if gain.name == "prior_preload_spread":
+        return gain._replace(nominal=preload)
+    # Next to no noise, a delay that is a little wrong is all that a hypothesis sees.
+    return gain._replace(lower=lambda m: LEAST_FLOOR) if gain.name == "force_noise_floor" else gain
 
 
 class RetrospectiveDelayBank(RetrospectiveReference):
@@ -32,12 +54,11 @@ class RetrospectiveDelayBank(RetrospectiveReference):
     estimates_delay: ClassVar[bool] = True
     misfit: ClassVar[float] = 0.01
     knows: ClassVar[tuple[str, ...]] = (EQUIVALENT_MASS, ROUGH_FORCE_DELAY, FORCE_NOISE, DEAD_ZONE)
+    settings: ClassVar[Mapping[str, Mapping[str, float]]] = {
+        name: {**gains, **WIDE} for name, gains in RetrospectiveReference.settings.items()
+    }
     gains: ClassVar[tuple[Gain, ...]] = (
-        *(
-            # Next to no noise, a delay that is a little wrong is all that a hypothesis sees.
-            gain._replace(lower=lambda m: LEAST_FLOOR) if gain.name == "force_noise_floor" else gain
-            for gain in RetrospectiveReference.gains
-        ),
+        *(_own(gain) for gain in RetrospectiveReference.gains),
         rig_gain(
             "delay_spread",
             lower=lambda m: 0.0,

@@ -145,12 +145,12 @@ class RetrospectiveReference(Compensator):
         return prior
 
     def moved(self, learnt: Any) -> tuple[Array, Array] | None:
-        """By how much the force is older than the law assumes, and the surface deeper than it was met [s]; None:
-        neither is."""
+        """By how much the force is older than the law assumes, and the surface deeper than it was met [s];
+        None: neither is."""
         return None
 
     def begin(self, prepared: Prepared, learnt: Any, meeting: Meeting) -> tuple[Any, Int[Array, "*batch"]]:
-        """What is known where a contact begins; from how many ticks before it on to learn from the readings."""
+        """What is known where a contact begins; from how many ticks before it on to learn from readings."""
         found = meeting.found
         mean = jnp.where(found[None], prepared.prior.mean, learnt.mean)
         covariance = jnp.where(found[None, None], prepared.prior.covariance, learnt.covariance)
@@ -216,7 +216,7 @@ class RetrospectiveReference(Compensator):
 
     def _fly(self, prepared, state, signals, history, read, tick):
         """The readings of the flight to a surface, and where one is found the contact that begins with it:
-        what is known of it, where surfaces are expected from now on, the contact under way and its reference."""
+        what is known of it, where surfaces are expected, the contact under way and its reference."""
         gains, constants = prepared.gains, prepared.constants
         period, clearance = constants.control_period, constants.clearance
         begins, old = signals.age == 0, state.episode.scales
@@ -253,7 +253,9 @@ class RetrospectiveReference(Compensator):
             return learnt, meeting.planes, _begun(state.episode, meeting, earlier), reference
 
         found = lax.cond(jnp.any(flies), finds, lambda: nothing_found(period))
-        met = lax.cond(jnp.any(found.detected), begun, lambda: (state.learnt, state.planes, episode, state.reference))
+        met = lax.cond(
+            jnp.any(found.detected), begun, lambda: (state.learnt, state.planes, episode, state.reference)
+        )
         return onset, *met
 
     def _contact(self, prepared, old, learnt, reference, history, signals, read):

@@ -164,8 +164,8 @@ class ReferenceMotion:
         self.scales = scales
         self.live = Motion()
         self.replay = 0.0  # rho
-        # The force is older by `shift` [s] than it was taken for, the surface `deeper` [s] than it was met: it
-        # belongs to the depth X - shift V - deeper.
+        # The force is older by `shift` [s] than it was taken for, the surface `deeper` [s] than it was met:
+        # the force belongs to the depth X - shift V - deeper.
         self.shift = 0.0
         self.deeper = 0.0
         self.begin(-1, NOTHING, 0.5, 0.0)

@@ -66,10 +66,10 @@ class Retrospective(Compensator):
     """
 
     __slots__ = (
-        "_alignment", "_bias_spread", "_clearance", "_curve", "_dead_zone", "_deeper", "_deepest", "_doubts", "_floor",
-        "_gone", "_hardware_deepest", "_history", "_learnt_deepest", "_limit", "_mass", "_next", "_noise",
-        "_onset", "_pace", "_period", "_plane_spread", "_planes", "_reference", "_replay", "_scales",
-        "_shift", "_side", "_speed", "_started", "_strength", "_velocity_gain", "status",
+        "_alignment", "_bias_spread", "_clearance", "_curve", "_dead_zone", "_deeper", "_deepest",
+        "_doubts", "_floor", "_gone", "_hardware_deepest", "_history", "_learnt_deepest", "_limit", "_mass",
+        "_next", "_noise", "_onset", "_pace", "_period", "_plane_spread", "_planes", "_reference", "_replay",
+        "_scales", "_shift", "_side", "_speed", "_started", "_strength", "_velocity_gain", "status",
     )  # fmt: skip
 
     misfit: ClassVar[float] = 0.003  # of a force, by which a map may be wrong
