@@ -104,7 +104,7 @@ def begin(
     depth = (meeting.scales.plane[None] - place) / (speed / pace)[None]
     first = jnp.max(depth - offsets * pace[None], axis=0)
     tick = period * pace
-    earlier = jnp.minimum(jnp.ceil(jnp.where(first > 0, first, 0) / tick), EARLIER).astype(jnp.int32)
+    earlier = jnp.minimum(jnp.ceil(jnp.where(first > SURFACE, first, 0) / tick), EARLIER).astype(jnp.int32)
     off = share * (meeting.stiffness * tick)
     fresh = _repeated(prior)
     fresh = fresh._replace(covariance=fresh.covariance.at[PRELOAD, PRELOAD].add((off * off / 12)[None]))

@@ -226,7 +226,7 @@ static void jaxhil_bank_finish(jaxhil_learnt *bank) {
  * the first to enter, as it was met. */
 static double jaxhil_bank_place(jaxhil_learnt *bank, const jaxhil_meeting *meeting, double share) {
     const double length = meeting->speed / meeting->pace;
-    double first = 0.0;
+    double first = jaxhil_map_surface;
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         const double place = share * (meeting->place - bank->offsets[h] * meeting->speed);
         const double depth = (meeting->place - place) / length;
@@ -234,7 +234,7 @@ static double jaxhil_bank_place(jaxhil_learnt *bank, const jaxhil_meeting *meeti
         bank->deeper[h] = -depth;
         first = inside > first ? inside : first;
     }
-    return first;
+    return first > jaxhil_map_surface ? first : 0.0;
 }
 
 /* How much where it was met counts beside where it was told: all, if the two disagree whatever the delay. */

@@ -102,7 +102,7 @@ class DelayBank:
         self._restart()
         self._covariance[PRELOAD, PRELOAD] += off * off / 12.0
         self._conclude(self._weigh())
-        return min(ceil((first if first > 0.0 else 0.0) / meeting.tick), EARLIER)
+        return min(ceil((first if first > SURFACE else 0.0) / meeting.tick), EARLIER)
 
     @np.errstate(all="ignore")
     def learn(
