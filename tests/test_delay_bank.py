@@ -1,6 +1,7 @@
 """The bank of delays: its weights against exact densities, both recursions, and what it finds of a delay."""
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -64,8 +65,11 @@ def in_arrays(met):
     """The same for the law in JAX; what it does not ask for is left out."""
     zero = jnp.zeros(())
     scales = Scales(zero + 1, zero + met.place, zero + met.speed, zero + met.pace, zero, zero)
-    none = (None,) * 4
-    return MeetingInJax(jnp.asarray(True), scales, *none, zero + met.variance, zero + met.stiffness)
+    unasked: Any = None
+    return MeetingInJax(
+        found=jnp.asarray(True), scales=scales, planes=unasked, start=unasked, index=unasked, since=unasked,
+        variance=zero + met.variance, stiffness=zero + met.stiffness,
+    )  # fmt: skip
 
 
 def weights_of(bank):
