@@ -143,7 +143,7 @@ def test_a_run_is_the_command_s(run, command, tmp_path):
     options = [f"--set={path}={value}" for path, value in TWO.items()]
     document = command("simulate", "--compensator", "phase_lead", "--json", *options).document
     assert [
-        {name: value for name, value in contact._asdict().items() if name != "force_delay"}
+        {name: value for name, value in contact._asdict().items() if value is not None}
         for contact in run.contacts
     ] == document["contacts"]
     assert (run.gains, run.status, run.compensator) == (document["gains"], "ok", "phase_lead")

@@ -54,7 +54,7 @@ def test_logarithm_by_square_roots():
 
 
 def test_both_sides_look_for_the_same():
-    names = ("STIFFNESS", "STIFFNESS_VARIANCE", "JUMP_VARIANCE", "CERTAIN", "WAIT", "LONGEST")
+    names = ("STIFFNESS", "STIFFNESS_VARIANCE", "JUMP_VARIANCE", "CERTAIN", "WAIT", "LONGEST_FLIGHT")
     for name in names:
         assert getattr(in_jax, name) == getattr(on_the_rig, name)
     assert tuple(in_jax.AGES) == AGES

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-LATE = 0.25  # how uncertain the surface is, of the ticks until it was found
+PER_TICK = 0.25  # how uncertain the surface is, of the ticks until it was found
 DRIFT = 1e-6  # m, from contact to contact
 ELSEWHERE = 25.0  # times the variance of where the surface is expected
 
@@ -19,7 +19,7 @@ class Plane(NamedTuple):
 
 def found_variance(width: Array, age: Array) -> Float[Array, "*shape"]:
     """Of a surface [m^2] that was met so many ticks before that was found, each of this width [m]."""
-    late = LATE * age.astype(width.dtype)
+    late = PER_TICK * age.astype(width.dtype)
     return width * width * (1 / 12 + late * late)
 
 

@@ -46,7 +46,7 @@ LEAST, LEAST_CARRIED = 1e-200, 1e-12
 NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, some do not
 SQUARINGS, DENSITY_SQUARINGS = 10, 8  # n = 2^10 of the likelihood, 2^8 of what is known of damping
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
-LATE = 25.0  # times the variance of where a surface was met: soft ones are found late
+SOFT = 25.0  # times the variance of where a surface was met: soft ones are found late
 EARLIER = 30  # ticks before it was met, whose readings count
 
 
@@ -227,7 +227,7 @@ def _means(bank: Bank, weights: Array, offsets: Array) -> Bank:
 def _share(meeting: Meeting, reach: Array, plane_spread: Array) -> Float[Array, "*batch"]:
     """How much where the surface was met counts beside where it was told: all, if the two disagree whatever
     the delay, which moves it by up to `reach` [m]."""
-    known, found = plane_spread**2, LATE * meeting.variance
+    known, found = plane_spread**2, SOFT * meeting.variance
     away = jnp.abs(meeting.scales.plane) - reach
     elsewhere = (away > 0) & (away * away > ELSEWHERE * (known + found))
     return jnp.where(elsewhere, 1, known / (known + found))

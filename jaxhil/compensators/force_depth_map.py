@@ -28,7 +28,7 @@ DAMPING, DEPTH_DAMPING, UNLOADING, FRICTION, PRELOAD = PLACES
 PARAMETERS = SEGMENTS + len(PLACES)
 WIDTHS = np.append(np.diff(KNOTS), np.inf)
 WANDERING = 0.03  # s of depth over which a slope wanders by its spread
-WIDE = 0.092  # s of depth, beyond which slopes wander less and less
+BROAD = 0.092  # s of depth, beyond which slopes wander less and less
 SLOW = 0.03  # speed at which friction turns
 REACH = 0.03  # s of depth at which the depth damping is as strong as its name says
 SURFACE = 1e-12  # s of depth: nearer than that is on the surface, which rounding does not decide
@@ -89,8 +89,8 @@ def prior(
     stiffness K0, spreads s_K (`common`), s_S (`wandering`) and of `unloading` [1/s^2], of `damping`,
     `depth_damping`, `friction` and `preload` [1/s], of one shape.
     """
-    ratio = WIDE / np.where(KNOTS > WIDE, KNOTS, WIDE)
-    wandered = np.where(KNOTS > WIDE, WIDE * (4 - ratio**3) / 3, KNOTS)
+    ratio = BROAD / np.where(KNOTS > BROAD, KNOTS, BROAD)
+    wandered = np.where(KNOTS > BROAD, BROAD * (4 - ratio**3) / 3, KNOTS)
     shared = _column(np.minimum.outer(wandered, wandered) / WANDERING, stiffness)
     slopes = common[None, None] ** 2 + wandering[None, None] ** 2 * shared
     zeros = jnp.zeros_like(slopes[:, :1])

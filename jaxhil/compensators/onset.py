@@ -25,7 +25,7 @@ STIFFNESS_VARIANCE = 160000.0  # s_K^2 [1/s^4]
 JUMP_VARIANCE = 36.0  # s_B^2 [1/s^2]
 CERTAIN = 9.0
 WAIT = 0.004  # s, and a tick, since the surface was met: then its stiffness shows
-LONGEST = 65536  # ticks of a flight up to which the sums are exact enough; then they begin anew
+LONGEST_FLIGHT = 65536  # ticks of a flight up to which the sums are exact enough; then they begin anew
 
 
 class Onset(NamedTuple):
@@ -55,7 +55,7 @@ def watch(
     old: Onset, tick: Int[Array, ""], flies: Bool[Array, "*batch"], force: Array, shown: Array
 ) -> Onset:
     """A reading [1/s] more where the model `flies` to a surface; elsewhere the next flight is to begin."""
-    starts = old.watched == LONGEST
+    starts = old.watched == LONGEST_FLIGHT
     watched = jnp.where(flies, jnp.where(starts, 0, old.watched) + 1, 0)
     m = watched.astype(force.dtype)
     terms = jnp.stack([jnp.ones_like(force), m, m * m, force, m * force])

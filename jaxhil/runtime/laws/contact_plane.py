@@ -3,7 +3,7 @@
 from math import sqrt
 from typing import NamedTuple
 
-LATE = 0.25  # how uncertain the surface is, of the ticks until it was found
+PER_TICK = 0.25  # how uncertain the surface is, of the ticks until it was found
 DRIFT = 1e-6  # m, from contact to contact
 ELSEWHERE = 25.0  # times the variance of where it is expected
 
@@ -40,5 +40,5 @@ class ContactPlane:
 
 def found_variance(width: float, age: int) -> float:
     """Of a surface [m^2] that was met so many ticks before that was found, each of this width [m]."""
-    late = LATE * float(age)
+    late = PER_TICK * float(age)
     return width * width * (1.0 / 12.0 + late * late)

@@ -39,7 +39,7 @@ LEAST, LEAST_CARRIED = 1e-200, 1e-12
 NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, some do not
 SQUARINGS, DENSITY_SQUARINGS = 10, 8
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
-LATE = 25.0  # times the variance of where a surface was met: soft ones are found late
+SOFT = 25.0  # times the variance of where a surface was met: soft ones are found late
 EARLIER = 30  # ticks before it was met, whose readings count
 
 _KNOTS = np.array(KNOTS)[:, None]
@@ -117,7 +117,7 @@ class DelayBank:
         """How much where the surface was met counts beside where it was told: all, if the two disagree
         whatever the delay."""
         known = self._plane_spread * self._plane_spread
-        found = LATE * meeting.variance
+        found = SOFT * meeting.variance
         away = abs(meeting.place) - float(self._offsets[-1]) * meeting.speed
         elsewhere = away > 0.0 and away * away > ELSEWHERE * (known + found)
         return 1.0 if elsewhere else known / (known + found)

@@ -18,7 +18,7 @@ DAMPING, DEPTH_DAMPING, UNLOADING, FRICTION, PRELOAD = range(SEGMENTS, SEGMENTS 
 OTHERS = 5
 PARAMETERS = SEGMENTS + OTHERS
 WANDERING = 0.03  # s of depth over which a slope wanders by its spread
-WIDE = 0.092  # s of depth, beyond which slopes wander less and less
+BROAD = 0.092  # s of depth, beyond which slopes wander less and less
 SLOW = 0.03  # speed at which friction turns
 REACH = 0.03  # s of depth at which the depth damping is as strong as its name says
 SURFACE = 1e-12  # s of depth: nearer than that is on the surface, which rounding does not decide
@@ -194,12 +194,12 @@ class ForceDepthMap:
 
 
 def wandered(depth: float) -> float:
-    """Over how much depth [s] slopes have wandered at a depth [s]: beyond WIDE ever less, as
-    (WIDE/depth)^4."""
-    if not depth > WIDE:
+    """Over how much depth [s] slopes have wandered at a depth [s]: beyond BROAD ever less, as
+    (BROAD/depth)^4."""
+    if not depth > BROAD:
         return depth
-    ratio = WIDE / depth
-    return WIDE * (4.0 - ratio * ratio * ratio) / 3.0
+    ratio = BROAD / depth
+    return BROAD * (4.0 - ratio * ratio * ratio) / 3.0
 
 
 def turning(speed: float) -> float:

@@ -19,7 +19,7 @@ class Sample(NamedTuple):
     velocity: float  # likewise [m/s]
 
 
-NOTHING = Sample(0.0, 0.0, 0.0, 0.0)
+NO_SAMPLE = Sample(0.0, 0.0, 0.0, 0.0)
 
 
 class History:
@@ -28,7 +28,7 @@ class History:
     __slots__ = ("_forces", "_levels", "_shows", "newest")
 
     def __init__(self) -> None:
-        self._levels = [[NOTHING] * SLOTS for _ in range(LEVELS)]
+        self._levels = [[NO_SAMPLE] * SLOTS for _ in range(LEVELS)]
         self._forces = [0.0] * SLOTS
         self._shows = [False] * SLOTS
         self.restart()

@@ -20,7 +20,7 @@ STIFFNESS_VARIANCE = 160000.0  # s_K^2 [1/s^4]
 JUMP_VARIANCE = 36.0  # s_B^2 [1/s^2]
 CERTAIN = 9.0
 WAIT = 0.004  # s, and a tick, since the surface was met: then its stiffness shows
-LONGEST = 65536  # ticks of a flight up to which the sums are exact enough; then they begin anew
+LONGEST_FLIGHT = 65536  # ticks of a flight up to which the sums are exact enough; then they begin anew
 
 
 class Found(NamedTuple):
@@ -49,7 +49,7 @@ class Onset:
 
     def take(self, force: float, shown: bool) -> None:
         """One reading [1/s], and whether the sensor shows it."""
-        if self._watched == LONGEST:
+        if self._watched == LONGEST_FLIGHT:
             self.restart()
         sums = self._sums[self._watched % SLOTS]
         self._watched += 1

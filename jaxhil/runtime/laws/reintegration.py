@@ -12,7 +12,7 @@ by tick under the newest map. Samples count by the hardware's ticks, the present
 from math import floor
 
 from .force_depth_map import REACH, Curve, turning
-from .history import LEVELS, NOTHING, SLOTS, History, Sample
+from .history import LEVELS, NO_SAMPLE, SLOTS, History, Sample
 
 STRIDE = 24  # steps per tick of the pass from the entry
 COARSE = 0.002  # s, the longest step of a pass where every sample is kept, at least a tick
@@ -68,7 +68,7 @@ class Motion:
 
     def __init__(self) -> None:
         self.curve = Curve()
-        self.enter(NOTHING)
+        self.enter(NO_SAMPLE)
 
     def enter(self, sample: Sample) -> None:
         """Depth 0, speed 1, at the hardware's last sample before its own entry."""
@@ -168,7 +168,7 @@ class ReferenceMotion:
         # the force belongs to the depth X - shift V - deeper.
         self.shift = 0.0
         self.deeper = 0.0
-        self.begin(-1, NOTHING, 0.5, 0.0)
+        self.begin(-1, NO_SAMPLE, 0.5, 0.0)
 
     def begin(self, entry: int, start: Sample, since: float, depth: float) -> None:
         """Before a tick at which the hardware has met the surface `since` [ticks] before the sample after
