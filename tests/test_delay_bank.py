@@ -18,7 +18,7 @@ from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.runtime import Controller
 from jaxhil.runtime.laws.contact_plane import Meeting
-from jaxhil.runtime.laws.delay_bank import HYPOTHESES, LATE, DelayBank
+from jaxhil.runtime.laws.delay_bank import HYPOTHESES, SOFT, DelayBank
 from jaxhil.runtime.laws.force_depth_map import KNOTS, ForceDepthMap, Prior
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import evaluate
@@ -102,7 +102,7 @@ def test_likelihood_is_the_root_of_the_density_of_all_readings():
     for place, name in enumerate(("damping", "depth_damping", "unloading", "friction", "preload"), start=12):
         covariance[place, place] = PRIOR[name] ** 2
     mean = np.r_[np.full(12, PRIOR["stiffness"]), np.zeros(5)]
-    share = TOLD**2 / (TOLD**2 + LATE * FOUND**2)
+    share = TOLD**2 / (TOLD**2 + SOFT * FOUND**2)
     covariance[16, 16] += (share * STIFFNESS * PERIOD) ** 2 / 12
     exact = []
     for offset in OFFSETS:

@@ -206,7 +206,7 @@ def average(maps: Map, weights: Float[Array, "hypotheses *batch"]) -> Curve:
     lost = (
         jnp.sum(positive_mean(maps.mean[i], maps.covariance[i, i]) * weights, axis=0) for i in PLACES[:-1]
     )
-    return Curve(slopes, *lost, jnp.sum(maps.mean[PRELOAD] * weights, axis=0))
+    return Curve(slopes, *lost, preload=jnp.sum(maps.mean[PRELOAD] * weights, axis=0))
 
 
 def exponential(u: Array, squarings: int) -> Array:

@@ -160,7 +160,7 @@ def update(
 def curve(old: Map) -> Curve:
     """What counts of the map."""
     lost = (positive_mean(old.mean[i], old.covariance[i, i]) for i in PLACES[:-1])
-    return Curve(old.mean[:SEGMENTS], *lost, old.mean[PRELOAD])
+    return Curve(old.mean[:SEGMENTS], *lost, preload=old.mean[PRELOAD])
 
 
 def elastic(now: Curve, depth: Float[Array, "*batch"]) -> Float[Array, "*batch"]:

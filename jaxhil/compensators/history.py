@@ -5,6 +5,8 @@ and 256th: the last of each block of so many ticks of the run. Rings are written
 lanes share; as their runs begin at different ticks, what is written is the newest such sample of each lane.
 """
 
+from functools import reduce
+from operator import add
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -78,7 +80,7 @@ def take(
 def level_of(history: History, index: Int[Array, "*batch"]) -> Int[Array, "*batch"]:
     """Of the samples as old as that of the tick `index` of the run, every 4^level-th is kept."""
     age = history.age - index
-    return sum((age >= (SLOTS - 1) * 4**level).astype(jnp.int32) for level in range(LEVELS - 1))
+    return reduce(add, ((age >= (SLOTS - 1) * 4**level).astype(jnp.int32) for level in range(LEVELS - 1)))
 
 
 def recall(history: History, index: Int[Array, "*batch"]) -> Samples:

@@ -12,6 +12,8 @@ hardware's ticks, the present lies between two of them. Passes from the entry ta
 which goes on tick by tick under the newest map (notebooks/guide/retrospective_reference.md section 3).
 """
 
+from functools import reduce
+from operator import add
 from typing import NamedTuple
 
 import jax
@@ -234,7 +236,7 @@ def _verlet(curve: Curve, motion: ReferenceState, duration: Array, missing: Arra
 def longest_step(period: Array) -> Int[Array, "*batch"]:
     """The ticks of the longest step of a pass where every sample is kept: a power of two."""
     most = COARSE * (1 + 1e-9) / period
-    return sum(((most >= 2**power).astype(jnp.int32) << (power - 1) for power in range(1, 8)), jnp.int32(1))
+    return 1 + reduce(add, ((most >= 2**power).astype(jnp.int32) << (power - 1) for power in range(1, 8)))
 
 
 def _choose(condition, when_true, when_false):
