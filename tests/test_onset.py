@@ -48,6 +48,15 @@ def test_evidence_is_the_ratio_of_the_two_densities(age, hidden):
     assert found.bias == pytest.approx(np.sum(before) / (len(before) + noise / unknown), rel=1e-12)
 
 
+@pytest.mark.parametrize("age", [7, 13, 20, 47, 119, 200, 224])
+def test_every_tick_is_told_apart(age):
+    """Of a jump without noise to speak of, also between the ages that are tried first."""
+    onset = Onset(PERIOD)
+    for tick in range(300):
+        onset.take(float(tick >= 300 - age), True)
+    assert onset.find(1e-4, 8.0, lambda age: 321.0).age == age
+
+
 def test_logarithm_by_square_roots():
     for value in (1e-12, 0.3, 1.0, 7.0, 1e6, 1e20):
         assert logarithm(value) == pytest.approx(math.log(value), rel=2e-4, abs=1e-12)
@@ -58,6 +67,8 @@ def test_both_sides_look_for_the_same():
     for name in names:
         assert getattr(in_jax, name) == getattr(on_the_rig, name)
     assert tuple(in_jax.AGES) == AGES
+    assert tuple(in_jax.BOUNDS) == on_the_rig.BOUNDS
+    assert in_jax.STEPS == on_the_rig.STEPS
 
 
 class Flight(NamedTuple):

@@ -10,7 +10,6 @@ from operator import add
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -100,7 +99,9 @@ def reading_at(history: History, index: Int[Array, "*batch"]) -> tuple[Array, Bo
 
 
 def positions_before(
-    history: History, tick: Int[Array, ""], ages: Int[np.ndarray, "ages"]
+    history: History, tick: Int[Array, ""], ages: Int[Array, "ages *batch"]
 ) -> Float[Array, "ages *batch"]:
     """The positions [m] so many ticks ago, less than 256."""
-    return history.ring[(tick - ages) & (SLOTS - 1), 2]
+    return jnp.take_along_axis(
+        history.ring[:SLOTS, 2], (tick - ages) & (SLOTS - 1), axis=0, mode="promise_in_bounds"
+    )

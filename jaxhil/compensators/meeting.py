@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from jaxhil.compensators.base import Constants, Gains
 from jaxhil.compensators.contact_plane import Plane, found_variance, learn_plane
 from jaxhil.compensators.history import History, Samples, positions_before, recall
-from jaxhil.compensators.onset import AGES, Found, Onset, find, rarity
+from jaxhil.compensators.onset import Found, Onset, find, rarity
 from jaxhil.compensators.reintegration import Scales, beyond
 
 USUAL_PACE = 14.0  # 1/s: slower contact is followed on a slower scale of time
@@ -49,9 +49,11 @@ def search(
     variance = gains["force_noise_floor"] ** 2 + noise / (weight * weight)
     unknown = (gains["bias_spread"] / weight) ** 2
     place, spread = (jnp.where(side < 0, both[1], both[0])[None] for both in planes)
-    positions = positions_before(history, tick, AGES)
-    away = beyond(side[None], constants.clearance[None], positions) - place
-    rare = rarity(away, spread, (period * speed)[None])
+
+    def rare(ages):
+        away = beyond(side[None], constants.clearance[None], positions_before(history, tick, ages)) - place
+        return rarity(away, spread, (period * speed)[None])
+
     return find(onset, tick, period, variance, unknown, rare)
 
 

@@ -5,10 +5,12 @@ force would be y = b + B + K s, s the time since the middle of that tick, K ~ N(
 before, y = b, the sensor's bias. Its evidence against free flight throughout has a closed form in sums over
 the readings; the surface is found when the evidence of the best tick, with how likely a surface is there,
 exceeds e^CERTAIN. The surface is expected at a place with a spread s: of a distance d s from there its
-density is 1/(pi s (1 + d^2)). Scaled by approach speed and mass: forces in 1/s, K in 1/s^2.
+density is 1/(pi s (1 + d^2)). The farther back, the fewer ticks are tried; beside the best of them all are,
+by ever smaller steps. Scaled by approach speed and mass: forces in 1/s, K in 1/s^2.
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -18,8 +20,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.compensators.history import SLOTS
 
-# Ticks since the surface was met that are told apart.
+# Ticks since the surface was met that are tried first, what bounds them, and the steps from the best of them.
 AGES = np.array([1, 2, 3, 4, 5, 6, 8, 11, 16, 24, 36, 56, 88, 140, 224], np.int32)
+BOUNDS = np.array([0, *AGES, 225], np.int32)
+STEPS = (32, 16, 8, 4, 2, 1)
 STIFFNESS = 300.0  # K0 [1/s^2]
 STIFFNESS_VARIANCE = 160000.0  # s_K^2 [1/s^4]
 JUMP_VARIANCE = 36.0  # s_B^2 [1/s^2]
@@ -65,21 +69,45 @@ def watch(
 
 
 def find(
-    onset: Onset, tick: Int[Array, ""], period: Array, noise: Array, unknown: Array, rarity: Array
+    onset: Onset,
+    tick: Int[Array, ""],
+    period: Array,
+    noise: Array,
+    unknown: Array,
+    rarity: Callable[[Array], Array],
 ) -> Found:
-    """The surface, by the variances of a reading (`noise`) and of the bias (`unknown`) [1/s^2]; one met at
-    each of the `AGES` is 1/`rarity` (ages, *batch) as likely as none."""
+    """The surface, by the variances of a reading (`noise`) and of the bias (`unknown`) [1/s^2]; one met so
+    many ticks ago as `rarity` is given (ages, *batch) is one over that as likely as none."""
+    scales = period[None], noise[None], unknown[None]
+
+    def evidence(ages):
+        before = _sums_before(onset, tick, ages)
+        # What is compared alone moves nothing that is differentiated.
+        return _suppose(*lax.stop_gradient((onset, before, ages, *scales, rarity(ages))))[0]
+
     ages = jnp.asarray(AGES.reshape(-1, *[1] * period.ndim))
-    before = jnp.moveaxis(onset.ring[(tick - AGES) & (SLOTS - 1)], 1, 0)
-    supposed = (onset, before, ages, period[None], noise[None], unknown[None])
-    # What is compared alone moves nothing that is differentiated.
-    evidence = _suppose(*lax.stop_gradient((*supposed, rarity)))[0]
-    best = jnp.argmax(jnp.where(ages < onset.watched[None], evidence, -CERTAIN), axis=0)[None]
-    evidence = jnp.take_along_axis(evidence, best, axis=0)[0]
-    age = jnp.asarray(AGES)[best[0]]
-    bias, stiffness = (jnp.take_along_axis(each, best, axis=0)[0] for each in _suppose(*supposed, 1.0)[1:])
+    tried = jnp.where(ages < onset.watched[None], evidence(ages), -CERTAIN)
+    best = jnp.argmax(tried, axis=0)
+    first = jnp.asarray(AGES)[best], jnp.take_along_axis(tried, best[None], axis=0)[0]
+    certain = (first[0] < onset.watched) & (first[1] > CERTAIN)
+    below, above = jnp.asarray(BOUNDS)[best], jnp.asarray(BOUNDS)[best + 2]
+
+    def beside():
+        age, most = first
+        for step in STEPS:
+            middle = age
+            for other in (middle - step, middle + step):
+                tried = certain & (other > below) & (other < above) & (other < onset.watched)
+                other = jnp.where(tried, other, middle)
+                one = evidence(other[None])[0]
+                more = tried & (one > most)
+                age, most = jnp.where(more, other, age), jnp.where(more, one, most)
+        return age, most
+
+    age = lax.cond(jnp.any(certain), beside, lambda: first)[0]
+    _, bias, stiffness = _suppose(onset, _sums_before(onset, tick, age[None]), age[None], *scales, 1.0)
     waited = (age > 1) & (age.astype(period.dtype) * period >= WAIT * (1 - 1e-9))
-    return Found((age < onset.watched) & (evidence > CERTAIN) & waited, age, bias, stiffness)
+    return Found(certain & waited, age, bias[0], stiffness[0])
 
 
 def nothing_found(like: Float[Array, "*batch"]) -> Found:
@@ -100,6 +128,12 @@ def logarithm(z: Array) -> Array:
     for _ in range(10):
         z = jnp.sqrt(z)
     return 2048 * (z - 1) / (z + 1)
+
+
+def _sums_before(onset, tick, ages):
+    """The sums (5, ages, *batch) so many ticks ago."""
+    slots = ((tick - ages) & (SLOTS - 1))[:, None]
+    return jnp.moveaxis(jnp.take_along_axis(onset.ring, slots, axis=0, mode="promise_in_bounds"), 1, 0)
 
 
 def _suppose(onset, before, ages, period, noise, unknown, rarity):

@@ -38,7 +38,7 @@ GENTLE = SHARP | {
     "correction_limit": 0.7,
     "replay_noise": 0.6,
 }
-USUAL_PRELOAD = 2.0  # 1/s
+USUAL_PRELOAD = 1.0  # 1/s
 LEAST_PLANE_SPREAD, MOST_PLANE_SPREAD = 1e-6, 0.1  # m
 
 

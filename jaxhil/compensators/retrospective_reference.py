@@ -62,6 +62,7 @@ from jaxhil.contact.laws import deflection
 FAREWELL = 0.006  # s for which it goes on after the hardware has left the surface
 MOST = 1.2  # of the peak force, that the model is to feel of the map
 LEAST_WEIGHT = 1e-9  # kg m/s, mass times approach speed: at less nothing is scaled by it
+MISFIT_TIME = 0.001  # s, over which a force may be off by the law's `misfit`
 
 
 class Episode(NamedTuple):
@@ -278,7 +279,7 @@ class RetrospectiveReference(Compensator):
         zone = gains["dead_zone"] / scales.weight
         spread = read.variance / scales.weight**2
         teaching = _Teaching(
-            history, scales, clearance, gains["force_noise_floor"] ** 2 + spread, zone, usable
+            history, scales, clearance, gains["force_noise_floor"] ** 2 + spread, slow, zone, usable
         )
         learnt, known, next_, learnt_deepest = self._catch_up(prepared, learnt, teaching, old)
         expected = force(known, depth, rate, hardware_deepest)
@@ -328,7 +329,7 @@ class RetrospectiveReference(Compensator):
                 depth,
                 scales.side * sample.velocity / scales.speed,
                 seen,
-                teaching.variance + (self.misfit * seen) ** 2,
+                teaching.variance + (self.misfit * seen) ** 2 * (MISFIT_TIME / teaching.period),
                 ~shown,
                 teaching.zone,
                 counts,
@@ -359,6 +360,7 @@ class _Teaching(NamedTuple):
     scales: Scales  # of the contact
     clearance: Array  # [m]
     variance: Array  # of a reading [1/s^2]
+    period: Array  # of a tick, in the contact's own time [s]
     zone: Array  # dead zone [1/s]
     usable: Array  # whether there is a contact
 

@@ -5,7 +5,8 @@
  * before, y = b, the sensor's bias. Its evidence against free flight throughout has a closed form in sums over the
  * readings; the surface is found when the evidence of the best tick, with how likely a surface is there, exceeds
  * e^9. The surface is expected at a place with a spread s: of a distance d s from there its density is
- * 1/(pi s (1 + d^2)). Scaled by approach speed and mass: forces in 1/s, K in 1/s^2.
+ * 1/(pi s (1 + d^2)). The farther back, the fewer ticks are tried; beside the best of them all are, by ever smaller
+ * steps. Scaled by approach speed and mass: forces in 1/s, K in 1/s^2.
  */
 #include <math.h>
 #include <stdbool.h>
@@ -15,7 +16,7 @@
 
 /* == Declarations == */
 
-enum { JAXHIL_AGES = 15, JAXHIL_SUMS = 5 };
+enum { JAXHIL_AGES = 15, JAXHIL_AGE_STEP = 32, JAXHIL_SUMS = 5 };
 
 /* Sums over the readings that the sensor showed since the flight began: 1, the tick m, m^2, y, m y. */
 typedef struct {
@@ -33,7 +34,9 @@ typedef struct {
 
 /* == Definitions == */
 
-static const long jaxhil_ages[JAXHIL_AGES] = {1, 2, 3, 4, 5, 6, 8, 11, 16, 24, 36, 56, 88, 140, 224};
+/* The first and the last are not tried. */
+static const long jaxhil_ages[JAXHIL_AGES + 2] = {0,  1,  2,  3,  4,  5,  6,   8,  11,
+                                                  16, 24, 36, 56, 88, 140, 224, 225};
 static const double jaxhil_onset_stiffness = 300.0, jaxhil_onset_stiffness_variance = 160000.0;
 static const double jaxhil_onset_jump_variance = 36.0;
 static const double jaxhil_onset_certain = 9.0;

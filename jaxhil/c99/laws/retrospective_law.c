@@ -43,6 +43,7 @@ static const double jaxhil_farewell = 0.006;  /* s for which it goes on after th
 static const double jaxhil_usual_pace = 14.0; /* 1/s: slower contact is followed on a slower scale of time */
 static const double jaxhil_slowest = 0.01;    /* of that */
 static const double jaxhil_most = 1.2;        /* of the peak force, that the model is to feel of the map */
+static const double jaxhil_misfit_time = 0.001; /* s, over which a force may be off by the law's misfit */
 static const double jaxhil_margin = 0.0625;   /* of the stretch between two samples, off whose end the surface is */
 static const double jaxhil_least_weight = 1e-9; /* kg m/s, mass times approach speed: less does not scale */
 enum { JAXHIL_READINGS = 2 };                 /* per tick that the map learns from, while it has to catch up */
@@ -126,7 +127,8 @@ static void jaxhil_law_learn(jaxhil_law *law, double variance, double zone) {
         }
         law->doubts.readings += depth > 0.0 && !hidden;
         const double off = jaxhil_misfit * force;
-        jaxhil_learnt_read(&law->learnt, depth, rate, law->learnt_deepest, force, variance + off * off,
+        const double misfit = off * off * (jaxhil_misfit_time / law->reference.period);
+        jaxhil_learnt_read(&law->learnt, depth, rate, law->learnt_deepest, force, variance + misfit,
                            hidden, zone);
     }
 }
@@ -219,28 +221,46 @@ static void jaxhil_law_meet(jaxhil_law *law, double side, double reach, double s
     jaxhil_reference_motion_begin(&law->reference, history, entry, since, depth > 0.0 ? depth : 0.0);
 }
 
-/* Flying to the surface on this side with this speed [m/s]: whether the force tells that it was met. */
-static bool jaxhil_law_watch(jaxhil_law *law, double side, double speed, double force, bool shown,
-                             jaxhil_found *found) {
+/* Flying to the surface on this side with this speed [m/s]: that it was met so many ticks ago is `found` if that is
+ * more evident. */
+static void jaxhil_law_suppose(const jaxhil_law *law, double side, double speed, long age, jaxhil_found *found) {
     const double weight = law->mass * speed;
     const double noise =
         law->floor * law->floor + jaxhil_force_noise_variance(&law->noise) / (weight * weight);
     const double spread = law->bias_spread / weight;
     const jaxhil_plane *plane = &law->planes[side < 0.0];
-    jaxhil_onset_take(&law->onset, side * force / weight, shown);
+    const double position = jaxhil_history_recall(&law->history, law->history.newest - age)->position;
+    const double place = (side < 0.0 ? -law->clearance - position : position) - plane->place;
+    const double away = place / plane->spread;
+    const double rarity = jaxhil_map_pi * plane->spread * (1.0 + away * away) / (law->period * speed);
+    jaxhil_found one;
+    one.age = age;
+    one.evidence = jaxhil_onset_evidence(&law->onset, age, noise, spread * spread, rarity, &one);
+    if (one.evidence > found->evidence) {
+        *found = one;
+    }
+}
+
+/* Whether the force tells that the surface was met. */
+static bool jaxhil_law_watch(jaxhil_law *law, double side, double speed, double force, bool shown,
+                             jaxhil_found *found) {
+    jaxhil_onset_take(&law->onset, side * force / (law->mass * speed), shown);
     found->evidence = jaxhil_onset_certain;
     found->age = 0;
-    for (int i = 0; i < JAXHIL_AGES && jaxhil_ages[i] < law->onset.watched; i++) {
-        const long age = jaxhil_ages[i];
-        const double position = jaxhil_history_recall(&law->history, law->history.newest - age)->position;
-        const double place = (side < 0.0 ? -law->clearance - position : position) - plane->place;
-        const double away = place / plane->spread;
-        const double rarity = jaxhil_map_pi * plane->spread * (1.0 + away * away) / (law->period * speed);
-        jaxhil_found one;
-        one.age = age;
-        one.evidence = jaxhil_onset_evidence(&law->onset, age, noise, spread * spread, rarity, &one);
-        if (one.evidence > found->evidence) {
-            *found = one;
+    long below = 0, above = 0;
+    for (int i = 1; i <= JAXHIL_AGES && jaxhil_ages[i] < law->onset.watched; i++) {
+        jaxhil_law_suppose(law, side, speed, jaxhil_ages[i], found);
+        if (found->age == jaxhil_ages[i]) {
+            below = jaxhil_ages[i - 1];
+            above = jaxhil_ages[i + 1];
+        }
+    }
+    for (long step = JAXHIL_AGE_STEP; step > 0 && found->age > 0; step /= 2) {
+        const long middle = found->age;
+        for (long age = middle - step; age <= middle + step; age += 2 * step) {
+            if (age > below && age < above && age < law->onset.watched) {
+                jaxhil_law_suppose(law, side, speed, age, found);
+            }
         }
     }
     return found->age > 1 && (double)found->age * law->period >= jaxhil_onset_wait * (1.0 - 1e-9);

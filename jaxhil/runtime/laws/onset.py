@@ -5,16 +5,20 @@ force would be y = b + B + K s, s the time since the middle of that tick, K ~ N(
 before, y = b, the sensor's bias. Its evidence against free flight throughout has a closed form in sums over
 the readings; the surface is found when the evidence of the best tick, with how likely a surface is there,
 exceeds e^CERTAIN. The surface is expected at a place with a spread s: of a distance d s from there its
-density is 1/(pi s (1 + d^2)). Scaled by approach speed and mass: forces in 1/s, K in 1/s^2.
+density is 1/(pi s (1 + d^2)). The farther back, the fewer ticks are tried; beside the best of them all are,
+by ever smaller steps. Scaled by approach speed and mass: forces in 1/s, K in 1/s^2.
 """
 
+from collections.abc import Callable
 from math import pi, sqrt
 from typing import NamedTuple
 
 from .history import SLOTS
 
-# Ticks since the surface was met that are told apart.
+# Ticks since the surface was met that are tried first, what bounds them, and the steps from the best of them.
 AGES = (1, 2, 3, 4, 5, 6, 8, 11, 16, 24, 36, 56, 88, 140, 224)
+BOUNDS = (0, *AGES, 225)
+STEPS = (32, 16, 8, 4, 2, 1)
 STIFFNESS = 300.0  # K0 [1/s^2]
 STIFFNESS_VARIANCE = 160000.0  # s_K^2 [1/s^4]
 JUMP_VARIANCE = 36.0  # s_B^2 [1/s^2]
@@ -59,9 +63,27 @@ class Onset:
             sums = (number + 1.0, ticks + m, squares + m * m, forces + force, moments + m * force)
         self._sums[self._watched % SLOTS] = sums
 
-    def ages(self) -> tuple[int, ...]:
-        """Those of `AGES` at which this flight had begun."""
-        return tuple(age for age in AGES if age < self._watched)
+    def find(self, noise: float, unknown: float, rarity: Callable[[int], float]) -> Found | None:
+        """The surface, if the readings tell of one; `rarity` is of each age, for the rest see `suppose`."""
+        best = None
+        below = above = 0
+        for place, age in enumerate(AGES):
+            if age >= self._watched:
+                break
+            one = self.suppose(age, noise, unknown, rarity(age))
+            if one.evidence > (best.evidence if best else CERTAIN):
+                best = one
+                below, above = BOUNDS[place], BOUNDS[place + 2]
+        if best is None:
+            return None
+        for step in STEPS:
+            middle = best.age
+            for age in (middle - step, middle + step):
+                if below < age < above and age < self._watched:
+                    one = self.suppose(age, noise, unknown, rarity(age))
+                    best = one if one.evidence > best.evidence else best
+        waited = best.age > 1 and float(best.age) * self._period >= WAIT * (1.0 - 1e-9)
+        return best if waited else None
 
     def suppose(self, age: int, noise: float, unknown: float, rarity: float) -> Found:
         """What the readings say of a surface met `age` ticks ago.

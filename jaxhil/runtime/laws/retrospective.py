@@ -30,7 +30,7 @@ from .contact_plane import ContactPlane, Meeting, found_variance
 from .doubts import FAR, Doubts
 from .force_depth_map import SURFACE, Prior
 from .history import History
-from .onset import CERTAIN, WAIT, Found, Onset, rarity
+from .onset import Found, Onset, rarity
 from .readings import Alignment, ForceNoise
 from .reintegration import ReferenceMotion, Scales
 
@@ -38,6 +38,7 @@ FAREWELL = 0.006  # s for which it goes on after the hardware has left the surfa
 USUAL_PACE = 14.0  # 1/s: slower contact is followed on a slower scale of time
 SLOWEST = 0.01  # of that
 MOST = 1.2  # of the peak force, that the model is to feel of the map
+MISFIT_TIME = 0.001  # s, over which a force may be off by the law's `misfit`
 MARGIN = 0.0625  # of the stretch between two samples, that the surface is off its end
 LEAST_WEIGHT = 1e-9  # kg m/s, mass times approach speed: at less nothing is scaled by it
 READINGS = 2  # per tick that the map learns from, while it has to catch up
@@ -203,23 +204,17 @@ class Retrospective(Compensator):
         weight = self._mass * speed
         noise = self._floor * self._floor + self._noise.variance / (weight * weight)
         spread = self._bias_spread / weight
-        unknown = spread * spread
         onset = self._onset
         history = self._history
         plane = self._planes[side]
         width = self._period * speed
         onset.take(side * force / weight, shown)
-        best = CERTAIN
-        found = None
-        for age in onset.ages():
+
+        def rare(age: int) -> float:
             away = scales.beyond(history.recall(history.newest - age).position) - plane.place
-            one = onset.suppose(age, noise, unknown, rarity(away, plane.spread, width))
-            if one.evidence > best:
-                best = one.evidence
-                found = one
-        if found is None or not (found.age > 1 and float(found.age) * self._period >= WAIT * (1.0 - 1e-9)):
-            return None
-        return found
+            return rarity(away, plane.spread, width)
+
+        return onset.find(noise, spread * spread, rare)
 
     def _meet(self, side: float, speed: float, position: float, found: Found) -> None:
         """A surface is found, met between two samples: between them it lies where it was most expected."""
@@ -330,7 +325,8 @@ class Retrospective(Compensator):
             if depth > 0.0 and shown:
                 self._doubts.readings += 1
             off = self.misfit * force
-            self._learn(depth, rate, self._learnt_deepest, force, variance + off * off, not shown, zone)
+            misfit = off * off * (MISFIT_TIME / self._reference.period)
+            self._learn(depth, rate, self._learnt_deepest, force, variance + misfit, not shown, zone)
             self._next += 1
 
     def _pass_on(self, force: float, position_desired: float, position: float) -> tuple[float, bool]:
