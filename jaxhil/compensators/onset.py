@@ -92,17 +92,19 @@ def find(
     certain = (first[0] < onset.watched) & (first[1] > CERTAIN)
     below, above = jnp.asarray(BOUNDS)[best], jnp.asarray(BOUNDS)[best + 2]
 
+    def nearer(reached, step):
+        age, most = reached
+        others = jnp.stack([age - step, age + step])
+        within = (others > below[None]) & (others < above[None]) & (others < onset.watched[None])
+        tried = certain[None] & within
+        found = jnp.where(tried, evidence(jnp.where(tried, others, age[None])), most[None])
+        for other, one in zip(others, found, strict=True):
+            age, most = jnp.where(one > most, other, age), jnp.maximum(one, most)
+        return (age, most), None
+
     def beside():
-        age, most = first
-        for step in STEPS:
-            middle = age
-            for other in (middle - step, middle + step):
-                tried = certain & (other > below) & (other < above) & (other < onset.watched)
-                other = jnp.where(tried, other, middle)
-                one = evidence(other[None])[0]
-                more = tried & (one > most)
-                age, most = jnp.where(more, other, age), jnp.where(more, one, most)
-        return age, most
+        # A loop that is not written out: what each step compares hangs on all steps before.
+        return lax.scan(nearer, first, jnp.asarray(STEPS, jnp.int32))[0]
 
     age = lax.cond(jnp.any(certain), beside, lambda: first)[0]
     _, bias, stiffness = _suppose(onset, _sums_before(onset, tick, age[None]), age[None], *scales, 1.0)
