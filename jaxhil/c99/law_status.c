@@ -1,7 +1,7 @@
 /* What a law says of its own command: its status after each tick, counted over a contact. The contact is not
  * reached where no force was measured; unsure where the law did not act; else unsure, too short, displaced or
  * noisy, by the most frequent, where the law was any of them on more than two fifths of the ticks on which it acted;
- * else saturated, where its correction was at its limit on more than half of them; else identified.
+ * else unexplained or saturated, where it was so on the last of them; else identified.
  */
 #include <stdbool.h>
 #include <stdint.h>
@@ -11,26 +11,28 @@
 /* == Declarations == */
 
 /* What the law said of a contact: the contact's number, 0 before the first; on how many ticks the law acted, and
- * on how many of them it was unsure, saturated, or found the contact too short, displaced or noisy; the status
- * that counts. */
+ * on how many of them it was unsure, saturated, or found the contact too short, displaced or noisy; its status on
+ * the last of them, and the status that counts. */
 typedef struct {
     int64_t number, ticks, unsure, saturated, too_short, displaced, noisy;
-    int status;
+    int last, status;
 } jaxhil_contact_record;
 
 /* == Definitions == */
 
 static const double jaxhil_doubtful = 0.4; /* of the ticks on which the law acts */
-static const double jaxhil_saturating = 0.5;
 
 static jaxhil_contact_record jaxhil_contact_record_begin(int64_t number, int status) {
-    const jaxhil_contact_record record = {number, 0, 0, 0, 0, 0, 0, status};
+    const jaxhil_contact_record record = {number, 0, 0, 0, 0, 0, 0, JAXHIL_OUT_OF_CONTACT, status};
     return record;
 }
 
 /* One tick's status. */
 static void jaxhil_contact_record_take(jaxhil_contact_record *record, int status) {
-    record->ticks += status != JAXHIL_UNSTATED && status != JAXHIL_OUT_OF_CONTACT;
+    if (status != JAXHIL_UNSTATED && status != JAXHIL_OUT_OF_CONTACT) {
+        record->ticks++;
+        record->last = status;
+    }
     record->unsure += status == JAXHIL_UNSURE;
     record->saturated += status == JAXHIL_SATURATED;
     record->too_short += status == JAXHIL_TOO_SHORT;
@@ -56,8 +58,8 @@ static bool jaxhil_contact_record_end(jaxhil_contact_record *record, bool measur
         record->status = JAXHIL_UNSURE;
     } else if ((double)all > jaxhil_doubtful * (double)record->ticks) {
         record->status = statuses[most];
-    } else if ((double)record->saturated > jaxhil_saturating * (double)record->ticks) {
-        record->status = JAXHIL_SATURATED;
+    } else if (record->last == JAXHIL_UNEXPLAINED || record->last == JAXHIL_SATURATED) {
+        record->status = record->last;
     }
     return record->status != JAXHIL_IDENTIFIED;
 }

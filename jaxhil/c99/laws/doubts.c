@@ -1,8 +1,8 @@
 /* What speaks against a contact's being known, scaled by approach speed and equivalent mass: it is unsure, where it
  * was hardly read; too short, where the hardware entered when half of it was over; displaced, where its surface is
  * far from where it was told; noisy, where the force that the map expects is uncertain by a hundredth of its peak,
- * the dead zone is a tenth of that, or second differences show that the measured position is noisy; else
- * identified.
+ * the dead zone is a tenth of that, or second differences show that the measured position is noisy; unexplained,
+ * where the readings are not those of contact that the map can be (balance.c); else identified.
  */
 #include <stdbool.h>
 
@@ -12,11 +12,12 @@
 /* == Declarations == */
 
 /* Of one contact: position [m] measured last and its step; squares and number of second differences; by how much
- * [s] the hardware entered late; readings in contact; whether its surface is far from where it was told. */
+ * [s] the hardware entered late; readings in contact; whether its surface is far from where it was told, and whether the
+ * readings are unexplained. */
 typedef struct {
     double position, step, swings, swung, late;
     long readings;
-    bool displaced;
+    bool displaced, unexplained;
 } jaxhil_doubts;
 
 /* == Definitions == */
@@ -38,6 +39,7 @@ static void jaxhil_doubts_restart(jaxhil_doubts *doubts) {
     doubts->readings = 0;
     doubts->late = 0.0;
     doubts->displaced = false;
+    doubts->unexplained = false;
     doubts->swings = 0.0;
     doubts->swung = 0.0;
 }
@@ -69,5 +71,5 @@ static int jaxhil_doubts_status(const jaxhil_doubts *doubts, double peak, double
         doubts->swings > 6.0 * doubts->swung * (shaking * shaking)) {
         return JAXHIL_NOISY;
     }
-    return JAXHIL_IDENTIFIED;
+    return doubts->unexplained ? JAXHIL_UNEXPLAINED : JAXHIL_IDENTIFIED;
 }

@@ -208,6 +208,17 @@ static double jaxhil_curve_elastic(const jaxhil_curve *curve, double depth) {
     return curve->at_knots[segment] + curve->slopes[segment] * (depth - jaxhil_knots[segment]);
 }
 
+/* What is stored at a depth: the integral of the elastic force. */
+static double jaxhil_curve_stored(const jaxhil_curve *curve, double depth) {
+    double stored = 0.0;
+    for (int j = 0; j < JAXHIL_SEGMENTS && depth > jaxhil_knots[j]; j++) {
+        const bool through = j + 1 < JAXHIL_SEGMENTS && depth > jaxhil_knots[j + 1];
+        const double width = (through ? jaxhil_knots[j + 1] : depth) - jaxhil_knots[j];
+        stored += (curve->at_knots[j] + 0.5 * (curve->slopes[j] * width)) * width;
+    }
+    return stored;
+}
+
 /* Force [1/s], 0 out of contact. */
 static double jaxhil_curve_force(const jaxhil_curve *curve, double depth, double speed, double deepest) {
     if (!(depth > 0.0)) {

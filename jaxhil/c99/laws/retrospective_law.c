@@ -10,6 +10,7 @@
 #include <stdbool.h>
 
 #include "contact_plane.c"
+#include "balance.c"
 #include "doubts.c"
 #include "gains_table.c"
 #include "history.c"
@@ -33,6 +34,7 @@ typedef struct {
     jaxhil_history history;
     jaxhil_onset onset;
     jaxhil_doubts doubts;
+    jaxhil_balance balance;
     bool started;
     int status;
 } jaxhil_law;
@@ -59,6 +61,7 @@ static void jaxhil_law_restart(jaxhil_law *law) {
     jaxhil_history_restart(&law->history);
     jaxhil_onset_restart(&law->onset);
     jaxhil_doubts_restart(&law->doubts);
+    jaxhil_balance_restart(&law->balance);
     law->started = false;
     law->status = JAXHIL_OUT_OF_CONTACT;
 }
@@ -128,6 +131,11 @@ static void jaxhil_law_learn(jaxhil_law *law, double variance, double zone) {
         law->doubts.readings += depth > 0.0 && !hidden;
         const double off = jaxhil_misfit * force;
         const double misfit = off * off * (jaxhil_misfit_time / law->reference.period);
+        if (!hidden) {
+            jaxhil_balance_take(&law->balance, jaxhil_learnt_curve(&law->learnt), depth,
+                                law->reference.shift * rate + law->reference.deeper, rate, law->learnt_deepest,
+                                force, variance + misfit, jaxhil_learnt_variance(&law->learnt));
+        }
         jaxhil_learnt_read(&law->learnt, depth, rate, law->learnt_deepest, force, variance + misfit,
                            hidden, zone);
     }
@@ -168,6 +176,9 @@ static double jaxhil_law_follow(jaxhil_law *law, double x, double v, double dept
     if (own > most) {
         own = most;
     }
+    law->doubts.unexplained =
+        jaxhil_balance_unexplained(&law->balance, curve, peak, law->learnt_deepest, reference->shift,
+                                   law->pace);
     const double correction = jaxhil_law_repayment(law, peak, v - 0.5 * reference->period * own, zone);
     return *separated ? correction : own + (force - expected) + correction;
 }
@@ -216,6 +227,7 @@ static void jaxhil_law_meet(jaxhil_law *law, double side, double reach, double s
     law->learnt_deepest = 0.0;
     law->next = entry + 1 - (earlier < entry ? earlier : entry);
     jaxhil_doubts_restart(&law->doubts);
+    jaxhil_balance_restart(&law->balance);
     law->doubts.late = depth - (double)found.age * law->reference.period;
     law->doubts.displaced = place > far || place < -far;
     jaxhil_reference_motion_begin(&law->reference, history, entry, since, depth > 0.0 ? depth : 0.0);

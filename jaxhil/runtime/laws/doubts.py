@@ -8,12 +8,13 @@ The first that holds is reported, with p the peak force that the map predicts, s
     noisy        the force that the map expects where it was read last has a standard deviation above WIDE p;
                  the sensor's dead zone is above HIDING p; the measured position's noise is above SHAKING: the
                  mean square of its second differences is 6 times its variance: the motion has hardly any
+    unexplained  the readings are not those of contact that the map can be (`balance`)
     identified   else
 """
 
 from math import pi
 
-from ..law_status import DISPLACED, IDENTIFIED, NOISY, TOO_SHORT, UNSURE
+from ..law_status import DISPLACED, IDENTIFIED, NOISY, TOO_SHORT, UNEXPLAINED, UNSURE
 
 FEW = 5
 LATE = 0.5
@@ -26,7 +27,7 @@ SHAKING = 0.0005  # s, over the approach speed
 class Doubts:
     """What is counted of one contact."""
 
-    __slots__ = ("_position", "_step", "_swings", "_swung", "displaced", "late", "readings")
+    __slots__ = ("_position", "_step", "_swings", "_swung", "displaced", "late", "readings", "unexplained")
 
     def __init__(self) -> None:
         self.start(0.0, 0.0)
@@ -42,6 +43,7 @@ class Doubts:
         self.readings = 0  # in contact
         self.late = 0.0  # by how much [s] the hardware enters after the numerical model
         self.displaced = False  # whether its surface is far from where it was told
+        self.unexplained = False  # whether the readings are
         self._swings = 0.0
         self._swung = 0.0
 
@@ -68,4 +70,4 @@ class Doubts:
         hides = zone > HIDING * peak
         if hides or variance > wide * wide or self._swings > 6.0 * self._swung * (shaking * shaking):
             return NOISY
-        return IDENTIFIED
+        return UNEXPLAINED if self.unexplained else IDENTIFIED

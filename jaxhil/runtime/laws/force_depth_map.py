@@ -88,6 +88,17 @@ class Curve:
             return 0.0
         return self.at_knots[segment] + self.slopes[segment] * (depth - KNOTS[segment])
 
+    def stored(self, depth: float) -> float:
+        """What is stored at a depth [s]: the integral of `elastic`."""
+        stored = 0.0
+        for j in range(SEGMENTS):
+            if not depth > KNOTS[j]:
+                break
+            through = j + 1 < SEGMENTS and depth > KNOTS[j + 1]
+            width = (KNOTS[j + 1] if through else depth) - KNOTS[j]
+            stored += (self.at_knots[j] + 0.5 * (self.slopes[j] * width)) * width
+        return stored
+
     def force(self, depth: float, speed: float, deepest: float) -> float:
         """Force [1/s], 0 out of contact; the deepest point may be short of the depth."""
         if not depth > 0.0:

@@ -26,6 +26,7 @@ from ..bounds import DAMPINGS_BY_MASS, FORCES, MASSES, STIFFNESSES_BY_MASS, TIME
 from ..law_status import IDENTIFIED, OUT_OF_CONTACT, SATURATED, UNSURE
 from ..registry import Compensator, GainSpecification
 from ..surfaces import deflection
+from .balance import Balance
 from .contact_plane import ContactPlane, Meeting, found_variance
 from .doubts import FAR, Doubts
 from .force_depth_map import SURFACE, Prior
@@ -67,7 +68,7 @@ class Retrospective(Compensator):
     """
 
     __slots__ = (
-        "_alignment", "_bias_spread", "_clearance", "_curve", "_dead_zone", "_deeper", "_deepest",
+        "_alignment", "_balance", "_bias_spread", "_clearance", "_curve", "_dead_zone", "_deeper", "_deepest",
         "_doubts", "_floor", "_gone", "_hardware_deepest", "_history", "_learnt_deepest", "_limit", "_mass",
         "_next", "_noise", "_onset", "_pace", "_period", "_plane_spread", "_planes", "_reference", "_replay",
         "_scales", "_shift", "_side", "_speed", "_started", "_strength", "_velocity_gain", "status",
@@ -115,6 +116,7 @@ class Retrospective(Compensator):
         self._replay = gains["force_replay"]
         self._strength = gains["replay_noise"] * gains["replay_noise"]
         self._doubts = Doubts()
+        self._balance = Balance()
         self._shift = 0.0
         self._deeper = 0.0
         self._prepare(gains, Prior(*(gains[name] for name in PRIOR)))
@@ -174,6 +176,7 @@ class Retrospective(Compensator):
         self._history.restart()
         self._onset.restart()
         self._doubts.restart()
+        self._balance.restart()
         self._started = False
         self.status = OUT_OF_CONTACT
 
@@ -252,6 +255,7 @@ class Retrospective(Compensator):
         self._learnt_deepest = 0.0
         self._next = entry + 1 - min(earlier, entry)
         self._doubts.restart()
+        self._balance.restart()
         self._doubts.late = depth - float(found.age) * self._reference.period
         self._doubts.displaced = abs(self.contact_plane) > FAR * self._plane_spread
         self._reference.begin(entry, start, since, depth if depth > 0.0 else 0.0)
@@ -303,6 +307,9 @@ class Retrospective(Compensator):
         most = MOST * peak
         if own > most:
             own = most
+        self._doubts.unexplained = self._balance.unexplained(
+            curve, peak, self._learnt_deepest, reference.shift, self._pace
+        )
         correction = self._repayment(peak, v - 0.5 * reference.period * own, zone)
         command = correction if separated else own + (read - expected) + correction
         return self._side * scales.weight * command, separated
@@ -312,6 +319,7 @@ class Retrospective(Compensator):
         [1/s^2], the dead zone [1/s]."""
         history = self._history
         scales = self._scales
+        reference = self._reference
         for _ in range(READINGS):
             if self._next > history.newest:
                 break
@@ -325,8 +333,12 @@ class Retrospective(Compensator):
             if depth > 0.0 and shown:
                 self._doubts.readings += 1
             off = self.misfit * force
-            misfit = off * off * (MISFIT_TIME / self._reference.period)
-            self._learn(depth, rate, self._learnt_deepest, force, variance + misfit, not shown, zone)
+            misfit = off * off * (MISFIT_TIME / reference.period)
+            one = rate, self._learnt_deepest, force, variance + misfit
+            if shown:
+                moved = reference.shift * rate + reference.deeper
+                self._balance.take(self._curve, depth, moved, *one, self._variance())
+            self._learn(depth, *one, not shown, zone)
             self._next += 1
 
     def _pass_on(self, force: float, position_desired: float, position: float) -> tuple[float, bool]:
