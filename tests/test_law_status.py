@@ -339,14 +339,21 @@ def test_what_the_shares_rest_on(suite, setting):
         assert most > DOUBTFUL
 
 
+class Wrong(NamedTuple):
+    """What differs from the nominal mechanism, and what of it the controller knows."""
+
+    changes: tuple[str, ...] = ()
+    known: tuple[str, ...] = ()
+
+
 WRONG = {
-    "nothing": (),
-    "surface 10 ms x v0 deeper": ("rig.contact_plane=5e-5",),
-    "surface 10 ms x v0 nearer": ("rig.contact_plane=-5e-5",),
-    "position noise of 1 ms x v0": ("rig.position_sensor.noise_std=5e-6",),
-    "force noise of 9 %, dead zone of 12 N": (
-        "rig.force_sensor.noise_std=2.667",
-        "rig.force_sensor.dead_zone=12.0",
+    "nothing": Wrong(),
+    "surface 1 mm deeper": Wrong(("rig.contact_plane=1e-3",)),
+    "surface 1 mm nearer": Wrong(("rig.contact_plane=-1e-3",)),
+    "force 1 ms older than told": Wrong(("rig.force_sensor.delay=0.009",)),
+    "position noise of 1 ms x v0": Wrong(known=("rig.position_sensor.noise_std=5e-6",)),
+    "force noise of 9 %, dead zone of 12 N": Wrong(
+        known=("rig.force_sensor.noise_std=2.667", "rig.force_sensor.dead_zone=12.0")
     ),
 }
 
@@ -354,24 +361,24 @@ WRONG = {
 @pytest.mark.slow
 @pytest.mark.parametrize("law", [LAW, "retrospective_delay_bank"])
 @pytest.mark.parametrize("wrong", WRONG)
-def test_what_is_called_identified_errs_like_an_ordinary_contact(wrong, law):
-    """By less than 1 %, whatever is wrong; and where nothing is, all are identified. The controller knows the
-    nominal mechanism and its sensors."""
-    changes, contacts = WRONG[wrong], 100
-    known = load("suite-noisy", [change for change in changes if "sensor" in change]).mechanism
+def test_of_what_is_called_identified_hardly_any_errs(wrong, law):
+    """Whatever is wrong, by more than 1.5 %; and where nothing is, 98 in 100 are identified."""
+    (changes, known), contacts = WRONG[wrong], 100
+    told = load("suite-noisy", list(known)).mechanism
+    odd = identified = 0
     for suite in ("noisy", "hertz", "hardening", "layered"):
         errors, said = np.empty(contacts), []
-        for place, mechanism in enumerate(contacts_of(suite, 6, contacts, changes)):
-            one = controller(mechanism, law, literature_gains(known, law))
+        for place, mechanism in enumerate(contacts_of(suite, 6, contacts, (*changes, *known))):
+            one = controller(mechanism, law, literature_gains(told, law))
             velocity = run(mechanism, one, place).rows[:, ROW.index("velocity")]
             errors[place] = 100 * (abs(velocity[-1]) / velocity[0] - 1)
             said.append(one.last_contact.status)
         counts = {status: said.count(status) for status in sorted(set(said))}
-        known = np.abs(errors[[status == "identified" for status in said]])
+        passed = np.abs(errors[[status == "identified" for status in said]])
         rms = float(np.sqrt(np.mean(errors**2)))
         print(f"{law}, {wrong}, {suite}: error {rms:.2f} % rms, {np.max(np.abs(errors)):.2f} % at most")
-        print(f"  {counts}, identified: {np.max(known, initial=0.0):.2f} % at most")
-        if changes:
-            assert np.max(known, initial=0.0) < 1.0 and len(known) < 0.5 * contacts
-        else:
-            assert np.quantile(known, 0.99) < 1.5 and len(known) == contacts
+        print(f"  {counts}, identified: {np.max(passed, initial=0.0):.2f} % at most")
+        odd, identified = odd + int(np.sum(passed > 1.5)), identified + len(passed)
+    assert odd <= 0.01 * 4 * contacts
+    if not (changes or known):
+        assert identified >= 0.98 * 4 * contacts
