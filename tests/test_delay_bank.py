@@ -222,8 +222,11 @@ def test_an_unknown_delay_is_found_and_leaves_little(repeated):
 
 @pytest.mark.slow
 def test_what_an_unknown_delay_leaves_on_the_standard_suites(capsys):
-    """Eight contacts of 200 scenarios a suite, the delay unknown to +-1 ms, the phase drawn for each."""
+    """Eight contacts of 200 scenarios a suite, the delay unknown to +-1 ms, the phase drawn for each.
+
+    Damped ones slow down from contact to contact, which makes more of the noise."""
     squares = []
+    first = {"noisy": 0.75, "damped": 0.75}
     for suite in ("noisy", "damped", "hertz", "hardening", "layered"):
         mechanism = load(f"suite-{suite}", ["approach.contacts=8", DELAYS]).mechanism
         rms = {}
@@ -239,10 +242,22 @@ def test_what_an_unknown_delay_leaves_on_the_standard_suites(capsys):
             given, ours = rms.values()
             print(f"{suite:10s} rms [%], contacts 1, 2, 4, 8:", *np.round(ours[[0, 1, 3, 7]], 2), end="")
             print("; delay taken as given:", *np.round(given[[0, 7]], 2))
-    first, *_, eighth = np.sqrt(np.mean(squares, axis=0))
+        assert ours[0] <= first.get(suite, 0.4) and (ours[7] <= 0.3 or suite == "damped")
+    whole = np.sqrt(np.mean(squares, axis=0))
     with capsys.disabled():
-        print(f"all five: {first:.2f} on the first, {eighth:.2f} on the eighth")
-    assert np.max(squares, axis=0)[0] <= 0.8**2 and eighth <= 0.4
+        print(f"all five: {whole[0]:.2f} on the first, {whole[7]:.2f} on the eighth")
+    assert whole[7] <= 0.4
+
+
+@pytest.mark.slow
+def test_what_an_unknown_delay_leaves_of_damped_contact_is_the_control_periods():
+    rms = []
+    for period in (0.001, 0.00025):
+        mechanism = load("suite-damped", [DELAYS, f"rig.control_period={period}"]).mechanism
+        scenarios = build_scenarios(mechanism, draw(mechanism, 100, 78), 78)
+        outcome = evaluate(build_loop(mechanism, LAW, scenarios), literature_gains(mechanism, LAW), scenarios)
+        rms.append(100 * np.sqrt(np.mean(np.asarray(outcome.error)[0] ** 2)))
+    assert rms[1] <= 0.6 * rms[0] <= 0.6 * 0.85
 
 
 def test_simulate_and_the_controller_report_the_delay(jaxhil):

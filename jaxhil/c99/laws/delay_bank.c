@@ -46,6 +46,7 @@ static const double jaxhil_bank_nothing = 1e-300; /* a smaller product is none: 
 static const double jaxhil_bank_least_carried = 1e-12;
 static const double jaxhil_bank_least_shift = 1e-12; /* s: where nothing tells delays apart, rounding does not */
 static const double jaxhil_bank_late = 25.0; /* times the variance of where it was met: soft surfaces are found late */
+static const double jaxhil_bank_elsewhere = 9.0; /* times the variance of where it is expected: it is not there */
 static const long jaxhil_bank_earlier = 30;  /* ticks before it was met, whose readings count */
 enum { JAXHIL_SQUARINGS = 10, JAXHIL_DENSITY_SQUARINGS = 8 };
 
@@ -242,7 +243,7 @@ static double jaxhil_bank_share(const jaxhil_learnt *bank, const jaxhil_meeting 
     const double known = bank->plane_spread * bank->plane_spread;
     const double found = jaxhil_bank_late * meeting->variance;
     const double away = fabs(meeting->place) - bank->offsets[JAXHIL_HYPOTHESES - 1] * meeting->speed;
-    const bool elsewhere = away > 0.0 && away * away > jaxhil_plane_elsewhere * (known + found);
+    const bool elsewhere = away > 0.0 && away * away > jaxhil_bank_elsewhere * (known + meeting->variance);
     return elsewhere ? 1.0 : known / (known + found);
 }
 

@@ -13,7 +13,7 @@ from math import ceil, pi, sqrt
 
 import numpy as np
 
-from .contact_plane import ELSEWHERE, Meeting
+from .contact_plane import Meeting
 from .force_depth_map import (
     DAMPING,
     DEPTH_DAMPING,
@@ -40,6 +40,7 @@ NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, 
 SQUARINGS, DENSITY_SQUARINGS = 10, 8
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
 SOFT = 25.0  # times the variance of where a surface was met: soft ones are found late
+ELSEWHERE = 9.0  # times the variance of where it is expected: it is not there
 EARLIER = 30  # ticks before it was met, whose readings count
 
 _KNOTS = np.array(KNOTS)[:, None]
@@ -119,7 +120,7 @@ class DelayBank:
         known = self._plane_spread * self._plane_spread
         found = SOFT * meeting.variance
         away = abs(meeting.place) - float(self._offsets[-1]) * meeting.speed
-        elsewhere = away > 0.0 and away * away > ELSEWHERE * (known + found)
+        elsewhere = away > 0.0 and away * away > ELSEWHERE * (known + meeting.variance)
         return 1.0 if elsewhere else known / (known + found)
 
     def _restart(self) -> None:
