@@ -99,7 +99,7 @@ def reading_at(history: History, index: Int[Array, "*batch"]) -> tuple[Array, Bo
 
 
 def positions_before(
-    history: History, tick: Int[Array, ""], ages: Int[Array, "ages *batch"]
+    history: History, tick: Int[Array, ""], ages: Int[Array, "ages *#batch"]
 ) -> Float[Array, "ages *batch"]:
     """The positions [m] so many ticks ago, less than 256."""
     return jnp.take_along_axis(
