@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from jaxhil.compensators.base import Gain, rig_gain
+from jaxhil.compensators.base import Gain, Gains, rig_gain
 from jaxhil.compensators.estimates import (
     contact_plane_spread,
     force_bias,
@@ -11,6 +11,7 @@ from jaxhil.compensators.estimates import (
     peak_force,
     preload,
 )
+from jaxhil.compensators.force_depth_map import Map, prior
 from jaxhil.mechanism.structs import Mechanism
 
 # Two sets of gains for any mechanism, each judged on linear, damped, Hertzian, hardening and layered contact
@@ -40,6 +41,20 @@ GENTLE = SHARP | {
 }
 USUAL_PRELOAD = 1.0  # 1/s
 LEAST_PLANE_SPREAD, MOST_PLANE_SPREAD = 1e-6, 0.1  # m
+
+
+def map_prior(gains: Gains) -> Map:
+    """The map before the first reading of a contact, of the gains called `prior_...`."""
+    return prior(
+        stiffness=gains["prior_stiffness"],
+        common=gains["prior_stiffness_spread"],
+        wandering=gains["prior_slope_spread"],
+        damping=gains["prior_damping_spread"],
+        depth_damping=gains["prior_depth_damping_spread"],
+        unloading=gains["prior_unloading_spread"],
+        friction=gains["prior_friction_spread"],
+        preload=gains["prior_preload_spread"],
+    )
 
 
 def _fact(mechanism) -> bool:

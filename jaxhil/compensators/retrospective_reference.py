@@ -56,7 +56,7 @@ from jaxhil.compensators.reintegration import (
     longest_step,
     unentered,
 )
-from jaxhil.compensators.retrospective_gains import GAINS, GENTLE, SHARP
+from jaxhil.compensators.retrospective_gains import GAINS, GENTLE, SHARP, map_prior
 from jaxhil.contact.laws import deflection
 
 FAREWELL = 0.006  # s for which it goes on after the hardware has left the surface
@@ -363,20 +363,6 @@ class _Teaching(NamedTuple):
     period: Array  # of a tick, in the contact's own time [s]
     zone: Array  # dead zone [1/s]
     usable: Array  # whether there is a contact
-
-
-def map_prior(gains: Gains) -> Map:
-    """The map before the first reading of a contact, of the gains called `prior_...`."""
-    return prior(
-        stiffness=gains["prior_stiffness"],
-        common=gains["prior_stiffness_spread"],
-        wandering=gains["prior_slope_spread"],
-        damping=gains["prior_damping_spread"],
-        depth_damping=gains["prior_depth_damping_spread"],
-        unloading=gains["prior_unloading_spread"],
-        friction=gains["prior_friction_spread"],
-        preload=gains["prior_preload_spread"],
-    )
 
 
 def _begun(old: Episode, meeting: Meeting, earlier: Array) -> Episode:
