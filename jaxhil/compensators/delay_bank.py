@@ -46,7 +46,7 @@ NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, 
 SQUARINGS, DENSITY_SQUARINGS = 10, 8  # n = 2^10 of the likelihood, 2^8 of what is known of damping
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
 SOFT = 25.0  # times the variance of where a surface was met: soft ones are found late
-ELSEWHERE = 9.0  # times the variance of where it is expected: it is not there
+DEEPER = 9.0  # times the variance of where the surface is expected: it is deeper
 EARLIER = 30  # ticks before it was met, whose readings count
 
 
@@ -229,7 +229,7 @@ def _share(meeting: Meeting, reach: Array, plane_spread: Array) -> Float[Array, 
     the delay, which moves it by up to `reach` [m]."""
     known, found = plane_spread**2, SOFT * meeting.variance
     away = jnp.abs(meeting.scales.plane) - reach
-    elsewhere = (away > 0) & (away * away > ELSEWHERE * (known + meeting.variance))
+    elsewhere = (away > 0) & (away * away > DEEPER * (known + meeting.variance))
     return jnp.where(elsewhere, 1, known / (known + found))
 
 

@@ -89,7 +89,8 @@ static void jaxhil_balance_take(jaxhil_balance *balance, const jaxhil_curve *cur
     }
     if (rate < 0.0 && rate > jaxhil_balance_turning) {
         balance->missing += expected - force;
-        balance->spread += variance + known;
+        /* Of readings that no sensor makes, rounding leaves less than nothing. */
+        balance->spread += known > 0.0 ? variance + known : variance;
         balance->turned += 1.0;
     }
 }

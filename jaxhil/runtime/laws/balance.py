@@ -94,7 +94,8 @@ class Balance:
         self._terms = terms
         if 0.0 > rate > TURNING:
             self._missing += expected - force
-            self._spread += variance + known
+            # Of readings that no sensor makes, rounding leaves less than nothing.
+            self._spread += variance + known if known > 0.0 else variance
             self._turned += 1.0
 
     def unexplained(self, curve: Curve, peak: float, deepest: float, shift: float, pace: float) -> bool:

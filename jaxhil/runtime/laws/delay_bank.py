@@ -40,7 +40,7 @@ NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, 
 SQUARINGS, DENSITY_SQUARINGS = 10, 8
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
 SOFT = 25.0  # times the variance of where a surface was met: soft ones are found late
-ELSEWHERE = 9.0  # times the variance of where it is expected: it is not there
+DEEPER = 9.0  # times the variance of where the surface is expected: it is deeper
 EARLIER = 30  # ticks before it was met, whose readings count
 
 _KNOTS = np.array(KNOTS)[:, None]
@@ -120,7 +120,7 @@ class DelayBank:
         known = self._plane_spread * self._plane_spread
         found = SOFT * meeting.variance
         away = abs(meeting.place) - float(self._offsets[-1]) * meeting.speed
-        elsewhere = away > 0.0 and away * away > ELSEWHERE * (known + meeting.variance)
+        elsewhere = away > 0.0 and away * away > DEEPER * (known + meeting.variance)
         return 1.0 if elsewhere else known / (known + found)
 
     def _restart(self) -> None:
