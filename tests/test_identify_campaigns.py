@@ -1,0 +1,117 @@
+"""Acceptance on campaigns with known truth: coverage of intervals, errors, laws, verdicts.
+
+All of it is slow; `test_identify.py` has a sample for every day. Print the figures with
+`pytest -m slow -s tests/test_identify_campaigns.py`.
+"""
+
+import campaigns
+import numpy as np
+import pytest
+
+from tuning.identification.estimate import Options, identify
+
+pytestmark = pytest.mark.slow
+REPEATS = 400
+MASS = 350.0
+
+
+def truth(name):
+    """The true numbers by key, as a gauge without a delay of the position sensor has them."""
+    kind = campaigns.KINDS[name]
+    simulator, sensor = kind.rig["simulator"], kind.rig["force_sensor"]
+    ahead = kind.rig["position_sensor"].get("delay", 0.0)
+    delay, stiffness, damping = sensor["delay"] - ahead, kind.contact["stiffness"], kind.contact["damping"][0]
+    numbers = {
+        "rig.simulator.delay": simulator["delay"] + ahead,
+        "rig.force_sensor.delay": delay,
+        "rig.force_sensor.noise_std": sensor["noise_std"],
+        "rig.force_sensor.bias": sensor.get("bias", 0.0),
+        "rig.contact_plane": kind.rig.get("contact_plane", 0.0),
+        "contact.damping.0": damping,
+        "apparent damping": damping - stiffness[0] * (delay + sensor.get("time_constant", 0.0)),
+        **{f"contact.stiffness.{i}": value for i, value in enumerate(stiffness)},
+    }
+    for key in ("natural_frequency", "damping_ratio"):
+        if key in simulator:
+            numbers[f"rig.simulator.{key}"] = simulator[key]
+    return numbers
+
+
+@pytest.mark.parametrize("name", ("clean", "noisy", "coloured", "jitter"))
+def test_stated_95_percent_intervals_cover_that_often(name):
+    numbers = truth(name)
+    inside, scores = {key: [] for key in numbers}, {key: [] for key in numbers}
+    for seed in range(REPEATS):
+        campaign = campaigns.campaign(name, 10_000 + seed)
+        found = identify(campaign, options=Options(law="kelvin_voigt", order=2, hold_out=0.0, seed=seed))
+        for key, value in numbers.items():
+            one = found[key]
+            inside[key].append(one.low <= value <= one.high)
+            scores[key].append((one.value - value) / one.std)
+    print(name)
+    for key in numbers:
+        rms = np.sqrt(np.mean(np.square(scores[key])))
+        print(f"  {key:36s} covered {np.mean(inside[key]):.3f}, rms error over its std {rms:.3f}")
+    # The bars are 92 to 98 %; three standard errors of 400 repeats are allowed beyond the stated 95 %.
+    shares = {key: np.mean(values) for key, values in inside.items()}
+    assert all(0.917 <= share <= 0.985 for share in shares.values()), shares
+
+
+BARS = {
+    # allowed errors: delay of motion [s], delay and lag of force [s], stiffness (relative), plane [m]
+    "clean": (2e-5, 1.5e-4, 0.003, 5e-6),
+    "noisy": (2e-5, 6e-4, 0.007, 5e-6),
+    "coloured": (2e-5, 3e-4, 0.005, 5e-6),
+    "jitter": (2e-5, 2e-4, 0.003, 5e-6),
+    "lagging": (2e-5, 4e-4, 0.003, 5e-6),
+    "third_order": (2e-5, 2e-4, 0.003, 5e-6),
+    "resonance": (1e-4, 2e-4, 0.003, 5e-6),
+    "stiffnesses": (2e-5, 2e-4, 0.005, 5e-6),
+    "dead_zone": (2e-5, None, 0.01, None),
+}
+
+
+@pytest.mark.parametrize("name", BARS)
+def test_errors_are_within_the_bars(name):
+    numbers, bars = truth(name), BARS[name]
+    kind = campaigns.KINDS[name]
+    critical = 2.0 * np.sqrt(min(kind.contact["stiffness"]) * MASS)
+    rows, good = [], 0
+    for seed in range(10):
+        found = identify(
+            campaigns.campaign(name, 20_000 + seed), options=Options(law="kelvin_voigt", seed=seed)
+        )
+        delays = found["rig.force_sensor.delay"].value
+        lag = next((one.value for one in found.estimates if one.key.endswith("sensor.time_constant")), 0.0)
+        true_lag = kind.rig["force_sensor"].get("time_constant", 0.0)
+        plane = next((one.value for one in found.estimates if one.key == "rig.contact_plane"), np.nan)
+        rows.append([
+            found["rig.simulator.delay"].value - numbers["rig.simulator.delay"],
+            delays + lag - numbers["rig.force_sensor.delay"] - true_lag,
+            max(abs(found[key].value / value - 1.0) for key, value in numbers.items() if "stiffness" in key),
+            plane - numbers["rig.contact_plane"],
+            (found["apparent damping"].value - (numbers["apparent damping"] + 0.0)) / critical,
+        ])  # fmt: skip
+        good += found.good
+    rms, worst = np.sqrt(np.mean(np.square(rows), axis=0)), np.max(np.abs(rows), axis=0)
+    print(name, "rms", rms, "worst", worst, "good", good)
+    for value, bar in zip(worst, bars, strict=False):
+        assert bar is None or value <= bar
+    if true_lag == 0.0:
+        assert worst[-1] <= 0.01
+    assert good >= 9
+
+
+@pytest.mark.parametrize("name, law", (
+    ("clean", "kelvin_voigt"), ("hertz", "hunt_crossley"), ("stiffnesses", "kelvin_voigt"),
+))  # fmt: skip
+def test_the_law_is_named_in_20_of_20(name, law):
+    for seed in range(20):
+        found = identify(campaigns.campaign(name, 30_000 + seed), options=Options(hold_out=0.0))
+        assert found.contact.law.name == law, (seed, found.contact.law)
+
+
+def test_no_drift_is_missed():
+    for seed in range(20):
+        found = identify(campaigns.campaign("drifting", 40_000 + seed), options=Options(law="kelvin_voigt"))
+        assert not found.good
