@@ -76,6 +76,13 @@ RESONANT = {
 PUBLISHED = {"force_sensor__bias": 1.3, "force_sensor__quantum": 0.5, "position_sensor__quantum": 1e-6}
 HERTZ = {"law": "hunt_crossley", "stiffness": [6e6], "damping": [2.0], "exponent": 1.5}
 
+LAYERED = {
+    "law": "piecewise_linear",
+    "stiffness": [[8e4, 2.4e5]],
+    "damping": [300.0],
+    "depths": [0.0003],
+}
+
 KINDS = {
     "clean": Kind(_rig(), _voigt()),
     "noisy": Kind(_rig(noise=2.67, **PUBLISHED), _voigt()),
@@ -86,6 +93,7 @@ KINDS = {
     "third_order": Kind(_rig(simulator=THIRD, command_hold="zoh", command_latency=1), _voigt()),
     "resonance": Kind(_rig(simulator=RESONANT), _voigt()),
     "hertz": Kind(_rig(), HERTZ),
+    "layered": Kind(_rig(), LAYERED),
     "stiffnesses": Kind(_rig(contact_plane=2e-4), _voigt((1.2e5, 2.4e5, 7e4))),
     "drifting": Kind(_rig(), _voigt(), drift=0.15),
 }

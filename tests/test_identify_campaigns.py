@@ -104,6 +104,7 @@ def test_errors_are_within_the_bars(name):
 
 @pytest.mark.parametrize("name, law", (
     ("clean", "kelvin_voigt"), ("hertz", "hunt_crossley"), ("stiffnesses", "kelvin_voigt"),
+    ("layered", "piecewise_linear"),
 ))  # fmt: skip
 def test_the_law_is_named_in_20_of_20(name, law):
     for seed in range(20):

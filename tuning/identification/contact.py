@@ -36,6 +36,7 @@ class ContactFit:
     problem: Problem
     posterior: Posterior
     freedom: int  # readings less parameters
+    noise_error: float  # relative standard deviation of the noise that residuals are weighed by
     dead_zone: bool  # whether readings are those of a dead zone: "bias" is then less by it
 
     @property
@@ -89,7 +90,8 @@ def estimate(
         posterior = profile(problem, seed, lag.near)
         posterior = lag.spread(posterior, seed)
     freedom = len(problem.kept) - len(posterior.names)
-    return ContactFit(law, judged, problem, posterior, freedom, bool(hidden))
+    error = 0.0 if noise is None or hidden else noise.std_std / max(noise.std, 1e-300)
+    return ContactFit(law, judged, problem, posterior, freedom, error, bool(hidden))
 
 
 def _noise_from_contact(motion: Motion, readings: Readings, plane: float | None) -> Readings:

@@ -28,9 +28,9 @@ class Law:
     shape: dict[str, Any] = field(default_factory=dict)  # keys of the mechanism file that make the shape
 
     @property
-    def size(self) -> int:
-        """Coefficients with one entry of the list."""
-        return len(self.names)
+    def complexity(self) -> int:
+        """Numbers to find with one entry of the list: coefficients, and those of the shape."""
+        return len(self.names) + len(self.shape.get("depths", ())) + ("exponent" in self.shape)
 
 
 def _nothing(depth, rate):

@@ -2,7 +2,7 @@
 
 Every law is fitted to the odd touches and judged on the even ones, and the other way round, by the log
 likelihood of whole touches. Laws within two standard errors of the best, touch by touch, are as good; the one
-with the fewest coefficients is taken. With fewer than four touches the Bayesian information criterion judges.
+with the fewest numbers is taken. With fewer than four touches the Bayesian information criterion judges.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from tuning.identification.motion import Motion
 
 FEWEST = 4  # touches for judging on others than those fitted
 ERRORS = 2.0  # standard errors within which laws are as good
+ONSET = 1e-3  # s, before and after a touch's begin, by which laws are not judged
 DEPTH = 1e-3  # m, reference depth that is written for a law which needs some
 COMMON_EXPONENTS = (1.0, 1.5, 2.0, 3.0)
 
@@ -41,13 +42,14 @@ class Judged:
 def judge(motion: Motion, readings: Readings, plane: float | None, names=None) -> list[Judged]:
     """All laws (or those named), the one to take first."""
     judged = []
-    guess = None
-    for name, build in families(readings):
+    _, plane_there, _ = guess = _fit(motion, readings, laws.kelvin_voigt(), plane, None)
+    judging = replace(readings, counts=readings.counts & ~_at_onset(motion, readings, guess))
+    deepest = float(np.max(motion.at(guess[0])[0][readings.counts])) - plane_there
+    for name, build in families(readings, deepest):
         if names is not None and name not in names:
             continue
-        law, found = build(lambda one, guess=guess: _fit(motion, readings, one, plane, guess), readings)
-        guess = guess or found
-        judged.append((law, found, _by_others(motion, readings, law, plane, found)))
+        law, found = build(lambda one: _fit(motion, readings, one, plane, guess), readings)
+        judged.append((law, found, _by_others(motion, readings, judging, law, plane, found)))
     totals = [likelihood.sum() for _, _, likelihood in judged]
     best = judged[int(np.argmax(totals))][2]
     results = []
@@ -56,7 +58,7 @@ def judge(motion: Motion, readings: Readings, plane: float | None, names=None) -
         error = float(np.sqrt(len(behind)) * behind.std(ddof=1)) if len(behind) > 1 else 0.0
         results.append(Judged(law, delay, at, misfit, likelihood, (float(behind.sum()), error)))
     good = [one for one in results if one.short[0] <= ERRORS * one.short[1] + 1e-9]
-    taken = min(good, key=lambda one: one.law.size)
+    taken = min(good, key=lambda one: one.law.complexity)
     return [taken, *(one for one in sorted(results, key=lambda one: one.short[0]) if one is not taken)]
 
 
@@ -64,8 +66,8 @@ Fitted = tuple[float, float, float]  # delay, plane, misfit
 Build = Callable[[Callable[[Law], Fitted], Readings], tuple[Law, Fitted]]
 
 
-def families(readings: Readings) -> list[tuple[str, Build]]:
-    """Each law by its name, with the search for its shape."""
+def families(readings: Readings, deepest: float) -> list[tuple[str, Build]]:
+    """Each law by its name, with the search for its shape; `deepest`: of all touches [m]."""
 
     def plain(law: Law) -> Build:
         return lambda fit, _: (law, fit(law))
@@ -76,7 +78,7 @@ def families(readings: Readings) -> list[tuple[str, Build]]:
                 lambda shape: fit(make(shape))[2],
                 bounds=(low, high),
                 method="bounded",
-                options={"xatol": 0.01},
+                options={"xatol": 0.001 * (high - low)},
             )
             shape = float(found.x)
             # A usual value that explains as much is meant.
@@ -95,6 +97,8 @@ def families(readings: Readings) -> list[tuple[str, Build]]:
         ("hunt_crossley", searched(laws.hunt_crossley, 1.05, 3.0, COMMON_EXPONENTS[1:])),
         ("depth_damped", searched(lambda n: laws.depth_damped(n, DEPTH), 1.0, 3.0, COMMON_EXPONENTS)),
     ]
+    middle = 0.1 * deepest, 0.9 * deepest
+    found.append(("piecewise_linear", searched(lambda depth: laws.piecewise_linear((depth,)), *middle)))
     if readings.entries == 1:
         found.append(("hardening", plain(laws.hardening())))
     return found
@@ -124,11 +128,19 @@ def quick(problem: Problem, guess: Fitted | None = None) -> Fitted:
     return best
 
 
-def _by_others(motion, readings, law, plane, found: Fitted) -> np.ndarray:
+def _at_onset(motion: Motion, readings: Readings, guess: Fitted) -> np.ndarray:
+    """Rows near the first and the last of a contact: a damped one begins with a jump, and whether a row is on
+    this or that side of it says nothing of the law."""
+    delay, plane, _ = guess
+    flags = [motion.at(max(one, 0.0))[0] > plane for one in (delay - ONSET, delay, delay + ONSET)]
+    return np.any(flags, axis=0) & ~np.all(flags, axis=0)
+
+
+def _by_others(motion, readings, judging: Readings, law, plane, found: Fitted) -> np.ndarray:
     """Log likelihood of each touch under the fit to the touches of the other parity."""
     lanes = readings.force.shape[1]
     if lanes < FEWEST:
-        size = law.size * np.log(max(readings.counts.sum(), 2)) / 2.0
+        size = law.complexity * np.log(max(readings.counts.sum(), 2)) / 2.0
         return np.array([-0.5 * found[2] - size])
     likelihood = np.empty(lanes)
     for parity in (0, 1):
@@ -137,7 +149,7 @@ def _by_others(motion, readings, law, plane, found: Fitted) -> np.ndarray:
         problem = Problem(motion, taught, law, plane)
         delay, at, _ = quick(problem, found)
         coefficients = problem.at(delay, at).coefficients
-        likelihood[mine] = -0.5 * misfits(problem, readings, delay, at, coefficients)[mine]
+        likelihood[mine] = -0.5 * misfits(problem, judging, delay, at, coefficients)[mine]
     return likelihood
 
 

@@ -147,7 +147,10 @@ def _left(contact: ContactFit, held: np.ndarray) -> Line:
     return Line(
         "contact law",
         f"leaves {ratio:.3g} times the noise's power on touches not fitted",
-        bool(stats.chi2.sf(every.sum(), count.sum()) < RARE),
+        bool(
+            special.ndtr(-(ratio - 1.0) / np.hypot(np.sqrt(2.0 / count.sum()), 2.0 * contact.noise_error))
+            < RARE
+        ),
         float(np.sqrt(beyond)),
         f"touch {int(np.argmax(every / np.maximum(count, 1)))}",
     )
