@@ -8,6 +8,7 @@ import pytest
 from scipy.linalg import expm
 
 from tuning.identification import contact_laws
+from tuning.identification.contact import pieces
 from tuning.identification.contact_problem import Problem, Readings, lag_weights
 from tuning.identification.contact_profile import profile
 from tuning.identification.law_choice import judge
@@ -93,6 +94,20 @@ def test_the_posterior_covers_the_truth_and_knows_the_apparent_damping_best():
     assert apparent.std() < 3.0 < 1e5 * values["delay"].std() + values["damping"].std()
     assert values["delay"].std() < 1e-4 and values["damping"].min() >= 0.0
     assert np.corrcoef(values["delay"], values["damping"])[0, 1] > 0.5
+
+
+def test_a_long_press_is_fitted_in_pieces_as_exactly():
+    kind = campaigns.KINDS["clean"]
+    silent = {
+        sensor: {**kind.rig[sensor], "noise_std": 0.0} for sensor in ("force_sensor", "position_sensor")
+    }
+    run = campaigns._press_run(replace(kind, rig={**kind.rig, **silent}), np.random.default_rng(0), 10.0)
+    cut = pieces(run, 0.001)
+    assert sum(int(piece.valid.sum()) for piece in cut) == len(run.tick) - 500
+    timing = campaigns.campaign("clean", 0, speeds=(), seconds=0, rest=0).timing
+    law = contact_laws.kelvin_voigt()
+    inner = Problem(Motion(SECOND, cut, timing, 0.022), Readings.of(cut, 0.5), law, 0.0).at(0.0037, 0.0)
+    np.testing.assert_allclose(inner.coefficients, [1.2e5, 650.0, 0.0], rtol=1e-5, atol=1e-3)
 
 
 def test_undamped_contact_has_no_negative_damping():

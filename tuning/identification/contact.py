@@ -22,9 +22,30 @@ from tuning.identification.rational import Model
 from tuning.identification.records import Run, Timing
 from tuning.identification.sensor_lag import sensor_lag
 
+SETTLING = 0.5  # s, of a motion simulator
+PIECE = 1.0  # s
 BEYOND = 4.0  # standard deviations beyond the dead zone from which a reading counts
 ROUGH = 21, 5  # delays and planes of the grid for the fit that is only judged
 UNEXPLAINED = 1.3  # chi-squared per degree of freedom above which intervals are widened by it
+
+
+def pieces(run: Run, period: float) -> list[Run]:
+    """A long run in pieces of a second, so that no lane is much longer than the others.
+
+    Each begins in the run before it, with rows that do not count while the motion simulator settles."""
+    settling, length = round(SETTLING / period), round(PIECE / period)
+    if len(run.tick) <= settling + 2 * length:
+        return [run]
+    found = []
+    for begin in range(settling, len(run.tick), length):
+        part = slice(begin - settling, min(begin + length, len(run.tick)))
+        names = ("tick", "position_desired", "position_measured", "force_measured", "velocity_desired",
+                 "force_command", "contact_index")  # fmt: skip
+        cut = {name: None if getattr(run, name) is None else getattr(run, name)[part] for name in names}
+        valid = run.valid[part].copy()
+        valid[:settling] = False
+        found.append(replace(run, valid=valid, **cut))
+    return found
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,12 @@ def identify(
     options = options or Options()
     _check(options)
     runs = {kind: [run for run in campaign.runs if run.kind == kind] for kind in ("rest", "free")}
-    touching = [run for run in campaign.runs if run.kind in ("contact", "press", "tap")]
+    touching = [
+        piece
+        for run in campaign.runs
+        if run.kind in ("contact", "press", "tap")
+        for piece in contacts.pieces(run, campaign.timing.control_period)
+    ]
     force, position = _noise(runs)
     motion = free_motion.estimate(runs["free"], campaign.timing, options.order)
     model = motion.model if motion is not None else _told_model(prior)
