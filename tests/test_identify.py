@@ -122,6 +122,24 @@ def test_what_is_told_is_taken_as_told(clean):
         )
 
 
+def test_an_entry_of_the_lists_that_is_never_met_is_that_before_it():
+    campaign = campaigns.campaign("stiffnesses", 0, speeds=(0.006, 0.012, 0.003) * 2, seconds=15.0)
+    runs = tuple(run for run in campaign.runs if run.kind != "contact" or run.contact_index[0] != 1)
+    found = identify(replace(campaign, runs=runs), options=Options(law="kelvin_voigt"))
+    first, between, last = found.mechanism["contact"]["stiffness"]
+    assert first == between == pytest.approx(1.2e5, rel=0.01) and last == pytest.approx(7e4, rel=0.01)
+    assert "only entries 0, 2 were met" in found.notes[0]
+
+
+@pytest.mark.parametrize("options, message", (
+    ({"law": "rubber"}, "law: found 'rubber', allowed linear"),
+    ({"order": 7}, "order: found 7, allowed 0, 1, 2"),
+))  # fmt: skip
+def test_a_law_or_an_order_that_there_is_not_is_refused(options, message):
+    with pytest.raises(jaxhil.InputError, match=message):
+        identify(campaigns.campaign("clean", 0, (), 5.0), options=Options(**options))
+
+
 def test_of_every_speed_some_touches_are_held_out():
     runs = campaigns.campaign("clean", 0, seconds=0, rest=0).runs
     held = held_out(runs, 0.2)

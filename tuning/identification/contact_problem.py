@@ -30,7 +30,7 @@ class Readings:
     force: np.ndarray  # N, 0 where it does not count
     counts: np.ndarray  # bool
     entry: np.ndarray  # int, entry of the contact's lists
-    entries: int  # number of entries
+    entries: tuple[int, ...]  # those that are met
     std: float  # N, of the noise
     whitening: tuple[float, ...] = (1.0,)  # filter that makes the noise white
     threshold: float = 0.0  # N: predicted forces below it do not count (a dead zone hides them)
@@ -55,11 +55,17 @@ class Readings:
             gap: Any = lfilter(np.ones(len(whitening)), [1.0], ~counts, axis=0)
             counts = counts & (gap < 0.5)
             counts[: len(whitening) - 1] = False
-        return cls(force, counts, entry, int(entry.max()) + 1, std, tuple(whitening), threshold)
+        entries = tuple(int(one) for one in np.unique(entry[counts])) or (0,)
+        return cls(force, counts, entry, entries, std, tuple(whitening), threshold)
 
 
 def _entries(run: Run) -> np.ndarray:
-    return np.zeros(len(run.tick), int) if run.contact_index is None else np.maximum(run.contact_index, 0)
+    """Of each row; out of contact that of the contact next to it."""
+    known = np.full(len(run.tick), -1) if run.contact_index is None else run.contact_index
+    if not np.any(known >= 0):
+        return np.zeros(len(run.tick), int)
+    last = np.maximum.accumulate(np.where(known >= 0, np.arange(len(known)), -1))
+    return np.where(last >= 0, known[last], known[np.argmax(known >= 0)])
 
 
 @dataclass(frozen=True)
@@ -109,7 +115,7 @@ class Problem:
     def names(self) -> list[str]:
         law, entries = self.law, self.readings.entries
         own = len(law.own(np.zeros(1), np.zeros(1)))
-        numbered = [f"{name}.{i}" for i in range(entries) for name in law.names[:own]]
+        numbered = [f"{name}.{i}" for i in entries for name in law.names[:own]]
         return [*numbered, *law.names[own:], "bias"]
 
     def whiten(self, values: np.ndarray) -> np.ndarray:
@@ -151,9 +157,9 @@ class Problem:
     def _columns(self, depth: np.ndarray, rate: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """The law's functions at rows in contact, one per coefficient but the bias."""
         own, entries = self.law.own(depth, rate), self.readings.entries
-        if entries > 1:
+        if len(entries) > 1:
             entry = self.entry[rows]
-            own = [np.where(entry == i, value, 0.0) for i in range(entries) for value in own]
+            own = [np.where(entry == i, value, 0.0) for i in entries for value in own]
         return np.array([*own, *self.law.shared(depth, rate)])
 
     def _touching(self, moved, plane: float, coefficients: np.ndarray | None) -> np.ndarray:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxhil.errors import InputError
+from jaxhil.errors import InputError, shown
 from jaxhil.mechanism.file import to_builtins
 from jaxhil.mechanism.structs import Mechanism, numeric_keys
 from tuning.identification import contact as contacts
@@ -21,6 +21,7 @@ from tuning.identification import free_motion, parameters, validation
 from tuning.identification.contact import ContactFit
 from tuning.identification.contact_profile import DRAWS
 from tuning.identification.free_motion import FreeMotion
+from tuning.identification.law_choice import NAMES
 from tuning.identification.mechanism_file import uncertainty_tables
 from tuning.identification.noise import Noise, at_rest
 from tuning.identification.rational import STRUCTURES, Model
@@ -98,6 +99,11 @@ def _check(options: Options) -> None:
     for key in options.fixed:
         if key not in FIXABLE:
             raise InputError(f"fix: found {key}, allowed {' and '.join(FIXABLE)}")
+    if options.law is not None and options.law not in NAMES:
+        raise InputError(f"law: found {shown(options.law)}, allowed {', '.join(NAMES)}")
+    orders = sorted({one.order for one in STRUCTURES})
+    if options.order is not None and options.order not in orders:
+        raise InputError(f"order: found {options.order}, allowed {', '.join(map(str, orders))}")
 
 
 def _told_model(prior: Mechanism | None) -> Model:
@@ -333,6 +339,8 @@ def _notes(motion: FreeMotion | None, contact: ContactFit | None, force: Noise |
         notes.append("no contact: the contact and the force delay are the prior's")
     if force is not None and force.pole > 0.5:
         notes.append(f"the force's noise is coloured (pole {force.pole:.2f}); tuning weighs it as white")
+    if contact is not None and (entries := contact.readings.entries) != tuple(range(len(entries))):
+        notes.append(f"of the contact lists only entries {', '.join(map(str, entries))} were met")
     if contact is not None and contact.dead_zone:
         notes.append("the force has a dead zone: the contact plane was taken as told")
     return notes

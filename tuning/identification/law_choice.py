@@ -66,6 +66,9 @@ Fitted = tuple[float, float, float]  # delay, plane, misfit
 Build = Callable[[Callable[[Law], Fitted], Readings], tuple[Law, Fitted]]
 
 
+NAMES = ("linear", "kelvin_voigt", "hunt_crossley", "depth_damped", "piecewise_linear", "hardening")
+
+
 def families(readings: Readings, deepest: float) -> list[tuple[str, Build]]:
     """Each law by its name, with the search for its shape; `deepest`: of all touches [m]."""
 
@@ -99,7 +102,7 @@ def families(readings: Readings, deepest: float) -> list[tuple[str, Build]]:
     ]
     middle = 0.1 * deepest, 0.9 * deepest
     found.append(("piecewise_linear", searched(lambda depth: laws.piecewise_linear((depth,)), *middle)))
-    if readings.entries == 1:
+    if len(readings.entries) == 1:
         found.append(("hardening", plain(laws.hardening())))
     return found
 

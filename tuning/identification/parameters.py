@@ -75,7 +75,7 @@ def contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
     if contact.problem.plane is None:
         found["rig.contact_plane"] = own["plane"]
     law, entries = contact.law, contact.readings.entries
-    for i in range(entries):
+    for i in entries:
         if law.name == "piecewise_linear":
             for name in law.names[:-1]:
                 found[f"contact.stiffness.{i}.{int(name[5:]) - 1}"] = own[f"{name}.{i}"]
@@ -97,24 +97,21 @@ def contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
 def contact_section(law: Law, values: dict[str, float]) -> dict[str, Any]:
     """`contact` of a mechanism file from values by key."""
     section: dict[str, Any] = {"law": law.name, **law.shape}
-    stiffness = sorted(key for key in values if key.startswith("contact.stiffness."))
-    if law.name == "piecewise_linear":
-        entries: dict[int, dict[int, float]] = {}
-        for key in stiffness:
-            entry, slope = map(int, key.split(".")[2:])
-            entries.setdefault(entry, {})[slope] = values[key]
-        section["stiffness"] = [[slopes[j] for j in sorted(slopes)] for _, slopes in sorted(entries.items())]
-    else:
-        section["stiffness"] = [values[key] for key in sorted(stiffness, key=_number)]
-    damping = [
-        values[key] for key in sorted((k for k in values if k.startswith("contact.damping.")), key=_number)
-    ]
-    if damping:
-        section["damping"] = [max(value, 0.0) for value in damping]
+    stiffness = _entries(values, "contact.stiffness.")
+    section["stiffness"] = stiffness if law.name == "piecewise_linear" else [one for (one,) in stiffness]
+    if damping := _entries(values, "contact.damping."):
+        section["damping"] = [max(one, 0.0) for (one,) in damping]
     if "contact.reference_depth" in values:
         section["reference_depth"] = values["contact.reference_depth"]
     return section
 
 
-def _number(key: str) -> int:
-    return int(key.rsplit(".", 1)[1])
+def _entries(values: dict[str, float], prefix: str) -> list[list[float]]:
+    """The values of a list's entries in order; an entry that was never met is that before it."""
+    found: dict[int, list[float]] = {}
+    for key in sorted(key for key in values if key.startswith(prefix)):
+        found.setdefault(int(key[len(prefix) :].split(".")[0]), []).append(values[key])
+    if not found:
+        return []
+    first = min(found)
+    return [found[max((i for i in found if i <= j), default=first)] for j in range(max(found) + 1)]
