@@ -108,10 +108,13 @@ def test_what_is_told_wrongly_is_a_bad_verdict(jaxhil, day, tmp_path):
         (["LOGS", "--fix", "rig.contact_plane"], ["--fix rig.contact_plane"]),
         (["LOGS", "--fix", "rig.contact_plane=a"], ["contact_plane=a: found 'a', allowed a number"]),
         (["LOGS", "--limit", "nan"], ["--limit"]),
+        (["LOGS", "--order", "ten"], ["--order: found 'ten', allowed auto, or 0 to 4"]),
+        (["LOGS", "--map", "MAP", "--stage", "press"], ["--stage: found 'press'", "contact, free"]),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_one_line(jaxhil, day, tmp_path, arguments, words):
-    given = [one for word in arguments for one in (logs(day) if word == "LOGS" else [word])]
+    words_for = {"LOGS": logs(day), "MAP": [drafted(jaxhil, day)] if "MAP" in arguments else []}
+    given = [one for word in arguments for one in words_for.get(word, [word])]
     prior = [] if "--prior" in arguments or "--guess" in arguments else ["--prior", "rig-300kg"]
     ran = jaxhil("identify", *given, *prior, "-o", tmp_path)
     assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1

@@ -99,6 +99,14 @@ def test_of_a_free_run_too(tmp_path):
     assert read(write_csv(tmp_path / "d.csv", sway(amplitude=0.0)), "rest").runs[0].kind == "rest"
 
 
+def test_readings_that_are_held(tmp_path):
+    held = sway() | {"xm": np.repeat(sway()["xm"][::4], 4)}
+    (note,) = read(write_csv(tmp_path / "a.csv", held), "free").notes
+    assert "the same in 75 % of rows, as if each reading was held for 4 of them" in note
+    rounded = sway() | {"xm": np.round(sway()["xm"], 5)}
+    assert read(write_csv(tmp_path / "b.csv", rounded), "free").notes == ()
+
+
 def test_a_press_by_what_raises_its_force_and_clipping(tmp_path):
     press = sway()
     press["F"] = STIFFNESS * np.maximum(press["xm"] + 5e-4, 0.0)

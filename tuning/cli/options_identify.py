@@ -36,9 +36,13 @@ class Identify:
         str | None, text("MECHANISM", "Mechanism file, or a built-in's name, for what the logs do not tell.")
     ] = None
     output: Annotated[str, folder("Folder for what is written.")] = "jaxhil-out/identified"
-    order: Annotated[
-        int | None, text("NUMBER", "Order of the motion simulator; by default the logs choose.")
+    stage: Annotated[
+        str | None,
+        text("KIND", "Take runs of this kind alone (free, press, contact or tap), and those at rest."),
     ] = None
+    order: Annotated[
+        str, text("NUMBER", "Order of the motion simulator; by default 'auto': the logs choose.")
+    ] = "auto"
     law: Annotated[str | None, text("NAME", "Contact law; by default the contacts choose.")] = None
     fix: Annotated[
         UseAppendAction[tuple[str, ...]],

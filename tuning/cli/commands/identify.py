@@ -1,6 +1,7 @@
 """`jaxhil identify`: from a rig's logs to a mechanism file."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from tuning.front_door import arguments
 from tuning.identification.records import Campaign
 
 SCHEMA = "jaxhil/identification/1"
+MOST_ORDER = 4
 MECHANISM, DOCUMENT = "mechanism.toml", "identification.json"
 
 
@@ -31,12 +33,12 @@ def run(options: Identify) -> int:
     arguments.integers(0, seed=options.seed)
     if not 0.0 <= options.hold_out < 1.0:
         raise InputError(f"--hold-out: found {options.hold_out}, allowed a share from 0 to below 1")
-    fixed = _fixed(options)
+    fixed, order = _fixed(options), _order(options)
     prior = None if options.prior is None else load(options.prior).mechanism
     folder = Path(options.output)
     checks.output(folder)
     checks.own_results(folder / DOCUMENT, "estimates", (MECHANISM,))
-    campaign = _read(options, logs, prior)
+    campaign = _of_stage(_read(options, logs, prior), options.stage)
     from tuning.identification.estimate import Options, identify
     from tuning.identification.mechanism_file import to_toml
 
@@ -44,7 +46,7 @@ def run(options: Identify) -> int:
         campaign,
         prior,
         Options(
-            order=options.order,
+            order=order,
             law=options.law,
             fixed=fixed,
             hold_out=options.hold_out,
@@ -88,6 +90,25 @@ def _read(options: Identify, logs: list[Path], prior: Mechanism | None) -> Campa
         return read_campaign(logs, None, prior)
     except InputError as error:
         raise InputError(f"{error} (--map says what columns mean; --guess drafts one)") from None
+
+
+def _of_stage(campaign: Campaign, stage: str | None) -> Campaign:
+    """The runs of one kind, and those at rest."""
+    if stage is None:
+        return campaign
+    runs = tuple(run for run in campaign.runs if run.kind in (stage, "rest"))
+    kinds = sorted({run.kind for run in campaign.runs} - {"rest"})
+    if stage not in kinds:
+        raise InputError(f"--stage: found {shown(stage)}, allowed a kind that the logs have: {', '.join(kinds)}")
+    return replace(campaign, runs=runs)
+
+
+def _order(options: Identify) -> int | None:
+    if options.order == "auto":
+        return None
+    if not options.order.isdecimal() or int(options.order) > MOST_ORDER:
+        raise InputError(f"--order: found {shown(options.order)}, allowed auto, or 0 to {MOST_ORDER}")
+    return int(options.order)
 
 
 def _fixed(options: Identify) -> dict[str, float]:

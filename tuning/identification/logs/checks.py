@@ -21,6 +21,7 @@ SMALLEST_STROKE = 1e-5  # m
 FASTEST = 5.0  # m/s
 SMOOTH = 10  # ticks, over which speeds are taken
 MOST_LAG = 400  # ticks, of a reading behind its command
+HELD = 0.4  # share of rows that repeat a reading, beyond which it is one that is held
 FOLLOWS = 0.3  # correlation of speeds, below which a reading does not follow its command
 IMPULSE = 0.2, 5.0  # measured over what the change of speed needs
 SAMPLE = 200_000  # rows looked at, where some say as much as all
@@ -49,7 +50,7 @@ def check_motion(label: str, kind: str, stretch: Stretch, period: float) -> list
             f"{label}: position_measured: found {measured[0]:g} m in every row, allowed a reading"
         )
     _check_size(label, x, measured, period)
-    return _check_following(label, x, measured)
+    return [*_held(label, x, measured), *_check_following(label, x, measured)]
 
 
 def check_force(
@@ -199,6 +200,19 @@ def _check_following(label: str, x: np.ndarray, measured: np.ndarray) -> list[st
             f"{label}: position_measured: found {found}, allowed one that follows (are the two swapped?)"
         )
     return []
+
+
+def _held(label: str, x: np.ndarray, measured: np.ndarray) -> list[str]:
+    """A note where readings stay the same while the command moves by more than they are rounded to."""
+    moving = np.abs(np.diff(x)) > _resolution(measured)
+    if np.count_nonzero(moving) < FEWEST_ROWS // 2:
+        return []
+    share = float(np.mean(np.diff(measured)[moving] == 0.0))
+    if share < HELD:
+        return []
+    held = 1 / (1 - share) if share < 1 else np.inf
+    said = f"the same in {100 * share:.0f} % of rows, as if each reading was held for {held:.2g} of them"
+    return [f"{label}: position_measured: {said}: its delay is then longer by half of that"]
 
 
 def _wrong_sign(label: str, what: str) -> InputError:
