@@ -60,6 +60,7 @@ def test_interrupt_anywhere_is_130(jaxhil, monkeypatch):
         (["verify", "nowhere.json"], ["nowhere.json", "No such file"]),
         (["verify", "x", "--scenarios", "0"], ["--scenarios"]),
         (["init", "rig-300"], ["rig-300", "did you mean rig-300kg"]),
+        (["init", "a.toml", "-o", "b.toml"], ["--output", "'b.toml' beside a file", "one of them"]),
     ],
 )
 def test_unusable_input_is_reported_in_one_line(jaxhil, arguments, words):

@@ -76,9 +76,11 @@ class Init:
 
     name: Annotated[
         Positional[str | None],
-        text("[NAME]", "Built-in mechanism whose values it has; by default 'varying'."),
+        text("[NAME]", "Built-in mechanism whose values it has, by default 'varying'; or the file, NAME.toml."),
     ] = None
-    output: Annotated[str, arg(aliases=("-o",), metavar="FILE", help="The file.")] = "mechanism.toml"
+    output: Annotated[
+        str | None, text("FILE", "The file; by default mechanism.toml.", aliases=("-o",))
+    ] = None
     list: Annotated[FlagCreatePairsOff[bool], text(None, "Only list the names, writing nothing.")] = False
     json: Json = False
 

@@ -1,10 +1,11 @@
 """`jaxhil init`: a mechanism file to start from, written where no file is."""
 
+import shlex
 from pathlib import Path
 
 import msgspec
 
-from jaxhil.errors import InputError, one_line
+from jaxhil.errors import InputError, one_line, shown
 from jaxhil.files import write_new, writing
 from jaxhil.mechanism.file import DEFAULT, builtin_names, builtin_path, load, suite_names
 from jaxhil.mechanism.template import commented
@@ -24,23 +25,26 @@ def run(options: Init) -> int:
         else:
             terminal.emit(*names)
         return 0
-    # `jaxhil init my-rig.toml` means the file, too.
-    names_file = options.name is not None and options.name.endswith(SUFFIX)
-    path = Path(options.name if options.name and names_file else options.output)
-    source = DEFAULT if options.name is None or names_file else options.name
+    source, output = options.name or DEFAULT, options.output
+    if source.endswith(SUFFIX):  # the file, not a name
+        if output is not None:
+            raise InputError(f"--output: found {shown(output)} beside a file, allowed one of them")
+        source, output = DEFAULT, source
     builtin_path(source)  # refuses a name that is not built in
+    path = Path(output or f"mechanism{SUFFIX}")
     name = one_line(path.name.removesuffix(SUFFIX), 100) or source
     mechanism = msgspec.structs.replace(load(source).mechanism, name=name)
-    shown = one_line(str(path))
+    place = one_line(str(path))
     checks.output(path.parent)
     with writing(path):
         try:
             write_new(path, commented(mechanism).encode())
         except FileExistsError:
             taken = "found something there, allowed a name that is not taken: nothing is overwritten"
-            raise InputError(f"--output: {shown}: {taken}") from None
+            raise InputError(f"--output: {place}: {taken}") from None
     if options.json:
         terminal.emit_json({"file": str(path), "name": name, "from": source})
     else:
-        terminal.emit(f"{shown}: written, with the values of {source}. Change it, then: jaxhil tune {shown}")
+        then = f"jaxhil tune {shlex.quote(place)}"
+        terminal.emit(f"{place}: written, with the values of {source}. Change it, then: {then}")
     return 0
