@@ -156,10 +156,10 @@ MECHANISM_FILE = """\
 # The mechanism file
 
 TOML, one file for one docking mechanism on one rig: `schema = "jaxhil/mechanism/1"`. `jaxhil init
-my-rig.toml` writes one with every key explained. This page is made of the types that read it. Numbers are in SI units,
-natural frequencies in Hz. A key that is not given has its default; an unknown key, a wrong type or a value
-that is not allowed ends in one line that names file, key, what was found and what is allowed, and in exit
-code 2. A key that the chosen law or model does not use is refused where it says anything.
+my-rig.toml` writes one with every key explained. This page is made of the types that read it. Numbers are in
+SI units, natural frequencies in Hz. A key that is not given has its default; an unknown key, a wrong type or
+a value that is not allowed ends in one line that names file, key, what was found and what is allowed, and in
+exit code 2. A key that the chosen law or model does not use is refused where it says anything.
 
 Editors complete and check such files by the [JSON Schema](mechanism.schema.json)
 (`jaxhil mechanisms --schema > mechanism.schema.json`); those that go by a line of the file itself want

@@ -76,11 +76,13 @@ class Init:
 
     name: Annotated[
         Positional[str | None],
-        text("[NAME]", "Built-in mechanism whose values it has, by default 'varying'; or the file, NAME.toml."),
+        text(
+            "[NAME]", "Built-in mechanism whose values it has, by default 'varying'; or the file, NAME.toml."
+        ),
     ] = None
-    output: Annotated[
-        str | None, text("FILE", "The file; by default mechanism.toml.", aliases=("-o",))
-    ] = None
+    output: Annotated[str | None, text("FILE", "The file; by default mechanism.toml.", aliases=("-o",))] = (
+        None
+    )
     list: Annotated[FlagCreatePairsOff[bool], text(None, "Only list the names, writing nothing.")] = False
     json: Json = False
 

@@ -99,7 +99,9 @@ def _of_stage(campaign: Campaign, stage: str | None) -> Campaign:
     runs = tuple(run for run in campaign.runs if run.kind in (stage, "rest"))
     kinds = sorted({run.kind for run in campaign.runs} - {"rest"})
     if stage not in kinds:
-        raise InputError(f"--stage: found {shown(stage)}, allowed a kind that the logs have: {', '.join(kinds)}")
+        raise InputError(
+            f"--stage: found {shown(stage)}, allowed a kind that the logs have: {', '.join(kinds)}"
+        )
     return replace(campaign, runs=runs)
 
 
