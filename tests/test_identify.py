@@ -55,9 +55,13 @@ def test_its_mechanism_file_loads_with_what_is_uncertain_and_correlated(clean, t
     assert apparent.std() < 1.3 * np.hypot(clean["apparent damping"].std, floor)
 
 
-@pytest.mark.parametrize("wrong, worst", (
-    ("hold", "command hold"), ("order", "motion model"), ("sign", "sign of the force"), ("scale", "scale"),
-))  # fmt: skip
+DEFECTS = {"hold": "command hold", "sign": "sign of the force", "scale": "scale"}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "worst"),
+    [("order", "motion model"), *(pytest.param(*one, marks=pytest.mark.slow) for one in DEFECTS.items())],
+)
 def test_a_defect_is_named_and_the_verdict_bad(wrong, worst):
     campaign = campaigns.campaign("resonance" if wrong == "order" else "clean", 1, speeds=FEW)
     options = Options(law="kelvin_voigt", order=2 if wrong == "order" else None)
@@ -89,6 +93,7 @@ def test_a_dead_zone_is_told_from_a_bias_and_the_pair_it_confounds_named():
     assert found.mechanism["rig"]["force_sensor"]["dead_zone"] == dead.value
 
 
+@pytest.mark.slow
 def test_without_free_motion_the_prior_tells_the_motion_and_without_contact_the_contact():
     prior = jaxhil.load("varying")
     campaign = campaigns.campaign("clean", 2, speeds=FEW, seconds=0)
