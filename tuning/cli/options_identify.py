@@ -15,7 +15,7 @@ class Identify:
     Example: jaxhil identify day1/*.csv --map logs.toml --prior rig-300kg
 
     Writes DIR/mechanism.toml, which tunes as it is, and DIR/identification.json. Exit code 1 if what the
-    model leaves unexplained can change a restitution by the limit or more.
+    model leaves unexplained can change a restitution by the limit or more. With --check nothing is written.
     """
 
     logs: Annotated[
@@ -35,6 +35,14 @@ class Identify:
     prior: Annotated[
         str | None, text("MECHANISM", "Mechanism file, or a built-in's name, for what the logs do not tell.")
     ] = None
+    check: Annotated[
+        FlagCreatePairsOff[bool],
+        text(None, "Set the logs against a mechanism as it is, --prior or the last of LOGS; find nothing."),
+    ] = False
+    bayes: Annotated[
+        FlagCreatePairsOff[bool],
+        text(None, "Take the normal entries of the prior's [uncertainty] as evidence beside the logs."),
+    ] = False
     output: Annotated[str, folder("Folder for what is written.")] = "jaxhil-out/identified"
     stage: Annotated[
         str | None,
@@ -46,7 +54,7 @@ class Identify:
     law: Annotated[str | None, text("NAME", "Contact law; by default the contacts choose.")] = None
     fix: Annotated[
         UseAppendAction[tuple[str, ...]],
-        text("KEY=VALUE", "A number that is known, as rig.contact_plane=0; repeatable."),
+        text("KEY=VALUE", "A number, or a list of them, that is known, as rig.contact_plane=0; repeatable."),
     ] = ()
     hold_out: Annotated[float, number("Share of the contacts that judge the fit to the others.")] = 0.2
     limit: Annotated[

@@ -17,13 +17,14 @@ from jaxhil.errors import InputError, shown
 from jaxhil.mechanism.file import to_builtins
 from jaxhil.mechanism.structs import Mechanism, numeric_keys
 from tuning.identification import contact as contacts
-from tuning.identification import free_motion, parameters, validation
+from tuning.identification import free_motion, knowledge, known, parameters, validation
 from tuning.identification.contact import ContactFit
 from tuning.identification.contact_profile import DRAWS
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.law_choice import NAMES
-from tuning.identification.mechanism_file import uncertainty_tables
+from tuning.identification.mechanism_file import put, uncertainty_tables
 from tuning.identification.noise import Noise, at_rest
+from tuning.identification.parameters import SIMULATOR
 from tuning.identification.rational import STRUCTURES, Model
 from tuning.identification.records import Campaign, Run
 from tuning.identification.result import Estimate, Identification, confounded
@@ -38,7 +39,8 @@ class Options:
 
     order: int | None = None  # of the motion simulator; None lets the lines choose
     law: str | None = None  # of the contact; None lets the touches choose
-    fixed: Mapping[str, float] = field(default_factory=dict)  # by key: told, not estimated
+    fixed: Mapping[str, Any] = field(default_factory=dict)  # by key, a list's too: told, not estimated
+    bayes: bool = False  # whether the prior's normal marginals are evidence beside the logs
     hold_out: float = 0.2  # share of the touches that judge the fit to the others
     limit: float = 0.01  # on the restitution, of all that the model does not explain
     calibration: float = 0.001  # relative uncertainty of the force sensor's scale
@@ -46,7 +48,7 @@ class Options:
     seed: int = 0
 
 
-FIXABLE = ("rig.contact_plane", "rig.position_sensor.delay")
+FIRST = ("rig.contact_plane", "rig.position_sensor.delay")  # told before anything is fitted
 
 
 def identify(
@@ -57,7 +59,7 @@ def identify(
     `prior` gives what the logs do not tell. Raises `InputError` where neither does for a number that a
     mechanism file must have."""
     options = options or Options()
-    _check(options)
+    _check(options, prior)
     runs = {kind: [run for run in campaign.runs if run.kind == kind] for kind in ("rest", "free")}
     touching = [
         piece
@@ -75,19 +77,25 @@ def identify(
     if motion is not None:
         lines = [*validation.of_motion(motion, frequency), *(lines or [])]
     found = _draws(motion, contact, model, frequency, options)
-    estimates, told = _estimates(found, motion, contact, force, position, options)
+    if options.bayes:
+        found = knowledge.with_prior(found, prior, frequency, options.seed)
+    later = {key: value for key, value in options.fixed.items() if key not in FIRST}
+    later = knowledge.spread_out(later, list(found))
+    found, denied = knowledge.with_told(found, later)
+    fixed = {**{key: options.fixed[key] for key in FIRST if key in options.fixed}, **later}
+    estimates, told = _estimates(found, motion, contact, force, position, fixed)
     mechanism = _mechanism(campaign, prior, model, contact, (*estimates, *told), found, options)
     keys = list(found)
     table = np.array([found[key] for key in keys]).T if keys else np.zeros((DRAWS, 0))
     return Identification(
         estimates=(*estimates, *told),
         draws=table,
-        combinations=_combinations(found, contact),
+        combinations=_combinations({**found, **{k: np.full(DRAWS, v) for k, v in later.items()}}, contact),
         confounded=confounded(keys, table),
         lines=tuple(lines or ()),
         mechanism=mechanism,
         limit=options.limit,
-        notes=tuple(_notes(motion, contact, force)),
+        notes=(*_notes(motion, contact, force), *denied),
         motion=motion,
         contact=contact,
         force_noise=force,
@@ -95,10 +103,12 @@ def identify(
     )
 
 
-def _check(options: Options) -> None:
-    for key in options.fixed:
-        if key not in FIXABLE:
-            raise InputError(f"fix: found {key}, allowed {' and '.join(FIXABLE)}")
+def _check(options: Options, prior: Mechanism | None) -> None:
+    for key in FIRST:
+        if not isinstance(options.fixed.get(key, 0.0), (int, float)):
+            raise InputError(f"fix: {key}: found {shown(options.fixed[key])}, allowed a number")
+    if options.bayes and prior is None:
+        raise InputError("bayes: found no prior, allowed a mechanism with [uncertainty]")
     if options.law is not None and options.law not in NAMES:
         raise InputError(f"law: found {shown(options.law)}, allowed {', '.join(NAMES)}")
     orders = sorted({one.order for one in STRUCTURES})
@@ -109,20 +119,7 @@ def _check(options: Options) -> None:
 def _told_model(prior: Mechanism | None) -> Model:
     if prior is None:
         raise InputError("logs: found no free motion, allowed a run of kind free or a prior mechanism")
-    simulator = prior.rig.simulator
-    by_name = {structure.name: structure for structure in STRUCTURES}
-    delay = simulator.delay + prior.rig.position_sensor.delay
-    if simulator.model == "ideal":
-        return Model(by_name["ideal"], np.array([delay]))
-    if simulator.model == "first_order" and simulator.time_constant:
-        return Model(by_name["first_order"], np.array([np.log(simulator.time_constant), delay]))
-    if simulator.model == "second_order" and simulator.natural_frequency and simulator.damping_ratio:
-        w = 2.0 * np.pi * simulator.natural_frequency
-        return Model(by_name["second_order"], np.array([np.log(w), np.log(simulator.damping_ratio), delay]))
-    raise InputError(
-        f"prior: rig.simulator.model: found {simulator.model}, allowed ideal, first_order or second_order "
-        "where the logs hold no free motion"
-    )
+    return known.motion_model(prior)
 
 
 def _noise(runs: Mapping[str, Sequence[Run]]) -> tuple[Noise | None, Noise | None]:
@@ -190,7 +187,7 @@ def _draws(
     return found
 
 
-def _estimates(found, motion, contact, force, position, options) -> tuple[list[Estimate], list[Estimate]]:
+def _estimates(found, motion, contact, force, position, fixed) -> tuple[list[Estimate], list[Estimate]]:
     """Estimates of what has draws, then of what the sensors say at rest and of what was told."""
     estimates = [_of_draws(key, values) for key, values in found.items()]
     others = []
@@ -211,8 +208,7 @@ def _estimates(found, motion, contact, force, position, options) -> tuple[list[E
         std = motion.noise_std
         others.append(_plain("rig.position_sensor.noise_std", std, std / np.sqrt(2.0 * max(count, 1))))
     others += [
-        Estimate(key, value, 0.0, value, value, unit_of(key), told=True)
-        for key, value in options.fixed.items()
+        Estimate(key, value, 0.0, value, value, unit_of(key), told=True) for key, value in fixed.items()
     ]
     return estimates, others
 
@@ -278,7 +274,11 @@ def _mechanism(
         document["contact"] = parameters.contact_section(contact.law, values)
         if prior is None:
             document["approach"]["contacts"] = len(document["contact"]["stiffness"])
-    elif prior is None:
+    elif prior is not None:
+        for key, value in values.items():
+            if key.startswith("contact."):
+                put(document, key, value)
+    else:
         raise InputError(
             "logs: found no contact, allowed a run of kind contact, press or tap, or a prior mechanism"
         )
@@ -288,12 +288,16 @@ def _mechanism(
         "command_latency": timing.command_latency,
         "command_hold": timing.command_hold,
     }
-    if "rig.simulator.delay" in found:
-        rig["simulator"] = {
-            **{k: v for k, v in rig.get("simulator", {}).items() if k.endswith("_limit")},
+    simulator = {key[len(SIMULATOR) :]: one for key, one in values.items() if key.startswith(SIMULATOR)}
+    if simulator:
+        before = rig.get("simulator", {})
+        simulator = {
+            **{k: v for k, v in before.items() if k.endswith("_limit")},
             **parameters.simulator_section(model),
-            "delay": max(values["rig.simulator.delay"], 0.0),
+            "delay": before.get("delay", 0.0),
+            **simulator,
         }
+        rig["simulator"] = {**simulator, "delay": max(simulator["delay"], 0.0)}
     for section in ("force_sensor", "position_sensor"):
         told = {**rig.get(section, {})}
         prefix = f"rig.{section}."
@@ -302,6 +306,8 @@ def _mechanism(
     if "rig.contact_plane" in values:
         rig["contact_plane"] = values["rig.contact_plane"]
     document["rig"] = rig
+    if found:
+        document.pop("correlation", None)
     document |= _uncertainty(document, found, options)
     return document
 

@@ -70,15 +70,7 @@ class FreeMotion:
 
 def estimate(runs: Sequence[Run], timing: Timing, order: int | None = None) -> FreeMotion | None:
     """From all free runs together; None where none is long enough to say anything."""
-    rest = round(SETTLING * SLOWEST / timing.control_period)
-    spectra = []
-    for run in runs:
-        found = spectrum(
-            run.position_desired, run.position_measured, run.valid & np.isfinite(run.position_measured),
-            timing.control_period, rest,
-        )  # fmt: skip
-        if found is not None and len(found.frequency) >= 4:
-            spectra.append(found)
+    spectra = spectra_of(runs, timing)
     if not spectra:
         return None
     lines = join(spectra, timing)
@@ -94,6 +86,38 @@ def estimate(runs: Sequence[Run], timing: Timing, order: int | None = None) -> F
         gain_of(chosen.fit, lines),
         chosen.criterion - criterion(choose(other, order, highest)[0].fit, left(candidates)),
     )
+
+
+def of_known(runs: Sequence[Run], timing: Timing, model: Model) -> FreeMotion | None:
+    """The same with a model that is known: what it leaves of the lines, nothing fitted."""
+    spectra = spectra_of(runs, timing)
+    if not spectra:
+        return None
+
+    def held(lines: Lines) -> Fit:
+        size = len(model.parameters)
+        return Fit(model, np.zeros((size, size)), (model.predict(lines) - lines.output) / lines.std)
+
+    lines = join(spectra, timing)
+    other = replace(lines, hold="linear" if lines.hold == "zoh" else "zoh")
+    fit, inflation = held(lines), max(1.0, held(lines).chi2 / max(held(lines).freedom, 1))
+    candidate = Candidate(fit, criterion(fit, inflation), "")
+    gain = candidate.criterion - criterion(held(other), inflation)
+    return FreeMotion(lines, tuple(spectra), candidate, (candidate,), gain_of(fit, lines), gain)
+
+
+def spectra_of(runs: Sequence[Run], timing: Timing) -> list[Spectrum]:
+    """Of the runs that are long enough."""
+    rest = round(SETTLING * SLOWEST / timing.control_period)
+    spectra = []
+    for run in runs:
+        found = spectrum(
+            run.position_desired, run.position_measured, run.valid & np.isfinite(run.position_measured),
+            timing.control_period, rest,
+        )  # fmt: skip
+        if found is not None and len(found.frequency) >= 4:
+            spectra.append(found)
+    return spectra
 
 
 def join(spectra: Sequence[Spectrum], timing: Timing) -> Lines:

@@ -53,6 +53,15 @@ def _path(key: str) -> str:
     return ".".join(parts)
 
 
+def put(document: dict[str, Any], key: str, value: float) -> None:
+    """Set the number of a dotted key, lists by their entries' numbers, in a mechanism as tables."""
+    *path, last = [int(part) if part.isdigit() else part for part in key.split(".")]
+    place: Any = document
+    for part in path:
+        place = place[part]
+    place[last] = value
+
+
 def to_toml(document: dict[str, Any], comment: str = "") -> str:
     """A mechanism, as `jaxhil.mechanism.file.to_builtins` gives it, as TOML."""
     lines = [f"# {line}" for line in comment.splitlines()]

@@ -1,4 +1,4 @@
-"""`jaxhil identify`: from a rig's logs to a mechanism file."""
+"""`jaxhil identify`: from a rig's logs to a mechanism file, or a mechanism file against a rig's logs."""
 
 import math
 from dataclasses import replace
@@ -7,7 +7,7 @@ from typing import Any
 
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.files import write_whole, writing
-from jaxhil.mechanism.conversion import KeyProblem, dotted
+from jaxhil.mechanism.conversion import KeyProblem
 from jaxhil.mechanism.file import from_builtins, load
 from jaxhil.mechanism.overrides import parse_override
 from jaxhil.mechanism.structs import Mechanism, value_at
@@ -33,6 +33,8 @@ def run(options: Identify) -> int:
     arguments.integers(0, seed=options.seed)
     if not 0.0 <= options.hold_out < 1.0:
         raise InputError(f"--hold-out: found {options.hold_out}, allowed a share from 0 to below 1")
+    if options.check:
+        return _check(options, logs)
     fixed, order = _fixed(options), _order(options)
     prior = None if options.prior is None else load(options.prior).mechanism
     folder = Path(options.output)
@@ -49,6 +51,7 @@ def run(options: Identify) -> int:
             order=order,
             law=options.law,
             fixed=fixed,
+            bayes=options.bayes,
             hold_out=options.hold_out,
             limit=options.limit,
             seed=options.seed,
@@ -78,6 +81,32 @@ def _guess(options: Identify, logs: list[Path]) -> int:
     else:
         print(text, end="", flush=True)
     return 0
+
+
+def _check(options: Identify, logs: list[Path]) -> int:
+    for name in ("order", "law", "fix", "bayes"):
+        if getattr(options, name) != getattr(Identify(), name):
+            raise InputError(f"--check: found --{name} beside it, allowed none: nothing is estimated")
+    last = options.prior
+    if last is None:
+        if len(logs) < 2:
+            raise InputError("--check: found no mechanism, allowed one after the logs, or --prior")
+        last = str(logs.pop())
+    mechanism = load(last).mechanism
+    campaign = _of_stage(_read(options, logs, mechanism), options.stage)
+    from tuning.identification.check import check
+
+    found = check(campaign, mechanism, options.limit)
+    document = _document(options, campaign, mechanism, found)
+    terminal.warn(campaign.notes)
+    if options.json:
+        terminal.emit_json(document)
+    else:
+        runs = ", ".join(f"{number} {kind}" for kind, number in document["runs"].items())
+        terminal.emit(
+            _left(document, f"What {mechanism.name} leaves of runs: {runs}"), f"{document['reason']}."
+        )
+    return 0 if found.good else 1
 
 
 def _read(options: Identify, logs: list[Path], prior: Mechanism | None) -> Campaign:
@@ -113,17 +142,25 @@ def _order(options: Identify) -> int | None:
     return int(options.order)
 
 
-def _fixed(options: Identify) -> dict[str, float]:
-    fixed = {}
+def _fixed(options: Identify) -> dict[str, Any]:
+    fixed: dict[str, Any] = {}
     for text in options.fix:
         try:
             path, value = parse_override(text)
         except KeyProblem as problem:
             raise InputError(f"--fix {one_line(text, 60)}: {problem}") from None
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise InputError(f"--fix {one_line(text, 60)}: found {shown(value)}, allowed a number")
-        fixed[dotted(path)] = float(value)
+        if not _numbers(value):
+            allowed = "a number, or a list of them"
+            raise InputError(f"--fix {one_line(text, 60)}: found {shown(value)}, allowed {allowed}")
+        fixed[".".join(map(str, path))] = value
     return fixed
+
+
+def _numbers(value: Any) -> bool:
+    """Whether it is a finite number, or a list of them."""
+    if isinstance(value, list):
+        return bool(value) and all(map(_numbers, value))
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _document(options: Identify, campaign: Campaign, prior: Mechanism | None, found) -> dict[str, Any]:
@@ -196,17 +233,22 @@ def _print(document: dict[str, Any], folder: Path) -> None:
     rows = [_row(one) for one in (*document["estimates"], *document["combinations"])]
     headings = ["number", "estimate", "95 % from", "to", "unit", "prior", "off the prior"]
     things: list[Any] = [terminal.table(f"Identified from runs: {runs}", headings, rows, texts=(0, 4))]
-    left = [
-        [one["name"], ", ".join(filter(None, (one["finding"], one["where"]))), one["effect"] * one["there"]]
-        for one in document["checks"]
-    ]
-    things.append(terminal.table("What the model leaves", ["check", "found", "effect on e"], left, (0, 1)))
+    things.append(_left(document, "What the model leaves"))
     things += [
         f"{pair['one']} and {pair['other']} are hardly told apart (correlation {pair['correlation']:.3f}): "
         f"{pair['experiment']} would."
         for pair in document["confounded"]
     ]
     terminal.emit(*things, f"{document['reason']}.", f"Wrote {folder / MECHANISM} and {folder / DOCUMENT}")
+
+
+def _left(document: dict[str, Any], title: str) -> Any:
+    """The checks as a table."""
+    rows = [
+        [one["name"], ", ".join(filter(None, (one["finding"], one["where"]))), one["effect"] * one["there"]]
+        for one in document["checks"]
+    ]
+    return terminal.table(title, ["check", "found", "effect on e"], rows, (0, 1))
 
 
 def _row(one: dict[str, Any]) -> list[Any]:

@@ -1,0 +1,132 @@
+"""Whether logs are those of a mechanism as it is: its own model against every run, nothing estimated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxhil.errors import InputError
+from jaxhil.mechanism.file import to_builtins
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.uncertainty import draw
+from tuning.identification import contact as contacts
+from tuning.identification import free_motion, known, validation
+from tuning.identification.contact import ContactFit
+from tuning.identification.contact_problem import Inner, Problem, Readings
+from tuning.identification.contact_profile import LONGEST, Posterior
+from tuning.identification.motion import Motion
+from tuning.identification.noise import Noise, at_rest
+from tuning.identification.rational import Model
+from tuning.identification.records import Campaign, Run
+from tuning.identification.result import Identification
+
+CLOCK = 2e-5  # s, to which no delay is known better
+USUAL_FREQUENCY = 3.0  # Hz, of contacts, where none was made
+# Lines of fits alone: what is told has no sign to be found.
+OF_FITS = ("sign of the motion's delay", "sign of the force")
+
+
+def check(campaign: Campaign, mechanism: Mechanism, limit: float = 0.01) -> Identification:
+    """What the mechanism leaves of the logs: an identification without estimates, `limit` on its effect on e.
+
+    The force's noise is that of the runs at rest, else the mechanism's. Raises `InputError` for logs with
+    neither free motion nor contact, and for a contact law that cannot be set against logs."""
+    model = known.motion_model(mechanism)
+    free = [run for run in campaign.runs if run.kind == "free"]
+    touching = [
+        piece
+        for run in campaign.runs
+        if run.kind in ("contact", "press", "tap")
+        for piece in contacts.pieces(run, campaign.timing.control_period)
+    ]
+    motion = free_motion.of_known(free, campaign.timing, model)
+    contact = None
+    if touching:
+        contact = _known_contact(touching, model, campaign, mechanism)
+    elif motion is None:
+        raise InputError("logs: found neither free motion nor contact, allowed runs of either kind")
+    frequency = USUAL_FREQUENCY if contact is None else contacts.frequency(contact, campaign.equivalent_mass)
+    lines = [] if motion is None else validation.of_motion(motion, frequency)
+    if contact is not None:
+        s = np.array([2j * np.pi * frequency])
+        lag = -float(np.angle(model.response(s)[0])) / (2.0 * np.pi * frequency) + contact.posterior.best[0]
+        every = np.ones(len(touching), bool)
+        lines += validation.of_contact(contact, touching, campaign.equivalent_mass, frequency, lag, every)
+    return Identification(
+        estimates=(),
+        draws=np.zeros((0, 0)),
+        combinations=(),
+        confounded=(),
+        lines=tuple(line for line in lines if line.name not in OF_FITS),
+        mechanism=to_builtins(mechanism),
+        limit=limit,
+        motion=motion,
+        contact=contact,
+    )
+
+
+def _known_contact(runs: Sequence[Run], model: Model, campaign: Campaign, mechanism: Mechanism) -> ContactFit:
+    """The mechanism's contact in the place of a fitted one."""
+    rig, contact, period = mechanism.rig, mechanism.contact, campaign.timing.control_period
+    law = known.contact_law(contact)
+    delay = rig.force_sensor.delay - rig.position_sensor.delay
+    plane, lag = rig.contact_plane, rig.force_sensor.time_constant
+    motion = Motion(model, runs, campaign.timing, max(LONGEST, delay) + period)
+    noise = _noise(campaign.runs)
+    hidden = rig.force_sensor.dead_zone > 0.0
+    std, whitening = rig.force_sensor.noise_std, (1.0,)
+    if noise is not None and not noise.silent:
+        std, whitening = float(np.hypot(noise.innovation, noise.quantum / np.sqrt(12.0))), noise.filter
+    if hidden or not std:
+        whitening = (1.0,)
+    readings = Readings.of(runs, std or 1.0, whitening, std if hidden else 0.0)
+    numbers = [number for entry in readings.entries for number in known.coefficients(contact, entry)]
+    numbers.append(-rig.force_sensor.dead_zone if hidden else rig.force_sensor.bias)
+    values = np.array(numbers)
+    if not std:
+        std = _scatter(Problem(motion, readings, law, plane, lag), delay, plane, values)
+        readings = Readings.of(runs, std)
+    problem = Problem(motion, readings, law, plane, lag)
+    inner = Inner(values, np.zeros((len(values), len(values))), 0.0, 0.0, 0.0, 0.0)
+    posterior = Posterior(
+        ["delay", "plane", *problem.names],
+        np.column_stack([*_places(mechanism), np.tile(values, (validation.CERTAIN_DRAWS, 1))]),
+        np.array([delay]),
+        np.zeros(1),
+        (delay, plane, inner),
+    )
+    error = 0.0 if noise is None or noise.silent else noise.std_std / max(noise.std, 1e-300)
+    return ContactFit(law, (), problem, posterior, len(problem.kept), error, hidden)
+
+
+def _noise(runs: Sequence[Run]) -> Noise | None:
+    """The force sensor's at rest, or else in free motion."""
+    for kind in ("rest", "free"):
+        for run in runs:
+            if run.kind == kind and run.force_measured is not None:
+                readings = run.force_measured[run.valid & np.isfinite(run.force_measured)]
+                if len(readings) >= 200:
+                    return at_rest(readings)
+    return None
+
+
+def _scatter(problem: Problem, delay: float, plane: float, values: np.ndarray) -> float:
+    """Standard deviation of what the law leaves, from one row to the next [N]."""
+    left = problem.readings.force - problem.force(delay, plane, values)
+    steps = np.diff(left, axis=0)[problem.readings.counts[1:] & problem.readings.counts[:-1]]
+    return max(1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2.0), 1e-9)
+
+
+def _places(mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray]:
+    """Delays and planes that the mechanism's uncertainty allows: which rows are surely in contact."""
+    count, rig = validation.CERTAIN_DRAWS, mechanism.rig
+    drawn = draw(mechanism, count, 0)
+
+    def of(key: str, nominal: float) -> np.ndarray:
+        return drawn.get(key, np.full(count, nominal))
+
+    delay = of("rig.force_sensor.delay", rig.force_sensor.delay)
+    delay = delay - of("rig.position_sensor.delay", rig.position_sensor.delay)
+    clock = CLOCK * np.random.default_rng(0).standard_normal(count)
+    return delay + clock, of("rig.contact_plane", rig.contact_plane)

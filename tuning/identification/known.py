@@ -1,0 +1,81 @@
+"""The numbers of a mechanism file as the models that logs are set against; nothing is estimated here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from jaxhil.errors import InputError, shown
+from jaxhil.mechanism.structs import Contact, Mechanism, Simulator
+from tuning.identification import contact_laws as laws
+from tuning.identification.contact_laws import Law
+from tuning.identification.rational import Model, Structure
+
+REAL = 1e-9  # of a pole's magnitude: an imaginary part below it is rounding
+
+
+def motion_model(mechanism: Mechanism) -> Model:
+    """From the command to the measured position: the delay is the motion's and the position sensor's."""
+    simulator, delay = mechanism.rig.simulator, mechanism.rig.simulator.delay
+    numerator, denominator = _fraction(simulator)
+    poles = np.roots(denominator)
+    real = np.abs(poles.imag) <= REAL * np.abs(poles)
+    times = -1.0 / poles[real].real
+    pairs = poles[~real & (poles.imag > 0.0)]
+    sections = np.column_stack([np.abs(pairs), -pairs.real / np.abs(pairs)]).ravel()
+    above = (np.asarray(numerator) / numerator[-1])[-2::-1]
+    structure = Structure(simulator.model, len(times), len(pairs), len(above))
+    whole = delay + mechanism.rig.position_sensor.delay
+    return Model(structure, np.concatenate([np.log(times), np.log(sections), above, [whole]]))
+
+
+def _fraction(simulator: Simulator) -> tuple[list[float], list[float]]:
+    """Numerator and denominator of G(s) in descending powers of s."""
+    if simulator.model == "first_order" and simulator.time_constant:
+        return [1.0], [simulator.time_constant, 1.0]
+    if simulator.model == "second_order" and simulator.natural_frequency and simulator.damping_ratio:
+        w = 2.0 * np.pi * simulator.natural_frequency
+        return [1.0], [1.0 / w**2, 2.0 * simulator.damping_ratio / w, 1.0]
+    if simulator.model == "third_order" and simulator.coefficients:
+        return [1.0], [*simulator.coefficients[::-1], 1.0]
+    if simulator.model == "transfer_function" and simulator.numerator and simulator.denominator:
+        return list(np.trim_zeros(simulator.numerator, "f")), list(simulator.denominator)
+    return [1.0], [1.0]
+
+
+def contact_law(contact: Contact) -> Law:
+    """The law with its shape; every entry of the lists has all coefficients of its own.
+
+    Raises `InputError` for a law whose force is no sum of known functions of depth and rate."""
+    made = {
+        "linear": laws.linear,
+        "kelvin_voigt": lambda: laws.kelvin_voigt(contact.tension),
+        "hunt_crossley": lambda: laws.hunt_crossley(contact.exponent),
+        "depth_damped": lambda: laws.depth_damped(contact.exponent, contact.reference_depth or np.inf),
+        "hardening": laws.hardening,
+        "piecewise_linear": lambda: laws.piecewise_linear(tuple(contact.depths)),
+    }
+    if contact.law not in made:
+        raise InputError(f"contact.law: found {shown(contact.law)}, allowed {', '.join(made)}")
+    law = made[contact.law]()
+
+    def every(depth, rate):
+        return [*law.own(depth, rate), *law.shared(depth, rate)]
+
+    return replace(law, own=every, shared=lambda depth, rate: [])
+
+
+def coefficients(contact: Contact, entry: int) -> list[float]:
+    """Of `contact_law`'s functions, in their order, for an entry of the lists; the last one repeats."""
+    stiffness = contact.stiffness[min(entry, len(contact.stiffness) - 1)]
+    damping = contact.damping[min(entry, len(contact.damping) - 1)]
+    if isinstance(stiffness, list):
+        return [*stiffness, damping]
+    if contact.law == "linear":
+        return [stiffness]
+    if contact.law == "hunt_crossley":
+        return [stiffness, stiffness * damping]
+    if contact.law == "hardening":
+        return [stiffness, stiffness / (contact.reference_depth or np.inf) ** 2, damping]
+    return [stiffness, damping]
