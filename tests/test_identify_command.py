@@ -69,6 +69,14 @@ def test_a_day_of_logs_becomes_a_mechanism_file(jaxhil, day, tmp_path):
     (delay,) = (one for one in ran.document["estimates"] if one["key"] == "rig.force_sensor.delay")
     assert delay["low"] < 0.0037 < delay["high"] and delay["unit"] == "s" and delay["prior"] is None
 
+    # The file explains its own logs, and one of another rig does not.
+    told, map = tmp_path / "mechanism.toml", ("--map", drafted(jaxhil, day))
+    ran = jaxhil("identify", "--check", *logs(day), told, *map)
+    assert ran.code == 0 and "What identified leaves of runs: 9 contact, 1 free, 1 rest" in ran.out
+    told.write_text(told.read_text().replace("stiffness = [1", "stiffness = [2"))
+    ran = jaxhil("identify", "--check", *logs(day), *map, "--prior", told, "--json")
+    assert ran.code == 1 and ran.document["estimates"] == [] and "contact law" in ran.document["reason"]
+
     # What is not ours is not written over.
     (tmp_path / "identification.json").unlink()
     refused = jaxhil(*given)
@@ -107,15 +115,25 @@ def test_what_is_told_wrongly_is_a_bad_verdict(jaxhil, day, tmp_path):
         (["LOGS", "--hold-out", "1"], ["--hold-out: found 1.0"]),
         (["LOGS", "--fix", "rig.contact_plane"], ["--fix rig.contact_plane"]),
         (["LOGS", "--fix", "rig.contact_plane=a"], ["contact_plane=a: found 'a', allowed a number"]),
+        (["LOGS", "--fix", "contact.damping=[650, nan]"], ["found [650, nan], allowed a number, or a list"]),
+        (["--check", "LOG"], ["--check: found no mechanism"]),
+        (["--check", "LOG", "rig-300"], ["did you mean rig-300kg"]),
+        (["--check", "LOG", "rig-300kg", "--law", "linear"], ["--check: found --law beside it"]),
+        (["LOGS", "--bayes"], ["--bayes: found no prior"]),
         (["LOGS", "--limit", "nan"], ["--limit"]),
         (["LOGS", "--order", "ten"], ["--order: found 'ten', allowed auto, or 0 to 4"]),
         (["LOGS", "--map", "MAP", "--stage", "press"], ["--stage: found 'press'", "contact, free"]),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_one_line(jaxhil, day, tmp_path, arguments, words):
-    words_for = {"LOGS": logs(day), "MAP": [drafted(jaxhil, day)] if "MAP" in arguments else []}
+    words_for = {
+        "LOGS": logs(day),
+        "LOG": logs(day)[:1],
+        "MAP": [drafted(jaxhil, day)] if "MAP" in arguments else [],
+    }
     given = [one for word in arguments for one in words_for.get(word, [word])]
-    prior = [] if "--prior" in arguments or "--guess" in arguments else ["--prior", "rig-300kg"]
+    own = {"--prior", "--guess", "--check", "--bayes"} & {*arguments}
+    prior = [] if own else ["--prior", "rig-300kg"]
     ran = jaxhil("identify", *given, *prior, "-o", tmp_path)
     assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1
     assert all(word in ran.err for word in words)

@@ -77,7 +77,7 @@ def identify(
     if motion is not None:
         lines = [*validation.of_motion(motion, frequency), *(lines or [])]
     found = _draws(motion, contact, model, frequency, options)
-    if options.bayes:
+    if options.bayes and prior is not None:
         found = knowledge.with_prior(found, prior, frequency, options.seed)
     later = {key: value for key, value in options.fixed.items() if key not in FIRST}
     later = knowledge.spread_out(later, list(found))

@@ -166,6 +166,8 @@ def aperiodic(command: np.ndarray, output: np.ndarray, period: float) -> Spectru
     power = _smooth(np.abs(U) ** 2)
     middle = np.arange(SIDE, len(U) - SIDE)
     middle = middle[power[middle] > DRIVEN * power[1:].max()]
+    # Of periods too few to average, every other line is silent.
+    middle = middle[np.abs(U[middle]) ** 2 > DRIVEN * power[middle]]
     width = 2 * SIDE + 1
     r = np.arange(-SIDE, SIDE + 1) / SIDE
     powers = r[:, None] ** np.arange(DEGREE + 1)

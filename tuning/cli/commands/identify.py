@@ -33,6 +33,8 @@ def run(options: Identify) -> int:
     arguments.integers(0, seed=options.seed)
     if not 0.0 <= options.hold_out < 1.0:
         raise InputError(f"--hold-out: found {options.hold_out}, allowed a share from 0 to below 1")
+    if options.bayes and options.prior is None:
+        raise InputError("--bayes: found no prior, allowed --prior with a normal entry in [uncertainty]")
     if options.check:
         return _check(options, logs)
     fixed, order = _fixed(options), _order(options)
