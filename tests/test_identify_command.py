@@ -104,6 +104,13 @@ def test_what_is_told_wrongly_is_a_bad_verdict(jaxhil, day, tmp_path):
     assert "off the prior" in ran.out and (tmp_path / "mechanism.toml").exists()
 
 
+def test_nothing_is_written_where_neither_logs_nor_prior_tell_what_a_file_must_have(jaxhil, day, tmp_path):
+    free = [path for path in logs(day) if path.name.startswith("free")]
+    ran = jaxhil("identify", *free, "--map", drafted(jaxhil, day), "-o", tmp_path)
+    assert ran.code == 1 and not list(tmp_path.iterdir())
+    assert "neither the logs nor a prior tell contact.stiffness" in " ".join(ran.out.split())
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

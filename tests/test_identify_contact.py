@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import expm
 
 from tuning.identification import contact_laws
-from tuning.identification.contact import pieces
+from tuning.identification.contact import after_gaps, pieces
 from tuning.identification.contact_problem import Problem, Readings, lag_weights
 from tuning.identification.contact_profile import profile
 from tuning.identification.law_choice import judge
@@ -108,6 +108,32 @@ def test_a_long_press_is_fitted_in_pieces_as_exactly():
     law = contact_laws.kelvin_voigt()
     inner = Problem(Motion(SECOND, cut, timing, 0.022), Readings.of(cut, 0.5), law, 0.0).at(0.0037, 0.0)
     np.testing.assert_allclose(inner.coefficients, [1.2e5, 650.0, 0.0], rtol=1e-5, atol=1e-3)
+
+
+def test_a_contact_cut_by_lost_rows_counts_once_the_motion_has_forgotten_them():
+    """30 rows lost as the touches turn: what was commanded there is in the motion that follows."""
+    kind = campaigns.KINDS["clean"]
+    silent = {"force_sensor": {**kind.rig["force_sensor"], "noise_std": 0.0}}
+    runs = campaigns._touch_runs(
+        replace(kind, rig={**kind.rig, **silent}), np.random.default_rng(0), (0.006, 0.012)
+    )
+    timing = campaigns.campaign("clean", 0, speeds=(), seconds=0, rest=0).timing
+    names = ("tick", "position_desired", "position_measured", "force_measured", "velocity_desired", "valid",
+             "force_command", "contact_index")  # fmt: skip
+    halves = [
+        replace(run, **{name: getattr(run, name)[part] for name in names})
+        for run in runs
+        for part in (slice(0, 120), slice(150, None))
+    ]
+    known = after_gaps(halves, SECOND, 0.001)
+    assert [int(run.valid.sum()) for run in known] == [120, 79, 120, 79]
+    assert after_gaps(runs, SECOND, 0.001)[0].valid.all()
+    worst = []
+    for cut in (known, halves):
+        motion = Motion(SECOND, cut, timing, 0.022)
+        inner = Problem(motion, Readings.of(cut, 0.5), contact_laws.kelvin_voigt(), 0.0).at(0.0037, 0.0)
+        worst.append(np.max(np.abs(inner.coefficients - [1.2e5, 650.0, 0.0]) / [1.2e5, 650.0, 1.0]))
+    assert worst[0] < 1e-3 < 1e-2 < worst[1]
 
 
 def test_undamped_contact_has_no_negative_damping():

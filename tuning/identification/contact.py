@@ -24,6 +24,8 @@ from tuning.identification.sensor_lag import sensor_lag
 
 SETTLING = 0.5  # s, of a motion simulator
 PIECE = 1.0  # s
+TIME_CONSTANTS = 10.0  # after which what was commanded before is over
+FIRST_ROWS, STEADY = 5, 0.01  # rows over which, and share by which, the speed of uniform motion may change
 BEYOND = 4.0  # standard deviations beyond the dead zone from which a reading counts
 ROUGH = 21, 5  # delays and planes of the grid for the fit that is only judged
 UNEXPLAINED = 1.3  # chi-squared per degree of freedom above which intervals are widened by it
@@ -46,6 +48,29 @@ def pieces(run: Run, period: float) -> list[Run]:
         valid[:settling] = False
         found.append(replace(run, valid=valid, **cut))
     return found
+
+
+def after_gaps(runs: Sequence[Run], model: Model, period: float) -> list[Run]:
+    """Runs whose first rows do not count where the log lost rows in mid-contact, commands and all.
+
+    What was commanded there is in the motion until ten of its time constants and all delays later. A run that
+    begins in uniform motion was so before."""
+    slowest = max((-1.0 / pole.real for pole in np.roots(model.fraction[1])), default=0.0)
+    settling = int(np.ceil((TIME_CONSTANTS * slowest + max(model.delay, 0.0) + LONGEST) / period))
+    found, ends = [], {}
+    for run in runs:
+        lost = ends.get(run.source, run.tick[0]) + 1 < run.tick[0]
+        ends[run.source] = int(run.tick[-1])
+        if lost and not _uniform(run.position_desired):
+            run = replace(run, valid=run.valid & (np.arange(len(run.tick)) >= settling))
+        found.append(run)
+    return found
+
+
+def _uniform(position: np.ndarray) -> bool:
+    """Whether the first rows are those of a motion that nothing accelerates."""
+    first, second = np.diff(position[: 2 * FIRST_ROWS + 1 : FIRST_ROWS])
+    return bool(abs(second - first) <= STEADY * abs(first))
 
 
 @dataclass(frozen=True)
@@ -100,11 +125,12 @@ def estimate(
         spread = float(np.hypot(noise.innovation, noise.quantum / np.sqrt(12.0)))
         readings = Readings.of(runs, spread, noise.filter)
     judged: tuple[Judged, ...] = ()
+    near = None
     if law is None or isinstance(law, str):
         judged = tuple(judge(motion, readings, plane, None if law is None else (law,)))
-        law = judged[0].law
+        law, near = judged[0].law, (judged[0].delay, judged[0].plane)
     problem = Problem(motion, readings, law, plane)
-    posterior = profile(problem, seed)
+    posterior = profile(problem, seed, near)
     lag = None if hidden else sensor_lag(problem, posterior)
     if lag is not None:
         problem = Problem(motion, readings, law, plane, lag.value)

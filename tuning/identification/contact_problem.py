@@ -7,9 +7,9 @@ the law is linear in its coefficients: stiffness, damping, the sensor's bias.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import special
@@ -76,8 +76,17 @@ class Inner:
     covariance: np.ndarray
     misfit: float  # sum of squares over the variance of the noise
     evidence: float  # log of the posterior density of delay and plane, up to a constant
-    slope: float  # of misfit / 2 by the plane
-    curvature: float  # of misfit / 2 by the plane, all else fitted
+    slope: float = 0.0  # of misfit / 2 by the plane
+    curvature: float = 0.0  # of misfit / 2 by the plane, all else fitted
+
+
+class _Near(NamedTuple):
+    """Rows that may be in contact, over several planes: what the law makes of them."""
+
+    rows: np.ndarray  # (rows,)
+    depth: np.ndarray  # m, (planes, rows); 0 out of contact
+    rate: np.ndarray  # m/s, (rows,)
+    columns: np.ndarray  # (planes, coefficients, rows), one per coefficient but the bias
 
 
 class Problem:
@@ -96,7 +105,6 @@ class Problem:
         self.kept = np.flatnonzero(readings.counts)
         # Filters need the rows between those that count.
         self.where = self.kept if self.plain else np.arange(readings.counts.size)
-        self.entry = readings.entry.ravel()[self.where]
         self.target = self.whiten(readings.force).ravel()[self.kept] / readings.std
         self.rate_like = [i for i, name in enumerate(self.names) if name.startswith("damping")]
         # A dead zone takes its share of every reading beyond it; a bias is in every reading.
@@ -120,32 +128,48 @@ class Problem:
 
     def whiten(self, values: np.ndarray) -> np.ndarray:
         """Values of (..., rows, lanes), filtered along the rows."""
-        if len(self.readings.whitening) == 1:
-            return values
-        filtered: Any = lfilter(self.readings.whitening, [1.0], values, axis=-2)
+        filtered = values.copy() if len(self.readings.whitening) > 1 else values
+        for lag, weight in enumerate(self.readings.whitening[1:], 1):
+            filtered[..., lag:, :] += weight * values[..., :-lag, :]
         return filtered
 
     def at(self, delay: float, plane: float) -> Inner:
         """Fit the coefficients; rows where the law would pull count as out of contact."""
-        moved = self._moved(delay)
-        touching = [self._touching(one, plane, self._guess) for one in moved]
-        fit = self._solve(moved, plane, touching)
+        near, flags, fit = self._settle(delay, np.array([plane]))
+        (inner,) = self._inner(fit)
+        if self.plane is not None:
+            return inner
+        by_plane = self._by_plane(inner.coefficients, near, flags)
+        residual, design = fit[3][0], fit[4][0]
+        along = design @ by_plane
+        across = along @ inner.covariance @ along
+        return replace(inner, slope=float(residual @ by_plane), curvature=float(by_plane @ by_plane - across))
+
+    def across(self, delay: float, planes: np.ndarray) -> list[Inner]:
+        """The same at several planes at once, without slopes by the plane."""
+        return self._inner(self._settle(delay, planes)[2])
+
+    def _settle(self, delay: float, planes: np.ndarray):
+        """Rows near contact, those of them in contact, and the linear fit to them, until they agree."""
+        near = [self._near(*moved, self.where, planes) for moved in self._moved(delay)]
+        flags = [self._touching(one, self._guess) for one in near]
+        fit = self._solve(near, flags)
         for _ in range(2):
-            again = [self._touching(one, plane, fit[0]) for one in moved]
-            if all(np.array_equal(one, other) for one, other in zip(again, touching, strict=True)):
+            again = [self._touching(one, fit[0]) for one in near]
+            if all(np.array_equal(one, other) for one, other in zip(again, flags, strict=True)):
                 break
-            touching = again
-            fit = self._solve(moved, plane, touching)
-        coefficients, covariance, misfit, by_row = fit
-        self._guess = coefficients
-        slope = curvature = 0.0
-        if self.plane is None:
-            slope, curvature = self._by_plane(coefficients, covariance, moved, plane, touching, by_row)
-        allowed = 0.0
-        for i in self.rate_like:
-            allowed += float(special.log_ndtr(coefficients[i] / np.sqrt(covariance[i, i])))
-        evidence = -0.5 * misfit + 0.5 * float(np.linalg.slogdet(covariance)[1]) + allowed
-        return Inner(coefficients, covariance, misfit, evidence, slope, curvature)
+            flags = again
+            fit = self._solve(near, flags)
+        self._guess = fit[0][len(planes) // 2]
+        return near, flags, fit
+
+    def _inner(self, fit) -> list[Inner]:
+        coefficients, covariance, misfit = fit[:3]
+        allowed = sum(
+            special.log_ndtr(coefficients[:, i] / np.sqrt(covariance[:, i, i])) for i in self.rate_like
+        )
+        evidence = -0.5 * misfit + 0.5 * np.linalg.slogdet(covariance)[1] + allowed
+        return [Inner(*one) for one in zip(coefficients, covariance, misfit, evidence, strict=True)]
 
     def _moved(self, delay: float) -> list[tuple[np.ndarray, np.ndarray]]:
         """Position and rate at the rows of `where`, for each part of a period before them."""
@@ -154,109 +178,122 @@ class Problem:
             self._at = delay, [(x.ravel()[self.where], v.ravel()[self.where]) for x, v in moved]
         return self._at[1]
 
+    def _near(self, position, rate, where, planes: np.ndarray) -> _Near:
+        rows = np.flatnonzero(position > planes.min())
+        depth, rate = np.maximum(position[rows] - planes[:, None], 0.0), rate[rows]
+        return _Near(rows, depth, rate, self._columns(depth, rate, where[rows]))
+
     def _columns(self, depth: np.ndarray, rate: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """The law's functions at rows in contact, one per coefficient but the bias."""
+        """The law's functions at rows of the readings, (planes, coefficients, rows)."""
         own, entries = self.law.own(depth, rate), self.readings.entries
         if len(entries) > 1:
-            entry = self.entry[rows]
+            entry = self.readings.entry.ravel()[rows]
             own = [np.where(entry == i, value, 0.0) for i in entries for value in own]
-        return np.array([*own, *self.law.shared(depth, rate)])
+        every = (*own, *self.law.shared(depth, rate))
+        columns = np.empty((len(depth), len(every), depth.shape[1]))
+        for i, one in enumerate(every):
+            columns[:, i] = one
+        return columns
 
-    def _touching(self, moved, plane: float, coefficients: np.ndarray | None) -> np.ndarray:
+    def _touching(self, near: _Near, coefficients: np.ndarray | None) -> np.ndarray:
         """Rows in contact, without those where the law with these coefficients would pull."""
-        position, rate = moved
-        rows = np.flatnonzero(position > plane)
+        inside = near.depth > 0.0
         if coefficients is None or self.law.pulls or not self.rate_like:
-            return rows
-        pushing = rows[coefficients[:-1] @ self._columns(position[rows] - plane, rate[rows], rows) > 0.0]
+            return inside
+        pushing = inside & (_force(coefficients, near.columns) > 0.0)
         # Where the force has the wrong sign the law pulls throughout, and is to be found so.
-        return pushing if 2 * len(pushing) > len(rows) else rows
+        sound = 2 * pushing.sum(axis=1) > inside.sum(axis=1)
+        return np.where(sound[:, None], pushing, inside)
 
-    def _filtered(self, parts: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    def _filtered(self, tables: list[np.ndarray], places: list[np.ndarray]) -> np.ndarray:
         """Columns at their rows, for each part of a period, as the sensor gives them at every row."""
         shape, full = self.readings.force.shape, []
-        for columns, rows in parts:
-            table = np.zeros((len(columns), len(self.where)))
-            table[:, rows] = columns
-            full.append(table.reshape(len(columns), *shape))
+        for columns, rows in zip(tables, places, strict=True):
+            table = np.zeros((*columns.shape[:2], self.readings.force.size))
+            table[:, :, rows] = columns
+            full.append(table.reshape(*columns.shape[:2], *shape))
         if self.time_constant == 0.0:
             return full[0]
         pole, (now, half, last) = lag_weights(self.motion.period / self.time_constant)
         drive = now * full[0] + half * full[1]
-        drive[:, 1:] += last * full[0][:, :-1]
+        drive[:, :, 1:] += last * full[0][:, :, :-1]
         lagged: Any = lfilter([1.0], [1.0, -pole], drive, axis=-2)
         return lagged
 
-    def _design(self, parts: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """Columns over the noise: at their rows, or at all that count where they are filtered."""
+    def _design(self, near: list[_Near], tables: list[np.ndarray]) -> np.ndarray:
+        """Columns at their rows, or at all that count where they are filtered."""
         if self.plain:
-            return parts[0][0] / self.readings.std
-        full = self.whiten(self._filtered(parts))
-        return full.reshape(len(full), -1)[:, self.kept] / self.readings.std
+            return tables[0]
+        full = self.whiten(self._filtered(tables, [one.rows for one in near]))
+        return full.reshape(*full.shape[:2], -1)[:, :, self.kept]
 
-    def _solve(self, moved, plane: float, touching):
-        """Coefficients, their covariance, the misfit, and residuals with the design at its rows."""
-        parts = []
-        for (position, rate), rows in zip(moved, touching, strict=True):
-            columns = self._columns(position[rows] - plane, rate[rows], rows)
-            parts.append(
-                (np.concatenate([columns, np.ones((1, len(rows)))]) if self.local else columns, rows)
-            )
-        design = self._design(parts)
-        target = self.target[touching[0]] if self.plain else self.target
-        if not self.local:
-            shift = float(np.sum(self.readings.whitening)) / self.readings.std
-            design = np.concatenate([design, np.full((1, design.shape[1]), shift)])
-        normal, right = design @ design.T, design @ target
+    def _solve(self, near: list[_Near], flags: list[np.ndarray]):
+        """Coefficients, their covariance, the misfit, residuals and the design, for each plane.
+
+        Design and residuals are over the noise's standard deviation."""
+        std, tables = self.readings.std, []
+        for one, flag in zip(near, flags, strict=True):
+            # The last column is the bias: in the rows in contact alone under a dead zone, else in all.
+            table = np.empty((len(flag), one.columns.shape[1] + 1, len(one.rows)))
+            np.multiply(one.columns, flag[:, None] / std, out=table[:, :-1])
+            table[:, -1] = flag / std if self.local else 1.0 / std
+            tables.append(table)
+        design = self._design(near, tables)
+        if not self.plain and not self.local:
+            design[:, -1] = float(np.sum(self.readings.whitening)) / std
+        target = self.target[near[0].rows] if self.plain else self.target
+        normal, right = design @ design.swapaxes(1, 2), design @ target
         summed = self.plain and not self.local
         if summed:
-            normal[-1, -1], right[-1] = self.sums[:2]
-        size = np.sqrt(np.maximum(np.diag(normal), 1e-60))
-        scaled = normal / np.outer(size, size) + 1e-13 * np.eye(len(size))
-        covariance = np.linalg.inv(scaled) / np.outer(size, size)
-        coefficients = covariance @ right
-        residual = coefficients @ design - target
-        misfit = residual @ residual
+            normal[:, -1, -1], right[:, -1] = self.sums[:2]
+        size = np.sqrt(np.maximum(np.einsum("pii->pi", normal), 1e-60))
+        scale = size[:, :, None] * size[:, None]
+        covariance = np.linalg.inv(normal / scale + 1e-13 * np.eye(size.shape[1])) / scale
+        coefficients = np.einsum("pij,pj->pi", covariance, right)
+        residual = (coefficients[:, None] @ design)[:, 0] - target
+        misfit = np.einsum("pm,pm->p", residual, residual)
         if self.plain:
             # Rows out of contact have the bias as their residual.
-            bias = coefficients[-1] if summed else 0.0
-            misfit += self.sums[2] - target @ target
-            misfit += bias**2 * (self.sums[0] - len(target) / self.readings.std**2)
-            misfit -= 2.0 * bias * (self.sums[1] - target.sum() / self.readings.std)
-        return coefficients, covariance, float(misfit), (residual, design)
+            bias = coefficients[:, -1] if summed else np.zeros(len(design))
+            misfit = misfit + self.sums[2] - target @ target
+            misfit += bias**2 * (self.sums[0] - len(target) / std**2)
+            misfit -= 2.0 * bias * (self.sums[1] - target.sum() / std)
+        return coefficients, covariance, misfit, residual, design
 
-    def _by_plane(self, coefficients, covariance, moved, plane, touching, by_row) -> tuple[float, float]:
-        """Slope and curvature of half the misfit by the plane, all else fitted."""
-        step, parts = 1e-7, []
-        for (position, rate), rows in zip(moved, touching, strict=True):
-            depth = position[rows] - plane
-            up, down = (self._columns(np.maximum(depth + d, 0.0), rate[rows], rows) for d in (step, -step))
-            parts.append(((coefficients[:-1] @ (down - up))[None] / (2.0 * step), rows))
-        slope = self._design(parts)[0]
-        residual, design = by_row
-        across = design @ slope
-        return float(residual @ slope), float(slope @ slope - across @ covariance @ across)
+    def _by_plane(self, coefficients, near: list[_Near], flags: list[np.ndarray]) -> np.ndarray:
+        """Slope of the readings predicted by the one plane, at the rows of the design, over the noise."""
+        step, tables = 1e-7, []
+        for one, flag in zip(near, flags, strict=True):
+            rows = self.where[one.rows]
+            up, down = (
+                _force(coefficients, self._columns(np.maximum(one.depth + d, 0.0), one.rate, rows))
+                for d in (step, -step)
+            )
+            tables.append(((down - up) * flag / (2.0 * step * self.readings.std))[:, None])
+        return self._design(near, tables)[0, 0]
 
     def force(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
         """The readings the law predicts [N], the bias included, (rows, lanes)."""
-        full = Problem.__new__(Problem)
-        full.__dict__ |= self.__dict__ | {"where": np.arange(self.readings.force.size), "_at": None}
-        full.entry = self.readings.entry.ravel()
-        parts = []
-        for moved in full._moved(delay):
-            rows = full._touching(moved, plane, coefficients)
-            columns = full._columns(moved[0][rows] - plane, moved[1][rows], rows)
-            parts.append(((coefficients[:-1] @ columns + self.local * coefficients[-1])[None], rows))
-        return full._filtered(parts)[0] + (0.0 if self.local else coefficients[-1])
+        forces, places = [], []
+        for part in self.before:
+            near, flag = self._everywhere(delay + part * self.motion.period, plane, coefficients)
+            value = _force(coefficients[None], near.columns) + self.local * coefficients[-1]
+            forces.append((value * flag)[:, None])
+            places.append(near.rows)
+        return self._filtered(forces, places)[0, 0] + (0.0 if self.local else coefficients[-1])
 
     def touching(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
         """Whether each row is in contact by the model, (rows, lanes)."""
-        position, rate = self.motion.at(delay)
-        entry, self.entry = self.entry, self.readings.entry.ravel()
-        flags = np.zeros(position.size, bool)
-        flags[self._touching((position.ravel(), rate.ravel()), plane, coefficients)] = True
-        self.entry = entry
-        return flags.reshape(position.shape)
+        near, flag = self._everywhere(delay, plane, coefficients)
+        flags = np.zeros(self.readings.force.shape, bool)
+        flags.ravel()[near.rows] = flag[0]
+        return flags
+
+    def _everywhere(self, delay: float, plane: float, coefficients) -> tuple[_Near, np.ndarray]:
+        """The rows near contact, whether they count or not, and whether they are in it."""
+        position, rate = (value.ravel() for value in self.motion.at(delay))
+        near = self._near(position, rate, np.arange(position.size), np.array([plane]))
+        return near, self._touching(near, coefficients[None])
 
     def settled(self, delay: float, plane: float) -> tuple[float, Inner, float]:
         """The plane of least misfit at a delay, a fit next to it, and by how much the log likelihood there is
@@ -272,6 +309,11 @@ class Problem:
                 return plane, inner, gain
             inner = self.at(delay, plane)
         return plane, inner, 0.0
+
+
+def _force(coefficients: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """The law without the bias, (planes, rows)."""
+    return (coefficients[..., None, :-1] @ columns)[:, 0]
 
 
 def lag_weights(rate: float) -> tuple[float, tuple[float, float, float]]:

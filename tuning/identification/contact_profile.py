@@ -21,8 +21,9 @@ COARSE = 0.0005  # s, between the first delays that are looked at
 FINE = 1e-5  # s, between the next: damped touches begin with a jump, and a row on its other side costs much
 REGION = 25.0  # of twice the log posterior below its best: what the final grid covers
 ROUGH_REGION = 400.0  # the same of the coarse grid, whose heights are full of rows on the wrong side
-FEW_PLANES = 7  # of the grid that finds the region
-DELAYS, PLANES = 61, 13  # of the final grid
+FEW_PLANES = 5  # of the grid that finds the region
+DELAYS, PLANES = 61, 9  # of the final grid
+REACH = 0.003  # s, on each side of a delay that is known roughly
 PLANE_REACH = 3.2  # standard deviations of the plane at a given delay, on each side
 DRAWS = 4000
 
@@ -54,22 +55,24 @@ def profile(
 ) -> Posterior:
     """The posterior of the force delay, the plane and the coefficients.
 
-    `near`: a delay [s] and the plane there [m] within a millisecond of the best, where they are known; else
-    all delays are looked at. `size`: of the final grid, delays and planes."""
+    `near`: a delay [s] and the plane there [m] within some milliseconds of the best, where they are known;
+    else all delays are looked at. `size`: of the final grid, delays and planes."""
     if near is None:
         delays = np.arange(0.0, LONGEST + COARSE / 2.0, COARSE)
         start = first_plane(problem, LONGEST / 4.0) if problem.plane is None else problem.plane
     else:
-        delays, start = np.clip(near[0] + COARSE * np.linspace(-2.0, 2.0, 9), 0.0, LONGEST), near[1]
-        delays = np.unique(delays)
-    planes, heights = _scan(problem, delays, start)
+        delays, start = near[0] + np.arange(-REACH, REACH + COARSE / 2.0, COARSE), near[1]
+        delays = np.unique(np.clip(delays, 0.0, LONGEST))
+    planes, stds, heights = _scan(problem, delays, start)
     low, high = _region(delays, heights, ROUGH_REGION)
     finer = np.linspace(low, high, int(np.clip((high - low) / FINE, 21, 151)))
-    places, cells = _grid(problem, finer, np.interp(finer, delays, planes), FEW_PLANES)
-    heights, planes = _by_delay(places, cells, len(finer))
+    known = (np.interp(finer, delays, one) for one in (planes, stds))
+    places, cells = _grid(problem, finer, *known, FEW_PLANES)
+    heights, planes, stds = _by_delay(places, cells, len(finer))
     low, high = _region(finer, heights, REGION)
     delays = np.linspace(low, high, size[0])
-    places, cells = _grid(problem, delays, np.interp(delays, finer, planes), size[1])
+    known = (np.interp(delays, finer, one) for one in (planes, stds))
+    places, cells = _grid(problem, delays, *known, size[1])
     return _sample(problem, places, cells, delays, seed)
 
 
@@ -84,16 +87,15 @@ def first_plane(problem: Problem, delay: float) -> float:
     return float(np.median(found)) if found else 0.0
 
 
-def _scan(problem: Problem, delays: np.ndarray, starts) -> tuple[np.ndarray, np.ndarray]:
-    """At each delay the best plane, and the log posterior with the plane integrated out."""
-    starts = np.broadcast_to(np.asarray(starts, float), delays.shape)
-    planes, heights = [], []
-    for delay, start in zip(delays, starts, strict=True):
+def _scan(problem: Problem, delays: np.ndarray, start: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """At each delay the best plane, its standard deviation, and the log posterior with it integrated out."""
+    planes, stds, heights = [], [], []
+    for delay in delays:
         plane, inner, gain = problem.settled(delay, start)
-        width = 0.0 if problem.plane is not None else -0.5 * np.log(max(inner.curvature, 1e-300))
+        stds.append(1.0 if problem.plane is not None else 1.0 / np.sqrt(max(inner.curvature, 1e-300)))
         planes.append(plane)
-        heights.append(inner.evidence + gain + width)
-    return np.array(planes), np.array(heights)
+        heights.append(inner.evidence + gain + np.log(stds[-1]))
+    return np.array(planes), np.array(stds), np.array(heights)
 
 
 def _region(delays: np.ndarray, heights: np.ndarray, reach: float) -> tuple[float, float]:
@@ -104,34 +106,35 @@ def _region(delays: np.ndarray, heights: np.ndarray, reach: float) -> tuple[floa
 
 
 def _grid(
-    problem: Problem, delays: np.ndarray, centres: np.ndarray, across: int
+    problem: Problem, delays: np.ndarray, centres: np.ndarray, stds: np.ndarray, across: int
 ) -> tuple[np.ndarray, list[Inner]]:
     """Fits at each delay and at planes across the plane's uncertainty there.
 
     The plane alone moves rows to the other side of an onset, so one plane a delay does not tell how good the
     delay is. Places are rows of (delay, plane, width in the plane)."""
     places, cells = [], []
-    for delay, centre in zip(delays, centres, strict=True):
-        middle = problem.at(delay, centre)
+    for delay, centre, std in zip(delays, centres, stds, strict=True):
         if problem.plane is not None:
-            cells.append(middle)
-            places.append((delay, centre, 1.0))
+            cells.append(problem.at(delay, problem.plane))
+            places.append((delay, problem.plane, 1.0))
             continue
-        std = 1.0 / np.sqrt(max(middle.curvature, 1e-300))
-        # From the parabola's lowest point, unless a row on the wrong side has thrown it far off.
-        centre = centre - np.clip(middle.slope * std, -1.0, 1.0) * std
-        for plane in centre + PLANE_REACH * std * np.linspace(-1.0, 1.0, across):
-            cells.append(problem.at(delay, plane))
-            places.append((delay, plane, 2.0 * PLANE_REACH * std / (across - 1)))
+        planes = centre + PLANE_REACH * std * np.linspace(-1.0, 1.0, across)
+        cells += problem.across(delay, planes)
+        places += [(delay, plane, planes[1] - planes[0]) for plane in planes]
     return np.array(places), cells
 
 
-def _by_delay(places: np.ndarray, cells: list[Inner], count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Log posterior of each delay, all planes together, and the mean plane there."""
-    heights = _heights(places, cells).reshape(count, -1)
+def _by_delay(
+    places: np.ndarray, cells: list[Inner], count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Log posterior of each delay, all planes together; mean and standard deviation of the plane there."""
+    heights, planes = _heights(places, cells).reshape(count, -1), places[:, 1].reshape(count, -1)
     total: Any = special.logsumexp(heights, axis=1)
     share = np.exp(heights - total[:, None])
-    return total, np.sum(share * places[:, 1].reshape(count, -1), axis=1)
+    mean = np.sum(share * planes, axis=1)
+    spread = np.sqrt(np.sum(share * (planes - mean[:, None]) ** 2, axis=1))
+    # A grid so wide that one plane has it all says no more than the distance to the next.
+    return total, mean, np.maximum(spread, places[:, 2].reshape(count, -1)[:, 0] / 2.0)
 
 
 def _heights(places: np.ndarray, cells: list[Inner]) -> np.ndarray:
@@ -157,7 +160,7 @@ def _sample(
         spread = rng.uniform(-0.5, 0.5, (count, 2)) * [step, width * (problem.plane is None)]
         values = _coefficients(cells[index], problem.rate_like, count, rng)
         rows.append(np.column_stack([np.clip(delay + spread[:, 0], 0.0, None), plane + spread[:, 1], values]))
-    profile, _ = _by_delay(places, cells, len(delays))
+    profile = _by_delay(places, cells, len(delays))[0]
     best = int(np.argmax(heights))
     return Posterior(
         ["delay", "plane", *problem.names],

@@ -24,6 +24,7 @@ from tuning.identification.free_motion import FreeMotion
 from tuning.identification.law_choice import NAMES
 from tuning.identification.mechanism_file import put, uncertainty_tables
 from tuning.identification.noise import Noise, at_rest
+from tuning.identification.order import VAGUE
 from tuning.identification.parameters import SIMULATOR
 from tuning.identification.rational import STRUCTURES, Model
 from tuning.identification.records import Campaign, Run
@@ -31,6 +32,7 @@ from tuning.identification.result import Estimate, Identification, confounded
 
 SHORTEST_REST = 200  # rows from which a run at rest says what a sensor's noise is
 USUAL_FREQUENCY = 3.0  # Hz, of contacts, where none was made
+TOUCHING = ("contact", "press", "tap")
 
 
 @dataclass(frozen=True)
@@ -56,26 +58,24 @@ def identify(
 ) -> Identification:
     """What the runs of a campaign say of the rig and the mechanism.
 
-    `prior` gives what the logs do not tell. Raises `InputError` where neither does for a number that a
-    mechanism file must have."""
+    `prior` gives what the logs do not tell. Where neither does for a number that a mechanism file must have,
+    there is no mechanism and the verdict is bad. Raises `InputError` for options that cannot be."""
     options = options or Options()
     _check(options, prior)
-    runs = {kind: [run for run in campaign.runs if run.kind == kind] for kind in ("rest", "free")}
-    touching = [
-        piece
-        for run in campaign.runs
-        if run.kind in ("contact", "press", "tap")
-        for piece in contacts.pieces(run, campaign.timing.control_period)
-    ]
+    runs = {kind: [run for run in campaign.runs if run.kind == kind] for kind in ("rest", "free", *TOUCHING)}
+    period, mass = campaign.timing.control_period, campaign.equivalent_mass
     force, position = _noise(runs)
     motion = free_motion.estimate(runs["free"], campaign.timing, options.order)
-    model = motion.model if motion is not None else _told_model(prior)
-    contact = lines = None
-    if touching:
+    model = _told_model(prior) if motion is None else motion.model
+    contact, lines, frequency = None, [], USUAL_FREQUENCY
+    whole = [run for run in campaign.runs if run.kind in TOUCHING]
+    if whole and model is not None:
+        whole = contacts.after_gaps(whole, model, period)
+        touching = [piece for run in whole for piece in contacts.pieces(run, period)]
         contact, lines = _contact(touching, model, campaign, force, options)
-    frequency = USUAL_FREQUENCY if contact is None else contacts.frequency(contact, campaign.equivalent_mass)
+        frequency = contacts.frequency(contact, mass)
     if motion is not None:
-        lines = [*validation.of_motion(motion, frequency), *(lines or [])]
+        lines = [*validation.of_motion(motion, frequency), *lines]
     found = _draws(motion, contact, model, frequency, options)
     if options.bayes and prior is not None:
         found = knowledge.with_prior(found, prior, frequency, options.seed)
@@ -83,24 +83,44 @@ def identify(
     later = knowledge.spread_out(later, list(found))
     found, denied = knowledge.with_told(found, later)
     fixed = {**{key: options.fixed[key] for key in FIRST if key in options.fixed}, **later}
-    estimates, told = _estimates(found, motion, contact, force, position, fixed)
-    mechanism = _mechanism(campaign, prior, model, contact, (*estimates, *told), found, options)
+    told = {key: np.full(DRAWS, value) for key, value in later.items()}
+    vague = [key for key, draws in found.items() if key.startswith("contact.stiffness") and _vague(draws)]
+    told_contact = None if vague else contact
+    if vague:
+        found = {key: draws for key, draws in found.items() if key.startswith(SIMULATOR)}
+    estimates = _estimates(found, motion, told_contact, force, position, fixed)
+    mechanism, missing = None, _missing(prior, model, told_contact)
+    if not missing:
+        mechanism = _mechanism(campaign, prior, model, told_contact, estimates, found, options)
     keys = list(found)
     table = np.array([found[key] for key in keys]).T if keys else np.zeros((DRAWS, 0))
     return Identification(
-        estimates=(*estimates, *told),
+        estimates=estimates,
         draws=table,
-        combinations=_combinations({**found, **{k: np.full(DRAWS, v) for k, v in later.items()}}, contact),
+        combinations=_combinations(found | told, told_contact),
         confounded=confounded(keys, table),
-        lines=tuple(lines or ()),
+        lines=tuple(lines),
         mechanism=mechanism,
         limit=options.limit,
-        notes=(*_notes(motion, contact, force), *denied),
+        notes=(*_notes(motion, contact, force, vague), *denied),
+        missing=missing,
         motion=motion,
         contact=contact,
         force_noise=force,
         position_noise=position,
     )
+
+
+def _vague(draws: np.ndarray) -> bool:
+    return bool(draws.std() > VAGUE * abs(draws.mean()))
+
+
+def _missing(prior: Mechanism | None, model: Model | None, contact: ContactFit | None) -> tuple[str, ...]:
+    """What neither the logs nor the prior tell, and the run that would."""
+    missing = ["rig.simulator (a run of kind free would)"] if model is None else []
+    if prior is None and contact is None:
+        missing.append("contact.stiffness (a run of kind contact or press would)")
+    return tuple(missing)
 
 
 def _check(options: Options, prior: Mechanism | None) -> None:
@@ -116,10 +136,8 @@ def _check(options: Options, prior: Mechanism | None) -> None:
         raise InputError(f"order: found {options.order}, allowed {', '.join(map(str, orders))}")
 
 
-def _told_model(prior: Mechanism | None) -> Model:
-    if prior is None:
-        raise InputError("logs: found no free motion, allowed a run of kind free or a prior mechanism")
-    return known.motion_model(prior)
+def _told_model(prior: Mechanism | None) -> Model | None:
+    return None if prior is None else known.motion_model(prior)
 
 
 def _noise(runs: Mapping[str, Sequence[Run]]) -> tuple[Noise | None, Noise | None]:
@@ -168,11 +186,15 @@ def held_out(runs: Sequence[Run], share: float) -> np.ndarray:
 
 
 def _draws(
-    motion: FreeMotion | None, contact: ContactFit | None, model: Model, frequency: float, options: Options
+    motion: FreeMotion | None,
+    contact: ContactFit | None,
+    model: Model | None,
+    frequency: float,
+    options: Options,
 ) -> dict[str, np.ndarray]:
     """Draws of every number by its key, in the key's unit."""
     found, lag = {}, np.zeros(DRAWS)
-    if motion is not None:
+    if motion is not None and model is not None:
         rng = np.random.default_rng([options.seed, 1])
         found, lag = parameters.simulator_draws(model, motion.covariance, frequency, DRAWS, rng)
     if contact is not None:
@@ -187,7 +209,7 @@ def _draws(
     return found
 
 
-def _estimates(found, motion, contact, force, position, fixed) -> tuple[list[Estimate], list[Estimate]]:
+def _estimates(found, motion, contact, force, position, fixed) -> tuple[Estimate, ...]:
     """Estimates of what has draws, then of what the sensors say at rest and of what was told."""
     estimates = [_of_draws(key, values) for key, values in found.items()]
     others = []
@@ -210,7 +232,7 @@ def _estimates(found, motion, contact, force, position, fixed) -> tuple[list[Est
     others += [
         Estimate(key, value, 0.0, value, value, unit_of(key), told=True) for key, value in fixed.items()
     ]
-    return estimates, others
+    return (*estimates, *others)
 
 
 def _of_draws(key: str, values: np.ndarray) -> Estimate:
@@ -255,7 +277,7 @@ def _combinations(found: Mapping[str, np.ndarray], contact: ContactFit | None) -
 def _mechanism(
     campaign: Campaign,
     prior: Mechanism | None,
-    model: Model,
+    model: Model | None,
     contact: ContactFit | None,
     estimates: Sequence[Estimate],
     found: Mapping[str, np.ndarray],
@@ -274,14 +296,10 @@ def _mechanism(
         document["contact"] = parameters.contact_section(contact.law, values)
         if prior is None:
             document["approach"]["contacts"] = len(document["contact"]["stiffness"])
-    elif prior is not None:
+    else:
         for key, value in values.items():
             if key.startswith("contact."):
                 put(document, key, value)
-    else:
-        raise InputError(
-            "logs: found no contact, allowed a run of kind contact, press or tap, or a prior mechanism"
-        )
     rig = dict(document.get("rig", {}))
     rig |= {
         "control_period": timing.control_period,
@@ -289,7 +307,7 @@ def _mechanism(
         "command_hold": timing.command_hold,
     }
     simulator = {key[len(SIMULATOR) :]: one for key, one in values.items() if key.startswith(SIMULATOR)}
-    if simulator:
+    if simulator and model is not None:
         before = rig.get("simulator", {})
         simulator = {
             **{k: v for k, v in before.items() if k.endswith("_limit")},
@@ -337,8 +355,15 @@ def _source(campaign: Campaign) -> str:
     return f"identified from {files or 'a campaign in memory'}"[:9_000]
 
 
-def _notes(motion: FreeMotion | None, contact: ContactFit | None, force: Noise | None) -> list[str]:
+def _notes(
+    motion: FreeMotion | None, contact: ContactFit | None, force: Noise | None, vague: Sequence[str]
+) -> list[str]:
     notes = []
+    if vague:
+        notes.append(
+            f"{', '.join(vague)}: known to {100 * VAGUE:.0f} % at best: the contact is the prior's; "
+            "more touches or deeper ones would tell it"
+        )
     if motion is None:
         notes.append("no free motion: the motion simulator is the prior's")
     if contact is None:

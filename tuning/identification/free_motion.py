@@ -8,29 +8,36 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from scipy import optimize, stats
 
 from tuning.identification.frf import Spectrum, spectrum
 from tuning.identification.order import Candidate, choose, criterion, left
-from tuning.identification.rational import Fit, Lines, Model
+from tuning.identification.rational import Fit, Lines, Model, fit
 from tuning.identification.records import Run, Timing
 
 SETTLING = 10.0  # time constants after which a transient is over
 SLOWEST = 0.05  # s, time constant assumed before any is known
 UNEXPLAINED = 1.3  # chi-squared per degree of freedom above which intervals are widened by it
+RARE = 1e-3  # probability under which the model itself is taken to err
+BANDS = 10  # of frequency, in each of which it errs by as much everywhere
+LARGEST = 10.0  # relative error that is looked for
+ROUNDS = 3  # of fitting and of looking how much it errs
 
 
 @dataclass(frozen=True)
 class FreeMotion:
     """What runs without contact say."""
 
-    lines: Lines
+    lines: Lines  # with the noise that the runs show
     spectra: tuple[Spectrum, ...]  # one a run
     chosen: Candidate
     candidates: tuple[Candidate, ...]
     gain: tuple[float, float]  # of the measured position over the desired one, and its standard deviation
     other_hold: float  # by how much the criterion falls with the other hold; negative: it rises
+    beyond: float = 0.0  # relative error of the model that counts at each line beside the noise
 
     @property
     def model(self) -> Model:
@@ -42,13 +49,15 @@ class FreeMotion:
 
     @property
     def left(self) -> float:
-        """Chi-squared per degree of freedom."""
-        return self.fit.chi2 / max(self.fit.freedom, 1)
+        """Power of what the model leaves over that of the noise."""
+        error, noise = self.misfit()
+        return float(2.0 * np.sum(np.abs(error / noise) ** 2)) / max(self.fit.freedom, 1)
 
     @property
     def covariance(self) -> np.ndarray:
         """Of the model's parameters; wider where the model leaves more than noise."""
-        return self.fit.covariance * (self.left if self.left > UNEXPLAINED else 1.0)
+        unexplained = self.fit.chi2 / max(self.fit.freedom, 1)
+        return self.fit.covariance * (unexplained if unexplained > UNEXPLAINED else 1.0)
 
     @property
     def noise_std(self) -> float:
@@ -78,14 +87,42 @@ def estimate(runs: Sequence[Run], timing: Timing, order: int | None = None) -> F
     # What a wrong hold leaves, one order more takes up.
     highest = chosen.fit.model.structure.order + 1
     other = replace(lines, hold="linear" if lines.hold == "zoh" else "zoh")
-    return FreeMotion(
-        lines,
-        tuple(spectra),
-        chosen,
-        tuple(candidates),
-        gain_of(chosen.fit, lines),
-        chosen.criterion - criterion(choose(other, order, highest)[0].fit, left(candidates)),
-    )
+    other_hold = chosen.criterion - criterion(choose(other, order, highest)[0].fit, left(candidates))
+    beyond, weighed = 0.0, lines
+    for _ in range(ROUNDS):
+        beyond = erring(chosen.fit.model, lines)
+        if beyond == 0.0:
+            break
+        weighed = replace(lines, std=np.hypot(lines.std, beyond * np.abs(lines.output)))
+        chosen = replace(chosen, fit=fit(chosen.fit.model.structure, weighed))
+    gain = gain_of(chosen.fit, weighed)
+    return FreeMotion(lines, tuple(spectra), chosen, tuple(candidates), gain, other_hold, beyond)
+
+
+def erring(model: Model, lines: Lines) -> float:
+    """Standard deviation of the model's relative error that counts at each line, 0 where noise explains all.
+
+    A model errs smoothly: all lines of a band share one error. So it is found from the means over bands, and
+    counts as often as a band has lines; else lines of little noise would decide what it is elsewhere."""
+    size = np.abs(lines.output)
+    errors, variances, counts = [], [], []
+    for band in np.array_split(np.argsort(lines.frequency), min(BANDS, len(lines))):
+        weight = size[band] ** 2 / lines.std[band] ** 2
+        relative = (model.predict(lines)[band] - lines.output[band]) / lines.output[band]
+        errors.append(np.abs(np.sum(weight * relative) / weight.sum()))
+        variances.append(1.0 / weight.sum())
+        counts.append(len(band))
+    power, variance = np.square(errors), np.array(variances)
+    freedom = 2 * len(power) - model.structure.size
+    if freedom < 1 or stats.chi2.sf(np.sum(2.0 * power / variance), freedom) > RARE:
+        return 0.0
+
+    def excess(logarithm: float) -> float:
+        return float(np.sum(2.0 * power / (variance + np.exp(2.0 * logarithm)))) - freedom
+
+    least, most = np.log(1e-9), np.log(LARGEST)
+    root: Any = optimize.brentq(excess, least, most) if excess(most) < 0.0 else most
+    return float(np.exp(root) * np.sqrt(np.mean(counts)))
 
 
 def of_known(runs: Sequence[Run], timing: Timing, model: Model) -> FreeMotion | None:

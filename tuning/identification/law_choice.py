@@ -113,13 +113,14 @@ def _fit(motion, readings, law, plane, guess: Fitted | None) -> Fitted:
     return quick(problem, guess)
 
 
-def quick(problem: Problem, guess: Fitted | None = None) -> Fitted:
-    """The best delay and plane: near a guess, or anywhere."""
+def quick(problem: Problem, guess: Fitted | None = None, reach: int = 4) -> Fitted:
+    """The best delay and plane: within `reach` of the coarse steps about a guess, or anywhere."""
     if guess is None:
         start = problem.plane if problem.plane is not None else first_plane(problem, LONGEST / 4.0)
         delays = np.arange(0.0, LONGEST, 2.0 * COARSE)
     else:
-        start, delays = guess[1], np.clip(guess[0] + COARSE * np.array([-4, -2, -1, 0, 1, 2, 4]), 0.0, None)
+        steps = np.array([step for step in (-4, -2, -1, 0, 1, 2, 4) if abs(step) <= reach])
+        start, delays = guess[1], np.clip(guess[0] + COARSE * steps, 0.0, None)
     best = (0.0, start, np.inf)
     for width in (0.0, COARSE, COARSE / 4.0):
         if width:
@@ -150,7 +151,7 @@ def _by_others(motion, readings, judging: Readings, law, plane, found: Fitted) -
         mine = np.arange(lanes) % 2 == parity
         taught = replace(readings, counts=readings.counts & ~mine)
         problem = Problem(motion, taught, law, plane)
-        delay, at, _ = quick(problem, found)
+        delay, at, _ = quick(problem, found, 1)
         coefficients = problem.at(delay, at).coefficients
         likelihood[mine] = -0.5 * misfits(problem, judging, delay, at, coefficients)[mine]
     return likelihood

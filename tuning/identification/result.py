@@ -51,9 +51,10 @@ class Identification:
     combinations: tuple[Estimate, ...]  # sums and products that the logs tell better than their parts
     confounded: tuple[tuple[str, str, float, str], ...]  # two keys, correlation, what separates
     lines: tuple[Line, ...]
-    mechanism: dict[str, Any]  # as a mechanism file has it
+    mechanism: dict[str, Any] | None  # as a mechanism file has it; None where something is missing
     limit: float  # on e, of all effects together
     notes: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()  # what neither logs nor prior tell, and the run that would
     motion: FreeMotion | None = field(default=None, repr=False)
     contact: ContactFit | None = field(default=None, repr=False)
     force_noise: Noise | None = field(default=None, repr=False)
@@ -66,7 +67,7 @@ class Identification:
 
     @property
     def good(self) -> bool:
-        return self.effect < self.limit
+        return not self.missing and self.effect < self.limit
 
     @property
     def worst(self) -> Line | None:
@@ -76,6 +77,8 @@ class Identification:
 
     @property
     def verdict(self) -> str:
+        if self.missing:
+            return f"Bad: neither the logs nor a prior tell {' and '.join(self.missing)}; no file is written"
         if self.good:
             return (
                 f"Good: what the model leaves can change e by {self.effect:.2g}, allowed below {self.limit:g}"

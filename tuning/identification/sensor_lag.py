@@ -47,7 +47,7 @@ def sensor_lag(problem: Problem, posterior: Posterior) -> Lag | None:
     def fit(value: float) -> Fitted:
         if value not in fits:
             start = (max(delay - value, 0.0), plane, inner.misfit)
-            fits[value] = quick(_lagging(problem, value), start)
+            fits[value] = quick(_lagging(problem, value), start, 2)
         return fits[value]
 
     needed = GAIN + np.log(len(problem.kept))

@@ -61,7 +61,7 @@ def _misfit(motion: FreeMotion, frequency: float) -> Line:
     near = middle <= max(HARMONICS * frequency, middle[0])
     worst = int(np.argmax(beyond * near))
     freedom = max(motion.fit.freedom, 1)
-    probability = stats.chi2.sf(motion.fit.chi2, freedom)
+    probability = stats.chi2.sf(motion.left * freedom, freedom)
     return Line(
         "motion model",
         f"leaves {motion.left:.3g} times the noise's power, {beyond[worst]:.2g} of the motion near contacts",
@@ -73,7 +73,6 @@ def _misfit(motion: FreeMotion, frequency: float) -> Line:
 
 def _gain(motion: FreeMotion) -> Line:
     gain, std = motion.gain
-    std *= max(1.0, np.sqrt(motion.left))
     return Line(
         "scale of the measured position",
         f"{gain:.5f} +- {std:.2g} of the desired one",
@@ -183,7 +182,7 @@ def _stiffness(contact: ContactFit) -> Line:
 def restitution_errors(contact: ContactFit, runs: list[Run], mass: float) -> tuple[np.ndarray, np.ndarray]:
     """By how much the force that the law does not explain changes e of each touch, and the noise's part.
 
-    NaN where the numerical model was not a free body, or did not rebound."""
+    NaN where the numerical model was not a free body, or did not rebound, or the log has not all of it."""
     delay, plane, inner = contact.posterior.best
     predicted = contact.problem.force(delay, plane, inner.coefficients)
     readings, period = contact.readings, contact.problem.motion.period
@@ -199,7 +198,7 @@ def restitution_errors(contact: ContactFit, runs: list[Run], mass: float) -> tup
         )
         counts = readings.counts[:rows, lane]
         before, after = float(speed[0]), float(speed[-1])
-        if before <= 0.0 or after >= 0.0:
+        if before <= 0.0 or after >= 0.0 or not run.valid[0] or run.position_desired[-1] > plane:
             continue
         touching = counts & (run.position_desired > plane - abs(before) * 0.02)
         left = (readings.force[:rows, lane] - predicted[:rows, lane]) * touching

@@ -59,18 +59,19 @@ def run(options: Identify) -> int:
             seed=options.seed,
         ),
     )
-    from_builtins(found.mechanism, "identified mechanism")
     document = _document(options, campaign, prior, found)
-    path = folder / MECHANISM
-    with writing(path):
-        write_whole(path, to_toml(found.mechanism, found.verdict).encode())
-    with writing(folder / DOCUMENT):
-        write_whole(folder / DOCUMENT, terminal.as_json(document).encode("ascii"))
+    if found.mechanism is not None:
+        from_builtins(found.mechanism, "identified mechanism")
+        path = folder / MECHANISM
+        with writing(path):
+            write_whole(path, to_toml(found.mechanism, found.verdict).encode())
+        with writing(folder / DOCUMENT):
+            write_whole(folder / DOCUMENT, terminal.as_json(document).encode("ascii"))
     terminal.warn([*campaign.notes, *found.notes])
     if options.json:
         terminal.emit_json(document)
     else:
-        _print(document, folder)
+        _print(document, None if found.mechanism is None else folder)
     return 0 if found.good else 1
 
 
@@ -230,7 +231,7 @@ def _told(prior: Mechanism | None, key: str) -> float | None:
     return float(value) if isinstance(value, (int, float)) else None
 
 
-def _print(document: dict[str, Any], folder: Path) -> None:
+def _print(document: dict[str, Any], folder: Path | None) -> None:
     runs = ", ".join(f"{number} {kind}" for kind, number in document["runs"].items())
     rows = [_row(one) for one in (*document["estimates"], *document["combinations"])]
     headings = ["number", "estimate", "95 % from", "to", "unit", "prior", "off the prior"]
@@ -241,7 +242,8 @@ def _print(document: dict[str, Any], folder: Path) -> None:
         f"{pair['experiment']} would."
         for pair in document["confounded"]
     ]
-    terminal.emit(*things, f"{document['reason']}.", f"Wrote {folder / MECHANISM} and {folder / DOCUMENT}")
+    wrote = [] if folder is None else [f"Wrote {folder / MECHANISM} and {folder / DOCUMENT}"]
+    terminal.emit(*things, f"{document['reason']}.", *wrote)
 
 
 def _left(document: dict[str, Any], title: str) -> Any:
