@@ -66,13 +66,13 @@ def profile(
     planes, stds, heights = _scan(problem, delays, start)
     low, high = _region(delays, heights, ROUGH_REGION)
     finer = np.linspace(low, high, int(np.clip((high - low) / FINE, 21, 151)))
-    known = (np.interp(finer, delays, one) for one in (planes, stds))
-    places, cells = _grid(problem, finer, *known, FEW_PLANES)
+    known = np.interp(finer, delays, planes), np.interp(finer, delays, stds)
+    places, cells = _grid(problem, finer, known, FEW_PLANES)
     heights, planes, stds = _by_delay(places, cells, len(finer))
     low, high = _region(finer, heights, REGION)
     delays = np.linspace(low, high, size[0])
-    known = (np.interp(delays, finer, one) for one in (planes, stds))
-    places, cells = _grid(problem, delays, *known, size[1])
+    known = np.interp(delays, finer, planes), np.interp(delays, finer, stds)
+    places, cells = _grid(problem, delays, known, size[1])
     return _sample(problem, places, cells, delays, seed)
 
 
@@ -106,14 +106,15 @@ def _region(delays: np.ndarray, heights: np.ndarray, reach: float) -> tuple[floa
 
 
 def _grid(
-    problem: Problem, delays: np.ndarray, centres: np.ndarray, stds: np.ndarray, across: int
+    problem: Problem, delays: np.ndarray, known: tuple[np.ndarray, np.ndarray], across: int
 ) -> tuple[np.ndarray, list[Inner]]:
-    """Fits at each delay and at planes across the plane's uncertainty there.
+    """Fits at each delay and at planes across the plane's uncertainty there: `known`, its mean and standard
+    deviation at each.
 
     The plane alone moves rows to the other side of an onset, so one plane a delay does not tell how good the
     delay is. Places are rows of (delay, plane, width in the plane)."""
     places, cells = [], []
-    for delay, centre, std in zip(delays, centres, stds, strict=True):
+    for delay, centre, std in zip(delays, *known, strict=True):
         if problem.plane is not None:
             cells.append(problem.at(delay, problem.plane))
             places.append((delay, problem.plane, 1.0))
