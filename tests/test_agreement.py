@@ -36,6 +36,7 @@ from tuning.verification.replay import REPLAY_LIMIT, LaneReplay, replay
 pytestmark = pytest.mark.users_options
 
 RING = 256  # samples, more than any identification delay at the shortest period
+RUNS = 6  # of a mechanism that are recorded
 RECORD = 3072  # ticks, more than any record has: its programs serve every mechanism
 # It is the laws that are compared, also beyond what a rig's controller lets out.
 UNLIMITED = {
@@ -219,19 +220,23 @@ def random_readings(name: str, lanes: int, ticks: int, seed: int) -> Readings:
     )
 
 
+LONG_LAWS = ("retrospective_reference", "retrospective_delay_bank")
+
+
 @pytest.mark.parametrize(
     "name, lanes",
     [
-        *((name, 8 if "retrospective" in name else 60) for name in COMPENSATORS),
+        # Those that take long to compile: as many as recorded below, for which that program serves.
+        *((name, RUNS if name in LONG_LAWS else 60) for name in COMPENSATORS),
         pytest.param("response_error", 510, marks=pytest.mark.slow),
-        pytest.param("retrospective_delay_bank", 60, marks=pytest.mark.slow),
-        pytest.param("retrospective_reference", 60, marks=pytest.mark.slow),
+        *(pytest.param(name, 60, marks=pytest.mark.slow) for name in LONG_LAWS),
     ],
 )
 def test_random_ticks(name, lanes):
-    count = compare(name, random_readings(name, lanes, 2000, seed=1))
+    ticks = RECORD if lanes == RUNS else 2000
+    count = compare(name, random_readings(name, lanes, ticks, seed=1))
     print(name, count)
-    assert count.ticks == 2000 * lanes
+    assert count.ticks == ticks * lanes
     assert count.compared >= 0.98 * count.ticks
     assert count.magnified <= 0.02 * lanes
 
@@ -248,7 +253,7 @@ def test_recorded_ticks(mechanism_name):
     law = COMPENSATORS["response_error"]
     gains = {gain.name: gain.nominal(mechanism) for gain in law.gains}
     loaded = check_document(build_document(law.name, gains, mechanism, sha256, {}, {}, 0, {}))
-    batch = nominal_and_draws(mechanism, 6, seed=2)
+    batch = nominal_and_draws(mechanism, RUNS, seed=2)
     _, lanes = record_lanes(loaded, batch)
     for index, lane in enumerate(lanes):
         gain_file = GainFile(law.name, gains, mechanism.rig.control_period, mechanism.contact.clearance)

@@ -111,7 +111,11 @@ def test_without_compensation_the_error_is_the_closed_form():
 
 
 @pytest.mark.parametrize(
-    "name", ["suite-damped", "suite-hertz", "suite-depth-damped", "suite-elastoplastic", "suite-repeated"]
+    "name",
+    [
+        *("suite-damped", "suite-depth-damped", "suite-elastoplastic", "suite-repeated"),
+        pytest.param("suite-hertz", marks=pytest.mark.slow),
+    ],
 )
 def test_damped_twins_span_a_third_of_the_speed(name):
     parsed = load(name).mechanism

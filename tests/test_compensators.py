@@ -243,8 +243,12 @@ def test_runs_begin_anew(name):
     first = jax.tree.map(lambda leaf: leaf[60], signals)
     fresh = law.init(gains, constants, RING)
     used = fresh
+    step = jax.jit(
+        lambda state, tick: law.step(law.prepare(gains, constants), state, first, tick)[1],
+        compiler_options=QUICK,
+    )
     for tick in range(4):
-        used = law.step(law.prepare(gains, constants), used, first, jnp.asarray(tick))[1]
+        used = step(used, jnp.asarray(tick))
     no, yes = jnp.asarray(False), jnp.asarray(True)
     for goes_on in (law.restart(gains, used, no, no), law.restart(gains, used, no, yes)):
         jax.tree.map(np.testing.assert_array_equal, goes_on, used)

@@ -260,6 +260,7 @@ def test_what_an_unknown_delay_leaves_of_damped_contact_is_the_control_periods()
     assert rms[1] <= 0.6 * rms[0] <= 0.6 * 0.85
 
 
+@pytest.mark.slow
 def test_simulate_and_the_controller_report_the_delay(jaxhil):
     given = ["--set", "rig.force_sensor.delay=0.0085"]
     answer = jaxhil("simulate", "suite-layered", "--compensator", LAW, *given, "--json")

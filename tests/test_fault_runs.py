@@ -86,7 +86,7 @@ def test_python_raises_every_fault_on_its_tick(law):
 @needs_compiler
 @pytest.mark.parametrize("law", COMPENSATORS)
 def test_c_raises_every_fault_on_its_tick(law):
-    c_runs(200_000, law, 20)
+    c_runs(60_000, law, 20)
 
 
 @pytest.mark.slow

@@ -54,6 +54,7 @@ def test_nothing_is_loaded_before_it_is_asked_for():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+@pytest.mark.slow
 def test_the_command_tunes_the_same(jaxhil, tuned, tmp_path):
     jaxhil("tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY)
     written = json.loads((tmp_path / "rig-300kg" / "gains.json").read_text())

@@ -20,10 +20,27 @@ PHASES = np.linspace(0, 1, 21)
 
 def on_jax(positions, clearance=np.inf):
     """Gate at every tick of a reading (ticks, lanes), but for the first."""
-    excess = deflection(jnp.asarray(positions), jnp.full(np.shape(positions), clearance))
-    shares = share_beyond(excess[1:], excess[:-1], jnp.asarray(np.diff(positions, axis=0)))
+    return np.asarray(_gates(jnp.asarray(positions), clearance))
+
+
+@jax.jit
+def _gates(positions, clearance):
+    shares = _shares(positions, clearance)
     before = jnp.concatenate([jnp.zeros_like(shares[:1]), shares[:-1]])
-    return np.asarray(gate(shares, before))
+    return gate(shares, before)
+
+
+def _shares(positions, clearance):
+    excess = deflection(positions, jnp.full(positions.shape, clearance))
+    return share_beyond(excess[1:], excess[:-1], jnp.diff(positions, axis=0))
+
+
+@jax.jit
+@jax.grad
+def slope(positions, clearance):
+    """Of the last gate, by every reading (ticks,)."""
+    shares = _shares(positions, clearance)
+    return gate(shares[1], shares[0])
 
 
 def rig(positions, clearance=np.inf):
@@ -80,8 +97,9 @@ def test_once_differentiable_in_the_time_of_the_crossing():
         shares = share_beyond(excess[1:], excess[:-1], jnp.diff(x))
         return gate(shares[1:], shares[:-1])
 
+    slope_of = jax.jit(jax.jacfwd(gates_of))
     for at in (-1.0, 0.0, 2.0):  # where an entry moves to another tick
-        slopes = [jax.jacfwd(gates_of)(jnp.asarray(at + side)) for side in (-1e-9, 0.0, 1e-9)]
+        slopes = [slope_of(jnp.asarray(at + side)) for side in (-1e-9, 0.0, 1e-9)]
         np.testing.assert_allclose(slopes[0], slopes[2], rtol=0, atol=1e-8)
         np.testing.assert_allclose(slopes[1], slopes[2], rtol=0, atol=1e-8)
         assert np.abs(slopes[0]).max() > 0.9
@@ -108,12 +126,6 @@ READINGS = st.floats(-1e3, 1e3) | st.sampled_from([0.0, 1e-300, -1e-300, -CLEARA
 def test_both_sides_agree_and_have_derivatives_anywhere(readings, clearance):
     x = np.array(readings)[:, None]
     np.testing.assert_allclose(on_jax(x, clearance), rig(x, clearance), rtol=0, atol=1e-12)
-
-    def last(x):
-        excess = deflection(x, jnp.full(x.shape, clearance))
-        shares = share_beyond(excess[1:], excess[:-1], jnp.diff(x))
-        return gate(shares[1], shares[0])
-
     # A change of a few denormals has a slope that no float holds.
     if np.abs(np.diff(x, axis=0))[np.diff(x, axis=0) != 0].min(initial=1.0) > 1e-150:
-        assert np.all(np.isfinite(jax.grad(last)(jnp.asarray(x[:, 0]))))
+        assert np.all(np.isfinite(slope(jnp.asarray(x[:, 0]), clearance)))

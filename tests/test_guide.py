@@ -186,7 +186,11 @@ def test_the_script_is_the_one_that_is_run():
     assert sizes.sub(r"\1", run).endswith(sizes.sub(r"\1", block[1]))
 
 
-@pytest.mark.parametrize("path", [ROOT / "README.md", GUIDE / "python.md"], ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "path",
+    [ROOT / "README.md", pytest.param(GUIDE / "python.md", marks=pytest.mark.slow)],
+    ids=lambda path: path.name,
+)
 def test_examples_run(path, tmp_path):
     """The blocks of a page that are marked as runnable, one after the other in a process of their own."""
     blocks = RUNNABLE.findall(path.read_text(encoding="utf-8"))

@@ -114,6 +114,7 @@ def test_only_what_amplifies_has_something_to_trade():
 # Fronts
 
 
+@pytest.mark.slow
 def test_every_point_s_figures_are_those_of_an_evaluation(results, made):
     for mechanism, result, front in zip(MECHANISMS, results, made[0], strict=True):
         seed = SETTINGS.seed + VALIDATION_SEED
@@ -134,6 +135,7 @@ def test_every_point_s_figures_are_those_of_an_evaluation(results, made):
         ]
 
 
+@pytest.mark.slow
 def test_no_point_is_better_under_another_s_weight(results, made):
     """On the scenarios that they were tuned on: none beats another at its own weight, nor do the gains that
     were tuned before. So the heavier the weight, the quieter and the less accurate."""
@@ -157,6 +159,7 @@ def test_no_point_is_better_under_another_s_weight(results, made):
         assert (np.diff(rms) >= -2e-4 * rms[0]).all() and rms[-1] > 1.2 * rms[0]
 
 
+@pytest.mark.slow
 def test_all_weights_of_all_mechanisms_share_one_program(made):
     assert made[1] == 1
 

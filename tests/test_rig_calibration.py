@@ -81,7 +81,7 @@ def watch(limits, signals, rules, lane):
     return found
 
 
-@pytest.mark.parametrize("sided", [1, 2])
+@pytest.mark.parametrize("sided", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_the_audit_is_the_watchdogs_to_the_bit(sided):
     rules, _ = watchdog_rules({1: ONE_SIDED, 2: NOISY_GAP}[sided])
     chunk, slots = recorded(sided), 8

@@ -51,7 +51,8 @@ ORACLE = {"quantum": {"noise_level": 0.5}}
 
 # Each of these is the first of a program of its own; what they add is tested elsewhere, one by one.
 SELDOM = ("rattling, elastoplastic", "rattling against layers", "depth-damped", "layers", "damped layers")
-SELDOM += ("transfer function with latency", "third order with latency", "position lead, late drives")
+SELDOM += ("transfer function with latency", "third order with latency", "position lead", "first order")
+SELDOM += ("hardening",)
 slow_if_seldom = [
     pytest.param(name, marks=pytest.mark.slow if name.startswith(SELDOM) else ()) for name in CASES
 ]
@@ -112,7 +113,9 @@ def test_work_of_the_real_force(name):
         assert found["work_out"] == pytest.approx(expected["work_out"], rel=0, abs=accuracy)
 
 
-@pytest.mark.parametrize("name", [n for n, c in CASES.items() if "clearance" not in c.mechanism["contact"]])
+@pytest.mark.parametrize(
+    "name", [one for one in slow_if_seldom if "clearance" not in CASES[one.values[0]].mechanism["contact"]]
+)
 def test_first_contact_is_over_at_the_oracles_tick(name):
     ticks, length = cases.loop_contacts(name)[0]["ticks"], stretch_length(cases.batches()[name].loop)
     assert ticks == length * (oracle(name)[0]["end_tick"] // length + 1)

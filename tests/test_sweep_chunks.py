@@ -32,9 +32,7 @@ def sweep(request):
 def test_rows_do_not_depend_on_the_chunks(sweep):
     whole = run_chunk(sweep, 0, 112)
     assert same_rows(joined([rows for _, rows in run_parts(sweep, range(4))]), whole) == []
-    uneven = [
-        run_chunk(sweep, first, until - first) for first, until in ((0, 1), (1, 20), (20, 77), (77, 112))
-    ]
+    uneven = [run_chunk(sweep, first, until - first) for first, until in ((0, 1), (1, 77), (77, 112))]
     assert same_rows(joined(uneven), whole) == []
     assert np.ptp(whole["error_1"]) > 1e-3
 

@@ -47,7 +47,9 @@ def varying():
     return loaded_gains(*CASES["varying"])
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=pytest.mark.slow if case == "rattling" else ()) for case in CASES]
+)
 def test_what_agrees_is_verified(case):
     loaded = loaded_gains(*CASES[case])
     messages = []
