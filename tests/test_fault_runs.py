@@ -78,13 +78,20 @@ def test_a_fault_that_is_not_raised_is_found():
         check(run, results)
 
 
-@pytest.mark.parametrize("law", COMPENSATORS)
+# Faults are raised around the law, whichever it is.
+FEW = ("none", "response_error", "retrospective_delay_bank")
+few_laws = pytest.mark.parametrize(
+    "law", [pytest.param(law, marks=() if law in FEW else pytest.mark.slow) for law in COMPENSATORS]
+)
+
+
+@few_laws
 def test_python_raises_every_fault_on_its_tick(law):
     python_runs(20_000, law, 10)
 
 
 @needs_compiler
-@pytest.mark.parametrize("law", COMPENSATORS)
+@few_laws
 def test_c_raises_every_fault_on_its_tick(law):
     c_runs(60_000, law, 20)
 

@@ -186,6 +186,7 @@ def test_what_a_start_reached_is_distinguished_from_its_noise():
     assert pareto_search._found(task, 0.003, [broken])[0].gains == task.literature
 
 
+@pytest.mark.slow
 def test_settings_other_than_the_weight_stay(results, monkeypatch):
     seen = []
 

@@ -52,7 +52,7 @@ ORACLE = {"quantum": {"noise_level": 0.5}}
 # Each of these is the first of a program of its own; what they add is tested elsewhere, one by one.
 SELDOM = ("rattling, elastoplastic", "rattling against layers", "depth-damped", "layers", "damped layers")
 SELDOM += ("transfer function with latency", "third order with latency", "position lead", "first order")
-SELDOM += ("hardening",)
+SELDOM += ("hardening", "rattling, lag")
 slow_if_seldom = [
     pytest.param(name, marks=pytest.mark.slow if name.startswith(SELDOM) else ()) for name in CASES
 ]
@@ -121,6 +121,7 @@ def test_first_contact_is_over_at_the_oracles_tick(name):
     assert ticks == length * (oracle(name)[0]["end_tick"] // length + 1)
 
 
+@pytest.mark.slow
 def test_lag_at_every_control_period():
     """Contact at 5 Hz, elastic and heavily damped, under the compensation that a lag upsets most."""
     periods = (0.25e-3, 1e-3, 2e-3, 4e-3)
