@@ -1,4 +1,4 @@
-"""The options of `jaxhil identify`, as tyro reads them."""
+"""The options of `jaxhil identify` and `jaxhil monitor`, as tyro reads them."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -61,4 +61,27 @@ class Identify:
         float, arg(metavar="NUMBER", help="Restitution error from which the verdict is bad.")
     ] = 0.01
     seed: Annotated[int, number("Seed of the draws behind intervals.")] = 0
+    json: Json = False
+
+
+@dataclass(frozen=True)
+class Monitor:
+    """Whether the rig still is the one that was identified: contact by contact, and since when it is not.
+
+    Example: jaxhil monitor identified/mechanism.toml day2/contact_*.csv --map logs.toml
+
+    Good: nothing changed. Watch: something did, within what the file's [uncertainty] covers. Bad: beyond that;
+    exit code 1.
+    """
+
+    mechanism: Annotated[
+        Positional[str], text("MECHANISM", "Mechanism file, as identify writes it, or a built-in's name.")
+    ]
+    logs: Annotated[
+        Positional[tuple[str, ...]], text("LOG [LOG ...]", "Logs of contacts, in the order they were made.")
+    ] = ()
+    map: Annotated[
+        str | None,
+        text("FILE", "What the columns mean and what was done (TOML); by default those of simulate --log."),
+    ] = None
     json: Json = False

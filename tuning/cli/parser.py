@@ -25,7 +25,7 @@ from tuning.cli.options import (
     Sweep,
     Tune,
 )
-from tuning.cli.options_identify import Identify
+from tuning.cli.options_identify import Identify, Monitor
 from tuning.cli.options_rig import DEFAULT_RIG_PLOT, Export, RigOptions, Verify
 
 DESCRIPTION = """Gains that keep hardware-in-the-loop docking tests from diverging.
@@ -37,6 +37,7 @@ Command = (
     Annotated[Init, subcommand("init")]
     | Annotated[Simulate, subcommand("simulate")]
     | Annotated[Identify, subcommand("identify")]
+    | Annotated[Monitor, subcommand("monitor")]
     | Annotated[Tune, subcommand("tune")]
     | Annotated[Sweep, subcommand("sweep")]
     | Annotated[Replay, subcommand("replay")]

@@ -42,7 +42,7 @@ def run(options: Identify) -> int:
     folder = Path(options.output)
     checks.output(folder)
     checks.own_results(folder / DOCUMENT, "estimates", (MECHANISM,))
-    campaign = _of_stage(_read(options, logs, prior), options.stage)
+    campaign = _of_stage(read_logs(logs, options.map, prior), options.stage)
     from tuning.identification.estimate import Options, identify
     from tuning.identification.mechanism_file import to_toml
 
@@ -96,7 +96,7 @@ def _check(options: Identify, logs: list[Path]) -> int:
             raise InputError("--check: found no mechanism, allowed one after the logs, or --prior")
         last = str(logs.pop())
     mechanism = load(last).mechanism
-    campaign = _of_stage(_read(options, logs, mechanism), options.stage)
+    campaign = _of_stage(read_logs(logs, options.map, mechanism), options.stage)
     from tuning.identification.check import check
 
     found = check(campaign, mechanism, options.limit)
@@ -112,12 +112,13 @@ def _check(options: Identify, logs: list[Path]) -> int:
     return 0 if found.good else 1
 
 
-def _read(options: Identify, logs: list[Path], prior: Mechanism | None) -> Campaign:
+def read_logs(logs: list[Path], mapping: str | None, prior: Mechanism | None) -> Campaign:
+    """The campaign of log files; `mapping` is the file that says what their columns mean."""
     from tuning.identification.logs.campaign import read_campaign
     from tuning.identification.logs.mapping import load_mapping
 
-    if options.map is not None:
-        return read_campaign(logs, load_mapping(options.map), prior)
+    if mapping is not None:
+        return read_campaign(logs, load_mapping(mapping), prior)
     try:
         return read_campaign(logs, None, prior)
     except InputError as error:

@@ -1,0 +1,199 @@
+"""Contacts of an independent rig against a mechanism file: exact without noise, calibrated with it."""
+
+from dataclasses import replace
+
+import campaigns
+import numpy as np
+import pytest
+
+import jaxhil as package
+from jaxhil.mechanism.file import from_builtins, to_builtins
+from tuning.identification.mechanism_file import to_toml
+from tuning.identification.monitor.figures import BIAS, NAMES, NOISE
+from tuning.identification.monitor.monitor import monitor
+from tuning.identification.monitor.uncertain import uncertain
+
+SPEEDS = (0.006, 0.012) * 3
+STATED = {
+    "contact.stiffness": {"distribution": "normal", "std": 120.0},
+    "contact.damping": {"distribution": "normal", "std": 4.0},
+    "rig.force_sensor.delay": {"distribution": "normal", "std": 3e-5},
+    "rig.contact_plane": {"distribution": "normal", "std": 2e-7},
+}
+
+
+def file_of(kind, stated=None):
+    """A mechanism file that knows the rig of that kind."""
+    bodies = {"equivalent_mass": kind.mass}
+    document = {"schema": "jaxhil/mechanism/1", "name": "known", "bodies": bodies, "rig": kind.rig}
+    document |= {"approach": {"velocity": 0.006}, "contact": kind.contact}
+    return from_builtins(document | {"uncertainty": STATED if stated is None else stated}, "known")
+
+
+def quiet(kind):
+    """Without noise and quanta."""
+    sensors = ("force_sensor", "position_sensor")
+    kept = {
+        one: {k: v for k, v in kind.rig[one].items() if k not in ("noise_std", "quantum")} for one in sensors
+    }
+    return replace(kind, rig={**kind.rig, **kept})
+
+
+def contacts(kind, seed=0, speeds=SPEEDS, name="monitored"):
+    campaigns.KINDS[name] = replace(
+        kind, rig={**kind.rig, "force_sensor": {"noise_std": 0.0, **kind.rig["force_sensor"]},
+                   "position_sensor": {"noise_std": 0.0, **kind.rig["position_sensor"]}}
+    )  # fmt: skip
+    try:
+        return campaigns.campaign(name, seed, speeds=speeds, seconds=0, rest=0)
+    finally:
+        del campaigns.KINDS[name]
+
+
+def changed(kind, **sections):
+    """The kind with other numbers in some tables of its rig."""
+    return replace(kind, rig=kind.rig | {one: kind.rig[one] | table for one, table in sections.items()})
+
+
+CLEAN = campaigns.KINDS["clean"]
+EVERY = ("lagging", "stiffnesses", "dead_zone")
+RARER = ("clean", "third_order", "resonance", "hertz", "layered")
+
+
+@pytest.mark.parametrize("name", (*EVERY, *(pytest.param(one, marks=pytest.mark.slow) for one in RARER)))
+def test_without_noise_all_is_0(name):
+    """Laws, lags, latencies and holds of the file's rig are those of the independent one."""
+    kind = quiet(campaigns.KINDS[name])
+    stated = {k: v for k, v in STATED.items() if k == "rig.force_sensor.delay"}
+    found = monitor(contacts(kind, speeds=(0.006, 0.012, 0.006)), file_of(kind, stated))
+    value = np.array([one.value for one in found.contacts])
+    told = np.isfinite(value).any(axis=0)
+    assert told[:4].all() and told[BIAS] == (name != "dead_zone") and not told[NOISE]
+    # The generator's lag is a quadrature over a force that begins with a jump.
+    allowed = 2e4 if name == "lagging" else 1.0
+    bound = allowed * np.array([1e-9, 1e-5, 5e-8, 1e-9, 1e-9, np.inf, 1e-9])
+    assert np.all(np.abs(np.nan_to_num(value)) < bound)
+
+
+def test_a_rig_that_is_the_file_s_scatters_as_predicted():
+    found = monitor(contacts(CLEAN, seed=3), file_of(CLEAN))
+    assert found.state == "good" and found.alarm is None and found.changes == ()
+    z = np.array([one.z for one in found.contacts])
+    assert z.shape == (6, len(NAMES)) and 0.7 < z.std() < 1.3
+    assert "all of 6 contacts" in found.verdict
+
+
+CHANGES = {
+    # what is changed; the figure that tells, by how much, and within what
+    "stiffness": (replace(CLEAN, contact=campaigns._voigt((1.236e5,))), "stiffness", 0.03, 0.003),
+    "delay": (changed(CLEAN, force_sensor={"delay": 0.0043}), "apparent damping", -72.0, 12.0),
+    "motion": (changed(CLEAN, simulator={"delay": 0.0047}), "lag of motion", 4e-4, 6e-5),
+    "bias": (changed(CLEAN, force_sensor={"bias": 3.0}), "bias", 3.0, 0.1),
+    "noise": (changed(CLEAN, force_sensor={"noise_std": 1.0}), "noise", 1.0, 0.1),
+}
+DAILY = ("delay", "noise")
+
+
+@pytest.mark.parametrize(
+    "what", [pytest.param(one, marks=() if one in DAILY else pytest.mark.slow) for one in CHANGES]
+)
+def test_a_change_is_found_and_named(what):
+    other, name, value, within = CHANGES[what]
+    before, after = contacts(CLEAN, seed=1, speeds=SPEEDS[:3]), contacts(other, seed=2, speeds=SPEEDS[:3])
+    found = monitor(replace(before, runs=(*before.runs, *after.runs)), file_of(CLEAN))
+    assert (
+        found.state == "bad"
+        and found.since == 3
+        and [one.state for one in found.contacts[:3]] == ["good"] * 3
+    )
+    (change,) = (one for one in found.changes if one.name == name)
+    assert change.value == pytest.approx(value, abs=within) and change.std < within
+    assert f"since contact 4 of 6 (touch_0.csv): {found.changes[0].name}" in found.verdict
+
+
+def test_what_the_file_covers_is_to_be_watched():
+    """A change within a wide range, after contacts that told where in the range the rig is."""
+    wide = STATED | {"contact.stiffness": {"distribution": "uniform", "factor": [0.8, 1.2]}}
+    before = contacts(CLEAN, seed=4, speeds=SPEEDS)
+    after = contacts(replace(CLEAN, contact=campaigns._voigt((1.3e5,))), seed=5, speeds=SPEEDS[:2])
+    found = monitor(replace(before, runs=(*before.runs, *after.runs)), file_of(CLEAN, wide))
+    assert found.state == "watch" and found.since == 6 and "covers it" in found.verdict
+
+
+def test_numbers_hang_together_as_the_file_says():
+    wide = STATED | {
+        "contact.stiffness": {"distribution": "loguniform", "factor": [0.5, 2.0], "independent": True}
+    }
+    document = to_builtins(file_of(campaigns.KINDS["stiffnesses"], wide))
+    document["correlation"] = {
+        "keys": ["contact.damping", "rig.force_sensor.delay"],
+        "matrix": [[1.0], [0.9, 1.0]],
+    }
+    numbers, correlation = uncertain(from_builtins(document, "known"))
+    place = {(one.path, one.entry): i for i, one in enumerate(numbers)}
+    damping, delay = place["contact.damping", None], place["rig.force_sensor.delay", None]
+    assert correlation[damping, delay] == pytest.approx(0.9, abs=0.01)
+    assert numbers[damping].std == pytest.approx(4.0, rel=0.05)
+    assert numbers[place["rig.simulator.delay", None]].std == 2e-5
+    one = numbers[place["contact.stiffness", (1,)]]
+    stepped = one.stepped(from_builtins(document, "known")).contact.stiffness
+    # Of a loguniform number between m/f and m f: m^2 (f^2 - f^-2)/(4 log f) - mean^2.
+    mean = (2.0 - 0.5) / np.log(4.0)
+    expected = 2.4e5 * np.sqrt((4.0 - 0.25) / (2.0 * np.log(4.0)) - mean**2)
+    assert one.std == pytest.approx(expected, rel=0.05)
+    assert stepped == [1.2e5, pytest.approx(2.4e5 + one.std), 7e4]
+
+
+def written(folder, campaign):
+    """The contacts as `simulate --log` writes them, a file each."""
+    folder.mkdir()
+    columns = ("position_desired", "position_measured", "force_measured", "velocity_desired", "force_command")
+    for number, run in enumerate(campaign.runs):
+        rows = np.stack([1e-3 * run.tick, *(getattr(run, name) for name in columns)], axis=1)
+        header = ",".join(("time", *columns))
+        np.savetxt(folder / f"{number:02}.csv", rows, "%.15g", ",", header=header, comments="")
+    return sorted(folder.glob("*.csv"))
+
+
+def test_the_command_prints_a_verdict_and_ends_with_it(jaxhil, tmp_path):
+    known = tmp_path / "known.toml"
+    known.write_text(to_toml(to_builtins(file_of(CLEAN))))
+    logs = written(tmp_path / "same", contacts(CLEAN, seed=3, speeds=SPEEDS[:3]))
+    ran = jaxhil("monitor", known, *logs, "--json")
+    assert ran.code == 0 and ran.document["state"] == "good" and ran.document["since"] is None
+    assert ran.document["contacts"][2]["log"] == "02.csv" and ran.document["sources"].keys() == {
+        path.name for path in logs
+    }
+    assert ran.document["contacts"][0]["figures"].keys() == set(NAMES)
+    other = changed(CLEAN, force_sensor={"delay": 0.0047})
+    ran = jaxhil("monitor", known, *written(tmp_path / "later", contacts(other, seed=3, speeds=SPEEDS[:3])))
+    assert ran.code == 1 and "Bad: since contact 1 of 3 (00.csv): apparent damping" in ran.out
+    assert "[N s/m]" in ran.out and ran.err == ""
+
+
+@pytest.mark.parametrize("arguments, words", (
+    (["varying"], "logs: found none"),
+    (["varying", "LOG", "--map", "FREE"], "found no contact, allowed a run of kind contact or tap"),
+    (["nowhere.toml", "LOG"], "nowhere"),
+    (["TWO", "LOG"], "contact.clearance: found 0.02, allowed inf"),
+    (["OTHER", "LOG"], "contact.law: found elastoplastic, allowed linear, kelvin_voigt"),
+))  # fmt: skip
+def test_what_cannot_be_held_against_is_one_line(jaxhil, tmp_path, arguments, words):
+    campaign = contacts(CLEAN, speeds=SPEEDS[:1])
+    mapping = tmp_path / "map.toml"
+    channels = (
+        "time = 'time'\nposition_desired = 'position_desired'\nposition_measured = 'position_measured'\n"
+    )
+    mapping.write_text(
+        f"schema = 'jaxhil/log/1'\n[channels]\n{channels}[[runs]]\nfiles = '*'\nkind = 'free'\n"
+    )
+    two = to_builtins(package.load("varying", {"contact.clearance": 0.02}))
+    other = to_builtins(package.load("varying"))
+    law = {"law": "elastoplastic", "unloading_ratio": 2.0, "damping": [0.0], "stiffness": [1e5]}
+    other = other | {"contact": law, "uncertainty": {}}
+    paths = {"LOG": written(tmp_path / "logs", campaign)[0], "FREE": mapping}
+    for name, document in (("TWO", two), ("OTHER", other)):
+        paths[name] = tmp_path / f"{name}.toml"
+        paths[name].write_text(to_toml(document))
+    ran = jaxhil("monitor", *(paths.get(one, one) for one in arguments))
+    assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1 and words in ran.err

@@ -1,0 +1,83 @@
+"""How often the monitor is wrong and how soon it is right, on files that were identified from other contacts.
+
+All of it is slow; `test_monitor.py` has a sample for every day. Print the figures with
+`pytest -m slow -s tests/test_monitor_campaigns.py`.
+"""
+
+from dataclasses import replace
+
+import campaigns
+import numpy as np
+import pytest
+
+from jaxhil.mechanism.file import from_builtins
+from tuning.identification.estimate import Options, identify
+from tuning.identification.monitor.figures import NAMES
+from tuning.identification.monitor.monitor import monitor
+
+pytestmark = pytest.mark.slow
+FILES = 8
+SPEEDS = np.array([0.003, 0.006, 0.012])
+CLEAN = campaigns.KINDS["clean"]
+
+
+@pytest.fixture(scope="module")
+def files():
+    """Of the same rig, each identified from a day of its own."""
+    found = []
+    for seed in range(FILES):
+        day = campaigns.campaign("clean", 60_000 + seed)
+        options = Options(law="kelvin_voigt", order=2, hold_out=0.0, seed=seed)
+        found.append(from_builtins(identify(day, options=options).mechanism, "identified"))
+    return found
+
+
+def contacts(name, seed, speeds):
+    return campaigns.campaign(name, 70_000 + seed, speeds=tuple(speeds), seconds=0, rest=0)
+
+
+def delayed(seed, speeds, growth):
+    """Contacts in the course of which the force delay grows [s]."""
+    runs = []
+    for i, speed in enumerate(speeds):
+        delay = CLEAN.rig["force_sensor"]["delay"] + growth * i / (len(speeds) - 1)
+        rig = CLEAN.rig | {"force_sensor": CLEAN.rig["force_sensor"] | {"delay": delay}}
+        campaigns.KINDS["delayed"] = replace(CLEAN, rig=rig)
+        runs += contacts("delayed", 1000 * seed + i, (speed,)).runs
+    del campaigns.KINDS["delayed"]
+    return replace(contacts("clean", seed, SPEEDS), runs=tuple(runs))
+
+
+def test_a_rig_that_does_not_change_raises_no_alarm_in_500_contacts(files):
+    z, alarms, number = [], 0, 0
+    for seed, mechanism in enumerate(files):
+        speeds = np.random.default_rng(seed).choice(SPEEDS, 250)
+        found = monitor(contacts("clean", seed, speeds), mechanism)
+        alarms, number = alarms + (found.alarm is not None), number + len(found.contacts)
+        z += [one.z for one in found.contacts]
+    print(f"{alarms} alarms in {number} contacts")
+    for name, mean, std in zip(NAMES, np.mean(z, axis=0), np.std(z, axis=0), strict=True):
+        print(f"  {name:18s} mean {mean:+.3f}, std {std:.3f} of the predicted")
+        assert abs(mean) < 0.2 and abs(std - 1.0) < 0.1
+    assert alarms <= number / 500
+
+
+@pytest.mark.parametrize("number", (15, 60))
+def test_drifts_are_found_early(files, number):
+    """Over so many contacts the stiffness grows by 15 %, or the force delay by 0.6 ms."""
+    found = {"stiffness [%]": [], "force delay [ms]": []}
+    for seed, mechanism in enumerate(files):
+        speeds = np.repeat(SPEEDS, 5) if number == 15 else np.random.default_rng(seed).choice(SPEEDS, number)
+        stiffer = monitor(contacts("drifting", seed, speeds), mechanism)
+        later = monitor(delayed(seed, speeds, 0.0006), mechanism)
+        assert stiffer.state == later.state == "bad"
+        assert "stiffness" in {one.name for one in stiffer.changes}
+        assert "apparent damping" in {one.name for one in later.changes}
+        found["stiffness [%]"].append(15.0 * stiffer.alarm / (number - 1))
+        found["force delay [ms]"].append(0.6 * later.alarm / (number - 1))
+    for name, reached in found.items():
+        print(f"{number} contacts: {name} when it was found: {np.round(reached, 2)}")
+    assert np.median(found["stiffness [%]"]) < 3.0
+    if number > 15:
+        # The first five of the fifteen are too slow to tell a delay.
+        assert np.max(found["stiffness [%]"]) < 3.0 and np.max(found["force delay [ms]"]) < 0.3

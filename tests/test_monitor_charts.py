@@ -1,0 +1,80 @@
+"""Charts: the change point by hand, and how often and how soon they raise an alarm."""
+
+import numpy as np
+import pytest
+
+from tuning.identification.monitor.charts import CONTACTS, LIMIT, WINDOW, changes
+from tuning.identification.monitor.figures import NAMES
+
+CUSUM_LIMIT, AVERAGE_LIMIT = 9.0, 4.07  # with 0.5 allowed and weight 0.2: together as rare as `LIMIT`
+
+
+def test_a_change_by_hand():
+    z = np.array([[0.0, 1.0], [0.0, np.nan], [2.0, 1.0], [2.0, np.nan]])
+    likelier, since = changes(z)
+    # (2 + 2)^2 / 2 and (1 + 1)^2 / 2, which not knowing changes nothing of.
+    np.testing.assert_allclose(likelier, [8.0, 2.0])
+    assert since.tolist() == [2, 0]
+    long = np.zeros((WINDOW + 50, 1))
+    long[0], long[-1] = 100.0, 1.0
+    likelier, since = changes(long)
+    assert likelier == 1.0 and since == WINDOW + 49
+
+
+def alarms(mean, lanes, contacts, rng):
+    """Contacts to the first alarm of one figure in each lane, by the likelihood ratio and by both charts."""
+    sums, up, down, average = np.zeros((WINDOW, lanes)), *np.zeros((3, lanes))
+    first = np.full((2, lanes), contacts)
+    for i in range(contacts):
+        z = rng.standard_normal(lanes) + mean(i)
+        # Row i holds the sum from contact i on.
+        sums[i % WINDOW] = 0.0
+        sums += z
+        known = min(WINDOW, i + 1)
+        number = 1.0 + (i - np.arange(known)[:, None]) % WINDOW
+        up, down = np.maximum(up + z - 0.5, 0.0), np.maximum(down - z - 0.5, 0.0)
+        average += 0.2 * (z - average)
+        beyond = np.stack([
+            (sums[:known] ** 2 / number).max(axis=0) > LIMIT,
+            (np.maximum(up, down) > CUSUM_LIMIT) | (np.abs(average) > AVERAGE_LIMIT / 3.0),
+        ])  # fmt: skip
+        first = np.where(beyond & (first == contacts), i, first)
+        if np.all(first < contacts):
+            break
+    return first
+
+
+def test_one_alarm_is_that_of_the_charts():
+    """The ratios that are counted here are those of `changes`."""
+    z = np.random.default_rng(2).standard_normal((40, 3)) + np.array([0.0, 1.5, -4.0])
+    for figure in range(3):
+        first = next((i for i in range(40) if changes(z[: i + 1])[0][figure] > LIMIT), 40)
+        series = iter(z[:, figure])
+        found = alarms(lambda i, series=series: next(series), 1, 40, Silent())
+        assert found[0, 0] == first
+
+
+class Silent:
+    """A generator of noise that there is none of."""
+
+    def standard_normal(self, lanes):
+        return np.zeros(lanes)
+
+
+@pytest.mark.slow
+def test_false_alarms_are_as_rare_as_stated_and_jumps_found_sooner_than_by_other_charts():
+    rng, contacts = np.random.default_rng(0), 4000
+    first = alarms(lambda i: 0.0, 1500, contacts, rng)
+    watched, raised = first.sum(axis=1), (first < contacts).sum(axis=1)
+    between = watched / raised / len(NAMES)
+    print("contacts to a false alarm", between.round(), "of", raised)
+    assert abs(between[0] / CONTACTS - 1.0) < 0.15 and between[1] < 1.2 * between[0]
+    for name, mean in (
+        ("a jump of 1", lambda i: 1.0), ("of 2", lambda i: 2.0), ("of 4", lambda i: 4.0), ("of 6", lambda i: 6.0),
+        ("a drift of 0.1", lambda i: 0.1 * i), ("of 1", lambda i: 1.0 * i),
+    ):  # fmt: skip
+        found = alarms(mean, 2000, 100, rng).mean(axis=1) + 1.0
+        print(
+            f"{name} std a contact: found after {found[0]:.2f} contacts, by CUSUM and average {found[1]:.2f}"
+        )
+        assert found[0] < 1.15 * found[1]

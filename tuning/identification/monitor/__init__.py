@@ -1,0 +1,1 @@
+"""Whether a rig still is the one of a mechanism file, contact by contact."""

@@ -1,0 +1,176 @@
+"""Contact by contact: whether the rig still is the one of the mechanism file, and since when it is not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from jaxhil.errors import InputError
+from jaxhil.mechanism.structs import Mechanism
+from tuning.identification.monitor.charts import LIMIT, changes
+from tuning.identification.monitor.figures import FIGURES, NAMES, Colour, Sensors, figures, weights
+from tuning.identification.monitor.known import Readings, motion_of, readings
+from tuning.identification.monitor.prediction import Prediction
+from tuning.identification.monitor.uncertain import Uncertain, uncertain
+from tuning.identification.records import Campaign, Run, Timing
+
+BLOCK = 64  # runs computed at once
+SENSOR_DELAYS = "rig.force_sensor.delay", "rig.position_sensor.delay"
+State = Literal["good", "watch", "bad"]
+
+
+@dataclass(frozen=True)
+class Contact:
+    """One contact, by the file; figures in SI units and the order of `NAMES`."""
+
+    source: str  # name of its log
+    value: np.ndarray  # 0 where the file is right, NaN where the log does not tell
+    predicted_std: np.ndarray
+    z: np.ndarray  # value less the predicted one, over that
+    state: State
+
+
+@dataclass(frozen=True)
+class Change:
+    """One figure that is not what it was, on the mean of the contacts since."""
+
+    name: str
+    value: float  # by the file, SI
+    std: float  # by the noise of these contacts
+
+
+@dataclass(frozen=True)
+class Monitored:
+    """What the contacts of a log say."""
+
+    contacts: tuple[Contact, ...]
+    alarm: int | None  # contact at which a change was certain, from 0
+    since: int | None  # contact with which it likely began
+    changes: tuple[Change, ...]  # the figures that raised an alarm, the clearest first
+
+    @property
+    def state(self) -> State:
+        return self.contacts[-1].state
+
+    @property
+    def verdict(self) -> str:
+        number = len(self.contacts)
+        if self.alarm is None or self.since is None:
+            return f"Good: the rig is that of the file in all of {number} contacts"
+        what = ", ".join(_said(one) for one in self.changes)
+        where = f"since contact {self.since + 1} of {number} ({self.contacts[self.since].source}): {what}"
+        if self.state == "watch":
+            return f"Watch: {where}; the file's uncertainty covers it: identify again when convenient"
+        return f"Bad: {where}; beyond the file's uncertainty: gains tuned on it are no longer vouched for"
+
+
+def _said(change: Change) -> str:
+    _, unit, scale = FIGURES[NAMES.index(change.name)]
+    shown = "" if unit == "1" else f" {unit}"
+    return f"{change.name} {scale * change.value:+.3g}{shown} (+- {scale * change.std:.2g})"
+
+
+def monitor(campaign: Campaign, mechanism: Mechanism) -> Monitored:
+    """Hold the contacts of a campaign, in their order, against a mechanism.
+
+    Raises `InputError` where there is no contact, or the mechanism is none that a log can be held against."""
+    runs = [run for run in campaign.runs if run.kind in ("contact", "tap") and run.force_measured is not None]
+    if not runs:
+        raise InputError("logs: found no contact, allowed a run of kind contact or tap")
+    numbers, correlation = uncertain(mechanism)
+    sensor = mechanism.rig.force_sensor
+    prediction = Prediction(correlation, float(np.hypot(sensor.noise_std, sensor.quantum)))
+    watch = _Watch(prediction)
+    for run, told in zip(runs, _told(runs, mechanism, campaign, numbers), strict=True):
+        watch.add(run.source, *told)
+    return watch.outcome()
+
+
+def _told(
+    runs: Sequence[Run], mechanism: Mechanism, campaign: Campaign, numbers: Sequence[Uncertain]
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of each run: figures, their slopes by the numbers, their covariance."""
+    rig, timing = mechanism.rig, campaign.timing
+    sensor = rig.force_sensor
+    sensors = Sensors(sensor.noise_std, sensor.quantum, sensor.dead_zone, sensor.range, sensor.time_constant)
+    stds = {one.path: one.std for one in numbers}
+    delay = float(np.hypot(*(stds[path] for path in ("rig.simulator.delay", "rig.force_sensor.delay"))))
+    slack = delay, stds.get("rig.contact_plane", 0.0)
+    colours = Colour(np.empty(0)), Colour(np.empty(0))
+    for begin in range(0, len(runs), BLOCK):
+        block = runs[begin : begin + BLOCK]
+        expected, stepped = _expected(mechanism, block, timing, numbers)
+        for lane, run in enumerate(block):
+            rows = len(run.tick)
+            each = weights(
+                run, expected, lane, sensors, slack, campaign.equivalent_mass, timing.control_period
+            )
+            slopes = [each.shift(f[:rows, lane], x[:rows, lane]) for f, x in stepped]
+            value, noise = figures(run, expected, lane, each, sensors, colours)
+            yield value, np.array(slopes).T, noise
+
+
+def _expected(
+    mechanism: Mechanism, runs: Sequence[Run], timing: Timing, numbers: Sequence[Uncertain]
+) -> tuple[Readings, list[tuple[np.ndarray, np.ndarray]]]:
+    """What is read, and by how much more force and position with each number one standard deviation up."""
+    slack = max(one.std for one in numbers if one.path in SENSOR_DELAYS)
+    motion, found = motion_of(mechanism, runs, timing, slack), []
+    expected = readings(mechanism, runs, motion)
+    for one in numbers:
+        other = one.stepped(mechanism)
+        own = motion_of(other, runs, timing, slack) if one.path.startswith("rig.simulator.") else motion
+        read = readings(other, runs, own)
+        found.append((read.force - expected.force, read.position - expected.position))
+    return expected, found
+
+
+class _Watch:
+    """What was seen so far. After an alarm nothing more is learnt."""
+
+    def __init__(self, prediction: Prediction):
+        self.prediction = prediction
+        self.seen: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        self.contacts: list[Contact] = []
+        self.alarm: int | None = None
+        self.since = 0
+        self.beyond = np.zeros(len(NAMES), bool)  # figures that raised an alarm
+
+    def add(self, source: str, value: np.ndarray, slopes: np.ndarray, noise: np.ndarray) -> None:
+        off, std = self.prediction.deviation(value, slopes, noise)
+        self.seen.append((value, slopes, noise))
+        self.contacts.append(Contact(source, value, std, off / std, "good"))
+        likelier, began = changes(np.array([one.z for one in self.contacts]))
+        self.beyond |= likelier > LIMIT
+        if not self.beyond.any():
+            self.prediction.learn(value, slopes, noise)
+            return
+        if self.alarm is None:
+            # Of a drift, later contacts would tell when it was steepest.
+            self.alarm, self.since = len(self.contacts) - 1, int(began[np.argmax(likelier)])
+        covered = self.prediction.covers(*self._mean())
+        self.contacts[-1] = replace(self.contacts[-1], state="watch" if covered else "bad")
+
+    def outcome(self) -> Monitored:
+        if self.alarm is None:
+            return Monitored(tuple(self.contacts), None, None, ())
+        value, _, noise = self._mean()
+        std = np.sqrt(np.diag(noise))
+        order = sorted(np.flatnonzero(self.beyond), key=lambda i: -abs(value[i] / std[i]))
+        found = tuple(Change(NAMES[i], float(value[i]), float(std[i])) for i in order)
+        return Monitored(tuple(self.contacts), self.alarm, self.since, found)
+
+    def _mean(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Over the contacts since the change: figures, slopes, and the figures' covariance."""
+        values, slopes, noises = (np.array(part) for part in zip(*self.seen[self.since :], strict=True))
+        number = np.isfinite(values).sum(axis=0)
+        counted = np.maximum(number, 1)
+        value = np.where(number > 0, np.nansum(values, axis=0) / counted, np.nan)
+        return (
+            value,
+            np.nan_to_num(slopes).mean(axis=0),
+            np.nansum(noises, axis=0) / np.outer(counted, counted),
+        )
