@@ -70,8 +70,8 @@ def test_false_alarms_are_as_rare_as_stated_and_jumps_found_sooner_than_by_other
     print("contacts to a false alarm", between.round(), "of", raised)
     assert abs(between[0] / CONTACTS - 1.0) < 0.15 and between[1] < 1.2 * between[0]
     for name, mean in (
-        ("a jump of 1", lambda i: 1.0), ("of 2", lambda i: 2.0), ("of 4", lambda i: 4.0), ("of 6", lambda i: 6.0),
-        ("a drift of 0.1", lambda i: 0.1 * i), ("of 1", lambda i: 1.0 * i),
+        ("a jump of 1", lambda i: 1.0), ("of 2", lambda i: 2.0), ("of 4", lambda i: 4.0),
+        ("of 6", lambda i: 6.0), ("a drift of 0.1", lambda i: 0.1 * i), ("of 1", lambda i: 1.0 * i),
     ):  # fmt: skip
         found = alarms(mean, 2000, 100, rng).mean(axis=1) + 1.0
         print(

@@ -70,8 +70,8 @@ class Monitor:
 
     Example: jaxhil monitor identified/mechanism.toml day2/contact_*.csv --map logs.toml
 
-    Good: nothing changed. Watch: something did, within what the file's [uncertainty] covers. Bad: beyond that;
-    exit code 1.
+    Good: nothing changed. Watch: something did, within what the file's [uncertainty] covers. Bad: beyond
+    that; exit code 1.
     """
 
     mechanism: Annotated[

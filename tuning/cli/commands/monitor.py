@@ -14,12 +14,12 @@ from tuning.identification.monitor.monitor import Monitored, monitor
 
 SCHEMA = "jaxhil/monitor/1"
 UNSTATED = (
-    "the mechanism file has no [uncertainty]: whatever is off by more than delays and scales ever are is bad"
+    "the mechanism file has no [uncertainty]: what is off by more than a clock or a scale may be is bad"
 )
 
 
 def run(options: Monitor) -> int:
-    """Hold the contacts against the mechanism; 1 where the rig is not within the file's uncertainty, else 0."""
+    """Hold contacts against the mechanism; 1 where the rig is beyond the file's uncertainty, else 0."""
     loaded = load(options.mechanism)
     campaign = read_logs([Path(log) for log in options.logs], options.map, loaded.mechanism)
     found = monitor(campaign, loaded.mechanism)

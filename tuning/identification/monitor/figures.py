@@ -129,7 +129,8 @@ class Colour:
 
 
 def figures(
-    run: Run, expected: Readings, lane: int, weights: Weights, sensors: Sensors, colours: tuple[Colour, Colour]
+    run: Run, expected: Readings, lane: int, weights: Weights, sensors: Sensors,
+    colours: tuple[Colour, Colour],
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """The figures of a contact and their covariance by the noise of its readings; NaN where it does not tell.
 

@@ -39,15 +39,15 @@ class Readings:
 
 
 def motion_of(mechanism: Mechanism, runs: Sequence[Run], timing: Timing, slack: float) -> Motion:
-    """Of the rig's motion simulator under the commands of runs; `slack` [s]: by how much longer than the file's
-    the sensors' delays may get. Raises `InputError` for a G that passes some of the command at once."""
+    """Of the rig's motion simulator under the commands of runs; `slack` [s]: by how much the sensors' delays
+    may exceed the file's. Raises `InputError` for a G that passes some of the command at once."""
     rig = mechanism.rig
     longest = max(rig.force_sensor.delay, rig.position_sensor.delay) + slack + timing.control_period
     return Motion(transfer(rig.simulator), runs, timing, longest)
 
 
 def readings(mechanism: Mechanism, runs: Sequence[Run], motion: Motion) -> Readings:
-    """Of runs with at most one contact each, and their motion. Raises `InputError` for a law that a log cannot
+    """Of runs with at most one contact each, and their motion. Raises `InputError` for a law that no log can
     be held against."""
     rig, sensor, period = mechanism.rig, mechanism.rig.force_sensor, motion.period
     law, table = law_of(mechanism.contact)

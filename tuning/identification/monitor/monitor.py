@@ -97,8 +97,8 @@ def _told(
     sensor = rig.force_sensor
     sensors = Sensors(sensor.noise_std, sensor.quantum, sensor.dead_zone, sensor.range, sensor.time_constant)
     stds = {one.path: one.std for one in numbers}
-    delay = float(np.hypot(*(stds[path] for path in ("rig.simulator.delay", "rig.force_sensor.delay"))))
-    slack = delay, stds.get("rig.contact_plane", 0.0)
+    delay = np.hypot(stds["rig.simulator.delay"], stds["rig.force_sensor.delay"])
+    slack = float(delay), stds.get("rig.contact_plane", 0.0)
     colours = Colour(np.empty(0)), Colour(np.empty(0))
     for begin in range(0, len(runs), BLOCK):
         block = runs[begin : begin + BLOCK]
