@@ -176,7 +176,7 @@ def test_the_command_prints_a_verdict_and_ends_with_it(jaxhil, tmp_path):
     (["varying", "LOG", "--map", "FREE"], "found no contact, allowed a run of kind contact or tap"),
     (["nowhere.toml", "LOG"], "nowhere"),
     (["TWO", "LOG"], "contact.clearance: found 0.02, allowed inf"),
-    (["OTHER", "LOG"], "contact.law: found elastoplastic, allowed linear, kelvin_voigt"),
+    (["OTHER", "LOG"], "contact.law: found 'elastoplastic', allowed linear, kelvin_voigt"),
 ))  # fmt: skip
 def test_what_cannot_be_held_against_is_one_line(jaxhil, tmp_path, arguments, words):
     campaign = contacts(CLEAN, speeds=SPEEDS[:1])

@@ -10,34 +10,20 @@ noise.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 
 from tuning.identification.hold import ROW_SHIFT
+from tuning.identification.rational import Model
 from tuning.identification.records import Run, Timing
 
 TOLERANCE = 1e-9  # periods: nearer to a tick than this is at the tick
 
 
-class Simulator(Protocol):
-    """A motion simulator: G(s) with a delay."""
-
-    @property
-    def fraction(self) -> tuple[np.ndarray, np.ndarray]:
-        """Numerator and denominator of G in descending powers of s."""
-        ...
-
-    @property
-    def delay(self) -> float:
-        """Seconds."""
-        ...
-
-
 class Motion:
     """The response of one model to the commands of several runs."""
 
-    def __init__(self, model: Simulator, runs: Sequence[Run], timing: Timing, longest: float):
+    def __init__(self, model: Model, runs: Sequence[Run], timing: Timing, longest: float):
         """`longest`: greatest delay after the model's own [s] that `at` will be asked for."""
         self.delay, self.period = model.delay, timing.control_period
         self.shift = ROW_SHIFT[timing.row]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuning.identification.monitor.known import Readings
+from tuning.identification.monitor.readings import Readings
 from tuning.identification.noise import at_rest, autoregression, whitened_share
 from tuning.identification.records import Run
 

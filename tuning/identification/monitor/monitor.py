@@ -12,8 +12,8 @@ from jaxhil.errors import InputError
 from jaxhil.mechanism.structs import Mechanism
 from tuning.identification.monitor.charts import LIMIT, changes
 from tuning.identification.monitor.figures import FIGURES, NAMES, Colour, Sensors, figures, weights
-from tuning.identification.monitor.known import Readings, motion_of, readings
 from tuning.identification.monitor.prediction import Prediction
+from tuning.identification.monitor.readings import Readings, motion_of, readings
 from tuning.identification.monitor.uncertain import Uncertain, uncertain
 from tuning.identification.records import Campaign, Run, Timing
 
