@@ -6,10 +6,10 @@ the contact should have had since its entry is integrated over again while the m
 (`reintegration`), and the numerical model's speed v_d is led to that motion's, v_r, until the hardware itself
 has separated. No model of the motion simulator is used. Scaled by approach speed v0 and equivalent mass M,
 F the map, (X, V) the measured motion aligned with the measured force y, p the peak force that the map
-predicts:
+predicts, t the time left of pi/p since the hardware's entry:
 
-    f_0 = max(F(x_d, v_d), 0)
-    f_e = clip(c (v_d - T f_0/2 - v_r), -limit p, limit p)
+    f_0 = clip(F(x_d, v_d), 0, MOST p), separated 0
+    f_e = clip((v_d - T f_0/2 - v_r)/(1/c + s t), -limit p, (1 + limit) p - f_0)
     no contact:  F_c = 0, until the force tells of one, and of where its surface is
     in contact:  F_c = f_0 + (y - F(X, V)) + f_e
     separated:   F_c = f_e  until the hardware has left the surface for 6 ms, then 0
@@ -19,6 +19,7 @@ no approach speed to scale by: there F_c is the measured force, as it is.
 notebooks/guide/retrospective_reference.md says more.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
@@ -293,8 +294,9 @@ class RetrospectiveReference(Compensator):
 
         own = force(known, x, v, deepest)
         separated = (x <= 0) | ((v < 0) & (own <= 0))
+        since = (history.age - reference.entry.tick).astype(slow.dtype) * slow
         command = _command(
-            gains, v, known, own, separated, seen, expected, reference.live.speed, scales.pace, slow
+            gains, v, known, own, separated, seen, expected, reference, since, scales.pace, slow
         )
         command = side * scales.weight * command
         bent = side * deflection(read.position, clearance)
@@ -384,11 +386,16 @@ def _deepest(before, depth):
     return jnp.where(depth > before, depth, before)
 
 
-def _command(gains, v, known, own, separated, read, expected, reference_speed, pace, period):
-    """F_c/(M v0) [1/s], of the module's text; `own` is the map's force on the numerical model."""
+def _command(gains, v, known, own, separated, read, expected, reference, since, pace, period):
+    """F_c/(M v0) [1/s], of the module's text; `own` is the map's force on the numerical model, the hardware's
+    entry so long `since` [s]."""
     peak = peak_force(known)
     own = jnp.where(own > 0, jnp.where(own > MOST * peak, MOST * peak, own), 0)
-    limit = gains["correction_limit"] * peak
-    wanted = gains["velocity_gain"] / pace * (v - 0.5 * period * own - reference_speed)
-    correction = jnp.where(wanted > limit, limit, jnp.where(wanted < -limit, -limit, wanted))
+    least = -gains["correction_limit"] * peak
+    most = (1 + gains["correction_limit"]) * peak - jnp.where(separated, 0, own)
+    left = math.pi / peak - since
+    gain = gains["velocity_gain"] / pace
+    slower = 1 + gain * gains["repayment_time"] * jnp.where(left > 0, left, 0)
+    wanted = gain * (v - 0.5 * period * own - reference.live.speed) / slower
+    correction = jnp.where(wanted > most, most, jnp.where(wanted < least, least, wanted))
     return jnp.where(separated, correction, own + (read - expected) + correction)

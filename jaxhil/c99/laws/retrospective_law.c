@@ -1,10 +1,11 @@
 /* What the retrospective references share: find the surface, identify the contact, work out what should have
  * happened, pay it back. Until the force tells of contact F_c = 0. In contact F_c = f_0 + (y - F(X, V)) + f_e,
  * f_0 = clip(F(x_d, v_d), 0, most p), F the force-depth map identified on delay-aligned readings (X, V, y) since the
- * surface was met; separated F_c = f_e until the hardware has left the surface for 6 ms, then 0. f_e = clip(c (v_d -
- * T f_0/2 - v_r), -limit p, limit p), v_r the speed of the motion that the contact should have had since its entry,
- * p the peak force that the map predicts. Scaled by approach speed and equivalent mass. Slow contact is followed on
- * a slower scale of time: with T and 1/c times its pace, v0 over it, it is as usual contact.
+ * surface was met; separated f_0 = 0 and F_c = f_e until the hardware has left the surface for 6 ms, then 0. f_e =
+ * clip((v_d - T f_0/2 - v_r)/(1/c + s t), -limit p, (1 + limit) p - f_0), v_r the speed of the motion that the
+ * contact should have had since its entry, p the peak force that the map predicts, t the time left of pi/p since the
+ * hardware's entry. Scaled by approach speed and equivalent mass. Slow contact is followed on a slower scale of time:
+ * with T and 1/c times its pace, v0 over it, it is as usual contact.
  */
 #include <math.h>
 #include <stdbool.h>
@@ -22,7 +23,7 @@
 /* == Declarations == */
 
 typedef struct {
-    double period, clearance, mass, dead_zone, floor, velocity_gain, limit, replay, strength;
+    double period, clearance, mass, dead_zone, floor, velocity_gain, share, limit, replay, strength;
     double plane_spread, bias_spread;
     double pace, side, speed, gone, deepest, hardware_deepest, learnt_deepest;
     long next;
@@ -84,6 +85,7 @@ static bool jaxhil_law_init(jaxhil_law *law, const jaxhil_gains *gains) {
     law->dead_zone = gains->dead_zone;
     law->floor = gains->force_noise_floor;
     law->velocity_gain = gains->velocity_gain;
+    law->share = gains->repayment_time;
     law->limit = gains->correction_limit;
     law->replay = gains->force_replay;
     law->strength = gains->replay_noise * gains->replay_noise;
@@ -99,18 +101,23 @@ static bool jaxhil_law_init(jaxhil_law *law, const jaxhil_gains *gains) {
     return jaxhil_alignment_init(&law->alignment, gains->identification_delay, period);
 }
 
-/* f_e [1/s], by the map's peak force and the speed of the model in the middle of the next period; `status` judges
+/* f_e [1/s], by the map's peak force, f_0 and the speed of the model in the middle of the next period; `status` judges
  * it. */
-static double jaxhil_law_repayment(jaxhil_law *law, double peak, double speed, double zone) {
-    const double limit = law->limit * peak;
-    const double correction = law->velocity_gain / law->pace * (speed - law->reference.live.speed);
+static double jaxhil_law_repayment(jaxhil_law *law, double peak, double own, double speed, double zone) {
+    const jaxhil_reference_motion *reference = &law->reference;
+    const double least = -(law->limit * peak), most = (1.0 + law->limit) * peak - own;
+    const double left =
+        jaxhil_map_pi / peak - (double)(law->history.newest - reference->entry) * reference->period;
+    const double gain = law->velocity_gain / law->pace;
+    const double slower = 1.0 + gain * (law->share * (left > 0.0 ? left : 0.0));
+    const double correction = gain * (speed - reference->live.speed) / slower;
     law->status =
         jaxhil_doubts_status(&law->doubts, peak, jaxhil_learnt_variance(&law->learnt), zone, law->speed);
-    if (!(correction > limit || correction < -limit)) {
+    if (!(correction > most || correction < least)) {
         return correction;
     }
     law->status = law->status == JAXHIL_IDENTIFIED ? JAXHIL_SATURATED : law->status;
-    return correction > limit ? limit : -limit;
+    return correction > most ? most : least;
 }
 
 /* The map learns from the readings since the surface was met, one after the other; noise of a `variance` [1/s^2],
@@ -172,14 +179,15 @@ static double jaxhil_law_follow(jaxhil_law *law, double x, double v, double dept
         own = 0.0;
     }
     const double peak = jaxhil_curve_peak_force(curve);
-    const double most = jaxhil_most * peak;
-    if (own > most) {
-        own = most;
+    const double felt = jaxhil_most * peak;
+    if (own > felt) {
+        own = felt;
     }
     law->doubts.unexplained =
         jaxhil_balance_unexplained(&law->balance, curve, peak, law->learnt_deepest, reference->shift,
                                    law->pace);
-    const double correction = jaxhil_law_repayment(law, peak, v - 0.5 * reference->period * own, zone);
+    const double middle = v - 0.5 * reference->period * own;
+    const double correction = jaxhil_law_repayment(law, peak, *separated ? 0.0 : own, middle, zone);
     return *separated ? correction : own + (force - expected) + correction;
 }
 

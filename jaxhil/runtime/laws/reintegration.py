@@ -150,8 +150,8 @@ class ReferenceMotion:
     """The `live` motion, and the pass behind it that is to take its place."""
 
     __slots__ = (
-        "_behind", "_beyond", "_coarse", "_entry", "_history", "_present", "_reached", "_since", "_start",
-        "deeper", "live", "period", "replay", "scales", "shift",
+        "_behind", "_beyond", "_coarse", "_history", "_present", "_reached", "_since", "_start",
+        "deeper", "entry", "live", "period", "replay", "scales", "shift",
     )  # fmt: skip
 
     def __init__(self, history: History, scales: Scales, period: float) -> None:
@@ -177,7 +177,7 @@ class ReferenceMotion:
         ticks = depth / self.period - since
         ticks = ticks if ticks < LONGEST else float(LONGEST)
         whole = float(floor(ticks)) if ticks > 0.0 else 0.0
-        self._entry = entry
+        self.entry = entry  # tick of the last sample before the hardware's own entry
         self._start = start
         self._reached = entry
         self._since = since
@@ -190,7 +190,7 @@ class ReferenceMotion:
 
     def tick(self, curve: Curve) -> None:
         """One tick more, with the newest curve."""
-        entry = self._entry
+        entry = self.entry
         self._present += 1
         whole = self._history.newest - entry < LONGEST
         if self._reached > entry or whole:
@@ -213,7 +213,7 @@ class ReferenceMotion:
                 break
             following = self._next(reached)
             ticks = float(following - reached)
-            if reached == self._entry:
+            if reached == self.entry:
                 ticks += self._since - 1.0
             self._reached = following
             self._advance(self._behind, following, ticks)

@@ -6,10 +6,11 @@ map from depth to force; they integrate the motion that it should have had since
 they add to the force a correction that brings the model's speed back to the reference's.
 
 Scaled by approach speed v0 and equivalent mass M, F the force-depth map identified on delay-aligned readings
-(X, V, y), p the peak force that it predicts, v_r the reference's speed:
+(X, V, y), p the peak force that it predicts, v_r the reference's speed, t the time left of pi/p
+since the hardware's entry:
 
-    f_0 = clip(F(x_d, v_d), 0, MOST p)
-    f_e = clip(c (v_d - T f_0/2 - v_r), -limit p, limit p)
+    f_0 = clip(F(x_d, v_d), 0, MOST p), separated 0
+    f_e = clip((v_d - T f_0/2 - v_r)/(1/c + s t), -limit p, (1 + limit) p - f_0)
     no contact:  F_c = 0, until the force tells of one, and of where its surface is
     in contact:  F_c = f_0 + (y - F(X, V)) + f_e
     separated:   F_c = f_e  until the hardware has left the surface for 6 ms, then 0
@@ -19,7 +20,7 @@ said of usual contact holds of it. notebooks/guide/retrospective_reference.md sa
 """
 
 from collections.abc import Mapping
-from math import inf, sqrt
+from math import inf, pi, sqrt
 from typing import ClassVar
 
 from ..bounds import DAMPINGS_BY_MASS, FORCES, MASSES, STIFFNESSES_BY_MASS, TIMES
@@ -71,7 +72,7 @@ class Retrospective(Compensator):
         "_alignment", "_balance", "_bias_spread", "_clearance", "_curve", "_dead_zone", "_deeper", "_deepest",
         "_doubts", "_floor", "_gone", "_hardware_deepest", "_history", "_learnt_deepest", "_limit", "_mass",
         "_next", "_noise", "_onset", "_pace", "_period", "_plane_spread", "_planes", "_reference", "_replay",
-        "_scales", "_shift", "_side", "_speed", "_started", "_strength", "_velocity_gain", "status",
+        "_scales", "_share", "_shift", "_side", "_speed", "_started", "_strength", "_velocity_gain", "status",
     )  # fmt: skip
 
     misfit: ClassVar[float] = 0.003  # of a force, by which a map may be wrong
@@ -92,6 +93,7 @@ class Retrospective(Compensator):
         "prior_preload_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
         "force_noise_floor": GainSpecification("1/s", 1e-4, 10.0),
         "velocity_gain": GainSpecification("1/s", 0.0, 1e5),
+        "repayment_time": GainSpecification("1", 0.0, 10.0),
         "correction_limit": GainSpecification("1", 0.0, 20.0),
         "force_replay": GainSpecification("1", 0.0, 1.0),
         "replay_noise": GainSpecification("1/s", 0.01, 100.0),
@@ -112,6 +114,7 @@ class Retrospective(Compensator):
         self._plane_spread = gains["plane_spread"]
         self._floor = gains["force_noise_floor"]
         self._velocity_gain = gains["velocity_gain"]
+        self._share = gains["repayment_time"]
         self._limit = gains["correction_limit"]
         self._replay = gains["force_replay"]
         self._strength = gains["replay_noise"] * gains["replay_noise"]
@@ -304,13 +307,14 @@ class Retrospective(Compensator):
         if not own > 0.0:
             own = 0.0
         peak = curve.peak_force()
-        most = MOST * peak
-        if own > most:
-            own = most
+        felt = MOST * peak
+        if own > felt:
+            own = felt
         self._doubts.unexplained = self._balance.unexplained(
             curve, peak, self._learnt_deepest, reference.shift, self._pace
         )
-        correction = self._repayment(peak, v - 0.5 * reference.period * own, zone)
+        middle = v - 0.5 * reference.period * own
+        correction = self._repayment(peak, 0.0 if separated else own, middle, zone)
         command = correction if separated else own + (read - expected) + correction
         return self._side * scales.weight * command, separated
 
@@ -352,14 +356,19 @@ class Retrospective(Compensator):
         self.status = UNSURE
         return 0.0 if separated or bent < 0.0 else force, separated
 
-    def _repayment(self, peak: float, speed: float, zone: float) -> float:
-        """f_e [1/s], by the map's peak force [1/s] and the speed of the model in the middle of the next
-        period; `status` judges it."""
-        limit = self._limit * peak
-        correction = self._velocity_gain / self._pace * (speed - self._reference.live.speed)
+    def _repayment(self, peak: float, own: float, speed: float, zone: float) -> float:
+        """f_e [1/s], by the map's peak force [1/s], f_0 [1/s] and the speed of the model in the middle of the
+        next period; `status` judges it."""
+        reference = self._reference
+        least = -(self._limit * peak)
+        most = (1.0 + self._limit) * peak - own
+        left = pi / peak - float(self._history.newest - reference.entry) * reference.period
+        gain = self._velocity_gain / self._pace
+        slower = 1.0 + gain * (self._share * (left if left > 0.0 else 0.0))
+        correction = gain * (speed - reference.live.speed) / slower
         self.status = self._doubts.status(peak, self._variance(), zone, self._speed)
-        if correction > limit or correction < -limit:
-            correction = limit if correction > limit else -limit
+        if correction > most or correction < least:
+            correction = most if correction > most else least
             if self.status == IDENTIFIED:
                 self.status = SATURATED
         return correction
