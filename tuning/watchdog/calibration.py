@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
+from jaxhil.compensators import COMPENSATORS
 from jaxhil.errors import InputError
 from jaxhil.mechanism.uncertainty import extremes
 from jaxhil.runtime.limits import LIMITS
@@ -127,8 +128,9 @@ def watchdog_rules(loaded: LoadedGains) -> tuple[Rules, float]:
         alignment=max(0.0, force.delay + force.time_constant - position.delay),
         settling=MARGIN * wait,
         fading=max(noise, unfelt),
+        finds_plane=COMPENSATORS[loaded.compensator].finds_plane,
     )
-    error = 6 * drawn["position_noise"] + drawn["position_quantum"]
+    error = 6 * drawn["position_noise"] + drawn["position_quantum"] + max(0.0, drawn["nearer"])
     free_distance = error + drawn["velocity"] * (RETREAT + drawn["position_delay"])
     return rules, min(free_distance, mechanism.contact.clearance / 4)
 
@@ -222,6 +224,7 @@ def _largest(loaded: LoadedGains) -> dict[str, float]:
         "position_noise": position.noise_std,
         "position_quantum": position.quantum,
         "velocity": scenarios.velocity,
+        "nearer": -scenarios.contact_plane,
     }
     return {name: float(np.max(values)) for name, values in largest.items()}
 
