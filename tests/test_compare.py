@@ -40,6 +40,7 @@ def test_the_same_seed_gives_the_same_document(tmp_path):
         costs = document.pop("timings")["microseconds_per_tick"]
         assert set(costs) == {"none", "passivity"} and all(cost > 0 for cost in costs.values())
     assert documents[0] == documents[1]
+    assert documents[0]["transparency"].endswith("at 25 and 75 % of the contact's duration in space")
     [mechanism] = documents[0]["mechanisms"]
     none, passivity = mechanism["laws"]
     assert none["knows"] == [] and set(none["figures"]) == {"literature"}

@@ -167,6 +167,7 @@ class TunedGains:
     def document(self) -> dict[str, Any]:
         """The content of the gain file."""
         from tuning.gain_file import build_document, validity_envelope
+        from tuning.transparency.pushes import PUSHES
 
         found = self.found
         return build_document(
@@ -179,7 +180,7 @@ class TunedGains:
                 "nominal": found.nominal,
                 "robust": found.figures,
                 "tuned_intervals": found.intervals.plain() if found.intervals else None,
-                **({"honesty": found.transparency} if found.transparency else {}),
+                **({"honesty": found.transparency, "transparency": PUSHES} if found.transparency else {}),
             },
             found.settings.seed,
             found.timings,

@@ -25,6 +25,8 @@ from tuning.batches import join
 
 SIZE, WIDTH = 0.2, 0.02  # of the peak force; s
 EARLY, LATE = 0.25, 0.75  # of the contact's duration
+# What `early` and `late` are, as written files say it; those of another definition do not say so.
+PUSHES = f"a push on the hardware at {100 * EARLY:g} and {100 * LATE:g} % of the contact's duration in space"
 SAMPLES = 129  # of a reference's motion
 LANES = 256  # integrated in one call
 

@@ -28,6 +28,7 @@ def run(options: Compare) -> int:
     checks.own_results(folder / "compare.json", "mechanisms", PICTURES)
     prepare()
     from tuning.benchmark.study import Failed
+    from tuning.transparency.pushes import PUSHES
 
     laws, names = asked.laws, [one.mechanism.name for one in loaded]
     found: dict[str, dict[str, Any]] = {name: {} for name in names}
@@ -48,6 +49,7 @@ def run(options: Compare) -> int:
     document = {
         **{key: getattr(options, key) for key in ("limit", "seed", "scenarios", "judged")},
         "tuned": not options.untuned,
+        "transparency": PUSHES,
         "mechanisms": [board(one, asked, found[one.mechanism.name]).document for one in loaded],
         "timings": {"microseconds_per_tick": _costs(loaded[0], ordered)},
         "problems": problems,
@@ -124,8 +126,7 @@ def _print(
             texts=(0, 1),
         ),
         f"rms, p99, worst: |e - e*|. fail: scenarios beyond {100 * options.limit:g} %, or that do not end.",
-        "early, late: transparency to a push on the hardware at 25 and 75 % of the contact's duration in "
-        "space (1: perfect, 0: blind).",
+        f"early, late: transparency to {document['transparency']} (1: perfect, 0: blind).",
         "slope: of e against e* over damped twins. peak: command over the reference, 99th percentile.",
         "path: x_d off the reference. noise: amplification. *: better than every other law, tuned, by more",
         "than the 95 % intervals.",
