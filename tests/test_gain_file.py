@@ -9,6 +9,7 @@ from collections import namedtuple
 
 import numpy as np
 import pytest
+from conftest import Ran
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from laws_from_elsewhere import SquaredSpring
@@ -19,7 +20,7 @@ from jaxhil.compensators import COMPENSATORS
 from jaxhil.compensators.response_error import typical_stiffness
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import builtin_names, load
-from jaxhil.runtime import Controller, digest
+from jaxhil.runtime import Controller, GainFileError, digest
 from jaxhil.simulation.gain_file import check_document, load_gain_file
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gain_file import build_document, plain, validity_envelope, write_gain_file
@@ -203,6 +204,24 @@ def test_what_is_no_gain_file_is_refused(content, tmp_path):
     with pytest.raises(InputError) as caught:
         load_gain_file(file)
     assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize("law", ["retrospective_reference", "retrospective_delay_bank"])
+def test_gains_of_an_earlier_law_are_refused_with_the_way_to_new_ones(law, tmp_path, jaxhil):
+    """Of one that took the surface as told: by the library, on the rig and by the commands."""
+    file, document = tmp_path / "gains.json", make("varying", law)
+    for name in ("plane_spread", "bias_spread", "prior_friction_spread", "prior_preload_spread"):
+        del document["gains"][name]
+    file.write_text(json.dumps({**document, "sha256": digest(document)}))
+    with pytest.raises(InputError) as caught:
+        load_gain_file(file)
+    with pytest.raises(GainFileError) as on_the_rig:
+        Controller.from_file(file)
+    text = str(caught.value)
+    assert text.startswith(f"{file}: gains.") and text.isprintable() and text == str(on_the_rig.value)
+    assert f"found nothing, allowed all gains of {law} (" in text and "`jaxhil tune` makes a new file" in text
+    for command in (["sweep"], ["export"], ["simulate", "--gains"]):
+        assert jaxhil(*command, file) == Ran(2, "", f"jaxhil: {text}\n")
 
 
 def test_an_edit_without_a_new_digest_is_refused(tmp_path):
