@@ -1,0 +1,133 @@
+"""What the retrospective reference leaves on fresh scenarios where the surface, the sensor's offset, preload,
+friction, duration and control period are not those of the standard suites; one set of gains per setting.
+
+`pytest -m slow -s tests/test_law_accuracy.py` prints it: of |e - e*| in % the root mean square, the 99th
+percentile and the largest.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from jaxhil.compensators import literature_gains
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.evaluation import Outcome, evaluate
+from jaxhil.simulation.scenario import Scenario, build_scenarios
+from tuning.transparency.probes import LANES_PER_SCENARIO, ProbedScenarios, probe_figures, probed_scenarios
+
+pytestmark = pytest.mark.slow
+LAW, SEED = "retrospective_reference", 0xACC  # of scenarios that nothing was tuned or judged on elsewhere
+SETTINGS = "sharp", "gentle"
+CONTACTS = 4
+
+
+def within(path: str, low: float, high: float) -> str:
+    """An override: a number that lies anywhere between two."""
+    return f'uncertainty."{path}"={{distribution="uniform",low={low},high={high}}}'
+
+
+PLANE = "rig.contact_plane=0.0", within("rig.contact_plane", -1e-3, 1e-3)
+BIAS = "rig.force_sensor.bias=0.0", within("rig.force_sensor.bias", -5.0, 5.0)
+FRICTION = "contact.friction=3.0", within("contact.friction", 0.0, 6.0)
+
+
+def outcome_of(mechanism: Mechanism, gains: Mapping[str, Any], scenarios: Scenario) -> Outcome:
+    loop = build_loop(mechanism, LAW, scenarios)
+    # Lane by lane, so that one program serves every set of gains.
+    lanes = scenarios.velocity.shape
+    return evaluate(loop, {name: np.broadcast_to(value, lanes) for name, value in gains.items()}, scenarios)
+
+
+def left(errors: Any) -> tuple[float, float, float]:
+    """Root mean square, 99th percentile and largest of |e - e*| [%]."""
+    size = 100 * np.abs(np.asarray(errors))
+    return float(np.sqrt(np.mean(size**2))), float(np.percentile(size, 99)), float(np.max(size))
+
+
+def printed(*what: object) -> None:
+    print(*(f"{one:.2f}" if isinstance(one, float) else one for one in what), flush=True)
+
+
+def copies_of(probed: ProbedScenarios, outcome: Outcome) -> Outcome:
+    """With an axis for a scenario's plain run, its two pushes and its damped twin."""
+    number = len(probed.plain)
+    return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], number, LANES_PER_SCENARIO), outcome)
+
+
+@pytest.mark.parametrize("noise", ["0.5 %", "none"])
+@pytest.mark.parametrize("suite", ["noisy", "damped", "hertz", "hardening", "layered"])
+def test_a_surface_anywhere_within_1_mm(suite, noise):
+    """At 5 mm/s; by the fourth contact as good as where the surface is told."""
+    clean = ("rig.force_sensor.noise_std=0.0",) if noise == "none" else ()
+    changes = [*PLANE, *clean, f"approach.contacts={CONTACTS}"]
+    mechanism = load(f"suite-{suite}", changes).mechanism
+    probed = probed_scenarios(mechanism, draw(mechanism, 200, SEED), SEED)
+    told = load(f"suite-{suite}", [*clean, f"approach.contacts={CONTACTS}"]).mechanism
+    known = probed.scenarios._replace(contact_plane=0 * probed.scenarios.contact_plane)
+    for setting in SETTINGS:
+        gains = literature_gains(mechanism, LAW, setting)
+        copies = copies_of(probed, outcome_of(mechanism, gains, probed.scenarios))
+        assert np.all(copies.good[..., 0])
+        first, fourth = left(copies.error[0, :, 0]), left(copies.error[3, :, 0])
+        gains = {**literature_gains(told, LAW, setting), "plane_spread": 1e-6}
+        given = left(copies_of(probed, outcome_of(told, gains, known)).error[3, :, 0])
+        figures = {name: one.value for name, one in probe_figures(probed, copies).items()}
+        printed(suite, "noise", noise, setting, *first, "fourth", *fourth, "told", *given, figures)
+        assert first[0] < 0.5 and first[1] < 1.5 and first[2] < 3.0
+        assert fourth[0] < given[0] + 0.05
+        assert min(figures["early"], figures["late"]) > (0.75 if noise == "none" else 0.85)
+
+
+@pytest.mark.parametrize("noise", ["none", "0.5 % of its own peak", "0.15 N"])
+@pytest.mark.parametrize("period", [2.5e-4, 1e-3, 4e-3])
+def test_contact_of_1_to_8_s(period, noise):
+    """Of 0.06 to 0.5 Hz. No command goes beyond 3 times the peak in space and 20 times the noise."""
+    sensor = "rig.force_sensor.noise_std=0.15"
+    for damped in (False, True):
+        damping = [f"contact.damping=[{2 * 0.05 * np.sqrt(414.5 * 350):.6g}]"] if damped else []
+        mechanism = load("suite-long", [f"rig.control_period={period}", sensor, *damping]).mechanism
+        scenarios = build_scenarios(mechanism, draw(mechanism, 32, SEED), SEED)
+        peak = np.asarray(scenarios.velocity) * np.sqrt(np.asarray(scenarios.contact.stiffness)[0] * 350.0)
+        std = {"none": 0 * peak, "0.15 N": 0 * peak + 0.15}.get(noise, 0.005 * peak)
+        scenarios = scenarios._replace(force_sensor=scenarios.force_sensor._replace(noise_std=std))
+        for setting in SETTINGS:
+            gains = literature_gains(mechanism, LAW, setting)
+            outcome = outcome_of(mechanism, {**gains, "force_noise": std}, scenarios)
+            assert np.all(outcome.good[0])
+            found = left(outcome.error[0])
+            excess = (outcome.peak_ratio[0] - 3) * outcome.reference_peak_force[0]
+            beyond = int(np.sum(excess > 20 * std))
+            kind = "damped" if damped else "elastic"
+            printed(
+                f"{1e3 * period:g} ms, noise {noise}, {kind}, {setting}:", *found, "peaks beyond:", beyond
+            )
+            assert found[0] < {"none": 0.2, "0.15 N": 2.0}.get(noise, 0.3)
+            assert not beyond
+
+
+OFFSETS = {
+    "preload": ("preload", ()),
+    "friction": ("friction", ()),
+    "bias": ("noisy", BIAS),
+    "all": ("preload", FRICTION + BIAS),
+}
+
+
+@pytest.mark.parametrize("case", OFFSETS)
+def test_preload_friction_and_bias(case):
+    """To 10 N, 6 N and 5 N either way, alone and together."""
+    suite, changes = OFFSETS[case]
+    mechanism = load(f"suite-{suite}", changes).mechanism
+    scenarios = build_scenarios(mechanism, draw(mechanism, 200, SEED), SEED)
+    for setting in SETTINGS:
+        outcome = outcome_of(mechanism, literature_gains(mechanism, LAW, setting), scenarios)
+        assert np.all(outcome.good[0])
+        found = left(outcome.error[0])
+        printed(case, setting, *found)
+        assert found[0] < 0.8 and found[2] < 2.0
