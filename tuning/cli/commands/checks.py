@@ -11,9 +11,14 @@ from tuning.cli.options import PICTURES
 
 def picture(path: str) -> None:
     """A picture can be written there; folders on the way are made."""
-    target = Path(path)
-    if target.suffix.lower() not in PICTURES:
+    if Path(path).suffix.lower() not in PICTURES:
         raise InputError(f"--plot: found {shown(path)}, allowed a name that ends in {', '.join(PICTURES)}")
+    file(path)
+
+
+def file(path: str) -> None:
+    """A file can be written there: folders on the way are made, the last rid of what was left unfinished."""
+    target = Path(path)
     with writing(target):
         target = follow(target)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -40,7 +45,7 @@ def own_results(document: Path, mark: str, pictures: Sequence[str]) -> None:
 
 def _has(document: Path, mark: str) -> bool:
     try:
-        with open_plain(document) as file:
-            return mark in json.loads(file.read())
+        with open_plain(document) as opened:
+            return mark in json.loads(opened.read())
     except (OSError, ValueError, TypeError, RecursionError):
         return False

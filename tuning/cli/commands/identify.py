@@ -62,11 +62,11 @@ def run(options: Identify) -> int:
     document = _document(options, campaign, prior, found)
     if found.mechanism is not None:
         from_builtins(found.mechanism, "identified mechanism")
-        path = folder / MECHANISM
-        with writing(path):
-            write_whole(path, to_toml(found.mechanism, found.verdict).encode())
+        # In this order: the document tells the next run that what lies beside it is its own.
         with writing(folder / DOCUMENT):
             write_whole(folder / DOCUMENT, terminal.as_json(document).encode("ascii"))
+        with writing(folder / MECHANISM):
+            write_whole(folder / MECHANISM, to_toml(found.mechanism, found.verdict).encode())
     terminal.warn([*campaign.notes, *found.notes])
     if options.json:
         terminal.emit_json(document)

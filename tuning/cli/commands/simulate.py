@@ -25,6 +25,8 @@ def run(options: Simulate) -> int:
     arguments.integers(0, seed=options.seed)
     if options.plot is not None:
         checks.picture(options.plot)
+    if options.log is not None:
+        checks.file(options.log)
     if options.compensator is not None:
         arguments.compensators([options.compensator])
     mechanism = None
