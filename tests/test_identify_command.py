@@ -36,6 +36,12 @@ def logs(folder):
     return sorted(folder.glob("*.csv"))
 
 
+@pytest.fixture(autouse=True)
+def _undrawn(monkeypatch):
+    """Pictures have tests of their own."""
+    monkeypatch.setattr("tuning.identification.pictures.draw", lambda *_: {})
+
+
 @pytest.fixture(scope="module")
 def day(tmp_path_factory):
     """Logs of a clean rig."""

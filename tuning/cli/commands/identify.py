@@ -22,6 +22,7 @@ from tuning.identification.records import Campaign
 SCHEMA = "jaxhil/identification/1"
 MOST_ORDER = 4
 MECHANISM, DOCUMENT = "mechanism.toml", "identification.json"
+PICTURES = ("bode.png", "delay.png", "contacts.png", "residuals.png", "compare.png")
 
 
 def run(options: Identify) -> int:
@@ -41,7 +42,7 @@ def run(options: Identify) -> int:
     prior = None if options.prior is None else load(options.prior).mechanism
     folder = Path(options.output)
     checks.output(folder)
-    checks.own_results(folder / DOCUMENT, "estimates", (MECHANISM,))
+    checks.own_results(folder / DOCUMENT, "estimates", (MECHANISM, *PICTURES))
     campaign = _of_stage(read_logs(logs, options.map, prior), options.stage)
     from tuning.identification.estimate import Options, identify
     from tuning.identification.mechanism_file import to_toml
@@ -67,6 +68,7 @@ def run(options: Identify) -> int:
             write_whole(folder / DOCUMENT, terminal.as_json(document).encode("ascii"))
         with writing(folder / MECHANISM):
             write_whole(folder / MECHANISM, to_toml(found.mechanism, found.verdict).encode())
+        _draw(found, document, folder)
     terminal.warn([*campaign.notes, *found.notes])
     if options.json:
         terminal.emit_json(document)
@@ -110,6 +112,20 @@ def _check(options: Identify, logs: list[Path]) -> int:
             _left(document, f"What {mechanism.name} leaves of runs: {runs}"), f"{document['reason']}."
         )
     return 0 if found.good else 1
+
+
+def _draw(found, document: dict[str, Any], folder: Path) -> None:
+    """Pictures beside the file; one that an earlier run drew, and this one cannot, goes."""
+    from jaxhil.simulation.contact_plot import save
+    from tuning.identification import pictures
+
+    drawn = pictures.draw(found, document["estimates"])
+    for name in PICTURES:
+        with writing(folder / name):
+            if name in drawn:
+                save(drawn[name], folder / name)
+            else:
+                (folder / name).unlink(missing_ok=True)
 
 
 def read_logs(logs: list[Path], mapping: str | None, prior: Mechanism | None) -> Campaign:
@@ -243,7 +259,11 @@ def _print(document: dict[str, Any], folder: Path | None) -> None:
         f"{pair['experiment']} would."
         for pair in document["confounded"]
     ]
-    wrote = [] if folder is None else [f"Wrote {folder / MECHANISM} and {folder / DOCUMENT}"]
+    wrote = (
+        []
+        if folder is None
+        else [f"Wrote {folder / MECHANISM}, {folder / DOCUMENT} and pictures beside them"]
+    )
     terminal.emit(*things, f"{document['reason']}.", *wrote)
 
 
