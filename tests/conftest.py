@@ -29,7 +29,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # Shapes are checked in the modules that compute with arrays; every day, in their own tests alone: checked
 # programs take a quarter longer to trace.
-PACKAGES = ("compensators", "contact", "simulation")
+PACKAGES = ("compensators", "contact", "simulation", "sixdof")
 # What a caller gives them, these check themselves.
 FRONT_DOOR = ("gain_choice", "gain_file", "jacobian", "registration", "run")
 CHECKED = [

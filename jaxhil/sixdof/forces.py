@@ -1,0 +1,88 @@
+"""Contact at several points: normal force, friction, and the wrench that they make together.
+
+A contact law of `jaxhil.contact` gives each candidate's normal force from its depth and rate, a friction law
+the tangential one from its slip. Neither asks whether shapes are in touch: without depth there is no force.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxhil.contact.base import ContactLaw, ContactParameters
+from jaxhil.sixdof.candidates import Candidates, Touch, motion_at
+from jaxhil.sixdof.friction import Friction, Touching
+from jaxhil.sixdof.relative import Pose, Twist, Wrench
+from jaxhil.sixdof.vectors import Vector, cross
+
+
+class ContactGroup(eqx.Module):
+    """Candidates of one kind, with their laws; several kinds are several of these."""
+
+    candidates: Candidates  # where they are
+    law: ContactLaw = eqx.field(static=True)  # of the normal force
+    parameters: ContactParameters  # of the law, (candidates, *batch)
+    friction: Friction  # law of the tangential force
+
+    def init(self) -> "Memory":
+        """State before the first touch."""
+        like = jnp.zeros_like(self.parameters.damping)
+        return Memory(self.law.init(like), self.friction.init(like))
+
+
+class Memory(NamedTuple):
+    """State of a contact's laws."""
+
+    law: tuple[Array, ...]
+    friction: tuple[Vector, ...]
+
+
+class Forces(NamedTuple):
+    """The forces of each candidate on the chaser, in T axes."""
+
+    touch: Touch  # where
+    normal: Float[Array, "candidates *batch"]  # F [N]
+    tangential: Vector  # f_t [N]
+    slip: Vector  # [m/s]
+
+
+def contact_forces(
+    group: ContactGroup, memory: Memory, pose: Pose, twist: Twist, duration: Float[Array, "*batch"]
+) -> tuple[Forces, Memory]:
+    """Forces at a pose and twist, `duration` [s] after the laws were evaluated last."""
+    pose, twist, duration = jax.tree.map(lambda leaf: leaf[None], (pose, twist, duration))
+    touch = group.candidates.touch(pose)
+    rate, slip = motion_at(touch, pose, twist)
+    normal, law = group.law.step(group.parameters, memory.law, touch.depth, rate)
+    # A law that may pull has no friction while it does.
+    pressed = jnp.where(normal > 0, normal, 0)
+    tangential, friction = group.friction.step(
+        Touching(pressed, touch.normal, slip, duration), memory.friction
+    )
+    return Forces(touch, normal, tangential, slip), Memory(law, friction)
+
+
+def total_wrench(forces: Forces) -> Wrench:
+    """The wrench of all candidates on the chaser, its moment about T's origin."""
+    force = forces.normal * forces.touch.normal + forces.tangential
+    moment = cross(forces.touch.point, force)
+    return Wrench(*(jax.tree.map(lambda part: part.sum(axis=0), part) for part in (force, moment)))
+
+
+def contact_wrench(
+    groups: tuple[ContactGroup, ...],
+    memories: tuple[Memory, ...],
+    pose: Pose,
+    twist: Twist,
+    duration: Float[Array, "*batch"],
+) -> tuple[Wrench, tuple[Memory, ...]]:
+    """The wrench [N, N m] of contacts of several kinds, and the laws' next states."""
+    found = [
+        contact_forces(group, memory, pose, twist, duration)
+        for group, memory in zip(groups, memories, strict=True)
+    ]
+    wrenches = [total_wrench(forces) for forces, _ in found]
+    added: Any = jax.tree.map(lambda *parts: sum(parts), *wrenches)
+    return added, tuple(memory for _, memory in found)

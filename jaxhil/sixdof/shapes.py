@@ -1,0 +1,168 @@
+"""Shapes in touch: signed distance of a point from a surface, and the surface's outward normal there.
+
+Numbers of a shape are arrays of the candidates' shape, (candidates, *batch), in the axes of the frame in
+which it is fixed [m]. Distances are positive outside. Formulas: Quilez, "3D signed distance functions".
+"""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxhil.sixdof.rotations import Quaternion, rotate, rotate_back
+from jaxhil.sixdof.vectors import Vector, direction, dot, norm, root
+
+NEAR_AXIS = 1e-12  # m: how far from its axis a surface of revolution begins to know a radial direction
+
+
+class Surface(NamedTuple):
+    """A surface as seen from a point."""
+
+    distance: Float[Array, "..."]  # signed [m]
+    normal: Vector  # unit vector, outward
+
+
+class Shape(eqx.Module):
+    """Interface of all shapes."""
+
+    @abc.abstractmethod
+    def surface(self, point: Vector) -> Surface:
+        """Distance of `point` [m] from the surface, and the normal."""
+
+
+class Plane(Shape):
+    """All that is behind a point, seen along a normal."""
+
+    point: Vector  # on it [m]
+    normal: Vector  # unit vector
+
+    def surface(self, point):
+        return Surface(dot(self.normal, point - self.point), self.normal)
+
+
+class Ball(Shape):
+    """A sphere from outside; at its very centre the normal is 0."""
+
+    centre: Vector  # [m]
+    radius: Float[Array, "..."]  # [m]
+
+    def surface(self, point):
+        apart = point - self.centre
+        return Surface(norm(apart) - self.radius, direction(apart))
+
+
+class Cavity(Shape):
+    """A sphere from inside: with the point as end of a slack tether, the tether's limit."""
+
+    centre: Vector  # [m]
+    radius: Float[Array, "..."]  # [m]
+
+    def surface(self, point):
+        apart = point - self.centre
+        return Surface(self.radius - norm(apart), -direction(apart))
+
+
+class Drogue(Shape):
+    """A cone about z that opens along +z, from inside, on a bottom of a sphere tangent to it.
+
+    A sphere in it must be smaller than its bottom: it never touches the wall from the axis.
+    """
+
+    half_angle: Float[Array, "..."]  # of the cone [rad]
+    bottom_radius: Float[Array, "..."]  # [m]
+    bottom: Float[Array, "..."]  # z of the bottom sphere's centre [m]
+
+    def surface(self, point):
+        radius, outward = _radial(point)
+        height = point.z - self.bottom
+        sine, cosine = jnp.sin(self.half_angle), jnp.cos(self.half_angle)
+        zero = jnp.zeros_like(height)
+        centre = Vector(zero, zero, self.bottom + zero)
+        bottom = Cavity(centre, self.bottom_radius).surface(point)
+        wall = self.bottom_radius - (radius * cosine - height * sine)
+        inward = -cosine * outward + sine * Vector(zero, zero, zero + 1)
+        on_wall = radius * sine + height * cosine > 0
+        return Surface(jnp.where(on_wall, wall, bottom.distance), _either(on_wall, inward, bottom.normal))
+
+
+class Rim(Shape):
+    """A ring about z, of round section: the rim of a drogue's mouth."""
+
+    ring_radius: Float[Array, "..."]  # of the section's centres [m]
+    height: Float[Array, "..."]  # z of them [m]
+    radius: Float[Array, "..."]  # of the section [m]
+
+    def surface(self, point):
+        radius, outward = _radial(point)
+        across, along = radius - self.ring_radius, point.z - self.height
+        apart = root(across**2 + along**2)
+        share = 1 / jnp.where(apart > 0, apart, 1)
+        zero = jnp.zeros_like(along)
+        normal = (share * across) * outward + Vector(zero, zero, share * along)
+        return Surface(apart - self.radius, normal)
+
+
+class Capsule(Shape):
+    """All that is nearer to a segment than a radius."""
+
+    start: Vector  # of the segment [m]
+    end: Vector  # [m]
+    radius: Float[Array, "..."]  # [m]
+
+    def surface(self, point):
+        apart = point - self.at(self.nearest(point))
+        return Surface(norm(apart) - self.radius, direction(apart))
+
+    def at(self, s: Float[Array, "..."]) -> Vector:
+        """The point at the fraction s of the segment."""
+        return self.start + s * (self.end - self.start)
+
+    def nearest(self, point: Vector) -> Float[Array, "..."]:
+        """The fraction of the segment that is nearest to a point."""
+        along = self.end - self.start
+        square = dot(along, along)
+        return jnp.clip(dot(along, point - self.start) / jnp.where(square > 0, square, 1), 0, 1)
+
+
+class Box(Shape):
+    """A box with rounded edges; as a thin one, a face with a border."""
+
+    centre: Vector  # [m]
+    attitude: Quaternion  # from the box's axes
+    half_lengths: Vector  # of its edges, rounding included [m]
+    rounding: Float[Array, "..."]  # radius of the edges [m], positive
+
+    def surface(self, point):
+        own = rotate_back(self.attitude, point - self.centre)
+        sign = Vector(*(jnp.where(part < 0, -1, 1).astype(part.dtype) for part in _parts(own)))
+        core = [half - self.rounding for half in _parts(self.half_lengths)]
+        beyond = [s * part - half for s, part, half in zip(_parts(sign), _parts(own), core, strict=True)]
+        outside = Vector(*(jnp.where(part > 0, part, 0) for part in beyond))
+        apart = norm(outside)
+        # Deeper than the rounding, the nearest face counts.
+        x, y, z = beyond
+        first, second = (x >= y) & (x >= z), y >= z
+        faces = first, ~first & second, ~first & ~second
+        unit = Vector(*(face.astype(x.dtype) for face in faces))
+        inside = apart == 0
+        normal = _either(inside, unit, direction(outside))
+        signed = Vector(sign.x * normal.x, sign.y * normal.y, sign.z * normal.z)
+        depth = jnp.where(first, x, jnp.where(second, y, z))
+        return Surface(jnp.where(inside, depth, apart) - self.rounding, rotate(self.attitude, signed))
+
+
+def _parts(vector: Vector) -> tuple[Array, Array, Array]:
+    return vector.x, vector.y, vector.z
+
+
+def _either(condition: Array, a: Vector, b: Vector) -> Vector:
+    """Of two vectors the first where the condition holds."""
+    return Vector(*(jnp.where(condition, u, v) for u, v in zip(_parts(a), _parts(b), strict=True)))
+
+
+def _radial(point: Vector) -> tuple[Array, Vector]:
+    """Distance from the z axis [m], and the direction away from it: 0 on the axis, and smooth."""
+    radius = jnp.sqrt(point.x**2 + point.y**2 + NEAR_AXIS**2)
+    return radius, Vector(point.x / radius, point.y / radius, jnp.zeros_like(radius))

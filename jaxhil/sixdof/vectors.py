@@ -1,0 +1,94 @@
+"""Vectors and matrices in space, component by component.
+
+Each component is an array of the batch shape: an axis of three would be taken apart and put together again at
+every tick.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class Vector(eqx.Module):
+    """Three components; `number * vector`, sums, differences."""
+
+    x: Float[Array, "..."]
+    y: Float[Array, "..."]
+    z: Float[Array, "..."]
+
+    # NumPy's numbers leave `number * vector` to this class.
+    __array_ufunc__ = None
+
+    def __add__(self, other: "Vector") -> "Vector":
+        return Vector(self.x + other.x, self.y + other.y, self.z + other.z)
+
+    def __sub__(self, other: "Vector") -> "Vector":
+        return Vector(self.x - other.x, self.y - other.y, self.z - other.z)
+
+    def __neg__(self) -> "Vector":
+        return Vector(-self.x, -self.y, -self.z)
+
+    def __rmul__(self, number: Array | float | int) -> "Vector":
+        return Vector(number * self.x, number * self.y, number * self.z)
+
+
+class Matrix(eqx.Module):
+    """Three rows; `matrix @ vector`."""
+
+    x: Vector
+    y: Vector
+    z: Vector
+
+    def __matmul__(self, vector: Vector) -> Vector:
+        return Vector(dot(self.x, vector), dot(self.y, vector), dot(self.z, vector))
+
+
+def vector(components: Float[Array, "3 *batch"]) -> Vector:
+    """The components along the leading axis as a vector."""
+    return Vector(components[0], components[1], components[2])
+
+
+def components(vector: Vector) -> Float[Array, "3 *batch"]:
+    """The components of a vector along a leading axis."""
+    return jnp.stack([vector.x, vector.y, vector.z])
+
+
+def matrix(entries: Float[Array, "3 3 *batch"]) -> Matrix:
+    """The entries along the two leading axes, rows first, as a matrix."""
+    return Matrix(vector(entries[0]), vector(entries[1]), vector(entries[2]))
+
+
+def dot(a: Vector, b: Vector) -> Float[Array, "..."]:
+    """Scalar product."""
+    return a.x * b.x + a.y * b.y + a.z * b.z
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """Vector product a x b."""
+    return Vector(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x)
+
+
+def norm(a: Vector) -> Float[Array, "..."]:
+    """Length; its derivative at 0 is 0."""
+    return root(dot(a, a))
+
+
+def direction(a: Vector) -> Vector:
+    """Unit vector along a; 0 where a is 0."""
+    length = norm(a)
+    return (1 / jnp.where(length > 0, length, 1)) * a
+
+
+def root(square: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Square root of a number that is not negative; its derivative at 0 is 0."""
+    positive = square > 0
+    # Not sqrt of 0 in a branch that is not taken: its derivative would be 0 times infinity.
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)
+
+
+def inverse(a: Matrix) -> Matrix:
+    """Inverse of a regular matrix, by its cofactors."""
+    columns = cross(a.y, a.z), cross(a.z, a.x), cross(a.x, a.y)
+    share = 1 / dot(a.x, columns[0])
+    i, j, k = (share * column for column in columns)
+    return Matrix(Vector(i.x, j.x, k.x), Vector(i.y, j.y, k.y), Vector(i.z, j.z, k.z))

@@ -1,0 +1,308 @@
+"""Contact in space, six degrees of freedom: closed forms of impacts, and what does not depend on axes.
+
+One program, two candidates a lane; the lanes are the cases.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxhil.contact.laws import LAWS, ContactParameters
+from jaxhil.sixdof.bodies import (
+    angular_momentum,
+    build_body,
+    build_state,
+    kinetic_energy,
+    linear_momentum,
+)
+from jaxhil.sixdof.candidates import ChaserSpheres
+from jaxhil.sixdof.forces import ContactGroup
+from jaxhil.sixdof.friction import Bristle, Frictionless, Regularised
+from jaxhil.sixdof.relative import Pair, States, effective_mass, power, wrench_at_chaser
+from jaxhil.sixdof.rotations import Quaternion
+from jaxhil.sixdof.shapes import Cavity, Plane
+from jaxhil.sixdof.space import follow
+from jaxhil.sixdof.vectors import components, matrix, vector
+
+LANES = ("central", "off_centre", "couple", "sliding", "rolling", "oblique", "elsewhere")
+STEPS = 1500
+EYE, Z = np.eye(3), np.array([0.0, 0.0, 1.0])
+
+
+def case(**changes):
+    """A lane; lengths in m, speeds in m/s. The contact lasts half a period of sqrt(mass/k)."""
+    values = {
+        "masses": (1800.0, 420.0),
+        "inertias": (np.diag([1400.0, 1100.0, 800.0]), np.diag([150.0, 180.0, 110.0])),
+        "interfaces": ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0)),
+        "pose": (0.0, 0.0, 1e-9),  # of C against T
+        "velocity": (0.0, 0.0, -0.02),
+        "angular": (0.0, 0.0, 0.0),
+        "spheres": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        "radius": 0.0,
+        "normals": (Z, Z),
+        "stiffness": (1e6, 0.0),
+        "exponent": 1.0,
+        "damping": 0.0,
+        "friction": 0.0,
+        "slip": 1e-3,
+        "duration": 0.1,
+    }
+    return values | changes
+
+
+BALL = {
+    "masses": (1e12, 1.0), "inertias": (1e12 * EYE, 0.4 * 0.1**2 * EYE), "interfaces": ((0.0, 0.0, 0.0),) * 2,
+    "pose": (0.0, 0.0, 0.1 + 1e-9), "radius": 0.1, "stiffness": (1e4, 0.0), "duration": 0.05,
+}  # fmt: skip
+OBLIQUE = {
+    "inertias": (
+        np.array([[1400.0, 30, -20], [30, 1100, 15], [-20, 15, 800]]),
+        np.array([[150.0, 10, 5], [10, 180, -8], [5, -8, 110]]),
+    ),
+    "interfaces": ((0.05, -0.02, 1.2), (0.01, 0.04, -1.0)), "velocity": (0.01, -0.006, -0.02),
+    "angular": (0.003, -0.02, 0.001), "spheres": ((0.3, 0.1, 0.0), (-0.2, 0.2, 0.001)),
+    "pose": (0.0, 0.0, 1e-9), "stiffness": (1e6, 2e6), "exponent": 1.5, "damping": 2.0, "friction": 0.2,
+    "slip": 2e-3, "duration": 0.3,
+}  # fmt: skip
+CASES = {
+    "central": case(exponent=1.5, stiffness=(3e6, 0.0), damping=3.0, duration=0.2),
+    "off_centre": case(spheres=((0.5, -0.3, 0.0),) * 2, velocity=(0.0, 0.0, -0.002)),
+    "couple": case(
+        interfaces=((0.0, 0.0, 0.0),) * 2, velocity=(0.0,) * 3, angular=(0.0, 1e-3, 0.0),
+        pose=(0.0, 0.0, 0.0), spheres=((0.6, 0.0, 0.0), (-0.6, 0.0, 0.0)), normals=(Z, -Z),
+        stiffness=(1e6, 1e6), duration=0.06,
+    ),
+    "sliding": case(**BALL, velocity=(0.5, 0.0, -0.1), friction=0.2),
+    "rolling": case(**BALL, velocity=(0.3, 0.0, -0.1), friction=1.0),
+    "oblique": case(**OBLIQUE),
+    "elsewhere": case(**OBLIQUE),
+}  # fmt: skip
+TURNED, BOOST, MOVED = (
+    Rotation.from_rotvec([0.5, -1.0, 2.0]),
+    np.array([0.3, -0.7, 1.1]),
+    np.array([5, 2, -3]),
+)
+HERE = LANES.index("elsewhere")
+
+
+def gathered(key, index=None):
+    """Of every lane one value, lanes last."""
+    every = [CASES[name][key] if index is None else CASES[name][key][index] for name in LANES]
+    return np.moveaxis(np.array(every, float), 0, -1)
+
+
+def both(key):
+    """Of both candidates, (components, candidates, lanes)."""
+    return vector(jnp.asarray(np.moveaxis(gathered(key), 0, 1)))
+
+
+def world():
+    """Start of every lane: the target at rest at the origin; the last lane's world is turned and boosted."""
+    zero = np.zeros((3, len(LANES)))
+    target_offset, chaser_offset = gathered("interfaces", 0), gathered("interfaces", 1)
+    position = target_offset + gathered("pose") - chaser_offset
+    velocity = gathered("velocity") - np.cross(gathered("angular"), chaser_offset, axis=0)
+    places, speeds = [zero.copy(), position], [zero.copy(), velocity]
+    turns = np.tile([[1.0], [0.0], [0.0], [0.0]], len(LANES))
+    x, y, z, w = TURNED.as_quat()
+    turns[:, HERE] = w, x, y, z
+    for place, speed in zip(places, speeds, strict=True):
+        place[:, HERE] = TURNED.apply(place[:, HERE]) + MOVED
+        speed[:, HERE] = TURNED.apply(speed[:, HERE]) + BOOST
+    attitude = Quaternion(jnp.asarray(turns[0]), vector(jnp.asarray(turns[1:])))
+    return places, speeds, attitude, (zero, gathered("angular"))
+
+
+def group():
+    # One array per parameter, (candidates, lanes).
+    same = {
+        key: np.tile(gathered(key), (2, 1)) for key in ("exponent", "damping", "friction", "slip", "radius")
+    }
+    zero = jnp.zeros((2, len(LANES)))
+    parameters = ContactParameters(
+        jnp.asarray(gathered("stiffness")), *(jnp.asarray(same[key]) for key in ("damping", "exponent")),
+        zero[:1], zero > 1, zero, zero, zero, zero,
+    )  # fmt: skip
+    points = vector(jnp.zeros((3, 2, len(LANES))))
+    return ContactGroup(
+        ChaserSpheres(both("spheres"), jnp.asarray(same["radius"]), Plane(points, both("normals"))),
+        LAWS["hunt_crossley"],
+        parameters,
+        Regularised(*(jnp.asarray(same[key]) for key in ("friction", "slip"))),
+    )
+
+
+@jax.jit
+def begin(masses, inertias, offsets, places, speeds, attitude, angular):
+    none = Quaternion(jnp.ones_like(masses[0]), vector(jnp.zeros_like(places[0])))
+    pair = Pair(*(
+        build_body(mass, matrix(inertia), vector(offset), none)
+        for mass, inertia, offset in zip(masses, inertias, offsets, strict=True)
+    ))  # fmt: skip
+    states = States(*(
+        build_state(body, vector(place), vector(speed), attitude, vector(rate))
+        for body, place, speed, rate in zip(pair, places, speeds, angular, strict=True)
+    ))  # fmt: skip
+    return pair, states
+
+
+@jax.jit
+def simulate(pair, states, contact, step):
+    final, seen = follow(pair, states, (contact,), step, STEPS)
+    lifted = jax.tree.map(lambda leaf: leaf[None], pair)
+
+    def of_both(function):
+        return sum(function(*one) for one in zip(lifted, seen.states, strict=True))
+
+    return final, {
+        "twist": components(seen.twist.linear),
+        "angular": components(seen.twist.angular),
+        "position": components(seen.pose.position),
+        "force": components(seen.wrench.force),
+        "moment": components(seen.wrench.moment),
+        "energy": of_both(kinetic_energy),
+        "linear": of_both(lambda *one: components(linear_momentum(*one))),
+        "momentum": of_both(lambda *one: components(angular_momentum(*one))),
+        "power": power(wrench_at_chaser(seen.wrench, seen.pose), seen.twist),
+    }
+
+
+def prepared():
+    """Bodies, states, contact and step of every lane."""
+    keys = ("masses", "inertias", "interfaces")
+    arguments = [[gathered(key, index) for index in range(2)] for key in keys]
+    places, speeds, attitude, angular = world()
+    pair, states = begin(*jax.tree.map(jnp.asarray, (*arguments, places, speeds)), attitude, angular)
+    return pair, states, group(), jnp.asarray(gathered("duration") / STEPS)
+
+
+@pytest.fixture(scope="module")
+def run():
+    pair, states, contact, step = prepared()
+    _, seen = simulate(pair, states, contact, step)
+    at = [vector(jnp.asarray(part)) for part in (gathered("spheres", 0), gathered("normals", 0))]
+    mass = np.asarray(effective_mass(pair, states, *at))
+    seen = {
+        name: {key: np.asarray(part[..., lane]).T for key, part in seen.items()}
+        for lane, name in enumerate(LANES)
+    }
+    return seen, dict(zip(LANES, mass, strict=True)), dict(zip(LANES, np.asarray(step), strict=True))
+
+
+def test_central_impact_is_that_of_one_axis(run):
+    seen, mass, _ = run
+    found, given = seen["central"], CASES["central"]
+    np.testing.assert_allclose(mass["central"], 1800 * 420 / 2220, rtol=1e-12)
+    restitution = found["twist"][-1, 2] / 0.02
+    # Of Hunt and Crossley's law: a (1 + e) = log((1 + a)/(1 - a e)), a = (3/2) chi v.
+    a = 1.5 * given["damping"] * 0.02
+    np.testing.assert_allclose(a * (1 + restitution), np.log((1 + a) / (1 - a * restitution)), rtol=1e-9)
+    assert found["force"][-1, 2] == 0 and 0.5 < restitution < 0.95
+
+
+def test_off_centre_the_effective_mass_rebounds(run):
+    """To first order in the rotation: the impulse is 2 m_n v_n, and no energy is lost."""
+    seen, mass, step = run
+    found = seen["off_centre"]
+    impulse = np.sum(found["force"][:, 2]) * step["off_centre"]
+    assert mass["off_centre"] < 0.8 * mass["central"] and found["force"][-1, 2] == 0
+    np.testing.assert_allclose(impulse, 2 * mass["off_centre"] * 0.002, rtol=1e-4)
+    np.testing.assert_allclose(found["energy"][-1], found["energy"][0], rtol=2e-6)
+    arm = np.array([0.5, -0.3, 0.0])
+    after = found["twist"][-1, 2] + np.cross(found["angular"][-1], arm)[2]
+    np.testing.assert_allclose(after, 0.002, rtol=1e-3)
+
+
+def test_a_pure_couple_swings_the_reduced_inertia(run):
+    seen, _, step = run
+    inertia = 1100.0 * 180 / (1100 + 180)
+    frequency = np.sqrt(2 * 1e6 * 0.6**2 / inertia)
+    time = np.arange(STEPS) * step["couple"]
+    swing = np.where(frequency * time < np.pi, np.cos(frequency * time), -1)
+    np.testing.assert_allclose(seen["couple"]["angular"][:, 1], 1e-3 * swing, atol=1e-7)
+    np.testing.assert_allclose(np.min(seen["couple"]["moment"][:, 1]), -inertia * frequency * 1e-3, rtol=1e-4)
+    assert frequency * time[-1] > 3.2 and np.max(np.abs(seen["couple"]["force"])) < 1e-3
+
+
+def test_a_ball_slides_or_rolls_off_a_plane(run):
+    """Coulomb: v_t - mu (1 + e) v_n while it slides; 5/7 v_t where it ends up rolling (Walton)."""
+    seen, *_ = run
+    sliding, rolling = seen["sliding"]["twist"][-1], seen["rolling"]["twist"][-1]
+    np.testing.assert_allclose(sliding[2], 0.1, rtol=1e-6)
+    np.testing.assert_allclose(sliding[0], 0.5 - 0.2 * 2 * 0.1, rtol=1e-4)
+    np.testing.assert_allclose(rolling[0], 5 / 7 * 0.3, rtol=1e-3 / 0.3)
+    # Its spin, about y, is that of rolling.
+    np.testing.assert_allclose(seen["rolling"]["angular"][-1, 1], rolling[0] / 0.1, rtol=2 * 1e-3 / 0.3)
+
+
+def test_momentum_and_energy_balance(run):
+    seen, _, step = run
+    for name in ("off_centre", "oblique", "elsewhere"):
+        found = seen[name]
+        exchanged = np.sum(np.abs(found["force"])) * step[name]
+        assert np.max(np.abs(found["linear"] - found["linear"][0])) < 1e-11 * max(exchanged, 1000)
+        # Runge and Kutta's method does not conserve the angular one to rounding.
+        assert np.max(np.abs(found["momentum"] - found["momentum"][0])) < 1e-8 * max(exchanged, 1000)
+        assert exchanged > 0.5
+        power = found["power"]
+        work = np.sum(power[1:] + power[:-1]) / 2 * step[name]
+        gained = found["energy"][-1] - found["energy"][0]
+        np.testing.assert_allclose(work, gained, atol=2e-4 * np.max(np.abs(np.cumsum(power))) * step[name])
+    # Friction and damping take energy.
+    assert seen["oblique"]["energy"][-1] < 0.95 * seen["oblique"]["energy"][0]
+
+
+def test_the_world_may_be_turned_and_boosted(run):
+    seen, *_ = run
+    for key in ("twist", "angular", "position", "force", "moment"):
+        one, other = seen["oblique"][key], seen["elsewhere"][key]
+        np.testing.assert_allclose(one, other, atol=1e-9 * np.max(np.abs(one)))
+    touched = np.max(np.abs(seen["oblique"]["force"][:, :2]))
+    assert touched > 10
+
+
+@pytest.mark.slow
+def test_a_law_with_a_memory_beside_another_kind():
+    """Elastoplastic on the central lane: e = 1/sqrt(r), under the bristle that stays at rest, and a tether
+    beside it that stays slack."""
+    pair, states, contact, step = prepared()
+    parameters = contact.parameters._replace(unloading_ratio=jnp.full((2, len(LANES)), 4.0))
+    same = [jnp.full((2, len(LANES)), value) for value in (0.2, 1e6, 10.0)]
+    yields = ContactGroup(contact.candidates, LAWS["elastoplastic"], parameters, Bristle(*same))
+    slack = Cavity(contact.candidates.centre, jnp.full((2, len(LANES)), 5.0))
+    tether = ChaserSpheres(contact.candidates.centre, jnp.zeros((2, len(LANES))), slack)
+    tethered = ContactGroup(tether, LAWS["hunt_crossley"], contact.parameters, Frictionless())
+    final, _ = jax.jit(follow, static_argnums=4)(pair, states, (yields, tethered), step, STEPS)
+    lane = LANES.index("central")
+    speed = np.asarray(final.chaser.velocity.z - final.target.velocity.z)[lane]
+    np.testing.assert_allclose(speed / 0.02, 0.5, rtol=2e-3)
+    assert abs(final.chaser.velocity.x[lane]) < 1e-15
+
+
+@pytest.mark.slow
+def test_derivatives_are_those_of_differences():
+    """Of the final twist by stiffness, damping and friction; and none is NaN where there is no slip."""
+    pair, states, contact, step = prepared()
+
+    @jax.jit
+    def speeds(scales):
+        stiffness, damping, friction = scales
+        changed = contact.parameters._replace(
+            stiffness=stiffness * contact.parameters.stiffness, damping=damping * contact.parameters.damping
+        )
+        law = Regularised(friction * contact.friction.coefficient, contact.friction.slip)
+        given = ContactGroup(contact.candidates, contact.law, changed, law)
+        final, _ = follow(pair, states, (given,), step, STEPS)
+        return jnp.stack([*jax.tree.leaves(final.chaser.velocity), *jax.tree.leaves(final.chaser.spin)])
+
+    one = jnp.ones(3)
+    slopes = np.asarray(jax.jit(jax.jacfwd(speeds))(one))
+    assert np.isfinite(slopes).all()
+    smooth = [LANES.index(name) for name in ("central", "oblique", "elsewhere")]
+    for index in range(3):
+        change = jnp.zeros(3).at[index].set(1e-4)
+        expected = np.asarray(speeds(one + change) - speeds(one - change)) / 2e-4
+        np.testing.assert_allclose(slopes[..., smooth, index], expected[..., smooth], rtol=1e-4, atol=1e-6)

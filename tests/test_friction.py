@@ -1,0 +1,85 @@
+"""Friction laws: Coulomb's cone, a spring at rest, no NaN where nothing slips or nothing presses."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from jaxhil.sixdof.friction import Bristle, Regularised, Touching
+from jaxhil.sixdof.vectors import components, norm, vector
+
+COEFFICIENT, STIFFNESS, DAMPING, SLIP = 0.3, 2e6, 300.0, 1e-3
+PERIOD = 1e-3
+
+
+def of_one(value):
+    return jnp.asarray(np.full((1, 1), value))
+
+
+BRISTLE = Bristle(of_one(COEFFICIENT), of_one(STIFFNESS), of_one(DAMPING))
+REGULARISED = Regularised(of_one(COEFFICIENT), of_one(SLIP))
+
+
+def along_x(force, speed):
+    zero = 0 * force
+    normal = vector(jnp.stack([zero, zero, zero + 1]))
+    return Touching(force, normal, vector(jnp.stack([speed, zero, zero])), of_one(PERIOD))
+
+
+@jax.jit
+def pulled(forces, speeds):
+    """Tangential force along x, tick after tick."""
+
+    def tick(state, given):
+        force, state = BRISTLE.step(along_x(*given), state)
+        return state, force.x
+
+    return lax.scan(tick, BRISTLE.init(of_one(0.0)), (forces[:, None, None], speeds[:, None, None]))[1][
+        :, 0, 0
+    ]
+
+
+def test_a_bristle_is_a_spring_then_slides_and_forgets():
+    speeds = np.r_[np.full(10, 1e-6), np.zeros(10), np.full(80, 1e-3), np.zeros(1), np.zeros(1)]
+    forces = np.r_[np.full(100, 50.0), 0.0, 50.0]
+    found = np.asarray(pulled(jnp.asarray(forces), jnp.asarray(speeds)))
+    # It sticks: a spring, to the share that it has of the limit.
+    held = STIFFNESS * 1e-6 * PERIOD * 10
+    np.testing.assert_allclose(found[10:20], -held, rtol=held / (COEFFICIENT * 50))
+    np.testing.assert_allclose(found[99], -COEFFICIENT * 50, rtol=1e-6)
+    assert found[100] == 0 and found[101] == 0
+
+
+@pytest.mark.slow
+def test_neither_law_leaves_the_cone():
+    generator = np.random.default_rng(8)
+    forces = generator.uniform(0, 80, 3000) * (generator.random(3000) > 0.1)
+    found = np.asarray(pulled(jnp.asarray(forces), jnp.asarray(generator.normal(size=3000) * 0.02)))
+    assert np.all(np.abs(found) <= COEFFICIENT * forces * (1 + 1e-12))
+    slip = vector(jnp.asarray(generator.normal(size=(3, 1, 1)) * 10))
+    force, _ = REGULARISED.step(along_x(of_one(50.0), of_one(0.0))._replace(slip=slip), ())
+    assert 0.999 < norm(force)[0, 0] / (COEFFICIENT * 50) < 1
+    opposite = -norm(force)[0, 0] / norm(slip)[0, 0]
+    np.testing.assert_allclose(components(force), opposite * np.asarray(components(slip)), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_creep_of_what_should_stick():
+    """v_s s/sqrt(1 - s^2) where s = |f_t|/(mu F)."""
+    share = 0.6
+    creep = SLIP * share / np.sqrt(1 - share**2)
+    force, _ = REGULARISED.step(along_x(of_one(50.0), of_one(creep)), ())
+    np.testing.assert_allclose(force.x, -share * COEFFICIENT * 50, rtol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", [BRISTLE, REGULARISED])
+@pytest.mark.parametrize("force", [0.0, 50.0])
+def test_no_nan_at_no_slip(law, force):
+    def tangential(force, speed):
+        found, _ = law.step(along_x(force, speed), law.init(force))
+        return found.x
+
+    slopes = jax.jacfwd(tangential, argnums=(0, 1))(of_one(force), of_one(0.0))
+    assert all(np.isfinite(slope).all() for slope in slopes)
