@@ -1,0 +1,92 @@
+"""The six-axis force sensor on the ground: what it reads of a contact, and how a controller takes that back.
+
+The sensor is on one of two sides. On the fixed side, under the target's mechanism, it reads the reaction; what
+weighs on it is constant and tared. On the moving side, between the flange and the chaser's mechanism, it also
+carries that mechanism, the tool: its weight and its inertia come on top, and change with the pose. Delay and
+lag are the loop's.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxhil.simulation.sensors import sample_force
+from jaxhil.sixdof.relative import Pose, Twist, Wrench
+from jaxhil.sixdof.rotations import rotate, rotate_back
+from jaxhil.sixdof.vectors import Matrix, Vector, cross
+
+
+class Tool(NamedTuple):
+    """What is between a sensor on the moving side and the contact."""
+
+    mass: Float[Array, "..."]  # m_t [kg]
+    centre: Vector  # c, its centre of mass from C's origin, in C axes [m]
+    inertia: Matrix  # J_t about its centre of mass, in C axes [kg m^2]
+
+
+class SampleErrors(NamedTuple):
+    """What becomes of a sample; per channel (fx, fy, fz, mx, my, mz), in N and N m."""
+
+    crosstalk: Float[Array, "6 6 *batch"]  # what each channel (row) reads of each component [1]
+    bias: Float[Array, "6 *batch"]
+    quantum: Float[Array, "6 *batch"]  # 0 for none
+    dead_zone: Float[Array, "6 *batch"]
+    range: Float[Array, "6 *batch"]  # infinite for none
+
+
+def tool_load(tool: Tool, pose: Pose, twist: Twist, acceleration: Twist, gravity: Vector) -> Wrench:
+    """Weight and inertia of the tool [N, N m], about C's origin, in T axes: what the flange has to hold.
+
+    `acceleration` is that of C's origin and of the angular velocity, on the ground, where T is at rest.
+    """
+    centre = rotate(pose.attitude, tool.centre)
+    angular, alpha = twist.angular, acceleration.angular
+    carried = acceleration.linear + cross(alpha, centre) + cross(angular, cross(angular, centre))
+    force = tool.mass * (gravity - carried)
+    turned = _inertia(tool, pose, alpha) + cross(angular, _inertia(tool, pose, angular))
+    return Wrench(force, cross(centre, force) - turned)
+
+
+def read_moving(wrench: Wrench, load: Wrench, pose: Pose) -> Wrench:
+    """Reading of a sensor on the moving side, about C's origin, in C axes: contact and tool on the flange."""
+    moment = wrench.moment - cross(pose.position, wrench.force) + load.moment
+    return Wrench(*(rotate_back(pose.attitude, part) for part in (wrench.force + load.force, moment)))
+
+
+def undo_moving(reading: Wrench, load: Wrench, pose: Pose) -> Wrench:
+    """The contact's wrench, from a reading on the moving side: with the controller's own numbers of the tool
+    (`load`) and the pose that it measures."""
+    force, moment = (rotate(pose.attitude, part) for part in reading)
+    force = force - load.force
+    return Wrench(force, moment - load.moment + cross(pose.position, force))
+
+
+def read_fixed(wrench: Wrench, mounting: Pose) -> Wrench:
+    """Reading of a sensor on the fixed side, about its own origin, in its own axes: the reaction.
+
+    `mounting` is the pose of its frame against T.
+    """
+    at, attitude = mounting
+    moment = wrench.moment - cross(at, wrench.force)
+    return Wrench(*(-rotate_back(attitude, part) for part in (wrench.force, moment)))
+
+
+def undo_fixed(reading: Wrench, mounting: Pose) -> Wrench:
+    """The contact's wrench, from a reading on the fixed side."""
+    at, attitude = mounting
+    force, moment = (-rotate(attitude, part) for part in reading)
+    return Wrench(force, moment + cross(at, force))
+
+
+def sample(reading: Wrench, errors: SampleErrors, noise: Float[Array, "6 *batch"]) -> Wrench:
+    """A sample of a reading: cross-talk, bias, noise [N, N m]; then quantum, dead zone and range."""
+    channels, structure = jax.tree.flatten(reading)
+    mixed = jnp.sum(errors.crosstalk * jnp.stack(channels)[None], axis=1) + errors.bias + noise
+    return structure.unflatten(list(sample_force(mixed, errors.quantum, errors.dead_zone, errors.range)))
+
+
+def _inertia(tool: Tool, pose: Pose, angular: Vector) -> Vector:
+    """R J_t R^T angular."""
+    return rotate(pose.attitude, tool.inertia @ rotate_back(pose.attitude, angular))

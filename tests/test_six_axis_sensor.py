@@ -1,0 +1,132 @@
+"""The six-axis sensor: a tool of many particles, readings taken back, and what wrong numbers leave over."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxhil.sixdof.relative import Coordinates, Pose, Twist, Wrench, motion_of
+from jaxhil.sixdof.rotations import exponential, rotate
+from jaxhil.sixdof.sensor import (
+    SampleErrors,
+    Tool,
+    read_fixed,
+    read_moving,
+    sample,
+    tool_load,
+    undo_fixed,
+    undo_moving,
+)
+from jaxhil.sixdof.vectors import Vector, components, matrix, vector
+
+SEEDED = np.random.default_rng(21)
+PARTICLES = 6
+MASSES, PLACES = SEEDED.uniform(1, 3, PARTICLES), SEEDED.normal(size=(3, PARTICLES)) * 0.2
+GRAVITY = np.array([0.5, -1.0, -9.7])
+# Coordinates of a motion: value, rate and acceleration.
+MOTION = SEEDED.normal(size=(3, 6))
+
+
+def triple(values):
+    return Vector(*(jnp.asarray(value) for value in np.asarray(values, float)))
+
+
+def tool():
+    centre = PLACES @ MASSES / MASSES.sum()
+    arms = PLACES - centre[:, None]
+    inertia = np.sum(MASSES * np.sum(arms**2, axis=0)) * np.eye(3) - (MASSES * arms) @ arms.T
+    return Tool(jnp.asarray(MASSES.sum()), triple(centre), matrix(jnp.asarray(inertia)))
+
+
+def along(time):
+    """Coordinates at a time."""
+    at = MOTION[0] + time * MOTION[1] + time**2 / 2 * MOTION[2]
+    return Coordinates(vector(at[:3]), vector(at[3:]))
+
+
+def moving():
+    """Pose, twist and acceleration at time 0."""
+
+    def motion(time):
+        return motion_of(*jax.jvp(along, (time,), (jnp.ones_like(time),)))
+
+    (pose, twist), (_, acceleration) = jax.jvp(motion, (jnp.asarray(0.0),), (jnp.asarray(1.0),))
+    return pose, twist, Twist(*acceleration)
+
+
+def wrench():
+    return Wrench(triple([40.0, -15.0, 120.0]), triple([3.0, 8.0, -2.0]))
+
+
+def close(found, expected, **tolerances):
+    leaves = zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True)
+    for one, other in leaves:
+        np.testing.assert_allclose(one, other, **tolerances)
+
+
+@pytest.mark.slow
+def test_a_tool_is_its_particles():
+    """Each is carried along by the motion, and pushes with its weight less its inertia."""
+
+    def places(time):
+        at = along(time)
+        turn = exponential(at.rotation)
+        return jnp.stack([components(at.position + rotate(turn, triple(place))) for place in PLACES.T])
+
+    def slope(function):
+        return lambda time: jax.jvp(function, (time,), (jnp.ones_like(time),))[1]
+
+    now = jnp.asarray(0.0)
+    forces = MASSES[:, None] * (GRAVITY - np.asarray(jax.jit(slope(slope(places)))(now)))
+    pose, twist, acceleration = moving()
+    arms = np.asarray(places(now)) - np.asarray(components(pose.position))
+    load = tool_load(tool(), pose, twist, acceleration, triple(GRAVITY))
+    np.testing.assert_allclose(components(load.force), forces.sum(axis=0), rtol=1e-11)
+    np.testing.assert_allclose(components(load.moment), np.cross(arms, forces).sum(axis=0), rtol=1e-11)
+
+
+@pytest.mark.slow
+def test_with_its_own_numbers_right_the_controller_finds_the_contact():
+    pose, twist, acceleration = moving()
+    load = tool_load(tool(), pose, twist, acceleration, triple(GRAVITY))
+    reading = read_moving(wrench(), load, pose)
+    close(undo_moving(reading, load, pose), wrench(), rtol=1e-12)
+    # About C's origin, in C axes, and without a tool.
+    turn = Rotation.from_rotvec(MOTION[0, 3:])
+    force, moment = (np.array(jax.tree.leaves(part)) for part in wrench())
+    nothing = jax.tree.map(jnp.zeros_like, load)
+    at_chaser = turn.inv().apply([force, moment - np.cross(MOTION[0, :3], force)])
+    close(read_moving(wrench(), nothing, pose), list(at_chaser.ravel()), rtol=1e-12)
+    close(undo_fixed(read_fixed(wrench(), pose), pose), wrench(), rtol=1e-12)
+    close(read_fixed(wrench(), pose), list(-at_chaser.ravel()), rtol=1e-12)
+
+
+def test_wrong_numbers_leave_gravity_over():
+    """A share of the weight for the mass, and the weight times the angle for the attitude."""
+    still = Twist(triple([0.0] * 3), triple([0.0] * 3))
+    level = Pose(triple([0.1, 0.0, 0.2]), exponential(triple([0.0, 0.0, 0.0])))
+    down = triple([0.0, 0.0, -9.80665])
+    carried = tool()._replace(mass=jnp.asarray(12.0))
+    load = tool_load(carried, level, still, still, down)
+    reading = read_moving(wrench(), load, level)
+    lighter = tool_load(carried._replace(mass=0.98 * carried.mass), level, still, still, down)
+    left = undo_moving(reading, lighter, level).force - wrench().force
+    np.testing.assert_allclose(components(left), [0, 0, -0.02 * 12 * 9.80665], atol=1e-12)
+    # The contact's own force turns with the measured attitude, too.
+    tilted = level._replace(attitude=exponential(triple([0.03, 0.0, 0.0])))
+    left = undo_moving(read_moving(jax.tree.map(jnp.zeros_like, load), load, level), load, tilted).force
+    np.testing.assert_allclose(left.y, 0.03 * 12 * 9.80665, rtol=2e-4)
+
+
+@pytest.mark.slow
+def test_a_sample_is_mixed_then_biased_then_rounded():
+    mixing = np.eye(6)
+    mixing[0, 2], mixing[4, 1] = 0.01, -0.02
+    zero = np.zeros(6)
+    quantum, dead_zone, limit = zero.copy(), zero.copy(), np.full(6, np.inf)
+    quantum[1], dead_zone[5], limit[2] = 4.0, 0.5, 100.0
+    given = SampleErrors(*(jnp.asarray(part) for part in (mixing, zero + 0.25, quantum, dead_zone, limit)))
+    found = sample(wrench(), given, jnp.asarray(zero + 0.125))
+    expected = [40 + 1.2 + 0.375, -16.0, 100.0, 3.375, 8 + 0.3 + 0.375, -2 + 0.375 + 0.5]
+    close(found, expected, rtol=1e-12)
