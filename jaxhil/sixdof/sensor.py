@@ -1,9 +1,9 @@
 """The six-axis force sensor on the ground: what it reads of a contact, and how a controller takes that back.
 
-The sensor is on one of two sides. On the fixed side, under the target's mechanism, it reads the reaction; what
-weighs on it is constant and tared. On the moving side, between the flange and the chaser's mechanism, it also
-carries that mechanism, the tool: its weight and its inertia come on top, and change with the pose. Delay and
-lag are the loop's.
+The sensor is on one of two sides. On the fixed side, under the target's mechanism, it reads the reaction;
+what weighs on it is constant and tared. On the moving side, between the flange and the chaser's mechanism, it
+also carries that mechanism, the tool: its weight and its inertia come on top, and change with the pose. Delay
+and lag are the loop's.
 """
 
 from typing import NamedTuple
