@@ -6,7 +6,7 @@ the contact should have had since its entry is integrated over again while the m
 (`reintegration`), and the numerical model's speed v_d is led to that motion's, v_r, until the hardware itself
 has separated. No model of the motion simulator is used. Scaled by approach speed v0 and equivalent mass M,
 F the map, (X, V) the measured motion aligned with the measured force y, p the peak force that the map
-predicts, t the time left of pi/p since the hardware's entry:
+predicts, t the time left of 2/p since the hardware's entry:
 
     f_0 = clip(F(x_d, v_d), 0, MOST p), separated 0
     f_e = clip((v_d - T f_0/2 - v_r)/(1/c + s t), -limit p, (1 + limit) p - f_0)
@@ -19,7 +19,6 @@ no approach speed to scale by: there F_c is the measured force, as it is.
 notebooks/guide/retrospective_reference.md says more.
 """
 
-import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
@@ -393,7 +392,8 @@ def _command(gains, v, known, own, separated, read, expected, reference, since, 
     own = jnp.where(own > 0, jnp.where(own > MOST * peak, MOST * peak, own), 0)
     least = -gains["correction_limit"] * peak
     most = (1 + gains["correction_limit"]) * peak - jnp.where(separated, 0, own)
-    left = math.pi / peak - since
+    # Elastic contact of this peak lasts no less.
+    left = 2 / peak - since
     gain = gains["velocity_gain"] / pace
     slower = 1 + gain * gains["repayment_time"] * jnp.where(left > 0, left, 0)
     wanted = gain * (v - 0.5 * period * own - reference.live.speed) / slower

@@ -3,7 +3,7 @@
  * f_0 = clip(F(x_d, v_d), 0, most p), F the force-depth map identified on delay-aligned readings (X, V, y) since the
  * surface was met; separated f_0 = 0 and F_c = f_e until the hardware has left the surface for 6 ms, then 0. f_e =
  * clip((v_d - T f_0/2 - v_r)/(1/c + s t), -limit p, (1 + limit) p - f_0), v_r the speed of the motion that the
- * contact should have had since its entry, p the peak force that the map predicts, t the time left of pi/p since the
+ * contact should have had since its entry, p the peak force that the map predicts, t the time left of 2/p since the
  * hardware's entry. Scaled by approach speed and equivalent mass. Slow contact is followed on a slower scale of time:
  * with T and 1/c times its pace, v0 over it, it is as usual contact.
  */
@@ -106,8 +106,8 @@ static bool jaxhil_law_init(jaxhil_law *law, const jaxhil_gains *gains) {
 static double jaxhil_law_repayment(jaxhil_law *law, double peak, double own, double speed, double zone) {
     const jaxhil_reference_motion *reference = &law->reference;
     const double least = -(law->limit * peak), most = (1.0 + law->limit) * peak - own;
-    const double left =
-        jaxhil_map_pi / peak - (double)(law->history.newest - reference->entry) * reference->period;
+    /* Elastic contact of this peak lasts no less. */
+    const double left = 2.0 / peak - (double)(law->history.newest - reference->entry) * reference->period;
     const double gain = law->velocity_gain / law->pace;
     const double slower = 1.0 + gain * (law->share * (left > 0.0 ? left : 0.0));
     const double correction = gain * (speed - reference->live.speed) / slower;

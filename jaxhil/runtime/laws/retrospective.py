@@ -6,7 +6,7 @@ map from depth to force; they integrate the motion that it should have had since
 they add to the force a correction that brings the model's speed back to the reference's.
 
 Scaled by approach speed v0 and equivalent mass M, F the force-depth map identified on delay-aligned readings
-(X, V, y), p the peak force that it predicts, v_r the reference's speed, t the time left of pi/p
+(X, V, y), p the peak force that it predicts, v_r the reference's speed, t the time left of 2/p
 since the hardware's entry:
 
     f_0 = clip(F(x_d, v_d), 0, MOST p), separated 0
@@ -20,7 +20,7 @@ said of usual contact holds of it. notebooks/guide/retrospective_reference.md sa
 """
 
 from collections.abc import Mapping
-from math import inf, pi, sqrt
+from math import inf, sqrt
 from typing import ClassVar
 
 from ..bounds import DAMPINGS_BY_MASS, FORCES, MASSES, STIFFNESSES_BY_MASS, TIMES
@@ -362,7 +362,8 @@ class Retrospective(Compensator):
         reference = self._reference
         least = -(self._limit * peak)
         most = (1.0 + self._limit) * peak - own
-        left = pi / peak - float(self._history.newest - reference.entry) * reference.period
+        # Elastic contact of this peak lasts no less.
+        left = 2.0 / peak - float(self._history.newest - reference.entry) * reference.period
         gain = self._velocity_gain / self._pace
         slower = 1.0 + gain * (self._share * (left if left > 0.0 else 0.0))
         correction = gain * (speed - reference.live.speed) / slower
