@@ -10,6 +10,7 @@ compared separately are
   (Monte Carlo arithmetic: Parker, Pierce and Eggert 2000).
 """
 
+import functools
 import math
 import random
 from typing import NamedTuple
@@ -69,7 +70,7 @@ class Count(NamedTuple):
     magnified_difference: float
 
 
-@jax.jit(static_argnums=0)
+@functools.partial(jax.jit, static_argnums=0)
 def simulate(name, signals, gains, constants):
     """The jax compensator's force commands and identified parameters, (ticks, lanes), of any readings."""
     law = COMPENSATORS[name]
