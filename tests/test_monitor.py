@@ -176,6 +176,7 @@ def test_the_command_prints_a_verdict_and_ends_with_it(jaxhil, tmp_path):
     (["varying", "LOG", "--map", "FREE"], "found no contact, allowed a run of kind contact or tap"),
     (["nowhere.toml", "LOG"], "nowhere"),
     (["TWO", "LOG"], "contact.clearance: found 0.02, allowed inf"),
+    (["FAR", "LOG"], "rig.contact_plane: found 0.05 m, which none of the contacts in the logs goes beyond"),
     (["OTHER", "LOG"], "contact.law: found 'elastoplastic', allowed linear, kelvin_voigt"),
 ))  # fmt: skip
 def test_what_cannot_be_held_against_is_one_line(jaxhil, tmp_path, arguments, words):
@@ -192,7 +193,8 @@ def test_what_cannot_be_held_against_is_one_line(jaxhil, tmp_path, arguments, wo
     law = {"law": "elastoplastic", "unloading_ratio": 2.0, "damping": [0.0], "stiffness": [1e5]}
     other = other | {"contact": law, "uncertainty": {}}
     paths = {"LOG": written(tmp_path / "logs", campaign)[0], "FREE": mapping}
-    for name, document in (("TWO", two), ("OTHER", other)):
+    far = to_builtins(package.load("varying", {"rig.contact_plane": 0.05}))
+    for name, document in (("TWO", two), ("FAR", far), ("OTHER", other)):
         paths[name] = tmp_path / f"{name}.toml"
         paths[name].write_text(to_toml(document))
     ran = jaxhil("monitor", *(paths.get(one, one) for one in arguments))

@@ -86,6 +86,9 @@ def monitor(campaign: Campaign, mechanism: Mechanism) -> Monitored:
     watch = _Watch(prediction)
     for run, told in zip(runs, _told(runs, mechanism, campaign, numbers), strict=True):
         watch.add(run.source, *told)
+    if not any(np.isfinite(one.value[0]) for one in watch.contacts):
+        found = f"found {mechanism.rig.contact_plane:g} m, which none of the contacts in the logs goes beyond"
+        raise InputError(f"rig.contact_plane: {found}, allowed where the hardware touches")
     return watch.outcome()
 
 
