@@ -16,7 +16,6 @@ from oracle_motion import simulator_matrices
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
-from jaxhil.mechanism.file import from_builtins
 from tuning.identification.records import Campaign, Run, Timing
 
 SPEEDS = tuple(np.repeat([0.003, 0.006, 0.012], 5))
@@ -298,21 +297,6 @@ def _coloured(rng, shape, std, pole):
     drive = white * np.sqrt(1.0 - pole**2)
     drive[0] = white[0]
     return std * lfilter([1.0], [1.0, -pole], drive, axis=0)
-
-
-def mechanism(name, **changed):
-    """The rig of a kind of campaign as a mechanism file has it; keys `changed` by "section__key"."""
-    kind = KINDS[name]
-    rig = {key: {**value} if isinstance(value, dict) else value for key, value in kind.rig.items()}
-    tables = {"contact": {**kind.contact}, **{one: rig[one] for one in rig if isinstance(rig[one], dict)}}
-    tables["rig"] = rig
-    for path, value in changed.items():
-        section, key = path.split("__")
-        tables[section][key] = value
-    bodies, approach = {"equivalent_mass": kind.mass}, {"velocity": 0.006, "contacts": 1}
-    approach["contacts"] = len(kind.contact["stiffness"])
-    whole = {"schema": "jaxhil/mechanism/1", "name": name, "bodies": bodies, "approach": approach}
-    return from_builtins({**whole, "contact": tables["contact"], "rig": rig}, name)
 
 
 def campaign(name, seed, speeds=SPEEDS, seconds=60.0, rest=5.0, press=False) -> Campaign:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import campaign_rigs
 import campaigns
 import pytest
 
@@ -21,7 +22,7 @@ def worst(found):
 
 
 def test_logs_of_the_mechanism_itself_are_good(clean):
-    found = check(clean, campaigns.mechanism("clean"))
+    found = check(clean, campaign_rigs.mechanism("clean"))
     assert found.good and found.effect == 0.0 and found.estimates == ()
     names = [line.name for line in found.lines]
     assert "motion model" in names and "contact law" in names and "drift from touch to touch" not in names
@@ -41,7 +42,7 @@ def test_logs_of_the_mechanism_itself_are_good(clean):
 )
 def test_another_mechanism_is_bad(clean, changed, name):
     """The hold is the logs', not the mechanism's: told with them."""
-    found = check(clean, campaigns.mechanism("clean", **changed))
+    found = check(clean, campaign_rigs.mechanism("clean", **changed))
     assert found.good == (name is None)
     assert name in [None, *(line.name for line in found.lines if line.there)]
 
@@ -49,7 +50,7 @@ def test_another_mechanism_is_bad(clean, changed, name):
 def test_the_hold_that_logs_are_told_with_is_checked(clean):
     wrong = replace(clean, timing=replace(clean.timing, command_hold="zoh"))
     assert "command hold" in [
-        line.name for line in check(wrong, campaigns.mechanism("clean")).lines if line.there
+        line.name for line in check(wrong, campaign_rigs.mechanism("clean")).lines if line.there
     ]
 
 
@@ -58,21 +59,23 @@ def test_the_hold_that_logs_are_told_with_is_checked(clean):
 def test_every_kind_of_rig_explains_its_own_logs(name):
     if name in ("coloured", "jitter"):
         pytest.skip("the same rig as clean")
-    good = [check(campaigns.campaign(name, 60 + seed), campaigns.mechanism(name)).good for seed in range(5)]
+    good = [
+        check(campaigns.campaign(name, 60 + seed), campaign_rigs.mechanism(name)).good for seed in range(5)
+    ]
     assert all(good)
 
 
 @pytest.mark.slow
 def test_a_drift_is_noticed():
-    found = check(campaigns.campaign("drifting", 1), campaigns.mechanism("drifting"))
+    found = check(campaigns.campaign("drifting", 1), campaign_rigs.mechanism("drifting"))
     assert not found.good and any(line.name.startswith("drift") and line.there for line in found.lines)
 
 
 def test_what_cannot_be_set_against_logs_is_refused(clean):
     held = replace(clean, runs=tuple(run for run in clean.runs if run.kind == "rest"))
     with pytest.raises(InputError, match="found neither free motion nor contact"):
-        check(held, campaigns.mechanism("clean"))
-    plastic = campaigns.mechanism("clean", contact__law="elastoplastic", contact__unloading_ratio=2.0,
+        check(held, campaign_rigs.mechanism("clean"))
+    plastic = campaign_rigs.mechanism("clean", contact__law="elastoplastic", contact__unloading_ratio=2.0,
                                   contact__damping=[0.0])  # fmt: skip
     with pytest.raises(InputError, match=r"contact\.law: found 'elastoplastic', allowed linear"):
         check(clean, plastic)

@@ -132,6 +132,9 @@ def test_nothing_is_written_where_neither_logs_nor_prior_tell_what_a_file_must_h
         (["--check", "LOG"], ["--check: found no mechanism"]),
         (["--check", "LOG", "rig-300"], ["did you mean rig-300kg"]),
         (["--check", "LOG", "rig-300kg", "--law", "linear"], ["--check: found --law beside it"]),
+        (["--design"], ["--design: found 0 mechanisms"]),
+        (["--design", "rig-300"], ["did you mean rig-300kg"]),
+        (["--design", "rig-300kg", "--stroke", "0"], ["--stroke: found 0 m, allowed a number > 0"]),
         (["LOGS", "--bayes"], ["--bayes: found no prior"]),
         (["LOGS", "--limit", "nan"], ["--limit"]),
         (["LOGS", "--order", "ten"], ["--order: found 'ten', allowed auto, or 0 to 4"]),
@@ -145,7 +148,7 @@ def test_what_is_wrong_is_one_line(jaxhil, day, tmp_path, arguments, words):
         "MAP": [drafted(jaxhil, day)] if "MAP" in arguments else [],
     }
     given = [one for word in arguments for one in words_for.get(word, [word])]
-    own = {"--prior", "--guess", "--check", "--bayes"} & {*arguments}
+    own = {"--prior", "--guess", "--check", "--bayes", "--design"} & {*arguments}
     prior = [] if own else ["--prior", "rig-300kg"]
     ran = jaxhil("identify", *given, *prior, "-o", tmp_path)
     assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1

@@ -32,6 +32,11 @@ class Identify:
         FlagCreatePairsOff[bool],
         text(None, "Print a draft of --map, from the names of columns and what is in them; nothing else."),
     ] = False
+    design: Annotated[
+        FlagCreatePairsOff[bool],
+        text(None, "Write commands for a rig that tell the numbers of a mechanism, --prior or LOGS, best."),
+    ] = False
+    stroke: Annotated[float, number("With --design: how far the rig may go to either side [m].")] = 0.002
     prior: Annotated[
         str | None, text("MECHANISM", "Mechanism file, or a built-in's name, for what the logs do not tell.")
     ] = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -87,6 +88,9 @@ def _known_contact(runs: Sequence[Run], model: Model, campaign: Campaign, mechan
     if not std:
         std = _scatter(Problem(motion, readings, law, plane, lag), delay, plane, values)
         readings = Readings.of(runs, std)
+    if hidden:
+        predicted = Problem(motion, readings, law, plane, lag).force(delay, plane, values)
+        readings = replace(readings, counts=readings.counts & (predicted > contacts.BEYOND * std))
     problem = Problem(motion, readings, law, plane, lag)
     inner = Inner(values, np.zeros((len(values), len(values))), 0.0, 0.0, 0.0, 0.0)
     posterior = Posterior(

@@ -14,7 +14,7 @@ from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.runtime import digest
 from tuning import terminal
 from tuning.caches.sources import versions
-from tuning.cli.commands import checks
+from tuning.cli.commands import checks, identify_design
 from tuning.cli.options_identify import Identify
 from tuning.front_door import arguments
 from tuning.identification.records import Campaign
@@ -30,6 +30,8 @@ def run(options: Identify) -> int:
     logs = [Path(log) for log in options.logs]
     if options.guess:
         return _guess(options, logs)
+    if options.design:
+        return identify_design.run(options)
     arguments.limit(options.limit)
     arguments.integers(0, seed=options.seed)
     if not 0.0 <= options.hold_out < 1.0:

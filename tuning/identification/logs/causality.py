@@ -26,6 +26,7 @@ FEWEST = 100  # rows
 FAR = 8.0  # times the median residual, beyond which a row is left out
 AGREE = 0.7  # of the runs that tell
 ROUNDS = 6  # of leaving rows out
+MOST_RUNS = 50  # looked at, of any number
 MOST_DELAY = 4  # ticks
 ROWS_AHEAD = {"sent": 1, "tick": 0, "after": -1}
 
@@ -49,7 +50,9 @@ def check_rows_of(runs: Sequence[Run], timing: Timing, computing_delay: int) -> 
 def rows_ahead(runs: Sequence[Run]) -> int | None:
     """By how many rows the last reading that a command depends on is after it; None where nothing tells,
     one run alone does, or runs by themselves tell otherwise."""
-    parts = [part for run in runs if run.kind == "contact" for part in [_columns(run)] if part is not None]
+    contacts = [run for run in runs if run.kind == "contact"]
+    contacts = contacts[:: -(-len(contacts) // MOST_RUNS) or 1]
+    parts = [part for run in contacts for part in [_columns(run)] if part is not None]
     if not parts:
         return None
     found = _first(*(np.concatenate([part[place] for part in parts]) for place in (0, 1)))

@@ -98,9 +98,10 @@ def _phase(stamps: np.ndarray, period: float) -> np.ndarray:
         starts = starts[:-1]  # the last lot has the rest as well
     turns = stamps / period
     # The whole turns say nothing, and would cost digits.
-    unit = np.exp(2j * np.pi * (turns - np.rint(turns)))
+    turns -= np.rint(turns)
+    turns *= 2.0 * np.pi
     sizes = np.diff(np.append(starts, len(stamps)))
-    angle = np.unwrap(np.angle(np.add.reduceat(unit, starts)))
+    angle = np.unwrap(np.arctan2(*(np.add.reduceat(one(turns), starts) for one in (np.sin, np.cos))))
     middle = np.add.reduceat(stamps, starts) / sizes
     if len(middle) > 1:
         # On to the outer rows of the outer lots.

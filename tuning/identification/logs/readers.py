@@ -28,6 +28,7 @@ Columns = dict[str, np.ndarray]  # numbers in float64, texts as objects, stamps 
 
 PLAIN = Text()
 DELIMITERS = "\t;,"  # that are looked for in the line of names, in this order
+BLOCK = 1 << 22  # bytes that are parsed at a time
 LONGEST_LINE = 1 << 20
 SHOWN = 12  # columns in a message
 
@@ -158,35 +159,33 @@ def _read_text(
     chosen = {name: unique[names.index(name)] for name in wanted}
     kinds = {chosen[name]: pa.string() if name in texts else pa.float64() for name in wanted}
 
-    def table(threads: bool) -> pa.Table:
-        return arrow_csv.read_csv(
-            path,
-            arrow_csv.ReadOptions(
-                column_names=unique, skip_rows=skipped, use_threads=threads, block_size=1 << 22
-            ),
-            arrow_csv.ParseOptions(delimiter=delimiter),
-            arrow_csv.ConvertOptions(
-                column_types=kinds,
-                include_columns=list(kinds),
-                decimal_point=decimal,
-                strings_can_be_null=False,
-            ),
-        )
-
-    try:
-        found = table(threads=True)
-    except pa.ArrowInvalid:
-        # Only a single thread counts the rows, so that the message names the bad one.
-        found = table(threads=False)
-    return {name: _array(found.column(place), name) for name, place in chosen.items()}
+    batches = arrow_csv.open_csv(
+        path,
+        arrow_csv.ReadOptions(column_names=unique, skip_rows=skipped, block_size=BLOCK, use_threads=False),
+        arrow_csv.ParseOptions(delimiter=delimiter),
+        arrow_csv.ConvertOptions(
+            column_types=kinds,
+            include_columns=list(kinds),
+            decimal_point=decimal,
+            strings_can_be_null=False,
+        ),
+    )
+    # A table of a long log takes three times the memory of its numbers. Of threads one alone counts the rows,
+    # so that a message names the bad one.
+    parts: dict[str, list[np.ndarray]] = {name: [np.empty(0)] for name in chosen}
+    for batch in batches:
+        for name, place in chosen.items():
+            parts[name].append(_array(pa.chunked_array([batch.column(place)]), name).copy())
+    return {name: np.concatenate(parts.pop(name)) for name in chosen}
 
 
 def _parquet_log(path: Path, label: str) -> Log:
     names = list(parquet.read_schema(path).names)
 
     def read(wanted: Sequence[str]) -> Columns:
-        found = parquet.read_table(path, columns=list(wanted))
-        return {name: _array(found.column(name), name) for name in wanted}
+        # Column by column: a table of a long log beside its numbers takes twice the memory.
+        found = (parquet.read_table(path, columns=[name]).column(0) for name in wanted)
+        return {name: _array(column, name) for name, column in zip(wanted, found, strict=True)}
 
     return Log(label, names, _checked(label, names, read))
 

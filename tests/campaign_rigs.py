@@ -1,0 +1,38 @@
+"""The rigs of campaigns with known truth: as mechanism files, and under commands of one's own."""
+
+import campaigns
+import numpy as np
+from oracle_contact import Law
+
+from jaxhil.mechanism.file import from_builtins
+
+
+def mechanism(name, **changed):
+    """The rig of a kind of campaign as a mechanism file has it; keys `changed` by "section__key"."""
+    kind = campaigns.KINDS[name]
+    rig = {key: {**value} if isinstance(value, dict) else value for key, value in kind.rig.items()}
+    tables = {"contact": {**kind.contact}, **{one: rig[one] for one in rig if isinstance(rig[one], dict)}}
+    tables["rig"] = rig
+    for path, value in changed.items():
+        section, key = path.split("__")
+        tables[section][key] = value
+    bodies, approach = {"equivalent_mass": kind.mass}, {"velocity": 0.006, "contacts": 1}
+    approach["contacts"] = len(kind.contact["stiffness"])
+    whole = {"schema": "jaxhil/mechanism/1", "name": name, "bodies": bodies, "approach": approach}
+    return from_builtins({**whole, "contact": tables["contact"], "rig": rig}, name)
+
+
+def commanded(name, what, command, seed, noise=True):
+    """A run, "free" or "press", of that kind of rig under a command [m]; contact may begin and end in it."""
+    kind, rng = campaigns.KINDS[name], np.random.default_rng(seed)
+    rig, T, sensor = kind.rig, kind.rig["control_period"], kind.rig["force_sensor"]
+    plant, law = campaigns.Plant(rig), Law(kind.contact, rig.get("contact_plane", 0.0))
+    own = rig["simulator"].get("delay", 0.0)
+    measured = campaigns._position(plant, command, (own + rig["position_sensor"].get("delay", 0.0)) / T)
+    lag, near = (own + sensor.get("delay", 0.0)) / T, 1e-3
+    before, at, after = (campaigns._position(plant, command, lag + shift) for shift in (near, 0.0, -near))
+    raw = law.raw(at - law.plane, (after - before) / (2.0 * near * T), 0)
+    force = np.where((at > law.plane) & (what == "press"), np.maximum(raw, 0.0), 0.0)
+    force = force + noise * campaigns._coloured(rng, len(command), sensor["noise_std"], kind.colour)
+    measured = measured + noise * rig["position_sensor"]["noise_std"] * rng.standard_normal(len(command))
+    return campaigns._run(kind, what, command, measured, campaigns.sense(force, sensor))

@@ -1,0 +1,124 @@
+"""`jaxhil identify --design`: commands for a rig that tell its numbers as well as its limits allow."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxhil.errors import InputError, one_line
+from jaxhil.files import write_whole, writing
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.structs import numeric_keys
+from jaxhil.runtime import digest
+from jaxhil.simulation.environment import computing
+from tuning import terminal
+from tuning.caches.sources import versions
+from tuning.cli.commands import checks
+from tuning.cli.options_identify import Identify
+from tuning.front_door import arguments
+
+if TYPE_CHECKING:
+    from tuning.identification.design.excitation import Design, Excitation
+
+SCHEMA = "jaxhil/design/1"
+DOCUMENT = "design.json"
+COMPENSATOR = "response_error"
+
+
+def run(options: Identify) -> int:
+    """Write both commands and what they will tell; 0."""
+    given = [*options.logs, *([options.prior] if options.prior is not None else [])]
+    if len(given) != 1:
+        raise InputError(f"--design: found {len(given)} mechanisms, allowed one, roughly known")
+    if not 0.0 < options.stroke <= 1.0:
+        raise InputError(f"--stroke: found {options.stroke:g} m, allowed a number > 0 and <= 1 m")
+    arguments.integers(0, seed=options.seed)
+    mechanism = load(given[0]).mechanism
+    folder = Path(options.output)
+    checks.output(folder)
+    checks.own_results(folder / DOCUMENT, "predicted", ("free.csv", "press.csv"))
+    with computing():
+        from jaxhil.simulation.gain_choice import choose_gains
+        from tuning.identification.design.excitation import design, error_slopes
+
+        gains = choose_gains(mechanism, COMPENSATOR, None)[1]
+        slopes_by = partial(error_slopes, mechanism, COMPENSATOR, gains)
+        found = design(mechanism, options.stroke, slopes_by, options.seed)
+    sensors = mechanism.rig.position_sensor, mechanism.rig.force_sensor
+    if not all(one.noise_std or one.quantum for one in sensors):
+        terminal.warn(["where the mechanism states no noise, 5 um and 0.5 N are assumed"])
+    document = _document(options, mechanism.name, found)
+    period = mechanism.rig.control_period
+    for name, one in (("free", found.free), ("press", found.press)):
+        _write(folder / f"{name}.csv", one, period)
+    with writing(folder / DOCUMENT):
+        write_whole(folder / DOCUMENT, terminal.as_json(document).encode("ascii"))
+    if options.json:
+        terminal.emit_json(document)
+    else:
+        _print(document, folder)
+    return 0
+
+
+def _write(path: Path, excitation: Excitation, period: float) -> None:
+    rows = [f"{period * n:.9g},{x:.9g}\n" for n, x in enumerate(excitation.position.tolist())]
+    with writing(path):
+        write_whole(path, "".join(["time,position_desired\n", *rows]).encode("ascii"))
+
+
+def _document(options: Identify, name: str, found: Design) -> dict[str, Any]:
+    effects = np.sqrt(np.mean(found.slopes**2, axis=0)) * found.std
+    numbers = zip(found.keys, found.values, found.std, effects, strict=True)
+    content = {
+        "schema": SCHEMA,
+        "mechanism": one_line(name),
+        "predicted": [
+            {"key": key, "value": value, "std": std, "effect": effect, "unit": _unit(key)}
+            for key, value, std, effect in numbers
+        ],
+        "error": found.error,
+        "flat": found.flat,
+        "runs": {
+            kind: {
+                "crest_factor": one.crest,
+                "rms": float(np.sqrt(0.5 * np.sum(one.amplitude**2))),
+                "rows": len(one.position),
+                "lines": [
+                    [f, a] for f, a in zip(one.frequency.tolist(), one.amplitude.tolist(), strict=True)
+                ],
+            }
+            for kind, one in (("free", found.free), ("press", found.press))
+        },
+        "stroke": options.stroke,
+        "seed": options.seed,
+        "versions": versions(),
+    }
+    plain = terminal.finite(content)
+    return {**plain, "sha256": digest(plain)}
+
+
+def _unit(key: str) -> str:
+    parts = key.split(".")
+    while parts[-1].isdigit():
+        parts.pop()
+    return numeric_keys()[".".join(parts)].unit
+
+
+def _print(document: dict[str, Any], folder: Path) -> None:
+    rows = [
+        [one[name] for name in ("key", "value", "std", "unit", "effect")] for one in document["predicted"]
+    ]
+    headings = ["number", "value", "std", "unit", "effect on e"]
+    things: list[Any] = [terminal.table("What logs of both runs will tell", headings, rows, (0, 3))]
+    runs = document["runs"]
+    things.append(
+        f"Together they leave {document['error']:.2g} of e, flat spectra within the same limits "
+        f"{document['flat']:.2g} times that; crest factors {runs['free']['crest_factor']:.2f} and "
+        f"{runs['press']['crest_factor']:.2f}."
+    )
+    files = ", ".join(str(folder / name) for name in ("free.csv", "press.csv"))
+    things.append(f"Wrote {files} and {folder / DOCUMENT}")
+    terminal.emit(*things)
