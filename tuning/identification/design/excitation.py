@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import optimize
@@ -279,9 +280,9 @@ def _press_depth(mechanism: Mechanism) -> tuple[float, float]:
     far = 1e-6
     while left(far) < 0.0:
         far *= 2.0
-    deepest = optimize.brentq(left, 0.0, far)
+    deepest: Any = optimize.brentq(left, 0.0, far)
     greatest = min(float(_force(mechanism, np.array([deepest]))[0]), USED * mechanism.rig.force_sensor.range)
-    pressed = optimize.brentq(
+    pressed: Any = optimize.brentq(
         lambda depth: float(_force(mechanism, np.array([depth]))[0]) - PRELOAD * greatest, 0.0, deepest
     )
     return float(pressed), greatest
