@@ -19,7 +19,7 @@ from tuning.identification.noise import at_rest
 from tuning.identification.records import Timing
 
 # d(e - e*) by the numbers of "clean", as the slow test has them of the loop.
-SLOPES = np.array([[0.0076, 0.0905, 3.95, 30.4, 2.8e-7, 5.7e-5]])
+SLOPES = np.array([[0.0076, -0.089, -3.9, 30.4, -2.8e-7, -5.7e-5]])
 
 
 def test_a_slope_is_best_found_at_both_ends():
@@ -76,8 +76,8 @@ def test_the_limits_are_kept_and_used(planned):
     speed, acceleration = np.diff(free) / 1e-3, np.diff(free, 2) / 1e-6
     assert np.abs(speed).max() < 0.3 and np.abs(acceleration).max() < 20.0
     assert np.abs(free).max() > 0.0017 or np.abs(acceleration).max() > 0.85 * 18.0
-    # Nearly all of its power in two lines beside each other has a crest factor of 2.
-    assert planned.free.crest < 1.75 and planned.press.crest < 1.6
+    # With speed and acceleration limited beside the stroke no wave is low in all three.
+    assert max(planned.free.crest, planned.press.crest) < 2.1
     # Never off the mechanism while pressed, and within the force of an approach.
     force = campaign_rigs.commanded("clean", "press", press, 0, noise=False).force_measured
     greatest = 0.006 * np.sqrt(1.2e5 * 350.0)
@@ -102,11 +102,13 @@ def spread(planned, repeats):
     return np.std(found, axis=0, ddof=1) / planned.std[:3], np.mean(found, axis=0)
 
 
-def test_estimates_scatter_as_predicted(planned):
-    ratio, mean = spread(planned, 5)
-    # Chi-squared of 4: 99.9 % are between 0.13 and 2.24.
-    assert np.all(ratio < 2.25) and np.all(ratio > 0.13)
-    np.testing.assert_allclose(mean, (12.0, 0.8, 0.0043), rtol=1e-3)
+def test_a_fit_to_it_knows_the_numbers_as_well_as_predicted(planned):
+    run = campaign_rigs.commanded("clean", "free", planned.free.position - 0.05, 0)
+    one = free_motion.estimate([run], Timing(1e-3, "linear", 0, "tick"), 2)
+    assert one is not None and one.spectra[0].periods == PERIODS - 1
+    values, std = one.model.parameters, np.sqrt(np.diag(one.covariance))
+    scale = np.array([np.exp(values[0]) / (2.0 * np.pi), np.exp(values[1]), 1.0])
+    np.testing.assert_allclose(scale * std, planned.std[:3], rtol=0.1)
 
 
 @pytest.mark.slow
@@ -114,6 +116,7 @@ def test_estimates_of_many_campaigns_scatter_as_predicted():
     mechanism = campaign_rigs.mechanism("clean")
     gains = choose_gains(mechanism, "response_error", None)[1]
     planned = design(mechanism, 0.002, partial(error_slopes, mechanism, "response_error", gains))
+    assert max(planned.free.crest, planned.press.crest) < 1.8
     print("slopes", np.round(planned.slopes.mean(axis=0), 9).tolist(), "flat over best", planned.flat)
     np.testing.assert_allclose(planned.slopes.mean(axis=0), SLOPES[0], rtol=0.2, atol=1e-6)
     ratio, _ = spread(planned, 100)

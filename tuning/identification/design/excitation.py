@@ -48,7 +48,7 @@ class Excitation:
     position: np.ndarray  # m, of the command: from where it starts, or (press) from the nominal plane
     frequency: np.ndarray  # Hz, of the lines
     amplitude: np.ndarray  # m
-    crest: float  # peak over rms of a period
+    crest: float  # peak over rms, of what is nearest to its limit
 
 
 @dataclass(frozen=True)
@@ -88,23 +88,27 @@ def design(mechanism: Mechanism, stroke: float, slopes_by: Slopes, seed: int = 0
     best = powers.best_powers(groups, weight)
     even = [powers.flat_powers(group) for group in groups]
     mixed = [(1.0 - EVEN) * one + EVEN * other for one, other in zip(best, even, strict=True)]
-    waves, found = [], []
+    waves, found, crests = [], [], []
     for power, limits in zip(mixed, plan.limits, strict=True):
         amplitude = np.sqrt(2.0 * power)
-        angle = waveform.phases(amplitude, plan.lines, plan.rows, seed)
-        room = min(
-            limit / np.abs(plan.wave(amplitude * np.abs(r), angle + np.angle(r))).max() for r, limit in limits
-        )
-        waves.append((room * amplitude, angle))
-        found.append(power * room**2)
+        angle = waveform.phases(amplitude, plan.lines, plan.rows, limits, seed)
+        signals = waveform.made(amplitude, plan.lines, plan.rows, angle, limits)
+        shares = [np.abs(one).max() for one in signals]
+        waves.append(plan.wave(amplitude, angle) / max(shares))
+        crests.append(waveform.crest_factor(signals[int(np.argmax(shares))]))
+        found.append(power / max(shares) ** 2)
     covariance = powers.inverse(powers.information(groups, found))
     errors = [
         np.sqrt(np.trace(weight @ powers.inverse(powers.information(groups, p)))) for p in (even, mixed)
     ]
-    free, press = (plan.wave(*one) for one in waves)
+    runs = [plan.repeated(waves[0]), plan.pressed(waves[1])]
+    free, press = (
+        Excitation(position, plan.frequency, np.sqrt(2.0 * power), crest)
+        for position, power, crest in zip(runs, found, crests, strict=True)
+    )
     return Design(
-        _excitation(plan, waves[0], plan.repeated(free)),
-        _excitation(plan, waves[1], plan.pressed(press)),
+        free,
+        press,
         plan.keys,
         plan.values,
         np.sqrt(np.diag(covariance)),
@@ -112,10 +116,6 @@ def design(mechanism: Mechanism, stroke: float, slopes_by: Slopes, seed: int = 0
         covariance,
         float(errors[0] / errors[1]),
     )
-
-
-def _excitation(plan: _Plan, wave: tuple[np.ndarray, np.ndarray], position: np.ndarray) -> Excitation:
-    return Excitation(position, plan.frequency, wave[0], waveform.crest_factor(plan.wave(*wave)))
 
 
 def error_slopes(

@@ -1,38 +1,72 @@
 """Multisines of low crest factor: phases for given amplitudes, and commands that begin and end at rest.
 
-Phases start from Schroeder's (1970) and from random ones; then the wave is clipped and its amplitudes are put
-back, again and again, which lowers its peaks (Van der Ouderaa, Schoukens and Renneboog 1988).
+Phases start from Schroeder's (1970) and from random ones; then means of growing even powers of the wave are
+made small, whose limit is its peak (Guillaume, Schoukens, Pintelon and Kollar 1991).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
+from scipy import optimize
 
-STARTS = 8  # of random phases
-ROUNDS = 200  # of clipping
-CLIP = 0.7, 0.99  # of the peak, in the first round and in the last
+Limited = tuple[np.ndarray | complex, float]  # a response to the wave, at its lines, and a limit
+PLAIN: Limited = (1.0 + 0.0j, 1.0)
+
+STARTS = 1  # of random phases
+DOUBLINGS = 3, 5  # means of the 8th, then of the 32nd power
+STEPS = 40  # of the solver, for each
 
 
-def phases(amplitude: np.ndarray, lines: np.ndarray, rows: int, seed: int = 0) -> np.ndarray:
-    """Phases [rad] of the lines (numbers of periods in `rows`) that make the wave's peak low."""
+def phases(
+    amplitude: np.ndarray, lines: np.ndarray, rows: int, limited: Sequence[Limited] = (PLAIN,), seed: int = 0
+) -> np.ndarray:
+    """Phases [rad] of the lines (numbers of periods in `rows`) that keep peaks low.
+
+    `limited`: what is made of the wave, by its response at the lines, and the largest value it may have; the
+    largest of all peaks over their limits is made small."""
     power = amplitude**2 / np.sum(amplitude**2)
     # Schroeder: the phase's slope by frequency goes with the power below it.
     schroeder = -2.0 * np.pi * np.cumsum(np.cumsum(power) - power) * np.gradient(lines.astype(float))
     rng = np.random.default_rng(seed)
     starts = [schroeder, *rng.uniform(0.0, 2.0 * np.pi, (STARTS, len(lines)))]
-    tried = [_clipped(amplitude, lines, rows, one) for one in starts]
-    return min(tried, key=lambda one: crest_factor(wave(amplitude, lines, rows, one)))
+    tried = [_lowered(amplitude, lines, rows, limited, one) for one in starts]
+    return min(
+        tried, key=lambda one: max(np.abs(s).max() for s in made(amplitude, lines, rows, one, limited))
+    )
 
 
-def _clipped(amplitude: np.ndarray, lines: np.ndarray, rows: int, angle: np.ndarray) -> np.ndarray:
-    best, least = angle, np.inf
-    for level in np.linspace(*CLIP, ROUNDS):
-        made = wave(amplitude, lines, rows, angle)
-        if (found := crest_factor(made)) < least:
-            best, least = angle, found
-        peak = level * np.abs(made).max()
-        angle = np.angle(np.fft.rfft(np.clip(made, -peak, peak))[lines])
-    return best
+def _lowered(amplitude, lines, rows, limited, angle) -> np.ndarray:
+    size = max(np.abs(one).max() for one in made(amplitude, lines, rows, angle, limited))
+
+    def mean(angle, doublings):
+        """Logarithm of the mean of a power of all signals, and its derivative by the phases."""
+        power, total, slope = 2**doublings, 0.0, np.zeros(len(lines))
+        for (response, limit), signal in zip(
+            limited, made(amplitude, lines, rows, angle, limited), strict=True
+        ):
+            raised, one_less = signal / size, np.ones_like(signal)
+            for _ in range(doublings):
+                one_less = one_less * raised
+                raised = raised * raised
+            total += np.sum(raised)
+            pull = np.conj(np.fft.rfft(one_less)[lines])
+            slope += np.real(1j * amplitude * response / (limit * size) * np.exp(1j * angle) * pull)
+        return np.log(total) / power, slope / total
+
+    for doublings in DOUBLINGS:
+        found: Any = optimize.minimize(
+            mean, angle, (doublings,), method="L-BFGS-B", jac=True, options={"maxiter": STEPS}
+        )
+        angle = found.x
+    return angle
+
+
+def made(amplitude, lines, rows, angle, limited: Sequence[Limited]) -> list[np.ndarray]:
+    """One period of what is made of the wave, over its limits."""
+    return [wave(amplitude * np.abs(r) / limit, lines, rows, angle + np.angle(r)) for r, limit in limited]
 
 
 def wave(amplitude: np.ndarray, lines: np.ndarray, rows: int, angle: np.ndarray) -> np.ndarray:
