@@ -131,11 +131,10 @@ def estimate(
         law, near = judged[0].law, (judged[0].delay, judged[0].plane)
     problem = Problem(motion, readings, law, plane)
     posterior = profile(problem, seed, near)
-    lag = None if hidden else sensor_lag(problem, posterior)
+    lag = None if hidden else sensor_lag(problem, posterior, seed)
     if lag is not None:
         problem = Problem(motion, readings, law, plane, lag.value)
-        posterior = profile(problem, seed, lag.near)
-        posterior = lag.spread(posterior, seed)
+        posterior = lag.posterior
     freedom = len(problem.kept) - len(posterior.names)
     error = 0.0 if noise is None or hidden else noise.std_std / max(noise.std, 1e-300)
     return ContactFit(law, judged, problem, posterior, freedom, error, bool(hidden))

@@ -37,6 +37,7 @@ class Posterior:
     delays: np.ndarray  # s, the final grid
     log_posterior: np.ndarray  # of the delay there, less its largest
     best: tuple[float, float, Inner]  # delay, plane and fit of greatest posterior density
+    evidence: float = 0.0  # logarithm of the posterior's integral, up to a constant of the readings
 
     @property
     def mean(self) -> np.ndarray:
@@ -73,6 +74,15 @@ def profile(
     delays = np.linspace(low, high, size[0])
     known = np.interp(delays, finer, planes), np.interp(delays, finer, stds)
     places, cells = _grid(problem, delays, known, size[1])
+    return _sample(problem, places, cells, delays, seed)
+
+
+def around(problem: Problem, delays: np.ndarray, plane: float, seed: int) -> Posterior:
+    """The posterior over these delays alone, about this plane; where no jump at the onset makes it rough."""
+    few = np.linspace(delays[0], delays[-1], FEW_PLANES)
+    planes, stds, _ = _scan(problem, few, plane)
+    known = np.interp(delays, few, planes), np.interp(delays, few, stds)
+    places, cells = _grid(problem, delays, known, FEW_PLANES)
     return _sample(problem, places, cells, delays, seed)
 
 
@@ -169,6 +179,7 @@ def _sample(
         delays,
         profile - profile.max(),
         (float(places[best, 0]), float(places[best, 1]), cells[best]),
+        float(heights.max() + np.log(np.sum(np.exp(heights - heights.max())) * step)),
     )
 
 

@@ -13,33 +13,25 @@ import numpy as np
 from scipy import optimize
 
 from tuning.identification.contact_problem import Problem
-from tuning.identification.contact_profile import Posterior
+from tuning.identification.contact_profile import DRAWS, Posterior, around
 from tuning.identification.law_choice import Fitted, quick
 
 LARGEST = 0.005  # s
 TRIED = 0.0005, 0.0015, 0.004  # s, of which one gains if any does
 GAIN = 6.0  # of the criterion
-STEPS = 3.0  # standard deviations of the lag on each side at which the other numbers are fitted again
+NODES, WIDEST = 9, 3.5  # lags at which all else is fitted, and standard deviations of the lag that they span
+DELAYS, REACH = 21, 5.0  # of the grid at each lag, and standard deviations of the delay that it reaches
 
 
 @dataclass(frozen=True)
 class Lag:
-    """The sensor's time constant, and how the other numbers move with it."""
+    """The sensor's time constant, and all numbers with it."""
 
-    value: float  # s
-    std: float  # s
-    near: tuple[float, float]  # s and m, best delay and plane with it
-    slopes: np.ndarray  # of delay, plane and coefficients by the time constant
-
-    def spread(self, posterior: Posterior, seed: int) -> Posterior:
-        """Draws with the time constant's uncertainty in them, and itself as the last number."""
-        off = self.std * np.random.default_rng([seed, 2]).standard_normal(len(posterior.draws))
-        draws = posterior.draws + off[:, None] * self.slopes
-        draws = np.column_stack([draws, self.value + off])
-        return replace(posterior, names=[*posterior.names, "time_constant"], draws=draws)
+    value: float  # s, of greatest posterior density
+    posterior: Posterior  # "time_constant" the last of its names; its best is at `value`
 
 
-def sensor_lag(problem: Problem, posterior: Posterior) -> Lag | None:
+def sensor_lag(problem: Problem, posterior: Posterior, seed: int = 0) -> Lag | None:
     """The time constant where the readings ask for one, else None."""
     delay, plane, inner = posterior.best
     fits: dict[float, Fitted] = {}
@@ -53,25 +45,45 @@ def sensor_lag(problem: Problem, posterior: Posterior) -> Lag | None:
     needed = GAIN + np.log(len(problem.kept))
     if inner.misfit - min(fit(value)[2] for value in TRIED) < 0.5 * needed:
         return None
+    period = problem.motion.period
     found: Any = optimize.minimize_scalar(
-        lambda value: fit(value)[2], bounds=(0.1 * problem.motion.period, LARGEST), method="bounded",
-        options={"xatol": 0.02 * problem.motion.period},
+        lambda value: fit(value)[2], bounds=(0.1 * period, LARGEST), method="bounded",
+        options={"xatol": 0.1 * period},
     )  # fmt: skip
-    value, gain = float(found.x), inner.misfit - float(found.fun)
-    if gain < needed:
+    if inner.misfit - float(found.fun) < needed:
         return None
-    step = 0.1 * value
+    value, step = float(found.x), 0.1 * float(found.x)
     for _ in range(2):
         rise = np.mean([fit(value + side * step)[2] for side in (-1.0, 1.0)]) - found.fun
         std = step / np.sqrt(max(rise, 0.1))
-        step = min(STEPS * std, 0.5 * value)
-    numbers = []
-    for side in (-1.0, 1.0):
-        at, where, _ = fit(value + side * step)
-        numbers.append(
-            np.array([at, where, *_lagging(problem, value + side * step).at(at, where).coefficients])
-        )
-    return Lag(value, float(std), fit(value)[:2], (numbers[1] - numbers[0]) / (2.0 * step))
+        step = min(2.0 * std, 0.5 * value)
+    nodes = value + std * np.linspace(-WIDEST, WIDEST, NODES)
+    nodes = nodes[nodes > 0.1 * period]
+    spread = REACH * float(posterior.draws[:, 0].std()) * np.linspace(-1.0, 1.0, DELAYS)
+    each = []
+    for one in nodes:
+        at, plane, _ = fit(one)
+        each.append(around(_lagging(problem, one), np.unique(np.maximum(at + spread, 0.0)), plane, seed))
+    return _joined(nodes, each, seed)
+
+
+def _joined(nodes: np.ndarray, each: list[Posterior], seed: int) -> Lag:
+    """The posterior over lags evenly spaced: draws of every node by its weight, moved between the nodes."""
+    evidence = np.array([one.evidence for one in each])
+    weights = np.exp(evidence - evidence.max())
+    rng = np.random.default_rng([seed, 2])
+    places = (np.arange(DRAWS) + rng.uniform(size=DRAWS)) / DRAWS * weights.sum()
+    picked = np.minimum(np.searchsorted(np.cumsum(weights), places), len(nodes) - 1)
+    step, means = nodes[1] - nodes[0], np.array([one.mean for one in each])
+    slopes = np.gradient(means, step, axis=0)
+    off = rng.uniform(-0.5, 0.5, DRAWS) * step
+    draws = np.array([each[node].draws[i] for i, node in enumerate(picked)]) + off[:, None] * slopes[picked]
+    draws = rng.permutation(np.column_stack([draws, nodes[picked] + off]))
+    best = each[int(np.argmax(weights))]
+    return Lag(
+        float(nodes[np.argmax(weights)]),
+        replace(best, names=[*best.names, "time_constant"], draws=draws),
+    )
 
 
 def _lagging(problem: Problem, value: float) -> Problem:
