@@ -1,0 +1,66 @@
+"""Time of `jaxhil identify` of a day's logs in memory, beside a general optimizer on the touches alone.
+
+60 s of free motion at 1 kHz and 15 touches. The other one is what one would write oneself: SciPy's least
+squares with differences, over the same exact motion, from a start some per cent off, without intervals and
+without a check of anything. Times are those of the processor. Run with
+`pytest -m benchmark -s tests/benchmarks/test_identify_time.py`.
+"""
+
+import time
+
+import campaigns
+import numpy as np
+import pytest
+from scipy import optimize
+
+from tuning.identification.contact_problem import Readings
+from tuning.identification.estimate import Options, identify
+from tuning.identification.motion import Motion
+
+pytestmark = pytest.mark.benchmark
+BAR = 10.0  # s, warm
+TRUE = np.array([0.0037, 0.0, 1.2e5, 650.0])  # force delay, plane, stiffness, damping
+UNITS = np.array([1e-3, 1e-6, 1e5, 100.0])
+
+
+def general(campaign, model):
+    """The four numbers and the bias by a general optimizer."""
+    runs = [run for run in campaign.runs if run.kind == "contact"]
+    motion, readings = Motion(model, runs, campaign.timing, 0.022), Readings.of(runs, 0.5)
+
+    def residuals(scaled):
+        delay, plane, stiffness, damping = scaled[:4] * UNITS
+        position, velocity = motion.at(delay)
+        force = stiffness * (position - plane) + damping * velocity
+        force = np.where((position > plane) & (force > 0.0), force, 0.0) + scaled[4]
+        return ((force - readings.force) / readings.std)[readings.counts]
+
+    start = np.append(TRUE * 1.05 / UNITS, 0.0)
+    least, most = [0.0, *[-np.inf] * 4], [20.0, *[np.inf] * 4]
+    return optimize.least_squares(residuals, start, x_scale="jac", bounds=(least, most)).x[:4] * UNITS
+
+
+def test_time_of_a_day(capsys):
+    campaign = campaigns.campaign("clean", 0)
+    options = Options(law="kelvin_voigt")
+    identify(campaign, options=options)
+    begin = time.process_time()
+    found = identify(campaign, options=options)
+    took = time.process_time() - begin
+    begin = time.process_time()
+    identify(campaign)
+    every = time.process_time() - begin
+    begin = time.process_time()
+    numbers = general(campaign, found.motion.model)
+    alone = time.process_time() - begin
+    keys = "rig.force_sensor.delay", "contact.damping.0"
+    ours = [abs(found[key].value - true) for key, true in zip(keys, TRUE[[0, 3]], strict=True)]
+    theirs = np.abs(numbers - TRUE)[[0, 3]]
+    with capsys.disabled():
+        print(
+            f"\nidentify: {took:.2f} s with the law told, {every:.2f} s with all laws tried; "
+            f"general optimizer on the touches: {alone:.2f} s\n"
+            f"errors of force delay and damping: {1e3 * ours[0]:.3f} ms and {ours[1]:.1f} N s/m; "
+            f"general optimizer: {1e3 * theirs[0]:.3f} ms and {theirs[1]:.1f} N s/m"
+        )
+    assert max(took, every) < BAR
