@@ -1,8 +1,10 @@
 """A headless Chromium that tests open pages in, spoken to over a pipe by the DevTools protocol."""
 
+import base64
 import fcntl
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -115,6 +117,33 @@ class Browser:
         told = self._call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in told, told
         return told["result"].get("value")
+
+    def click(self, selector: str) -> None:
+        """Press the mouse in the middle of the first element, scrolled into view."""
+        x, y = self.evaluate(
+            f"""(() => {{ const one = document.querySelector({json.dumps(selector)});
+            one.scrollIntoView({{ block: "center", behavior: "instant" }});
+            const box = one.getBoundingClientRect();
+            return [box.x + box.width / 2, box.y + box.height / 2]; }})()"""
+        )
+        for kind in ("mousePressed", "mouseReleased"):
+            self._call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+        self.evaluate(f"new Promise(done => setTimeout(done, {SETTLED}))")
+
+    def printed(self, width: int, height: int, selector: str) -> tuple[int, list[list[Any]]]:
+        """How many sheets the page is printed on, and of each element shown on paper that wide its tag, width
+        and height [pixels] and whether it may be broken between sheets."""
+        self._call("Emulation.setEmulatedMedia", media="print")
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self._call("Emulation.setDeviceMetricsOverride", **size)
+        found = self.evaluate(
+            f"""[...document.querySelectorAll({json.dumps(selector)})].filter(one => one.checkVisibility())
+            .map(one => [one.tagName, one.getBoundingClientRect().width, one.getBoundingClientRect().height,
+                         getComputedStyle(one).breakInside])"""
+        )
+        self._call("Emulation.setEmulatedMedia", media="")
+        paper = base64.b64decode(self._call("Page.printToPDF", preferCSSPageSize=True)["data"])
+        return len(re.findall(rb"/Type\s*/Page\b", paper)), [[one[0].lower(), *one[1:]] for one in found]
 
     def close(self) -> None:
         """End the browser."""

@@ -2,8 +2,8 @@
 
     import tuning
 
-offers what the commands of these names do as functions: `tune`, `sweep`, `compare`, `export`, `verify`. Each
-is loaded when it is first asked for: nothing here imports jax.
+offers what the commands of these names do as functions: `tune`, `sweep`, `compare`, `map`, `export`,
+`verify`, `report`. Each is loaded when it is first asked for: nothing here imports jax.
 """
 
 from importlib import import_module
@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from tuning.front_door.compare import compare
     from tuning.front_door.export import export
+    from tuning.front_door.map import map
+    from tuning.front_door.report import report
     from tuning.front_door.sweep import sweep
     from tuning.front_door.tune import tune
     from tuning.front_door.verify import verify
 
-__all__ = ["compare", "export", "sweep", "tune", "verify"]
+__all__ = ["compare", "export", "map", "report", "sweep", "tune", "verify"]
 
 
 def __getattr__(name: str) -> Any:

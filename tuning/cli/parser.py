@@ -26,6 +26,7 @@ from tuning.cli.options import (
     Tune,
 )
 from tuning.cli.options_identify import Identify, Monitor
+from tuning.cli.options_report import Map, Report
 from tuning.cli.options_rig import DEFAULT_RIG_PLOT, Export, RigOptions, Verify
 
 DESCRIPTION = """Gains that keep hardware-in-the-loop docking tests from diverging.
@@ -45,6 +46,8 @@ Command = (
     | Annotated[Verify, subcommand("verify")]
     | Annotated[RigOptions, subcommand("rig")]
     | Annotated[Compare, subcommand("compare")]
+    | Annotated[Map, subcommand("map")]
+    | Annotated[Report, subcommand("report")]
     | Annotated[Mechanisms, subcommand("mechanisms")]
 )
 

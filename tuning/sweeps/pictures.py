@@ -127,7 +127,7 @@ def failure_region(plan: Plan, regions: Regions, manifest: Manifest, name: str) 
             )
         _name_axis(axes.xaxis, one, points.inputs[place])
         axes.set(yscale="log", ylim=(low, high * 1.1), ylabel="worst error of the scenario |e - e*| [1]")
-        _plain_ticks(axes.yaxis, low, high)
+        plain_ticks(axes.yaxis, low, high)
     for axes in panels:
         finish(axes, None)
     handles, labels = panels[-1].get_legend_handles_labels()
@@ -181,10 +181,22 @@ def convergence(
     _limit_probability(axes, looks, share, low, high, acceptable)
     finish(axes, None)
     axes.set_xlim(looks[0] / 1.05, looks[-1] * 1.05)
-    _plain_ticks(axes.xaxis, looks[0], looks[-1])
+    plain_ticks(axes.xaxis, looks[0], looks[-1])
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}".replace(",", " ")))
     figure.legend(loc="lower center", fontsize=9, frameon=False, ncols=2)
     return figure
+
+
+def plain_ticks(axis: Axis, low: float, high: float) -> None:
+    """Ticks of a logarithmic axis as plain numbers, enough of them to read off values."""
+    decades = np.log10(high / low)
+    some = (1.0,) if decades > 5 else (1.0, 3.0) if decades > 2.2 else (1.0, 2.0, 5.0)
+    if decades < 0.9:
+        axis.set_major_locator(MaxNLocator(5, steps=(1, 2, 2.5, 5, 10)))
+    else:
+        axis.set_major_locator(LogLocator(subs=some))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def _draw_profile(axes: Axes, one: Input, cells: int, sizes: np.ndarray, limit: float | None) -> None:
@@ -204,7 +216,7 @@ def _draw_profile(axes: Axes, one: Input, cells: int, sizes: np.ndarray, limit: 
         axes.axhline(limit, color=BLACK, linewidth=1.5, linestyle="--", label=f"limit {limit:g}")
     _name_axis(axes.xaxis, one)
     axes.set(xlabel="", ylabel="|e - e*| not exceeded by [1]")
-    _plain_ticks(axes.yaxis, *axes.get_ylim())
+    plain_ticks(axes.yaxis, *axes.get_ylim())
     finish(axes, None)
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=5, fontsize=8, frameon=False)
 
@@ -304,7 +316,7 @@ def _limit_probability(axes: Axes, looks, share, low, high, acceptable: float | 
     else:
         axes.set_yscale("log")
         axes.set_ylim(least / 3, min(1.0, 3 * top))
-        _plain_ticks(axes.yaxis, least / 3, 3 * top)
+        plain_ticks(axes.yaxis, least / 3, 3 * top)
 
 
 def _name_axis(axis: Axis, one: Input, values: Sequence[float] | np.ndarray = ()) -> None:
@@ -317,25 +329,13 @@ def _name_axis(axis: Axis, one: Input, values: Sequence[float] | np.ndarray = ()
     limits: Any = axes.set_xlim if across else axes.set_ylim
     if one.logarithmic:
         scale("log")
-        _plain_ticks(axis, low, high)
+        plain_ticks(axis, low, high)
     else:
         axis.set_major_locator(MaxNLocator(6, steps=(1, 2, 2.5, 5, 10)))
     room = 0.02 if len(values) else 0.0
     ends = np.log([low, high]) if one.logarithmic else np.array([low, high])
     ends = ends + room * (ends[1] - ends[0]) * np.array([-1, 1])
     limits(*(np.exp(ends) if one.logarithmic else ends))
-
-
-def _plain_ticks(axis: Axis, low: float, high: float) -> None:
-    """Ticks of a logarithmic axis as plain numbers, enough of them to read off values."""
-    decades = np.log10(high / low)
-    some = (1.0,) if decades > 5 else (1.0, 3.0) if decades > 2.2 else (1.0, 2.0, 5.0)
-    if decades < 0.9:
-        axis.set_major_locator(MaxNLocator(5, steps=(1, 2, 2.5, 5, 10)))
-    else:
-        axis.set_major_locator(LogLocator(subs=some))
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def _drawn_limit(manifest: Manifest) -> float | None:

@@ -7,6 +7,7 @@ from typing import Any
 
 from jaxhil.files import write_whole, writing
 from jaxhil.mechanism.file import LoadedMechanism, load, suite_names
+from jaxhil.runtime import digest
 from jaxhil.simulation.environment import prepare, usable_cores
 from tuning import terminal
 from tuning.cli.commands import checks
@@ -55,6 +56,8 @@ def run(options: Compare) -> int:
         "problems": problems,
         "interrupted": interrupted,
     }
+    document = terminal.finite(document)
+    document["sha256"] = digest(document)
     path = folder / "compare.json"
     with writing(path):
         write_whole(path, terminal.as_json(document).encode("ascii"))

@@ -3,12 +3,12 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxhil.errors import InputError, one_line, shown
-from jaxhil.mechanism.file import from_builtins, load, to_builtins
+from jaxhil.mechanism.file import load
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.environment import prepare
 from tuning import terminal
 from tuning.cli.commands import checks
+from tuning.cli.commands.choice import chosen
 from tuning.cli.options import Simulate
 from tuning.front_door import arguments, meaning
 
@@ -35,7 +35,7 @@ def run(options: Simulate) -> int:
     prepare()
     from jaxhil.simulation.run import simulate
 
-    mechanism, compensator, gains = _chosen(options, mechanism)
+    mechanism, compensator, gains = chosen(options, mechanism)
     _check(mechanism, compensator, gains)
     meaning.say(mechanism, None if options.json else terminal.emit_line)
     done = simulate(mechanism, compensator, gains, seed=options.seed)
@@ -85,30 +85,6 @@ def _reason(status: str) -> str | None:
 def _entry(contact: "ContactResult") -> dict[str, Any]:
     """A contact as JSON says it: delay and plane only of a law that estimates them."""
     return {name: value for name, value in contact._asdict().items() if value is not None}
-
-
-def _chosen(options: Simulate, mechanism: Mechanism | None) -> tuple[Mechanism, str, str | Path | None]:
-    """Mechanism, compensator, and its setting or gain file, if one is given."""
-    if options.gains is None:
-        assert mechanism is not None
-        compensator = options.compensator or "none"
-        arguments.setting(compensator, options.setting)
-        return mechanism, compensator, options.setting
-
-    from jaxhil.simulation.gain_file import load_gain_file
-
-    if options.setting is not None:
-        raise InputError(f"--setting: found {shown(options.setting)}, allowed none beside a gain file")
-    loaded = load_gain_file(options.gains)
-    label = one_line(options.gains)
-    if options.compensator not in (None, loaded.compensator):
-        raise InputError(
-            f"--compensator: found {options.compensator}, allowed {loaded.compensator}, which {label} is for"
-        )
-    if mechanism is None:
-        raw = to_builtins(loaded.mechanism)
-        mechanism = from_builtins(raw, label, options.overrides, options.unset)
-    return mechanism, loaded.compensator, Path(options.gains)
 
 
 def _print(options: Simulate, done: "Run", contacts: list[dict[str, Any]], good: bool) -> None:

@@ -1,0 +1,205 @@
+"""Stability maps: theory beside them, growth in contact against long simulated ones, margins, refusals."""
+
+import cmath
+import json
+import math
+import time
+
+import numpy as np
+import pytest
+from continuous import delayed_restitution
+
+import jaxhil
+import tuning
+from jaxhil.compensators import literature_gains
+from jaxhil.simulation.scenario import build_scenarios
+from tuning.reporting.closed_forms import characteristic_root, critical_delay, series
+from tuning.reporting.contact_growth import LINEAR_COMPENSATORS, growth
+
+SOFT = {  # one contact that lasts for about 4.8 s, all but uniform on the scale of what else moves
+    "approach.contacts": 1, "contact.stiffness": [150.0], "contact.damping": [0.4], "uncertainty": {},
+}  # fmt: skip
+IDEAL = {
+    "approach.contacts": 1, "contact.law": "linear", "rig.simulator": {"model": "ideal"}, "uncertainty": {},
+}  # fmt: skip
+RIGS = {
+    "as it is": {},
+    "lag, jumps, latency": {
+        "rig.force_sensor.time_constant": 0.003, "rig.command_hold": "zoh", "rig.command_latency": 1,
+    },
+    "other integrator, other simulator": {
+        "rig.integrator": "explicit_euler", "rig.control_period": 0.004,
+        "rig.simulator": {"model": "transfer_function", "numerator": [0.01, 1.0],
+                          "denominator": [1e-6, 4e-4, 0.03, 1.0]},
+    },
+    "ideal, zero-order hold": {
+        "rig.integrator": "zoh", "rig.simulator": {"model": "ideal", "delay": 0.0013},
+    },
+}  # fmt: skip
+
+
+def simulated_growth(run, period):
+    """ln|z|/T of the slowest mode z^n of x_d while it is in contact, after all faster ones have died out."""
+    position = run.position_desired
+    begin, step = round(1.5 / period), round(0.7 / period)
+    end = np.flatnonzero(position > 0)[-1] - round(0.2 / period)
+    now, later, last = (position[begin + k * step : end - (2 - k) * step] for k in range(3))
+    # x(n + 2s) = 2 Re z^s x(n + s) - |z|^(2s) x(n)
+    solved = np.linalg.lstsq(np.stack([later, -now], axis=1), last, rcond=None)[0]
+    return math.log(solved[1]) / (2 * step * period)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("changes", RIGS.values(), ids=RIGS)
+@pytest.mark.parametrize("compensator", LINEAR_COMPENSATORS)
+def test_growth_is_that_of_a_long_simulated_contact(compensator, changes):
+    mechanism = jaxhil.load("varying", SOFT | changes)
+    found = growth(
+        mechanism, compensator, literature_gains(mechanism, compensator), build_scenarios(mechanism)
+    )
+    run = jaxhil.simulate(mechanism, compensator)
+    expected = simulated_growth(run, mechanism.rig.control_period)
+    assert found.per_second == pytest.approx(expected, rel=1e-5, abs=1e-8)
+
+
+@pytest.mark.slow
+def test_derivatives_by_gains_are_those_of_finite_differences():
+    mechanism = jaxhil.load("varying", {"uncertainty": {}})
+    gains, scenarios = literature_gains(mechanism, "phase_lead"), build_scenarios(mechanism)
+    slopes = growth(mechanism, "phase_lead", gains, scenarios).by_gain
+    for name, value in gains.items():
+        step = 1e-5 * value
+        low, high = (
+            growth(mechanism, "phase_lead", gains | {name: value + side * step}, scenarios).spectral_radius
+            for side in (-1, 1)
+        )
+        assert slopes[name] == pytest.approx((high - low) / (2 * step), rel=1e-5)
+
+
+def test_closed_forms():
+    phases = np.array([0.02, 0.05, 0.2, 0.7])
+    assert series(phases) == pytest.approx([delayed_restitution(phase) for phase in phases], abs=1e-6)
+    assert np.isnan(series(np.array([-0.1, 1.5]))).all() and series(np.zeros(1)) == pytest.approx(1)
+    # s^2 = -omega^2 e^(-s tau), time in units of 1/omega: growth and oscillation give the root back.
+    for phase in phases:
+        ratio = math.log(characteristic_root(phase)) / math.pi
+        root = solved_root(phase)
+        assert root.real / abs(root.imag) == pytest.approx(ratio, rel=1e-9)
+    mass, stiffness, damping = 350.0, 1.2e5, np.array([100.0, 3000.0])
+    delay = critical_delay(mass, stiffness, damping)
+    for b, tau in zip(damping, delay, strict=True):
+        # At the limit something on the imaginary axis solves M s^2 + (b s + k) e^(-s tau) = 0.
+        frequencies = np.geomspace(1, 1e3, 200_001)
+        left = -mass * frequencies**2 + (1j * b * frequencies + stiffness) * np.exp(-1j * frequencies * tau)
+        assert np.min(np.abs(left)) < 1e-4 * stiffness
+
+
+def solved_root(phase):
+    """Newton's root of s^2 + e^(-s phase) = 0 near j."""
+    root = 1j
+    for _ in range(50):
+        grown = cmath.exp(-root * phase)
+        root -= (root**2 + grown) / (2 * root - phase * grown)
+    return root
+
+
+@pytest.fixture(scope="module")
+def ideal(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("map")
+    mechanism = jaxhil.load("varying", IDEAL)
+    across, up = "contact.stiffness=5e4:4e5", "rig.force_sensor.delay=0.0005:0.008"
+    return tuning.map(mechanism, across, up, points=5, limit=0.2, folder=folder), folder
+
+
+def test_map_of_an_uncompensated_contact_is_that_of_theory(ideal):
+    found, folder = ideal
+    document = json.loads((folder / "map.json").read_text())
+    assert (folder / "map.png").stat().st_size > 20_000 and document["sha256"] == found.document["sha256"]
+    theory = np.array(document["theory"]["series"])
+    assert np.array(document["restitution"]) == pytest.approx(theory, abs=1e-3)
+    assert np.array(document["error"]) == pytest.approx(theory - 1, abs=1e-3)
+    root = np.array(document["theory"]["characteristic_root"])
+    assert document["spectral_radius"]["values"] == pytest.approx(growing(found, root), abs=1e-5)
+
+
+def growing(found, restitution):
+    """The spectral radius of a contact that grows over half an oscillation as the restitution says."""
+    stiffness, delay = np.meshgrid(found.x, found.y)
+    frequency = np.sqrt(stiffness / 350.0)
+    roots = np.vectorize(solved_root)(frequency * delay)
+    assert np.exp(np.pi * roots.real / abs(roots.imag)) == pytest.approx(restitution, rel=1e-9)
+    return np.exp(roots.real * frequency * 0.001)
+
+
+def test_margins_are_where_the_limit_is(ideal):
+    found, _ = ideal
+    nominal = found.document["nominal"]
+    [stiffness, delay] = (nominal["margins"]["error"][axis] for axis in "xy")
+    assert stiffness["low"] is None and delay["low"] is None and nominal["margins"]["spectral_radius"] is None
+    phase = math.sqrt(124355.0 / 350.0) * delay["high"]
+    assert delayed_restitution(phase) == pytest.approx(1.2, abs=1e-3)
+    nominal_phase = math.sqrt(124355.0 / 350.0) * 0.004
+    assert nominal["restitution"] == pytest.approx(delayed_restitution(nominal_phase), abs=1e-3)
+    assert math.sqrt(stiffness["high"] / 350.0) * 0.004 == pytest.approx(phase, rel=1e-2)
+
+
+def test_axes_are_those_asked_for(ideal):
+    found, _ = ideal
+    assert found.x[[0, -1]] == pytest.approx([5e4, 4e5]) and found.y[[0, -1]] == pytest.approx([5e-4, 8e-3])
+    assert found.error.shape == (5, 5) and found.document["x"]["nominal"] == 124355.0
+
+
+@pytest.mark.parametrize(
+    ("axes", "said"),
+    [
+        (("contact.stifness", "rig.force_sensor.delay"), "--x: found 'contact.stifness'"),
+        (("contact.stiffness=2:1", "rig.force_sensor.delay"), "LOW < HIGH"),
+        (("contact.stiffness=-1:1", "rig.force_sensor.delay"), "contact.stiffness[0]: found -1.0"),
+        (("contact.stiffness[3]", "rig.force_sensor.delay"), "--x contact.stiffness[3]: found a value"),
+        (("contact.stiffness", "contact.stiffness"), "--y: found contact.stiffness"),
+        (("contact.stiffness", "rig.force_sensor.bias"), "allowed rig.force_sensor.bias=LOW:HIGH"),
+        (("contact.stiffness", "gains.lead"), "--y: found 'gains.lead', allowed no gain"),
+        (("contact.stiffness", "rig.simulator.time_constant"), "found no value"),
+    ],
+)
+def test_refusals(jaxhil, tmp_path, axes, said):
+    ended = jaxhil("map", "varying", "--x", axes[0], "--y", axes[1], "-o", str(tmp_path))
+    assert ended.code == 2 and said in ended.err and ended.out == ""
+
+
+@pytest.mark.slow
+def test_limits_of_a_small_control_period():
+    """Contours of items 1 and 2, and the growth limit of item 5, are met to 1e-3 in the limit."""
+    axes = "contact.stiffness=5e4:2e5", "rig.force_sensor.delay=0.0005:0.008"
+    for period, allowed in ((4e-4, 1e-3), (1e-4, 1e-4)):
+        found = tuning.map(jaxhil.load("varying", IDEAL | {"rig.control_period": period}), *axes, points=12)
+        theory = np.array(found.document["theory"]["series"], float)
+        error = np.max(np.abs(found.restitution - theory))
+        print(f"\nT = {period:g} s: |e - e of item 1| at most {error:.2g}", end="")
+        assert error < allowed
+    damped = IDEAL | {"contact.law": "kelvin_voigt", "contact.damping": [500.0], "rig.control_period": 1e-4}
+    mechanism = jaxhil.load("varying", damped)
+    limit = float(critical_delay(np.array(350.0), np.array(124355.0), np.array(500.0)))
+    low, high = 0.5 * limit, 2 * limit
+    for _ in range(30):
+        middle = (low + high) / 2
+        scenarios = build_scenarios(mechanism, {"rig.force_sensor.delay": np.array([middle])})
+        grows = growth(mechanism, "none", {}, scenarios).spectral_radius > 1
+        low, high = (low, middle) if grows else (middle, high)
+    print(f"\ncritical delay {1e3 * low:.6f} ms, by item 5 {1e3 * limit:.6f} ms")
+    assert low == pytest.approx(limit, rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.users_options
+@pytest.mark.parametrize("compensator", ["none", "response_error", "retrospective_reference"])
+def test_time_of_a_map_of_100_by_100_points(compensator):
+    axes = "contact.stiffness", "rig.force_sensor.delay=0.001:0.008"
+    took = spent = 0.0
+    for _ in range(2):
+        begun, before = time.monotonic(), time.process_time()
+        tuning.map("varying", *axes, compensator)
+        took, spent = time.monotonic() - begun, time.process_time() - before
+    print(f"\n{compensator}: 100 x 100 points, warm: {took:.1f} s, {spent:.1f} s of all cores' time")
+    # Of two cores, however busy others keep them.
+    assert spent < 2 * 20

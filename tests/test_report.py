@@ -1,0 +1,231 @@
+"""The page for a review board: what it refuses, that names stay text, and how it behaves in a browser."""
+
+import html
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import CHROMIUM, LAYOUT, Browser
+
+import jaxhil
+import tuning
+from jaxhil.runtime import digest
+from tuning.cli.commands.identify import SCHEMA
+
+SCRIPT = "<script>window.hurt = 1</script>"
+HOSTILE = f'x"\'>{SCRIPT}<img src=x onerror="window.hurt=1"> {{{{ 7 * 7 }}}} $\\frac$ &amp;'
+WIDTHS = (375, 1440)
+A4 = 703, 1017  # pixels within the margins
+
+
+def signed(document):
+    return {**document, "sha256": digest(document)}
+
+
+def identified(name=HOSTILE, **others):
+    """What `jaxhil identify` writes, with texts from elsewhere."""
+    estimate = {"key": name, "value": 1.0, "std": 0.1, "low": 0.8, "high": 1.2, "unit": name, "known": False}
+    check = {"name": name, "finding": name, "where": name, "there": False, "effect": 0.001}
+    document = {
+        "schema": SCHEMA, "estimates": [estimate], "checks": [check], "effect": 0.001, "limit": 0.01,
+        "verdict": "good", "reason": name, "notes": [name], "sources": {name: name}, "seed": 0,
+        "versions": {name: name}, "mechanism": {"name": name},
+    }  # fmt: skip
+    return signed({**document, **others})
+
+
+def mapped(name=HOSTILE):
+    """What `jaxhil map` writes."""
+    error = [[0.1, -0.02, None], [0.3, 0.0, 0.01]]
+    margin = {"low": None, "high": 4.0}
+    return signed({
+        "schema": "jaxhil/map/1", "mechanism": name, "compensator": name, "gains": {}, "limit": 0.01,
+        "seed": 0,
+        "x": {"key": name, "unit": name, "nominal": 2.0, "values": [1.0, 2.0, 3.0]},
+        "y": {"key": "b", "unit": "s", "nominal": 0.1, "values": [0.1, 0.2]},
+        "error": error, "restitution": error, "theory": {"none_because": name},
+        "spectral_radius": {"x": [1.0, 3.0], "y": [0.1, 0.2], "values": [[0.9, 1.1], [1.0, 1.2]]},
+        "nominal": {"error": -0.02, "restitution": 0.98, "growth": None,
+                    "margins": {"error": {"x": margin, "y": margin}, "spectral_radius": None}},
+    })  # fmt: skip
+
+
+def compared(name=HOSTILE):
+    """What `jaxhil compare` writes."""
+    figures = {name: {"rms": {"value": 0.1, "low": 0.05, "high": None}, "noise": {"value": None}}}
+    return signed({
+        "limit": 0.01, "seed": 0, "scenarios": 2, "judged": 4, "tuned": True,
+        "mechanisms": [{"mechanism": name, "laws": [{"law": name, "figures": figures}]}],
+    })  # fmt: skip
+
+
+@pytest.fixture
+def put(tmp_path):
+    def write(document, name="identification.json", folder="result"):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        text = document if isinstance(document, str) else json.dumps(document)
+        (tmp_path / folder / name).write_text(text)
+        return tmp_path / folder
+
+    return write
+
+
+def test_names_stay_text(put):
+    places = [
+        put(identified(), folder="a"),
+        put(mapped(), "map.json", "b"),
+        put(compared(), "compare.json", "c"),
+    ]
+    made = tuning.report(places)
+    page = made.html.decode()
+    assert made.verdict == "good" and "7 * 7" in page and "49 " not in page
+    # Of all that could run there is the page's own script alone; tags from a name are text.
+    assert page.count("<script>") == 1 and not re.search(r"<[^>]*\sonerror\s*=", re.sub(r'"[^"]*"', "", page))
+    assert page.count(html.escape(SCRIPT)) > 10
+    assert "script-src 'sha256-" in page and "default-src 'none'" in page
+
+
+def test_verdict_is_that_of_the_requirements(put):
+    made = tuning.report(put(identified(effect=0.02, verdict="bad")))
+    assert made.verdict == "bad" and "Bad: not every requirement is met." in made.html.decode()
+    [one] = made.requirements
+    assert one["margin"] == "-0.01" and one["result"] == "0.02" and one["verdict"] == "bad"
+    assert tuning.report(put(compared(), "compare.json", "c")).verdict == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("document", "said"),
+    [
+        (identified() | {"effect": 0.0}, "it was changed"),
+        (identified(estimates=[{"key": 1}]), "Expected `str`, got `int` - at `$.estimates[0].key`"),
+        (identified(schema="other/1"), "found the schema 'other/1'"),
+        (signed(mapped() | {"error": [[0.0]]}), "tables that do not fit their axes"),
+        ({"some": "thing"}, "no schema of jaxhil"),
+        ([1, 2], "found no JSON object"),
+        ('{"schema": NaN}', "found no JSON"),
+        ("[" * 100_000, "found no JSON"),
+        ({"schema": "jaxhil/gains/1"}, "sha256: found nothing"),
+    ],
+)
+def test_foreign_results_are_refused_in_one_line(jaxhil, put, tmp_path, document, said):
+    ended = jaxhil("report", put(document), "-o", tmp_path / "page.html")
+    assert ended.code == 2 and said in ended.err and ended.err.count("\n") == 1
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_arguments_are_checked(jaxhil, put, tmp_path):
+    one = put(identified())
+    for arguments, said in (
+        ([], "found nothing"),
+        ([one, one], "one of each kind"),
+        ([tmp_path / "none"], "cannot be read"),
+        ([tmp_path], "found no result"),
+        ([one, "-o", tmp_path / "page.png"], "ends in .html"),
+    ):
+        ended = jaxhil("report", *arguments)
+        assert ended.code == 2 and said in ended.err, arguments
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    """A whole way, with a name from elsewhere: tuned, swept, compared, mapped, exported."""
+    place = tmp_path_factory.mktemp("results")
+    mechanism = jaxhil.load("varying", {"name": HOSTILE, "rig.force_sensor.noise_std": 0.5})
+    tuned = tuning.tune(mechanism, "phase_lead", scenarios=16, starts=1)
+    tuned.save(place / "gains.json")
+    study = tuning.sweep(
+        place / "gains.json", scenarios=1500, folder=place / "sweep", drivers=64, rare=0.9, limit=0.5
+    )
+    tuning.export(tuned, place / "bundle", sweep=study, false_alarms=1.0, missed=1.0)
+    axes = "contact.stiffness", "rig.force_sensor.delay"
+    tuning.map(mechanism, *axes, "phase_lead", tuned.gains, points=12, folder=place / "map")
+    return [place / name for name in ("gains.json", "sweep", "bundle", "map")]
+
+
+@pytest.fixture(scope="module")
+def whole(results, tmp_path_factory):
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    made = tuning.report(results)
+    made.save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    if CHROMIUM is None:
+        pytest.skip("no Chromium")
+    browser = Browser(tmp_path_factory.mktemp("browser"))
+    yield browser
+    browser.close()
+
+
+@pytest.mark.slow
+def test_all_that_is_known_is_there(whole):
+    text = whole.read_text(encoding="utf-8")
+    for place in ("requirements", "assumptions", "gains", "runs", "errors", "drivers", "watchdog", "map",
+                  "reproduction", "sign-off"):  # fmt: skip
+        assert f'<section id="{place}">' in text
+    assert text.count('class="trace"') > 10 and "jaxhil replay" in text and "jaxhil sweep" in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", WIDTHS)
+def test_the_page_opens_offline(whole, browser, width):
+    assert browser.open(whole, width) == ([], [], [])
+    seen = browser.evaluate(LAYOUT)
+    assert seen["faults"] == [] and seen["texts"] > 100
+    assert browser.evaluate("window.hurt") is None
+
+
+SHOWN = "[...document.querySelectorAll('.trace')].filter(one => one.checkVisibility()).map(one => one.id)"
+
+
+@pytest.mark.slow
+def test_a_click_on_a_scenario_shows_its_trace(whole, browser):
+    browser.open(whole, 1440)
+    first = browser.evaluate(SHOWN)
+    links = browser.evaluate(
+        "[...document.querySelectorAll('.picture a')].map(one => one.getAttribute('href'))"
+    )
+    assert len(first) == 1 and {f"#{one}" for one in first} < set(links)
+    wanted = next(link for link in links if link != f"#{first[0]}")
+    browser.click(f".picture a[href='{wanted}']")
+    assert browser.evaluate(SHOWN) == [wanted[1:]]
+    assert browser.evaluate(f"document.querySelector('{wanted} svg').getBoundingClientRect().height") > 100
+
+
+@pytest.mark.slow
+def test_pictures_are_magnified(whole, browser):
+    browser.open(whole, 1440)
+    seen = "+document.querySelector('.picture svg').getAttribute('viewBox').split(' ')[2]"
+    before = browser.evaluate(seen)
+    browser.click(".buttons button")
+    assert browser.evaluate(seen) == pytest.approx(before / 1.6)
+
+
+@pytest.mark.slow
+def test_the_page_is_accessible(whole, browser):
+    """axe-core finds nothing serious; it would take minutes in the pictures, which have names as a whole."""
+    package = pytest.importorskip("axe_core_python")
+    axe = (Path(package.__file__).parent / "axe.min.js").read_text(encoding="utf-8")
+    for width in WIDTHS:
+        browser.open(whole, width)
+        browser.evaluate(f"{axe}; 0")
+        script = """axe.run({ exclude: ['.picture svg > g'] }, { resultTypes: ['violations'] })
+            .then(told => told.violations.map(one => [one.impact, one.id, one.nodes[0].target.join(' ')]))"""
+        found = browser.evaluate(script)
+        assert [one for one in found if one[0] in ("serious", "critical")] == []
+
+
+@pytest.mark.slow
+def test_no_figure_is_cut_on_paper(whole, browser):
+    """All that stands on a page fits on one, and nothing is broken between two."""
+    browser.open(whole, 1440)
+    pages, figures = browser.printed(*A4, "figure, .picture svg, tr")
+    assert pages > 3 and len(figures) > 20
+    for tag, width, height, breaks in figures:
+        assert width <= A4[0] + 1 and height <= A4[1], (tag, width, height)
+        assert tag == "svg" or breaks == "avoid"
+    assert np.max([height for tag, _, height, _ in figures if tag == "svg"]) > 200

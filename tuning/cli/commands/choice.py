@@ -1,0 +1,36 @@
+"""What a command is to run: from --compensator, --gains, --setting and FILE."""
+
+from pathlib import Path
+
+from jaxhil.errors import InputError, one_line, shown
+from jaxhil.mechanism.file import from_builtins, to_builtins
+from jaxhil.mechanism.structs import Mechanism
+from tuning.cli.options import Simulate
+from tuning.cli.options_report import Map
+from tuning.front_door import arguments
+
+
+def chosen(options: Simulate | Map, mechanism: Mechanism | None) -> tuple[Mechanism, str, str | Path | None]:
+    """Mechanism, compensator, and its setting or gain file, if one is given.
+
+    `mechanism` is that of FILE, None where a gain file's is meant. Raises `InputError`; imports jax."""
+    if options.gains is None:
+        assert mechanism is not None
+        compensator = options.compensator or "none"
+        arguments.setting(compensator, options.setting)
+        return mechanism, compensator, options.setting
+
+    from jaxhil.simulation.gain_file import load_gain_file
+
+    if options.setting is not None:
+        raise InputError(f"--setting: found {shown(options.setting)}, allowed none beside a gain file")
+    loaded = load_gain_file(options.gains)
+    label = one_line(options.gains)
+    if options.compensator not in (None, loaded.compensator):
+        raise InputError(
+            f"--compensator: found {options.compensator}, allowed {loaded.compensator}, which {label} is for"
+        )
+    if mechanism is None:
+        raw = to_builtins(loaded.mechanism)
+        mechanism = from_builtins(raw, label, options.overrides, options.unset)
+    return mechanism, loaded.compensator, Path(options.gains)

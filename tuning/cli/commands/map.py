@@ -1,0 +1,88 @@
+"""`jaxhil map`: the restitution error over two keys of a mechanism."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from jaxhil.errors import one_line
+from jaxhil.mechanism.file import load
+from jaxhil.simulation.environment import prepare
+from tuning import terminal
+from tuning.cli.commands import checks
+from tuning.cli.commands.choice import chosen
+from tuning.cli.options_report import Map
+from tuning.front_door import arguments, meaning
+from tuning.front_door.map import DOCUMENT, MOST_POINTS, PICTURE, map
+
+
+def run(options: Map) -> int:
+    """Compute, write and report the map; 0."""
+    arguments.limit(options.limit)
+    arguments.integers(2, MOST_POINTS, points=options.points)
+    arguments.integers(0, seed=options.seed)
+    if options.compensator is not None:
+        arguments.compensators([options.compensator])
+    mechanism = None
+    if options.gains is None or options.file is not None:
+        mechanism = load(options.file, options.overrides, options.unset).mechanism
+    target = Path(options.output)
+    checks.output(target)
+    checks.own_results(target / DOCUMENT, "theory", [PICTURE])
+    prepare()
+    mechanism, compensator, gains = chosen(options, mechanism)
+    made = map(
+        mechanism, options.x, options.y, compensator, gains,
+        limit=options.limit, points=options.points, seed=options.seed, folder=target, progress=True,
+    )  # fmt: skip
+    meaning.say(mechanism, None if options.json else terminal.emit_line)
+    if options.json:
+        terminal.emit_json(made.document)
+    else:
+        terminal.emit(*_lines(made.document))
+        terminal.emit_line(f"Wrote {one_line(str(target / DOCUMENT))} and {PICTURE}")
+    return 0
+
+
+def _lines(document: Mapping[str, Any]) -> Iterator[str]:
+    """The nominal point, its margins, and what theory does not say and why."""
+    nominal, limit = document["nominal"], document["limit"]
+    error = nominal["error"]
+    if error is None:
+        yield "Nominal: a contact did not end."
+    else:
+        kind = "divergence" if error > 0 else "convergence"
+        within = "within" if abs(error) <= limit else "beyond"
+        yield f"Nominal: largest error {error:+.4f} ({kind}), {within} {limit:g}."
+    if (margins := nominal["margins"]["error"]) is not None:
+        yield from (f"{text}, within {limit:g}." for text in _margins(document, margins))
+    growth = nominal["growth"]
+    if growth is None:
+        yield f"No spectral radius: {document['spectral_radius']['none_because']}."
+    else:
+        radius, rate = growth["spectral_radius"], growth["per_second"]
+        said = f"{'grows' if rate > 0 else 'decays'} by {abs(rate):.4g} per second"
+        said += f" at {growth['frequency']:.3g} Hz"
+        half = growth["per_half_oscillation"]
+        factor = "" if half is None else f", by the factor {half:.4f} over half an oscillation"
+        yield f"A contact that lasts {said}{factor} (spectral radius {radius:.6f} a control period)."
+        if growth["by_gain"]:
+            slopes = ", ".join(f"{slope:+.3g} by {name}" for name, slope in growth["by_gain"].items())
+            yield f"Derivative of the spectral radius, in SI units: {slopes}."
+        if (margins := nominal["margins"]["spectral_radius"]) is not None:
+            yield from (
+                f"{text}, with a spectral radius of at most 1." for text in _margins(document, margins)
+            )
+    if (reason := document["theory"]["none_because"]) is not None:
+        yield f"No closed form beside it: {reason}."
+
+
+def _margins(document: Mapping[str, Any], margins: Mapping[str, Any]) -> Iterator[str]:
+    for axis in "xy":
+        known, values = margins[axis], document[axis]["values"]
+        ends = [
+            f"{document[axis]['values'][place]:.4g} (the map's end)"
+            if known[end] is None
+            else f"{known[end]:.4g}"
+            for end, place in (("low", 0), ("high", len(values) - 1))
+        ]
+        yield f"{document[axis]['key']}: from {ends[0]} to {ends[1]} {document[axis]['unit']}"

@@ -1,0 +1,67 @@
+"""The options of `jaxhil map` and `jaxhil report`, as tyro reads them."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from tuning.cli.options import Json, OptionalFile, Overrides, Setting, Unset, folder, number, text
+
+AXIS = "PATH[=LOW:HIGH]"
+
+
+@dataclass(frozen=True)
+class Map:
+    """Stability map: the restitution error over two keys, its contours, and what theory says there.
+
+    Example: jaxhil map rig-300kg --x contact.stiffness=5e4:5e5 --y rig.force_sensor.delay
+
+    Writes DIR/map.json and DIR/map.png. The gains are the nominal ones at every point.
+    """
+
+    x: Annotated[
+        str,
+        text(
+            AXIS,
+            "Key along x, in SI units, or gains.NAME. Without ends: what is drawn of it, else 0.3 to 3 times "
+            "its value; of a gain its bounds.",
+        ),
+    ]
+    y: Annotated[str, text(AXIS, "Key along y, likewise.")]
+    file: OptionalFile = None
+    compensator: Annotated[
+        str | None, arg(metavar="NAME", help="Compensator, at the literature's gains; 'none' by default.")
+    ] = None
+    setting: Setting = None
+    gains: Annotated[
+        str | None,
+        arg(metavar="GAINS", help="Gain file: its compensator and gains and, without FILE, its mechanism."),
+    ] = None
+    overrides: Overrides = ()
+    unset: Unset = ()
+    points: Annotated[int, number("Points along either axis.")] = 100
+    output: Annotated[str, folder("Folder for what is written.")] = "jaxhil-out/map"
+    limit: Annotated[float, arg(metavar="NUMBER", help="Restitution error to which margins are told.")] = 0.01
+    seed: Annotated[int, number("Seed of the sensor noise, the same at every point.")] = 0
+    json: Json = False
+
+
+@dataclass(frozen=True)
+class Report:
+    """One HTML page for a review board, of what identify, tune, sweep, compare, map and export wrote.
+
+    Example: jaxhil report jaxhil-out/varying jaxhil-out/varying/gains-sweep jaxhil-out/bundle
+
+    It needs nothing else, and is readable without JavaScript and on paper. Exit code 1 if its verdict is bad.
+    """
+
+    results: Annotated[
+        Positional[tuple[str, ...]],
+        text(
+            "RESULT [RESULT ...]", "Results of one mechanism, at most one of each command: folders or files."
+        ),
+    ] = ()
+    output: Annotated[str, text("FILE", "The page; by default jaxhil-out/report.html.", aliases=("-o",))] = (
+        "jaxhil-out/report.html"
+    )
+    json: Json = False

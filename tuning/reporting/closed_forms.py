@@ -1,0 +1,114 @@
+"""What theory says of an uncompensated contact behind a pure delay (notebooks/guide/model.md, section 6).
+
+Items 1 and 2 hold for linear contact without damping, item 5 for Kelvin-Voigt contact, both of them in the
+limit of a small control period, of which what is left is its mean delay (item 7).
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import lambertw
+
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.scenario import Scenario
+
+TERMS = 40  # of the series; 4.5^81/81! is far below rounding
+LONGEST_DELAY = 1.0  # omega tau up to which the series has its first zero before 4.5/omega
+ENTRIES = 2049  # of a table of the series, between which straight lines miss less than 1e-6
+INTEGRATORS = {"semi_implicit_euler": 0.0, "zoh": 0.5, "explicit_euler": 1.0}  # own delay, periods
+
+
+class ClosedForms(NamedTuple):
+    """Of every lane of a batch; None where a form does not apply."""
+
+    series: np.ndarray | None  # restitution e, item 1 [1]
+    characteristic_root: np.ndarray | None  # restitution e, item 2 [1]
+    # the delay over the one from which a lasting contact grows, item 5 [1]
+    delay_over_critical: np.ndarray | None
+    reason: str | None  # why none applies
+
+
+def closed_forms(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> ClosedForms:
+    """What applies to a batch of scenarios of a mechanism, of its stiffest contact each."""
+    reason = _reason(mechanism, compensator, scenarios)
+    if reason:
+        return ClosedForms(None, None, None, reason)
+    contacts = mechanism.approach.contacts
+    stiffness = np.max(np.asarray(scenarios.contact.stiffness)[:contacts], axis=0)
+    damping = np.max(np.asarray(scenarios.contact.damping)[:contacts], axis=0)
+    mass, delay = np.asarray(scenarios.equivalent_mass), mean_delay(mechanism, scenarios)
+    if np.all(damping > 0):
+        return ClosedForms(None, None, delay / critical_delay(mass, stiffness, damping), None)
+    phase = np.sqrt(stiffness / mass) * delay
+    return ClosedForms(series(phase), characteristic_root(phase), None, None)
+
+
+def mean_delay(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
+    """All that delays the force behind the motion of an ideal motion simulator [s]: its own delay and the
+    sensor's, and of the control period the share of integrator, latency and hold (item 7)."""
+    rig = mechanism.rig
+    periods = INTEGRATORS[rig.integrator] + rig.command_latency - 0.5 * (rig.command_hold == "zoh")
+    sensed = np.asarray(scenarios.force_sensor.delay) + np.asarray(scenarios.simulator.delay)
+    return sensed + periods * np.asarray(scenarios.control_period)
+
+
+def series(phase: np.ndarray) -> np.ndarray:
+    """Restitution of x'' = -omega^2 x(t - tau) at phase = omega tau, where 0 <= phase <= 1, else NaN: the
+    motion S(t) = sum_n (-1)^n (t - n tau)^(2n+1)/(2n+1)!, from its first zero t_s on for tau, |S'(t_s + tau)|
+    (item 1), time in units of 1/omega."""
+    table = np.linspace(0.0, LONGEST_DELAY, ENTRIES)
+    low, high = np.full_like(table, 2.0), np.full_like(table, 4.5)
+    for _ in range(50):
+        middle = (low + high) / 2
+        before = _motion(middle, table, 0) > 0
+        low, high = np.where(before, middle, low), np.where(before, high, middle)
+    rebound = np.abs(_motion(low + table, table, 1))
+    phase = np.asarray(phase, float)
+    return np.where((phase >= 0) & (phase <= LONGEST_DELAY), np.interp(phase, table, rebound), np.nan)
+
+
+def characteristic_root(phase: np.ndarray) -> np.ndarray:
+    """Restitution exp(pi Re s/|Im s|) at phase = omega tau >= 0, by the root s = (2/tau) W_0(j omega tau/2)
+    of s^2 = -omega^2 e^(-s tau) (item 2)."""
+    phase = np.asarray(phase, float)
+    root = lambertw(0.5j * np.where(phase > 0, phase, 1.0))
+    with np.errstate(divide="ignore"):
+        grown = np.exp(math.pi * root.real / np.abs(root.imag))
+    return np.where(phase > 0, grown, np.where(phase == 0, 1.0, np.nan))
+
+
+def critical_delay(mass: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> np.ndarray:
+    """tau_c [s] beyond which M x'' + b x'(t - tau) + k x(t - tau) = 0 grows (item 5)."""
+    square = (damping**2 + np.sqrt(damping**4 + 4 * mass**2 * stiffness**2)) / (2 * mass**2)
+    frequency = np.sqrt(square)
+    return np.arctan(damping * frequency / stiffness) / frequency
+
+
+def _reason(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> str | None:
+    """Why no closed form applies, if none does."""
+    damping = np.asarray(scenarios.contact.damping)[: mechanism.approach.contacts]
+    if compensator != "none":
+        return "there is a compensation"
+    if mechanism.contact.law not in ("linear", "kelvin_voigt"):
+        return f"the contact law is {mechanism.contact.law}"
+    if mechanism.rig.simulator.model != "ideal":
+        return f"the motion simulator is {mechanism.rig.simulator.model}"
+    if np.any(np.asarray(scenarios.force_sensor.time_constant) > 0):
+        return "the force sensor has a lag"
+    if np.any(np.isfinite(np.asarray(scenarios.clearance))):
+        return "there are two surfaces"
+    if np.any(damping > 0) and not np.all(damping > 0):
+        return "some contacts are damped and some are not"
+    return None
+
+
+def _motion(time: np.ndarray, delay: np.ndarray, derivative: int) -> np.ndarray:
+    """S, or its derivative, where it is made of no more than `TERMS` terms, elementwise."""
+    total = np.zeros_like(time)
+    for n in range(TERMS):
+        power = 2 * n + 1 - derivative
+        since = np.maximum(time - n * delay, 0.0)
+        term = since**power / math.factorial(power)
+        total += np.where(time > n * delay, (-1) ** n * term, 0.0)
+    return total

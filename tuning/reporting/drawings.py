@@ -1,0 +1,203 @@
+"""Pictures of a report: those of the other commands, as SVG that stands in the page itself.
+
+Nothing is drawn by a script: the pictures are there without JavaScript and on paper. A scenario's point is a
+link to its trace. (A plotting library in the page would add more than 3 MB, and show nothing on paper.)
+"""
+
+import html
+import io
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import matplotlib.style
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+from jaxhil.compensators import literature_gains
+from jaxhil.simulation.contact_plot import BLACK, GREEN, SKY, VERMILION, contact_plot, finish, new_figure
+from jaxhil.simulation.gain_file import LoadedGains
+from jaxhil.simulation.motion import nominal_motion
+from tuning.reporting.closed_forms import ClosedForms
+from tuning.reporting.contact_growth import Growth
+from tuning.reporting.documents import AxisOfMap, MapDocument, WorstScenario
+from tuning.reporting.map_axes import MapAxis
+from tuning.reporting.map_grid import Map, Margin, Nominal, Radii
+from tuning.reporting.map_picture import map_picture
+from tuning.sweeps.chunks import build_sweep
+from tuning.sweeps.pictures import plain_ticks
+from tuning.sweeps.regions import Points, add_rows, empty_regions, make_plan
+from tuning.sweeps.replay import motion_of
+from tuning.sweeps.store import Store, kept_part
+
+TYPICAL = 6  # scenarios with traces besides the worst, at equal distances in the order of their errors
+IDENTIFIER = re.compile(r'<g id="[^"]*"')
+LINK = re.compile(r'<a xlink:href="#scenario-(\d+)"[^>]*>')
+
+
+class Drawing(NamedTuple):
+    """A picture in a page."""
+
+    svg: str
+    says: str  # what it shows, for those who do not see it
+    caption: str
+
+
+class Trace(NamedTuple):
+    """A scenario's run."""
+
+    index: int
+    text: str  # how it ended
+    drawing: Drawing
+
+
+def nominal_drawing(subject: LoadedGains) -> Drawing:
+    """The nominal run uncompensated, under the literature's gains and under those of the file."""
+    law = subject.compensator
+    laws = {"before": ("none", {}), "literature": (law, literature_gains(subject.mechanism, law))}
+    if law == "none":
+        laws = {}
+    motion = nominal_motion(subject.mechanism, {**laws, "tuned": (law, subject.gains)})
+    figure = contact_plot(motion, f"{subject.mechanism.name}, nominal run: {law}", sensors="tuned")
+    return Drawing(as_svg(figure), "Force and position over time of every contact", "The nominal run.")
+
+
+def map_drawing(found: MapDocument) -> Drawing:
+    """The stability map."""
+    title = f"{found.mechanism}, compensation: {found.compensator}"
+    figure = map_picture(_map_of(found), title, np.inf if found.limit is None else found.limit)
+    says = f"Restitution error over {found.x.key} and {found.y.key}"
+    return Drawing(as_svg(figure), says, f"{says}, under gains that stay the same.")
+
+
+def sweep_drawings(
+    store: Store, worst: Sequence[WorstScenario], say: Callable[[str], None]
+) -> tuple[Drawing, list[Trace]]:
+    """Errors of scenarios as points, and the traces of the worst and of some others, which points lead to."""
+    sweep = build_sweep(store.manifest)
+    plan = regions = None
+    for part in range(store.manifest.parts):
+        rows = kept_part(store, part)
+        if rows is None:
+            break
+        plan = plan or make_plan(store.manifest, sweep.mechanism, rows)
+        regions = add_rows(plan, regions or empty_regions(plan), rows)
+    assert plan is not None and regions is not None
+    points = regions.points
+    texts = {one.index: _ended(one.outcome, one.worst_error, one.worst_contact) for one in worst}
+    for place in _typical(points):
+        texts.setdefault(int(points.index[place]), f"|e - e*| at most {points.size[place]:.4g}")
+    name = sweep.mechanism.name
+    figure = _points_figure(name, plan.per_scenario, points, store.manifest.limit, list(texts))
+    caption = "Scenarios of the sweep. A ringed one leads to its trace below."
+    drawing = Drawing(as_svg(figure, texts), "Worst error of scenarios over the inputs drawn", caption)
+    traces = []
+    for index, text in texts.items():
+        say(f"scenario {index}")
+        shown = contact_plot(motion_of(sweep, index), f"{name}, scenario {index}", sensors="rig")
+        own = Drawing(as_svg(shown), f"Force and position over time of scenario {index}", f"{text}.")
+        traces.append(Trace(index, text, own))
+    return drawing, traces
+
+
+@matplotlib.style.context("default")
+def as_svg(figure: Figure, points: Mapping[int, str] | None = None) -> str:
+    """A figure as an element of a page; links to scenarios, `points`, say how these ended."""
+    content = io.StringIO()
+    FigureCanvasSVG(figure)
+    # Equal figures give equal elements, and what one defines has no name that another's has.
+    with rc_context({"svg.hashsalt": "jaxhil", "svg.fonttype": "none"}):
+        figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})
+    svg = content.getvalue()
+    svg = IDENTIFIER.sub("<g", svg[svg.index("<svg") :])
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.S)
+
+    def link(match: re.Match[str]) -> str:
+        index = int(match[1])
+        said = html.escape(f"scenario {index}: {(points or {}).get(index, '')}")
+        return f'<a href="#scenario-{index}" aria-label="{said}"><title>{said}</title>'
+
+    return LINK.sub(link, svg).replace("xlink:href", "href")
+
+
+@matplotlib.style.context("default")
+def _points_figure(
+    name: str, inputs: Sequence[Any], points: Points, limit: float | None, linked: Sequence[int]
+) -> Figure:
+    number = max(1, len(inputs))
+    figure = new_figure((5.4 * number + 0.6, 4.6), f"{name}: worst error of scenarios", below=0.95)
+    panels: Any = figure.subplots(1, number, squeeze=False)[0]
+    places = {int(index): place for place, index in enumerate(points.index)}
+    ringed = [places[index] for index in linked if index in places]
+    finite = points.size[np.isfinite(points.size) & (points.size > 0)]
+    high = 1.5 * max([*finite, limit or 0.0, 1e-6])
+    shown = np.clip(np.where(np.isfinite(points.size), points.size, high), 1e-4 * high, None)
+    for place, axes in enumerate(panels):
+        across = points.inputs[place] if inputs else points.index
+        for which, label, colour, marker in (
+            (~points.failed, "not failed", SKY, "."), (points.failed, "failed", VERMILION, "x"),
+        ):  # fmt: skip
+            if np.any(which):
+                axes.plot(across[which], shown[which], linestyle="none", marker=marker, markersize=3,
+                          color=colour, label=label, rasterized=True)  # fmt: skip
+        rings = axes.scatter(across[ringed], shown[ringed], s=55, facecolors=(1, 1, 1, 0.6), edgecolors=BLACK,
+                             linewidths=1.3, label="with a trace", zorder=4)  # fmt: skip
+        rings.set_urls([f"#scenario-{int(points.index[one])}" for one in ringed])
+        if limit:
+            axes.axhline(limit, color=GREEN, linewidth=1.5, linestyle="--", label=f"limit {limit:g}")
+        label = inputs[place].label if inputs else "scenario [1]"
+        axes.set(yscale="log", xlabel=label, ylabel="worst |e - e*| of the scenario [1]")
+        plain_ticks(axes.yaxis, *axes.get_ylim())
+        if inputs and inputs[place].logarithmic:
+            axes.set_xscale("log")
+            plain_ticks(axes.xaxis, *axes.get_xlim())
+        finish(axes, None)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower center", ncols=len(labels), fontsize=9, frameon=False)
+    return figure
+
+
+def _typical(points: Points) -> list[int]:
+    """Places of scenarios between the smallest and the largest error."""
+    order = np.argsort(points.size, kind="stable")
+    order = order[np.isfinite(points.size[order])]
+    wanted = np.linspace(0, len(order) - 1, TYPICAL + 1)[:-1].round().astype(int) if len(order) else []
+    return [int(order[place]) for place in dict.fromkeys(wanted)]
+
+
+def _ended(outcome: str, error: float | None, contact: int | None) -> str:
+    if error is None:
+        return outcome
+    return f"{outcome}, e - e* = {error:+.4f}" + ("" if contact is None else f" in contact {contact}")
+
+
+def _map_of(found: MapDocument) -> Map:
+    """The map that a document describes."""
+
+    def table(values: Any) -> Any:
+        return None if values is None else np.array(values, float)
+
+    def axis(one: AxisOfMap) -> MapAxis:
+        return MapAxis(one.key, "", (), one.unit, one.nominal, one.values[0], one.values[-1])
+
+    theory, radius, nominal = found.theory, found.spectral_radius, found.nominal
+    closed = ClosedForms(
+        table(theory.series), table(theory.characteristic_root), table(theory.delay_over_critical),
+        theory.none_because,
+    )  # fmt: skip
+    radii = None if radius.values is None else Radii(table(radius.x), table(radius.y), table(radius.values))
+    margins = [
+        None if one is None else tuple(Margin(one[axis].low, one[axis].high) for axis in "xy")
+        for one in (nominal.margins.error, nominal.margins.spectral_radius)
+    ]
+    grown = None
+    if (own := nominal.growth) is not None:
+        half = own.per_half_oscillation
+        grown = Growth(own.spectral_radius, own.per_second, half, own.frequency, own.by_gain)
+    point = Nominal(nominal.restitution, nominal.error, grown, *margins)  # pyright: ignore[reportArgumentType]
+    return Map(
+        (axis(found.x), axis(found.y)), table(found.x.values), table(found.y.values),
+        table(found.restitution), table(found.error), closed, radii, radius.none_because, point,
+    )  # pyright: ignore[reportArgumentType]  # fmt: skip

@@ -1,0 +1,191 @@
+"""A stability map: the restitution error over two keys, what theory says there, how far the nominal point is
+from where it ends.
+
+Gains stay what they are over the whole map: it shows what a controller meets that is not told. All points,
+and two lines through the nominal one, are lanes of one program.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.evaluation import Outcome, evaluate
+from jaxhil.simulation.scenario import Scenario, build_scenarios
+from tuning.reporting.closed_forms import ClosedForms, closed_forms
+from tuning.reporting.contact_growth import Growth, cost, growth, no_growth, spectral_radii
+from tuning.reporting.map_axes import MapAxis, draws
+
+LINE = 201  # points of each line through the nominal point
+MOST_WORK = 5e7  # of eigenvalues: where the whole map would take more, the spectral radius has a coarser grid
+FEWEST = 15  # points along an axis of that
+
+
+class Margin(NamedTuple):
+    """Where one key, going from its nominal value, meets a limit; None where the map ends first."""
+
+    low: float | None  # the nearest value below the nominal one [unit of the key]
+    high: float | None  # the nearest one above it
+
+
+class Radii(NamedTuple):
+    """The spectral radius of the loop in contact, over a grid of its own."""
+
+    x: np.ndarray  # (columns,)
+    y: np.ndarray  # (rows,)
+    values: np.ndarray  # (rows, columns) [1]
+
+
+class Nominal(NamedTuple):
+    """The point that the file describes."""
+
+    restitution: float | None  # e of the contact with the largest error [1]
+    error: float | None  # its e - e* [1]; None where a contact did not end
+    growth: Growth | None  # of a contact that lasts, where the loop in contact is linear
+    error_margins: tuple[Margin, Margin] | None  # along x and y, to the limit; None where the error is beyond
+    radius_margins: tuple[Margin, Margin] | None  # along x and y, to a spectral radius of 1
+
+
+class Map(NamedTuple):
+    """All that is known of a map."""
+
+    axes: tuple[MapAxis, MapAxis]  # x and y
+    x: np.ndarray  # (columns,), in the unit of its key
+    y: np.ndarray  # (rows,)
+    restitution: np.ndarray  # e of the contact with the largest error (rows, columns) [1]
+    error: np.ndarray  # its e - e* (rows, columns) [1]; NaN where a contact did not end
+    closed: ClosedForms  # each (rows, columns)
+    radii: Radii | None  # of a contact that lasts
+    no_growth: str | None  # why there are no radii
+    nominal: Nominal
+
+
+def compute_map(
+    mechanism: Mechanism,
+    compensator: str,
+    gains: Mapping[str, float],
+    axes: tuple[MapAxis, MapAxis],
+    points: int,
+    limit: float,
+    seed: int,
+    say: Callable[[str], None],
+) -> Map:
+    """The map of so many points along either axis."""
+
+    def batch(values: np.ndarray) -> tuple[dict[str, Any], Scenario]:
+        return _gains(gains, axes, values), _scenarios(mechanism, axes, values, seed)
+
+    x, y = (axis.values(points) for axis in axes)
+    lines = [axis.values(LINE) for axis in axes]
+    middle = np.array([[axis.nominal for axis in axes]])
+    across, up = np.repeat(middle, LINE, axis=0), np.repeat(middle, LINE, axis=0)
+    across[:, 0], up[:, 1] = lines
+    own, scenarios = batch(np.concatenate([_grid(x, y), across, up, middle]))
+    say(f"{points} x {points} runs")
+    outcome = evaluate(build_loop(mechanism, compensator, scenarios), own, scenarios)
+    restitution, error = _worst(outcome)
+    size = points**2
+
+    say("eigenvalues of the loop in contact")
+    reason = no_growth(mechanism, compensator)
+    radii = on_lines = grown = None
+    if reason is None:
+        own, at = batch(middle)
+        grown = growth(mechanism, compensator, {name: float(value) for name, value in gains.items()}, at)
+        few = min(points, max(FEWEST, int((MOST_WORK / cost(mechanism, compensator, scenarios)) ** 0.5)))
+        grid = [axis.values(few) for axis in axes]
+        values = np.concatenate([_grid(*grid), across, up])
+        own, at = batch(values)
+        found = spectral_radii(mechanism, compensator, own, at)
+        radii = Radii(grid[0], grid[1], found[: few**2].reshape(few, few))
+        on_lines = found[few**2 :].reshape(2, LINE)
+    closed = closed_forms(mechanism, compensator, batch(_grid(x, y))[1])
+    ended = np.isfinite(error[-1])
+    sizes = np.nan_to_num(np.abs(error[size:-1]), nan=np.inf).reshape(2, LINE)
+    nominal = Nominal(
+        restitution=float(restitution[-1]) if ended else None,
+        error=float(error[-1]) if ended else None,
+        growth=grown,
+        error_margins=_margins(axes, lines, sizes, limit) if ended and abs(error[-1]) <= limit else None,
+        radius_margins=(
+            _margins(axes, lines, on_lines, 1.0)
+            if on_lines is not None and grown is not None and grown.spectral_radius <= 1
+            else None
+        ),
+    )
+    return Map(
+        axes, x, y, restitution[:size].reshape(points, points), error[:size].reshape(points, points),
+        _reshaped(closed, points), radii, reason, nominal,
+    )  # fmt: skip
+
+
+def _grid(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Points of a grid row by row, (rows x columns, 2)."""
+    across, up = np.meshgrid(x, y)
+    return np.stack([across.ravel(), up.ravel()], axis=1)
+
+
+def _reshaped(closed: ClosedForms, points: int) -> ClosedForms:
+    """Rows and columns instead of lanes."""
+    series, root, critical = (None if one is None else one.reshape(points, points) for one in closed[:3])
+    return ClosedForms(series, root, critical, closed.reason)
+
+
+def _scenarios(
+    mechanism: Mechanism, axes: tuple[MapAxis, MapAxis], values: np.ndarray, seed: int
+) -> Scenario:
+    phase = {"approach.phase": np.full(len(values), mechanism.approach.phase)}
+    made = build_scenarios(mechanism, phase | draws(mechanism, axes, values), seed)
+    # The noise of every lane is that of the first.
+    return made._replace(key=np.broadcast_to(made.key[:, :1], made.key.shape))  # pyright: ignore[reportArgumentType]
+
+
+def _gains(gains: Mapping[str, float], axes: tuple[MapAxis, MapAxis], values: np.ndarray) -> dict[str, Any]:
+    """One value a lane of all of them where a gain varies."""
+    moving = {
+        axis.key.partition(".")[2]: values[:, place] for place, axis in enumerate(axes) if not axis.path
+    }
+    if not moving:
+        return dict(gains)
+    return {name: moving.get(name, np.full(len(values), value)) for name, value in gains.items()}
+
+
+def _worst(outcome: Outcome) -> tuple[np.ndarray, np.ndarray]:
+    """e and e - e* of each lane's contact with the largest error; NaN where one did not end."""
+    size = np.where(outcome.wanted & outcome.good, np.abs(outcome.error), -1.0)
+    place = np.argmax(size, axis=0)[None]
+    ended = ~np.any(outcome.wanted & ~outcome.good, axis=0)
+    return tuple(
+        np.where(ended, np.take_along_axis(np.asarray(one), place, axis=0)[0], np.nan)
+        for one in (outcome.metrics.restitution, outcome.error)
+    )  # pyright: ignore[reportReturnType]
+
+
+def _margins(
+    axes: tuple[MapAxis, MapAxis], lines: list[np.ndarray], values: np.ndarray, most: float
+) -> tuple[Margin, Margin]:
+    """Where `values` (axes, points) along the lines, each through the nominal point, first exceed `most`."""
+    found = []
+    for axis, line, along in zip(axes, lines, values, strict=True):
+        below, above = line < axis.nominal, line > axis.nominal
+        found.append(
+            Margin(
+                _crossing(line[below][::-1], along[below][::-1], most),
+                _crossing(line[above], along[above], most),
+            )
+        )
+    return found[0], found[1]
+
+
+def _crossing(line: np.ndarray, values: np.ndarray, most: float) -> float | None:
+    """The first place at which values exceed the most, between two points along a straight line."""
+    beyond = np.flatnonzero(values > most)
+    if not len(beyond):
+        return None
+    place = int(beyond[0])
+    if place == 0 or not np.isfinite(values[place]):
+        return float(line[place])
+    share = (most - values[place - 1]) / (values[place] - values[place - 1])
+    return float(line[place - 1] + share * (line[place] - line[place - 1]))

@@ -1,0 +1,157 @@
+"""The picture of a stability map, in the colours and units of the other pictures."""
+
+from typing import Any
+
+import matplotlib.style
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap, SymLogNorm
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
+
+from jaxhil.errors import one_line
+from jaxhil.simulation.contact_plot import BLACK, BLUE, GREEN, SKY, VERMILION, finish, new_figure
+from tuning.reporting.map_axes import MapAxis
+from tuning.reporting.map_grid import Map
+from tuning.sweeps.pictures import plain_ticks
+from tuning.sweeps.regions import NAMES, UNITS
+
+STEPS = [step * 10.0**power for power in range(-4, 2) for step in (1, 3)]  # errors that have a contour
+LARGEST = 10.0  # error that has a colour of its own
+FEW, MANY = 4, 20  # contours on either side at most, the outermost; ticks of the colour bar
+PALE = "#F7CF85"  # an orange on which black lines are seen
+
+
+@matplotlib.style.context("default")
+def map_picture(found: Map, title: str, limit: float) -> Figure:
+    """The signed error in colours, its contours, those of theory beside them, the nominal point with its
+    margins."""
+    figure = new_figure((8.6, 7.0), title, above=0.55, below=1.35)
+    figure.subplots_adjust(left=0.09, right=0.88)
+    axes = figure.subplots()
+    x, y = (_shown(axis, values) for axis, values in zip(found.axes, (found.x, found.y), strict=True))
+    handles = _draw_error(figure, axes, found, x, y, limit)
+    handles += _draw_growth(axes, found)
+    handles += _draw_theory(axes, found, x, y, limit)
+    handles += _draw_nominal(axes, found)
+    for axis, which in zip(found.axes, (axes.xaxis, axes.yaxis), strict=True):
+        low, high = _shown(axis, np.array([axis.low, axis.high]))
+        # A key is text, not a formula.
+        label = f"{NAMES.get(axis.key, one_line(axis.key, 60))} [{one_line(_unit(axis), 20)}]"
+        which.set_label_text(label.replace("$", r"\$"))
+        if axis.logarithmic:
+            (axes.set_xscale if which is axes.xaxis else axes.set_yscale)("log")
+            plain_ticks(which, low, high)
+        else:
+            which.set_major_locator(MaxNLocator(6, steps=(1, 2, 2.5, 5, 10)))
+        (axes.set_xlim if which is axes.xaxis else axes.set_ylim)(low, high)
+    finish(axes, None)
+    axes.grid(False)
+    figure.legend(handles=handles, loc="lower center", fontsize=8.5, frameon=False, ncols=2, handlelength=3.5)
+    return figure
+
+
+def _draw_error(
+    figure: Figure, axes: Axes, found: Map, x: np.ndarray, y: np.ndarray, limit: float
+) -> list[Any]:
+    error = found.error
+    anchors = [BLUE, SKY, "white", PALE, VERMILION]
+    colours = LinearSegmentedColormap.from_list("error", anchors).with_extremes(bad="0.75")
+    finite = np.abs(error[np.isfinite(error)])
+    drawn = limit if 0 < limit < np.inf else 0.01
+    most = float(np.clip(np.max(finite, initial=0.0), 3 * drawn, LARGEST))
+    mesh = axes.pcolormesh(
+        x, y, np.ma.masked_invalid(np.clip(error, -most, most)), cmap=colours, shading="nearest",
+        norm=SymLogNorm(drawn, vmin=-most, vmax=most), rasterized=True,
+    )  # fmt: skip
+    bar = figure.colorbar(mesh, ax=axes, pad=0.02, fraction=0.05)
+    bar.set_label("largest error of a contact, e - e* [1]  (above 0: divergence)")
+    bar.ax.yaxis.set_major_locator(FixedLocator([0.0, *_levels(np.array([-most, most]), drawn, MANY)]))
+    bar.ax.yaxis.set_minor_locator(NullLocator())
+    bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:+.3g}" if value else "0"))
+    handles: list[Any] = []
+    levels = [one for one in _levels(error, drawn) if abs(one) != drawn]
+    if levels:
+        lines = axes.contour(x, y, error, levels=levels, colors=BLACK, linewidths=0.8, linestyles="-")
+        axes.clabel(lines, fmt=lambda value: f"{value:+.2g}", fontsize=8)
+        handles.append(Line2D([], [], color=BLACK, linewidth=0.8, label="error as labelled"))
+    if np.any(finite <= drawn) and np.any(finite > drawn):
+        axes.contour(x, y, np.abs(error), levels=[drawn], colors=BLACK, linewidths=2.2)
+        handles.append(Line2D([], [], color=BLACK, linewidth=2.2, label=f"error of {drawn:g}, the limit"))
+    if np.any(~np.isfinite(error)):
+        handles.append(Patch(color="0.75", label="a contact did not end"))
+    return handles
+
+
+def _draw_theory(axes: Axes, found: Map, x: np.ndarray, y: np.ndarray, limit: float) -> list[Any]:
+    """The contours that theory has, at the levels of the map's own."""
+    handles: list[Any] = []
+    drawn = limit if 0 < limit < np.inf else 0.01
+    for values, colour, line, label in (
+        (found.closed.series, BLUE, (0, (5, 4)), "theory, small control period: series"),
+        (found.closed.characteristic_root, GREEN, (0, (1, 2)), "theory: characteristic root"),
+    ):
+        levels = [] if values is None else [one for one in _levels(found.error, drawn) if one > 0]
+        if values is not None and levels:
+            axes.contour(x, y, values - 1, levels=levels, colors=colour, linewidths=2.0, linestyles=[line])
+            handles.append(Line2D([], [], color=colour, linewidth=2.0, linestyle=line, label=label))
+    critical = found.closed.delay_over_critical
+    if critical is not None and np.min(critical) < 1 < np.max(critical):
+        style: dict[str, Any] = {"linestyles": [(0, (5, 4))], "linewidths": 2.2}
+        axes.contour(x, y, critical, levels=[1.0], colors=BLUE, **style)
+        label = "theory, small control period: growth limit"
+        handles.append(Line2D([], [], color=BLUE, linewidth=2.2, linestyle=(0, (5, 4)), label=label))
+    return handles
+
+
+def _draw_growth(axes: Axes, found: Map) -> list[Any]:
+    """Where the spectral radius of a contact that lasts is 1."""
+    radii = found.radii
+    if radii is None or not np.min(radii.values) < 1 < np.max(radii.values):
+        return []
+    x, y = (_shown(axis, one) for axis, one in zip(found.axes, (radii.x, radii.y), strict=True))
+    axes.contour(x, y, radii.values, levels=[1.0], colors=GREEN, linewidths=2.2)
+    label = "spectral radius 1: beyond, a contact that lasts grows"
+    return [Line2D([], [], color=GREEN, linewidth=2.2, label=label)]
+
+
+def _draw_nominal(axes: Axes, found: Map) -> list[Any]:
+    point = [float(_shown(axis, np.array(axis.nominal))) for axis in found.axes]
+    style: dict[str, Any] = {
+        "marker": "o",
+        "markersize": 8,
+        "markerfacecolor": "white",
+        "markeredgecolor": BLACK,
+    }
+    axes.plot(*point, label="nominal", linestyle="none", markeredgewidth=1.6, zorder=5, **style)
+    label = "nominal"
+    if found.nominal.error_margins is not None:
+        label = "nominal, and how far either key may go within the limit"
+        for place, (axis, margin) in enumerate(zip(found.axes, found.nominal.error_margins, strict=True)):
+            ends = [
+                axis.low if margin.low is None else margin.low,
+                axis.high if margin.high is None else margin.high,
+            ]
+            line = [list(_shown(axis, np.array(ends))), [point[1 - place]] * 2]
+            axes.plot(*(line if place == 0 else line[::-1]), color=BLACK, linewidth=1.2, linestyle=":")
+    return [Line2D([], [], linestyle=":" if "and" in label else "none", color=BLACK, label=label, **style)]
+
+
+def _levels(error: np.ndarray, limit: float, most: int = FEW) -> list[float]:
+    """Errors that contours are drawn of: 1 and 3 in each decade, and the limit, within what there is."""
+    sizes = sorted({limit, *(one for one in STEPS if one > 1.5 * limit)})
+    low, high = np.nanmin(error, initial=0.0), np.nanmax(error, initial=0.0)
+    above = [one for one in sizes if one < high][-most:]
+    below = [-one for one in sizes if -one > low][-most:]
+    return sorted([*below, *above])
+
+
+def _unit(axis: MapAxis) -> str:
+    return UNITS.get(axis.unit, (1.0, axis.unit))[1]
+
+
+def _shown(axis: MapAxis, values: np.ndarray) -> np.ndarray:
+    """Values in the unit of the picture."""
+    return UNITS.get(axis.unit, (1.0, axis.unit))[0] * values

@@ -1,0 +1,62 @@
+"""The page of a review board: one HTML file with all in it, readable without JavaScript and on paper.
+
+Whatever comes from a file is text: the template escapes it, and the page's own policy lets no script run but
+its own, which only magnifies pictures.
+"""
+
+import base64
+import hashlib
+from collections.abc import Callable
+from importlib import resources
+
+import jinja2
+from markupsafe import Markup
+
+from tuning.reporting import content, study_sections
+from tuning.reporting.content import Section
+from tuning.reporting.reading import Results
+
+TEMPLATE, SCRIPT, STYLE = "page.html.jinja", "magnify.js", "page.css"
+HEADLINES = {
+    content.GOOD: "Good: every requirement is met.",
+    content.BAD: "Bad: not every requirement is met.",
+    content.UNKNOWN: "Not decided: what was given does not show that every requirement is met.",
+}
+
+
+def page(results: Results, say: Callable[[str], None] = lambda _: None) -> bytes:
+    """The page of what was read."""
+    found = content.requirements(results)
+    verdict = content.verdict_of(found)
+    sections: list[Section | None] = [
+        content.assumptions(results),
+        content.identification(results),
+        content.gains(results),
+        study_sections.runs(results, say),
+        study_sections.errors(results),
+        study_sections.drivers(results),
+        study_sections.comparison(results),
+        content.watchdog(results),
+        study_sections.stability_map(results, say),
+        study_sections.reproduction(results),
+    ]
+    script = _text(SCRIPT)
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    made = environment.from_string(_text(TEMPLATE)).render(
+        title=content.title_of(results),
+        verdict=verdict,
+        headline=HEADLINES[verdict],
+        requirements=found,
+        sections=[one for one in sections if one is not None],
+        style=Markup(_text(STYLE)),
+        script=Markup(script),
+        script_sha256=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+        drawn=Markup,
+    )
+    return made.encode("utf-8")
+
+
+def _text(name: str) -> str:
+    return (resources.files("tuning.reporting") / name).read_text(encoding="utf-8")
