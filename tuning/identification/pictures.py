@@ -119,14 +119,15 @@ def contacts(contact: ContactFit) -> Figure:
     at, plane, inner = contact.posterior.best
     depth = problem.motion.at(at)[0] - plane
     predicted = problem.force(at, plane, inner.coefficients)
-    lanes = _shown(contact)
+    inside = readings.counts & (depth > 0.0)
+    lanes = _shown(contact, inside)
     title = f"Touches: force over time and depth, law {contact.law.name}"
     figure = new_figure((11, 6.6), title)
     figure.subplots_adjust(hspace=0.3)
-    grid: Any = figure.subplots(2, len(lanes), squeeze=False)
+    grid: Any = figure.subplots(2, max(len(lanes), 1), squeeze=False)
     for column, lane in enumerate(lanes):
         counts = readings.counts[:, lane]
-        touched = np.flatnonzero(counts & (depth[:, lane] > 0.0))
+        touched = np.flatnonzero(inside[:, lane])
         around = slice(max(0, touched[0] - 20), touched[-1] + 20)
         rows = np.arange(readings.force.shape[0])[around]
         time = 1e3 * problem.motion.period * (rows - touched[0])
@@ -139,7 +140,8 @@ def contacts(contact: ContactFit) -> Figure:
         grid[1, column].set_xlabel("depth when the force was [mm]")
     for axes in grid[:, 0]:
         axes.set_ylabel("force [N]")
-    grid[0, 0].legend(loc="upper right", fontsize=8)
+    if lanes:
+        grid[0, 0].legend(loc="upper right", fontsize=8)
     return figure
 
 
@@ -223,13 +225,13 @@ def _distortions(motion: FreeMotion) -> list[float]:
     ]
 
 
-def _shown(contact: ContactFit) -> list[int]:
-    """Touches of the least, the middle and the greatest force."""
-    peak = np.max(np.where(contact.readings.counts, contact.readings.force, 0.0), axis=0)
-    order = np.argsort(peak)
-    return list(
-        dict.fromkeys(int(order[i]) for i in np.linspace(0, len(order) - 1, TOUCHES).round().astype(int))
-    )
+def _shown(contact: ContactFit, inside: np.ndarray) -> list[int]:
+    """Touches of the least, the middle and the greatest force, of those with rows in contact."""
+    lanes = np.flatnonzero(inside.any(axis=0))
+    peak = np.max(np.where(inside, contact.readings.force, 0.0), axis=0)[lanes]
+    order = lanes[np.argsort(peak, kind="stable")]
+    places = np.linspace(0, len(order) - 1, TOUCHES).round().astype(int)
+    return list(dict.fromkeys(order[places].tolist())) if len(order) else []
 
 
 def _correlation(axes: Axes, one: np.ndarray, other: np.ndarray, lags: range, words: str) -> None:
