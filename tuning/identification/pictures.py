@@ -122,7 +122,7 @@ def contacts(contact: ContactFit) -> Figure:
     inside = readings.counts & (depth > 0.0)
     lanes = _shown(contact, inside)
     title = f"Touches: force over time and depth, law {contact.law.name}"
-    figure = new_figure((11, 6.6), title)
+    figure = new_figure((11, 6.6), title, above=0.75)
     figure.subplots_adjust(hspace=0.3)
     grid: Any = figure.subplots(2, max(len(lanes), 1), squeeze=False)
     for column, lane in enumerate(lanes):
@@ -136,7 +136,8 @@ def contacts(contact: ContactFit) -> Figure:
             axes.plot(place, force, color=BLUE, label="measured", **DOTS)
             axes.plot(place, predicted[around, lane], color=BLACK, linewidth=1.2, label="model")
             finish(axes, None)
-        grid[0, column].set(xlabel="time since the touch [ms]", title=f"touch {lane}")
+        grid[0, column].set_xlabel("time since the touch [ms]")
+        grid[0, column].set_title(f"touch {lane}", fontsize=10)
         grid[1, column].set_xlabel("depth when the force was [mm]")
     for axes in grid[:, 0]:
         axes.set_ylabel("force [N]")
