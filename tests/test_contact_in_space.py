@@ -26,6 +26,7 @@ from jaxhil.sixdof.shapes import Cavity, Plane
 from jaxhil.sixdof.space import follow
 from jaxhil.sixdof.vectors import components, matrix, vector
 
+pytestmark = pytest.mark.slow
 LANES = ("central", "off_centre", "couple", "sliding", "rolling", "oblique", "elsewhere")
 STEPS = 1500
 EYE, Z = np.eye(3), np.array([0.0, 0.0, 1.0])
@@ -264,7 +265,6 @@ def test_the_world_may_be_turned_and_boosted(run):
     assert touched > 10
 
 
-@pytest.mark.slow
 def test_a_law_with_a_memory_beside_another_kind():
     """Elastoplastic on the central lane: e = 1/sqrt(r), under the bristle that stays at rest, and a tether
     beside it that stays slack."""
@@ -282,7 +282,6 @@ def test_a_law_with_a_memory_beside_another_kind():
     assert abs(final.chaser.velocity.x[lane]) < 1e-15
 
 
-@pytest.mark.slow
 def test_derivatives_are_those_of_differences():
     """Of the final twist by stiffness, damping and friction; and none is NaN where there is no slip."""
     pair, states, contact, step = prepared()
