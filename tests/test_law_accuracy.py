@@ -6,7 +6,7 @@ percentile and the largest.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -23,8 +23,20 @@ from tuning.transparency.probes import LANES_PER_SCENARIO, ProbedScenarios, prob
 
 pytestmark = pytest.mark.slow
 LAW, SEED = "retrospective_reference", 0xACC  # of scenarios that nothing was tuned or judged on elsewhere
-SETTINGS = "sharp", "gentle"
 CONTACTS = 4
+
+
+class Most(NamedTuple):
+    """What a setting may leave, in % but for the transparency that it has at least."""
+
+    rms: float
+    percentile: float
+    largest: float
+    transparency: float  # with noise
+    quiet: float  # without
+
+
+SETTINGS = {"sharp": Most(0.55, 1.5, 3.0, 0.8, 0.7), "gentle": Most(0.65, 2.0, 3.5, 0.65, 0.5)}
 
 
 def within(path: str, low: float, high: float) -> str:
@@ -70,7 +82,7 @@ def test_a_surface_anywhere_within_1_mm(suite, noise):
     probed = probed_scenarios(mechanism, draw(mechanism, 200, SEED), SEED)
     told = load(f"suite-{suite}", [*clean, f"approach.contacts={CONTACTS}"]).mechanism
     known = probed.scenarios._replace(contact_plane=0 * probed.scenarios.contact_plane)
-    for setting in SETTINGS:
+    for setting, most in SETTINGS.items():
         gains = literature_gains(mechanism, LAW, setting)
         copies = copies_of(probed, outcome_of(mechanism, gains, probed.scenarios))
         assert np.all(copies.good[..., 0])
@@ -79,9 +91,10 @@ def test_a_surface_anywhere_within_1_mm(suite, noise):
         given = left(copies_of(probed, outcome_of(told, gains, known)).error[3, :, 0])
         figures = {name: one.value for name, one in probe_figures(probed, copies).items()}
         printed(suite, "noise", noise, setting, *first, "fourth", *fourth, "told", *given, figures)
-        assert first[0] < 0.5 and first[1] < 1.5 and first[2] < 3.0
+        assert first[0] < most.rms and first[1] < most.percentile and first[2] < most.largest
         assert fourth[0] < given[0] + 0.05
-        assert min(figures["early"], figures["late"]) > (0.75 if noise == "none" else 0.85)
+        least = most.quiet if noise == "none" else most.transparency
+        assert min(figures["early"], figures["late"]) > least
 
 
 @pytest.mark.parametrize("noise", ["none", "0.5 % of its own peak", "0.15 N"])
