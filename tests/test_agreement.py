@@ -5,9 +5,10 @@ the command's range, those of the retrospective reference, whose recursion is lo
 compared separately are
 
 - ticks whose decisions lie within 1e-9 of a threshold (see `tuning.verification.replay`), and
-- lanes that magnify rounding: where successive regressors of the identification are nearly parallel, one unit
-  in the last place of every operation moves the runtime's own command by as much as the two sides differ
-  (Monte Carlo arithmetic: Parker, Pierce and Eggert 2000).
+- lanes that magnify rounding: where successive regressors of the identification are nearly parallel, or gains
+  make a prior's variance 1e15 times that of the noise, one unit in the last place of every operation moves
+  the runtime's own command by as much as the two sides differ (Monte Carlo arithmetic: Parker, Pierce and
+  Eggert 2000).
 """
 
 import functools
@@ -278,7 +279,8 @@ def test_recorded_ticks(mechanism_name):
         count = compare(name, Readings(signals, columns, constants), ticks)
         print(mechanism_name, name, count)
         assert count.ticks == count.compared == sum(ticks)
-        assert count.magnified == 0
+        # One of the draws has such a prior.
+        assert count.magnified <= (name in LONG_LAWS)
 
 
 def test_a_contact_held_for_long():
