@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import campaign_kinds
 import campaign_rigs
 import campaigns
 import numpy as np
@@ -144,7 +145,7 @@ def test_what_cannot_be_designed_for_is_refused():
     for changed, reason in (
         (dict(zip(("contact__law", "contact__unloading_ratio", "contact__damping"), PLASTIC, strict=True)),
          r"contact\.law: found 'elastoplastic'"),
-        ({"rig__simulator": campaigns.RESONANT}, r"rig\.simulator\.model: found 'transfer_function'"),
+        ({"rig__simulator": campaign_kinds.RESONANT}, r"rig\.simulator\.model: found 'transfer_function'"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=reason):
             design(campaign_rigs.mechanism("clean", **changed), 0.002, lambda keys: SLOPES)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import campaign_kinds
 import campaigns
 import numpy as np
 import pytest
@@ -85,7 +86,7 @@ def test_a_rig_that_is_the_file_s_scatters_as_predicted():
 
 CHANGES = {
     # what is changed; the figure that tells, by how much, and within what
-    "stiffness": (replace(CLEAN, contact=campaigns._voigt((1.236e5,))), "stiffness", 0.03, 0.003),
+    "stiffness": (replace(CLEAN, contact=campaign_kinds.voigt((1.236e5,))), "stiffness", 0.03, 0.003),
     "delay": (changed(CLEAN, force_sensor={"delay": 0.0043}), "apparent damping", -72.0, 12.0),
     "motion": (changed(CLEAN, simulator={"delay": 0.0047}), "lag of motion", 4e-4, 6e-5),
     "bias": (changed(CLEAN, force_sensor={"bias": 3.0}), "bias", 3.0, 0.1),
@@ -115,7 +116,7 @@ def test_what_the_file_covers_is_to_be_watched():
     """A change within a wide range, after contacts that told where in the range the rig is."""
     wide = STATED | {"contact.stiffness": {"distribution": "uniform", "factor": [0.8, 1.2]}}
     before = contacts(CLEAN, seed=4, speeds=SPEEDS)
-    after = contacts(replace(CLEAN, contact=campaigns._voigt((1.3e5,))), seed=5, speeds=SPEEDS[:2])
+    after = contacts(replace(CLEAN, contact=campaign_kinds.voigt((1.3e5,))), seed=5, speeds=SPEEDS[:2])
     found = monitor(replace(before, runs=(*before.runs, *after.runs)), file_of(CLEAN, wide))
     assert found.state == "watch" and found.since == 6 and "covers it" in found.verdict
 

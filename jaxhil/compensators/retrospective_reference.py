@@ -15,8 +15,7 @@ predicts, t the time left of 2/p since the hardware's entry:
     separated:   F_c = f_e  until the hardware has left the surface for 6 ms, then 0
 
 Every contact starts afresh, but for what is known of where the surfaces are. A run that begins in contact has
-no approach speed to scale by: there F_c is the measured force, as it is.
-notebooks/guide/retrospective_reference.md says more.
+no approach speed to scale by: there F_c is the measured force (notebooks/guide/retrospective_reference.md).
 """
 
 from collections.abc import Mapping
