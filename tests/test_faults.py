@@ -53,6 +53,11 @@ def _export(out: Path, gains: Path) -> list[Any]:
     return ["export", gains / "lead.json", "--json", "--format", "csv", "-o", out / "bundle"]
 
 
+def _map(out: Path, _: Path) -> list[Any]:
+    axes = ["--x", "contact.stiffness", "--y", "rig.force_sensor.delay", "--points", 3]
+    return ["map", "rig-300kg", *axes, "--json", "-o", out / "map"]
+
+
 def _identify(out: Path, gains: Path) -> list[Any]:
     return ["identify", gains / "run.csv", "--prior", "rig-300kg", "--law", "linear", "--json", "-o", out]
 
@@ -68,6 +73,8 @@ COMMANDS = {
     "simulate-cold": Command(lambda out, _: ["simulate", "rig-300kg", "--json"], cold=True),
     "simulate-log": Command(lambda out, _: ["simulate", "rig-300kg", "--json", "--log", out / "run.csv"]),
     "identify": Command(_identify),
+    "map": Command(_map),
+    "report": Command(lambda out, gains: ["report", gains / "lead.json", "--json", "-o", out / "page.html"]),
     "tune": Command(lambda out, _: ["tune", "rig-300kg", *TUNED, "--json", "-o", out], again=("--resume",)),
     "sweep": Command(_sweep, again=("--resume",)),
     "export": Command(_export, before=(("--seed", "1"),), one_piece="bundle"),
