@@ -357,7 +357,7 @@ class Retrospective(Compensator):
         return 0.0 if separated or bent < 0.0 else force, separated
 
     def _repayment(self, peak: float, own: float, speed: float, zone: float) -> float:
-        """f_e [1/s], by the map's peak and f_0 [1/s], and the speed in the middle of the next period; judged."""
+        """f_e [1/s], by the map's peak, f_0 and the model's speed half a period on; `status` judges it."""
         reference = self._reference
         least = -(self._limit * peak)
         most = (1.0 + self._limit) * peak - own
