@@ -91,6 +91,18 @@ def _compiled(request):
     compile_quickly(everyday and request.node.get_closest_marker("users_options") is None)
 
 
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    """Chromium without a screen; skips where there is none."""
+    from browser import CHROMIUM, Browser
+
+    if CHROMIUM is None:
+        pytest.skip("no Chromium")
+    browser = Browser(tmp_path_factory.mktemp("browser"))
+    yield browser
+    browser.close()
+
+
 class Ran(NamedTuple):
     """Exit code, standard output, standard error."""
 

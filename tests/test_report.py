@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, LAYOUT, Browser
+from browser import LAYOUT
 
 import jaxhil
 import tuning
@@ -150,15 +150,6 @@ def whole(results, tmp_path_factory):
     made = tuning.report(results)
     made.save(path)
     return path
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    if CHROMIUM is None:
-        pytest.skip("no Chromium")
-    browser = Browser(tmp_path_factory.mktemp("browser"))
-    yield browser
-    browser.close()
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from urllib.parse import unquote, urldefrag
 
 import pytest
 import yaml
-from browser import CHROMIUM, LAYOUT, Browser
+from browser import LAYOUT
 
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.mechanism.keys import tables
@@ -132,15 +132,6 @@ def test_every_link_leads_somewhere(site):
             target = (path.parent / unquote(address)).resolve() if address else path
             assert target.exists(), f"{path.name}: {link}"
             assert target.suffix != ".html" or unquote(place) in pages[target].places, f"{path.name}: {link}"
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    if CHROMIUM is None:
-        pytest.skip("no Chromium")
-    browser = Browser(tmp_path_factory.mktemp("browser"))
-    yield browser
-    browser.close()
 
 
 @pytest.mark.slow

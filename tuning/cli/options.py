@@ -57,6 +57,13 @@ Resume = Annotated[
     bool,
     arg(name="resume", metavar="", help="Go on after an interruption: what is finished is not done again."),
 ]
+CompensatorName = Annotated[
+    str | None, arg(metavar="NAME", help="Compensator, at the literature's gains; 'none' by default.")
+]
+GainSource = Annotated[
+    str | None,
+    arg(metavar="GAINS", help="Gain file: its compensator and gains and, without FILE, its mechanism."),
+]
 Setting = Annotated[
     str | None,
     text(
@@ -97,14 +104,9 @@ class Simulate:
     """
 
     file: OptionalFile = None
-    compensator: Annotated[
-        str | None, arg(metavar="NAME", help="Compensator, at the literature's gains; 'none' by default.")
-    ] = None
+    compensator: CompensatorName = None
     setting: Setting = None
-    gains: Annotated[
-        str | None,
-        arg(metavar="GAINS", help="Gain file: its compensator and gains and, without FILE, its mechanism."),
-    ] = None
+    gains: GainSource = None
     overrides: Overrides = ()
     unset: Unset = ()
     plot: Annotated[

@@ -5,7 +5,18 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from tuning.cli.options import Json, OptionalFile, Overrides, Setting, Unset, folder, number, text
+from tuning.cli.options import (
+    CompensatorName,
+    GainSource,
+    Json,
+    OptionalFile,
+    Overrides,
+    Setting,
+    Unset,
+    folder,
+    number,
+    text,
+)
 
 AXIS = "PATH[=LOW:HIGH]"
 
@@ -29,14 +40,9 @@ class Map:
     ]
     y: Annotated[str, text(AXIS, "Key along y, likewise.")]
     file: OptionalFile = None
-    compensator: Annotated[
-        str | None, arg(metavar="NAME", help="Compensator, at the literature's gains; 'none' by default.")
-    ] = None
+    compensator: CompensatorName = None
     setting: Setting = None
-    gains: Annotated[
-        str | None,
-        arg(metavar="GAINS", help="Gain file: its compensator and gains and, without FILE, its mechanism."),
-    ] = None
+    gains: GainSource = None
     overrides: Overrides = ()
     unset: Unset = ()
     points: Annotated[int, number("Points along either axis.")] = 100

@@ -116,9 +116,7 @@ def delay(contact: ContactFit, told: float | None) -> Figure:
 def contacts(contact: ContactFit) -> Figure:
     """Measured force and the model's over time and over depth, of three touches."""
     readings, problem = contact.readings, contact.problem
-    at, plane, inner = contact.posterior.best
-    depth = problem.motion.at(at)[0] - plane
-    predicted = problem.force(at, plane, inner.coefficients)
+    depth, predicted = _modelled(contact)
     inside = readings.counts & (depth > 0.0)
     lanes = _shown(contact, inside)
     title = f"Touches: force over time and depth, law {contact.law.name}"
@@ -150,9 +148,8 @@ def contacts(contact: ContactFit) -> Figure:
 def residuals(contact: ContactFit) -> Figure:
     """What the contact law leaves of the force, over its noise: in time, by depth, and correlated."""
     readings, problem = contact.readings, contact.problem
-    at, plane, inner = contact.posterior.best
-    depth = problem.motion.at(at)[0] - plane
-    left = problem.whiten(readings.force - problem.force(at, plane, inner.coefficients)) / readings.std
+    depth, predicted = _modelled(contact)
+    left = problem.whiten(readings.force - predicted) / readings.std
     left = np.where(readings.counts, left, np.nan)
     figure = new_figure((11, 6.6), "Force less the model's, over the noise")
     figure.subplots_adjust(hspace=0.3)
@@ -224,6 +221,13 @@ def _distortions(motion: FreeMotion) -> list[float]:
         max((level for one in motion.spectra if (level := getattr(one, parity)) is not None), default=0.0)
         for parity in ("odd", "even")
     ]
+
+
+def _modelled(contact: ContactFit) -> tuple[np.ndarray, np.ndarray]:
+    """Depth [m] when each force was, and the best fit's force [N], (rows, touches)."""
+    at, plane, inner = contact.posterior.best
+    problem = contact.problem
+    return problem.motion.at(at)[0] - plane, problem.force(at, plane, inner.coefficients)
 
 
 def _shown(contact: ContactFit, inside: np.ndarray) -> list[int]:

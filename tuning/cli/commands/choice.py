@@ -3,17 +3,27 @@
 from pathlib import Path
 
 from jaxhil.errors import InputError, one_line, shown
-from jaxhil.mechanism.file import from_builtins, to_builtins
+from jaxhil.mechanism.file import from_builtins, load, to_builtins
 from jaxhil.mechanism.structs import Mechanism
 from tuning.cli.options import Simulate
 from tuning.cli.options_report import Map
 from tuning.front_door import arguments
 
 
+def named(options: Simulate | Map) -> Mechanism | None:
+    """The mechanism of FILE, None where a gain file's is meant. Raises `InputError`, for an unknown
+    compensator too; imports no jax."""
+    if options.compensator is not None:
+        arguments.compensators([options.compensator])
+    if options.gains is not None and options.file is None:
+        return None
+    return load(options.file, options.overrides, options.unset).mechanism
+
+
 def chosen(options: Simulate | Map, mechanism: Mechanism | None) -> tuple[Mechanism, str, str | Path | None]:
     """Mechanism, compensator, and its setting or gain file, if one is given.
 
-    `mechanism` is that of FILE, None where a gain file's is meant. Raises `InputError`; imports jax."""
+    `mechanism` is what `named` returned. Raises `InputError`; imports jax."""
     if options.gains is None:
         assert mechanism is not None
         compensator = options.compensator or "none"

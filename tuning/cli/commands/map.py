@@ -5,11 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import one_line
-from jaxhil.mechanism.file import load
 from jaxhil.simulation.environment import prepare
 from tuning import terminal
 from tuning.cli.commands import checks
-from tuning.cli.commands.choice import chosen
+from tuning.cli.commands.choice import chosen, named
 from tuning.cli.options_report import Map
 from tuning.front_door import arguments, meaning
 from tuning.front_door.map import DOCUMENT, MOST_POINTS, PICTURE, map
@@ -20,11 +19,7 @@ def run(options: Map) -> int:
     arguments.limit(options.limit)
     arguments.integers(2, MOST_POINTS, points=options.points)
     arguments.integers(0, seed=options.seed)
-    if options.compensator is not None:
-        arguments.compensators([options.compensator])
-    mechanism = None
-    if options.gains is None or options.file is not None:
-        mechanism = load(options.file, options.overrides, options.unset).mechanism
+    mechanism = named(options)
     target = Path(options.output)
     checks.output(target)
     checks.own_results(target / DOCUMENT, "theory", [PICTURE])

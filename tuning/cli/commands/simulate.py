@@ -3,12 +3,11 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxhil.mechanism.file import load
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.environment import prepare
 from tuning import terminal
 from tuning.cli.commands import checks
-from tuning.cli.commands.choice import chosen
+from tuning.cli.commands.choice import chosen, named
 from tuning.cli.options import Simulate
 from tuning.front_door import arguments, meaning
 
@@ -27,11 +26,7 @@ def run(options: Simulate) -> int:
         checks.picture(options.plot)
     if options.log is not None:
         checks.file(options.log)
-    if options.compensator is not None:
-        arguments.compensators([options.compensator])
-    mechanism = None
-    if options.gains is None or options.file is not None:
-        mechanism = load(options.file, options.overrides, options.unset).mechanism
+    mechanism = named(options)
     prepare()
     from jaxhil.simulation.run import simulate
 
