@@ -18,8 +18,9 @@ from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.runtime import Controller
 from jaxhil.runtime.laws.contact_plane import Meeting
-from jaxhil.runtime.laws.delay_bank import HYPOTHESES, SOFT, DelayBank
+from jaxhil.runtime.laws.delay_bank import HYPOTHESES, SOFT, USUAL, WHOLE, DelayBank
 from jaxhil.runtime.laws.force_depth_map import KNOTS, ForceDepthMap, Prior
+from jaxhil.runtime.laws.onset import Onset
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import evaluate
 from jaxhil.simulation.scenario import build_scenarios
@@ -58,17 +59,17 @@ def plain(spread=SPREAD, plane_spread=TOLD):
 
 def meeting(place=0.0, pace=1.0):
     """A surface met `place` [m] beyond where it was told."""
-    return Meeting(place, FOUND**2, SPEED, pace, PERIOD * pace, STIFFNESS)
+    return Meeting(place, place, FOUND**2, SPEED, pace, PERIOD * pace, STIFFNESS)
 
 
 def in_arrays(met):
     """The same for the law in JAX; what it does not ask for is left out."""
     zero = jnp.zeros(())
-    scales = Scales(zero + 1, zero + met.place, zero + met.speed, zero + met.pace, zero, zero)
+    scales = Scales(zero + 1, zero + met.plane, zero + met.speed, zero + met.pace, zero, zero)
     unasked: Any = None
     return MeetingInJax(
         found=jnp.asarray(True), scales=scales, planes=unasked, start=unasked, index=unasked, since=unasked,
-        variance=zero + met.variance, stiffness=zero + met.stiffness,
+        place=zero + met.place, variance=zero + met.variance, stiffness=zero + met.stiffness,
     )  # fmt: skip
 
 
@@ -103,13 +104,13 @@ def test_likelihood_is_the_root_of_the_density_of_all_readings():
         covariance[place, place] = PRIOR[name] ** 2
     mean = np.r_[np.full(12, PRIOR["stiffness"]), np.zeros(5)]
     share = TOLD**2 / (TOLD**2 + SOFT * FOUND**2)
-    covariance[16, 16] += (share * STIFFNESS * PERIOD) ** 2 / 12
+    covariance[16, 16] += (USUAL * share * STIFFNESS * FOUND / SPEED) ** 2
     exact = []
     for offset in OFFSETS:
         x = depths - offset * (speeds - share)
         assert np.all(x > 0)
-        widths = np.append(np.diff(KNOTS), np.inf)
-        ramps = np.clip(x[:, None] - knots, 0, widths)
+        moved = knots + share * offset * np.minimum(knots / WHOLE, 1)
+        ramps = np.clip(x[:, None] - moved, 0, np.append(np.diff(moved), np.inf))
         phi = np.column_stack([ramps, speeds, x * speeds / 0.03, x - np.maximum.accumulate(x)])
         phi = np.column_stack([phi, speeds / np.hypot(speeds, 0.03), np.ones_like(x)])
         spread = phi @ covariance @ phi.T + VARIANCE * np.eye(len(x))
@@ -196,6 +197,45 @@ def test_surface_lies_between_where_it_was_told_and_where_it_was_met(plane_sprea
     np.testing.assert_allclose(-bank._below - OFFSETS * pace, depth, atol=1e-6)
     assert earlier == min(math.ceil(max(depth.max() / (PERIOD * pace) - 1e-2, 0)), 30)
     assert bank.shift == 0 and bank.deeper == pytest.approx(-(1 - share) * place / SPEED * pace, abs=1e-6)
+
+
+@pytest.mark.parametrize("delay", [-0.0005, 0.0005])
+@pytest.mark.parametrize("bends", [0.04, 0.042])  # 46 is a knot
+def test_where_a_contact_bends_does_not_tell_its_delay(bends, delay):
+    """Two layers without noise, the surface met where it is: a map that misses the bend must not pass that off
+    as a delay that moves the bend of the way back to a knot."""
+    bank = plain(plane_spread=1e-3)
+    phase = (0.5e-3 - 0.002 + PERIOD * np.arange(150)) * math.pi / 0.15
+    depths, speeds = 0.15 / math.pi * np.sin(phase), np.cos(phase)
+    bank.begin(meeting(place=delay * SPEED)._replace(variance=1e-13))
+    for depth, speed in zip(depths.tolist(), speeds.tolist(), strict=True):
+        # A force that is `delay` older, of depths that begin where the hardware then was.
+        x = depth - delay * (speed - 1)
+        force = max(300 * x + 600 * max(x - bends, 0), 0)
+        variance = 1e-4 + (0.01 * force) ** 2
+        bank.learn(depth, speed, force, variance, False, 0.0)
+    assert bank.shift == pytest.approx(delay, abs=2e-4)
+
+
+def test_onset_is_as_spread_as_the_readings_leave_it():
+    """Against every tick beside it, without a step; where it is expected does not count."""
+    rng = np.random.default_rng(4)
+    for jump, stiffness in ((0.0, 150.0), (2.0, 400.0)):
+        onset = Onset(PERIOD)
+        for tick in range(1, 91):
+            time = PERIOD * (tick - 80.3)
+            onset.take(0.1 * rng.standard_normal() + (jump + stiffness * time if time > 0 else 0.0), True)
+        found = onset.find(0.01, 0.0, lambda age: 1.0)
+        assert found is not None
+        ages = np.arange(1, 2 * found.age + 8)
+        evidence = np.array([onset.suppose(int(age), 0.01, 0.0, 1.0).evidence for age in ages])
+        weights = np.exp(evidence - evidence.max()) / np.sum(np.exp(evidence - evidence.max()))
+        mean = np.sum(weights * ages)
+        variance = np.sum(weights * (ages - mean) ** 2)
+        assert abs(found.age + found.earlier - mean) < 0.3 * math.sqrt(variance + 1 / 12)
+        assert found.variance == pytest.approx(variance, rel=0.5, abs=0.02)
+        assert abs(found.age + found.earlier - 10.2) < 3 * math.sqrt(found.variance + 1 / 12)
+        assert abs(found.earlier) < 0.1 if jump else found.variance > 0.5
 
 
 @pytest.fixture(scope="module")

@@ -2,14 +2,16 @@
 
 Hypothesis h takes the force to be d_h [s] older than assumed: it belongs to the depth X - d_h V - p_h, to
 first order in d_h. The surface was met at X_0; by this hypothesis it lies at p_h = g (X_0 - d_h v_0) beyond
-where it was told, g = spread^2/(spread^2 + found^2) by how uncertain either is. Each identifies a
-`force_depth_map` of its own and says beforehand what it expects to read, f_h with a variance s_h (0 with the
-noise's own variance r out of contact, and where what it expects while the contact opens is not positive). Its
-weight is the product of the likelihood of all readings y of this contact and of those before, in each
-(r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), and of how well its damping goes with what is known of contacts
-(`plausibility`): see notebooks/guide/retrospective_reference.md section 7. The exponentials are (1 + u/n)^-n:
-algebraic, the same on every machine. What counts is the mean over all hypotheses, of their maps, delays and
-surfaces.
+where it was told, g = spread^2/(spread^2 + found^2) by how uncertain either is, or 1 where they disagree.
+Each identifies a `force_depth_map` of its own and says beforehand what it expects to read, f_h with a
+variance s_h (0 with the noise's own variance r out of contact, and where what it expects while the contact
+opens is not positive). Its weight is the product of the likelihood of all readings y of this contact and of
+those before, in each (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), of how well its damping goes with what is known
+of contacts (`plausibility`), and of how likely its surface is there: see
+notebooks/guide/retrospective_reference.md section 7. The exponentials are (1 + u/n)^-n: algebraic, the same
+on every machine. What counts is the mean over all hypotheses, of their maps, delays and surfaces. Their maps
+bend at the same places, wherever they have the surface: which fits best is not to be decided by what a
+contact that bends between two knots leaves.
 """
 
 import math
@@ -21,6 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxhil.compensators.force_depth_map import (
     DAMPING,
+    KNOTS,
     PLACES,
     PRELOAD,
     SEGMENTS,
@@ -35,6 +38,7 @@ from jaxhil.compensators.force_depth_map import (
     tells,
 )
 from jaxhil.compensators.meeting import Meeting
+from jaxhil.compensators.onset import SQUARINGS, exponential
 
 HYPOTHESES = 17
 OFFSETS = np.linspace(-1, 1, HYPOTHESES)  # of their delays, in terms of the farthest
@@ -43,10 +47,13 @@ BROADENING = 2.0  # of the variance of the damping
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
 LEAST, LEAST_CARRIED = 1e-200, 1e-12
 NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, some do not
-SQUARINGS, DENSITY_SQUARINGS = 10, 8  # n = 2^10 of the likelihood, 2^8 of what is known of damping
+DENSITY_SQUARINGS = 8  # n = 2^8 of what is known of damping
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
 SOFT = 25.0  # times the variance of where a surface was met: soft ones are found late
-DEEPER = 9.0  # times the variance of where the surface is expected: it is deeper
+ELSEWHERE = 9.0  # times the variance of where the surface is expected: it is not there
+UNLIKELY = 0.1  # that it is not
+USUAL = 0.5  # stiffness, of the most that it may be
+FARTHEST, WHOLE = 0.004, 0.015  # s by which knots are moved, from what depth [s] on; before it less
 EARLIER = 30  # ticks before it was met, whose readings count
 
 
@@ -65,6 +72,8 @@ class Bank(NamedTuple):
     pace: Float[Array, "*batch"]  # seconds on the contact's scale of time in one
     shift: Float[Array, "*batch"]  # mean of d_h [s]
     deeper: Float[Array, "*batch"]  # mean of `below` [s]
+    farther: Float[Array, "hypotheses *batch"]  # by how much farther in each has its knots than usual [s]
+    likely: Float[Array, "hypotheses *batch"]  # how likely the surface is there
 
 
 def no_bank(prior: Map) -> Bank:
@@ -72,8 +81,9 @@ def no_bank(prior: Map) -> Bank:
     zero = jnp.zeros_like(prior.mean[0])
     each = jnp.stack([zero] * HYPOTHESES)
     return Bank(
-        _repeated(prior), each, each + 1, each + 1, each, each, zero, zero, each, zero + 1, zero, zero
-    )
+        _repeated(prior), each, each + 1, each + 1, each, each, zero, zero, each, zero + 1, zero, zero,
+        each, each + 1,
+    )  # fmt: skip
 
 
 def begin(
@@ -99,15 +109,12 @@ def begin(
     precision = 1 / jnp.where(variance > 0, variance, 1)
     speed, pace = (jnp.where(begins, each, 1) for each in (meeting.scales.speed, meeting.scales.pace))
     offsets = _offsets(speed) * farthest[None]
-    share = _share(meeting, farthest * speed, plane_spread)
-    place = share[None] * (meeting.scales.plane[None] - offsets * speed[None])
-    depth = (meeting.scales.plane[None] - place) / (speed / pace)[None]
-    first = jnp.max(depth - offsets * pace[None], axis=0)
+    placed = _place(meeting, offsets, speed / pace, speed, plane_spread)
+    first = jnp.max(-placed.below - offsets * pace[None], axis=0)
     tick = period * pace
     earlier = jnp.minimum(jnp.ceil(jnp.where(first > SURFACE, first, 0) / tick), EARLIER).astype(jnp.int32)
-    off = share * (meeting.stiffness * tick)
     fresh = _repeated(prior)
-    fresh = fresh._replace(covariance=fresh.covariance.at[PRELOAD, PRELOAD].add((off * off / 12)[None]))
+    fresh = fresh._replace(covariance=fresh.covariance.at[PRELOAD, PRELOAD].add(placed.preload))
     now = old._replace(
         maps=Map(
             jnp.where(begins[None, None], fresh.mean, old.maps.mean),
@@ -120,7 +127,9 @@ def begin(
         weighted=old.weighted + jnp.where(ends[None], precision * mean, 0),
         met=old.met + jnp.where(ends, 1, 0),
         learning=jnp.where(begins, 0, old.learning),
-        below=jnp.where(begins[None], -depth, old.below),
+        below=jnp.where(begins[None], placed.below, old.below),
+        farther=jnp.where(begins[None], placed.farther, old.farther),
+        likely=jnp.where(begins[None], placed.likely, old.likely),
         pace=jnp.where(begins, pace, old.pace),
     )
     means = _means(now, weigh(now, damping), offsets)
@@ -142,7 +151,7 @@ def learn(old: Bank, reading: Reading, farthest: Array, damping: Array) -> tuple
     deepest = jnp.where(counts & (depth > old.deepest), depth, old.deepest)
     noise = (reading.variance + jnp.where(reading.hidden, reading.zone**2 / 12, 0))[None]
     inside = depth > SURFACE
-    phi = features(depth, rate, deepest)
+    phi = features(depth, rate, deepest, knots_of(old))
     predicted = predict(old.maps, phi, noise)
     # Hidden, a force is known to be small: half of the zone, where the map expects more than all of it.
     tight = hidden & (predicted.force <= zone)
@@ -169,7 +178,7 @@ def learn(old: Bank, reading: Reading, farthest: Array, damping: Array) -> tuple
         learning=jnp.where(reading.counts, 1, old.learning),
     )
     weights = weigh(now, damping)
-    return _means(now, weights, offsets), average(maps, weights)
+    return _means(now, weights, offsets), average(maps, weights, knots_of(now))
 
 
 def weigh(bank: Bank, damping: Array) -> Float[Array, "hypotheses *batch"]:
@@ -182,7 +191,7 @@ def weigh(bank: Bank, damping: Array) -> Float[Array, "hypotheses *batch"]:
     variance = BROADENING * (bank.met[None] + 1) / total
     plausible = plausibility(mean, variance, damping[None] * per_second)
     plausible = jnp.where(own > 0, jnp.where(plausible > LEAST_CARRIED, plausible, LEAST_CARRIED), 1)
-    weights = bank.likelihood * bank.carried * plausible
+    weights = bank.likelihood * bank.carried * (plausible * bank.likely)
     return weights / jnp.sum(weights, axis=0, keepdims=True)
 
 
@@ -200,21 +209,26 @@ def plausibility(mean: Array, variance: Array, prior: Array) -> Float[Array, "*b
     return ELASTIC * (jnp.sqrt(prior) / spread) * density + (1 - ELASTIC) * at_least_0
 
 
-def average(maps: Map, weights: Float[Array, "hypotheses *batch"]) -> Curve:
-    """What counts of the maps, by their weights."""
-    slopes = jnp.sum(maps.mean[:SEGMENTS] * weights[None], axis=1)
+def knots_of(bank: Bank) -> Float[Array, "segments hypotheses *batch"]:
+    """Where the knots of each map are [s]."""
+    usual = jnp.asarray(KNOTS.reshape(-1, *[1] * bank.farther.ndim), bank.farther.dtype)
+    return usual + bank.farther[None] * jnp.minimum(usual / WHOLE, 1)
+
+
+def average(maps: Map, weights: Float[Array, "hypotheses *batch"], knots: Array) -> Curve:
+    """What counts of the maps, by their weights; of the force at the usual knots."""
+    own, preload = maps.mean[:SEGMENTS], maps.mean[PRELOAD]
+    usual = jnp.asarray(KNOTS.reshape(-1, *[1] * weights.ndim), weights.dtype)
+    reached = jnp.concatenate([preload[None], own[:-1] * jnp.diff(knots, axis=0)])
+    past = usual - knots
+    there = jnp.where(past < 0, jnp.concatenate([own[:1], own[:-1]]), own)
+    at_knots = jnp.sum(weights[None] * (jnp.cumsum(reached, axis=0) + past * there), axis=1)
+    slopes = jnp.diff(at_knots, axis=0) / jnp.diff(usual[:, 0], axis=0)
+    slopes = jnp.concatenate([slopes, jnp.sum(weights * own[-1], axis=0)[None]])
     lost = (
         jnp.sum(positive_mean(maps.mean[i], maps.covariance[i, i]) * weights, axis=0) for i in PLACES[:-1]
     )
-    return Curve(slopes, *lost, preload=jnp.sum(maps.mean[PRELOAD] * weights, axis=0))
-
-
-def exponential(u: Array, squarings: int) -> Array:
-    """(1 + u/n)^-n at u >= 0, n = 2^squarings: exp(-u), and less steep far out."""
-    value = 1 / (1 + u / 2**squarings)
-    for _ in range(squarings):
-        value = value * value
-    return value
+    return Curve(slopes, *lost, preload=at_knots[0])
 
 
 def _means(bank: Bank, weights: Array, offsets: Array) -> Bank:
@@ -224,13 +238,32 @@ def _means(bank: Bank, weights: Array, offsets: Array) -> Bank:
     return bank._replace(shift=shift, deeper=jnp.sum(weights * bank.below, axis=0))
 
 
-def _share(meeting: Meeting, reach: Array, plane_spread: Array) -> Float[Array, "*batch"]:
-    """How much where the surface was met counts beside where it was told: all, if the two disagree whatever
-    the delay, which moves it by up to `reach` [m]."""
-    known, found = plane_spread**2, SOFT * meeting.variance
-    away = jnp.abs(meeting.scales.plane) - reach
-    elsewhere = (away > 0) & (away * away > DEEPER * (known + meeting.variance))
-    return jnp.where(elsewhere, 1, known / (known + found))
+class _Placed(NamedTuple):
+    """Where each hypothesis has the surface."""
+
+    below: Array  # by how much deeper than it was met [s]
+    farther: Array  # by how much farther in its knots are than usual [s]
+    likely: Array  # how likely it is there
+    preload: Array  # variance of the force at the entry [1/s^2]
+
+
+def _place(meeting: Meeting, offsets: Array, length: Array, speed: Array, plane_spread: Array) -> _Placed:
+    """Between where it was met and where it was told, or, where these disagree, where it was met; there the
+    force at the entry is known to what the stiffness makes of the uncertain place. A second is `length`
+    [m]."""
+    known = plane_spread**2
+    away = meeting.place[None] - offsets * speed[None]
+    elsewhere = away * away > (ELSEWHERE * (known + meeting.variance))[None]
+    share = jnp.where(elsewhere, 1, (known / (known + SOFT * meeting.variance))[None])
+    place = share * away
+    positive = meeting.variance > 0
+    spread = jnp.where(positive, jnp.sqrt(jnp.where(positive, meeting.variance, 1)), 0) / length
+    return _Placed(
+        below=(place - meeting.scales.plane[None]) / length[None],
+        farther=jnp.clip((meeting.place[None] - place) / length[None], -FARTHEST, FARTHEST),
+        likely=jnp.where(elsewhere, UNLIKELY, 1),
+        preload=(USUAL * (share * (meeting.stiffness * spread)[None])) ** 2,
+    )
 
 
 def _shares(values: Array, least: float) -> Array:

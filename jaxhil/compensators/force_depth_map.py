@@ -104,16 +104,22 @@ def prior(
     return Map(mean, jnp.concatenate(rows))
 
 
-def ramps(depth: Float[Array, "*batch"]) -> Float[Array, "segments *batch"]:
-    """How far [s] each segment is pressed in."""
-    beyond = depth[None] - _column(KNOTS, depth)
-    return jnp.where(beyond > 0, jnp.minimum(beyond, _column(WIDTHS, depth)), 0)
+def ramps(depth: Float[Array, "*batch"], knots: Array | None = None) -> Float[Array, "segments *batch"]:
+    """How far [s] each segment is pressed in; between `knots` [s], if they are not the usual ones."""
+    if knots is None:
+        knots, widths = _column(KNOTS, depth), _column(WIDTHS, depth)
+    else:
+        widths = jnp.concatenate([jnp.diff(knots, axis=0), jnp.full_like(knots[:1], np.inf)])
+    beyond = depth[None] - knots
+    return jnp.where(beyond > 0, jnp.minimum(beyond, widths), 0)
 
 
-def features(depth: Array, speed: Array, deepest: Array) -> Float[Array, "parameters *batch"]:
+def features(
+    depth: Array, speed: Array, deepest: Array, knots: Array | None = None
+) -> Float[Array, "parameters *batch"]:
     """phi, of which the force is phi.theta."""
     others = jnp.stack([speed, depth * speed / REACH, depth - deepest, turning(speed), jnp.ones_like(depth)])
-    return jnp.concatenate([ramps(depth), others])
+    return jnp.concatenate([ramps(depth, knots), others])
 
 
 def predict(old: Map, phi: Array, variance: Array) -> Prediction:

@@ -28,7 +28,8 @@ class Meeting(NamedTuple):
     start: Samples  # last sample before the hardware met it
     index: Array  # tick of the run, of that sample
     since: Float[Array, "*batch"]  # from the meeting to the next sample [ticks]
-    variance: Float[Array, "*batch"]  # of where the surface is [m^2]
+    place: Float[Array, "*batch"]  # by how much the surface is deeper than told, by these readings alone [m]
+    variance: Float[Array, "*batch"]  # of that [m^2]
     stiffness: Float[Array, "*batch"]  # the most that it may be, on the contact's scale of time [1/s^2]
 
 
@@ -74,8 +75,8 @@ def meet(
     high = beyond(side, clearance, recall(history, index + 1).position)
     row = jnp.where(side < 0, 1, 0)
     expected = Plane(*(jnp.take_along_axis(both, row[None], axis=0)[0] for both in planes))
-    variance = found_variance(high - low, found.age)
-    now = learn_plane(expected, low, high, variance)
+    width = high - low
+    now = learn_plane(expected, low, high, found_variance(width, found.age))
     end = high - MARGIN * (high - low)
     place = jnp.where(now.place < low, low, jnp.where(now.place > end, end, now.place))
     wide = high > low
@@ -90,4 +91,6 @@ def meet(
     here = detected[None] & (row[None] == jnp.arange(2).reshape(2, *[1] * row.ndim))
     carried = Plane(*(jnp.where(here, new[None], both) for new, both in zip(now, planes, strict=True)))
     stiffness = found.stiffness / (pace * pace)
-    return Meeting(detected, chosen, carried, start, index, since, variance, stiffness)
+    met = 0.5 * (low + high) - found.earlier * width
+    around = width * width * (1 / 12 + found.variance)
+    return Meeting(detected, chosen, carried, start, index, since, met, around, stiffness)

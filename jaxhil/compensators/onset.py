@@ -30,6 +30,8 @@ JUMP_VARIANCE = 36.0  # s_B^2 [1/s^2]
 CERTAIN = 9.0
 WAIT = 0.004  # s, and a tick, since the surface was met: then its stiffness shows
 LONGEST_FLIGHT = 65536  # ticks of a flight up to which the sums are exact enough; then they begin anew
+BESIDE = 8  # steps to both sides of what was found, and the share of its age per step
+SQUARINGS = 10
 
 
 class Onset(NamedTuple):
@@ -47,6 +49,8 @@ class Found(NamedTuple):
     age: Int[Array, "*batch"]  # ticks since it was met
     bias: Float[Array, "*batch"]  # of the force [1/s]
     stiffness: Float[Array, "*batch"]  # the most that it may be, by three standard deviations [1/s^2]
+    earlier: Float[Array, "*batch"]  # ticks by which it was met before the middle of that tick, in the mean
+    variance: Float[Array, "*batch"]  # of that, where the surface is not expected anywhere
 
 
 def no_onset(like: Float[Array, "*batch"]) -> Onset:
@@ -109,13 +113,20 @@ def find(
     age = lax.cond(jnp.any(certain), beside, lambda: first)[0]
     _, bias, stiffness = _suppose(onset, _sums_before(onset, tick, age[None]), age[None], *scales, 1.0)
     waited = (age > 1) & (age.astype(period.dtype) * period >= WAIT * (1 - 1e-9))
-    return Found(certain & waited, age, bias[0], stiffness[0])
+    detected = certain & waited
+
+    def around():
+        return _spread(onset, tick, age, lax.stop_gradient(scales))
+
+    zeros = jnp.zeros_like(period)
+    earlier, variance = lax.cond(jnp.any(detected), around, lambda: (zeros, zeros))
+    return Found(detected, age, bias[0], stiffness[0], earlier, variance)
 
 
 def nothing_found(like: Float[Array, "*batch"]) -> Found:
     """No surface."""
     zeros = jnp.zeros_like(like)
-    return Found(zeros > 0, zeros.astype(jnp.int32) + 1, zeros, zeros)
+    return Found(zeros > 0, zeros.astype(jnp.int32) + 1, *[zeros] * 4)
 
 
 def rarity(away: Array, spread: Array, width: Array) -> Array:
@@ -130,6 +141,31 @@ def logarithm(z: Array) -> Array:
     for _ in range(10):
         z = jnp.sqrt(z)
     return 2048 * (z - 1) / (z + 1)
+
+
+def exponential(u: Array, squarings: int) -> Array:
+    """(1 + u/n)^-n, n = 2^squarings: exp(-u), and less steep far out."""
+    value = 1 / (1 + u / 2**squarings)
+    for _ in range(squarings):
+        value = value * value
+    return value
+
+
+def _spread(onset, tick, age, scales):
+    """How much earlier than found the surface was met, in the mean, and the variance of that, by the ticks
+    beside it [ticks]."""
+    beside = jnp.arange(-BESIDE, BESIDE + 1).reshape(-1, *[1] * age.ndim) * (1 + age // BESIDE)[None]
+    ages = age[None] + beside
+    counts = (ages >= 1) & (ages < onset.watched[None]) & (ages <= AGES[-1])
+    ages = jnp.where(counts, ages, age[None])
+    evidence = _suppose(onset, _sums_before(onset, tick, ages), ages, *scales, 1.0)[0]
+    most = evidence[BESIDE]
+    weights = jnp.where(counts & (evidence > -CERTAIN), exponential(most[None] - evidence, SQUARINGS), 0)
+    earlier = beside.astype(evidence.dtype)
+    total = jnp.sum(weights, axis=0)
+    total = jnp.where(total > 0, total, 1)
+    mean = jnp.sum(weights * earlier, axis=0) / total
+    return lax.stop_gradient((mean, jnp.sum(weights * earlier**2, axis=0) / total - mean * mean))
 
 
 def _sums_before(onset, tick, ages):

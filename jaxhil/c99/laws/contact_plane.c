@@ -9,10 +9,11 @@ typedef struct {
     double place, spread;
 } jaxhil_plane;
 
-/* A surface that was met: its side, 1 or -1; where [m], by the delay that is given, and the variance of that; the speed
- * [m/s] and the pace; a tick on that scale of time [s] and the most that the stiffness may be [1/s^2]. */
+/* A surface that was met: where it counts as met and, by these readings alone, `place` [m], by the delay that is given,
+ * and the variance of that; the speed [m/s] and the pace; a tick on that scale of time [s] and the most that the stiffness
+ * may be [1/s^2]. */
 typedef struct {
-    double side, place, variance, speed, pace, tick, stiffness;
+    double plane, place, variance, speed, pace, tick, stiffness;
 } jaxhil_meeting;
 
 /* == Definitions == */

@@ -1,12 +1,14 @@
 /* Hypotheses of the force delay side by side, each with a map of its own, weighed by what they explain.
  * Hypothesis h takes the force to be d_h older than given: it belongs to the depth X - d_h V - p_h. The surface was met
- * at X_0; by this hypothesis it lies at p_h = g (X_0 - d_h v_0) beyond where it was told, g = spread^2/(spread^2 +
- * found^2) by how uncertain either is. It expects to read f_h with a variance s_h (0 with the noise's own variance r out
- * of contact, and where what it expects while the contact opens is not positive). Its weight is the product of the
- * likelihoods of all readings of this contact and of those before, (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), and of how
- * well its damping, of mean B and variance s^2, goes with what is known of contacts: p (s_0/s) exp(-t^2/2)
- * + (1 - p) 2 Phi(t), t = B/s, p = 1/3. The exponentials are (1 + u/n)^-n. What counts is the mean over all hypotheses,
- * of their maps, delays and surfaces.
+ * at X_0, with a variance s^2; by this hypothesis it lies at p_h = g (X_0 - d_h v_0) beyond where it was told, with
+ * g = spread^2/(spread^2 + 25 s^2), or 1 where the two disagree. It expects to read f_h with a variance s_h (0 with the
+ * noise's own variance r out of contact, and where what it expects while the contact opens is not positive). Its weight
+ * is the product of the likelihoods of all readings of this contact and of those before, (r/s_h)^(1/4)
+ * exp(-(y - f_h)^2/(4 s_h)), of how well its damping, of mean B and variance s^2, goes with what is known of contacts:
+ * p (s_0/s) exp(-t^2/2) + (1 - p) 2 Phi(t), t = B/s, p = 1/3, and, where its surface is not where it was told, 1/10. The
+ * exponentials are (1 + u/n)^-n. What counts is the mean over all hypotheses, of their maps, delays and surfaces. Their
+ * maps bend at the same places, wherever they have the surface: which fits best is not to be decided by what a contact
+ * that bends between two knots leaves.
  */
 #include <math.h>
 #include <stdbool.h>
@@ -14,13 +16,14 @@
 #include "contact_plane.c"
 #include "force_depth_map.c"
 #include "gains_table.c"
+#include "onset.c"
 
 /* == Declarations == */
 
 enum { JAXHIL_HYPOTHESES = 17 };
 
-/* Of each hypothesis its delay, by how much [s] it has the surface deeper than it was met, map, deepest point, the
- * likelihoods of this contact and of those before; sums over these of the damping's precision and of precision times
+/* Of each hypothesis its delay, by how much [s] it has the surface deeper than it was met and its knots farther in than
+ * usual, how likely it is that the surface is there, map, deepest point, the likelihoods of this contact and of those before; sums over these of the damping's precision and of precision times
  * mean, their number `met`; whether this contact is to be added to them. The mean of the maps and, `shift` [s] and
  * `below` [s], of the delays and of how much deeper; the delay that was `given`. */
 typedef struct {
@@ -28,6 +31,7 @@ typedef struct {
     double known[JAXHIL_HYPOTHESES];
     jaxhil_force_depth_map prior;
     double offsets[JAXHIL_HYPOTHESES], deeper[JAXHIL_HYPOTHESES], deepest[JAXHIL_HYPOTHESES];
+    double farther[JAXHIL_HYPOTHESES], likely[JAXHIL_HYPOTHESES];
     double likelihood[JAXHIL_HYPOTHESES], carried[JAXHIL_HYPOTHESES];
     double precision[JAXHIL_HYPOTHESES], weighted[JAXHIL_HYPOTHESES];
     double estimate[JAXHIL_HYPOTHESES][JAXHIL_PARAMETERS];
@@ -47,17 +51,12 @@ static const double jaxhil_bank_least_carried = 1e-12;
 static const double jaxhil_bank_least_shift = 1e-12; /* s: where nothing tells delays apart, rounding does not */
 static const double jaxhil_bank_late = 25.0; /* times the variance of where it was met: soft surfaces are found late */
 static const double jaxhil_bank_elsewhere = 9.0; /* times the variance of where it is expected: it is not there */
+static const double jaxhil_bank_unlikely = 0.1;  /* that it is not */
+static const double jaxhil_bank_usual = 0.5;     /* stiffness, of the most that it may be */
+static const double jaxhil_bank_farthest = 0.004; /* s, by which knots are moved, */
+static const double jaxhil_bank_whole = 0.015;    /* from this depth [s] on, and less before */
 static const long jaxhil_bank_earlier = 30;  /* ticks before it was met, whose readings count */
-enum { JAXHIL_SQUARINGS = 10, JAXHIL_DENSITY_SQUARINGS = 8 };
-
-/* (1 + u/n)^-n, n = 2^squarings. */
-static double jaxhil_bank_exponential(double u, int squarings) {
-    double value = 1.0 / (1.0 + u / (double)(1L << squarings));
-    for (int i = 0; i < squarings; i++) {
-        value = value * value;
-    }
-    return value;
-}
+enum { JAXHIL_DENSITY_SQUARINGS = 8 };
 
 /* Of their sum, at least so much. */
 static void jaxhil_bank_shares(double *values, double least) {
@@ -92,6 +91,8 @@ static void jaxhil_learnt_reset(jaxhil_learnt *bank) {
     jaxhil_bank_restart(bank);
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         bank->deeper[h] = 0.0;
+        bank->farther[h] = 0.0;
+        bank->likely[h] = 1.0;
         bank->carried[h] = 1.0;
         bank->precision[h] = 0.0;
         bank->weighted[h] = 0.0;
@@ -135,7 +136,7 @@ static double jaxhil_learnt_deeper(const jaxhil_learnt *bank) {
 static double jaxhil_bank_plausibility(double mean, double variance, double prior) {
     const double spread = sqrt(variance);
     const double ratio = mean / spread;
-    const double density = jaxhil_bank_exponential(0.5 * (ratio * ratio), JAXHIL_DENSITY_SQUARINGS);
+    const double density = jaxhil_exponential(0.5 * (ratio * ratio), JAXHIL_DENSITY_SQUARINGS);
     const double size = fabs(ratio);
     const double mills =
         jaxhil_map_pi / ((jaxhil_map_pi - 1.0) * size + sqrt(size * size + 2.0 * jaxhil_map_pi));
@@ -160,7 +161,7 @@ static void jaxhil_bank_weigh(const jaxhil_learnt *bank, double *weights) {
             plausible = jaxhil_bank_plausibility(mean, variance, bank->prior.damping * (pace * pace));
             plausible = plausible > jaxhil_bank_least_carried ? plausible : jaxhil_bank_least_carried;
         }
-        weights[h] = bank->likelihood[h] * bank->carried[h] * plausible;
+        weights[h] = bank->likelihood[h] * bank->carried[h] * (plausible * bank->likely[h]);
         total = h > 0 ? total + weights[h] : weights[h];
     }
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
@@ -168,26 +169,46 @@ static void jaxhil_bank_weigh(const jaxhil_learnt *bank, double *weights) {
     }
 }
 
+/* Where the knots of hypothesis h are [s]. */
+static void jaxhil_bank_knots(const jaxhil_learnt *bank, int h, double *knots) {
+    for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
+        const double share = jaxhil_knots[j] / jaxhil_bank_whole;
+        knots[j] = jaxhil_knots[j] + bank->farther[h] * (share < 1.0 ? share : 1.0);
+    }
+}
+
+/* The mean of the maps, of the force at the usual knots. */
+static void jaxhil_bank_average(jaxhil_learnt *bank, const double *weights) {
+    jaxhil_curve *curve = &bank->curve;
+    const int last = JAXHIL_SEGMENTS - 1;
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        const double *slopes = bank->estimate[h];
+        double knots[JAXHIL_SEGMENTS];
+        double reached = slopes[JAXHIL_PRELOAD];
+        jaxhil_bank_knots(bank, h, knots);
+        for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
+            if (j > 0) {
+                reached += slopes[j - 1] * (knots[j] - knots[j - 1]);
+            }
+            const double past = jaxhil_knots[j] - knots[j];
+            const double force = weights[h] * (reached + past * (past < 0.0 ? slopes[j - 1] : slopes[j]));
+            curve->at_knots[j] = h > 0 ? curve->at_knots[j] + force : force;
+        }
+        const double slope = weights[h] * slopes[last];
+        curve->slopes[last] = h > 0 ? curve->slopes[last] + slope : slope;
+    }
+    for (int j = 0; j < last; j++) {
+        curve->slopes[j] =
+            (curve->at_knots[j + 1] - curve->at_knots[j]) / (jaxhil_knots[j + 1] - jaxhil_knots[j]);
+    }
+}
+
 /* The mean over the hypotheses, by their weights: the delay, and what counts of the maps. */
 static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
     jaxhil_curve *curve = &bank->curve;
     double lost[4] = {0.0, 0.0, 0.0, 0.0};
-    double reached = bank->estimate[0][JAXHIL_PRELOAD] * weights[0];
     double shift = 0.0;
-    for (int h = 1; h < JAXHIL_HYPOTHESES; h++) {
-        reached += bank->estimate[h][JAXHIL_PRELOAD] * weights[h];
-    }
-    for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
-        double slope = bank->estimate[0][j] * weights[0];
-        for (int h = 1; h < JAXHIL_HYPOTHESES; h++) {
-            slope += bank->estimate[h][j] * weights[h];
-        }
-        if (j > 0) {
-            reached += curve->slopes[j - 1] * (jaxhil_knots[j] - jaxhil_knots[j - 1]);
-        }
-        curve->slopes[j] = slope;
-        curve->at_knots[j] = reached;
-    }
+    jaxhil_bank_average(bank, weights);
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         for (int k = 0; k < 4; k++) {
             const int place = JAXHIL_SEGMENTS + k;
@@ -223,28 +244,33 @@ static void jaxhil_bank_finish(jaxhil_learnt *bank) {
     bank->met += 1.0;
 }
 
-/* Each hypothesis has the surface between where it was met and where it was told; how far [s] the hardware was in, by
- * the first to enter, as it was met. */
-static double jaxhil_bank_place(jaxhil_learnt *bank, const jaxhil_meeting *meeting, double share) {
+/* Each hypothesis has the surface between where it was met and where it was told, or, where these disagree, where it
+ * was met; there the force at the entry is known to what the stiffness makes of the uncertain place. How far [s] the
+ * hardware was in, by the first to enter, as it was met. */
+static double jaxhil_bank_place(jaxhil_learnt *bank, const jaxhil_meeting *meeting) {
     const double length = meeting->speed / meeting->pace;
+    const double known = bank->plane_spread * bank->plane_spread;
+    const double found = jaxhil_bank_late * meeting->variance;
+    const double spread = sqrt(meeting->variance) / length;
     double first = jaxhil_map_surface;
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
-        const double place = share * (meeting->place - bank->offsets[h] * meeting->speed);
-        const double depth = (meeting->place - place) / length;
+        const double away = meeting->place - bank->offsets[h] * meeting->speed;
+        const bool elsewhere = away * away > jaxhil_bank_elsewhere * (known + meeting->variance);
+        const double share = elsewhere ? 1.0 : known / (known + found);
+        const double place = share * away;
+        const double farther = (meeting->place - place) / length;
+        const double off = jaxhil_bank_usual * (share * (meeting->stiffness * spread));
+        const double depth = (meeting->plane - place) / length;
         const double inside = depth - bank->offsets[h] * meeting->pace;
         bank->deeper[h] = -depth;
+        bank->farther[h] = farther > jaxhil_bank_farthest
+                               ? jaxhil_bank_farthest
+                               : (farther < -jaxhil_bank_farthest ? -jaxhil_bank_farthest : farther);
+        bank->likely[h] = elsewhere ? jaxhil_bank_unlikely : 1.0;
+        bank->covariance[h][JAXHIL_PRELOAD][JAXHIL_PRELOAD] += off * off;
         first = inside > first ? inside : first;
     }
     return first > jaxhil_map_surface ? first : 0.0;
-}
-
-/* How much where it was met counts beside where it was told: all, if the two disagree whatever the delay. */
-static double jaxhil_bank_share(const jaxhil_learnt *bank, const jaxhil_meeting *meeting) {
-    const double known = bank->plane_spread * bank->plane_spread;
-    const double found = jaxhil_bank_late * meeting->variance;
-    const double away = fabs(meeting->place) - bank->offsets[JAXHIL_HYPOTHESES - 1] * meeting->speed;
-    const bool elsewhere = away > 0.0 && away * away > jaxhil_bank_elsewhere * (known + meeting->variance);
-    return elsewhere ? 1.0 : known / (known + found);
 }
 
 /* A contact begins: the one before is added to what is carried, and the maps are the prior. How many ticks before the
@@ -254,14 +280,9 @@ static long jaxhil_learnt_begin(jaxhil_learnt *bank, const jaxhil_meeting *meeti
     if (bank->learning) {
         jaxhil_bank_finish(bank);
     }
-    const double share = jaxhil_bank_share(bank, meeting);
-    const double ticks = ceil(jaxhil_bank_place(bank, meeting, share) / meeting->tick);
-    const double off = share * (meeting->stiffness * meeting->tick);
     bank->pace = meeting->pace;
     jaxhil_bank_restart(bank);
-    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
-        bank->covariance[h][JAXHIL_PRELOAD][JAXHIL_PRELOAD] += off * off / 12.0;
-    }
+    const double ticks = ceil(jaxhil_bank_place(bank, meeting) / meeting->tick);
     jaxhil_bank_weigh(bank, weights);
     jaxhil_bank_conclude(bank, weights);
     return ticks < (double)jaxhil_bank_earlier ? (long)ticks : jaxhil_bank_earlier;
@@ -272,7 +293,7 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
                                double variance, bool hidden, double zone, double *sharpness) {
     double(*covariance)[JAXHIL_PARAMETERS] = bank->covariance[h];
     double *estimate = bank->estimate[h];
-    double phi[JAXHIL_PARAMETERS], g[JAXHIL_PARAMETERS];
+    double knots[JAXHIL_SEGMENTS], phi[JAXHIL_PARAMETERS], g[JAXHIL_PARAMETERS];
     const double x = depth - bank->offsets[h] * bank->pace * rate - bank->deeper[h];
     const double read = hidden ? 0.0 : force;
     const double noise = hidden ? variance + zone * zone / 12.0 : variance;
@@ -280,11 +301,12 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
     if (x > bank->deepest[h]) {
         bank->deepest[h] = x;
     }
+    jaxhil_bank_knots(bank, h, knots);
     for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
-        const double beyond = x - jaxhil_knots[j];
+        const double beyond = x - knots[j];
         phi[j] = beyond > 0.0 ? beyond : 0.0;
-        if (j < JAXHIL_SEGMENTS - 1 && beyond > jaxhil_knots[j + 1] - jaxhil_knots[j]) {
-            phi[j] = jaxhil_knots[j + 1] - jaxhil_knots[j];
+        if (j < JAXHIL_SEGMENTS - 1 && beyond > knots[j + 1] - knots[j]) {
+            phi[j] = knots[j + 1] - knots[j];
         }
     }
     phi[JAXHIL_DAMPING] = rate;
@@ -342,7 +364,7 @@ static void jaxhil_learnt_read(jaxhil_learnt *bank, double depth, double rate, d
         }
     }
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
-        const double likely = jaxhil_bank_exponential(surprise[h] - least, JAXHIL_SQUARINGS);
+        const double likely = jaxhil_exponential(surprise[h] - least, JAXHIL_SQUARINGS);
         bank->likelihood[h] = bank->likelihood[h] * sharpness[h] * likely;
     }
     jaxhil_bank_shares(bank->likelihood, jaxhil_bank_least);

@@ -26,10 +26,11 @@ typedef struct {
 } jaxhil_onset;
 
 /* What was found: by how many ticks the surface was met before now, the bias [1/s], ln of the evidence, the most
- * that the stiffness may be [1/s^2], by three standard deviations. */
+ * that the stiffness may be [1/s^2], by three standard deviations; by how many ticks it was met `earlier` than in the
+ * middle of that tick, in the mean, and the variance of that, where it is not expected anywhere. */
 typedef struct {
     long age;
-    double bias, evidence, stiffness;
+    double bias, evidence, stiffness, earlier, variance;
 } jaxhil_found;
 
 /* == Definitions == */
@@ -42,6 +43,8 @@ static const double jaxhil_onset_jump_variance = 36.0;
 static const double jaxhil_onset_certain = 9.0;
 static const double jaxhil_onset_wait = 0.004; /* s, and a tick, since then: its stiffness shows */
 static const long jaxhil_onset_longest = 65536; /* ticks of a flight, up to which the sums are exact enough */
+static const long jaxhil_onset_beside = 8; /* steps to both sides of what was found, and the share of its age per step */
+enum { JAXHIL_SQUARINGS = 10 };
 
 static void jaxhil_onset_restart(jaxhil_onset *onset) {
     onset->watched = 0;
@@ -71,6 +74,15 @@ static double jaxhil_logarithm(double z) {
         z = sqrt(z);
     }
     return 2048.0 * (z - 1.0) / (z + 1.0);
+}
+
+/* (1 + u/n)^-n, n = 2^squarings: exp(-u), and less steep far out. */
+static double jaxhil_exponential(double u, int squarings) {
+    double value = 1.0 / (1.0 + u / (double)(1L << squarings));
+    for (int i = 0; i < squarings; i++) {
+        value = value * value;
+    }
+    return value;
 }
 
 /* ln of the evidence for a surface met `age` ticks ago against none; noise and bias of these variances [1/s^2],
@@ -108,4 +120,27 @@ static double jaxhil_onset_evidence(const jaxhil_onset *onset, long age, double 
     return 0.5 * (explained / noise -
                   jaxhil_onset_stiffness * jaxhil_onset_stiffness / jaxhil_onset_stiffness_variance -
                   y * y * left / (noise * silence) - jaxhil_logarithm(occam * rarity * rarity));
+}
+
+/* How much earlier than found the surface was met, by the ticks beside it. */
+static void jaxhil_onset_spread(const jaxhil_onset *onset, double noise, double unknown, jaxhil_found *found) {
+    jaxhil_found one;
+    const double most = jaxhil_onset_evidence(onset, found->age, noise, unknown, 1.0, &one);
+    const long step = 1 + found->age / jaxhil_onset_beside;
+    double total = 0.0, mean = 0.0, square = 0.0;
+    for (long i = -jaxhil_onset_beside; i <= jaxhil_onset_beside; i++) {
+        const long age = found->age + i * step;
+        if (age < 1 || age >= onset->watched || age > jaxhil_ages[JAXHIL_AGES]) {
+            continue;
+        }
+        const double evidence = jaxhil_onset_evidence(onset, age, noise, unknown, 1.0, &one);
+        const double weight =
+            evidence > -jaxhil_onset_certain ? jaxhil_exponential(most - evidence, JAXHIL_SQUARINGS) : 0.0;
+        const double earlier = (double)(i * step);
+        total += weight;
+        mean += weight * earlier;
+        square += weight * (earlier * earlier);
+    }
+    found->earlier = mean / total;
+    found->variance = square / total - found->earlier * found->earlier;
 }

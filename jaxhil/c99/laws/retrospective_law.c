@@ -214,15 +214,17 @@ static void jaxhil_law_meet(jaxhil_law *law, double side, double reach, double s
     scales->weight = law->mass * speed * law->pace;
     const double low = jaxhil_scales_beyond(scales, jaxhil_history_recall(history, entry)->position);
     const double high = jaxhil_scales_beyond(scales, jaxhil_history_recall(history, entry + 1)->position);
-    const double variance = jaxhil_plane_found(high - low, found.age);
-    jaxhil_plane_learn(plane, low, high, variance);
+    jaxhil_plane_learn(plane, low, high, jaxhil_plane_found(high - low, found.age));
     /* Not at the end of the stretch: the reference would not have entered. */
     const double end = high - jaxhil_margin * (high - low);
     scales->plane = plane->place < low ? low : (plane->place > end ? end : plane->place);
     const double since = high > low ? (high - scales->plane) / (high - low) : 0.5;
     const double tick = law->reference.period;
     const double stiffness = found.stiffness / (law->pace * law->pace);
-    const jaxhil_meeting meeting = {side, scales->plane, variance, speed, law->pace, tick, stiffness};
+    const double width = high - low;
+    const double met = 0.5 * (low + high) - found.earlier * width;
+    const double around = width * width * (1.0 / 12.0 + found.variance);
+    const jaxhil_meeting meeting = {scales->plane, met, around, speed, law->pace, tick, stiffness};
     const long earlier = jaxhil_learnt_begin(&law->learnt, &meeting);
     const double depth = (reach - scales->plane) / scales->length - jaxhil_learnt_deeper(&law->learnt);
     const double far = jaxhil_far * law->plane_spread;
@@ -241,13 +243,19 @@ static void jaxhil_law_meet(jaxhil_law *law, double side, double reach, double s
     jaxhil_reference_motion_begin(&law->reference, history, entry, since, depth > 0.0 ? depth : 0.0);
 }
 
+/* Of a reading and of the bias the variance [1/s^2], flying with this speed [m/s]. */
+static void jaxhil_law_uncertain(const jaxhil_law *law, double speed, double *noise, double *unknown) {
+    const double weight = law->mass * speed;
+    const double spread = law->bias_spread / weight;
+    *noise = law->floor * law->floor + jaxhil_force_noise_variance(&law->noise) / (weight * weight);
+    *unknown = spread * spread;
+}
+
 /* Flying to the surface on this side with this speed [m/s]: that it was met so many ticks ago is `found` if that is
  * more evident. */
 static void jaxhil_law_suppose(const jaxhil_law *law, double side, double speed, long age, jaxhil_found *found) {
-    const double weight = law->mass * speed;
-    const double noise =
-        law->floor * law->floor + jaxhil_force_noise_variance(&law->noise) / (weight * weight);
-    const double spread = law->bias_spread / weight;
+    double noise, unknown;
+    jaxhil_law_uncertain(law, speed, &noise, &unknown);
     const jaxhil_plane *plane = &law->planes[side < 0.0];
     const double position = jaxhil_history_recall(&law->history, law->history.newest - age)->position;
     const double place = (side < 0.0 ? -law->clearance - position : position) - plane->place;
@@ -255,7 +263,7 @@ static void jaxhil_law_suppose(const jaxhil_law *law, double side, double speed,
     const double rarity = jaxhil_map_pi * plane->spread * (1.0 + away * away) / (law->period * speed);
     jaxhil_found one;
     one.age = age;
-    one.evidence = jaxhil_onset_evidence(&law->onset, age, noise, spread * spread, rarity, &one);
+    one.evidence = jaxhil_onset_evidence(&law->onset, age, noise, unknown, rarity, &one);
     if (one.evidence > found->evidence) {
         *found = one;
     }
@@ -283,7 +291,13 @@ static bool jaxhil_law_watch(jaxhil_law *law, double side, double speed, double 
             }
         }
     }
-    return found->age > 1 && (double)found->age * law->period >= jaxhil_onset_wait * (1.0 - 1e-9);
+    if (!(found->age > 1 && (double)found->age * law->period >= jaxhil_onset_wait * (1.0 - 1e-9))) {
+        return false;
+    }
+    double noise, unknown;
+    jaxhil_law_uncertain(law, speed, &noise, &unknown);
+    jaxhil_onset_spread(&law->onset, noise, unknown, found);
+    return true;
 }
 
 /* Flying freely: whether the force tells that a surface was met; if so, the contact begins. */
@@ -291,7 +305,7 @@ static bool jaxhil_law_meets(jaxhil_law *law, double force, bool shown, double p
                              double velocity_desired) {
     const double side = velocity_desired > 0.0 ? 1.0 : -1.0;
     const double speed = side * velocity_desired;
-    jaxhil_found found = {0, 0.0, 0.0, 0.0};
+    jaxhil_found found = {0, 0.0, 0.0, 0.0, 0.0, 0.0};
     law->status = JAXHIL_OUT_OF_CONTACT;
     if (!(law->mass * speed > jaxhil_least_weight) || (side < 0.0 && law->clearance == INFINITY)) {
         jaxhil_onset_restart(&law->onset);

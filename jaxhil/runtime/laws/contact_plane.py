@@ -11,7 +11,8 @@ ELSEWHERE = 25.0  # times the variance of where it is expected
 class Meeting(NamedTuple):
     """A surface that was met."""
 
-    place: float  # by how much it is deeper than told, if the force is as old as the given delay says [m]
+    plane: float  # by how much it counts as deeper than told, the force as old as the given delay says [m]
+    place: float  # by how much it is by these readings alone [m]
     variance: float  # of that [m^2]
     speed: float  # at which it was met [m/s]
     pace: float  # seconds on the contact's scale of time in one [1]

@@ -2,11 +2,13 @@
 
 Hypothesis h takes the force to be d_h [s] older than given: it belongs to the depth X - d_h V - p_h. The
 surface was met at X_0; by this hypothesis it lies at p_h = g (X_0 - d_h v_0) beyond where it was told,
-g = spread^2/(spread^2 + found^2) by how uncertain either is. Each identifies a force-depth map
-(`force_depth_map`); its weight is the product of the likelihoods of all readings of this contact and of those
-before and of how well its damping goes with what is known of contacts
-(notebooks/guide/retrospective_reference.md section 7). What counts is the mean over all hypotheses, of their
-maps, delays and surfaces. In NumPy, all hypotheses at a time; sums are taken one term after another.
+g = spread^2/(spread^2 + found^2) by how uncertain either is, or 1 where they disagree. Each identifies a
+force-depth map (`force_depth_map`); its weight is the product of the likelihoods of all readings of this
+contact and of those before, of how well its damping goes with what is known of contacts, and of how likely
+its surface is there (notebooks/guide/retrospective_reference.md section 7). What counts is the mean over all
+hypotheses, of their maps, delays and surfaces. Their maps bend at the same places, wherever they have the
+surface: which fits best is not to be decided by what a contact that bends between two knots leaves. In NumPy,
+all hypotheses at a time; sums are taken one term after another.
 """
 
 from math import ceil, pi, sqrt
@@ -30,6 +32,7 @@ from .force_depth_map import (
     Prior,
     turning,
 )
+from .onset import SQUARINGS, exponential
 
 HYPOTHESES = 17
 ELASTIC = 1 / 3  # probability that a contact has no damping
@@ -37,14 +40,18 @@ BROADENING = 2.0  # of the variance of the damping, as the delay lies between tw
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
 LEAST, LEAST_CARRIED = 1e-200, 1e-12
 NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, some do not
-SQUARINGS, DENSITY_SQUARINGS = 10, 8
+DENSITY_SQUARINGS = 8
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
 SOFT = 25.0  # times the variance of where a surface was met: soft ones are found late
-DEEPER = 9.0  # times the variance of where the surface is expected: it is deeper
+ELSEWHERE = 9.0  # times the variance of where the surface is expected: it is not there
+UNLIKELY = 0.1  # that it is not
+USUAL = 0.5  # stiffness, of the most that it may be
+FARTHEST, WHOLE = 0.004, 0.015  # s by which knots are moved, from what depth [s] on; before it less
 EARLIER = 30  # ticks before it was met, whose readings count
 
 _KNOTS = np.array(KNOTS)[:, None]
-_WIDTHS = np.append(np.diff(KNOTS), np.inf)[:, None]
+_GAPS = np.diff(KNOTS)
+_MOVED = np.minimum(np.array(KNOTS) / WHOLE, 1.0)[:, None]
 # Beside an array, a number takes longer than an array does.
 _0, _1 = np.zeros(HYPOTHESES), np.ones(HYPOTHESES)
 
@@ -54,9 +61,10 @@ class DelayBank:
     where the surface was told [m], and of the map's prior."""
 
     __slots__ = (
-        "_below", "_carried", "_covariance", "_damping", "_deepest", "_estimate", "_known", "_learning",
-        "_likelihood", "_met", "_offsets", "_pace", "_plane_spread", "_precision", "_prior_covariance",
-        "_prior_estimate", "_weighted", "curve", "deeper", "shift", "variance",
+        "_below", "_carried", "_covariance", "_damping", "_deepest", "_estimate", "_knots", "_known",
+        "_learning", "_likelihood", "_likely", "_met", "_offsets", "_pace", "_past", "_plane_spread",
+        "_precision", "_prior_covariance", "_prior_estimate", "_weighted", "_widths", "curve", "deeper",
+        "shift", "variance",
     )  # fmt: skip
 
     def __init__(self, spread: float, plane_spread: float, prior: Prior) -> None:
@@ -76,6 +84,8 @@ class DelayBank:
         self._precision = np.zeros(HYPOTHESES)
         self._weighted = np.zeros(HYPOTHESES)
         self._below = np.zeros(HYPOTHESES)  # by how much deeper each has the surface than it was met [s]
+        self._likely = np.ones(HYPOTHESES)  # how likely it is there
+        self._bend(np.zeros(HYPOTHESES))
         self._met = 0.0
         self._pace = 1.0
         self.shift = 0.0  # the mean of the hypotheses' delays [s]
@@ -93,15 +103,9 @@ class DelayBank:
             self._precision = self._precision + precision
             self._weighted = self._weighted + precision * (self._estimate[DAMPING] * pace)
             self._met += 1.0
-        share = self._share(meeting)
-        places = share * (meeting.place - self._offsets * meeting.speed)
-        depths = (meeting.place - places) / (meeting.speed / meeting.pace)
-        first = float(np.maximum.reduce(depths - self._offsets * meeting.pace))
-        off = share * (meeting.stiffness * meeting.tick)
-        self._below = -depths
         self._pace = meeting.pace
         self._restart()
-        self._covariance[PRELOAD, PRELOAD] += off * off / 12.0
+        first = self._place(meeting)
         self._conclude(self._weigh())
         return min(ceil((first if first > SURFACE else 0.0) / meeting.tick), EARLIER)
 
@@ -114,14 +118,29 @@ class DelayBank:
         self._read(depth, rate, force, variance, hidden, zone)
         self._conclude(self._weigh())
 
-    def _share(self, meeting: Meeting) -> float:
-        """How much where the surface was met counts beside where it was told: all, if the two disagree
-        whatever the delay."""
+    def _place(self, meeting: Meeting) -> float:
+        """Each hypothesis has the surface between where it was met and where it was told, or, where these
+        disagree, where it was met; there the force at the entry is known to what the stiffness makes of the
+        uncertain place. How far [s] the hardware was in, by the first to enter, as it was met."""
+        length = meeting.speed / meeting.pace
         known = self._plane_spread * self._plane_spread
-        found = SOFT * meeting.variance
-        away = abs(meeting.place) - float(self._offsets[-1]) * meeting.speed
-        elsewhere = away > 0.0 and away * away > DEEPER * (known + meeting.variance)
-        return 1.0 if elsewhere else known / (known + found)
+        away = meeting.place - self._offsets * meeting.speed
+        elsewhere = away * away > ELSEWHERE * (known + meeting.variance)
+        share = np.where(elsewhere, 1.0, known / (known + SOFT * meeting.variance))
+        places = share * away
+        off = USUAL * (share * (meeting.stiffness * (sqrt(meeting.variance) / length)))
+        depths = (meeting.plane - places) / length
+        self._below = -depths
+        self._bend(np.fmin(np.fmax((meeting.place - places) / length, -FARTHEST), FARTHEST))
+        self._likely = np.where(elsewhere, UNLIKELY, 1.0)
+        self._covariance[PRELOAD, PRELOAD] += off * off
+        return float(np.maximum.reduce(depths - self._offsets * meeting.pace))
+
+    def _bend(self, farther: np.ndarray) -> None:
+        """The knots of each map lie so much farther in [s] than usual."""
+        self._knots = _KNOTS + farther * _MOVED
+        self._widths = np.append(self._knots[1:] - self._knots[:-1], np.full((1, HYPOTHESES), np.inf), axis=0)
+        self._past = _KNOTS - self._knots
 
     def _restart(self) -> None:
         """Another contact: the maps are the prior, nothing has been read."""
@@ -139,9 +158,9 @@ class DelayBank:
         estimate = self._estimate
         depths = depth - self._offsets * self._pace * rate - self._below
         deepest = np.fmax(self._deepest, depths)
-        beyond = depths - _KNOTS
+        beyond = depths - self._knots
         phi = np.empty((PARAMETERS, HYPOTHESES))
-        phi[:SEGMENTS] = np.fmax(np.minimum(beyond, _WIDTHS), _0)
+        phi[:SEGMENTS] = np.fmax(np.minimum(beyond, self._widths), _0)
         phi[DAMPING] = rate
         phi[DEPTH_DAMPING] = depths * rate / REACH
         phi[UNLOADING] = depths - deepest
@@ -175,7 +194,7 @@ class DelayBank:
         surprise = 0.25 * (missed * missed) / wide
         surprise -= np.minimum.reduce(surprise)
         sharpness = np.sqrt(np.sqrt(np.fmin(noise / wide, _1)))
-        likelihood = self._likelihood * sharpness * _exponential(surprise, SQUARINGS)
+        likelihood = self._likelihood * sharpness * exponential(surprise, SQUARINGS)
         self._likelihood = _shares(likelihood, LEAST)
         self._deepest = deepest
         self._learning = True
@@ -200,7 +219,7 @@ class DelayBank:
         variance = BROADENING * (self._met + 1.0) / total
         plausible = _plausibility(mean, variance, self._damping * (pace * pace))
         plausible = np.where(own > _0, np.fmax(plausible, LEAST_CARRIED), _1)
-        weights = self._likelihood * self._carried * plausible
+        weights = self._likelihood * self._carried * (plausible * self._likely)
         return weights / _total(weights)
 
     def _conclude(self, weights: np.ndarray) -> None:
@@ -210,18 +229,19 @@ class DelayBank:
         self.deeper = float(_total(weights * self._below))
         self.variance = float(_total(weights * self._known))
         estimate = self._estimate
-        slopes = np.add.accumulate(estimate[:SEGMENTS] * weights, axis=1)[:, -1].tolist()
-        reached = float(_total(estimate[PRELOAD] * weights))
-        at_knots = [reached] * SEGMENTS
-        for j in range(1, SEGMENTS):
-            reached += slopes[j - 1] * (KNOTS[j] - KNOTS[j - 1])
-            at_knots[j] = reached
+        # The force at each map's own knots, then at the usual ones.
+        slopes = estimate[:SEGMENTS]
+        steps = np.concatenate((estimate[PRELOAD:], slopes[:-1] * self._widths[:-1]))
+        there = np.where(self._past < _0, np.concatenate((slopes[:1], slopes[:-1])), slopes)
+        forces = weights * (np.add.accumulate(steps, axis=0) + self._past * there)
+        at_knots = np.add.accumulate(forces, axis=1)[:, -1]
+        last = float(_total(weights * slopes[-1]))
         # Without a copy.
         diagonal = self._covariance.reshape(-1, HYPOTHESES)[:: PARAMETERS + 1]
         lost = _positive_mean(estimate[DAMPING:PRELOAD], diagonal[DAMPING:PRELOAD]) * weights
         curve = self.curve
-        curve.slopes = slopes
-        curve.at_knots = at_knots
+        curve.slopes = [*((at_knots[1:] - at_knots[:-1]) / _GAPS).tolist(), last]
+        curve.at_knots = at_knots.tolist()
         losses = np.add.accumulate(lost, axis=1)[:, -1].tolist()
         curve.damping, curve.depth_damping, curve.unloading, curve.friction = losses
 
@@ -231,7 +251,7 @@ def _plausibility(mean: np.ndarray, variance: np.ndarray, prior: float) -> np.nd
     N(0, prior) does; Phi as in `force_depth_map.positive_mean`."""
     spread = np.sqrt(variance)
     ratio = mean / spread
-    density = _exponential(0.5 * (ratio * ratio), DENSITY_SQUARINGS)
+    density = exponential(0.5 * (ratio * ratio), DENSITY_SQUARINGS)
     size = np.abs(ratio)
     mills = pi / ((pi - 1.0) * size + np.sqrt(size * size + 2.0 * pi))
     beyond = density * mills * (2.0 / sqrt(2.0 * pi))
@@ -256,14 +276,6 @@ def _positive_mean(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
     density = tail / sqrt(2.0 * pi)
     above = positive + density / (1.0 - density * mills)
     return np.where(known, spread * np.where(above_0, above, below), np.fmax(mean, _0))
-
-
-def _exponential(u: np.ndarray, squarings: int) -> np.ndarray:
-    """(1 + u/n)^-n, n = 2^squarings."""
-    value = 1.0 / (1.0 + u / float(1 << squarings))
-    for _ in range(squarings):
-        value *= value
-    return value
 
 
 def _shares(values: np.ndarray, least: float) -> np.ndarray:

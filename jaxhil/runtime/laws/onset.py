@@ -11,7 +11,7 @@ by ever smaller steps. Scaled by approach speed and mass: forces in 1/s, K in 1/
 
 from collections.abc import Callable
 from math import pi, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from .history import SLOTS
 
@@ -25,6 +25,8 @@ JUMP_VARIANCE = 36.0  # s_B^2 [1/s^2]
 CERTAIN = 9.0
 WAIT = 0.004  # s, and a tick, since the surface was met: then its stiffness shows
 LONGEST_FLIGHT = 65536  # ticks of a flight up to which the sums are exact enough; then they begin anew
+BESIDE = 8  # steps to both sides of what was found, and the share of its age per step
+SQUARINGS = 10
 
 
 class Found(NamedTuple):
@@ -34,6 +36,8 @@ class Found(NamedTuple):
     evidence: float  # ln of that for it against none
     bias: float  # of the force [1/s]
     stiffness: float  # the most that it may be, by three standard deviations [1/s^2]
+    earlier: float = 0.0  # ticks by which it was met before the middle of that tick, in the mean
+    variance: float = 0.0  # of that, where the surface is not expected anywhere
 
 
 class Onset:
@@ -83,7 +87,7 @@ class Onset:
                     one = self.suppose(age, noise, unknown, rarity(age))
                     best = one if one.evidence > best.evidence else best
         waited = best.age > 1 and float(best.age) * self._period >= WAIT * (1.0 - 1e-9)
-        return best if waited else None
+        return self._spread(best, noise, unknown) if waited else None
 
     def suppose(self, age: int, noise: float, unknown: float, rarity: float) -> Found:
         """What the readings say of a surface met `age` ticks ago.
@@ -122,6 +126,24 @@ class Onset:
         stiffness = ((r * f - s * y) + 3.0 * sqrt(r * noise * determinant)) / determinant
         return Found(age, evidence, bias, stiffness)
 
+    def _spread(self, found: Found, noise: float, unknown: float) -> Found:
+        """With how much earlier the surface was met, by the ticks beside it."""
+        most = self.suppose(found.age, noise, unknown, 1.0).evidence
+        step = 1 + found.age // BESIDE
+        total = mean = square = 0.0
+        for i in range(-BESIDE, BESIDE + 1):
+            age = found.age + i * step
+            if age < 1 or age >= self._watched or age > AGES[-1]:
+                continue
+            evidence = self.suppose(age, noise, unknown, 1.0).evidence
+            weight = exponential(most - evidence, SQUARINGS) if evidence > -CERTAIN else 0.0
+            earlier = float(i * step)
+            total += weight
+            mean += weight * earlier
+            square += weight * (earlier * earlier)
+        mean /= total
+        return found._replace(earlier=mean, variance=square / total - mean * mean)
+
 
 def rarity(away: float, spread: float, width: float) -> float:
     """One over the probability of a surface in a stretch of this width, so far `away` from where it is
@@ -135,3 +157,11 @@ def logarithm(z: float) -> float:
     for _ in range(10):
         z = sqrt(z)
     return 2048.0 * (z - 1.0) / (z + 1.0)
+
+
+def exponential(u: Any, squarings: int) -> Any:
+    """(1 + u/n)^-n, n = 2^squarings: exp(-u), and less steep far out; of a number or of an array of them."""
+    value = 1.0 / (1.0 + u / float(1 << squarings))
+    for _ in range(squarings):
+        value = value * value
+    return value

@@ -240,14 +240,16 @@ class Retrospective(Compensator):
         low = scales.beyond(start.position)
         high = scales.beyond(history.recall(entry + 1).position)
         plane = self._planes[side]
-        variance = found_variance(high - low, found.age)
-        plane.learn(low, high, variance)
+        width = high - low
+        plane.learn(low, high, found_variance(width, found.age))
         # Not at the end of the stretch: the reference would not have entered.
         end = high - MARGIN * (high - low)
         scales.plane = low if plane.place < low else (end if plane.place > end else plane.place)
-        since = (high - scales.plane) / (high - low) if high > low else 0.5
+        since = (high - scales.plane) / width if high > low else 0.5
         stiffness = found.stiffness / (pace * pace)
-        meeting = Meeting(scales.plane, variance, speed, pace, self._reference.period, stiffness)
+        met = 0.5 * (low + high) - found.earlier * width
+        around = width * width * (1.0 / 12.0 + found.variance)
+        meeting = Meeting(scales.plane, met, around, speed, pace, self._reference.period, stiffness)
         earlier = self._begin(meeting)
         depth = scales.depth(position) - self._deeper
         self._side = side
