@@ -7,8 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from c99_cases import ROW
 from gain_documents import gain_document
+from rig_lock_step import controller
 from scipy import stats
+from test_law_status import run
 
 from jaxhil.compensators import delay_bank as in_jax
 from jaxhil.compensators import force_depth_map, literature_gains
@@ -38,6 +41,8 @@ PRIOR = {
     "preload": 0.3,
 }
 OFFSETS = SPREAD * np.linspace(-1, 1, HYPOTHESES)
+SUITES = ("noisy", "damped", "hertz", "hardening", "layered")
+PLANES = 'uncertainty."rig.contact_plane"={distribution="uniform",low=-1e-3,high=1e-3}'
 DELAYS = 'uncertainty."rig.force_sensor.delay"={distribution="uniform",low=0.007,high=0.009}'
 
 
@@ -202,8 +207,8 @@ def test_surface_lies_between_where_it_was_told_and_where_it_was_met(plane_sprea
 @pytest.mark.parametrize("delay", [-0.0005, 0.0005])
 @pytest.mark.parametrize("bends", [0.04, 0.042])  # 46 is a knot
 def test_where_a_contact_bends_does_not_tell_its_delay(bends, delay):
-    """Two layers without noise, the surface met where it is: a map that misses the bend must not pass that off
-    as a delay that moves the bend of the way back to a knot."""
+    """Two layers without noise, the surface met where it is: what a map misses of the bend must not pass
+    for a delay that moves the bend of the way back to a knot."""
     bank = plain(plane_spread=1e-3)
     phase = (0.5e-3 - 0.002 + PERIOD * np.arange(150)) * math.pi / 0.15
     depths, speeds = 0.15 / math.pi * np.sin(phase), np.cos(phase)
@@ -260,33 +265,59 @@ def test_an_unknown_delay_is_found_and_leaves_little(repeated):
     assert np.sqrt(np.mean(found[-1] ** 2)) < 1.5e-4 < 3 * np.sqrt(np.mean(found[0] ** 2))
 
 
-@pytest.mark.slow
-def test_what_an_unknown_delay_leaves_on_the_standard_suites(capsys):
-    """Eight contacts of 200 scenarios a suite, the delay unknown to +-1 ms, the phase drawn for each.
+def restitution(mechanism):
+    """Of linear damped contact that does not adhere: the force is 0 where the speed is greatest."""
+    [stiffness], [damping] = mechanism.contact.stiffness, mechanism.contact.damping
+    ratio = damping / (2 * math.sqrt(stiffness * mechanism.bodies.mass))
+    return math.exp(-ratio / math.sqrt(1 - ratio**2) * (math.pi - 2 * math.asin(ratio)))
 
-    Damped ones slow down from contact to contact, which makes more of the noise."""
-    squares = []
-    first = {"noisy": 0.75, "damped": 0.75}
-    for suite in ("noisy", "damped", "hertz", "hardening", "layered"):
-        mechanism = load(f"suite-{suite}", ["approach.contacts=8", DELAYS]).mechanism
-        rms = {}
-        for law in ("retrospective_reference", LAW):
-            scenarios = build_scenarios(mechanism, draw(mechanism, 200, 77), 77)
-            outcome = evaluate(
-                build_loop(mechanism, law, scenarios), literature_gains(mechanism, law), scenarios
-            )
-            assert np.all(outcome.good[:8])
-            rms[law] = 100 * np.sqrt(np.mean(np.asarray(outcome.error)[:8] ** 2, axis=1))
-        squares.append(rms[LAW] ** 2)
-        with capsys.disabled():
-            given, ours = rms.values()
-            print(f"{suite:10s} rms [%], contacts 1, 2, 4, 8:", *np.round(ours[[0, 1, 3, 7]], 2), end="")
-            print("; delay taken as given:", *np.round(given[[0, 7]], 2))
-        assert ours[0] <= first.get(suite, 0.4) and (ours[7] <= 0.3 or suite == "damped")
-    whole = np.sqrt(np.mean(squares, axis=0))
+
+@pytest.mark.slow
+@pytest.mark.parametrize("plane", ["told", "unknown"])
+@pytest.mark.parametrize("suite", SUITES)
+def test_what_an_unknown_delay_leaves_on_the_standard_suites(suite, plane, capsys):
+    """Eight contacts of 100 scenarios, the delay unknown to +-1 ms, the phase drawn for each; the surface where it
+    was told, or unknown to +-1 mm."""
+    changes = ["approach.contacts=8", DELAYS, *([PLANES] if plane == "unknown" else [])]
+    mechanism = load(f"suite-{suite}", changes).mechanism
+    scenarios = build_scenarios(mechanism, draw(mechanism, 100, 77), 77)
+    outcome = evaluate(build_loop(mechanism, LAW, scenarios), literature_gains(mechanism, LAW), scenarios)
+    assert np.all(outcome.good[:8])
+    rms = 100 * np.sqrt(np.mean(np.asarray(outcome.error)[:8] ** 2, axis=1))
     with capsys.disabled():
-        print(f"all five: {whole[0]:.2f} on the first, {whole[7]:.2f} on the eighth")
-    assert whole[7] <= 0.4
+        print(
+            f"\n{suite:10s} plane {plane:8s} rms [%], contacts 1, 2, 4, 8:", *np.round(rms[[0, 1, 3, 7]], 2)
+        )
+    dissipates = suite in ("noisy", "damped")
+    first, eighth = {"told": (0.75 if dissipates else 0.4, 0.3), "unknown": (0.85, 0.45)}[plane]
+    # Damped contacts slow down from one to the next, which makes more of the noise: see below.
+    assert rms[0] <= first and (rms[7] <= eighth or suite == "damped")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("off", [None, 0.0, 1e-5, 2e-5])
+def test_what_it_leaves_of_damped_contacts_at_one_speed(off, capsys):
+    """The delay unknown to +-1 ms, the surface unknown to +-1 mm or told as exact and so much [m] off."""
+    number, contacts = 24, 8
+    changes = [DELAYS, PLANES] if off is None else [DELAYS]
+    told = load("suite-damped", changes).mechanism
+    drawn = draw(told, number, 79)
+    errors = np.empty((number, contacts))
+    for place in range(number):
+        values = {path: each[place].tolist() for path, each in drawn.items() if path != "approach.phase"}
+        values["rig.contact_plane"] = values.get("rig.contact_plane", off)
+        one = controller(told, LAW, literature_gains(told, LAW))
+        for contact in range(contacts):
+            values["approach.phase"] = np.random.default_rng([place, contact]).random()
+            mechanism = load("suite-damped", [f"{path}={value}" for path, value in values.items()]).mechanism
+            velocity = run(mechanism, one, contact).rows[:, ROW.index("velocity")]
+            errors[place, contact] = 100 * (abs(velocity[-1]) / velocity[0] - restitution(mechanism))
+            one.next_contact()
+    rms = np.sqrt(np.mean(errors**2, axis=0))
+    name = "unknown" if off is None else f"told, {1e3 * off:.2f} mm off"
+    with capsys.disabled():
+        print(f"\ndamped, plane {name}: rms [%], contacts 1, 2, 4, 8:", *np.round(rms[[0, 1, 3, 7]], 2))
+    assert rms[0] <= 1.0 and rms[7] <= 0.75
 
 
 @pytest.mark.slow

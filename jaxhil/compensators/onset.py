@@ -30,7 +30,7 @@ JUMP_VARIANCE = 36.0  # s_B^2 [1/s^2]
 CERTAIN = 9.0
 WAIT = 0.004  # s, and a tick, since the surface was met: then its stiffness shows
 LONGEST_FLIGHT = 65536  # ticks of a flight up to which the sums are exact enough; then they begin anew
-BESIDE = 8  # steps to both sides of what was found, and the share of its age per step
+BESIDE = 8  # steps to both sides of what was found, together its age
 SQUARINGS = 10
 
 
@@ -154,7 +154,7 @@ def exponential(u: Array, squarings: int) -> Array:
 def _spread(onset, tick, age, scales):
     """How much earlier than found the surface was met, in the mean, and the variance of that, by the ticks
     beside it [ticks]."""
-    beside = jnp.arange(-BESIDE, BESIDE + 1).reshape(-1, *[1] * age.ndim) * (1 + age // BESIDE)[None]
+    beside = jnp.arange(-BESIDE, BESIDE + 1).reshape(-1, *[1] * age.ndim) * (1 + age // (2 * BESIDE))[None]
     ages = age[None] + beside
     counts = (ages >= 1) & (ages < onset.watched[None]) & (ages <= AGES[-1])
     ages = jnp.where(counts, ages, age[None])

@@ -43,7 +43,7 @@ static const double jaxhil_onset_jump_variance = 36.0;
 static const double jaxhil_onset_certain = 9.0;
 static const double jaxhil_onset_wait = 0.004; /* s, and a tick, since then: its stiffness shows */
 static const long jaxhil_onset_longest = 65536; /* ticks of a flight, up to which the sums are exact enough */
-static const long jaxhil_onset_beside = 8; /* steps to both sides of what was found, and the share of its age per step */
+static const long jaxhil_onset_beside = 8; /* steps to both sides of what was found, together its age */
 enum { JAXHIL_SQUARINGS = 10 };
 
 static void jaxhil_onset_restart(jaxhil_onset *onset) {
@@ -126,7 +126,7 @@ static double jaxhil_onset_evidence(const jaxhil_onset *onset, long age, double 
 static void jaxhil_onset_spread(const jaxhil_onset *onset, double noise, double unknown, jaxhil_found *found) {
     jaxhil_found one;
     const double most = jaxhil_onset_evidence(onset, found->age, noise, unknown, 1.0, &one);
-    const long step = 1 + found->age / jaxhil_onset_beside;
+    const long step = 1 + found->age / (2 * jaxhil_onset_beside);
     double total = 0.0, mean = 0.0, square = 0.0;
     for (long i = -jaxhil_onset_beside; i <= jaxhil_onset_beside; i++) {
         const long age = found->age + i * step;

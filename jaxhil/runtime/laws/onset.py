@@ -25,7 +25,7 @@ JUMP_VARIANCE = 36.0  # s_B^2 [1/s^2]
 CERTAIN = 9.0
 WAIT = 0.004  # s, and a tick, since the surface was met: then its stiffness shows
 LONGEST_FLIGHT = 65536  # ticks of a flight up to which the sums are exact enough; then they begin anew
-BESIDE = 8  # steps to both sides of what was found, and the share of its age per step
+BESIDE = 8  # steps to both sides of what was found, together its age
 SQUARINGS = 10
 
 
@@ -129,7 +129,7 @@ class Onset:
     def _spread(self, found: Found, noise: float, unknown: float) -> Found:
         """With how much earlier the surface was met, by the ticks beside it."""
         most = self.suppose(found.age, noise, unknown, 1.0).evidence
-        step = 1 + found.age // BESIDE
+        step = 1 + found.age // (2 * BESIDE)
         total = mean = square = 0.0
         for i in range(-BESIDE, BESIDE + 1):
             age = found.age + i * step
