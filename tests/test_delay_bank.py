@@ -276,8 +276,8 @@ def restitution(mechanism):
 @pytest.mark.parametrize("plane", ["told", "unknown"])
 @pytest.mark.parametrize("suite", SUITES)
 def test_what_an_unknown_delay_leaves_on_the_standard_suites(suite, plane, capsys):
-    """Eight contacts of 100 scenarios, the delay unknown to +-1 ms, the phase drawn for each; the surface where it
-    was told, or unknown to +-1 mm."""
+    """Eight contacts of 100 scenarios, the delay unknown to +-1 ms, the phase drawn for each; the surface
+    where it was told, or unknown to +-1 mm."""
     changes = ["approach.contacts=8", DELAYS, *([PLANES] if plane == "unknown" else [])]
     mechanism = load(f"suite-{suite}", changes).mechanism
     scenarios = build_scenarios(mechanism, draw(mechanism, 100, 77), 77)
@@ -295,7 +295,7 @@ def test_what_an_unknown_delay_leaves_on_the_standard_suites(suite, plane, capsy
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("off", [None, 0.0, 1e-5, 2e-5])
+@pytest.mark.parametrize("off", [None, 1e-5])
 def test_what_it_leaves_of_damped_contacts_at_one_speed(off, capsys):
     """The delay unknown to +-1 ms, the surface unknown to +-1 mm or told as exact and so much [m] off."""
     number, contacts = 24, 8
