@@ -156,14 +156,13 @@ def _spread(onset, tick, age, scales):
     beside it [ticks]."""
     beside = jnp.arange(-BESIDE, BESIDE + 1).reshape(-1, *[1] * age.ndim) * (1 + age // (2 * BESIDE))[None]
     ages = age[None] + beside
-    counts = (ages >= 1) & (ages < onset.watched[None]) & (ages <= AGES[-1])
+    counts = (beside != 0) & (ages >= 1) & (ages < onset.watched[None]) & (ages <= AGES[-1])
     ages = jnp.where(counts, ages, age[None])
     evidence = _suppose(onset, _sums_before(onset, tick, ages), ages, *scales, 1.0)[0]
     most = evidence[BESIDE]
     weights = jnp.where(counts & (evidence > -CERTAIN), exponential(most[None] - evidence, SQUARINGS), 0)
     earlier = beside.astype(evidence.dtype)
-    total = jnp.sum(weights, axis=0)
-    total = jnp.where(total > 0, total, 1)
+    total = 1 + jnp.sum(weights, axis=0)  # with that of what was found
     mean = jnp.sum(weights * earlier, axis=0) / total
     return lax.stop_gradient((mean, jnp.sum(weights * earlier**2, axis=0) / total - mean * mean))
 

@@ -127,10 +127,10 @@ static void jaxhil_onset_spread(const jaxhil_onset *onset, double noise, double 
     jaxhil_found one;
     const double most = jaxhil_onset_evidence(onset, found->age, noise, unknown, 1.0, &one);
     const long step = 1 + found->age / (2 * jaxhil_onset_beside);
-    double total = 0.0, mean = 0.0, square = 0.0;
+    double total = 1.0, mean = 0.0, square = 0.0; /* of what was found */
     for (long i = -jaxhil_onset_beside; i <= jaxhil_onset_beside; i++) {
         const long age = found->age + i * step;
-        if (age < 1 || age >= onset->watched || age > jaxhil_ages[JAXHIL_AGES]) {
+        if (i == 0 || age < 1 || age >= onset->watched || age > jaxhil_ages[JAXHIL_AGES]) {
             continue;
         }
         const double evidence = jaxhil_onset_evidence(onset, age, noise, unknown, 1.0, &one);

@@ -131,7 +131,7 @@ class DelayBank:
         off = USUAL * (share * (meeting.stiffness * (sqrt(meeting.variance) / length)))
         depths = (meeting.plane - places) / length
         self._below = -depths
-        self._bend(np.fmin(np.fmax((meeting.place - places) / length, -FARTHEST), FARTHEST))
+        self._bend(np.minimum(np.maximum((meeting.place - places) / length, -FARTHEST), FARTHEST))
         self._likely = np.where(elsewhere, UNLIKELY, 1.0)
         self._covariance[PRELOAD, PRELOAD] += off * off
         return float(np.maximum.reduce(depths - self._offsets * meeting.pace))

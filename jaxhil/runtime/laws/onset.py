@@ -130,10 +130,11 @@ class Onset:
         """With how much earlier the surface was met, by the ticks beside it."""
         most = self.suppose(found.age, noise, unknown, 1.0).evidence
         step = 1 + found.age // (2 * BESIDE)
-        total = mean = square = 0.0
+        total = 1.0  # that of what was found
+        mean = square = 0.0
         for i in range(-BESIDE, BESIDE + 1):
             age = found.age + i * step
-            if age < 1 or age >= self._watched or age > AGES[-1]:
+            if i == 0 or age < 1 or age >= self._watched or age > AGES[-1]:
                 continue
             evidence = self.suppose(age, noise, unknown, 1.0).evidence
             weight = exponential(most - evidence, SQUARINGS) if evidence > -CERTAIN else 0.0
