@@ -154,7 +154,10 @@ def exponential(u: Array, squarings: int) -> Array:
 def _spread(onset, tick, age, scales):
     """How much earlier than found the surface was met, in the mean, and the variance of that, by the ticks
     beside it [ticks]."""
-    beside = jnp.arange(-BESIDE, BESIDE + 1).reshape(-1, *[1] * age.ndim) * (1 + age // (2 * BESIDE))[None]
+    beside = (
+        jnp.arange(-BESIDE, BESIDE + 1, dtype=jnp.int32).reshape(-1, *[1] * age.ndim)
+        * (1 + age // (2 * BESIDE))[None]
+    )
     ages = age[None] + beside
     counts = (beside != 0) & (ages >= 1) & (ages < onset.watched[None]) & (ages <= AGES[-1])
     ages = jnp.where(counts, ages, age[None])
