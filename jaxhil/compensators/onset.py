@@ -151,7 +151,7 @@ def exponential(u: Array, squarings: int) -> Array:
     return value
 
 
-def _spread(onset, tick, age, scales):
+def _spread(onset: Onset, tick: Array, age: Array, scales: tuple[Array, Array, Array]):
     """How much earlier than found the surface was met, in the mean, and the variance of that, by the ticks
     beside it [ticks]."""
     beside = (

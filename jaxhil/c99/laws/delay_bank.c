@@ -23,9 +23,10 @@
 enum { JAXHIL_HYPOTHESES = 17 };
 
 /* Of each hypothesis its delay, by how much [s] it has the surface deeper than it was met and its knots farther in than
- * usual, how likely it is that the surface is there, map, deepest point, the likelihoods of this contact and of those before; sums over these of the damping's precision and of precision times
- * mean, their number `met`; whether this contact is to be added to them. The mean of the maps and, `shift` [s] and
- * `below` [s], of the delays and of how much deeper; the delay that was `given`. */
+ * usual, how likely it is that the surface is there, map, deepest point, the likelihoods of this contact and of those
+ * before; sums over these of the damping's precision and of precision times mean, their number `met`; whether this
+ * contact is to be added to them. The mean of the maps and, `shift` [s] and `below` [s], of the delays and of how much
+ * deeper; the delay that was `given`. */
 typedef struct {
     double given, shift, below, met, variance, pace, plane_spread;
     double known[JAXHIL_HYPOTHESES];

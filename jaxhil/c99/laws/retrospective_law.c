@@ -214,14 +214,14 @@ static void jaxhil_law_meet(jaxhil_law *law, double side, double reach, double s
     scales->weight = law->mass * speed * law->pace;
     const double low = jaxhil_scales_beyond(scales, jaxhil_history_recall(history, entry)->position);
     const double high = jaxhil_scales_beyond(scales, jaxhil_history_recall(history, entry + 1)->position);
-    jaxhil_plane_learn(plane, low, high, jaxhil_plane_found(high - low, found.age));
+    const double width = high - low;
+    jaxhil_plane_learn(plane, low, high, jaxhil_plane_found(width, found.age));
     /* Not at the end of the stretch: the reference would not have entered. */
-    const double end = high - jaxhil_margin * (high - low);
+    const double end = high - jaxhil_margin * width;
     scales->plane = plane->place < low ? low : (plane->place > end ? end : plane->place);
-    const double since = high > low ? (high - scales->plane) / (high - low) : 0.5;
+    const double since = high > low ? (high - scales->plane) / width : 0.5;
     const double tick = law->reference.period;
     const double stiffness = found.stiffness / (law->pace * law->pace);
-    const double width = high - low;
     const double met = 0.5 * (low + high) - found.earlier * width;
     const double around = width * width * (1.0 / 12.0 + found.variance);
     const jaxhil_meeting meeting = {scales->plane, met, around, speed, law->pace, tick, stiffness};
@@ -232,9 +232,7 @@ static void jaxhil_law_meet(jaxhil_law *law, double side, double reach, double s
     law->side = side;
     law->speed = speed;
     law->gone = 0.0;
-    law->deepest = 0.0;
-    law->hardware_deepest = 0.0;
-    law->learnt_deepest = 0.0;
+    law->deepest = law->hardware_deepest = law->learnt_deepest = 0.0;
     law->next = entry + 1 - (earlier < entry ? earlier : entry);
     jaxhil_doubts_restart(&law->doubts);
     jaxhil_balance_restart(&law->balance);

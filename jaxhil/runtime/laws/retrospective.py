@@ -243,7 +243,7 @@ class Retrospective(Compensator):
         width = high - low
         plane.learn(low, high, found_variance(width, found.age))
         # Not at the end of the stretch: the reference would not have entered.
-        end = high - MARGIN * (high - low)
+        end = high - MARGIN * width
         scales.plane = low if plane.place < low else (end if plane.place > end else plane.place)
         since = (high - scales.plane) / width if high > low else 0.5
         stiffness = found.stiffness / (pace * pace)
@@ -255,9 +255,7 @@ class Retrospective(Compensator):
         self._side = side
         self._speed = speed
         self._gone = 0.0
-        self._deepest = 0.0
-        self._hardware_deepest = 0.0
-        self._learnt_deepest = 0.0
+        self._deepest = self._hardware_deepest = self._learnt_deepest = 0.0
         self._next = entry + 1 - min(earlier, entry)
         self._doubts.restart()
         self._balance.restart()
