@@ -11,26 +11,16 @@ from pathlib import Path
 
 import jax
 
-
-def _is_known(name: str, value: int | bool) -> bool:
-    """Whether this version of the compiler has an option of that name."""
-    try:
-        jax.jit(lambda: 0, compiler_options={name: value})()
-    except jax.errors.JaxRuntimeError:
-        return False
-    return True
-
+from jaxhil.simulation.environment import known_options
 
 # Of one program, given to `jax.jit`: more than can be switched for all that a module compiles.
-QUICK = {
-    name: value
-    for name, value in {
+QUICK = known_options(
+    {
         "xla_backend_optimization_level": 0,
         "xla_llvm_disable_expensive_passes": True,
         "xla_cpu_use_fusion_emitters": False,
-    }.items()
-    if _is_known(name, value)
-}
+    }
+)
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
 

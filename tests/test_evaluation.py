@@ -65,12 +65,12 @@ def test_neutral_gains_are_no_compensation(compensator):
 def test_other_mechanism_seed_and_number_reuse_the_program():
     loop, gains, scenarios = setting(lanes=40)
     evaluate(loop, gains, scenarios)
-    programs = programs_of("run_tiles")
+    programs = programs_of("_run_tiles")
     other, other_gains, other_scenarios = setting(name="claw-350kg", seed=7, lanes=35)
     assert other == loop
     evaluate(other, other_gains, other_scenarios)
     evaluate(*setting(seed=3, lanes=64, overrides=("bodies.equivalent_mass=200",)))
-    assert programs_of("run_tiles") == programs > 0
+    assert programs_of("_run_tiles") == programs > 0
 
 
 def test_every_contact_is_set_beside_its_own_reference():

@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from functools import cache
 from pathlib import Path
 
 from jaxhil.simulation.compile_cache import keep_sealed
@@ -24,6 +25,11 @@ DEVICES = "--xla_force_host_platform_device_count"
 RARELY = 100_000, 50, 50
 # What compiled programs are kept under: all that takes longer to compile than to read.
 KEEPING = {"jax_persistent_cache_min_compile_time_secs": 0.1, "jax_persistent_cache_min_entry_size_bytes": 0}
+# Options of one program, by this compiler's names: vectors as wide as the processor has, and for what runs a
+# batch without derivatives each array computed on its own, twice as fast together. A Jacobian would take
+# three times as long like that.
+WIDE = {"xla_cpu_prefer_vector_width": 512}
+ROLLOUT = {**WIDE, "xla_disable_hlo_passes": "cpu_multi_output_fusion"}
 _started_with: list[str] = []  # XLA_FLAGS that jax was started with, once `start` did it
 
 
@@ -157,6 +163,22 @@ def flags(given: str) -> str:
     named = {flag.split("=")[0] for flag in given.split()}
     added = [f"{name}={value}" for name, value in ours.items() if name not in named]
     return " ".join([*given.split(), *added])
+
+
+def known_options(options: Mapping[str, int | str]) -> dict[str, int | str]:
+    """Those of a program's `compiler_options` that this version of the compiler has. It starts jax."""
+    return {name: value for name, value in options.items() if _is_known(name, value)}
+
+
+@cache
+def _is_known(name: str, value: int | str) -> bool:
+    import jax
+
+    try:
+        jax.jit(lambda: 0, compiler_options={name: value})()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 def usable_cores() -> int:

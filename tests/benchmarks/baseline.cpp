@@ -118,10 +118,11 @@ struct alignas(64) Block {
 };
 
 // Share of a period that a reading, straight between two ticks, spends beyond a threshold.
+// Without a branch: a division that only some lanes make would keep the compiler from doing several lanes at a time.
 inline double share_beyond(double now, double before, double threshold) {
-    const bool beyond = now > threshold, crossed = beyond != (before > threshold);
-    const double inside = (beyond ? now : before) - threshold, moved = std::fabs(now - before);
-    return crossed ? inside / (crossed ? moved : 1) : beyond;
+    const double beyond = now > threshold, crossed = beyond != (before > threshold);
+    const double inside = beyond * now + (1 - beyond) * before - threshold;
+    return crossed * inside / (std::fabs(now - before) + (1 - crossed)) + (1 - crossed) * beyond;
 }
 
 // The time beyond, weighed with a triangle two periods wide, from its shares of the last two periods.

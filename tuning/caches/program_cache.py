@@ -10,7 +10,7 @@ import hashlib
 import os
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from jax import export
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from jaxhil.files import read_sealed, remove_stale, write_sealed
+from jaxhil.simulation.environment import WIDE, known_options
 from tuning.caches.sources import PACKAGES, sources_sha256, versions
 
 # Calls into LAPACK have no promise to mean the same in other versions; the name has the version in it.
@@ -60,8 +61,9 @@ def _program(function, static, structure, shapes, folder):
     def flat(*leaves):
         return tuple(function(static, jax.tree.unflatten(structure, leaves)))
 
+    compiled = partial(jax.jit, compiler_options=known_options(WIDE))
     if folder is None:
-        return jax.jit(flat)
+        return compiled(flat)
     path = Path(folder) / f"{_name(function, static, structure, shapes)}.program"
     exported = _read(path)
     if exported is None:
@@ -70,10 +72,10 @@ def _program(function, static, structure, shapes, folder):
         exported = export.export(jax.jit(flat), disabled_checks=checks)(*like)
         _write(path, exported.serialize())
     if exported.nr_devices == 1:
-        return jax.jit(exported.call)
+        return compiled(exported.call)
     devices = jax.devices()[: exported.nr_devices]
     mesh = jax.make_mesh((len(devices),), ("device",), axis_types=(AxisType.Auto,), devices=devices)
-    return jax.jit(exported.call, in_shardings=NamedSharding(mesh, PartitionSpec()))
+    return compiled(exported.call, in_shardings=NamedSharding(mesh, PartitionSpec()))
 
 
 def _is_foreign(value: Any) -> bool:

@@ -28,7 +28,7 @@ from tuning.optimisation.unit_box import Bounds
 from tuning.transparency.probes import LANES_PER_SCENARIO
 
 FEW, MANY = 4, 32  # problems in one call of the program
-TILE = 128  # lanes computed side by side on a device: more leave the cache
+TILE = 64  # lanes computed side by side on a device: more leave the cache
 FIRST_ROUND = 8  # steps
 PROMISING = 3  # starts of a task that go on after the first round
 LONGEST = 32  # steps of one call

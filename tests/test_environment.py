@@ -1,0 +1,16 @@
+"""Options of the compiler that need not be there in its next version."""
+
+import jax
+import numpy as np
+import pytest
+
+from jaxhil.simulation.environment import ROLLOUT, known_options
+
+
+def test_options_that_the_compiler_lacks_are_left_out():
+    unknown = {"xla_cpu_no_such_option": 1}
+    assert known_options({**ROLLOUT, **unknown}) == ROLLOUT
+    assert known_options(unknown) == {}
+    # It would not compile otherwise.
+    with pytest.raises(jax.errors.JaxRuntimeError):
+        jax.jit(lambda x: x + 1, compiler_options=unknown)(np.ones(3))
