@@ -11,7 +11,7 @@ from continuous import delayed_restitution
 
 import jaxhil
 import tuning
-from jaxhil.compensators import literature_gains
+from jaxhil.compensators import COMPENSATORS, literature_gains
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.reporting.closed_forms import characteristic_root, critical_delay, series
 from tuning.reporting.contact_growth import LINEAR_COMPENSATORS, growth
@@ -192,7 +192,7 @@ def test_limits_of_a_small_control_period():
 
 @pytest.mark.slow
 @pytest.mark.users_options
-@pytest.mark.parametrize("compensator", ["none", "response_error", "retrospective_reference"])
+@pytest.mark.parametrize("compensator", COMPENSATORS)
 def test_time_of_a_map_of_100_by_100_points(compensator):
     axes = "contact.stiffness", "rig.force_sensor.delay=0.001:0.008"
     took = spent = 0.0

@@ -63,6 +63,15 @@ def test_stages_are_counted_as_they_begin(clock, capsys):
     ]
 
 
+def test_what_is_over_at_once_is_not_said(clock, capsys):
+    with terminal.stages(3) as stages:
+        for text in ("one", "two", "three"):
+            stages.turn_to(text)
+        clock[0] += 11
+        stages.reach(2)
+    assert lines(capsys) == ["2 of 3 stages, 10.9 stages/min, 0:00:06 left, three"]
+
+
 def test_silence_is_broken_with_the_time_by_then(monkeypatch, capsys):
     monkeypatch.setattr(terminal, "SECONDS_BETWEEN_LINES", 0.02)
     monkeypatch.setattr(terminal, "SECONDS_OF_SILENCE", 0.03)

@@ -15,7 +15,7 @@ from jaxhil.runtime import digest
 from tuning.cli.commands.identify import SCHEMA
 
 SCRIPT = "<script>window.hurt = 1</script>"
-HOSTILE = f'x"\'>{SCRIPT}<img src=x onerror="window.hurt=1"> {{{{ 7 * 7 }}}} $\\frac$ &amp;'
+HOSTILE = f'x"\'>{SCRIPT}<img src=x onerror="window.hurt=1"> {{{{ 12345 * 6789 }}}} $\\frac$ &amp;'
 WIDTHS = (375, 1440)
 A4 = 703, 1017  # pixels within the margins
 
@@ -52,6 +52,19 @@ def mapped(name=HOSTILE):
     })  # fmt: skip
 
 
+def monitored(name=HOSTILE, **others):
+    """What `jaxhil monitor --json` prints."""
+    figures = {one: {"value": 0.01, "predicted_std": 0.02, "z": 0.5} for one in ("stiffness", "noise", name)}
+    figures["bias"] = {"value": None, "predicted_std": None, "z": None}
+    contacts = [{"contact": n, "log": name, "state": "good", "figures": figures} for n in range(1, 81)]
+    document = {
+        "schema": "jaxhil/monitor/1", "mechanism": name, "mechanism_sha256": name, "state": "good",
+        "reason": name, "alarm": None, "since": None, "contacts": contacts, "notes": [name],
+        "sources": {name: name}, "versions": {name: name},
+    }  # fmt: skip
+    return signed({**document, **others})
+
+
 def compared(name=HOSTILE):
     """What `jaxhil compare` writes."""
     figures = {name: {"rms": {"value": 0.1, "low": 0.05, "high": None}, "noise": {"value": None}}}
@@ -77,10 +90,11 @@ def test_names_stay_text(put):
         put(identified(), folder="a"),
         put(mapped(), "map.json", "b"),
         put(compared(), "compare.json", "c"),
+        put(monitored(), "monitor.json", "d") / "monitor.json",
     ]
     made = tuning.report(places)
     page = made.html.decode()
-    assert made.verdict == "good" and "7 * 7" in page and "49 " not in page
+    assert made.verdict == "good" and "12345 * 6789" in page and "83810205" not in page
     # Of all that could run there is the page's own script alone; tags from a name are text.
     assert page.count("<script>") == 1 and not re.search(r"<[^>]*\sonerror\s*=", re.sub(r'"[^"]*"', "", page))
     assert page.count(html.escape(SCRIPT)) > 10
@@ -93,6 +107,8 @@ def test_verdict_is_that_of_the_requirements(put):
     [one] = made.requirements
     assert one["margin"] == "-0.01" and one["result"] == "0.02" and one["verdict"] == "bad"
     assert tuning.report(put(compared(), "compare.json", "c")).verdict == "unknown"
+    made = tuning.report(put(monitored(state="bad", since=4), "monitor.json", "d") / "monitor.json")
+    assert made.verdict == "bad" and made.requirements[0]["result"] == "bad since contact 4 of 80 contacts"
 
 
 @pytest.mark.parametrize(

@@ -154,14 +154,23 @@ class Progress:
     def begin(self, text: str) -> None:
         """The unit before, if any, is done and `text` begins."""
         with self._lock:
-            self._done += self._begun_stage
-            self._begun_stage = True
+            self._end_unit()
             self.say(text)
+
+    def turn_to(self, text: str) -> None:
+        """Like `begin`, for what may be over at once: without a bar it is said only if it takes long."""
+        with self._lock:
+            self._end_unit()
+            self.reach(self._done, text)
 
     def remind(self) -> None:
         """Say again how far it is, if nothing was said for long."""
         with self._lock:
             self._show(due=SECONDS_OF_SILENCE)
+
+    def _end_unit(self) -> None:
+        self._done += self._begun_stage
+        self._begun_stage = True
 
     def _show(self, due: float) -> None:
         if self._bar is not None:

@@ -93,7 +93,7 @@ def map(
         from jaxhil.compensators import COMPENSATORS
         from jaxhil.simulation.gain_choice import choose_gains
         from tuning.reporting.map_axes import check_axes, parse_axis
-        from tuning.reporting.map_grid import compute_map
+        from tuning.reporting.map_grid import compute_map, runs
 
         name, values = choose_gains(checked, compensator, gains)
         law = COMPENSATORS[name]
@@ -104,8 +104,8 @@ def map(
             error.__dict__.setdefault("option", f"--{error}" if str(error)[:1] in "xy" else str(error))
             raise
         meaning.check(checked)
-        with terminal.stages(2, progress) as bar:
-            found = compute_map(checked, name, values, axes, points, limit, seed, bar.begin)
+        with terminal.progress(runs(points), "runs", progress) as bar:
+            found = compute_map(checked, name, values, axes, points, limit, seed, bar.tell)
         document = _document(checked, name, values, found, limit, seed)
         made = StabilityMap(document, found.x, found.y, found.error, found.restitution, found)
         if target is not None:

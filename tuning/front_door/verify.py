@@ -79,12 +79,14 @@ def _verified_bundle(folder: Path, key: Any, scenarios: int, seed: int, progress
     from tuning.bundle.signing import verifier
 
     signed_by = None if key is None else verifier(arguments.folder("key", key))
-    with computing():
+    with computing(), terminal.stages(2, progress) as stages:
+        stages.begin("making the bundle anew from its gains")
         checked = check_bundle(folder, signed_by)
-    document = {"bundle": str(folder), "signature": checked.signature, "self_test": []}
-    reasons = checked.reasons
-    if not reasons:
-        document["self_test"], reasons = run_selftest(checked, os.path.basename(os.path.abspath(folder)))
+        document = {"bundle": str(folder), "signature": checked.signature, "self_test": []}
+        reasons = checked.reasons
+        if not reasons:
+            stages.begin("running its self-test")
+            document["self_test"], reasons = run_selftest(checked, os.path.basename(os.path.abspath(folder)))
     if reasons:
         return {**document, "verdict": False, "reasons": reasons}
     return _verified(checked, {**document, "file": str(folder / "gains.json")}, scenarios, seed, progress)

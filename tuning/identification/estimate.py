@@ -7,7 +7,7 @@ delay is shared with the position sensor's.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -33,6 +33,7 @@ from tuning.identification.result import Estimate, Identification, confounded
 SHORTEST_REST = 200  # rows from which a run at rest says what a sensor's noise is
 USUAL_FREQUENCY = 3.0  # Hz, of contacts, where none was made
 TOUCHING = ("contact", "press", "tap")
+STAGES = 3  # free motion, contact, validation
 
 
 @dataclass(frozen=True)
@@ -54,17 +55,22 @@ FIRST = ("rig.contact_plane", "rig.position_sensor.delay")  # told before anythi
 
 
 def identify(
-    campaign: Campaign, prior: Mechanism | None = None, options: Options | None = None
+    campaign: Campaign,
+    prior: Mechanism | None = None,
+    options: Options | None = None,
+    say: Callable[[str], None] = lambda _: None,
 ) -> Identification:
     """What the runs of a campaign say of the rig and the mechanism.
 
     `prior` gives what the logs do not tell. Where neither does for a number that a mechanism file must have,
-    there is no mechanism and the verdict is bad. Raises `InputError` for options that cannot be."""
+    there is no mechanism and the verdict is bad. `say` is called with what begins, in words, `STAGES` times
+    at most. Raises `InputError` for options that cannot be."""
     options = options or Options()
     _check(options, prior)
     runs = {kind: [run for run in campaign.runs if run.kind == kind] for kind in ("rest", "free", *TOUCHING)}
     period, mass = campaign.timing.control_period, campaign.equivalent_mass
     force, position = _noise(runs)
+    say("fitting the motion simulator")
     motion = free_motion.estimate(runs["free"], campaign.timing, options.order)
     model = _told_model(prior) if motion is None else motion.model
     contact, lines, frequency = None, [], USUAL_FREQUENCY
@@ -72,7 +78,7 @@ def identify(
     if whole and model is not None:
         whole = contacts.after_gaps(whole, model, period)
         touching = [piece for run in whole for piece in contacts.pieces(run, period)]
-        contact, lines = _contact(touching, model, campaign, force, options)
+        contact, lines = _contact(touching, model, campaign, force, options, say)
         frequency = contacts.frequency(contact, mass)
     if motion is not None:
         lines = [*validation.of_motion(motion, frequency), *lines]
@@ -158,11 +164,18 @@ def _whole(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def _contact(
-    runs: list[Run], model: Model, campaign: Campaign, force: Noise | None, options: Options
+    runs: list[Run],
+    model: Model,
+    campaign: Campaign,
+    force: Noise | None,
+    options: Options,
+    say: Callable[[str], None],
 ) -> tuple[ContactFit, list[validation.Line]]:
     """The fit to all touches, and how one to most of them explains the others."""
     plane = options.fixed.get("rig.contact_plane")
+    say(f"fitting the contact to {len(runs)} touches")
     fit = contacts.estimate(runs, model, campaign.timing, force, options.law, plane, options.seed)
+    say("judging the fit by touches left out of it")
     held = held_out(runs, options.hold_out)
     judged = fit if not held.any() else contacts.without(fit, held, options.seed)
     frequency = contacts.frequency(fit, campaign.equivalent_mass)

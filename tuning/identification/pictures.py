@@ -190,7 +190,8 @@ def compare(entries: Sequence[Mapping[str, Any]]) -> Figure:
         style: dict[str, Any] = {"linestyle": "none", "marker": "D", "markersize": 5, "color": VERMILION}
         axes.plot(shares, [row for row, _ in told], label="prior", **style)
     names = [f"{one['key']}\n{one['value']:.4g} {one['unit']}".removesuffix(" 1") for one in plain]
-    axes.set_yticks(range(len(plain)), names)
+    # A key is text, not a formula.
+    axes.set_yticks(range(len(plain)), [name.replace("$", r"\$") for name in names])
     axes.tick_params(axis="y", labelsize=7)
     axes.set(xlabel="distance from the estimate [%]", ylim=(len(plain) - 0.5, -0.5))
     axes.set_xscale("symlog", linthresh=0.1)

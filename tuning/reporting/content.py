@@ -56,7 +56,8 @@ class Requirement:
 
 def requirements(results: Results) -> list[Requirement]:
     """What the results themselves were judged by."""
-    return [*_of_sweep(results), *_of_watchdog(results), *_of_identification(results)]
+    of_rig = (*_of_identification(results), *_of_monitoring(results))
+    return [*_of_sweep(results), *_of_watchdog(results), *of_rig]
 
 
 def verdict_of(found: Sequence[Requirement]) -> str:
@@ -94,36 +95,6 @@ def assumptions(results: Results) -> Section | None:
         texts.append("Some of these numbers vary together, as the file's [correlation] says.")
     heads = ("key", "value", "unit", "varies", "known from")
     return Section("assumptions", "What is assumed, and how it is known", texts, [Table(heads, rows, 9)])
-
-
-def identification(results: Results) -> Section | None:
-    """What was identified of the rig's logs."""
-    found = results.identification
-    if found is None:
-        return None
-    rows = [
-        (
-            one.key,
-            number(one.value, 6),
-            _interval(one.low, one.high),
-            one.unit,
-            "given" if one.known else "logs",
-        )
-        for one in found.estimates
-    ]
-    checks = [
-        (one.name, "yes" if one.there else "no", number(one.effect, 3), one.finding) for one in found.checks
-    ]
-    tables = [
-        Table(("number", "value", "95 %", "unit", "from"), rows),
-        Table(("what the model may lack", "there", "effect on e", "finding"), checks, 9),
-    ]
-    texts = [found.reason + ".", *(f"{note[:1].upper()}{note[1:]}." for note in found.notes)]
-    if results.subject is not None and not _is_identified(results):
-        texts.append(
-            "The gains were tuned for other numbers than those identified: this says nothing of them."
-        )
-    return Section("identification", "From the rig's logs", texts, tables)
 
 
 def gains(results: Results) -> Section | None:
@@ -196,9 +167,28 @@ def _of_identification(results: Results) -> Iterator[Requirement]:
         margin = number(None if effect is None or limit is None else limit - effect, 3)
         what = "change of e by what the identified model leaves unexplained"
         # What was identified says nothing of gains that were tuned for something else.
-        elsewhere = results.subject is not None and not _is_identified(results)
+        elsewhere = results.subject is not None and not is_identified(results)
         verdict = UNKNOWN if elsewhere else _known(found.verdict)
         yield Requirement(what, f"below {number(limit)}", number(effect), margin, verdict)
+
+
+def _of_monitoring(results: Results) -> Iterator[Requirement]:
+    found = results.monitoring
+    if found is not None:
+        since = "in all" if found.since is None else f"since contact {found.since}"
+        result = f"{one_line(found.state, 20)} {since} of {len(found.contacts)} contacts"
+        verdict = BAD if found.state == "bad" else GOOD if found.state in (GOOD, "watch") else UNKNOWN
+        verdict = UNKNOWN if is_of_another_file(results) else verdict
+        what = "whether the rig still is that of the mechanism file"
+        yield Requirement(what, "within the file's uncertainty", result, number(None), verdict)
+
+
+def is_of_another_file(results: Results) -> bool:
+    """Whether the contacts that were monitored were held against another file than the gains' own."""
+    found, subject = results.monitoring, results.subject
+    if found is None or subject is None:
+        return False
+    return found.mechanism_sha256 != subject.document.get("mechanism_sha256")
 
 
 def watchdog_rates(results: Results) -> Mapping[str, Any]:
@@ -231,7 +221,7 @@ def _reached(figures: Any) -> Iterator[tuple[str, ...]]:
             if name == "tuned" and isinstance(intervals, Mapping):
                 span = intervals.get(key)
             if isinstance(span, Mapping):
-                text += f" ({_interval(span.get('low'), span.get('high'))})"
+                text += f" ({interval(span.get('low'), span.get('high'))})"
             cells.append(text)
         yield (LABELS[name], *cells)
 
@@ -239,7 +229,7 @@ def _reached(figures: Any) -> Iterator[tuple[str, ...]]:
 def _identified(results: Results) -> dict[str, str]:
     """How each key is known, where an identification says so."""
     found = results.identification
-    if found is None or not _is_identified(results):
+    if found is None or not is_identified(results):
         return {}
     said = {}
     for one in found.estimates:
@@ -247,12 +237,12 @@ def _identified(results: Results) -> dict[str, str]:
         key = path if place.isdigit() else one.key
         text = "given to the identification"
         if not one.known:
-            text = f"the logs, 95 %: {_interval(one.low, one.high)}"
+            text = f"the logs, 95 %: {interval(one.low, one.high)}"
         said[key] = text if key not in said else f"{said[key]}; {text}"
     return said
 
 
-def _is_identified(results: Results) -> bool:
+def is_identified(results: Results) -> bool:
     """Whether the mechanism of the gains is the one that was identified, in its own numbers."""
     subject, raw = results.subject, results.identified
     if subject is None:
@@ -290,7 +280,7 @@ def _value(value: Any) -> str:
     return number(value, 6)
 
 
-def _interval(low: Any, high: Any) -> str:
+def interval(low: Any, high: Any) -> str:
     return f"{number(low)} to {number(high)}"
 
 
@@ -302,6 +292,8 @@ def title_of(results: Results) -> str:
     if results.map is not None:
         return f"{one_line(results.map.mechanism, 80)}: {one_line(results.map.compensator, 40)}"
     names = [one.mechanism for one in results.comparison.mechanisms] if results.comparison else []
+    if not names and not results.identified and results.monitoring is not None:
+        names = [results.monitoring.mechanism]
     return one_line(", ".join(names), 80) or _name_of(results.identified)
 
 

@@ -95,6 +95,7 @@ class Estimate(Struct):
     value: float
     unit: str
     known: bool
+    std: float | None = None
     low: float | None = None
     high: float | None = None
     prior: float | None = None
@@ -123,6 +124,37 @@ class Identification(Struct):
     sources: dict[str, str]
     seed: int
     versions: dict[str, str]
+
+
+class MonitoredFigure(Struct):
+    """Of a contact, 0 where the mechanism file is right; None where the log does not tell."""
+
+    value: float | None
+    predicted_std: float | None
+    z: float | None  # value less the predicted one, over that
+
+
+class MonitoredContact(Struct):
+    """A contact of later logs."""
+
+    contact: int
+    log: str
+    state: str
+    figures: dict[str, MonitoredFigure]
+
+
+class Monitoring(Struct):
+    """What `jaxhil monitor --json` prints."""
+
+    mechanism: str  # path of its file, or the name of a built-in one
+    mechanism_sha256: str | None
+    state: str
+    reason: str
+    contacts: list[MonitoredContact]
+    notes: list[str]
+    sources: dict[str, str]
+    versions: dict[str, str]
+    since: int | None = None  # contact with which a change likely began, from 1
 
 
 class Figure(Struct):

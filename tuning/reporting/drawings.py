@@ -20,9 +20,10 @@ from jaxhil.compensators import literature_gains
 from jaxhil.simulation.contact_plot import BLACK, GREEN, SKY, VERMILION, contact_plot, finish, new_figure
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.motion import nominal_motion
+from tuning.identification.pictures import compare
 from tuning.reporting.closed_forms import ClosedForms
 from tuning.reporting.contact_growth import Growth
-from tuning.reporting.documents import AxisOfMap, MapDocument, WorstScenario
+from tuning.reporting.documents import AxisOfMap, Identification, MapDocument, WorstScenario
 from tuning.reporting.map_axes import MapAxis
 from tuning.reporting.map_grid import Map, Margin, Nominal, Radii
 from tuning.reporting.map_picture import map_picture
@@ -33,6 +34,7 @@ from tuning.sweeps.replay import motion_of
 from tuning.sweeps.store import Store, kept_part
 
 TYPICAL = 6  # scenarios with traces besides the worst, at equal distances in the order of their errors
+ESTIMATE = ("key", "value", "unit", "std", "low", "high", "prior")  # what a picture shows of one
 IDENTIFIER = re.compile(r'<g id="[^"]*"')
 LINK = re.compile(r'<a xlink:href="#scenario-(\d+)"[^>]*>')
 
@@ -70,6 +72,14 @@ def map_drawing(found: MapDocument) -> Drawing:
     figure = map_picture(_map_of(found), title, np.inf if found.limit is None else found.limit)
     says = f"Restitution error over {found.x.key} and {found.y.key}"
     return Drawing(as_svg(figure), says, f"{says}, under gains that stay the same.")
+
+
+def estimates_drawing(found: Identification) -> Drawing:
+    """What was identified beside what was known."""
+    known = [one for one in found.estimates if None not in (one.low, one.high)]
+    entries = [{name: getattr(one, name) for name in ESTIMATE} for one in known]
+    says = "Every estimate's interval, and the prior's value, over the estimate"
+    return Drawing(as_svg(compare(entries)), says, f"{says}.")
 
 
 def sweep_drawings(

@@ -8,17 +8,19 @@ and two lines through the nominal one, are lanes of one program.
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import Outcome, evaluate
+from jaxhil.simulation.evaluation import Outcome, evaluate, expected_duration
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.reporting.closed_forms import ClosedForms, closed_forms
 from tuning.reporting.contact_growth import Growth, cost, growth, no_growth, spectral_radii
 from tuning.reporting.map_axes import MapAxis, draws
 
 LINE = 201  # points of each line through the nominal point
+PART = 2048  # runs at a time
 MOST_WORK = 5e7  # of eigenvalues: where the whole map would take more, the spectral radius has a coarser grid
 FEWEST = 15  # points along an axis of that
 
@@ -70,9 +72,10 @@ def compute_map(
     points: int,
     limit: float,
     seed: int,
-    say: Callable[[str], None],
+    tell: Callable[[str, float], None],
 ) -> Map:
-    """The map of so many points along either axis."""
+    """The map of so many points along either axis; `tell` is called with what is going on, and how many of
+    all `runs` are done."""
 
     def batch(values: np.ndarray) -> tuple[dict[str, Any], Scenario]:
         return _gains(gains, axes, values), _scenarios(mechanism, axes, values, seed)
@@ -83,12 +86,10 @@ def compute_map(
     across, up = np.repeat(middle, LINE, axis=0), np.repeat(middle, LINE, axis=0)
     across[:, 0], up[:, 1] = lines
     own, scenarios = batch(np.concatenate([_grid(x, y), across, up, middle]))
-    say(f"{points} x {points} runs")
-    outcome = evaluate(build_loop(mechanism, compensator, scenarios), own, scenarios)
-    restitution, error = _worst(outcome)
+    restitution, error = _run(mechanism, compensator, own, scenarios, tell)
     size = points**2
 
-    say("eigenvalues of the loop in contact")
+    tell("eigenvalues of the loop in contact", runs(points))
     reason = no_growth(mechanism, compensator)
     radii = on_lines = grown = None
     if reason is None:
@@ -119,6 +120,31 @@ def compute_map(
         axes, x, y, restitution[:size].reshape(points, points), error[:size].reshape(points, points),
         _reshaped(closed, points), radii, reason, nominal,
     )  # fmt: skip
+
+
+def runs(points: int) -> int:
+    """How many runs a map of so many points along either axis takes."""
+    return points**2 + 2 * LINE + 1
+
+
+def _run(
+    mechanism: Mechanism,
+    compensator: str,
+    gains: Mapping[str, Any],
+    scenarios: Scenario,
+    tell: Callable[[str, float], None],
+) -> tuple[np.ndarray, np.ndarray]:
+    """e and e - e* of each lane, part by part: each part has lanes that take long and lanes that do not."""
+    loop, order = build_loop(mechanism, compensator, scenarios), np.argsort(expected_duration(scenarios))
+    found = np.empty((2, len(order)))
+    parts = -(-len(order) // PART)
+    for number in range(parts):
+        tell("running the contacts", number * len(order) // parts)
+        part = order[number::parts]
+        own = {name: value[part] if np.ndim(value) else value for name, value in gains.items()}
+        lanes = jax.tree.map(lambda leaf, part=part: np.asarray(leaf)[..., part], scenarios)
+        found[:, part] = _worst(evaluate(loop, own, lanes, at_least=-(-len(order) // parts)))
+    return found[0], found[1]
 
 
 def _grid(x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from importlib import resources
 import jinja2
 from markupsafe import Markup
 
-from tuning.reporting import content, study_sections
+from tuning.reporting import content, rig_sections, study_sections
 from tuning.reporting.content import Section
 from tuning.reporting.reading import Results
 
@@ -30,7 +30,8 @@ def page(results: Results, say: Callable[[str], None] = lambda _: None) -> bytes
     verdict = content.verdict_of(found)
     sections: list[Section | None] = [
         content.assumptions(results),
-        content.identification(results),
+        rig_sections.identification(results),
+        rig_sections.monitoring(results),
         content.gains(results),
         study_sections.runs(results, say),
         study_sections.errors(results),

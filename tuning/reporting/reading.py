@@ -16,17 +16,25 @@ from jaxhil.files import open_plain
 from jaxhil.runtime import digest
 from jaxhil.simulation.gain_file import LoadedGains, check_document
 from tuning.bundle import selftest
-from tuning.reporting.documents import Comparison, Identification, MapDocument, SweepVerdict, Theory
+from tuning.reporting.documents import (
+    Comparison,
+    Identification,
+    MapDocument,
+    Monitoring,
+    SweepVerdict,
+    Theory,
+)
 from tuning.sweeps.manifest import loaded_gains
 from tuning.sweeps.store import VERDICT, Store, read_store
 
 LARGEST = 200_000_000  # bytes of a document
 NAMES = ("manifest.json", "gains.json", "identification.json", "compare.json", "map.json")
 ALLOWED = (
-    "what jaxhil identify, tune, sweep, compare, map or export wrote: its folder, or the JSON file in it"
+    "what jaxhil identify, tune, sweep, compare, map or export wrote, its folder or the JSON file in it, or "
+    "what monitor --json printed"
 )
 GAINS, SWEEP, BUNDLE = "jaxhil/gains/", "jaxhil/sweep/", "jaxhil/bundle/"
-IDENTIFICATION, MAP = "jaxhil/identification/", "jaxhil/map/"
+IDENTIFICATION, MONITOR, MAP = "jaxhil/identification/", "jaxhil/monitor/", "jaxhil/map/"
 Kind = TypeVar("Kind")
 
 
@@ -48,6 +56,7 @@ class Results:
     bundle: LoadedGains | None = None  # the gain file of a bundle, with its limits
     identification: Identification | None = None
     identified: dict[str, Any] = field(default_factory=dict)  # the mechanism that was identified
+    monitoring: Monitoring | None = None
     comparison: Comparison | None = None
     map: MapDocument | None = None
     sources: list[Source] = field(default_factory=list)
@@ -95,6 +104,10 @@ def _add(results: Results, given: Path) -> None:
         _set(results, "identification", _typed(document, Identification, where), where)
         results.identified = dict(document.get("mechanism") or {})
         results.sources.append(Source("identify", path, document["sha256"]))
+    elif schema.startswith(MONITOR):
+        _check_digest(document, where)
+        _set(results, "monitoring", _typed(document, Monitoring, where), where)
+        results.sources.append(Source("monitor", path, document["sha256"]))
     elif schema.startswith(MAP):
         _check_digest(document, where)
         _set(results, "map", _typed(document, MapDocument, where), where)

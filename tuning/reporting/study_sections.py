@@ -147,9 +147,10 @@ def reproduction(results: Results) -> Section:
     """Where every figure comes from: files, digests, versions, commands."""
     sources = [(f"jaxhil {one.command}", one_line(str(one.path), 200), one.sha256) for one in results.sources]
     tables = [Table(("result of", "file", "SHA-256"), sources, 9)]
-    if (found := results.identification) is not None:
-        logs = [(one_line(name, 200), sha256) for name, sha256 in found.sources.items()]
-        tables.append(Table(("log", "SHA-256"), logs, 9))
+    for found in (results.identification, results.monitoring):
+        if found is not None:
+            logs = [(one_line(name, 200), sha256) for name, sha256 in found.sources.items()]
+            tables.append(Table(("log", "SHA-256"), logs, 9))
     if versions := _versions(results):
         tables.append(Table(("version of", "with which the results were made"), list(versions.items()), 9))
     texts = ["Each of these commands, on the files above, prints the figures again."]
@@ -189,6 +190,8 @@ def _commands(results: Results) -> Iterator[str]:
         yield _command("map", *names, "--x", axes[0], "--y", axes[1], *law, *given, *_options(options))
     if (known := results.identification) is not None:
         yield _command("identify", *known.sources, "--seed", str(known.seed))
+    if (known := results.monitoring) is not None:
+        yield _command("monitor", known.mechanism, *known.sources)
 
 
 def _command(*words: str) -> str:
@@ -205,8 +208,8 @@ def _versions(results: Results) -> dict[str, str]:
     subject, found = results.subject, {}
     if subject is not None and isinstance(known := subject.document.get("versions"), Mapping):
         found = {str(name): str(value) for name, value in known.items()}
-    if results.identification is not None:
-        found = results.identification.versions | found
+    for one in (results.identification, results.monitoring):
+        found = found if one is None else one.versions | found
     return found
 
 

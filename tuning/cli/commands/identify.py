@@ -45,32 +45,32 @@ def run(options: Identify) -> int:
     folder = Path(options.output)
     checks.output(folder)
     checks.own_results(folder / DOCUMENT, "estimates", (MECHANISM, *PICTURES))
-    campaign = _of_stage(read_logs(logs, options.map, prior), options.stage)
-    from tuning.identification.estimate import Options, identify
+    from tuning.identification.estimate import STAGES, Options, identify
     from tuning.identification.mechanism_file import to_toml
 
-    found = identify(
-        campaign,
-        prior,
-        Options(
-            order=order,
-            law=options.law,
-            fixed=fixed,
-            bayes=options.bayes,
-            hold_out=options.hold_out,
-            limit=options.limit,
-            seed=options.seed,
-        ),
+    asked = Options(
+        order=order,
+        law=options.law,
+        fixed=fixed,
+        bayes=options.bayes,
+        hold_out=options.hold_out,
+        limit=options.limit,
+        seed=options.seed,
     )
-    document = _document(options, campaign, prior, found)
-    if found.mechanism is not None:
-        from_builtins(found.mechanism, "identified mechanism")
-        # In this order: the document tells the next run that what lies beside it is its own.
-        with writing(folder / DOCUMENT):
-            write_whole(folder / DOCUMENT, terminal.as_json(document).encode("ascii"))
-        with writing(folder / MECHANISM):
-            write_whole(folder / MECHANISM, to_toml(found.mechanism, found.verdict).encode())
-        _draw(found, document, folder)
+    with terminal.stages(STAGES + 2) as stages:
+        stages.turn_to("reading the logs")
+        campaign = _of_stage(read_logs(logs, options.map, prior), options.stage)
+        found = identify(campaign, prior, asked, stages.turn_to)
+        document = _document(options, campaign, prior, found)
+        if found.mechanism is not None:
+            from_builtins(found.mechanism, "identified mechanism")
+            # In this order: the document tells the next run that what lies beside it is its own.
+            with writing(folder / DOCUMENT):
+                write_whole(folder / DOCUMENT, terminal.as_json(document).encode("ascii"))
+            with writing(folder / MECHANISM):
+                write_whole(folder / MECHANISM, to_toml(found.mechanism, found.verdict).encode())
+            stages.turn_to("drawing")
+            _draw(found, document, folder)
     terminal.warn([*campaign.notes, *found.notes])
     if options.json:
         terminal.emit_json(document)
@@ -100,10 +100,13 @@ def _check(options: Identify, logs: list[Path]) -> int:
             raise InputError("--check: found no mechanism, allowed one after the logs, or --prior")
         last = str(logs.pop())
     mechanism = load(last).mechanism
-    campaign = _of_stage(read_logs(logs, options.map, mechanism), options.stage)
     from tuning.identification.check import check
 
-    found = check(campaign, mechanism, options.limit)
+    with terminal.stages(2) as stages:
+        stages.turn_to("reading the logs")
+        campaign = _of_stage(read_logs(logs, options.map, mechanism), options.stage)
+        stages.turn_to("setting them against the mechanism")
+        found = check(campaign, mechanism, options.limit)
     document = _document(options, campaign, mechanism, found)
     terminal.warn(campaign.notes)
     if options.json:

@@ -40,10 +40,11 @@ def run(options: Identify) -> int:
     folder = Path(options.output)
     checks.output(folder)
     checks.own_results(folder / DOCUMENT, "predicted", ("free.csv", "press.csv"))
-    with computing():
+    with computing(), terminal.stages(1) as stages:
         from jaxhil.simulation.gain_choice import choose_gains
         from tuning.identification.design.excitation import design, error_slopes
 
+        stages.turn_to("looking for the motions that tell most")
         gains = choose_gains(mechanism, COMPENSATOR, None)[1]
         slopes_by = partial(error_slopes, mechanism, COMPENSATOR, gains)
         found = design(mechanism, options.stroke, slopes_by, options.seed)

@@ -21,8 +21,11 @@ UNSTATED = (
 def run(options: Monitor) -> int:
     """Hold contacts against the mechanism; 1 where the rig is beyond the file's uncertainty, else 0."""
     loaded = load(options.mechanism)
-    campaign = read_logs([Path(log) for log in options.logs], options.map, loaded.mechanism)
-    found = monitor(campaign, loaded.mechanism)
+    with terminal.stages(2) as stages:
+        stages.turn_to("reading the logs")
+        campaign = read_logs([Path(log) for log in options.logs], options.map, loaded.mechanism)
+        stages.turn_to("setting the contacts against the mechanism")
+        found = monitor(campaign, loaded.mechanism)
     content = {
         "schema": SCHEMA,
         "mechanism": loaded.label,
