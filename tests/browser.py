@@ -65,6 +65,28 @@ LAYOUT = """(() => {
   return { faults, texts: boxes.length };
 })()"""
 
+# What is cut on sheets of paper that wide and high: what sticks out, boxes that would scroll, and pictures
+# and rows of tables that do not fit on one sheet or may be broken between two.
+PAPER = """(wide, high) => {
+  const faults = [];
+  for (const one of document.body.querySelectorAll("*")) {
+    if (!one.checkVisibility() || one.closest("svg svg, svg g")) continue;
+    const style = getComputedStyle(one), box = one.getBoundingClientRect();
+    const text = one.textContent.trim().slice(0, 40);
+    const name = `${one.tagName.toLowerCase()} ${one.getAttribute("class")} "${text}"`;
+    const drawn = ["IMG", "SVG", "FIGURE"].includes(one.tagName.toUpperCase());
+    if ((drawn || one.matches("table, tr, pre, p")) && box.width > 0 && box.right > wide + 1)
+      faults.push(`${name} ends at ${Math.round(box.right)} px of ${wide}`);
+    if (style.overflowX !== "visible" && one.scrollWidth > one.clientWidth + 1 && one.clientWidth > 1)
+      faults.push(`${name} hides ${one.scrollWidth - one.clientWidth} px`);
+    if ((drawn || one.tagName === "TR") && box.height > high)
+      faults.push(`${name} is ${Math.round(box.height)} px high`);
+    if (one.matches("figure, tr") && style.breakInside !== "avoid")
+      faults.push(`${name} may be broken`);
+  }
+  return faults;
+}"""
+
 
 class Opened(NamedTuple):
     """What a page did when it was opened."""
@@ -130,20 +152,15 @@ class Browser:
             self._call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
         self.evaluate(f"new Promise(done => setTimeout(done, {SETTLED}))")
 
-    def printed(self, width: int, height: int, selector: str) -> tuple[int, list[list[Any]]]:
-        """How many sheets the page is printed on, and of each element shown on paper that wide its tag, width
-        and height [pixels] and whether it may be broken between sheets."""
+    def printed(self, width: int, height: int) -> tuple[int, list[str]]:
+        """How many sheets the page is printed on, and what is cut on sheets with so many pixels for it."""
         self._call("Emulation.setEmulatedMedia", media="print")
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self._call("Emulation.setDeviceMetricsOverride", **size)
-        found = self.evaluate(
-            f"""[...document.querySelectorAll({json.dumps(selector)})].filter(one => one.checkVisibility())
-            .map(one => [one.tagName, one.getBoundingClientRect().width, one.getBoundingClientRect().height,
-                         getComputedStyle(one).breakInside])"""
-        )
+        faults = self.evaluate(f"({PAPER})({width}, {height})")
         self._call("Emulation.setEmulatedMedia", media="")
         paper = base64.b64decode(self._call("Page.printToPDF", preferCSSPageSize=True)["data"])
-        return len(re.findall(rb"/Type\s*/Page\b", paper)), [[one[0].lower(), *one[1:]] for one in found]
+        return len(re.findall(rb"/Type\s*/Page\b", paper)), faults
 
     def close(self) -> None:
         """End the browser."""

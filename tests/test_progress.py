@@ -48,7 +48,7 @@ def test_of_one_thing_the_share_is_said(clock, capsys):
     with terminal.progress(1, "fronts") as bar:
         clock[0] += 36
         bar.tell("searching", 0.25)
-    assert lines(capsys) == ["25 %, 25 fronts/h, 0:01:48 left, searching"]
+    assert lines(capsys) == ["25 %, 41.7 %/min, 0:01:48 left, searching"]
 
 
 def test_stages_are_counted_as_they_begin(clock, capsys):
@@ -81,6 +81,14 @@ def test_silence_is_broken_with_the_time_by_then(monkeypatch, capsys):
     found = lines(capsys)
     assert len(found) >= 3 and all(line.endswith("compiling") for line in found)
     assert all(re.match(r"1 of 10 scenarios, .* left, compiling", line) for line in found)
+
+
+def test_before_anything_is_known_there_is_the_time(clock, capsys):
+    with terminal.progress(100, "runs") as bar:
+        clock[0] += 21
+        bar.remind()
+        bar.advance(1)
+    assert lines(capsys) == ["0:00:21 so far"]
 
 
 def test_unless_it_is_to_be_shown_there_is_nothing(clock, capsys):

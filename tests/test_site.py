@@ -1,5 +1,6 @@
 """The documentation site: nothing is missing in its generated pages; it is built, and opened in a browser."""
 
+import dataclasses
 import os
 import re
 import subprocess
@@ -8,12 +9,15 @@ import tomllib
 import typing
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Annotated
 from urllib.parse import unquote, urldefrag
 
 import pytest
+import tyro
 import yaml
 from browser import LAYOUT
 
+import jaxhil
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.mechanism.keys import tables
 from tuning.cli.parser import Command
@@ -21,10 +25,12 @@ from tuning.cli.parser import Command
 ROOT = Path(__file__).resolve().parents[1]
 SITE = ROOT / "notebooks" / "site"
 WIDTHS = (375, 1440)
+A4 = 703, 1017  # pixels within the margins
 COMMANDS = [typing.get_args(entry)[1].name for entry in typing.get_args(Command)]
 BAD = """<!doctype html><meta name="viewport" content="width=device-width"><body style="margin: 0">
 <p style="margin: 0">One</p>
 <p style="margin: -1.2em 0 0">lies on the other</p><div style="width: 500px">wide</div><img src="nowhere.png">
+<svg width="900" height="2000"></svg>
 <script>console.error("heard"); undefined_name()</script><script src="http://127.0.0.1:9/x.js"></script>"""
 
 
@@ -55,6 +61,42 @@ def test_every_option_is_there(jaxhil, reference, command):
     [part] = re.findall(rf"^## jaxhil {command}$(.*?)(?=^## |\Z)", text, re.M | re.S)
     options = set(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", jaxhil(command, "--help").out.split("options")[1]))
     assert options - {"-h", "--help"} <= set(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", part))
+
+
+def test_options_that_the_guide_names_are_there(reference):
+    parts = dict(
+        re.findall(r"^## jaxhil (\w+)$(.*?)(?=^## |\Z)", reference["reference/commands.md"], re.M | re.S)
+    )
+    seen = 0
+    for page in (ROOT / "README.md", *(ROOT / "notebooks" / "guide").glob("*.md")):
+        text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+        # To the end of the words in code, or of the line.
+        for command, rest in re.findall(r"\bjaxhil ([a-z]+)((?: [^\s`]+|\n[^`\n]+(?=`))*)", text):
+            for option in re.findall(r"(?<= )--?[a-z][a-z-]*", rest) if command in parts else ():
+                assert re.search(rf"(?<![\w-]){option}(?![\w-])", parts[command]), (
+                    page.name,
+                    command,
+                    option,
+                )
+                seen += 1
+    assert seen > 50
+
+
+def test_what_is_not_explained_fails_the_build(reference, monkeypatch):
+    """An option without help, a gain without unit."""
+    module = sys.modules["reference"]
+
+    @dataclasses.dataclass
+    class Options:
+        """An option that nobody explains."""
+
+        depth: Annotated[float, tyro.conf.arg(metavar="NUMBER")] = 1.0
+
+    with pytest.raises(ValueError, match="simulate: depth has no help"):
+        module._command(Options, tyro.conf.subcommand("simulate"))
+    gain = COMPENSATORS["phase_lead"].gains[0]
+    with pytest.raises(ValueError, match="a gain without unit"):
+        module._row_of_gain(gain._replace(unit=""), jaxhil.load("varying"))
 
 
 def test_every_gain_is_there(reference):
@@ -142,8 +184,11 @@ def test_the_browser_finds_what_is_wrong(browser, tmp_path):
     assert any("heard" in error for error in opened.errors)
     assert any("undefined_name" in error for error in opened.errors)
     assert opened.elsewhere == ["http://127.0.0.1:9/x.js"] and len(opened.missing) == 2
+    pages, cut = browser.printed(*A4)
+    assert pages > 1 and [fault.split('" ')[1][:10] for fault in cut] == ["ends at 90", "is 2000 px"]
+    browser.open(path, 375)
     found = browser.evaluate(LAYOUT)["faults"]
-    assert [" ".join(fault.split()[:2]) for fault in found] == ["500 px", "no picture", '"lies on']
+    assert [" ".join(fault.split()[:2]) for fault in found] == ["900 px", "no picture", '"lies on']
 
 
 @pytest.mark.slow
@@ -155,6 +200,14 @@ def test_every_page_opens_offline(site, browser, width):
         assert browser.open(path, width) == ([], [], []), name
         seen = browser.evaluate(LAYOUT)
         assert seen["faults"] == [] and seen["texts"] > 10, name
+
+
+@pytest.mark.slow
+def test_nothing_is_cut_on_paper(site, browser):
+    for path in sorted(site.rglob("*.html")):
+        browser.open(path, max(WIDTHS))
+        pages, faults = browser.printed(*A4)
+        assert pages > 0 and faults == [], path.relative_to(site)
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from rich.text import Text
 WIDTH = 110  # where there is no terminal to ask
 SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal for a bar
 SECONDS_OF_SILENCE = 20.0  # after which the last line is said again, with the time left by then
-KNOWN_FROM = 0.02  # share of the work that has to be done before a rate is known
+KNOWN_FROM = 0.05  # share of the work that has to be done before a rate is known
 
 
 def emit(*things: RenderableType, wrap: bool = True) -> None:
@@ -188,10 +188,13 @@ class Progress:
 
     def _pace(self) -> str:
         if (rate := self.rate) is None or self._done < KNOWN_FROM * self._total:
-            return f"{_span(time.monotonic() - self._begun)} so far" if self._text else ""
-        each = next(((r, per) for r, per in ((rate, "s"), (60 * rate, "min")) if r >= 1), (3600 * rate, "h"))
+            return f"{_span(time.monotonic() - self._begun)} so far"
         left = max(self._total - self._done, 0.0) / rate
-        return f"{figure(each[0], 3)} {self._unit}/{each[1]}, {_span(left)} left"
+        # Of a single thing it is the share whose rate says something.
+        scale, unit = (100.0, " %") if self._total == 1 else (1.0, f" {self._unit}")
+        hourly = 3600 * scale * rate
+        over, per = next((one for one in ((3600, "s"), (60, "min")) if hourly >= one[0]), (1, "h"))
+        return f"{figure(hourly / over, 3)}{unit}/{per}, {_span(left)} left"
 
 
 @contextmanager

@@ -145,12 +145,13 @@ def _calibrated(
     with _store(sweep) as store:
         runs = WITHOUT_STORE if store is None else held_scenarios(store)
         with terminal.progress(runs, "runs", progress) as bar:
+            bar.reach(0, "working out the limits")
             return calibrate(
                 loaded,
                 store,
                 replaced=replaced,
                 allowed=Allowed(*allowed),
-                progress=lambda number: bar.advance(number, "working out the limits"),
+                progress=bar.advance,
             )
 
 

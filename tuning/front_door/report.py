@@ -56,7 +56,7 @@ def report(
 
         found = read_results(paths)
         with terminal.progress(pictures(found), "pictures", progress) as bar:
-            html = page(found, bar.begin)
+            html = page(found, bar.turn_to)
         asked = requirements(found)
         return Report(html, verdict_of(asked), [_plain(one) for one in asked])
 

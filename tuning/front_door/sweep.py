@@ -229,6 +229,7 @@ def run_study(
                     needed = scenarios_needed(known.value, options.until_width)
                     return f"{text}, about {needed} wanted"
 
+                bar.reach(0, "running scenarios")
                 done, tally = run_sweep(
                     store,
                     lambda rows, _: bar.skip(rows),

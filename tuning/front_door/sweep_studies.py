@@ -24,6 +24,7 @@ def drivers(options: Any, store, sweep, unwritten: list[InputError], progress: b
     # Noise, if there is any, adds an input; the bar need not know.
     total = evaluations(len(independent_inputs(sweep.mechanism)), number)
     with terminal.progress(total, "scenarios", progress) as bar:
+        bar.say("drivers")
         found = error_indices(sweep, number, lambda more: bar.advance(more, "drivers"))
     with put_off(unwritten):
         write_study(store, request, found)

@@ -1,0 +1,74 @@
+"""Commands of README and guide print what stands below them; figures stand below the command that does."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+GUIDE = ROOT / "notebooks" / "guide"
+PAGES = [ROOT / "README.md", *sorted(GUIDE.glob("*.md"))]
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.M | re.S)
+STEP = re.compile(r"^\$ ((?:.*\\\n)*.*)\n((?:(?!\$ ).*\n)*)", re.M)
+COMMAND = re.compile(
+    r"`(?:jaxhil|pytest|python3?) [^`]+`|^(?:\$ )?(?:jaxhil|pytest|python3?) |^```python", re.M
+)
+NUMBER = re.compile(r"\d+\.\d+|\d+")
+# What takes more than minutes, or a rig's logs.
+LEFT_OUT = ("rig", "compare", "identify", "monitor")
+# Pages in the order in which a reader takes them, each with what the ones before it wrote.
+ORDER = ("first_ten_minutes", "tuning", "sweeps", "to_the_rig")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_figures_stand_below_the_command_that_prints_them(page):
+    """Between a block of figures and the heading above it there is the command, or the script."""
+    text = page.read_text(encoding="utf-8")
+    for block in BLOCK.finditer(text):
+        if block[1] == "text" and re.search(r"\d\.\d", block[2]):
+            section = text[max(text.rfind("\n#", 0, block.start()), 0) : block.end()]
+            assert COMMAND.search(section), block[2]
+
+
+def shown(page):
+    """Commands of a page with the lines below each, in order."""
+    text = page.read_text(encoding="utf-8")
+    for block in BLOCK.finditer(text):
+        if block[1] == "text":
+            yield from ((step[1].replace("\\\n", " "), step[2]) for step in STEP.finditer(block[2]))
+
+
+@pytest.mark.slow
+def test_commands_print_what_is_shown(tmp_path):
+    """Words and lines; of numbers, which follow a solver, those that differ are printed."""
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": path, "COLUMNS": "110"}
+    names = {"jaxhil": [sys.executable, "-m", "tuning"], "python": [sys.executable]}
+    printed: dict[str, list[str]] = {}
+    for page in [*(GUIDE / f"{name}.md" for name in ORDER), ROOT / "README.md"]:
+        for command, lines in shown(page):
+            first, *others = shlex.split(command)
+            if others[0] in LEFT_OUT:
+                continue
+            if command not in printed:
+                ran = subprocess.run(
+                    [*names[first], *others], cwd=tmp_path, env=environment, capture_output=True, text=True,
+                    check=False,
+                )  # fmt: skip
+                assert ran.returncode == ("Bad:" in lines), ran.stderr
+                printed[command] = [line.rstrip() for line in ran.stdout.splitlines()]
+            found = {words(line) for line in printed[command]}
+            missing = [line for line in lines.splitlines() if words(line) not in found]
+            assert not missing, f"{page.name}: {command}: {missing}\n" + "\n".join(printed[command])
+            for line in set(lines.splitlines()) - set(printed[command]):
+                print(f"\n{page.name}: {line}", end="")
+    assert len(printed) > 12
+
+
+def words(line):
+    """A line without its numbers."""
+    return " ".join(NUMBER.sub("N", line).split())
