@@ -1,6 +1,9 @@
 """Pictures say what they show, come out the same twice, and their reference is the undelayed contact."""
 
+import ast
 import math
+import re
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -200,3 +203,27 @@ def test_motion_in_space_is_the_reference(name):
     assert np.max(curve.force) == pytest.approx(float(reference.peak_force[0, 0]), rel=2e-3)
     rebound = -np.diff(curve.position)[-1] / np.diff(curve.time)[-1]
     assert rebound == pytest.approx(velocity * float(reference.restitution[0, 0]), rel=2e-3)
+
+
+ROOT = Path(__file__).resolve().parents[1]
+DRAWING = [
+    path
+    for package in ("jaxhil", "tuning")
+    for path in sorted((ROOT / package).rglob("*.py"))
+    if "matplotlib" in path.read_text(encoding="utf-8")
+]
+
+
+@pytest.mark.parametrize("path", DRAWING, ids=lambda path: "/".join(path.parts[-2:]))
+def test_pictures_have_one_palette_and_units(path):
+    """Colours are those of `contact_plot` or greys; axes are named with their unit, unless they count."""
+    counted = ("", "solver step", "contact")
+    for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for keyword in call.keywords if isinstance(call, ast.Call) else ():
+            if not isinstance(keyword.value, ast.Constant) or not isinstance(keyword.value.value, str):
+                continue
+            text = keyword.value.value
+            if "color" in (keyword.arg or ""):
+                assert re.fullmatch(r"0\.\d+|white|none", text), text
+            elif keyword.arg in ("xlabel", "ylabel"):
+                assert re.search(r"\[.+\]", text) or text in counted, text

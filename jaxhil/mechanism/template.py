@@ -83,7 +83,7 @@ def _wrapped(text: str, comment: str) -> Iterator[str]:
 
 
 def _comment(text: str) -> list[str]:
-    return [f"# {line}" for line in text.splitlines()]
+    return [f"# {part}" for line in text.splitlines() for part in textwrap.wrap(line, WIDTH - 2)]
 
 
 def _value(value: Any) -> str:

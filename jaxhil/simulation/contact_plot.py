@@ -50,7 +50,9 @@ def contact_plot(pieces: Sequence[Piece], title: str, sensors: str | None = None
     if len(pieces) > len(shown):
         title += f" (the first {len(shown)} of {len(pieces)} contacts)"
     # Two lines of title above the axes; the legend below.
-    figure = new_figure((max(7.0, 3.6 * len(shown) + 1), 6.4), title, above=1.0, below=0.95)
+    width = max(7.0, 3.6 * len(shown) + 1)
+    figure = new_figure((width, 6.4), title, above=1.0, below=0.95)
+    figure.subplots_adjust(left=1.1 / width)  # the position's name takes two lines
     grid = figure.subplots(2, len(shown), squeeze=False, sharex="col")
     for column, piece in enumerate(shown):
         force, position = grid[0, column], grid[1, column]

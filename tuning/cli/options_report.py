@@ -64,7 +64,9 @@ class Report:
     results: Annotated[
         Positional[tuple[str, ...]],
         text(
-            "RESULT [RESULT ...]", "Results of one mechanism, at most one of each command: folders or files."
+            "RESULT [RESULT ...]",
+            "Results of one mechanism, at most one of each command: folders or files; of monitor what --json "
+            "printed.",
         ),
     ] = ()
     output: Annotated[str, text("FILE", "The page; by default jaxhil-out/report.html.", aliases=("-o",))] = (

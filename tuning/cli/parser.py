@@ -31,6 +31,8 @@ from tuning.cli.options_rig import DEFAULT_RIG_PLOT, Export, RigOptions, Verify
 
 DESCRIPTION = """Gains that keep hardware-in-the-loop docking tests from diverging.
 
+To begin: jaxhil init mine.toml, then jaxhil tune mine.toml. More of a command: jaxhil COMMAND --help.
+
 jaxhil --version says which version this is. Completion by the Tab key, for bash (or zsh, tcsh):
 jaxhil --tyro-write-completion bash ~/.local/share/bash-completion/completions/jaxhil"""
 

@@ -36,7 +36,7 @@ def report(
 
     Args:
         results: paths of what `identify`, `tune`, `sweep`, `compare`, `map` and `export` wrote, at most one
-            of each: a folder or the JSON file in it.
+            of each: a folder or the JSON file in it; of `monitor` the file of what `--json` printed.
         progress: say on standard error what is going on.
 
     Raises:

@@ -64,7 +64,7 @@ def errors_plot(result: TuneResult, limit: float) -> Figure:
             rasterized=True,
         )
     if drawn:
-        left.axvline(limit, color=GREEN, linewidth=1, linestyle=":", label=f"limit {limit:g}")
+        left.axvline(limit, color=BLACK, linewidth=1.2, linestyle="--", label=f"limit {limit:g}")
         right.axhspan(-limit, limit, color=GREEN, alpha=0.15, linewidth=0, label=f"within {limit:g}")
     positive = [value for value in sizes if value > 0] or [1.0]
     left.set(xscale="log", yscale="log", xlim=(min(positive) / 1.5, 1.5 * max(positive)))
@@ -130,7 +130,7 @@ def overview_plot(results: Sequence[TuneResult], limit: float) -> Figure:
         style = {"linestyle": "none", "marker": MARKERS[name], "color": STYLES[name][0], "markersize": 5}
         axes.plot(rms, rows, label=LABELS[name], **style)
     if 0 < limit < np.inf:
-        axes.axvline(limit, color=GREEN, linewidth=1, linestyle=":", label=f"limit {limit:g}")
+        axes.axvline(limit, color=BLACK, linewidth=1.2, linestyle="--", label=f"limit {limit:g}")
     axes.set_yticks(rows, [one_line(r.mechanism.name, 40).replace("$", r"\$") for r in results], fontsize=8)
     axes.set(xscale="log", xlabel="rms of the restitution error e - e* [1]", ylim=(len(results) - 0.5, -0.5))
     finish(axes, None)
@@ -160,7 +160,7 @@ def front_plot(front: Front, result: TuneResult, limit: float) -> Figure:
             style: dict[str, Any] = {"linestyle": "none", "marker": marker, "markersize": size}
             axes.plot(*places, color=edge, markerfacecolor=face, label=label, zorder=3, **style)
     if 0 < limit < np.inf:
-        axes.axhline(limit, color=GREEN, linewidth=1, linestyle=":", label=f"limit {limit:g}")
+        axes.axhline(limit, color=BLACK, linewidth=1.2, linestyle="--", label=f"limit {limit:g}")
     numbers: dict[tuple[float, float], list[str]] = {}  # points that came out alike share a place
     for number, one in enumerate(front.points, start=1):
         numbers.setdefault(one.place, []).append(str(number))

@@ -17,7 +17,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from jaxhil.compensators import literature_gains
-from jaxhil.simulation.contact_plot import BLACK, GREEN, SKY, VERMILION, contact_plot, finish, new_figure
+from jaxhil.simulation.contact_plot import BLACK, SKY, VERMILION, contact_plot, finish, new_figure
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.motion import nominal_motion
 from tuning.identification.pictures import compare
@@ -156,7 +156,7 @@ def _points_figure(
                              linewidths=1.3, label="with a trace", zorder=4)  # fmt: skip
         rings.set_urls([f"#scenario-{int(points.index[one])}" for one in ringed])
         if limit:
-            axes.axhline(limit, color=GREEN, linewidth=1.5, linestyle="--", label=f"limit {limit:g}")
+            axes.axhline(limit, color=BLACK, linewidth=1.5, linestyle="--", label=f"limit {limit:g}")
         label = inputs[place].label if inputs else "scenario [1]"
         axes.set(yscale="log", xlabel=label, ylabel="worst |e - e*| of the scenario [1]")
         plain_ticks(axes.yaxis, *axes.get_ylim())

@@ -28,7 +28,7 @@ PALE = "#F7CF85"  # an orange on which black lines are seen
 def map_picture(found: Map, title: str, limit: float) -> Figure:
     """The signed error in colours, its contours, those of theory beside them, the nominal point with its
     margins."""
-    figure = new_figure((8.6, 7.0), title, above=0.55, below=1.35)
+    figure = new_figure((8.6, 7.0), title)
     figure.subplots_adjust(left=0.09, right=0.88)
     axes = figure.subplots()
     x, y = (_shown(axis, values) for axis, values in zip(found.axes, (found.x, found.y), strict=True))
@@ -49,6 +49,7 @@ def map_picture(found: Map, title: str, limit: float) -> Figure:
         (axes.set_xlim if which is axes.xaxis else axes.set_ylim)(low, high)
     finish(axes, None)
     axes.grid(False)
+    figure.subplots_adjust(bottom=(0.7 + 0.22 * -(-len(handles) // 2)) / 7.0)
     figure.legend(handles=handles, loc="lower center", fontsize=8.5, frameon=False, ncols=2, handlelength=3.5)
     return figure
 
