@@ -30,7 +30,7 @@ COMMANDS = [typing.get_args(entry)[1].name for entry in typing.get_args(Command)
 BAD = """<!doctype html><meta name="viewport" content="width=device-width"><body style="margin: 0">
 <p style="margin: 0">One</p>
 <p style="margin: -1.2em 0 0">lies on the other</p><div style="width: 500px">wide</div><img src="nowhere.png">
-<svg width="900" height="2000"></svg>
+<svg style="display: block" width="900" height="2000"></svg>
 <script>console.error("heard"); undefined_name()</script><script src="http://127.0.0.1:9/x.js"></script>"""
 
 

@@ -7,17 +7,17 @@ import numpy as np
 from matplotlib.figure import Figure as Picture
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from jaxhil.simulation.contact_plot import GREEN, LABELS, STYLES, new_figure
+from jaxhil.simulation.contact_plot import BLACK, GREEN, LABELS, STYLES, finish, new_figure
 from tuning.benchmark.study import LITERATURE, TUNED, LawFigures
 from tuning.benchmark.tables import best
 from tuning.pictures.plots import MARKERS
 
 COLUMNS = 4  # of panels
 TRANSPARENCY = {
-    "early": "transparency, push at 25 %",
-    "late": "transparency, push at 75 %",
-    "slope": "slope of e against e*",
-    "peak": "peak command / reference's peak",
+    "early": "transparency, push at 25 % [1]",
+    "late": "transparency, push at 75 % [1]",
+    "slope": "slope of e against e* [1]",
+    "peak": "peak command / reference's peak [1]",
 }
 
 
@@ -44,14 +44,16 @@ def errors_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]],
             values = [100 * one.value for one in figures]
             marker = MARKERS.get(key, "D")
             panel.plot(values, heights, marker, color=colour, markersize=4, label=LABELS.get(key, key))
-        panel.axvline(100 * limit, color="0.5", linewidth=1, linestyle=":", label="limit")
+        panel.axvline(
+            100 * limit, color=BLACK, linewidth=1.2, linestyle="--", label=f"limit {100 * limit:g} %"
+        )
         panel.set_xscale("log")
         panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         panel.xaxis.set_minor_formatter(NullFormatter())
         panel.tick_params(axis="x", labelsize=8)
         panel.set_title(name.removeprefix("suite-"), fontsize=9)
-        panel.grid(axis="x", alpha=0.3)
+        finish(panel, None)
     for panel in list(panels.flat)[len(names) :]:
         panel.set_visible(False)
     first = panels[0, 0]
@@ -71,9 +73,9 @@ def errors_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]],
 def transparency_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> Picture:
     """Transparency, slope and peak force of every law, tuned: a point for every mechanism."""
     laws = list(dict.fromkeys(one.law for name in names for one in found[name]))
-    size = (12.0, 1.7 + 0.34 * len(laws))
+    size = (12.0, 1.75 + 0.34 * len(laws))
     gains = "Tuned gains" if TUNED in _keys(names, found) else "The literature's gains"
-    picture = new_figure(size, f"Is it still a test of the hardware? {gains}, 1 is perfect", above=0.8)
+    picture = new_figure(size, f"Is it still a test of the hardware? {gains}", above=0.6, below=0.95)
     panels = picture.subplots(1, len(TRANSPARENCY), sharey=True)
     picture.subplots_adjust(left=1.6 / size[0], wspace=0.08)
     for panel, (key, title) in zip(panels, TRANSPARENCY.items(), strict=True):
@@ -83,15 +85,19 @@ def transparency_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigu
             spread = place + np.linspace(-0.25, 0.25, max(len(values), 2))[: len(values)]
             # What lies beyond is drawn at the edge.
             values = np.clip(values, low, high)
-            panel.plot(values, spread, "o", color=STYLES[TUNED][0], markersize=4, alpha=0.6, clip_on=False)
-        panel.axvline(1, color="0.3", linewidth=1, linestyle="--")
+            label = None if place else "a mechanism each, from above in the order given"
+            style = {"color": STYLES[TUNED][0], "markersize": 4, "alpha": 0.6, "clip_on": False}
+            panel.plot(values, spread, "o", label=label, **style)
+        panel.axvline(1, color=BLACK, linewidth=1.2, linestyle="--", label="1: as in space")
         panel.set_xlim(low, high)
         if key == "peak":
             panel.set_xscale("log")
         panel.set_xlabel(title, fontsize=9)
-        panel.grid(axis="x", alpha=0.3)
+        finish(panel, None)
     panels[0].set_yticks(range(len(laws)), [law.replace("_", " ") for law in laws], fontsize=8)
     panels[0].set_ylim(len(laws) - 0.5, -0.5)
+    handles, labels = panels[0].get_legend_handles_labels()
+    picture.legend(handles, labels, loc="lower center", ncols=2, frameon=False, fontsize=9)
     return picture
 
 

@@ -34,6 +34,7 @@ SHORTEST_REST = 200  # rows from which a run at rest says what a sensor's noise 
 USUAL_FREQUENCY = 3.0  # Hz, of contacts, where none was made
 TOUCHING = ("contact", "press", "tap")
 STAGES = 3  # free motion, contact, validation
+Say = Callable[[str], None]  # told what begins
 
 
 @dataclass(frozen=True)
@@ -54,11 +55,12 @@ class Options:
 FIRST = ("rig.contact_plane", "rig.position_sensor.delay")  # told before anything is fitted
 
 
+def _silent(text: str) -> None:
+    pass
+
+
 def identify(
-    campaign: Campaign,
-    prior: Mechanism | None = None,
-    options: Options | None = None,
-    say: Callable[[str], None] = lambda _: None,
+    campaign: Campaign, prior: Mechanism | None = None, options: Options | None = None, say: Say = _silent
 ) -> Identification:
     """What the runs of a campaign say of the rig and the mechanism.
 
@@ -169,7 +171,7 @@ def _contact(
     campaign: Campaign,
     force: Noise | None,
     options: Options,
-    say: Callable[[str], None],
+    say: Say,
 ) -> tuple[ContactFit, list[validation.Line]]:
     """The fit to all touches, and how one to most of them explains the others."""
     plane = options.fixed.get("rig.contact_plane")
