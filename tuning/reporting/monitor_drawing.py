@@ -40,7 +40,7 @@ def _figure(found: Monitoring) -> Figure:
         if found.since is not None:
             style: dict[str, Any] = {"color": VERMILION, "linestyle": "--", "linewidth": 1.3}
             axes.axvline(found.since - 0.5, label="a change is likely since", **style)
-        axes.set_ylabel(f"{figure_name} [{unit}]")
+        axes.set_ylabel(f"{figure_name} [{unit}]", fontsize=9)
         axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
         finish(axes, None)
     grid[3, 1].set_axis_off()

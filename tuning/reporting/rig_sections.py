@@ -1,9 +1,11 @@
 """What a rig's own logs say, in sections: what was identified of them, and whether the rig still is that."""
 
+import math
+
 from jaxhil.errors import one_line
 from tuning.identification.monitor.figures import FIGURES
-from tuning.reporting.content import Section, Table, interval, is_identified, is_of_another_file, number
-from tuning.reporting.documents import MonitoredFigure
+from tuning.reporting.content import Section, Table, is_identified, is_of_another_file, number
+from tuning.reporting.documents import Estimate, MonitoredFigure
 from tuning.reporting.drawings import estimates_drawing
 from tuning.reporting.monitor_drawing import monitor_drawing
 from tuning.reporting.reading import Results
@@ -19,15 +21,16 @@ def identification(results: Results) -> Section | None:
     rows = [
         (
             one.key,
-            number(one.value, 6),
-            interval(one.low, one.high),
+            number(one.value, _digits(one)),
+            f"{number(one.low, _digits(one))} to {number(one.high, _digits(one))}",
             one.unit,
             "given" if one.known else "logs",
         )
         for one in found.estimates
     ]
     checks = [
-        (one.name, "yes" if one.there else "no", number(one.effect, 3), one.finding) for one in found.checks
+        (one.name, "yes" if one.there else "no", number(one.effect if one.there else 0.0, 3), one.finding)
+        for one in found.checks
     ]
     tables = [Table(("number", "value", "95 %", "unit", "from"), rows)] if rows else []
     tables.append(Table(("what the model may lack", "there", "effect on e", "finding"), checks, 9))
@@ -48,10 +51,9 @@ def monitoring(results: Results) -> Section | None:
     heads = [f"{name} [{unit}]" if unit != "1" else name for name, unit, _ in FIGURES]
     rows = [
         (
-            str(one.contact),
+            f"{one.contact}, {one_line(one.log, 60)}",
             *(_shown(one.figures.get(name), scale) for name, _, scale in FIGURES),
-            one.state,
-            one_line(one.log, 60),
+            one_line(one.state, 20),
         )
         for one in found.contacts[-MOST_ROWS:]
     ]
@@ -64,8 +66,15 @@ def monitoring(results: Results) -> Section | None:
         texts.append(f"Of {len(found.contacts)} contacts the table has the last {MOST_ROWS}.")
     if is_of_another_file(results):
         texts.append("The gains were tuned for another file: this says nothing of them.")
-    table = Table(("contact", *heads, "state", "log"), rows)
+    table = Table(("contact, log", *heads, "state"), rows)
     return Section("monitoring", "The rig since", texts, [table], [monitor_drawing(found)])
+
+
+def _digits(one: Estimate) -> int:
+    """As many as it is known to, and one more."""
+    if not one.std or not one.value or not math.isfinite(ratio := abs(one.value / one.std)):
+        return 4
+    return min(max(2 + math.ceil(math.log10(ratio)), 3), 9) if ratio > 0 else 3
 
 
 def _shown(one: MonitoredFigure | None, scale: float) -> str:

@@ -32,7 +32,7 @@ def run(options: Report) -> int:
         )
     else:
         rows = [tuple(one.values()) for one in made.requirements]
-        heads = ["of all", "required", "result", "margin", "verdict"]
+        heads = ["judged", "required", "result", "margin", "verdict"]
         tables = [terminal.table("Requirements", heads, rows, texts=range(5))] if rows else []
         terminal.emit(*tables, f"Verdict: {made.verdict}.")
         terminal.emit_line(f"Wrote {one_line(str(target))}, {len(made.html) / 1e6:.2g} MB")
