@@ -14,7 +14,7 @@ from jaxhil.runtime import digest
 from tuning.cli.commands.identify import SCHEMA
 
 SCRIPT = "<script>window.hurt = 1</script>"
-HOSTILE = f'x"\'>{SCRIPT}<img src=x onerror="window.hurt=1"> {{{{ 12345 * 6789 }}}} $\\frac$ &amp;'
+HOSTILE = f'x"\'>{SCRIPT}<img src=x onerror="window.hurt=1"> {{{{ 9**9 }}}} $\\frac$ &amp;'
 WIDTHS = (375, 1440)
 A4 = 703, 1017  # pixels within the margins
 
@@ -93,7 +93,7 @@ def test_names_stay_text(put):
     ]
     made = tuning.report(places)
     page = made.html.decode()
-    assert made.verdict == "good" and "12345 * 6789" in page and "83810205" not in page
+    assert made.verdict == "good" and "9**9" in page and "387420489" not in page
     # Of all that could run there is the page's own script alone; tags from a name are text.
     assert page.count("<script>") == 1 and not re.search(r"<[^>]*\sonerror\s*=", re.sub(r'"[^"]*"', "", page))
     assert page.count(html.escape(SCRIPT)) > 10

@@ -29,8 +29,8 @@ A4 = 703, 1017  # pixels within the margins
 COMMANDS = [typing.get_args(entry)[1].name for entry in typing.get_args(Command)]
 BAD = """<!doctype html><meta name="viewport" content="width=device-width"><body style="margin: 0">
 <p style="margin: 0">One</p>
-<p style="margin: -1.2em 0 0">lies on the other</p><p style="margin: 0; width: 500px">wide</p><img src="nowhere.png">
-<svg width="300" height="2000"></svg>
+<p style="margin: -1.2em 0 0">lies on the other</p><p style="margin: 0; width: 500px">wide</p>
+<img src="nowhere.png"><svg width="300" height="2000"></svg>
 <script>console.error("heard"); undefined_name()</script><script src="http://127.0.0.1:9/x.js"></script>"""
 
 
