@@ -295,11 +295,27 @@ def _press_run(kind, rng, seconds=30.0, depth=0.0008, rms=5e-5):
     lag = (rig["simulator"].get("delay", 0.0) + sensor.get("delay", 0.0)) / T
     # Dense enough for its own velocity: the press never leaves the contact.
     near = 1e-3
-    at = [_position(plant, command, lag + shift) for shift in (near, 0.0, -near)]
     law = Law(kind.contact, rig.get("contact_plane", 0.0))
-    force = law.raw(at[1] - law.plane, (at[2] - at[0]) / (2.0 * near * T), 0)
+
+    def force_at(lag):
+        at = [_position(plant, command, lag + shift) for shift in (near, 0.0, -near)]
+        return law.raw(at[1] - law.plane, (at[2] - at[0]) / (2.0 * near * T), 0)
+
+    force = _lagged(force_at, lag, sensor.get("time_constant", 0.0) / T)
     force = force + _coloured(rng, len(command), sensor["noise_std"], kind.colour)
     return _run(kind, "press", command, _measured(kind, rng, actual), sense(force, sensor))
+
+
+def _lagged(force_at, lag, time_constant):
+    """A force at the ticks, less `lag` of them, through a sensor's first-order lag [ticks]."""
+    if time_constant == 0.0:
+        return force_at(lag)
+    drive = sum(
+        weight * np.exp((node - 1.0) / time_constant) / time_constant * force_at(lag + 1.0 - node)
+        for node, weight in zip(NODES, WEIGHTS, strict=True)
+    )
+    pole = np.exp(-1.0 / time_constant)
+    return lfilter([1.0], [1.0, -pole], drive, zi=[pole * force_at(lag)[0]])[0]
 
 
 def _measured(kind, rng, actual):

@@ -2,12 +2,16 @@
 
 from dataclasses import replace
 
+import campaign_kinds
+import campaign_rigs
 import campaigns
 import numpy as np
 import pytest
 
 import jaxhil
+from jaxhil.mechanism.file import from_builtins
 from jaxhil.mechanism.uncertainty import draw
+from tuning.identification.check import check
 from tuning.identification.estimate import Options, held_out, identify
 from tuning.identification.mechanism_file import to_toml, uncertainty_tables
 
@@ -150,6 +154,35 @@ def test_an_entry_of_the_lists_that_is_never_met_is_that_before_it():
     first, between, last = found.mechanism["contact"]["stiffness"]
     assert first == between == pytest.approx(1.2e5, rel=0.01) and last == pytest.approx(7e4, rel=0.01)
     assert "only entries 0, 2 were met" in found.notes[0]
+
+
+@pytest.mark.slow
+def test_an_entry_that_touches_hardly_tell_is_that_before_it():
+    """The second entry is met by touches that only graze the contact."""
+    campaign = campaigns.campaign("stiffnesses", 0, speeds=(0.012, 0.0002, 0.012, 0.006, 0.0002, 0.006))
+    found = identify(campaign, options=Options(law="kelvin_voigt", hold_out=0.0))
+    first, second, last = found.mechanism["contact"]["stiffness"]
+    assert first == second == pytest.approx(1.2e5, rel=0.02) and last == pytest.approx(7e4, rel=0.02)
+    assert "contact.stiffness.1: known to 30 % at best: taken as the entry before it" in found.notes[0]
+
+
+@pytest.mark.slow
+def test_a_position_sensor_that_lags_more_than_the_force_sensor_takes_some_of_the_delay(monkeypatch):
+    rig = campaign_kinds.rig(force_sensor__delay=0.0012, position_sensor__delay=0.003)
+    monkeypatch.setitem(campaigns.KINDS, "slow", campaign_kinds.Kind(rig, campaign_kinds.voigt()))
+    campaign = campaigns.campaign("slow", 0, speeds=FEW, seconds=30.0)
+    found = identify(campaign, options=Options(law="kelvin_voigt"))
+    share = found["rig.position_sensor.delay"].value
+    assert found["rig.simulator.delay"].value + share == pytest.approx(0.0073, abs=2e-5)
+    assert 0.0 < found["rig.force_sensor.delay"].value == pytest.approx(share - 0.0018, abs=2.5e-4)
+    assert "the position sensor lags more than the force sensor" in found.notes[0] and found.good
+    assert check(campaign, from_builtins(found.mechanism, "found")).good
+    # A prior tells the share, and the rest follows.
+    prior = campaign_rigs.mechanism("slow")
+    found = identify(campaign, prior, Options(law="kelvin_voigt"))
+    assert found["rig.simulator.delay"].value == pytest.approx(0.0043, abs=2e-5)
+    assert found["rig.force_sensor.delay"].value == pytest.approx(0.0012, abs=2.5e-4)
+    assert found.mechanism["rig"]["position_sensor"]["delay"] == 0.003 and found.notes == ()
 
 
 @pytest.mark.parametrize("options, message", (

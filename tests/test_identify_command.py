@@ -5,6 +5,7 @@ import json
 import campaigns
 import numpy as np
 import pytest
+from campaign_logs import logs, write
 
 import jaxhil as package
 from jaxhil.runtime import digest
@@ -12,28 +13,6 @@ from tuning.identification.logs.campaign import read_campaign
 from tuning.identification.logs.mapping import load_mapping
 
 FEW = (0.003, 0.006, 0.012) * 3
-
-
-def write(folder, campaign, jitter=0.0):
-    """A file for every run, in units of rigs, without the rows that were lost; the mapping beside them."""
-    random = np.random.default_rng(0)
-    for number, run in enumerate(campaign.runs):
-        late = np.clip(jitter * random.standard_normal(len(run.tick)), -4.5e-4, 4.5e-4)
-        columns = {
-            "Time [ms]": 1e3 * (7.0 + 1e-3 * run.tick + late),
-            "Command [mm]": 1e3 * run.position_desired,
-            "Position [mm]": 1e3 * run.position_measured,
-            "Force [kN]": 1e-3 * run.force_measured,
-            "Fc [N]": run.force_command,
-            "vd [mm/s]": None if run.velocity_desired is None else 1e3 * run.velocity_desired,
-        }
-        rows = np.stack([one[run.valid] for one in columns.values() if one is not None], axis=1)
-        names = ",".join(name for name, one in columns.items() if one is not None)
-        np.savetxt(folder / f"{run.kind}_{number:02}.csv", rows, "%.15g", ",", header=names, comments="")
-
-
-def logs(folder):
-    return sorted(folder.glob("*.csv"))
 
 
 @pytest.fixture(autouse=True)

@@ -9,11 +9,12 @@ from scipy.linalg import expm
 
 from tuning.identification import contact_laws
 from tuning.identification.contact import after_gaps, pieces
-from tuning.identification.contact_problem import Problem, Readings, lag_weights
+from tuning.identification.contact_problem import Problem, Readings
 from tuning.identification.contact_profile import profile
 from tuning.identification.law_choice import judge
 from tuning.identification.motion import Motion, exponential
 from tuning.identification.rational import STRUCTURES, Model
+from tuning.identification.sensor_filter import lag_weights, onset_weights
 
 SECOND = Model(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
 
@@ -51,8 +52,8 @@ def test_with_a_lag_too():
     """The position sensor's delay is the motion's here, and less of the force's."""
     lagging = problem("lagging", contact_laws.kelvin_voigt(), 0.0, (0.006, 0.012), 0, 0.0, 0.0016)
     inner = lagging.at(0.0037 - 0.0012, 0.0)
-    np.testing.assert_allclose(inner.coefficients, [1.2e5, 650.0, 0.0], rtol=2e-3, atol=0.05)
-    assert np.abs(lagging.force(0.0025, 0.0, inner.coefficients) - lagging.readings.force).max() < 0.3
+    np.testing.assert_allclose(inner.coefficients, [1.2e5, 650.0, 0.0], rtol=2e-4, atol=0.01)
+    assert np.abs(lagging.force(0.0025, 0.0, inner.coefficients) - lagging.readings.force).max() < 0.06
 
 
 def test_a_lag_is_exact_on_a_parabola():
@@ -64,6 +65,16 @@ def test_a_lag_is_exact_on_a_parabola():
         exact = np.trapezoid(kernel * t**power, t)
         assert np.dot(weights, np.array([1.0, 0.5, 0.0]) ** power) == pytest.approx(exact, rel=1e-9)
     assert pole == pytest.approx(np.exp(-rate)) and sum(weights) == pytest.approx(1.0 - pole)
+
+
+def test_a_lag_is_exact_where_contact_begins_within_the_period():
+    rate, left = 0.7, np.array([0.03, 0.4, 1.0])
+    after, end = onset_weights(rate, left)
+    for share, one, other in zip(left, after, end, strict=True):
+        t = np.linspace(1.0 - share, 1.0, 200_001)
+        line = 3.0 + 2.0 * (t - t[0]) / share
+        exact = np.trapezoid(rate * np.exp(-(1.0 - t) * rate) * line, t)
+        assert one * 3.0 + other * 5.0 == pytest.approx(exact, rel=1e-9)
 
 
 def test_white_noise_and_its_sums_give_what_the_filtered_path_gives():

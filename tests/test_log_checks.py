@@ -117,3 +117,22 @@ def test_a_press_by_what_raises_its_force_and_clipping(tmp_path):
     clipped = LOG | {"F": np.minimum(LOG["F"], 20.0)}
     notes = read(write_csv(tmp_path / "b.csv", clipped), force_command=None).notes
     assert any("rows at the largest reading" in note for note in notes)
+
+
+@pytest.mark.parametrize("every", [2, 5])
+def test_commands_and_forces_of_another_rate(tmp_path, every):
+    def held(values):
+        return np.repeat(values[::every], every)[: len(values)]
+
+    path = write_csv(tmp_path / "a.csv", sway() | {"xd": held(sway()["xd"])})
+    assert f"position_desired: found one that changes every {every} rows, allowed one" in message(
+        path, "free"
+    )
+    assert read(path, "free", timing={"command_hold": "zoh"}).runs[0].kind == "free"
+    path = write_csv(tmp_path / "b.csv", LOG | {"F": held(LOG["F"])})
+    (note,) = read(path, force_command=None).notes
+    assert f"force_measured: a new reading every {every} rows" in note
+    # A steady motion in steps of the last digit changes as regularly.
+    slow = {"t": PERIOD * np.arange(800), "xd": 1e-5 * (np.arange(800) // every), "xm": sway()["xm"]}
+    slow["xm"] = np.concatenate([np.zeros(LAG), slow["xd"][:-LAG]])
+    assert read(write_csv(tmp_path / "c.csv", slow), "free").runs[0].kind == "free"

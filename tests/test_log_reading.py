@@ -108,6 +108,15 @@ def test_runs_by_begin_and_end_by_mode_and_by_index(tmp_path):
         read(path, mode={"column": "state", "values": {"0": "contact"}})
 
 
+def test_a_contact_that_a_gap_cuts_is_one(tmp_path):
+    log = touches(2)
+    deep = int(np.argmax(log["F"][:600]))
+    cut = {name: np.delete(one, slice(deep - 8, deep + 8)) for name, one in log.items()}
+    runs = read(write_csv(tmp_path / "a.csv", cut)).runs
+    assert [int(run.contact_index[0]) for run in runs] == [0, 0, 1]
+    assert runs[1].tick[0] - runs[0].tick[-1] == 17
+
+
 def test_a_simulated_run_is_read_as_it_was(tmp_path):
     mechanism = load("varying").mechanism
     run = jaxhil.simulate(mechanism)

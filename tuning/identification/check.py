@@ -14,8 +14,8 @@ from jaxhil.mechanism.uncertainty import draw
 from tuning.identification import contact as contacts
 from tuning.identification import free_motion, known, validation
 from tuning.identification.contact import ContactFit
-from tuning.identification.contact_problem import Inner, Problem, Readings
-from tuning.identification.contact_profile import LONGEST, Posterior
+from tuning.identification.contact_problem import LONGEST, Inner, Problem, Readings
+from tuning.identification.contact_profile import Posterior
 from tuning.identification.motion import Motion
 from tuning.identification.noise import Noise, at_rest
 from tuning.identification.rational import Model

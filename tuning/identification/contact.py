@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tuning.identification.contact_laws import Law, kelvin_voigt
-from tuning.identification.contact_problem import Problem, Readings
-from tuning.identification.contact_profile import LONGEST, Posterior, profile
+from tuning.identification.contact_problem import LONGEST, Problem, Readings
+from tuning.identification.contact_profile import Posterior, profile
 from tuning.identification.law_choice import Judged, judge, quick
 from tuning.identification.motion import Motion
 from tuning.identification.noise import Noise
@@ -28,6 +28,7 @@ TIME_CONSTANTS = 10.0  # after which what was commanded before is over
 FIRST_ROWS, STEADY = 5, 0.01  # rows over which, and share by which, the speed of uniform motion may change
 BEYOND = 4.0  # standard deviations beyond the dead zone from which a reading counts
 ROUGH = 21, 5  # delays and planes of the grid for the fit that is only judged
+SURE = 3.0  # standard deviations from which a dead zone is there
 UNEXPLAINED = 1.3  # chi-squared per degree of freedom above which intervals are widened by it
 
 
@@ -116,6 +117,7 @@ def estimate(
     A law as a string is the name of one whose shape is searched; None lets the touches choose.
     """
     motion = Motion(model, runs, timing, LONGEST + timing.control_period)
+    told = plane
     hidden = noise is not None and noise.silent
     if noise is None or hidden:
         readings = Readings.of(runs, 1.0, threshold=1.0 if hidden else 0.0)
@@ -135,9 +137,18 @@ def estimate(
     if lag is not None:
         problem = Problem(motion, readings, law, plane, lag.value)
         posterior = lag.posterior
+    if hidden and not _hides(posterior):
+        # A channel that is 0 out of contact is no sensor's.
+        return estimate(runs, model, timing, None, law, told, seed)
     freedom = len(problem.kept) - len(posterior.names)
     error = 0.0 if noise is None or hidden else noise.std_std / max(noise.std, 1e-300)
     return ContactFit(law, judged, problem, posterior, freedom, error, bool(hidden))
+
+
+def _hides(posterior: Posterior) -> bool:
+    """Whether readings lack so much that there is a dead zone."""
+    lacking = -posterior.draws[:, posterior.names.index("bias")]
+    return bool(lacking.mean() > SURE * lacking.std())
 
 
 def _noise_from_contact(motion: Motion, readings: Readings, plane: float | None) -> Readings:

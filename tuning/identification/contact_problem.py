@@ -18,7 +18,10 @@ from scipy.signal import lfilter
 from tuning.identification.contact_laws import Law
 from tuning.identification.motion import Motion
 from tuning.identification.records import Run
+from tuning.identification.sensor_filter import lag_weights, onset_weights, onsets
 
+LONGEST = 0.02  # s, of the delays that are looked at
+COARSE = 0.0005  # s, between the first delays that are looked at
 STEPS = 6  # of Newton's for the plane
 CLOSE = 2.0  # gain of log likelihood below which a step more is not taken
 
@@ -89,6 +92,16 @@ class _Near(NamedTuple):
     columns: np.ndarray  # (planes, coefficients, rows), one per coefficient but the bias
 
 
+class _Onsets(NamedTuple):
+    """Where contact begins within a period that a sensor's lag integrates."""
+
+    plane: np.ndarray  # (onsets,), place among the planes
+    row: np.ndarray  # (onsets,), place among the rows near contact
+    columns: np.ndarray  # (coefficients, onsets), the law's functions just after
+    after: np.ndarray  # (onsets,), weight of the force there
+    end: np.ndarray  # (onsets,), and of that at the end of the period
+
+
 class Problem:
     """Forces, the motion under them and a law; `plane` is told or None.
 
@@ -101,6 +114,8 @@ class Problem:
     ):
         self.motion, self.readings, self.law, self.plane = motion, readings, law, plane
         self.time_constant = time_constant
+        # A delay is one behind the position sensor's, which may be the longer one.
+        self.shortest = -COARSE * float(np.floor(max(motion.delay, 0.0) / COARSE))
         self.plain = len(readings.whitening) == 1 and time_constant == 0.0
         self.kept = np.flatnonzero(readings.counts)
         # Filters need the rows between those that count.
@@ -139,7 +154,7 @@ class Problem:
         (inner,) = self._inner(fit)
         if self.plane is not None:
             return inner
-        by_plane = self._by_plane(inner.coefficients, near, flags)
+        by_plane = self._by_plane(delay, plane, inner.coefficients, near[0], flags[0])
         residual, design = fit[3][0], fit[4][0]
         along = design @ by_plane
         across = along @ inner.covariance @ along
@@ -151,15 +166,17 @@ class Problem:
 
     def _settle(self, delay: float, planes: np.ndarray):
         """Rows near contact, those of them in contact, and the linear fit to them, until they agree."""
-        near = [self._near(*moved, self.where, planes) for moved in self._moved(delay)]
+        moved = self._moved(delay)
+        near = [self._near(*one, self.where, planes) for one in moved]
         flags = [self._touching(one, self._guess) for one in near]
-        fit = self._solve(near, flags)
+        onsets = self._onsets(near[0], [x for x, _ in moved], planes)
+        fit = self._solve(near, flags, onsets)
         for _ in range(2):
             again = [self._touching(one, fit[0]) for one in near]
             if all(np.array_equal(one, other) for one, other in zip(again, flags, strict=True)):
                 break
             flags = again
-            fit = self._solve(near, flags)
+            fit = self._solve(near, flags, onsets)
         self._guess = fit[0][len(planes) // 2]
         return near, flags, fit
 
@@ -205,40 +222,53 @@ class Problem:
         sound = 2 * pushing.sum(axis=1) > inside.sum(axis=1)
         return np.where(sound[:, None], pushing, inside)
 
-    def _filtered(self, tables: list[np.ndarray], places: list[np.ndarray]) -> np.ndarray:
-        """Columns at their rows, for each part of a period, as the sensor gives them at every row."""
-        shape, full = self.readings.force.shape, []
-        for columns, rows in zip(tables, places, strict=True):
-            table = np.zeros((*columns.shape[:2], self.readings.force.size))
-            table[:, :, rows] = columns
-            full.append(table.reshape(*columns.shape[:2], *shape))
+    def _onsets(self, near: _Near, positions: list[np.ndarray], planes: np.ndarray) -> _Onsets | None:
+        """Of positions at all rows, and half a period before them; None without a lag."""
         if self.time_constant == 0.0:
+            return None
+        now, half = positions
+        before = near.rows - self.readings.force.shape[1]
+        last = np.where(before >= 0, now[np.maximum(before, 0)], now[near.rows])
+        left = onsets(last, half[near.rows], now[near.rows], planes[:, None])
+        plane, row = np.nonzero(left)
+        columns = self._columns(np.zeros((1, len(row))), near.rate[row], self.where[near.rows[row]])[0]
+        rate = self.motion.period / self.time_constant
+        return _Onsets(plane, row, columns, *onset_weights(rate, left[plane, row]))
+
+    def _filtered(self, near: list[_Near], tables: list[np.ndarray], onsets, first) -> np.ndarray:
+        """Columns at their rows, for each part of a period, as the sensor gives them at every row; `first`:
+        the columns just after the onsets, (columns, onsets)."""
+        shape, full = self.readings.force.shape, []
+        for columns, one in zip(tables, near, strict=True):
+            table = np.zeros((*columns.shape[:2], self.readings.force.size))
+            table[:, :, one.rows] = columns
+            full.append(table.reshape(*columns.shape[:2], *shape))
+        if onsets is None:
             return full[0]
         pole, (now, half, last) = lag_weights(self.motion.period / self.time_constant)
         drive = now * full[0] + half * full[1]
         drive[:, :, 1:] += last * full[0][:, :, :-1]
+        flat = drive.reshape(*drive.shape[:2], -1)
+        then = tables[0][onsets.plane, :, onsets.row].T
+        flat[onsets.plane, :, near[0].rows[onsets.row]] = (onsets.after * first + onsets.end * then).T
         lagged: Any = lfilter([1.0], [1.0, -pole], drive, axis=-2)
         return lagged
 
-    def _design(self, near: list[_Near], tables: list[np.ndarray]) -> np.ndarray:
-        """Columns at their rows, or at all that count where they are filtered."""
-        if self.plain:
-            return tables[0]
-        full = self.whiten(self._filtered(tables, [one.rows for one in near]))
-        return full.reshape(*full.shape[:2], -1)[:, :, self.kept]
-
-    def _solve(self, near: list[_Near], flags: list[np.ndarray]):
+    def _solve(self, near: list[_Near], flags: list[np.ndarray], onsets: _Onsets | None):
         """Coefficients, their covariance, the misfit, residuals and the design, for each plane.
 
         Design and residuals are over the noise's standard deviation."""
-        std, tables = self.readings.std, []
+        std, tables, first = self.readings.std, [], None
         for one, flag in zip(near, flags, strict=True):
             # The last column is the bias: in the rows in contact alone under a dead zone, else in all.
             table = np.empty((len(flag), one.columns.shape[1] + 1, len(one.rows)))
             np.multiply(one.columns, flag[:, None] / std, out=table[:, :-1])
             table[:, -1] = flag / std if self.local else 1.0 / std
             tables.append(table)
-        design = self._design(near, tables)
+        if onsets is not None:
+            ones = np.ones((1, len(onsets.row)))
+            first = np.vstack([onsets.columns, ones]) * flags[0][onsets.plane, onsets.row] / std
+        design = tables[0] if self.plain else self._at_kept(self._filtered(near, tables, onsets, first))
         if not self.plain and not self.local:
             design[:, -1] = float(np.sum(self.readings.whitening)) / std
         target = self.target[near[0].rows] if self.plain else self.target
@@ -260,40 +290,54 @@ class Problem:
             misfit -= 2.0 * bias * (self.sums[1] - target.sum() / std)
         return coefficients, covariance, misfit, residual, design
 
-    def _by_plane(self, coefficients, near: list[_Near], flags: list[np.ndarray]) -> np.ndarray:
+    def _at_kept(self, full: np.ndarray) -> np.ndarray:
+        """Values at all rows, (planes, columns, rows, lanes), with white noise and at those that count."""
+        return self.whiten(full).reshape(*full.shape[:2], -1)[:, :, self.kept]
+
+    def _by_plane(
+        self, delay: float, plane: float, coefficients, near: _Near, flag: np.ndarray
+    ) -> np.ndarray:
         """Slope of the readings predicted by the one plane, at the rows of the design, over the noise."""
-        step, tables = 1e-7, []
-        for one, flag in zip(near, flags, strict=True):
-            rows = self.where[one.rows]
-            up, down = (
-                _force(coefficients, self._columns(np.maximum(one.depth + d, 0.0), one.rate, rows))
-                for d in (step, -step)
-            )
-            tables.append(((down - up) * flag / (2.0 * step * self.readings.std))[:, None])
-        return self._design(near, tables)[0, 0]
+        step = 1e-7
+        if self.time_constant:
+            high, low = (self.force(delay, plane + d, coefficients) for d in (step, -step))
+            return self._at_kept((high - low)[None, None] / (2.0 * step * self.readings.std))[0, 0]
+        rows = self.where[near.rows]
+        up, down = (
+            _force(coefficients, self._columns(np.maximum(near.depth + d, 0.0), near.rate, rows))
+            for d in (step, -step)
+        )
+        table = ((down - up) * flag / (2.0 * step * self.readings.std))[:, None]
+        return (table if self.plain else self._at_kept(self._filtered([near], [table], None, None)))[0, 0]
 
     def force(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
         """The readings the law predicts [N], the bias included, (rows, lanes)."""
-        forces, places = [], []
-        for part in self.before:
-            near, flag = self._everywhere(delay + part * self.motion.period, plane, coefficients)
-            value = _force(coefficients[None], near.columns) + self.local * coefficients[-1]
-            forces.append((value * flag)[:, None])
-            places.append(near.rows)
-        return self._filtered(forces, places)[0, 0] + (0.0 if self.local else coefficients[-1])
+        near, flags, onsets = self._everywhere(delay, plane, coefficients)
+        offset, first = self.local * coefficients[-1], None
+        tables = [
+            ((_force(coefficients[None], one.columns) + offset) * flag)[:, None]
+            for one, flag in zip(near, flags, strict=True)
+        ]
+        if onsets is not None:
+            first = (coefficients[:-1] @ onsets.columns + offset) * flags[0][onsets.plane, onsets.row]
+        return self._filtered(near, tables, onsets, first)[0, 0] + (0.0 if self.local else coefficients[-1])
 
     def touching(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
         """Whether each row is in contact by the model, (rows, lanes)."""
-        near, flag = self._everywhere(delay, plane, coefficients)
+        (near, *_), (flag, *_), _ = self._everywhere(delay, plane, coefficients)
         flags = np.zeros(self.readings.force.shape, bool)
         flags.ravel()[near.rows] = flag[0]
         return flags
 
-    def _everywhere(self, delay: float, plane: float, coefficients) -> tuple[_Near, np.ndarray]:
-        """The rows near contact, whether they count or not, and whether they are in it."""
-        position, rate = (value.ravel() for value in self.motion.at(delay))
-        near = self._near(position, rate, np.arange(position.size), np.array([plane]))
-        return near, self._touching(near, coefficients[None])
+    def _everywhere(self, delay: float, plane: float, coefficients):
+        """The rows near contact, whether they count or not, and whether they are in it, for each part of a
+        period; and the onsets."""
+        moved = [self.motion.at(delay + part * self.motion.period) for part in self.before]
+        moved = [(position.ravel(), rate.ravel()) for position, rate in moved]
+        every, planes = np.arange(moved[0][0].size), np.array([plane])
+        near = [self._near(*one, every, planes) for one in moved]
+        flags = [self._touching(one, coefficients[None]) for one in near]
+        return near, flags, self._onsets(near[0], [x for x, _ in moved], planes)
 
     def settled(self, delay: float, plane: float) -> tuple[float, Inner, float]:
         """The plane of least misfit at a delay, a fit next to it, and by how much the log likelihood there is
@@ -314,18 +358,3 @@ class Problem:
 def _force(coefficients: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """The law without the bias, (planes, rows)."""
     return (coefficients[..., None, :-1] @ columns)[:, 0]
-
-
-def lag_weights(rate: float) -> tuple[float, tuple[float, float, float]]:
-    """A first-order lag over one period: what it keeps of itself, and the weights of the force at the end,
-    the middle and the beginning of the period; exact where the force is a parabola. `rate`: period over the
-    time constant."""
-    pole = float(np.exp(-rate))
-    # Moments of rate exp(-(1 - s) rate) over s = 0..1.
-    first = 1.0 - pole
-    second = 1.0 - first / rate
-    third = 1.0 - 2.0 * second / rate
-    last, half, now = np.linalg.solve(
-        [[1.0, 1.0, 1.0], [0.0, 0.5, 1.0], [0.0, 0.25, 1.0]], [first, second, third]
-    )
-    return pole, (float(now), float(half), float(last))

@@ -14,10 +14,8 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from tuning.identification.contact_problem import Inner, Problem
+from tuning.identification.contact_problem import COARSE, LONGEST, Inner, Problem
 
-LONGEST = 0.02  # s, of the delays that are looked at
-COARSE = 0.0005  # s, between the first delays that are looked at
 FINE = 1e-5  # s, between the next: damped touches begin with a jump, and a row on its other side costs much
 REGION = 25.0  # of twice the log posterior below its best: what the final grid covers
 ROUGH_REGION = 400.0  # the same of the coarse grid, whose heights are full of rows on the wrong side
@@ -59,18 +57,18 @@ def profile(
     `near`: a delay [s] and the plane there [m] within some milliseconds of the best, where they are known;
     else all delays are looked at. `size`: of the final grid, delays and planes."""
     if near is None:
-        delays = np.arange(0.0, LONGEST + COARSE / 2.0, COARSE)
+        delays = np.arange(problem.shortest, LONGEST + COARSE / 2.0, COARSE)
         start = first_plane(problem, LONGEST / 4.0) if problem.plane is None else problem.plane
     else:
         delays, start = near[0] + np.arange(-REACH, REACH + COARSE / 2.0, COARSE), near[1]
-        delays = np.unique(np.clip(delays, 0.0, LONGEST))
+        delays = np.unique(np.clip(delays, problem.shortest, LONGEST))
     planes, stds, heights = _scan(problem, delays, start)
-    low, high = _region(delays, heights, ROUGH_REGION)
+    low, high = _region(problem, delays, heights, ROUGH_REGION)
     finer = np.linspace(low, high, int(np.clip((high - low) / FINE, 21, 151)))
     known = np.interp(finer, delays, planes), np.interp(finer, delays, stds)
     places, cells = _grid(problem, finer, known, FEW_PLANES)
     heights, planes, stds = _by_delay(places, cells, len(finer))
-    low, high = _region(finer, heights, REGION)
+    low, high = _region(problem, finer, heights, REGION)
     delays = np.linspace(low, high, size[0])
     known = np.interp(delays, finer, planes), np.interp(delays, finer, stds)
     places, cells = _grid(problem, delays, known, size[1])
@@ -108,11 +106,11 @@ def _scan(problem: Problem, delays: np.ndarray, start: float) -> tuple[np.ndarra
     return np.array(planes), np.array(stds), np.array(heights)
 
 
-def _region(delays: np.ndarray, heights: np.ndarray, reach: float) -> tuple[float, float]:
+def _region(problem: Problem, delays: np.ndarray, heights: np.ndarray, reach: float) -> tuple[float, float]:
     """The delays around the best whose posterior is worth a grid, one step wider on each side."""
     inside = np.flatnonzero(2.0 * (heights.max() - heights) <= reach)
     step = delays[1] - delays[0]
-    return max(0.0, delays[inside[0]] - step), min(LONGEST, delays[inside[-1]] + step)
+    return max(problem.shortest, delays[inside[0]] - step), min(LONGEST, delays[inside[-1]] + step)
 
 
 def _grid(
@@ -170,7 +168,8 @@ def _sample(
         delay, plane, width = places[index]
         spread = rng.uniform(-0.5, 0.5, (count, 2)) * [step, width * (problem.plane is None)]
         values = _coefficients(cells[index], problem.rate_like, count, rng)
-        rows.append(np.column_stack([np.clip(delay + spread[:, 0], 0.0, None), plane + spread[:, 1], values]))
+        moved = np.maximum(delay + spread[:, 0], problem.shortest)
+        rows.append(np.column_stack([moved, plane + spread[:, 1], values]))
     profile = _by_delay(places, cells, len(delays))[0]
     best = int(np.argmax(heights))
     return Posterior(

@@ -93,7 +93,8 @@ def estimate(runs: Sequence[Run], timing: Timing, order: int | None = None) -> F
         beyond = erring(chosen.fit.model, lines)
         if beyond == 0.0:
             break
-        weighed = replace(lines, std=np.hypot(lines.std, beyond * np.abs(lines.output)))
+        expected = np.abs(chosen.fit.model.predict(lines))
+        weighed = replace(lines, std=np.hypot(lines.std, beyond * expected))
         chosen = replace(chosen, fit=fit(chosen.fit.model.structure, weighed))
     gain = gain_of(chosen.fit, weighed)
     return FreeMotion(lines, tuple(spectra), chosen, tuple(candidates), gain, other_hold, beyond)
@@ -103,12 +104,14 @@ def erring(model: Model, lines: Lines) -> float:
     """Standard deviation of the model's relative error that counts at each line, 0 where noise explains all.
 
     A model errs smoothly: all lines of a band share one error. So it is found from the means over bands, and
-    counts as often as a band has lines; else lines of little noise would decide what it is elsewhere."""
-    size = np.abs(lines.output)
+    counts as often as a band has lines; else lines of little noise would decide what it is elsewhere. The
+    error is relative to the model's output: where nothing comes out, what was measured is noise alone."""
+    expected = model.predict(lines)
+    size = np.abs(expected)
     errors, variances, counts = [], [], []
     for band in np.array_split(np.argsort(lines.frequency), min(BANDS, len(lines))):
         weight = size[band] ** 2 / lines.std[band] ** 2
-        relative = (model.predict(lines)[band] - lines.output[band]) / lines.output[band]
+        relative = (lines.output[band] - expected[band]) / expected[band]
         errors.append(np.abs(np.sum(weight * relative) / weight.sum()))
         variances.append(1.0 / weight.sum())
         counts.append(len(band))

@@ -16,8 +16,8 @@ from scipy import optimize
 
 from tuning.identification import contact_laws as laws
 from tuning.identification.contact_laws import Law
-from tuning.identification.contact_problem import Problem, Readings
-from tuning.identification.contact_profile import COARSE, LONGEST, first_plane
+from tuning.identification.contact_problem import COARSE, LONGEST, Problem, Readings
+from tuning.identification.contact_profile import first_plane
 from tuning.identification.motion import Motion
 
 FEWEST = 4  # touches for judging on others than those fitted
@@ -117,14 +117,15 @@ def quick(problem: Problem, guess: Fitted | None = None, reach: int = 4) -> Fitt
     """The best delay and plane: within `reach` of the coarse steps about a guess, or anywhere."""
     if guess is None:
         start = problem.plane if problem.plane is not None else first_plane(problem, LONGEST / 4.0)
-        delays = np.arange(0.0, LONGEST, 2.0 * COARSE)
+        delays = np.arange(problem.shortest, LONGEST, 2.0 * COARSE)
     else:
         steps = np.array([step for step in (-4, -2, -1, 0, 1, 2, 4) if abs(step) <= reach])
-        start, delays = guess[1], np.clip(guess[0] + COARSE * steps, 0.0, None)
+        start, delays = guess[1], np.maximum(guess[0] + COARSE * steps, problem.shortest)
     best = (0.0, start, np.inf)
     for width in (0.0, COARSE, COARSE / 4.0):
         if width:
-            delays = np.clip(best[0] + width * np.array([-1.0, -0.5, 0.5, 1.0]), 0.0, LONGEST)
+            delays = best[0] + width * np.array([-1.0, -0.5, 0.5, 1.0])
+            delays = np.clip(delays, problem.shortest, LONGEST)
         for delay in delays:
             plane, inner, gain = problem.settled(float(delay), best[1])
             if inner.misfit - 2.0 * gain < best[2]:
@@ -136,7 +137,8 @@ def _at_onset(motion: Motion, readings: Readings, guess: Fitted) -> np.ndarray:
     """Rows near the first and the last of a contact: a damped one begins with a jump, and whether a row is on
     this or that side of it says nothing of the law."""
     delay, plane, _ = guess
-    flags = [motion.at(max(one, 0.0))[0] > plane for one in (delay - ONSET, delay, delay + ONSET)]
+    shortest = -max(motion.delay, 0.0)
+    flags = [motion.at(max(one, shortest))[0] > plane for one in (delay - ONSET, delay, delay + ONSET)]
     return np.any(flags, axis=0) & ~np.all(flags, axis=0)
 
 

@@ -34,7 +34,9 @@ class Motion:
         self.history = (
             int(np.ceil((max(self.delay, 0.0) + longest) / self.period)) + timing.command_latency + 4
         )
-        command = self._commands(runs)
+        # Readings of later ticks, by the way rows are written or by a delay below 0, need commands of then.
+        ahead = 1 + int(np.ceil(max(-self.delay, 0.0) / self.period))
+        command = self._commands(runs, ahead)
         latency = timing.command_latency
         self.end = command[1 : len(command) - latency]
         self.start = self.end if timing.command_hold == "zoh" else command[: len(command) - 1 - latency]
@@ -66,8 +68,8 @@ class Motion:
         states = np.einsum("i,nil->nl", row[: self.order], self.states[taken]) if self.order else 0.0
         return states + row[-2] * start + row[-1] * end
 
-    def _commands(self, runs: Sequence[Run]) -> np.ndarray:
-        """Commands with their history, (history + rows + 1, lanes); a shorter run holds its last one."""
+    def _commands(self, runs: Sequence[Run], ahead: int) -> np.ndarray:
+        """Commands with their history, (history + rows + ahead, lanes); after a run its last one is held."""
         lanes = []
         for run in runs:
             x = run.position_desired
@@ -78,8 +80,7 @@ class Motion:
             else:
                 step = 0.0
             before = x[0] + step * np.arange(-self.history, 0)
-            lanes.append(np.concatenate([before, x, np.full(self.rows - len(x) + 1, x[-1])]))
-        # One row more: readings that come after the command are those of the next tick.
+            lanes.append(np.concatenate([before, x, np.full(self.rows - len(x) + ahead, x[-1])]))
         return np.array(lanes).T
 
     def _after(self, place: float):
@@ -127,12 +128,13 @@ def _companion(numerator: np.ndarray, denominator: np.ndarray, period: float):
 
 
 def exponential(matrix: np.ndarray) -> np.ndarray:
-    """Matrix exponential by scaling, Taylor and squaring, to rounding for norms up to 64.
+    """Matrix exponential by scaling, Taylor and squaring, to rounding.
 
     Small matrices by the hundred: the general one's choice of a method takes longer than the method."""
-    scaled, total = matrix / 64.0, np.eye(len(matrix))
+    halvings = max(6, int(np.ceil(np.log2(np.abs(matrix).sum(axis=0).max(initial=1.0)))))
+    scaled, total = matrix / 2.0**halvings, np.eye(len(matrix))
     for term in range(13, 0, -1):
         total = np.eye(len(matrix)) + scaled @ total / term
-    for _ in range(6):
+    for _ in range(halvings):
         total = total @ total
     return total

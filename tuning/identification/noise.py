@@ -31,6 +31,7 @@ class Noise:
     silent: bool  # readings are exactly 0 most of the time: mean and std are unknown
     filter: tuple[float, ...]  # makes the noise white, its first coefficient 1
     number: int  # readings
+    drift: float = 0.0  # of the readings, from the first to the last; 0 where it is lost in the noise
 
     @property
     def pole(self) -> float:
@@ -49,7 +50,10 @@ def at_rest(readings: np.ndarray) -> Noise:
     number = len(readings)
     if np.mean(readings == 0.0) > SILENT and (quantum == 0.0 or np.ptp(readings) < 1.5 * quantum):
         return Noise(0.0, 0.0, np.inf, np.inf, quantum, True, (1.0,), number)
-    mean, std = _binned(readings, quantum) if quantum else (readings.mean(), readings.std(ddof=1))
+    drift = _drift(readings)
+    readings = readings - drift * (np.arange(number) / (number - 1.0) - 0.5)
+    rounded = quantum and not drift
+    mean, std = _binned(readings, quantum) if rounded else (readings.mean(), readings.std(ddof=1))
     colour = autoregression(readings - mean)
     # The mean of correlated readings is less certain, by what the noise holds at frequency 0.
     at_zero = np.sqrt(whitened_share(colour)) / abs(np.sum(colour))
@@ -65,7 +69,15 @@ def at_rest(readings: np.ndarray) -> Noise:
         False,
         colour,
         number,
+        drift,
     )
+
+
+def _drift(readings: np.ndarray) -> float:
+    """From the first to the last, by a straight line, where that is more than what is left scatters."""
+    time = np.linspace(-0.5, 0.5, len(readings))
+    drift = float(time @ (readings - readings.mean()) / (time @ time))
+    return drift if abs(drift) > np.std(readings - drift * time) else 0.0
 
 
 def steps(readings: np.ndarray) -> float:

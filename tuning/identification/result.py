@@ -67,7 +67,7 @@ class Identification:
 
     @property
     def good(self) -> bool:
-        return not self.missing and self.effect < self.limit
+        return not self.missing and bool(self.lines) and self.effect < self.limit
 
     @property
     def worst(self) -> Line | None:
@@ -79,6 +79,8 @@ class Identification:
     def verdict(self) -> str:
         if self.missing:
             return f"Bad: neither the logs nor a prior tell {' and '.join(self.missing)}; no file is written"
+        if not self.lines:
+            return "Bad: neither free motion nor contact is in the logs: nothing shows that the file is right"
         if self.good:
             return (
                 f"Good: what the model leaves can change e by {self.effect:.2g}, allowed below {self.limit:g}"
@@ -101,6 +103,8 @@ class Identification:
 
 def confounded(keys: list[str], draws: np.ndarray) -> tuple[tuple[str, str, float, str], ...]:
     """The pairs that the logs hardly tell apart, and the experiment that would."""
+    moving = np.ptp(draws, axis=0) > 0.0
+    keys, draws = [key for key, one in zip(keys, moving, strict=True) if one], draws[:, moving]
     if len(keys) < 2:
         return ()
     correlation = np.corrcoef(draws.T)

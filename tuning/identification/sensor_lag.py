@@ -38,7 +38,7 @@ def sensor_lag(problem: Problem, posterior: Posterior, seed: int = 0) -> Lag | N
 
     def fit(value: float) -> Fitted:
         if value not in fits:
-            start = (max(delay - value, 0.0), plane, inner.misfit)
+            start = (max(delay - value, problem.shortest), plane, inner.misfit)
             fits[value] = quick(_lagging(problem, value), start, 2)
         return fits[value]
 
@@ -63,7 +63,8 @@ def sensor_lag(problem: Problem, posterior: Posterior, seed: int = 0) -> Lag | N
     each = []
     for one in nodes:
         at, plane, _ = fit(one)
-        each.append(around(_lagging(problem, one), np.unique(np.maximum(at + spread, 0.0)), plane, seed))
+        delays = np.unique(np.maximum(at + spread, problem.shortest))
+        each.append(around(_lagging(problem, one), delays, plane, seed))
     return _joined(nodes, each, seed)
 
 

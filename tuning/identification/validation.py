@@ -15,14 +15,16 @@ import numpy as np
 from scipy import special, stats
 
 from tuning.identification.contact import ContactFit
+from tuning.identification.contact_problem import LONGEST
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.law_choice import misfits
 from tuning.identification.records import Run
 
-OTHER_HOLD = 1.0  # gain of the information criterion from which the other hold explains more
+OTHER_HOLD = 2.0  # gain of the information criterion from which the other hold explains more
 RARE = 1e-3  # probability under which a defect is taken to be there
 HARMONICS = 4.0  # of the contact's frequency: up to there the motion decides what a contact does
 CERTAIN_DRAWS = 40  # of the posterior, under all of which a row is in contact or under none
+AT_THE_END = 0.93  # of the longest force delay that is looked for
 NEIGHBOURS = 5  # lines over which the motion's misfit is averaged
 
 
@@ -124,7 +126,7 @@ def of_contact(
     contact: ContactFit, runs: list[Run], mass: float, frequency: float, lag: float, held: np.ndarray
 ) -> list[Line]:
     """Checks of the contact's model on touches that it was not fitted to (`held`, a flag each)."""
-    lines = [_left(contact, held), _stiffness(contact)]
+    lines = [_left(contact, held), _stiffness(contact), *_at_the_end(contact)]
     errors, stds = restitution_errors(contact, runs, mass)
     usable = held & np.isfinite(errors)
     if usable.any():
@@ -138,7 +140,7 @@ def _left(contact: ContactFit, held: np.ndarray) -> Line:
     readings = contact.readings
     readings = replace(readings, counts=readings.counts & _certain(contact))
     every = misfits(contact.problem, readings, delay, plane, inner.coefficients)[held]
-    count = readings.counts.sum(axis=0)[held]
+    count = np.maximum(readings.counts.sum(axis=0)[held], 1)
     ratio = float(every.sum() / count.sum())
     # The force's rms error over the touch, as a share of its rms, is at most what it can do to e.
     force = np.where(readings.counts, readings.force, 0.0)[:, held]
@@ -177,6 +179,15 @@ def _stiffness(contact: ContactFit) -> Line:
         min(values) <= 0.0,
         1.0,
     )
+
+
+def _at_the_end(contact: ContactFit) -> list[Line]:
+    """A delay at the end of those that were looked at is none."""
+    delay = contact.posterior.mean[0]
+    if delay < AT_THE_END * LONGEST:
+        return []
+    found = f"{1e3 * delay:.4g} ms, the longest that was looked for"
+    return [Line("force delay", found, True, 1.0)]
 
 
 def restitution_errors(contact: ContactFit, runs: list[Run], mass: float) -> tuple[np.ndarray, np.ndarray]:

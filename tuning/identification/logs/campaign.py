@@ -95,6 +95,8 @@ class _Reading:
         self.label, self.notes = one_line(str(path)) or "''", list[str]()
         self.kind: Kind = entry.kind
         self._path, self._timing, self._mass = path, timing, mass
+        # Contacts met so far; last tick and resting force of one that a gap cut off.
+        self._met, self._open = 0, None
         self._integrator = "semi_implicit_euler" if prior is None else prior.rig.integrator
         # Of the contact lists the last entry repeats.
         lists = () if prior is None else (prior.contact.stiffness, prior.contact.damping)
@@ -129,7 +131,6 @@ class _Reading:
         if modes is not None:
             cuts = np.union1d(cuts, np.flatnonzero(modes[1:] != modes[:-1]) + 1)
         runs: list[Run] = []
-        contacts = 0
         for stretch in stretches(tick, channels, cuts, self._timing.control_period, self._mass):
             if len(stretch.tick) < SCRAP:
                 self.notes.append(f"{self.label}: {len(stretch.tick)} rows between gaps are left out")
@@ -137,9 +138,7 @@ class _Reading:
             kind: Kind = self.kind
             if modes is not None:
                 kind = KINDS[int(modes[np.searchsorted(tick, stretch.tick[:1])][0])]
-            found = self._stretch(stretch, kind, contacts)
-            contacts += len(found) * (kind in TOUCHING)
-            runs += found
+            runs += self._stretch(stretch, kind)
         if not runs:
             allowed = (
                 f"at least {SCRAP} without a gap of more than 3, with a contact where there is to be one"
@@ -147,16 +146,16 @@ class _Reading:
             raise InputError(f"{self.label}: found {len(tick)} rows, allowed {allowed}")
         return runs
 
-    def _stretch(self, stretch: Stretch, kind: Kind, before: int) -> list[Run]:
-        """The runs of a stretch, checked: one for each contact, or the whole; `before` came before it."""
+    def _stretch(self, stretch: Stretch, kind: Kind) -> list[Run]:
+        """The runs of a stretch, checked: one for each contact, or the whole."""
         period, force = self._timing.control_period, stretch.channels["force_measured"]
-        self.notes += checks.check_motion(self.label, kind, stretch, period)
+        self.notes += checks.check_motion(self.label, kind, stretch, period, self._timing.command_hold)
         if kind not in ("press", *TOUCHING):
             return [self._run(stretch, kind, slice(None), None, None)]
         if force is None:
             allowed = "one where there is contact"
             raise InputError(f"{self.label}: force_measured: found no such channel, allowed {allowed}")
-        touched = segments.contacts(force, period)
+        touched = self._touched(stretch.tick, force)
         self.notes += checks.check_force(self.label, kind, stretch, touched, period, self._mass)
         if kind == "press":
             return [self._run(stretch, kind, slice(None), None, None)]
@@ -167,10 +166,23 @@ class _Reading:
             self.notes.append(f"{self.label}: {len(stretch.tick)} rows without contact are left out")
         middles = [(one[1] + two[0]) // 2 for one, two in pairwise(touched)]
         parts = [slice(*edges) for edges in pairwise([0, *middles, len(stretch.tick)])]
+        first = self._met - len(touched)
         return [
-            self._run(stretch, kind, part, one, min(before + number, self._last))
+            self._run(stretch, kind, part, one, min(first + number, self._last))
             for number, (part, one) in enumerate(zip(parts, touched, strict=False))
         ]
+
+    def _touched(self, tick: np.ndarray, force: np.ndarray) -> list[tuple[int, int]]:
+        """The contacts of a stretch, and how many there were so far; one may go on over a gap."""
+        period, rest = self._timing.control_period, None
+        if self._open is not None and (tick[0] - self._open[0]) * period < segments.APART:
+            rest = self._open[1]
+        touched = segments.contacts(force, period, rest)
+        goes_on = rest is not None and bool(touched) and touched[0][0] == 0
+        self._met += len(touched) - goes_on
+        ended = not touched or touched[-1][1] < len(force) - segments.TICKS
+        self._open = None if ended else (tick[-1], segments.resting(force) if rest is None else rest)
+        return touched
 
     def _run(
         self, stretch: Stretch, kind: Kind, part: slice, touched: tuple[int, int] | None, number: int | None

@@ -22,6 +22,8 @@ FASTEST = 5.0  # m/s
 SMOOTH = 10  # ticks, over which speeds are taken
 MOST_LAG = 400  # ticks, of a reading behind its command
 HELD = 0.4  # share of rows that repeat a reading, beyond which it is one that is held
+LONGEST_HELD = 20  # rows
+ALWAYS = 0.9  # share of the changes that come as far apart as most
 FOLLOWS = 0.3  # correlation of speeds, below which a reading does not follow its command
 IMPULSE = 0.2, 5.0  # measured over what the change of speed needs
 SAMPLE = 200_000  # rows looked at, where some say as much as all
@@ -36,8 +38,9 @@ def check_rows(label: str, name: str, values: np.ndarray) -> None:
         raise InputError(f"{label}: row {row}: {name}: found {found:g}, allowed {allowed}")
 
 
-def check_motion(label: str, kind: str, stretch: Stretch, period: float) -> list[str]:
-    """Position channels of one stretch: size, excitation, one against the other. Returns notes."""
+def check_motion(label: str, kind: str, stretch: Stretch, period: float, hold: str) -> list[str]:
+    """Position channels of one stretch: size, excitation, one against the other; drives with the `hold`
+    "linear" get a command every row. Returns notes."""
     x, measured = (_of(stretch, name)[stretch.valid] for name in ("position_desired", "position_measured"))
     if kind == "rest":
         return []
@@ -50,6 +53,11 @@ def check_motion(label: str, kind: str, stretch: Stretch, period: float) -> list
             f"{label}: position_measured: found {measured[0]:g} m in every row, allowed a reading"
         )
     _check_size(label, x, measured, period)
+    if hold == "linear" and (rows := changes_every(x)) > 1:
+        allowed = 'one of every row; or command_hold = "zoh" where the drives hold it so long'
+        raise InputError(
+            f"{label}: position_desired: found one that changes every {rows} rows, allowed {allowed}"
+        )
     return [*_held(label, x, measured), *_check_following(label, x, measured)]
 
 
@@ -57,7 +65,7 @@ def check_force(
     label: str, kind: str, stretch: Stretch, touched: list[tuple[int, int]], period: float, mass: float
 ):
     """Sign and unit of the measured force of contacts, by the change of speed that it makes; of a press, by
-    the motion that raises it. Returns notes."""
+    the motion that raises it; whether it is one of every row. Returns notes."""
     force, x = _of(stretch, "force_measured"), _of(stretch, "position_desired")
     found = force[stretch.valid]
     if np.ptp(found) == 0.0:
@@ -66,7 +74,7 @@ def check_force(
         measured = _of(stretch, "position_measured")[stretch.valid]
         if np.corrcoef(found, measured)[0, 1] < -0.5:
             raise _wrong_sign(label, "falls where the hardware is pushed deeper")
-        return []
+        return _late(label, found)
     needed, made = [], []
     for begin, end in touched:
         if begin >= SMOOTH and end + SMOOTH <= len(x):
@@ -82,12 +90,34 @@ def check_force(
         raise InputError(
             f"{label}: force_measured: found {ratio:.3g} times the impulse that there was, allowed {allowed}"
         )
+    notes = _late(label, found)
     top = np.abs(found) >= np.max(np.abs(found))
     if np.count_nonzero(top[1:] & top[:-1]) >= 10:
-        return [
+        notes.append(
             f"{label}: force_measured: {np.count_nonzero(top)} rows at the largest reading, as if clipped"
-        ]
-    return []
+        )
+    return notes
+
+
+def _late(label: str, force: np.ndarray) -> list[str]:
+    """A note where readings come more seldom than rows."""
+    rows = changes_every(force)
+    if rows == 1:
+        return []
+    return [f"{label}: force_measured: a new reading every {rows} rows alone: those between do not fit a law"]
+
+
+def changes_every(values: np.ndarray) -> int:
+    """Every how many rows the values change, where that is always the same; else 1."""
+    steps = np.diff(values[:SAMPLE])
+    apart = np.diff(np.flatnonzero(steps))
+    if len(apart) < FEWEST_ROWS // 10:
+        return 1
+    usual = int(np.median(apart))
+    # Rounded values of a steady motion change as regularly, by one unit of their last digit.
+    coarse = np.median(np.abs(steps[steps != 0.0])) <= 4 * _resolution(values)
+    held = 1 < usual <= LONGEST_HELD and np.mean(apart == usual) > ALWAYS and not coarse
+    return usual if held else 1
 
 
 def check_command(

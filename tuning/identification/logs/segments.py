@@ -10,12 +10,12 @@ APART = 0.1  # s, between two contacts; what is nearer is one
 FIRST = 200  # rows at most, from which the force at rest is taken
 
 
-def contacts(force: np.ndarray, period: float) -> list[tuple[int, int]]:
+def contacts(force: np.ndarray, period: float, rest: float | None = None) -> list[tuple[int, int]]:
     """First row of each contact and the row after its last one.
 
-    `force` [N] begins without contact; NaN where a row was lost.
+    `force` [N] begins without contact, unless what it is at `rest` is given; NaN where a row was lost.
     """
-    touched = np.abs(force - resting(force)) > threshold(force)
+    touched = np.abs(force - (resting(force) if rest is None else rest)) > threshold(force)
     long = touched.copy()
     for ticks in range(1, TICKS):
         long[: len(force) - ticks] &= touched[ticks:]

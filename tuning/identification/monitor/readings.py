@@ -12,11 +12,11 @@ from scipy.signal import lfilter
 from jaxhil.errors import InputError
 from jaxhil.mechanism.structs import Mechanism
 from tuning.identification.contact_laws import Law
-from tuning.identification.contact_problem import lag_weights
 from tuning.identification.known import coefficients, contact_law, motion_model
 from tuning.identification.motion import Motion
 from tuning.identification.rational import Model
 from tuning.identification.records import Run, Timing
+from tuning.identification.sensor_filter import lag_weights
 
 
 @dataclass(frozen=True)
