@@ -1,9 +1,12 @@
 """The C++ baseline against the JAX loop: the same contacts to rounding, so that their speeds compare."""
 
+import os
+import subprocess
+
 import jax
 import numpy as np
 import pytest
-from baseline import RESULTS, compile_baseline
+from baseline import FLAGS, KINDS, RESULTS, SOURCE, compile_baseline
 
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
@@ -69,6 +72,21 @@ def test_bare_ticks_make_the_first_contact(baseline):
     for name in RESULTS:
         np.testing.assert_allclose(bare[name][0], contacts[name][0], rtol=1e-12, err_msg=name)
     assert np.all(bare["status"][1:] == NOT_REACHED)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the report is that of g++ on Linux")
+def test_every_law_of_it_does_several_lanes_at_a_time():
+    """The loop over the lanes of a tick, three instances: the compiler's own report."""
+    source = SOURCE.read_text().splitlines()
+    (line,) = (n for n, text in enumerate(source, 1) if "const double x = b.position[l], v" in text)
+    report = subprocess.run(
+        ["g++", *FLAGS, "-fopt-info-vec-optimized", "-c", str(SOURCE), "-o", os.devnull],
+        capture_output=True, text=True, check=True,
+    ).stderr  # fmt: skip
+    loops = [
+        one for one in report.splitlines() if f"{SOURCE.name}:{line - 1}:" in one and "loop vectorized" in one
+    ]
+    assert len(loops) == len(KINDS)
 
 
 def test_what_is_out_of_scope_is_refused(baseline):
