@@ -53,6 +53,7 @@ Limit = Annotated[float, arg(metavar="NUMBER", help="Restitution error beyond wh
 Json = Annotated[
     FlagCreatePairsOff[bool], text(None, "One JSON document on standard output, nothing else there.")
 ]
+Timings = Annotated[FlagCreatePairsOff[bool], text(None, "Say on standard error where the time went.")]
 Resume = Annotated[
     bool,
     arg(name="resume", metavar="", help="Go on after an interruption: what is finished is not done again."),
@@ -92,6 +93,7 @@ class Init:
     )
     list: Annotated[FlagCreatePairsOff[bool], text(None, "Only list the names, writing nothing.")] = False
     json: Json = False
+    timings: Timings = False
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,7 @@ class Simulate:
     limit: Limit = 0.01
     seed: Annotated[int, number("Seed of the sensor noise.")] = 0
     json: Json = False
+    timings: Timings = False
 
 
 @dataclass(frozen=True)
@@ -201,6 +204,7 @@ class Tune:
     limit: Limit = 0.01
     resume: Resume = False
     json: Json = False
+    timings: Timings = False
 
 
 @dataclass(frozen=True)
@@ -261,6 +265,7 @@ class Sweep:
         arg(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster that computes the parts."),
     ] = None
     json: Json = False
+    timings: Timings = False
 
 
 @dataclass(frozen=True)
@@ -279,6 +284,7 @@ class Replay:
         arg(metavar="[PICTURE]", help=f"Plot to a .png, .pdf or .svg file; bare: {DEFAULT_REPLAY_PLOT}."),
     ] = None
     json: Json = False
+    timings: Timings = False
 
 
 @dataclass(frozen=True)
@@ -313,6 +319,7 @@ class Compare:
     resume: Resume = False
     seed: Annotated[int, number("Seed of scenarios, starts and resampling.")] = 0
     json: Json = False
+    timings: Timings = False
 
 
 @dataclass(frozen=True)
@@ -326,3 +333,4 @@ class Mechanisms:
         FlagCreatePairsOff[bool], text(None, "Instead the JSON Schema of mechanism files, for editors.")
     ] = False
     json: Json = False
+    timings: Timings = False

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
-from tuning.cli.options import Json, folder, number, text
+from tuning.cli.options import Json, Timings, folder, number, text
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,7 @@ class Identify:
     ] = 0.01
     seed: Annotated[int, number("Seed of the draws behind intervals.")] = 0
     json: Json = False
+    timings: Timings = False
 
 
 @dataclass(frozen=True)
@@ -90,3 +91,4 @@ class Monitor:
         text("FILE", "What the columns mean and what was done (TOML); by default those of simulate --log."),
     ] = None
     json: Json = False
+    timings: Timings = False

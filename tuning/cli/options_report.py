@@ -12,6 +12,7 @@ from tuning.cli.options import (
     OptionalFile,
     Overrides,
     Setting,
+    Timings,
     Unset,
     folder,
     number,
@@ -50,6 +51,7 @@ class Map:
     limit: Annotated[float, arg(metavar="NUMBER", help="Restitution error to which margins are told.")] = 0.01
     seed: Annotated[int, number("Seed of the sensor noise, the same at every point.")] = 0
     json: Json = False
+    timings: Timings = False
 
 
 @dataclass(frozen=True)
@@ -73,3 +75,4 @@ class Report:
         "jaxhil-out/report.html"
     )
     json: Json = False
+    timings: Timings = False

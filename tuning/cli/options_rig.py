@@ -5,7 +5,7 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
-from tuning.cli.options import Json, Limit, folder, number, text
+from tuning.cli.options import Json, Limit, Timings, folder, number, text
 
 DEFAULT_RIG_PLOT = "jaxhil-out/rig.png"
 
@@ -58,6 +58,7 @@ class Export:
         text("KEY", "Sign the bundle with this private key (Ed25519, PEM); needs jaxhil[sign]."),
     ] = None
     json: Json = False
+    timings: Timings = False
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,7 @@ class Verify:
     scenarios: Annotated[int, number("Runs to replay: the nominal one, then draws.")] = 6
     seed: Annotated[int, number("Seed of the draws.")] = 0
     json: Json = False
+    timings: Timings = False
 
 
 @dataclass(frozen=True)
@@ -113,3 +115,4 @@ class RigOptions:
     ] = None
     limit: Limit = 0.01
     json: Json = False
+    timings: Timings = False

@@ -28,6 +28,7 @@ from tuning.cli.options import (
 from tuning.cli.options_identify import Identify, Monitor
 from tuning.cli.options_report import Map, Report
 from tuning.cli.options_rig import DEFAULT_RIG_PLOT, Export, RigOptions, Verify
+from tuning.cli.timings import measured
 
 DESCRIPTION = """Gains that keep hardware-in-the-loop docking tests from diverging.
 
@@ -68,7 +69,8 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
 
     def run() -> int:
         command = type(options).__name__.removesuffix("Options").lower()
-        return importlib.import_module(f"tuning.cli.commands.{command}").run(options)
+        with measured(options.timings):
+            return importlib.import_module(f"tuning.cli.commands.{command}").run(options)
 
     return run
 

@@ -1,0 +1,35 @@
+"""`--timings`: time is counted once, whatever lies within what, and the command does what it does anyway."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from tuning.cli import timings
+
+
+def test_what_overlaps_counts_once():
+    assert timings.covered([(0.0, 2.0), (1.0, 3.0), (5.0, 6.0), (5.2, 5.5)]) == 4.0
+    spans = {
+        "importing": [(0.0, 1.0)],
+        "reading kept programs": [(2.0, 2.25)],
+        "compiling": [(2.0, 3.0)],
+        "tracing": [(0.5, 2.0), (1.0, 1.5)],
+    }
+    assert timings.said(0.0, 10.0, spans) == (
+        "10.00 s in all: all else 7.00 s, importing 1.00 s, tracing 1.00 s, compiling 0.75 s, "
+        "reading kept programs 0.25 s"
+    )
+
+
+def test_programs_that_are_made_are_noticed(capsys):
+    with timings.measured(True):
+        jax.jit(lambda x: jnp.sin(x) * jnp.arange(7919.0) + jnp.cumsum(jnp.cos(x)))(1.0)
+    said = capsys.readouterr().err
+    assert said.startswith("took: ") and "compiling" in said and "tracing" in said
+
+
+@pytest.mark.parametrize("arguments", [(), ("--json",)])
+def test_a_command_prints_the_same(jaxhil, arguments):
+    plain, ran = jaxhil("mechanisms", *arguments), jaxhil("mechanisms", "--timings", *arguments)
+    assert ran.code == plain.code == 0 and ran.out == plain.out
+    assert plain.err == "" and ran.err.startswith("took: ") and "s in all" in ran.err
