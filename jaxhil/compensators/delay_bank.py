@@ -42,7 +42,7 @@ from jaxhil.compensators.onset import SQUARINGS, exponential
 
 HYPOTHESES = 17
 OFFSETS = np.linspace(-1, 1, HYPOTHESES)  # of their delays, in terms of the farthest
-ELASTIC = 1 / 3  # probability that a contact has no damping
+ELASTIC = 0.5  # probability that a contact has no damping
 BROADENING = 2.0  # of the variance of the damping
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
 LEAST, LEAST_CARRIED = 1e-200, 1e-12
@@ -159,7 +159,10 @@ def learn(old: Bank, reading: Reading, farthest: Array, damping: Array) -> tuple
     force = force + jnp.zeros_like(depth)
     # While a contact closes its force is not negative. Opening, nothing may be left of it before depth 0.
     closes = rate > 0
-    used = counts & inside & ~tight & (closes | tells(predicted, force, noise))
+    # On which side of the surface it was, between two delays, is not known.
+    near = 0.5 * (OFFSETS[1] - OFFSETS[0]) * farthest[None] * old.pace[None]
+    beside = (depth < near) & (depth > -near)
+    used = counts & inside & ~beside & ~tight & (closes | tells(predicted, force, noise))
     maps = correct(old.maps, predicted, force, used)
 
     nothing = ~inside | tight | (~closes & (predicted.force <= 0))
@@ -167,9 +170,9 @@ def learn(old: Bank, reading: Reading, farthest: Array, damping: Array) -> tuple
     wide = jnp.where(wide > 0, wide, 1)
     read = jnp.where(reading.hidden, 0, reading.force)[None]
     missed = jnp.where(nothing, read, force - predicted.force)
-    surprise = 0.25 * missed**2 / wide
+    surprise = jnp.where(beside, 0.25, 0.25 * missed**2 / wide)
     surprise = surprise - jnp.min(surprise, axis=0, keepdims=True)
-    sharpness = jnp.sqrt(jnp.sqrt(jnp.where(wide > noise, noise / wide, 1)))
+    sharpness = jnp.where(beside, 1, jnp.sqrt(jnp.sqrt(jnp.where(wide > noise, noise / wide, 1))))
     likelihood = _shares(old.likelihood * sharpness * exponential(surprise, SQUARINGS), LEAST)
     now = old._replace(
         maps=maps,

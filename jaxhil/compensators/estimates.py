@@ -36,10 +36,10 @@ def force_delay_spread(mechanism: Mechanism) -> float:
     return UNKNOWN_DELAY_SPREAD if told is None else told
 
 
-def contact_plane_spread(mechanism: Mechanism, unknown: float = UNKNOWN_PLANE_SPREAD) -> float:
-    """How far [m] the contact plane lies from where the controller takes it to be, and may: `unknown` where
-    the file says nothing of the latter."""
-    return _size(mechanism, "rig.contact_plane", unknown)
+def contact_plane_spread(mechanism: Mechanism) -> float:
+    """How far [m] the contact plane lies from where the controller takes it to be, and may: 1 mm where the
+    file says nothing of the latter."""
+    return _size(mechanism, "rig.contact_plane", UNKNOWN_PLANE_SPREAD)
 
 
 def force_bias(mechanism: Mechanism) -> float:

@@ -8,8 +8,8 @@ delays on the tick before, the depth as old as the force is X - d V, and the mea
 reference is integrated over again with are moved alike.
 
 Delays are told apart by how badly maps fit, which a prior that no contact fits would decide: it is wide. The
-instant at which a surface is met where it was told says most of a delay: unless the mechanism file says how
-uncertain that place is, it counts as known.
+instant at which a surface is met says most of a delay where the surface's place is known to a few
+micrometres: only what the mechanism file says of that is believed.
 """
 
 from collections.abc import Mapping
@@ -22,11 +22,9 @@ from jaxhil.compensators.estimates import (
     EQUIVALENT_MASS,
     FORCE_NOISE,
     ROUGH_FORCE_DELAY,
-    contact_plane_spread,
     force_delay_spread,
     preload,
 )
-from jaxhil.compensators.retrospective_gains import LEAST_PLANE_SPREAD
 from jaxhil.compensators.retrospective_reference import RetrospectiveReference
 
 MOST = 0.004  # s: beyond it hypotheses are too far apart, and too far off for the first order in d
@@ -38,9 +36,6 @@ def _own(gain: Gain) -> Gain:
     """One of the retrospective reference's gains, as it is where the delay is hardly known."""
     if gain.name in WIDE:
         return gain._replace(nominal=lambda m: WIDE[gain.name])
-    if gain.name == "plane_spread":
-        spread = LEAST_PLANE_SPREAD
-        return gain._replace(nominal=lambda m: max(contact_plane_spread(m, unknown=spread), spread))
     if gain.name == "prior_preload_spread":
         return gain._replace(nominal=preload)
     # Next to no noise, a delay that is a little wrong is all that a hypothesis sees.

@@ -5,7 +5,7 @@
  * noise's own variance r out of contact, and where what it expects while the contact opens is not positive). Its weight
  * is the product of the likelihoods of all readings of this contact and of those before, (r/s_h)^(1/4)
  * exp(-(y - f_h)^2/(4 s_h)), of how well its damping, of mean B and variance s^2, goes with what is known of contacts:
- * p (s_0/s) exp(-t^2/2) + (1 - p) 2 Phi(t), t = B/s, p = 1/3, and, where its surface is not where it was told, 1/10. The
+ * p (s_0/s) exp(-t^2/2) + (1 - p) 2 Phi(t), t = B/s, p = 1/2, and, where its surface is not where it was told, 1/10. The
  * exponentials are (1 + u/n)^-n. What counts is the mean over all hypotheses, of their maps, delays and surfaces. Their
  * maps bend at the same places, wherever they have the surface: which fits best is not to be decided by what a contact
  * that bends between two knots leaves.
@@ -44,7 +44,7 @@ typedef struct {
 /* == Definitions == */
 
 static const double jaxhil_misfit = 0.01; /* of a force, by which a map may be wrong */
-static const double jaxhil_bank_elastic = 1.0 / 3.0;
+static const double jaxhil_bank_elastic = 0.5;
 static const double jaxhil_bank_broadening = 2.0;
 static const double jaxhil_bank_least = 1e-200;
 static const double jaxhil_bank_nothing = 1e-300; /* a smaller product is none: some machines keep such numbers */
@@ -289,19 +289,9 @@ static long jaxhil_learnt_begin(jaxhil_learnt *bank, const jaxhil_meeting *meeti
     return ticks < (double)jaxhil_bank_earlier ? (long)ticks : jaxhil_bank_earlier;
 }
 
-/* Hypothesis h reads: the square of what it missed, over its variance, times a quarter; how sharply it knew. */
-static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double rate, double force,
-                               double variance, bool hidden, double zone, double *sharpness) {
-    double(*covariance)[JAXHIL_PARAMETERS] = bank->covariance[h];
-    double *estimate = bank->estimate[h];
-    double knots[JAXHIL_SEGMENTS], phi[JAXHIL_PARAMETERS], g[JAXHIL_PARAMETERS];
-    const double x = depth - bank->offsets[h] * bank->pace * rate - bank->deeper[h];
-    const double read = hidden ? 0.0 : force;
-    const double noise = hidden ? variance + zone * zone / 12.0 : variance;
-    const double seen = hidden ? 0.5 * zone : force;
-    if (x > bank->deepest[h]) {
-        bank->deepest[h] = x;
-    }
+/* What the force is linear in, at a depth [s] and speed, by hypothesis h. */
+static void jaxhil_bank_features(const jaxhil_learnt *bank, int h, double x, double rate, double *phi) {
+    double knots[JAXHIL_SEGMENTS];
     jaxhil_bank_knots(bank, h, knots);
     for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
         const double beyond = x - knots[j];
@@ -315,6 +305,26 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
     phi[JAXHIL_UNLOADING] = x - bank->deepest[h];
     phi[JAXHIL_FRICTION] = jaxhil_turning(rate);
     phi[JAXHIL_PRELOAD] = 1.0;
+}
+
+/* Hypothesis h reads: the square of what it missed, over its variance, times a quarter; how sharply it knew. Nearer to
+ * its surface than half of the step to the next delay it cannot tell on which side the reading was: that counts as one
+ * that is a standard deviation off. */
+static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double rate, double force,
+                               double variance, bool hidden, double zone, double *sharpness) {
+    double(*covariance)[JAXHIL_PARAMETERS] = bank->covariance[h];
+    double *estimate = bank->estimate[h];
+    double phi[JAXHIL_PARAMETERS], g[JAXHIL_PARAMETERS];
+    const double x = depth - bank->offsets[h] * bank->pace * rate - bank->deeper[h];
+    const double near = 0.5 * (bank->offsets[1] - bank->offsets[0]) * bank->pace;
+    const bool beside = x < near && x > -near;
+    const double read = hidden ? 0.0 : force;
+    const double noise = hidden ? variance + zone * zone / 12.0 : variance;
+    const double seen = hidden ? 0.5 * zone : force;
+    if (x > bank->deepest[h]) {
+        bank->deepest[h] = x;
+    }
+    jaxhil_bank_features(bank, h, x, rate, phi);
     double expected = 0.0;
     double s = 0.0;
     for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
@@ -335,7 +345,7 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
     wide = wide > 0.0 ? wide : 1.0;
     const double missed = nothing ? read : innovation;
     *sharpness = sqrt(sqrt(wide > noise ? noise / wide : 1.0));
-    if (inside && s > 0.0 &&
+    if (inside && !beside && s > 0.0 &&
         (closes || expected > 0.0 || seen * seen > jaxhil_map_outlying * noise)) {
         const double share = 1.0 / s;
         bank->known[h] = noise * ((s - noise) * share);
@@ -346,6 +356,10 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
                 covariance[i][j] -= scaled * g[j];
             }
         }
+    }
+    if (beside) {
+        *sharpness = 1.0;
+        return 0.25;
     }
     return 0.25 * (missed * missed) / wide;
 }

@@ -35,7 +35,7 @@ from .force_depth_map import (
 from .onset import SQUARINGS, exponential
 
 HYPOTHESES = 17
-ELASTIC = 1 / 3  # probability that a contact has no damping
+ELASTIC = 0.5  # probability that a contact has no damping
 BROADENING = 2.0  # of the variance of the damping, as the delay lies between two hypotheses
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
 LEAST, LEAST_CARRIED = 1e-200, 1e-12
@@ -158,14 +158,7 @@ class DelayBank:
         estimate = self._estimate
         depths = depth - self._offsets * self._pace * rate - self._below
         deepest = np.fmax(self._deepest, depths)
-        beyond = depths - self._knots
-        phi = np.empty((PARAMETERS, HYPOTHESES))
-        phi[:SEGMENTS] = np.fmax(np.minimum(beyond, self._widths), _0)
-        phi[DAMPING] = rate
-        phi[DEPTH_DAMPING] = depths * rate / REACH
-        phi[UNLOADING] = depths - deepest
-        phi[FRICTION] = turning(rate)
-        phi[PRELOAD] = 1.0
+        phi = self._features(depths, rate, deepest)
         read = force
         noise = variance
         if hidden:
@@ -179,9 +172,12 @@ class DelayBank:
         inside = depths > SURFACE
         if hidden:
             inside &= expected > zone
+        # On which side of the surface it was, between two delays, is not known.
+        near = 0.5 * float(self._offsets[1] - self._offsets[0]) * self._pace
+        beside = (depths < near) & (depths > -near)
         positive = expected > _0
         closes = rate > 0.0
-        used = inside & (s > _0)
+        used = inside & (s > _0) & ~beside
         if not closes and not force * force > OUTLYING * noise:
             used &= positive
         nothing = ~inside
@@ -191,9 +187,9 @@ class DelayBank:
         wide = np.where(nothing, noise, s)
         wide = np.where(wide > _0, wide, _1)
         missed = np.where(nothing, read, innovation)
-        surprise = 0.25 * (missed * missed) / wide
+        surprise = np.where(beside, 0.25, 0.25 * (missed * missed) / wide)
         surprise -= np.minimum.reduce(surprise)
-        sharpness = np.sqrt(np.sqrt(np.fmin(noise / wide, _1)))
+        sharpness = np.where(beside, _1, np.sqrt(np.sqrt(np.fmin(noise / wide, _1))))
         likelihood = self._likelihood * sharpness * exponential(surprise, SQUARINGS)
         self._likelihood = _shares(likelihood, LEAST)
         self._deepest = deepest
@@ -208,6 +204,17 @@ class DelayBank:
             less = np.where(used, less, 0.0)
         self._estimate = estimate + correction
         self._covariance -= less
+
+    def _features(self, depths: np.ndarray, rate: float, deepest: np.ndarray) -> np.ndarray:
+        """What the force is linear in, by each hypothesis."""
+        phi = np.empty((PARAMETERS, HYPOTHESES))
+        phi[:SEGMENTS] = np.fmax(np.minimum(depths - self._knots, self._widths), _0)
+        phi[DAMPING] = rate
+        phi[DEPTH_DAMPING] = depths * rate / REACH
+        phi[UNLOADING] = depths - deepest
+        phi[FRICTION] = turning(rate)
+        phi[PRELOAD] = 1.0
+        return phi
 
     def _weigh(self) -> np.ndarray:
         """Weights of the hypotheses; their sum is 1."""
