@@ -23,6 +23,8 @@ pytestmark = [
 BAR = 100.0  # ns
 # They integrate a whole contact over again.
 BARS = {"retrospective_reference": 20_000.0, "retrospective_delay_bank": 20_000.0}
+# And on 999 of 1000 ticks in contact.
+TAILS = {"retrospective_reference": 20_000.0, "retrospective_delay_bank": 100_000.0}
 ROWS = 200_000
 REPEATS = 40
 # Contacts of 0.2 s, of up to 84 N, and 0.3 s between them: time enough for every law's force to die out, so
@@ -50,7 +52,7 @@ WIDE = {
     "equivalent_mass": 350.0,
     "restitution_margin": 1e12,
     "energy_balance": 1e12,
-    "longest_contact": 10.0,
+    "longest_contact": 1e4,  # the motion does not heed the law
     "alignment": 0.008,
 }
 
@@ -66,11 +68,12 @@ def test_time_of_a_tick(law, tmp_path):
     ran = subprocess.run(
         [str(program), str(ROWS), str(REPEATS)], input=rows.tobytes(), capture_output=True, check=True
     )
-    bare, tick, contact, cause = (float(number) for number in ran.stdout.split())
+    bare, tick, contact, cause, tail = (float(number) for number in ran.stdout.split())
     bar = BARS.get(law, BAR)
     print(
         f"\nC tick, {law}: {tick:.1f} ns (bar {bar:.0f} ns); bare loop {bare:.1f} ns; "
-        f"{contact / ROWS:.0%} of the ticks in contact"
+        f"{contact / ROWS:.0%} of the ticks in contact, "
+        f"of these 999 in 1000 up to {1e-3 * tail:.1f} us"
     )
     assert cause == 0 and contact > 0
-    assert tick <= bar
+    assert tick <= bar and tail <= TAILS.get(law, np.inf)

@@ -1,7 +1,7 @@
 """Time of a tick of the rig's controller in Python beside an empty loop, bare and with all its guards.
 
-A tick is `step` with its time and `position_command`; the watchdog watches. Run with
-`pytest -m benchmark -s tests/benchmarks/test_python_tick.py`.
+A tick is `step` with its time and `position_command`; the watchdog watches. Times are those of the
+processor, as the machine is shared. Run with `pytest -m benchmark -s tests/benchmarks/test_python_tick.py`.
 """
 
 import time
@@ -20,6 +20,7 @@ TICKS = 200_000
 BAR = 10.0  # us
 # They integrate a whole contact over again.
 BARS = {"retrospective_reference": 300.0, "retrospective_delay_bank": 300.0}
+TAILS = {"retrospective_reference": 500.0, "retrospective_delay_bank": 2000.0}  # on 999 of 1000 in contact
 
 
 @pytest.mark.parametrize("guarded", [False, True], ids=["bare", "guarded"])
@@ -34,7 +35,7 @@ def test_time_of_a_tick(law, guarded, capsys):
     rows = contact_rows(TICKS, np.random.default_rng(0), controller.control_period, *CONTACTS)
     in_contact = rows[:, 2] > 0.0
     took, empty = [], []
-    clock, step, position_command = time.perf_counter_ns, controller.step, controller.position_command
+    clock, step, position_command = time.thread_time_ns, controller.step, controller.position_command
     for _, force, desired, velocity, measured, now, _, x, v, a in rows.tolist():
         begin = clock()
         step(force, desired, velocity, measured, now)
@@ -51,4 +52,4 @@ def test_time_of_a_tick(law, guarded, capsys):
             f"\n{law}, {'guarded' if guarded else 'bare'}: {median:.2f} us a tick in contact (median), "
             f"{tail:.2f} us (99.9th percentile); empty loop {bare:.2f} and {bare_tail:.2f} us"
         )
-    assert median <= BARS.get(law, BAR)
+    assert median <= BARS.get(law, BAR) and tail <= TAILS.get(law, np.inf)
