@@ -8,6 +8,7 @@ import campaigns
 import numpy as np
 import pytest
 
+from tuning.identification.contact_problem import Problem
 from tuning.identification.estimate import Options, identify
 
 pytestmark = pytest.mark.slow
@@ -138,6 +139,33 @@ def test_no_drift_is_missed():
     for seed in range(20):
         found = identify(campaigns.campaign("drifting", 40_000 + seed), options=Options(law="kelvin_voigt"))
         assert not found.good
+
+
+def test_delay_and_lag_of_the_force_sensor_are_found_as_well_as_the_bound_allows():
+    """The Cramer-Rao bound of delay, lag, plane, stiffness, damping and bias together, by differences."""
+    true = np.array([0.0025, 0.0016, 0.0, 1.2e5, 650.0, 0.0])
+    steps = np.array([2e-6, 2e-6, 2e-8, 10.0, 0.1, 0.01])
+    off, bounds = [], []
+    for seed in range(10):
+        campaign = campaigns.campaign("lagging", 20_000 + seed)
+        found = identify(campaign, options=Options(law="kelvin_voigt", hold_out=0.0))
+        off.append(found["delay and lag of force"].value - 0.0041)
+        problem = found.contact.problem
+
+        def force(numbers, problem=problem):
+            lag = Problem(problem.motion, problem.readings, problem.law, None, numbers[1])
+            return lag.force(numbers[0], numbers[2], numbers[3:]).ravel()[problem.kept] / 0.5
+
+        slopes = np.array(
+            [(force(true + step) - force(true - step)) / (2.0 * step.sum()) for step in np.diag(steps)]
+        )
+        size = np.linalg.norm(slopes, axis=1)
+        covariance = np.linalg.inv(slopes @ slopes.T / np.outer(size, size)) / np.outer(size, size)
+        bounds.append(np.sqrt(covariance[:2, :2].sum()))
+    rms = np.sqrt(np.mean(np.square(off)))
+    print(f"rms error {1e3 * rms:.3f} ms, bound {1e3 * np.mean(bounds):.3f} ms")
+    # Of 10 normal numbers the rms is below 1.6 standard deviations in 997 of 1000 cases.
+    assert rms < 1.6 * np.mean(bounds)
 
 
 def test_a_press_tells_the_force_delay_from_the_damping():
