@@ -1,0 +1,94 @@
+"""Other identifications of a motion simulator, in an environment that has them: a line of JSON.
+
+`python identify_others.py DATA.npz`: command and reading [m], period [s], the averaged response (frequency
+[Hz], complex), and frequencies `at` [Hz]. Each method gives its response at those, its delay where it has
+one, and its time. Discrete models have a delay of whole periods, as they count them: the best of several.
+"""
+
+import contextlib
+import json
+import os
+import sys
+import time
+import warnings
+
+import numpy as np
+
+DELAYS = range(2, 7)
+BLOCKS, THINNED = 10, 10  # of the subspace method: rows of the Hankel matrices, rows from one to the next
+ROWS = {"OE": 2_000, "ARX": 20_000}  # what each can do within a minute
+
+
+def parametric(data, method):
+    """ARX or output error of second order with the delay [periods] under which it predicts best."""
+    from sippy_unipi import system_identification
+
+    u, y = data["command"][None, : ROWS[method]], data["reading"][None, : ROWS[method]]
+    tried = []
+    for delay in DELAYS:
+        orders = {"ARX_orders": [2, 2, delay]} if method == "ARX" else {"OE_orders": [2, 2, delay]}
+        # Numbers of order 1, as its solver wants them.
+        model = system_identification(1e3 * y, 1e3 * u, method, tsample=1.0, max_iterations=100, **orders)
+        left = np.ravel(model.Yid)[50:] - 1e3 * y[0, 50:]
+        tried.append((float(left @ left), delay, model.G))
+    _, delay, model = min(tried, key=lambda one: one[0])
+    z = np.exp(2j * np.pi * data["at"] * data["period"])
+    return [complex(np.squeeze(model(one))) for one in z], float(delay * data["period"])
+
+
+def subspace(data):
+    """N4SID, the delay among its states, of every tenth row: at 1 kHz its states are nearly alike."""
+    import pandas
+    from nfoursid.nfoursid import NFourSID
+
+    rows = slice(0, None, THINNED)
+    frame = pandas.DataFrame({"u": 1e3 * data["command"][rows], "y": 1e3 * data["reading"][rows]})
+    found = NFourSID(frame, output_columns=["y"], input_columns=["u"], num_block_rows=BLOCKS)
+    found.subspace_identification()
+    model, _ = found.system_identification(rank=4)
+    z = np.exp(2j * np.pi * data["at"] * THINNED * data["period"])
+    eye = np.eye(len(model.a))
+    return [
+        complex((model.c @ np.linalg.solve(one * eye - model.a, model.b) + model.d)[0, 0]) for one in z
+    ], None
+
+
+def vectors(data):
+    """Vector fitting of the averaged response: a sum of poles, the delay among them."""
+    import skrf
+    from skrf.vectorFitting import VectorFitting
+
+    frequency = skrf.Frequency.from_f(data["frequency"], unit="hz")
+    network = skrf.Network(frequency=frequency, s=data["response"].reshape(-1, 1, 1))
+    fitted = VectorFitting(network)
+    fitted.vector_fit(n_poles_real=0, n_poles_cmplx=3, enforce_dc=False)
+    return [complex(one) for one in fitted.get_model_response(0, 0, data["at"])], None
+
+
+def main():
+    data = dict(np.load(sys.argv[1]))
+    methods = {
+        "sippy ARX": lambda: parametric(data, "ARX"),
+        "sippy OE": lambda: parametric(data, "OE"),
+        "nfoursid N4SID": lambda: subspace(data),
+        "scikit-rf vector fitting": lambda: vectors(data),
+    }
+    found = {}
+    warnings.simplefilter("ignore")
+    for name, method in methods.items():
+        begin = time.process_time()
+        # They print as they go.
+        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+            response, delay = method()
+        took = time.process_time() - begin
+        found[name] = {
+            "response": [[one.real, one.imag] for one in response],
+            "delay": delay,
+            "seconds": took,
+        }
+    sys.stderr.flush()
+    print("\n" + json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,93 @@
+"""The motion simulator by `jaxhil identify` and by other identifications, on the same clean free motion.
+
+The others are in an environment of their own, since they want other versions of what we use: make one,
+install `sippy-unipi`, `nfoursid` and `scikit-rf` in it, and name its interpreter in JAXHIL_OTHERS; else they
+are left out. Run with `pytest -m benchmark -s tests/benchmarks/test_identify_others.py`.
+"""
+
+import json
+import os
+import subprocess
+import time
+from pathlib import Path
+
+import campaigns
+import numpy as np
+import pytest
+from scipy import optimize
+
+from tuning.identification import free_motion
+from tuning.identification.hold import response as hold_response
+from tuning.identification.rational import STRUCTURES, Model
+
+pytestmark = pytest.mark.benchmark
+SCRIPT = Path(__file__).with_name("identify_others.py")
+TRUE = Model(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
+CONTACT = 3.0  # Hz, at which the lag counts
+AT = np.concatenate([[CONTACT], np.linspace(5.0, 20.0, 301)])
+
+
+def by_hand(spectrum):
+    """What one would write oneself: least squares on the response, no hold, no weights."""
+
+    def left(parameters):
+        model = Model(STRUCTURES[2], np.array([*parameters[:2], 1e-3 * parameters[2]]))
+        off = model.response(2j * np.pi * spectrum.frequency) - spectrum.output / spectrum.command
+        return np.concatenate([off.real, off.imag])
+
+    found = optimize.least_squares(left, [np.log(60.0), 0.0, 1.0]).x
+    return Model(STRUCTURES[2], np.array([*found[:2], 1e-3 * found[2]]))
+
+
+def figures(response):
+    """Errors of the lag at the contacts' frequency [ms] and of the bandwidth [%]."""
+
+    def lag(values):
+        return -np.angle(values[0]) / (2.0 * np.pi * CONTACT)
+
+    exact = TRUE.response(2j * np.pi * AT)
+    gain = np.abs(response[1:] / response[0]) * np.abs(exact[0])
+    width = np.interp(-np.sqrt(0.5), -gain, AT[1:])
+    return 1e3 * (lag(response) - lag(exact)), 100.0 * (width / TRUE.bandwidth() - 1.0)
+
+
+def test_methods(tmp_path, capsys):
+    run = campaigns.campaign("clean", 0, speeds=(), rest=0).runs[0]
+    timing = campaigns.campaign("clean", 0, speeds=(), seconds=0, rest=0).timing
+    period, rows = timing.control_period, []
+    begin = time.process_time()
+    ours = free_motion.estimate([run], timing)
+    rows.append(
+        ("jaxhil", ours.model.response(2j * np.pi * AT), ours.model.delay, time.process_time() - begin)
+    )
+    begin = time.process_time()
+    hand = by_hand(ours.spectra[0])
+    rows.append(
+        ("least squares by hand", hand.response(2j * np.pi * AT), hand.delay, time.process_time() - begin)
+    )
+    interpreter = os.environ.get("JAXHIL_OTHERS")
+    if interpreter:
+        spectrum, steady = ours.spectra[0], slice(5000, None)
+        level = run.position_desired[steady].mean()
+        np.savez(tmp_path / "data.npz", command=run.position_desired[steady] - level,
+                 reading=run.position_measured[steady] - level, period=period, at=AT,
+                 frequency=spectrum.frequency, response=spectrum.output / spectrum.command)  # fmt: skip
+        ran = subprocess.run(
+            [interpreter, SCRIPT, tmp_path / "data.npz"], capture_output=True, text=True, check=True
+        )
+        for name, one in json.loads(ran.stdout.splitlines()[-1]).items():
+            values = np.array(one["response"]) @ [1.0, 1j]
+            # From commands to readings: what the hold makes of the commands is in it.
+            held = hold_response(AT, period, "linear", 0)
+            rows.append((name, values / held, one["delay"], one["seconds"]))
+    headings = "lag at 3 Hz [ms]", "bandwidth [%]", "delay [ms]", "time [s]"
+    with capsys.disabled():
+        print("\nErrors of" + "".join(f"{one:>18s}" for one in headings))
+        for name, values, delay, seconds in rows:
+            lag, width = figures(values)
+            off = "none" if delay is None else f"{1e3 * (delay - 0.0043):+.4f}"
+            print(f"{name:26s} {lag:+.4f} {width:+17.3f} {off:>17s} {seconds:17.2f}")
+    lag, width = figures(rows[0][1])
+    assert abs(lag) < 0.02 and abs(width) < 0.3 and abs(rows[0][2] - 0.0043) < 2e-5
+    delays = [abs(delay - 0.0043) for _, _, delay, _ in rows if delay is not None]
+    assert min(delays[1:]) > 5.0 * delays[0]
