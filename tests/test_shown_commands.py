@@ -7,7 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import campaigns
 import pytest
+from test_identify_command import write
 
 ROOT = Path(__file__).resolve().parents[1]
 GUIDE = ROOT / "notebooks" / "guide"
@@ -67,6 +69,29 @@ def test_commands_print_what_is_shown(tmp_path):
             for line in set(lines.splitlines()) - set(printed[command]):
                 print(f"\n{page.name}: {line}", end="")
     assert len(printed) > 12
+
+
+@pytest.mark.slow
+def test_logs_tell_what_is_shown(tmp_path):
+    """The first day of the page on logs, of the rig that it names."""
+    (tmp_path / "day1").mkdir()
+    write(tmp_path / "day1", campaigns.campaign("clean", 0))
+    environment = {**os.environ, "COLUMNS": "110"}
+    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    for command, lines in shown(GUIDE / "from_logs.md"):
+        if "day1" in command:
+            ran = subprocess.run(
+                command.replace("jaxhil", f"{sys.executable} -m tuning", 1), shell=True, cwd=tmp_path,
+                env=environment, capture_output=True, text=True, check=False,
+            )  # fmt: skip
+            assert ran.returncode == 0, ran.stderr
+            found = ran.stdout.splitlines()
+            assert {words(line) for line in lines.splitlines()} <= {words(line) for line in found}
+            print("\n" + "\n".join(line.rstrip() for line in found), end="")
+        if "--guess" in command:
+            # What only the rig's owner knows.
+            draft = (tmp_path / "logs.toml").read_text().replace("# [bodies]", "[bodies]")
+            (tmp_path / "logs.toml").write_text(draft.replace("# equivalent_mass", "equivalent_mass"))
 
 
 def words(line):
