@@ -23,7 +23,7 @@ from jaxhil.sixdof.friction import Bristle, Frictionless, Regularised
 from jaxhil.sixdof.relative import Pair, States, effective_mass, power, wrench_at_chaser
 from jaxhil.sixdof.rotations import Quaternion
 from jaxhil.sixdof.shapes import Cavity, Plane
-from jaxhil.sixdof.space import follow
+from jaxhil.sixdof.space import Space, follow
 from jaxhil.sixdof.vectors import components, matrix, vector
 
 pytestmark = pytest.mark.slow
@@ -152,7 +152,8 @@ def begin(masses, inertias, offsets, places, speeds, attitude, angular):
 
 @jax.jit
 def simulate(pair, states, contact, step):
-    final, seen = follow(pair, states, (contact,), step, STEPS)
+    flight, seen = follow(Space(pair, (contact,), ()), states, step, STEPS, step)
+    final = flight.states
     lifted = jax.tree.map(lambda leaf: leaf[None], pair)
 
     def of_both(function):
@@ -275,7 +276,9 @@ def test_a_law_with_a_memory_beside_another_kind():
     slack = Cavity(contact.candidates.centre, jnp.full((2, len(LANES)), 5.0))
     tether = ChaserSpheres(contact.candidates.centre, jnp.zeros((2, len(LANES))), slack)
     tethered = ContactGroup(tether, LAWS["hunt_crossley"], contact.parameters, Frictionless())
-    final, _ = jax.jit(follow, static_argnums=4)(pair, states, (yields, tethered), step, STEPS)
+    space = Space(pair, (yields, tethered), ())
+    flight, _ = jax.jit(follow, static_argnums=3)(space, states, step, STEPS, step)
+    final = flight.states
     lane = LANES.index("central")
     speed = np.asarray(final.chaser.velocity.z - final.target.velocity.z)[lane]
     np.testing.assert_allclose(speed / 0.02, 0.5, rtol=2e-3)
@@ -294,7 +297,8 @@ def test_derivatives_are_those_of_differences():
         )
         law = Regularised(friction * contact.friction.coefficient, contact.friction.slip)
         given = ContactGroup(contact.candidates, contact.law, changed, law)
-        final, _ = follow(pair, states, (given,), step, STEPS)
+        flight, _ = follow(Space(pair, (given,), ()), states, step, STEPS, step)
+        final = flight.states
         return jnp.stack([*jax.tree.leaves(final.chaser.velocity), *jax.tree.leaves(final.chaser.spin)])
 
     one = jnp.ones(3)

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from six_axes import ideal_sensor, second_order, springs
 
 import jaxhil as package
-from jaxhil.contact.laws import LAWS, ContactParameters
-from jaxhil.simulation.scenario import MotionSimulator
+from jaxhil.contact.laws import LAWS
 from jaxhil.sixdof.bodies import (
     angular_momentum,
     build_body,
@@ -24,11 +24,12 @@ from jaxhil.sixdof.bodies import (
 from jaxhil.sixdof.candidates import ChaserSpheres
 from jaxhil.sixdof.forces import ContactGroup
 from jaxhil.sixdof.friction import Regularised
-from jaxhil.sixdof.loop import Loop, Rig, run
+from jaxhil.sixdof.kinematics import TaskSpace
+from jaxhil.sixdof.loop import Loop, run
 from jaxhil.sixdof.relative import Pair, States
 from jaxhil.sixdof.rotations import Quaternion
+from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.shapes import Plane
-from jaxhil.sixdof.task_space import build_task_space
 from jaxhil.sixdof.vectors import components, matrix, vector
 
 LANES, TICKS, PERIOD, FORCE_DELAY = 6, 450, 1e-3, 4e-3
@@ -99,22 +100,21 @@ def simulate(loop, given, points, delays, friction):
     ))  # fmt: skip
     one = jnp.ones((1, LANES))
     none = 0 * one
-    parameters = ContactParameters(
-        STIFFNESS * one, DAMPING * one, one, none[:0], none > 1, one, one, none, none
-    )
     flat = vector(jnp.zeros((3, 1, LANES)))
     up = vector(jnp.stack([none, none, one]))
     spheres = ChaserSpheres(vector(points[:, None]), none, Plane(flat, up))
-    group = ContactGroup(spheres, LAWS["kelvin_voigt"], parameters, Regularised(friction[None], 2e-3 * one))
-    frequency = 2 * np.pi * 12.0 + 0 * delays
-    same = 1 + 0 * delays
-    simulator = MotionSimulator(
-        jnp.stack([0 * same, frequency**2]),
-        jnp.stack([same, 2 * 0.8 * frequency, frequency**2]),
-        delays, same, same,
+    group = ContactGroup(
+        spheres,
+        LAWS["kelvin_voigt"],
+        springs(STIFFNESS * one, DAMPING * one, one),
+        Regularised(friction[None], 2e-3 * one),
+    )
+    simulator = second_order(12.0 + 0 * delays, 0.8 + 0 * delays, delays)
+    scenario = Scenario(
+        pair, states, (group,), (), simulator, TaskSpace(), ideal_sensor(FORCE_DELAY + zero), PERIOD + zero,
+        PERIOD * TICKS + zero, jnp.zeros((2, LANES), jnp.uint32),
     )  # fmt: skip
-    plant = build_task_space(simulator, FORCE_DELAY + zero, PERIOD + zero, loop.hold)
-    _, seen = run(loop, Rig(pair, plant, (group,), PERIOD + zero), states, TICKS)
+    _, seen = run(loop, {}, scenario, TICKS)
 
     def of_both(function):
         lifted = jax.tree.map(lambda leaf: leaf[None], pair)
@@ -122,8 +122,8 @@ def simulate(loop, given, points, delays, friction):
 
     return {
         "speed": components(seen.states.chaser.velocity) - components(seen.states.target.velocity),
-        "force": components(seen.wrench.force),
-        "moment": components(seen.wrench.moment),
+        "force": components(seen.command.force),
+        "moment": components(seen.command.moment),
         "energy": of_both(kinetic_energy)[None],
         "linear": of_both(lambda *one: components(linear_momentum(*one))),
         "angular": of_both(lambda *one: components(angular_momentum(*one))),

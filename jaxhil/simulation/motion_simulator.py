@@ -133,6 +133,27 @@ def read(row: Array, state: State, start: Array, end: Array) -> Array:
     return total
 
 
+def rate_row(
+    row: Float[Array, "columns *batch"],
+    denominator: Float[Array, "order_plus_1 *batch"],
+    control_period: Float[Array, "*batch"],
+) -> Float[Array, "columns *batch"]:
+    """The row of the rate [1/s] of what a row gives at a place within the sampling interval.
+
+    There d/ds E(s) = E(s) G, G the generator of `propagation`.
+    """
+    *state, start, end = row
+    zero = jnp.zeros_like(start)
+    level = start + end
+    if state:
+        system = _last_row(denominator, control_period)
+        rates = [below + state[-1] * a for below, a in zip([zero, *state[:-1]], system, strict=True)]
+        driven = state[-1]
+    else:
+        rates, driven = [], zero
+    return jnp.stack([*rates, driven - level, level]) / control_period[None]
+
+
 def steady_state(plant: Propagation, command: Array, step: Array) -> State:
     """State at a tick of a uniform motion: drive input `command` now, growing by `step` per period."""
     order = plant.steady_command.shape[0]
@@ -165,9 +186,14 @@ def _companion(numerator, denominator, control_period):
     powers = [control_period**i for i in range(order + 1)]
     zero, one = jnp.zeros_like(control_period), jnp.ones_like(control_period)
     system = [[one if j == i + 1 else zero for j in range(order)] for i in range(order - 1)]
-    system.append([-denominator[order - i] * powers[order - i] / denominator[0] for i in range(order)])
+    system.append(_last_row(denominator, control_period))
     output = [numerator[order - 1 - i] * powers[order - i] / denominator[0] for i in range(order)]
     return system, output
+
+
+def _last_row(denominator, control_period):
+    order = denominator.shape[0] - 1
+    return [-denominator[order - i] * control_period ** (order - i) / denominator[0] for i in range(order)]
 
 
 def _steady_velocity(system, transition, steady_command, hold):

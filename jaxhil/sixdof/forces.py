@@ -77,12 +77,23 @@ def contact_wrench(
     pose: Pose,
     twist: Twist,
     duration: Float[Array, "*batch"],
-) -> tuple[Wrench, tuple[Memory, ...]]:
-    """The wrench [N, N m] of contacts of several kinds, and the laws' next states."""
+) -> tuple[Wrench, tuple[Forces, ...], tuple[Memory, ...]]:
+    """The wrench [N, N m] of contacts of several kinds, their forces, and the laws' next states."""
     found = [
         contact_forces(group, memory, pose, twist, duration)
         for group, memory in zip(groups, memories, strict=True)
     ]
-    wrenches = [total_wrench(forces) for forces, _ in found]
-    added: Any = jax.tree.map(lambda *parts: sum(parts), *wrenches)
-    return added, tuple(memory for _, memory in found)
+    zero = Vector(*(jnp.zeros_like(duration) for _ in range(3)))
+    wrench: Any = Wrench(zero, zero)
+    for forces, _ in found:
+        wrench = jax.tree.map(jnp.add, wrench, total_wrench(forces))
+    return wrench, tuple(forces for forces, _ in found), tuple(memory for _, memory in found)
+
+
+def deepest(groups: tuple[ContactGroup, ...], pose: Pose) -> Float[Array, "*batch"]:
+    """Depth [m] of the deepest candidate at a pose; minus infinity without any."""
+    lifted = jax.tree.map(lambda leaf: leaf[None], pose)
+    depth = jnp.full_like(pose.position.x, -jnp.inf)
+    for group in groups:
+        depth = jnp.maximum(depth, group.candidates.touch(lifted).depth.max(axis=0))
+    return depth

@@ -1,33 +1,53 @@
-"""The rig's loop in six degrees of freedom, without compensation: one tick after the other.
+"""The rig's loop in six degrees of freedom: one tick after the other.
 
-A tick reads the wrench that the real contact had a force delay ago, moves the two bodies of the numerical
-model by it, and sends their relative pose to the motion simulator, on which the contact happens. The wrench
-is formed on the hardware's pose, in T axes about T's origin, and acts at the model's T.
+A tick reads the wrench that the real contact had a force delay ago, compensates it, moves the two bodies of
+the numerical model by it, and sends their relative pose to the motion simulator, on which the contact is.
+The wrench is formed on the hardware's pose, in T axes about T's origin, and acts at the model's T.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt32
 
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.compensators.base import Constants, Gains, Signals
+from jaxhil.simulation.sensors import lag, white_noise
+from jaxhil.sixdof.axes import Axes, Hardware, Motion, actuate, build_axes, enter, sampled
 from jaxhil.sixdof.bodies import SHARES
-from jaxhil.sixdof.forces import ContactGroup, Memory, contact_wrench
+from jaxhil.sixdof.forces import ContactGroup, Forces, Memory, contact_wrench
+from jaxhil.sixdof.kinematics import Kinematics, Moving, moving
+from jaxhil.sixdof.latch import Held, Latch, init_latch, latch_wrench
 from jaxhil.sixdof.relative import (
-    Coordinates,
     Pair,
+    Pose,
     States,
+    Twist,
     Wrench,
     advance,
     coordinates,
-    interface_frame,
-    motion_of,
-    relative_motion,
+    relative,
 )
-from jaxhil.sixdof.task_space import Hardware, TaskSpace, actuate, enter, sampled
+from jaxhil.sixdof.rotations import exponential
+from jaxhil.sixdof.scenario import Scenario
+from jaxhil.sixdof.sensor import (
+    Sensor,
+    read_fixed,
+    read_moving,
+    sample,
+    tool_load,
+    undo_fixed,
+    undo_moving,
+    weight,
+)
 from jaxhil.sixdof.vectors import vector
+
+PER_AXIS = ("none", "phase_lead")  # compensators that work on six channels as on one
+SIDES = ("fixed", "moving")  # of the force sensor
+HISTORY = 256  # ticks before a run in which axes follow what is no straight line to them
 
 
 class Loop(eqx.Module):
@@ -37,15 +57,33 @@ class Loop(eqx.Module):
     hold: str = eqx.field(static=True)  # of the command within a period, "linear" or "zoh"
     latency: int = eqx.field(static=True)  # of the command, 0 or 1 periods
     ring: int = eqx.field(static=True)  # samples that are kept, a power of two beyond the longest delay
+    side: str = eqx.field(static=True, default="fixed")  # of the force sensor, one of `SIDES`
+    has_noise: bool = eqx.field(static=True, default=False)  # whether the force sensor has noise
+    compensator: str = eqx.field(static=True, default="none")  # one of `PER_AXIS`
+    episodes: int = eqx.field(static=True, default=1)  # that are judged
+    whole: bool = eqx.field(static=True, default=False)  # whether a run lasts its whole duration
 
 
 class Rig(NamedTuple):
     """What stays constant during a run."""
 
     bodies: Pair  # of the numerical model
-    plant: TaskSpace  # motion simulator and force delay
+    axes: Axes  # of the motion simulator, with the sensors' delays
+    kinematics: Kinematics
     groups: tuple[ContactGroup, ...]  # the real contact
+    latches: tuple[Latch, ...]
+    sensor: Sensor
     period: Float[Array, "*batch"]  # T [s]
+    key: UInt32[Array, "2 *batch"]  # of the sensor's noise
+    gains: Gains  # of the compensator, (6, *batch)
+
+
+class Channels(NamedTuple):
+    """The force sensor's channels and the controller's memory of them."""
+
+    raw: Wrench  # reading of the last tick, before the lag
+    lagged: Wrench  # behind the lag
+    controller: tuple[Any, ...]  # state of the compensator of each channel
 
 
 class RunState(NamedTuple):
@@ -54,6 +92,8 @@ class RunState(NamedTuple):
     states: States  # of the numerical model
     hardware: Hardware
     memories: tuple[Memory, ...]  # of the contact's laws
+    held: tuple[Held, ...]  # by the latches
+    channels: Channels
     tick: Int[Array, ""]
 
 
@@ -61,33 +101,169 @@ class Tick(NamedTuple):
     """What is recorded of a tick."""
 
     states: States  # of the numerical model, at the tick
-    wrench: Wrench  # that moves it
+    pose: Pose  # of the hardware, when the force sensor samples it
+    twist: Twist  # likewise
+    contact: Wrench  # of the real contact then, latches included
+    forces: tuple[Forces, ...]  # of its candidates
+    held: tuple[Held, ...]  # by the latches
+    command: Wrench  # that moves the numerical model
 
 
-def run(loop: Loop, rig: Rig, states: States, ticks: int) -> tuple[States, Tick]:
-    """The numerical model's states after so many ticks, and every tick, (ticks, ...).
-
-    Before the start the command was in uniform motion, at the states' relative pose and rates.
-    """
-    at, rates = _command(rig.bodies, states)
-    hardware = enter(rig.plant, at, rates * rig.period[None], rig.period, loop.hold, loop.latency, loop.ring)
-    begin = RunState(states, hardware, tuple(group.init() for group in rig.groups), jnp.array(0, jnp.int32))
-    end, seen = lax.scan(lambda state, _: _tick(loop, rig, state), begin, None, length=ticks)
-    return end.states, seen
+def build_loop(scenario: Scenario, **static: Any) -> Loop:
+    """The loop of a batch of scenarios; `static` are the fields of `Loop`, without the ring."""
+    sensor, period = scenario.sensor, scenario.control_period
+    slowest = jnp.maximum(sensor.delay, sensor.position_delay)[None] + scenario.simulator.delay
+    intervals = int(jnp.max(slowest / period[None])) + 2
+    return Loop(ring=1 << intervals.bit_length(), **static)
 
 
-def _tick(loop: Loop, rig: Rig, state: RunState) -> tuple[RunState, Tick]:
-    found = sampled(rig.plant, state.hardware, state.tick, rig.period)
-    at, rates = (Coordinates(vector(part[:3]), vector(part[3:])) for part in found)
-    wrench, memories = contact_wrench(rig.groups, state.memories, *motion_of(at, rates), rig.period)
-    states = advance(rig.bodies, state.states, wrench, rig.period, SHARES[loop.integrator])
-    command, _ = _command(rig.bodies, states)
-    hardware = actuate(rig.plant, state.hardware, state.tick, command, loop.hold, loop.latency)
-    return RunState(states, hardware, memories, state.tick + 1), Tick(state.states, wrench)
+def build_rig(loop: Loop, gains: Gains, scenario: Scenario) -> Rig:
+    """Discretise the axes; `gains` are scalars, or of the batch shape, or (6, *batch)."""
+    sensor, period = scenario.sensor, scenario.control_period
+    axes = build_axes(scenario.simulator, sensor.delay, sensor.position_delay, period, loop.hold)
+    return Rig(
+        scenario.bodies, axes, scenario.kinematics, scenario.groups, scenario.latches, sensor, period,
+        scenario.key, {name: _six(jnp.asarray(value), period) for name, value in gains.items()},
+    )  # fmt: skip
 
 
-def _command(bodies: Pair, states: States) -> tuple[Array, Array]:
+def begin(loop: Loop, rig: Rig, states: States) -> RunState:
+    """Before tick 0: so far the command was in uniform motion, at the states' relative pose and rates."""
+    at, rates = command_of(rig.bodies, states)
+    stride = rates * rig.period[None]
+    history = 0 if rig.kinematics.is_linear else HISTORY
+    first = at - history * stride
+    legs, leg_rates = jax.jvp(rig.kinematics.command, (first,), (stride,))
+    hardware = enter(
+        rig.axes, legs, leg_rates, rig.period, loop.hold, loop.latency, loop.ring, loop.side == "moving"
+    )
+
+    def before(hardware, tick):
+        command = rig.kinematics.command(first + (tick + 1).astype(at.dtype) * stride)
+        return actuate(rig.axes, hardware, tick, command, loop.hold, loop.latency), None
+
+    hardware, _ = lax.scan(before, hardware, jnp.arange(history, dtype=jnp.int32))
+    pose, _ = relative(rig.bodies, states)
+    zero = vector(jnp.zeros_like(at[:3]))
+    nothing = Wrench(zero, zero)
+    law, constants = COMPENSATORS[loop.compensator], _constants(rig)
+    controllers = tuple(law.init(_gains(rig, channel), constants, 1) for channel in range(6))
+    return RunState(
+        states,
+        hardware,
+        tuple(group.init() for group in rig.groups),
+        tuple(init_latch(latch, pose) for latch in rig.latches),
+        Channels(nothing, nothing, controllers),
+        jnp.array(history, jnp.int32),
+    )
+
+
+def run(loop: Loop, gains: Gains, scenario: Scenario, ticks: int) -> tuple[RunState, Tick]:
+    """The state after so many ticks, and every tick, (ticks, ...)."""
+    rig = build_rig(loop, gains, scenario)
+    state = begin(loop, rig, scenario.start)
+    return lax.scan(lambda state, _: tick(loop, rig, state), state, None, length=ticks)
+
+
+def tick(loop: Loop, rig: Rig, state: RunState) -> tuple[RunState, Tick]:
+    """One control period."""
+    found = sampled(rig.axes, state.hardware, state.tick)
+    near, _ = command_of(rig.bodies, state.states)
+    here = moving(rig.kinematics.coordinates(found.motion, near))
+    contact, forces, memories = contact_wrench(rig.groups, state.memories, here.pose, here.twist, rig.period)
+    held = []
+    for latch, before in zip(rig.latches, state.held, strict=True):
+        caught, now = latch_wrench(latch, before, here.pose, here.twist)
+        contact = jax.tree.map(jnp.add, contact, caught)
+        held.append(now)
+    measured = None
+    if found.measured is not None:
+        still = Motion(found.measured, jnp.zeros_like(found.measured), None)
+        at = rig.kinematics.coordinates(still, near).position
+        measured = Pose(vector(at[:3]), exponential(vector(at[3:])))
+    command, channels = _sense(loop, rig, state, contact, here, measured)
+    states = advance(rig.bodies, state.states, command, rig.period, SHARES[loop.integrator])
+    position, _ = command_of(rig.bodies, states)
+    sent = rig.kinematics.command(position)
+    hardware = actuate(rig.axes, state.hardware, state.tick, sent, loop.hold, loop.latency)
+    seen = Tick(state.states, here.pose, here.twist, contact, forces, tuple(held), command)
+    return RunState(states, hardware, memories, tuple(held), channels, state.tick + 1), seen
+
+
+def command_of(bodies: Pair, states: States) -> tuple[Array, Array]:
     """Coordinates (6, *batch) of C against T in the numerical model, and their rates."""
-    frames = [interface_frame(*one) for one in zip(bodies, states, strict=True)]
-    at, rates = coordinates(*relative_motion(*frames))
+    at, rates = coordinates(*relative(bodies, states))
     return jnp.stack(jax.tree.leaves(at)), jnp.stack(jax.tree.leaves(rates))
+
+
+def _sense(
+    loop: Loop, rig: Rig, state: RunState, contact: Wrench, here: Moving, measured: Pose | None
+) -> tuple[Wrench, Channels]:
+    """What the sensor and the controller make of the contact: the wrench on the numerical model."""
+    sensor, channels = rig.sensor, state.channels
+    if here.acceleration is None:
+        raw = read_fixed(contact, sensor.mounting)
+    else:
+        load = tool_load(sensor.tool, here.pose, here.twist, here.acceleration, sensor.gravity)
+        raw = read_moving(contact, load, here.pose)
+    first = state.tick == (0 if rig.kinematics.is_linear else HISTORY)
+    never = jnp.zeros_like(rig.period)
+
+    def late(now: Array, before: Array, lagged: Array) -> Array:
+        """Behind the lag, of a reading that is a straight line between two ticks."""
+        before, lagged = jnp.where(first, now, before), jnp.where(first, now, lagged)
+        middle = (before + now) / 2
+        return lag(lagged, never, rig.period, never, [before, middle, now], sensor.time_constant)
+
+    lagged: Wrench = jax.tree.map(late, raw, channels.raw, channels.lagged)
+    noise = _noise(rig, state.tick) if loop.has_noise else jnp.zeros_like(sensor.noise_std)
+    reading = sample(lagged, sensor.errors, noise)
+    given: Wrench = jax.tree.map(jnp.subtract, reading, _wrench(sensor.assumed_bias))
+    if measured is None:
+        found = undo_fixed(given, sensor.mounting)
+    else:
+        load = weight(sensor.assumed_tool, measured.attitude, sensor.assumed_gravity)
+        found = undo_moving(given, load, measured)
+    command, controller = _compensate(loop, rig, found, channels.controller, state.tick)
+    return command, Channels(raw, lagged, controller)
+
+
+def _compensate(loop: Loop, rig: Rig, found: Wrench, states: tuple, now: Array) -> tuple[Wrench, tuple]:
+    """The compensator on each channel by itself."""
+    law, constants = COMPENSATORS[loop.compensator], _constants(rig)
+    forces, structure = jax.tree.flatten(found)
+    never, age = jnp.zeros_like(rig.period), jnp.zeros(rig.period.shape, jnp.int32) + now
+    passed, after = [], []
+    for channel, (force, state) in enumerate(zip(forces, states, strict=True)):
+        prepared = law.prepare(_gains(rig, channel), constants)
+        signals = Signals(force, never, never, never, age)
+        command, state = law.step(prepared, state, signals, now)
+        passed.append(command)
+        after.append(state)
+    return structure.unflatten(passed), tuple(after)
+
+
+def _wrench(channels: Array) -> Wrench:
+    return Wrench(vector(channels[:3]), vector(channels[3:]))
+
+
+def _gains(rig: Rig, channel: int) -> Gains:
+    return {name: value[channel] for name, value in rig.gains.items()}
+
+
+def _constants(rig: Rig) -> Constants:
+    return Constants(rig.period, jnp.full_like(rig.period, jnp.inf))
+
+
+def _noise(rig: Rig, now: Array) -> Array:
+    channel = jnp.arange(6, dtype=jnp.int32).reshape(6, *[1] * rig.period.ndim)
+    count = jnp.broadcast_to(6 * now + channel, (6, *rig.period.shape))
+    episode = jnp.zeros(rig.period.shape, jnp.int32)
+    return rig.sensor.noise_std * white_noise(rig.key, episode, count, rig.period.dtype)
+
+
+def _six(value: Array, like: Array) -> Array:
+    """The value for each of six channels, (6, *batch)."""
+    if value.ndim <= like.ndim:
+        value = jnp.broadcast_to(value, like.shape)[None]
+    return jnp.broadcast_to(value, (6, *like.shape))

@@ -97,6 +97,12 @@ def relative_motion(target: Frame, chaser: Frame) -> tuple[Pose, Twist]:
     return pose, Twist(rotate_back(target.attitude, velocity), rotate_back(target.attitude, angular))
 
 
+def relative(bodies: Pair, states: States) -> tuple[Pose, Twist]:
+    """Pose and twist of C against T."""
+    target, chaser = (interface_frame(*one) for one in zip(bodies, states, strict=True))
+    return relative_motion(target, chaser)
+
+
 def coordinates(pose: Pose, twist: Twist) -> tuple[Coordinates, Coordinates]:
     """Coordinates (p, theta) of a pose, |theta| < pi, and their rates."""
     theta = logarithm(pose.attitude)

@@ -9,12 +9,11 @@ and lag are the loop's.
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxhil.simulation.sensors import sample_force
 from jaxhil.sixdof.relative import Pose, Twist, Wrench
-from jaxhil.sixdof.rotations import rotate, rotate_back
+from jaxhil.sixdof.rotations import Quaternion, rotate, rotate_back
 from jaxhil.sixdof.vectors import Matrix, Vector, cross
 
 
@@ -36,6 +35,22 @@ class SampleErrors(NamedTuple):
     range: Float[Array, "6 *batch"]  # infinite for none
 
 
+class Sensor(NamedTuple):
+    """The sensor, and what the controller takes it to be."""
+
+    delay: Float[Array, "*batch"]  # [s]
+    time_constant: Float[Array, "*batch"]  # of the lag of all channels [s]; 0 for none
+    errors: SampleErrors
+    noise_std: Float[Array, "6 *batch"]  # [N, N m]
+    mounting: Pose  # of a sensor on the fixed side: its frame against T
+    tool: Tool  # on the moving side
+    gravity: Vector  # in T axes [m/s^2]
+    assumed_tool: Tool  # the controller's
+    assumed_gravity: Vector  # likewise [m/s^2]
+    assumed_bias: Float[Array, "6 *batch"]  # likewise [N, N m]
+    position_delay: Float[Array, "*batch"]  # of the measured pose [s]
+
+
 def tool_load(tool: Tool, pose: Pose, twist: Twist, acceleration: Twist, gravity: Vector) -> Wrench:
     """Weight and inertia of the tool [N, N m], about C's origin, in T axes: what the flange has to hold.
 
@@ -47,6 +62,12 @@ def tool_load(tool: Tool, pose: Pose, twist: Twist, acceleration: Twist, gravity
     force = tool.mass * (gravity - carried)
     turned = _inertia(tool, pose, alpha) + cross(angular, _inertia(tool, pose, angular))
     return Wrench(force, cross(centre, force) - turned)
+
+
+def weight(tool: Tool, attitude: Quaternion, gravity: Vector) -> Wrench:
+    """Weight of the tool alone, as `tool_load`."""
+    force = tool.mass * gravity
+    return Wrench(force, cross(rotate(attitude, tool.centre), force))
 
 
 def read_moving(wrench: Wrench, load: Wrench, pose: Pose) -> Wrench:
@@ -82,9 +103,16 @@ def undo_fixed(reading: Wrench, mounting: Pose) -> Wrench:
 
 def sample(reading: Wrench, errors: SampleErrors, noise: Float[Array, "6 *batch"]) -> Wrench:
     """A sample of a reading: cross-talk, bias, noise [N, N m]; then quantum, dead zone and range."""
-    channels, structure = jax.tree.flatten(reading)
-    mixed = jnp.sum(errors.crosstalk * jnp.stack(channels)[None], axis=1) + errors.bias + noise
-    return structure.unflatten(list(sample_force(mixed, errors.quantum, errors.dead_zone, errors.range)))
+    # Component by component: slices of what was stacked are worked out over and over.
+    components, structure = jax.tree.flatten(reading)
+
+    def channel(row: int) -> Array:
+        mixed = errors.bias[row] + noise[row]
+        for column, component in enumerate(components):
+            mixed = mixed + errors.crosstalk[row, column] * component
+        return sample_force(mixed, errors.quantum[row], errors.dead_zone[row], errors.range[row])
+
+    return structure.unflatten([channel(row) for row in range(6)])
 
 
 def _inertia(tool: Tool, pose: Pose, angular: Vector) -> Vector:

@@ -1,8 +1,9 @@
 """Contact in space, without a rig: continuous and undelayed, which is what a rig is judged against.
 
-The two bodies are followed by Runge and Kutta's method of order four. Within a step each stage sees what the
-laws remember from the step's start; so laws with a memory are of first order in the step, and so is a force
-that jumps within it.
+The two bodies are followed by Dormand and Prince's pair of order 5(4), in steps whose error is held small: a
+step in which a force jumps or bends is made again, shorter. Each lane has its own steps. Within a step each
+stage sees what the laws remember from the step's start: laws with a memory are of first order, and have
+shorter steps.
 """
 
 from typing import Any, NamedTuple
@@ -10,10 +11,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxhil.sixdof.bodies import Body, Load, State, angular_velocity
-from jaxhil.sixdof.forces import ContactGroup, Memory, contact_wrench
+from jaxhil.sixdof.forces import ContactGroup, Forces, Memory, contact_wrench
+from jaxhil.sixdof.latch import Held, Latch, init_latch, latch_wrench
 from jaxhil.sixdof.relative import (
     Pair,
     Pose,
@@ -22,11 +24,44 @@ from jaxhil.sixdof.relative import (
     Wrench,
     interface_frame,
     loads,
-    relative_motion,
+    relative,
 )
 from jaxhil.sixdof.rotations import Quaternion, compose, normalise
+from jaxhil.sixdof.vectors import norm
 
-STAGES = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))  # place in the step, weight
+TOLERANCE = 1e-10  # of a step's error, per the relative speed
+SHORTEST = 1e-9  # s: a step that is accepted whatever its error
+LATCHED = 1e-6  # s: within which the time at which a latch catches is found
+REMEMBERING = 1e-4  # s: longest step of laws with a memory
+SMALLEST, LARGEST = 0.1, 4.0  # change of the length from one step to the next
+# Dormand and Prince 1980: nodes, coefficients of the stages, the last of which is the solution of order 5,
+# and the error, solution of order 5 less that of order 4.
+NODES = (0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)
+STAGES = (
+    (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    (1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    (3 / 40, 9 / 40, 0.0, 0.0, 0.0, 0.0, 0.0),
+    (44 / 45, -56 / 15, 32 / 9, 0.0, 0.0, 0.0, 0.0),
+    (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0.0, 0.0, 0.0),
+    (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0, 0.0),
+    (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84, 0.0),
+)
+ERROR = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
+
+
+class Space(NamedTuple):
+    """What stays constant."""
+
+    bodies: Pair
+    groups: tuple[ContactGroup, ...]  # the contact
+    latches: tuple[Latch, ...]
+
+
+class Memories(NamedTuple):
+    """What a contact remembers."""
+
+    laws: tuple[Memory, ...]
+    held: tuple[Held, ...]  # by the latches
 
 
 class Instant(NamedTuple):
@@ -36,48 +71,185 @@ class Instant(NamedTuple):
     pose: Pose
     twist: Twist
     wrench: Wrench  # on the chaser, about T's origin
+    forces: tuple[Forces, ...]  # of the candidates
+
+
+class Flight(NamedTuple):
+    """A motion on its way."""
+
+    time: Float[Array, "*batch"]  # since its start [s]
+    length: Float[Array, "*batch"]  # of the next step [s]
+    memories: Memories
+    states: States  # of the bodies
+
+
+class Step(NamedTuple):
+    """A step that was tried."""
+
+    now: Instant  # at its end
+    memories: Memories
+    accepted: Bool[Array, "*batch"]
+
+
+def start_flight(space: Space, states: States, length: Float[Array, "*batch"]) -> Flight:
+    """A motion at its start; its first step is `length` [s]."""
+    pose, _ = relative(space.bodies, states)
+    memories = Memories(
+        tuple(group.init() for group in space.groups),
+        tuple(init_latch(latch, pose) for latch in space.latches),
+    )
+    return Flight(0 * length, length, memories, states)
+
+
+def instant(
+    space: Space, states: States, memories: Memories, duration: Float[Array, "*batch"]
+) -> tuple[Instant, Memories]:
+    """What happens at the states, `duration` [s] after the laws were evaluated last."""
+    pose, twist = relative(space.bodies, states)
+    wrench, forces, laws = contact_wrench(space.groups, memories.laws, pose, twist, duration)
+    held = []
+    for latch, before in zip(space.latches, memories.held, strict=True):
+        pull, now = latch_wrench(latch, before, pose, twist)
+        wrench = jax.tree.map(jnp.add, wrench, pull)
+        held.append(now)
+    return Instant(states, pose, twist, wrench, forces), Memories(laws, tuple(held))
+
+
+def advance_flight(
+    space: Space, flight: Flight, longest: Float[Array, "*batch"], speed: Float[Array, "*batch"]
+) -> tuple[Flight, Step]:
+    """One try of a step no longer than `longest` [s], at a relative speed [m/s] that scales its error: the
+    motion at its end or, where it was not accepted, at its start, with a shorter step ahead."""
+    if _remembers(space):
+        longest = jnp.minimum(longest, REMEMBERING)
+    length = lax.stop_gradient(jnp.minimum(flight.length, longest))
+    now, memories, error = take_step(space, flight, length, speed)
+    catches = jnp.zeros(length.shape, bool)
+    for before, after in zip(flight.memories.held, memories.held, strict=True):
+        catches = catches | jnp.any(after.caught & ~before.caught, axis=0)
+    late = catches & (length > LATCHED)
+    accepted = ((error <= 1) | (length <= SHORTEST)) & ~late
+    safe = jnp.where(jnp.isfinite(error), jnp.maximum(error, 1e-12), 1e12)
+    change = jnp.clip(0.9 * safe**-0.2, SMALLEST, jnp.where(accepted, LARGEST, 0.9))
+    proposed = length * change
+    # A step cut short by its limit says little of the next.
+    cut = accepted & (length < flight.length)
+    proposed = jnp.where(cut, jnp.maximum(flight.length, proposed), proposed)
+    ahead = lax.stop_gradient(jnp.where(late, length / 4, proposed))
+    # Of what is not a number, there is no more to come.
+    time = jnp.where(jnp.isfinite(error), flight.time + length, jnp.inf)
+    moved = Flight(time, ahead, memories, now.states)
+    return choose(accepted, moved, flight._replace(length=ahead)), Step(now, memories, accepted)
+
+
+def take_step(
+    space: Space, flight: Flight, length: Float[Array, "*batch"], speed: Array
+) -> tuple[Instant, Memories, Array]:
+    """A step of `length` [s]: what is at its end, and its error over what is allowed."""
+    states, lanes = flight.states, [1] * length.ndim
+
+    def combined(row: Array, slopes: Any) -> Any:
+        weights = row.reshape(-1, *lanes)
+        return jax.tree.map(lambda leaf: length * jnp.sum(weights * leaf, axis=0), slopes)
+
+    def stage(carry, given):
+        slopes, *_ = carry
+        index, row, node = given
+        at: States = jax.tree.map(jnp.add, states, combined(row, slopes))
+        now, memories = instant(space, at, flight.memories, node * length)
+        slope = slope_at(space, now)
+        slopes = jax.tree.map(lambda all_, one: all_.at[index].set(one), slopes, slope)
+        return (slopes, now, memories), None
+
+    stages = len(NODES)
+    none = jax.tree.map(lambda leaf: jnp.zeros((stages, *leaf.shape), leaf.dtype), states)
+    given = jnp.arange(stages), jnp.asarray(STAGES, length.dtype), jnp.asarray(NODES, length.dtype)
+    # A loop, not unrolled: a fraction to compile.
+    blank = jax.eval_shape(lambda: instant(space, states, flight.memories, length)[0])
+    empty: Any = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), blank)
+    (slopes, now, memories), _ = lax.scan(stage, (none, empty, flight.memories), given)
+    error = combined(jnp.asarray(ERROR, length.dtype), slopes)
+    level: Any = States(*(one._replace(attitude=normalise(one.attitude)) for one in now.states))
+    return now._replace(states=level), memories, _size(space, error, speed) / TOLERANCE
+
+
+def slope_at(space: Space, now: Instant) -> States:
+    """Rates of the states."""
+    states = now.states
+    target, chaser = loads(now.wrench, interface_frame(space.bodies.target, states.target), states)
+    return States(
+        _slope(space.bodies.target, states.target, target), _slope(space.bodies.chaser, states.chaser, chaser)
+    )
 
 
 def follow(
-    bodies: Pair, states: States, groups: tuple[ContactGroup, ...], step: Float[Array, "*batch"], steps: int
-) -> tuple[States, Instant]:
-    """The states after so many steps of `step` [s], and every step's start, (steps, ...)."""
+    space: Space,
+    states: States,
+    period: Float[Array, "*batch"],
+    periods: int,
+    longest: Float[Array, "*batch"],
+) -> tuple[Flight, Instant]:
+    """The motion after so many periods [s], and each period's start, (periods, ...); steps are no longer than
+    `longest` [s]."""
+    speed = scale(space, states)
 
-    def body(carry, _):
-        states, memories = carry
-        after, instant = _stages(bodies, states, groups, memories, step)
-        _, memories = _instant(bodies, after, groups, memories, step)
-        return (after, memories), instant
+    def body(flight, _):
+        flight = flight._replace(time=0 * flight.time)
+        seen, _ = instant(space, flight.states, flight.memories, flight.time)
+        return fly(space, flight, period, longest, speed), seen
 
-    start = states, tuple(group.init() for group in groups)
-    (states, _), seen = lax.scan(body, start, None, length=steps)
-    return states, seen
-
-
-def _stages(bodies, states, groups, memories, step):
-    """The states after a step, and the instant at its start."""
-
-    def stage(carry, place_and_weight):
-        slope, total = carry
-        place, weight = (part.astype(step.dtype) * step for part in place_and_weight)
-        at = _moved(states, place, slope)
-        instant, _ = _instant(bodies, at, groups, memories, place)
-        target, chaser = loads(instant.wrench, interface_frame(bodies.target, at.target), at)
-        slope = States(_slope(bodies.target, at.target, target), _slope(bodies.chaser, at.chaser, chaser))
-        return (slope, _moved(total, weight, slope)), instant
-
-    # A loop, not unrolled: a quarter to compile.
-    nothing = jax.tree.map(jnp.zeros_like, states)
-    (_, total), seen = lax.scan(stage, (nothing, states), jnp.asarray(STAGES))
-    total = States(*(state._replace(attitude=normalise(state.attitude)) for state in total))
-    return total, jax.tree.map(lambda leaf: leaf[0], seen)
+    begin = start_flight(space, states, jnp.minimum(period, longest))
+    return lax.scan(body, begin, None, length=periods)
 
 
-def _instant(bodies, states, groups, memories, duration) -> tuple[Instant, tuple[Memory, ...]]:
-    target = interface_frame(bodies.target, states.target)
-    pose, twist = relative_motion(target, interface_frame(bodies.chaser, states.chaser))
-    wrench, memories = contact_wrench(groups, memories, pose, twist, duration)
-    return Instant(states, pose, twist, wrench), memories
+def fly(space: Space, flight: Flight, until: Array, longest: Array, speed: Array) -> Flight:
+    """The motion at a time [s] since its start."""
+
+    def body(flight):
+        left = until - flight.time
+        moved, _ = advance_flight(space, flight, jnp.minimum(longest, left), speed)
+        return choose(left > _nothing(until), moved, flight)
+
+    def ahead(flight):
+        return jnp.any(until - flight.time > _nothing(until))
+
+    return lax.while_loop(ahead, body, flight)
+
+
+def scale(space: Space, states: States) -> Float[Array, "*batch"]:
+    """A speed [m/s] to hold errors against: that of C, and that of a point 1 m off it."""
+    _, twist = relative(space.bodies, states)
+    return lax.stop_gradient(norm(twist.linear) + norm(twist.angular) + 1e-9)
+
+
+def choose(condition: Array, one: Any, other: Any) -> Any:
+    """Lane by lane, one or the other; lanes are the last axes."""
+
+    def either(a: Array, b: Array) -> Array:
+        return jnp.where(condition.reshape(*[1] * (a.ndim - condition.ndim), *condition.shape), a, b)
+
+    return jax.tree.map(either, one, other)
+
+
+def _nothing(until: Array) -> Array:
+    """What is left of a time for rounding [s]."""
+    return 1e-14 + 1e-13 * until
+
+
+def _remembers(space: Space) -> bool:
+    memories = jax.eval_shape(lambda: [group.init() for group in space.groups])
+    return bool(jax.tree.leaves(memories))
+
+
+def _size(space: Space, error: States, speed: Array) -> Array:
+    """Of an error, relative: velocities against the speed, positions against its way in 0.1 s."""
+    largest = jnp.zeros_like(speed)
+    for body, one in zip(space.bodies, error, strict=True):
+        turning = norm(body.inverse_inertia @ one.spin)
+        tilt = 2 * norm(one.attitude.v)
+        for part in (norm(one.velocity), turning, 10 * norm(one.position), 10 * tilt):
+            largest = jnp.maximum(largest, part / speed)
+    return lax.stop_gradient(largest)
 
 
 def _slope(body: Body, state: State, load: Load) -> State:
@@ -85,8 +257,3 @@ def _slope(body: Body, state: State, load: Load) -> State:
     angular = angular_velocity(body, state)
     turning = compose(state.attitude, Quaternion(0 * state.attitude.w, 0.5 * angular))
     return State(state.velocity, (1 / body.mass) * load.force, turning, load.torque)
-
-
-def _moved(states: States, duration: Array, slope: States) -> States:
-    moved: Any = jax.tree.map(lambda value, rate: value + duration * rate, states, slope)
-    return moved

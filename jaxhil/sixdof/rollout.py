@@ -1,0 +1,237 @@
+"""A batch of runs on the rig: from the approach until the episodes that count are over.
+
+An episode is a contact with all its touches: it begins with the first one and is over when nothing has
+touched for as long as a reading takes, the numerical model is free, too, and its wrench has died out. Ticks
+run in short stretches; what begins and ends is looked at between them. The program ends with its slowest
+lane.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxhil.compensators.base import Gains
+from jaxhil.simulation.metrics import RUNAWAY
+from jaxhil.simulation.watch import FADED, LONGEST_FADING
+from jaxhil.sixdof.forces import deepest
+from jaxhil.sixdof.loop import Loop, Rig, RunState, Tick, begin, build_rig, tick
+from jaxhil.sixdof.relative import States, relative
+from jaxhil.sixdof.scenario import Scenario
+from jaxhil.sixdof.sensor import Sensor
+from jaxhil.sixdof.space import choose
+from jaxhil.sixdof.vectors import dot, norm
+
+STRETCH = 16  # ticks between looks at what began and ended
+MISS, REBOUNDED, CAPTURED, JAMMED, TIMEOUT, DIVERGED, NON_FINITE = range(7)
+STATUS_NAMES = ("miss", "rebounded", "captured", "jammed", "timeout", "diverged", "non-finite")
+
+
+class Peak(NamedTuple):
+    """Largest size of something sampled, between samples that of the parabola through three of them."""
+
+    largest: Float[Array, "*batch"]
+    before: tuple[Array, Array]  # the last two samples
+
+
+class Watch(NamedTuple):
+    """The episode under way."""
+
+    begun: Bool[Array, "*batch"]
+    entry: States  # of the numerical model: free, and without an episode
+    entry_tick: Int[Array, "*batch"]
+    touching: tuple[Bool[Array, "candidates *batch"], ...]
+    touches: Int[Array, "*batch"]  # candidates that began to touch
+    touched: Int[Array, "*batch"]  # ticks at which something touched
+    quiet: Int[Array, "*batch"]  # ticks since anything touched
+    caught: Bool[Array, "*batch"]  # whether a latch holds
+    force: Peak  # of the real contact [N]
+    moment: Peak  # about T's origin [N m]
+    command: tuple[Array, Array]  # size of the force [N] and of the moment [N m] on the numerical model
+    highest: tuple[Array, Array]  # largest of them
+
+
+class Episode(NamedTuple):
+    """What became of episodes, (episodes, *batch)."""
+
+    entry: States  # of the numerical model before
+    end: States  # of the numerical model at the end
+    entry_time: Float[Array, "episodes *batch"]  # [s]
+    end_time: Float[Array, "episodes *batch"]  # [s]
+    touches: Int[Array, "episodes *batch"]
+    duration: Float[Array, "episodes *batch"]  # in which something touched [s]
+    peak_force: Float[Array, "episodes *batch"]  # [N]
+    peak_moment: Float[Array, "episodes *batch"]  # about T's origin [N m]
+    status: Int[Array, "episodes *batch"]  # index of `STATUS_NAMES`
+
+
+class Progress(NamedTuple):
+    """Runs on their way."""
+
+    run: RunState
+    watch: Watch
+    episodes: Episode
+    index: Int[Array, "*batch"]  # of the episode under way or ahead
+    active: Bool[Array, "*batch"]
+    first: Int[Array, ""]  # tick at which the run began
+
+
+class Outcome(NamedTuple):
+    """What became of runs."""
+
+    episodes: Episode
+    final: States  # of the numerical model, at the end of the run
+    final_time: Float[Array, "*batch"]  # [s]
+
+
+def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
+    """The episodes of every lane; `gains` as for `jaxhil.sixdof.loop.build_rig`."""
+    rig = build_rig(loop, gains, scenario)
+    last = jnp.round(scenario.duration / rig.period).astype(jnp.int32)
+
+    def body(progress: Progress) -> Progress:
+        progress = _enter(rig, progress)
+        progress, _ = lax.scan(lambda now, _: (_tick(loop, rig, last, now), None), progress, None, STRETCH)
+        return _turn_over(loop, rig, last, progress)
+
+    start = _start(loop, rig, scenario.start)
+    ended = lax.while_loop(lambda progress: jnp.any(progress.active), body, start)
+    age = jnp.minimum(ended.run.tick - start.first, last)
+    # A lane that ended early has stood still since.
+    early = jnp.max(ended.episodes.end_time, axis=0)
+    time = age.astype(rig.period.dtype) * rig.period
+    if not loop.whole:
+        time = jnp.where(ended.index >= loop.episodes, early, time)
+    return Outcome(ended.episodes, ended.run.states, time)
+
+
+def _start(loop: Loop, rig: Rig, states: States) -> Progress:
+    run = begin(loop, rig, states)
+    like, none = jnp.zeros_like(rig.period), jnp.zeros(rig.period.shape, jnp.int32)
+    watch = _fresh(rig, states, none)
+    slots: Any = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (loop.episodes, *leaf.shape)), states)
+    numbers = jnp.zeros((loop.episodes, *like.shape), like.dtype)
+    counts = numbers.astype(jnp.int32)
+    episodes = Episode(slots, slots, numbers, numbers, counts, numbers, numbers, numbers, counts + MISS)
+    return Progress(run, watch, episodes, none, none == 0, run.tick)
+
+
+def _fresh(rig: Rig, states: States, now: Array) -> Watch:
+    zero, none = jnp.zeros_like(rig.period), jnp.zeros(rig.period.shape, jnp.int32)
+    peak = Peak(zero, (zero, zero))
+    touching = tuple(group.parameters.damping > jnp.inf for group in rig.groups)
+    return Watch(
+        none > 0, states, now, touching, none, none, none, none > 0, peak, peak, (zero, zero), (zero, zero)
+    )  # fmt: skip
+
+
+def _tick(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progress:
+    """One tick; where the run is over the bodies stand still."""
+    run, watch = progress.run, progress.watch
+    after, seen = tick(loop, rig, run)
+    goes = progress.active & (run.tick - progress.first < last)
+    watched = choose(goes, _watch(watch, seen), watch)
+    return progress._replace(run=after._replace(states=choose(goes, after.states, run.states)), watch=watched)
+
+
+def _watch(watch: Watch, seen: Tick) -> Watch:
+    touching = tuple(forces.touch.depth > 0 for forces in seen.forces)
+    caught = watch.caught
+    for held in seen.held:
+        caught = caught | jnp.any(held.caught, axis=0)
+    now, touches = caught, watch.touches
+    for one, before in zip(touching, watch.touching, strict=True):
+        now = now | jnp.any(one, axis=0)
+        touches = touches + jnp.sum(one & ~before, axis=0, dtype=touches.dtype)
+    command = norm(seen.command.force), norm(seen.command.moment)
+    highest = tuple(jnp.maximum(a, b) for a, b in zip(watch.highest, command, strict=True))
+    return watch._replace(
+        begun=watch.begun | now,
+        touching=touching,
+        touches=touches,
+        touched=watch.touched + now.astype(touches.dtype),
+        quiet=jnp.where(now, 0, watch.quiet + 1),
+        caught=caught,
+        force=_higher(watch.force, norm(seen.contact.force)),
+        moment=_higher(watch.moment, norm(seen.contact.moment)),
+        command=command,
+        highest=(highest[0], highest[1]),
+    )
+
+
+def _higher(peak: Peak, now: Array) -> Peak:
+    first, middle = peak.before
+    bend = 2 * middle - first - now
+    crest = (middle >= first) & (middle >= now) & (bend > 0) & (first > 0) & (now > 0)
+    vertex = middle + (now - first) ** 2 / (8 * jnp.where(crest, bend, 1))
+    return Peak(jnp.maximum(peak.largest, jnp.where(crest, vertex, now)), (middle, now))
+
+
+def _enter(rig: Rig, progress: Progress) -> Progress:
+    """Where the numerical model is free and no episode is under way, this may be the last moment before."""
+    watch = progress.watch
+    free = _is_free(rig, progress.run.states) & ~watch.begun & progress.active
+    age = jnp.broadcast_to(progress.run.tick - progress.first, watch.entry_tick.shape)
+    entry = choose(free, progress.run.states, watch.entry)
+    watch = watch._replace(entry=entry, entry_tick=jnp.where(free, age, watch.entry_tick))
+    return progress._replace(watch=watch)
+
+
+def _is_free(rig: Rig, states: States) -> Array:
+    pose, _ = relative(rig.bodies, states)
+    return deepest(rig.groups, pose) < 0
+
+
+def quiet_time(sensor: Sensor, period: Array) -> Array:
+    """Time [s] without a touch after which a contact is over: tau_f + 20 sensor time constants + 2 T."""
+    return sensor.delay + 20 * sensor.time_constant + 2 * period
+
+
+def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progress:
+    """Enter the episodes that are over."""
+    watch, run, period = progress.watch, progress.run, rig.period
+    age = run.tick - progress.first
+    still = jnp.floor(quiet_time(rig.sensor, period) / period + 1e-9).astype(jnp.int32) + 1
+    patience = still + jnp.ceil(LONGEST_FADING / period).astype(jnp.int32)
+    noise = 3 * rig.sensor.noise_std
+    levels = jnp.max(noise[:3], axis=0), jnp.max(noise[3:], axis=0)
+    faded = jnp.ones(period.shape, bool)
+    for now, highest, level in zip(watch.command, watch.highest, levels, strict=True):
+        faded = faded & (now <= jnp.maximum(FADED * highest, level))
+    over = watch.begun & (watch.quiet >= still) & _is_free(rig, run.states)
+    over = over & (faded | (watch.quiet >= patience)) & progress.active
+    status = _failure(rig, watch, run.states)
+    out = (age >= last) | (status != MISS)
+    held = jnp.where(watch.caught, CAPTURED, jnp.where(watch.quiet < still, JAMMED, TIMEOUT))
+    status = jnp.where(status != MISS, status, jnp.where(over, REBOUNDED, jnp.where(watch.begun, held, MISS)))
+    ends = progress.active & (over | out)
+    time = jnp.minimum(age, last).astype(period.dtype) * period
+    found = Episode(
+        watch.entry, run.states, watch.entry_tick.astype(period.dtype) * period, time, watch.touches,
+        watch.touched.astype(period.dtype) * period, watch.force.largest, watch.moment.largest, status,
+    )  # fmt: skip
+    slot = jnp.arange(loop.episodes, dtype=jnp.int32).reshape(-1, *[1] * period.ndim)
+    here = (slot == progress.index[None]) & (ends & (status != MISS))[None]
+    episodes = jax.tree.map(lambda one, all_: jnp.where(here, one[None], all_), found, progress.episodes)
+    index = progress.index + (ends & (status != MISS)).astype(jnp.int32)
+    active = progress.active & ~out
+    if not loop.whole:
+        active = active & (index < loop.episodes)
+    now = jnp.broadcast_to(age, index.shape)
+    watch = choose(over, _fresh(rig, run.states, now)._replace(touching=watch.touching), watch)
+    return progress._replace(watch=watch, episodes=episodes, index=index, active=active)
+
+
+def _failure(rig: Rig, watch: Watch, states: States) -> Array:
+    """DIVERGED or NON_FINITE, else MISS."""
+
+    def energy(states: States) -> Array:
+        _, (linear, angular) = relative(rig.bodies, states)
+        share = 1 / rig.bodies.target.mass + 1 / rig.bodies.chaser.mass
+        return dot(linear, linear) / share + dot(angular, rig.bodies.chaser.inertia @ angular)
+
+    now = energy(states)
+    wild = jnp.where(now > RUNAWAY**2 * energy(watch.entry), DIVERGED, MISS)
+    return jnp.where(jnp.isfinite(now), wild, NON_FINITE).astype(jnp.int32)

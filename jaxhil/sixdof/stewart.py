@@ -1,0 +1,72 @@
+"""The hexapod of Stewart and Gough: a platform on six legs, each of them an axis.
+
+A leg's length is that of the line from its joint on the base to its joint on the platform. The pose that has
+given lengths is found by Newton's method, from a pose that is near.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxhil.sixdof.axes import Motion
+from jaxhil.sixdof.kinematics import Kinematics
+from jaxhil.sixdof.rotations import exponential, rotate
+from jaxhil.sixdof.vectors import Vector, norm, vector
+
+NEWTON_STEPS = 3  # squared each: from 1e-3 to rounding
+
+
+class Stewart(Kinematics):
+    """A platform that carries C, on a base that carries T."""
+
+    base: Vector  # joints on the base, (6, *batch) each, in T axes [m]
+    platform: Vector  # joints on the platform, (6, *batch) each, in C axes [m]
+    height: Vector  # of the platform's origin over the base's where C is T [m]
+
+    @property
+    def is_linear(self):
+        return False
+
+    def command(self, coordinates):
+        position, theta = (vector(part[:, None]) for part in (coordinates[:3], coordinates[3:]))
+        height = jax.tree.map(lambda part: part[None], self.height)
+        return norm(height + position + rotate(exponential(theta), self.platform) - self.base)
+
+    def coordinates(self, motion, near):
+        def newton(at: Array) -> Array:
+            return at + solve(jacobian(self, at), motion.position - self.command(at))
+
+        at = near
+        for _ in range(NEWTON_STEPS - 1):
+            at = newton(at)
+        # The last step alone is differentiated: derivatives of the pose, not of the way to it.
+        at = newton(jax.lax.stop_gradient(at))
+        slopes = jacobian(self, at)
+        rate = solve(slopes, motion.rate)
+        if motion.acceleration is None:
+            return Motion(at, rate, None)
+
+        def leg_rates(at: Array) -> Array:
+            return jax.jvp(self.command, (at,), (rate,))[1]
+
+        bent = jax.jvp(leg_rates, (at,), (rate,))[1]
+        return Motion(at, rate, solve(slopes, motion.acceleration - bent))
+
+
+def jacobian(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "6 6 *batch"]:
+    """How fast each leg (row) grows with each coordinate [m, rad] at coordinates."""
+    unit = jnp.broadcast_to(jnp.eye(6, dtype=at.dtype).reshape(6, 6, *[1] * (at.ndim - 1)), (6, *at.shape))
+    _, slope = jax.linearize(hexapod.command, at)
+    return jnp.moveaxis(jax.vmap(slope)(unit), 0, 1)
+
+
+def condition(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "*batch"]:
+    """Condition number of the legs' Jacobian, lengths in m: large where a pose is hardly held."""
+    return jnp.linalg.cond(jnp.moveaxis(jacobian(hexapod, at), (0, 1), (-2, -1)))
+
+
+def solve(matrix: Float[Array, "6 6 *batch"], right: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
+    """matrix^-1 right."""
+    rows = jnp.moveaxis(matrix, (0, 1), (-2, -1))
+    found = jnp.linalg.solve(rows, jnp.moveaxis(right, 0, -1)[..., None])
+    return jnp.moveaxis(found[..., 0], -1, 0)

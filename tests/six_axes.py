@@ -1,0 +1,84 @@
+"""Parts of a rig in six axes that most tests have in common."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhil.contact.laws import LAWS, ContactParameters
+from jaxhil.simulation.scenario import MotionSimulator
+from jaxhil.sixdof.approach import begin
+from jaxhil.sixdof.bodies import build_body
+from jaxhil.sixdof.candidates import ChaserSpheres
+from jaxhil.sixdof.forces import ContactGroup
+from jaxhil.sixdof.friction import Frictionless
+from jaxhil.sixdof.relative import Pose, Twist
+from jaxhil.sixdof.rotations import exponential, identity
+from jaxhil.sixdof.sensor import SampleErrors, Sensor, Tool
+from jaxhil.sixdof.vectors import Matrix, Vector, matrix, vector
+
+
+def zeros(like):
+    """The vector 0 of a batch."""
+    return Vector(*(jnp.zeros_like(like) for _ in range(3)))
+
+
+def lanes(values, batch=()):
+    """Numbers, repeated over a trailing batch."""
+    values = np.asarray(values, float)
+    spread = values.reshape(*values.shape, *[1] * len(batch))
+    return jnp.asarray(np.broadcast_to(spread, (*values.shape, *batch)))
+
+
+def no_tool(like):
+    """A tool without mass."""
+    return Tool(jnp.zeros_like(like), zeros(like), Matrix(zeros(like), zeros(like), zeros(like)))
+
+
+def ideal_sensor(delay, **changes):
+    """A sensor on the fixed side, in T, with a delay [s] (*batch) and nothing else."""
+    batch, none = delay.shape, jnp.zeros((6, *delay.shape))
+    errors = SampleErrors(lanes(np.eye(6), batch), none, none, none, none + jnp.inf)
+    mounting = Pose(zeros(delay), identity(delay))
+    sensor = Sensor(
+        delay, 0 * delay, errors, none, mounting, no_tool(delay), zeros(delay), no_tool(delay), zeros(delay),
+        none, 0 * delay,
+    )  # fmt: skip
+    return sensor._replace(**changes)
+
+
+def second_order(frequencies, dampings, delays):
+    """A motion simulator of natural frequencies [Hz], damping ratios and delays [s], each (axes, *batch)."""
+    frequency, same = 2 * np.pi * frequencies, jnp.ones_like(delays)
+    return MotionSimulator(
+        jnp.stack([0 * same, frequency**2]),
+        jnp.stack([same, 2 * dampings * frequency, frequency**2]),
+        delays, jnp.inf * same, jnp.inf * same,
+    )  # fmt: skip
+
+
+def springs(stiffness, damping, exponent):
+    """Parameters of a contact law, each (candidates, *batch)."""
+    zero = jnp.zeros_like(stiffness)
+    return ContactParameters(stiffness, damping, exponent, zero[:1], zero > 1, zero, zero, zero, zero)
+
+
+def place(values, batch=()):
+    """A vector of three numbers, over a batch."""
+    return vector(lanes(values, batch))
+
+
+def plain_body(mass, inertia, interface, batch=()):
+    """A body of a mass, an inertia (3, 3) and an interface, whose frame is not turned against the body."""
+    number = lanes(mass, batch)
+    return build_body(number, matrix(lanes(inertia, batch)), place(interface, batch), identity(number))
+
+
+def meeting(bodies, pose, twist, before):
+    """States `before` [s] a pose (p, theta) and a twist (v, w), each (6, *batch)."""
+    at = Pose(vector(pose[:3]), exponential(vector(pose[3:])))
+    return begin(bodies, at, Twist(vector(twist[:3]), vector(twist[3:])), before)
+
+
+def spheres(centres, radii, shape, law, parameters, friction=None):
+    """A group of spheres of the chaser, centres (3, candidates, *batch)."""
+    candidates = ChaserSpheres(vector(centres), radii, shape)
+    return ContactGroup(candidates, LAWS[law], parameters, friction or Frictionless())

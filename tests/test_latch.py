@@ -1,0 +1,68 @@
+"""Latches: what is caught, and the spring that holds it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from six_axes import lanes, place
+
+from jaxhil.sixdof.latch import Latch, init_latch, latch_wrench
+from jaxhil.sixdof.relative import Pose, Twist
+from jaxhil.sixdof.rotations import exponential, left_jacobian
+from jaxhil.sixdof.vectors import components, vector
+
+BATCH = (1,)
+STIFFNESS = np.diag([1e5, 1.3e5, 2e5, 5e3, 7e3, 4e3])
+STIFFNESS[0, 4] = STIFFNESS[4, 0] = 6e3
+
+
+def latch(from_start, damping=0.0):
+    number = lanes([1.0], BATCH)
+    return Latch(
+        place([0, 0, 0], (1, 1)), 1e-3 * number, 0.05 * number, jnp.inf * number,
+        lanes(STIFFNESS, (1, 1)), damping * lanes(STIFFNESS, (1, 1)), jnp.full((1, 1), from_start),
+    )  # fmt: skip
+
+
+def at(position, theta):
+    return Pose(place(position, BATCH), exponential(place(theta, BATCH)))
+
+
+def test_it_catches_what_is_deep_and_aligned_and_holds_on():
+    """Nothing before, nothing at first, and a spring from there on."""
+    one = latch(False)
+    still = Twist(place([0, 0, 0], BATCH), place([0, 0, 0], BATCH))
+    held = init_latch(one, at([0, 0, 0.01], [0, 0, 0]))
+    step = jax.jit(latch_wrench)
+    for position, theta in (([0, 0, -5e-4], [0, 0, 0]), ([0, 0, -2e-3], [0.06, 0, 0])):
+        wrench, held = step(one, held, at(position, theta), still)
+        assert not held.caught.any() and not np.any(components(wrench.force))
+    caught = [3e-3, 0, -2e-3]
+    wrench, held = step(one, held, at(caught, [0.01, 0, 0]), still)
+    assert held.caught.all() and np.max(np.abs(components(wrench.force))) < 1e-12
+    # From far away, too; about T's origin.
+    wrench, held = step(one, held, at([3e-3, 0, 0.098], [0.01, 0, 0]), still)
+    np.testing.assert_allclose(components(wrench.force)[:, 0], [0, 0, -2e4], atol=1e-9)
+    np.testing.assert_allclose(components(wrench.moment)[:, 0], [0, 3e-3 * 2e4, 0], atol=1e-9)
+    assert held.caught.all()
+
+
+@pytest.mark.slow
+def test_the_spring_has_an_energy():
+    """Around a closed way of large rotations it does no work."""
+    phase = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    way = 0.8 * np.stack([np.cos(phase) - 1, np.sin(phase), 0.5 * np.sin(2 * phase)])
+    rates = 0.8 * np.stack([-np.sin(phase), np.cos(phase), np.cos(2 * phase)])
+    one, still = latch(True), Twist(place([0, 0, 0], BATCH), place([0, 0, 0], BATCH))
+    held = init_latch(one, at([0, 0, 0], [0, 0, 0]))
+
+    @jax.jit
+    def power(theta, rate):
+        wrench, _ = latch_wrench(one, held, Pose(still.linear, exponential(vector(theta))), still)
+        angular = left_jacobian(vector(theta), vector(rate))
+        return jnp.sum(components(wrench.moment) * components(angular))
+
+    work = [
+        power(*(jnp.asarray(part[:, None]) for part in parts)) for parts in zip(way.T, rates.T, strict=True)
+    ]
+    assert np.max(np.abs(work)) > 100 and abs(np.mean(work)) < 1e-9 * np.max(np.abs(work))

@@ -1,0 +1,103 @@
+"""Episodes in six axes: judged on one axis by its own figures, and in space by closed forms.
+
+One program; its lanes are the cases: a central contact of claw-350kg, an oblique one far off the line through
+the centres of mass, and a miss.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from six_axes import ideal_sensor, lanes, meeting, place, plain_body, second_order, spheres, springs
+
+import jaxhil as package
+from jaxhil.sixdof.approach import touching_height
+from jaxhil.sixdof.friction import Regularised
+from jaxhil.sixdof.kinematics import TaskSpace
+from jaxhil.sixdof.loop import build_loop
+from jaxhil.sixdof.metrics import evaluate
+from jaxhil.sixdof.relative import Pair
+from jaxhil.sixdof.rollout import STATUS_NAMES
+from jaxhil.sixdof.rotations import identity
+from jaxhil.sixdof.scenario import Scenario
+from jaxhil.sixdof.shapes import Plane
+
+pytestmark = pytest.mark.slow
+CENTRAL, ASIDE, AWAY = range(3)
+BATCH = (3,)
+PERIOD = 1e-3
+EYE = np.eye(3)
+STATIC = {"integrator": "semi_implicit_euler", "hold": "linear", "latency": 0}
+
+
+def scenario():
+    bodies = Pair(
+        plain_body(1050.0, np.diag([900.0, 700.0, 500.0]), [0, 0, 1.0], BATCH),
+        plain_body(525.0, np.diag([150.0, 180.0, 110.0]), [0, 0, -1.0], BATCH),
+    )
+    centres = np.zeros((3, 1, 3))
+    centres[:, :, ASIDE] = np.array([0.4, -0.3, 0.0])[:, None]
+    one = jnp.ones((1, 3))
+    flat = Plane(place([0, 0, 0], one.shape), place([0, 0, 1], one.shape))
+    friction = Regularised(lanes([0.0, 0.2, 0.0])[None] * one, 2e-3 * one)
+    spring = springs(124355.0 * one, 395.8 * one, one)
+    contact = spheres(jnp.asarray(centres), 0 * one, flat, "kelvin_voigt", spring, friction)
+    zero = jnp.zeros(3)
+    height = touching_height((contact,), zero, zero, identity(zero))
+    twist = lanes([0, 0, -0.005, 0, 0, 0], BATCH).at[2, AWAY].set(0.005).at[0, ASIDE].set(0.002)
+    pose = jnp.zeros((6, 3)).at[2].set(height)
+    before = jnp.where(jnp.arange(3) == AWAY, -0.1, 0.02 + PERIOD / 3)
+    delays = lanes([4e-3] * 6, BATCH)
+    return Scenario(
+        bodies, meeting(bodies, pose, twist, before), (contact,), (),
+        second_order(12.0 + 0 * delays, 0.8 + 0 * delays, delays), TaskSpace(), ideal_sensor(4e-3 + zero),
+        PERIOD + zero, 0.6 + zero, jnp.zeros((2, 3), jnp.uint32),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def judged():
+    given = scenario()
+    loop = build_loop(given, **STATIC)
+    return jax.tree.map(np.asarray, jax.jit(evaluate, static_argnums=0)(loop, {}, given))
+
+
+def test_a_central_episode_is_that_of_one_axis(judged):
+    expected = package.simulate("claw-350kg", "none").contacts[0]
+    found = judged.metrics
+
+    def of(name):
+        return getattr(found, name)[..., 0, CENTRAL]
+
+    e, reference = expected.restitution, expected.reference_restitution
+    np.testing.assert_allclose(of("restitution"), e, rtol=1e-9)
+    np.testing.assert_allclose(of("reference_restitution"), reference, rtol=1e-7)
+    np.testing.assert_allclose(of("energy_error"), e**2 - reference**2, rtol=1e-6)
+    np.testing.assert_allclose(of("twist_error"), (e - reference) / (1 + reference), rtol=1e-6)
+    np.testing.assert_allclose(of("normal_part"), (e - reference) / (1 + reference), rtol=1e-6)
+    assert max(of("lateral_part"), of("rotational_part")) < 1e-9
+    np.testing.assert_allclose([of("effective_mass"), of("approach_velocity")], [350, 0.005], rtol=1e-9)
+    np.testing.assert_allclose(of("peak_force"), expected.peak_force, rtol=1e-4)
+    np.testing.assert_allclose(of("reference_peak_force"), expected.reference_peak_force, rtol=1e-3)
+    assert STATUS_NAMES[of("status")] == "rebounded" and of("touches") == of("reference_touches") == 1
+    np.testing.assert_allclose(of("normal"), [0, 0, 1], atol=1e-12)
+
+
+def test_aside_all_three_parts_have_a_share(judged):
+    found = judged.metrics
+
+    def of(name):
+        return getattr(found, name)[..., 0, ASIDE]
+
+    parts = [of(f"{name}_part") for name in ("normal", "lateral", "rotational")]
+    np.testing.assert_allclose(np.linalg.norm(parts), of("twist_error"), rtol=1e-9)
+    assert min(np.abs(parts)) > 1e-3
+    assert of("energy_error") > 1 and of("reference_energy_change") < 0
+    assert 100 < of("effective_mass") < 300
+
+
+def test_a_miss_is_one(judged):
+    found = judged.metrics
+    assert STATUS_NAMES[found.status[0, AWAY]] == "miss"
+    assert np.isnan(found.energy_error[0, AWAY]) and found.touches[0, AWAY] == 0
+    np.testing.assert_allclose(judged.final_time[AWAY], 0.6)

@@ -1,0 +1,109 @@
+"""The hexapod: a pose and its legs, there and back; equal legs against task space; two robots."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from six_axes import lanes, place, second_order
+
+from jaxhil.sixdof.axes import Motion, actuate, build_axes, enter, sampled
+from jaxhil.sixdof.kinematics import TaskSpace, TwoRobots
+from jaxhil.sixdof.stewart import Stewart, condition
+from jaxhil.sixdof.vectors import vector
+
+pytestmark = pytest.mark.slow
+BATCH = (2,)
+ANGLES = np.radians([[-8, 8, 112, 128, 232, 248], [-52, 52, 68, 172, 188, 292]])
+PERIOD, TICKS, RING = 1e-3, 400, 32
+
+
+def joints(radius, angles):
+    circle = radius * np.stack([np.cos(angles), np.sin(angles), 0 * angles])
+    return vector(lanes(circle, BATCH))
+
+
+def hexapod():
+    return Stewart(joints(1.2, ANGLES[0]), joints(0.7, ANGLES[1]), place([0, 0, 1.1], BATCH))
+
+
+def poses():
+    seeded = np.random.default_rng(3)
+    scales = np.array([0.1, 0.1, 0.1, 0.2, 0.2, 0.2])[:, None]
+    return [jnp.asarray(scales * seeded.uniform(-1, 1, (6, 2))) for _ in range(3)]
+
+
+def test_a_pose_and_its_legs_there_and_back():
+    """With rates and accelerations of the legs those of the pose."""
+    rig, (at, rate, bend) = hexapod(), poses()
+
+    def along(time):
+        return rig.command(at + time * rate + time**2 / 2 * bend)
+
+    def slope(function):
+        return lambda time: jax.jvp(function, (time,), (jnp.ones_like(time),))[1]
+
+    now = jnp.asarray(0.0)
+    legs = Motion(along(now), slope(along)(now), slope(slope(along))(now))
+    found = jax.jit(lambda *given: rig.coordinates(*given))(legs, at + 2e-3)
+    for part, expected in zip(found, (at, rate, bend), strict=True):
+        np.testing.assert_allclose(part, expected, atol=1e-10)
+    assert np.all(np.asarray(condition(rig, at)) < 100)
+
+
+def test_derivatives_of_the_pose_are_those_of_differences():
+    rig, (at, *_) = hexapod(), poses()
+    legs = rig.command(at)
+
+    @jax.jit
+    def pose(scale):
+        changed = Stewart(scale * rig.base, rig.platform, rig.height)
+        return changed.coordinates(Motion(legs, 0 * legs, None), at).position
+
+    one = jnp.asarray(1.0)
+    _, found = jax.jvp(pose, (one,), (one,))
+    expected = (pose(one + 1e-6) - pose(one - 1e-6)) / 2e-6
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-8)
+    assert np.max(np.abs(found)) > 0.1
+
+
+def moved(kinematics, axes, amplitude):
+    """Coordinates that the sensor meets while the command swings."""
+    shape = jnp.asarray([1.0, -0.5, 0.7, 0.8, 0.6, -0.9])[:, None] * jnp.ones((6, 2))
+    number = kinematics.command(shape).shape[0]
+    late = lanes([4.4e-3] * number, BATCH)
+    zero, period = jnp.zeros(BATCH), PERIOD + jnp.zeros(BATCH)
+    plant = build_axes(second_order(axes + 0 * late, 0.8 + 0 * late, late), zero, zero, period, "linear")
+    start = kinematics.command(0 * shape)
+    hardware = enter(plant, start, 0 * start, period, "linear", 0, RING, False)
+
+    def body(hardware, tick):
+        seen = kinematics.coordinates(sampled(plant, hardware, tick).motion, 0 * shape)
+        way = jnp.sin(2 * np.pi * 3.0 * PERIOD * (tick + 1).astype(float)) ** 2
+        hardware = actuate(plant, hardware, tick, kinematics.command(amplitude * way * shape), "linear", 0)
+        return hardware, jnp.concatenate([seen.position, seen.rate])
+
+    return lax.scan(body, hardware, jnp.arange(TICKS, dtype=jnp.int32))[1]
+
+
+def test_equal_legs_are_task_space_for_small_strokes():
+    """Of second order in the stroke."""
+    both = [
+        [np.asarray(jax.jit(moved, static_argnums=(1, 2))(one, 12.0, size)) for size in (1e-2, 1e-3)]
+        for one in (hexapod(), TaskSpace())
+    ]
+    large, small = (np.max(np.abs(a - b)) for a, b in zip(*both, strict=True))
+    assert np.max(np.abs(both[0][0])) > 0.01 and large > 1e-6
+    np.testing.assert_allclose(large / small, 100, rtol=0.2)
+
+
+def test_two_equal_robots_are_one():
+    share = lanes([0.2, 0.3, 0.0, 0.7, 1.0, 0.5], BATCH)
+    one, two = (jax.jit(moved, static_argnums=(1, 2)) for _ in range(2))
+    expected = np.asarray(one(TaskSpace(), 12.0, 0.01))
+    np.testing.assert_allclose(two(TwoRobots(share), 12.0, 0.01), expected, atol=1e-14)
+    # A slow robot of the target shows where it has a share.
+    slow = jnp.concatenate([lanes([12.0] * 6, BATCH), lanes([3.0] * 6, BATCH)])
+    found = np.asarray(jax.jit(lambda share: moved(TwoRobots(share), slow, 0.01))(share))
+    apart = np.max(np.abs(found - expected), axis=(0, 2))
+    assert apart[2] < 1e-14 and np.all(apart[[0, 1, 3, 4, 5]] > 1e-5)
