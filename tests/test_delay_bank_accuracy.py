@@ -100,7 +100,7 @@ def errors_at_one_speed(told, suite, changes, number, contacts=8):
     [
         ("surface unknown", [PLANES], 1.0, 0.6),
         ("surface unknown, no noise", [PLANES, QUIET], 0.85, 0.45),
-        ("surface told", [PLANE], 0.85, 0.35),
+        ("surface told", [PLANE], 0.9, 0.45),
         ("told, and 5 um off", [PLANE, "rig.contact_plane=5e-6"], 2.0, 2.5),
     ],
 )
