@@ -1,0 +1,171 @@
+"""Rig and contact in six axes once more, in plain NumPy: rotation matrices, the matrix exponential and a
+Runge-Kutta method of order 8, one case at a time.
+
+A case is a dict: `masses`, `inertias` and `interfaces` of target and chaser; `start`, position, velocity,
+rotation matrix and angular velocity (body axes) of each; `spheres` (centre, radius), `numbers` of the drogue
+(half angle, radius and height of its bottom), `stiffness`, `exponent`, `damping`, `friction`, `slip`; of the
+rig `period`, `frequency`, `ratio` and `delays` of the six axes, and `force_delay`.
+"""
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+
+def skew(a):
+    return np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
+
+
+def jacobian(theta):
+    """The left one: the mean of the rotations on the way to theta, by its power series."""
+    total, term = np.eye(3), np.eye(3)
+    for order in range(2, 30):
+        term = term @ skew(theta) / order
+        total = total + term
+    return total
+
+
+def drogue(x, half_angle, radius, bottom):
+    """Signed distance and normal, from the profile: a circle, and a line that touches it."""
+    rho, z = np.hypot(x[0], x[1]), x[2] - bottom
+    outward = np.array([x[0], x[1], 0.0]) / rho if rho > 0 else np.zeros(3)
+    touching = radius * np.array([np.cos(half_angle), -np.sin(half_angle)])
+    along = np.array([np.sin(half_angle), np.cos(half_angle)])
+    if (np.array([rho, z]) - touching) @ along > 0:
+        inward = np.array([-along[1], along[0]])
+        return (np.array([rho, z]) - touching) @ inward, inward[0] * outward + np.array([0, 0, inward[1]])
+    apart = np.hypot(rho, z)
+    return radius - apart, -(rho * outward + np.array([0, 0, z])) / apart
+
+
+def wrench(case, p, rotation, v, w):
+    """Force and moment about T's origin on the chaser."""
+    force, moment = np.zeros(3), np.zeros(3)
+    for centre, radius in case["spheres"]:
+        x = p + rotation @ np.asarray(centre)
+        distance, n = drogue(x, *case["numbers"])
+        depth, point = radius - distance, x - distance * n
+        if depth <= 0:
+            continue
+        speed = v + np.cross(w, point - p)
+        slip = speed - (n @ speed) * n
+        pressed = case["stiffness"] * depth ** case["exponent"] * (1 - 1.5 * case["damping"] * (n @ speed))
+        pressed = max(pressed, 0.0)
+        one = pressed * (n - case["friction"] * slip / np.sqrt(slip @ slip + case["slip"] ** 2))
+        force, moment = force + one, moment + np.cross(point, one)
+    return force, moment
+
+
+def relative(case, bodies):
+    """p, R, v, w of C against T, and T's place and attitude in the world."""
+    (r1, v1, a1, w1), (r2, v2, a2, w2) = bodies
+    o1, o2 = (np.asarray(o) for o in case["interfaces"])
+    world1, world2 = a1 @ w1, a2 @ w2
+    apart = r2 + a2 @ o2 - r1 - a1 @ o1
+    speed = v2 + np.cross(world2, a2 @ o2) - v1 - np.cross(world1, a1 @ o1) - np.cross(world1, apart)
+    return a1.T @ apart, a1.T @ a2, a1.T @ speed, a1.T @ (world2 - world1), r1 + a1 @ o1, a1
+
+
+def loads(case, bodies, force, moment):
+    """Force and torque on each body, in world axes."""
+    *_, place, axes = relative(case, bodies)
+    f, m = axes @ force, axes @ moment
+    (r1, *_), (r2, *_) = bodies
+    return [(-f, -m - np.cross(place - r1, f)), (f, m + np.cross(place - r2, f))]
+
+
+def in_space(case, time):
+    """Bodies after a time, by a Runge-Kutta method of order 8 on rotation matrices."""
+    inertias = [np.asarray(j) for j in case["inertias"]]
+
+    def unpacked(y):
+        return [(one[:3], one[3:6], one[6:15].reshape(3, 3), one[15:18]) for one in (y[:18], y[18:])]
+
+    def slope(_, y):
+        bodies = unpacked(y)
+        found = wrench(case, *relative(case, bodies)[:4])
+        rates = []
+        for body, (f, torque), mass, j in zip(
+            bodies, loads(case, bodies, *found), case["masses"], inertias, strict=True
+        ):
+            _, v, a, w = body
+            spun = np.linalg.solve(j, a.T @ torque - np.cross(w, j @ w))
+            rates += [v, f / mass, (a @ skew(w)).ravel(), spun]
+        return np.concatenate(rates)
+
+    begin = np.concatenate([np.ravel(part) for body in case["start"] for part in body])
+    found = solve_ivp(slope, (0, time), begin, method="DOP853", rtol=1e-12, atol=1e-14, max_step=5e-4)
+    return unpacked(found.y[:, -1])
+
+
+def moved(case, bodies, force, moment):
+    """A period of the numerical model: the force first, then the motion."""
+    period, after = case["period"], []
+    for (r, v, a, w), (f, torque), mass, j in zip(
+        bodies, loads(case, bodies, force, moment), case["masses"], case["inertias"], strict=True
+    ):
+        v = v + period / mass * f
+        spin = a @ np.asarray(j) @ w + period * torque
+        inverse = np.linalg.inv(j)
+        half = a @ Rotation.from_rotvec(period / 2 * inverse @ a.T @ spin).as_matrix()
+        a = a @ Rotation.from_rotvec(period * inverse @ half.T @ spin).as_matrix()
+        after.append((r + period * v, v, a, inverse @ a.T @ spin))
+    return after
+
+
+def command(case, bodies):
+    p, rotation, v, w, *_ = relative(case, bodies)
+    theta = Rotation.from_matrix(rotation).as_rotvec()
+    return np.concatenate([p, theta]), np.concatenate([v, np.linalg.solve(jacobian(theta), w)])
+
+
+class Axis:
+    """y'' + 2 zeta w y' + w^2 y = w^2 u, u straight between ticks, from uniform motion on."""
+
+    def __init__(self, frequency, ratio, period, at, rate):
+        w = 2 * np.pi * frequency
+        self.flow = np.zeros((4, 4))
+        self.flow[0, 1] = self.flow[2, 3] = 1
+        self.flow[1] = [-(w**2), -2 * ratio * w, w**2, 0]
+        self.period, self.late = period, 2 * ratio / w * rate
+        self.at, self.rate = at, rate
+        self.starts = []
+        self.state, self.sent = np.array([at - self.late, rate]), at
+
+    def send(self, value):
+        """The command at the next tick."""
+        start = np.array([*self.state, self.sent, (value - self.sent) / self.period])
+        self.starts.append(start)
+        self.state, self.sent = (expm(self.flow * self.period) @ start)[:2], value
+
+    def response(self, time):
+        """y and y' at a time since the first tick."""
+        if time <= 0:
+            return np.array([self.at - self.late + self.rate * time, self.rate])
+        index = min(int(np.ceil(time / self.period - 1e-9)) - 1, len(self.starts) - 1)
+        return (expm(self.flow * (time - index * self.period)) @ self.starts[index])[:2]
+
+
+def on_the_rig(case, ticks):
+    """Bodies of the numerical model after so many ticks."""
+    bodies, period = case["start"], case["period"]
+    at, rates = command(case, bodies)
+    axes = [
+        Axis(*numbers, period, x, rate)
+        for *numbers, x, rate in zip(case["frequency"], case["ratio"], at, rates, strict=True)
+    ]
+
+    def seen(now, delay):
+        each = zip(axes, case["delays"], strict=True)
+        return np.array([axis.response(now - delay - own) for axis, own in each]).T
+
+    for tick in range(ticks):
+        x, rate = seen(tick * period, case["force_delay"])
+        theta, slopes = x[3:], jacobian(x[3:])
+        rotation, w = Rotation.from_rotvec(theta).as_matrix(), slopes @ rate[3:]
+        force, moment = wrench(case, x[:3], rotation, rate[:3], w)
+        bodies = moved(case, bodies, force, moment)
+        for axis, value in zip(axes, command(case, bodies)[0], strict=True):
+            axis.send(value)
+    return bodies

@@ -1,0 +1,121 @@
+"""Rig and space in six axes against an implementation of their own (`six_axis_oracle`).
+
+Off-centre and oblique, with friction and unequal delays: a probe in a drogue.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from six_axes import (
+    ideal_sensor,
+    lanes,
+    place,
+    plain_body,
+    second_order,
+    spheres,
+    springs,
+)
+from six_axis_oracle import in_space, on_the_rig
+
+from jaxhil.sixdof.bodies import build_state
+from jaxhil.sixdof.friction import Regularised
+from jaxhil.sixdof.kinematics import TaskSpace
+from jaxhil.sixdof.loop import build_loop, run
+from jaxhil.sixdof.metrics import reference_final
+from jaxhil.sixdof.relative import Pair, States
+from jaxhil.sixdof.rotations import Quaternion
+from jaxhil.sixdof.scenario import Scenario
+from jaxhil.sixdof.shapes import Drogue
+from jaxhil.sixdof.vectors import components
+
+pytestmark = pytest.mark.slow
+BATCH, TICKS, PERIOD = (1,), 300, 1e-3
+FULL = (
+    np.array([[1400.0, 30, -20], [30, 1100, 15], [-20, 15, 800]]),
+    np.array([[150.0, 10, 5], [10, 180, -8], [5, -8, 110]]),
+)
+TURN = Rotation.from_rotvec([0.02, 0.03, -0.01]).as_matrix()
+COMMON = {
+    "masses": (1800.0, 420.0), "inertias": FULL, "interfaces": ((0.05, -0.02, 1.2), (0.01, 0.04, -1.0)),
+    "exponent": 1.5, "damping": 1.5, "friction": 0.15, "slip": 2e-3, "period": PERIOD,
+    "frequency": [14.0, 13.0, 12.0, 11.0, 10.0, 9.0], "ratio": [0.8, 0.7, 0.8, 0.9, 0.8, 1.1],
+    "delays": [4e-3, 4.2e-3, 3e-3, 5.3e-3, 5.05e-3, 4.4e-3], "force_delay": 3.7e-3,
+}  # fmt: skip
+PROBE = COMMON | {
+    "spheres": [((0.0, 0.0, 0.0), 0.02)], "numbers": (0.75, 0.04, 0.0), "stiffness": 3e6,
+    "height": 0.014,
+}  # fmt: skip
+
+
+def started(case):
+    """The case with its bodies: C off T, turned, and moving towards it."""
+    o1, o2 = (np.asarray(o) for o in case["interfaces"])
+    apart = np.array([0.03, -0.025, case["height"]])
+    chaser = (o1 + apart - TURN @ o2, np.array([1e-3, -2e-3, -0.025]), TURN, np.array([3e-3, -2e-3, 1e-3]))
+    target = (np.zeros(3), np.zeros(3), np.eye(3), np.array([1e-3, 2e-3, -1e-3]))
+    return case | {"start": [target, chaser]}
+
+
+def as_scenario(case):
+    bodies = Pair(*(
+        plain_body(mass, inertia, interface, BATCH)
+        for mass, inertia, interface in zip(case["masses"], case["inertias"], case["interfaces"], strict=True)
+    ))  # fmt: skip
+    states = []
+    for body, (r, v, attitude, w) in zip(bodies, case["start"], strict=True):
+        x, y, z, scalar = Rotation.from_matrix(attitude).as_quat()
+        turn = Quaternion(lanes(scalar, BATCH), place([x, y, z], BATCH))
+        states.append(build_state(body, place(r, BATCH), place(v, BATCH), turn, place(w, BATCH)))
+    one = jnp.ones((len(case["spheres"]), 1))
+    centres = jnp.asarray(np.array([centre for centre, _ in case["spheres"]], float).T[..., None])
+    radii = lanes([radius for _, radius in case["spheres"]], BATCH)
+    shape = Drogue(*(number * one for number in case["numbers"]))
+    law = springs(case["stiffness"] * one, case["damping"] * one, case["exponent"] * one)
+    contact = spheres(
+        centres, radii, shape, "hunt_crossley", law, Regularised(case["friction"] * one, case["slip"] * one)
+    )
+    axes = (lanes(case[key], BATCH) for key in ("frequency", "ratio", "delays"))
+    sensor = ideal_sensor(lanes(case["force_delay"], BATCH))
+    return Scenario(
+        bodies, States(*states), (contact,), (), second_order(*axes), TaskSpace(), sensor,
+        lanes(PERIOD, BATCH), lanes(TICKS * PERIOD, BATCH), jnp.zeros((2, 1), jnp.uint32),
+    )  # fmt: skip
+
+
+def close(states, expected, tolerance):
+    """Places and velocities against those of the other implementation."""
+    for state, (r, v, attitude, _) in zip(states, expected, strict=True):
+        np.testing.assert_allclose(np.asarray(components(state.velocity))[:, 0], v, atol=tolerance)
+        np.testing.assert_allclose(np.asarray(components(state.position))[:, 0], r, atol=tolerance)
+        x, y, z = np.asarray(components(state.attitude.v))[:, 0]
+        turned = Rotation.from_quat([x, y, z, np.asarray(state.attitude.w)[0]])
+        np.testing.assert_allclose(turned.as_matrix(), attitude, atol=tolerance)
+
+
+def test_the_rig_is_that_of_another_implementation():
+    case = started(PROBE)
+    given = as_scenario(case)
+    loop = build_loop(
+        given, integrator="semi_implicit_euler", hold="linear", latency=0
+    )  # fmt: skip
+    end, seen = jax.jit(run, static_argnums=(0, 3))(loop, {}, given, TICKS)
+    assert np.max(np.abs(components(seen.contact.force))) > 20
+    expected = on_the_rig(case, TICKS)
+    close(end.states, expected, 1e-10)
+    # Angular velocities, and the momentum of the whole.
+    spins = [np.asarray(components(state.spin))[:, 0] for state in end.states]
+    for spin, (_, _, attitude, w), inertia in zip(spins, expected, case["inertias"], strict=True):
+        np.testing.assert_allclose(spin, attitude @ inertia @ w, atol=1e-9)
+
+
+def test_space_is_that_of_another_implementation():
+    case = started(PROBE)
+    given = as_scenario(case)
+    time = lanes(TICKS * PERIOD, BATCH)
+    found = jax.jit(reference_final)(given, time)
+    before = case["start"][1][1]
+    expected = in_space(case, TICKS * PERIOD)
+    assert np.linalg.norm(expected[1][1] - before) > 0.01
+    close(found, expected, 1e-9)
