@@ -8,6 +8,7 @@ its path, what was found and what is allowed. Rules that join several keys are i
 from __future__ import annotations
 
 import difflib
+import functools
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -48,6 +49,9 @@ Extra = Mapping[str, Any]  # what `jaxhil.mechanism.structs.says` puts beside a 
 NUMBER_FOR_LIST = ("contact", "stiffness"), ("contact", "damping")
 # Polynomials, whose leading zeros say nothing.
 _POLYNOMIALS = {("rig", "simulator", "numerator"), ("rig", "simulator", "denominator")}
+
+
+_type_info = functools.cache(inspect.type_info)
 
 
 class KeyProblem(Exception):
@@ -105,21 +109,24 @@ def to_mechanism(raw: Mapping[str, Any]) -> Mechanism:
 
 def to_struct(kind: type[AnyStruct], raw: Mapping[str, Any]) -> AnyStruct:
     """The raw table as a struct whose fields say what is allowed, as `Mechanism`. Raises `KeyProblem`."""
-    return msgspec.convert(_clean(inspect.type_info(kind), raw, (), PLAIN), kind)
+    return msgspec.convert(_clean(_type_info(kind), raw, (), PLAIN), kind)
 
 
 def step_into(kind: inspect.Type, part: str | int, path: Path) -> inspect.Type:
     """The type of what `part` names inside a value of type `kind`, or raises `KeyProblem`."""
     match kind:
+        case inspect.Metadata(type=inner, extra={"six": names}) if part in names:
+            return step_into(inner, 0, path)
         case inspect.Metadata(type=inner):
             return step_into(inner, part, path)
         case inspect.UnionType(types=members):
-            inner = [member for member in members if isinstance(_bare(member), inspect.ListType)]
-            if isinstance(part, int) and inner:
+            inside = inspect.ListType if isinstance(part, int) else (inspect.ListType, inspect.StructType)
+            inner = [member for member in members if isinstance(_bare(member), inside)]
+            if inner:
                 return step_into(inner[0], part, path)
         case inspect.StructType(fields=fields) if isinstance(part, str):
             for entry in fields:
-                if entry.name == part:
+                if entry.encode_name == part:
                     return entry.type
             raise _unknown_key(kind, part, path)
         case inspect.DictType(value_type=value) if isinstance(part, str):
@@ -136,6 +143,11 @@ def allowed_of(kind: inspect.Type, extra: Extra = PLAIN) -> str:
     match kind:
         case inspect.Metadata(extra={"one_of": names}):
             return f"one of {', '.join(names)}"
+        case inspect.Metadata(type=inner, extra={"six": names}):
+            entry = allowed_of(inner.item_type, PLAIN) if isinstance(inner, inspect.ListType) else ""
+            return f"{entry}, {{ {', '.join(names)} }} of two, or a list of six"
+        case inspect.Metadata(type=inner, extra={"square": size}):
+            return f"one number for all entries, or a list of {size} rows of {size} entries"
         case inspect.Metadata(type=inner):
             return allowed_of(inner, kind.extra or PLAIN)
         case inspect.UnionType(types=members):
@@ -164,7 +176,7 @@ def _bare(kind: inspect.Type) -> inspect.Type:
 
 
 def _unknown_key(kind: inspect.StructType, key: str, path: Path) -> KeyProblem:
-    names = [entry.name for entry in kind.fields]
+    names = [entry.encode_name for entry in kind.fields]
     allowed = f"one of {', '.join(names)}{close_match(key, names)}"
     return KeyProblem((*path, key), "an unknown key", allowed)
 
@@ -177,6 +189,11 @@ def _clean(kind: inspect.Type, value: Any, path: Path, extra: Extra) -> Any:
         case inspect.Metadata(extra={"one_of": names}):
             if isinstance(value, str) and value in names:
                 return value
+        case inspect.Metadata(type=inner, extra={"six": names}):
+            return _clean(inner, _six_entries(kind, names, value, path), path, PLAIN)
+        case inspect.Metadata(type=inner, extra={"square": size}):
+            number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            return _clean(inner, [[value] * size] * size if number else value, path, PLAIN)
         case inspect.Metadata(type=inner):
             return _clean(inner, value, path, kind.extra or PLAIN)
         case inspect.UnionType(types=members):
@@ -221,18 +238,30 @@ def _clean(kind: inspect.Type, value: Any, path: Path, extra: Extra) -> Any:
 
 
 def _clean_struct(kind: inspect.StructType, value: Mapping[Any, Any], path: Path) -> dict[str, Any]:
-    names = {entry.name for entry in kind.fields}
+    names = {entry.encode_name for entry in kind.fields}
     for key in value:
         # Unknown keys come first: a misspelt key is also a missing one.
         if key not in names:
             raise _unknown_key(kind, str(key), path)
     cleaned = {}
     for entry in kind.fields:
-        if entry.name in value:
-            cleaned[entry.name] = _clean(entry.type, value[entry.name], (*path, entry.name), PLAIN)
+        name = entry.encode_name
+        if name in value:
+            cleaned[name] = _clean(entry.type, value[name], (*path, name), PLAIN)
         elif entry.required:
-            raise KeyProblem((*path, entry.name), "nothing", allowed_of(entry.type, PLAIN))
+            raise KeyProblem((*path, name), "nothing", allowed_of(entry.type, PLAIN))
     return cleaned
+
+
+def _six_entries(kind: inspect.Metadata, names: Sequence[str], value: Any, path: Path) -> Any:
+    """Six entries of one number, or of one each for the two `names`; anything else as it is."""
+    if isinstance(value, (list, tuple)):
+        return value
+    if isinstance(value, Mapping) and set(value) == set(names):
+        return [value[name] for name in names for _ in range(3)]
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return [value] * 6
+    raise KeyProblem(path, shown(value), allowed_of(kind, PLAIN))
 
 
 def _member(members: Iterable[inspect.Type], value: Any) -> inspect.Type:

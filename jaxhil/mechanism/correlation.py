@@ -23,16 +23,19 @@ import numpy as np
 
 from jaxhil.errors import shown
 from jaxhil.mechanism.conversion import KeyProblem, close_match
+from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Correlation, Mechanism
 
 __all__ = ["certain", "check_correlation", "correlated", "correlated_groups", "remaining"]
+
+AnyMechanism = Mechanism | SixAxisMechanism
 
 LEAST_EIGENVALUE = 1e-10  # of a matrix that counts as positive definite
 
 _LEAST, _LARGEST = 2.0**-54, 1.0 - 2.0**-53  # of what has a finite normal number, and is below 1
 
 
-def correlated(mechanism: Mechanism, uniform: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def correlated(mechanism: AnyMechanism, uniform: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The uniform numbers (number, columns) of every key, made to vary together as the mechanism says."""
     table = mechanism.correlation
     if table is None:
@@ -56,7 +59,7 @@ def correlated(mechanism: Mechanism, uniform: Mapping[str, np.ndarray]) -> dict[
     return {**uniform, **together}
 
 
-def correlated_groups(mechanism: Mechanism) -> list[tuple[str, ...]]:
+def correlated_groups(mechanism: AnyMechanism) -> list[tuple[str, ...]]:
     """The keys of ``[correlation]`` in groups that are independent of one another, in their order there."""
     table = mechanism.correlation
     if table is None:
@@ -89,7 +92,7 @@ def remaining(
     return ([keys[place] for place in kept], triangle) if kept else None
 
 
-def check_correlation(mechanism: Mechanism) -> None:
+def check_correlation(mechanism: AnyMechanism) -> None:
     """Raises `KeyProblem` unless the table names uncertain keys, each once, and its matrix is one of
     correlations."""
     table = mechanism.correlation

@@ -1,8 +1,8 @@
 """Reading a mechanism file: bytes, TOML, overrides, validation.
 
 `load` turns a file (or the name of a built-in one or suite), the ``PATH=VALUE`` overrides of ``--set`` and
-the keys that ``--unset`` takes out into a validated `Mechanism`. Whatever is wrong with them raises
-`InputError` with one line.
+the keys that ``--unset`` takes out into a validated `Mechanism`; `load_any` takes files of six axes as well.
+Whatever is wrong with them raises `InputError` with one line.
 """
 
 from __future__ import annotations
@@ -13,24 +13,31 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.mechanism import rules as mechanism_rules
-from jaxhil.mechanism.conversion import KeyProblem, close_match, to_mechanism
+from jaxhil.mechanism.conversion import KeyProblem, close_match, to_mechanism, to_struct
 from jaxhil.mechanism.overrides import apply_override, parse_override
-from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.six_axes import SCHEMA_SIX, SixAxisMechanism, is_six_axes
+from jaxhil.mechanism.six_axes_rules import check_six_axes
+from jaxhil.mechanism.structs import SCHEMA, Mechanism
 from jaxhil.mechanism.toml_table import parse_toml, read_bytes
 
 __all__ = [
     "DEFAULT",
+    "AnyMechanism",
+    "LoadedAny",
     "LoadedMechanism",
+    "any_from_builtins",
     "builtin_names",
     "builtin_path",
     "from_builtins",
     "load",
+    "load_any",
+    "six_axis_names",
     "source_sha256",
     "suite_names",
     "to_builtins",
@@ -39,12 +46,16 @@ __all__ = [
 DEFAULT = "varying"
 
 Overrides = Sequence[str] | Mapping[str, Any]
+AnyMechanism = Mechanism | SixAxisMechanism
+Kind = TypeVar("Kind", Mechanism, AnyMechanism)
 
 SUITE = "suite-"  # begins the names of the standard suites
 
+_UNLIMITED = [math.inf] * 6  # six numbers that are the default of their key
 _sources: dict[str, str] = {}  # digests of the files read, by those of what was read
 
 _FOLDER = Path(__file__).parent / "builtin"
+_SIX_AXES = _FOLDER / "six_axes"
 
 
 class LoadedMechanism(NamedTuple):
@@ -55,10 +66,18 @@ class LoadedMechanism(NamedTuple):
     label: str
 
 
+class LoadedAny(NamedTuple):
+    """A validated mechanism of one axis or of six; else as `LoadedMechanism`."""
+
+    mechanism: AnyMechanism
+    sha256: str
+    label: str
+
+
 def load(
     path_or_name: str | os.PathLike[str] | None = None, overrides: Overrides = (), unset: Sequence[str] = ()
 ) -> LoadedMechanism:
-    """The mechanism of a TOML file or of a built-in's name (`None`: the default built-in).
+    """The mechanism of a TOML file or of a built-in's name (`None`: the default built-in), of one axis.
 
     `overrides` are ``PATH=VALUE`` texts as given to ``--set``, applied in order before validation:
     PATH a dotted TOML key, possibly with an index (``contact.stiffness[1]``), VALUE a TOML value; a
@@ -66,24 +85,21 @@ def load(
     itself does the same, and takes out the key whose value is None. `unset` are PATHs as given to
     ``--unset``, keys that are then taken out.
 
-    Raises `InputError`, one line, for whatever is wrong.
+    Raises `InputError`, one line, for whatever is wrong, and for a mechanism of six axes.
     """
-    name = DEFAULT if path_or_name is None else path_or_name
-    if isinstance(name, str) and name in (*builtin_names(), *suite_names()):
-        path, label = builtin_path(name), name
-    else:
-        path, label = Path(name), one_line(str(name)) or "''"
-    try:
-        data = read_bytes(path, label, "a mechanism")
-    except FileNotFoundError:
-        raise _missing(label) from None
-    mechanism = from_builtins(parse_toml(data, label, "a mechanism"), label, overrides, unset)
-    sha256 = hashlib.sha256(data).hexdigest()
-    _sources[_content_sha256(mechanism)] = sha256
-    return LoadedMechanism(mechanism, sha256, label)
+    raw, sha256, label = _read(path_or_name)
+    return LoadedMechanism(_noted(from_builtins(raw, label, overrides, unset), sha256), sha256, label)
 
 
-def source_sha256(mechanism: Mechanism) -> str:
+def load_any(
+    path_or_name: str | os.PathLike[str] | None = None, overrides: Overrides = (), unset: Sequence[str] = ()
+) -> LoadedAny:
+    """Like `load`, of one axis or of six."""
+    raw, sha256, label = _read(path_or_name)
+    return LoadedAny(_noted(any_from_builtins(raw, label, overrides, unset), sha256), sha256, label)
+
+
+def source_sha256(mechanism: AnyMechanism) -> str:
     """SHA-256 in hex of the file that an equal mechanism was read from, or of its content if it was not read
     from any."""
     content = _content_sha256(mechanism)
@@ -95,8 +111,20 @@ def from_builtins(
 ) -> Mechanism:
     """The validated mechanism of plain data, such as a parsed TOML or JSON table, changed as by `load`.
 
-    `label` is what an error calls its source. Raises `InputError`.
+    `label` is what an error calls its source. Raises `InputError`, for a mechanism of six axes too.
     """
+    if is_six_axes(raw):
+        allowed = f"{SCHEMA} here: of the commands, simulate, mechanisms and init know six axes so far"
+        raise InputError(f"{one_line(label)}: schema: found {SCHEMA_SIX}, six axes, allowed {allowed}")
+    mechanism = any_from_builtins(raw, label, overrides, unset)
+    assert isinstance(mechanism, Mechanism)
+    return mechanism
+
+
+def any_from_builtins(
+    raw: Mapping[str, Any], label: str, overrides: Overrides = (), unset: Sequence[str] = ()
+) -> AnyMechanism:
+    """Like `from_builtins`, of one axis or of six, as the schema says."""
     changed, label = raw, one_line(label)
     given = _given(overrides, unset)
     for option, changes in given.items():
@@ -112,7 +140,7 @@ def from_builtins(
         raise InputError(f"{label}{blamed}: {problem}") from None
 
 
-def to_builtins(mechanism: Mechanism) -> dict[str, Any]:
+def to_builtins(mechanism: AnyMechanism) -> dict[str, Any]:
     """The mechanism as plain data fit for JSON; `from_builtins` makes an equal mechanism of it.
 
     Keys without a value and infinite numbers are left out: both are the defaults of their keys.
@@ -121,7 +149,7 @@ def to_builtins(mechanism: Mechanism) -> dict[str, Any]:
 
 
 def builtin_names() -> list[str]:
-    """The names of the built-in mechanism files, the standard suites apart."""
+    """The names of the built-in mechanism files of one axis, the standard suites apart."""
     return [name for name in _names() if not name.startswith(SUITE)]
 
 
@@ -131,18 +159,43 @@ def suite_names() -> list[str]:
     return [name for name in _names() if name.startswith(SUITE)]
 
 
+def six_axis_names() -> list[str]:
+    """The names of the built-in mechanism files of six axes."""
+    return sorted(path.stem for path in _SIX_AXES.glob("*.toml"))
+
+
 def builtin_path(name: str) -> Path:
     """The file of a built-in mechanism or suite. Raises `InputError` for an unknown name."""
-    names = [*builtin_names(), *suite_names()]
+    names = [*builtin_names(), *suite_names(), *six_axis_names()]
     if name not in names:
         raise InputError(
             f"{one_line(name)}: found no built-in mechanism of this name, "
             f"allowed {', '.join(names)}{close_match(name, names)}"
         )
-    return _FOLDER / f"{name}.toml"
+    return (_SIX_AXES if name in six_axis_names() else _FOLDER) / f"{name}.toml"
 
 
-def _content_sha256(mechanism: Mechanism) -> str:
+def _read(path_or_name: str | os.PathLike[str] | None) -> tuple[dict[str, Any], str, str]:
+    """The table of a file, the digest of its bytes, and what to call it."""
+    name = DEFAULT if path_or_name is None else path_or_name
+    if isinstance(name, str) and name in (*builtin_names(), *suite_names(), *six_axis_names()):
+        path, label = builtin_path(name), name
+    else:
+        path, label = Path(name), one_line(str(name)) or "''"
+    try:
+        data = read_bytes(path, label, "a mechanism")
+    except FileNotFoundError:
+        raise _missing(label) from None
+    return parse_toml(data, label, "a mechanism"), hashlib.sha256(data).hexdigest(), label
+
+
+def _noted(mechanism: Kind, sha256: str) -> Kind:
+    """The mechanism, its content's digest kept with that of its file."""
+    _sources[_content_sha256(mechanism)] = sha256
+    return mechanism
+
+
+def _content_sha256(mechanism: AnyMechanism) -> str:
     content = json.dumps(to_builtins(mechanism), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(content.encode()).hexdigest()
 
@@ -152,12 +205,18 @@ def _names() -> list[str]:
 
 
 def _missing(label: str) -> InputError:
-    names = builtin_names()
+    names = [*builtin_names(), *six_axis_names()]
     hint = close_match(label, [*names, *suite_names()]) or f" (built-in: {', '.join(names)})"
     return InputError(f"{label}: found no such file, allowed a mechanism file{hint}")
 
 
-def _validated(raw: Mapping[str, Any]) -> Mechanism:
+def _validated(raw: Mapping[str, Any]) -> AnyMechanism:
+    if is_six_axes(raw):
+        in_space = to_struct(SixAxisMechanism, raw)
+        check_six_axes(in_space)
+        return in_space
+    if isinstance(raw, Mapping) and raw.get("schema", SCHEMA) != SCHEMA:
+        raise KeyProblem(("schema",), shown(raw["schema"]), f"{SCHEMA}, or {SCHEMA_SIX} of six axes")
     mechanism = to_mechanism(raw)
     mechanism_rules.check(mechanism)
     return mechanism
@@ -199,5 +258,5 @@ def _short(given: object) -> str:
 def _without_empty(value: Any) -> Any:
     if isinstance(value, dict):
         entries = {key: _without_empty(entry) for key, entry in value.items()}
-        return {key: entry for key, entry in entries.items() if entry is not None and entry != math.inf}
+        return {key: entry for key, entry in entries.items() if entry not in (None, math.inf, _UNLIMITED)}
     return value

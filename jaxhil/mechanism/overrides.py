@@ -15,7 +15,8 @@ from typing import Any
 from jaxhil.errors import shown
 from jaxhil.mechanism.conversion import KeyProblem, Path, close_match, dotted, entry_count, step_into
 from jaxhil.mechanism.correlation import remaining
-from jaxhil.mechanism.structs import MAX_CONTACTS, numeric_keys, schema_type
+from jaxhil.mechanism.six_axes import is_six_axes, numeric_keys_beside, six_axis_type
+from jaxhil.mechanism.structs import MAX_CONTACTS, Range, numeric_keys, schema_type
 
 __all__ = ["apply_override", "parse_key", "parse_override"]
 
@@ -83,16 +84,23 @@ def apply_override(raw: Mapping[str, Any], path: Path, value: Any) -> dict[str, 
     Raises `KeyProblem` when the schema has no such path, a list no such entry, or where there is no such key
     to take out.
     """
-    kind = schema_type()
+    in_space = is_six_axes(raw)
+    kind = six_axis_type() if in_space else schema_type()
     for depth, part in enumerate(path):
         try:
             kind = step_into(kind, part, path[:depth])
         except KeyProblem as problem:
-            hint = close_match(dotted(path), numeric_keys())
+            hint = close_match(dotted(path), _numeric_keys(raw) if in_space else numeric_keys())
             if hint and "did you mean" not in problem.allowed:
                 problem = KeyProblem(problem.path, problem.found, problem.allowed + hint)
             raise problem from None
     return _removed(raw, path) if value is None else _replaced(raw, path, 0, value)
+
+
+def _numeric_keys(raw: Mapping[str, Any]) -> dict[str, Range]:
+    """Of a raw table of six axes."""
+    contacts = raw.get("contact")
+    return numeric_keys_beside(tuple(map(str, contacts)) if isinstance(contacts, Mapping) else ())
 
 
 def _parse_path(text: str, key: str | None = None) -> tuple[Path, int]:

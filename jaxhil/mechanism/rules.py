@@ -15,20 +15,28 @@ from typing import Any
 import numpy as np
 
 from jaxhil.errors import shown
-from jaxhil.mechanism.conversion import KeyProblem, close_match, computable
+from jaxhil.mechanism.conversion import KeyProblem
 from jaxhil.mechanism.correlation import check_correlation
 from jaxhil.mechanism.structs import (
     BUILT_IN_LAWS,
     Contact,
     Mechanism,
     Simulator,
-    Uncertainty,
-    is_computable,
     numeric_keys,
     value_at,
 )
+from jaxhil.mechanism.uncertainty_rules import Span, check_uncertainty
 
-__all__ = ["KEYS_OF_MODELS", "LAWS_OF_KEYS", "UNDAMPED", "check", "is_hurwitz"]
+__all__ = [
+    "FIXED",
+    "KEYS_OF_MODELS",
+    "LAWS_OF_KEYS",
+    "UNDAMPED",
+    "check",
+    "check_model",
+    "check_texts",
+    "is_hurwitz",
+]
 
 # Keys of each model of the motion simulator.
 KEYS_OF_MODELS = {
@@ -52,22 +60,18 @@ LAWS_OF_KEYS = {
 # Laws without damping, and what they dissipate by.
 UNDAMPED = {"elastoplastic": "yielding", "preloaded": "friction"}
 _PLAIN = Contact(law="linear", stiffness=[1.0])
-_Span = tuple[np.ndarray, np.ndarray]
-_FIXED = ("rig.simulator.numerator", "rig.simulator.denominator")
+FIXED = ("rig.simulator.numerator", "rig.simulator.denominator")
 
 
 def check(mechanism: Mechanism) -> None:
     """Every rule in turn; raises `KeyProblem` for the first one broken."""
-    _check_texts(mechanism)
+    check_texts(mechanism)
     _check_bodies(mechanism)
     _check_contact(mechanism.contact)
     _check_keys_of_laws(mechanism)
-    _check_simulator(mechanism.rig.simulator)
+    check_model(mechanism.rig.simulator)
     _check_hold(mechanism)
-    spans = {
-        path: _check_uncertainty(mechanism, path, uncertainty)
-        for path, uncertainty in mechanism.uncertainty.items()
-    }
+    spans = {path: _check_uncertainty(mechanism, path) for path in mechanism.uncertainty}
     check_correlation(mechanism)
     _check_gap(mechanism, spans)
 
@@ -91,7 +95,8 @@ def is_hurwitz(polynomial: Sequence[float]) -> bool:
     return upper[0] > 0
 
 
-def _check_texts(mechanism: Mechanism) -> None:
+def check_texts(mechanism: Any) -> None:
+    """Name and source can be shown. Raises `KeyProblem`."""
     if not mechanism.name.isprintable():
         raise KeyProblem(("name",), shown(mechanism.name), "printable characters")
     if not mechanism.source.replace("\n", "").replace("\t", "").isprintable():
@@ -160,7 +165,8 @@ def _is_damped(mechanism: Mechanism, *, by: str = "damping") -> bool:
     return bool(some) or (uncertain is not None and uncertain.factor is None)
 
 
-def _check_simulator(simulator: Simulator) -> None:
+def check_model(simulator: Any) -> None:
+    """The motion simulator's keys are those of its model, and it is stable. Raises `KeyProblem`."""
     path = ("rig", "simulator")
     for key in KEYS_OF_MODELS[simulator.model]:
         if getattr(simulator, key) is None:
@@ -172,7 +178,7 @@ def _check_simulator(simulator: Simulator) -> None:
         if value is not None and key not in KEYS_OF_MODELS[simulator.model]:
             allowed = f"nothing ({simulator.model} does not use it: unset it)"
             raise KeyProblem((*path, key), shown(value), allowed)
-    if simulator.model == "first_order" and simulator.time_constant == 0.0:
+    if simulator.model == "first_order" and not np.all(simulator.time_constant):
         raise KeyProblem((*path, "time_constant"), "0.0", "a number > 0 (first_order), or ideal")
     if simulator.model == "third_order" and simulator.coefficients is not None:
         if not is_hurwitz([*reversed(simulator.coefficients), 1.0]):
@@ -207,7 +213,7 @@ def _check_hold(mechanism: Mechanism) -> None:
         raise KeyProblem(("rig", "command_hold"), shown(rig.command_hold), allowed)
 
 
-def _check_gap(mechanism: Mechanism, spans: Mapping[str, _Span]) -> None:
+def _check_gap(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
     # The approach starts at x_d = min(plane, 0) - v (0.02 s + phase T) with x_a behind by the motion
     # simulator's delay and lag and the command's latency, and has to lie inside the gap. An unbounded
     # distribution reaches every value, so that only the nominal one can be judged.
@@ -247,65 +253,14 @@ def _greatest_lag(simulator: Simulator, extreme: Callable[[str, int], Any]) -> f
     return 0.0
 
 
-def _check_uncertainty(mechanism: Mechanism, path: str, uncertainty: Uncertainty) -> _Span:
-    where = ("uncertainty", path)
-    known = {key: allowed for key, allowed in numeric_keys().items() if key not in _FIXED}
-    if path not in known:
-        allowed = f"the dotted path of a numeric key{close_match(path, known)}"
-        if path in _FIXED:
-            allowed += " other than a polynomial, which fixes G(0) = 1"
-        raise KeyProblem(where, "no such uncertain key", allowed)
-    value = value_at(mechanism, path)
-    if value is None or value == [] or value == math.inf:
-        allowed = f"a key with a value: set {path}, or unset its uncertainty"
-        raise KeyProblem(where, f"{shown(value)} as its value", allowed)
-    nominal = np.asarray(value, dtype=float)
-    low, high = _span(where, path, uncertainty, nominal)
-    ends = [float(end) for end in np.concatenate((low.ravel(), high.ravel()))]
-    if uncertainty.distribution != "normal":
-        outside = [end for end in ends if not (known[path].allows(end) and math.isfinite(end))]
-        if outside:
-            raise KeyProblem(where, f"values as far as {outside[0]:g}", str(known[path]))
-        beyond = [end for end in ends if not is_computable(end)]
-        if beyond:
-            raise KeyProblem(where, f"values as far as {beyond[0]:g}", computable(known[path]))
-    if path == "contact.depths" and uncertainty.independent and np.any(high[:-1] >= low[1:]):
+def _check_uncertainty(mechanism: Mechanism, path: str) -> Span:
+    low, high = check_uncertainty(mechanism, path, numeric_keys(), FIXED)
+    where, independent = ("uncertainty", path), mechanism.uncertainty[path].independent
+    if path == "contact.depths" and independent and np.any(high[:-1] >= low[1:]):
         raise KeyProblem((*where, "independent"), "true", "false, or depths that keep their order")
     if path == "rig.simulator.coefficients" and mechanism.rig.simulator.model == "third_order":
-        largest = high[2] if uncertainty.independent else low[2]
+        largest = high[2] if independent else low[2]
         if not low[0] * low[1] > largest:
             allowed = "a stable motion simulator throughout: a1 a2 > a3"
             raise KeyProblem(where, "values for which it is not stable", allowed)
     return low, high
-
-
-def _span(where: tuple[str, str], path: str, uncertainty: Uncertainty, nominal: np.ndarray) -> _Span:
-    """Least and greatest value of each entry when drawn; `KeyProblem` for a wrong distribution."""
-    kind = uncertainty.distribution
-    given = {k for k in ("low", "high", "factor", "std") if getattr(uncertainty, k) is not None}
-    wanted = [{"std"}] if kind == "normal" else [{"factor"}, {"low", "high"}]
-    if given not in wanted:
-        found = " and ".join(sorted(given)) or "no range"
-        allowed = "std" if kind == "normal" else "either factor, or both low and high"
-        raise KeyProblem(where, found, f"{allowed} for {kind}")
-    single = uncertainty.independent or np.all(nominal == nominal.flat[0])
-    if not single and nominal.flat[0] == 0.0 and uncertainty.factor is None:
-        raise KeyProblem(where, f"0 as the first entry of {path}", "a factor, or independent = true")
-    if kind == "normal":
-        allowed = numeric_keys()[path]
-        return np.full_like(nominal, allowed.low), np.full_like(nominal, allowed.high)
-    bounds = uncertainty.factor or [uncertainty.low or 0.0, uncertainty.high or 0.0]
-    key = "factor" if uncertainty.factor else "low"
-    if not bounds[0] < bounds[1]:
-        raise KeyProblem((*where, key), shown(bounds), "low < high")
-    if kind == "loguniform" and not bounds[0] > 0.0:
-        raise KeyProblem((*where, key), shown(bounds[0]), "a number > 0 for loguniform")
-    # An end that overflows is infinite, and refused as such.
-    with np.errstate(over="ignore"):
-        if uncertainty.factor:
-            ends = [nominal * bound for bound in bounds]
-        elif single:
-            ends = [np.full_like(nominal, bound) for bound in bounds]
-        else:
-            ends = [nominal * (bound / nominal.flat[0]) for bound in bounds]
-    return np.minimum(*ends), np.maximum(*ends)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
@@ -38,6 +38,7 @@ __all__ = [
     "is_computable",
     "numeric_keys",
     "range_of",
+    "ranges_of",
     "schema_type",
     "value_at",
 ]
@@ -322,6 +323,12 @@ def schema_type() -> msgspec.inspect.StructType:
 @functools.cache
 def numeric_keys() -> dict[str, Range]:
     """Every key of real numbers by dotted path, and its allowed values (or its entries')."""
+    return ranges_of(schema_type(), PLAIN)
+
+
+def ranges_of(kind: msgspec.inspect.Type, names: Mapping[str, Sequence[str]]) -> dict[str, Range]:
+    """Every key of real numbers below a struct, by dotted path; `names` are those of the tables that a
+    dictionary holds, by its path."""
     keys: dict[str, Range] = {}
 
     def visit(kind: msgspec.inspect.Type, path: str, extra: Mapping[str, Any] = PLAIN) -> None:
@@ -329,7 +336,7 @@ def numeric_keys() -> dict[str, Range]:
             case msgspec.inspect.StructType(fields=fields):
                 for entry in fields:
                     if entry.name != "correlation":  # its numbers speak of other keys
-                        visit(entry.type, f"{path}.{entry.name}".lstrip("."))
+                        visit(entry.type, f"{path}.{entry.encode_name}".lstrip("."))
             case msgspec.inspect.Metadata(type=inner):
                 visit(inner, path, kind.extra or PLAIN)
             case msgspec.inspect.UnionType(types=members):
@@ -337,15 +344,30 @@ def numeric_keys() -> dict[str, Range]:
                     visit(member, path, extra)
             case msgspec.inspect.ListType(item_type=item):
                 visit(item, path)
+            case msgspec.inspect.DictType(value_type=table):
+                for name in names.get(path, ()):
+                    visit(table, f"{path}.{name}")
             case msgspec.inspect.FloatType():
                 keys[path] = range_of(kind, extra)
             case _:
                 pass
 
-    visit(schema_type(), "")
+    visit(kind, "")
     return keys
 
 
-def value_at(mechanism: Mechanism, path: str) -> Any:
-    """The value at a dotted path of struct fields, such as ``rig.simulator.delay``."""
-    return functools.reduce(getattr, path.split("."), mechanism)
+def value_at(mechanism: Struct, path: str) -> Any:
+    """The value at a dotted path of keys, such as ``rig.simulator.delay``; None below a table that is not
+    there."""
+    return functools.reduce(_within, path.split("."), mechanism)
+
+
+def _within(table: Any, key: str) -> Any:
+    if table is None:
+        return None
+    if isinstance(table, dict):
+        return table.get(key)
+    if key in table.__struct_fields__:
+        return getattr(table, key)
+    fields = dict(zip(table.__struct_encode_fields__, table.__struct_fields__, strict=True))
+    return getattr(table, fields[key])

@@ -10,7 +10,8 @@ On a list one draw scales all of it: by the factor drawn, or, for values in the 
 by the draw for the first entry over that entry (when all entries are equal the draw is their
 common value). With ``independent = true`` every entry has a draw of its own. The phase of each
 contact within a control period is drawn as well, each contact its own, uniform on 0..1 unless the
-table says otherwise: the phase alone moves the restitution, and nobody controls it.
+table says otherwise: the phase alone moves the restitution, and nobody controls it. In six axes it is that
+of the first touch, and there is none where the start is stated.
 
 Draw number i depends on the seed, on i, on its own entry of the table, and on the keys that ``[correlation]``
 names before it (`jaxhil.mechanism.correlation`): neither on how many draws are made at once, nor on the other
@@ -27,9 +28,12 @@ import numpy as np
 from scipy import special
 
 from jaxhil.mechanism.correlation import correlated
+from jaxhil.mechanism.six_axes import SixAxisMechanism, numeric_keys_of
 from jaxhil.mechanism.structs import Mechanism, Range, Uncertainty, numeric_keys, value_at
 
 __all__ = ["PHASE", "at_points", "dimensions", "draw", "extremes", "quantiles", "quasi_random"]
+
+AnyMechanism = Mechanism | SixAxisMechanism
 
 PHASE = "approach.phase"
 BLOCK = 1024
@@ -39,12 +43,12 @@ _LARGEST = 1.0 - 2.0**-53  # of a generator's uniform numbers
 _UNIFORM_PHASE = Uncertainty(distribution="uniform", low=0.0, high=1.0)
 
 
-def draw(mechanism: Mechanism, number: int, seed: int, first: int = 0) -> dict[str, np.ndarray]:
+def draw(mechanism: AnyMechanism, number: int, seed: int, first: int = 0) -> dict[str, np.ndarray]:
     """Draws `first` to `first + number - 1` of every uncertain number of a valid mechanism.
 
     Returns by dotted path an array of shape ``(number,)`` for a number, ``(number, *entries)`` for
-    a list, and ``(number, contacts)`` for ``approach.phase``, which is always there; units of the
-    key. Uniform numbers come from a Philox generator per key and block of 1024 draws, and go
+    a list, and on one axis ``(number, contacts)`` for ``approach.phase``, which is always there; units of
+    the key. Uniform numbers come from a Philox generator per key and block of 1024 draws, and go
     through the inverse of the distribution function. Raises ValueError for a negative argument.
     """
     if number < 0 or seed < 0 or first < 0:
@@ -54,7 +58,7 @@ def draw(mechanism: Mechanism, number: int, seed: int, first: int = 0) -> dict[s
     return _values(mechanism, correlated(mechanism, uniform))
 
 
-def quasi_random(mechanism: Mechanism, number: int, seed: int) -> dict[str, np.ndarray]:
+def quasi_random(mechanism: AnyMechanism, number: int, seed: int) -> dict[str, np.ndarray]:
     """Like `draw`, with the uniform numbers of a scrambled Sobol sequence, one point per draw.
 
     The points fill the box of all uncertain numbers more evenly than random ones; best for a power
@@ -72,7 +76,7 @@ def quasi_random(mechanism: Mechanism, number: int, seed: int) -> dict[str, np.n
     return at_points(mechanism, points)
 
 
-def at_points(mechanism: Mechanism, points: np.ndarray) -> dict[str, np.ndarray]:
+def at_points(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
     """The draws that belong to points of the unit box, (number, sum of `dimensions`), as `draw` returns them.
 
     Coordinates that vary together are made to, and each goes through the inverse of its distribution
@@ -81,28 +85,31 @@ def at_points(mechanism: Mechanism, points: np.ndarray) -> dict[str, np.ndarray]
     return _values(mechanism, correlated(mechanism, _by_key(mechanism, points)))
 
 
-def quantiles(mechanism: Mechanism, points: np.ndarray) -> dict[str, np.ndarray]:
+def quantiles(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
     """Like `at_points`, each key by itself: its quantile at its coordinates, whatever it varies with."""
     return _values(mechanism, _by_key(mechanism, points))
 
 
-def extremes(mechanism: Mechanism) -> dict[str, np.ndarray]:
+def extremes(mechanism: AnyMechanism) -> dict[str, np.ndarray]:
     """Every uncertain number at one end of what can be drawn, then at the other, whatever it varies with."""
     ends = np.array([[0.0], [_LARGEST]])
     return quantiles(mechanism, np.repeat(ends, sum(dimensions(mechanism).values()), axis=1))
 
 
-def dimensions(mechanism: Mechanism) -> dict[str, int]:
+def dimensions(mechanism: AnyMechanism) -> dict[str, int]:
     """How many uniform numbers each key takes: sorted by path, the phases last."""
     columns = {}
     for path in sorted(set(mechanism.uncertainty) - {PHASE}):
         independent = mechanism.uncertainty[path].independent
         columns[path] = np.size(value_at(mechanism, path)) if independent else 1
-    columns[PHASE] = mechanism.approach.contacts
+    if isinstance(mechanism, Mechanism):
+        columns[PHASE] = mechanism.approach.contacts
+    elif mechanism.approach is not None:
+        columns[PHASE] = 1
     return columns
 
 
-def _by_key(mechanism: Mechanism, points: np.ndarray) -> dict[str, np.ndarray]:
+def _by_key(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
     columns = dimensions(mechanism)
     edges = np.cumsum(list(columns.values()))[:-1]
     return dict(zip(columns, np.split(points, edges, axis=1), strict=True))
@@ -121,14 +128,16 @@ def _uniform(path: str, count: int, number: int, seed: int, first: int) -> np.nd
     return np.concatenate(blocks)[skipped : skipped + number]
 
 
-def _values(mechanism: Mechanism, uniform: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _values(mechanism: AnyMechanism, uniform: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    one_axis = isinstance(mechanism, Mechanism)
+    ranges = numeric_keys() if one_axis else numeric_keys_of(mechanism)
     return {
         path: _key_values(
             np.asarray(value_at(mechanism, path), dtype=float),
             mechanism.uncertainty.get(path, _UNIFORM_PHASE),
-            numeric_keys()[path],
+            ranges[path],
             numbers,
-            path == PHASE,
+            one_axis and path == PHASE,
         )
         for path, numbers in uniform.items()
     }

@@ -87,6 +87,28 @@ class Drogue(Shape):
         return Surface(jnp.where(on_wall, wall, bottom.distance), _either(on_wall, inward, bottom.normal))
 
 
+class Shell(Drogue):
+    """A drogue that ends at its mouth: a thin shell, which is touched from outside as from inside.
+
+    A sphere that meets it needs a radius.
+    """
+
+    mouth_radius: Float[Array, "..."]  # of the wall's edge [m]
+
+    def surface(self, point):
+        signed, inward = super().surface(point)
+        side = jnp.where(signed < 0, -1, 1).astype(signed.dtype)
+        sine, cosine = jnp.sin(self.half_angle), jnp.cos(self.half_angle)
+        height = self.bottom + (self.mouth_radius * cosine - self.bottom_radius) / sine
+        edge = Rim(self.mouth_radius, height, jnp.zeros_like(height)).surface(point)
+        radius, _ = _radial(point)
+        # Where the foot on the wall would be: beyond the mouth the edge is nearest.
+        on_wall = radius * sine + (point.z - self.bottom) * cosine > 0
+        beyond = on_wall & (radius + signed * cosine > self.mouth_radius)
+        distance = jnp.where(beyond, edge.distance, side * signed)
+        return Surface(distance, _either(beyond, edge.normal, side * inward))
+
+
 class Rim(Shape):
     """A ring about z, of round section: the rim of a drogue's mouth."""
 

@@ -114,6 +114,12 @@ class Simulate:
     plot: Annotated[
         str | None, arg(metavar="[PICTURE]", help=f"Plot to a .png, .pdf or .svg file; bare: {DEFAULT_PLOT}.")
     ] = None
+    animate: Annotated[
+        str | None,
+        text(
+            "FILM", "Of a mechanism of six axes: the contact in space beside that on the rig, .gif or .mp4."
+        ),
+    ] = None
     log: Annotated[
         str | None, text("FILE", "Write every tick to a CSV file, as a rig's log, which identify reads.")
     ] = None

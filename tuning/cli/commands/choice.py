@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from jaxhil.errors import InputError, one_line, shown
-from jaxhil.mechanism.file import from_builtins, load, to_builtins
+from jaxhil.mechanism.file import AnyMechanism, from_builtins, load, load_any, to_builtins
 from jaxhil.mechanism.structs import Mechanism
 from tuning.cli.options import Simulate
 from tuning.cli.options_report import Map
@@ -12,12 +12,19 @@ from tuning.front_door import arguments
 
 def named(options: Simulate | Map) -> Mechanism | None:
     """The mechanism of FILE, None where a gain file's is meant. Raises `InputError`, for an unknown
-    compensator too; imports no jax."""
+    compensator too, or one of six axes; imports no jax."""
+    return load(options.file, options.overrides, options.unset).mechanism if _by_file(options) else None
+
+
+def named_any(options: Simulate) -> AnyMechanism | None:
+    """Likewise, of one axis or of six."""
+    return load_any(options.file, options.overrides, options.unset).mechanism if _by_file(options) else None
+
+
+def _by_file(options: Simulate | Map) -> bool:
     if options.compensator is not None:
         arguments.compensators([options.compensator])
-    if options.gains is not None and options.file is None:
-        return None
-    return load(options.file, options.overrides, options.unset).mechanism
+    return options.gains is None or options.file is not None
 
 
 def chosen(options: Simulate | Map, mechanism: Mechanism | None) -> tuple[Mechanism, str, str | Path | None]:

@@ -1,5 +1,6 @@
 """`jaxhil init`: a mechanism file to start from, written where no file is."""
 
+import json
 import shlex
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import msgspec
 
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.files import write_new, writing
-from jaxhil.mechanism.file import DEFAULT, builtin_names, builtin_path, load, suite_names
+from jaxhil.mechanism.file import DEFAULT, builtin_names, builtin_path, load, six_axis_names, suite_names
 from jaxhil.mechanism.template import commented
 from tuning import terminal
 from tuning.cli.commands import checks
@@ -18,7 +19,7 @@ SUFFIX = ".toml"
 
 def run(options: Init) -> int:
     """Write it, or list the names; always 0."""
-    names = [*builtin_names(), *suite_names()]
+    names = [*builtin_names(), *suite_names(), *six_axis_names()]
     if options.list:
         if options.json:
             terminal.emit_json({"names": names})
@@ -33,18 +34,31 @@ def run(options: Init) -> int:
     builtin_path(source)  # refuses a name that is not built in
     path = Path(output or f"mechanism{SUFFIX}")
     name = one_line(path.name.removesuffix(SUFFIX), 100) or source
-    mechanism = msgspec.structs.replace(load(source).mechanism, name=name)
+    text = _of_six_axes(source, name) if source in six_axis_names() else _of_one_axis(source, name)
     place = one_line(str(path))
     checks.output(path.parent)
     with writing(path):
         try:
-            write_new(path, commented(mechanism).encode())
+            write_new(path, text.encode())
         except FileExistsError:
             taken = "found something there, allowed a name that is not taken: nothing is overwritten"
             raise InputError(f"--output: {place}: {taken}") from None
     if options.json:
         terminal.emit_json({"file": str(path), "name": name, "from": source})
     else:
-        then = f"jaxhil tune {shlex.quote(place)}"
+        command = "simulate" if source in six_axis_names() else "tune"
+        then = f"jaxhil {command} {shlex.quote(place)}"
         terminal.emit(f"{place}: written, with the values of {source}. Change it, then: {then}")
     return 0
+
+
+def _of_one_axis(source: str, name: str) -> str:
+    """Every key with its meaning, at the values of a built-in mechanism."""
+    return commented(msgspec.structs.replace(load(source).mechanism, name=name))
+
+
+def _of_six_axes(source: str, name: str) -> str:
+    """The built-in file as it is, under another name: its comments say what its keys are."""
+    # A mechanism's name is printable: JSON's text of it is TOML's.
+    named = f"name = {json.dumps(name, ensure_ascii=False)}"
+    return builtin_path(source).read_text(encoding="utf-8").replace(f'name = "{source}"', named, 1)

@@ -3,8 +3,17 @@
 import math
 from typing import Any
 
-from jaxhil.mechanism.file import DEFAULT, builtin_names, builtin_path, load, suite_names
+from jaxhil.mechanism.file import (
+    DEFAULT,
+    builtin_names,
+    builtin_path,
+    load,
+    load_any,
+    six_axis_names,
+    suite_names,
+)
 from jaxhil.mechanism.json_schema import json_schema
+from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
 from tuning import terminal
 from tuning.cli.options import Mechanisms
@@ -19,9 +28,10 @@ def run(options: Mechanisms) -> int:
     tables = {
         title: [_entry(name, load(name).mechanism) for name in names] for title, names in titles.items()
     }
+    in_space = [_entry_in_space(name) for name in six_axis_names()]
     if options.json:
         mechanisms, suites = tables.values()
-        terminal.emit_json({"mechanisms": mechanisms, "suites": suites})
+        terminal.emit_json({"mechanisms": mechanisms, "suites": suites, "six_axes": in_space})
         return 0
     headings = ["name", "law", "contacts", "mass [kg]", "contact frequencies [Hz]"]
     for title, entries in tables.items():
@@ -29,6 +39,14 @@ def run(options: Mechanisms) -> int:
             terminal.table(title, headings, [_row(entry) for entry in entries], texts=(0, 1, 4)),
             *(f"{entry['name']}: {entry['source']}\n" for entry in entries),
         )
+    rows = [[*(one[key] for key in COLUMNS), " ".join(one["laws"])] for one in in_space]
+    terminal.emit(
+        terminal.table(
+            "Built-in mechanisms of six axes (simulate alone knows them so far)",
+            ["name", "masses [kg]", "pairs of shapes", "laws"], rows, texts=(0, 1, 3),
+        ),
+        *(f"{one['name']}: {one['source']}\n" for one in in_space),
+    )  # fmt: skip
     terminal.emit(f"The files are in {builtin_path(DEFAULT).parent}; `jaxhil init NAME` copies one.")
     return 0
 
@@ -45,6 +63,24 @@ def _entry(name: str, mechanism: Mechanism) -> dict[str, Any]:
         "contacts": mechanism.approach.contacts,
         "mass": mechanism.bodies.mass,
         "contact_frequencies": _frequencies(mechanism),
+        "control_period": mechanism.rig.control_period,
+        "source": mechanism.source,
+        "path": str(builtin_path(name)),
+    }
+
+
+COLUMNS = ("name", "masses", "pairs")
+
+
+def _entry_in_space(name: str) -> dict[str, Any]:
+    mechanism = load_any(name).mechanism
+    assert isinstance(mechanism, SixAxisMechanism)
+    contacts = mechanism.contact.values()
+    return {
+        "name": name,
+        "masses": f"{mechanism.target.mass:g} and {mechanism.chaser.mass:g}",
+        "pairs": sum(contact.pattern.count if contact.pattern else 1 for contact in contacts),
+        "laws": sorted({contact.law for contact in contacts}),
         "control_period": mechanism.rig.control_period,
         "source": mechanism.source,
         "path": str(builtin_path(name)),

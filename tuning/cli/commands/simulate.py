@@ -3,11 +3,13 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jaxhil.errors import InputError, shown
+from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.environment import prepare
 from tuning import terminal
-from tuning.cli.commands import checks
-from tuning.cli.commands.choice import chosen, named
+from tuning.cli.commands import checks, simulate_six
+from tuning.cli.commands.choice import chosen, named_any
 from tuning.cli.options import Simulate
 from tuning.front_door import arguments, meaning
 
@@ -26,7 +28,14 @@ def run(options: Simulate) -> int:
         checks.picture(options.plot)
     if options.log is not None:
         checks.file(options.log)
-    mechanism = named(options)
+    mechanism = named_any(options)
+    if isinstance(mechanism, SixAxisMechanism):
+        simulate_six.check(options)
+        prepare()
+        return simulate_six.run(options, mechanism)
+    if options.animate is not None:
+        allowed = "none: there is an animation of six axes only"
+        raise InputError(f"--animate: found {shown(options.animate)}, allowed {allowed}")
     prepare()
     from jaxhil.simulation.run import simulate
 

@@ -1,0 +1,151 @@
+"""Rules of the contacts of a mechanism file of six axes: which shapes can touch, and which keys they have."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxhil.errors import shown
+from jaxhil.mechanism.conversion import KeyProblem, Path
+from jaxhil.mechanism.rules import LAWS_OF_KEYS, UNDAMPED
+from jaxhil.mechanism.six_axes import Contact, Friction, Shape, SixAxisMechanism
+from jaxhil.mechanism.structs import BUILT_IN_LAWS
+
+__all__ = ["check_contact"]
+
+# Keys that each shape needs, and those that it may have.
+KEYS_OF_SHAPES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "sphere": (("centre", "radius"), ("inside",)),
+    "plane": (("point", "normal"), ()),
+    "drogue": (("half_angle", "bottom_radius", "bottom"), ("mouth_radius",)),
+    "capsule": (("from", "to", "radius"), ()),
+    "box": (("centre", "half_lengths", "rounding"), ("rotation",)),
+}
+KEYS_OF_FRICTION: Mapping[str, tuple[str, ...]] = {
+    "regularised": ("slip",),
+    "bristle": ("stiffness", "damping"),
+}
+# Keys of some contact laws alone, as they are called here.
+_LAWS_OF_KEYS = {**LAWS_OF_KEYS, "dry_friction": LAWS_OF_KEYS["friction"]}
+del _LAWS_OF_KEYS["friction"]
+_DEFAULTS: Mapping[str, Any] = {
+    "tension": False, "exponent": 1.5, "depths": [], "reference_depth": None, "unloading_ratio": None,
+    "preload": 0.0, "dry_friction": 0.0,
+}  # fmt: skip
+
+
+def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> None:
+    """The contact's shapes can touch, and its keys are those of its shapes and laws. Raises `KeyProblem`."""
+    path: Path = ("contact", name)
+    for body in ("chaser", "target"):
+        _check_shape((*path, body), getattr(contact, body))
+    _check_pair(path, contact)
+    if contact.target_pattern is not None and contact.pattern is None:
+        raise KeyProblem(
+            (*path, "target_pattern"), "a table", "nothing, or pattern = { count = N } beside it"
+        )
+    _check_law(mechanism, path, contact)
+    if contact.friction is not None:
+        _check_friction((*path, "friction"), contact.friction)
+
+
+def _check_shape(path: Path, shape: Shape) -> None:
+    needed, more = KEYS_OF_SHAPES[shape.shape]
+    for key, value in _given(shape).items():
+        if key in needed and value is None:
+            kind = "a number" if key in ("radius", "half_angle", "bottom_radius", "bottom") else "a list"
+            raise KeyProblem((*path, key), "nothing", f"{kind} ({shape.shape} needs it)")
+        if key not in (*needed, *more) and value not in (None, False):
+            raise KeyProblem((*path, key), shown(value), f"nothing ({shape.shape} does not use it: unset it)")
+    if shape.shape == "plane" and not np.any(shape.normal):
+        raise KeyProblem((*path, "normal"), shown(shape.normal), "a direction, outwards from the body")
+    if shape.shape == "capsule" and shape.start == shape.end:
+        raise KeyProblem((*path, "to"), "the point that is from", "another point; a sphere has one")
+    if shape.shape == "sphere" and shape.inside and not shape.radius:
+        raise KeyProblem((*path, "radius"), "0.0", "a number > 0 m, as it is touched from inside")
+    if shape.mouth_radius is not None:
+        least = (shape.bottom_radius or 0.0) * math.cos(shape.half_angle or 0.0)
+        if not shape.mouth_radius > least:
+            allowed = f"a number > {least:g} m, where the rounded bottom ends"
+            raise KeyProblem((*path, "mouth_radius"), shown(shape.mouth_radius), allowed)
+    if shape.shape == "box":
+        smallest = min(shape.half_lengths or [0.0])
+        if (shape.rounding or 0.0) > smallest:
+            raise KeyProblem(
+                (*path, "rounding"), shown(shape.rounding), f"at most half_lengths, {smallest:g} m"
+            )
+
+
+def _check_pair(path: Path, contact: Contact) -> None:
+    chaser, target = contact.chaser, contact.target
+    if chaser.shape == "drogue":
+        raise KeyProblem(
+            (*path, "chaser", "shape"), "drogue", "a drogue on the target, where it opens along +z"
+        )
+    balls = [one.shape == "sphere" and not one.inside for one in (chaser, target)]
+    if not any(balls) and not chaser.shape == target.shape == "capsule":
+        found = f"{target.shape} against the chaser's {chaser.shape}"
+        raise KeyProblem((*path, "target", "shape"), found, "a sphere on either body, or two capsules")
+    if target.mouth_radius is not None and not chaser.radius:
+        allowed = "a number > 0 m: a drogue with a mouth is a thin shell"
+        raise KeyProblem((*path, "chaser", "radius"), shown(chaser.radius), allowed)
+    for body, ball, other in (("chaser", chaser, target), ("target", target, chaser)):
+        narrow = other.bottom_radius if other.shape == "drogue" else other.radius if other.inside else None
+        if narrow is not None and not (ball.radius or 0.0) < narrow:
+            allowed = f"a number < {narrow:g} m, the radius that it is to fit into"
+            raise KeyProblem((*path, body, "radius"), shown(ball.radius), allowed)
+
+
+def _check_law(mechanism: SixAxisMechanism, path: Path, contact: Contact) -> None:
+    law, nested = contact.law, contact.law == "piecewise_linear"
+    if nested and not contact.depths:
+        raise KeyProblem(
+            (*path, "depths"), "no entries", "at least one depth (law piecewise_linear needs it)"
+        )
+    for i, (depth, deeper) in enumerate(zip(contact.depths, contact.depths[1:], strict=False)):
+        if deeper <= depth:
+            raise KeyProblem((*path, "depths", i + 1), shown(deeper), f"a depth > the one before, {depth:g}")
+    slopes = contact.stiffness if isinstance(contact.stiffness, list) else []
+    if nested and len(slopes) != len(contact.depths) + 1:
+        allowed = f"a list of {len(contact.depths) + 1} slopes, one more than depths (law piecewise_linear)"
+        raise KeyProblem((*path, "stiffness"), shown(contact.stiffness), allowed)
+    if slopes and not nested:
+        raise KeyProblem((*path, "stiffness"), shown(contact.stiffness), f"a number > 0 (law {law})")
+    for key, laws in _LAWS_OF_KEYS.items():
+        value, default = getattr(contact, key), _DEFAULTS[key]
+        if law in laws and value is None:
+            raise KeyProblem((*path, key), "nothing", f"a number > 0 (law {law} needs it)")
+        if law not in laws and law in BUILT_IN_LAWS:
+            only = f"only for law {' or '.join(laws)}"
+            if value != default:
+                raise KeyProblem((*path, key), shown(value), f"nothing ({only})")
+            uncertain = ".".join((*map(str, path), key))
+            if uncertain in mechanism.uncertainty and value not in (None, []):
+                raise KeyProblem(("uncertainty", uncertain), f"a key {only}", "keys that the law uses")
+    uncertain = mechanism.uncertainty.get(f"contact.{path[1]}.damping")
+    if law in UNDAMPED and (contact.damping or (uncertain is not None and uncertain.factor is None)):
+        found = shown(contact.damping) if contact.damping else "an uncertain damping"
+        raise KeyProblem((*path, "damping"), found, f"0 (law {law} dissipates by {UNDAMPED[law]})")
+    if law == "linear" and contact.damping:
+        raise KeyProblem(
+            (*path, "damping"), shown(contact.damping), "0 (law linear has none), or kelvin_voigt"
+        )
+
+
+def _check_friction(path: Path, friction: Friction) -> None:
+    for law, keys in KEYS_OF_FRICTION.items():
+        for key in keys:
+            value = getattr(friction, key)
+            if law == friction.law and value is None and key != "damping":
+                raise KeyProblem((*path, key), "nothing", f"a number > 0 ({law} needs it)")
+            if law != friction.law and value is not None:
+                raise KeyProblem((*path, key), shown(value), f"nothing ({friction.law} does not use it)")
+
+
+def _given(shape: Shape) -> dict[str, Any]:
+    """Every key but the shape's name, as the file calls it, with its value."""
+    names = zip(shape.__struct_encode_fields__, shape.__struct_fields__, strict=True)
+    return {key: getattr(shape, name) for key, name in names if name != "shape"}

@@ -1,0 +1,187 @@
+"""Rules of a mechanism file of six axes that join several keys: bodies, start, rig, what is uncertain.
+
+As in `jaxhil.mechanism.rules`, each raises a `KeyProblem` that names the key to change. Those of shapes and
+contact laws are in `jaxhil.mechanism.six_axes_contacts`.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from jaxhil.errors import shown
+from jaxhil.mechanism.conversion import KeyProblem, Path
+from jaxhil.mechanism.correlation import check_correlation
+from jaxhil.mechanism.rules import FIXED, check_model, check_texts
+from jaxhil.mechanism.six_axes import Inertia, Rig, RigidBody, SixAxisMechanism, Start, numeric_keys_of
+from jaxhil.mechanism.six_axes_contacts import check_contact
+from jaxhil.mechanism.uncertainty_rules import check_uncertainty
+
+__all__ = ["check_six_axes", "inertia_matrix"]
+
+LARGEST_ATTITUDE = 1.0  # rad, of C against T at the start
+MOMENTS = 1e-9  # by how much of itself a moment of inertia may exceed the sum of the others
+UNIT = 1e-6  # by how much a quaternion's norm may differ from 1
+NAME = re.compile(r"[A-Za-z0-9_-]{1,60}")
+
+
+def check_six_axes(mechanism: SixAxisMechanism) -> None:
+    """Every rule in turn; raises `KeyProblem` for the first one broken."""
+    check_texts(mechanism)
+    for name, body in (("target", mechanism.target), ("chaser", mechanism.chaser)):
+        _check_body(name, body)
+    _check_start(mechanism)
+    for name, contact in mechanism.contact.items():
+        if not NAME.fullmatch(name):
+            raise KeyProblem(("contact", name), "this name", "at most 60 letters, digits, - and _")
+        check_contact(mechanism, name, contact)
+    check_model(mechanism.rig.simulator)
+    _check_hold(mechanism)
+    _check_sensor(mechanism.rig)
+    for path in mechanism.uncertainty:
+        _check_uncertainty(mechanism, path)
+    check_correlation(mechanism)
+
+
+def inertia_matrix(inertia: Inertia) -> np.ndarray:
+    """Three moments, or three rows, as a matrix (3, 3); drawn ones (..., 3) or (..., 3, 3) likewise."""
+    given = np.asarray(inertia, float)
+    return given if given.shape[-2:] == (3, 3) else given[..., None] * np.eye(3)
+
+
+def _check_body(name: str, body: RigidBody) -> None:
+    _check_inertia((name, "inertia"), body.inertia)
+    angle = float(np.linalg.norm(body.interface_rotation))
+    if not angle < np.pi:
+        found = f"a rotation by {angle:.4g} rad"
+        raise KeyProblem((name, "interface_rotation"), found, "a rotation vector shorter than pi")
+
+
+def _check_inertia(path: Path, inertia: Inertia, *, massless: bool = False) -> None:
+    """Symmetric and positive definite, no principal moment more than the sum of the others; all 0 where it
+    may be `massless`."""
+    if len({isinstance(entry, list) for entry in inertia}) > 1:
+        raise KeyProblem(path, shown(inertia), "three moments, or three rows of three entries")
+    matrix = inertia_matrix(inertia)
+    size = np.max(np.abs(matrix))
+    if massless and size == 0:
+        return
+    if np.any(np.abs(matrix - matrix.T) > 1e-12 * size):
+        row, column = np.argwhere(np.abs(matrix - matrix.T) > 1e-12 * size)[0]
+        found = (
+            f"{matrix[row, column]:g} at row {row + 1}, column {column + 1}, {matrix[column, row]:g} there"
+        )
+        raise KeyProblem(path, found + " transposed", "a symmetric matrix")
+    first, second, third = (float(one) for one in np.linalg.eigvalsh(matrix / size) * size)
+    if not first > 0:
+        raise KeyProblem(path, f"a principal moment of {first:g} kg m^2", "positive principal moments")
+    if third > (first + second) * (1 + MOMENTS):
+        found = f"principal moments {first:.6g}, {second:.6g} and {third:.6g} kg m^2"
+        allowed = "those of a body: none more than the sum of the other two"
+        raise KeyProblem(path, found, allowed)
+
+
+def _check_start(mechanism: SixAxisMechanism) -> None:
+    approach, start = mechanism.approach, mechanism.start
+    if (approach is None) == (start is None):
+        if start is None:
+            raise KeyProblem(
+                ("approach",), "nothing", "[approach], or [start] with the states of both bodies"
+            )
+        raise KeyProblem(("start",), "[approach] beside it", "one of the two")
+    if start is not None:
+        _check_states(start)
+    if approach is None:
+        return
+    if not mechanism.contact:
+        raise KeyProblem(("contact",), "nothing", "[contact.NAME]: an approach ends in a touch")
+    angle = float(np.linalg.norm(approach.attitude))
+    if angle > LARGEST_ATTITUDE:
+        allowed = f"a rotation vector of at most {LARGEST_ATTITUDE:g} rad"
+        raise KeyProblem(("approach", "attitude"), f"a rotation by {angle:.4g} rad", allowed)
+    if not approach.velocity[2] < 0:
+        allowed = "a number < 0 m/s: the z axis of T points to the chaser, which comes along -z"
+        raise KeyProblem(("approach", "velocity", 2), shown(approach.velocity[2]), allowed)
+    _check_sides(mechanism)
+
+
+def _check_states(start: Start) -> None:
+    for name, state in (("target", start.target), ("chaser", start.chaser)):
+        norm = float(np.linalg.norm(state.attitude))
+        if not abs(norm - 1) <= UNIT:
+            allowed = f"a quaternion (w, x, y, z) of norm 1, to {UNIT:g}"
+            raise KeyProblem(("start", name, "attitude"), f"one of norm {norm:.8g}", allowed)
+
+
+def _check_sides(mechanism: SixAxisMechanism) -> None:
+    """Each body is on its side of the interface: else an axis was taken the wrong way round."""
+    for name, body, side in (("target", mechanism.target, 1.0), ("chaser", mechanism.chaser, -1.0)):
+        axis = _turned(body.interface_rotation, np.array([0.0, 0.0, 1.0]))
+        along = float(axis @ np.asarray(body.interface))
+        if along * side < 0:
+            where = "behind T, at negative z" if side > 0 else "beyond C, at positive z"
+            found = f"a centre of mass at z = {-along:g} m of the interface frame"
+            raise KeyProblem((name, "interface"), found, f"one {where}: z points from target to chaser")
+
+
+def _turned(rotation: list[float], vector: np.ndarray) -> np.ndarray:
+    """exp(rotation) vector (Rodrigues)."""
+    turn = np.asarray(rotation, float)
+    angle = float(np.linalg.norm(turn))
+    if angle == 0:
+        return vector
+    axis = turn / angle
+    across = np.cross(axis, vector)
+    return vector + np.sin(angle) * across + (1 - np.cos(angle)) * np.cross(axis, across)
+
+
+def _check_hold(mechanism: SixAxisMechanism) -> None:
+    # As on one axis: an ideal simulator that jumps has no velocity for a damper, or for friction.
+    rig = mechanism.rig
+    damped = any(contact.damping or contact.friction or contact.dry_friction
+                 for contact in mechanism.contact.values())  # fmt: skip
+    if rig.simulator.model == "ideal" and rig.command_hold == "zoh" and damped:
+        allowed = '"linear" for an ideal simulator with contact damping or friction (or another model)'
+        raise KeyProblem(("rig", "command_hold"), shown(rig.command_hold), allowed)
+
+
+def _check_sensor(rig: Rig) -> None:
+    sensor, path = rig.force_sensor, ("rig", "force_sensor")
+    mixed = np.eye(6) + np.asarray(sensor.crosstalk)
+    if not np.linalg.cond(mixed) < 100:
+        found = "channels that are nearly the same"
+        raise KeyProblem((*path, "crosstalk"), found, "entries of which 1 + E has a condition below 100")
+    if sensor.side == "fixed":
+        for key, given in (("tool", sensor.tool), ("gravity", any(sensor.gravity) or None)):
+            if given is not None:
+                value = "a table" if key == "tool" else shown(sensor.gravity)
+                allowed = 'nothing (a fixed sensor carries no tool that moves: unset it, or side = "moving")'
+                raise KeyProblem((*path, key), value, allowed)
+        if rig.position_sensor.delay:
+            allowed = '0 (a fixed force sensor is not turned back by the pose), or side = "moving"'
+            raise KeyProblem(("rig", "position_sensor", "delay"), shown(rig.position_sensor.delay), allowed)
+        return
+    if sensor.tool is None:
+        raise KeyProblem((*path, "tool"), "nothing", 'a table with mass and com (side = "moving" needs it)')
+    for key in ("inertia", "inertia_assumed"):
+        given = getattr(sensor.tool, key)
+        if given is not None:
+            _check_inertia((*path, "tool", key), given, massless=True)
+
+
+def _check_uncertainty(mechanism: SixAxisMechanism, path: str) -> None:
+    low, high = check_uncertainty(mechanism, path, numeric_keys_of(mechanism), FIXED)
+    where, uncertainty = ("uncertainty", path), mechanism.uncertainty[path]
+    if path.endswith((".inertia", ".inertia_assumed")) and uncertainty.independent and low.ndim == 2:
+        allowed = "false, or three moments: rows drawn apart are not symmetric"
+        raise KeyProblem((*where, "independent"), "true", allowed)
+    if path.endswith(".depths") and uncertainty.independent and np.any(high[:-1] >= low[1:]):
+        raise KeyProblem((*where, "independent"), "true", "false, or depths that keep their order")
+    if path == "approach.velocity" and uncertainty.distribution != "normal" and not high[2] < 0:
+        raise KeyProblem(where, f"a z component as far as {high[2]:g}", "draws below 0 m/s")
+    if path == "rig.simulator.coefficients" and mechanism.rig.simulator.model == "third_order":
+        largest = high[2] if uncertainty.independent else low[2]
+        if not low[0] * low[1] > largest:
+            allowed = "a stable motion simulator throughout: a1 a2 > a3"
+            raise KeyProblem(where, "values for which it is not stable", allowed)

@@ -1,0 +1,137 @@
+"""The contacts of a mechanism file of six axes as groups of candidates, every copy of a pattern one of them.
+
+Candidates whose shapes and laws are of the same kinds make one group, whatever tables they stand in.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhil.contact.laws import LAWS, ContactParameters
+from jaxhil.mechanism import six_axes
+from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.sixdof.candidates import Candidates, Capsules, ChaserSpheres, TargetSpheres
+from jaxhil.sixdof.forces import ContactGroup
+from jaxhil.sixdof.friction import Bristle, Friction, Frictionless, Regularised
+from jaxhil.sixdof.rotations import compose
+from jaxhil.sixdof.shapes import Ball, Box, Capsule, Cavity, Drogue, Plane, Shape, Shell
+from jaxhil.sixdof.values import Values
+from jaxhil.sixdof.vectors import Vector
+
+
+class Candidate(NamedTuple):
+    """One pair of shapes with its laws; leaves (number,)."""
+
+    name: str  # of its table, and which of its copies it is
+    pair: Candidates
+    law: str
+    parameters: ContactParameters
+    friction: Friction
+
+
+def candidates(mechanism: SixAxisMechanism, numbers: Values) -> list[list[Candidate]]:
+    """All candidates, those of one kind together."""
+    groups: dict[Any, list[Candidate]] = {}
+    for name, contact in mechanism.contact.items():
+        count = contact.pattern.count if contact.pattern else 1
+        for copy in range(count):
+            one = _candidate(contact, numbers, name, copy, count)
+            kind = one.law, len(contact.depths), jax.tree.structure((one.pair, one.friction))
+            groups.setdefault(kind, []).append(one)
+    return list(groups.values())
+
+
+def candidate_names(mechanism: SixAxisMechanism) -> tuple[str, ...]:
+    """What to call the candidates, in the order of `build_groups`."""
+    groups = candidates(mechanism, Values(mechanism, {}))
+    return tuple(one.name for group in groups for one in group)
+
+
+def build_groups(mechanism: SixAxisMechanism, numbers: Values) -> tuple[ContactGroup, ...]:
+    """All candidates in groups, leaves (candidates, number)."""
+
+    def stacked(*leaves: Any) -> Any:
+        # Slopes and depths have their segments before the candidates.
+        return numbers.np.stack(leaves, axis=max(leaves[0].ndim - 1, 0))
+
+    return tuple(
+        ContactGroup(
+            jax.tree.map(stacked, *(one.pair for one in group)),
+            LAWS[group[0].law],
+            jax.tree.map(stacked, *(one.parameters for one in group)),
+            jax.tree.map(stacked, *(one.friction for one in group)),
+        )
+        for group in candidates(mechanism, numbers)
+    )
+
+
+def _candidate(contact: six_axes.Contact, numbers: Values, name: str, copy: int, count: int) -> Candidate:
+    path = f"contact.{name}"
+    turn = numbers(f"{path}.pattern.phase", 0.0) + 2 * np.pi * copy / count
+    turns = {"chaser": turn, "target": turn + numbers(f"{path}.target_pattern.phase", 0.0)}
+    chaser, target = (
+        _shape(getattr(contact, body), numbers, f"{path}.{body}", turns[body]) for body in turns
+    )
+    return Candidate(
+        name if count == 1 else f"{name}[{copy}]",
+        _pair(chaser, target),
+        contact.law,
+        _parameters(contact, numbers, path),
+        _friction(contact.friction, numbers, f"{path}.friction"),
+    )
+
+
+def _pair(chaser: Shape, target: Shape) -> Candidates:
+    if isinstance(chaser, Ball):
+        return ChaserSpheres(chaser.centre, chaser.radius, target)
+    if isinstance(target, Ball):
+        return TargetSpheres(target.centre, target.radius, chaser)
+    assert isinstance(chaser, Capsule) and isinstance(target, Capsule)
+    return Capsules(chaser, target)
+
+
+def _shape(shape: six_axes.Shape, numbers: Values, path: str, turn: Any) -> Shape:
+    def of(key: str) -> Any:
+        return jnp.asarray(numbers(f"{path}.{key}"))
+
+    def place(key: str) -> Vector:
+        return numbers.vector(numbers.turned(turn, numbers(f"{path}.{key}")))
+
+    if shape.shape == "plane":
+        return Plane(place("point"), numbers.direction(numbers.turned(turn, numbers(f"{path}.normal"))))
+    if shape.shape == "capsule":
+        return Capsule(place("from"), place("to"), of("radius"))
+    if shape.shape == "drogue":
+        cone = of("half_angle"), of("bottom_radius"), of("bottom")
+        return Drogue(*cone) if shape.mouth_radius is None else Shell(*cone, of("mouth_radius"))
+    if shape.shape == "box":
+        own = numbers.rotation(numbers(f"{path}.rotation", [0.0, 0.0, 0.0]))
+        about_z = numbers.rotation(numbers.np.stack([0 * turn, 0 * turn, turn]))
+        return Box(place("centre"), compose(about_z, own), numbers.vector(of("half_lengths")), of("rounding"))
+    return (Cavity if shape.inside else Ball)(place("centre"), of("radius"))
+
+
+def _parameters(contact: six_axes.Contact, numbers: Values, path: str) -> ContactParameters:
+    """Of one candidate, (number,) each; slopes and depths (segments, number)."""
+    tension: Any = np.full(numbers.number, contact.tension)
+    return ContactParameters(
+        stiffness=numbers(f"{path}.stiffness"),
+        damping=numbers(f"{path}.damping"),
+        exponent=numbers(f"{path}.exponent"),
+        depths=numbers(f"{path}.depths"),
+        tension=tension,
+        reference_depth=numbers(f"{path}.reference_depth", 1.0),
+        unloading_ratio=numbers(f"{path}.unloading_ratio", 1.0),
+        preload=numbers(f"{path}.preload"),
+        friction=numbers(f"{path}.dry_friction"),
+    )
+
+
+def _friction(friction: six_axes.Friction | None, numbers: Values, path: str) -> Friction:
+    if friction is None:
+        return Frictionless()
+    keys = ("slip",) if friction.law == "regularised" else ("stiffness", "damping")
+    parts = (jnp.asarray(numbers(f"{path}.{key}", 0.0)) for key in ("coefficient", *keys))
+    return (Regularised if friction.law == "regularised" else Bristle)(*parts)

@@ -1,0 +1,99 @@
+"""A run of six axes, tick by tick, as NumPy arrays of one lane; beside it the same contact in space."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.sixdof.building import build_scenarios, loop_of
+from jaxhil.sixdof.building_contacts import candidate_names
+from jaxhil.sixdof.forces import ContactGroup, Forces
+from jaxhil.sixdof.loop import Loop, command_of, run
+from jaxhil.sixdof.relative import coordinates
+from jaxhil.sixdof.scenario import Scenario
+from jaxhil.sixdof.space import Space, follow
+from jaxhil.sixdof.vectors import Vector
+
+LEAST_TICKS = 256  # a program runs a power of two of them, so that most runs share one
+
+
+class Recorded(NamedTuple):
+    """Every tick; coordinates (p, theta) and wrenches (force, moment about T) in T axes; SI units."""
+
+    time: np.ndarray  # (ticks,) [s]
+    desired: np.ndarray  # (ticks, 6), of the numerical model
+    actual: np.ndarray  # (ticks, 6), of the hardware when the force sensor samples it
+    in_space: np.ndarray  # (ticks, 6), of two free bodies without a rig
+    wrench: np.ndarray  # (ticks, 6), of the real contact when it is sampled
+    command: np.ndarray  # (ticks, 6), that moves the numerical model
+    wrench_in_space: np.ndarray  # (ticks, 6)
+    names: tuple[str, ...]  # of the candidates
+    force: np.ndarray  # (ticks, candidates), normal [N]
+    depth: np.ndarray  # (ticks, candidates) [m], negative apart
+    point: np.ndarray  # (ticks, candidates, 3), where they touch, in T axes [m]
+    push: np.ndarray  # (ticks, candidates, 3), force on the chaser, friction included [N]
+    groups: tuple[ContactGroup, ...]  # the candidates
+
+
+def record(
+    mechanism: SixAxisMechanism, compensator: str, gains: dict[str, Any], seed: int, duration: float
+) -> Recorded:
+    """The nominal run of a mechanism for so long [s]."""
+    scenario = build_scenarios(mechanism, seed=seed)
+    period = mechanism.rig.control_period
+    ticks = max(round(duration / period), 2)
+    length = max(LEAST_TICKS, 1 << (ticks - 1).bit_length())
+    found = _run(loop_of(mechanism, compensator, scenario), length, gains, scenario)
+    return Recorded(
+        time=np.arange(ticks) * period,
+        names=candidate_names(mechanism),
+        groups=scenario.groups,
+        **{name: np.asarray(value, float)[:ticks, ..., 0] for name, value in found.items()},
+    )
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _run(loop: Loop, ticks: int, gains: dict[str, Any], scenario: Scenario) -> dict[str, Any]:
+    _, seen = run(loop, gains, scenario, ticks)
+    space, period = Space(scenario.bodies, scenario.groups, scenario.latches), scenario.control_period
+    _, free = follow(space, scenario.start, period, ticks, period)
+    desired, _ = jax.vmap(lambda states: command_of(scenario.bodies, states))(seen.states)
+    found = {
+        "desired": desired,
+        "actual": _six(coordinates(seen.pose, seen.twist)[0]),
+        "in_space": _six(coordinates(free.pose, free.twist)[0]),
+        "wrench": _six(seen.contact),
+        "command": _six(seen.command),
+        "wrench_in_space": _six(free.wrench),
+    }
+    nothing = {name: jnp.zeros((ticks, 0, *more, *period.shape)) for name, more in _OF_CANDIDATES.items()}
+    candidates = [nothing, *map(_of_candidates, seen.forces)]
+    return found | {name: jnp.concatenate([one[name] for one in candidates], axis=1) for name in nothing}
+
+
+_OF_CANDIDATES = {"force": (), "depth": (), "point": (3,), "push": (3,)}
+
+
+def _of_candidates(forces: Forces) -> dict[str, Any]:
+    """(ticks, candidates, ..., lanes)"""
+    touch = forces.touch
+    push = forces.normal * touch.normal + forces.tangential
+    return {
+        "force": forces.normal,
+        "depth": touch.depth,
+        "point": _components(touch.point),
+        "push": _components(push),
+    }
+
+
+def _components(place: Vector) -> Any:
+    """(ticks, candidates, 3, lanes)"""
+    return jnp.stack([place.x, place.y, place.z], axis=2)
+
+
+def _six(pair: Any) -> Any:
+    """Two vectors as (ticks, 6, lanes)."""
+    return jnp.stack(jax.tree.leaves(pair), axis=1)

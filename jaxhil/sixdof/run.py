@@ -1,0 +1,226 @@
+"""One run of a mechanism of six axes: what became of each episode, and every tick of the way there."""
+
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhil.errors import InputError, shown
+from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.simulation.environment import computing
+from jaxhil.simulation.gain_choice import choose_gains
+from jaxhil.simulation.run import check_seed
+from jaxhil.sixdof.approach import FAR
+from jaxhil.sixdof.bodies import angular_velocity
+from jaxhil.sixdof.building import build_scenarios, loop_of
+from jaxhil.sixdof.forces import deepest
+from jaxhil.sixdof.loop import PER_AXIS, Loop
+from jaxhil.sixdof.meaning import Meaning, meaning
+from jaxhil.sixdof.metrics import Metrics, evaluate, reference_final
+from jaxhil.sixdof.recording import Recorded, record
+from jaxhil.sixdof.relative import Pair, States, coordinates, effective_mass, relative
+from jaxhil.sixdof.rollout import STATUS_NAMES
+from jaxhil.sixdof.scenario import Scenario
+from jaxhil.sixdof.vectors import Vector, components, cross, direction, vector
+
+GOOD = ("rebounded", "captured")  # how an episode may end
+MOST_TICKS = 1e7  # of a run
+LARGEST_ATTITUDE = 1.0  # rad, of C against T at the start
+
+
+class Episode(NamedTuple):
+    """A contact with all its touches; NaN for what it does not have."""
+
+    energy_error: float  # excess of kinetic energy over that in space, over that of the approach [1]
+    twist_error: float  # deviation of the twist from that in space, over what the contact changes there [1]
+    normal_part: float  # of it along the reference's impulse [1]
+    lateral_part: float  # of the rest, in translation [1]
+    rotational_part: float  # and in rotation [1]
+    restitution: float  # e, of a single touch [1]
+    reference_restitution: float  # e* in space [1]
+    effective_mass: float  # m_n at the first touch [kg]
+    approach_velocity: float  # along its normal [m/s]
+    point: tuple[float, ...]  # of the first touch, in T axes [m]
+    normal: tuple[float, ...]  # there, outward from the target
+    peak_force: float  # of the real contact [N]
+    reference_peak_force: float  # in space [N]
+    peak_moment: float  # of the real contact about T [N m]
+    reference_peak_moment: float  # in space [N m]
+    duration: float  # in touch [s]
+    reference_duration: float  # in space [s]
+    touches: int  # candidates that began to touch
+    reference_touches: int  # in space
+    status: str  # how it ended
+
+
+class Final(NamedTuple):
+    """The motion at the end."""
+
+    time: float  # [s]
+    pose: tuple[float, ...]  # position and rotation vector of C against T, in T axes [m, rad]
+    twist: tuple[float, ...]  # velocity and angular velocity, likewise [m/s, rad/s]
+    v1: tuple[float, ...]  # of the target's centre of mass, in world axes [m/s]
+    w1: tuple[float, ...]  # of the target, in body axes [rad/s]
+    v2: tuple[float, ...]  # of the chaser's centre of mass, in world axes [m/s]
+    w2: tuple[float, ...]  # of the chaser, in body axes [rad/s]
+
+
+@dataclass(frozen=True, eq=False)
+class SixAxisRun:
+    """The episodes of a mechanism of six axes under a compensator, run once."""
+
+    mechanism: SixAxisMechanism = field(repr=False)
+    compensator: str  # its name
+    gains: dict[str, float]  # by name, in SI units
+    seed: int  # of the sensor's noise
+    episodes: tuple[Episode, ...]
+    status: str  # of the first episode that did not rebound or was not captured, else of the last
+    final: Final  # of the numerical model
+    meaning: Meaning  # of the mechanism
+
+    @cached_property
+    def reference_final(self) -> Final:
+        """The motion of two free bodies in space, from the same start on, at the time of `final`."""
+        with computing():
+            scenario = build_scenarios(self.mechanism, seed=self.seed)
+            return _final(self.final.time, jax.device_get(_in_space(scenario, np.array([self.final.time]))))
+
+    @cached_property
+    def ticks(self) -> Recorded:
+        """Every tick of the run."""
+        with computing():
+            return record(self.mechanism, self.compensator, self.gains, self.seed, self.final.time)
+
+
+def simulate_six_axes(
+    mechanism: SixAxisMechanism, compensator: str = "none", gains: Any = None, *, seed: int = 0
+) -> SixAxisRun:
+    """Run a mechanism of six axes once, as it is nominally: see `jaxhil.simulate`.
+
+    `compensator` is "none" or "phase_lead", which leads each channel of the wrench by itself.
+    """
+    if compensator not in PER_AXIS:
+        allowed = f"{', '.join(PER_AXIS)}: in six axes there are no others so far"
+        raise InputError(f"compensator: found {shown(compensator)}, allowed {allowed}")
+    number = check_seed(seed)
+    # Its gains are those of one axis: they depend on the sensor's delay and on the control period alone.
+    like_one_axis: Any = mechanism
+    name, values = choose_gains(like_one_axis, compensator, gains)
+    with computing():
+        scenario = build_scenarios(mechanism, seed=number)
+        check_scenario(mechanism, scenario)
+        loop = loop_of(mechanism, name, scenario)
+        found = jax.device_get(_run(loop, {key: jnp.asarray(one) for key, one in values.items()}, scenario))
+    return _result(mechanism, name, values, number, found)
+
+
+def _result(
+    mechanism: SixAxisMechanism, compensator: str, gains: dict[str, float], seed: int, found: Any
+) -> SixAxisRun:
+    metrics, time, final, tangential = found
+    episodes = tuple(
+        _episode(metrics, slot)
+        for slot in range(metrics.status.shape[0])
+        if slot == 0 or STATUS_NAMES[int(metrics.status[slot, 0])] != "miss"
+    )
+    bad = [episode.status for episode in episodes if episode.status not in GOOD]
+    first = episodes[0]
+    means = meaning(
+        mechanism, first.effective_mass, float(tangential[0]), first.reference_duration,
+        first.reference_peak_force, first.reference_restitution,
+    )  # fmt: skip
+    status = [*bad, episodes[-1].status][0]
+    return SixAxisRun(
+        mechanism, compensator, gains, seed, episodes, status, _final(float(time[0]), final), means
+    )
+
+
+def _episode(metrics: Metrics, slot: int) -> Episode:
+    def value(name: str) -> Any:
+        found = np.asarray(getattr(metrics, name))[..., slot, 0]
+        if name == "status":
+            return STATUS_NAMES[int(found)]
+        return tuple(found.tolist()) if found.ndim else found.item()
+
+    return Episode(*map(value, Episode._fields))
+
+
+def _final(time: float, motion: Any) -> Final:
+    at, twist, *each = (tuple(np.asarray(one, float)[:, 0].tolist()) for one in motion)
+    return Final(time, at, twist, *each)
+
+
+def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
+    """The nominal run begins apart, at a pose that six coordinates can say, and takes at most 1e7 ticks.
+
+    Raises `InputError`.
+    """
+    ticks = float(scenario.duration[0] / scenario.control_period[0])
+    where = "start" if mechanism.start is not None else "approach"
+    if not ticks <= MOST_TICKS:
+        found = f"{where}.duration: found {scenario.duration[0]:g} s, {ticks:.2g} control periods"
+        raise InputError(f"{mechanism.name}: {found}, allowed at most {MOST_TICKS:.0e}")
+    at, depth = (np.asarray(one)[..., 0] for one in _begins(scenario))
+    if not np.all(np.isfinite(at)):
+        found = f"nothing to touch below {FAR:g} m: it goes past the target"
+        raise InputError(
+            f"{mechanism.name}: approach.offset: found {found}, allowed an approach that touches"
+        )
+    angle = float(np.linalg.norm(at[3:]))
+    if angle > LARGEST_ATTITUDE:
+        allowed = f"at most {LARGEST_ATTITUDE:g} rad between C and T (interface_rotation counts)"
+        found = f"start.chaser.attitude: found a rotation by {angle:.3g} rad"
+        raise InputError(f"{mechanism.name}: {found}, allowed {allowed}")
+    if depth > 0:
+        key = "start.chaser.position" if mechanism.start else "approach.angular_velocity"
+        found = f"{key}: found a start that is in touch already, {depth:.3g} m deep"
+        raise InputError(f"{mechanism.name}: {found}, allowed one apart: move the chaser along z of T")
+
+
+@partial(jax.jit, static_argnums=0)
+def _run(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> tuple[Any, ...]:
+    """Figures of the episodes, the time at the end, the motion then, and the mass along the surface."""
+    found = evaluate(loop, gains, scenario)
+    final = _motion(scenario.bodies, found.final)
+    return found.metrics, found.final_time, final, _tangential_mass(scenario, found.metrics)
+
+
+@jax.jit
+def _in_space(scenario: Scenario, time: Any) -> tuple[Any, ...]:
+    return _motion(scenario.bodies, reference_final(scenario, time))
+
+
+def _tangential_mass(scenario: Scenario, metrics: Metrics) -> Any:
+    """Mass [kg] that the first touch meets along the surface, where it is less of two directions."""
+    point, normal = (vector(one[:, 0]) for one in (metrics.point, metrics.normal))
+    zero = jnp.zeros_like(normal.x)
+    flat = jnp.abs(normal.x) < 0.9
+    across = direction(cross(normal, Vector(jnp.where(flat, 1, zero), jnp.where(flat, zero, 1), zero)))
+    sides = (across, cross(normal, across))
+    return jnp.minimum(*(effective_mass(scenario.bodies, scenario.start, point, side) for side in sides))
+
+
+def _motion(bodies: Pair, states: States) -> tuple[Any, ...]:
+    """What `Final` says but the time, each along a leading axis."""
+    pose, twist = relative(bodies, states)
+    at, _ = coordinates(pose, twist)
+    target, chaser = (
+        (components(one.velocity), components(angular_velocity(body, one)))
+        for body, one in zip(bodies, states, strict=True)
+    )
+    return _six(at), _six(twist), *target, *chaser
+
+
+@jax.jit
+def _begins(scenario: Scenario) -> tuple[Any, Any]:
+    """Coordinates at the start, and how deep the mechanisms are in each other then."""
+    pose, twist = relative(scenario.bodies, scenario.start)
+    at, _ = coordinates(pose, twist)
+    return _six(at), deepest(scenario.groups, pose)
+
+
+def _six(pair: Any) -> Any:
+    return jnp.stack(jax.tree.leaves(pair))

@@ -1,0 +1,69 @@
+"""The numbers of a mechanism of six axes by dotted path, drawn or nominal, one per lane.
+
+What is worked out of them is NumPy's, as long as nothing drawn is jax's; what is put together is jax's.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.mechanism.structs import value_at
+from jaxhil.sixdof.rotations import Quaternion, exponential
+from jaxhil.sixdof.vectors import Matrix, Vector
+
+
+class Values:
+    """Arrays of shape (*entries, number): NumPy's, or jax's where what is drawn is."""
+
+    def __init__(self, mechanism: SixAxisMechanism, draws: Mapping[str, Any]) -> None:
+        # The namespace of the arrays.
+        self.np: Any = jnp if any(isinstance(drawn, jax.Array) for drawn in draws.values()) else np
+        self.number = len(next(iter(draws.values()))) if draws else 1
+        self._mechanism, self._draws = mechanism, draws
+
+    def __call__(self, path: str, default: Any = None) -> Any:
+        """What was drawn, else the nominal value or, where the file has none, the `default`."""
+        value = self._draws.get(path)
+        if value is None:
+            nominal = value_at(self._mechanism, path)
+            nominal = np.asarray(default if nominal is None else nominal, float)
+            value = np.broadcast_to(nominal, (self.number, *nominal.shape))
+        return self.np.moveaxis(self.np.asarray(value, float), 0, -1)
+
+    def constant(self, value: float) -> Any:
+        """The same number in every lane."""
+        return np.full(self.number, value)
+
+    def inertia(self, path: str, default: Any = None) -> Any:
+        """Three moments, or three rows, as (3, 3, number)."""
+        given = self(path, default)
+        return given if given.ndim == 3 else np.eye(3)[:, :, None] * given[None]
+
+    def rotation(self, theta: Any) -> Quaternion:
+        """Of rotation vectors (3, number)."""
+        if self.np is jnp:
+            return exponential(self.vector(theta))
+        half = np.sqrt((theta**2).sum(axis=0)) / 2
+        return Quaternion(jnp.asarray(np.cos(half)), self.vector(np.sinc(half / np.pi) / 2 * theta))
+
+    def vector(self, given: Any) -> Vector:
+        """Of components (3, number)."""
+        return Vector(*(jnp.asarray(part) for part in given))
+
+    def matrix(self, given: Any) -> Matrix:
+        """Of rows (3, 3, number)."""
+        return Matrix(*(self.vector(row) for row in given))
+
+    def turned(self, angle: Any, place: Any) -> Any:
+        """(3, number), turned about z by an angle [rad]."""
+        cosine, sine = self.np.cos(angle), self.np.sin(angle)
+        x, y, z = place
+        return self.np.stack([cosine * x - sine * y, sine * x + cosine * y, z])
+
+    def direction(self, given: Any) -> Vector:
+        """Unit vector along (3, number)."""
+        return self.vector(given / self.np.sqrt((given**2).sum(axis=0)))

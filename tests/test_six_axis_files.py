@@ -1,0 +1,190 @@
+"""Mechanism files of six axes: what they say, and what is refused, in one line."""
+
+import copy
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxhil.errors import InputError
+from jaxhil.mechanism.file import any_from_builtins, builtin_path, load, load_any, six_axis_names, to_builtins
+from jaxhil.mechanism.six_axes import numeric_keys_of
+from jaxhil.mechanism.toml_table import parse_toml
+from jaxhil.mechanism.uncertainty import PHASE, draw
+
+RAW = {name: parse_toml(builtin_path(name).read_bytes(), name, "") for name in six_axis_names()}
+BODY = {"position": [0, 0, 0], "attitude": [1, 0, 0, 0], "velocity": [0, 0, 0], "angular_velocity": [0, 0, 0]}
+
+
+def refusal(*overrides, name="probe-drogue", unset=()):
+    with pytest.raises(InputError) as caught:
+        load_any(name, overrides, unset)
+    message = str(caught.value)
+    assert message.isprintable() and message.startswith(f"{name}: ")
+    return message
+
+
+@pytest.mark.parametrize("name", RAW)
+def test_builtins_are_read_and_say_where_their_numbers_are_from(name):
+    mechanism = load_any(name).mechanism
+    assert mechanism.name == name and mechanism.uncertainty
+    assert "assumed" in mechanism.source
+    text = json.dumps(to_builtins(mechanism), allow_nan=False)
+    assert any_from_builtins(json.loads(text), name) == mechanism
+
+
+def test_six_numbers_may_be_said_as_one_or_two():
+    simulator = load_any("probe-drogue").mechanism.rig.simulator
+    assert simulator.damping_ratio == [0.8] * 6
+    assert simulator.natural_frequency == [14.0] * 3 + [11.0] * 3
+    changes = {"rig.simulator.natural_frequency.rotation": 9.0, "rig.simulator.delay[5]": 0.0}
+    changes["rig.force_sensor.noise_std"] = {"force": 0.5, "torque": 0.05}
+    changes["rig.force_sensor.crosstalk"] = 0.01
+    rig = load_any("probe-drogue", changes).mechanism.rig
+    assert rig.simulator.natural_frequency == [14.0] * 3 + [9.0] * 3
+    assert rig.simulator.delay == [4e-3, 4e-3, 3e-3, 5.3e-3, 5.3e-3, 0.0]
+    assert rig.force_sensor.noise_std == [0.5] * 3 + [0.05] * 3
+    assert rig.force_sensor.crosstalk == [[0.01] * 6] * 6
+
+
+@pytest.mark.parametrize(
+    ("override", "reason"),
+    [
+        ("schema=jaxhil/mechanism/3", "schema: found 'jaxhil/mechanism/3', allowed"),
+        ("target.inertia=[1, 1, 3]", "principal moments 1, 1 and 3 kg m^2, allowed those of a body"),
+        ("target.inertia=[1, 1, -1]", "principal moment of -1 kg m^2, allowed positive"),
+        ("target.inertia=[[1, 2, 0], [1, 2, 0], [0, 0, 2]]", "2 at row 1, column 2, 1 there transposed"),
+        ("target.inertia=[[1, 0, 0], 2, 3]", "three moments, or three rows"),
+        ("chaser.interface=[0, 0, 1.0]", "allowed one beyond C, at positive z"),
+        ("target.interface_rotation=[3, 0, 0]", "target.interface: found a centre of mass at z = 1.18"),
+        ("target.interface_rotation=[4, 0, 0]", "a rotation by 4 rad, allowed a rotation vector shorter"),
+        ("approach.attitude=[1, 1, 0]", "a rotation by 1.414 rad, allowed a rotation vector of at most 1"),
+        ("approach.velocity[2]=0.01", "approach.velocity[2]: found 0.01, allowed a number < 0 m/s"),
+        ("contact={}", "contact: found nothing, allowed [contact.NAME]"),
+        ("contact.tip.stifness=1", "an unknown key, allowed one of chaser, target"),
+        ("contact.tip.stifness=1", "did you mean stiffness?"),
+        ("contact.tip.stiffness=[1, 2]", "[1.0, 2.0], allowed a number > 0 (law hunt_crossley)"),
+        ("contact.tip.law=hardening", "reference_depth: found nothing, allowed a number > 0"),
+        ("contact.tip.depths=[1]", "depths: found [1.0], allowed nothing (only for law piecewise_linear)"),
+        ("contact.tip.friction.law=bristle", "slip: found 0.0005, allowed nothing (bristle"),
+        ("contact.tip.chaser.radius=0.05", "0.05, allowed a number < 0.04 m, the radius that it is to fit"),
+        ("contact.tip.chaser.radius=0", "allowed a number > 0 m: a drogue with a mouth is a thin shell"),
+        ("contact.tip.chaser.from=[0, 0, 0]", "allowed nothing (sphere does not use it: unset it)"),
+        ("contact.tip.chaser.shape=drogue", "centre: found [0.0, 0.0, 0.0], allowed nothing (drogue"),
+        ("contact.tip.target.mouth_radius=0.02", "allowed a number > 0.0292"),
+        ("contact.tip.target_pattern.phase=1", "allowed nothing, or pattern = { count = N } beside it"),
+        ("rig.simulator.delay=[1, 2]", "a list of 2 entries, allowed a list of 6 entries"),
+        ("rig.simulator.delay=2.0", "rig.simulator.delay[0]: found 2.0, allowed a number from 0 to 1 s"),
+        ("rig.simulator.model=ideal", "damping_ratio: found [0.8, 0.8,"),
+        ("rig.force_sensor.side=fixed", "tool: found a table, allowed nothing (a fixed sensor"),
+        ("rig.force_sensor.tool.inertia=[1, 1, 3]", "tool.inertia: found principal moments 1, 1 and 3"),
+        ("rig.force_sensor.crosstalk=[[0,1,0,0,0,0],[1,0,0,0,0,0],[0,0,0,0,0,0],[0,0,0,0,0,0],"
+         "[0,0,0,0,0,0],[0,0,0,0,0,0]]", "crosstalk: found channels that are nearly the same"),
+        ("rig.velocity_limit=1", "rig.velocity_limit: found an unknown key"),
+        ('uncertainty."contact.tip.stifness"={distribution="normal",std=1}', "did you mean contact.tip"),
+        ('uncertainty."target.inertia"={distribution="normal",std=1,independent=true}', "are not symmetric"),
+        ('uncertainty."approach.velocity"={distribution="uniform",low=-0.1,high=0.1,independent=true}',
+         "a z component as far as 0.1, allowed draws below 0 m/s"),
+    ],
+)  # fmt: skip
+def test_unusable_values_are_named(override, reason):
+    assert reason in refusal(override)
+
+
+def test_shapes_that_cannot_touch():
+    capsule = {"shape": "capsule", "from": [0, 0, 0], "to": [0, 0, 1], "radius": 0.1}
+    raw = copy.deepcopy(RAW["probe-drogue"])
+    raw["contact"]["tip"]["chaser"] = capsule
+    with pytest.raises(InputError, match="found drogue against the chaser's capsule, allowed a sphere on"):
+        any_from_builtins(raw, "f")
+    raw["contact"]["tip"]["target"] = {**capsule, "to": [0, 0, 0]}
+    with pytest.raises(InputError, match=r"contact\.tip\.target\.to: found the point that is from"):
+        any_from_builtins(raw, "f")
+    raw["contact"]["tip"]["target"] = capsule
+    assert any_from_builtins(raw, "f")
+
+
+def test_a_start_stands_instead_of_an_approach():
+    start = {"start.target": BODY, "start.chaser": {**BODY, "position": [0, 0, 3]}}
+    with pytest.raises(InputError, match=r"start: found \[approach\] beside it, allowed one of the two"):
+        load_any("probe-drogue", start)
+    mechanism = load_any(
+        "probe-drogue", {**start, "approach": None, "contact": {}, "uncertainty": {}}
+    ).mechanism
+    assert mechanism.start.duration is None and PHASE not in draw(mechanism, 1, 0)
+    assert "approach: found nothing, allowed [approach], or [start]" in refusal(unset=["approach"])
+    start["start.chaser"]["attitude"] = [1, 0.1, 0, 0]
+    with pytest.raises(InputError, match=r"attitude: found one of norm 1\.0049876, allowed a quaternion"):
+        load_any("probe-drogue", {**start, "approach": None})
+
+
+def test_all_can_be_uncertain_lists_and_inertias_included():
+    entry = {"distribution": "uniform", "factor": [0.9, 1.1]}
+    mechanism = load_any("petals").mechanism
+    uncertain = {
+        path: entry
+        for path in ("target.inertia", "contact.edge_left.chaser.from", "contact.rings.friction.stiffness")
+    }
+    assert set(uncertain) < set(numeric_keys_of(mechanism))
+    independent = {"distribution": "normal", "std": 0.01, "independent": True}
+    uncertain["rig.force_sensor.crosstalk"] = independent
+    drawn = draw(load_any("petals", {"uncertainty": uncertain}).mechanism, 64, 1)
+    assert drawn["target.inertia"].shape == (64, 3) and drawn["rig.force_sensor.crosstalk"].shape == (
+        64,
+        6,
+        6,
+    )
+    share = drawn["contact.edge_left.chaser.from"] / np.array([0.527, -0.286, 1.0])
+    np.testing.assert_allclose(share[:, 0], share[:, 1])
+    assert np.all(drawn["contact.edge_left.chaser.from"][:, 2] == 0)
+    assert np.all((drawn[PHASE] >= 0) & (drawn[PHASE] <= 1)) and drawn[PHASE].shape == (64,)
+    assert 0.008 < np.std(drawn["rig.force_sensor.crosstalk"]) < 0.012
+
+
+def test_commands_of_one_axis_say_so():
+    with pytest.raises(
+        InputError, match=r"^petals: schema: found jaxhil/mechanism/2, six axes, allowed jaxhil"
+    ):
+        load("petals")
+
+
+JUNK = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda one: st.lists(one, max_size=7) | st.dictionaries(st.text(max_size=8), one, max_size=3),
+    max_leaves=8,
+)
+
+
+def places(node, path=()):
+    """The path of every value in a raw table."""
+    entries = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    for key, value in entries:
+        yield (*path, key)
+        yield from places(value, (*path, key))
+
+
+PLACES = [(name, path) for name, raw in RAW.items() for path in places(raw)]
+
+
+@settings(deadline=None, max_examples=40)
+@given(place=st.sampled_from(PLACES), junk=JUNK, sibling=st.sampled_from(PLACES))
+def test_any_table_is_read_or_refused_in_one_line(place, junk, sibling):
+    """One value replaced by another: of any kind, or by one from elsewhere in the files."""
+    name, path = place
+    for value in (junk, at(RAW[sibling[0]], sibling[1])):
+        raw = copy.deepcopy(RAW[name])
+        at(raw, path[:-1])[path[-1]] = value
+        try:
+            mechanism = any_from_builtins(raw, "f")
+        except InputError as error:
+            assert str(error).isprintable() and ": found " in str(error) and ", allowed " in str(error)
+        else:
+            assert any_from_builtins(to_builtins(mechanism), "f") == mechanism
+
+
+def at(node, path):
+    for part in path:
+        node = node[part]
+    return node

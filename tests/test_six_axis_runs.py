@@ -1,0 +1,170 @@
+"""Mechanism files of six axes as runs: what is built of them, what `jaxhil simulate` says, one axis as
+oracle."""
+
+import copy
+import json
+
+import jax
+import numpy as np
+import pytest
+
+import jaxhil as package
+from jaxhil.errors import InputError
+from jaxhil.mechanism.file import any_from_builtins, builtin_names, load_any, six_axis_names, to_builtins
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.sixdof.building import build_scenarios
+from jaxhil.sixdof.building_contacts import candidate_names
+from jaxhil.sixdof.run import simulate_six_axes
+
+STILL = {"velocity": [0, 0, 0], "angular_velocity": [0, 0, 0], "attitude": [1, 0, 0, 0]}
+APART = {"approach": None, "uncertainty": {}, "start.duration": 0.05}
+APART |= {"start.target": {**STILL, "position": [0, 0, 0]}, "start.chaser": {**STILL, "position": [0, 0, 3]}}
+
+
+def test_patterns_are_turned_copies():
+    mechanism = load_any("petals", APART).mechanism
+    scenario = build_scenarios(mechanism)
+    edges, rings = jax.tree.map(np.asarray, scenario.groups)
+    assert candidate_names(mechanism)[:3] == ("edge_left[0]", "edge_left[1]", "edge_left[2]")
+    turned = np.exp(2j * np.pi / 3 * np.arange(3))
+    chaser, target = edges.candidates.chaser.start, edges.candidates.target.start
+    np.testing.assert_allclose((chaser.x + 1j * chaser.y)[:3, 0], (0.527 - 0.286j) * turned)
+    further = turned * np.exp(-1.0472j)
+    np.testing.assert_allclose((target.x + 1j * target.y)[:3, 0], (0.527 + 0.286j) * further)
+    centre = rings.candidates.centre
+    np.testing.assert_allclose((centre.x + 1j * centre.y)[:, 0], 0.6 * np.exp(1j * np.pi / 3 * np.arange(6)))
+    np.testing.assert_allclose(rings.candidates.shape.normal.z, np.ones((6, 1)))
+
+
+def test_draws_are_lanes():
+    """Lists, matrices and numbers of tables, each lane its own; what is not drawn is nominal."""
+    factor = {"distribution": "uniform", "factor": [0.9, 1.1]}
+    uncertain = {
+        key: factor for key in ("target.inertia", "contact.edge_left.chaser.from", "rig.simulator.delay")
+    }
+    mechanism = load_any("petals", {**APART, "uncertainty": uncertain}).mechanism
+    drawn = draw(mechanism, 5, 0)
+    scenario = build_scenarios(mechanism, drawn)
+    np.testing.assert_array_equal(scenario.bodies.target.inertia.y.y, drawn["target.inertia"][:, 1])
+    np.testing.assert_allclose(
+        scenario.groups[0].candidates.chaser.start.x[0], drawn["contact.edge_left.chaser.from"][:, 0]
+    )
+    np.testing.assert_array_equal(scenario.simulator.delay, drawn["rig.simulator.delay"].T)
+    assert np.all(scenario.bodies.chaser.mass == 420.0) and scenario.sensor.errors.crosstalk.shape == (
+        6,
+        6,
+        5,
+    )
+
+
+def central(name):
+    """A built-in mechanism of one axis, one contact of it, as two bodies that meet on their line."""
+    one = load_any(name, {"approach.contacts": 1}).mechanism
+    raw = to_builtins(one)
+    body = {"mass": 2 * one.bodies.mass, "inertia": [3.0, 4.0, 5.0]}
+    contact = {key: value for key, value in raw["contact"].items() if key != "clearance"}
+    contact |= {key: contact[key][0] for key in ("stiffness", "damping") if key in contact}
+    if "friction" in contact:
+        contact["dry_friction"] = contact.pop("friction")
+    contact |= {
+        "chaser": {"shape": "sphere", "centre": [0, 0, 0], "radius": 0},
+        "target": {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]},
+    }
+    rig = copy.deepcopy(raw["rig"])
+    for key in ("contact_plane", "position_sensor"):
+        rig.pop(key, None)
+    for key in ("velocity_limit", "acceleration_limit"):
+        rig["simulator"].pop(key, None)
+    rig["force_sensor"].pop("noise_std", None)
+    return one, {
+        "schema": "jaxhil/mechanism/2",
+        "name": name,
+        "target": {**body, "interface": [0, 0, 1]},
+        "chaser": {**body, "interface": [0, 0, -1]},
+        "approach": {"velocity": [0, 0, -one.approach.velocity], "phase": one.approach.phase},
+        "contact": {"nose": contact},
+        "rig": rig,
+    }  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in builtin_names() if name != "rattling"])
+def test_a_central_contact_is_that_of_one_axis(name):
+    one, raw = central(name)
+    quiet = {"approach.contacts": 1, "rig.force_sensor.noise_std": 0.0, "rig.contact_plane": 0.0}
+    expected = package.simulate(package.load(name, quiet), "none").contacts[0]
+    [found] = simulate_six_axes(any_from_builtins(raw, name)).episodes
+    np.testing.assert_allclose(found.restitution, expected.restitution, rtol=1e-9)
+    np.testing.assert_allclose(found.reference_restitution, expected.reference_restitution, rtol=1e-6)
+    np.testing.assert_allclose(found.effective_mass, one.bodies.mass, rtol=1e-12)
+    error = expected.restitution**2 - expected.reference_restitution**2
+    np.testing.assert_allclose(found.energy_error, error, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_starts_that_cannot_be_run():
+    for changes, reason in (
+        ({"approach.offset": [9.0, 0.0]}, "approach.offset: found nothing to touch"),
+        ({"approach.duration": 999.0, "rig.control_period": 1e-5}, "approach.duration: found 999.02 s"),
+        (
+            {**APART, "start.chaser.position": [0, 0, 2.2]},
+            "start.chaser.position: found a start that is in touch",
+        ),
+    ):
+        with pytest.raises(InputError) as caught:
+            simulate_six_axes(load_any("probe-drogue", changes).mechanism)
+        assert str(caught.value).startswith("probe-drogue: " + reason)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", six_axis_names())
+def test_simulate_a_builtin(jaxhil, tmp_path, name):
+    picture = tmp_path / "run.png"
+    ran = jaxhil("simulate", name, "--json", "--plot", picture)
+    assert ran.code == 1
+    document = json.loads(ran.out)
+    assert document["axes"] == 6 and document["verdict"] == "bad"
+    [episode] = document["episodes"]
+    assert episode["energy_error"] > 1 and 0.3 < episode["twist_error"] < 2
+    parts = [episode[f"{part}_part"] for part in ("normal", "lateral", "rotational")]
+    np.testing.assert_allclose(np.linalg.norm(parts), episode["twist_error"], rtol=1e-6)
+    assert episode["status"] == document["status"] == "rebounded"
+    # Without a force from outside momentum stays what it was: the target's was 0.
+    mechanism = load_any(name).mechanism
+    momenta = [mechanism.target.mass * np.array(document["final"]["v1"])]
+    momenta.append(mechanism.chaser.mass * np.array(document["final"]["v2"]))
+    in_space = [mechanism.target.mass * np.array(document["reference_final"]["v1"])]
+    in_space.append(mechanism.chaser.mass * np.array(document["reference_final"]["v2"]))
+    np.testing.assert_allclose(sum(momenta), sum(in_space), rtol=1e-9)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    film = tmp_path / "run.gif"
+    ran = jaxhil("simulate", name, "--json", "--compensator", "phase_lead", "--animate", film)
+    assert film.read_bytes().startswith(b"GIF8")
+    lead = json.loads(ran.out)
+    assert lead["episodes"][0]["energy_error"] < episode["energy_error"]
+    assert set(lead["gains"]) == {"phase_lead", "lead_filter"}
+
+
+def test_what_six_axes_do_not_have_is_said_in_one_line(jaxhil, tmp_path):
+    for arguments, reason in (
+        (["tune", "petals"], "six axes, allowed jaxhil/mechanism/1 here"),
+        (["simulate", "petals", "--gains", "x.json"], "--gains: found 'x.json', allowed none: in six axes"),
+        (
+            ["simulate", "petals", "--animate", "x.avi"],
+            "--animate: found 'x.avi', allowed a name that ends in .gif",
+        ),
+        (["simulate", "petals", "--compensator", "response_error"], "allowed none, phase_lead: in six axes"),
+        (
+            ["simulate", "rig-300kg", "--animate", "x.gif"],
+            "allowed none: there is an animation of six axes only",
+        ),
+    ):
+        ran = jaxhil(*arguments)
+        assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1 and reason in ran.err
+
+
+def test_init_copies_a_builtin_under_a_name(jaxhil, tmp_path):
+    path = tmp_path / "mine.toml"
+    assert jaxhil("init", "petals", "-o", path).code == 0
+    mine, builtin = load_any(path).mechanism, load_any("petals").mechanism
+    assert mine.name == "mine" and to_builtins(mine) | {"name": ""} == to_builtins(builtin) | {"name": ""}

@@ -1,0 +1,145 @@
+"""`jaxhil simulate` on a mechanism of six axes."""
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jaxhil.errors import InputError, shown
+from jaxhil.mechanism.six_axes import SixAxisMechanism
+from tuning import terminal
+from tuning.cli.commands import checks
+from tuning.cli.options import Simulate
+
+if TYPE_CHECKING:
+    from jaxhil.sixdof.run import Episode, SixAxisRun
+
+COMPENSATORS = ("none", "phase_lead")
+FILMS = (".gif", ".mp4")
+GOOD = ("rebounded", "captured")  # how a run may end
+
+
+def check(options: Simulate) -> None:
+    """What six axes do not have yet is not asked for. Raises `InputError`."""
+    for name, given in (("--gains", options.gains), ("--setting", options.setting), ("--log", options.log)):
+        if given is not None:
+            raise InputError(f"{name}: found {shown(given)}, allowed none: in six axes there is none so far")
+    if options.compensator not in (None, *COMPENSATORS):
+        allowed = f"{', '.join(COMPENSATORS)}: in six axes there are no others so far"
+        raise InputError(f"--compensator: found {shown(options.compensator)}, allowed {allowed}")
+    if options.animate is not None:
+        _check_film(options.animate)
+
+
+def _check_film(path: str) -> None:
+    suffix = Path(path).suffix.lower()
+    if suffix not in FILMS:
+        raise InputError(f"--animate: found {shown(path)}, allowed a name that ends in {', '.join(FILMS)}")
+    if suffix == ".mp4" and shutil.which("ffmpeg") is None:
+        raise InputError(
+            f"--animate: found {shown(path)}, allowed .gif: there is no ffmpeg, which makes .mp4"
+        )
+    checks.file(path)
+
+
+def run(options: Simulate, mechanism: SixAxisMechanism) -> int:
+    """Run the episodes, report each; 0 if both errors of each are within the limit, else 1."""
+    from jaxhil.sixdof.run import simulate_six_axes
+
+    done = simulate_six_axes(mechanism, options.compensator or "none", seed=options.seed)
+    good = done.status in GOOD and all(_worst(episode) <= options.limit for episode in done.episodes)
+    terminal.warn(f"{mechanism.name}: {warning}" for warning in done.meaning.warnings)
+    _draw(options, done)
+    if options.json:
+        terminal.emit_json(_document(options, done, good))
+    else:
+        terminal.emit_line(done.meaning.line(mechanism.name))
+        _print(options, done, good)
+    return 0 if good else 1
+
+
+def _worst(episode: "Episode") -> float:
+    return max(abs(episode.energy_error), episode.twist_error)
+
+
+def _draw(options: Simulate, done: "SixAxisRun") -> None:
+    title = f"{done.mechanism.name}, compensation: {done.compensator}"
+    if options.plot is not None:
+        from jaxhil.files import follow, writing
+        from jaxhil.simulation.contact_plot import save
+        from tuning.pictures.six_axes import six_axes_plot
+
+        with writing(options.plot):
+            save(six_axes_plot(done.ticks, title), follow(options.plot))
+        terminal.note(f"wrote {options.plot}")
+    if options.animate is not None:
+        from jaxhil.files import follow, writing
+        from tuning.pictures.animation import animate
+
+        with writing(options.animate):
+            animate(done.ticks, title, follow(options.animate))
+        terminal.note(f"wrote {options.animate}")
+
+
+def _document(options: Simulate, done: "SixAxisRun", good: bool) -> dict[str, Any]:
+    return {
+        "mechanism": done.mechanism.name,
+        "axes": 6,
+        "compensator": done.compensator,
+        "gains": done.gains,
+        "episodes": [episode._asdict() for episode in done.episodes],
+        "final": done.final._asdict(),
+        "reference_final": done.reference_final._asdict(),
+        "status": done.status,
+        "meaning": done.meaning._asdict(),
+        "limit": options.limit,
+        "verdict": "good" if good else "bad",
+    }
+
+
+def _print(options: Simulate, done: "SixAxisRun", good: bool) -> None:
+    rows = [
+        [
+            number,
+            f"{episode.energy_error:+.4f}",
+            f"{episode.twist_error:.4f}",
+            episode.restitution,
+            episode.reference_restitution,
+            episode.peak_force,
+            episode.peak_moment,
+            1e3 * episode.duration,
+            episode.status,
+        ]
+        for number, episode in enumerate(done.episodes, start=1)
+    ]
+    headings = [
+        "episode", "energy error", "twist error", "e", "e*", "peak [N]", "peak [N m]", "in touch [ms]",
+        "status",
+    ]  # fmt: skip
+    title = f"{done.mechanism.name}, compensation: {done.compensator}"
+    title += ", gains by the literature's rule" if done.compensator != "none" else ""
+    terminal.emit(
+        terminal.table(title, headings, rows, texts=(len(headings) - 1,)),
+        *(_more(number, episode) for number, episode in enumerate(done.episodes, start=1)),
+        _verdict(options, done, good),
+    )
+
+
+def _more(number: int, episode: "Episode") -> str:
+    parts = f"normal {episode.normal_part:+.3f}, lateral {episode.lateral_part:.3f}"
+    parts += f", rotational {episode.rotational_part:.3f}"
+    space = f"{episode.reference_peak_force:.4g} N, {episode.reference_peak_moment:.3g} N m"
+    space += f", {1e3 * episode.reference_duration:.4g} ms"
+    touches = f"touches: {episode.touches}, in space {episode.reference_touches}"
+    return f"Episode {number}: twist error {parts}; in space {space}; {touches}."
+
+
+def _verdict(options: Simulate, done: "SixAxisRun", good: bool) -> str:
+    if done.status == "miss":
+        return "Bad: nothing touched."
+    if done.status not in GOOD:
+        return f"Bad: the run ended with status '{done.status}'."
+    if good:
+        return f"Good: every energy and twist error is within {options.limit:g}."
+    worst = max(done.episodes, key=_worst)
+    errors = f"{worst.energy_error:+.4f} and {worst.twist_error:.4f}"
+    return f"Bad: the largest energy and twist errors are {errors}, allowed {options.limit:g}."

@@ -1,0 +1,97 @@
+"""A contact in six axes as a film: in space beside that on the rig."""
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import matplotlib.style
+import numpy as np
+from matplotlib.animation import AbstractMovieWriter, FFMpegWriter, PillowWriter
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from jaxhil.files import write_whole
+from jaxhil.simulation.contact_plot import BLUE, new_figure
+from jaxhil.sixdof.recording import Recorded
+from tuning.pictures.outlines import Line, outlines, rotation_matrix
+from tuning.pictures.six_axes import AXES, VIEWS, first_touch_in_space, rotation_of, window
+
+FRAMES, RATE = 60, 12  # how many there are, and how many are shown in a second
+ROUND = 3.0  # of the motion, how far around it is seen
+COLUMNS = ("in space", "on the rig")
+
+
+@matplotlib.style.context("default")
+def animate(recorded: Recorded, title: str, path: str | Path) -> None:
+    """Write the film, whole or not at all: both mechanisms where they touch, from two sides.
+
+    Raises OSError when that is not possible.
+    """
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shown_ = window(recorded)
+    ticks = np.unique(np.linspace(shown_.start, shown_.stop - 1, FRAMES).astype(int))
+    figure = new_figure((7.6, 8), title, above=0.9, below=0.6)
+    FigureCanvasAgg(figure)
+    figure.subplots_adjust(hspace=0.28, wspace=0.28)
+    moving = _scene(figure, recorded)
+    clock = figure.text(0.5, 0.925, "", ha="center", fontsize=10)
+    origin = recorded.time[first_touch_in_space(recorded)]
+    writer = _writer(target)
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / f"film{target.suffix.lower()}"
+        with writer.saving(figure, str(made), 64):
+            for tick in ticks:
+                clock.set_text(
+                    f"{1e3 * (recorded.time[tick] - origin):.0f} ms since the first touch in space"
+                )
+                for lines, chaser, place, view in moving:
+                    lines.set_segments(_seen(chaser, place[tick], view))
+                writer.grab_frame()
+        write_whole(target, made.read_bytes())
+
+
+def _writer(target: Path) -> AbstractMovieWriter:
+    return PillowWriter(fps=RATE) if target.suffix.lower() == ".gif" else FFMpegWriter(fps=RATE)
+
+
+def _scene(figure: Figure, recorded: Recorded) -> list[tuple[LineCollection, list[Line], np.ndarray, Any]]:
+    """Axes with the target in them; per axes the chaser's lines there and in C, its poses, the view."""
+    target, chaser = outlines(recorded.groups)
+    middle, half = _region(recorded)
+    moving = []
+    for row, view in enumerate(VIEWS):
+        for column, poses in enumerate((recorded.in_space, recorded.actual)):
+            axes = figure.add_subplot(2, 2, 2 * row + column + 1)
+            fixed: Any = [1e3 * line[:, list(view)] for line in target]
+            axes.add_collection(LineCollection(fixed, colors="0.55", linewidths=1.2))
+            lines = LineCollection([], colors=BLUE, linewidths=1.2)
+            axes.add_collection(lines)
+            _frame(axes, middle[list(view)], half, view)
+            axes.set_title(COLUMNS[column], fontsize=10)
+            moving.append((lines, chaser, poses, view))
+    return moving
+
+
+def _region(recorded: Recorded) -> tuple[np.ndarray, float]:
+    """Middle and half the width [m] of what is shown: where forces are, and as far around as things move."""
+    touching = recorded.depth > 0
+    points = recorded.point[touching] if np.any(touching) else recorded.actual[:1, :3]
+    shown_ = window(recorded)
+    moved = np.ptp(recorded.desired[shown_, :3], axis=0).max()
+    low, high = points.min(axis=0), points.max(axis=0)
+    return (low + high) / 2, float(np.max(high - low) / 2 + ROUND * moved + 0.01)
+
+
+def _frame(axes: Axes, middle: np.ndarray, half: float, view: tuple[int, int]) -> None:
+    across, up = (1e3 * (one + half * np.array([-1, 1])) for one in middle)
+    axes.set(xlim=tuple(across), ylim=tuple(up), aspect="equal")
+    axes.set(xlabel=f"{AXES[view[0]]} of T [mm]", ylabel=f"{AXES[view[1]]} of T [mm]")
+    axes.grid(True, color="0.9", linewidth=0.6)
+
+
+def _seen(chaser: list[Line], place: np.ndarray, view: tuple[int, int]) -> Any:
+    turn = rotation_matrix(rotation_of(place[3:]))
+    return [1e3 * (line @ turn.T + place[:3])[:, list(view)] for line in chaser]

@@ -1,0 +1,144 @@
+"""Outlines of the shapes that may touch, as lines in space: what pictures of six axes draw of a mechanism."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxhil.sixdof.candidates import Candidates, Capsules, ChaserSpheres, TargetSpheres
+from jaxhil.sixdof.forces import ContactGroup
+from jaxhil.sixdof.rotations import Quaternion
+from jaxhil.sixdof.shapes import Ball, Box, Capsule, Cavity, Drogue, Plane, Rim, Shape, Shell
+from jaxhil.sixdof.vectors import Vector
+
+Line = np.ndarray  # (points, 3) [m]
+
+TURN = np.linspace(0, 2 * np.pi, 49)
+MERIDIANS = 24  # of a surface of revolution
+MARK = 0.02  # of the size of the mechanism: a point's cross
+
+
+def outlines(groups: Sequence[ContactGroup]) -> tuple[list[Line], list[Line]]:
+    """Of the first lane's target, in T axes, and chaser, in C axes; each line once."""
+    pairs = [pair for group in groups for pair in _pairs(group.candidates)]
+    places = np.concatenate([_corners(shape) for pair in pairs for shape in pair])
+    size = float(np.max(np.linalg.norm(places, axis=1), initial=1e-3))
+    drawn = []
+    for shapes in ([target for _, target in pairs], [chaser for chaser, _ in pairs]):
+        lines = {line.round(9).tobytes(): line for shape in shapes for line in _lines(shape, size)}
+        drawn.append(list(lines.values()))
+    return drawn[0], drawn[1]
+
+
+def _pairs(candidates: Candidates) -> list[tuple[Shape, Shape]]:
+    """(chaser's, target's) shapes of the first lane."""
+
+    def every(shape: Any) -> list[Any]:
+        leaves, structure = jax.tree.flatten(shape)
+        rows = np.asarray([np.broadcast_arrays(*leaves)], float)[0, :, :, 0]
+        return [structure.unflatten(list(row)) for row in rows.T]
+
+    if isinstance(candidates, Capsules):
+        return list(zip(every(candidates.chaser), every(candidates.target), strict=True))
+    assert isinstance(candidates, (ChaserSpheres, TargetSpheres))
+    balls, others = every(Ball(candidates.centre, candidates.radius)), every(candidates.shape)
+    one_on_chaser = isinstance(candidates, ChaserSpheres)
+    return list(zip(balls, others, strict=True) if one_on_chaser else zip(others, balls, strict=True))
+
+
+def _corners(shape: Any) -> np.ndarray:
+    """Points (n, 3) that say how large a shape is; of a plane or a cone without end none."""
+    if isinstance(shape, (Ball, Cavity)):
+        reach = 0.0 if isinstance(shape, Cavity) else float(shape.radius)
+        return _point(shape.centre)[None] + reach * np.eye(3)
+    if isinstance(shape, Capsule):
+        return np.stack([_point(shape.start), _point(shape.end)])
+    if isinstance(shape, Shell):
+        return np.array([[float(shape.mouth_radius), 0.0, 0.0]])
+    if isinstance(shape, Box):
+        return _point(shape.centre)[None] + _point(shape.half_lengths)
+    return np.zeros((0, 3))
+
+
+def _lines(shape: Any, size: float) -> list[Line]:
+    if isinstance(shape, (Ball, Cavity)):
+        radius = float(shape.radius)
+        circles = [radius * np.roll(_circle(), turn, axis=1) for turn in range(3)] if radius else _cross(size)
+        return [_point(shape.centre) + circle for circle in circles]
+    if isinstance(shape, Plane):
+        return _plane(shape, size)
+    if isinstance(shape, Drogue):
+        return _drogue(shape, size)
+    if isinstance(shape, Rim):
+        return [float(shape.ring_radius) * _circle() + [0, 0, float(shape.height)]]
+    if isinstance(shape, Capsule):
+        return _capsule(shape)
+    assert isinstance(shape, Box)
+    return _box(shape)
+
+
+def _circle() -> Line:
+    return np.stack([np.cos(TURN), np.sin(TURN), 0 * TURN], axis=1)
+
+
+def _cross(size: float) -> list[Line]:
+    return [MARK * size * np.outer([-1, 1], axis) for axis in np.eye(3)]
+
+
+def _plane(plane: Plane, size: float) -> list[Line]:
+    normal = _point(plane.normal)
+    across = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    across /= np.linalg.norm(across)
+    sides = np.stack([across, np.cross(normal, across)])
+    corners = 1.2 * size * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1], [1, 1]]) @ sides
+    return [_point(plane.point) + corners]
+
+
+def _drogue(drogue: Drogue, size: float) -> list[Line]:
+    """Meridians and parallels of the bottom and the cone, up to the mouth."""
+    angle, bottom = float(drogue.half_angle), float(drogue.bottom_radius)
+    mouth = float(drogue.mouth_radius) if isinstance(drogue, Shell) else 1.2 * size
+    below = np.linspace(0, np.pi / 2 - angle, 9)
+    radius, height = bottom * np.sin(below), -bottom * np.cos(below)
+    end = (mouth * np.cos(angle) - bottom) / np.sin(angle)
+    radius, height = np.append(radius, mouth), np.append(height, end) + float(drogue.bottom)
+    meridian = np.stack([radius, 0 * radius, height], axis=1)
+    lines = [meridian @ _about_z(turn).T for turn in np.linspace(0, 2 * np.pi, MERIDIANS, endpoint=False)]
+    return lines + [r * _circle() + [0, 0, z] for r, z in zip(radius[-2:], height[-2:], strict=True)]
+
+
+def _capsule(capsule: Capsule) -> list[Line]:
+    start, end, radius = _point(capsule.start), _point(capsule.end), float(capsule.radius)
+    along = (end - start) / np.linalg.norm(end - start)
+    across = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
+    across *= radius / np.linalg.norm(across)
+    sides = [across, np.cross(along, across), -across, -np.cross(along, across)]
+    return [np.stack([start, end]), *(np.stack([start + side, end + side]) for side in sides)]
+
+
+def _box(box: Box) -> list[Line]:
+    half = _point(box.half_lengths)
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    edges = [(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit]
+    turned = (corners * half) @ rotation_matrix(box.attitude).T + _point(box.centre)
+    return [turned[list(edge)] for edge in edges]
+
+
+def rotation_matrix(attitude: Quaternion) -> np.ndarray:
+    """R (3, 3) of a unit quaternion."""
+    w, (x, y, z) = float(attitude.w), _point(attitude.v)
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+
+
+def _about_z(angle: float) -> np.ndarray:
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+
+
+def _point(vector: Vector) -> np.ndarray:
+    return np.array([float(vector.x), float(vector.y), float(vector.z)])

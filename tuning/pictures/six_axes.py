@@ -1,0 +1,136 @@
+"""Pictures of a run in six axes: poses and forces over time, and the mechanism as it touches."""
+
+from typing import Any
+
+import matplotlib.style
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from jaxhil.simulation.contact_plot import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION, finish, new_figure
+from jaxhil.sixdof.recording import Recorded
+from tuning.pictures.outlines import Line, outlines, rotation_matrix
+
+AXES = ("x", "y", "z")
+COLOURS = (BLUE, VERMILION, GREEN)
+MANY = (BLUE, VERMILION, GREEN, ORANGE, SKY, "0.35")  # candidates; further ones repeat them, dashed
+MARGIN = 0.05  # s shown before the first force and after the last
+MOST_NAMES = 12  # candidates in a legend
+VIEWS = ((0, 2), (1, 2))  # what is across and what is up
+
+
+@matplotlib.style.context("default")
+def six_axes_plot(recorded: Recorded, title: str) -> Figure:
+    """Pose, forces of the candidates and load over time, beside the same contact in space; below, the
+    mechanism at the first touch and at the deepest contact."""
+    figure = new_figure((12, 8.8), title, above=0.6, below=0.75)
+    rows = figure.add_gridspec(3, 4, height_ratios=(1, 1, 0.75), hspace=0.38, wspace=0.36)
+    shown, origin = window(recorded), first_touch_in_space(recorded)
+    time = 1e3 * (recorded.time[shown] - recorded.time[origin])
+    for place, name, part in ((rows[0, :2], "position [mm]", 0), (rows[0, 2:], "rotation [mrad]", 3)):
+        axes = figure.add_subplot(place)
+        for axis, colour in enumerate(COLOURS):
+            entry = part + axis
+            curves = (curve[shown, entry] - recorded.in_space[origin, entry] for curve in recorded[1:4])
+            desired, actual, in_space = (1e3 * curve for curve in curves)
+            axes.plot(time, in_space, color="0.7", linewidth=3)
+            axes.plot(time, desired, color=colour, label=AXES[axis])
+            axes.plot(time, actual, color=colour, linestyle=":")
+        axes.set(ylabel=f"{name}, less that\nat first touch in space")
+        finish(axes, "best")
+    left, right = figure.add_subplot(rows[1, :2]), figure.add_subplot(rows[1, 2:])
+    _forces(left, recorded, shown, time)
+    _moments(right, recorded, shown, time)
+    moments = (
+        ("first touch", first_touch(recorded)),
+        ("deepest", int(np.argmax(recorded.depth.max(axis=1)))),
+    )
+    target, chaser = outlines(recorded.groups)
+    for column, (name, tick) in enumerate(moments):
+        after = 1e3 * (recorded.time[tick] - recorded.time[origin])
+        for view, (across, up) in enumerate(VIEWS):
+            axes = figure.add_subplot(rows[2, 2 * column + view])
+            draw_view(axes, recorded, tick, target, chaser, across, up)
+            axes.set_title(f"{name} on the rig, {after:.3g} ms", fontsize=10)
+    lines = "Solid: numerical model; dotted: hardware, when the sensor samples it; grey: in space."
+    lines += " Below: target grey, chaser blue, forces on the chaser black."
+    figure.text(0.5, 0.015, lines, ha="center", fontsize=9)
+    return figure
+
+
+def first_touch(recorded: Recorded) -> int:
+    """The tick at which the sensor first samples a contact; the last one where there is none."""
+    touching = np.flatnonzero(np.any(recorded.depth > 0, axis=1))
+    return int(touching[0]) if len(touching) else len(recorded.time) - 1
+
+
+def first_touch_in_space(recorded: Recorded) -> int:
+    """Likewise of the two free bodies; that on the rig where they never touch."""
+    touching = np.flatnonzero(np.any(recorded.wrench_in_space != 0, axis=1))
+    return int(touching[0]) if len(touching) else first_touch(recorded)
+
+
+def window(recorded: Recorded) -> slice:
+    """The ticks worth showing: those with contact on the rig or in space, and some around them."""
+    touching = np.any(recorded.depth > 0, axis=1) | np.any(recorded.wrench_in_space != 0, axis=1)
+    ticks = np.flatnonzero(touching)
+    if not len(ticks):
+        return slice(0, len(recorded.time))
+    around = round(MARGIN / float(recorded.time[1] - recorded.time[0])) + 1
+    return slice(max(ticks[0] - around, 0), min(ticks[-1] + around, len(recorded.time)))
+
+
+def draw_view(
+    axes: Axes, recorded: Recorded, tick: int, target: list[Line], chaser: list[Line], across: int, up: int
+) -> None:
+    """Both mechanisms at a tick, seen along the third axis, in mm."""
+    place = recorded.actual[tick]
+    turn = rotation_matrix(rotation_of(place[3:]))
+    moved = [line @ turn.T + place[:3] for line in chaser]
+    for lines, colour in ((target, "0.55"), (moved, BLUE)):
+        flat: Any = [1e3 * line[:, [across, up]] for line in lines]
+        axes.add_collection(LineCollection(flat, colors=colour, linewidths=0.9))
+    axes.autoscale_view()
+    axes.set_aspect("equal", adjustable="box")
+    largest = max(float(np.max(recorded.force)), 1e-12)
+    reach = 0.4 * np.ptp(axes.dataLim.intervaly)
+    for candidate in np.flatnonzero(recorded.depth[tick] > 0):
+        start = 1e3 * recorded.point[tick, candidate][[across, up]]
+        push = reach * recorded.push[tick, candidate][[across, up]] / largest
+        axes.plot(*start, marker=".", color=BLACK, markersize=5)
+        axes.annotate("", start + push, start, arrowprops={"arrowstyle": "->", "color": BLACK})
+    axes.set(xlabel=f"{AXES[across]} of T [mm]", ylabel=f"{AXES[up]} of T [mm]")
+    axes.tick_params(labelsize=8)
+
+
+def rotation_of(theta: np.ndarray) -> Any:
+    """The quaternion of a rotation vector [rad]."""
+    from jaxhil.sixdof.rotations import Quaternion
+    from jaxhil.sixdof.vectors import vector
+
+    angle = float(np.linalg.norm(theta))
+    part: Any = np.sinc(angle / (2 * np.pi)) / 2 * theta
+    return Quaternion(np.cos(angle / 2), vector(part))  # pyright: ignore[reportArgumentType]
+
+
+def _forces(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> None:
+    """Normal force of every candidate that touches, and the whole force in space."""
+    whole = np.linalg.norm(recorded.wrench_in_space[shown, :3], axis=1)
+    axes.plot(time, whole, color="0.7", linewidth=3, label="in space, whole")
+    for place, candidate in enumerate(np.flatnonzero(np.any(recorded.force > 0, axis=0))):
+        colour, line = MANY[place % len(MANY)], "-" if place < len(MANY) else "--"
+        name = recorded.names[candidate] if place < MOST_NAMES else None
+        axes.plot(time, recorded.force[shown, candidate], color=colour, linestyle=line, label=name)
+    axes.set(ylabel="normal force of each contact [N]", xlabel="time since the first touch in space [ms]")
+    finish(axes, "best")
+
+
+def _moments(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> None:
+    """Moment about T of the real contact, of what moves the numerical model, and in space."""
+    for axis, colour in enumerate(COLOURS):
+        axes.plot(time, recorded.wrench_in_space[shown, 3 + axis], color="0.7", linewidth=3)
+        axes.plot(time, recorded.command[shown, 3 + axis], color=colour, label=AXES[axis])
+        axes.plot(time, recorded.wrench[shown, 3 + axis], color=colour, linestyle=":")
+    axes.set(ylabel="moment about T [N m]", xlabel="time since the first touch in space [ms]")
+    finish(axes, "best")
