@@ -139,6 +139,7 @@ def test_simulate_a_builtin(jaxhil, tmp_path, name):
     assert picture.read_bytes().startswith(b"\x89PNG")
     film = tmp_path / "run.gif"
     ran = jaxhil("simulate", name, "--json", "--compensator", "phase_lead", "--animate", film)
+    assert ran.code == 1, ran.err
     assert film.read_bytes().startswith(b"GIF8")
     lead = json.loads(ran.out)
     assert lead["episodes"][0]["energy_error"] < episode["energy_error"]

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhil.errors import InputError, shown
+from jaxhil.mechanism.file import load
 from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.environment import computing
 from jaxhil.simulation.gain_choice import choose_gains
 from jaxhil.simulation.run import check_seed
@@ -106,15 +108,24 @@ def simulate_six_axes(
         allowed = f"{', '.join(PER_AXIS)}: in six axes there are no others so far"
         raise InputError(f"compensator: found {shown(compensator)}, allowed {allowed}")
     number = check_seed(seed)
-    # Its gains are those of one axis: they depend on the sensor's delay and on the control period alone.
-    like_one_axis: Any = mechanism
-    name, values = choose_gains(like_one_axis, compensator, gains)
+    name, values = choose_gains(_like_one_axis(mechanism), compensator, gains)
     with computing():
         scenario = build_scenarios(mechanism, seed=number)
         check_scenario(mechanism, scenario)
         loop = loop_of(mechanism, name, scenario)
         found = jax.device_get(_run(loop, {key: jnp.asarray(one) for key, one in values.items()}, scenario))
     return _result(mechanism, name, values, number, found)
+
+
+def _like_one_axis(mechanism: SixAxisMechanism) -> Mechanism:
+    """One of one axis with the same gains: they depend on force sensor and control period alone."""
+    rig = mechanism.rig
+    values = {
+        "rig.control_period": rig.control_period,
+        "rig.force_sensor.delay": rig.force_sensor.delay,
+        "rig.force_sensor.time_constant": rig.force_sensor.time_constant,
+    }
+    return load("rig-300kg", [f"{path}={value!r}" for path, value in values.items()]).mechanism
 
 
 def _result(

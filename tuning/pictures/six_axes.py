@@ -106,12 +106,12 @@ def draw_view(
 
 def rotation_of(theta: np.ndarray) -> Any:
     """The quaternion of a rotation vector [rad]."""
-    from jaxhil.sixdof.rotations import Quaternion
+    import jax.numpy as jnp
+
+    from jaxhil.sixdof.rotations import exponential
     from jaxhil.sixdof.vectors import vector
 
-    angle = float(np.linalg.norm(theta))
-    part: Any = np.sinc(angle / (2 * np.pi)) / 2 * theta
-    return Quaternion(np.cos(angle / 2), vector(part))  # pyright: ignore[reportArgumentType]
+    return exponential(vector(jnp.asarray(theta)))
 
 
 def _forces(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> None:
