@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from conftest import Ran
 
-from jaxhil.mechanism.file import builtin_names, load, suite_names
+from jaxhil.mechanism.file import builtin_names, load, six_axis_names, suite_names
 from jaxhil.mechanism.json_schema import json_schema
 from jaxhil.simulation import environment
 from tuning.cli.commands.tune import folder_name, is_better
@@ -164,7 +164,7 @@ def test_init_overwrites_nothing(jaxhil, tmp_path, taken):
 
 
 def test_init_lists_names(jaxhil):
-    names = [*builtin_names(), *suite_names()]
+    names = [*builtin_names(), *suite_names(), *six_axis_names()]
     assert (
         jaxhil("init", "--list").out.split() == jaxhil("init", "--list", "--json").document["names"] == names
     )

@@ -50,7 +50,7 @@ NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, 
 DENSITY_SQUARINGS = 8  # n = 2^8 of what is known of damping
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
 SOFT = 25.0  # times the variance of where a surface was met: soft ones are found late
-ELSEWHERE = 9.0  # times the variance of where the surface is expected: it is not there
+NOT_THERE = 9.0  # times the variance of where the surface is expected: it is not there
 UNLIKELY = 0.1  # that it is not
 USUAL = 0.5  # stiffness, of the most that it may be
 FARTHEST, WHOLE = 0.004, 0.015  # s by which knots are moved, from what depth [s] on; before it less
@@ -160,7 +160,7 @@ def learn(old: Bank, reading: Reading, farthest: Array, damping: Array) -> tuple
     # While a contact closes its force is not negative. Opening, nothing may be left of it before depth 0.
     closes = rate > 0
     # On which side of the surface it was, between two delays, is not known.
-    near = 0.5 * (OFFSETS[1] - OFFSETS[0]) * farthest[None] * old.pace[None]
+    near = float(0.5 * (OFFSETS[1] - OFFSETS[0])) * farthest[None] * old.pace[None]
     beside = (depth < near) & (depth > -near)
     used = counts & inside & ~beside & ~tight & (closes | tells(predicted, force, noise))
     maps = correct(old.maps, predicted, force, used)
@@ -256,7 +256,7 @@ def _place(meeting: Meeting, offsets: Array, length: Array, speed: Array, plane_
     [m]."""
     known = plane_spread**2
     away = meeting.place[None] - offsets * speed[None]
-    elsewhere = away * away > (ELSEWHERE * (known + meeting.variance))[None]
+    elsewhere = away * away > (NOT_THERE * (known + meeting.variance))[None]
     share = jnp.where(elsewhere, 1, (known / (known + SOFT * meeting.variance))[None])
     place = share * away
     positive = meeting.variance > 0

@@ -43,7 +43,7 @@ NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, 
 DENSITY_SQUARINGS = 8
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
 SOFT = 25.0  # times the variance of where a surface was met: soft ones are found late
-ELSEWHERE = 9.0  # times the variance of where the surface is expected: it is not there
+NOT_THERE = 9.0  # times the variance of where the surface is expected: it is not there
 UNLIKELY = 0.1  # that it is not
 USUAL = 0.5  # stiffness, of the most that it may be
 FARTHEST, WHOLE = 0.004, 0.015  # s by which knots are moved, from what depth [s] on; before it less
@@ -125,7 +125,7 @@ class DelayBank:
         length = meeting.speed / meeting.pace
         known = self._plane_spread * self._plane_spread
         away = meeting.place - self._offsets * meeting.speed
-        elsewhere = away * away > ELSEWHERE * (known + meeting.variance)
+        elsewhere = away * away > NOT_THERE * (known + meeting.variance)
         share = np.where(elsewhere, 1.0, known / (known + SOFT * meeting.variance))
         places = share * away
         off = USUAL * (share * (meeting.stiffness * (sqrt(meeting.variance) / length)))
