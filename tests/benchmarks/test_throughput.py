@@ -31,8 +31,8 @@ WIDTHS = 8, 16  # lanes a block of the C++ loop; which is faster depends on law 
 INFORMATION = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
 PROCESSOR = next((row.split(":")[1].strip() for row in INFORMATION.splitlines() if "model name" in row), "?")
 INTEL = "GenuineIntel" in INFORMATION
-# Bars beside the C++ loop at its best width, at 16 lanes a block, and of scenarios to the fixed horizon. An Intel
-# Xeon (model 207) made 0.38 to 0.46 and 0.46 to 0.52 of the C++ loop's lane-steps/s.
+# Bars beside the C++ loop at its best width, at 16 lanes a block, and of scenarios to the fixed horizon. An
+# Intel Xeon (model 207) made 0.38 to 0.46 and 0.46 to 0.52 of the C++ loop's lane-steps/s.
 LANE_STEPS = {"none": 0.33, "response_error": 0.4} if INTEL else {"none": 0.5, "response_error": 0.5}
 LANE_STEPS_16 = {"none": 0.33, "response_error": 0.43} if INTEL else {"none": 0.65, "response_error": 0.65}
 SCENARIOS = {"none": 0.4, "response_error": 0.45} if INTEL else {"none": 1.0, "response_error": 1.0}
