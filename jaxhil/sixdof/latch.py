@@ -89,6 +89,7 @@ def _either(condition: Array, one, other):
 
 
 def _product(matrix: Array, linear: Vector, angular: Vector) -> tuple[Vector, Vector]:
-    parts = jnp.stack(jax.tree.leaves((linear, angular)))
+    # All latches turn alike: the angular velocity has a leading axis of length 1.
+    parts = jnp.stack(jnp.broadcast_arrays(*jax.tree.leaves((linear, angular))))
     result = jnp.sum(matrix * parts[None], axis=1)
     return vector(result[:3]), vector(result[3:])
