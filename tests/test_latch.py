@@ -47,30 +47,34 @@ def test_it_catches_what_is_deep_and_aligned_and_holds_on():
     assert held.caught.all()
 
 
+@pytest.mark.slow
 def test_several_hold_as_much_as_each_alone():
     """Caught at unlike depths, with unlike springs, and with dampers."""
-    kinds = [latch(False, 0.01)._replace(point=place([0.2, y, 0.0], (1, 1))) for y in (-0.1, 0.0, 0.3)]
-    kinds = [one._replace(stiffness=share * one.stiffness) for share, one in enumerate(kinds, 1)]
-    number = {"stiffness": 2, "damping": 2}
-    together = Latch(*(
-        jax.tree.map(lambda *parts, at=number.get(name, 0): jnp.concatenate(parts, axis=at), *leaves)
-        for name, *leaves in zip(Latch._fields, *kinds, strict=True)
-    ))  # fmt: skip
+    one, share = latch(False, 0.01), jnp.array([[1.0], [2.0], [3.0]])
+    points = place([[0.2, 0.2, 0.2], [-0.1, 0.0, 0.3], [0.0, 0.0, 0.0]], BATCH)
+    all_three = Latch(
+        points, share * one.depth, share * one.angle, share * one.speed,
+        share[None, None] * one.stiffness, share[None, None] ** 2 * one.damping, share < 0,
+    )  # fmt: skip
     motion = Twist(place([0.01, 0.02, -0.01], BATCH), place([0.1, 0.0, 0.2], BATCH))
-    step = jax.jit(latch_wrench)
 
-    def after(one):
-        held = init_latch(one, at([0, 0, 0.01], [0, 0, 0]))
-        for position, theta in (([0, 0, -3e-3], [0.02, 0, 0]), ([0.01, 0, -5e-3], [0.01, 0.02, 0.03])):
-            wrench, held = step(one, held, at(position, theta), motion)
-        return jnp.stack(jax.tree.leaves(wrench)), held.caught
+    @jax.jit
+    def after(latches):
+        held = init_latch(latches, at([0, 0, 0.01], [0, 0, 0]))
+        poses = [([0, 0, -5e-3], [0.02, 0, 0]), ([0.01, 0, -8e-3], [0.01, 0.02, 0.03])]
+        given = jax.tree.map(lambda *parts: jnp.stack(parts), *(at(*pose) for pose in poses))
+        return jax.lax.scan(lambda held, pose: latch_wrench(latches, held, pose, motion)[::-1], held, given)
 
+    held, together = after(all_three)
+    assert held.caught.shape == (3, 1) and held.caught.all()
     # One alone: the others are never deep enough.
-    alone = [after(together._replace(depth=jnp.where(one[:, None], 1e-3, jnp.inf))) for one in jnp.eye(3) > 0]
-    wrench, caught = after(together)
-    assert caught.shape == (3, 1) and caught.all()
-    np.testing.assert_allclose(wrench, sum(part for part, _ in alone), rtol=1e-12)
-    assert all(caught.sum() == 1 for _, caught in alone)
+    alone = [after(all_three._replace(depth=jnp.where(one[:, None], 1e-3, jnp.inf))) for one in np.eye(3) > 0]
+    assert all(held.caught.sum() == 1 for held, _ in alone)
+    for found, *parts in zip(
+        *map(jax.tree.leaves, (together, *(wrench for _, wrench in alone))), strict=True
+    ):
+        np.testing.assert_allclose(found, sum(parts), rtol=1e-9, atol=1e-9)
+    assert np.max(np.abs(components(together.force))) > 1e3
 
 
 @pytest.mark.slow
