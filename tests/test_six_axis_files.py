@@ -19,8 +19,9 @@ BODY = {"position": [0, 0, 0], "attitude": [1, 0, 0, 0], "velocity": [0, 0, 0], 
 
 
 def refusal(*overrides, name="probe-drogue", unset=()):
+    given = overrides[0] if len(overrides) == 1 and isinstance(overrides[0], dict) else overrides
     with pytest.raises(InputError) as caught:
-        load_any(name, overrides, unset)
+        load_any(name, given, unset)
     message = str(caught.value)
     assert message.isprintable() and message.startswith(f"{name}: ")
     return message
@@ -68,7 +69,7 @@ def test_six_numbers_may_be_said_as_one_or_two():
         ("contact.tip.stiffness=[1, 2]", "[1.0, 2.0], allowed a number > 0 (law hunt_crossley)"),
         ("contact.tip.law=hardening", "reference_depth: found nothing, allowed a number > 0"),
         ("contact.tip.depths=[1]", "depths: found [1.0], allowed nothing (only for law piecewise_linear)"),
-        ("contact.tip.friction.law=bristle", "slip: found 0.0005, allowed nothing (bristle"),
+        ("contact.tip.friction.law=bristle", "slip: found 0.0025, allowed nothing (bristle"),
         ("contact.tip.chaser.radius=0.05", "0.05, allowed a number < 0.04 m, the radius that it is to fit"),
         ("contact.tip.chaser.radius=0", "allowed a number > 0 m: a drogue with a mouth is a thin shell"),
         ("contact.tip.chaser.from=[0, 0, 0]", "allowed nothing (sphere does not use it: unset it)"),
@@ -91,6 +92,42 @@ def test_six_numbers_may_be_said_as_one_or_two():
 )  # fmt: skip
 def test_unusable_values_are_named(override, reason):
     assert reason in refusal(override)
+
+
+SPRING = np.eye(6).tolist()
+NO_SPRING = (-np.eye(6)).tolist()
+LEGS = "hydraulic-hexapod"
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "reason"),
+    [
+        ("ring-capture", {"latch.hooks.depth": None}, "hooks.depth: found nothing, allowed a number, or"),
+        ("ring-capture", {"latch.hooks.latched": True}, "latched: found true, allowed false: an approach"),
+        ("ring-capture", {"latch.hooks.stiffness": None}, "stiffness: found nothing, allowed six numbers"),
+        ("ring-capture", {"latch.hooks.stiffness_matrix": SPRING}, "stiffness_matrix beside it, allowed"),
+        ("ring-capture",
+         {"latch.hooks.stiffness": None, "latch.hooks.stiffness_matrix": NO_SPRING,
+          "uncertainty": {}}, "or has an eigenvalue below 0, allowed that of a spring"),
+        ("ring-capture", {"latch.hooks.angel": 0.1}, "an unknown key, allowed one of chaser, pattern"),
+        ("ring-capture", {"latch.hooks.pattern.count": 0}, "count: found 0, allowed an integer from 1"),
+        ("ring-capture", {"latch": {"a b": {"chaser": [0, 0, 0]}}}, 'latch."a b": found this name, allowed'),
+        (LEGS, {"rig.simulator.height": None}, 'height: found nothing, allowed what space = "stewart" needs'),
+        (LEGS, {"rig.simulator.base": [[0, 0, 0]]}, "base: found a list of 1 entry, allowed a list of 6"),
+        (LEGS, {"rig.simulator.base[2]": [0, 0]}, "base[2]: found a list of 2 entries, allowed a list of 3"),
+        (LEGS, {"rig.simulator.stroke": [2, 1]}, "stroke: found [2.0, 1.0], allowed a longest leg longer"),
+        (LEGS, {"rig.simulator.delay": {"translation": 1e-3, "rotation": 2e-3}}, "list of six, one each leg"),
+        (LEGS, {"rig.simulator.space": "task"}, '(space = "task" does not use it)'),
+        (LEGS, {"rig.simulator.space": "two_robots", "rig.simulator.target_robot.share": 0.5},
+         'base: found [[1.58, 0.255, 0.0]'),
+        ("claw-two-arms", {"rig.simulator.target_robot": None}, "target_robot: found nothing, allowed what"),
+        ("claw-two-arms", {"rig.simulator.target_robot.share": 1.5}, "share[0]: found 1.5, allowed a number"),
+        ("claw-two-arms", {"rig.simulator.target_robot.time_constant": 0.1}, "(model second_order does not"),
+        ("claw-two-arms", {"rig.simulator.space": "tasks"}, "allowed one of stewart, task, two_robots"),
+    ],
+)  # fmt: skip
+def test_unusable_latches_and_simulators_are_named(name, changes, reason):
+    assert reason in refusal(changes, name=name)
 
 
 def test_shapes_that_cannot_touch():

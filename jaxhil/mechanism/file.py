@@ -22,7 +22,7 @@ from jaxhil.mechanism import rules as mechanism_rules
 from jaxhil.mechanism.conversion import KeyProblem, close_match, to_mechanism, to_struct
 from jaxhil.mechanism.overrides import apply_override, parse_override
 from jaxhil.mechanism.six_axes import SCHEMA_SIX, SixAxisMechanism, is_six_axes
-from jaxhil.mechanism.six_axes_rules import check_six_axes
+from jaxhil.mechanism.six_axes_rules import check_legs, check_six_axes
 from jaxhil.mechanism.structs import SCHEMA, Mechanism
 from jaxhil.mechanism.toml_table import parse_toml, read_bytes
 
@@ -213,6 +213,7 @@ def _missing(label: str) -> InputError:
 def _validated(raw: Mapping[str, Any]) -> AnyMechanism:
     if is_six_axes(raw):
         in_space = to_struct(SixAxisMechanism, raw)
+        check_legs(raw)
         check_six_axes(in_space)
         return in_space
     if isinstance(raw, Mapping) and raw.get("schema", SCHEMA) != SCHEMA:

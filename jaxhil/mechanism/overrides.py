@@ -99,8 +99,8 @@ def apply_override(raw: Mapping[str, Any], path: Path, value: Any) -> dict[str, 
 
 def _numeric_keys(raw: Mapping[str, Any]) -> dict[str, Range]:
     """Of a raw table of six axes."""
-    contacts = raw.get("contact")
-    return numeric_keys_beside(tuple(map(str, contacts)) if isinstance(contacts, Mapping) else ())
+    tables = (raw.get(key) for key in ("contact", "latch"))
+    return numeric_keys_beside(*(tuple(map(str, one)) if isinstance(one, Mapping) else () for one in tables))
 
 
 def _parse_path(text: str, key: str | None = None) -> tuple[Path, int]:

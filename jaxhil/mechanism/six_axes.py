@@ -10,22 +10,18 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Struct, field
 
+from jaxhil.mechanism.six_axes_rig import Inertia, Length, Metre, Radian, Rig, six, three, zeros
 from jaxhil.mechanism.structs import (
-    Coefficient,
-    CommandHold,
     Correlation,
     Depth,
-    Integrator,
     Law,
-    Polynomial,
     Range,
-    SimulatorModel,
     Slopes,
     Stiffness,
     Uncertainty,
@@ -38,18 +34,14 @@ __all__ = [
     "Approach",
     "BodyState",
     "Contact",
-    "ForceSensor",
     "Friction",
+    "Latch",
     "Pattern",
-    "PositionSensor",
-    "Rig",
     "RigidBody",
     "Shape",
-    "Simulator",
     "SixAxisMechanism",
     "Start",
     "TargetPattern",
-    "Tool",
     "is_six_axes",
     "numeric_keys_beside",
     "numeric_keys_of",
@@ -57,47 +49,18 @@ __all__ = [
 ]
 
 SCHEMA_SIX = "jaxhil/mechanism/2"
-MOTION = ("translation", "rotation")
-LOADS = ("force", "torque")
 
 ShapeName = Literal["sphere", "plane", "drogue", "capsule", "box"]
 
 # Entries of lists.
-Metre = Annotated[float, says("component", "m")]
-Radian = Annotated[float, says("component of a rotation vector", "rad")]
 Speed = Annotated[float, says("component", "m/s")]
 Rate = Annotated[float, says("component", "rad/s")]
-Acceleration = Annotated[float, says("component", "m/s^2")]
 Part = Annotated[float, says("component", "1")]
-Length = Annotated[float, says("length", "m", gt=0.0)]
-Moment = Annotated[float, says("entry of the inertia", "kg m^2")]
-MomentRow = Annotated[list[Moment], Meta(min_length=3, max_length=3)]
-Inertia = list[Moment | MomentRow]
-CrosstalkRow = Annotated[
-    list[Annotated[float, says("of one component in another's channel", "1", ge=-1.0, le=1.0)]],
-    Meta(min_length=6, max_length=6),
+Spring = Annotated[float, says("of one axis", "N/m, N m", ge=0.0)]
+SpringRow = Annotated[
+    list[Annotated[float, says("entry of the stiffness", "N/m, N, N m")]], Meta(min_length=6, max_length=6)
 ]
-# Of six axes or channels. Where translation and rotation have different units, both are said.
-Hertz = Annotated[float, says("of one axis", "Hz", gt=0.0)]
-Ratio = Annotated[float, says("of one axis", "1", gt=0.0)]
-Second = Annotated[float, says("of one axis", "s", ge=0.0, le=1.0)]
-Load = Annotated[float, says("of one channel", "N, N m")]
-Spread = Annotated[float, says("of one channel", "N, N m", ge=0.0)]
-Limit = Annotated[float, says("of one channel", "N, N m", gt=0.0, infinite=True)]
-
-
-def three(meaning: str) -> Meta:
-    """Of a vector, what it means."""
-    return Meta(min_length=3, max_length=3, description=meaning)
-
-
-def six(meaning: str, names: tuple[str, str] = MOTION) -> Meta:
-    """Of six numbers, what they mean. A file may say one number for all, or one each for the `names`."""
-    return Meta(min_length=6, max_length=6, description=meaning, extra={"six": names})
-
-
-def _zeros(count: int) -> Callable[[], list[Any]]:
-    return lambda: [0.0] * count
+Damper = Annotated[float, says("of one axis", "N s/m, N m s", ge=0.0)]
 
 
 class RigidBody(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -108,21 +71,21 @@ class RigidBody(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     interface: Annotated[list[Metre], three("from the centre of mass to the interface frame, in body axes")]
     interface_rotation: Annotated[
         list[Radian], three("rotation vector of the interface frame against the body axes")
-    ] = field(default_factory=_zeros(3))
+    ] = field(default_factory=zeros(3))
 
 
 class Approach(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How the bodies meet: C against T at the first touch, in T axes, in free flight."""
 
     offset: Annotated[list[Metre], Meta(min_length=2, max_length=2, description="of C's origin, x and y")] = (
-        field(default_factory=_zeros(2))
+        field(default_factory=zeros(2))
     )
     attitude: Annotated[list[Radian], three("rotation vector of C against T")] = field(
-        default_factory=_zeros(3)
+        default_factory=zeros(3)
     )
     velocity: Annotated[list[Speed], three("of C's origin, as seen from T; z is negative")]
     angular_velocity: Annotated[list[Rate], three("of the chaser against the target")] = field(
-        default_factory=_zeros(3)
+        default_factory=zeros(3)
     )
     episodes: Annotated[int, says("how many chains of touches a run has, at most", "1", ge=1, le=100)] = 1
     duration: Annotated[float, says("of the run, at most", "s", gt=0.0, le=1000.0)] = 3.0
@@ -228,87 +191,26 @@ class Contact(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     friction: Annotated[Friction, says("along the surface")] | None = None
 
 
-class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The motion simulator, axis by axis, from commanded to actual coordinates: G(s) exp(-s delay)."""
+class Latch(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A point of the chaser that is caught, and from then on held by a spring of six axes."""
 
-    space: Annotated[Literal["task"], says("what its axes are")] = "task"
-    model: Annotated[SimulatorModel, says("what G(s) is")]
-    natural_frequency: Annotated[list[Hertz], six("of second_order")] | None = None
-    damping_ratio: Annotated[list[Ratio], six("of second_order")] | None = None
-    time_constant: Annotated[list[Second], six("of first_order")] | None = None
-    coefficients: (
+    chaser: Annotated[list[Metre], three("the point, in C axes")]
+    pattern: Annotated[Pattern, says("copies of the point, held alike")] | None = None
+    depth: Annotated[float, says("below T's plane z = 0 from which it is caught", "m", ge=0.0)] | None = None
+    angle: Annotated[float, says("of C against T up to which it is caught", "rad", gt=0.0)] | None = None
+    speed: Annotated[float, says("of receding up to which it is caught", "m/s", ge=0.0, infinite=True)] = (
+        math.inf
+    )
+    stiffness: Annotated[list[Spring], six("of the spring, in T axes")] | None = None
+    stiffness_matrix: (
         Annotated[
-            list[Coefficient],
-            Meta(min_length=3, max_length=3, description="[a1, a2, a3] of 1/(1 + a1 s + a2 s^2 + a3 s^3)"),
+            list[SpringRow],
+            Meta(min_length=6, max_length=6, description="instead, of force and moment in T axes"),
         ]
         | None
     ) = None
-    numerator: Annotated[Polynomial, Meta(description="of G(s), in descending powers of s")] | None = None
-    denominator: Annotated[Polynomial, Meta(description="of G(s), in descending powers of s")] | None = None
-    delay: Annotated[list[Second], six("transport delay of the motion")] = field(default_factory=_zeros(6))
-
-
-class Tool(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a moving sensor carries, and what the controller takes it to be."""
-
-    mass: Annotated[float, says("of the tool", "kg", ge=0.0)]
-    com: Annotated[list[Metre], three("its centre of mass, in C axes")]
-    inertia: Annotated[Inertia, three("about its centre of mass, in C axes")] = field(
-        default_factory=_zeros(3)
-    )
-    mass_assumed: Annotated[float, says("what the controller takes it to be", "kg", ge=0.0)] | None = None
-    com_assumed: Annotated[list[Metre], three("what the controller takes it to be")] | None = None
-    inertia_assumed: Annotated[Inertia, three("what the controller takes it to be")] | None = None
-
-
-class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The six-axis force sensor: where it is, its delay and lag, then what becomes of a sample."""
-
-    side: Annotated[Literal["fixed", "moving"], says("under the target's mechanism, or on the flange")] = (
-        "fixed"
-    )
-    delay: Annotated[float, says("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
-    time_constant: Annotated[float, says("of the reading's first-order lag", "s", ge=0.0)] = 0.0
-    noise_std: Annotated[list[Spread], six("standard deviation of white noise", LOADS)] = field(
-        default_factory=_zeros(6)
-    )
-    crosstalk: Annotated[
-        list[CrosstalkRow],
-        Meta(min_length=6, max_length=6, description="of each component (column) in each channel (row)",
-             extra={"square": 6}),
-    ] = field(default_factory=lambda: [[0.0] * 6 for _ in range(6)])  # fmt: skip
-    bias: Annotated[list[Load], six("added to every reading", LOADS)] = field(default_factory=_zeros(6))
-    quantum: Annotated[list[Spread], six("to multiples of which a reading is rounded", LOADS)] = field(
-        default_factory=_zeros(6)
-    )
-    dead_zone: Annotated[list[Spread], six("below which nothing is read", LOADS)] = field(
-        default_factory=_zeros(6)
-    )
-    range: Annotated[list[Limit], six("beyond which a reading saturates", LOADS)] = field(
-        default_factory=lambda: [math.inf] * 6
-    )
-    tool: Annotated[Tool, says("what a moving sensor carries")] | None = None
-    gravity: Annotated[list[Acceleration], three("for a moving sensor, in T axes")] = field(
-        default_factory=_zeros(3)
-    )
-
-
-class PositionSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The sensor of the hardware's pose, by which the reading of a moving force sensor is turned back."""
-
-    delay: Annotated[float, says("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
-
-
-class Rig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The controller, the motion simulator, the sensor."""
-
-    control_period: Annotated[float, says("time from tick to tick", "s", gt=0.0, le=0.1)]
-    integrator: Annotated[Integrator, says("of the numerical model")] = "semi_implicit_euler"
-    command_latency: Annotated[int, says("periods until a command reaches the drives", "1", ge=0, le=1)] = 0
-    command_hold: Annotated[CommandHold, says("of the command within a period")] = "linear"
-    simulator: Annotated[Simulator, says("the motion simulator")]
-    force_sensor: Annotated[ForceSensor, says("the force sensor")] = field(default_factory=ForceSensor)
-    position_sensor: Annotated[PositionSensor, says("the position sensor")] = PositionSensor()
+    damping: Annotated[list[Damper], six("beside the spring, in T axes")] = field(default_factory=zeros(6))
+    latched: Annotated[bool, says("whether it holds from the start on")] = False
 
 
 class SixAxisMechanism(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -322,6 +224,9 @@ class SixAxisMechanism(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     approach: Annotated[Approach, says("how they meet")] | None = None
     start: Annotated[Start, says("their states at the start, instead of approach")] | None = None
     contact: Annotated[dict[str, Contact], says("where they may touch")] = field(default_factory=dict)
+    latch: Annotated[dict[str, Latch], says("what holds the chaser once it is caught")] = field(
+        default_factory=dict
+    )
     rig: Annotated[Rig, says("the rig")]
     uncertainty: Annotated[
         dict[str, Uncertainty], says("how uncertain the number of each dotted path is")
@@ -336,13 +241,13 @@ def is_six_axes(raw: object) -> bool:
 
 def numeric_keys_of(mechanism: SixAxisMechanism) -> dict[str, Range]:
     """Every key of real numbers that the mechanism could have, by dotted path, and its allowed values."""
-    return numeric_keys_beside(tuple(mechanism.contact))
+    return numeric_keys_beside(tuple(mechanism.contact), tuple(mechanism.latch))
 
 
 @functools.cache
-def numeric_keys_beside(contacts: tuple[str, ...]) -> dict[str, Range]:
-    """Likewise, with contacts of these names."""
-    named: Any = {"contact": contacts}
+def numeric_keys_beside(contacts: tuple[str, ...], latches: tuple[str, ...]) -> dict[str, Range]:
+    """Likewise, with contacts and latches of these names."""
+    named: Any = {"contact": contacts, "latch": latches}
     return ranges_of(six_axis_type(), named)
 
 

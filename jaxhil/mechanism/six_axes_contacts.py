@@ -11,10 +11,10 @@ import numpy as np
 from jaxhil.errors import shown
 from jaxhil.mechanism.conversion import KeyProblem, Path
 from jaxhil.mechanism.rules import LAWS_OF_KEYS, UNDAMPED
-from jaxhil.mechanism.six_axes import Contact, Friction, Shape, SixAxisMechanism
+from jaxhil.mechanism.six_axes import Contact, Friction, Latch, Shape, SixAxisMechanism
 from jaxhil.mechanism.structs import BUILT_IN_LAWS
 
-__all__ = ["check_contact"]
+__all__ = ["check_contact", "check_latch"]
 
 # Keys that each shape needs, and those that it may have.
 KEYS_OF_SHAPES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -50,6 +50,28 @@ def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> N
     _check_law(mechanism, path, contact)
     if contact.friction is not None:
         _check_friction((*path, "friction"), contact.friction)
+
+
+def check_latch(mechanism: SixAxisMechanism, name: str, latch: Latch) -> None:
+    """The latch has one spring, and what it is caught by. Raises `KeyProblem`."""
+    path: Path = ("latch", name)
+    if latch.latched and mechanism.approach is not None:
+        allowed = "false: an approach is free until the first touch ([start] says where a latch holds)"
+        raise KeyProblem((*path, "latched"), "true", allowed)
+    for key in ("depth", "angle"):
+        if not latch.latched and getattr(latch, key) is None:
+            raise KeyProblem((*path, key), "nothing", "a number, or latched = true: held from the start on")
+    if (latch.stiffness is None) == (latch.stiffness_matrix is None):
+        found = "nothing" if latch.stiffness is None else "stiffness_matrix beside it"
+        raise KeyProblem((*path, "stiffness"), found, "six numbers, or stiffness_matrix instead")
+    if latch.stiffness_matrix is not None:
+        matrix = np.asarray(latch.stiffness_matrix)
+        size = np.max(np.abs(matrix))
+        if np.any(np.abs(matrix - matrix.T) > 1e-12 * size) or np.linalg.eigvalsh(matrix)[0] < -1e-9 * size:
+            found = "one that is not symmetric or has an eigenvalue below 0"
+            raise KeyProblem(
+                (*path, "stiffness_matrix"), found, "that of a spring: symmetric, no eigenvalue below 0"
+            )
 
 
 def _check_shape(path: Path, shape: Shape) -> None:

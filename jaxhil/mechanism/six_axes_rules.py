@@ -7,22 +7,31 @@ contact laws are in `jaxhil.mechanism.six_axes_contacts`.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from jaxhil.errors import shown
 from jaxhil.mechanism.conversion import KeyProblem, Path
 from jaxhil.mechanism.correlation import check_correlation
-from jaxhil.mechanism.rules import FIXED, check_model, check_texts
-from jaxhil.mechanism.six_axes import Inertia, Rig, RigidBody, SixAxisMechanism, Start, numeric_keys_of
-from jaxhil.mechanism.six_axes_contacts import check_contact
+from jaxhil.mechanism.rules import FIXED, KEYS_OF_MODELS, check_model, check_texts
+from jaxhil.mechanism.six_axes import RigidBody, SixAxisMechanism, Start, numeric_keys_of
+from jaxhil.mechanism.six_axes_contacts import check_contact, check_latch
+from jaxhil.mechanism.six_axes_rig import AXES, Inertia, Rig, Simulator
 from jaxhil.mechanism.uncertainty_rules import check_uncertainty
 
-__all__ = ["check_six_axes", "inertia_matrix"]
+__all__ = ["check_legs", "check_six_axes", "inertia_matrix"]
 
 LARGEST_ATTITUDE = 1.0  # rad, of C against T at the start
 MOMENTS = 1e-9  # by how much of itself a moment of inertia may exceed the sum of the others
 UNIT = 1e-6  # by how much a quaternion's norm may differ from 1
+# Keys of each kind of axes of the motion simulator: those it needs, and those it may have.
+KEYS_OF_SPACES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "task": ((), ()),
+    "stewart": (("base", "platform", "height"), ("stroke",)),
+    "two_robots": (("target_robot",), ()),
+}
 NAME = re.compile(r"[A-Za-z0-9_-]{1,60}")
 
 
@@ -32,16 +41,31 @@ def check_six_axes(mechanism: SixAxisMechanism) -> None:
     for name, body in (("target", mechanism.target), ("chaser", mechanism.chaser)):
         _check_body(name, body)
     _check_start(mechanism)
+    for table, names in (("contact", mechanism.contact), ("latch", mechanism.latch)):
+        for name in names:
+            if not NAME.fullmatch(name):
+                raise KeyProblem((table, name), "this name", "at most 60 letters, digits, - and _")
     for name, contact in mechanism.contact.items():
-        if not NAME.fullmatch(name):
-            raise KeyProblem(("contact", name), "this name", "at most 60 letters, digits, - and _")
         check_contact(mechanism, name, contact)
+    for name, latch in mechanism.latch.items():
+        check_latch(mechanism, name, latch)
     check_model(mechanism.rig.simulator)
+    _check_space(mechanism.rig.simulator)
     _check_hold(mechanism)
     _check_sensor(mechanism.rig)
     for path in mechanism.uncertainty:
         _check_uncertainty(mechanism, path)
     check_correlation(mechanism)
+
+
+def check_legs(raw: Mapping[str, Any]) -> None:
+    """Of a hexapod's legs a raw table speaks as legs: they are neither translations nor rotations. Raises
+    `KeyProblem`."""
+    simulator = raw["rig"]["simulator"]
+    for key in AXES:
+        if simulator.get("space") == "stewart" and isinstance(simulator.get(key), Mapping):
+            found = "a table of translation and rotation"
+            raise KeyProblem(("rig", "simulator", key), found, "one number, or a list of six, one each leg")
 
 
 def inertia_matrix(inertia: Inertia) -> np.ndarray:
@@ -136,6 +160,28 @@ def _turned(rotation: list[float], vector: np.ndarray) -> np.ndarray:
     return vector + np.sin(angle) * across + (1 - np.cos(angle)) * np.cross(axis, across)
 
 
+def _check_space(simulator: Simulator) -> None:
+    """The keys are those of the kind of axes, and of the model."""
+    path: Path = ("rig", "simulator")
+    needed, more = KEYS_OF_SPACES[simulator.space]
+    for key in sorted({key for pair in KEYS_OF_SPACES.values() for keys in pair for key in keys}):
+        value = getattr(simulator, key)
+        if key in needed and value is None:
+            raise KeyProblem((*path, key), "nothing", f'what space = "{simulator.space}" needs')
+        if key not in (*needed, *more) and value is not None:
+            found = "a table" if key == "target_robot" else shown(value)
+            raise KeyProblem((*path, key), found, f'nothing (space = "{simulator.space}" does not use it)')
+    if simulator.stroke is not None and not simulator.stroke[0] < simulator.stroke[1]:
+        allowed = "a longest leg longer than the shortest"
+        raise KeyProblem((*path, "stroke"), shown(simulator.stroke), allowed)
+    robot = simulator.target_robot
+    for key in AXES if robot else ():
+        unused = key != "delay" and key not in KEYS_OF_MODELS[simulator.model]
+        if unused and getattr(robot, key) is not None:
+            allowed = f"nothing (model {simulator.model} does not use it)"
+            raise KeyProblem((*path, "target_robot", key), shown(getattr(robot, key)), allowed)
+
+
 def _check_hold(mechanism: SixAxisMechanism) -> None:
     # As on one axis: an ideal simulator that jumps has no velocity for a damper, or for friction.
     rig = mechanism.rig
@@ -176,8 +222,12 @@ def _check_uncertainty(mechanism: SixAxisMechanism, path: str) -> None:
     if path.endswith((".inertia", ".inertia_assumed")) and uncertainty.independent and low.ndim == 2:
         allowed = "false, or three moments: rows drawn apart are not symmetric"
         raise KeyProblem((*where, "independent"), "true", allowed)
+    if path.endswith(".stiffness_matrix") and uncertainty.independent:
+        raise KeyProblem((*where, "independent"), "true", "false: entries drawn apart are not symmetric")
     if path.endswith(".depths") and uncertainty.independent and np.any(high[:-1] >= low[1:]):
         raise KeyProblem((*where, "independent"), "true", "false, or depths that keep their order")
+    if path == "rig.simulator.stroke" and uncertainty.independent and not high[0] < low[1]:
+        raise KeyProblem((*where, "independent"), "true", "false, or strokes that keep their order")
     if path == "approach.velocity" and uncertainty.distribution != "normal" and not high[2] < 0:
         raise KeyProblem(where, f"a z component as far as {high[2]:g}", "draws below 0 m/s")
     if path == "rig.simulator.coefficients" and mechanism.rig.simulator.model == "third_order":

@@ -10,18 +10,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhil.mechanism.six_axes import SixAxisMechanism, Tool
+from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.mechanism.six_axes_rig import Tool
 from jaxhil.simulation.scenario import MotionSimulator
 from jaxhil.sixdof import sensor
 from jaxhil.sixdof.approach import begin, touching_height
 from jaxhil.sixdof.bodies import Body, build_body, build_state
-from jaxhil.sixdof.building_contacts import build_groups
+from jaxhil.sixdof.building_contacts import build_groups, build_latches
 from jaxhil.sixdof.forces import ContactGroup
-from jaxhil.sixdof.kinematics import TaskSpace
+from jaxhil.sixdof.kinematics import Kinematics, TaskSpace, TwoRobots
 from jaxhil.sixdof.loop import Loop, build_loop
 from jaxhil.sixdof.relative import Pair, Pose, States, Twist
 from jaxhil.sixdof.rotations import Quaternion, exponential
 from jaxhil.sixdof.scenario import Scenario
+from jaxhil.sixdof.stewart import Stewart
 from jaxhil.sixdof.values import Values
 from jaxhil.sixdof.vectors import Vector, vector
 
@@ -55,9 +57,9 @@ def build_scenarios(
         bodies=bodies,
         start=start,
         groups=groups,
-        latches=(),
+        latches=build_latches(mechanism, numbers),
         simulator=_simulator(mechanism, numbers),
-        kinematics=TaskSpace(),
+        kinematics=_kinematics(mechanism, numbers),
         sensor=_sensor(mechanism, numbers),
         control_period=period,
         duration=duration,
@@ -120,21 +122,44 @@ def _lowered(bodies, groups, offset, attitude, velocity, angular_velocity, befor
     return begin(bodies, pose, Twist(vector(velocity), vector(angular_velocity)), before)
 
 
+def _kinematics(mechanism: SixAxisMechanism, numbers: Values) -> Kinematics:
+    """What the axes move."""
+    path, simulator = "rig.simulator.", mechanism.rig.simulator
+    if simulator.space == "task":
+        return TaskSpace()
+    if simulator.space == "two_robots":
+        return TwoRobots(jnp.asarray(numbers(path + "target_robot.share")))
+    base, platform = (
+        numbers.vector(numbers.np.moveaxis(numbers(path + key), 1, 0)) for key in ("base", "platform")
+    )
+    height, stroke = numbers.vector(numbers(path + "height")), numbers(path + "stroke", [0.0, np.inf])
+    return Stewart(base, platform, height, jnp.asarray(stroke))
+
+
 def _simulator(mechanism: SixAxisMechanism, numbers: Values) -> MotionSimulator:
     """Every model as a transfer function of each axis; `ideal` has order 0."""
     path, model = "rig.simulator.", mechanism.rig.simulator.model
-    delay = numbers(path + "delay")
+
+    def of(key: str) -> Any:
+        """Of each axis: the target's robot has after the chaser's what it is said to have, else the same."""
+        own = numbers(path + key)
+        if mechanism.rig.simulator.target_robot is None:
+            return own
+        other = path + "target_robot." + key
+        return numbers.np.concatenate([own, numbers(other) if numbers.has(other) else own])
+
+    delay = of("delay")
     one, stack = 0 * delay + 1, numbers.np.stack
     numerator: Any
     denominator: Any
     if model == "ideal":
         numerator, denominator = np.zeros((0, *one.shape)), one[None]
     elif model == "first_order":
-        numerator, denominator = one[None], stack([numbers(path + "time_constant"), one])
+        numerator, denominator = one[None], stack([of("time_constant"), one])
     elif model == "second_order":
-        frequency = 2 * np.pi * numbers(path + "natural_frequency")
+        frequency = 2 * np.pi * of("natural_frequency")
         numerator = stack([0 * one, frequency**2])
-        denominator = stack([one, 2 * numbers(path + "damping_ratio") * frequency, frequency**2])
+        denominator = stack([one, 2 * of("damping_ratio") * frequency, frequency**2])
     elif model == "third_order":
         a_1, a_2, a_3 = numbers(path + "coefficients")
         numerator, denominator = stack([0 * one, 0 * one, one]), stack([a_3 * one, a_2 * one, a_1 * one, one])

@@ -1,4 +1,5 @@
-"""The contacts of a mechanism file of six axes as groups of candidates, every copy of a pattern one of them.
+"""The contacts of a mechanism file of six axes as groups of candidates, every copy of a pattern one of them,
+and its latches.
 
 Candidates whose shapes and laws are of the same kinds make one group, whatever tables they stand in.
 """
@@ -15,6 +16,7 @@ from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.sixdof.candidates import Candidates, Capsules, ChaserSpheres, TargetSpheres
 from jaxhil.sixdof.forces import ContactGroup
 from jaxhil.sixdof.friction import Bristle, Friction, Frictionless, Regularised
+from jaxhil.sixdof.latch import Latch
 from jaxhil.sixdof.rotations import compose
 from jaxhil.sixdof.shapes import Ball, Box, Capsule, Cavity, Drogue, Plane, Shape, Shell
 from jaxhil.sixdof.values import Values
@@ -64,6 +66,39 @@ def build_groups(mechanism: SixAxisMechanism, numbers: Values) -> tuple[ContactG
             jax.tree.map(stacked, *(one.friction for one in group)),
         )
         for group in candidates(mechanism, numbers)
+    )
+
+
+def build_latches(mechanism: SixAxisMechanism, numbers: Values) -> tuple[Latch, ...]:
+    """Every table's latches, leaves (..., latches, number)."""
+    return tuple(_latch(latch, numbers, f"latch.{name}") for name, latch in mechanism.latch.items())
+
+
+def _latch(latch: six_axes.Latch, numbers: Values, path: str) -> Latch:
+    count = latch.pattern.count if latch.pattern else 1
+
+    def repeated(value: Any) -> Any:
+        return numbers.np.repeat(value[..., None, :], count, axis=-2)
+
+    def diagonal(value: Any) -> Any:
+        return np.eye(6)[:, :, None] * value[None]
+
+    first, point = numbers(f"{path}.pattern.phase", 0.0), numbers(f"{path}.chaser")
+    points = [numbers.turned(first + 2 * np.pi * copy / count, point) for copy in range(count)]
+    spring = (
+        numbers(f"{path}.stiffness_matrix")
+        if latch.stiffness is None
+        else diagonal(numbers(f"{path}.stiffness"))
+    )
+    holds: Any = np.full((count, numbers.number), latch.latched)
+    return Latch(
+        point=numbers.vector(numbers.np.stack(points, axis=1)),
+        depth=repeated(numbers(f"{path}.depth", 0.0)),
+        angle=repeated(numbers(f"{path}.angle", np.pi)),
+        speed=repeated(numbers(f"{path}.speed")),
+        stiffness=repeated(spring),
+        damping=repeated(diagonal(numbers(f"{path}.damping"))),
+        from_start=holds,
     )
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxhil.sixdof.axes import Motion
 from jaxhil.sixdof.relative import Coordinates, Pose, Twist, motion_of
@@ -31,6 +31,10 @@ class Kinematics(eqx.Module):
     def is_linear(self) -> bool:
         """Whether a straight line of coordinates is one of the axes."""
         return True
+
+    def reaches(self, axes: Float[Array, "axes *batch"]) -> Bool[Array, "*batch"]:
+        """Whether the axes can be there."""
+        return jnp.all(jnp.isfinite(axes), axis=0)
 
     @abc.abstractmethod
     def command(self, coordinates: Float[Array, "6 *batch"]) -> Float[Array, "axes *batch"]:

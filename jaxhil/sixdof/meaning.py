@@ -3,7 +3,8 @@
 import math
 from typing import NamedTuple
 
-from jaxhil.mechanism.six_axes import Simulator, SixAxisMechanism
+from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.mechanism.six_axes_rig import Simulator, TargetRobot
 
 FASTEST = 0.1  # contact frequency over control rate, of files that can be meant
 
@@ -70,12 +71,28 @@ def meaning(
 
 
 def _lateness(simulator: Simulator) -> float:
-    """By how much [s] the slowest axis follows a uniform motion late: its delay, and -G'(0)."""
+    """By how much [s] the slowest axis follows a uniform motion late; of two robots, both by their shares."""
+    own, robot = _lags(simulator, simulator), simulator.target_robot
+    if robot is None:
+        return max(own)
+    other = _lags(simulator, robot)
+    return max(
+        (1 - share) * chaser + share * target
+        for share, chaser, target in zip(robot.share, own, other, strict=True)
+    )
+
+
+def _lags(simulator: Simulator, robot: Simulator | TargetRobot) -> list[float]:
+    """By how much [s] each axis of a robot follows a uniform motion late: its delay, and -G'(0)."""
+
+    def of(key: str) -> list[float]:
+        return getattr(robot, key) or getattr(simulator, key)
+
     lag = [0.0] * 6
     if simulator.model == "first_order":
-        lag = simulator.time_constant or lag
+        lag = of("time_constant")
     elif simulator.model == "second_order":
-        pairs = zip(simulator.damping_ratio or lag, simulator.natural_frequency or lag, strict=True)
+        pairs = zip(of("damping_ratio"), of("natural_frequency"), strict=True)
         lag = [damping / (math.pi * frequency) for damping, frequency in pairs]
     elif simulator.model == "third_order" and simulator.coefficients:
         lag = [simulator.coefficients[0]] * 6
@@ -83,4 +100,4 @@ def _lateness(simulator: Simulator) -> float:
         *_, slope, value = simulator.denominator or []
         *_, lead, gain = 0.0, *(simulator.numerator or [])
         lag = [slope / value - lead / gain] * 6
-    return max(one + delay for one, delay in zip(lag, simulator.delay, strict=True))
+    return [one + delay for one, delay in zip(lag, of("delay"), strict=True)]

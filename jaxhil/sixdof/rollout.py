@@ -17,7 +17,7 @@ from jaxhil.compensators.base import Gains
 from jaxhil.simulation.metrics import RUNAWAY
 from jaxhil.simulation.watch import FADED, LONGEST_FADING
 from jaxhil.sixdof.forces import deepest
-from jaxhil.sixdof.loop import Loop, Rig, RunState, Tick, begin, build_rig, tick
+from jaxhil.sixdof.loop import Loop, Rig, RunState, Tick, begin, build_rig, command_of, tick
 from jaxhil.sixdof.relative import States, relative
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.sensor import Sensor
@@ -25,8 +25,8 @@ from jaxhil.sixdof.space import choose
 from jaxhil.sixdof.vectors import dot, norm
 
 STRETCH = 16  # ticks between looks at what began and ended
-MISS, REBOUNDED, CAPTURED, JAMMED, TIMEOUT, DIVERGED, NON_FINITE = range(7)
-STATUS_NAMES = ("miss", "rebounded", "captured", "jammed", "timeout", "diverged", "non-finite")
+MISS, REBOUNDED, CAPTURED, JAMMED, TIMEOUT, DIVERGED, NON_FINITE, REACH = range(8)
+STATUS_NAMES = ("miss", "rebounded", "captured", "jammed", "timeout", "diverged", "non-finite", "reach")
 
 
 class Peak(NamedTuple):
@@ -225,7 +225,7 @@ def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progres
 
 
 def _failure(rig: Rig, watch: Watch, states: States) -> Array:
-    """DIVERGED or NON_FINITE, else MISS."""
+    """DIVERGED, NON_FINITE, or REACH where an axis is to be where it cannot be; else MISS."""
 
     def energy(states: States) -> Array:
         _, (linear, angular) = relative(rig.bodies, states)
@@ -233,5 +233,7 @@ def _failure(rig: Rig, watch: Watch, states: States) -> Array:
         return dot(linear, linear) / share + dot(angular, rig.bodies.chaser.inertia @ angular)
 
     now = energy(states)
+    sent = rig.kinematics.command(command_of(rig.bodies, states)[0])
     wild = jnp.where(now > RUNAWAY**2 * energy(watch.entry), DIVERGED, MISS)
+    wild = jnp.where(rig.kinematics.reaches(sent), wild, REACH)
     return jnp.where(jnp.isfinite(now), wild, NON_FINITE).astype(jnp.int32)

@@ -15,13 +15,12 @@ from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.environment import computing
 from jaxhil.simulation.gain_choice import choose_gains
 from jaxhil.simulation.run import check_seed
-from jaxhil.sixdof.approach import FAR
 from jaxhil.sixdof.bodies import angular_velocity
 from jaxhil.sixdof.building import build_scenarios, loop_of
-from jaxhil.sixdof.forces import deepest
 from jaxhil.sixdof.loop import PER_AXIS, Loop
 from jaxhil.sixdof.meaning import Meaning, meaning
 from jaxhil.sixdof.metrics import Metrics, evaluate, reference_final
+from jaxhil.sixdof.plausibility import check_scenario
 from jaxhil.sixdof.recording import Recorded, record
 from jaxhil.sixdof.relative import Pair, States, coordinates, effective_mass, relative
 from jaxhil.sixdof.rollout import STATUS_NAMES
@@ -29,8 +28,6 @@ from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.vectors import Vector, components, cross, direction, vector
 
 GOOD = ("rebounded", "captured")  # how an episode may end
-MOST_TICKS = 1e7  # of a run
-LARGEST_ATTITUDE = 1.0  # rad, of C against T at the start
 
 
 class Episode(NamedTuple):
@@ -164,33 +161,6 @@ def _final(time: float, motion: Any) -> Final:
     return Final(time, at, twist, *each)
 
 
-def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
-    """The nominal run begins apart, at a pose that six coordinates can say, and takes at most 1e7 ticks.
-
-    Raises `InputError`.
-    """
-    ticks = float(scenario.duration[0] / scenario.control_period[0])
-    where = "start" if mechanism.start is not None else "approach"
-    if not ticks <= MOST_TICKS:
-        found = f"{where}.duration: found {scenario.duration[0]:g} s, {ticks:.2g} control periods"
-        raise InputError(f"{mechanism.name}: {found}, allowed at most {MOST_TICKS:.0e}")
-    at, depth = (np.asarray(one)[..., 0] for one in _begins(scenario))
-    if not np.all(np.isfinite(at)):
-        found = f"nothing to touch below {FAR:g} m: it goes past the target"
-        raise InputError(
-            f"{mechanism.name}: approach.offset: found {found}, allowed an approach that touches"
-        )
-    angle = float(np.linalg.norm(at[3:]))
-    if angle > LARGEST_ATTITUDE:
-        allowed = f"at most {LARGEST_ATTITUDE:g} rad between C and T (interface_rotation counts)"
-        found = f"start.chaser.attitude: found a rotation by {angle:.3g} rad"
-        raise InputError(f"{mechanism.name}: {found}, allowed {allowed}")
-    if depth > 0:
-        key = "start.chaser.position" if mechanism.start else "approach.angular_velocity"
-        found = f"{key}: found a start that is in touch already, {depth:.3g} m deep"
-        raise InputError(f"{mechanism.name}: {found}, allowed one apart: move the chaser along z of T")
-
-
 @partial(jax.jit, static_argnums=0)
 def _run(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> tuple[Any, ...]:
     """Figures of the episodes, the time at the end, the motion then, and the mass along the surface."""
@@ -223,14 +193,6 @@ def _motion(bodies: Pair, states: States) -> tuple[Any, ...]:
         for body, one in zip(bodies, states, strict=True)
     )
     return _six(at), _six(twist), *target, *chaser
-
-
-@jax.jit
-def _begins(scenario: Scenario) -> tuple[Any, Any]:
-    """Coordinates at the start, and how deep the mechanisms are in each other then."""
-    pose, twist = relative(scenario.bodies, scenario.start)
-    at, _ = coordinates(pose, twist)
-    return _six(at), deepest(scenario.groups, pose)
 
 
 def _six(pair: Any) -> Any:

@@ -22,10 +22,17 @@ class Stewart(Kinematics):
     base: Vector  # joints on the base, (6, *batch) each, in T axes [m]
     platform: Vector  # joints on the platform, (6, *batch) each, in C axes [m]
     height: Vector  # of the platform's origin over the base's where C is T [m]
+    stroke: Float[Array, "2 *batch"] | None = None  # shortest and longest leg [m]; None for any
 
     @property
     def is_linear(self):
         return False
+
+    def reaches(self, axes):
+        if self.stroke is None:
+            return super().reaches(axes)
+        shortest, longest = self.stroke[:, None]
+        return jnp.all((axes >= shortest) & (axes <= longest), axis=0)
 
     def command(self, coordinates):
         position, theta = (vector(part[:, None]) for part in (coordinates[:3], coordinates[3:]))

@@ -34,6 +34,10 @@ class Values:
             value = np.broadcast_to(nominal, (self.number, *nominal.shape))
         return self.np.moveaxis(self.np.asarray(value, float), 0, -1)
 
+    def has(self, path: str) -> bool:
+        """Whether the file says it."""
+        return value_at(self._mechanism, path) is not None
+
     def constant(self, value: float) -> Any:
         """The same number in every lane."""
         return np.full(self.number, value)

@@ -16,6 +16,7 @@ AXES = ("x", "y", "z")
 COLOURS = (BLUE, VERMILION, GREEN)
 MANY = (BLUE, VERMILION, GREEN, ORANGE, SKY, "0.35")  # candidates; further ones repeat them, dashed
 MARGIN = 0.05  # s shown before the first force and after the last
+FLATTEST = 0.3  # height of a view over its width, at least
 MOST_NAMES = 12  # candidates in a legend
 VIEWS = ((0, 2), (1, 2))  # what is across and what is up
 
@@ -93,8 +94,12 @@ def draw_view(
         axes.add_collection(LineCollection(flat, colors=colour, linewidths=0.9))
     axes.autoscale_view()
     axes.set_aspect("equal", adjustable="box")
+    wide, high = (float(np.ptp(one)) for one in (axes.dataLim.intervalx, axes.dataLim.intervaly))
+    # A flat mechanism still has room for its forces.
+    missing = max(FLATTEST * wide - high, 0.0)
+    axes.set_ylim(axes.get_ylim()[0] - missing / 2, axes.get_ylim()[1] + missing / 2)
     largest = max(float(np.max(recorded.force)), 1e-12)
-    reach = 0.4 * np.ptp(axes.dataLim.intervaly)
+    reach = 0.4 * max(high, FLATTEST * wide)
     for candidate in np.flatnonzero(recorded.depth[tick] > 0):
         start = 1e3 * recorded.point[tick, candidate][[across, up]]
         push = reach * recorded.push[tick, candidate][[across, up]] / largest

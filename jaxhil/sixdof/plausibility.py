@@ -1,0 +1,101 @@
+"""Whether the nominal run of a mechanism of six axes can begin: apart, in reach, and soon over."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxhil.errors import InputError
+from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.sixdof.approach import FAR
+from jaxhil.sixdof.forces import deepest
+from jaxhil.sixdof.latch import init_latch, latch_wrench
+from jaxhil.sixdof.loop import command_of
+from jaxhil.sixdof.relative import relative
+from jaxhil.sixdof.scenario import Scenario
+from jaxhil.sixdof.stewart import Stewart, condition
+
+MOST_TICKS = 1e7  # of a run
+LARGEST_ATTITUDE = 1.0  # rad, of C against T at the start
+LARGEST_CONDITION = 100.0  # of a hexapod's legs, lengths in m
+
+
+class Beginning(NamedTuple):
+    """The start of a run, and a hexapod's legs there and where C is T."""
+
+    coordinates: Float[Array, "6 *batch"]
+    depth: Float[Array, "*batch"]  # of the mechanisms in each other [m]
+    caught: tuple[Bool[Array, "latches *batch"], ...]  # by latches
+    legs: tuple[Float[Array, "6 *batch"], ...]  # [m]
+    conditions: tuple[Float[Array, "*batch"], ...]  # of their Jacobian
+
+
+def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
+    """The nominal run begins apart, at a pose that six coordinates can say and the rig can reach, and takes
+    at most 1e7 ticks.
+
+    Raises `InputError`.
+    """
+    ticks = float(scenario.duration[0] / scenario.control_period[0])
+    where = "start" if mechanism.start is not None else "approach"
+    if not ticks <= MOST_TICKS:
+        found = f"{where}.duration: found {scenario.duration[0]:g} s, {ticks:.2g} control periods"
+        raise InputError(f"{mechanism.name}: {found}, allowed at most {MOST_TICKS:.0e}")
+    begins: Beginning = jax.tree.map(np.asarray, _beginning(scenario))
+    at = begins.coordinates[:, 0]
+    if not np.all(np.isfinite(at)):
+        found = f"nothing to touch below {FAR:g} m: it goes past the target"
+        raise InputError(
+            f"{mechanism.name}: approach.offset: found {found}, allowed an approach that touches"
+        )
+    angle = float(np.linalg.norm(at[3:]))
+    if angle > LARGEST_ATTITUDE:
+        allowed = f"at most {LARGEST_ATTITUDE:g} rad between C and T (interface_rotation counts)"
+        found = f"start.chaser.attitude: found a rotation by {angle:.3g} rad"
+        raise InputError(f"{mechanism.name}: {found}, allowed {allowed}")
+    depth = float(begins.depth[0])
+    if depth > 0:
+        key = "start.chaser.position" if mechanism.start else "approach.angular_velocity"
+        found = f"{key}: found a start that is in touch already, {depth:.3g} m deep"
+        raise InputError(f"{mechanism.name}: {found}, allowed one apart: move the chaser along z of T")
+    for (name, latch), caught in zip(mechanism.latch.items(), begins.caught, strict=True):
+        if caught.any() and not latch.latched:
+            found = f"latch.{name}.depth: found {latch.depth:g} m, deep enough at the start already"
+            allowed = "a depth or an angle that is not yet met there, or latched = true"
+            raise InputError(f"{mechanism.name}: {found}, allowed {allowed}")
+    _check_legs(mechanism, begins)
+
+
+def _check_legs(mechanism: SixAxisMechanism, begins: Beginning) -> None:
+    """A hexapod reaches the start and the pose at which C is T, and holds the platform firmly there."""
+    stroke = mechanism.rig.simulator.stroke
+    poses = zip(("the start", "C at T"), begins.legs, begins.conditions, strict=False)
+    for pose, legs, hold in poses:
+        lengths, number = legs[:, 0], float(hold[0])
+        if not number <= LARGEST_CONDITION:
+            found = f"rig.simulator.base: found legs that hardly hold the platform with {pose}"
+            allowed = f"joints whose Jacobian has a condition number of at most {LARGEST_CONDITION:g}"
+            raise InputError(f"{mechanism.name}: {found} (condition number {number:.3g}), allowed {allowed}")
+        if stroke is not None and not (stroke[0] <= lengths.min() and lengths.max() <= stroke[1]):
+            found = f"rig.simulator.stroke: found legs from {lengths.min():.4g} to {lengths.max():.4g} m"
+            allowed = f"{stroke[0]:g} to {stroke[1]:g} m: change stroke or height"
+            raise InputError(f"{mechanism.name}: {found} with {pose}, allowed {allowed}")
+
+
+@jax.jit
+def _beginning(scenario: Scenario) -> Beginning:
+    pose, twist = relative(scenario.bodies, scenario.start)
+    at, _ = command_of(scenario.bodies, scenario.start)
+    caught = tuple(
+        latch_wrench(latch, init_latch(latch, pose), pose, twist)[1].caught for latch in scenario.latches
+    )
+    legs: tuple[Any, ...] = ()
+    conditions: tuple[Any, ...] = ()
+    hexapod = scenario.kinematics
+    if isinstance(hexapod, Stewart):
+        poses = at, jnp.zeros_like(at)
+        legs = tuple(hexapod.command(one) for one in poses)
+        conditions = tuple(condition(hexapod, one) for one in poses)
+    return Beginning(at, deepest(scenario.groups, pose), caught, legs, conditions)
