@@ -36,7 +36,7 @@ class Most(NamedTuple):
     quiet: float  # without
 
 
-SETTINGS = {"sharp": Most(0.5, 1.5, 3.0, 0.8, 0.75), "gentle": Most(0.5, 1.5, 3.0, 0.75, 0.7)}
+SETTINGS = {"sharp": Most(0.5, 1.5, 3.0, 0.84, 0.75), "gentle": Most(0.5, 1.5, 3.0, 0.75, 0.7)}
 
 
 def within(path: str, low: float, high: float) -> str:

@@ -14,7 +14,7 @@ import rich.progress
 from rich import box
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TextColumn
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 WIDTH = 110  # where there is no terminal to ask
@@ -26,8 +26,10 @@ KNOWN_FROM = 0.05  # share of the work that has to be done before a rate is know
 def emit(*things: RenderableType, wrap: bool = True) -> None:
     """Print on standard output, long texts on several lines. A reader that has gone away is no error."""
     try:
-        console = _console(sys.stdout)
         for thing in things:
+            console = _console(sys.stdout)
+            if isinstance(thing, Table):
+                console.width = _fitted(thing, console)
             console.print(thing, soft_wrap=not wrap)
         sys.stdout.flush()
     except BrokenPipeError:
@@ -200,8 +202,7 @@ class Progress:
 @contextmanager
 def progress(total: float, unit: str, shown: bool = True) -> Iterator[Progress]:
     """A bar on a terminal, a plain line now and then elsewhere; nothing if it is not to be shown."""
-    texts = [TextColumn(f"{{task.{name}}}", markup=False) for name in ("fields[pace]", "description")]
-    with _bar(shown, SpinnerColumn(), BarColumn(bar_width=20), TaskProgressColumn(), *texts) as bar:
+    with _bar(shown, SpinnerColumn(), BarColumn(bar_width=10), TaskProgressColumn(), _State()) as bar:
         made = Progress(total, unit, bar, quiet=not shown)
         over = threading.Event()
 
@@ -225,6 +226,19 @@ def stages(total: int, shown: bool = True) -> AbstractContextManager[Progress]:
     return progress(total, "stages", shown)
 
 
+class _State(TextColumn):
+    """Pace and what is going on. On a narrow terminal their end is cut, and nothing else."""
+
+    def __init__(self) -> None:
+        # In the eyes of the table it can be wrapped, so it is the column that gives way.
+        super().__init__("{task.fields[pace]}  {task.description}", markup=False, table_column=Column())
+
+    def render(self, task: rich.progress.Task) -> Text:
+        text = super().render(task)
+        text.no_wrap, text.overflow = True, "ellipsis"
+        return text
+
+
 @contextmanager
 def _bar(shown: bool, *columns: rich.progress.ProgressColumn) -> Iterator[rich.progress.Progress | None]:
     """A bar if it is to be shown and there is a terminal, else none."""
@@ -234,6 +248,25 @@ def _bar(shown: bool, *columns: rich.progress.ProgressColumn) -> Iterator[rich.p
         return
     with rich.progress.Progress(*columns, console=console, transient=True) as bar:
         yield bar
+
+
+def _fitted(table: Table, console: Console) -> int:
+    """The width at which a table loses no digit and breaks no word, at least the terminal's. Where that is
+    narrow its headings take a line a word; what is wider even so is for the terminal to wrap."""
+
+    def natural() -> int:
+        return console.measure(table, options=console.options.update(max_width=10_000)).maximum
+
+    if natural() <= console.width:
+        return console.width
+    table.padding, broken = 0, 0
+    for column in table.columns:
+        column.header = "\n".join(str(column.header).split())
+        cells = [str(cell) for cell in column.cells]
+        if not column.no_wrap:
+            words = [word for text in (*cells, column.header) for word in text.split()]
+            broken += max(map(len, cells), default=0) - max(map(len, words), default=0)
+    return max(console.width, natural() - max(broken, 0))
 
 
 def _span(seconds: float) -> str:

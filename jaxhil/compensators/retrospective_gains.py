@@ -115,10 +115,10 @@ GAINS: tuple[Gain, ...] = (
     rig_gain(
         "repayment_time", lambda m: 0.0, lambda m: 10.0, lambda m: SHARP["repayment_time"], tuned=_fact,
     ),
-    # Where the limit binds, it hides from the solver what the other gains do.
+    # Where the limit does not bind, no derivative tells of the force that it could spare.
     rig_gain(
         "correction_limit", lambda m: 0.01, lambda m: 20.0, lambda m: SHARP["correction_limit"],
-        logarithmic=True, begins=lambda m: 3.0,
+        logarithmic=True, begins=lambda m: 1.0,
     ),
     # Neither is tuned: what is replayed is what makes it a test of the hardware, whatever that errs by.
     rig_gain("force_replay", lambda m: 0.0, lambda m: 1.0, lambda m: 1.0, tuned=_fact),

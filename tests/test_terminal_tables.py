@@ -1,0 +1,27 @@
+"""Tables as they are printed: on any width no digit is lost and no name is broken."""
+
+import pytest
+
+from tuning import terminal
+
+LAW = "retrospective_reference"
+FIGURES = [12.34, 20.15, 200.2, 0.1041, 0.5123, 0.9252, 1.443, 4.125]
+
+
+@pytest.mark.parametrize("width", [30, 60, 80, 110, 300])
+def test_no_digit_is_lost(monkeypatch, capsys, width):
+    monkeypatch.setattr(terminal, "WIDTH", width)
+    heads = ["law", *(f"figure {number} %" for number in range(len(FIGURES)))]
+    terminal.emit(terminal.table("suite-damped: each law, and a title that is long", heads, [[LAW, *FIGURES]]))
+    title, *_, line, _ = capsys.readouterr().out.splitlines()
+    assert title == "suite-damped: each law, and a title that is long"
+    assert line.split() == [LAW, *(f"{figure:.4g}" for figure in FIGURES)]
+
+
+def test_long_texts_are_folded_between_words(monkeypatch, capsys):
+    monkeypatch.setattr(terminal, "WIDTH", 60)
+    text = "force delay, noise of the force sensor and dead zone, equivalent mass, roughly the surface"
+    terminal.emit(terminal.table("costs", ["law", "known beforehand", "us"], [[LAW, text, 1.25]], (0, 1)))
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 60
+    assert set(" ".join(lines).split()) >= {LAW, *text.split(), "1.25"}
