@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+from clusters import started
 from continuous import delayed_restitution
 
 import jaxhil
@@ -204,3 +205,14 @@ def test_time_of_a_map_of_100_by_100_points(compensator):
     print(f"\n{compensator}: 100 x 100 points, warm: {took:.1f} s, {spent:.1f} s of all cores' time")
     # Of two cores, however busy others keep them.
     assert spent < 2 * 20
+
+
+@pytest.mark.slow
+@pytest.mark.users_options
+def test_on_a_cluster_it_is_the_same_to_the_bit(tmp_path):
+    asked = {"x": "rig.force_sensor.delay", "y": "contact.stiffness", "points": 60}
+    here = tuning.map("varying", **asked)
+    with started(tmp_path) as cluster:
+        cluster.worker()
+        there = tuning.map("varying", scheduler=cluster.address, **asked)
+    assert there.document == here.document

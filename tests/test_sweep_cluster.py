@@ -1,21 +1,16 @@
 """Sweeps on a dask.distributed cluster whose workers were started by hand: the same rows, whoever dies."""
 
-import json
 import os
-import signal
 import subprocess
 import sys
-import time
-from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
+from clusters import ROOT, started
 from sweep_cases import case, manifest
 
 from jaxhil.errors import InputError
-from tuning.sweeps import worker
-from tuning.sweeps.cluster import on_cluster
+from tuning.sweeps.cluster import on_cluster, run_part
 from tuning.sweeps.manifest import encode
 from tuning.sweeps.parts import same_rows
 from tuning.sweeps.run import run_sweep
@@ -23,7 +18,6 @@ from tuning.sweeps.store import open_store, read_part
 
 pytestmark = pytest.mark.users_options
 
-ROOT = Path(__file__).parent.parent
 MANIFEST = manifest(case(), scenarios=300, limit=1.5)
 
 
@@ -42,54 +36,6 @@ def whole(tmp_path_factory):
     return rows_of(tmp_path_factory.mktemp("whole") / "store")
 
 
-class Cluster:
-    """A scheduler and plain workers, each a process of its own, as a user starts them."""
-
-    def __init__(self, folder):
-        self.file, self.processes = folder / "scheduler.json", []
-        self._start("scheduler", "--host", "127.0.0.1", "--port", "0")
-        while not self.file.exists() or not self.file.read_text().endswith("}"):
-            time.sleep(0.05)
-        self.address = json.loads(self.file.read_text())["address"]
-
-    def _start(self, kind, *arguments, **environment):
-        """With nothing in the environment but where the packages are."""
-        ours = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "NPROC")}
-        path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
-        command = [sys.executable, "-m", "dask", kind, "--scheduler-file", str(self.file), "--no-dashboard"]
-        self.processes.append(
-            subprocess.Popen(
-                [*command, *arguments],
-                env={**ours, "PYTHONPATH": path, **environment},
-                cwd=self.file.parent,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                start_new_session=True,
-            )
-        )
-        return self.processes[-1]
-
-    def worker(self, *arguments, **environment):
-        return self._start("worker", *arguments, **environment)
-
-    def kill(self, process):
-        """The worker and the process that watches over it."""
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-
-
-@contextmanager
-def started(folder):
-    pytest.importorskip("distributed")
-    cluster = Cluster(folder)
-    try:
-        yield cluster
-    finally:
-        for process in cluster.processes:
-            if process.poll() is None:
-                cluster.kill(process)
-
-
 def test_a_scheduler_that_is_not_there_is_one_line(tmp_path):
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
@@ -97,7 +43,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(tmp_path):
 
 
 def test_a_worker_imports_no_jax_before_its_flags_are_set():
-    code = "import sys, tuning.sweeps.worker as w; assert 'jax' not in sys.modules; w.dask_setup(None);"
+    code = "import sys, tuning.caches.worker as w; assert 'jax' not in sys.modules; w.dask_setup(None);"
     code += "import os; assert '--xla_backend_optimization_level=1' in os.environ['XLA_FLAGS']"
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     subprocess.run([sys.executable, "-c", code], check=True, env={**environment, "PYTHONPATH": str(ROOT)})
@@ -108,7 +54,7 @@ def test_a_worker_of_other_flags_says_how_to_start_it(monkeypatch):
         patched.setattr("tuning.sweeps.manifest.xla_flags", lambda: "--others")
         asked = encode(manifest(case()))
     with pytest.raises(InputError, match=r"start workers by: dask worker ADDRESS --preload"):
-        worker.run_part(asked, 0)
+        run_part(asked, 0)
 
 
 @pytest.mark.slow
@@ -130,10 +76,10 @@ def test_a_worker_on_which_jax_runs_already_is_refused_or_preloaded(whole, tmp_p
     (tmp_path / "early.py").write_text("def dask_setup(worker):\n    import jax\n    jax.devices()\n")
     with started(tmp_path) as cluster:
         wrong = cluster.worker("--preload", str(tmp_path / "early.py"))
-        with pytest.raises(InputError, match=r"dask worker ADDRESS --preload tuning\.sweeps\.worker"):
+        with pytest.raises(InputError, match=r"dask worker ADDRESS --preload tuning\.caches\.worker"):
             rows_of(tmp_path / "refused", on_cluster(cluster.address))
         cluster.kill(wrong)
-        cluster.worker("--preload", "tuning.sweeps.worker", "--preload", str(tmp_path / "early.py"))
+        cluster.worker("--preload", "tuning.caches.worker", "--preload", str(tmp_path / "early.py"))
         rows, _ = rows_of(tmp_path / "store", on_cluster(cluster.address))
     assert same_rows(rows, whole[0]) == []
 
@@ -142,7 +88,7 @@ def test_a_worker_on_which_jax_runs_already_is_refused_or_preloaded(whole, tmp_p
 def test_a_part_that_kills_its_workers_is_computed_here(tmp_path):
     """Every worker dies of its first part, and is started anew."""
     few = manifest(case(), scenarios=64, limit=1.5)
-    code = "import os, signal, tuning.sweeps.worker as w\n"
+    code = "import os, signal, tuning.caches.worker as w\n"
     (tmp_path / "deadly.py").write_text(code + "w.prepare = lambda: os.kill(os.getpid(), signal.SIGKILL)\n")
     with started(tmp_path) as cluster:
         cluster.worker("--preload", str(tmp_path / "deadly.py"))
@@ -153,7 +99,7 @@ def test_a_part_that_kills_its_workers_is_computed_here(tmp_path):
 
 @pytest.mark.slow
 def test_without_workers_parts_are_computed_here(tmp_path, monkeypatch):
-    monkeypatch.setattr("tuning.sweeps.cluster.PATIENCE", 1.0)
+    monkeypatch.setattr("tuning.caches.cluster.PATIENCE", 1.0)
     few = manifest(case(), scenarios=64, limit=1.5)
     with started(tmp_path) as cluster:
         rows, _ = rows_of(tmp_path / "store", on_cluster(cluster.address), few)

@@ -12,7 +12,9 @@ FIGURES = [12.34, 20.15, 200.2, 0.1041, 0.5123, 0.9252, 1.443, 4.125]
 def test_no_digit_is_lost(monkeypatch, capsys, width):
     monkeypatch.setattr(terminal, "WIDTH", width)
     heads = ["law", *(f"figure {number} %" for number in range(len(FIGURES)))]
-    terminal.emit(terminal.table("suite-damped: each law, and a title that is long", heads, [[LAW, *FIGURES]]))
+    terminal.emit(
+        terminal.table("suite-damped: each law, and a title that is long", heads, [[LAW, *FIGURES]])
+    )
     title, *_, line, _ = capsys.readouterr().out.splitlines()
     assert title == "suite-damped: each law, and a title that is long"
     assert line.split() == [LAW, *(f"{figure:.4g}" for figure in FIGURES)]

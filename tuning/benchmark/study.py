@@ -16,7 +16,9 @@ from typing import Any, NamedTuple
 from jaxhil.errors import one_line
 from jaxhil.mechanism.file import to_builtins
 from jaxhil.mechanism.structs import Mechanism
-from tuning.caches.pieces import NOTHING_KEPT, Pieces
+from tuning.caches.cluster import Piece, on_workers
+from tuning.caches.pieces import NOTHING_KEPT, Pieces, digest_of
+from tuning.caches.worker import setting
 from tuning.statistics.intervals import Estimate
 
 LITERATURE, TUNED = "literature", "tuned"
@@ -73,10 +75,12 @@ def compare(
     processes: int,
     tell: Callable[[str, float, float], None] = lambda text, done, kept: None,
     pieces: Pieces = NOTHING_KEPT,
+    scheduler: str | None = None,
 ) -> Iterator[LawFigures | Failed]:
     """What is found of each law on every mechanism, as it is done: in so many processes or, with 0 of them,
-    one after the other in this one, where an error ends all. `tell` is called with what is going on, how many
-    results are there, shares of those under way counted, and how many were kept from before."""
+    one after the other in this one, where an error ends all; with a `scheduler`, by the workers of a cluster.
+    `tell` is called with what is going on, how many results are there, shares of those under way counted, and
+    how many were kept from before."""
     kept = _kept(mechanisms, laws, settings, pieces) if pieces.resumes else []
     yield from kept
     there = {(one.mechanism, one.law) for one in kept}
@@ -92,10 +96,12 @@ def compare(
 
     def missing(scenes: list[list[Any]]) -> list[tuple[list[Any], str]]:
         """Those with the most to compile first, so that no process is left with one of them at the end."""
-        order = sorted(laws, key=_gains, reverse=True) if processes else laws
+        order = sorted(laws, key=_gains, reverse=True) if processes or scheduler else laws
         return [(own, law) for own in scenes for law in order if (own[0].mechanism.name, law) not in there]
 
-    if processes == 0:
+    if scheduler is not None:
+        computed = _on_cluster(scheduler, missing(build_scenes(left, settings)), settings, told)
+    elif processes == 0:
         computed = _one_by_one(missing(build_scenes(left, settings)), settings, told)
     else:
         computed = _in_processes(processes, left, settings, missing, told)
@@ -136,6 +142,32 @@ def _one_by_one(
         done += len(group)
 
 
+def _on_cluster(
+    scheduler: str, tasks: list[tuple[list[Any], str]], settings: CompareSettings, tell: Tell
+) -> Iterator[Judged]:
+    pieces = [Piece(i, (group, law, settings)) for i, (group, law) in enumerate(tasks)]
+    inputs = [_piece([scene.mechanism for scene in group], law, settings) for group, law in tasks]
+    done, what = 0, f"compare-{digest_of(inputs)[:16]}"
+    tell(f"{len(tasks)} pieces on the cluster", done)
+    for i, found in on_workers(scheduler, judge_or_say_why, pieces, setting(), what):
+        group, law = tasks[i]
+        done += len(group)
+        tell(law, done)
+        yield group, law, found
+
+
+def judge_or_say_why(group: list[Any], law: str, settings: CompareSettings) -> list[LawFigures] | Failed:
+    """`judge_law`; where it cannot be done, why."""
+    try:
+        return judge_law(group, law, settings)
+    except Exception as error:
+        return _failed(law, error)
+
+
+def _failed(law: str, error: BaseException) -> Failed:
+    return Failed(law, one_line(f"{type(error).__name__}: {error}", 200))
+
+
 def _in_processes(
     processes: int,
     mechanisms: list[Mechanism],
@@ -159,9 +191,8 @@ def _in_processes(
                 for future in ended:
                     i = running.pop(future)
                     error = future.exception()
-                    reason = error and one_line(f"{type(error).__name__}: {error}", 200)
                     shares[i] = 1.0
-                    yield *tasks[i], Failed(tasks[i][1], reason) if reason else future.result()
+                    yield *tasks[i], _failed(tasks[i][1], error) if error else future.result()
         except BaseException:
             # What they compute nobody waits for.
             for child in multiprocessing.active_children():

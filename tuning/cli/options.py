@@ -54,6 +54,10 @@ Json = Annotated[
     FlagCreatePairsOff[bool], text(None, "One JSON document on standard output, nothing else there.")
 ]
 Timings = Annotated[FlagCreatePairsOff[bool], text(None, "Say on standard error where the time went.")]
+Scheduler = Annotated[
+    str | None,
+    arg(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster whose workers do the computing."),
+]
 Resume = Annotated[
     bool,
     arg(name="resume", metavar="", help="Go on after an interruption: what is finished is not done again."),
@@ -266,10 +270,7 @@ class Sweep:
     ] = None
     resume: Resume = False
     chunk: Annotated[int, number("Scenarios computed at a time, and rows of each part.")] = 16384
-    scheduler: Annotated[
-        str | None,
-        arg(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster that computes the parts."),
-    ] = None
+    scheduler: Scheduler = None
     json: Json = False
     timings: Timings = False
 
@@ -323,6 +324,7 @@ class Compare:
     unset: Unset = ()
     limit: Annotated[float, arg(metavar="NUMBER", help="Restitution error that counts as a failure.")] = 0.01
     resume: Resume = False
+    scheduler: Scheduler = None
     seed: Annotated[int, number("Seed of scenarios, starts and resampling.")] = 0
     json: Json = False
     timings: Timings = False

@@ -64,6 +64,7 @@ class CompareOptions:
     judged: int = 256
     limit: float = 0.01
     seed: int = 0
+    scheduler: str | None = None
 
     def check(self) -> None:
         """Raises `InputError` for what will not do."""
@@ -91,6 +92,7 @@ def compare(
     judged: int = 256,
     limit: float = 0.01,
     seed: int = 0,
+    scheduler: str | None = None,
     progress: bool = False,
 ) -> Any:
     """Compensators for a mechanism, each tuned to its best, on the same fresh scenarios, with intervals.
@@ -107,6 +109,7 @@ def compare(
         judged: how many fresh scenarios to judge on.
         limit: the restitution error [1] that counts as a failure.
         seed: of scenarios, starts and resampling.
+        scheduler: address of a dask.distributed cluster's scheduler, whose workers then compute the figures.
         progress: say on standard error what is going on.
 
     Returns:
@@ -116,7 +119,7 @@ def compare(
         InputError: one line, for an argument that will not do.
     """
     loaded, several = arguments.mechanisms(mechanism)
-    options = CompareOptions(tuple(_names(compensators)), untuned, scenarios, judged, limit, seed)
+    options = CompareOptions(tuple(_names(compensators)), untuned, scenarios, judged, limit, seed, scheduler)
     options.check()
     arguments.flags(progress=progress)
     check_names(loaded)
@@ -150,7 +153,8 @@ def compare_each(
     for one in loaded:
         meaning.check(one.mechanism, one.label)
     mechanisms = [one.mechanism for one in loaded]
-    yield from compare(mechanisms, options.laws, settings, processes, bar.tell, pieces or NOTHING_KEPT)
+    kept = pieces or NOTHING_KEPT
+    yield from compare(mechanisms, options.laws, settings, processes, bar.tell, kept, options.scheduler)
 
 
 def check_names(loaded: Sequence[LoadedMechanism]) -> None:

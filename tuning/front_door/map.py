@@ -59,6 +59,7 @@ def map(
     points: int = 100,
     seed: int = 0,
     folder: str | os.PathLike[str] | None = None,
+    scheduler: str | None = None,
     progress: bool = False,
 ) -> StabilityMap:
     """The restitution error over two keys of a mechanism, with what theory says there.
@@ -79,6 +80,7 @@ def map(
         points: along either axis.
         seed: of the sensors' noise, the same at every point.
         folder: where to write map.json and map.png; None writes nothing.
+        scheduler: address of a dask.distributed cluster's scheduler, whose workers then run the contacts.
         progress: say on standard error what is going on.
 
     Raises:
@@ -105,7 +107,7 @@ def map(
             raise
         meaning.check(checked)
         with terminal.progress(runs(points), "runs", progress) as bar:
-            found = compute_map(checked, name, values, axes, points, limit, seed, bar.tell)
+            found = compute_map(checked, name, values, axes, points, limit, seed, bar.tell, scheduler)
         document = _document(checked, name, values, found, limit, seed)
         made = StabilityMap(document, found.x, found.y, found.error, found.restitution, found)
         if target is not None:

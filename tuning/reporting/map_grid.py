@@ -5,16 +5,21 @@ Gains stay what they are over the whole map: it shows what a controller meets th
 and two lines through the nominal one, are lanes of one program.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from jaxhil.mechanism.file import to_builtins
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import Outcome, evaluate, expected_duration
+from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.scenario import Scenario, build_scenarios
+from tuning.caches.cluster import Piece, on_workers
+from tuning.caches.pieces import digest_of
+from tuning.caches.worker import setting
 from tuning.reporting.closed_forms import ClosedForms, closed_forms
 from tuning.reporting.contact_growth import Growth, cost, growth, no_growth, spectral_radii
 from tuning.reporting.map_axes import MapAxis, draws
@@ -73,9 +78,10 @@ def compute_map(
     limit: float,
     seed: int,
     tell: Callable[[str, float], None],
+    scheduler: str | None = None,
 ) -> Map:
     """The map of so many points along either axis; `tell` is called with what is going on, and how many of
-    all `runs` are done."""
+    all `runs` are done. With a `scheduler` the workers of a cluster run the contacts."""
 
     def batch(values: np.ndarray) -> tuple[dict[str, Any], Scenario]:
         return _gains(gains, axes, values), _scenarios(mechanism, axes, values, seed)
@@ -86,7 +92,7 @@ def compute_map(
     across, up = np.repeat(middle, LINE, axis=0), np.repeat(middle, LINE, axis=0)
     across[:, 0], up[:, 1] = lines
     own, scenarios = batch(np.concatenate([_grid(x, y), across, up, middle]))
-    restitution, error = _run(mechanism, compensator, own, scenarios, tell)
+    restitution, error = _run(mechanism, compensator, own, scenarios, tell, scheduler)
     size = points**2
 
     tell("eigenvalues of the loop in contact", runs(points))
@@ -127,24 +133,43 @@ def runs(points: int) -> int:
     return points**2 + 2 * LINE + 1
 
 
+def run_part(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least: int) -> np.ndarray:
+    """e and e - e* of each lane of a part, (2, lanes)."""
+    return np.stack(_worst(evaluate(loop, gains, scenarios, at_least=at_least)))
+
+
 def _run(
     mechanism: Mechanism,
     compensator: str,
     gains: Mapping[str, Any],
     scenarios: Scenario,
     tell: Callable[[str, float], None],
-) -> tuple[np.ndarray, np.ndarray]:
+    scheduler: str | None,
+) -> np.ndarray:
     """e and e - e* of each lane, part by part: each part has lanes that take long and lanes that do not."""
     loop, order = build_loop(mechanism, compensator, scenarios), np.argsort(expected_duration(scenarios))
     found = np.empty((2, len(order)))
     parts = -(-len(order) // PART)
-    for number in range(parts):
-        tell("running the contacts", number * len(order) // parts)
-        part = order[number::parts]
-        own = {name: value[part] if np.ndim(value) else value for name, value in gains.items()}
-        lanes = jax.tree.map(lambda leaf, part=part: np.asarray(leaf)[..., part], scenarios)
-        found[:, part] = _worst(evaluate(loop, own, lanes, at_least=-(-len(order) // parts)))
-    return found[0], found[1]
+    lanes = [order[number::parts] for number in range(parts)]
+
+    def asked() -> Iterator[Piece]:
+        for number, part in enumerate(lanes):
+            own = {name: value[part] if np.ndim(value) else value for name, value in gains.items()}
+            some = jax.tree.map(lambda leaf, part=part: np.asarray(leaf)[..., part], scenarios)
+            yield Piece(number, (loop, own, some, len(lanes[0])))
+
+    if scheduler is None:
+        computed = ((number, run_part(*arguments)) for number, arguments in asked())
+    else:
+        inputs = to_builtins(mechanism), compensator, gains, jax.tree.leaves(scenarios)
+        computed = on_workers(scheduler, run_part, asked(), setting(), f"map-{digest_of(inputs)[:16]}")
+    done = 0
+    tell("running the contacts", done)
+    for number, values in computed:
+        found[:, lanes[number]] = values
+        done += len(lanes[number])
+        tell("running the contacts", done)
+    return found
 
 
 def _grid(x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -27,7 +27,8 @@ def run(options: Map) -> int:
     mechanism, compensator, gains = chosen(options, mechanism)
     made = map(
         mechanism, options.x, options.y, compensator, gains,
-        limit=options.limit, points=options.points, seed=options.seed, folder=target, progress=True,
+        limit=options.limit, points=options.points, seed=options.seed, folder=target,
+        scheduler=options.scheduler, progress=True,
     )  # fmt: skip
     meaning.say(mechanism, None if options.json else terminal.emit_line)
     if options.json:

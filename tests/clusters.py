@@ -1,0 +1,62 @@
+"""A dask.distributed cluster on this machine, as a user starts it: a scheduler and plain workers."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+class Cluster:
+    """A scheduler and plain workers, each a process of its own, as a user starts them."""
+
+    def __init__(self, folder):
+        self.file, self.processes = folder / "scheduler.json", []
+        self._start("scheduler", "--host", "127.0.0.1", "--port", "0")
+        while not self.file.exists() or not self.file.read_text().endswith("}"):
+            time.sleep(0.05)
+        self.address = json.loads(self.file.read_text())["address"]
+
+    def _start(self, kind, *arguments, **environment):
+        """With nothing in the environment but where the packages are."""
+        ours = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "NPROC")}
+        path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+        command = [sys.executable, "-m", "dask", kind, "--scheduler-file", str(self.file), "--no-dashboard"]
+        self.processes.append(
+            subprocess.Popen(
+                [*command, *arguments],
+                env={**ours, "PYTHONPATH": path, **environment},
+                cwd=self.file.parent,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+        )
+        return self.processes[-1]
+
+    def worker(self, *arguments, **environment):
+        return self._start("worker", *arguments, **environment)
+
+    def kill(self, process):
+        """The worker and the process that watches over it."""
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+@contextmanager
+def started(folder):
+    pytest.importorskip("distributed")
+    cluster = Cluster(folder)
+    try:
+        yield cluster
+    finally:
+        for process in cluster.processes:
+            if process.poll() is None:
+                cluster.kill(process)

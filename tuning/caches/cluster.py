@@ -1,0 +1,118 @@
+"""Pieces of work handed to the workers of a dask.distributed cluster (`tuning.caches.worker`).
+
+A worker that dies costs the time of the pieces that it had. A piece of which several died, and any piece
+while there are no workers, is computed here.
+"""
+
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager
+from itertools import islice
+from typing import Any, NamedTuple
+
+from jaxhil.errors import InputError, one_line, shown
+from tuning.caches.worker import Setting, run
+
+PATIENCE = 20.0  # s without a piece done, after which it is asked whether there are workers
+
+
+class Piece(NamedTuple):
+    """Something to compute."""
+
+    name: Any  # one of its own
+    arguments: tuple[Any, ...]  # of the function
+
+
+def on_workers(
+    address: str, function: Callable[..., Any], pieces: Iterable[Piece], setting: Setting | None, what: str
+) -> Generator[tuple[Any, Any], None, None]:
+    """(name, result of `function`) of every piece, in the order in which workers finish them; a few are under
+    way per worker.
+
+    `function` is one of a module, and is called on workers that are as `setting` says; with None it has to
+    see to that itself. `what` names the work, differently from any other under way.
+
+    Raises `InputError`, one line, where there is no cluster, where it is lost, and where a worker is not as
+    `setting` says; and whatever the function raises.
+    """
+    with _client(address) as client, _connected(address):
+        from cloudpickle import dumps  # pyright: ignore[reportMissingImports]
+
+        waiting, running = iter(pieces), {}
+
+        def submit(number: int) -> None:
+            for piece in islice(waiting, number):
+                # As bytes: what is in it may import jax, which is to start as a command starts it.
+                asked = dumps((function, piece.arguments))
+                future = client.submit(run, asked, setting, key=f"jaxhil-{what}-{piece.name}", pure=False)
+                running[future] = piece
+
+        submit(max(2, 2 * _workers(client)))
+        while running:
+            ended = _ended(client, list(running))
+            if not ended and not _workers(client):
+                ended = [next(iter(running))]
+                ended[0].cancel()
+            for future in ended:
+                piece = running.pop(future)
+                submit(1)
+                found = _found(future)
+                yield piece.name, function(*piece.arguments) if found is None else found[0]
+
+
+def _workers(client: Any) -> int:
+    return len(client.scheduler_info(n_workers=-1)["workers"])
+
+
+def _ended(client: Any, futures: list[Any]) -> list[Any]:
+    """Those that have ended; none if that takes long."""
+    from distributed import wait  # pyright: ignore[reportMissingImports]
+
+    try:
+        with client.as_current():
+            ended: Any = wait(futures, timeout=PATIENCE, return_when="FIRST_COMPLETED")
+        return list(ended.done)
+    except TimeoutError:
+        return []
+
+
+def _client(address: str) -> Any:
+    try:
+        from distributed import Client  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        missing = "nothing installed for it, allowed once `pip install jaxhil[distributed]` was done"
+        raise InputError(f"--scheduler: found {missing}") from None
+    try:
+        return Client(address, timeout=10, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        reason = one_line(str(error), 100)
+        raise InputError(f"--scheduler: found {shown(address)}, allowed a scheduler's: {reason}") from None
+
+
+def _found(future: Any) -> tuple[Any] | None:
+    """What a worker found of a piece; None if several died of it, or there are none."""
+    from distributed import KilledWorker  # pyright: ignore[reportMissingImports]
+
+    if future.cancelled():
+        return None
+    try:
+        return (future.result(),)
+    except KilledWorker:
+        return None
+    except ImportError as error:
+        reason = one_line(str(error), 100)
+        raise InputError(f"--scheduler: a worker: {reason}, allowed workers with jaxhil installed") from None
+    finally:
+        future.release()
+
+
+@contextmanager
+def _connected(address: str) -> Iterator[None]:
+    """A scheduler that is lost is an `InputError`, one line."""
+    from distributed import CancelledError  # pyright: ignore[reportMissingImports]
+
+    try:
+        yield
+    except (CancelledError, OSError) as error:
+        reason = one_line(f"{type(error).__name__}: {error}", 100)
+        kept = "what is there is kept, --resume goes on"
+        raise InputError(f"--scheduler: {one_line(address)}: lost, {reason}; {kept}") from None
