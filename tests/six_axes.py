@@ -15,6 +15,12 @@ from jaxhil.sixdof.rotations import exponential, identity
 from jaxhil.sixdof.sensor import SampleErrors, Sensor, Tool
 from jaxhil.sixdof.vectors import Matrix, Vector, matrix, vector
 
+# Full inertias of a target and a chaser, in body axes [kg m^2].
+FULL = (
+    np.array([[1400.0, 30, -20], [30, 1100, 15], [-20, 15, 800]]),
+    np.array([[150.0, 10, 5], [10, 180, -8], [5, -8, 110]]),
+)
+
 
 def zeros(like):
     """The vector 0 of a batch."""

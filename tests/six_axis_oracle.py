@@ -2,9 +2,10 @@
 Runge-Kutta method of order 8, one case at a time.
 
 A case is a dict: `masses`, `inertias` and `interfaces` of target and chaser; `start`, position, velocity,
-rotation matrix and angular velocity (body axes) of each; `spheres` (centre, radius), `numbers` of the drogue
-(half angle, radius and height of its bottom), `stiffness`, `exponent`, `damping`, `friction`, `slip`; of the
-rig `period`, `frequency`, `ratio` and `delays` of the six axes, and `force_delay`.
+rotation matrix and angular velocity (body axes) of each; `spheres` (centre, radius), `shape` ("plane" or
+"drogue", with its numbers in `numbers`), `stiffness`, `exponent`, `damping`, `friction`, `slip`; of the rig
+`period`, `frequency`, `ratio` and `delays` of the six axes, `force_delay`, `position_delay`; on the moving
+side `tool` (mass, centre, inertia), `assumed` (mass, centre) and `gravity`, else None.
 """
 
 import numpy as np
@@ -39,12 +40,16 @@ def drogue(x, half_angle, radius, bottom):
     return radius - apart, -(rho * outward + np.array([0, 0, z])) / apart
 
 
+def plane(x):
+    return x[2], np.array([0.0, 0.0, 1.0])
+
+
 def wrench(case, p, rotation, v, w):
     """Force and moment about T's origin on the chaser."""
     force, moment = np.zeros(3), np.zeros(3)
     for centre, radius in case["spheres"]:
         x = p + rotation @ np.asarray(centre)
-        distance, n = drogue(x, *case["numbers"])
+        distance, n = {"plane": plane, "drogue": drogue}[case["shape"]](x, *case["numbers"])
         depth, point = radius - distance, x - distance * n
         if depth <= 0:
             continue
@@ -140,11 +145,12 @@ class Axis:
         self.state, self.sent = (expm(self.flow * self.period) @ start)[:2], value
 
     def response(self, time):
-        """y and y' at a time since the first tick."""
-        if time <= 0:
-            return np.array([self.at - self.late + self.rate * time, self.rate])
+        """y, y', y'' at a time since the first tick."""
+        if time <= 1e-9 * self.period:
+            return np.array([self.at - self.late + self.rate * time, self.rate, 0.0])
         index = min(int(np.ceil(time / self.period - 1e-9)) - 1, len(self.starts) - 1)
-        return (expm(self.flow * (time - index * self.period)) @ self.starts[index])[:2]
+        found = expm(self.flow * (time - index * self.period)) @ self.starts[index]
+        return np.array([found[0], found[1], (self.flow @ found)[1]])
 
 
 def on_the_rig(case, ticks):
@@ -161,11 +167,36 @@ def on_the_rig(case, ticks):
         return np.array([axis.response(now - delay - own) for axis, own in each]).T
 
     for tick in range(ticks):
-        x, rate = seen(tick * period, case["force_delay"])
+        x, rate, bend = seen(tick * period, case["force_delay"])
         theta, slopes = x[3:], jacobian(x[3:])
         rotation, w = Rotation.from_rotvec(theta).as_matrix(), slopes @ rate[3:]
         force, moment = wrench(case, x[:3], rotation, rate[:3], w)
+        if case["tool"] is not None:
+            measured, *_ = seen(tick * period, case["position_delay"])
+            force, moment = weighed(case, x, rotation, w, rate, bend, force, moment, measured)
         bodies = moved(case, bodies, force, moment)
         for axis, value in zip(axes, command(case, bodies)[0], strict=True):
             axis.send(value)
     return bodies
+
+
+def weighed(case, x, rotation, w, rate, bend, force, moment, measured):
+    """What a sensor behind the tool and a controller that takes its weight back make of a contact."""
+    mass, centre, inertia = case["tool"]
+    step = 1e-6
+    ahead, behind = (
+        jacobian(x[3:] + s * step * rate[3:]) @ (rate[3:] + s * step * bend[3:]) for s in (1, -1)
+    )
+    alpha = (ahead - behind) / (2 * step)
+    arm = rotation @ centre
+    carried = bend[:3] + np.cross(alpha, arm) + np.cross(w, np.cross(w, arm))
+    pull = mass * (case["gravity"] - carried)
+    j = rotation @ inertia @ rotation.T
+    at_flange = moment - np.cross(x[:3], force) + np.cross(arm, pull) - j @ alpha - np.cross(w, j @ w)
+    reading = rotation.T @ (force + pull), rotation.T @ at_flange
+    found = Rotation.from_rotvec(measured[3:]).as_matrix()
+    mass, centre = case["assumed"]
+    weight = mass * case["gravity"]
+    force = found @ reading[0] - weight
+    moment = found @ reading[1] - np.cross(found @ centre, weight) + np.cross(measured[:3], force)
+    return force, moment

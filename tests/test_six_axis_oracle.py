@@ -1,6 +1,7 @@
 """Rig and space in six axes against an implementation of their own (`six_axis_oracle`).
 
-Off-centre and oblique, with friction and unequal delays: a probe in a drogue.
+Off-centre and oblique, with friction, unequal delays: a probe in a drogue, three points of a ring on a plane,
+and the probe on a sensor that carries its tool.
 """
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from six_axes import (
+    FULL,
     ideal_sensor,
     lanes,
     place,
@@ -17,7 +19,7 @@ from six_axes import (
     spheres,
     springs,
 )
-from six_axis_oracle import in_space, on_the_rig
+from six_axis_oracle import command, in_space, on_the_rig, relative
 
 from jaxhil.sixdof.bodies import build_state
 from jaxhil.sixdof.friction import Regularised
@@ -27,25 +29,34 @@ from jaxhil.sixdof.metrics import reference_final
 from jaxhil.sixdof.relative import Pair, States
 from jaxhil.sixdof.rotations import Quaternion
 from jaxhil.sixdof.scenario import Scenario
-from jaxhil.sixdof.shapes import Drogue
-from jaxhil.sixdof.vectors import components
+from jaxhil.sixdof.sensor import Tool
+from jaxhil.sixdof.shapes import Drogue, Plane
+from jaxhil.sixdof.vectors import components, matrix
 
 pytestmark = pytest.mark.slow
 BATCH, TICKS, PERIOD = (1,), 300, 1e-3
-FULL = (
-    np.array([[1400.0, 30, -20], [30, 1100, 15], [-20, 15, 800]]),
-    np.array([[150.0, 10, 5], [10, 180, -8], [5, -8, 110]]),
-)
 TURN = Rotation.from_rotvec([0.02, 0.03, -0.01]).as_matrix()
 COMMON = {
     "masses": (1800.0, 420.0), "inertias": FULL, "interfaces": ((0.05, -0.02, 1.2), (0.01, 0.04, -1.0)),
     "exponent": 1.5, "damping": 1.5, "friction": 0.15, "slip": 2e-3, "period": PERIOD,
     "frequency": [14.0, 13.0, 12.0, 11.0, 10.0, 9.0], "ratio": [0.8, 0.7, 0.8, 0.9, 0.8, 1.1],
-    "delays": [4e-3, 4.2e-3, 3e-3, 5.3e-3, 5.05e-3, 4.4e-3], "force_delay": 3.7e-3,
+    "delays": [4e-3, 4.2e-3, 3e-3, 5.3e-3, 5.05e-3, 4.4e-3], "force_delay": 3.7e-3, "position_delay": 1.3e-3,
+    "tool": None,
 }  # fmt: skip
 PROBE = COMMON | {
-    "spheres": [((0.0, 0.0, 0.0), 0.02)], "numbers": (0.75, 0.04, 0.0), "stiffness": 3e6,
+    "spheres": [((0.0, 0.0, 0.0), 0.02)], "shape": "drogue", "numbers": (0.75, 0.04, 0.0), "stiffness": 3e6,
     "height": 0.014,
+}  # fmt: skip
+CASES = {
+    "probe": PROBE,
+    "ring": COMMON | {
+        "spheres": [((0.3, 0.0, 0.0), 0.01), ((-0.15, 0.26, 0.0), 0.01), ((-0.15, -0.26, 0.0), 0.01)],
+        "shape": "plane", "numbers": (), "stiffness": 1e6, "height": 0.0205,
+    },
+    "tool": PROBE | {
+        "tool": (12.0, np.array([0.01, 0.02, 0.15]), np.diag([0.2, 0.25, 0.1])),
+        "assumed": (11.8, np.array([0.012, 0.02, 0.14])), "gravity": np.array([0.3, -0.2, -9.8]),
+    },
 }  # fmt: skip
 
 
@@ -71,13 +82,24 @@ def as_scenario(case):
     one = jnp.ones((len(case["spheres"]), 1))
     centres = jnp.asarray(np.array([centre for centre, _ in case["spheres"]], float).T[..., None])
     radii = lanes([radius for _, radius in case["spheres"]], BATCH)
-    shape = Drogue(*(number * one for number in case["numbers"]))
+    if case["shape"] == "drogue":
+        shape = Drogue(*(number * one for number in case["numbers"]))
+    else:
+        shape = Plane(place([0, 0, 0], one.shape), place([0, 0, 1], one.shape))
     law = springs(case["stiffness"] * one, case["damping"] * one, case["exponent"] * one)
     contact = spheres(
         centres, radii, shape, "hunt_crossley", law, Regularised(case["friction"] * one, case["slip"] * one)
     )
     axes = (lanes(case[key], BATCH) for key in ("frequency", "ratio", "delays"))
-    sensor = ideal_sensor(lanes(case["force_delay"], BATCH))
+    sensor = ideal_sensor(
+        lanes(case["force_delay"], BATCH), position_delay=lanes(case["position_delay"], BATCH)
+    )
+    if case["tool"] is not None:
+        mass, centre, inertia = case["tool"]
+        tool = Tool(lanes(mass, BATCH), place(centre, BATCH), matrix(lanes(inertia, BATCH)))
+        assumed = Tool(lanes(case["assumed"][0], BATCH), place(case["assumed"][1], BATCH), tool.inertia)
+        gravity = place(case["gravity"], BATCH)
+        sensor = sensor._replace(tool=tool, assumed_tool=assumed, gravity=gravity, assumed_gravity=gravity)
     return Scenario(
         bodies, States(*states), (contact,), (), second_order(*axes), TaskSpace(), sensor,
         lanes(PERIOD, BATCH), lanes(TICKS * PERIOD, BATCH), jnp.zeros((2, 1), jnp.uint32),
@@ -94,11 +116,13 @@ def close(states, expected, tolerance):
         np.testing.assert_allclose(turned.as_matrix(), attitude, atol=tolerance)
 
 
-def test_the_rig_is_that_of_another_implementation():
-    case = started(PROBE)
+@pytest.mark.parametrize("name", CASES)
+def test_the_rig_is_that_of_another_implementation(name):
+    case = started(CASES[name])
     given = as_scenario(case)
     loop = build_loop(
-        given, integrator="semi_implicit_euler", hold="linear", latency=0
+        given, integrator="semi_implicit_euler", hold="linear", latency=0,
+        side="fixed" if case["tool"] is None else "moving",
     )  # fmt: skip
     end, seen = jax.jit(run, static_argnums=(0, 3))(loop, {}, given, TICKS)
     assert np.max(np.abs(components(seen.contact.force))) > 20
@@ -110,8 +134,9 @@ def test_the_rig_is_that_of_another_implementation():
         np.testing.assert_allclose(spin, attitude @ inertia @ w, atol=1e-9)
 
 
-def test_space_is_that_of_another_implementation():
-    case = started(PROBE)
+@pytest.mark.parametrize("name", ["probe", "ring"])
+def test_space_is_that_of_another_implementation(name):
+    case = started(CASES[name])
     given = as_scenario(case)
     time = lanes(TICKS * PERIOD, BATCH)
     found = jax.jit(reference_final)(given, time)
@@ -119,3 +144,4 @@ def test_space_is_that_of_another_implementation():
     expected = in_space(case, TICKS * PERIOD)
     assert np.linalg.norm(expected[1][1] - before) > 0.01
     close(found, expected, 1e-9)
+    assert np.all(np.isfinite(command(case, expected)[0])) and relative(case, expected)[0][2] > 0
