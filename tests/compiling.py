@@ -11,16 +11,10 @@ from pathlib import Path
 
 import jax
 
-from jaxhil.simulation.environment import known_options
+from jaxhil.simulation.environment import ONCE, known_options
 
 # Of one program, given to `jax.jit`: more than can be switched for all that a module compiles.
-QUICK = known_options(
-    {
-        "xla_backend_optimization_level": 0,
-        "xla_llvm_disable_expensive_passes": True,
-        "xla_cpu_use_fusion_emitters": False,
-    }
-)
+QUICK = known_options(ONCE)
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
 

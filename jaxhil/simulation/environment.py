@@ -30,6 +30,12 @@ KEEPING = {"jax_persistent_cache_min_compile_time_secs": 0.1, "jax_persistent_ca
 # three times as long like that.
 WIDE = {"xla_cpu_prefer_vector_width": 512}
 ROLLOUT = {**WIDE, "xla_disable_hlo_passes": "cpu_multi_output_fusion"}
+# Of what runs once and is soon done: compiled in half the time.
+ONCE = {
+    "xla_backend_optimization_level": 0,
+    "xla_llvm_disable_expensive_passes": True,
+    "xla_cpu_use_fusion_emitters": False,
+}
 _started_with: list[str] = []  # XLA_FLAGS that jax was started with, once `start` did it
 
 

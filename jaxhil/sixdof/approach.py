@@ -11,7 +11,7 @@ from jaxhil.sixdof.rotations import Quaternion, compose, identity, reverse, rota
 from jaxhil.sixdof.vectors import Vector, cross
 
 FAR = 10.0  # m: from where the chaser is lowered on the target
-STEPS = 400  # of the search for the first touch
+STEPS, POLISHES = 400, 3  # of the search for the first touch
 FLIGHTS = 8  # steps of the flight back
 
 
@@ -29,7 +29,7 @@ def touching_height(
     def depth(height: Array) -> Array:
         return deepest(groups, Pose(Vector(offset_x, offset_y, height), attitude))
 
-    def polished(height: Array) -> Array:
+    def polished(_, height: Array) -> Array:
         at = jax.lax.stop_gradient(height)
         found, slope = jax.jvp(depth, (at,), (jnp.ones_like(at),))
         return at - found / jnp.where(slope < 0, slope, -1)
@@ -37,7 +37,8 @@ def touching_height(
     start = jnp.full_like(offset_x, FAR)
     height = jax.lax.fori_loop(0, STEPS, lambda _, z: z + jax.lax.stop_gradient(depth(z)), start)
     touches = (jnp.abs(depth(height)) < 1e-6) & (height > -FAR)
-    return jnp.where(touches, polished(polished(polished(height))), jnp.nan)
+    polish = jax.lax.fori_loop(0, POLISHES, polished, height)
+    return jnp.where(touches, polish, jnp.nan)
 
 
 def begin(bodies: Pair, pose: Pose, twist: Twist, before: Float[Array, "*batch"]) -> States:

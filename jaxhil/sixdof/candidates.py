@@ -26,7 +26,7 @@ class Touch(NamedTuple):
 
     depth: Float[Array, "candidates *batch"]  # d [m], negative apart
     normal: Vector  # n, outward from the target's surface
-    point: Vector  # P, on the target's surface, where the force acts [m]
+    point: Vector  # P, on the shape that the sphere meets, else on the target's: there the force acts [m]
 
 
 class Candidates(eqx.Module):
@@ -61,7 +61,7 @@ class TargetSpheres(Candidates):
         centre = rotate_back(pose.attitude, self.centre - pose.position)
         distance, normal = self.shape.surface(centre)
         outward = -rotate(pose.attitude, normal)
-        return Touch(self.radius - distance, outward, self.centre + self.radius * outward)
+        return Touch(self.radius - distance, outward, self.centre + distance * outward)
 
 
 class Capsules(Candidates):

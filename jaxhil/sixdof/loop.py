@@ -90,6 +90,7 @@ class RunState(NamedTuple):
     """What is carried from tick to tick."""
 
     states: States  # of the numerical model
+    near: Float[Array, "6 *batch"]  # coordinates of C against T then
     hardware: Hardware
     memories: tuple[Memory, ...]  # of the contact's laws
     held: tuple[Held, ...]  # by the latches
@@ -150,6 +151,7 @@ def begin(loop: Loop, rig: Rig, states: States) -> RunState:
     controllers = tuple(law.init(_gains(rig, channel), constants, 1) for channel in range(6))
     return RunState(
         states,
+        at,
         hardware,
         tuple(group.init() for group in rig.groups),
         tuple(init_latch(latch, pose) for latch in rig.latches),
@@ -168,8 +170,7 @@ def run(loop: Loop, gains: Gains, scenario: Scenario, ticks: int) -> tuple[RunSt
 def tick(loop: Loop, rig: Rig, state: RunState) -> tuple[RunState, Tick]:
     """One control period."""
     found = sampled(rig.axes, state.hardware, state.tick)
-    near, _ = command_of(rig.bodies, state.states)
-    here = moving(rig.kinematics.coordinates(found.motion, near))
+    here = moving(rig.kinematics.coordinates(found.motion, state.near))
     contact, forces, memories = contact_wrench(rig.groups, state.memories, here.pose, here.twist, rig.period)
     held = []
     for latch, before in zip(rig.latches, state.held, strict=True):
@@ -179,7 +180,7 @@ def tick(loop: Loop, rig: Rig, state: RunState) -> tuple[RunState, Tick]:
     measured = None
     if found.measured is not None:
         still = Motion(found.measured, jnp.zeros_like(found.measured), None)
-        at = rig.kinematics.coordinates(still, near).position
+        at = rig.kinematics.coordinates(still, state.near).position
         measured = Pose(vector(at[:3]), exponential(vector(at[3:])))
     command, channels = _sense(loop, rig, state, contact, here, measured)
     states = advance(rig.bodies, state.states, command, rig.period, SHARES[loop.integrator])
@@ -187,7 +188,7 @@ def tick(loop: Loop, rig: Rig, state: RunState) -> tuple[RunState, Tick]:
     sent = rig.kinematics.command(position)
     hardware = actuate(rig.axes, state.hardware, state.tick, sent, loop.hold, loop.latency)
     seen = Tick(state.states, here.pose, here.twist, contact, forces, tuple(held), command)
-    return RunState(states, hardware, memories, tuple(held), channels, state.tick + 1), seen
+    return RunState(states, position, hardware, memories, tuple(held), channels, state.tick + 1), seen
 
 
 def command_of(bodies: Pair, states: States) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ from jaxhil.compensators.base import Gains
 from jaxhil.sixdof.bodies import kinetic_energy
 from jaxhil.sixdof.loop import Loop
 from jaxhil.sixdof.reference import Meeting, Passage, glide, meet, meeting_mass, pass_through
-from jaxhil.sixdof.relative import Pair, States, Twist, mass_matrix, relative
+from jaxhil.sixdof.relative import Pair, Pose, States, Twist, mass_matrix, relative
 from jaxhil.sixdof.rollout import CAPTURED, MISS, REBOUNDED, Episode, quiet_time, rollout
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.space import Space, fly, scale, start_flight
@@ -120,7 +120,8 @@ def _compare(space: Space, episodes: Episode, passage: Passage) -> Metrics:
         (passage.flight.states, both - passage.flight.time),
     ]
     start, end, expected = _later(bodies, flown)
-    mass, speed = meeting_mass(bodies, meeting), _closing(bodies, meeting, start.twist)
+    mass, (there, _) = meeting_mass(bodies, meeting), relative(bodies, meeting.states)
+    speed = _closing(there, meeting, start.twist)
     change, changed = end.energy - start.energy, expected.energy - start.energy
     parts = _twist_parts(expected.mass, end.twist, expected.twist, start.twist)
     met = (episodes.status != MISS) & (passage.touches > 0)
@@ -135,8 +136,8 @@ def _compare(space: Space, episodes: Episode, passage: Passage) -> Metrics:
     return Metrics(
         of(met, (change - changed) / (mass * speed**2 / 2)),
         *(of(met, part) for part in parts),
-        restitution=of(once & only, -_closing(bodies, meeting, end.twist) / speed),
-        reference_restitution=of(only, -_closing(bodies, meeting, expected.twist) / speed),
+        restitution=of(once & only, -_closing(there, meeting, end.twist) / speed),
+        reference_restitution=of(only, -_closing(there, meeting, expected.twist) / speed),
         effective_mass=of(met, mass),
         approach_velocity=of(met, speed),
         point=of(met[None], components(meeting.point)),
@@ -157,9 +158,8 @@ def _compare(space: Space, episodes: Episode, passage: Passage) -> Metrics:
     )
 
 
-def _closing(bodies: Pair, meeting: Meeting, twist: Twist) -> Array:
-    """Speed [m/s] at which the point of the first touch closes, its twist being another's."""
-    pose, _ = relative(bodies, meeting.states)
+def _closing(pose: Pose, meeting: Meeting, twist: Twist) -> Array:
+    """Speed [m/s] at which the point of the first touch, met at a pose, closes at another's twist."""
     velocity = twist.linear + cross(twist.angular, meeting.point - pose.position)
     return -dot(meeting.normal, velocity)
 

@@ -17,7 +17,7 @@ from jaxhil.compensators.base import Gains
 from jaxhil.simulation.metrics import RUNAWAY
 from jaxhil.simulation.watch import FADED, LONGEST_FADING
 from jaxhil.sixdof.forces import deepest
-from jaxhil.sixdof.loop import Loop, Rig, RunState, Tick, begin, build_rig, command_of, tick
+from jaxhil.sixdof.loop import Loop, Rig, RunState, Tick, begin, build_rig, tick
 from jaxhil.sixdof.relative import States, relative
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.sensor import Sensor
@@ -42,6 +42,7 @@ class Watch(NamedTuple):
     begun: Bool[Array, "*batch"]
     entry: States  # of the numerical model: free, and without an episode
     entry_tick: Int[Array, "*batch"]
+    entry_energy: Float[Array, "*batch"]  # of the relative motion then [J]
     touching: tuple[Bool[Array, "candidates *batch"], ...]
     touches: Int[Array, "*batch"]  # candidates that began to touch
     touched: Int[Array, "*batch"]  # ticks at which something touched
@@ -92,7 +93,6 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
     last = jnp.round(scenario.duration / rig.period).astype(jnp.int32)
 
     def body(progress: Progress) -> Progress:
-        progress = _enter(rig, progress)
         progress, _ = lax.scan(lambda now, _: (_tick(loop, rig, last, now), None), progress, None, STRETCH)
         return _turn_over(loop, rig, last, progress)
 
@@ -110,7 +110,8 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
 def _start(loop: Loop, rig: Rig, states: States) -> Progress:
     run = begin(loop, rig, states)
     like, none = jnp.zeros_like(rig.period), jnp.zeros(rig.period.shape, jnp.int32)
-    watch = _fresh(rig, states, none)
+    _, energy = _look(rig, states)
+    watch = _fresh(rig, states, none, energy)
     slots: Any = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (loop.episodes, *leaf.shape)), states)
     numbers = jnp.zeros((loop.episodes, *like.shape), like.dtype)
     counts = numbers.astype(jnp.int32)
@@ -118,12 +119,13 @@ def _start(loop: Loop, rig: Rig, states: States) -> Progress:
     return Progress(run, watch, episodes, none, none == 0, run.tick)
 
 
-def _fresh(rig: Rig, states: States, now: Array) -> Watch:
+def _fresh(rig: Rig, states: States, now: Array, energy: Array) -> Watch:
     zero, none = jnp.zeros_like(rig.period), jnp.zeros(rig.period.shape, jnp.int32)
     peak = Peak(zero, (zero, zero))
     touching = tuple(group.parameters.damping > jnp.inf for group in rig.groups)
     return Watch(
-        none > 0, states, now, touching, none, none, none, none > 0, peak, peak, (zero, zero), (zero, zero)
+        none > 0, states, now, energy, touching, none, none, none, none > 0, peak, peak,
+        (zero, zero), (zero, zero),
     )  # fmt: skip
 
 
@@ -169,19 +171,12 @@ def _higher(peak: Peak, now: Array) -> Peak:
     return Peak(jnp.maximum(peak.largest, jnp.where(crest, vertex, now)), (middle, now))
 
 
-def _enter(rig: Rig, progress: Progress) -> Progress:
-    """Where the numerical model is free and no episode is under way, this may be the last moment before."""
-    watch = progress.watch
-    free = _is_free(rig, progress.run.states) & ~watch.begun & progress.active
-    age = jnp.broadcast_to(progress.run.tick - progress.first, watch.entry_tick.shape)
-    entry = choose(free, progress.run.states, watch.entry)
-    watch = watch._replace(entry=entry, entry_tick=jnp.where(free, age, watch.entry_tick))
-    return progress._replace(watch=watch)
-
-
-def _is_free(rig: Rig, states: States) -> Array:
-    pose, _ = relative(rig.bodies, states)
-    return deepest(rig.groups, pose) < 0
+def _look(rig: Rig, states: States) -> tuple[Array, Array]:
+    """Whether the numerical model is free, and the energy of its relative motion [J], coupling left out."""
+    pose, (linear, angular) = relative(rig.bodies, states)
+    share = 1 / rig.bodies.target.mass + 1 / rig.bodies.chaser.mass
+    energy = dot(linear, linear) / share + dot(angular, rig.bodies.chaser.inertia @ angular)
+    return deepest(rig.groups, pose) < 0, energy
 
 
 def quiet_time(sensor: Sensor, period: Array) -> Array:
@@ -190,8 +185,9 @@ def quiet_time(sensor: Sensor, period: Array) -> Array:
 
 
 def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progress:
-    """Enter the episodes that are over."""
+    """Enter the episodes that are over; where the model is free and none is under way, one may begin."""
     watch, run, period = progress.watch, progress.run, rig.period
+    free, energy = _look(rig, run.states)
     age = run.tick - progress.first
     still = jnp.floor(quiet_time(rig.sensor, period) / period + 1e-9).astype(jnp.int32) + 1
     patience = still + jnp.ceil(LONGEST_FADING / period).astype(jnp.int32)
@@ -200,9 +196,9 @@ def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progres
     faded = jnp.ones(period.shape, bool)
     for now, highest, level in zip(watch.command, watch.highest, levels, strict=True):
         faded = faded & (now <= jnp.maximum(FADED * highest, level))
-    over = watch.begun & (watch.quiet >= still) & _is_free(rig, run.states)
+    over = watch.begun & (watch.quiet >= still) & free
     over = over & (faded | (watch.quiet >= patience)) & progress.active
-    status = _failure(rig, watch, run.states)
+    status = _failure(rig, watch, run, energy)
     out = (age >= last) | (status != MISS)
     held = jnp.where(watch.caught, CAPTURED, jnp.where(watch.quiet < still, JAMMED, TIMEOUT))
     status = jnp.where(status != MISS, status, jnp.where(over, REBOUNDED, jnp.where(watch.begun, held, MISS)))
@@ -220,20 +216,15 @@ def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progres
     if not loop.whole:
         active = active & (index < loop.episodes)
     now = jnp.broadcast_to(age, index.shape)
-    watch = choose(over, _fresh(rig, run.states, now)._replace(touching=watch.touching), watch)
+    fresh = _fresh(rig, run.states, now, energy)._replace(touching=watch.touching)
+    watch = choose(over, fresh, watch)
+    ahead = watch._replace(entry=run.states, entry_tick=now, entry_energy=energy)
+    watch = choose(free & ~watch.begun & active, ahead, watch)
     return progress._replace(watch=watch, episodes=episodes, index=index, active=active)
 
 
-def _failure(rig: Rig, watch: Watch, states: States) -> Array:
+def _failure(rig: Rig, watch: Watch, run: RunState, energy: Array) -> Array:
     """DIVERGED, NON_FINITE, or REACH where an axis is to be where it cannot be; else MISS."""
-
-    def energy(states: States) -> Array:
-        _, (linear, angular) = relative(rig.bodies, states)
-        share = 1 / rig.bodies.target.mass + 1 / rig.bodies.chaser.mass
-        return dot(linear, linear) / share + dot(angular, rig.bodies.chaser.inertia @ angular)
-
-    now = energy(states)
-    sent = rig.kinematics.command(command_of(rig.bodies, states)[0])
-    wild = jnp.where(now > RUNAWAY**2 * energy(watch.entry), DIVERGED, MISS)
-    wild = jnp.where(rig.kinematics.reaches(sent), wild, REACH)
-    return jnp.where(jnp.isfinite(now), wild, NON_FINITE).astype(jnp.int32)
+    wild = jnp.where(energy > RUNAWAY**2 * watch.entry_energy, DIVERGED, MISS)
+    wild = jnp.where(rig.kinematics.reaches(run.hardware.commands[0]), wild, REACH)
+    return jnp.where(jnp.isfinite(energy), wild, NON_FINITE).astype(jnp.int32)

@@ -1,7 +1,8 @@
 """One run of a mechanism of six axes: what became of each episode, and every tick of the way there."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -12,7 +13,7 @@ from jaxhil.errors import InputError, shown
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.simulation.environment import computing
+from jaxhil.simulation.environment import ONCE, computing, known_options
 from jaxhil.simulation.gain_choice import choose_gains
 from jaxhil.simulation.run import check_seed
 from jaxhil.sixdof.bodies import angular_velocity
@@ -110,7 +111,8 @@ def simulate_six_axes(
         scenario = build_scenarios(mechanism, seed=number)
         check_scenario(mechanism, scenario)
         loop = loop_of(mechanism, name, scenario)
-        found = jax.device_get(_run(loop, {key: jnp.asarray(one) for key, one in values.items()}, scenario))
+        given = {key: jnp.asarray(one) for key, one in values.items()}
+        found = jax.device_get(_compiled()(loop, given, scenario))
     return _result(mechanism, name, values, number, found)
 
 
@@ -161,7 +163,11 @@ def _final(time: float, motion: Any) -> Final:
     return Final(time, at, twist, *each)
 
 
-@partial(jax.jit, static_argnums=0)
+@cache
+def _compiled() -> Callable[..., Any]:
+    return jax.jit(_run, static_argnums=0, compiler_options=known_options(ONCE))
+
+
 def _run(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> tuple[Any, ...]:
     """Figures of the episodes, the time at the end, the motion then, and the mass along the surface."""
     found = evaluate(loop, gains, scenario)
