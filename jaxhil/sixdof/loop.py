@@ -130,7 +130,8 @@ def build_rig(loop: Loop, gains: Gains, scenario: Scenario) -> Rig:
 
 def begin(loop: Loop, rig: Rig, states: States) -> RunState:
     """Before tick 0: so far the command was in uniform motion, at the states' relative pose and rates."""
-    at, rates = command_of(rig.bodies, states)
+    pose, twist = relative(rig.bodies, states)
+    at, rates = (jnp.stack(jax.tree.leaves(part)) for part in coordinates(pose, twist))
     stride = rates * rig.period[None]
     history = 0 if rig.kinematics.is_linear else HISTORY
     first = at - history * stride
@@ -144,7 +145,6 @@ def begin(loop: Loop, rig: Rig, states: States) -> RunState:
         return actuate(rig.axes, hardware, tick, command, loop.hold, loop.latency), None
 
     hardware, _ = lax.scan(before, hardware, jnp.arange(history, dtype=jnp.int32))
-    pose, _ = relative(rig.bodies, states)
     zero = vector(jnp.zeros_like(at[:3]))
     nothing = Wrench(zero, zero)
     law, constants = COMPENSATORS[loop.compensator], _constants(rig)

@@ -93,11 +93,10 @@ class Step(NamedTuple):
 
 def start_flight(space: Space, states: States, length: Float[Array, "*batch"]) -> Flight:
     """A motion at its start; its first step is `length` [s]."""
-    pose, _ = relative(space.bodies, states)
-    memories = Memories(
-        tuple(group.init() for group in space.groups),
-        tuple(init_latch(latch, pose) for latch in space.latches),
-    )
+    memories = Memories(tuple(group.init() for group in space.groups), ())
+    if space.latches:
+        pose, _ = relative(space.bodies, states)
+        memories = memories._replace(held=tuple(init_latch(latch, pose) for latch in space.latches))
     return Flight(0 * length, length, memories, states)
 
 
