@@ -186,10 +186,8 @@ def _tangential_mass(scenario: Scenario, metrics: Metrics) -> Any:
     zero = jnp.zeros_like(normal.x)
     flat = jnp.abs(normal.x) < 0.9
     across = direction(cross(normal, Vector(jnp.where(flat, 1, zero), jnp.where(flat, zero, 1), zero)))
-    # Both at once, along an axis before the batch.
-    sides = jax.tree.map(lambda *one: jnp.stack(one), across, cross(normal, across))
-    bodies, start, point = jax.tree.map(lambda leaf: leaf[None], (scenario.bodies, scenario.start, point))
-    return effective_mass(bodies, start, point, sides).min(axis=0)
+    sides = (across, cross(normal, across))
+    return jnp.minimum(*(effective_mass(scenario.bodies, scenario.start, point, side) for side in sides))
 
 
 def _motion(bodies: Pair, states: States) -> tuple[Any, ...]:
