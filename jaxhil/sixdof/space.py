@@ -26,7 +26,7 @@ from jaxhil.sixdof.relative import (
     loads,
     relative,
 )
-from jaxhil.sixdof.rotations import Quaternion, compose, normalise
+from jaxhil.sixdof.rotations import Quaternion, compose, normalise, rotate
 from jaxhil.sixdof.vectors import norm
 
 TOLERANCE = 1e-10  # of a step's error, per the relative speed
@@ -216,9 +216,14 @@ def fly(space: Space, flight: Flight, until: Array, longest: Array, speed: Array
 
 
 def scale(space: Space, states: States) -> Float[Array, "*batch"]:
-    """A speed [m/s] to hold errors against: that of C, and that of a point 1 m off it."""
-    _, twist = relative(space.bodies, states)
-    return lax.stop_gradient(norm(twist.linear) + norm(twist.angular) + 1e-9)
+    """A speed [m/s] to hold errors against: that of the centres of mass against each other, and that of a
+    point 1 m off. It is the same wherever the interface frames are."""
+    target, chaser = (
+        rotate(state.attitude, angular_velocity(body, state))
+        for body, state in zip(space.bodies, states, strict=True)
+    )
+    apart = states.chaser.velocity - states.target.velocity
+    return lax.stop_gradient(norm(apart) + norm(chaser - target) + 1e-9)
 
 
 def choose(condition: Array, one: Any, other: Any) -> Any:
