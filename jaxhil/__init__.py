@@ -1,6 +1,6 @@
 """Contact in a hardware-in-the-loop docking rig: its physics, and the controller that runs on it.
 
-    load       a mechanism file, or a built-in one, as a `Mechanism`
+    load       a mechanism file, or a built-in one, of one axis or of six
     simulate   its contacts under a compensator, once
     jacobian   by how much a figure of each contact changes with the mechanism and the gains
     register   a compensator or a contact law of your own
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from jaxhil.compensators.base import Compensator, Gain
     from jaxhil.contact.base import ContactLaw
     from jaxhil.errors import InputError
+    from jaxhil.front_door import simulate
     from jaxhil.mechanism.loading import load
     from jaxhil.mechanism.structs import Mechanism
     from jaxhil.simulation.jacobian import jacobian
     from jaxhil.simulation.registration import register
-    from jaxhil.simulation.run import simulate
 
     __version__: str
 
@@ -47,7 +47,7 @@ _HOMES = {
     "jacobian": "jaxhil.simulation.jacobian",
     "load": "jaxhil.mechanism.loading",
     "register": "jaxhil.simulation.registration",
-    "simulate": "jaxhil.simulation.run",
+    "simulate": "jaxhil.front_door",
 }
 
 

@@ -1,5 +1,6 @@
 """A new mechanism file, the JSON Schema of such files, and the descriptions of keys that both are made of."""
 
+import functools
 import re
 import tomllib
 from typing import Annotated
@@ -8,7 +9,15 @@ import jsonschema
 import msgspec
 import pytest
 
-from jaxhil.mechanism.file import builtin_names, builtin_path, load, suite_names, to_builtins
+from jaxhil.mechanism.file import (
+    builtin_names,
+    builtin_path,
+    load,
+    load_any,
+    six_axis_names,
+    suite_names,
+    to_builtins,
+)
 from jaxhil.mechanism.json_schema import json_schema
 from jaxhil.mechanism.keys import tables
 from jaxhil.mechanism.structs import MAX_CONTACTS, numeric_keys, says
@@ -100,7 +109,7 @@ def test_a_key_without_meaning_or_unit_is_refused(kind, reason):
         tables(kind)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *six_axis_names()])
 def test_the_schema_takes_what_is_built_in(validator, name):
     validator.validate(tomllib.loads(builtin_path(name).read_text(encoding="utf-8")))
 
@@ -120,6 +129,26 @@ def test_the_schema_takes_what_is_built_in(validator, name):
 def test_the_schema_refuses_what_the_reader_refuses(validator, table, key, value):
     document = to_builtins(load("varying").mechanism)
     document[table][key] = value
+    assert not validator.is_valid(document)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("target", "mass"), 0.0),
+        (("contact", "tip", "chaser", "shape"), "cube"),
+        (("contact", "tip", "law"), "magic"),
+        (("rig", "simulator", "delay"), {"translation": 1e-3}),
+        (("rig", "simulator", "delay"), [1e-3] * 5),
+        (("rig", "force_sensor", "crosstalk"), "much"),
+        (("rig", "velocity_limit"), 1.0),
+    ],
+)
+def test_the_schema_refuses_what_the_reader_of_six_axes_refuses(validator, path, value):
+    document = to_builtins(load_any("probe-drogue").mechanism)
+    assert validator.is_valid(document)
+    *tables, key = path
+    functools.reduce(dict.__getitem__, tables, document)[key] = value
     assert not validator.is_valid(document)
 
 

@@ -20,6 +20,8 @@ from browser import LAYOUT
 import jaxhil
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.mechanism.keys import tables
+from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.mechanism.structs import Mechanism
 from tuning.cli.parser import Command
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -45,9 +47,12 @@ def reference():
         sys.path.remove(str(SITE))
 
 
-def test_every_key_of_the_mechanism_file_is_there(reference):
-    text = reference["reference/mechanism_file.md"]
-    for table in tables():
+@pytest.mark.parametrize(
+    ("page", "kind"), [("mechanism_file", Mechanism), ("mechanism_file_six_axes", SixAxisMechanism)]
+)
+def test_every_key_of_the_mechanism_file_is_there(reference, page, kind):
+    text = reference[f"reference/{page}.md"]
+    for table in tables(kind):
         part = text[text.index(f"## `[{table.path}]`") :] if table.path else text
         for key in table.keys:
             row = re.search(rf"^\| `{key.name}` \|.*", part, re.M)[0].split(" | ")

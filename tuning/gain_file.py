@@ -22,7 +22,8 @@ from jaxhil.contact.laws import LAWS
 from jaxhil.contact.reference_motion import integrate_contact
 from jaxhil.errors import InputError, shown
 from jaxhil.files import write_whole, writing
-from jaxhil.mechanism.file import to_builtins
+from jaxhil.mechanism.file import AnyMechanism, to_builtins
+from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.runtime import digest
 from jaxhil.runtime.gain_file import SCHEMA
@@ -36,7 +37,7 @@ VERSIONED = ("jaxhil", "jax", "numpy", "optimistix")
 def build_document(
     compensator: str,
     gains: Mapping[str, float],
-    mechanism: Mechanism,
+    mechanism: AnyMechanism,
     mechanism_sha256: str,
     envelope: Mapping[str, Any],
     figures: Mapping[str, Any],
@@ -56,6 +57,7 @@ def build_document(
         "schema": SCHEMA,
         "compensator": compensator,
         "gains": {gain.name: _gain_entry(gain, gains[gain.name], mechanism) for gain in law},
+        **({"axes": 6} if isinstance(mechanism, SixAxisMechanism) else {}),
         "control_period": mechanism.rig.control_period,
         "mechanism": to_builtins(mechanism),
         "mechanism_sha256": mechanism_sha256,
@@ -102,6 +104,21 @@ def validity_envelope(mechanism: Mechanism, scenarios: Scenario) -> dict[str, di
         "approach_velocity": _span(velocity, "m/s"),
         "force": _span(peak[made], "N"),
     }
+
+
+def envelope_in_space(scenarios: Any, outcome: Any) -> dict[str, dict[str, Any]]:
+    """What a batch of scenarios of six axes spans, likewise: contact frequency 1/(2 duration) [Hz] and
+    approach velocity [m/s] at the first touches, delay of force sensor and axes together [s], peak force in
+    space [N]; of the contacts of an outcome that ended."""
+    ended = outcome.good
+    known = {
+        "contact_frequency": (1 / (2 * np.maximum(outcome.metrics.duration, 1e-9)), "Hz"),
+        "approach_velocity": (outcome.metrics.approach_velocity, "m/s"),
+        "force": (outcome.reference_peak_force, "N"),
+    }
+    delay = np.asarray(scenarios.sensor.delay) + np.asarray(scenarios.simulator.delay)
+    spans = {name: _span(values[ended], unit) for name, (values, unit) in known.items() if np.any(ended)}
+    return {**spans, "delay": _span(delay, "s")}
 
 
 def plain(value: Any) -> Any:
@@ -173,7 +190,7 @@ def _span(values: np.ndarray, unit: str) -> dict[str, Any]:
     return {"low": float(np.min(values)), "high": float(np.max(values)), "unit": unit}
 
 
-def _gain_entry(gain: Gain, value: float, mechanism: Mechanism) -> dict[str, Any]:
+def _gain_entry(gain: Gain, value: float, mechanism: AnyMechanism) -> dict[str, Any]:
     lower, upper, margin = bounds_of(gain, mechanism)
     number = float(value)
     if not lower - margin <= number <= upper + margin:

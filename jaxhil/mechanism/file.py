@@ -114,7 +114,7 @@ def from_builtins(
     `label` is what an error calls its source. Raises `InputError`, for a mechanism of six axes too.
     """
     if is_six_axes(raw):
-        allowed = f"{SCHEMA} here: of the commands, simulate, mechanisms and init know six axes so far"
+        allowed = f"{SCHEMA}: six axes are known to init, mechanisms, simulate, tune, sweep and report"
         raise InputError(f"{one_line(label)}: schema: found {SCHEMA_SIX}, six axes, allowed {allowed}")
     mechanism = any_from_builtins(raw, label, overrides, unset)
     assert isinstance(mechanism, Mechanism)

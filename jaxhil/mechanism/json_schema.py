@@ -11,16 +11,26 @@ from typing import Any
 import msgspec
 
 from jaxhil.mechanism.conversion import NUMBER_FOR_LIST
+from jaxhil.mechanism.six_axes import SCHEMA_SIX, SixAxisMechanism
 from jaxhil.mechanism.structs import CONTACT_LAWS, Mechanism, numeric_keys
 
 __all__ = ["json_schema"]
 
+SIX = "SixAxes."  # begins the names of tables of six axes
+
 
 def json_schema() -> dict[str, Any]:
-    """The schema as plain data (draft 2020-12), with the contact laws that are registered."""
-    stated = msgspec.json.schema(Mechanism)
-    tables = {name: _tidy(table) for name, table in stated.pop("$defs").items()}
-    tables["Contact"]["properties"]["law"]["enum"] = list(CONTACT_LAWS)
+    """The schema as plain data (draft 2020-12), with the contact laws that are registered: that of one axis
+    or of six, as a file's own `schema` says."""
+    of_six_axes = {"properties": {"schema": {"const": SCHEMA_SIX}}, "required": ["schema"]}
+    kinds = {"then": {"$ref": f"#/$defs/{SIX}SixAxisMechanism"}, "else": {"$ref": "#/$defs/Mechanism"}}
+    tables = {**_one_axis(), **_six_axes()}
+    draft = "https://json-schema.org/draft/2020-12/schema"
+    return {"$schema": draft, "if": of_six_axes, **kinds, "$defs": tables}
+
+
+def _one_axis() -> dict[str, Any]:
+    tables = _tables(Mechanism)
     for table, name in NUMBER_FOR_LIST:
         properties = tables[table.capitalize()]["properties"]
         entry = properties[name]["items"]
@@ -28,7 +38,32 @@ def json_schema() -> dict[str, Any]:
         meaning = properties[name].pop("description")
         properties[name] = {"description": meaning, "anyOf": [number, properties[name]]}
     tables["Mechanism"]["properties"]["uncertainty"]["propertyNames"] = {"enum": sorted(numeric_keys())}
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **stated, "$defs": tables}
+    return tables
+
+
+def _six_axes() -> dict[str, Any]:
+    """Under names of their own: tables of one axis have the same."""
+    return {f"{SIX}{name}": _renamed(table) for name, table in _tables(SixAxisMechanism).items()}
+
+
+def _tables(kind: type[msgspec.Struct]) -> dict[str, Any]:
+    tables = {name: _tidy(table) for name, table in msgspec.json.schema(kind)["$defs"].items()}
+    tables["Contact"]["properties"]["law"]["enum"] = list(CONTACT_LAWS)
+    return tables
+
+
+def _renamed(node: Any) -> Any:
+    if isinstance(node, list):
+        return [_renamed(entry) for entry in node]
+    if not isinstance(node, dict):
+        return node
+    place = "#/$defs/"
+    return {
+        key: value.replace(place, place + SIX)
+        if key == "$ref" and isinstance(value, str)
+        else _renamed(value)
+        for key, value in node.items()
+    }
 
 
 def _tidy(node: Any) -> Any:
@@ -37,6 +72,8 @@ def _tidy(node: Any) -> Any:
         return [_tidy(entry) for entry in node]
     if not isinstance(node, dict):
         return node
+    if "six" in node or "square" in node:
+        return _shorter(node)
     tidied = {key: _tidy(value) for key, value in node.items() if key not in ("unit", "default")}
     if (unit := node.get("unit")) not in (None, "", "1"):
         tidied["description"] += f" [{unit}]"
@@ -48,3 +85,15 @@ def _tidy(node: Any) -> Any:
         [member] = members
         return {key: value for key, value in tidied.items() if key != "anyOf"} | member
     return tidied
+
+
+def _shorter(node: dict[str, Any]) -> dict[str, Any]:
+    """Six numbers that may be said as one or two, or a matrix that may be said as one."""
+    whole = _tidy({key: value for key, value in node.items() if key not in ("six", "square", "description")})
+    number = whole["items"]["items"] if "square" in node else whole["items"]
+    several = [number]
+    if names := node.get("six"):
+        each = dict.fromkeys(names, number)
+        table = {"type": "object", "properties": each, "required": names, "additionalProperties": False}
+        several.append(table)
+    return {"description": node["description"], "anyOf": [*several, whole]}

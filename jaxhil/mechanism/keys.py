@@ -51,7 +51,7 @@ def _tables(kind: inspect.Type, path: str) -> Iterator[Table]:
     assert isinstance(kind, inspect.StructType)
     keys, within = [], []
     for field in kind.fields:
-        where = f"{path}.{field.name}".lstrip(".")
+        where = f"{path}.{field.encode_name}".lstrip(".")
         inner = _table_of(field.type)
         if inner is None:
             keys.append(_key(field, where))
@@ -90,7 +90,7 @@ def _key(field: inspect.Field, path: str) -> Key:
     if field.default_factory is not NODEFAULT:
         default = field.default_factory()
     return Key(
-        field.name, meaning, _unit(field.type, path), allowed_of(field.type), field.required, default,
+        field.encode_name, meaning, _unit(field.type, path), allowed_of(field.type), field.required, default,
         _users(path),
     )  # fmt: skip
 

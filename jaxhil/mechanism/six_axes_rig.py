@@ -69,7 +69,10 @@ def three(meaning: str) -> Meta:
 
 def six(meaning: str, names: tuple[str, str] = MOTION) -> Meta:
     """Of six numbers, what they mean. A file may say one number for all, or one each for the `names`."""
-    return Meta(min_length=6, max_length=6, description=meaning, extra={"six": names})
+    stated: Any = {"six": list(names)}
+    return Meta(
+        min_length=6, max_length=6, description=meaning, extra={"six": names}, extra_json_schema=stated
+    )
 
 
 def zeros(count: int) -> Callable[[], list[Any]]:
@@ -151,7 +154,7 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     crosstalk: Annotated[
         list[CrosstalkRow],
         Meta(min_length=6, max_length=6, description="of each component (column) in each channel (row)",
-             extra={"square": 6}),
+             extra={"square": 6}, extra_json_schema={"square": 6}),
     ] = field(default_factory=lambda: [[0.0] * 6 for _ in range(6)])  # fmt: skip
     bias: Annotated[list[Load], six("added to every reading", LOADS)] = field(default_factory=zeros(6))
     quantum: Annotated[list[Spread], six("to multiples of which a reading is rounded", LOADS)] = field(

@@ -75,12 +75,18 @@ def check_gain_document(
     document: Mapping[str, Any],
     source: str = "gain document",
     others: Mapping[str, Mapping[str, GainSpecification]] = NO_OTHERS,
+    axes: tuple[int, ...] = (1,),
 ) -> GainFile:
     """The controller's part of a gain document, named `source` in errors. Raises GainFileError.
 
-    `others` are the gains of compensators, by name, that can be simulated but have no class here.
+    `others` are the gains of compensators, by name, that can be simulated but have no class here; `axes` the
+    numbers of axes that the gains may be for.
     """
     _check_form(document, source)
+    number = document.get("axes", 1)
+    if number not in axes:
+        allowed = f"{' or '.join(map(str, axes))}: gains of six axes are simulated only so far"
+        raise refusal(source, "axes", shown(number), allowed)
     name = _entry(document, "compensator", source, "")
     known = {**others, **{law: compensator.gains for law, compensator in COMPENSATORS.items()}}
     if not isinstance(name, str) or name not in known:
@@ -94,7 +100,7 @@ def check_gain_document(
     if _number(_entry(rig, "control_period", source, "mechanism.rig."), key, source) != period:
         allowed = f"{rig['control_period']!r}, as {key} says"
         raise refusal(source, "control_period", shown(period), allowed)
-    contact = _object(mechanism, "contact", source, "mechanism.")
+    contact = _object(mechanism, "contact", source, "mechanism.") if number == 1 else {}
     clearance = inf
     if "clearance" in contact:
         clearance = _number(contact["clearance"], "mechanism.contact.clearance", source)

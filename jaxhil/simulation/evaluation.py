@@ -6,7 +6,7 @@ compiled program.
 """
 
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, singledispatch
 from typing import Any, NamedTuple
 
 import jax
@@ -79,7 +79,7 @@ def parameters_by_slot(contact: ContactParameters) -> ContactParameters:
     )
 
 
-def evaluate(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least: int = 1) -> Outcome:
+def evaluate(loop: Any, gains: Mapping[str, Any], scenarios: Any, at_least: int = 1) -> Outcome:
     """Outcome (NumPy arrays) of `scenarios` (NumPy arrays, one batch axis), on every device.
 
     `gains` are scalars, or all of them one value per lane; they are taken in the scenarios' precision.
@@ -90,10 +90,10 @@ def evaluate(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least
 
 
 def begin_evaluation(
-    loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least: int = 1
+    loop: Any, gains: Mapping[str, Any], scenarios: Any, at_least: int = 1
 ) -> Callable[[], Outcome]:
     """Like `evaluate`, without waiting: what is returned waits for the outcome and returns it."""
-    number = len(scenarios.velocity)
+    number = lanes_of(scenarios)
     order = _by_duration(scenarios)
     running = run_tiles(loop, *shard(scenarios, gains, at_least))
 
@@ -108,11 +108,11 @@ def begin_evaluation(
 
 
 def shard(
-    scenarios: Scenario, gains: Mapping[str, Any], at_least: int = 1
-) -> tuple[dict[str, Any], dict[str, Any], Scenario]:
+    scenarios: Any, gains: Mapping[str, Any], at_least: int = 1
+) -> tuple[dict[str, Any], dict[str, Any], Any]:
     """Arguments of `run_tiles`: gains common to all lanes, gains per lane and scenarios as
     (devices, tiles, ..., lanes of a tile), sorted by expected duration and padded with idle lanes."""
-    number = len(scenarios.velocity)
+    number = lanes_of(scenarios)
     room = max(number, at_least)
     devices = jax.device_count()
     tile = TILE
@@ -125,10 +125,10 @@ def shard(
     padded = np.resize(_by_duration(scenarios), lanes)
     idle = np.arange(lanes) >= number
     scenarios = jax.tree.map(lambda leaf: np.asarray(leaf)[..., padded], scenarios)
-    contacts: Any = np.where(idle, 0, scenarios.contacts).astype(np.int32)
-    scenarios = scenarios._replace(contacts=contacts)
+    scenarios = at_rest(scenarios, idle)
     # The scenarios' precision is that of the program.
-    values = {name: np.asarray(value, scenarios.velocity.dtype) for name, value in gains.items()}
+    precision = scenarios.control_period.dtype
+    values = {name: np.asarray(value, precision) for name, value in gains.items()}
     per_lane = {name: value[padded] for name, value in values.items() if value.ndim}
     common = {name: value for name, value in values.items() if not value.ndim}
 
@@ -144,7 +144,29 @@ def _by_duration(scenarios):
     return np.argsort(-expected_duration(scenarios), kind="stable")
 
 
-def expected_duration(scenarios: Scenario) -> np.ndarray:
+def lanes_of(scenarios: Any) -> int:
+    """How many scenarios there are."""
+    return np.shape(scenarios.control_period)[-1]
+
+
+# What follows is another for scenarios and loops of six axes (`jaxhil.sixdof.evaluation`).
+
+
+@singledispatch
+def at_rest(scenarios: Any, idle: np.ndarray) -> Any:
+    """Scenarios of which the `idle` lanes do nothing."""
+    contacts: Any = np.where(idle, 0, scenarios.contacts).astype(np.int32)
+    return scenarios._replace(contacts=contacts)
+
+
+@singledispatch
+def run_lanes(loop: Any, gains: Any, scenario: Any) -> Outcome:
+    """Outcome of a tile's lanes."""
+    return compare_with_reference(loop, scenario, rollout(loop, gains, scenario))
+
+
+@singledispatch
+def expected_duration(scenarios: Any) -> np.ndarray:
     """Order of a run's duration [s]: half a period sqrt(M/k) per contact; for sorting only."""
     stiffness = np.asarray(scenarios.contact.stiffness)
     while stiffness.ndim > 2:
@@ -154,7 +176,7 @@ def expected_duration(scenarios: Scenario) -> np.ndarray:
     return np.sum(np.where(slots, periods, 0), axis=0)
 
 
-def run_tiles(loop: Loop, common: Any, per_lane: Any, scenarios: Scenario) -> Outcome:
+def run_tiles(loop: Any, common: Any, per_lane: Any, scenarios: Any) -> Outcome:
     """Outcome of what `shard` made, each leaf (devices, tiles, ..., lanes of a tile)."""
     return _compiled()(loop, common, per_lane, scenarios)
 
@@ -164,14 +186,13 @@ def _compiled() -> Callable[..., Outcome]:
     return jax.jit(_run_tiles, static_argnums=0, compiler_options=known_options(ROLLOUT))
 
 
-def _run_tiles(loop: Loop, common: Any, per_lane: Any, scenarios: Scenario) -> Outcome:
+def _run_tiles(loop: Any, common: Any, per_lane: Any, scenarios: Any) -> Outcome:
     mesh = jax.make_mesh((jax.device_count(),), ("device",), axis_types=(AxisType.Auto,))
 
     def one_device(common, arguments):
         def one_tile(arguments):
             gains, scenario = arguments
-            metrics = rollout(loop, {**common, **gains}, scenario)
-            return compare_with_reference(loop, scenario, metrics)
+            return run_lanes(loop, {**common, **gains}, scenario)
 
         own = jax.tree.map(lambda leaf: leaf[0], arguments)
         return jax.tree.map(lambda leaf: leaf[None], jax.lax.map(one_tile, own))

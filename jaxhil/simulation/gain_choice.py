@@ -8,11 +8,12 @@ from typing import Any
 from jaxhil.compensators import Compensator, literature_gains
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.mechanism.conversion import close_match
+from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.gain_file import LoadedGains, bounds_of, load_gain_file, look_up
 
 
-def choose_gains(mechanism: Mechanism, compensator: object, gains: object) -> tuple[str, dict[str, float]]:
+def choose_gains(mechanism: AnyMechanism, compensator: object, gains: object) -> tuple[str, dict[str, float]]:
     """The compensator's name and its gains [SI units] for a mechanism.
 
     `gains` is None (the literature's), the name of a setting of the compensator, a dict of some gains (the
@@ -37,7 +38,7 @@ def choose_gains(mechanism: Mechanism, compensator: object, gains: object) -> tu
     raise InputError(f"gains: found {shown(gains)}, allowed {allowed}")
 
 
-def check_fit(mechanism: Mechanism, loaded: LoadedGains, label: str) -> None:
+def check_fit(mechanism: AnyMechanism, loaded: LoadedGains, label: str) -> None:
     """The gains of a file fit a mechanism: they act per control period, and a bound of theirs may be the
     length of a delay line. Raises `InputError`."""
     period, tuned = mechanism.rig.control_period, loaded.mechanism.rig.control_period
@@ -62,7 +63,7 @@ def _is_path(text: str) -> bool:
         return True
 
 
-def _partial(mechanism: Mechanism, law: Compensator, given: Mapping[Any, Any]) -> dict[str, float]:
+def _partial(mechanism: AnyMechanism, law: Compensator, given: Mapping[Any, Any]) -> dict[str, float]:
     gains = literature_gains(mechanism, law.name)
     known = {gain.name: gain for gain in law.gains}
     for name, value in given.items():
@@ -91,12 +92,19 @@ def _number(value: Any) -> float:
 
 
 def _from_file(
-    mechanism: Mechanism, law: Compensator, path: str | os.PathLike[str]
+    mechanism: AnyMechanism, law: Compensator, path: str | os.PathLike[str]
 ) -> tuple[str, dict[str, float]]:
     label = one_line(os.fsdecode(path)) or "''"
-    loaded = load_gain_file(os.fsdecode(path))
+    loaded = load_gain_file(os.fsdecode(path), any_axes=True)
+    if isinstance(loaded.mechanism, Mechanism) != isinstance(mechanism, Mechanism):
+        found, allowed = f"gains of {_axes(loaded.mechanism)}", f"of {_axes(mechanism)}"
+        raise InputError(f"{label}: axes: found {found}, allowed {allowed}")
     if law.name not in ("none", loaded.compensator):
         found = f"compensator: found {law.name}, allowed {loaded.compensator}"
         raise InputError(f"{found}, which {label} is for")
     check_fit(mechanism, loaded, label)
     return loaded.compensator, loaded.gains
+
+
+def _axes(mechanism: AnyMechanism) -> str:
+    return "one axis" if isinstance(mechanism, Mechanism) else "six axes"

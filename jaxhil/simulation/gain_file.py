@@ -10,11 +10,10 @@ from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import Any, NamedTuple
 
-from jaxhil.compensators import COMPENSATORS, Compensator, Gain
+from jaxhil.compensators import COMPENSATORS, SIX_AXES, Compensator, Gain, compensator_of
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.mechanism.conversion import close_match
-from jaxhil.mechanism.file import from_builtins
-from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.file import AnyMechanism, any_from_builtins, from_builtins
 from jaxhil.runtime import GainFileError
 from jaxhil.runtime.gain_file import check_gain_document, read_gain_document
 from jaxhil.runtime.registry import COMPENSATORS as RUNTIME_COMPENSATORS
@@ -29,23 +28,28 @@ class LoadedGains(NamedTuple):
     document: dict[str, Any]  # its whole content
     compensator: str
     gains: dict[str, float]  # by name, in SI units
-    mechanism: Mechanism  # that the gains were tuned for
+    mechanism: Any  # that the gains were tuned for, a `Mechanism`; a `SixAxisMechanism` where that may be
 
 
-def load_gain_file(path: str | os.PathLike[str]) -> LoadedGains:
-    """The gain file at `path`, checked as a whole. Raises `InputError`, one line, for whatever is wrong."""
+def load_gain_file(path: str | os.PathLike[str], any_axes: bool = False) -> LoadedGains:
+    """The gain file at `path`, checked as a whole; of one axis, unless `any_axes` will do.
+
+    Raises `InputError`, one line, for whatever is wrong."""
     source = one_line(os.fspath(path))
     try:
         document = read_gain_document(path)
     except GainFileError as error:
         raise InputError(str(error)) from None
-    return check_document(document, source)
+    return check_document(document, source, any_axes)
 
 
-def check_document(document: dict[str, Any], source: str = "gain document") -> LoadedGains:
-    """The content of a gain file, checked as a whole; errors call it `source`. Raises `InputError`."""
+def check_document(
+    document: dict[str, Any], source: str = "gain document", any_axes: bool = False
+) -> LoadedGains:
+    """The content of a gain file, checked as a whole; errors call it `source`; of one axis, unless `any_axes`
+    will do. Raises `InputError`."""
     try:
-        on_the_rig = check_gain_document(document, source, _simulated_only())
+        on_the_rig = check_gain_document(document, source, _simulated_only(), (1, 6) if any_axes else (1,))
     except GainFileError as error:
         raise InputError(str(error)) from None
     for key, (fits, allowed) in _REQUIRED.items():
@@ -53,7 +57,8 @@ def check_document(document: dict[str, Any], source: str = "gain document") -> L
             raise _refusal(source, key, "nothing", "this key is required")
         if not fits(document[key]):
             raise _refusal(source, key, shown(document[key]), allowed)
-    mechanism = from_builtins(document["mechanism"], f"{source}: mechanism")
+    read = any_from_builtins if document.get("axes") == 6 else from_builtins
+    mechanism = read(document["mechanism"], f"{source}: mechanism")
     law = look_up(on_the_rig.compensator, source).gains
     check_names(on_the_rig.gains, law, f"{source}: gains")
     for gain in law:
@@ -63,11 +68,11 @@ def check_document(document: dict[str, Any], source: str = "gain document") -> L
 
 def look_up(compensator: object, source: str) -> Compensator:
     """The compensator of that name, built in or registered. Raises `InputError` that begins with `source`."""
-    if not isinstance(compensator, str) or compensator not in COMPENSATORS:
+    if not isinstance(compensator, str) or compensator not in {**COMPENSATORS, **SIX_AXES}:
         hint = close_match(compensator, COMPENSATORS) if isinstance(compensator, str) else ""
         allowed = f"one of {', '.join(COMPENSATORS)}{hint}"
         raise _refusal(source, "compensator", shown(compensator), allowed)
-    return COMPENSATORS[compensator]
+    return compensator_of(compensator)
 
 
 def check_names(gains: Mapping[str, Any], law: tuple[Gain, ...], source: str) -> None:
@@ -79,22 +84,22 @@ def check_names(gains: Mapping[str, Any], law: tuple[Gain, ...], source: str) ->
         raise _refusal(source, one_line(str(wrong), 60), found, ", ".join(names) or "no gains")
 
 
-def bounds_of(gain: Gain, mechanism: Mechanism) -> tuple[float, float, float]:
+def bounds_of(gain: Gain, mechanism: Any) -> tuple[float, float, float]:
     """Lower and upper bound of a gain for a mechanism, and by how much rounding may miss them."""
     lower, upper = float(gain.lower(mechanism)), float(gain.upper(mechanism))
     return lower, upper, ROUNDING * max(abs(lower), abs(upper))
 
 
 def _simulated_only() -> dict[str, dict[str, GainSpecification]]:
-    """The gains of compensators that were registered without a runtime class."""
+    """The gains of compensators that were registered without a runtime class, or are of six axes alone."""
     return {
         name: {gain.name: GainSpecification(gain.unit) for gain in law.gains}
-        for name, law in COMPENSATORS.items()
+        for name, law in {**COMPENSATORS, **SIX_AXES}.items()
         if name not in RUNTIME_COMPENSATORS
     }
 
 
-def _check_entry(gain: Gain, entry: Mapping[str, Any], mechanism: Mechanism, source: str) -> None:
+def _check_entry(gain: Gain, entry: Mapping[str, Any], mechanism: AnyMechanism, source: str) -> None:
     key = f"gains.{gain.name}"
     if entry["unit"] != gain.unit:
         raise _refusal(source, f"{key}.unit", shown(entry["unit"]), f"'{gain.unit}'")

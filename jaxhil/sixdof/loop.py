@@ -13,8 +13,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, UInt32
 
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.compensators import SIX_AXES
 from jaxhil.compensators.base import Constants, Gains, Signals
+from jaxhil.compensators.phase_lead_per_axis import PhaseLeadPerAxis
 from jaxhil.simulation.sensors import lag, white_noise
 from jaxhil.sixdof.axes import Axes, Hardware, Motion, actuate, build_axes, enter, sampled
 from jaxhil.sixdof.bodies import SHARES
@@ -45,7 +46,6 @@ from jaxhil.sixdof.sensor import (
 )
 from jaxhil.sixdof.vectors import vector
 
-PER_AXIS = ("none", "phase_lead")  # compensators that work on six channels as on one
 SIDES = ("fixed", "moving")  # of the force sensor
 HISTORY = 256  # ticks before a run in which axes follow what is no straight line to them
 
@@ -59,7 +59,7 @@ class Loop(eqx.Module):
     ring: int = eqx.field(static=True)  # samples that are kept, a power of two beyond the longest delay
     side: str = eqx.field(static=True, default="fixed")  # of the force sensor, one of `SIDES`
     has_noise: bool = eqx.field(static=True, default=False)  # whether the force sensor has noise
-    compensator: str = eqx.field(static=True, default="none")  # one of `PER_AXIS`
+    compensator: str = eqx.field(static=True, default="none")  # one of `SIX_AXES`
     episodes: int = eqx.field(static=True, default=1)  # that are judged
     whole: bool = eqx.field(static=True, default=False)  # whether a run lasts its whole duration
 
@@ -147,8 +147,8 @@ def begin(loop: Loop, rig: Rig, states: States) -> RunState:
     hardware, _ = lax.scan(before, hardware, jnp.arange(history, dtype=jnp.int32))
     zero = vector(jnp.zeros_like(at[:3]))
     nothing = Wrench(zero, zero)
-    law, constants = COMPENSATORS[loop.compensator], _constants(rig)
-    controllers = tuple(law.init(_gains(rig, channel), constants, 1) for channel in range(6))
+    law, constants = SIX_AXES[loop.compensator], _constants(rig)
+    controllers = tuple(law.init(_gains(loop, rig, channel), constants, 1) for channel in range(6))
     return RunState(
         states,
         at,
@@ -231,12 +231,12 @@ def _sense(
 
 def _compensate(loop: Loop, rig: Rig, found: Wrench, states: tuple, now: Array) -> tuple[Wrench, tuple]:
     """The compensator on each channel by itself."""
-    law, constants = COMPENSATORS[loop.compensator], _constants(rig)
+    law, constants = SIX_AXES[loop.compensator], _constants(rig)
     forces, structure = jax.tree.flatten(found)
     never, age = jnp.zeros_like(rig.period), jnp.zeros(rig.period.shape, jnp.int32) + now
     passed, after = [], []
     for channel, (force, state) in enumerate(zip(forces, states, strict=True)):
-        prepared = law.prepare(_gains(rig, channel), constants)
+        prepared = law.prepare(_gains(loop, rig, channel), constants)
         signals = Signals(force, never, never, never, age)
         command, state = law.step(prepared, state, signals, now)
         passed.append(command)
@@ -248,8 +248,10 @@ def _wrench(channels: Array) -> Wrench:
     return Wrench(vector(channels[:3]), vector(channels[3:]))
 
 
-def _gains(rig: Rig, channel: int) -> Gains:
-    return {name: value[channel] for name, value in rig.gains.items()}
+def _gains(loop: Loop, rig: Rig, channel: int) -> Gains:
+    law = SIX_AXES[loop.compensator]
+    gains = {name: value[channel] for name, value in rig.gains.items()}
+    return law.channel(gains, channel) if isinstance(law, PhaseLeadPerAxis) else gains
 
 
 def _constants(rig: Rig) -> Constants:

@@ -9,16 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhil.compensators import SIX_AXES
 from jaxhil.errors import InputError, shown
-from jaxhil.mechanism.file import load
 from jaxhil.mechanism.six_axes import SixAxisMechanism
-from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.environment import ONCE, computing, known_options
 from jaxhil.simulation.gain_choice import choose_gains
 from jaxhil.simulation.run import check_seed
 from jaxhil.sixdof.bodies import angular_velocity
 from jaxhil.sixdof.building import build_scenarios, loop_of
-from jaxhil.sixdof.loop import PER_AXIS, Loop
+from jaxhil.sixdof.loop import Loop
 from jaxhil.sixdof.meaning import Meaning, meaning
 from jaxhil.sixdof.metrics import Metrics, evaluate, reference_final
 from jaxhil.sixdof.plausibility import check_scenario
@@ -102,11 +101,11 @@ def simulate_six_axes(
 
     `compensator` is "none" or "phase_lead", which leads each channel of the wrench by itself.
     """
-    if compensator not in PER_AXIS:
-        allowed = f"{', '.join(PER_AXIS)}: in six axes there are no others so far"
+    if compensator not in SIX_AXES:
+        allowed = f"{', '.join(SIX_AXES)}: in six axes there are no others so far"
         raise InputError(f"compensator: found {shown(compensator)}, allowed {allowed}")
     number = check_seed(seed)
-    name, values = choose_gains(_like_one_axis(mechanism), compensator, gains)
+    name, values = choose_gains(mechanism, compensator, gains)
     with computing():
         scenario = build_scenarios(mechanism, seed=number)
         check_scenario(mechanism, scenario)
@@ -114,17 +113,6 @@ def simulate_six_axes(
         given = {key: jnp.asarray(one) for key, one in values.items()}
         found = jax.device_get(_compiled()(loop, given, scenario))
     return _result(mechanism, name, values, number, found)
-
-
-def _like_one_axis(mechanism: SixAxisMechanism) -> Mechanism:
-    """One of one axis with the same gains: they depend on force sensor and control period alone."""
-    rig = mechanism.rig
-    values = {
-        "rig.control_period": rig.control_period,
-        "rig.force_sensor.delay": rig.force_sensor.delay,
-        "rig.force_sensor.time_constant": rig.force_sensor.time_constant,
-    }
-    return load("rig-300kg", [f"{path}={value!r}" for path, value in values.items()]).mechanism
 
 
 def _result(

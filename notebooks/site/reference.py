@@ -19,9 +19,11 @@ from tyro.conf import FlagCreatePairsOff, Positional
 import jaxhil
 import tuning
 from jaxhil.compensators import COMPENSATORS, Gain
-from jaxhil.mechanism.file import builtin_names, load, suite_names
+from jaxhil.compensators import SIX_AXES as SIX_AXIS_LAWS
+from jaxhil.mechanism.file import builtin_names, load, load_any, six_axis_names, suite_names
 from jaxhil.mechanism.json_schema import json_schema
 from jaxhil.mechanism.keys import Key, Table, tables
+from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
 from tuning.cli.parser import DESCRIPTION, Command
 
@@ -32,6 +34,7 @@ def pages() -> dict[str, str]:
     """Every generated page, by its path on the site; the JSON Schema too."""
     return {
         "reference/mechanism_file.md": mechanism_file(),
+        "reference/mechanism_file_six_axes.md": mechanism_file_six_axes(),
         "reference/mechanism.schema.json": json.dumps(json_schema(), indent=2) + "\n",
         "reference/commands.md": commands(),
         "reference/gains.md": gains(),
@@ -45,6 +48,14 @@ def mechanism_file() -> str:
     return "\n".join([MECHANISM_FILE, *map(_table_of_keys, tables()), BUILT_IN, *_built_in()]) + "\n"
 
 
+def mechanism_file_six_axes() -> str:
+    """The same of six axes."""
+    described = map(_table_of_keys, tables(SixAxisMechanism))
+    rows = [[f"`{name}`", load_any(name).mechanism.source] for name in six_axis_names()]
+    built_in = _table(["name", "where its numbers come from"], rows)
+    return "\n".join([SIX_AXES, *described, BUILT_IN, built_in]) + "\n"
+
+
 def commands() -> str:
     """Every command with every option."""
     sections = [_command(*typing.get_args(entry)) for entry in typing.get_args(Command)]
@@ -55,7 +66,7 @@ def gains() -> str:
     """The gain file, and the gains of every compensator for the default mechanism."""
     mechanism = load(DEFAULT).mechanism
     sections = [GAINS]
-    for name, law in COMPENSATORS.items():
+    for name, law in {**COMPENSATORS, **SIX_AXIS_LAWS}.items():
         rows = [_row_of_gain(gain, mechanism) for gain in law.gains]
         text = inspect.getdoc(inspect.getmodule(type(law))) or ""
         known = ", ".join(law.knows) or "nothing"
@@ -166,6 +177,14 @@ Editors complete and check such files by the [JSON Schema](mechanism.schema.json
 `#:schema ./mechanism.schema.json` as its first one.
 
 Any key can be replaced for one call: `--set contact.damping=[100.0]`, or taken out: `--unset uncertainty`.
+"""
+SIX_AXES = """\
+# The mechanism file of six axes
+
+`schema = "jaxhil/mechanism/2"`: two rigid bodies, the shapes on them that touch, a rig of six axes. What a
+key means in the physics, and the frames, are on the page on [six axes](../guide/six_axes.md). `"KEY"` stands
+for a name of your own. Six numbers may be said as one, or as a table of the two that are named among what is
+allowed.
 """
 BUILT_IN = """\
 ## Built-in files

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from jaxhil.errors import InputError, one_line, shown
-from jaxhil.mechanism.file import LoadedMechanism, source_sha256
-from jaxhil.mechanism.loading import as_mechanism
+from jaxhil.mechanism.file import AnyMechanism, LoadedAny, LoadedMechanism, source_sha256
+from jaxhil.mechanism.loading import as_any_mechanism, as_mechanism
+from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.runtime.laws import LAWS
 
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
+
+
+SIX_AXES = ("none", "phase_lead", "phase_lead_per_axis")  # compensators of six axes
 
 
 class ArgumentError(InputError):
@@ -98,6 +102,25 @@ def compensators(names: Iterable[Any], argument: str = "compensator") -> None:
         one_of(known, **{argument: name})
 
 
+def fits(compensator: Any, mechanism: AnyMechanism | None, argument: str = "compensator") -> None:
+    """The name is that of a compensator of the mechanism's axes; of some axes where there is none yet."""
+    if mechanism is None:
+        one_of(tuple(dict.fromkeys([*compensator_names(), *SIX_AXES])), **{argument: compensator})
+    elif not isinstance(mechanism, SixAxisMechanism):
+        compensators([compensator], argument)
+    elif compensator not in SIX_AXES:
+        allowed = f"{', '.join(SIX_AXES)}: in six axes there are no others so far"
+        raise ArgumentError(argument, shown(compensator), allowed)
+
+
+def not_in_six_axes(mechanism: AnyMechanism, **given: Any) -> None:
+    """Nothing is given, or asked for, that six axes do not have yet."""
+    for name, value in given.items():
+        if isinstance(mechanism, SixAxisMechanism) and value:
+            found = "a function" if callable(value) else shown(value)
+            raise ArgumentError(name, found, "nothing: in six axes there is none so far")
+
+
 def compensator_names() -> tuple[str, ...]:
     """Of all compensators, the registered ones last. Starts no jax where there are none."""
     loaded = sys.modules.get("jaxhil.compensators")
@@ -131,27 +154,37 @@ def folder(name: str, value: Any) -> Path:
 
 
 def mechanisms(given: Any) -> tuple[list[LoadedMechanism], bool]:
-    """The mechanisms given, one or several, each as `jaxhil.load` returns it or by its name or file; whether
-    there were several. Raises `InputError`."""
-    listed, many = several(given, (Mechanism, str, os.PathLike))
+    """The mechanisms of one axis given, one or several, each as `jaxhil.load` returns it or by its name or
+    file; whether there were several. Raises `InputError`."""
+    listed, many = _listed(given)
+    checked = [as_mechanism(one) for one in listed]
+    return [LoadedMechanism(one, source_sha256(one), one.name) for one in checked], many
+
+
+def any_mechanisms(given: Any) -> tuple[list[LoadedAny], bool]:
+    """Likewise, of one axis or of six."""
+    listed, many = _listed(given)
+    checked = [as_any_mechanism(one) for one in listed]
+    return [LoadedAny(one, source_sha256(one), one.name) for one in checked], many
+
+
+def _listed(given: Any) -> tuple[list[Any], bool]:
+    listed, many = several(given, (Mechanism, SixAxisMechanism, str, os.PathLike))
     if not listed:
         raise ArgumentError("mechanism", "an empty list", "one mechanism or more")
-    loaded = []
-    for one in listed:
-        checked = as_mechanism(one)
-        loaded.append(LoadedMechanism(checked, source_sha256(checked), checked.name))
-    return loaded, many
+    return listed, many
 
 
-def gain_file(given: Any, argument: str = "gains") -> "LoadedGains":
-    """The gains given: a gain file's path, or its folder's, or what has a gain file's `document`."""
+def gain_file(given: Any, argument: str = "gains", any_axes: bool = False) -> "LoadedGains":
+    """The gains given: a gain file's path, or its folder's, or what has a gain file's `document`; of one
+    axis, unless `any_axes` will do."""
     from jaxhil.simulation.gain_file import check_document, load_gain_file
 
     document = getattr(given, "document", None)
     if isinstance(document, Mapping):
-        return check_document(dict(document))
+        return check_document(dict(document), any_axes=any_axes)
     path = folder(argument, given)
-    return load_gain_file(path / "gains.json" if path.is_dir() else path)
+    return load_gain_file(path / "gains.json" if path.is_dir() else path, any_axes)
 
 
 def readable_gain_file(given: Any, argument: str = "gains") -> Path:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jaxhil.errors import InputError, shown
+from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.runtime import digest
 from jaxhil.simulation.environment import computing
 from tuning import terminal
@@ -214,7 +215,9 @@ def run_study(
         from tuning.sweeps.tally import failure_probability
 
         choices = Choices(**{name: getattr(options, name) for name in Choices._fields})
-        loaded = arguments.gain_file(path)
+        loaded = arguments.gain_file(path, any_axes=True)
+        asked = {"works": options.works, "precision": options.precision == "float32" and "float32"}
+        arguments.not_in_six_axes(loaded.mechanism, **asked)
         meaning.check(loaded.mechanism)
         manifest = build_manifest(loaded, choices)
         with locked(folder):
@@ -282,6 +285,7 @@ def _complete(
 
 
 def _document(options: SweepOptions, store: "Store", done, tally, rate: float | None) -> dict[str, Any]:
+    from tuning.gains.simulated import compensator_name
     from tuning.sweeps.run import describe_outcomes
     from tuning.sweeps.tally import error_quantiles, failure_probability
 
@@ -296,7 +300,8 @@ def _document(options: SweepOptions, store: "Store", done, tally, rate: float | 
         "sweep_sha256": manifest.sha256,
         "gains_sha256": manifest.gains_sha256,
         "mechanism": done.mechanism.name,
-        "compensator": done.loop.compensator.name,
+        "axes": 6 if isinstance(done.mechanism, SixAxisMechanism) else 1,
+        "compensator": compensator_name(done.loop),
         "scenarios": tally.scenarios,
         "most_scenarios": manifest.scenarios,
         **{key: getattr(manifest, key) for key in ("seed", "sampling", "precision", "limit", "until_width")},
@@ -305,29 +310,29 @@ def _document(options: SweepOptions, store: "Store", done, tally, rate: float | 
         "left_out_of_replicates": tally.left_out,
         "error_quantiles": [one._asdict() for one in error_quantiles(tally)],
         "outcomes": describe_outcomes(tally),
-        "worst": [_scenario(store, index) for _, _, index in tally.worst],
+        "worst": [_scenario(store, done.mechanism, index) for _, _, index in tally.worst],
         "scenarios_per_second": rate,
         "acceptable": options.acceptable,
         "verdict": "good" if good else "bad",
     }
 
 
-def _scenario(store: "Store", index: int) -> dict[str, Any]:
+def _scenario(store: "Store", mechanism: Any, index: int) -> dict[str, Any]:
     """What is said of one scenario: how it ended, its worst contact, what was drawn."""
-    from tuning.sweeps.columns import texts_of
+    from tuning.sweeps.columns import slots, texts_of
     from tuning.sweeps.store import read_row
 
     row = read_row(store, index)
     columns = store.manifest.columns
     numbers = {one.name: row[one.name][0].item() for one in columns if one.kind != "text"}
-    errors = {name: value for name, value in numbers.items() if name.startswith("error_")}
+    errors = {slot: numbers[slot.error] for slot in slots(mechanism)}
     worst = numbers["worst_error"]
     return {
         "index": index,
         "outcome": texts_of("outcome")[int(row["outcome"][0])],
         "worst_error": worst,
         # None if no contact ended.
-        "worst_contact": next((int(name[6:]) for name, value in errors.items() if value == worst), None),
+        "worst_contact": next((slot.number for slot, value in errors.items() if value == worst), None),
         "inputs": {one.name: numbers[one.name] for one in columns if one.kind == "input"},
     }
 

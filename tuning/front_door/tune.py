@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from jaxhil.errors import one_line
-from jaxhil.mechanism.file import LoadedMechanism
-from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.file import AnyMechanism, LoadedAny, LoadedMechanism
+from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.environment import computing
 from tuning import terminal
 from tuning.front_door import arguments, meaning, tune_pareto
@@ -55,11 +55,19 @@ class TuneOptions:
         if self.scenarios is not None:
             arguments.integers(1, scenarios=self.scenarios)
         arguments.integers(0, seed=self.seed)
-        arguments.compensators([self.compensator])
+        arguments.fits(self.compensator, None)
         arguments.flags(global_search=self.global_search)
         if callable(self.objective) and self.pareto:
             raise ArgumentError("objective", "a function beside pareto", "one of rms, cvar, worst")
         tune_pareto.check(self.pareto, self.pareto_against, self.compensator)
+
+    def fits(self, mechanism: AnyMechanism) -> None:
+        """The mechanism has the axes for what is asked for. Raises `InputError`."""
+        arguments.fits(self.compensator, mechanism)
+        asked = ("setting", "start", "noise_weight", "chatter_weight", "transparency_weight", "pareto")
+        arguments.not_in_six_axes(mechanism, **{name: getattr(self, name) for name in asked})
+        if callable(self.objective):
+            arguments.not_in_six_axes(mechanism, objective=self.objective)
 
     def settings(self) -> "TuneSettings":
         """The same as tuning takes it. Raises `InputError`; imports jax."""
@@ -124,7 +132,7 @@ class TunedGains:
     pareto: tuple[TradedGains, ...] = ()
 
     @property
-    def mechanism(self) -> Mechanism:
+    def mechanism(self) -> AnyMechanism:
         """What was tuned for."""
         return self.found.mechanism
 
@@ -150,6 +158,13 @@ class TunedGains:
         return self.found.figures
 
     @property
+    def parts(self) -> "dict[str, dict[str, ErrorFigures]]":
+        """In six axes, the same of "energy_error" and "twist_error", each by itself; else nothing."""
+        from tuning.gains.tune import figures_of_parts
+
+        return figures_of_parts(self.found)
+
+    @property
     def verdict(self) -> str:
         """ "good" if every contact ended with the tuned gains, and their rms error is within the limit, else
         "bad"."""
@@ -157,29 +172,37 @@ class TunedGains:
         return "good" if tuned.failed == 0 and tuned.rms <= self.limit else "bad"
 
     @functools.cached_property
-    def meaning(self) -> "Meaning":
-        """What the mechanism means: mass, contacts in space, rates; `warnings` of what cannot be meant."""
+    def meaning(self) -> "Meaning | None":
+        """What the mechanism means: mass, contacts in space, rates; `warnings` of what cannot be meant. In
+        six axes None: a run of `jaxhil.simulate` has it."""
         from jaxhil.simulation import plausibility
 
+        if isinstance(self.mechanism, SixAxisMechanism):
+            return None
         return plausibility.meaning(self.mechanism)
 
     @functools.cached_property
     def document(self) -> dict[str, Any]:
         """The content of the gain file."""
-        from tuning.gain_file import build_document, validity_envelope
+        from tuning.gain_file import build_document, envelope_in_space, validity_envelope
         from tuning.transparency.pushes import PUSHES
 
         found = self.found
+        if isinstance(found.mechanism, SixAxisMechanism):
+            envelope = envelope_in_space(found.scenarios, found.outcomes["tuned"])
+        else:
+            envelope = validity_envelope(found.mechanism, found.scenarios)
         return build_document(
             found.compensator,
             found.gains,
             found.mechanism,
             self.mechanism_sha256,
-            validity_envelope(found.mechanism, found.scenarios),
+            envelope,
             {
                 "nominal": found.nominal,
                 "robust": found.figures,
                 "tuned_intervals": found.intervals.plain() if found.intervals else None,
+                **self.parts,
                 **({"honesty": found.transparency, "transparency": PUSHES} if found.transparency else {}),
             },
             found.settings.seed,
@@ -225,7 +248,8 @@ def tune(
     Args:
         mechanism: what `jaxhil.load` returns, or a name or path for it; or a list of those, which are tuned
             together.
-        compensator: name of a law, built in or registered.
+        compensator: name of a law, built in or registered; in six axes "none", "phase_lead" or
+            "phase_lead_per_axis".
         setting: take the law's gains of that name as they are, and only judge them.
         scenarios: how many to tune on; by default 32, or 128 where sensors are noisy.
         starts: of the solver, and of each further batch of starts where they disagree.
@@ -257,8 +281,10 @@ def tune(
     given = {name: value for name, value in locals().items() if name not in ("mechanism", "progress")}
     options = TuneOptions(**given)
     arguments.flags(progress=progress)
-    loaded, several = arguments.mechanisms(mechanism)
+    loaded, several = arguments.any_mechanisms(mechanism)
     options.check()
+    for one in loaded:
+        options.fits(one.mechanism)
     with computing():
         for one in loaded:
             meaning.check(one.mechanism, one.label)
@@ -275,7 +301,7 @@ def tune(
 
 
 def tune_each(
-    loaded: Sequence[LoadedMechanism],
+    loaded: Sequence[LoadedMechanism | LoadedAny],
     options: TuneOptions,
     bar: terminal.Progress,
     pieces: "Pieces | None" = None,

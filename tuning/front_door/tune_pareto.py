@@ -61,6 +61,7 @@ class TradedGains:
         from tuning.gain_file import build_document, validity_envelope
 
         found, point = self.tuned.found, self.point
+        mechanism: Any = found.mechanism
         figures: dict[str, Any] = {
             "nominal": {**found.nominal, "tuned": point.nominal},
             "robust": {**found.figures, "tuned": point.figures},
@@ -73,7 +74,7 @@ class TradedGains:
             point.gains,
             found.mechanism,
             self.tuned.mechanism_sha256,
-            validity_envelope(found.mechanism, found.scenarios),
+            validity_envelope(mechanism, found.scenarios),
             {**figures, "pareto": self.traded},
             found.settings.seed,
             {},

@@ -13,7 +13,7 @@ global optimization methods" (1987).
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -265,7 +265,8 @@ def _scan(
         task = validation.tasks[i]
         for gain in task.tuned:
             if gain.begins is not None:
-                place, begins = validation.names.index(gain.name), {gain.name: gain.begins(task.mechanism)}
+                mechanism: Any = task.mechanism
+                place, begins = validation.names.index(gain.name), {gain.name: gain.begins(mechanism)}
                 own[:, place] = validation.coordinates(i, [{**task.literature, **begins}])[0, place]
     values = validation.losses(objective, which, points, SCAN_SCENARIOS)
     order = np.argsort(np.where(np.isfinite(values), values, np.inf), axis=1, kind="stable")
@@ -277,7 +278,7 @@ def _scan(
 
 
 def _scan_evaluations(validation: Validation, number: int, scanned: int) -> int:
-    scenarios = len(validation.tasks[0].scenarios.velocity)
+    scenarios = validation.tasks[0].lanes
     return -(-max(scanned, 2 * number) * min(SCAN_SCENARIOS, scenarios) // scenarios)
 
 

@@ -32,9 +32,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.errors import InputError, shown
-from jaxhil.simulation.evaluation import Outcome, compare_with_reference
-from jaxhil.simulation.loop import Loop, RigConstants
-from jaxhil.simulation.rollout import run_contacts
+from jaxhil.simulation.evaluation import Outcome
+from tuning.gains import simulated
 from tuning.gains.metrics_function import MetricsFunction, ScenarioMetrics, scenario_metrics
 from tuning.transparency.probes import are_probes
 
@@ -120,7 +119,7 @@ class Weights(NamedTuple):
 class Problem(NamedTuple):
     """What one start is solved for; where there are several, each leaf has a leading axis of them."""
 
-    rig: RigConstants  # built for a batch of scenarios
+    rig: Any  # a batch of scenarios, as `tuning.gains.simulated.prepared` has it
     fixed: dict[str, Array]  # gains that stay as they are
     weights: Weights  # the objective's
 
@@ -149,7 +148,7 @@ def common_terms(objectives: Sequence[Objective], probed: bool = False, contacts
 
 
 def residuals(
-    static: tuple[Loop, tuple[str, ...], Terms],
+    static: tuple[Any, tuple[str, ...], Terms],
     gains: Float[Array, "problems gains"],
     problems: Problem,
 ) -> Float[Array, "problems residuals"]:
@@ -166,14 +165,14 @@ def residuals(
     loop, names, terms = static
     if terms.chatter:
         loop = dataclasses.replace(loop, chatter=True)
-    number, lanes = problems.rig.inverse_mass.shape
+    number, lanes = len(gains), jax.tree.leaves(problems.rig)[0].shape[-1]
     rig = jax.tree.map(_side_by_side, problems.rig)
     values: dict[str, Any] = {name: gains[:, i] for i, name in enumerate(names)}
     values = {name: jnp.repeat(value, lanes) for name, value in {**problems.fixed, **values}.items()}
 
     def run(arguments):
         values, rig = arguments
-        return compare_with_reference(loop, rig.scenario, run_contacts(loop, values, rig))
+        return simulated.outcome(loop, values, rig)
 
     outcome = _in_chunks(run, (values, rig)) if terms.transparency else run((values, rig))
 
@@ -181,7 +180,7 @@ def residuals(
         return jnp.moveaxis(leaf.reshape(-1, number, lanes), 1, 0).reshape(number, -1)
 
     error, excess, chatter = map(by_problem, contact_terms(outcome))
-    amplification = jnp.mean(by_problem(loop.compensator.noise_amplification(values, rig.constants)), axis=1)
+    amplification = jnp.mean(by_problem(simulated.amplification(loop, values, rig)), axis=1)
     probes = by_problem(jnp.broadcast_to(are_probes(number * lanes), outcome.wanted.shape))
     wanted = by_problem(outcome.wanted)
     figure = None

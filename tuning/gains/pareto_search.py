@@ -9,13 +9,12 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from itertools import chain
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from jaxhil.compensators import COMPENSATORS, Compensator, Constants
-from jaxhil.mechanism.structs import Mechanism
 from tuning.gains.multistart import choose_starts
 from tuning.gains.objective import FAILED, Objective
 from tuning.gains.rounds import Start, solve_tasks, step_runs
@@ -56,7 +55,7 @@ def has_trade_off(compensator: str) -> bool:
     return type(COMPENSATORS[compensator]).noise_amplification is not Compensator.noise_amplification
 
 
-def amplification(mechanism: Mechanism, compensator: str, gains: Mapping[str, float]) -> float:
+def amplification(mechanism: Any, compensator: str, gains: Mapping[str, float]) -> float:
     """A [1], nominally: `Compensator.noise_amplification`."""
     period, clearance = mechanism.rig.control_period, mechanism.contact.clearance
     constants = Constants(jnp.asarray(period), jnp.asarray(clearance))

@@ -16,10 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxhil.simulation.environment import program_folder
-from jaxhil.simulation.evaluation import expected_duration
-from jaxhil.simulation.loop import build_rig_constants
-from jaxhil.simulation.scenario import Scenario
+from jaxhil.simulation.evaluation import at_rest, expected_duration
 from tuning.caches import program_cache
+from tuning.gains import simulated
 from tuning.gains.objective import RMS, SCALE, Objective, Problem, common_terms, one_each, residuals
 from tuning.gains.tasks import TuneTask, common_loop, gain_bounds, gains_at, tuned_names
 from tuning.gains.work import Work
@@ -170,27 +169,30 @@ def prepare_solver(
     problems = [_Problem(index, nothing, nothing) for index in range(len(tasks)) for _ in range(starts)]
     static, call = _calls(tasks, names, bounds, one_each(objective, len(tasks)), len(problems))
     some = problems[: _size(len(problems))]
-    program_cache.prepare(_advance, static, call(some, 1), program_folder())
+    program_cache.prepare(_advance, static, call(some, 1), _folder(tasks))
 
 
 def _stepper(tasks, names, bounds, objectives, number, work: Work):
     """A function that tells of problems where up to so many steps further lead."""
     static, call = _calls(tasks, names, bounds, objectives, number)
-    size, runs = _size(number), step_runs(tasks, names)
+    size, runs, folder = _size(number), step_runs(tasks, names), _folder(tasks)
 
     def advance(problems: list[_Problem], limit: int) -> list[_Advanced]:
         advanced = []
         for begin in range(0, len(problems), size):
             some = problems[begin : begin + size]
-            solution = jax.device_get(
-                program_cache.run(_advance, static, call(some, limit), program_folder())
-            )
+            solution = jax.device_get(program_cache.run(_advance, static, call(some, limit), folder))
             places = np.argsort(sharded(size))[: len(some)]
             advanced += [_advanced(solution, int(place)) for place in places]
             work.ran(runs * sum(len(one.history) for one in advanced[begin:]))
         return advanced
 
     return advance
+
+
+def _folder(tasks: list[TuneTask]) -> Any:
+    """Where programs are kept; nowhere with contact laws whose sources are not known."""
+    return None if any(simulated.has_foreign_law(task.scenarios) for task in tasks) else program_folder()
 
 
 def step_runs(tasks: list[TuneTask], names: tuple[str, ...]) -> int:
@@ -218,7 +220,7 @@ def _calls(tasks, names, bounds, objectives, number):
     each = [(_in_order(t), f, w, b) for t, f, w, b in zip(tasks, fixed, weights, bounds, strict=True)]
     table = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *each)
     size = _size(number)
-    lanes = len(tasks[0].scenarios.velocity)
+    lanes = tasks[0].lanes
     terms = common_terms(objectives, tasks[0].probed, tasks[0].contacts)
     static = (loop, names, terms), LONGEST, max(1, TILE // lanes)
 
@@ -230,13 +232,12 @@ def _calls(tasks, names, bounds, objectives, number):
         index = np.array([p.task for p in filled])
         starts = np.stack([p.coordinates for p in filled])
         scenarios, others, weighed, limits = jax.tree.map(itemgetter(index), table)
-        contacts = np.where(idle, 0, scenarios.contacts).astype(np.int32)
-        return scenarios._replace(contacts=contacts), others, weighed, limits, starts, np.array(limit)
+        return at_rest(scenarios, idle), others, weighed, limits, starts, np.array(limit)
 
     return static, call
 
 
-def _in_order(task: TuneTask) -> Scenario:
+def _in_order(task: TuneTask) -> Any:
     """The task's scenarios. Where each has its probes, those that take as long are neighbours."""
     if not task.probed:
         return task.scenarios
@@ -271,6 +272,6 @@ def _advance(static: tuple[Any, int, int], arguments: Any) -> Solution:
     loop = what[0]
     scenarios, fixed, weights, bounds, starts, limit = arguments
 
-    rigs = jax.vmap(lambda scenarios: build_rig_constants(loop, scenarios))(scenarios)
+    rigs = jax.vmap(lambda scenarios: simulated.prepared(loop, scenarios))(scenarios)
     problems = Problem(rigs, fixed, weights)
     return solve(residuals, what, problems, bounds, starts, limit, longest=longest, tile=tile)

@@ -15,14 +15,14 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.stats import qmc
 
-from jaxhil.compensators import COMPENSATORS, Gain, literature_gains
+from jaxhil.compensators import Gain, compensator_of, literature_gains
 from jaxhil.contact.laws import ContactLaw
+from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import quasi_random
-from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import parameters_by_slot
-from jaxhil.simulation.loop import Loop
-from jaxhil.simulation.scenario import Scenario, build_scenarios
+from jaxhil.simulation.evaluation import lanes_of, parameters_by_slot
+from jaxhil.simulation.scenario import Scenario
+from tuning.gains import simulated
 from tuning.gains.common_program import CommonProgram
 from tuning.optimisation.unit_box import Bounds, to_gains
 from tuning.transparency.probes import LANES_PER_SCENARIO, probed_scenarios
@@ -39,11 +39,11 @@ SCENARIOS, NOISY_SCENARIOS = 32, 128  # to tune on, without and with sensor nois
 class TuneTask:
     """A mechanism to tune."""
 
-    mechanism: Mechanism  # what is tuned for
+    mechanism: AnyMechanism  # what is tuned for
     compensator: str  # what is tuned
     literature: dict[str, float]  # the compensator's gains by the literature's rule, or those of a setting
-    scenarios: Scenario  # to tune on
-    loop: Loop  # that runs them
+    scenarios: Any  # to tune on
+    loop: Any  # that runs them
     common: CommonProgram | None = None  # the program it shares with unlike mechanisms, if it does
     probed: bool = False  # whether each scenario comes with its transparency probes
 
@@ -55,21 +55,22 @@ class TuneTask:
     @property
     def lanes(self) -> int:
         """Scenarios, probes counted."""
-        return len(self.scenarios.velocity)
+        return lanes_of(self.scenarios)
 
     @property
     def contacts(self) -> int:
-        """Contacts of each scenario."""
-        return self.mechanism.approach.contacts
+        """Contacts of each scenario; in six axes two of each episode, one for each error."""
+        return simulated.contacts_of(self.mechanism)
 
     @property
     def tuned(self) -> tuple[Gain, ...]:
         """The gains that tuning moves for this mechanism."""
-        return tuple(gain for gain in COMPENSATORS[self.compensator].gains if gain.tuned(self.mechanism))
+        known: Any = self.mechanism
+        return tuple(gain for gain in compensator_of(self.compensator).gains if gain.tuned(known))
 
 
 def build_task(
-    mechanism: Mechanism,
+    mechanism: AnyMechanism,
     compensator: str,
     scenarios: int | None,
     seed: int,
@@ -90,59 +91,67 @@ def build_task(
     noisy = has_sensor_noise(mechanism)
     number = scenarios or (NOISY_SCENARIOS // (LANES_PER_SCENARIO if probed else 1) if noisy else SCENARIOS)
     draws = quasi_random(mechanism, number, seed)
-    if probed:
-        batch = probed_scenarios(mechanism, draws, seed).scenarios
+    one_axis = isinstance(mechanism, Mechanism)
+    if probed and one_axis:
+        batch: Any = probed_scenarios(mechanism, draws, seed).scenarios
     else:
-        batch = build_scenarios(mechanism, draws, seed)
-    loop = build_loop(mechanism, compensator, batch)
-    batch = batch._replace(time_limit=np.asarray(_patience(loop.law, batch)))
-    if common is not None:
+        batch = simulated.scenarios_of(mechanism, draws, seed)
+    loop = simulated.loop_of(mechanism, compensator, batch)
+    if one_axis:
+        batch = batch._replace(time_limit=np.asarray(_patience(loop.law, batch)))
+    if common is not None and one_axis:
         batch, loop = common.scenarios(mechanism, batch), common.loop(loop)
     gains = literature_gains(mechanism, compensator, setting)
     return TuneTask(mechanism, compensator, gains, batch, loop, common, probed)
 
 
-def has_sensor_noise(mechanism: Mechanism) -> bool:
+def has_sensor_noise(mechanism: AnyMechanism) -> bool:
     """Whether either sensor is noisy, in some scenarios at least."""
     rig = mechanism.rig
     paths = "rig.force_sensor.noise_std", "rig.position_sensor.noise_std"
-    return max(rig.force_sensor.noise_std, rig.position_sensor.noise_std) > 0 or any(
+    # In six axes the position sensor has none.
+    position = getattr(rig.position_sensor, "noise_std", 0.0)
+    return max(np.max(rig.force_sensor.noise_std), position) > 0 or any(
         path in mechanism.uncertainty for path in paths
     )
 
 
-def alike(loops: list[Loop], scenarios: list[Scenario]) -> list[list[int]]:
+def alike(loops: list[Any], scenarios: list[Any]) -> list[list[int]]:
     """Indices of what one program serves: loops that differ by the length of their delay lines alone, with
     scenario arrays of the same shapes. In the order in which they come."""
     groups: dict[Any, list[int]] = {}
     for index, (loop, batch) in enumerate(zip(loops, scenarios, strict=True)):
         shapes = tuple(leaf.shape for leaf in jax.tree.leaves(batch))
-        groups.setdefault((_with_rings([loop], 0, 0), shapes), []).append(index)
+        same = dataclasses.replace(loop, **dict.fromkeys(_rings(loop), 0))
+        groups.setdefault((same, jax.tree.structure(batch), shapes), []).append(index)
     return list(groups.values())
 
 
-def common_loop(loops: list[Loop]) -> Loop:
+def common_loop(loops: list[Any]) -> Any:
     """The loop of like ones, with the longest of their delay lines."""
-    return _with_rings(loops, max(loop.ring for loop in loops), max(loop.controller_ring for loop in loops))
+    longest = {name: max(getattr(loop, name) for loop in loops) for name in _rings(loops[0])}
+    return dataclasses.replace(loops[0], **longest)
 
 
-def _with_rings(loops: list[Loop], ring: int, controller_ring: int) -> Loop:
-    return dataclasses.replace(loops[0], ring=ring, controller_ring=controller_ring)
+def _rings(loop: Any) -> list[str]:
+    """Fields of a loop that are lengths of delay lines."""
+    return [name for name in ("ring", "controller_ring") if hasattr(loop, name)]
 
 
 def tuned_names(tasks: list[TuneTask]) -> tuple[str, ...]:
     """Names of all gains that are tuned for at least one of the tasks."""
     tuned = {gain.name for task in tasks for gain in task.tuned}
-    return tuple(gain.name for gain in COMPENSATORS[tasks[0].compensator].gains if gain.name in tuned)
+    return tuple(gain.name for gain in compensator_of(tasks[0].compensator).gains if gain.name in tuned)
 
 
 def gain_bounds(task: TuneTask, names: tuple[str, ...]) -> Bounds:
     """Bounds (gains,) of a task; of a gain that is not tuned for it both are the literature's value."""
-    gains = {gain.name: gain for gain in COMPENSATORS[task.compensator].gains}
+    gains = {gain.name: gain for gain in compensator_of(task.compensator).gains}
     moved = {gain.name for gain in task.tuned}
 
     def bounds(name: str) -> tuple[float, float, float]:
-        gain, mechanism = gains[name], task.mechanism
+        gain = gains[name]
+        mechanism: Any = task.mechanism
         if name not in moved:
             return task.literature[name], task.literature[name], 0.0
         return float(gain.lower(mechanism)), float(gain.upper(mechanism)), float(gain.logarithmic)

@@ -8,11 +8,12 @@ import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxhil.compensators import COMPENSATORS, literature_gains
+from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gain_file import validity_envelope
@@ -99,8 +100,15 @@ def nearest(mechanism: Mechanism, tuned: Sequence[Tuned]) -> Tuned:
     return min(tuned, key=lambda one: _apart(own, one.traits))
 
 
+def near_to(mechanism: AnyMechanism, sources: Sequence[Sequence[Tuned]]) -> list[Tuned]:
+    """The nearest mechanism of each source; in six axes it is not known what is near."""
+    if not isinstance(mechanism, Mechanism):
+        return []
+    return [nearest(mechanism, known) for known in sources]
+
+
 def carry_over(
-    compensator: str, gains: Mapping[str, float], source: Mechanism, target: Mechanism
+    compensator: str, gains: Mapping[str, float], source: Mechanism, target: Any
 ) -> dict[str, float]:
     """Gains of `compensator` tuned for `source`, for `target`.
 

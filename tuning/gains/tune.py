@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxhil.compensators import COMPENSATORS
-from jaxhil.mechanism.file import to_builtins
+from jaxhil.compensators import compensator_of
+from jaxhil.mechanism.file import AnyMechanism, to_builtins
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.evaluation import Outcome
 from jaxhil.simulation.metrics import Metrics
-from jaxhil.simulation.scenario import Scenario
 from tuning.caches.pieces import NOTHING_KEPT, Pieces
+from tuning.gains import simulated
 from tuning.gains.common_program import CommonProgram
 from tuning.gains.global_search import FACTOR, GlobalComparison, compare_with_global_search
 from tuning.gains.multistart import MultistartResult, expected_runs, find_gains
@@ -25,7 +25,7 @@ from tuning.gains.objective import SCALE
 from tuning.gains.rounds import Start
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import TuneTask, alike, build_task
-from tuning.gains.transfer import Tuned, carry_over, nearest
+from tuning.gains.transfer import Tuned, carry_over, near_to
 from tuning.gains.validation import (
     Validation,
     build_validation,
@@ -67,14 +67,14 @@ class TuneResult:
     """What tuning found for one mechanism; "before" is no compensation."""
 
     compensator: str  # what was tuned
-    mechanism: Mechanism  # for what it was
+    mechanism: AnyMechanism  # for what it was
     gains: dict[str, float]  # all of the compensator's, as tuned
     literature: dict[str, float]  # by the literature's rule
     figures: dict[str, ErrorFigures]  # of "before", "literature" and "tuned" on the same fresh scenarios
     nominal: dict[str, ErrorFigures]  # the same figures of the nominal run
     starts: list[Start]  # every start of the solver
     outcomes: dict[str, Outcome]  # on the fresh scenarios, for plots
-    scenarios: Scenario  # the fresh ones, for plots
+    scenarios: Any  # the fresh ones, for plots
     settings: TuneSettings  # how it was tuned
     timings: dict[str, float] = field(default_factory=dict)  # seconds by stage
     intervals: ErrorIntervals | None = None  # 95 % intervals of the tuned figures
@@ -106,14 +106,14 @@ class _Kept(NamedTuple):
 
 
 def tune(
-    mechanism: Mechanism, compensator: str, settings: TuneSettings, work: Work | None = None
+    mechanism: AnyMechanism, compensator: str, settings: TuneSettings, work: Work | None = None
 ) -> TuneResult:
     """Tune the gains of `compensator` for `mechanism`; the `work` hears how far it is."""
     return next(tune_all([mechanism], compensator, settings, work))[1]
 
 
 def tune_all(
-    mechanisms: Sequence[Mechanism],
+    mechanisms: Sequence[AnyMechanism],
     compensator: str,
     settings: TuneSettings,
     work: Work | None = None,
@@ -149,9 +149,13 @@ def tune_all(
         work.later = afterwards + sum(expected[number + 1 :])
         sources = [known for known in (tuned, found) if known]
         sources = sources[: max(settings.starts - 1, 1 if tuned else 0)]
-        near = [[nearest(mechanisms[i], known) for known in sources] for i in block]
+        near = [near_to(mechanisms[i], sources) for i in block]
         results = _kept_or_tuned([tasks[index] for index in block], settings, work, near, pieces)
-        found.extend(Tuned(one.mechanism, one.gains, one.mechanism.name) for one in results)
+        found.extend(
+            Tuned(one.mechanism, one.gains, one.mechanism.name)
+            for one in results
+            if isinstance(one.mechanism, Mechanism)
+        )
         yield from zip(block, results, strict=True)
 
 
@@ -353,12 +357,23 @@ def figures(outcome: Outcome) -> ErrorFigures:
     )
 
 
+def figures_of_parts(result: TuneResult) -> dict[str, dict[str, ErrorFigures]]:
+    """Of six axes, those of each error by itself, under its name; of one axis nothing."""
+    if isinstance(result.mechanism, Mechanism):
+        return {}
+    parts: dict[str, dict[str, ErrorFigures]] = {}
+    for key, outcome in result.outcomes.items():
+        for name, part in simulated.error_parts(outcome).items():
+            parts.setdefault(name, {})[key] = figures(part)
+    return parts
+
+
 def uncompensated(compensator: str, gains: dict[str, float]) -> tuple[str, dict[str, float]]:
     """Compensator and gains that pass the measured force on unchanged: what "before" is judged with.
 
     Neutral gains need no program of their own. In the place of a law that has none stands no compensation.
     """
-    if all(gain.neutral is None for gain in COMPENSATORS[compensator].gains):
+    if all(gain.neutral is None for gain in compensator_of(compensator).gains):
         return "none", {}
     return compensator, neutral_gains(compensator, gains)
 
@@ -366,7 +381,7 @@ def uncompensated(compensator: str, gains: dict[str, float]) -> tuple[str, dict[
 def neutral_gains(compensator: str, gains: dict[str, float]) -> dict[str, float]:
     """The gains, neutral where they can be."""
     neutral = {
-        gain.name: gain.neutral for gain in COMPENSATORS[compensator].gains if gain.neutral is not None
+        gain.name: gain.neutral for gain in compensator_of(compensator).gains if gain.neutral is not None
     }
     return {**gains, **neutral}
 

@@ -4,24 +4,19 @@ Both go through one compiled program, that of `jaxhil.simulation.evaluation`, wi
 call.
 """
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxhil.compensators import COMPENSATORS
-from jaxhil.compensators.base import Constants
+from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import Outcome, begin_evaluation, evaluate
-from jaxhil.simulation.loop import Loop
-from jaxhil.simulation.scenario import Scenario, build_scenarios
+from jaxhil.simulation.evaluation import Outcome, begin_evaluation, evaluate, lanes_of
 from tuning.batches import cut, join
+from tuning.gains import simulated
 from tuning.gains.objective import Objective, contact_terms, metrics_of, objective_value, one_each
 from tuning.gains.tasks import TuneTask, common_loop, gain_bounds, gains_at, tuned_names
 from tuning.gains.work import Work
@@ -37,14 +32,14 @@ class Validation:
     """Like tasks with fresh scenarios, ready to be evaluated under any gains; see `build_validation`."""
 
     tasks: list[TuneTask]  # the tasks, whose scenarios are those of training
-    fresh: list[Scenario]  # fresh scenarios of each
+    fresh: list[Any]  # fresh scenarios of each
     # the same with their transparency probes; None of each where the tasks are not probed
     probed: list[ProbedScenarios | None]
-    loop: Loop  # that of all tasks
+    loop: Any  # that of all tasks
     names: tuple[str, ...]  # of the gains that are tuned for any of the tasks
     bounds: list[Bounds]  # of those gains, of each task
     # fresh scenarios of all tasks side by side, with probes if any, after each task's its nominal run
-    judged: Scenario
+    judged: Any
     training: Any  # training scenarios, (tasks, ..., scenarios)
     lanes: int  # of `judged` that belong to a task
     work: Work  # hears of every run
@@ -57,7 +52,7 @@ class Validation:
         Of another `compensator` than that of the tasks, if one is given."""
         loop = self.loop
         if compensator is not None:
-            loop = dataclasses.replace(loop, compensator=COMPENSATORS[compensator])
+            loop = simulated.with_compensator(loop, compensator)
         values = {name: np.repeat([one[name] for one in gains], self.lanes) for name in gains[0]}
         every = cut(evaluate(loop, values, self.judged), self.lanes)
         self.work.ran(self.lanes * len(self.tasks))
@@ -85,7 +80,7 @@ class Validation:
         each. At least so many `lanes` are computed at a time."""
         objectives = one_each(objective, len(self.tasks))
         noise = any(objectives[task].noise_weight > 0 for task in which)
-        number = self.training.velocity.shape[-1]
+        number = lanes_of(self.training)
         number = min(scenarios or number, number)
         points = coordinates.shape[1]
         pairs = [(i, point) for i in range(len(which)) for point in range(points)]
@@ -140,8 +135,8 @@ class Validation:
         if not noise:
             return lambda: (ended(), np.ones(len(some)))
         # The mean over the scenarios, as `tuning.gains.objective.residuals` has it.
-        constants = Constants(jnp.asarray(scenarios.control_period), jnp.asarray(scenarios.clearance))
-        own: Any = {name: jnp.asarray(value) for name, value in values.items()}
+        constants = simulated.constants_of(scenarios)
+        own: Any = {name: jax.numpy.asarray(value) for name, value in values.items()}
         amplification = np.asarray(self.loop.compensator.noise_amplification(own, constants))
         return lambda: (ended(), np.mean(amplification.reshape(len(some), number), axis=1))
 
@@ -195,24 +190,25 @@ def split_nominal(outcome: Outcome) -> tuple[Any, Any]:
     return fresh, nominal
 
 
-def fresh_scenarios(task: TuneTask, number: int, seed: int) -> Scenario:
+def fresh_scenarios(task: TuneTask, number: int, seed: int) -> Any:
     """Scenarios of a task that its tuning with that seed never saw."""
     seed += VALIDATION_SEED
-    return build_scenarios(task.mechanism, draw(task.mechanism, number, seed), seed)
+    return simulated.scenarios_of(task.mechanism, draw(task.mechanism, number, seed), seed)
 
 
-def _fresh(task: TuneTask, number: int, seed: int) -> tuple[Scenario, ProbedScenarios | None, Scenario, Loop]:
+def _fresh(task: TuneTask, number: int, seed: int) -> tuple[Any, ProbedScenarios | None, Any, Any]:
     """Fresh scenarios of a task, the same with their probes, what is judged of it, its loop."""
     drawn = draw(task.mechanism, number, seed)
-    fresh, probed = build_scenarios(task.mechanism, drawn, seed), None
-    if task.probed:
+    fresh, probed = simulated.scenarios_of(task.mechanism, drawn, seed), None
+    if task.probed and isinstance(task.mechanism, Mechanism):
         probed = probed_scenarios(task.mechanism, drawn, seed)
         nominal = probed_scenarios(task.mechanism).scenarios
         judged = join([probed.scenarios, jax.tree.map(lambda leaf: leaf[..., :1], nominal)])
     else:
-        judged = join([fresh, build_scenarios(task.mechanism)])
+        judged = join([fresh, simulated.scenarios_of(task.mechanism)])
     if task.common is None:
         both = join([judged, task.scenarios])
-        return fresh, probed, judged, build_loop(task.mechanism, task.compensator, both, chatter=True)
-    loop = task.common.loop(build_loop(task.mechanism, task.compensator, judged, chatter=True))
+        return fresh, probed, judged, simulated.loop_of(task.mechanism, task.compensator, both, chatter=True)
+    assert isinstance(task.mechanism, Mechanism)
+    loop = task.common.loop(simulated.loop_of(task.mechanism, task.compensator, judged, chatter=True))
     return fresh, probed, task.common.scenarios(task.mechanism, judged), loop

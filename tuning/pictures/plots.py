@@ -22,6 +22,7 @@ from jaxhil.simulation.contact_plot import (
 )
 from tuning.gains.objective import Objective
 from tuning.gains.pareto import Front
+from tuning.gains.simulated import error_parts
 from tuning.gains.tune import TuneResult
 
 MARKERS = {"before": "^", "literature": "s", "tuned": "o"}
@@ -81,6 +82,34 @@ def errors_plot(result: TuneResult, limit: float) -> Figure:
         for handle in legend.legend_handles:
             if handle is not None:
                 handle.set_alpha(1 if handle.get_label() in LABELS.values() else 0.3)
+    return figure
+
+
+@matplotlib.style.context("default")
+def two_errors_plot(result: TuneResult, limit: float) -> Figure:
+    """Of six axes, how large the errors of energy and twist are and how often, before and after tuning."""
+    figure = new_figure((11, 4.6), f"{result.mechanism.name}: errors on fresh scenarios", above=0.6)
+    shown = {"energy_error": "size of the energy error [1]", "twist_error": "twist error [1]"}
+    for axes, (error, label) in zip(figure.subplots(1, 2), shown.items(), strict=True):
+        sizes: list[float] = [limit] if 0 < limit < np.inf else []
+        for name, outcome in result.outcomes.items():
+            part = error_parts(outcome)[error]
+            size = np.sort(np.abs(part.error[part.good]))[::-1]
+            if not len(size):
+                continue
+            colour, line, width = STYLES[name]
+            total = int(np.sum(part.wanted))
+            # Episodes that did not end are larger than any error: they raise the whole curve.
+            share = (np.arange(1, len(size) + 1) + total - len(size)) / total
+            style: dict[str, Any] = {"color": colour, "linestyle": line, "linewidth": width}
+            axes.step(size, share, where="post", label=LABELS[name], **style)
+            sizes += [float(size[0]), float(np.percentile(size, 2))]
+        if 0 < limit < np.inf:
+            axes.axvline(limit, color=BLACK, linewidth=1.2, linestyle="--", label=f"limit {limit:g}")
+        positive = [value for value in sizes if value > 0] or [1.0]
+        axes.set(xscale="log", yscale="log", xlim=(min(positive) / 1.5, 1.5 * max(positive)))
+        axes.set(xlabel=label, ylabel="share of episodes with a larger error [1]")
+        finish(axes, "lower left")
     return figure
 
 

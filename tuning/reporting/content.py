@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from jaxhil.errors import one_line
-from jaxhil.mechanism.structs import Uncertainty, numeric_keys, value_at
+from jaxhil.mechanism.file import AnyMechanism
+from jaxhil.mechanism.six_axes import numeric_keys_of
+from jaxhil.mechanism.structs import Mechanism, Uncertainty, numeric_keys, value_at
 from jaxhil.mechanism.uncertainty import PHASE
 from jaxhil.simulation.contact_plot import LABELS
 from tuning.bundle.summary import alarm_rates, is_shown
@@ -75,19 +77,22 @@ def assumptions(results: Results) -> Section | None:
         return None
     mechanism, known = subject.mechanism, _identified(results)
     rows = []
-    for path, allowed in numeric_keys().items():
+    keys = numeric_keys_of(mechanism) if results.axes == 6 else numeric_keys()
+    for path, allowed in keys.items():
         if path.startswith("uncertainty"):
             continue
         value = value_at(mechanism, path)
-        if value is None or value == [] or (isinstance(value, float) and math.isinf(value)):
+        if value is None or value == [] or np.all(np.isinf(value)):
             continue
         unit = unit_of(mechanism, path) or allowed.unit
         uncertain = mechanism.uncertainty.get(path)
-        varies = "uniform, 0 to 1, each contact its own" if path == PHASE else "fixed"
+        varies = "fixed"
+        if path == PHASE:
+            varies = "uniform, 0 to 1" + ("" if results.axes == 6 else ", each contact its own")
         varies = varies if uncertain is None else _drawn(uncertain, unit)
         rows.append((path, _value(value), unit, varies, known.get(path, "the file")))
     texts = [
-        f"Law of the contact: {mechanism.contact.law}; motion simulator: {mechanism.rig.simulator.model}; "
+        f"{_laws(mechanism)}; motion simulator: {mechanism.rig.simulator.model}; "
         f"integrator: {mechanism.rig.integrator}; command hold: {mechanism.rig.command_hold}.",
         f"Source of the file: {one_line(mechanism.source, 1000) or OTHER}",
     ]
@@ -95,6 +100,13 @@ def assumptions(results: Results) -> Section | None:
         texts.append("Some of these numbers vary together, as the file's [correlation] says.")
     heads = ("key", "value", "unit", "varies", "known from")
     return Section("assumptions", "What is assumed, and how it is known", texts, [Table(heads, rows, 9)])
+
+
+def _laws(mechanism: AnyMechanism) -> str:
+    if isinstance(mechanism, Mechanism):
+        return f"Law of the contact: {mechanism.contact.law}"
+    laws = (f"{name} {contact.law}" for name, contact in mechanism.contact.items())
+    return f"Laws of the contacts: {', '.join(laws) or 'none'}"
 
 
 def gains(results: Results) -> Section | None:
@@ -114,10 +126,15 @@ def gains(results: Results) -> Section | None:
         if is_shown(name)
     ]
     tables += [Table(("limit on the rig", "value", "unit"), shown)] if shown else []
-    reached = list(_reached(document.get("figures")))
     keys = ("rms", "99th percentile", "largest", "mean e - e*", "peak / reference")
-    if reached:
-        tables.append(Table(("error |e - e*| on fresh scenarios", *keys), reached))
+    if results.axes == 6:
+        keys = (*keys[:3], "mean", keys[4])
+        judged = {"energy error": "energy_error", "twist error": "twist_error"}
+    else:
+        judged = {"error |e - e*|": "robust"}
+    for name, key in judged.items():
+        reached = list(_reached(document.get("figures"), key))
+        tables += [Table((f"{name} on fresh scenarios", *keys), reached)] if reached else []
     return Section("gains", f"Gains of {subject.compensator}", () if rows else ("It has none.",), tables)
 
 
@@ -131,7 +148,7 @@ def _of_sweep(results: Results) -> Iterator[Requirement]:
     found = results.sweep
     if found is None:
         return
-    limit = "" if found.limit is None else f" with |e - e*| beyond {found.limit:g}, or"
+    limit = "" if found.limit is None else f" with {results.error} beyond {found.limit:g}, or"
     what = f"scenarios{limit} that do not end well"
     share = found.failure_probability
     result = (
@@ -209,9 +226,10 @@ def _known(verdict: str) -> str:
     return verdict if verdict in (GOOD, BAD) else UNKNOWN
 
 
-def _reached(figures: Any) -> Iterator[tuple[str, ...]]:
-    robust = figures.get("robust") if isinstance(figures, Mapping) else None
-    intervals = figures.get("tuned_intervals") if isinstance(figures, Mapping) else None
+def _reached(figures: Any, key: str) -> Iterator[tuple[str, ...]]:
+    robust = figures.get(key) if isinstance(figures, Mapping) else None
+    # They are those of all errors together.
+    intervals = figures.get("tuned_intervals") if isinstance(figures, Mapping) and key == "robust" else None
     for name, one in robust.items() if isinstance(robust, Mapping) else ():
         if name not in LABELS or not isinstance(one, Mapping):
             continue

@@ -17,10 +17,13 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from jaxhil.compensators import literature_gains
+from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.contact_plot import BLACK, SKY, VERMILION, contact_plot, finish, new_figure
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.motion import nominal_motion
+from jaxhil.sixdof.run import simulate_six_axes
 from tuning.identification.pictures import compare
+from tuning.pictures.six_axes import six_axes_plot
 from tuning.reporting.closed_forms import ClosedForms
 from tuning.reporting.contact_growth import Growth
 from tuning.reporting.documents import AxisOfMap, Identification, MapDocument, WorstScenario
@@ -57,6 +60,8 @@ class Trace(NamedTuple):
 
 def nominal_drawing(subject: LoadedGains) -> Drawing:
     """The nominal run uncompensated, under the literature's gains and under those of the file."""
+    if isinstance(subject.mechanism, SixAxisMechanism):
+        return _nominal_in_space(subject)
     law = subject.compensator
     laws = {"before": ("none", {}), "literature": (law, literature_gains(subject.mechanism, law))}
     if law == "none":
@@ -64,6 +69,15 @@ def nominal_drawing(subject: LoadedGains) -> Drawing:
     motion = nominal_motion(subject.mechanism, {**laws, "tuned": (law, subject.gains)})
     figure = contact_plot(motion, f"{subject.mechanism.name}, nominal run: {law}", sensors="tuned")
     return Drawing(as_svg(figure), "Force and position over time of every contact", "The nominal run.")
+
+
+def _nominal_in_space(subject: LoadedGains) -> Drawing:
+    run = simulate_six_axes(subject.mechanism, subject.compensator, subject.gains)
+    figure = six_axes_plot(run.ticks, f"{subject.mechanism.name}, nominal run: {subject.compensator}")
+    says = "Pose, forces and moment over time, beside the same contact in space"
+    [episode, *_] = run.episodes
+    errors = f"Energy error {episode.energy_error:+.4f}, twist error {episode.twist_error:.4f}"
+    return Drawing(as_svg(figure), says, f"The nominal run. {errors}.")
 
 
 def map_drawing(found: MapDocument) -> Drawing:

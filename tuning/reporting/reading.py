@@ -68,6 +68,16 @@ class Results:
             return self.bundle or self.gains
         return None if self.store is None else loaded_gains(self.store.manifest)
 
+    @property
+    def axes(self) -> int:
+        """How many axes what the report is about has, 1 or 6."""
+        return 6 if self.subject is not None and self.subject.document.get("axes") == 6 else 1
+
+    @property
+    def error(self) -> str:
+        """The sign of an error: that of the restitution, or either of six axes."""
+        return "|error|" if self.axes == 6 else "|e - e*|"
+
 
 def read_results(paths: list[Path]) -> Results:
     """The results at these paths. Raises `InputError`, one line, for what is none, was changed since it was
@@ -97,7 +107,7 @@ def _add(results: Results, given: Path) -> None:
         manifest = hashlib.sha256(path.read_bytes()).hexdigest()
         results.sources.append(Source("export", path.parent, manifest))
     elif schema.startswith(GAINS):
-        _set(results, "gains", check_document(document, where), where)
+        _set(results, "gains", check_document(document, where, any_axes=True), where)
         results.sources.append(Source("tune", path, document["sha256"]))
     elif schema.startswith(IDENTIFICATION):
         _check_digest(document, where)

@@ -23,7 +23,7 @@ TRANSPARENCY = (
 
 def pictures(results: Results) -> int:
     """How many pictures there are to be drawn, at most."""
-    scenarios = 0 if results.sweep is None else len(results.sweep.worst) + TYPICAL + 1
+    scenarios = 0 if results.sweep is None or results.axes == 6 else len(results.sweep.worst) + TYPICAL + 1
     return (results.subject is not None) + scenarios + (results.map is not None)
 
 
@@ -33,6 +33,8 @@ def runs(results: Results, say: Callable[[str], None]) -> Section | None:
         return None
     say("the nominal run")
     drawings, traces, texts = [nominal_drawing(results.subject)], [], []
+    if results.axes == 6:
+        return Section("runs", "The nominal run", texts, [], drawings, traces)
     if results.store is not None and results.sweep is not None:
         say("scenarios of the sweep")
         points, traces = sweep_drawings(results.store, results.sweep.worst, say)
@@ -52,7 +54,7 @@ def errors(results: Results) -> Section | None:
         (f"{100 * one.order:g} %", number(one.value), f"{number(one.low)} to {number(one.high)}")
         for one in found.error_quantiles
     ]
-    tables = [Table(("share of scenarios", "worst |e - e*| up to", "95 %"), rows)]
+    tables = [Table(("share of scenarios", f"worst {results.error} up to", "95 %"), rows)]
     ended = [
         (one, str(count), f"{count / max(found.scenarios, 1):.4g}") for one, count in found.outcomes.items()
     ]
@@ -82,13 +84,13 @@ def drivers(results: Results) -> Section | None:
         ]
         tables.append(Table(("input", "first order", "95 %", "total", "95 %"), rows))
         texts.append(
-            f"Sobol indices: shares of the variance of the worst |e - e*|, cut at {own.cap:g} "
+            f"Sobol indices: shares of the variance of the worst {results.error}, cut at {own.cap:g} "
             f"({own.capped} of {own.evaluations} runs)."
         )
     if (rare := found.rare) is not None:
         interval = f"{number(rare.low, 3)} to {number(rare.high, 3)}"
         row = (number(rare.limit), number(rare.probability, 3), interval, str(rare.evaluations))
-        tables.append(Table(("|e - e*| beyond", "probability", "95 %", "scenarios"), [row], 0))
+        tables.append(Table((f"{results.error} beyond", "probability", "95 %", "scenarios"), [row], 0))
         if rare.spread_beyond_formula:
             texts.append(
                 "The replicates of the subset simulation differ far more than its formula explains: some "
@@ -163,7 +165,7 @@ def _commands(results: Results) -> Iterator[str]:
     paths = {one.command: str(one.path) for one in results.sources}
     subject, sweep = results.subject, results.sweep
     gains = paths.get("tune", paths.get("export", "GAINS"))
-    if "tune" in paths or "export" in paths:
+    if ("tune" in paths or "export" in paths) and results.axes == 1:
         yield _command("verify", paths.get("export", gains))
     if sweep is not None:
         options = {"scenarios": sweep.scenarios, "seed": sweep.seed, "sampling": sweep.sampling,
@@ -171,7 +173,7 @@ def _commands(results: Results) -> Iterator[str]:
                    "acceptable": sweep.acceptable}  # fmt: skip
         studies = (["--drivers"] if sweep.drivers else []) + (["--rare"] if sweep.rare else [])
         yield _command("sweep", gains, "-o", "again", *_options(options), *studies)
-        for one in sweep.worst[:1]:
+        for one in sweep.worst[:1] if results.axes == 1 else ():
             yield _command("replay", paths["sweep"], str(one.index), "--plot", "worst.png")
     name = subject.mechanism.name if subject is not None else "MECHANISM"
     if (compared := results.comparison) is not None:

@@ -10,13 +10,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.uncertainty import extremes
-from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import begin_evaluation
 from jaxhil.simulation.gain_file import LoadedGains
-from jaxhil.simulation.loop import Loop
-from jaxhil.simulation.scenario import Scenario, build_scenarios
+from tuning.gains.simulated import loop_of, scenarios_of
 from tuning.sweeps.columns import rows_of
 from tuning.sweeps.draws import drawn_scenarios
 from tuning.sweeps.manifest import Manifest, loaded_gains
@@ -29,8 +27,8 @@ class Sweep(NamedTuple):
     """What a manifest asks for, ready to run."""
 
     manifest: Manifest
-    mechanism: Mechanism  # of the gain file
-    loop: Loop  # serves whatever can be drawn (`widest_loop`)
+    mechanism: AnyMechanism  # of the gain file
+    loop: Any  # serves whatever can be drawn (`widest_loop`)
     gains: dict[str, float]  # of the gain file
 
 
@@ -39,7 +37,7 @@ class _Batch(NamedTuple):
 
     first: int  # index of the first
     draws: dict[str, np.ndarray]  # what they are made of, by dotted path
-    scenarios: Scenario
+    scenarios: Any
 
 
 def build_sweep(manifest: Manifest) -> Sweep:
@@ -48,14 +46,14 @@ def build_sweep(manifest: Manifest) -> Sweep:
     return Sweep(manifest, loaded.mechanism, widest_loop(loaded, manifest.works), loaded.gains)
 
 
-def widest_loop(loaded: LoadedGains, works: bool) -> Loop:
+def widest_loop(loaded: LoadedGains, works: bool) -> Any:
     """The loop that serves whatever can be drawn."""
     draws = extremes(loaded.mechanism)
     if PERIOD in draws:
         # The longest delay counted in the shortest periods.
         draws[PERIOD] = draws[PERIOD][::-1]
-    scenarios = build_scenarios(loaded.mechanism, draws)
-    return build_loop(loaded.mechanism, loaded.compensator, scenarios, energies=works)
+    scenarios = scenarios_of(loaded.mechanism, draws)
+    return loop_of(loaded.mechanism, loaded.compensator, scenarios, energies=works)
 
 
 def run_chunk(sweep: Sweep, first: int, number: int, precision: str | None = None) -> Rows:
@@ -82,7 +80,7 @@ def run_parts(sweep: Sweep, parts: Iterable[int]) -> Generator[tuple[int, Rows],
         yield held
 
 
-def in_precision(scenarios: Scenario, precision: str) -> Scenario:
+def in_precision(scenarios: Any, precision: str) -> Any:
     """Scenarios whose numbers make the program one of that precision."""
 
     def cast(leaf: Any) -> Any:

@@ -4,17 +4,18 @@ A number per contact is a column per contact, `error_1`, `error_2`, ...; an entr
 likewise, `contact.stiffness_1`. What a contact that failed or was not reached does not have is null.
 """
 
-from collections.abc import Mapping
-from typing import Literal, NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
 
+from jaxhil.mechanism.file import AnyMechanism
+from jaxhil.mechanism.six_axes import SixAxisMechanism, numeric_keys_of
 from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.mechanism.uncertainty import PHASE, dimensions
 from jaxhil.simulation.evaluation import Outcome
 from jaxhil.simulation.metrics import DIVERGED, NON_FINITE, NOT_REACHED, OK, STATUS_NAMES, TIMEOUT
-from jaxhil.simulation.scenario import Scenario
 
 GOOD, BEYOND, SATURATED = "good", "error beyond limit", "saturated"
 SATURATION = "a force beyond the sensor's range, or a limit of the motion simulator that bound"
@@ -55,6 +56,13 @@ PER_CONTACT = (
     PerContact("energy_in", "J", "kinetic energy of the numerical model before the contact"),
     PerContact("energy_out", "J", "kinetic energy of the numerical model after the contact"),
 )
+# What episodes of six axes have of these, and in the place of the error both of theirs.
+PER_EPISODE = ("restitution", "reference_restitution", "peak_force", "peak_ratio", "duration")
+PER_EPISODE = (*PER_EPISODE, "approach_velocity")
+ERRORS_IN_SPACE = {
+    "energy_error": "kinetic energy gained beyond that in space, over that of the approach",
+    "twist_error": "deviation of the twist from that in space, over the change there",
+}
 WORKS = (
     PerContact("work_in", "J", "work done on the mechanism by the real contact force"),
     PerContact("work_out", "J", "work returned by the mechanism"),
@@ -81,7 +89,31 @@ _UNITS = {
 }
 
 
-def sweep_columns(mechanism: Mechanism, works: bool) -> list[Column]:
+class Slot(NamedTuple):
+    """Where a row says how one contact went, or one error of an episode."""
+
+    number: int  # of the contact or the episode, from 1
+    error: str  # column of its error
+    status: str  # and of its status
+
+
+def slots(mechanism: AnyMechanism) -> list[Slot]:
+    """One for every contact or, in six axes, first of all episodes' errors of the energy, then of the
+    twist: as the rows of an outcome."""
+    if not isinstance(mechanism, SixAxisMechanism):
+        return contact_slots(mechanism.approach.contacts)
+    made = range(1, (mechanism.approach.episodes if mechanism.approach else 1) + 1)
+    return [
+        Slot(number, f"{error}_{number}", f"status_{number}") for error in ERRORS_IN_SPACE for number in made
+    ]
+
+
+def contact_slots(contacts: int) -> list[Slot]:
+    """Those of so many contacts of one axis."""
+    return [Slot(number, f"error_{number}", f"status_{number}") for number in range(1, contacts + 1)]
+
+
+def sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
     """The columns of a sweep over `mechanism`, in their order."""
     columns = [Column("index", "integer", "", "number of the scenario")]
     columns += [
@@ -89,15 +121,16 @@ def sweep_columns(mechanism: Mechanism, works: bool) -> list[Column]:
         for path in dimensions(mechanism)
         for name in input_names(mechanism, path)
     ]
-    for number in range(1, mechanism.approach.contacts + 1):
+    what = "episode" if isinstance(mechanism, SixAxisMechanism) else "contact"
+    for number in sorted({slot.number for slot in slots(mechanism)}):
         columns += [
-            Column(f"{one.name}_{number}", "number", one.unit, f"contact {number}: {one.meaning}")
-            for one in (*PER_CONTACT, *(WORKS if works else ()))
+            Column(f"{one.name}_{number}", "number", one.unit, f"{what} {number}: {one.meaning}")
+            for one in _kept(mechanism, works)
         ]
-        columns.append(Column(f"status_{number}", "text", "", f"contact {number}: how it ended"))
+        columns.append(Column(f"status_{number}", "text", "", f"{what} {number}: how it ended"))
     return [
         *columns,
-        Column("worst_error", "number", "1", "the error of largest magnitude of all contacts that ended"),
+        Column("worst_error", "number", "1", f"the error of largest magnitude of all {what}s that ended"),
         Column(
             "outcome", "text", "", f"good, or why the scenario counts as failed; {SATURATED}: {SATURATION}"
         ),
@@ -110,22 +143,36 @@ def texts_of(column: str) -> tuple[str, ...]:
     return OUTCOMES if column == "outcome" else STATUSES
 
 
-def unit_of(mechanism: Mechanism, path: str) -> str:
+def _kept(mechanism: AnyMechanism, works: bool) -> list[PerContact]:
+    """The numbers that every contact has."""
+    if not isinstance(mechanism, SixAxisMechanism):
+        return [*PER_CONTACT, *(WORKS if works else ())]
+    errors = [PerContact(name, "1", meaning) for name, meaning in ERRORS_IN_SPACE.items()]
+    return [*errors, *(one for one in PER_CONTACT if one.name in PER_EPISODE)]
+
+
+def unit_of(mechanism: AnyMechanism, path: str) -> str:
     """SI unit of the mechanism file's key."""
-    key = path.rpartition(".")[2]
-    law = mechanism.contact.law
-    if path == "contact.stiffness":
+    table, _, key = path.rpartition(".")
+    name = table.removeprefix("contact.")
+    if not isinstance(mechanism, SixAxisMechanism):
+        law = mechanism.contact.law if table == "contact" else None
+    else:
+        law = mechanism.contact[name].law if name in mechanism.contact and name != table else None
+    if law is not None and key == "stiffness":
         return "N/m^n" if law in ("hunt_crossley", "depth_damped") else "N/m"
-    if path == "contact.damping":
+    if law is not None and key == "damping":
         return "s/m" if law == "hunt_crossley" else "N s/m"
+    if isinstance(mechanism, SixAxisMechanism):
+        return numeric_keys_of(mechanism)[path].unit
     if key in ("noise_std", "quantum"):
         return "N" if "force" in path else "m"
     return _UNITS.get(key, "")
 
 
-def input_names(mechanism: Mechanism, path: str) -> list[str]:
+def input_names(mechanism: AnyMechanism, path: str) -> list[str]:
     """Names of the columns of a key that is drawn: the path itself, or one per entry, counted from 1."""
-    if path == PHASE:
+    if path == PHASE and isinstance(mechanism, Mechanism):
         shape: tuple[int, ...] = (mechanism.approach.contacts,)
     else:
         shape = np.shape(value_at(mechanism, path))
@@ -133,60 +180,79 @@ def input_names(mechanism: Mechanism, path: str) -> list[str]:
 
 
 def rows_of(
-    mechanism: Mechanism,
+    mechanism: AnyMechanism,
     first: int,
     draws: Mapping[str, np.ndarray],
-    scenarios: Scenario,
+    scenarios: Any,
     outcome: Outcome,
     limit: float,
     works: bool,
 ) -> dict[str, np.ndarray]:
     """One array (number,) per column; NaN where there is nothing to say, texts as their places."""
-    metrics, made = outcome.metrics, mechanism.approach.contacts
+    metrics, made = outcome.metrics, slots(mechanism)
     number = metrics.status.shape[-1]
     rows = {"index": np.arange(first, first + number)}
     for path, values in draws.items():
         entries = np.reshape(values, (number, -1)).T
         rows.update(zip(input_names(mechanism, path), entries, strict=True))
-    status = np.asarray(metrics.status[:made])
+    status = np.asarray(metrics.status[: len(made)])
     ended, reached = status == OK, status != NOT_REACHED
-    rebound = metrics.restitution * metrics.approach_velocity
-    half_mass = (scenarios.equivalent_mass / 2).astype(rebound.dtype)
     values = {
         **{name: getattr(metrics, name) for name in metrics._fields},
         "reference_restitution": outcome.reference_restitution,
-        "error": outcome.error,
         "peak_ratio": outcome.peak_ratio,
-        "energy_in": half_mass * metrics.approach_velocity**2,
-        "energy_out": half_mass * rebound**2,
+        **_energies(scenarios, metrics),
     }
-    names = [one.name for one in (*PER_CONTACT, *(WORKS if works else ()))]
+    names = [one.name for one in _kept(mechanism, works)]
     codes = np.searchsorted(sorted(STATUS_NAMES), status).astype(np.int8)
-    for contact in range(made):
-        for name in names:
-            known = reached[contact] if name in KNOWN_UNENDED else ended[contact]
-            rows[f"{name}_{contact + 1}"] = np.where(known, values[name][contact], np.nan)
-        rows[f"status_{contact + 1}"] = codes[contact]
-    return {**rows, **judge(rows, made, np.asarray(scenarios.force_sensor.range), limit)}
+    for place, slot in enumerate(made):
+        for name in set(names) & set(values):
+            known = reached[place] if name in KNOWN_UNENDED else ended[place]
+            rows[f"{name}_{slot.number}"] = np.where(known, values[name][place], np.nan)
+        rows[slot.error] = np.where(ended[place], outcome.error[place], np.nan)
+        rows[slot.status] = codes[place]
+    found = {**rows, **judge(rows, made, force_range(scenarios), limit)}
+    names = [column.name for column in sweep_columns(mechanism, works)]
+    return {name: found[name] for name in names if name in found}
+
+
+def force_range(scenarios: Any) -> np.ndarray:
+    """Largest force [N] that the sensor reads, (number,); of three channels the least."""
+    if hasattr(scenarios, "sensor"):
+        return np.min(np.asarray(scenarios.sensor.errors.range)[:3], axis=0)
+    return np.asarray(scenarios.force_sensor.range)
+
+
+def _energies(scenarios: Any, metrics: Any) -> dict[str, np.ndarray]:
+    """Kinetic energy [J] before and after a contact on one axis."""
+    if not hasattr(scenarios, "equivalent_mass"):
+        return {}
+    rebound = metrics.restitution * metrics.approach_velocity
+    half_mass = (scenarios.equivalent_mass / 2).astype(rebound.dtype)
+    return {"energy_in": half_mass * metrics.approach_velocity**2, "energy_out": half_mass * rebound**2}
 
 
 def judge(
-    rows: Mapping[str, np.ndarray], contacts: int, force_range: np.ndarray, limit: float
+    rows: Mapping[str, np.ndarray], made: Sequence[Slot], force_range: np.ndarray, limit: float
 ) -> dict[str, np.ndarray]:
     """`worst_error`, `outcome` and `failed`, which follow from the columns of every contact.
 
     `force_range` [N] is the force sensor's, of every row or of all; `limit` [1] that of the error.
     """
 
-    def each(name: str) -> np.ndarray:
-        return np.stack([rows[f"{name}_{contact + 1}"] for contact in range(contacts)])
+    def each(names: Iterable[str]) -> np.ndarray:
+        return np.stack([rows[name] for name in names])
 
-    status, error, peak = np.array(sorted(STATUS_NAMES))[each("status")], each("error"), each("peak_force")
+    status = np.array(sorted(STATUS_NAMES))[each(slot.status for slot in made)]
+    error = each(slot.error for slot in made)
+    peak = each(f"peak_force_{slot.number}" for slot in made)
     size = np.where(status == OK, np.abs(error), -1)
     worst = np.take_along_axis(error, np.argmax(size, axis=0)[None], axis=0)[0]
     # What was not reached has no peak and no shortfall: they are beyond nothing.
     beyond_range = peak > force_range.astype(peak.dtype)
-    saturated = np.any(beyond_range | (each("position_shortfall") > 0), axis=0)
+    saturated = np.any(beyond_range, axis=0)
+    for name in {f"position_shortfall_{slot.number}" for slot in made} & set(rows):
+        saturated = saturated | (rows[name] > 0)
     outcome = _outcomes(status, ~(np.abs(worst) <= limit), saturated)
     return {"worst_error": worst, "outcome": outcome, "failed": outcome != OUTCOMES.index(GOOD)}
 

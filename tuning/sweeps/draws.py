@@ -10,26 +10,27 @@ sensors' noise included.
 """
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
-from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.uncertainty import at_points, dimensions, draw
-from jaxhil.simulation.scenario import Scenario, build_scenarios
+from tuning.gains.simulated import scenarios_of
 
 REPLICATES = 16
 BITS = 30  # of a Sobol point's coordinate
 
 
 def drawn_scenarios(
-    mechanism: Mechanism, sampling: str, seed: int, first: int, number: int
-) -> tuple[dict[str, np.ndarray], Scenario]:
+    mechanism: AnyMechanism, sampling: str, seed: int, first: int, number: int
+) -> tuple[dict[str, np.ndarray], Any]:
     """Draws and scenarios number `first` to `first + number - 1`; draws by dotted path, as of `draw`."""
     if sampling == "random":
         draws = draw(mechanism, number, seed, first)
     else:
         draws = at_points(mechanism, sobol_points(sum(dimensions(mechanism).values()), seed, first, number))
-    return draws, build_scenarios(mechanism, draws, seed, first)
+    return draws, scenarios_of(mechanism, draws, seed, first)
 
 
 def sobol_points(dimension: int, seed: int, first: int, number: int) -> np.ndarray:

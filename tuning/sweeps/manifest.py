@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import msgspec
 from msgspec import Meta
 
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.compensators import compensator_of
 from jaxhil.contact.laws import LAWS
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.files import open_plain
@@ -67,6 +67,11 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def largest_error(self) -> float:
         """The limit of the restitution error; infinite if there is none."""
         return math.inf if self.limit is None else self.limit
+
+    @property
+    def axes(self) -> int:
+        """How many axes the runs have, 1 or 6."""
+        return self.gain_file.get("axes", 1)
 
     def part_rows(self, part: int) -> tuple[int, int]:
         """Index of the first scenario of a part, and the number of its scenarios."""
@@ -149,7 +154,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 def loaded_gains(manifest: Manifest, source: str = "sweep") -> LoadedGains:
     """The gain file within a manifest, checked as if it were read."""
-    return check_document(manifest.gain_file, f"{source}: gain_file")
+    return check_document(manifest.gain_file, f"{source}: gain_file", any_axes=True)
 
 
 def differences(old: Manifest, new: Manifest) -> list[str]:
@@ -183,7 +188,9 @@ def unlike_here(manifest: Manifest) -> list[str]:
 
 
 def _sources(loaded: LoadedGains) -> str:
-    return sources_sha256(COMPENSATORS[loaded.compensator], LAWS[loaded.mechanism.contact.law])
+    contact = loaded.mechanism.contact
+    several = contact.values() if isinstance(contact, dict) else [contact]
+    return sources_sha256(compensator_of(loaded.compensator), *(LAWS[one.law] for one in several))
 
 
 def _other_versions(manifest: Manifest, sources: str, here: Mapping[str, str]) -> list[str]:

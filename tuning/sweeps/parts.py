@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from jaxhil.errors import InputError
-from tuning.sweeps.columns import Column, judge, texts_of
+from jaxhil.mechanism.six_axes import SixAxisMechanism
+from tuning.sweeps.columns import Column, judge, slots, texts_of
 from tuning.sweeps.manifest import Manifest, loaded_gains
 
 SWEEP = b"jaxhil.sweep.sha256"
@@ -66,8 +67,14 @@ def _checked(manifest: Manifest, part: int, table: Any) -> dict[str, np.ndarray]
     if not np.array_equal(rows["index"], np.arange(first, first + number)):
         return None
     mechanism = loaded_gains(manifest).mechanism
-    force_range = rows.get(FORCE_RANGE, np.array(mechanism.rig.force_sensor.range))
-    judged = judge(rows, mechanism.approach.contacts, force_range, manifest.largest_error)
+    if isinstance(mechanism, SixAxisMechanism):
+        # Whether it was drawn or not, the least of three.
+        forces = [f"{FORCE_RANGE}_{axis}" for axis in (1, 2, 3)]
+        ranges = zip(forces, mechanism.rig.force_sensor.range[:3], strict=True)
+        force_range = np.min(np.broadcast_arrays(*(rows.get(name, own) for name, own in ranges)), axis=0)
+    else:
+        force_range = rows.get(FORCE_RANGE, np.array(mechanism.rig.force_sensor.range))
+    judged = judge(rows, slots(mechanism), force_range, manifest.largest_error)
     return None if same_rows(judged, rows) else rows
 
 

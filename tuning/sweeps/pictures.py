@@ -14,6 +14,7 @@ from matplotlib.axis import Axis
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from matplotlib.text import Text
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from jaxhil.files import writing
@@ -35,6 +36,13 @@ from tuning.sweeps.store import PICTURES, Store, kept_part
 
 FEW = 20  # contacts of a cell below which it has no quantile: a 95th percentile needs as many
 FAILED, UNENDED = "failed", "failed, a contact did not end: drawn at the top"
+# What errors and contacts are called in six axes.
+IN_SPACE = {
+    "|e - e*|": "|error|",
+    "restitution error": "errors",
+    "a contact": "an episode",
+    "contacts": "errors",
+}
 # Every quantile of the profile: its order, label, colour, line.
 PROFILE = (
     (0.5, "half of the contacts", SKY, "-"),
@@ -63,7 +71,20 @@ def draw_store(store: Store, acceptable: float | None = None) -> dict[str, Figur
         failure_region(plan, regions, manifest, mechanism.name),
         convergence(plan, regions, manifest, mechanism.name, acceptable),
     )
+    if manifest.axes == 6:
+        for figure in drawn:
+            _say_in_space(figure)
     return dict(zip(PICTURES, drawn, strict=True))
+
+
+def _say_in_space(figure: Figure) -> None:
+    """Call an error what it is in six axes, where an episode has two."""
+    for text in figure.findobj(Text):
+        assert isinstance(text, Text)
+        said = text.get_text()
+        for one, other in IN_SPACE.items():
+            said = said.replace(one, other)
+        text.set_text(said)
 
 
 def write_pictures(store: Store, acceptable: float | None = None) -> list[str]:

@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.mechanism.uncertainty import PHASE, dimensions, quantiles
 from jaxhil.simulation.metrics import OK, STATUS_NAMES
 from tuning.statistics.quantiles import BINS, EDGES, binned_estimate
-from tuning.sweeps.columns import STATUSES, input_names, unit_of
+from tuning.sweeps.columns import STATUSES, Slot, input_names, slots, unit_of
 from tuning.sweeps.manifest import Manifest
 from tuning.sweeps.tally import error_sizes
 
@@ -63,7 +64,7 @@ class Plan(NamedTuple):
     per_scenario: tuple[Input, ...]  # the same as a scenario has them
     cells: int  # along an axis
     looks: np.ndarray  # numbers of scenarios to look at
-    contacts: int
+    contacts: tuple[Slot, ...]
     replicates: int
 
 
@@ -93,7 +94,7 @@ class Regions(NamedTuple):
         return int(np.sum(self.failures))
 
 
-def make_plan(manifest: Manifest, mechanism: Mechanism, rows: Rows) -> Plan:
+def make_plan(manifest: Manifest, mechanism: AnyMechanism, rows: Rows) -> Plan:
     """Stiffness and force delay where they are drawn; else the inputs with the strongest rank correlation
     with |error| among `rows`, of the first part."""
     size = error_sizes(rows)
@@ -102,13 +103,13 @@ def make_plan(manifest: Manifest, mechanism: Mechanism, rows: Rows) -> Plan:
     by_strength = sorted(varying, key=lambda path: -np.nanmax(varying[path]))
     paths = [path for path in PREFERRED if path in varying]
     paths = [*paths, *(path for path in by_strength if path not in paths)][:2]
-    contacts, of = mechanism.approach.contacts, manifest.replicates
+    contacts, of = tuple(slots(mechanism)), manifest.replicates
     looks = np.geomspace(min(10, manifest.scenarios), manifest.scenarios, LOOKS)
     looks = np.unique(np.round(looks / of).astype(np.int64)) * of
     ends = manifest.chunk * np.arange(1, min(manifest.parts, LOOKS))
     looks = np.unique([*looks, *ends[ends % of == 0], manifest.scenarios // of * of])
     looks = looks[(looks > 0) & (looks <= manifest.scenarios)]
-    cells = round(np.sqrt(manifest.scenarios * contacts / PER_CELL))
+    cells = round(np.sqrt(manifest.scenarios * len(contacts) / PER_CELL))
     return Plan(
         tuple(_per_contact(mechanism, path) for path in paths),
         tuple(_per_scenario(mechanism, path, int(np.nanargmax(varying[path]))) for path in paths),
@@ -159,11 +160,11 @@ def quantile(sizes: np.ndarray, order: float, least: int) -> np.ndarray:
 def _sizes(plan: Plan, rows: Rows, shape: tuple[int, ...]) -> np.ndarray:
     counts = np.zeros(int(np.prod(shape)), np.int64)
     good = np.ones(len(rows["index"]), bool)
-    for contact in range(plan.contacts):
+    for contact, slot in enumerate(plan.contacts):
         # A contact that did not end is larger than any error; what would come after it does not count.
         counted = good
-        good = good & (rows[f"status_{contact + 1}"] == STATUSES.index(STATUS_NAMES[OK]))
-        size = np.where(good, np.abs(rows[f"error_{contact + 1}"].astype(float)), np.inf)
+        good = good & (rows[slot.status] == STATUSES.index(STATUS_NAMES[OK]))
+        size = np.where(good, np.abs(rows[slot.error].astype(float)), np.inf)
         place = np.zeros(len(size), np.int64)
         for one in plan.per_contact:
             edges = one.edges(plan.cells)[1:-1]
@@ -181,7 +182,7 @@ def _first(points: Points) -> Points:
     return Points(*(values[..., kept] for values in points))
 
 
-def _strengths(mechanism: Mechanism, path: str, rows: Rows, size: np.ndarray) -> np.ndarray:
+def _strengths(mechanism: AnyMechanism, path: str, rows: Rows, size: np.ndarray) -> np.ndarray:
     """|rank correlation| (Spearman 1904) of each entry's column with `size`; NaN for what does not vary."""
     _, low, high = _ends(mechanism, path)
 
@@ -196,7 +197,7 @@ def _strengths(mechanism: Mechanism, path: str, rows: Rows, size: np.ndarray) ->
     return np.where(high > low, found, np.nan)
 
 
-def _ends(mechanism: Mechanism, path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _ends(mechanism: AnyMechanism, path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Nominal value, low end and high end of each entry of an input."""
     points = np.repeat(np.array(ENDS)[:, None], sum(dimensions(mechanism).values()), axis=1)
     low, high = quantiles(mechanism, points)[path].reshape(2, -1)
@@ -204,11 +205,12 @@ def _ends(mechanism: Mechanism, path: str) -> tuple[np.ndarray, np.ndarray, np.n
     return np.broadcast_to(np.ravel(nominal), low.shape).astype(float), low, high
 
 
-def _per_contact(mechanism: Mechanism, path: str) -> Input:
+def _per_contact(mechanism: AnyMechanism, path: str) -> Input:
     """Every contact has its own entry of a list of them."""
     names, (_, low, high) = input_names(mechanism, path), _ends(mechanism, path)
-    contacts = range(mechanism.approach.contacts)
-    if path == PHASE or (path in ("contact.stiffness", "contact.damping") and _is_list(mechanism, path)):
+    contacts = range(len(slots(mechanism)))
+    listed = path == PHASE or (path in ("contact.stiffness", "contact.damping") and _is_list(mechanism, path))
+    if listed and isinstance(mechanism, Mechanism):
         used = [min(contact, len(names) - 1) for contact in contacts]
         factor, unit = UNITS.get(unit_of(mechanism, path), (1.0, unit_of(mechanism, path)))
         low, high = factor * np.min(low[used]), factor * np.max(high[used])
@@ -216,10 +218,10 @@ def _per_contact(mechanism: Mechanism, path: str) -> Input:
         name = NAMES.get(path, path)
         return Input(name, unit, columns, factor, low, high, _logarithmic(mechanism, path, low, high))
     one = _per_scenario(mechanism, path, 0)
-    return one._replace(columns=one.columns * mechanism.approach.contacts)
+    return one._replace(columns=one.columns * len(contacts))
 
 
-def _per_scenario(mechanism: Mechanism, path: str, entry: int) -> Input:
+def _per_scenario(mechanism: AnyMechanism, path: str, entry: int) -> Input:
     """An entry of a list stands for all where they are drawn as one, as a share of its nominal value."""
     names, (nominal, low, high) = input_names(mechanism, path), _ends(mechanism, path)
     name = NAMES.get(path, path)
@@ -234,10 +236,10 @@ def _per_scenario(mechanism: Mechanism, path: str, entry: int) -> Input:
     return Input(name, unit, (names[entry],), factor, low, high, _logarithmic(mechanism, path, low, high))
 
 
-def _logarithmic(mechanism: Mechanism, path: str, low: float, high: float) -> bool:
+def _logarithmic(mechanism: AnyMechanism, path: str, low: float, high: float) -> bool:
     drawn = mechanism.uncertainty.get(path)
     return low > 0 and ((drawn is not None and drawn.distribution == "loguniform") or high > 5 * low)
 
 
-def _is_list(mechanism: Mechanism, path: str) -> bool:
+def _is_list(mechanism: AnyMechanism, path: str) -> bool:
     return np.ndim(value_at(mechanism, path)) == 1

@@ -5,6 +5,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxhil.errors import InputError, one_line
+from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.motion import Piece, scenario_motion
 from tuning.sweeps.chunks import Sweep, build_sweep, run_chunk
 from tuning.sweeps.draws import drawn_scenarios
@@ -27,6 +29,9 @@ def replay(store: Store, index: int) -> Replay:
 
     Raises `InputError` for an index that the store does not hold.
     """
+    if isinstance(loaded_gains(store.manifest).mechanism, SixAxisMechanism):
+        found, allowed = "a sweep of six axes", "one of one axis: jaxhil simulate runs six, --set says which"
+        raise InputError(f"{one_line(str(store.folder))}: found {found}, allowed {allowed}")
     stored = read_row(store, index)
     sweep = build_sweep(store.manifest)
     again = run_chunk(sweep, index, 1)

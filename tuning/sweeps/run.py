@@ -16,7 +16,7 @@ import numpy as np
 
 from tuning.statistics.intervals import enough
 from tuning.sweeps.chunks import Rows, Sweep, build_sweep, run_chunk, run_parts
-from tuning.sweeps.columns import OUTCOMES
+from tuning.sweeps.columns import OUTCOMES, slots
 from tuning.sweeps.store import Store, read_part, remove_parts, write_part
 from tuning.sweeps.tally import Tally, add_rows, empty_tally
 
@@ -69,7 +69,7 @@ def compare_precisions(sweep: Sweep, number: int = COMPARED) -> Precision:
     """What float32 changes, on the first `number` scenarios."""
     number = min(number, sweep.manifest.chunk, sweep.manifest.scenarios)
     single, double = (run_chunk(sweep, 0, number, precision) for precision in ("float32", "float64"))
-    names = [f"error_{contact + 1}" for contact in range(sweep.mechanism.approach.contacts)]
+    names = [slot.error for slot in slots(sweep.mechanism)]
     both = np.concatenate([np.abs(single[name].astype(float) - double[name]) for name in names])
     both = both[np.isfinite(both)]
     return Precision(

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxhil.mechanism.correlation import correlated_groups
-from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.uncertainty import at_points, dimensions
 from jaxhil.simulation.evaluation import evaluate
-from jaxhil.simulation.scenario import build_scenarios
+from tuning.gains.simulated import scenarios_of
 from tuning.statistics.sobol_indices import saltelli_design, sobol_indices
 from tuning.statistics.subset_simulation import (
     LEVELS,
@@ -86,7 +86,7 @@ def error_indices(sweep: Sweep, number: int, done: Done = lambda _: None) -> Err
     return ErrorIndices(tuple(found), cap, len(points), int(np.sum(sizes >= cap)))
 
 
-def independent_inputs(mechanism: Mechanism) -> dict[str, np.ndarray]:
+def independent_inputs(mechanism: AnyMechanism) -> dict[str, np.ndarray]:
     """The columns that each input has among those of `dimensions`: a key's, or those of all keys that are
     correlated."""
     columns = dimensions(mechanism)
@@ -144,7 +144,7 @@ def run_points(sweep: Sweep, points: np.ndarray, noise: np.ndarray, done: Done =
     for start in range(0, len(points), manifest.chunk):
         part = slice(start, start + manifest.chunk)
         draws = at_points(sweep.mechanism, points[part])
-        scenarios = build_scenarios(sweep.mechanism, draws, manifest.seed)
+        scenarios = scenarios_of(sweep.mechanism, draws, manifest.seed)
         key = np.stack([scenarios.key[0], noise[part].astype(np.uint32)])
         scenarios = in_precision(scenarios._replace(key=key), manifest.precision)
         outcome = evaluate(sweep.loop, sweep.gains, scenarios, at_least=manifest.chunk)
@@ -155,4 +155,4 @@ def run_points(sweep: Sweep, points: np.ndarray, noise: np.ndarray, done: Done =
 
 
 def _noisy(sweep: Sweep) -> bool:
-    return sweep.loop.has_force_noise or sweep.loop.has_position_noise
+    return any(getattr(sweep.loop, f"has_{kind}noise", False) for kind in ("", "force_", "position_"))

@@ -3,7 +3,15 @@
 from pathlib import Path
 
 from jaxhil.errors import InputError, one_line, shown
-from jaxhil.mechanism.file import AnyMechanism, from_builtins, load, load_any, to_builtins
+from jaxhil.mechanism.file import (
+    AnyMechanism,
+    any_from_builtins,
+    from_builtins,
+    load,
+    load_any,
+    to_builtins,
+)
+from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
 from tuning.cli.options import Simulate
 from tuning.cli.options_report import Map
@@ -18,7 +26,28 @@ def named(options: Simulate | Map) -> Mechanism | None:
 
 def named_any(options: Simulate) -> AnyMechanism | None:
     """Likewise, of one axis or of six."""
-    return load_any(options.file, options.overrides, options.unset).mechanism if _by_file(options) else None
+    if options.compensator is not None:
+        arguments.fits(options.compensator, None)
+    if options.gains is not None and options.file is None:
+        return None
+    found = load_any(options.file, options.overrides, options.unset).mechanism
+    arguments.fits(options.compensator or "none", found)
+    return found
+
+
+def in_six_axes(options: Simulate) -> SixAxisMechanism | None:
+    """The mechanism of a gain file of six axes, None of one axis. Raises `InputError`; imports jax."""
+    from jaxhil.simulation.gain_file import load_gain_file
+
+    assert options.gains is not None
+    _check_setting(options)
+    found = load_gain_file(options.gains, any_axes=True).mechanism
+    if not isinstance(found, SixAxisMechanism):
+        return None
+    label = one_line(options.gains)
+    changed = any_from_builtins(to_builtins(found), label, options.overrides, options.unset)
+    assert isinstance(changed, SixAxisMechanism)
+    return changed
 
 
 def _by_file(options: Simulate | Map) -> bool:
@@ -39,8 +68,7 @@ def chosen(options: Simulate | Map, mechanism: Mechanism | None) -> tuple[Mechan
 
     from jaxhil.simulation.gain_file import load_gain_file
 
-    if options.setting is not None:
-        raise InputError(f"--setting: found {shown(options.setting)}, allowed none beside a gain file")
+    _check_setting(options)
     loaded = load_gain_file(options.gains)
     label = one_line(options.gains)
     if options.compensator not in (None, loaded.compensator):
@@ -51,3 +79,8 @@ def chosen(options: Simulate | Map, mechanism: Mechanism | None) -> tuple[Mechan
         raw = to_builtins(loaded.mechanism)
         mechanism = from_builtins(raw, label, options.overrides, options.unset)
     return mechanism, loaded.compensator, Path(options.gains)
+
+
+def _check_setting(options: Simulate | Map) -> None:
+    if options.setting is not None:
+        raise InputError(f"--setting: found {shown(options.setting)}, allowed none beside a gain file")

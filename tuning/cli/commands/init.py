@@ -46,8 +46,8 @@ def run(options: Init) -> int:
     if options.json:
         terminal.emit_json({"file": str(path), "name": name, "from": source})
     else:
-        command = "simulate" if source in six_axis_names() else "tune"
-        then = f"jaxhil {command} {shlex.quote(place)}"
+        law = " --compensator phase_lead" if source in six_axis_names() else ""
+        then = f"jaxhil tune {shlex.quote(place)}{law}"
         terminal.emit(f"{place}: written, with the values of {source}. Change it, then: {then}")
     return 0
 

@@ -9,7 +9,7 @@ from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.environment import prepare
 from tuning import terminal
 from tuning.cli.commands import checks, simulate_six
-from tuning.cli.commands.choice import chosen, named_any
+from tuning.cli.commands.choice import chosen, in_six_axes, named_any
 from tuning.cli.options import Simulate
 from tuning.front_door import arguments, meaning
 
@@ -29,6 +29,9 @@ def run(options: Simulate) -> int:
     if options.log is not None:
         checks.file(options.log)
     mechanism = named_any(options)
+    if mechanism is None:
+        prepare()
+        mechanism = in_six_axes(options)
     if isinstance(mechanism, SixAxisMechanism):
         simulate_six.check(options)
         prepare()

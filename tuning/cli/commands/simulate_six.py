@@ -13,19 +13,15 @@ from tuning.cli.options import Simulate
 if TYPE_CHECKING:
     from jaxhil.sixdof.run import Episode, SixAxisRun
 
-COMPENSATORS = ("none", "phase_lead")
 FILMS = (".gif", ".mp4")
 GOOD = ("rebounded", "captured")  # how a run may end
 
 
 def check(options: Simulate) -> None:
     """What six axes do not have yet is not asked for. Raises `InputError`."""
-    for name, given in (("--gains", options.gains), ("--setting", options.setting), ("--log", options.log)):
+    for name, given in (("--setting", options.setting), ("--log", options.log)):
         if given is not None:
             raise InputError(f"{name}: found {shown(given)}, allowed none: in six axes there is none so far")
-    if options.compensator not in (None, *COMPENSATORS):
-        allowed = f"{', '.join(COMPENSATORS)}: in six axes there are no others so far"
-        raise InputError(f"--compensator: found {shown(options.compensator)}, allowed {allowed}")
     if options.animate is not None:
         _check_film(options.animate)
 
@@ -45,7 +41,8 @@ def run(options: Simulate, mechanism: SixAxisMechanism) -> int:
     """Run the episodes, report each; 0 if both errors of each are within the limit, else 1."""
     from jaxhil.sixdof.run import simulate_six_axes
 
-    done = simulate_six_axes(mechanism, options.compensator or "none", seed=options.seed)
+    gains = None if options.gains is None else Path(options.gains)
+    done = simulate_six_axes(mechanism, options.compensator or "none", gains, seed=options.seed)
     good = done.status in GOOD and all(_worst(episode) <= options.limit for episode in done.episodes)
     terminal.warn(f"{mechanism.name}: {warning}" for warning in done.meaning.warnings)
     _draw(options, done)
@@ -116,7 +113,8 @@ def _print(options: Simulate, done: "SixAxisRun", good: bool) -> None:
         "status",
     ]  # fmt: skip
     title = f"{done.mechanism.name}, compensation: {done.compensator}"
-    title += ", gains by the literature's rule" if done.compensator != "none" else ""
+    rule = "the gain file's gains" if options.gains is not None else "gains by the literature's rule"
+    title += f", {rule}" if done.compensator != "none" else ""
     terminal.emit(
         terminal.table(title, headings, rows, texts=(len(headings) - 1,)),
         *(_more(number, episode) for number, episode in enumerate(done.episodes, start=1)),

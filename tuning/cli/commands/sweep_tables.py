@@ -22,7 +22,7 @@ def _tables(document: dict[str, Any]) -> list[Any]:
     # All inputs beside each other would not fit; `replay` and the store have them.
     worst = terminal.table(
         "Worst scenarios",
-        ["index", "outcome", "error", "contact"],
+        ["index", "outcome", "error", "episode" if document["axes"] == 6 else "contact"],
         [
             (
                 one["index"],
@@ -34,9 +34,10 @@ def _tables(document: dict[str, Any]) -> list[Any]:
         ],
         texts=(1,),
     )
-    tables = [outcomes, _quantiles(document), worst]
+    symbol = "|error|" if document["axes"] == 6 else "|e - e*|"
+    tables = [outcomes, _quantiles(document, symbol), worst]
     if "drivers" in document:
-        tables.append(_drivers(document["drivers"]))
+        tables.append(_drivers(document["drivers"], symbol))
     if "rare" in document:
         tables.append(_rare(document["rare"]))
     return tables
@@ -50,7 +51,7 @@ def _lines(document: dict[str, Any]) -> list[str]:
     lines = [
         f"Failure probability {probability['value']:.4g}, 95 % interval {probability['low']:.3g} to "
         f"{probability['high']:.3g} ({probability['method']}); {document['failed']} of {number} failed, "
-        f"restitution error allowed {within}."
+        f"{'energy and twist' if document['axes'] == 6 else 'restitution'} error allowed {within}."
     ]
     lines += _sequential(document)
     lines += [f"{name}: {STATUS_REASONS[name]}." for name in document["outcomes"] if name in STATUS_REASONS]
@@ -78,9 +79,9 @@ def _lines(document: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _quantiles(document: dict[str, Any]):
+def _quantiles(document: dict[str, Any], symbol: str):
     return terminal.table(
-        "Worst |e - e*| of a scenario",
+        f"Worst {symbol} of a scenario",
         ["share of scenarios", "|error| up to", "95 % from", "to"],
         [
             (
@@ -94,9 +95,9 @@ def _quantiles(document: dict[str, Any]):
     )
 
 
-def _drivers(drivers: dict[str, Any]):
+def _drivers(drivers: dict[str, Any], symbol: str):
     return terminal.table(
-        f"What drives the worst |e - e*|, errors cut at {drivers['cap']:g} ({drivers['capped']} of "
+        f"What drives the worst {symbol}, errors cut at {drivers['cap']:g} ({drivers['capped']} of "
         f"{drivers['evaluations']} runs): shares of the variance",
         ["input", "first order", "95 % from", "to", "total", "95 % from", "to"],
         [

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from jaxhil.errors import InputError, one_line
 from jaxhil.files import make_folder, remove_stale, writing
-from jaxhil.mechanism.file import LoadedMechanism, load
+from jaxhil.mechanism.file import LoadedAny, load_any
+from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.environment import prepare, program_folder
 from tuning import terminal
 from tuning.cli.commands import checks, tune_pareto
@@ -39,7 +40,7 @@ def run(options: Tune) -> int:
         prepare()
         asked.settings()
         asked.known()
-    loaded, problems = _load(options)
+    loaded, problems = _load(options, asked)
     entries, interrupted = [], False
     if loaded:
         # Before jax starts: a folder that cannot be written costs no tuning.
@@ -91,12 +92,13 @@ class _Interrupted(Exception):
         self.entries = entries
 
 
-def _load(options: Tune) -> tuple[list[LoadedMechanism], list[str]]:
+def _load(options: Tune, asked: TuneOptions) -> tuple[list[LoadedAny], list[str]]:
     """The files that can be used, and what is wrong with the others."""
     loaded, problems, folders = [], [], {}
     for file in _expand(options.files, problems):
         try:
-            one = load(file, options.overrides, options.unset)
+            one = load_any(file, options.overrides, options.unset)
+            asked.fits(one.mechanism)
             folder = folder_name(one.mechanism.name)
             if folder in folders:
                 raise InputError(
@@ -106,14 +108,15 @@ def _load(options: Tune) -> tuple[list[LoadedMechanism], list[str]]:
             folders[folder] = one.label
             loaded.append(one)
         except InputError as error:
-            problems.append(str(error))
-            terminal.note(f"jaxhil: {error}")
+            problem = getattr(error, "option", str(error))
+            problems.append(problem)
+            terminal.note(f"jaxhil: {problem}")
     return loaded, problems
 
 
 def _understood(
-    options: Tune, asked: TuneOptions, loaded: list[LoadedMechanism], problems: list[str]
-) -> list[LoadedMechanism]:
+    options: Tune, asked: TuneOptions, loaded: list[LoadedAny], problems: list[str]
+) -> list[LoadedAny]:
     """The mechanisms that can be run; of each it is said what it means."""
     prepare()
     asked.settings()
@@ -153,7 +156,7 @@ def folder_name(name: str) -> str:
 def _tune_all(
     options: Tune,
     asked: TuneOptions,
-    loaded: list[LoadedMechanism],
+    loaded: list[LoadedAny],
     problems: list[str],
     pieces: "Pieces",
 ) -> list[dict[str, Any]]:
@@ -163,7 +166,9 @@ def _tune_all(
     try:
         with terminal.progress(len(loaded), "mechanisms") as bar, ThreadPoolExecutor(1) as meanwhile:
             if drawn and program_folder() is not None:
-                meanwhile.submit(_prepare_drawing, loaded[0].mechanism, options.compensator)
+                first = loaded[0].mechanism
+                if isinstance(first, Mechanism):
+                    meanwhile.submit(_prepare_drawing, first, options.compensator)
             for index, result in tune_each(loaded, asked, bar, pieces):
                 try:
                     entries[index] = _finish(options, loaded[index], result, drawn, bar.say)
@@ -207,7 +212,7 @@ def _in_order(by_index: dict[int, Any]) -> list[Any]:
 
 
 def _finish(
-    options: Tune, loaded: LoadedMechanism, result: TunedGains, drawn: bool, say: Callable[[str], None]
+    options: Tune, loaded: LoadedAny, result: TunedGains, drawn: bool, say: Callable[[str], None]
 ) -> dict[str, Any]:
     """Write what was found for one mechanism."""
     from tuning.gains.tasks import has_sensor_noise
@@ -231,6 +236,7 @@ def _finish(
         "gains": result.document["gains"],
         "literature": found.literature,
         "figures": found.figures,
+        **result.parts,
         "nominal": found.nominal,
         "tuned_intervals": found.intervals.plain() if found.intervals else None,
         "honesty": found.transparency,
@@ -286,15 +292,18 @@ def _draw(result, options: Tune, folder: Path) -> list[str]:
     from jaxhil.simulation.contact_plot import contact_plot, save
     from jaxhil.simulation.motion import nominal_motion
     from tuning.gains.tune import uncompensated
-    from tuning.pictures.plots import errors_plot, loss_plot
+    from tuning.pictures.plots import errors_plot, loss_plot, two_errors_plot
 
     name, compensator = result.mechanism.name, options.compensator
-    before, tuned = uncompensated(compensator, result.literature), (compensator, result.gains)
-    motion = nominal_motion(result.mechanism, {"before": before, "tuned": tuned})
-    figures = {
-        "errors.png": errors_plot(result, options.limit),
-        "contact.png": contact_plot(motion, f"{name}: nominal run, {compensator}"),
-    }
+    if isinstance(result.mechanism, Mechanism):
+        before, tuned = uncompensated(compensator, result.literature), (compensator, result.gains)
+        motion = nominal_motion(result.mechanism, {"before": before, "tuned": tuned})
+        figures = {
+            "errors.png": errors_plot(result, options.limit),
+            "contact.png": contact_plot(motion, f"{name}: nominal run, {compensator}"),
+        }
+    else:
+        figures = {"errors.png": two_errors_plot(result, options.limit)}
     if result.starts:
         figures["loss.png"] = loss_plot(result)
     for file, figure in figures.items():

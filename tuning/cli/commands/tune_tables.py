@@ -37,12 +37,16 @@ def print_overview(options: Tune, results: list[Any], entries: list[dict[str, An
 
 def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
     """Errors, gains and starts of one mechanism, and the verdict."""
-    tables = [_errors(options, result, entry["better_than_literature"])]
+    if "energy_error" in entry:
+        tables = [_two_errors(options, result, entry)]
+    else:
+        tables = [_errors(options, result, entry["better_than_literature"])]
     tables += [_transparency(result)] if result.transparency else []
     tables += [*_gains(options, result), *([_starts(options, result)] if result.starts else [])]
     closing = [f"wrote {path}" for path in (entry["gain_file"], *entry["plots"])]
     if not entry["sensor_noise"]:
-        closing.append("No sensor noise in the mechanism; with it: --set rig.force_sensor.noise_std=2.67")
+        noise = "'{force=0.5,torque=0.05}'" if "energy_error" in entry else "2.67"
+        closing.append(f"No sensor noise in the mechanism; with it: --set rig.force_sensor.noise_std={noise}")
     closing.append("took: " + ", ".join(f"{stage} {time:.1f} s" for stage, time in result.timings.items()))
     terminal.emit(*tables, *_how_sure(result), *closing, _verdict(options, result, entry["verdict"]), "")
 
@@ -68,9 +72,29 @@ def _errors(options: Tune, result: Any, better: bool) -> Any:
     )
 
 
+def _two_errors(options: Tune, result: Any, entry: dict[str, Any]) -> Any:
+    """Of six axes: what remains of the energy and of the twist."""
+    names = {"before": "before (uncompensated)", "literature": "literature's rule", "tuned": "tuned"}
+    if not entry["better_than_literature"]:
+        names["tuned"] = "tuned (NOT better than the literature's)"
+    rows = []
+    for key, label in names.items():
+        for error in ("energy_error", "twist_error"):
+            one = entry[error][key]
+            figures = one.rms, one.p99, one.max, f"{one.mean:+.4f}", f"{one.peak_ratio:.3f}", one.failed
+            rows.append((label if error == "energy_error" else "", error.replace("_", " "), *figures))
+    count = int(result.outcomes["tuned"].wanted.sum()) // 2
+    return terminal.table(
+        f"{result.mechanism.name}: errors of {count} episodes in {options.validation} fresh scenarios",
+        ["gains", "error", "rms", "99th pct", "max", "mean", "peak ratio", "not ended"],
+        rows,
+        texts=(0, 1),
+    )
+
+
 def _gains(options: Tune, result: Any) -> list[Any]:
     """The table of gains; none of a law without any."""
-    from jaxhil.compensators import COMPENSATORS
+    from jaxhil.compensators import compensator_of
 
     mechanism = result.mechanism
     rows = [
@@ -80,7 +104,7 @@ def _gains(options: Tune, result: Any) -> list[Any]:
             result.gains[gain.name] if gain.tuned(mechanism) else "(not tuned)",
             *([f"{100 * share:.1f} %" for share in result.freedom.get(gain.name, ())] or ["", ""]),
         )
-        for gain in COMPENSATORS[options.compensator].gains
+        for gain in compensator_of(options.compensator).gains
     ]
     headings = ["gain", "unit", "lower", "upper", "literature", "tuned", "free alone", "together"]
     return [terminal.table(f"Gains of {options.compensator}", headings, rows, texts=(0, 1))] if rows else []

@@ -1,0 +1,171 @@
+"""Six axes tuned and swept from end to end: gain file, store, report; and what says that six axes lack it."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+import jaxhil as package
+import tuning
+from jaxhil.compensators import SIX_AXES, literature_gains
+from jaxhil.errors import InputError
+from jaxhil.mechanism.file import load_any
+from jaxhil.simulation.gain_file import load_gain_file
+from tuning.front_door import arguments
+
+SMALL = {"scenarios": 8, "starts": 2, "steps": 4, "validation": 15}
+
+
+def test_the_laws_of_six_axes_are_known_to_the_front_door():
+    assert tuple(SIX_AXES) == arguments.SIX_AXES
+
+
+def test_each_channel_has_its_own_lead():
+    mechanism = load_any("petals").mechanism
+    law = SIX_AXES["phase_lead_per_axis"]
+    gains = literature_gains(mechanism, law.name)
+    assert len(gains) == 7 and set(gains.values()) == {0.0037, 0.001}
+    gains["phase_lead_rx"] = 0.02
+    leads = [law.channel(gains, channel)["phase_lead"] for channel in range(6)]
+    assert leads == [0.0037] * 3 + [0.02] + [0.0037] * 2
+
+
+def test_the_front_door_takes_six_axes():
+    mechanism = package.load("petals", {"target.mass": 2000.0})
+    assert (
+        mechanism.target.mass == 2000.0 and mechanism == load_any("petals", {"target.mass": 2000.0}).mechanism
+    )
+    for call, reason in (
+        (lambda: package.simulate(mechanism, "passivity"), "found 'passivity', allowed none, phase_lead"),
+        (lambda: tuning.tune(mechanism), "found 'response_error', allowed none, phase_lead"),
+        (lambda: tuning.tune(mechanism, "phase_lead", chatter_weight=1.0), "chatter_weight: found 1.0"),
+        (lambda: tuning.tune("rig-300kg", "phase_lead_per_axis"), "'phase_lead_per_axis', allowed none"),
+        (lambda: tuning.compare(mechanism), "six axes are known to init, mechanisms, simulate"),
+        (lambda: package.jacobian(mechanism, by=("target.mass",)), "found jaxhil/mechanism/2, six axes"),
+    ):  # fmt: skip
+        with pytest.raises(InputError) as caught:
+            call()
+        assert reason in str(caught.value) and str(caught.value).isprintable()
+
+
+def test_what_six_axes_do_not_have_is_said_in_one_line(jaxhil, tmp_path):
+    path = tmp_path / "gains.json"
+    for given, reason in (
+        (
+            ["tune", "petals", "-o", tmp_path],
+            "--compensator: found 'response_error', allowed none, phase_lead",
+        ),
+        (
+            ["tune", "petals", "--compensator", "phase_lead", "--pareto", 4, "-o", tmp_path],
+            "--pareto: found 4",
+        ),
+        (
+            ["map", "petals", "--x", "a=1:2", "--y", "b=1:2"],
+            "six axes are known to init, mechanisms, simulate",
+        ),
+    ):
+        ran = jaxhil(*given)
+        assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1 and reason in ran.err, ran.err
+    assert not path.exists()
+
+
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory):
+    found = tuning.tune("probe-drogue", "phase_lead", **SMALL)
+    path = tmp_path_factory.mktemp("six") / "gains.json"
+    found.save(path)
+    return found, path
+
+
+@pytest.mark.slow
+def test_tuning_lowers_both_errors(tuned):
+    found, path = tuned
+    for error in ("energy_error", "twist_error"):
+        figures = found.parts[error]
+        assert figures["tuned"].rms < figures["literature"].rms / 4 < figures["before"].rms / 4
+        assert figures["tuned"].failed == 0
+    assert 0.02 < found.gains["phase_lead"] < 0.03
+    loaded = load_gain_file(path, any_axes=True)
+    assert loaded.document["axes"] == 6 and loaded.gains == found.gains
+    assert loaded.mechanism == load_any("probe-drogue").mechanism
+    [episode] = package.simulate("probe-drogue", "none", path).episodes
+    [literature] = package.simulate("probe-drogue", "phase_lead").episodes
+    assert abs(episode.energy_error) < abs(literature.energy_error) / 4
+
+
+@pytest.mark.slow
+def test_equal_leads_of_all_axes_are_one_lead():
+    lead, filter_ = 0.02, 0.001
+    each = {f"phase_lead_{axis}": lead for axis in ("x", "y", "z", "rx", "ry", "rz")}
+    [one], [six] = (
+        package.simulate("probe-drogue", law, {**leads, "lead_filter": filter_}).episodes
+        for law, leads in (("phase_lead", {"phase_lead": lead}), ("phase_lead_per_axis", each))
+    )
+    np.testing.assert_allclose(six.energy_error, one.energy_error, rtol=1e-9)
+    np.testing.assert_allclose(six.twist_error, one.twist_error, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_gains_of_six_axes_do_not_reach_a_controller_of_one(tuned, jaxhil, tmp_path):
+    from jaxhil.runtime import Controller, GainFileError
+
+    _, path = tuned
+    with pytest.raises(GainFileError, match="axes: found 6, allowed 1"):
+        Controller.from_file(path)
+    for given in (["export", path, "-o", tmp_path / "bundle"], ["simulate", "rig-300kg", "--gains", path]):
+        ran = jaxhil(*given)
+        assert ran.code == 2 and ran.err.count("\n") == 1 and "axes: found" in ran.err
+
+
+@pytest.mark.slow
+def test_sweep_and_report(tuned, jaxhil, tmp_path):
+    _, path = tuned
+    store, page = tmp_path / "store", tmp_path / "page.html"
+    ran = jaxhil("sweep", path, "--scenarios", 64, "--chunk", 32, "--limit", 0.3, "-o", store, "--json")
+    assert ran.code in (0, 1), ran.err
+    document = json.loads(ran.out)
+    assert document["axes"] == 6 and sum(document["outcomes"].values()) == 64
+    study = tuning.sweep(path, scenarios=48, limit=0.3)
+    rows = {name: study.table[name].to_numpy() for name in ("energy_error_1", "twist_error_1", "worst_error")}
+    larger = np.abs(rows["energy_error_1"]) >= rows["twist_error_1"]
+    expected = np.where(larger, rows["energy_error_1"], rows["twist_error_1"])
+    np.testing.assert_array_equal(rows["worst_error"], expected)
+    failed = np.abs(rows["worst_error"]) > 0.3
+    np.testing.assert_array_equal(study.table["failed"].to_numpy(), failed)
+    ran = jaxhil("report", path, store, "-o", page)
+    assert ran.code in (0, 1), ran.err
+    text = page.read_text(encoding="utf-8")
+    assert "energy error on fresh scenarios" in text and "twist error on fresh scenarios" in text
+    assert "|error|" in text and "|e - e*|" not in text
+    ran = jaxhil("replay", store, 3)
+    assert ran.code == 2 and "found a sweep of six axes" in ran.err
+
+
+@pytest.mark.slow
+def test_derivatives_reach_through_the_loop():
+    """Of what tuning minimises, by both gains: those of central differences."""
+    from jaxhil.mechanism.uncertainty import quasi_random
+    from jaxhil.simulation.environment import computing
+    from tuning.gains import simulated
+    from tuning.gains.objective import RMS, Problem, common_terms, residuals
+
+    mechanism = load_any("probe-drogue").mechanism
+    with computing():
+        scenarios = simulated.scenarios_of(mechanism, quasi_random(mechanism, 8, 0))
+        loop = simulated.loop_of(mechanism, "phase_lead", scenarios)
+        rig, weights = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (scenarios, RMS.weights))
+        static = loop, ("phase_lead", "lead_filter"), common_terms([RMS], contacts=2)
+
+        @jax.jit
+        def found(gains):
+            return residuals(static, gains[None], Problem(rig, {}, weights))[0]
+
+        at = np.array([0.015, 0.001])
+        slopes = jax.jit(jax.jacfwd(found))(at)
+        for place, step in enumerate((1e-6, 1e-7)):
+            either = [found(at + sign * step * np.eye(2)[place]) for sign in (1, -1)]
+            expected = (either[0] - either[1]) / (2 * step)
+            np.testing.assert_allclose(
+                slopes[:, place], expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max()
+            )
