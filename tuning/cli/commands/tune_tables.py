@@ -23,9 +23,14 @@ def print_overview(options: Tune, results: list[Any], entries: list[dict[str, An
     headings = ["mechanism", "before", "literature", "tuned", "99th pct", "peak ratio"]
     headings += ["not ended"] if some_failed else []
     headings += ["above best"] if results[0].global_comparison else []
+    error = (
+        "e - e*, or of both errors in six axes,"
+        if any("energy_error" in one for one in entries)
+        else "e - e*"
+    )
     terminal.emit(
         terminal.table(
-            f"rms of e - e* on {options.validation} fresh scenarios each, {options.compensator}",
+            f"rms of {error} on {options.validation} fresh scenarios each, {options.compensator}",
             [*headings, "best start", "verdict"],
             rows,
             texts=(0, len(headings), len(headings) + 1),
