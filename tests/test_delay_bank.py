@@ -16,7 +16,7 @@ from jaxhil.compensators.meeting import Meeting as MeetingInJax
 from jaxhil.compensators.reintegration import Scales
 from jaxhil.runtime import Controller
 from jaxhil.runtime.laws.contact_plane import Meeting
-from jaxhil.runtime.laws.delay_bank import HYPOTHESES, SOFT, USUAL, WHOLE, DelayBank
+from jaxhil.runtime.laws.delay_bank import HYPOTHESES, UNLIKELY, USUAL, WHOLE, DelayBank
 from jaxhil.runtime.laws.force_depth_map import KNOTS, ForceDepthMap, Prior
 from jaxhil.runtime.laws.onset import Onset
 
@@ -97,7 +97,7 @@ def test_likelihood_is_the_root_of_the_density_of_all_readings():
     for place, name in enumerate(("damping", "depth_damping", "unloading", "friction", "preload"), start=12):
         covariance[place, place] = PRIOR[name] ** 2
     mean = np.r_[np.full(12, PRIOR["stiffness"]), np.zeros(5)]
-    share = TOLD**2 / (TOLD**2 + SOFT * FOUND**2)
+    share = TOLD**2 / (TOLD**2 + FOUND**2)
     covariance[16, 16] += (USUAL * share * STIFFNESS * FOUND / SPEED) ** 2
     exact = []
     for offset in OFFSETS:
@@ -192,7 +192,7 @@ def test_a_jump_between_two_hypotheses_rules_neither_out():
         (1e-7, 4e-6, 0.0),  # told: hypotheses enter one after the other
         (1e3, 4e-6, 1.0),  # unknown: all enter where it was met
         (1e-7, 4e-4, 1.0),  # told, and not there
-        (5 * FOUND, 4e-6, 0.5),
+        (FOUND, 4e-6, 0.5),
     ],
 )
 def test_surface_lies_between_where_it_was_told_and_where_it_was_met(plane_spread, place, share):
@@ -202,7 +202,12 @@ def test_surface_lies_between_where_it_was_told_and_where_it_was_met(plane_sprea
     depth = (1 - share) * (place - OFFSETS * SPEED) / SPEED * pace
     np.testing.assert_allclose(-bank._below - OFFSETS * pace, depth, atol=1e-6)
     assert earlier == min(math.ceil(max(depth.max() / (PERIOD * pace) - 1e-2, 0)), 30)
-    assert bank.shift == 0 and bank.deeper == pytest.approx(-(1 - share) * place / SPEED * pace, abs=1e-6)
+    away = (place - OFFSETS * SPEED) ** 2 / (plane_spread**2 + FOUND**2)
+    weights = np.maximum(np.exp(-0.5 * away), UNLIKELY)
+    weights /= np.sum(weights)
+    np.testing.assert_allclose(weights_of(bank), weights, rtol=0.03)
+    assert bank.shift == pytest.approx(weights @ OFFSETS, abs=1e-5)
+    assert bank.deeper == pytest.approx(weights @ bank._below, abs=1e-5)
 
 
 @pytest.mark.parametrize("delay", [-0.0005, 0.0005])

@@ -71,8 +71,9 @@ def test_what_an_unknown_delay_leaves_on_the_standard_suites(suite, plane, capsy
         )
     dissipates = suite in ("noisy", "damped")
     first, eighth = {"told": (0.75 if dissipates else 0.4, 0.3), "unknown": (0.85, 0.45)}[plane]
-    # Damped contacts slow down from one to the next, which makes more of the noise: see below.
-    assert rms[0] <= first and (rms[7] <= eighth or suite == "damped")
+    # A damped contact cannot be met with that: `test_delay_bounds`. They slow down from one to the next, too,
+    # which makes more of the noise: see below.
+    assert (rms[0] <= first and rms[7] <= eighth) if suite != "damped" else rms[0] <= 1.0
 
 
 def errors_at_one_speed(told, suite, changes, number, contacts=8):
@@ -124,21 +125,25 @@ def test_what_it_leaves_of_damped_contacts_at_one_speed(case, changes, first, ei
     assert rms[0] <= first and rms[7] <= eighth
 
 
-@pytest.mark.parametrize("suite", ["noisy", "hertz", "damped"])
-def test_what_a_lag_of_3_ms_that_is_not_told_leaves(suite, capsys):
-    """The delay is said to be uncertain by 4 ms: of elastic contact a lag is a delay. A damper's jump it
-    smooths, which no delay does: the bank has no hypothesis for that."""
+@pytest.mark.parametrize("delay", ["uncertain by 4 ms", "told"])
+@pytest.mark.parametrize("suite", SUITES)
+def test_what_a_lag_of_3_ms_that_is_not_told_leaves(suite, delay, capsys):
+    """Of elastic contact a lag is a delay, and found where the delay may be so far off. A damper's jump it
+    smooths, which no delay does: that is said, but where the lag hides the damper (`test_smoothed_jump`)."""
     uncertain = 'uncertainty."rig.force_sensor.delay"={distribution="uniform",low=0.004,high=0.012}'
-    told = load(f"suite-{suite}", [uncertain, PLANES]).mechanism
+    told = load(f"suite-{suite}", [PLANES, *([uncertain] if delay != "told" else [])]).mechanism
     errors, _, said = errors_at_one_speed(told, suite, [PLANES, "rig.force_sensor.time_constant=0.003"], 16)
     rms = np.sqrt(np.mean(errors**2, axis=0))
+    odd = np.mean([one == "identified" and abs(e) > 1.5 for one, e in zip(said, errors[:, -1], strict=True)])
     with capsys.disabled():
         counts = {status: said.count(status) for status in sorted(set(said))}
         print(
-            f"\n{suite}, lag of 3 ms: rms [%], contacts 1, 2, 4, 8:", *np.round(rms[[0, 1, 3, 7]], 2), counts
-        )
+            f"\n{suite}, lag of 3 ms, delay {delay}: rms [%], contacts 1, 2, 4, 8:",
+            *np.round(rms[[0, 1, 3, 7]], 2), counts,
+        )  # fmt: skip
     if suite != "damped":
-        assert rms[0] <= 1.0 and rms[7] <= 1.0
+        assert odd == 0 and (delay == "told" or (rms[0] <= 1.0 and rms[7] <= 1.0))
+    assert odd <= (0.25 if delay == "told" else 0.5)
 
 
 def test_what_an_unknown_delay_leaves_of_damped_contact_is_the_control_periods(capsys):

@@ -49,9 +49,8 @@ LEAST, LEAST_CARRIED = 1e-200, 1e-12
 NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, some do not
 DENSITY_SQUARINGS = 8  # n = 2^8 of what is known of damping
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
-SOFT = 25.0  # times the variance of where a surface was met: soft ones are found late
 NOT_THERE = 9.0  # times the variance of where the surface is expected: it is not there
-UNLIKELY = 0.1  # that it is not
+UNLIKELY = 0.1  # that it is not, at least
 USUAL = 0.5  # stiffness, of the most that it may be
 FARTHEST, WHOLE = 0.004, 0.015  # s by which knots are moved, from what depth [s] on; before it less
 EARLIER = 30  # ticks before it was met, whose readings count
@@ -256,15 +255,17 @@ def _place(meeting: Meeting, offsets: Array, length: Array, speed: Array, plane_
     [m]."""
     known = plane_spread**2
     away = meeting.place[None] - offsets * speed[None]
-    elsewhere = away * away > (NOT_THERE * (known + meeting.variance))[None]
-    share = jnp.where(elsewhere, 1, (known / (known + SOFT * meeting.variance))[None])
+    both = known + meeting.variance
+    elsewhere = away * away > (NOT_THERE * both)[None]
+    share = jnp.where(elsewhere, 1, (known / both)[None])
+    likely = exponential(0.5 * (away * away / both[None]), DENSITY_SQUARINGS)
     place = share * away
     positive = meeting.variance > 0
     spread = jnp.where(positive, jnp.sqrt(jnp.where(positive, meeting.variance, 1)), 0) / length
     return _Placed(
         below=(place - meeting.scales.plane[None]) / length[None],
         farther=jnp.clip((meeting.place[None] - place) / length[None], -FARTHEST, FARTHEST),
-        likely=jnp.where(elsewhere, UNLIKELY, 1),
+        likely=jnp.where(likely > UNLIKELY, likely, UNLIKELY),
         preload=(USUAL * (share * (meeting.stiffness * spread)[None])) ** 2,
     )
 

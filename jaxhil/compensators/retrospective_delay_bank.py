@@ -9,7 +9,7 @@ reference is integrated over again with are moved alike.
 
 Delays are told apart by how badly maps fit, which a prior that no contact fits would decide: it is wide. The
 instant at which a surface is met says most of a delay where the surface's place is known to a few
-micrometres: only what the mechanism file says of that is believed.
+micrometres: only what the mechanism file says of that is believed, and no more than 3 um.
 """
 
 from collections.abc import Mapping
@@ -29,6 +29,7 @@ from jaxhil.compensators.retrospective_reference import RetrospectiveReference
 
 MOST = 0.004  # s: beyond it hypotheses are too far apart, and too far off for the first order in d
 LEAST_FLOOR = 0.005  # 1/s
+LEAST_PLANE_SPREAD = 3e-6  # m: a rig's surface is not known better, and by 5 um tells a delay by 1 ms
 WIDE = {"prior_stiffness": 200.0, "prior_stiffness_spread": 250.0, "prior_slope_spread": 250.0}  # 1/s^2
 
 
@@ -38,6 +39,11 @@ def _own(gain: Gain) -> Gain:
         return gain._replace(nominal=lambda m: WIDE[gain.name])
     if gain.name == "prior_preload_spread":
         return gain._replace(nominal=preload)
+    if gain.name == "plane_spread":
+        told = gain.nominal
+        return gain._replace(
+            lower=lambda m: LEAST_PLANE_SPREAD, nominal=lambda m: max(told(m), LEAST_PLANE_SPREAD)
+        )
     # Next to no noise, a delay that is a little wrong is all that a hypothesis sees.
     return gain._replace(lower=lambda m: LEAST_FLOOR) if gain.name == "force_noise_floor" else gain
 

@@ -1,11 +1,12 @@
 /* Hypotheses of the force delay side by side, each with a map of its own, weighed by what they explain.
  * Hypothesis h takes the force to be d_h older than given: it belongs to the depth X - d_h V - p_h. The surface was met
  * at X_0, with a variance s^2; by this hypothesis it lies at p_h = g (X_0 - d_h v_0) beyond where it was told, with
- * g = spread^2/(spread^2 + 25 s^2), or 1 where the two disagree. It expects to read f_h with a variance s_h (0 with the
+ * g = spread^2/(spread^2 + s^2), or 1 where the two disagree. It expects to read f_h with a variance s_h (0 with the
  * noise's own variance r out of contact, and where what it expects while the contact opens is not positive). Its weight
  * is the product of the likelihoods of all readings of this contact and of those before, (r/s_h)^(1/4)
  * exp(-(y - f_h)^2/(4 s_h)), of how well its damping, of mean B and variance s^2, goes with what is known of contacts:
- * p (s_0/s) exp(-t^2/2) + (1 - p) 2 Phi(t), t = B/s, p = 1/2, and, where its surface is not where it was told, 1/10. The
+ * p (s_0/s) exp(-t^2/2) + (1 - p) 2 Phi(t), t = B/s, p = 1/2, and of how likely
+ * a surface is there, exp(-(X_0 - d_h v_0)^2/(2 (spread^2 + s^2))), at least 1/10. The
  * exponentials are (1 + u/n)^-n. What counts is the mean over all hypotheses, of their maps, delays and surfaces. Their
  * maps bend at the same places, wherever they have the surface: which fits best is not to be decided by what a contact
  * that bends between two knots leaves.
@@ -17,6 +18,7 @@
 #include "force_depth_map.c"
 #include "gains_table.c"
 #include "onset.c"
+#include "smoothed_jump.c"
 
 /* == Declarations == */
 
@@ -26,9 +28,9 @@ enum { JAXHIL_HYPOTHESES = 17 };
  * usual, how likely it is that the surface is there, map, deepest point, the likelihoods of this contact and of those
  * before; sums over these of the damping's precision and of precision times mean, their number `met`; whether this
  * contact is to be added to them. The mean of the maps and, `shift` [s] and `below` [s], of the delays and of how much
- * deeper; the delay that was `given`. */
+ * deeper; the delays' standard deviation [s]; the delay that was `given`. */
 typedef struct {
-    double given, shift, below, met, variance, pace, plane_spread;
+    double given, shift, open, below, met, variance, pace, plane_spread;
     double known[JAXHIL_HYPOTHESES];
     jaxhil_force_depth_map prior;
     double offsets[JAXHIL_HYPOTHESES], deeper[JAXHIL_HYPOTHESES], deepest[JAXHIL_HYPOTHESES];
@@ -38,6 +40,7 @@ typedef struct {
     double estimate[JAXHIL_HYPOTHESES][JAXHIL_PARAMETERS];
     double covariance[JAXHIL_HYPOTHESES][JAXHIL_PARAMETERS][JAXHIL_PARAMETERS];
     jaxhil_curve curve;
+    jaxhil_jump jump;
     bool learning;
 } jaxhil_learnt;
 
@@ -50,9 +53,10 @@ static const double jaxhil_bank_least = 1e-200;
 static const double jaxhil_bank_nothing = 1e-300; /* a smaller product is none: some machines keep such numbers */
 static const double jaxhil_bank_least_carried = 1e-12;
 static const double jaxhil_bank_least_shift = 1e-12; /* s: where nothing tells delays apart, rounding does not */
-static const double jaxhil_bank_late = 25.0; /* times the variance of where it was met: soft surfaces are found late */
 static const double jaxhil_bank_elsewhere = 9.0; /* times the variance of where it is expected: it is not there */
-static const double jaxhil_bank_unlikely = 0.1;  /* that it is not */
+static const double jaxhil_bank_unlikely = 0.1;  /* that it is not, at least */
+static const double jaxhil_bank_leaning = 0.5;   /* of the farthest delay */
+static const double jaxhil_bank_open = 0.0075;   /* of a restitution of 1, that what is open of the delay makes */
 static const double jaxhil_bank_usual = 0.5;     /* stiffness, of the most that it may be */
 static const double jaxhil_bank_farthest = 0.004; /* s, by which knots are moved, */
 static const double jaxhil_bank_whole = 0.015;    /* from this depth [s] on, and less before */
@@ -101,7 +105,9 @@ static void jaxhil_learnt_reset(jaxhil_learnt *bank) {
     bank->met = 0.0;
     bank->shift = 0.0;
     bank->below = 0.0;
+    bank->open = 0.0;
     bank->pace = 1.0;
+    jaxhil_jump_reset(&bank->jump);
 }
 
 static void jaxhil_learnt_init(jaxhil_learnt *bank, const jaxhil_gains *gains) {
@@ -131,6 +137,17 @@ static double jaxhil_learnt_shift(const jaxhil_learnt *bank) {
 
 static double jaxhil_learnt_deeper(const jaxhil_learnt *bank) {
     return bank->below;
+}
+
+/* Whether the force is likely to be older or newer than any hypothesis has it. */
+static bool jaxhil_learnt_leans(const jaxhil_learnt *bank) {
+    return fabs(bank->shift) > jaxhil_bank_leaning * bank->offsets[JAXHIL_HYPOTHESES - 1];
+}
+
+/* Whether the delay is left open, the restitution by it [pi/2 p d], or the sensor is likely to lag. */
+static bool jaxhil_learnt_open(const jaxhil_learnt *bank, double peak) {
+    return jaxhil_jump_smoothed(&bank->jump) ||
+           0.5 * jaxhil_map_pi * (peak * (bank->open * bank->pace)) > jaxhil_bank_open;
 }
 
 /* How much better a damping N(mean, variance) goes with one that is 0 or not negative than one N(0, prior) does. */
@@ -209,6 +226,7 @@ static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
     jaxhil_curve *curve = &bank->curve;
     double lost[4] = {0.0, 0.0, 0.0, 0.0};
     double shift = 0.0;
+    double square = 0.0;
     jaxhil_bank_average(bank, weights);
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         for (int k = 0; k < 4; k++) {
@@ -224,6 +242,11 @@ static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
         bank->below = h > 0 ? bank->below + below : below;
         bank->variance = h > 0 ? bank->variance + known : known;
     }
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        const double off = bank->offsets[h] - shift;
+        square += weights[h] * (off * off);
+    }
+    bank->open = sqrt(square);
     bank->shift = shift > jaxhil_bank_least_shift || shift < -jaxhil_bank_least_shift ? shift : 0.0;
     curve->damping = lost[0];
     curve->depth_damping = lost[1];
@@ -251,13 +274,14 @@ static void jaxhil_bank_finish(jaxhil_learnt *bank) {
 static double jaxhil_bank_place(jaxhil_learnt *bank, const jaxhil_meeting *meeting) {
     const double length = meeting->speed / meeting->pace;
     const double known = bank->plane_spread * bank->plane_spread;
-    const double found = jaxhil_bank_late * meeting->variance;
+    const double both = known + meeting->variance;
     const double spread = sqrt(meeting->variance) / length;
     double first = jaxhil_map_surface;
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         const double away = meeting->place - bank->offsets[h] * meeting->speed;
-        const bool elsewhere = away * away > jaxhil_bank_elsewhere * (known + meeting->variance);
-        const double share = elsewhere ? 1.0 : known / (known + found);
+        const bool elsewhere = away * away > jaxhil_bank_elsewhere * both;
+        const double share = elsewhere ? 1.0 : known / both;
+        const double likely = jaxhil_exponential(0.5 * (away * away / both), JAXHIL_DENSITY_SQUARINGS);
         const double place = share * away;
         const double farther = (meeting->place - place) / length;
         const double off = jaxhil_bank_usual * (share * (meeting->stiffness * spread));
@@ -267,7 +291,7 @@ static double jaxhil_bank_place(jaxhil_learnt *bank, const jaxhil_meeting *meeti
         bank->farther[h] = farther > jaxhil_bank_farthest
                                ? jaxhil_bank_farthest
                                : (farther < -jaxhil_bank_farthest ? -jaxhil_bank_farthest : farther);
-        bank->likely[h] = elsewhere ? jaxhil_bank_unlikely : 1.0;
+        bank->likely[h] = likely > jaxhil_bank_unlikely ? likely : jaxhil_bank_unlikely;
         bank->covariance[h][JAXHIL_PRELOAD][JAXHIL_PRELOAD] += off * off;
         first = inside > first ? inside : first;
     }
@@ -283,6 +307,7 @@ static long jaxhil_learnt_begin(jaxhil_learnt *bank, const jaxhil_meeting *meeti
     }
     bank->pace = meeting->pace;
     jaxhil_bank_restart(bank);
+    jaxhil_jump_begin(&bank->jump, meeting->tick, meeting->pace);
     const double ticks = ceil(jaxhil_bank_place(bank, meeting) / meeting->tick);
     jaxhil_bank_weigh(bank, weights);
     jaxhil_bank_conclude(bank, weights);
@@ -371,6 +396,9 @@ static void jaxhil_learnt_read(jaxhil_learnt *bank, double depth, double rate, d
     double surprise[JAXHIL_HYPOTHESES], sharpness[JAXHIL_HYPOTHESES], weights[JAXHIL_HYPOTHESES];
     double least = INFINITY;
     (void)deepest;
+    if (!hidden) {
+        jaxhil_jump_take(&bank->jump, depth, rate, force, variance);
+    }
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         surprise[h] = jaxhil_bank_read(bank, h, depth, rate, force, variance, hidden, zone, &sharpness[h]);
         /* What is not a number stays. */

@@ -50,6 +50,18 @@ static double jaxhil_learnt_deeper(const jaxhil_learnt *learnt) {
     return 0.0;
 }
 
+/* Whether the force is likely to be older or newer than it may be, and whether its delay is left open: not told. */
+static bool jaxhil_learnt_leans(const jaxhil_learnt *learnt) {
+    (void)learnt;
+    return false;
+}
+
+static bool jaxhil_learnt_open(const jaxhil_learnt *learnt, double peak) {
+    (void)learnt;
+    (void)peak;
+    return false;
+}
+
 /* One reading: depth [s], speed, deepest point [s], force [1/s], its variance [1/s^2], whether the sensor's dead
  * zone hides it, that zone [1/s]. */
 static void jaxhil_learnt_read(jaxhil_learnt *learnt, double depth, double rate, double deepest, double force,

@@ -185,7 +185,8 @@ static double jaxhil_law_follow(jaxhil_law *law, double x, double v, double dept
     }
     law->doubts.unexplained =
         jaxhil_balance_unexplained(&law->balance, curve, peak, law->learnt_deepest, reference->shift,
-                                   law->pace);
+                                   law->pace, jaxhil_learnt_leans(&law->learnt)) ||
+        jaxhil_learnt_open(&law->learnt, peak);
     const double middle = v - 0.5 * reference->period * own;
     const double correction = jaxhil_law_repayment(law, peak, *separated ? 0.0 : own, middle, zone);
     return *separated ? correction : own + (force - expected) + correction;

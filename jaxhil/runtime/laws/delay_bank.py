@@ -33,6 +33,7 @@ from .force_depth_map import (
     turning,
 )
 from .onset import SQUARINGS, exponential
+from .smoothed_jump import SmoothedJump
 
 HYPOTHESES = 17
 ELASTIC = 0.5  # probability that a contact has no damping
@@ -42,12 +43,13 @@ LEAST, LEAST_CARRIED = 1e-200, 1e-12
 NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, some do not
 DENSITY_SQUARINGS = 8
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
-SOFT = 25.0  # times the variance of where a surface was met: soft ones are found late
 NOT_THERE = 9.0  # times the variance of where the surface is expected: it is not there
-UNLIKELY = 0.1  # that it is not
+UNLIKELY = 0.1  # that it is not, at least
 USUAL = 0.5  # stiffness, of the most that it may be
 FARTHEST, WHOLE = 0.004, 0.015  # s by which knots are moved, from what depth [s] on; before it less
 EARLIER = 30  # ticks before it was met, whose readings count
+LEANING = 0.5  # of the farthest delay
+OPEN = 0.0075  # of a restitution of 1, that what is open of the delay makes
 
 _KNOTS = np.array(KNOTS)[:, None]
 _GAPS = np.diff(KNOTS)
@@ -61,8 +63,8 @@ class DelayBank:
     where the surface was told [m], and of the map's prior."""
 
     __slots__ = (
-        "_below", "_carried", "_covariance", "_damping", "_deepest", "_estimate", "_knots", "_known",
-        "_learning", "_likelihood", "_likely", "_met", "_offsets", "_pace", "_past", "_plane_spread",
+        "_below", "_carried", "_covariance", "_damping", "_deepest", "_estimate", "_jump", "_knots", "_known",
+        "_learning", "_likelihood", "_likely", "_met", "_off", "_offsets", "_pace", "_past", "_plane_spread",
         "_precision", "_prior_covariance", "_prior_estimate", "_weighted", "_widths", "curve", "deeper",
         "shift", "variance",
     )  # fmt: skip
@@ -75,6 +77,7 @@ class DelayBank:
         self._prior_estimate = np.repeat(np.array(estimate)[:, None], HYPOTHESES, axis=1)
         self._prior_covariance = np.repeat(np.array(covariance)[:, :, None], HYPOTHESES, axis=2)
         self.curve = Curve()  # the mean of the maps
+        self._jump = SmoothedJump()
         self.reset()
 
     def reset(self) -> None:
@@ -88,6 +91,8 @@ class DelayBank:
         self._bend(np.zeros(HYPOTHESES))
         self._met = 0.0
         self._pace = 1.0
+        self._off = 0.0  # standard deviation of the delays [s]
+        self._jump.reset()
         self.shift = 0.0  # the mean of the hypotheses' delays [s]
         self.deeper = 0.0  # and of how much deeper the surface is [s], on the contact's scale of time
 
@@ -105,6 +110,7 @@ class DelayBank:
             self._met += 1.0
         self._pace = meeting.pace
         self._restart()
+        self._jump.begin(meeting.tick, meeting.pace)
         first = self._place(meeting)
         self._conclude(self._weigh())
         return min(ceil((first if first > SURFACE else 0.0) / meeting.tick), EARLIER)
@@ -115,8 +121,20 @@ class DelayBank:
     ) -> None:
         """One reading: depth [s] and speed as old as the force by the given delay, force [1/s], its variance
         [1/s^2], whether the sensor's dead zone hides it, that zone [1/s]."""
+        if not hidden:
+            self._jump.take(depth, rate, force, variance)
         self._read(depth, rate, force, variance, hidden, zone)
         self._conclude(self._weigh())
+
+    @property
+    def leans(self) -> bool:
+        """Whether the force is likely to be older or newer than any hypothesis has it."""
+        return abs(self.shift) > LEANING * self._offsets[-1]
+
+    def leaves_open(self, peak: float) -> bool:
+        """Whether the delay is left open, the restitution of a contact of this peak force [1/s] by it
+        [pi/2 p d], or the sensor is likely to lag."""
+        return self._jump.smoothed or 0.5 * pi * (peak * (self._off * self._pace)) > OPEN
 
     def _place(self, meeting: Meeting) -> float:
         """Each hypothesis has the surface between where it was met and where it was told, or, where these
@@ -125,14 +143,16 @@ class DelayBank:
         length = meeting.speed / meeting.pace
         known = self._plane_spread * self._plane_spread
         away = meeting.place - self._offsets * meeting.speed
-        elsewhere = away * away > NOT_THERE * (known + meeting.variance)
-        share = np.where(elsewhere, 1.0, known / (known + SOFT * meeting.variance))
+        both = known + meeting.variance
+        elsewhere = away * away > NOT_THERE * both
+        share = np.where(elsewhere, 1.0, known / both)
+        likely = exponential(0.5 * (away * away / both), DENSITY_SQUARINGS)
         places = share * away
         off = USUAL * (share * (meeting.stiffness * (sqrt(meeting.variance) / length)))
         depths = (meeting.plane - places) / length
         self._below = -depths
         self._bend(np.minimum(np.maximum((meeting.place - places) / length, -FARTHEST), FARTHEST))
-        self._likely = np.where(elsewhere, UNLIKELY, 1.0)
+        self._likely = np.where(likely > UNLIKELY, likely, UNLIKELY)
         self._covariance[PRELOAD, PRELOAD] += off * off
         return float(np.maximum.reduce(depths - self._offsets * meeting.pace))
 
@@ -232,6 +252,8 @@ class DelayBank:
     def _conclude(self, weights: np.ndarray) -> None:
         """The mean over the hypotheses, by their weights."""
         shift = float(_total(weights * self._offsets))
+        off = self._offsets - shift
+        self._off = sqrt(_total(weights * (off * off)))
         self.shift = shift if shift > LEAST_SHIFT or shift < -LEAST_SHIFT else 0.0
         self.deeper = float(_total(weights * self._below))
         self.variance = float(_total(weights * self._known))

@@ -60,3 +60,9 @@ class RetrospectiveDelayBank(Retrospective):
 
     def _variance(self) -> float:
         return self._bank.variance
+
+    def _leans(self) -> bool:
+        return self._bank.leans
+
+    def _open(self, peak: float) -> bool:
+        return self._bank.leaves_open(peak)
