@@ -18,6 +18,7 @@
 #include "force_depth_map.c"
 #include "gains_table.c"
 #include "onset.c"
+#include "plausible_damping.c"
 #include "smoothed_jump.c"
 
 /* == Declarations == */
@@ -47,7 +48,6 @@ typedef struct {
 /* == Definitions == */
 
 static const double jaxhil_misfit = 0.01; /* of a force, by which a map may be wrong */
-static const double jaxhil_bank_elastic = 0.5;
 static const double jaxhil_bank_broadening = 2.0;
 static const double jaxhil_bank_least = 1e-200;
 static const double jaxhil_bank_nothing = 1e-300; /* a smaller product is none: some machines keep such numbers */
@@ -61,7 +61,6 @@ static const double jaxhil_bank_usual = 0.5;     /* stiffness, of the most that 
 static const double jaxhil_bank_farthest = 0.004; /* s, by which knots are moved, */
 static const double jaxhil_bank_whole = 0.015;    /* from this depth [s] on, and less before */
 static const long jaxhil_bank_earlier = 30;  /* ticks before it was met, whose readings count */
-enum { JAXHIL_DENSITY_SQUARINGS = 8 };
 
 /* Of their sum, at least so much. */
 static void jaxhil_bank_shares(double *values, double least) {
@@ -150,20 +149,6 @@ static bool jaxhil_learnt_open(const jaxhil_learnt *bank, double peak) {
            0.5 * jaxhil_map_pi * (peak * (bank->open * bank->pace)) > jaxhil_bank_open;
 }
 
-/* How much better a damping N(mean, variance) goes with one that is 0 or not negative than one N(0, prior) does. */
-static double jaxhil_bank_plausibility(double mean, double variance, double prior) {
-    const double spread = sqrt(variance);
-    const double ratio = mean / spread;
-    const double density = jaxhil_exponential(0.5 * (ratio * ratio), JAXHIL_DENSITY_SQUARINGS);
-    const double size = fabs(ratio);
-    const double mills =
-        jaxhil_map_pi / ((jaxhil_map_pi - 1.0) * size + sqrt(size * size + 2.0 * jaxhil_map_pi));
-    const double beyond = density * mills * (2.0 / sqrt(2.0 * jaxhil_map_pi));
-    const double at_least_0 = ratio > 0.0 ? 2.0 - beyond : beyond;
-    const double known = sqrt(prior > 0.0 ? prior : 1.0);
-    return jaxhil_bank_elastic * (known / spread) * density + (1.0 - jaxhil_bank_elastic) * at_least_0;
-}
-
 /* Weights of the hypotheses; their sum is 1. */
 static void jaxhil_bank_weigh(const jaxhil_learnt *bank, double *weights) {
     const double pace = bank->pace;
@@ -176,7 +161,7 @@ static void jaxhil_bank_weigh(const jaxhil_learnt *bank, double *weights) {
         const double variance = jaxhil_bank_broadening * (bank->met + 1.0) / sum;
         double plausible = 1.0;
         if (own > 0.0) {
-            plausible = jaxhil_bank_plausibility(mean, variance, bank->prior.damping * (pace * pace));
+            plausible = jaxhil_plausible_damping(mean, variance, bank->prior.damping * (pace * pace));
             plausible = plausible > jaxhil_bank_least_carried ? plausible : jaxhil_bank_least_carried;
         }
         weights[h] = bank->likelihood[h] * bank->carried[h] * (plausible * bank->likely[h]);
@@ -225,8 +210,7 @@ static void jaxhil_bank_average(jaxhil_learnt *bank, const double *weights) {
 static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
     jaxhil_curve *curve = &bank->curve;
     double lost[4] = {0.0, 0.0, 0.0, 0.0};
-    double shift = 0.0;
-    double square = 0.0;
+    double shift = 0.0, square = 0.0;
     jaxhil_bank_average(bank, weights);
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         for (int k = 0; k < 4; k++) {
@@ -350,8 +334,7 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
         bank->deepest[h] = x;
     }
     jaxhil_bank_features(bank, h, x, rate, phi);
-    double expected = 0.0;
-    double s = 0.0;
+    double expected = 0.0, s = 0.0;
     for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
         double product = 0.0;
         for (int j = 0; j < JAXHIL_PARAMETERS; j++) {
