@@ -6,6 +6,7 @@ is wrong by. A law names what it must know in `Compensator.knows`.
 
 import math
 
+from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism, value_at
 
 FORCE_DELAY = "force delay"
@@ -23,7 +24,7 @@ UNKNOWN_PLANE_SPREAD = 0.001  # m
 UNKNOWN_BIAS_SPREAD = 5.0  # N
 
 
-def force_delay(mechanism: Mechanism) -> float:
+def force_delay(mechanism: Mechanism | SixAxisMechanism) -> float:
     """The known delay [s] of the force measurement: transport plus first-order lag."""
     sensor = mechanism.rig.force_sensor
     return sensor.delay + sensor.time_constant
