@@ -29,6 +29,7 @@ Columns = dict[str, np.ndarray]  # numbers in float64, texts as objects, stamps 
 PLAIN = Text()
 DELIMITERS = "\t;,"  # that are looked for in the line of names, in this order
 BLOCK = 1 << 22  # bytes that are parsed at a time
+MORE_ROWS = 1 << 19  # by which columns grow
 LONGEST_LINE = 1 << 20
 SHOWN = 12  # columns in a message
 
@@ -170,13 +171,19 @@ def _read_text(
             strings_can_be_null=False,
         ),
     )
-    # A table of a long log takes three times the memory of its numbers. Of threads one alone counts the rows,
-    # so that a message names the bad one.
-    parts: dict[str, list[np.ndarray]] = {name: [np.empty(0)] for name in chosen}
+    # A table of a long log takes three times the memory of its numbers, and parts of columns twice. Of
+    # threads one alone counts the rows, so that a message names the bad one.
+    columns: Columns = {name: np.empty(0, object if name in texts else float) for name in chosen}
+    rows = 0
     for batch in batches:
+        until = rows + batch.num_rows
         for name, place in chosen.items():
-            parts[name].append(_array(pa.chunked_array([batch.column(place)]), name).copy())
-    return {name: np.concatenate(parts.pop(name)) for name in chosen}
+            column = columns[name]
+            if len(column) < until:
+                column.resize(until + MORE_ROWS, refcheck=False)
+            column[rows:until] = _array(pa.chunked_array([batch.column(place)]), name)
+        rows = until
+    return {name: column[:rows] for name, column in columns.items()}
 
 
 def _parquet_log(path: Path, label: str) -> Log:
