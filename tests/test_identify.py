@@ -5,11 +5,13 @@ from dataclasses import replace
 import campaign_kinds
 import campaign_rigs
 import campaigns
+import msgspec
 import numpy as np
 import pytest
 
 import jaxhil
 from jaxhil.mechanism.file import from_builtins
+from jaxhil.mechanism.structs import Uncertainty
 from jaxhil.mechanism.uncertainty import draw
 from tuning.identification.check import check
 from tuning.identification.estimate import Options, held_out, identify
@@ -145,6 +147,34 @@ def test_what_is_told_is_taken_as_told(clean):
         identify(
             campaigns.campaign("clean", 0, speeds=(), seconds=5.0), options=Options(fixed={"rig.range": 1.0})
         )
+
+
+def test_a_controller_that_answers_late_makes_the_motion_late(clean):
+    campaign = campaigns.campaign("clean", 0, speeds=FEW, seconds=30.0)
+    late = replace(campaign, timing=replace(campaign.timing, computing_delay=2), integrator="explicit_euler")
+    found = identify(late, options=Options(law="kelvin_voigt"))
+    delay = clean["rig.simulator.delay"].value
+    assert found["rig.simulator.delay"].value == pytest.approx(delay + 0.002, abs=1e-8)
+    force = clean["rig.force_sensor.delay"].value
+    assert found["rig.force_sensor.delay"].value == pytest.approx(force, abs=1e-6)
+    assert (
+        found.mechanism["rig"]["integrator"] == "explicit_euler"
+        and "integrator" not in clean.mechanism["rig"]
+    )
+
+
+def test_of_the_prior_only_that_is_left_which_logs_do_not_tell(clean):
+    sensors = {"rig.force_sensor.time_constant": 0.002, "rig.force_sensor.dead_zone": 3.0}
+    prior = jaxhil.load("rig-300kg", {**sensors, "rig.force_sensor.range": 800.0})
+    stated = {"rig.position_sensor.noise_std": Uncertainty(distribution="normal", std=1e-7)}
+    stated |= {"rig.simulator.damping_ratio": Uncertainty(distribution="normal", std=0.3)}
+    prior = msgspec.structs.replace(prior, uncertainty=stated, correlation=None)
+    campaign = campaigns.campaign("clean", 0, speeds=FEW, seconds=30.0)
+    found = identify(campaign, prior, Options(law="kelvin_voigt")).mechanism
+    sensor, uncertain = found["rig"]["force_sensor"], found["uncertainty"]
+    assert not {"time_constant", "dead_zone"} & sensor.keys() and sensor["range"] == 800.0
+    assert uncertain["rig.position_sensor.noise_std"]["std"] == 1e-7
+    assert uncertain["rig.simulator.damping_ratio"]["std"] < 1e-3
 
 
 def test_an_entry_of_the_lists_that_is_never_met_is_that_before_it():

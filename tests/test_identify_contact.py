@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from tuning.identification import contact_laws
+from tuning.identification import contact_laws, contact_profile
 from tuning.identification.contact import after_gaps, pieces
 from tuning.identification.contact_problem import Problem, Readings
 from tuning.identification.contact_profile import profile
@@ -169,3 +169,14 @@ def test_the_law_is_named(name, law):
     assert all(other.short[0] > 2.0 * other.short[1] for other in judged[1:] if other.law.name != law)
     if name == "hertz":
         assert judged[0].law.shape == {"exponent": 1.5}
+
+
+def test_cells_have_their_edges_where_rows_come_into_contact():
+    at = np.array([0.1, 0.15, 0.7])
+    np.testing.assert_allclose(contact_profile.cut(0.0, 1.0, at, 6), [0.0, 0.1, 0.15, 0.425, 0.7, 0.85, 1.0])
+    np.testing.assert_allclose(contact_profile.cut(0.0, 1.0, at, 3), [0.0, 0.15, 0.7, 1.0])
+    np.testing.assert_allclose(contact_profile.cut(0.0, 1.0, at[:0], 4), [0.0, 0.25, 0.5, 0.75, 1.0])
+    exact = problem("clean", contact_laws.kelvin_voigt(), speeds=(0.006, 0.012, 0.003), seed=3)
+    (plane, *_) = exact.onsets_between(0.0037, -3e-6, 3e-6)
+    inside = [exact.motion.at(0.0037)[0] > place for place in (plane - 1e-9, plane + 1e-9)]
+    assert np.sum(inside[0] != inside[1]) == 1

@@ -13,13 +13,13 @@ SECOND = Model(BY_NAME["second_order"], np.array([np.log(2.0 * np.pi * 12.0), np
 THIRD = Model(BY_NAME["third_order"], np.array([np.log(0.008), np.log(110.0), np.log(0.5), 0.0031]))
 
 
-def lines_of(model, hold="linear", latency=0, period=0.001, row="tick", std=5e-7):
+def lines_of(model, hold="linear", latency=0, period=0.001, shift=0, std=5e-7):
     """Exact spectra at 85 lines to 45 Hz."""
     frequency = np.delete(np.arange(1, 226, 2), np.s_[3::4]) / 5.0
     rng = np.random.default_rng(0)
     command = 1e-4 * np.exp(2j * np.pi * rng.uniform(size=len(frequency)))
-    empty = Lines(frequency, command, command, np.full(len(frequency), std), period, hold, latency, row)
-    return Lines(frequency, command, model.predict(empty), empty.std, period, hold, latency, row)
+    empty = Lines(frequency, command, command, np.full(len(frequency), std), period, hold, latency, shift)
+    return Lines(frequency, command, model.predict(empty), empty.std, period, hold, latency, shift)
 
 
 @pytest.mark.parametrize("name", ("clean", "third_order", "resonance"))
@@ -42,13 +42,13 @@ def test_the_model_gives_what_the_exactly_sampled_simulator_gives(name):
         np.testing.assert_allclose(np.exp(found.model.parameters[:2]), [2 * np.pi * 12.0, 0.8], rtol=1e-6)
 
 
-@pytest.mark.parametrize("kind, latency, row, periods", (
-    ("linear", 0, "tick", 0.0), ("zoh", 0, "tick", -0.5), ("zoh", 1, "tick", 0.5), ("linear", 1, "sent", 2.0),
-    ("linear", 0, "after", -1.0),
+@pytest.mark.parametrize("kind, latency, shift, periods", (
+    ("linear", 0, 0, 0.0), ("zoh", 0, 0, -0.5), ("zoh", 1, 0, 0.5), ("linear", 1, 1, 2.0),
+    ("linear", 0, -1, -1.0),
 ))  # fmt: skip
-def test_hold_latency_and_row_are_a_delay_of_whole_and_half_periods(kind, latency, row, periods):
+def test_hold_latency_and_row_are_a_delay_of_whole_and_half_periods(kind, latency, shift, periods):
     frequency = np.array([0.1, 1.0, 10.0])
-    response = hold.response(frequency, 0.002, kind, latency, row)
+    response = hold.response(frequency, 0.002, kind, latency, shift)
     np.testing.assert_allclose(np.angle(response), -2.0 * np.pi * frequency * periods * 0.002, atol=1e-12)
     assert np.all(np.diff(np.abs(response)) < 0.0) and abs(response[0]) > 0.9999
 

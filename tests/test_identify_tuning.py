@@ -27,14 +27,19 @@ def error(mechanism, compensator, gains):
     return float(np.sqrt(np.mean(found.error[found.wanted] ** 2)))
 
 
-@pytest.mark.parametrize("name", ("clean", "third_order", "stiffnesses"))
-def test_gains_tuned_on_the_identified_file_lose_little_on_the_true_rig(name):
-    truth, compensator = campaign_rigs.mechanism(name), "response_error"
-    found = identify(campaigns.campaign(name, 70_000), options=Options(law="kelvin_voigt"))
+@pytest.mark.parametrize(("name", "compensator", "press"), (
+    ("clean", "response_error", False), ("third_order", "response_error", False),
+    ("stiffnesses", "response_error", False), ("lagging", "response_error", False),
+    ("lagging", "response_error", True), ("clean", "retrospective_reference", False),
+))  # fmt: skip
+def test_gains_tuned_on_the_identified_file_lose_little_on_the_true_rig(name, compensator, press):
+    truth = campaign_rigs.mechanism(name)
+    found = identify(campaigns.campaign(name, 70_000, press=press), options=Options(law="kelvin_voigt"))
     identified = from_builtins({**found.mechanism, "uncertainty": {}, "correlation": None}, "identified")
     best, own = (
         error(truth, compensator, tuning.tune(one, compensator, validation=32).gains)
         for one in (truth, identified)
     )
-    print(f"{name}, {compensator}: rms e - e* {own:.5f}, of gains tuned on the truth {best:.5f}")
+    with_press = " with a press" if press else ""
+    print(f"{name}{with_press}, {compensator}: rms e - e* {own:.5f}, of gains tuned on the truth {best:.5f}")
     assert own <= 1.10 * best + 0.0005

@@ -3,10 +3,11 @@
 from dataclasses import replace
 
 import campaigns
+import numpy as np
 import pytest
 
 from jaxhil.errors import InputError
-from tuning.identification.logs.causality import check_rows_of, rows_ahead
+from tuning.identification.logs.causality import check_rows_of, integrator_of_all, rows_ahead
 
 SPEEDS = (0.003, 0.006, 0.012) * 2
 
@@ -39,15 +40,40 @@ def test_noise_tells_which_readings_are_in_a_row(kind):
     for ahead, row in ((-1, "after"), (0, "tick"), (1, "sent")):
         runs, timing = runs_of(kind, ahead)
         assert rows_ahead(runs) == ahead
-        check_rows_of(runs, replace(timing, row=row), 0)
+        check_rows_of(runs, replace(timing, row=row))
         for other in {"tick", "sent", "after"} - {row}:
             with pytest.raises(InputError, match=f'timing.row: found "{other}", but .* row = "{row}"'):
-                check_rows_of(runs, replace(timing, row=other), 0)
+                check_rows_of(runs, replace(timing, row=other))
     # Rows with the next tick's readings look as if the controller took a tick to compute.
     runs, timing = runs_of(kind, -1)
-    check_rows_of(runs, timing, 1)
-    with pytest.raises(InputError, match="or computing_delay = 1"):
-        check_rows_of(runs, timing, 0)
+    check_rows_of(runs, replace(timing, computing_delay=1))
+    with pytest.raises(InputError, match=r'or computing_delay = 1 or .* rig.integrator is "explicit_euler"'):
+        check_rows_of(runs, timing)
+
+
+def test_a_rig_that_is_driven_before_and_after_is_told_by_its_contact():
+    """A thousand rows to either side in which commands come from a path, and forces are noise."""
+    runs, _ = runs_of("noisy", -1)
+    rng, path = np.random.default_rng(0), 1e-3 * np.cos(np.linspace(0.0, 3.0, 1000))
+    for at, run in enumerate(runs):
+        before, after = run.position_desired[0] + path - path[-1], run.position_desired[-1] + path - path[0]
+        noise = 2.67 * rng.standard_normal((2, 1000))
+        force = np.concatenate([noise[0], run.force_measured, noise[1]])
+        x = np.concatenate([before, run.position_desired, after])
+        runs[at] = replace(run, position_desired=x, force_measured=force, valid=np.ones(len(x), bool))
+    assert rows_ahead(runs) == -1
+
+
+def test_the_explicit_integrator_answers_a_tick_late():
+    """It moves by the velocity before the force: commands are those of a controller that takes a tick."""
+    runs, timing = runs_of("noisy", -1)
+    speeds = [np.diff(run.position_desired, append=np.nan) / 1e-3 for run in runs]
+    moved = [replace(run, velocity_desired=v) for run, v in zip(runs, speeds, strict=True)]
+    found = integrator_of_all(moved, 1e-3)
+    assert found == "explicit_euler" and integrator_of_all(runs[:0], 1e-3) is None
+    check_rows_of(moved, timing, found)
+    with pytest.raises(InputError, match=r'"sent", but .* allowed row = "tick" or computing_delay = 1$'):
+        check_rows_of(moved, replace(timing, row="sent"), found)
 
 
 def test_without_noise_or_runs_enough_nothing_is_said():
@@ -58,4 +84,4 @@ def test_without_noise_or_runs_enough_nothing_is_said():
     smooth = [replace(one, force_measured=one.position_desired * 1e5) for one in (run, *others)]
     assert rows_ahead(smooth) is None
     assert rows_ahead(steady) in (None, 0)
-    check_rows_of(smooth, replace(timing, row="sent"), 0)
+    check_rows_of(smooth, replace(timing, row="sent"))

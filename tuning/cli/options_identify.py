@@ -62,6 +62,9 @@ class Identify:
         text("KEY=VALUE", "A number, or a list of them, that is known, as rig.contact_plane=0; repeatable."),
     ] = ()
     hold_out: Annotated[float, number("Share of the contacts that judge the fit to the others.")] = 0.2
+    bootstrap: Annotated[
+        int, number("Fits to contacts drawn again; intervals widen where contacts differ by more than noise.")
+    ] = 0
     limit: Annotated[
         float, arg(metavar="NUMBER", help="Restitution error from which the verdict is bad.")
     ] = 0.01

@@ -12,7 +12,7 @@ from jaxhil.mechanism.file import to_builtins
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw
 from tuning.identification import contact as contacts
-from tuning.identification import free_motion, known, validation
+from tuning.identification import free_motion, known, two_clocks, validation
 from tuning.identification.contact import ContactFit
 from tuning.identification.contact_problem import LONGEST, Inner, Problem, Readings
 from tuning.identification.contact_profile import Posterior
@@ -33,6 +33,7 @@ def check(campaign: Campaign, mechanism: Mechanism, limit: float = 0.01) -> Iden
 
     The force's noise is that of the runs at rest, else the mechanism's. Raises `InputError` for logs with
     neither free motion nor contact, and for a contact law that cannot be set against logs."""
+    two_clocks.refuse(campaign.timing)
     model = known.motion_model(mechanism)
     free = [run for run in campaign.runs if run.kind == "free"]
     touching = [

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tuning.identification import two_clocks
 from tuning.identification.contact_laws import Law, kelvin_voigt
 from tuning.identification.contact_problem import LONGEST, Problem, Readings
 from tuning.identification.contact_profile import Posterior, profile
@@ -21,6 +22,7 @@ from tuning.identification.noise import Noise
 from tuning.identification.rational import Model
 from tuning.identification.records import Run, Timing
 from tuning.identification.sensor_lag import sensor_lag
+from tuning.identification.two_clocks import Drift
 
 SETTLING = 0.5  # s, of a motion simulator
 PIECE = 1.0  # s
@@ -28,6 +30,7 @@ TIME_CONSTANTS = 10.0  # after which what was commanded before is over
 FIRST_ROWS, STEADY = 5, 0.01  # rows over which, and share by which, the speed of uniform motion may change
 BEYOND = 4.0  # standard deviations beyond the dead zone from which a reading counts
 ROUGH = 21, 5  # delays and planes of the grid for the fit that is only judged
+UNKNOWN_NOISE = 0.01  # of the largest force, where nothing tells it
 SURE = 3.0  # standard deviations from which a dead zone is there
 UNEXPLAINED = 1.3  # chi-squared per degree of freedom above which intervals are widened by it
 
@@ -85,6 +88,8 @@ class ContactFit:
     freedom: int  # readings less parameters
     noise_error: float  # relative standard deviation of the noise that residuals are weighed by
     dead_zone: bool  # whether readings are those of a dead zone: "bias" is then less by it
+    drift: Drift | None = None  # of a clock of the forces' own; the delay is then that and a constant
+    resampled: str = ""  # what fits to other contacts say of the draws, in words, where they were asked for
 
     @property
     def readings(self) -> Readings:
@@ -98,7 +103,7 @@ class ContactFit:
     def draws(self) -> np.ndarray:
         """Draws of the posterior; spread out where the law leaves more than noise."""
         values = self.posterior.draws
-        if self.left <= UNEXPLAINED:
+        if self.left <= UNEXPLAINED or self.resampled:
             return values
         return values.mean(axis=0) + (values - values.mean(axis=0)) * np.sqrt(self.left)
 
@@ -116,7 +121,8 @@ def estimate(
 
     A law as a string is the name of one whose shape is searched; None lets the touches choose.
     """
-    motion = Motion(model, runs, timing, LONGEST + timing.control_period)
+    apart = _drift(runs, model, timing, noise, law, plane) if timing.two_clocks else None
+    motion = Motion(model, runs, timing, LONGEST + timing.control_period, apart and apart.late)
     told = plane
     hidden = noise is not None and noise.silent
     if noise is None or hidden:
@@ -124,8 +130,7 @@ def estimate(
         plane = 0.0 if hidden and plane is None else plane
         readings = _noise_from_contact(motion, readings, plane)
     else:
-        spread = float(np.hypot(noise.innovation, noise.quantum / np.sqrt(12.0)))
-        readings = Readings.of(runs, spread, noise.filter)
+        readings = _readings(runs, noise)
     judged: tuple[Judged, ...] = ()
     near = None
     if law is None or isinstance(law, str):
@@ -142,7 +147,23 @@ def estimate(
         return estimate(runs, model, timing, None, law, told, seed)
     freedom = len(problem.kept) - len(posterior.names)
     error = 0.0 if noise is None or hidden else noise.std_std / max(noise.std, 1e-300)
-    return ContactFit(law, judged, problem, posterior, freedom, error, bool(hidden))
+    return ContactFit(law, judged, problem, posterior, freedom, error, bool(hidden), apart)
+
+
+def _readings(runs: Sequence[Run], noise: Noise) -> Readings:
+    return Readings.of(runs, float(np.hypot(noise.innovation, noise.quantum / np.sqrt(12.0))), noise.filter)
+
+
+def _drift(
+    runs: Sequence[Run], model: Model, timing: Timing, noise: Noise | None, law: Law | str | None, plane
+) -> Drift:
+    """Of the forces' clock; where no rest tells the noise, forces count by a share of the largest."""
+    if noise is None or noise.silent:
+        readings = Readings.of(runs, 1.0)
+        readings = replace(readings, std=UNKNOWN_NOISE * float(np.abs(readings.force).max()))
+    else:
+        readings = _readings(runs, noise)
+    return two_clocks.drift(runs, model, timing, readings, law, plane)
 
 
 def _hides(posterior: Posterior) -> bool:

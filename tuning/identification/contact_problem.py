@@ -61,6 +61,11 @@ class Readings:
         entries = tuple(int(one) for one in np.unique(entry[counts])) or (0,)
         return cls(force, counts, entry, entries, std, tuple(whitening), threshold)
 
+    def of_lanes(self, lanes: np.ndarray) -> Readings:
+        """Of some of the runs, each as often as it is named."""
+        force, counts, entry = (one[:, lanes] for one in (self.force, self.counts, self.entry))
+        return replace(self, force=force, counts=counts, entry=entry)
+
 
 def _entries(run: Run) -> np.ndarray:
     """Of each row; out of contact that of the contact next to it."""
@@ -194,6 +199,11 @@ class Problem:
             moved = [self.motion.at(delay + part * self.motion.period) for part in self.before]
             self._at = delay, [(x.ravel()[self.where], v.ravel()[self.where]) for x, v in moved]
         return self._at[1]
+
+    def onsets_between(self, delay: float, low: float, high: float) -> np.ndarray:
+        """The planes between these at which rows come into contact, in order."""
+        position, rate = self._moved(delay)[0]
+        return np.unique(position[(rate > 0.0) & (position > low) & (position < high)])
 
     def _near(self, position, rate, where, planes: np.ndarray) -> _Near:
         rows = np.flatnonzero(position > planes.min())

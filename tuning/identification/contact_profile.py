@@ -13,15 +13,19 @@ from typing import Any
 
 import numpy as np
 from scipy import special
+from scipy.ndimage import uniform_filter1d
 
 from tuning.identification.contact_problem import COARSE, LONGEST, Inner, Problem
 
-FINE = 1e-5  # s, between the next: damped touches begin with a jump, and a row on its other side costs much
-REGION = 25.0  # of twice the log posterior below its best: what the final grid covers
+FINE = 2e-5  # s, between the next
+SMOOTHED = 7  # of these delays, over which the plane is averaged
+REGION = 30.0  # of twice the log posterior below its best: what the final grid covers
 ROUGH_REGION = 400.0  # the same of the coarse grid, whose heights are full of rows on the wrong side
-FEW_PLANES = 5  # of the grid that finds the region
-DELAYS, PLANES = 61, 9  # of the final grid
+FEW_PLANES = 15  # of the grid that finds the region
+ROUGHLY = 2.0  # times the plane's standard deviation that the first look tells
+DELAYS, PLANES = 61, 13  # of the final grid
 REACH = 0.003  # s, on each side of a delay that is known roughly
+FEW_DELAYS = 5  # of the grid where nothing is rough, and planes
 PLANE_REACH = 3.2  # standard deviations of the plane at a given delay, on each side
 DRAWS = 4000
 
@@ -66,21 +70,23 @@ def profile(
     low, high = _region(problem, delays, heights, ROUGH_REGION)
     finer = np.linspace(low, high, int(np.clip((high - low) / FINE, 21, 151)))
     known = np.interp(finer, delays, planes), np.interp(finer, delays, stds)
-    places, cells = _grid(problem, finer, known, FEW_PLANES)
-    heights, planes, stds = _by_delay(places, cells, len(finer))
+    places, cells = _grid(problem, finer, (known[0], ROUGHLY * known[1]), FEW_PLANES)
+    heights, planes, spreads = _by_delay(places, cells, len(finer))
     low, high = _region(problem, finer, heights, REGION)
     delays = np.linspace(low, high, size[0])
-    known = np.interp(delays, finer, planes), np.interp(delays, finer, stds)
+    # Where one cell has all the posterior of a delay, that of the next delay may be in another.
+    planes = uniform_filter1d(planes, SMOOTHED, mode="nearest")
+    known = np.interp(delays, finer, planes), np.interp(delays, finer, np.maximum(spreads, known[1]))
     places, cells = _grid(problem, delays, known, size[1])
     return _sample(problem, places, cells, delays, seed)
 
 
 def around(problem: Problem, delays: np.ndarray, plane: float, seed: int) -> Posterior:
     """The posterior over these delays alone, about this plane; where no jump at the onset makes it rough."""
-    few = np.linspace(delays[0], delays[-1], FEW_PLANES)
+    few = np.linspace(delays[0], delays[-1], FEW_DELAYS)
     planes, stds, _ = _scan(problem, few, plane)
     known = np.interp(delays, few, planes), np.interp(delays, few, stds)
-    places, cells = _grid(problem, delays, known, FEW_PLANES)
+    places, cells = _grid(problem, delays, known, FEW_DELAYS)
     return _sample(problem, places, cells, delays, seed)
 
 
@@ -119,18 +125,33 @@ def _grid(
     """Fits at each delay and at planes across the plane's uncertainty there: `known`, its mean and standard
     deviation at each.
 
-    The plane alone moves rows to the other side of an onset, so one plane a delay does not tell how good the
-    delay is. Places are rows of (delay, plane, width in the plane)."""
+    Damped touches begin with a jump, and a row on its other side costs much: the likelihood is smooth but for
+    the planes at which a row comes into contact, and those are cells' edges. Places are rows of (delay,
+    plane, width in the plane)."""
     places, cells = [], []
     for delay, centre, std in zip(delays, *known, strict=True):
         if problem.plane is not None:
             cells.append(problem.at(delay, problem.plane))
             places.append((delay, problem.plane, 1.0))
             continue
-        planes = centre + PLANE_REACH * std * np.linspace(-1.0, 1.0, across)
+        low, high = centre - PLANE_REACH * std, centre + PLANE_REACH * std
+        edges = cut(low, high, problem.onsets_between(delay, low, high), across)
+        planes = (edges[1:] + edges[:-1]) / 2.0
         cells += problem.across(delay, planes)
-        places += [(delay, plane, planes[1] - planes[0]) for plane in planes]
+        places += [(delay, *one) for one in zip(planes, np.diff(edges), strict=True)]
     return np.array(places), cells
+
+
+def cut(low: float, high: float, at: np.ndarray, number: int) -> np.ndarray:
+    """The edges of so many cells from low to high, cut at these places first, then in the widest cells; of
+    places too many, those go that leave the smallest cells."""
+    edges = [low, *at, high]
+    while len(edges) <= number:
+        widest = int(np.argmax(np.diff(edges)))
+        edges.insert(widest + 1, (edges[widest] + edges[widest + 1]) / 2.0)
+    while len(edges) > number + 1:
+        del edges[1 + int(np.argmin(np.array(edges[2:]) - edges[:-2]))]
+    return np.array(edges)
 
 
 def _by_delay(
@@ -143,7 +164,9 @@ def _by_delay(
     mean = np.sum(share * planes, axis=1)
     spread = np.sqrt(np.sum(share * (planes - mean[:, None]) ** 2, axis=1))
     # A grid so wide that one plane has it all says no more than the distance to the next.
-    return total, mean, np.maximum(spread, places[:, 2].reshape(count, -1)[:, 0] / 2.0)
+    best = np.argmax(heights, axis=1)
+    width = places[:, 2].reshape(count, -1)[np.arange(count), best]
+    return total, mean, np.maximum(spread, width / 2.0)
 
 
 def _heights(places: np.ndarray, cells: list[Inner]) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxhil.mechanism.structs import Mechanism
 from tuning.identification import contact as contacts
 from tuning.identification import free_motion, knowledge, known, parameters, validation
+from tuning.identification.bootstrap import bootstrap
 from tuning.identification.contact import ContactFit
 from tuning.identification.contact_profile import DRAWS
 from tuning.identification.estimates import combinations, estimates
@@ -30,8 +31,9 @@ from tuning.identification.result import Identification, confounded
 SHORTEST_REST = 200  # rows from which a run at rest says what a sensor's noise is
 USUAL_FREQUENCY = 3.0  # Hz, of contacts, where none was made
 TOUCHING = ("contact", "press", "tap")
-STAGES = 3  # free motion, contact, validation
+STAGES = 3  # free motion, contact, validation; one more with a bootstrap
 Say = Callable[[str], None]  # told what begins
+FORCE_DELAY = "rig.force_sensor.delay"
 STIFFNESS, POSITION_DELAY = "contact.stiffness.", "rig.position_sensor.delay"
 CLEAR = 2.0  # standard deviations by which a force delay is taken to be above 0
 
@@ -47,7 +49,7 @@ def identify(
 
     `prior` gives what the logs do not tell. Where neither does for a number that a mechanism file must have,
     there is no mechanism and the verdict is bad. `say` is called with what begins, in words, `STAGES` times
-    at most. Raises `InputError` for options that cannot be."""
+    at most, once more with a bootstrap. Raises `InputError` for options that cannot be."""
     options = options or Options()
     check(options, prior)
     runs = {kind: [run for run in campaign.runs if run.kind == kind] for kind in ("rest", "free", *TOUCHING)}
@@ -65,19 +67,26 @@ def identify(
         frequency = contacts.frequency(contact, mass)
     if motion is not None:
         lines = [*validation.of_motion(motion, frequency), *lines]
-    share = _position_delay(motion, contact, prior, options)
+    apart = None if contact is None else contact.drift
+    share = _position_delay(motion, None if apart else contact, prior, options)
     found = _draws(motion, contact, model, frequency, share, options.seed)
+    first = FIRST
+    if apart is not None:
+        # What a constant between two clocks adds to it, no log shows.
+        del found[FORCE_DELAY]
+        first = (*FIRST, FORCE_DELAY)
     if options.bayes and prior is not None:
         found = knowledge.with_prior(found, prior, frequency, options.seed)
-    later = {key: value for key, value in options.fixed.items() if key not in FIRST}
+    later = {key: value for key, value in options.fixed.items() if key not in first}
     later = knowledge.spread_out(later, list(found))
     found, denied = knowledge.with_told(found, later)
-    fixed = {**_told_first(share, prior, options), **later}
+    fixed = {**_told_first(first, share, prior, options), **later}
     told = {key: np.full(DRAWS, value) for key, value in later.items()}
     found, vague = _without_vague(found)
     told_contact = contact if any(key.startswith(STIFFNESS) for key in (*found, *fixed)) else None
     numbers = estimates(found, motion, told_contact, force, position, fixed)
-    mechanism, missing = None, _missing(prior, model, told_contact)
+    untold = apart is not None and FORCE_DELAY not in fixed
+    mechanism, missing = None, _missing(prior, model, told_contact, untold)
     if not missing:
         mechanism = mechanism_of(campaign, prior, model, told_contact, numbers, found, options)
     keys = list(found)
@@ -115,9 +124,13 @@ def _without_vague(found: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray],
     return left, vague
 
 
-def _missing(prior: Mechanism | None, model: Model | None, contact: ContactFit | None) -> tuple[str, ...]:
-    """What neither the logs nor the prior tell, and the run that would."""
+def _missing(
+    prior: Mechanism | None, model: Model | None, contact: ContactFit | None, untold: bool
+) -> tuple[str, ...]:
+    """What neither the logs nor the prior tell, and the run that would; `untold`: the force delay."""
     missing = ["rig.simulator (a run of kind free would)"] if model is None else []
+    if prior is None and untold:
+        missing.append(f"{FORCE_DELAY} (--fix would: of two clocks nobody knows the constant)")
     if prior is None and contact is None:
         missing.append("contact.stiffness (a run of kind contact or press would)")
     return tuple(missing)
@@ -156,6 +169,9 @@ def _contact(
     plane = options.fixed.get("rig.contact_plane")
     say(f"fitting the contact to {len(runs)} touches")
     fit = contacts.estimate(runs, model, campaign.timing, force, options.law, plane, options.seed)
+    if options.bootstrap:
+        say(f"fitting {options.bootstrap} times to contacts drawn again")
+        fit = bootstrap(fit, options.bootstrap, options.seed)
     say("judging the fit by touches left out of it")
     held = held_out(runs, options.hold_out)
     judged = fit if not held.any() else contacts.without(fit, held, options.seed)
@@ -195,17 +211,19 @@ def _draws(
     if contact is not None:
         # An error of the motion's lag is one of the force delay, the other way round.
         found |= parameters.contact_draws(contact)
-        found["rig.force_sensor.delay"] = found["rig.force_sensor.delay"] - lag
+        found[FORCE_DELAY] = found[FORCE_DELAY] - lag
     if motion is not None:
         found["rig.simulator.delay"] = found["rig.simulator.delay"] - share
     if contact is not None:
-        found["rig.force_sensor.delay"] = found["rig.force_sensor.delay"] + share
+        found[FORCE_DELAY] = found[FORCE_DELAY] + share
     return found
 
 
-def _told_first(share: float, prior: Mechanism | None, options: Options) -> dict[str, float]:
+def _told_first(
+    keys: Sequence[str], share: float, prior: Mechanism | None, options: Options
+) -> dict[str, float]:
     """What was told before anything was fitted, and the position sensor's delay if it is not the prior's."""
-    first = {key: options.fixed[key] for key in FIRST if key in options.fixed}
+    first = {key: options.fixed[key] for key in keys if key in options.fixed}
     if share != (0.0 if prior is None else prior.rig.position_sensor.delay):
         first[POSITION_DELAY] = share
     return first
@@ -250,6 +268,12 @@ def _notes(
         notes.append("no free motion: the motion simulator is the prior's")
     if contact is None:
         notes.append("no contact: the contact and the force delay are the prior's")
+    elif contact.drift is not None:
+        rate, std = 1e6 * contact.drift.rate, 1e6 * contact.drift.std
+        gains = f"the forces' clock gains {rate:.3g} +- {std:.2g} ppm on the drives'"
+        notes.append(f"{gains}; a constant between them and {FORCE_DELAY} are one number: it is as told")
+    if contact is not None and contact.resampled:
+        notes.append(contact.resampled)
     if force is not None and force.drift:
         notes.append(f"the force drifts at rest, by {force.drift:.3g} N from the first row to the last")
     if force is not None and force.pole > 0.5:

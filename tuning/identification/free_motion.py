@@ -21,7 +21,7 @@ from tuning.identification.records import Run, Timing
 SETTLING = 10.0  # time constants after which a transient is over
 SLOWEST = 0.05  # s, time constant assumed before any is known
 UNEXPLAINED = 1.3  # chi-squared per degree of freedom above which intervals are widened by it
-RARE = 1e-3  # probability under which the model itself is taken to err
+RARE = 1e-6  # probability under which the model itself is taken to err: it costs most of what is known
 BANDS = 10  # of frequency, in each of which it errs by as much everywhere
 LARGEST = 10.0  # relative error that is looked for
 ROUNDS = 3  # of fitting and of looking how much it errs
@@ -170,7 +170,7 @@ def join(spectra: Sequence[Spectrum], timing: Timing) -> Lines:
         timing.control_period,
         timing.command_hold,
         timing.command_latency,
-        timing.row,
+        timing.shift,
     )
 
 

@@ -20,13 +20,9 @@ def frequencies(frequency: np.ndarray, period: float) -> np.ndarray:
     return frequency + np.arange(-COPIES, COPIES + 1)[:, None] / period
 
 
-def response(frequency: np.ndarray, period: float, hold: str, latency: int, row: str = "tick") -> np.ndarray:
-    """h at each frequency [Hz], complex: from the logged command to what the drives follow."""
+def response(frequency: np.ndarray, period: float, hold: str, latency: int, shift: int = 0) -> np.ndarray:
+    """h at each frequency [Hz], complex: from the logged command to what the drives follow; the readings of a
+    row lag its command by `shift` periods."""
     line = np.sinc(frequency * period)
-    periods = latency + ROW_SHIFT[row] - (0.5 if hold == "zoh" else 0.0)
+    periods = latency + shift - (0.5 if hold == "zoh" else 0.0)
     return (line if hold == "zoh" else line**2) * np.exp(-2j * np.pi * frequency * periods * period)
-
-
-# Ticks by which the logged readings lag the logged command by the way a row is written: "sent" rows hold the
-# command of the next tick, "after" rows the readings of the next one.
-ROW_SHIFT = {"tick": 0, "sent": 1, "after": -1}

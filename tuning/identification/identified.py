@@ -51,6 +51,7 @@ def mechanism_of(
         "command_latency": timing.command_latency,
         "command_hold": timing.command_hold,
     }
+    rig |= {} if campaign.integrator is None else {"integrator": campaign.integrator}
     simulator = {key[len(SIMULATOR) :]: one for key, one in values.items() if key.startswith(SIMULATOR)}
     if simulator and model is not None:
         before = rig.get("simulator", {})
@@ -63,6 +64,9 @@ def mechanism_of(
         rig["simulator"] = {**simulator, "delay": max(simulator["delay"], 0.0)}
     for section in ("force_sensor", "position_sensor"):
         told = {**rig.get(section, {})}
+        if section == "force_sensor" and contact is not None:
+            # What touches do not show is not there: a lag is in the delay that was found.
+            told = {key: value for key, value in told.items() if key not in ("time_constant", "dead_zone")}
         prefix = f"rig.{section}."
         told |= {key[len(prefix) :]: value for key, value in values.items() if key.startswith(prefix)}
         rig[section] = {**told, "delay": max(told.get("delay", 0.0), 0.0)}
@@ -88,11 +92,10 @@ def _uncertainty(document, found: Mapping[str, np.ndarray], options: Options) ->
         for key in keys
     ])  # fmt: skip
     tables = uncertainty_tables(keys, np.array([found[key] for key in keys]).T, floors)
-    kept = {
-        key: value
-        for key, value in document.get("uncertainty", {}).items()
-        if not key.startswith(tuple(name.rsplit(".", 1)[0] + "." for name in tables["uncertainty"]))
-    }
+    # Of a simulator or a contact that was found nothing of the prior's is left.
+    sections = {f"{name.rsplit('.', 1)[0]}." for name in tables["uncertainty"]} & {SIMULATOR, "contact."}
+    gone = (*sections, *tables["uncertainty"])
+    kept = {key: one for key, one in document.get("uncertainty", {}).items() if not key.startswith(gone)}
     return {**tables, "uncertainty": {**kept, **tables["uncertainty"]}}
 
 

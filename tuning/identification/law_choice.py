@@ -43,7 +43,7 @@ def judge(motion: Motion, readings: Readings, plane: float | None, names=None) -
     """All laws (or those named), the one to take first."""
     judged = []
     _, plane_there, _ = guess = _fit(motion, readings, laws.kelvin_voigt(), plane, None)
-    judging = replace(readings, counts=readings.counts & ~_at_onset(motion, readings, guess))
+    judging = replace(readings, counts=readings.counts & ~at_onset(motion, readings, guess))
     deepest = float(np.max(motion.at(guess[0])[0][readings.counts])) - plane_there
     for name, build in families(readings, deepest):
         if names is not None and name not in names:
@@ -133,7 +133,7 @@ def quick(problem: Problem, guess: Fitted | None = None, reach: int = 4) -> Fitt
     return best
 
 
-def _at_onset(motion: Motion, readings: Readings, guess: Fitted) -> np.ndarray:
+def at_onset(motion: Motion, readings: Readings, guess: Fitted) -> np.ndarray:
     """Rows near the first and the last of a contact: a damped one begins with a jump, and whether a row is on
     this or that side of it says nothing of the law."""
     delay, plane, _ = guess

@@ -10,10 +10,10 @@ noise.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 
-from tuning.identification.hold import ROW_SHIFT
 from tuning.identification.rational import Model
 from tuning.identification.records import Run, Timing
 
@@ -23,19 +23,28 @@ TOLERANCE = 1e-9  # periods: nearer to a tick than this is at the tick
 class Motion:
     """The response of one model to the commands of several runs."""
 
-    def __init__(self, model: Model, runs: Sequence[Run], timing: Timing, longest: float):
-        """`longest`: greatest delay after the model's own [s] that `at` will be asked for."""
+    def __init__(
+        self,
+        model: Model,
+        runs: Sequence[Run],
+        timing: Timing,
+        longest: float,
+        late: np.ndarray | None = None,
+    ):
+        """`longest`: greatest delay after the model's own [s] that `at` will be asked for; `late`: what each
+        run adds to it [s], by a clock of its own."""
         self.delay, self.period = model.delay, timing.control_period
-        self.shift = ROW_SHIFT[timing.row]
+        self.late = late if late is not None and np.any(late) else None
+        least, most = (0.0, 0.0) if late is None else (min(late.min(), 0.0), max(late.max(), 0.0))
+        self.shift = timing.shift
         self.rows = max(len(run.tick) for run in runs)
         numerator, denominator = model.fraction
         self.order = len(denominator) - 1
         self.A, self.B, self.C = _companion(numerator, denominator, self.period)
-        self.history = (
-            int(np.ceil((max(self.delay, 0.0) + longest) / self.period)) + timing.command_latency + 4
-        )
+        longest = max(self.delay, 0.0) + longest + most
+        self.history = int(np.ceil(longest / self.period)) + timing.command_latency + 4
         # Readings of later ticks, by the way rows are written or by a delay below 0, need commands of then.
-        ahead = 1 + int(np.ceil(max(-self.delay, 0.0) / self.period))
+        ahead = max(1, -self.shift) + int(np.ceil((max(-self.delay, 0.0) - least) / self.period))
         command = self._commands(runs, ahead)
         latency = timing.command_latency
         self.end = command[1 : len(command) - latency]
@@ -46,6 +55,12 @@ class Motion:
 
     def at(self, delay: float) -> tuple[np.ndarray, np.ndarray]:
         """Position [m] and velocity [m/s] that a sensor with this delay [s] sees, (rows, lanes)."""
+        if self.late is None:
+            return self._at(delay, slice(None))
+        lanes = [self._at(delay + late, slice(i, i + 1)) for i, late in enumerate(self.late)]
+        return np.hstack([x for x, _ in lanes]), np.hstack([v for _, v in lanes])
+
+    def _at(self, delay: float, lanes: slice) -> tuple[np.ndarray, np.ndarray]:
         lag = (self.delay + delay) / self.period + self.shift
         whole = int(np.floor(lag + TOLERANCE))
         place = min(1.0, 1.0 - (lag - whole))
@@ -53,7 +68,7 @@ class Motion:
         if first < 0:
             raise ValueError(f"a delay of {delay:g} s is longer than the history kept")
         taken = slice(first, first + self.rows)
-        start, end = self.start[taken], self.end[taken]
+        start, end, states = self.start[taken, lanes], self.end[taken, lanes], self.states[taken, :, lanes]
         state, one, other = self._after(place)
         position = np.concatenate([self.C @ state, [self.C @ one, self.C @ other]])
         rate = np.concatenate([(self.C @ self.A) @ state, [self.C @ self.A @ one, self.C @ self.A @ other]])
@@ -62,11 +77,19 @@ class Motion:
         else:
             rate[-2] += (self.C @ self.B) * (1.0 - place)
             rate[-1] += (self.C @ self.B) * place
-        return tuple(self._row(row, taken, start, end) for row in (position, rate / self.period))
+        x, v = (
+            np.einsum("i,nil->nl", row[: self.order], states) + row[-2] * start + row[-1] * end
+            for row in (position, rate / self.period)
+        )
+        return x, v
 
-    def _row(self, row, taken, start, end):
-        states = np.einsum("i,nil->nl", row[: self.order], self.states[taken]) if self.order else 0.0
-        return states + row[-2] * start + row[-1] * end
+    def of(self, lanes: np.ndarray) -> Motion:
+        """The motion of some of the runs, each as often as it is named."""
+        found = copy(self)
+        found.start, found.end = self.start[:, lanes], self.end[:, lanes]
+        found.states = self.states[:, :, lanes]
+        found.late = None if self.late is None else self.late[lanes]
+        return found
 
     def _commands(self, runs: Sequence[Run], ahead: int) -> np.ndarray:
         """Commands with their history, (history + rows + ahead, lanes); after a run its last one is held."""

@@ -21,12 +21,14 @@ class Options:
     fixed: Mapping[str, Any] = field(default_factory=dict)  # by key, a list's too: told, not estimated
     bayes: bool = False  # whether the prior's normal marginals are evidence beside the logs
     hold_out: float = 0.2  # share of the touches that judge the fit to the others
+    bootstrap: int = 0  # fits to contacts drawn again, that widen intervals where contacts differ
     limit: float = 0.01  # on the restitution, of all that the model does not explain
     calibration: float = 0.001  # relative uncertainty of the force sensor's scale
     clock: float = 2e-5  # s, uncertainty of a delay that no log shows
     seed: int = 0
 
 
+FEWEST_FITS = 20  # whose scatter says something
 FIRST = ("rig.contact_plane", "rig.position_sensor.delay")  # told before anything is fitted
 
 
@@ -39,6 +41,8 @@ def check(options: Options, prior: Mechanism | None) -> None:
         raise InputError("bayes: found no prior, allowed a mechanism with [uncertainty]")
     if options.law is not None and options.law not in NAMES:
         raise InputError(f"law: found {shown(options.law)}, allowed {', '.join(NAMES)}")
+    if 0 < options.bootstrap < FEWEST_FITS:
+        raise InputError(f"bootstrap: found {options.bootstrap}, allowed 0, or {FEWEST_FITS} or more")
     orders = sorted({one.order for one in STRUCTURES})
     if options.order is not None and options.order not in orders:
         raise InputError(f"order: found {options.order}, allowed {', '.join(map(str, orders))}")

@@ -65,14 +65,14 @@ class Lines:
     period: float  # s, of control
     hold: str
     latency: int
-    row: str = "tick"
+    shift: int = 0  # periods by which readings lag the command of their row
 
     @cached_property
     def copies(self) -> tuple[np.ndarray, np.ndarray]:
         """s of every copy of each line, and what the hold makes of the command there."""
         every = holds.frequencies(self.frequency, self.period)
         return 2j * np.pi * every, self.command * holds.response(
-            every, self.period, self.hold, self.latency, self.row
+            every, self.period, self.hold, self.latency, self.shift
         )
 
     def __len__(self) -> int:

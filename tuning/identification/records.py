@@ -15,6 +15,9 @@ import numpy as np
 Kind = Literal["free", "press", "tap", "contact", "rest"]
 Hold = Literal["zoh", "linear"]
 Row = Literal["tick", "sent", "after"]
+# Ticks by which the logged readings lag the logged command by the way a row is written: "sent" rows hold the
+# command of the next tick, "after" rows the readings of the next one.
+ROW_SHIFT = {"tick": 0, "sent": 1, "after": -1}
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,7 @@ class Run:
     valid: np.ndarray  # bool, False where the row was lost or rebuilt: its residual does not count
     contact_index: np.ndarray | None  # int64, which entry of the contact lists is met; -1 for none
     speed: float | None  # m/s, of the approach, where the log tells it
+    begin: float = 0.0  # s, of tick 0 by the stamps
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,15 @@ class Timing:
     command_latency: int  # periods
     row: Row  # of a tick; "sent": with the next tick's command, "after": with the next tick's readings
     clock: Clock | None = None  # that of the run whose stamps scatter most
+    computing_delay: int = 0  # periods from a reading to the command that answers it
+    two_clocks: bool = False  # whether forces were logged by a clock of their own
+
+    @property
+    def shift(self) -> int:
+        """Periods by which a row's readings lag its command and that are no delay of the motion.
+
+        A controller that answers late is to the loop what a motion is that begins late."""
+        return ROW_SHIFT[self.row] - self.computing_delay
 
 
 @dataclass(frozen=True)
@@ -65,3 +78,4 @@ class Campaign:
     equivalent_mass: float  # kg, of the numerical model
     sources: dict[str, str] = field(default_factory=dict)  # SHA-256 of each file, in hex
     notes: tuple[str, ...] = ()  # what readers wondered about
+    integrator: str | None = None  # of the numerical model, where the logs or a prior tell it

@@ -19,6 +19,7 @@ from tuning.identification.contact_problem import LONGEST
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.law_choice import misfits
 from tuning.identification.records import Run
+from tuning.identification.two_clocks import differences, slope
 
 OTHER_HOLD = 2.0  # gain of the information criterion from which the other hold explains more
 RARE = 1e-3  # probability under which a defect is taken to be there
@@ -127,12 +128,12 @@ def of_contact(
 ) -> list[Line]:
     """Checks of the contact's model on touches that it was not fitted to (`held`, a flag each)."""
     lines = [_left(contact, held), _stiffness(contact), *_at_the_end(contact)]
-    errors, stds = restitution_errors(contact, runs, mass)
-    usable = held & np.isfinite(errors)
-    if usable.any():
-        lines.append(_restitution(errors[usable], stds[usable]))
-    trend = _trend(contact, len(runs), 2.0 * np.pi * frequency * lag)
-    return lines if trend is None else [*lines, trend]
+    if contact.drift is None:
+        errors, stds = restitution_errors(contact, runs, mass)
+        usable = held & np.isfinite(errors)
+        if usable.any():
+            lines.append(_restitution(errors[usable], stds[usable]))
+    return [*lines, *_trends(contact, len(runs), frequency, lag)]
 
 
 def _left(contact: ContactFit, held: np.ndarray) -> Line:
@@ -233,31 +234,39 @@ def _restitution(errors: np.ndarray, stds: np.ndarray) -> Line:
     )
 
 
-def _trend(contact: ContactFit, touches: int, angle: float) -> Line | None:
-    """Whether the force over the law's grows or falls from touch to touch."""
+def _trends(contact: ContactFit, touches: int, frequency: float, lag: float) -> list[Line]:
+    """Whether the force over the law's, or its delay, grows or falls from touch to touch."""
     delay, plane, inner = contact.posterior.best
-    predicted = np.where(
-        contact.readings.counts, contact.problem.force(delay, plane, inner.coefficients), 0.0
-    )
+    problem, std = contact.problem, contact.readings.std
+    predicted = np.where(contact.readings.counts, problem.force(delay, plane, inner.coefficients), 0.0)
     force = np.where(contact.readings.counts, contact.readings.force, 0.0)
-    predicted, force = (contact.problem.whiten(value) for value in (predicted, force))
+    predicted, force = (problem.whiten(value) for value in (predicted, force))
     power = np.sum(predicted**2, axis=0)
-    used = power > 100.0 * contact.readings.std**2
+    used = power > 100.0 * std**2
     if used.sum() < 4:
-        return None
-    share = np.sum(predicted * force, axis=0)[used] / power[used]
-    weight = power[used] / contact.readings.std**2
+        return []
     number = np.flatnonzero(used) / max(touches - 1, 1)
-    centre = np.average(number, weights=weight)
-    spread = np.sum(weight * (number - centre) ** 2)
-    slope = float(np.sum(weight * (number - centre) * share) / spread)
-    # What the law leaves otherwise widens the slope's error too.
-    scatter = share - np.average(share, weights=weight) - slope * (number - centre)
-    inflation = max(1.0, float(np.sum(weight * scatter**2)) / (used.sum() - 2))
-    std = float(np.sqrt(inflation / spread))
-    return Line(
-        "drift from touch to touch",
-        f"force {100 * slope:+.2g} +- {100 * std:.2g} % from the first touch to the last",
-        bool(2.0 * special.ndtr(-abs(slope) / std) < RARE),
-        float(np.pi / 4.0 * angle * abs(slope)),
-    )
+    share = np.sum(predicted * force, axis=0)[used] / power[used]
+    grown, grown_std = slope(share, power[used] / std**2, number)
+    off, variance = differences(problem, delay, plane, inner.coefficients)
+    later, later_std = slope(off[used], 1.0 / variance[used], number)
+    angle = 2.0 * np.pi * frequency
+    first = "from the first touch to the last"
+    return [
+        Line(
+            "drift from touch to touch",
+            f"force {100 * grown:+.2g} +- {100 * grown_std:.2g} % {first}",
+            _is_there(grown, grown_std),
+            float(np.pi / 4.0 * angle * lag * abs(grown)),
+        ),
+        Line(
+            "drift of the force delay",
+            f"{1e3 * later:+.2g} +- {1e3 * later_std:.2g} ms {first}",
+            _is_there(later, later_std),
+            float(np.pi / 4.0 * angle * abs(later)),
+        ),
+    ]
+
+
+def _is_there(value: float, std: float) -> bool:
+    return bool(2.0 * special.ndtr(-abs(value) / std) < RARE)

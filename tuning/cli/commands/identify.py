@@ -33,7 +33,7 @@ def run(options: Identify) -> int:
     if options.design:
         return identify_design.run(options)
     arguments.limit(options.limit)
-    arguments.integers(0, seed=options.seed)
+    arguments.integers(0, seed=options.seed, bootstrap=options.bootstrap)
     if not 0.0 <= options.hold_out < 1.0:
         raise InputError(f"--hold-out: found {options.hold_out}, allowed a share from 0 to below 1")
     if options.bayes and options.prior is None:
@@ -54,10 +54,11 @@ def run(options: Identify) -> int:
         fixed=fixed,
         bayes=options.bayes,
         hold_out=options.hold_out,
+        bootstrap=options.bootstrap,
         limit=options.limit,
         seed=options.seed,
     )
-    with terminal.stages(STAGES + 2) as stages:
+    with terminal.stages(STAGES + 2 + (options.bootstrap > 0)) as stages:
         stages.turn_to("reading the logs")
         campaign = _of_stage(read_logs(logs, options.map, prior), options.stage)
         found = identify(campaign, prior, asked, stages.turn_to)

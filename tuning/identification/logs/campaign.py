@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,7 +18,7 @@ import numpy as np
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.mechanism.structs import Mechanism
 from tuning.identification.logs import checks, clock, segments
-from tuning.identification.logs.causality import check_rows_of
+from tuning.identification.logs.causality import check_rows_of, integrator_of_all
 from tuning.identification.logs.mapping import (
     KINDS,
     Channel,
@@ -73,11 +74,12 @@ def read_campaign(
                 runs += reading.runs
                 notes += reading.notes
                 clocks.append(reading.ticks.clock)
-    check_rows_of(runs, timing, mapping.timing.computing_delay)
-    worst = max(clocks, key=lambda one: one.jitter)
+    integrator = integrator_of_all(runs, timing.control_period) or (prior and prior.rig.integrator)
+    if not timing.two_clocks:
+        check_rows_of(runs, timing, integrator)
+    timing = replace(timing, clock=max(clocks, key=lambda one: one.jitter))
     sources = {path.name: _sha256(path) for path in logs}
-    timing = Timing(timing.control_period, timing.command_hold, timing.command_latency, timing.row, worst)
-    return Campaign(tuple(runs), timing, mass, sources, tuple(dict.fromkeys(notes)))
+    return Campaign(tuple(runs), timing, mass, sources, tuple(dict.fromkeys(notes)), integrator)
 
 
 class _Reading:
@@ -102,8 +104,10 @@ class _Reading:
         lists = () if prior is None else (prior.contact.stiffness, prior.contact.damping)
         self._last = max(map(len, lists)) - 1 if lists else sys.maxsize
         log = open_log(path, mapping.text)
-        columns, stamps = _columns(log, mapping)
+        columns, stamps, self._begin = _columns(log, mapping)
         kept = _kept(stamps, entry, timing.control_period)
+        if stamps is not None:
+            self._begin += float(stamps[kept][0]) if len(stamps[kept]) else 0.0
         stamps, columns = None if stamps is None else stamps[kept], {n: c[kept] for n, c in columns.items()}
         rows = len(next(iter(columns.values())))
         if rows < checks.FEWEST_ROWS:
@@ -207,6 +211,7 @@ class _Reading:
             valid=stretch.valid[part],
             contact_index=index,
             speed=None if touched is None else _speed(x, touched[0], self._timing.control_period),
+            begin=self._begin,
         )
 
 
@@ -224,11 +229,12 @@ def _timing(mapping: LogMapping, prior: Mechanism | None) -> Timing:
         )
     hold = said.command_hold or (rig.command_hold if rig else "linear")
     latency = said.command_latency if said.command_latency is not None else rig.command_latency if rig else 0
-    return Timing(period, hold, latency, said.row)
+    late, separate = said.computing_delay, said.clock == "separate"
+    return Timing(period, hold, latency, said.row, None, late, separate)
 
 
-def _columns(log, mapping: LogMapping) -> tuple[Columns, np.ndarray | None]:
-    """The channels that are there, in SI units, and the stamps [s]."""
+def _columns(log, mapping: LogMapping) -> tuple[Columns, np.ndarray | None, float]:
+    """The channels that are there, in SI units, the stamps [s] from the first, and that one."""
     channels = mapping.channels
     wanted: dict[str, str] = {}
     for name in (*NUMBERS, "mode"):
@@ -250,13 +256,13 @@ def _columns(log, mapping: LogMapping) -> tuple[Columns, np.ndarray | None]:
             factor, offset = si(channel, name)
             values = values if (factor, offset) == (1.0, 0.0) else factor * values + offset
         columns[name] = values
-    return columns, _stamps(log.label, read, mapping)
+    return columns, *_stamps(log.label, read, mapping)
 
 
-def _stamps(label: str, read: Columns, mapping: LogMapping) -> np.ndarray | None:
+def _stamps(label: str, read: Columns, mapping: LogMapping) -> tuple[np.ndarray | None, float]:
     time = mapping.channels.time
     if time.column is None:
-        return None
+        return None, 0.0
     stamps = read[time.column]
     if time.time_format is not None:
         return clock.parsed(stamps, time.time_format, label)
@@ -266,7 +272,7 @@ def _stamps(label: str, read: Columns, mapping: LogMapping) -> np.ndarray | None
     checks.check_rows(label, "time", stamps)
     # The first stamp may count from an epoch: what is left has digits to spare.
     factor = si(Channel(column=time.column, unit=time.unit), "time")[0]
-    return factor * (stamps - stamps[:1])
+    return factor * (stamps - stamps[:1]), factor * float(stamps[0]) if len(stamps) else 0.0
 
 
 def _kept(stamps: np.ndarray | None, entry: RunFiles, period: float) -> slice:

@@ -14,6 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxhil.errors import InputError
+from tuning.identification.logs.rows import integrator_of
+from tuning.identification.logs.segments import resting, threshold
 from tuning.identification.records import Run, Timing
 
 AHEAD, BEHIND = 2, 6  # rows after and before a command whose readings are tried
@@ -25,26 +27,39 @@ ALTERNATES = (
 FEWEST = 100  # rows
 FAR = 8.0  # times the median residual, beyond which a row is left out
 AGREE = 0.7  # of the runs that tell
+NEAR = 50  # rows before and after a contact
 ROUNDS = 6  # of leaving rows out
 MOST_RUNS = 50  # looked at, of any number
 MOST_DELAY = 4  # ticks
 ROWS_AHEAD = {"sent": 1, "tick": 0, "after": -1}
+EXPLICIT = "explicit_euler"  # moves the model by a reading a tick later than the others
 
 
-def check_rows_of(runs: Sequence[Run], timing: Timing, computing_delay: int) -> None:
+def check_rows_of(runs: Sequence[Run], timing: Timing, integrator: str | None = None) -> None:
     """Contacts' rows are as `timing.row` says, as far as noise tells: a command answers the reading of its
-    own tick, or of `computing_delay` ticks before. Raises `InputError`."""
+    own tick, or of `timing.computing_delay` ticks before; under the explicit integrator of a tick more.
+    Raises `InputError`."""
     found = rows_ahead(runs)
-    if found is None or found == ROWS_AHEAD[timing.row] - computing_delay:
+    usual = timing.computing_delay + (integrator == EXPLICIT)
+    if found is None or found == ROWS_AHEAD[timing.row] - usual:
         return
-    meant = [row for row, ahead in ROWS_AHEAD.items() if ahead - computing_delay == found]
-    late = ROWS_AHEAD[timing.row] - found
+    meant = [row for row, ahead in ROWS_AHEAD.items() if ahead - usual == found]
+    late = ROWS_AHEAD[timing.row] - found - (integrator == EXPLICIT)
     allowed = [f'row = "{row}"' for row in meant] + [f"computing_delay = {late}"] * (0 < late <= MOST_DELAY)
+    if late == 1 and integrator is None:
+        allowed.append(f'velocity_desired, or a prior whose rig.integrator is "{EXPLICIT}"')
     place = "their own row" if found == 0 else f"{abs(found)} rows {'after' if found > 0 else 'before'} them"
     raise InputError(
         f'timing.row: found "{timing.row}", but commands answer the force reading of {place}, '
         f"allowed {' or '.join(allowed) or 'another row'}"
     )
+
+
+def integrator_of_all(runs: Sequence[Run], period: float) -> str | None:
+    """How the numerical model moves by its velocity, by most of the contacts that log it."""
+    contacts = [run for run in runs if run.kind == "contact"][:MOST_RUNS]
+    told = [integrator_of(run.position_desired, run.velocity_desired, period) for run in contacts]
+    return max(set(told), key=told.count, default=None)
 
 
 def rows_ahead(runs: Sequence[Run]) -> int | None:
@@ -87,13 +102,19 @@ def _first(moved: np.ndarray, columns: np.ndarray) -> int | None:
 
 def _columns(run: Run) -> tuple[np.ndarray, np.ndarray] | None:
     """Second differences of the commands, and what they may depend on: readings about them, where the model
-    is and how fast; all differenced twice more. Rows in contact alone."""
+    is and how fast; all differenced twice more. Rows in contact and next to it alone: before and after that a
+    rig may be driven by something else."""
     x, force = run.position_desired, run.force_measured
     assert force is not None
     if len(x) < AHEAD + BEHIND + FEWEST // 2:
         return None
+    loud = np.abs(force - resting(force)) > threshold(force)
+    touched = np.flatnonzero(loud[:-2] & loud[1:-1] & loud[2:])
+    if not len(touched):
+        return None
     second = x[2:] - 2 * x[1:-1] + x[:-2]
-    rows = np.arange(BEHIND + 1, len(x) - AHEAD - 1)
+    first, last = touched[0] - NEAR, touched[-1] + 2 + NEAR
+    rows = np.arange(max(BEHIND + 1, first), min(len(x) - AHEAD - 1, last))
     readings = [force[rows + ahead] for ahead in range(AHEAD, -BEHIND - 1, -1)]
     whole = np.stack([second[rows - 1], *readings, x[rows], x[rows] - x[rows - 1]], axis=1)
     whole = np.diff(whole, n=2, axis=0)

@@ -60,8 +60,8 @@ def counted(rows: int, period: float) -> Ticks:
     return Ticks(np.arange(rows, dtype=np.int64), Clock(period, 0.0, 0.0, 0))
 
 
-def parsed(stamps: np.ndarray, time_format: str, label: str) -> np.ndarray:
-    """Seconds from the first stamp, of texts as `datetime.strptime` reads them."""
+def parsed(stamps: np.ndarray, time_format: str, label: str) -> tuple[np.ndarray, float]:
+    """Seconds from the first stamp, and of that one, of texts as `datetime.strptime` reads them."""
     found = []
     for row, stamp in enumerate(stamps):
         try:
@@ -71,7 +71,8 @@ def parsed(stamps: np.ndarray, time_format: str, label: str) -> np.ndarray:
             raise InputError(
                 f"{label}: row {row + 1}: time: found {shown(stamp)}, allowed {allowed}"
             ) from None
-    return np.array([(one - found[0]).total_seconds() for one in found])
+    begin = (found[0].replace(tzinfo=None) - datetime(1970, 1, 1)).total_seconds() if found else 0.0
+    return np.array([(one - found[0]).total_seconds() for one in found]), begin
 
 
 def _check_rate(steps: np.ndarray, period: float, label: str, column: str) -> None:

@@ -85,7 +85,7 @@ class LogTiming(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     computing_delay: Annotated[
         int, says("periods from a reading to the command that answers it", ge=0, le=4)
     ] = 0
-    clock: Literal["stamps", "index"] = "stamps"  # index: stamps only order the rows
+    clock: Literal["stamps", "index", "separate"] = "stamps"  # separate: of the drives alone
 
 
 class Text(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

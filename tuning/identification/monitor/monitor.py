@@ -16,6 +16,7 @@ from tuning.identification.monitor.prediction import Prediction
 from tuning.identification.monitor.readings import Readings, motion_of, readings
 from tuning.identification.monitor.uncertain import Uncertain, uncertain
 from tuning.identification.records import Campaign, Run, Timing
+from tuning.identification.two_clocks import refuse
 
 BLOCK = 64  # runs computed at once
 SENSOR_DELAYS = "rig.force_sensor.delay", "rig.position_sensor.delay"
@@ -77,6 +78,7 @@ def monitor(campaign: Campaign, mechanism: Mechanism) -> Monitored:
     """Hold the contacts of a campaign, in their order, against a mechanism.
 
     Raises `InputError` where there is no contact, or the mechanism is none that a log can be held against."""
+    refuse(campaign.timing)
     runs = [run for run in campaign.runs if run.kind in ("contact", "tap") and run.force_measured is not None]
     if not runs:
         raise InputError("logs: found no contact, allowed a run of kind contact or tap")

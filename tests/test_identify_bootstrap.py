@@ -1,0 +1,87 @@
+"""Fits to contacts drawn again: as wide as stated where noise is all, and wider where contacts differ."""
+
+from dataclasses import replace
+
+import campaigns
+import numpy as np
+import pytest
+
+import jaxhil
+from tuning.identification.bootstrap import bootstrap
+from tuning.identification.contact import estimate
+from tuning.identification.contact_laws import kelvin_voigt
+from tuning.identification.estimate import Options, identify
+from tuning.identification.rational import STRUCTURES, Model
+
+
+def scattering(seed, share, speeds=campaigns.SPEEDS):
+    """A campaign whose stiffness and damping differ from contact to contact by that share."""
+    whole = campaigns.campaign("clean", seed, speeds=(), seconds=10.0)
+    kind, rng = campaigns.KINDS["clean"], np.random.default_rng(seed)
+    runs = list(whole.runs)
+    for number, speed in enumerate(speeds):
+        times = 1.0 + share * rng.standard_normal()
+        contact = {**kind.contact, "stiffness": [1.2e5 * times], "damping": [650.0 * times]}
+        (run,) = campaigns._touch_runs(replace(kind, contact=contact), rng, (speed,))
+        runs.append(replace(run, source=f"{number}.csv"))
+    return replace(whole, runs=tuple(runs))
+
+
+def of(campaign, repeats):
+    return identify(campaign, options=Options(law="kelvin_voigt", order=2, bootstrap=repeats, hold_out=0.0))
+
+
+@pytest.mark.parametrize("times", (1.2, 3.0))
+def test_draws_scatter_as_the_fits_do_where_those_scatter_more(monkeypatch, times):
+    kind, timing = campaigns.KINDS["clean"], campaigns.campaign("clean", 0, (), 0, 0).timing
+    runs = campaigns._touch_runs(kind, np.random.default_rng(0), (0.006, 0.012) * 4)
+    model = Model(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
+    fit = estimate(runs, model, timing, None, kelvin_voigt())
+    had = fit.posterior.draws
+    monkeypatch.setattr(
+        "tuning.identification.bootstrap.fits", lambda *_: had.mean(axis=0) + times * (had - had.mean(axis=0))
+    )
+    found = bootstrap(fit, 20)
+    # Of n fits' scatter about their own mean n / (n - 1) is that about the truth.
+    expected = times * np.sqrt(8.0 / 7.0) if times > 1.5 else 1.0
+    np.testing.assert_allclose(found.draws().std(axis=0), expected * had.std(axis=0), rtol=0.05)
+    assert ("those of noise" if times < 1.5 else "the bootstrap's") in found.resampled.split(
+        "intervals are "
+    )[1]
+
+
+@pytest.mark.slow
+def test_where_contacts_differ_intervals_widen_to_match():
+    campaign = scattering(0, 0.02, (0.012, 0.006) * 4)
+    stated, wide = of(campaign, 0), of(campaign, 20)
+    assert any("intervals are the bootstrap's" in note for note in wide.notes)
+    # 2 % over 8 contacts, of unequal weight.
+    assert 0.004 < wide["contact.stiffness.0"].std / 1.2e5 < 0.015
+    assert wide["contact.stiffness.0"].std > 2.0 * stated["contact.stiffness.0"].std
+    assert wide["contact.stiffness.0"].value == pytest.approx(stated["contact.stiffness.0"].value, rel=1e-9)
+    written = wide.mechanism["uncertainty"]["contact.stiffness"]["std"]
+    assert written == pytest.approx(wide["contact.stiffness.0"].std, rel=0.01)
+
+
+def test_what_it_cannot_say_is_said():
+    few = campaigns.campaign("clean", 0, speeds=(0.006, 0.012, 0.006), seconds=5.0)
+    assert "no bootstrap: 3 contacts, 6 are needed" in of(few, 20).notes
+    with pytest.raises(jaxhil.InputError, match="bootstrap: found 5, allowed 0, or 20 or more"):
+        of(few, 5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("share", "repeats"), ((0.0, 40), (0.02, 40)))
+def test_intervals_cover_the_stiffness_whether_contacts_differ_or_not(share, repeats):
+    inside, without, widened = [], [], 0
+    for seed in range(repeats):
+        campaign = scattering(100 + seed, share)
+        wide, stated = of(campaign, 40), of(campaign, 0)
+        for flags, found in ((inside, wide), (without, stated)):
+            one = found["contact.stiffness.0"]
+            flags.append(one.low <= 1.2e5 <= one.high)
+        widened += any("the bootstrap's" in note for note in wide.notes)
+    covered = f"covered {np.mean(inside)}, without {np.mean(without)}, {widened} widened"
+    print(f"contacts differ by {share}: {covered}")
+    assert np.mean(inside) >= 0.85
+    assert widened <= 0.3 * repeats if share == 0.0 else widened == repeats
