@@ -100,7 +100,7 @@ def serve() -> None:
     import tuning.bundle.bundle
     import tuning.cli.parser
     import tuning.front_door.sweep
-    import tuning.gains.tune
+    import tuning.gains.tune_all
     import tuning.pictures.plots
     import tuning.sweeps.pictures
     import tuning.sweeps.replay

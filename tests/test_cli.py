@@ -131,13 +131,13 @@ def test_bad_files_do_not_stop_the_others(jaxhil, tuned, tmp_path):
 
 
 def test_interrupted_keeps_what_was_finished(jaxhil, tuned, tmp_path, monkeypatch):
-    from tuning.gains.tune import tune_all
+    from tuning.gains.tune_all import tune_all
 
     def stopped_after_the_first(*arguments, **named):
         yield next(tune_all(*arguments, **named))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tuning.gains.tune.tune_all", stopped_after_the_first)
+    monkeypatch.setattr("tuning.gains.tune_all.tune_all", stopped_after_the_first)
     files = ["rig-300kg", "rod-100n-mm", "--compensator", "none"]
     ran = jaxhil("tune", *files, "-o", tmp_path, "--json", *TINY)
     assert ran.code == 130

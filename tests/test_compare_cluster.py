@@ -1,5 +1,7 @@
 """A comparison on a dask.distributed cluster: the same figures to the bit, whoever dies."""
 
+from typing import Any
+
 import pytest
 from clusters import started
 
@@ -9,7 +11,7 @@ from jaxhil.errors import InputError
 
 pytestmark = pytest.mark.users_options
 LAWS = ["none", "phase_lead", "response_error"]
-FEW = {"untuned": True, "judged": 16}
+FEW: dict[str, Any] = {"untuned": True, "judged": 16}
 
 
 def figures(board):

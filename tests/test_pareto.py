@@ -21,7 +21,7 @@ from tuning.gains.pareto import dominated, fronts
 from tuning.gains.pareto_search import ENDS, amplification, has_trade_off, ladder
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import build_task
-from tuning.gains.tune import tune_all
+from tuning.gains.tune_all import tune_all
 from tuning.gains.validation import VALIDATION_SEED, build_validation
 
 POINTS = 5

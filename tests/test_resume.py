@@ -22,7 +22,7 @@ from tuning.caches import pieces
 from tuning.caches.pieces import FOLDER, Pieces
 from tuning.gains.common_program import common_programs
 from tuning.gains.settings import TuneSettings
-from tuning.gains.tune import tune_all
+from tuning.gains.tune_all import tune_all
 from tuning.statistics.intervals import Estimate
 
 HERE = Path(__file__).parent

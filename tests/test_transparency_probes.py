@@ -20,7 +20,7 @@ from tuning.gains.pareto_search import PEAK, TRANSPARENCY, default_axis
 from tuning.gains.rounds import solve_tasks
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import build_task
-from tuning.gains.tune import tune
+from tuning.gains.tune_all import tune
 from tuning.gains.validation import build_validation
 from tuning.transparency.probes import (
     LANES_PER_SCENARIO,

@@ -22,7 +22,8 @@ from tuning.gains.tasks import (
     spread_points,
     tuned_names,
 )
-from tuning.gains.tune import figures, tune, uncompensated
+from tuning.gains.tune import figures, uncompensated
+from tuning.gains.tune_all import tune
 from tuning.gains.validation import build_validation
 from tuning.optimisation.levenberg_marquardt import STATUSES
 from tuning.optimisation.unit_box import to_coordinates, to_gains

@@ -228,7 +228,7 @@ def judge_law(
     from jaxhil.compensators import COMPENSATORS, literature_gains
     from tuning.benchmark.runs import judge_gains, lanes_judged
     from tuning.gains.settings import TuneSettings
-    from tuning.gains.tune import tune_all
+    from tuning.gains.tune_all import tune_all
     from tuning.gains.work import Work
 
     mechanisms = [scene.mechanism for scene in scenes]

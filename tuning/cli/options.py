@@ -213,6 +213,7 @@ class Tune:
     unset: Unset = ()
     limit: Limit = 0.01
     resume: Resume = False
+    scheduler: Scheduler = None
     json: Json = False
     timings: Timings = False
 

@@ -47,6 +47,7 @@ class TuneOptions:
     limit: float = 0.01
     pareto: int = 0
     pareto_against: str | None = None
+    scheduler: str | None = None
 
     def check(self) -> None:
         """What can be checked without jax. Raises `InputError`."""
@@ -239,6 +240,7 @@ def tune(
     pareto_against: str | None = None,
     seed: int = 0,
     limit: float = 0.01,
+    scheduler: str | None = None,
     progress: bool = False,
 ) -> Any:
     """Tune a compensator's gains for a mechanism; judge them on scenarios that tuning never saw.
@@ -270,6 +272,8 @@ def tune(
             where the law anticipates.
         seed: of scenarios and starts.
         limit: the rms error [1] that is still good.
+        scheduler: address of a dask.distributed cluster's scheduler, whose workers then tune; a front is
+            computed here.
         progress: say on standard error what is going on.
 
     Returns:
@@ -309,7 +313,7 @@ def tune_each(
     """Index and result of every mechanism, as they are done; the `bar` shows how far it is. What is among the
     `pieces` is taken from there, and the rest kept there."""
     from tuning.caches.pieces import NOTHING_KEPT
-    from tuning.gains.tune import tune_all
+    from tuning.gains.tune_all import tune_all
     from tuning.gains.work import Work
 
     settings, known = options.settings(), options.known()
@@ -317,5 +321,8 @@ def tune_each(
     number = len(loaded)
     work = Work(lambda text, share, before: bar.tell(text, share * number, before * number))
     kept = pieces or NOTHING_KEPT
-    for index, found in tune_all(mechanisms, options.compensator, settings, work, known, pieces=kept):
+    results = tune_all(
+        mechanisms, options.compensator, settings, work, known, pieces=kept, scheduler=options.scheduler
+    )
+    for index, found in results:
         yield index, TunedGains(found, loaded[index].sha256, options.limit)

@@ -29,7 +29,8 @@ from tuning.gains.pareto_search import (
 )
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import TuneTask, alike, build_task
-from tuning.gains.tune import BLOCK, ErrorFigures, TuneResult, block_name, figures
+from tuning.gains.tune import ErrorFigures, TuneResult, block_name, figures
+from tuning.gains.tune_all import BLOCK
 from tuning.gains.validation import Validation, build_validation, judged_runs, split_nominal
 from tuning.gains.work import Work
 from tuning.statistics.bootstrap import ErrorIntervals, error_intervals

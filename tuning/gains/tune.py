@@ -1,35 +1,27 @@
-"""Tuning of mechanisms: scenarios, starts, solve, and judgement on scenarios that tuning never saw.
-
-What is found of each is kept at once, and until then every step of the search, where there is a place for it
-(`tuning.caches.pieces`).
-"""
+"""Tuning of mechanisms: scenarios, starts, solve, and judgement on scenarios that tuning never saw."""
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxhil.compensators import compensator_of
-from jaxhil.mechanism.file import AnyMechanism, to_builtins
+from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.evaluation import Outcome
-from jaxhil.simulation.metrics import Metrics
-from tuning.caches.pieces import NOTHING_KEPT, Pieces
 from tuning.gains import simulated
-from tuning.gains.common_program import CommonProgram
 from tuning.gains.global_search import FACTOR, GlobalComparison, compare_with_global_search
 from tuning.gains.multistart import MultistartResult, expected_runs, find_gains
 from tuning.gains.objective import SCALE
 from tuning.gains.rounds import Start
 from tuning.gains.settings import TuneSettings
-from tuning.gains.tasks import TuneTask, alike, build_task
-from tuning.gains.transfer import Tuned, carry_over, near_to
+from tuning.gains.tasks import TuneTask
+from tuning.gains.transfer import Tuned, carry_over
 from tuning.gains.validation import (
     Validation,
     build_validation,
-    fresh_scenarios,
     judged_runs,
     split_nominal,
 )
@@ -38,8 +30,6 @@ from tuning.optimisation.sensitivity import sensitivity
 from tuning.statistics.bootstrap import ErrorIntervals, error_intervals
 from tuning.statistics.intervals import Estimate
 from tuning.transparency.probes import probe_figures
-
-BLOCK = 16  # mechanisms tuned and judged together: what is done when work is interrupted is kept
 
 
 class ErrorFigures(NamedTuple):
@@ -90,151 +80,10 @@ class TuneResult:
         return max(self.settings.starts, 1 + len(self.first)) - len(self.first)
 
 
-class _Kept(NamedTuple):
-    """What of a result does not follow from what was asked for; its fields, and outcomes as arrays."""
-
-    gains: dict[str, float]
-    figures: dict[str, ErrorFigures]
-    nominal: dict[str, ErrorFigures]
-    starts: list[Start]
-    outcomes: dict[str, list[np.ndarray]]
-    timings: dict[str, float]
-    intervals: ErrorIntervals | None
-    freedom: dict[str, Freedom]
-    global_comparison: GlobalComparison | None
-    transparency: dict[str, dict[str, Estimate]]
-
-
-def tune(
-    mechanism: AnyMechanism, compensator: str, settings: TuneSettings, work: Work | None = None
-) -> TuneResult:
-    """Tune the gains of `compensator` for `mechanism`; the `work` hears how far it is."""
-    return next(tune_all([mechanism], compensator, settings, work))[1]
-
-
-def tune_all(
-    mechanisms: Sequence[AnyMechanism],
-    compensator: str,
-    settings: TuneSettings,
-    work: Work | None = None,
-    tuned: Sequence[Tuned] = (),
-    common: CommonProgram | None = None,
-    pieces: Pieces = NOTHING_KEPT,
-) -> Iterator[tuple[int, TuneResult]]:
-    """(index, result) of every mechanism, as they are done: like ones together, in one program.
-
-    The gains of the nearest of those `tuned` before, with the same compensator, are a start for each, and so
-    are those of the nearest that an earlier block found: in the places of the last other starts, never of the
-    literature's. Unlike mechanisms of one `common` program are tuned together in it.
-
-    Each result is a piece of those kept, under its mechanism's name. It follows from all mechanisms that are
-    tuned together: the last bits of each depend on the others.
-    """
-    work = work or Work()
-    tasks = [
-        build_task(
-            m, compensator, settings.scenarios, settings.seed, common, settings.setting, settings.probed
-        )
-        for m in mechanisms
-    ]
-    found: list[Tuned] = []
-    blocks = [
-        group[begin : begin + BLOCK]
-        for group in _groups(tasks, settings)
-        for begin in range(0, len(group), BLOCK)
-    ]
-    expected = [_expected_runs([tasks[index] for index in block], settings) for block in blocks]
-    afterwards = work.later
-    for number, block in enumerate(blocks):
-        work.later = afterwards + sum(expected[number + 1 :])
-        sources = [known for known in (tuned, found) if known]
-        sources = sources[: max(settings.starts - 1, 1 if tuned else 0)]
-        near = [near_to(mechanisms[i], sources) for i in block]
-        results = _kept_or_tuned([tasks[index] for index in block], settings, work, near, pieces)
-        found.extend(
-            Tuned(one.mechanism, one.gains, one.mechanism.name)
-            for one in results
-            if isinstance(one.mechanism, Mechanism)
-        )
-        yield from zip(block, results, strict=True)
-
-
-def _kept_or_tuned(
-    tasks: list[TuneTask], settings: TuneSettings, work: Work, near: list[list[Tuned]], pieces: Pieces
-) -> list[TuneResult]:
-    """A block's results, kept from before or tuned now."""
-    first = tasks[0]
-    work.name = block_name(tasks)
-    if not pieces.keeps:
-        return tune_block(tasks, settings, work, near)
-    inputs = [
-        *("tune", first.compensator, [to_builtins(task.mechanism) for task in tasks], settings, first.common),
-        [[(to_builtins(one.mechanism), one.gains, one.source) for one in own] for own in near],
-    ]
-    names = [f"tune {task.mechanism.name}" for task in tasks]
-    kept = [pieces.read(name, (inputs, i), _Kept) for i, name in enumerate(names)]
-    if all(kept):
-        work.keep("as kept", _expected_runs(tasks, settings))
-        return [_restored(*each, settings) for each in zip(tasks, near, kept, strict=True)]
-    work.journal = pieces.journal(names[0], inputs)
-    results = tune_block(tasks, settings, work, near)
-    for i, (name, one) in enumerate(zip(names, results, strict=True)):
-        pieces.write(name, (inputs, i), _to_keep(one))
-    work.journal.finish()
-    return results
-
-
-def _to_keep(result: TuneResult) -> _Kept:
-    values = {name: getattr(result, name) for name in _Kept._fields}
-    outcomes = {key: [*one.metrics, *one[1:]] for key, one in result.outcomes.items()}
-    return _Kept(**{**values, "outcomes": outcomes})
-
-
-def _restored(task: TuneTask, near: list[Tuned], kept: _Kept, settings: TuneSettings) -> TuneResult:
-    number = len(Metrics._fields)
-    arrays: dict[str, list[Any]] = {**kept.outcomes}
-    outcomes = {key: Outcome(Metrics(*own[:number]), *own[number:]) for key, own in arrays.items()}
-    return TuneResult(
-        **{**kept._asdict(), "outcomes": outcomes},
-        compensator=task.compensator,
-        mechanism=task.mechanism,
-        literature=task.literature,
-        scenarios=fresh_scenarios(task, settings.validation, settings.seed),
-        settings=settings,
-        first=tuple(near),
-    )
-
-
-def _expected_runs(tasks: list[TuneTask], settings: TuneSettings) -> float:
-    """Simulated runs that a block takes, about."""
-    return _search_runs(tasks, settings) + _judging_runs(tasks, settings)
-
-
-def _search_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
-    searched = settings.setting is None and any(task.tuned for task in tasks)
-    return expected_runs(tasks, settings) if searched else 0
-
-
-def _judging_runs(tasks: list[TuneTask], settings: TuneSettings) -> float:
-    """Those of the judgement and, if one is asked for, of the search everywhere."""
-    judged = 3 * len(tasks) * judged_runs(settings.validation, tasks[0].probed)
-    everywhere = FACTOR * _search_runs(tasks, settings) if settings.global_search else 0
-    return judged + everywhere
-
-
-def _groups(tasks: list[TuneTask], settings: TuneSettings) -> list[list[int]]:
-    """Indices of what one program serves; a user's function also gets as many contacts of all."""
-    groups = alike([task.loop for task in tasks], [task.scenarios for task in tasks])
-    if settings.objective.function is None:
-        return groups
-    numbers = {task.contacts for task in tasks}
-    split = ([i for i in group if tasks[i].contacts == number] for group in groups for number in numbers)
-    return [group for group in split if group]
-
-
 def tune_block(
     tasks: list[TuneTask], settings: TuneSettings, work: Work, near: list[list[Tuned]]
 ) -> list[TuneResult]:
+    """What is found for mechanisms of one program, each of which starts from gains `near` it as well."""
     clock, validation = _Clock(), build_validation(tasks, settings.validation, settings.seed, work)
     judging = _judging_runs(tasks, settings)
     work.later += judging
@@ -282,9 +131,26 @@ def tune_block(
     return results
 
 
+def runs_of_block(tasks: list[TuneTask], settings: TuneSettings) -> float:
+    """Simulated runs that a block takes, about."""
+    return _search_runs(tasks, settings) + _judging_runs(tasks, settings)
+
+
 def block_name(tasks: Sequence[TuneTask]) -> str:
     """What messages call mechanisms that are tuned together."""
     return tasks[0].mechanism.name if len(tasks) == 1 else f"{len(tasks)} mechanisms"
+
+
+def _search_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
+    searched = settings.setting is None and any(task.tuned for task in tasks)
+    return expected_runs(tasks, settings) if searched else 0
+
+
+def _judging_runs(tasks: list[TuneTask], settings: TuneSettings) -> float:
+    """Those of the judgement and, if one is asked for, of the search everywhere."""
+    judged = 3 * len(tasks) * judged_runs(settings.validation, tasks[0].probed)
+    everywhere = FACTOR * _search_runs(tasks, settings) if settings.global_search else 0
+    return judged + everywhere
 
 
 def _search(

@@ -1,0 +1,38 @@
+"""Tuning on a dask.distributed cluster: the same gains to the bit."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from clusters import started
+
+import jaxhil
+import tuning
+from jaxhil.errors import InputError
+
+pytestmark = pytest.mark.users_options
+FEW: dict[str, Any] = {"scenarios": 4, "starts": 1, "steps": 2, "validation": 15}
+
+
+def test_a_scheduler_that_is_not_there_is_one_line():
+    pytest.importorskip("distributed")
+    with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
+        tuning.tune("varying", scheduler="nowhere://x", **FEW)
+
+
+@pytest.mark.slow
+def test_the_same_gains_of_two_programs_and_two_blocks(tmp_path, monkeypatch):
+    monkeypatch.setattr("tuning.gains.tune_all.BLOCK", 2)
+    changes = [{"bodies.equivalent_mass": mass} for mass in (3e2, 4e2, 5e2)]
+    mechanisms = [jaxhil.load("varying", {**one, "name": f"mass {i}"}) for i, one in enumerate(changes)]
+    mechanisms.append(jaxhil.load("suite-rattling"))
+    here = tuning.tune(mechanisms, **FEW)
+    with started(tmp_path) as cluster:
+        cluster.worker()
+        cluster.worker()
+        there = tuning.tune(mechanisms, scheduler=cluster.address, **FEW)
+    for own, other in zip(here, there, strict=True):
+        assert other.gains == own.gains and other.figures == own.figures
+        assert other.found.starts[0].history == own.found.starts[0].history
+        for key, outcome in own.found.outcomes.items():
+            np.testing.assert_array_equal(other.found.outcomes[key].error, outcome.error)
