@@ -76,6 +76,9 @@ def drift(
         late = late + step * time
         if abs(step) * np.ptp(time) < CLOSE:
             break
+    if not std * np.ptp(time) < LONGEST:
+        allowed = "touches whose forces are within their runs"
+        raise InputError(f'timing.clock: found "separate" and forces that follow no touch, allowed {allowed}')
     rate = float(np.ptp(late) / np.ptp(time) * np.sign(np.dot(late - late.mean(), time)))
     return Drift(rate, std, late)
 
