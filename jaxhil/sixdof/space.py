@@ -1,7 +1,8 @@
 """Contact in space, without a rig: continuous and undelayed, which is what a rig is judged against.
 
 The two bodies are followed by Dormand and Prince's pair of order 5(4), in steps whose error is held small: a
-step in which a force jumps or bends is made again, shorter. Each lane has its own steps. Within a step each
+step in which something begins or ceases to touch is made again, down to 1 us: derivatives by what moves that
+time are then right, too. Each lane has its own steps. Within a step each
 stage sees what the laws remember from the step's start: laws with a memory are of first order, and have
 shorter steps.
 """
@@ -31,7 +32,7 @@ from jaxhil.sixdof.vectors import norm
 
 TOLERANCE = 1e-10  # of a step's error, per the relative speed
 SHORTEST = 1e-9  # s: a step that is accepted whatever its error
-LATCHED = 1e-6  # s: within which the time at which a latch catches is found
+EVENT = 1e-6  # s: within which the time is found at which something begins or ceases to touch, or is caught
 REMEMBERING = 1e-4  # s: longest step of laws with a memory
 SMALLEST, LARGEST = 0.1, 4.0  # change of the length from one step to the next
 # Dormand and Prince 1980: nodes, coefficients of the stages, the last of which is the solution of order 5,
@@ -79,6 +80,7 @@ class Flight(NamedTuple):
 
     time: Float[Array, "*batch"]  # since its start [s]
     length: Float[Array, "*batch"]  # of the next step [s]
+    touching: tuple[Bool[Array, "candidates *batch"], ...]  # now, of each group
     memories: Memories
     states: States  # of the bodies
 
@@ -97,7 +99,8 @@ def start_flight(space: Space, states: States, length: Float[Array, "*batch"]) -
     if space.latches:
         pose, _ = relative(space.bodies, states)
         memories = memories._replace(held=tuple(init_latch(latch, pose) for latch in space.latches))
-    return Flight(0 * length, length, memories, states)
+    touching = tuple(group.parameters.damping > jnp.inf for group in space.groups)
+    return Flight(0 * length, length, touching, memories, states)
 
 
 def instant(
@@ -123,10 +126,12 @@ def advance_flight(
         longest = jnp.minimum(longest, REMEMBERING)
     length = lax.stop_gradient(jnp.minimum(flight.length, longest))
     now, memories, error = take_step(space, flight, length, speed)
-    catches = jnp.zeros(length.shape, bool)
-    for before, after in zip(flight.memories.held, memories.held, strict=True):
-        catches = catches | jnp.any(after.caught & ~before.caught, axis=0)
-    late = catches & (length > LATCHED)
+    touching = tuple(forces.touch.depth > 0 for forces in now.forces)
+    before = (*flight.touching, *(held.caught for held in flight.memories.held))
+    happens = jnp.zeros(length.shape, bool)
+    for old, new in zip(before, (*touching, *(held.caught for held in memories.held)), strict=True):
+        happens = happens | jnp.any(old != new, axis=0)
+    late = happens & (length > EVENT)
     accepted = ((error <= 1) | (length <= SHORTEST)) & ~late
     safe = jnp.where(jnp.isfinite(error), jnp.maximum(error, 1e-12), 1e12)
     change = jnp.clip(0.9 * safe**-0.2, SMALLEST, jnp.where(accepted, LARGEST, 0.9))
@@ -137,7 +142,7 @@ def advance_flight(
     ahead = lax.stop_gradient(jnp.where(late, length / 4, proposed))
     # Of what is not a number, there is no more to come.
     time = jnp.where(jnp.isfinite(error), flight.time + length, jnp.inf)
-    moved = Flight(time, ahead, memories, now.states)
+    moved = Flight(time, ahead, touching, memories, now.states)
     return choose(accepted, moved, flight._replace(length=ahead)), Step(now, memories, accepted)
 
 
