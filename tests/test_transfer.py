@@ -9,7 +9,7 @@ import pytest
 from jaxhil.compensators import COMPENSATORS, literature_gains
 from jaxhil.mechanism.file import builtin_names, load
 from jaxhil.simulation.evaluation import evaluate
-from tuning.gains import tune
+from tuning.gains import tune_all
 from tuning.gains.multistart import choose_starts
 from tuning.gains.objective import RMS, objective_value
 from tuning.gains.rounds import solve_tasks
@@ -200,7 +200,7 @@ def test_a_given_start_never_ends_worse_than_it_was(task, validation, solved):
 @pytest.fixture
 def in_blocks(monkeypatch):
     """Where starts come from when mechanisms of 1e5, 3e5 and 2.9e5 N/m are tuned two at a time."""
-    monkeypatch.setattr(tune, "BLOCK", 2)
+    monkeypatch.setattr(tune_all, "BLOCK", 2)
 
     def block(tasks, settings, work, near):
         return [
@@ -208,12 +208,12 @@ def in_blocks(monkeypatch):
             for t, own in zip(tasks, near, strict=True)
         ]
 
-    monkeypatch.setattr(tune, "tune_block", block)
+    monkeypatch.setattr(tune_all, "tune_block", block)
 
     def call(starts, tuned=()):
         mechanisms = [claw(f"contact.stiffness=[{k}]", f"name='{k}'") for k in ("1e5", "3e5", "2.9e5")]
         settings = TuneSettings(scenarios=4, starts=starts)
-        every = dict(tune.tune_all(mechanisms, "phase_lead", settings, tuned=tuned))
+        every = dict(tune_all.tune_all(mechanisms, "phase_lead", settings, tuned=tuned))
         return [[one.source for one in every[i].near] for i in range(3)]
 
     return call

@@ -2,9 +2,8 @@
 
 The two bodies are followed by Dormand and Prince's pair of order 5(4), in steps whose error is held small: a
 step in which something begins or ceases to touch is made again, down to 1 us: derivatives by what moves that
-time are then right, too. Each lane has its own steps. Within a step each
-stage sees what the laws remember from the step's start: laws with a memory are of first order, and have
-shorter steps.
+time are then right, too. Each lane has its own steps. Within a step each stage sees what the laws remember
+from the step's start: laws with a memory are of first order, and have shorter steps.
 """
 
 from typing import Any, NamedTuple
@@ -99,7 +98,7 @@ def start_flight(space: Space, states: States, length: Float[Array, "*batch"]) -
     if space.latches:
         pose, _ = relative(space.bodies, states)
         memories = memories._replace(held=tuple(init_latch(latch, pose) for latch in space.latches))
-    touching = tuple(group.parameters.damping > jnp.inf for group in space.groups)
+    touching = tuple(jnp.zeros_like(group.parameters.damping, bool) for group in space.groups)
     return Flight(0 * length, length, touching, memories, states)
 
 

@@ -19,8 +19,8 @@ STEP = 0.0005  # s from place to place, at least a tick
 FIRST = -6  # of the places, in steps
 WAY = 0.012  # s of depth whose readings count
 VARIANCE = 4.0  # s_I^2 [1/s^2]
-LEAST = 1e-6  # of a likelihood: what one contact rules out, others may show
-CERTAIN = 20.0
+LEAST_LIKELY = 1e-6  # of a likelihood: what one contact rules out, others may show
+LIKELIER = 20.0  # than a sharp jump: then it counts as smoothed
 
 _LAGS = np.repeat(np.array(LAGS)[:, None], PLACES, axis=1)
 _STEPS = np.repeat(FIRST + np.arange(PLACES, dtype=float)[None], len(LAGS), axis=0)
@@ -59,7 +59,7 @@ class SmoothedJump:
         self._moment = zeros + STIFFNESS / STIFFNESS_VARIANCE
         carried = self._carried * self._likelihood
         share = carried / np.fmax.reduce(carried, initial=0.0)
-        self._carried = np.where(share > LEAST, share, LEAST)
+        self._carried = np.where(share > LEAST_LIKELY, share, LEAST_LIKELY)
         self._likelihood = np.ones(len(LAGS))
         self._over = False
 
@@ -85,7 +85,7 @@ class SmoothedJump:
     @property
     def smoothed(self) -> bool:
         """Whether the odds say so."""
-        return self.odds > CERTAIN
+        return self.odds > LIKELIER
 
     def _weigh(self) -> None:
         """The likelihood of each lag by all readings so far, and the odds."""
