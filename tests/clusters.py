@@ -60,3 +60,10 @@ def started(folder):
         for process in cluster.processes:
             if process.poll() is None:
                 cluster.kill(process)
+
+
+def awaited(seconds):
+    """A piece that takes so long: from when to when."""
+    begun = time.time()
+    time.sleep(seconds)
+    return begun, time.time()

@@ -6,10 +6,11 @@ import sys
 
 import numpy as np
 import pytest
-from clusters import ROOT, started
+from clusters import ROOT, awaited, started
 from sweep_cases import case, manifest
 
 from jaxhil.errors import InputError
+from tuning.caches.cluster import Piece, on_workers
 from tuning.sweeps.cluster import on_cluster, run_part
 from tuning.sweeps.manifest import encode
 from tuning.sweeps.parts import same_rows
@@ -95,6 +96,23 @@ def test_a_part_that_kills_its_workers_is_computed_here(tmp_path):
         rows, tally = rows_of(tmp_path / "store", on_cluster(cluster.address), few)
     here, again = rows_of(tmp_path / "here", label=few)
     assert same_rows(rows, here) == [] and tally == again
+
+
+@pytest.mark.slow
+def test_workers_that_join_later_have_pieces_too(tmp_path, monkeypatch):
+    monkeypatch.setattr("tuning.caches.cluster.RECOUNT", 0.5)
+    with started(tmp_path) as cluster:
+        cluster.worker()
+        spans = []
+        for _, span in on_workers(
+            cluster.address, awaited, (Piece(i, (1.0,)) for i in range(40)), None, "late"
+        ):
+            if not spans:
+                for _ in range(3):
+                    cluster.worker()
+            spans.append(span)
+    assert len(spans) == 40
+    assert max(sum(begun <= at < ended for begun, ended in spans) for at, _ in spans) == 4
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Tuning on a dask.distributed cluster: the same gains to the bit."""
+"""Tuning on a dask.distributed cluster: the same gains to the bit, and the same fronts."""
 
 from typing import Any
 
@@ -21,18 +21,20 @@ def test_a_scheduler_that_is_not_there_is_one_line():
 
 
 @pytest.mark.slow
-def test_the_same_gains_of_two_programs_and_two_blocks(tmp_path, monkeypatch):
-    monkeypatch.setattr("tuning.gains.tune_all.BLOCK", 2)
+def test_the_same_gains_and_fronts_of_two_programs_and_two_blocks(tmp_path, monkeypatch):
+    for place in ("tune_all", "pareto"):
+        monkeypatch.setattr(f"tuning.gains.{place}.BLOCK", 2)
     changes = [{"bodies.equivalent_mass": mass} for mass in (3e2, 4e2, 5e2)]
     mechanisms = [jaxhil.load("varying", {**one, "name": f"mass {i}"}) for i, one in enumerate(changes)]
     mechanisms.append(jaxhil.load("suite-rattling"))
-    here = tuning.tune(mechanisms, **FEW)
+    here = tuning.tune(mechanisms, pareto=2, **FEW)
     with started(tmp_path) as cluster:
         cluster.worker()
         cluster.worker()
-        there = tuning.tune(mechanisms, scheduler=cluster.address, **FEW)
+        there = tuning.tune(mechanisms, pareto=2, scheduler=cluster.address, **FEW)
     for own, other in zip(here, there, strict=True):
         assert other.gains == own.gains and other.figures == own.figures
         assert other.found.starts[0].history == own.found.starts[0].history
+        assert [one.point for one in other.pareto] == [one.point for one in own.pareto]
         for key, outcome in own.found.outcomes.items():
             np.testing.assert_array_equal(other.found.outcomes[key].error, outcome.error)

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 from jaxhil.simulation.compile_cache import keep_sealed
@@ -166,13 +167,21 @@ def flags(given: str) -> str:
         "--xla_backend_extra_options": "xla_cpu_small_while_loop_byte_threshold=1000000000,"
         "xla_cpu_use_multi_output_fusion",
     }
+    if find_spec("jax_plugins") and os.environ.get("JAX_PLATFORMS") != "cpu":
+        # A graphics card's programs would be optimised less, too; the other flags they do not know.
+        del ours["--xla_backend_optimization_level"]
     named = {flag.split("=")[0] for flag in given.split()}
     added = [f"{name}={value}" for name, value in ours.items() if name not in named]
     return " ".join([*given.split(), *added])
 
 
 def known_options(options: Mapping[str, int | str]) -> dict[str, int | str]:
-    """Those of a program's `compiler_options` that this version of the compiler has. It starts jax."""
+    """Those of a program's `compiler_options` that this version of the compiler has; for processors, all of
+    them. It starts jax."""
+    import jax
+
+    if jax.default_backend() != "cpu":
+        return {}
     return {name: value for name, value in options.items() if _is_known(name, value)}
 
 

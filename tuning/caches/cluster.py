@@ -4,15 +4,19 @@ A worker that dies costs the time of the pieces that it had. A piece of which se
 while there are no workers, is computed here.
 """
 
+import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from itertools import islice
+from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 
 from jaxhil.errors import InputError, one_line, shown
 from tuning.caches.worker import Setting, run
 
 PATIENCE = 20.0  # s without a piece done, after which it is asked whether there are workers
+RECOUNT = 2.0  # s, after which it is asked how many there are
+EACH = 2  # pieces under way per worker
 
 
 class Piece(NamedTuple):
@@ -26,7 +30,7 @@ def on_workers(
     address: str, function: Callable[..., Any], pieces: Iterable[Piece], setting: Setting | None, what: str
 ) -> Generator[tuple[Any, Any], None, None]:
     """(name, result of `function`) of every piece, in the order in which workers finish them; a few are under
-    way per worker.
+    way per worker, of those that join later too.
 
     `function` is one of a module, and is called on workers that are as `setting` says; with None it has to
     see to that itself. `what` names the work, differently from any other under way.
@@ -38,6 +42,7 @@ def on_workers(
         from cloudpickle import dumps  # pyright: ignore[reportMissingImports]
 
         waiting, running = iter(pieces), {}
+        ended: SimpleQueue[Any] = SimpleQueue()
 
         def submit(number: int) -> None:
             for piece in islice(waiting, number):
@@ -45,34 +50,36 @@ def on_workers(
                 asked = dumps((function, piece.arguments))
                 future = client.submit(run, asked, setting, key=f"jaxhil-{what}-{piece.name}", pure=False)
                 running[future] = piece
+                future.add_done_callback(ended.put)
 
-        submit(max(2, 2 * _workers(client)))
+        workers, counted = _workers(client), time.monotonic()
+        submit(max(2, EACH * workers))
         while running:
-            ended = _ended(client, list(running))
-            if not ended and not _workers(client):
-                ended = [next(iter(running))]
-                ended[0].cancel()
-            for future in ended:
-                piece = running.pop(future)
-                submit(1)
+            future, found = _next(ended), None
+            if time.monotonic() - counted > RECOUNT or future is None:
+                workers, counted = _workers(client), time.monotonic()
+            if future is not None and future in running:
                 found = _found(future)
-                yield piece.name, function(*piece.arguments) if found is None else found[0]
+            elif future is None and not workers:
+                future = next(iter(running))
+                future.cancel()
+            else:
+                continue
+            piece = running.pop(future)
+            submit(max(1, EACH * workers - len(running)))
+            yield piece.name, function(*piece.arguments) if found is None else found[0]
 
 
 def _workers(client: Any) -> int:
-    return len(client.scheduler_info(n_workers=-1)["workers"])
+    return client.scheduler_info(n_workers=0)["n_workers"]
 
 
-def _ended(client: Any, futures: list[Any]) -> list[Any]:
-    """Those that have ended; none if that takes long."""
-    from distributed import wait  # pyright: ignore[reportMissingImports]
-
+def _next(ended: "SimpleQueue[Any]") -> Any:
+    """One that has ended; None if that takes long."""
     try:
-        with client.as_current():
-            ended: Any = wait(futures, timeout=PATIENCE, return_when="FIRST_COMPLETED")
-        return list(ended.done)
-    except TimeoutError:
-        return []
+        return ended.get(timeout=PATIENCE)
+    except Empty:
+        return None
 
 
 def _client(address: str) -> Any:
@@ -89,11 +96,9 @@ def _client(address: str) -> Any:
 
 
 def _found(future: Any) -> tuple[Any] | None:
-    """What a worker found of a piece; None if several died of it, or there are none."""
+    """What a worker found of a piece; None if several died of it."""
     from distributed import KilledWorker  # pyright: ignore[reportMissingImports]
 
-    if future.cancelled():
-        return None
     try:
         return (future.result(),)
     except KilledWorker:

@@ -68,6 +68,9 @@ class Identify:
     limit: Annotated[
         float, arg(metavar="NUMBER", help="Restitution error from which the verdict is bad.")
     ] = 0.01
+    scheduler: Annotated[
+        str | None, text("ADDRESS", "With --bootstrap: a dask.distributed cluster whose workers do its fits.")
+    ] = None
     seed: Annotated[int, number("Seed of the draws behind intervals.")] = 0
     json: Json = False
     timings: Timings = False

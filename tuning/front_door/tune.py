@@ -272,8 +272,7 @@ def tune(
             where the law anticipates.
         seed: of scenarios and starts.
         limit: the rms error [1] that is still good.
-        scheduler: address of a dask.distributed cluster's scheduler, whose workers then tune; a front is
-            computed here.
+        scheduler: address of a dask.distributed cluster's scheduler, whose workers then tune.
         progress: say on standard error what is going on.
 
     Returns:
@@ -299,7 +298,7 @@ def tune(
         results = [found[index] for index in range(len(loaded))]
     if pareto:
         with computing(), terminal.progress(len(loaded), "fronts", progress) as bar:
-            for place, front in tune_pareto.trade(results, pareto, pareto_against, bar):
+            for place, front in tune_pareto.trade(results, pareto, pareto_against, bar, None, scheduler):
                 results[place] = dataclasses.replace(results[place], pareto=tuple(front))
     return results if several else results[0]
 

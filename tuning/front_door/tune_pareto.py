@@ -119,9 +119,11 @@ def trade(
     against: str | None,
     bar: Progress,
     pieces: "Pieces | None" = None,
+    scheduler: str | None = None,
 ) -> "Iterator[tuple[int, list[TradedGains]]]":
     """Place and front of every result, as they are done; the `bar` shows how far it is. What is among the
-    `pieces` is taken from there, and the rest kept there."""
+    `pieces` is taken from there, and the rest kept there. With a `scheduler`, a cluster's workers compute
+    them."""
     from tuning.caches.pieces import NOTHING_KEPT
     from tuning.gains.pareto import fronts
     from tuning.gains.work import Work
@@ -129,5 +131,5 @@ def trade(
     found = [one.found for one in tuned]
     axis: Any = axis_of(against, tuned[0].compensator) if tuned else None
     work = Work(lambda text, share, before: bar.tell(text, share * len(found), before * len(found)))
-    for place, front in fronts(found, number, work, axis, pieces or NOTHING_KEPT):
+    for place, front in fronts(found, number, work, axis, pieces or NOTHING_KEPT, scheduler):
         yield place, [TradedGains(tuned[place], front, point) for point in front.points]

@@ -6,16 +6,21 @@ still may have to choose between accuracy and the peak of its command (`Objectiv
 accuracy and transparency (`Objective.transparency_weight`).
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jaxhil.mechanism.file import to_builtins
 from jaxhil.simulation.evaluation import Outcome
-from tuning.caches.pieces import NOTHING_KEPT, Pieces
+from tuning.caches.cluster import Piece, on_workers
+from tuning.caches.pieces import NOTHING_KEPT, Pieces, decode, digest_of, encode
+from tuning.caches.worker import setting
 from tuning.gains.objective import Objective, contact_terms, objective_value
 from tuning.gains.pareto_search import (
     NOISE,
@@ -61,6 +66,39 @@ class Point(NamedTuple):
         return float(f"{self.error:.{DIGITS}g}"), float(f"{self.cost:.{DIGITS}g}")
 
 
+class _Block(NamedTuple):
+    """Mechanisms whose fronts are found together, in one program."""
+
+    tasks: list[TuneTask]  # one a mechanism
+    tuned: list[TuneResult]  # what was tuned of each
+    number: int  # of points
+    axis: Axis
+
+    @property
+    def settings(self) -> TuneSettings:
+        """How all were tuned."""
+        return self.tuned[0].settings
+
+    @property
+    def names(self) -> list[str]:
+        """Of the pieces."""
+        return [f"pareto {one.mechanism.name}" for one in self.tuned]
+
+    @property
+    def inputs(self) -> list[Any]:
+        """All that the fronts follow from."""
+        return [
+            *("pareto", self.number, self.axis, self.settings, self.tuned[0].compensator),
+            [(to_builtins(one.mechanism), one.gains, one.starts) for one in self.tuned],
+        ]
+
+    @property
+    def runs(self) -> int:
+        """Simulated ones that it takes, about."""
+        searched = ladder_runs(self.tasks, self.number, self.settings)
+        return searched + _judging_runs(self.tasks, self.settings, self.number)
+
+
 class Front(NamedTuple):
     """What can be had of accuracy and of the axis's cost."""
 
@@ -84,73 +122,105 @@ def fronts(
     work: Work | None = None,
     axis: Axis = NOISE,
     pieces: Pieces = NOTHING_KEPT,
+    scheduler: str | None = None,
 ) -> Iterator[tuple[int, Front]]:
     """(index, front of `number` points) of mechanisms that were tuned by one compensator with the same
     settings, as they are done. Transparency is traded by those whose settings judge it. Each front is a piece
-    of those kept."""
+    of those kept. With a `scheduler`, the workers of a cluster compute those of mechanisms of one program."""
     work = work or Work()
-    settings = results[0].settings if results else TuneSettings()
-    tasks = [
-        build_task(r.mechanism, r.compensator, settings.scenarios, settings.seed, probed=settings.probed)
+    tasks = _tasks(results)
+    groups = alike([task.loop for task in tasks], [task.scenarios for task in tasks])
+    places = [group[begin : begin + BLOCK] for group in groups for begin in range(0, len(group), BLOCK)]
+    blocks = [_Block([tasks[i] for i in own], [results[i] for i in own], number, axis) for own in places]
+    work.later = sum(block.runs for block in blocks)
+    if scheduler is None:
+        computed = _here(blocks, work, pieces)
+    else:
+        computed = _on_cluster(scheduler, blocks, work, pieces)
+    for place, made in computed:
+        yield from zip(places[place], made, strict=True)
+
+
+def _tasks(results: Sequence[TuneResult]) -> list[TuneTask]:
+    return [
+        build_task(
+            r.mechanism, r.compensator, r.settings.scenarios, r.settings.seed, probed=r.settings.probed
+        )
         for r in results
     ]
-    groups = alike([task.loop for task in tasks], [task.scenarios for task in tasks])
-    blocks = [group[begin : begin + BLOCK] for group in groups for begin in range(0, len(group), BLOCK)]
-    expected = [_expected_runs([tasks[index] for index in block], settings, number) for block in blocks]
+
+
+def _here(blocks: list[_Block], work: Work, pieces: Pieces) -> Iterator[tuple[int, list[Front]]]:
+    """(place, fronts) of every block, one after the other."""
     for place, block in enumerate(blocks):
-        work.later = sum(expected[place + 1 :])
-        some, tuned = [tasks[index] for index in block], [results[index] for index in block]
-        work.name = block_name(some)
-        made = _kept_or_made(some, tuned, number, settings, work, axis, pieces)
-        yield from zip(block, made, strict=True)
+        work.later -= block.runs
+        work.name = block_name(block.tasks)
+        made = _kept(block, pieces)
+        if made is not None:
+            work.keep("front as kept", block.runs)
+        else:
+            if pieces.keeps:
+                work.journal = pieces.journal(block.names[0], block.inputs)
+            made = _fronts_of(block, work)
+            _keep(block, pieces, made)
+            work.journal.finish()
+        yield place, made
 
 
-def _kept_or_made(
-    tasks: list[TuneTask],
-    tuned: list[TuneResult],
-    number: int,
-    settings: TuneSettings,
-    work: Work,
-    axis: Axis,
-    pieces: Pieces,
-) -> list[Front]:
-    """The fronts of mechanisms of one program, kept from before or made now."""
+def _on_cluster(
+    scheduler: str, blocks: list[_Block], work: Work, pieces: Pieces
+) -> Iterator[tuple[int, list[Front]]]:
+    """(place, fronts) of every block, in the order in which workers finish them."""
+    missing = []
+    for place, block in enumerate(blocks):
+        made = _kept(block, pieces)
+        if made is None:
+            # Runs and scenarios are for plots, and many.
+            light = [replace(one, outcomes={}, scenarios=None) for one in block.tuned]
+            missing.append(Piece(place, (light, block.number, block.axis)))
+            continue
+        work.later -= block.runs
+        work.keep("front as kept", block.runs)
+        yield place, made
+    what = f"pareto-{digest_of([block.inputs for block in blocks])[:16]}"
+    work.begin("on the cluster", 0.0)
+    for place, content in on_workers(scheduler, fronts_to_keep, missing, setting(), what):
+        block, made = blocks[place], decode(content, list[Front])
+        work.later -= block.runs
+        work.name = block_name(block.tasks)
+        work.begin("front from the cluster", block.runs)
+        work.ran(block.runs)
+        _keep(block, pieces, made)
+        yield place, made
+
+
+def fronts_to_keep(tuned: list[TuneResult], number: int, axis: Axis) -> bytes:
+    """The fronts of mechanisms of one program, on a worker."""
+    return encode(_fronts_of(_Block(_tasks(tuned), tuned, number, axis), Work()))
+
+
+def _kept(block: _Block, pieces: Pieces) -> list[Front] | None:
+    """A block's fronts as kept from before; None if one is missing."""
     if not pieces.keeps:
-        return _fronts_of(tasks, tuned, number, settings, work, axis)
-    inputs = [
-        *("pareto", number, axis, settings, tuned[0].compensator),
-        [(to_builtins(one.mechanism), one.gains, one.starts) for one in tuned],
-    ]
-    names = [f"pareto {one.mechanism.name}" for one in tuned]
-    kept = [pieces.read(name, (inputs, i), Front) for i, name in enumerate(names)]
-    if all(kept):
-        work.keep("front as kept", _expected_runs(tasks, settings, number))
-        return kept
-    work.journal = pieces.journal(names[0], inputs)
-    made = _fronts_of(tasks, tuned, number, settings, work, axis)
-    for i, (name, front) in enumerate(zip(names, made, strict=True)):
-        pieces.write(name, (inputs, i), front)
-    work.journal.finish()
-    return made
+        return None
+    kept = [pieces.read(name, (block.inputs, i), Front) for i, name in enumerate(block.names)]
+    return kept if all(kept) else None
 
 
-def _fronts_of(
-    tasks: list[TuneTask],
-    tuned: list[TuneResult],
-    number: int,
-    settings: TuneSettings,
-    work: Work,
-    axis: Axis,
-) -> list[Front]:
-    work.begin(f"accuracy against {axis.name}, {number} points", _expected_runs(tasks, settings, number))
+def _keep(block: _Block, pieces: Pieces, made: list[Front]) -> None:
+    if pieces.keeps:
+        for i, (name, front) in enumerate(zip(block.names, made, strict=True)):
+            pieces.write(name, (block.inputs, i), front)
+
+
+def _fronts_of(block: _Block, work: Work) -> list[Front]:
+    tasks, tuned, number, axis = block
+    settings = block.settings
+    work.begin(f"accuracy against {axis.name}, {number} points", block.runs)
     validation = build_validation(tasks, settings.validation, settings.seed, work)
     points = solve_ladders(validation, tuned, number, settings, axis)
     work.begin(f"judging {number} points", _judging_runs(tasks, settings, number))
     return _judge(validation, tuned, points, settings, axis)
-
-
-def _expected_runs(tasks: list[TuneTask], settings: TuneSettings, number: int) -> int:
-    return ladder_runs(tasks, number, settings) + _judging_runs(tasks, settings, number)
 
 
 def _judging_runs(tasks: list[TuneTask], settings: TuneSettings, number: int) -> int:

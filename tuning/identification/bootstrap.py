@@ -2,7 +2,7 @@
 
 The likelihood knows the noise of every reading alone. Where contacts differ by more, its intervals are too
 narrow; fits to as many contacts, drawn with replacement, scatter by all of it (Efron 1979). Contacts of one
-entry of the lists are drawn for one another.
+entry of the lists are drawn for one another. No fit needs another: the workers of a cluster can do them.
 """
 
 from __future__ import annotations
@@ -11,23 +11,27 @@ from dataclasses import replace
 
 import numpy as np
 
+from tuning.caches.cluster import Piece, on_workers
+from tuning.caches.pieces import digest_of
+from tuning.caches.worker import setting
 from tuning.identification.contact import ROUGH, ContactFit
-from tuning.identification.contact_problem import Problem
+from tuning.identification.contact_problem import Problem, Readings
 from tuning.identification.contact_profile import profile
 
 FEWEST = 6  # contacts
+FITS = 5  # of a piece for a worker
 WIDER = 1.5  # times the standard deviation stated, from which more than noise makes contacts differ
 
 
-def bootstrap(fit: ContactFit, repeats: int, seed: int = 0) -> ContactFit:
+def bootstrap(fit: ContactFit, repeats: int, seed: int = 0, scheduler: str | None = None) -> ContactFit:
     """The fit with draws that scatter as fits to other contacts do, if those scatter more than stated; what
-    was found is in its `resampled`."""
+    was found is in its `resampled`. With a `scheduler` the workers of a cluster fit."""
     posterior, readings = fit.posterior, fit.readings
     lanes = readings.force.shape[1]
     if lanes < FEWEST or fit.problem.time_constant:
         why = "the sensor's lag" if fit.problem.time_constant else f"{lanes} contacts, {FEWEST} are needed"
         return replace(fit, resampled=f"no bootstrap: {why}")
-    found = fits(fit, repeats, seed)
+    found = fits(fit, repeats, seed, scheduler)
     groups = len({*_entries(fit)})
     spread = np.cov(found.T) * lanes / max(lanes - groups, 1)
     stated = posterior.covariance
@@ -52,16 +56,30 @@ def bootstrap(fit: ContactFit, repeats: int, seed: int = 0) -> ContactFit:
     return replace(fit, posterior=widened, resampled=f"{said}: intervals are the bootstrap's")
 
 
-def fits(fit: ContactFit, repeats: int, seed: int) -> np.ndarray:
+def fits(fit: ContactFit, repeats: int, seed: int, scheduler: str | None = None) -> np.ndarray:
     """The numbers of the posterior, each time from other contacts, (repeats, names)."""
-    problem, rng, entries = fit.problem, np.random.default_rng([seed, 3]), _entries(fit)
+    rng, entries = np.random.default_rng([seed, 3]), _entries(fit)
     members = [np.flatnonzero(entries == entry) for entry in np.unique(entries)]
-    found = []
-    for _ in range(repeats):
-        lanes = np.concatenate([rng.choice(one, len(one)) for one in members])
-        again = Problem(problem.motion.of(lanes), fit.readings.of_lanes(lanes), fit.law, problem.plane)
-        found.append(profile(again, seed, fit.posterior.best[:2], ROUGH).mean)
-    return np.array(found)
+    drawn = [np.concatenate([rng.choice(one, len(one)) for one in members]) for _ in range(repeats)]
+    known = fit.problem, fit.readings, seed, fit.posterior.best[:2]
+    pieces = [Piece(begin, (drawn[begin : begin + FITS], *known)) for begin in range(0, repeats, FITS)]
+    if scheduler is None:
+        found = {piece.name: means(*piece.arguments) for piece in pieces}
+    else:
+        what = f"bootstrap-{digest_of((drawn, seed, fit.readings.force, fit.problem.motion.states))[:16]}"
+        found = dict(on_workers(scheduler, means, pieces, setting(), what))
+    return np.concatenate([found[piece.name] for piece in pieces])
+
+
+def means(
+    drawn: list[np.ndarray], problem: Problem, readings: Readings, seed: int, near: tuple[float, float]
+) -> np.ndarray:
+    """Posterior means of fits to the `drawn` lanes of each, (fits, names)."""
+    again = [
+        Problem(problem.motion.of(lanes), readings.of_lanes(lanes), problem.law, problem.plane)
+        for lanes in drawn
+    ]
+    return np.array([profile(one, seed, near, ROUGH).mean for one in again])
 
 
 def _entries(fit: ContactFit) -> np.ndarray:

@@ -132,7 +132,7 @@ class Problem:
         self.sums = (
             len(self.kept) / readings.std**2,
             self.target.sum() / readings.std,
-            self.target @ self.target,
+            _dot(self.target, self.target),
         )
         # Parts of a period before the row at which the force is computed: a lag integrates it.
         self.before = (0.0,) if time_constant == 0.0 else (0.0, 0.5)
@@ -161,9 +161,10 @@ class Problem:
             return inner
         by_plane = self._by_plane(delay, plane, inner.coefficients, near[0], flags[0])
         residual, design = fit[3][0], fit[4][0]
-        along = design @ by_plane
+        along = _dot(design, by_plane)
         across = along @ inner.covariance @ along
-        return replace(inner, slope=float(residual @ by_plane), curvature=float(by_plane @ by_plane - across))
+        slope, curvature = _dot(residual, by_plane), _dot(by_plane, by_plane) - across
+        return replace(inner, slope=float(slope), curvature=float(curvature))
 
     def across(self, delay: float, planes: np.ndarray) -> list[Inner]:
         """The same at several planes at once, without slopes by the plane."""
@@ -282,7 +283,7 @@ class Problem:
         if not self.plain and not self.local:
             design[:, -1] = float(np.sum(self.readings.whitening)) / std
         target = self.target[near[0].rows] if self.plain else self.target
-        normal, right = design @ design.swapaxes(1, 2), design @ target
+        normal, right = design @ design.swapaxes(1, 2), _dot(design, target)
         summed = self.plain and not self.local
         if summed:
             normal[:, -1, -1], right[:, -1] = self.sums[:2]
@@ -295,7 +296,7 @@ class Problem:
         if self.plain:
             # Rows out of contact have the bias as their residual.
             bias = coefficients[:, -1] if summed else np.zeros(len(design))
-            misfit = misfit + self.sums[2] - target @ target
+            misfit = misfit + self.sums[2] - _dot(target, target)
             misfit += bias**2 * (self.sums[0] - len(target) / std**2)
             misfit -= 2.0 * bias * (self.sums[1] - target.sum() / std)
         return coefficients, covariance, misfit, residual, design
@@ -368,3 +369,8 @@ class Problem:
 def _force(coefficients: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """The law without the bias, (planes, rows)."""
     return (coefficients[..., None, :-1] @ columns)[:, 0]
+
+
+def _dot(table: np.ndarray, values: np.ndarray) -> Any:
+    """Sums of products along the rows. BLAS would add up as many parts as it has threads: other last bits."""
+    return np.einsum("...m,m->...", table, values)

@@ -171,7 +171,7 @@ def _contact(
     fit = contacts.estimate(runs, model, campaign.timing, force, options.law, plane, options.seed)
     if options.bootstrap:
         say(f"fitting {options.bootstrap} times to contacts drawn again")
-        fit = bootstrap(fit, options.bootstrap, options.seed)
+        fit = bootstrap(fit, options.bootstrap, options.seed, options.scheduler)
     say("judging the fit by touches left out of it")
     held = held_out(runs, options.hold_out)
     judged = fit if not held.any() else contacts.without(fit, held, options.seed)

@@ -26,6 +26,7 @@ class Options:
     calibration: float = 0.001  # relative uncertainty of the force sensor's scale
     clock: float = 2e-5  # s, uncertainty of a delay that no log shows
     seed: int = 0
+    scheduler: str | None = None  # address of that of a cluster whose workers do the bootstrap's fits
 
 
 FEWEST_FITS = 20  # whose scatter says something

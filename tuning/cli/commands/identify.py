@@ -38,6 +38,8 @@ def run(options: Identify) -> int:
         raise InputError(f"--hold-out: found {options.hold_out}, allowed a share from 0 to below 1")
     if options.bayes and options.prior is None:
         raise InputError("--bayes: found no prior, allowed --prior with a normal entry in [uncertainty]")
+    if options.scheduler is not None and not options.bootstrap:
+        raise InputError("--scheduler: found no --bootstrap, allowed beside one: it is what workers do")
     if options.check:
         return _check(options, logs)
     fixed, order = _fixed(options), _order(options)
@@ -57,6 +59,7 @@ def run(options: Identify) -> int:
         bootstrap=options.bootstrap,
         limit=options.limit,
         seed=options.seed,
+        scheduler=options.scheduler,
     )
     with terminal.stages(STAGES + 2 + (options.bootstrap > 0)) as stages:
         stages.turn_to("reading the logs")

@@ -29,7 +29,8 @@ def trade(
     """Fronts of the mechanisms that are `done`, written beside their gains and added to their entries."""
     order, made = sorted(done), {}
     results = [done[index] for index in order]
-    for place, points in tune_pareto.trade(results, options.pareto, options.pareto_against, bar, pieces):
+    asked = options.pareto, options.pareto_against, bar, pieces, options.scheduler
+    for place, points in tune_pareto.trade(results, *asked):
         index = order[place]
         folder = Path(entries[index]["gain_file"]).parent
         try:

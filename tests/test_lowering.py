@@ -1,0 +1,99 @@
+"""One program for processors and graphics cards: rollout and derivatives lower for CUDA as they are, without
+a call back into Python, and options of the compiler for processors are given to those alone."""
+
+import re
+
+import jax
+import numpy as np
+import pytest
+from jax import export
+
+from jaxhil.compensators import COMPENSATORS, SIX_AXES, literature_gains
+from jaxhil.mechanism.file import load_any
+from jaxhil.simulation import environment
+from jaxhil.simulation.environment import ROLLOUT, flags, known_options
+from jaxhil.simulation.evaluation import _run_tiles, shard
+from tuning.gains import simulated
+
+LEVEL = "--xla_backend_optimization_level"
+LINEAR_EQUATIONS = {"cusolver_getrf_ffi", "cu_lu_pivots_to_permutation"}
+ONE_AXIS = [(name, law) for law in COMPENSATORS for name in ("varying", "suite-rattling")]
+
+
+def calls(function, *arguments):
+    """Names of all that a program, lowered for CUDA, calls outside of it."""
+    lowered = export.export(jax.jit(function), platforms=["cuda"])(*arguments)
+    assert lowered.platforms == ("cuda",)
+    assert not lowered.ordered_effects and not lowered.unordered_effects
+    return set(re.findall(r"custom_call @(\w+)", lowered.mlir_module()))
+
+
+def case(name, compensator):
+    mechanism = load_any(name).mechanism
+    scenarios = simulated.scenarios_of(mechanism)
+    return (
+        simulated.loop_of(mechanism, compensator, scenarios),
+        literature_gains(mechanism, compensator),
+        scenarios,
+    )
+
+
+def batch(name, compensator):
+    """What a batch on all devices calls."""
+    loop, gains, scenarios = case(name, compensator)
+    return calls(lambda *parts: _run_tiles(loop, *parts), *shard(scenarios, gains))
+
+
+def jacobian(name, compensator):
+    """What the derivatives of a tuning's errors by all gains call."""
+    loop, gains, scenarios = case(name, compensator)
+
+    def errors(values, scenarios):
+        rig = simulated.prepared(loop, scenarios)
+        return simulated.outcome(loop, dict(zip(gains, values, strict=True)), rig).error
+
+    return calls(jax.jacfwd(errors), np.array([*gains.values()], float), scenarios)
+
+
+def test_a_batch_lowers_for_cuda_and_calls_nothing_outside():
+    assert batch("varying", "none") == set()
+
+
+def test_what_calls_back_into_python_would_be_seen():
+    like = jax.ShapeDtypeStruct((), float)
+    with pytest.raises(ValueError, match="different from the lowering platform cuda"):
+        calls(lambda x: jax.pure_callback(np.sin, like, x), 1.0)
+    assert calls(lambda x: jax.scipy.linalg.expm(x), np.eye(2)) != set()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "compensator"), ONE_AXIS)
+def test_every_law_and_its_derivatives_lower_for_cuda(name, compensator):
+    assert batch(name, compensator) == set()
+    assert jacobian(name, compensator) == set()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("compensator", SIX_AXES)
+def test_six_axes_and_their_derivatives_lower_for_cuda(compensator):
+    """They solve six equations in six unknowns, by what the card has for that."""
+    assert batch("probe-drogue", compensator) <= LINEAR_EQUATIONS
+    assert jacobian("probe-drogue", compensator) <= LINEAR_EQUATIONS
+
+
+def test_options_for_processors_are_given_to_those_alone(monkeypatch):
+    assert known_options(ROLLOUT) == ROLLOUT
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert known_options(ROLLOUT) == {}
+
+
+@pytest.mark.parametrize(
+    ("plugin", "platforms", "given"), ((None, "", True), ("there", "", False), ("there", "cpu", True))
+)
+def test_less_optimisation_is_asked_of_the_compiler_for_processors_alone(
+    monkeypatch, plugin, platforms, given
+):
+    """Where jax has a plugin, as it needs for a graphics card, and is not told to leave it."""
+    monkeypatch.setattr(environment, "find_spec", {"jax_plugins": plugin}.get)
+    monkeypatch.setenv("JAX_PLATFORMS", platforms)
+    assert (LEVEL in flags("")) == given
