@@ -58,7 +58,7 @@ def found_age(mechanism):
 def test_gains_tuned_on_the_identified_file_lose_little_on_the_true_rig(name, compensator, press):
     truth = campaign_rigs.mechanism(name)
     found = identify(campaigns.campaign(name, 70_000, press=press), options=Options(law="kelvin_voigt"))
-    identified = from_builtins({**found.mechanism, "uncertainty": {}, "correlation": None}, "identified")
+    identified = from_builtins(found.mechanism, "identified")
     asked = [truth, identified]
     if name == "lagging" and not press:
         asked.append(as_well_as_can_be_known(truth, identified))
