@@ -13,13 +13,13 @@ import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 from typing import BinaryIO
 
-from jaxhil.errors import InputError, one_line
+from jaxhil.errors import InputError, one_line, shown
 
 TEMPORARY = ".tmp"  # end of the name under which a file is written first
 SEAL = 65  # bytes before the content of a sealed file
@@ -41,6 +41,25 @@ def writing(path: str | os.PathLike[str]) -> Iterator[None]:
             raise
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{one_line(os.fspath(path))}: cannot be written: {one_line(reason, 100)}") from None
+
+
+def as_path(path: object) -> Path:
+    """What a caller gives as a path. Raises `InputError` if it is none."""
+    if isinstance(path, (str, os.PathLike)) and isinstance(os.fspath(path), str):
+        return Path(path)
+    raise InputError(f"path: found {shown(path)}, allowed a path")
+
+
+def write_csv(path: object, columns: Mapping[str, Sequence[float]]) -> None:
+    """Columns of one length as a table, a row a line, under a line of their names; numbers to the last bit.
+
+    Raises `InputError` when the file cannot be written.
+    """
+    target = as_path(path)
+    rows = zip(*columns.values(), strict=True)
+    lines = [",".join(columns), *(",".join(map(repr, row)) for row in rows), ""]
+    with writing(target):
+        write_whole(follow(target), "\n".join(lines).encode("ascii"))
 
 
 def write_whole(path: Path, content: bytes | bytearray | memoryview, lasting: bool = True) -> None:

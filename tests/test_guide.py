@@ -188,7 +188,10 @@ def test_the_script_is_the_one_that_is_run():
 
 @pytest.mark.parametrize(
     "path",
-    [ROOT / "README.md", pytest.param(GUIDE / "python.md", marks=pytest.mark.slow)],
+    [
+        ROOT / "README.md",
+        *(pytest.param(GUIDE / name, marks=pytest.mark.slow) for name in ("python.md", "six_axes.md")),
+    ],
     ids=lambda path: path.name,
 )
 def test_examples_run(path, tmp_path):

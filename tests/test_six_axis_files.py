@@ -2,6 +2,8 @@
 
 import copy
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -54,6 +56,8 @@ def test_six_numbers_may_be_said_as_one_or_two():
     ("override", "reason"),
     [
         ("schema=jaxhil/mechanism/3", "schema: found 'jaxhil/mechanism/3', allowed"),
+        ("schema=jaxhil/mechanism/1", "found 'jaxhil/mechanism/1' beside target and chaser, allowed jaxhil"),
+        ("target.inertia=[0, 0, 0]", "nothing but zeros, in kg m^2, allowed positive principal moments"),
         ("target.inertia=[1, 1, 3]", "principal moments 1, 1 and 3 kg m^2, allowed those of a body"),
         ("target.inertia=[1, 1, -1]", "principal moment of -1 kg m^2, allowed positive"),
         ("target.inertia=[[1, 2, 0], [1, 2, 0], [0, 0, 2]]", "2 at row 1, column 2, 1 there transposed"),
@@ -64,9 +68,15 @@ def test_six_numbers_may_be_said_as_one_or_two():
         ("approach.attitude=[1, 1, 0]", "a rotation by 1.414 rad, allowed a rotation vector of at most 1"),
         ("approach.velocity[2]=0.01", "approach.velocity[2]: found 0.01, allowed a number < 0 m/s"),
         ("contact={}", "contact: found nothing, allowed [contact.NAME]"),
+        ("contact={law='linear', stiffness=1}", "a table without a name: law, stiffness, allowed [contact."),
+        ("contact.tip.target.half_angle=45", "found 45, allowed a number > 0 rad and < 1.5708 rad"),
+        ("contact.tip.target={shape='plane', point=[0, 0, 0]}",
+         "normal: found nothing, allowed a list of 3 entries, each a finite number (plane needs it)"),
+        ("contact.tip.friction={law='regularised', coefficient=1}",
+         "slip: found nothing, allowed a number > 0 m/s (regularised needs it)"),
         ("contact.tip.stifness=1", "an unknown key, allowed one of chaser, target"),
         ("contact.tip.stifness=1", "did you mean stiffness?"),
-        ("contact.tip.stiffness=[1, 2]", "[1.0, 2.0], allowed a number > 0 (law hunt_crossley)"),
+        ("contact.tip.stiffness=[1, 2]", "[1.0, 2.0], allowed a number > 0 N/m (law hunt_crossley)"),
         ("contact.tip.law=hardening", "reference_depth: found nothing, allowed a number > 0"),
         ("contact.tip.depths=[1]", "depths: found [1.0], allowed nothing (only for law piecewise_linear)"),
         ("contact.tip.friction.law=bristle", "slip: found 0.0025, allowed nothing (bristle"),
@@ -155,6 +165,15 @@ def test_a_start_stands_instead_of_an_approach():
     start["start.chaser"]["attitude"] = [1, 0.1, 0, 0]
     with pytest.raises(InputError, match=r"attitude: found one of norm 1\.0049876, allowed a quaternion"):
         load_any("probe-drogue", {**start, "approach": None})
+
+
+def test_the_start_that_the_guide_shows_is_read():
+    text = (Path(__file__).parents[1] / "notebooks" / "guide" / "six_axes.md").read_text(encoding="utf-8")
+    shown = re.search(r"^```toml\n(\[start\].*?)^```", text, re.M | re.S)
+    assert shown is not None
+    given = {"approach": None, "start": parse_toml(shown[1].encode(), "guide", "")["start"]}
+    start = load_any("probe-drogue", given).mechanism.start
+    assert start.duration == 1.2 and start.chaser.position == [0.06, -0.05, 2.25]
 
 
 def test_all_can_be_uncertain_lists_and_inertias_included():

@@ -7,6 +7,7 @@ import json
 import jax
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import jaxhil as package
 from jaxhil.errors import InputError
@@ -157,10 +158,11 @@ def test_starts_that_cannot_be_run():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", six_axis_names())
 def test_simulate_a_builtin(jaxhil, tmp_path, name):
-    picture = tmp_path / "run.png"
-    ran = jaxhil("simulate", name, "--json", "--plot", picture)
+    picture, log = tmp_path / "run.png", tmp_path / "run.csv"
+    ran = jaxhil("simulate", name, "--json", "--plot", picture, "--log", log)
     assert ran.code == 1 and ran.err.startswith("wrote "), ran.err
     document = json.loads(ran.out)
+    check_table(np.genfromtxt(log, delimiter=",", names=True), load_any(name).mechanism, document["final"])
     assert document["axes"] == 6 and document["verdict"] == "bad"
     [episode] = document["episodes"]
     captured = name == "ring-capture"
@@ -185,9 +187,65 @@ def test_simulate_a_builtin(jaxhil, tmp_path, name):
     assert set(lead["gains"]) == {"phase_lead", "lead_filter"}
 
 
+def check_table(ticks, mechanism, final):
+    """What a table says of bodies, poses and wrenches belongs together, and leads to the end of the run."""
+
+    def of(name, suffixes):
+        return np.stack([ticks[f"{name}_{suffix}"] for suffix in suffixes.split()], axis=1)
+
+    period = mechanism.rig.control_period
+    np.testing.assert_allclose(ticks["time"], period * np.arange(round(final["time"] / period)))
+    places, turns, velocities = {}, {}, {}
+    for body, key in (("target", "v1"), ("chaser", "v2")):
+        velocities[body] = np.vstack([of(body, "vx vy vz"), final[key]])
+        turns[body] = Rotation.from_quat(of(body, "qx qy qz qw"))
+        own = getattr(mechanism, body)
+        assert not np.any(own.interface_rotation)
+        places[body] = of(body, "x y z") + turns[body].apply(own.interface)
+    # Where C is against T.
+    back = turns["target"].inv()
+    np.testing.assert_allclose(
+        back.apply(places["chaser"] - places["target"]), of("desired", "x y z"), atol=1e-12
+    )
+    turned = (back * turns["chaser"]).as_rotvec()
+    np.testing.assert_allclose(turned, of("desired", "rx ry rz"), atol=1e-12)
+    # What the command does to the chaser in a period.
+    force = turns["target"].apply(of("command", "fx fy fz"))
+    change = mechanism.chaser.mass * np.diff(velocities["chaser"], axis=0)
+    np.testing.assert_allclose(change, period * force, atol=1e-9 * np.abs(force).max())
+    np.testing.assert_allclose(mechanism.target.mass * np.diff(velocities["target"], axis=0), -change,
+                               atol=1e-9 * np.abs(force).max())  # fmt: skip
+    # Of the real contact there is a force where something is deep.
+    depths = [ticks[name] for name in ticks.dtype.names if name.startswith("depth_")]
+    forces = [ticks[name] for name in ticks.dtype.names if name.startswith("force_")]
+    assert len(depths) == len(forces) > 0 and np.any(np.array(forces)[np.array(depths) > 0] > 0)
+    assert not np.any(np.array(forces)[np.array(depths) <= 0])
+
+
+@pytest.mark.slow
+def test_a_flight_without_a_contact(jaxhil, tmp_path):
+    """From states of both bodies on; the chaser turns about a principal axis."""
+    state = "{{position=[0,0,{}], attitude=[1,0,0,0], velocity=[0,0,0], angular_velocity=[0,{},0]}}"
+    start = f"start={{duration=0.2, target={state.format(0, 0)}, chaser={state.format(3, 0.5)}}}"
+    changes = ["--unset", "approach", "--set", start, "--set", "contact={}", "--set", "uncertainty={}"]
+    files = {option: tmp_path / f"run.{ending}" for option, ending in
+             (("--plot", "png"), ("--log", "csv"), ("--animate", "gif"))}  # fmt: skip
+    written = [part for pair in files.items() for part in pair]
+    ran = jaxhil("simulate", "probe-drogue", *changes, *written, "--json")
+    assert ran.code == 1 and ran.err.count("wrote ") == 3, ran.err
+    document, turned = json.loads(ran.out), Rotation.from_rotvec([0, 0.1, 0])
+    assert document["status"] == "miss" and document["final"]["time"] == 0.2
+    place = np.array([-0.05, 0.02, 1.8]) + turned.apply([0.01, 0.04, -1.0])
+    for final in ("final", "reference_final"):
+        np.testing.assert_allclose(document[final]["pose"], [*place, 0, 0.1, 0], atol=1e-9)
+    ticks = np.genfromtxt(files["--log"], delimiter=",", names=True)
+    assert len(ticks) == 200 and not any(name.startswith("depth") for name in ticks.dtype.names)
+    np.testing.assert_allclose(ticks["desired_ry"], 0.5 * ticks["time"], atol=1e-12)
+
+
 def test_what_six_axes_do_not_have_is_said_in_one_line(jaxhil, tmp_path):
     for arguments, reason in (
-        (["simulate", "petals", "--log", "x.csv"], "--log: found 'x.csv', allowed none: in six axes"),
+        (["simulate", "petals", "--setting", "x"], "--setting: found 'x', allowed none: in six axes"),
         (
             ["simulate", "petals", "--animate", "x.avi"],
             "--animate: found 'x.avi', allowed a name that ends in .gif",

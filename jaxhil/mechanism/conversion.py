@@ -31,6 +31,7 @@ __all__ = [
     "NUMBER_FOR_LIST",
     "KeyProblem",
     "Path",
+    "allowed_at",
     "allowed_of",
     "close_match",
     "computable",
@@ -169,6 +170,14 @@ def allowed_of(kind: inspect.Type, extra: Extra = PLAIN) -> str:
             return f"a list of {length} entries, each {allowed_of(item, PLAIN)}"
         case _:
             return "a table"
+
+
+def allowed_at(kind: type[msgspec.Struct], key: str) -> str:
+    """The values of a struct's key, in words."""
+    info = _type_info(kind)
+    assert isinstance(info, inspect.StructType)
+    [found] = (entry.type for entry in info.fields if entry.encode_name == key)
+    return allowed_of(found)
 
 
 def _bare(kind: inspect.Type) -> inspect.Type:

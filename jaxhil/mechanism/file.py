@@ -22,7 +22,7 @@ from jaxhil.mechanism import rules as mechanism_rules
 from jaxhil.mechanism.conversion import KeyProblem, close_match, to_mechanism, to_struct
 from jaxhil.mechanism.overrides import apply_override, parse_override
 from jaxhil.mechanism.six_axes import SCHEMA_SIX, SixAxisMechanism, is_six_axes
-from jaxhil.mechanism.six_axes_rules import check_legs, check_six_axes
+from jaxhil.mechanism.six_axes_rules import check_legs, check_named, check_six_axes
 from jaxhil.mechanism.structs import SCHEMA, Mechanism
 from jaxhil.mechanism.toml_table import parse_toml, read_bytes
 
@@ -212,12 +212,16 @@ def _missing(label: str) -> InputError:
 
 def _validated(raw: Mapping[str, Any]) -> AnyMechanism:
     if is_six_axes(raw):
+        check_named(raw)
         in_space = to_struct(SixAxisMechanism, raw)
         check_legs(raw)
         check_six_axes(in_space)
         return in_space
     if isinstance(raw, Mapping) and raw.get("schema", SCHEMA) != SCHEMA:
         raise KeyProblem(("schema",), shown(raw["schema"]), f"{SCHEMA}, or {SCHEMA_SIX} of six axes")
+    if isinstance(raw, Mapping) and {"target", "chaser"} <= set(raw):
+        found = f"{shown(raw['schema'])} beside" if "schema" in raw else "nothing beside"
+        raise KeyProblem(("schema",), f"{found} target and chaser", f"{SCHEMA_SIX}, of six axes")
     mechanism = to_mechanism(raw)
     mechanism_rules.check(mechanism)
     return mechanism

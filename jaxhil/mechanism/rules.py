@@ -8,14 +8,16 @@ it says anything: who wrote it means something by it. What a law from elsewhere 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from fractions import Fraction
+from itertools import pairwise
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from jaxhil.errors import shown
-from jaxhil.mechanism.conversion import KeyProblem
+from jaxhil.mechanism.conversion import KeyProblem, Path, allowed_at
 from jaxhil.mechanism.correlation import check_correlation
 from jaxhil.mechanism.structs import (
     BUILT_IN_LAWS,
@@ -33,6 +35,8 @@ __all__ = [
     "LAWS_OF_KEYS",
     "UNDAMPED",
     "check",
+    "check_depths",
+    "check_keys_of_law",
     "check_model",
     "check_texts",
     "is_hurwitz",
@@ -59,7 +63,6 @@ LAWS_OF_KEYS = {
 }
 # Laws without damping, and what they dissipate by.
 UNDAMPED = {"elastoplastic": "yielding", "preloaded": "friction"}
-_PLAIN = Contact(law="linear", stiffness=[1.0])
 FIXED = ("rig.simulator.numerator", "rig.simulator.denominator")
 
 
@@ -119,15 +122,41 @@ def _check_bodies(mechanism: Mechanism) -> None:
         raise KeyProblem(("bodies",), shown(bodies.mass), allowed)
 
 
+def check_depths(path: Path, law: str, depths: Sequence[float]) -> None:
+    """Where the slope changes is there for the law that needs it, and in order. Raises `KeyProblem`."""
+    if law == "piecewise_linear" and not depths:
+        allowed = "a list of at least one depth (law piecewise_linear needs it)"
+        raise KeyProblem((*path, "depths"), "no entries", allowed)
+    for i, (depth, deeper) in enumerate(pairwise(depths)):
+        if deeper <= depth:
+            raise KeyProblem(
+                (*path, "depths", i + 1), shown(deeper), f"a depth > the one before, {depth:g} m"
+            )
+
+
+def check_keys_of_law(
+    path: Path, contact: Any, uncertain: Collection[str], laws_of_keys: Mapping[str, tuple[str, ...]]
+) -> None:
+    """Of the keys of some laws alone the contact at a path has those of its law. Raises `KeyProblem`."""
+    kind, law = type(contact), contact.law
+    defaults = {one.name: one.default for one in msgspec.structs.fields(kind)}
+    for key, laws in laws_of_keys.items():
+        value, default = getattr(contact, key), defaults[key]
+        default = [] if default is msgspec.NODEFAULT else default
+        if law in laws and value is None:
+            raise KeyProblem((*path, key), "nothing", f"{allowed_at(kind, key)} (law {law} needs it)")
+        if law not in laws and law in BUILT_IN_LAWS:
+            only = f"only for law {' or '.join(laws)}"
+            if value != default:
+                raise KeyProblem((*path, key), shown(value), f"nothing ({only})")
+            where = ".".join((*map(str, path), key))
+            if where in uncertain and value not in (None, []):
+                raise KeyProblem(("uncertainty", where), f"a key {only}", "keys that the law uses")
+
+
 def _check_contact(contact: Contact) -> None:
     nested = contact.law == "piecewise_linear"
-    if nested and not contact.depths:
-        allowed = "a list of at least one depth (law piecewise_linear needs it)"
-        raise KeyProblem(("contact", "depths"), "no entries", allowed)
-    for i, (depth, deeper) in enumerate(zip(contact.depths, contact.depths[1:], strict=False)):
-        if deeper <= depth:
-            allowed = f"a depth > the one before, {depth:g}"
-            raise KeyProblem(("contact", "depths", i + 1), shown(deeper), allowed)
+    check_depths(("contact",), contact.law, contact.depths)
     for i, entry in enumerate(contact.stiffness):
         path = ("contact", "stiffness", i)
         if nested:
@@ -136,22 +165,12 @@ def _check_contact(contact: Contact) -> None:
             if not isinstance(entry, list) or len(entry) != length:
                 raise KeyProblem(path, shown(entry), allowed)
         elif isinstance(entry, list):
-            raise KeyProblem(path, shown(entry), f"a number > 0 (law {contact.law})")
+            raise KeyProblem(path, shown(entry), f"a number > 0 N/m (law {contact.law})")
 
 
 def _check_keys_of_laws(mechanism: Mechanism) -> None:
     contact = mechanism.contact
-    for key, laws in LAWS_OF_KEYS.items():
-        path, value, default = f"contact.{key}", getattr(contact, key), getattr(_PLAIN, key)
-        if contact.law in laws and value is None:
-            allowed = f"{numeric_keys()[path]} (law {contact.law} needs it)"
-            raise KeyProblem(("contact", key), "nothing", allowed)
-        if contact.law not in laws and contact.law in BUILT_IN_LAWS:
-            only = f"only for law {' or '.join(laws)}"
-            if value != default:
-                raise KeyProblem(("contact", key), shown(value), f"nothing ({only})")
-            if path in mechanism.uncertainty and value not in (None, []):
-                raise KeyProblem(("uncertainty", path), f"a key {only}", "keys that the law uses")
+    check_keys_of_law(("contact",), contact, mechanism.uncertainty, LAWS_OF_KEYS)
     if contact.law in UNDAMPED and _is_damped(mechanism):
         damping = shown(contact.damping) if any(contact.damping) else "an uncertain damping"
         allowed = f"0 (law {contact.law} dissipates by {UNDAMPED[contact.law]})"
@@ -170,9 +189,8 @@ def check_model(simulator: Any) -> None:
     path = ("rig", "simulator")
     for key in KEYS_OF_MODELS[simulator.model]:
         if getattr(simulator, key) is None:
-            lists = ("coefficients", "numerator", "denominator")
-            allowed = "a list of numbers" if key in lists else "a number > 0"
-            raise KeyProblem((*path, key), "nothing", f"{allowed} ({simulator.model} needs it)")
+            allowed = f"{allowed_at(type(simulator), key)} ({simulator.model} needs it)"
+            raise KeyProblem((*path, key), "nothing", allowed)
     for key in _OF_SOME_MODEL:
         value = getattr(simulator, key)
         if value is not None and key not in KEYS_OF_MODELS[simulator.model]:

@@ -19,12 +19,17 @@ from msgspec import Meta, Struct, field
 from jaxhil.mechanism.six_axes_rig import Inertia, Length, Metre, Radian, Rig, six, three, zeros
 from jaxhil.mechanism.structs import (
     Correlation,
-    Depth,
+    Depths,
+    Exponent,
     Law,
+    Preload,
     Range,
+    ReferenceDepth,
     Slopes,
     Stiffness,
+    Tension,
     Uncertainty,
+    UnloadingRatio,
     ranges_of,
     says,
 )
@@ -173,20 +178,12 @@ class Contact(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         float,
         says("in s/m for hunt_crossley, none for elastoplastic and preloaded", "N s/m", ge=0.0),
     ] = 0.0
-    tension: Annotated[bool, says("whether kelvin_voigt may pull")] = False
-    exponent: Annotated[float, says("of the depth, for hunt_crossley and depth_damped", "1", ge=1.0)] = 1.5
-    depths: Annotated[
-        list[Depth], Meta(max_length=20, description="where the slope changes, for piecewise_linear")
-    ] = field(default_factory=list)
-    reference_depth: (
-        Annotated[float, says("at which hardening has four times its first slope, and depth_damped its "
-                              "damping", "m", gt=0.0)] | None
-    ) = None  # fmt: skip
-    unloading_ratio: (
-        Annotated[float, says("slope of unloading over that of loading, for elastoplastic", "1", ge=1.0)]
-        | None
-    ) = None
-    preload: Annotated[float, says("of the spring at the touch, for preloaded", "N", ge=0.0)] = 0.0
+    tension: Tension = False
+    exponent: Exponent = 1.5
+    depths: Depths = field(default_factory=list)
+    reference_depth: ReferenceDepth | None = None
+    unloading_ratio: UnloadingRatio | None = None
+    preload: Preload = 0.0
     dry_friction: Annotated[float, says("against the depth's motion, for preloaded", "N", ge=0.0)] = 0.0
     friction: Annotated[Friction, says("along the surface")] | None = None
 

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from jaxhil.errors import shown
-from jaxhil.mechanism.conversion import KeyProblem, Path
-from jaxhil.mechanism.rules import LAWS_OF_KEYS, UNDAMPED
+from jaxhil.mechanism.conversion import KeyProblem, Path, allowed_at
+from jaxhil.mechanism.rules import LAWS_OF_KEYS, UNDAMPED, check_depths, check_keys_of_law
 from jaxhil.mechanism.six_axes import Contact, Friction, Latch, Shape, SixAxisMechanism
-from jaxhil.mechanism.structs import BUILT_IN_LAWS
 
 __all__ = ["check_contact", "check_latch"]
 
@@ -31,10 +30,6 @@ KEYS_OF_FRICTION: Mapping[str, tuple[str, ...]] = {
 # Keys of some contact laws alone, as they are called here.
 _LAWS_OF_KEYS = {**LAWS_OF_KEYS, "dry_friction": LAWS_OF_KEYS["friction"]}
 del _LAWS_OF_KEYS["friction"]
-_DEFAULTS: Mapping[str, Any] = {
-    "tension": False, "exponent": 1.5, "depths": [], "reference_depth": None, "unloading_ratio": None,
-    "preload": 0.0, "dry_friction": 0.0,
-}  # fmt: skip
 
 
 def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> None:
@@ -60,7 +55,8 @@ def check_latch(mechanism: SixAxisMechanism, name: str, latch: Latch) -> None:
         raise KeyProblem((*path, "latched"), "true", allowed)
     for key in ("depth", "angle"):
         if not latch.latched and getattr(latch, key) is None:
-            raise KeyProblem((*path, key), "nothing", "a number, or latched = true: held from the start on")
+            allowed = f"{allowed_at(Latch, key)}, or latched = true: held from the start on"
+            raise KeyProblem((*path, key), "nothing", allowed)
     if (latch.stiffness is None) == (latch.stiffness_matrix is None):
         found = "nothing" if latch.stiffness is None else "stiffness_matrix beside it"
         raise KeyProblem((*path, "stiffness"), found, "six numbers, or stiffness_matrix instead")
@@ -78,8 +74,8 @@ def _check_shape(path: Path, shape: Shape) -> None:
     needed, more = KEYS_OF_SHAPES[shape.shape]
     for key, value in _given(shape).items():
         if key in needed and value is None:
-            kind = "a number" if key in ("radius", "half_angle", "bottom_radius", "bottom") else "a list"
-            raise KeyProblem((*path, key), "nothing", f"{kind} ({shape.shape} needs it)")
+            allowed = f"{allowed_at(Shape, key)} ({shape.shape} needs it)"
+            raise KeyProblem((*path, key), "nothing", allowed)
         if key not in (*needed, *more) and value not in (None, False):
             raise KeyProblem((*path, key), shown(value), f"nothing ({shape.shape} does not use it: unset it)")
     if shape.shape == "plane" and not np.any(shape.normal):
@@ -123,30 +119,14 @@ def _check_pair(path: Path, contact: Contact) -> None:
 
 def _check_law(mechanism: SixAxisMechanism, path: Path, contact: Contact) -> None:
     law, nested = contact.law, contact.law == "piecewise_linear"
-    if nested and not contact.depths:
-        raise KeyProblem(
-            (*path, "depths"), "no entries", "at least one depth (law piecewise_linear needs it)"
-        )
-    for i, (depth, deeper) in enumerate(zip(contact.depths, contact.depths[1:], strict=False)):
-        if deeper <= depth:
-            raise KeyProblem((*path, "depths", i + 1), shown(deeper), f"a depth > the one before, {depth:g}")
+    check_depths(path, law, contact.depths)
     slopes = contact.stiffness if isinstance(contact.stiffness, list) else []
     if nested and len(slopes) != len(contact.depths) + 1:
         allowed = f"a list of {len(contact.depths) + 1} slopes, one more than depths (law piecewise_linear)"
         raise KeyProblem((*path, "stiffness"), shown(contact.stiffness), allowed)
     if slopes and not nested:
-        raise KeyProblem((*path, "stiffness"), shown(contact.stiffness), f"a number > 0 (law {law})")
-    for key, laws in _LAWS_OF_KEYS.items():
-        value, default = getattr(contact, key), _DEFAULTS[key]
-        if law in laws and value is None:
-            raise KeyProblem((*path, key), "nothing", f"a number > 0 (law {law} needs it)")
-        if law not in laws and law in BUILT_IN_LAWS:
-            only = f"only for law {' or '.join(laws)}"
-            if value != default:
-                raise KeyProblem((*path, key), shown(value), f"nothing ({only})")
-            uncertain = ".".join((*map(str, path), key))
-            if uncertain in mechanism.uncertainty and value not in (None, []):
-                raise KeyProblem(("uncertainty", uncertain), f"a key {only}", "keys that the law uses")
+        raise KeyProblem((*path, "stiffness"), shown(contact.stiffness), f"a number > 0 N/m (law {law})")
+    check_keys_of_law(path, contact, mechanism.uncertainty, _LAWS_OF_KEYS)
     uncertain = mechanism.uncertainty.get(f"contact.{path[1]}.damping")
     if law in UNDAMPED and (contact.damping or (uncertain is not None and uncertain.factor is None)):
         found = shown(contact.damping) if contact.damping else "an uncertain damping"
@@ -162,7 +142,7 @@ def _check_friction(path: Path, friction: Friction) -> None:
         for key in keys:
             value = getattr(friction, key)
             if law == friction.law and value is None and key != "damping":
-                raise KeyProblem((*path, key), "nothing", f"a number > 0 ({law} needs it)")
+                raise KeyProblem((*path, key), "nothing", f"{allowed_at(Friction, key)} ({law} needs it)")
             if law != friction.law and value is not None:
                 raise KeyProblem((*path, key), shown(value), f"nothing ({friction.law} does not use it)")
 

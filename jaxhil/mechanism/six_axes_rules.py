@@ -16,12 +16,12 @@ from jaxhil.errors import shown
 from jaxhil.mechanism.conversion import KeyProblem, Path
 from jaxhil.mechanism.correlation import check_correlation
 from jaxhil.mechanism.rules import FIXED, KEYS_OF_MODELS, check_model, check_texts
-from jaxhil.mechanism.six_axes import RigidBody, SixAxisMechanism, Start, numeric_keys_of
+from jaxhil.mechanism.six_axes import Contact, Latch, RigidBody, SixAxisMechanism, Start, numeric_keys_of
 from jaxhil.mechanism.six_axes_contacts import check_contact, check_latch
 from jaxhil.mechanism.six_axes_rig import AXES, Inertia, Rig, Simulator
 from jaxhil.mechanism.uncertainty_rules import check_uncertainty
 
-__all__ = ["check_legs", "check_six_axes", "inertia_matrix"]
+__all__ = ["check_legs", "check_named", "check_six_axes", "inertia_matrix"]
 
 LARGEST_ATTITUDE = 1.0  # rad, of C against T at the start
 MOMENTS = 1e-9  # by how much of itself a moment of inertia may exceed the sum of the others
@@ -58,6 +58,18 @@ def check_six_axes(mechanism: SixAxisMechanism) -> None:
     check_correlation(mechanism)
 
 
+def check_named(raw: Mapping[str, Any]) -> None:
+    """A raw table's contacts and latches have names. Raises `KeyProblem`."""
+    for key, kind in (("contact", Contact), ("latch", Latch)):
+        table = raw.get(key)
+        given = table.items() if isinstance(table, Mapping) else ()
+        own = [name for name, value in given
+               if name in kind.__struct_fields__ and not isinstance(value, Mapping)]  # fmt: skip
+        if own:
+            found = f"a table without a name: {', '.join(own)}"
+            raise KeyProblem((key,), found, f"[{key}.NAME], each with a name of its own")
+
+
 def check_legs(raw: Mapping[str, Any]) -> None:
     """Of a hexapod's legs a raw table speaks as legs: they are neither translations nor rotations. Raises
     `KeyProblem`."""
@@ -89,8 +101,10 @@ def _check_inertia(path: Path, inertia: Inertia, *, massless: bool = False) -> N
         raise KeyProblem(path, shown(inertia), "three moments, or three rows of three entries")
     matrix = inertia_matrix(inertia)
     size = np.max(np.abs(matrix))
-    if massless and size == 0:
-        return
+    if size == 0:
+        if massless:
+            return
+        raise KeyProblem(path, "nothing but zeros, in kg m^2", "positive principal moments")
     if np.any(np.abs(matrix - matrix.T) > 1e-12 * size):
         row, column = np.argwhere(np.abs(matrix - matrix.T) > 1e-12 * size)[0]
         found = (

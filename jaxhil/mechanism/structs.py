@@ -80,6 +80,20 @@ Stiffness = Annotated[float, says("slope of the force", "N/m", gt=0.0)]
 Slopes = Annotated[list[Stiffness], Meta(min_length=1, max_length=21)]
 Damping = Annotated[float, says("damping of the contact", "N s/m", ge=0.0)]
 Depth = Annotated[float, says("where the slope changes", "m", gt=0.0)]
+# Keys of some contact laws alone.
+Tension = Annotated[bool, says("whether kelvin_voigt may pull")]
+Exponent = Annotated[float, says("of the depth, for hunt_crossley and depth_damped", "1", ge=1.0)]
+Depths = Annotated[
+    list[Depth], Meta(max_length=20, description="where the slope changes, for piecewise_linear")
+]
+ReferenceDepth = Annotated[
+    float,
+    says("at which hardening has four times its first slope, and depth_damped its damping", "m", gt=0.0),
+]
+UnloadingRatio = Annotated[
+    float, says("slope of unloading over that of loading, for elastoplastic", "1", ge=1.0)
+]
+Preload = Annotated[float, says("of the spring at the touch, for preloaded", "N", ge=0.0)]
 Factor = Annotated[float, says("share of the nominal value", "1", gt=0.0)]
 Coefficient = Annotated[float, says("of the n-th power of s", "s^n", gt=0.0)]
 Polynomial = Annotated[
@@ -146,23 +160,15 @@ class Contact(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             description="of each contact; in s/m for hunt_crossley, none for elastoplastic and preloaded",
         ),
     ] = field(default_factory=_only(0.0))
-    tension: Annotated[bool, says("whether kelvin_voigt may pull")] = False
+    tension: Tension = False
     clearance: Annotated[
         float, says("between two surfaces; infinite where there is one", "m", gt=0.0, infinite=True)
     ] = math.inf
-    exponent: Annotated[float, says("of the depth, for hunt_crossley and depth_damped", "1", ge=1.0)] = 1.5
-    depths: Annotated[
-        list[Depth], Meta(max_length=20, description="where the slope changes, for piecewise_linear")
-    ] = field(default_factory=list)
-    reference_depth: (
-        Annotated[float, says("at which hardening has four times its first slope, and depth_damped its "
-                              "damping", "m", gt=0.0)] | None
-    ) = None  # fmt: skip
-    unloading_ratio: (
-        Annotated[float, says("slope of unloading over that of loading, for elastoplastic", "1", ge=1.0)]
-        | None
-    ) = None
-    preload: Annotated[float, says("of the spring at the touch, for preloaded", "N", ge=0.0)] = 0.0
+    exponent: Exponent = 1.5
+    depths: Depths = field(default_factory=list)
+    reference_depth: ReferenceDepth | None = None
+    unloading_ratio: UnloadingRatio | None = None
+    preload: Preload = 0.0
     friction: Annotated[float, says("dry friction against the motion, for preloaded", "N", ge=0.0)] = 0.0
 
 
@@ -289,7 +295,7 @@ class Range(NamedTuple):
             ending = "" if self.high_open else ", inf included"
             return f"a number {'>' if self.low_open else '>='} {self.low:g}{unit}{ending}"
         if self.low_open:
-            return f"a number > {self.low:g}{unit} and <= {self.high:g}{unit}"
+            return f"a number > {self.low:g}{unit} and {'<' if self.high_open else '<='} {self.high:g}{unit}"
         return f"a number from {self.low:g} to {self.high:g}{unit}"
 
 

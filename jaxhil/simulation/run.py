@@ -4,14 +4,13 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxhil.compensators import COMPENSATORS, Compensator
-from jaxhil.errors import InputError, one_line, shown
-from jaxhil.files import follow, write_whole
+from jaxhil.errors import InputError, shown
+from jaxhil.files import as_path, follow, write_csv, writing
 from jaxhil.mechanism.loading import as_mechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.building import build_loop
@@ -136,13 +135,7 @@ class Run:
 
         Raises `InputError` when the file cannot be written.
         """
-        columns = [column.tolist() for column in self.ticks]
-        rows = [",".join(map(repr, row)) for row in zip(*columns, strict=True)]
-        target = _target(path)
-        try:
-            write_whole(follow(target), "\n".join([",".join(Ticks._fields), *rows, ""]).encode("ascii"))
-        except (OSError, ValueError) as error:
-            raise _unwritable(target, error) from None
+        write_csv(path, {name: column.tolist() for name, column in self.ticks._asdict().items()})
 
     def plot(self, path: str | os.PathLike[str]) -> None:
         """Draw force and position over time, contact by contact, beside the same contacts in space.
@@ -150,7 +143,7 @@ class Run:
         The name ends in .png, .pdf or .svg; folders on the way are made. Raises `InputError` when the file
         cannot be written.
         """
-        target = _target(path)
+        target = as_path(path)
         if target.suffix.lower() not in PICTURES:
             allowed = f"a name that ends in {', '.join(PICTURES)}"
             raise InputError(f"plot: found {shown(str(target))}, allowed {allowed}")
@@ -160,10 +153,8 @@ class Run:
         with computing():
             motion = nominal_motion(self.mechanism, {"rig": (self.compensator, self.gains)}, self.seed)
         title = f"{self.mechanism.name}, compensation: {self.compensator}"
-        try:
+        with writing(target):
             save(contact_plot(motion, title, sensors="rig"), follow(target))
-        except (OSError, ValueError) as error:
-            raise _unwritable(target, error) from None
 
 
 def simulate(
@@ -226,14 +217,3 @@ def _contact(outcome: Outcome, slot: int, law: Compensator) -> ContactResult:
         contact_plane=value(metrics.contact_plane, reached) if law.finds_plane else None,
         status=STATUS_NAMES[status],
     )
-
-
-def _target(path: Any) -> Path:
-    if isinstance(path, (str, os.PathLike)) and isinstance(os.fspath(path), str):
-        return Path(path)
-    raise InputError(f"path: found {shown(path)}, allowed a path")
-
-
-def _unwritable(target: Path, error: Exception) -> InputError:
-    reason = getattr(error, "strerror", None) or str(error)
-    return InputError(f"{one_line(str(target))}: cannot be written: {one_line(reason, 100)}")

@@ -1,5 +1,6 @@
 """One run of a mechanism of six axes: what became of each episode, and every tick of the way there."""
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache, cached_property
@@ -11,6 +12,7 @@ import numpy as np
 
 from jaxhil.compensators import SIX_AXES
 from jaxhil.errors import InputError, shown
+from jaxhil.files import write_csv
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.environment import ONCE, computing, known_options
 from jaxhil.simulation.gain_choice import choose_gains
@@ -21,7 +23,7 @@ from jaxhil.sixdof.loop import Loop
 from jaxhil.sixdof.meaning import Meaning, meaning
 from jaxhil.sixdof.metrics import Metrics, evaluate, reference_final
 from jaxhil.sixdof.plausibility import check_scenario
-from jaxhil.sixdof.recording import Recorded, record
+from jaxhil.sixdof.recording import Recorded, record, table
 from jaxhil.sixdof.relative import Pair, States, coordinates, effective_mass, relative
 from jaxhil.sixdof.rollout import STATUS_NAMES
 from jaxhil.sixdof.scenario import Scenario
@@ -92,6 +94,13 @@ class SixAxisRun:
         """Every tick of the run."""
         with computing():
             return record(self.mechanism, self.compensator, self.gains, self.seed, self.final.time)
+
+    def to_csv(self, path: str | os.PathLike[str]) -> None:
+        """Write the ticks, a line each, under a line of their names; numbers in SI units, to the last bit.
+
+        Raises `InputError` when the file cannot be written.
+        """
+        write_csv(path, {name: column.tolist() for name, column in table(self.ticks).items()})
 
 
 def simulate_six_axes(

@@ -125,7 +125,8 @@ class Simulate:
         ),
     ] = None
     log: Annotated[
-        str | None, text("FILE", "Write every tick to a CSV file, as a rig's log, which identify reads.")
+        str | None,
+        text("FILE", "Write every tick to a CSV file; of one axis it is a rig's log, which identify reads."),
     ] = None
     limit: Limit = 0.01
     seed: Annotated[int, number("Seed of the sensor noise.")] = 0

@@ -16,7 +16,7 @@ from jaxhil.files import write_whole
 from jaxhil.simulation.contact_plot import BLUE, new_figure
 from jaxhil.sixdof.recording import Recorded
 from tuning.pictures.outlines import Line, outlines, rotation_matrix
-from tuning.pictures.six_axes import AXES, VIEWS, first_touch_in_space, rotation_of, window
+from tuning.pictures.six_axes import AXES, VIEWS, origin_of, rotation_of, window
 
 FRAMES, RATE = 60, 12  # how many there are, and how many are shown in a second
 ROUND = 3.0  # of the motion, how far around it is seen
@@ -38,15 +38,13 @@ def animate(recorded: Recorded, title: str, path: str | Path) -> None:
     figure.subplots_adjust(hspace=0.28, wspace=0.28)
     moving = _scene(figure, recorded)
     clock = figure.text(0.5, 0.925, "", ha="center", fontsize=10)
-    origin = recorded.time[first_touch_in_space(recorded)]
+    origin, since = origin_of(recorded)
     writer = _writer(target)
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / f"film{target.suffix.lower()}"
         with writer.saving(figure, str(made), 64):
             for tick in ticks:
-                clock.set_text(
-                    f"{1e3 * (recorded.time[tick] - origin):.0f} ms since the first touch in space"
-                )
+                clock.set_text(f"{1e3 * (recorded.time[tick] - recorded.time[origin]):.0f} ms {since}")
                 for lines, chaser, place, view in moving:
                     lines.set_segments(_seen(chaser, place[tick], view))
                 writer.grab_frame()

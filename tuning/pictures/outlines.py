@@ -22,7 +22,7 @@ MARK = 0.02  # of the size of the mechanism: a point's cross
 def outlines(groups: Sequence[ContactGroup]) -> tuple[list[Line], list[Line]]:
     """Of the first lane's target, in T axes, and chaser, in C axes; each line once."""
     pairs = [pair for group in groups for pair in _pairs(group.candidates)]
-    places = np.concatenate([_corners(shape) for pair in pairs for shape in pair])
+    places = np.concatenate([np.zeros((0, 3)), *(_corners(shape) for pair in pairs for shape in pair)])
     size = float(np.max(np.linalg.norm(places, axis=1), initial=1e-3))
     drawn = []
     for shapes in ([target for _, target in pairs], [chaser for chaser, _ in pairs]):

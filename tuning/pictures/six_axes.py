@@ -27,7 +27,7 @@ def six_axes_plot(recorded: Recorded, title: str) -> Figure:
     mechanism at the first touch and at the deepest contact."""
     figure = new_figure((12, 8.8), title, above=0.6, below=0.75)
     rows = figure.add_gridspec(3, 4, height_ratios=(1, 1, 0.75), hspace=0.38, wspace=0.36)
-    shown, origin = window(recorded), first_touch_in_space(recorded)
+    shown, (origin, since) = window(recorded), origin_of(recorded)
     time = 1e3 * (recorded.time[shown] - recorded.time[origin])
     for place, name, part in ((rows[0, :2], "position [mm]", 0), (rows[0, 2:], "rotation [mrad]", 3)):
         axes = figure.add_subplot(place)
@@ -38,17 +38,15 @@ def six_axes_plot(recorded: Recorded, title: str) -> Figure:
             axes.plot(time, in_space, color="0.7", linewidth=3)
             axes.plot(time, desired, color=colour, label=AXES[axis])
             axes.plot(time, actual, color=colour, linestyle=":")
-        axes.set(ylabel=f"{name}, less that\nat first touch in space")
+        axes.set(ylabel=f"{name}, less that\n{since.replace('since', 'at')}")
         finish(axes, "best")
     left, right = figure.add_subplot(rows[1, :2]), figure.add_subplot(rows[1, 2:])
     _forces(left, recorded, shown, time)
     _moments(right, recorded, shown, time)
-    moments = (
-        ("first touch", first_touch(recorded)),
-        ("deepest", int(np.argmax(recorded.depth.max(axis=1)))),
-    )
+    for axes in (left, right):
+        axes.set(xlabel=f"time {since} [ms]")
     target, chaser = outlines(recorded.groups)
-    for column, (name, tick) in enumerate(moments):
+    for column, (name, tick) in enumerate(_moments_shown(recorded) if recorded.names else ()):
         after = 1e3 * (recorded.time[tick] - recorded.time[origin])
         for view, (across, up) in enumerate(VIEWS):
             axes = figure.add_subplot(rows[2, 2 * column + view])
@@ -60,16 +58,21 @@ def six_axes_plot(recorded: Recorded, title: str) -> Figure:
     return figure
 
 
-def first_touch(recorded: Recorded) -> int:
-    """The tick at which the sensor first samples a contact; the last one where there is none."""
+def origin_of(recorded: Recorded) -> tuple[int, str]:
+    """The tick from which time is counted, and what it is: the first touch, in space if there is one."""
+    in_space = np.flatnonzero(np.any(recorded.wrench_in_space != 0, axis=1))
+    if len(in_space):
+        return int(in_space[0]), "since first touch in space"
+    on_the_rig = np.flatnonzero(np.any(recorded.depth > 0, axis=1))
+    return (int(on_the_rig[0]), "since first touch") if len(on_the_rig) else (0, "since the start")
+
+
+def _moments_shown(recorded: Recorded) -> tuple[tuple[str, int], ...]:
+    """Ticks at which the mechanism is drawn, and what they are."""
     touching = np.flatnonzero(np.any(recorded.depth > 0, axis=1))
-    return int(touching[0]) if len(touching) else len(recorded.time) - 1
-
-
-def first_touch_in_space(recorded: Recorded) -> int:
-    """Likewise of the two free bodies; that on the rig where they never touch."""
-    touching = np.flatnonzero(np.any(recorded.wrench_in_space != 0, axis=1))
-    return int(touching[0]) if len(touching) else first_touch(recorded)
+    if not len(touching):
+        return ("start", 0), ("end", len(recorded.time) - 1)
+    return ("first touch", int(touching[0])), ("deepest", int(np.argmax(recorded.depth.max(axis=1))))
 
 
 def window(recorded: Recorded) -> slice:
@@ -127,7 +130,7 @@ def _forces(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> N
         colour, line = MANY[place % len(MANY)], "-" if place < len(MANY) else "--"
         name = recorded.names[candidate] if place < MOST_NAMES else None
         axes.plot(time, recorded.force[shown, candidate], color=colour, linestyle=line, label=name)
-    axes.set(ylabel="normal force of each contact [N]", xlabel="time since the first touch in space [ms]")
+    axes.set(ylabel="normal force of each contact [N]")
     finish(axes, "best")
 
 
@@ -137,5 +140,5 @@ def _moments(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> 
         axes.plot(time, recorded.wrench_in_space[shown, 3 + axis], color="0.7", linewidth=3)
         axes.plot(time, recorded.command[shown, 3 + axis], color=colour, label=AXES[axis])
         axes.plot(time, recorded.wrench[shown, 3 + axis], color=colour, linestyle=":")
-    axes.set(ylabel="moment about T [N m]", xlabel="time since the first touch in space [ms]")
+    axes.set(ylabel="moment about T [N m]")
     finish(axes, "best")

@@ -19,9 +19,9 @@ GOOD = ("rebounded", "captured")  # how a run may end
 
 def check(options: Simulate) -> None:
     """What six axes do not have yet is not asked for. Raises `InputError`."""
-    for name, given in (("--setting", options.setting), ("--log", options.log)):
-        if given is not None:
-            raise InputError(f"{name}: found {shown(given)}, allowed none: in six axes there is none so far")
+    if options.setting is not None:
+        found = f"--setting: found {shown(options.setting)}"
+        raise InputError(f"{found}, allowed none: in six axes there is none so far")
     if options.animate is not None:
         _check_film(options.animate)
 
@@ -45,7 +45,7 @@ def run(options: Simulate, mechanism: SixAxisMechanism) -> int:
     done = simulate_six_axes(mechanism, options.compensator or "none", gains, seed=options.seed)
     good = done.status in GOOD and all(_worst(episode) <= options.limit for episode in done.episodes)
     terminal.warn(f"{mechanism.name}: {warning}" for warning in done.meaning.warnings)
-    _draw(options, done)
+    _write(options, done)
     if options.json:
         terminal.emit_json(_document(options, done, good))
     else:
@@ -58,7 +58,7 @@ def _worst(episode: "Episode") -> float:
     return max(abs(episode.energy_error), episode.twist_error)
 
 
-def _draw(options: Simulate, done: "SixAxisRun") -> None:
+def _write(options: Simulate, done: "SixAxisRun") -> None:
     title = f"{done.mechanism.name}, compensation: {done.compensator}"
     if options.plot is not None:
         from jaxhil.files import follow, writing
@@ -75,6 +75,9 @@ def _draw(options: Simulate, done: "SixAxisRun") -> None:
         with writing(options.animate):
             animate(done.ticks, title, follow(options.animate))
         terminal.note(f"wrote {options.animate}")
+    if options.log is not None:
+        done.to_csv(options.log)
+        terminal.note(f"wrote {options.log}")
 
 
 def _document(options: Simulate, done: "SixAxisRun", good: bool) -> dict[str, Any]:
