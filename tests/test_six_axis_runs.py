@@ -83,6 +83,8 @@ def test_latches_and_robots_are_built_as_said():
     delay = 0.004 + 0.7 * (lag[0] + 0.008) + 0.3 * (lag[1] + 0.016)
     late = meaning(mechanism, 1.0, 1.0, 1.0, 1.0, 1.0).delay
     np.testing.assert_allclose(late, max(delay, 0.004 + lag[1] + 0.008))
+    held = meaning(mechanism, 1.0, 1.0, np.nan, 1.0, np.nan)
+    assert "; in space a latch holds, peak force 1 N; the rig" in held.line("claw")
 
 
 def central(name):
@@ -170,6 +172,7 @@ def test_simulate_a_builtin(jaxhil, tmp_path, name):
     parts = [episode[f"{part}_part"] for part in ("normal", "lateral", "rotational")]
     np.testing.assert_allclose(np.linalg.norm(parts), episode["twist_error"], rtol=1e-6)
     assert episode["status"] == document["status"] == ("captured" if captured else "rebounded")
+    assert (document["meaning"]["frequency"] is None) == captured
     # Without a force from outside momentum stays what it was: the target's was 0.
     mechanism = load_any(name).mechanism
     momenta = [mechanism.target.mass * np.array(document["final"]["v1"])]

@@ -13,6 +13,7 @@ from jaxhil.errors import InputError
 from jaxhil.mechanism.file import load_any
 from jaxhil.simulation.gain_file import load_gain_file
 from tuning.front_door import arguments
+from tuning.front_door.tune import TuneOptions
 
 SMALL = {"scenarios": 8, "starts": 2, "steps": 4, "validation": 15}
 
@@ -68,6 +69,16 @@ def test_what_six_axes_do_not_have_is_said_in_one_line(jaxhil, tmp_path):
         ran = jaxhil(*given)
         assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1 and reason in ran.err, ran.err
     assert not path.exists()
+
+
+def test_a_lead_for_each_axis_is_tuned_like_any_law():
+    options = TuneOptions(compensator="phase_lead_per_axis", scenarios=4)
+    assert (
+        options.settings().objective
+        == TuneOptions(compensator="phase_lead", scenarios=4).settings().objective
+    )
+    with pytest.raises(InputError, match="setting: found 'x', allowed none, phase_lead_per_axis has no"):
+        arguments.setting("phase_lead_per_axis", "x")
 
 
 @pytest.fixture(scope="module")

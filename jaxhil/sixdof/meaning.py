@@ -13,7 +13,7 @@ class Meaning(NamedTuple):
     """Of the first touch, nominally; NaN where nothing touches."""
 
     effective_mass: float  # m_n [kg]
-    frequency: float  # of the contact in space, 1/(2 duration) [Hz]
+    frequency: float  # of the contact in space, 1/(2 duration) [Hz]; NaN where a latch holds in the end
     peak_force: float  # in space [N]
     restitution: float  # e* in space; NaN unless it is a single touch
     delay: float  # of the loop: the slowest axis with its lag, and the force sensor [s]
@@ -25,11 +25,9 @@ class Meaning(NamedTuple):
         if math.isnan(self.effective_mass):
             return f"{name}: nothing touches; the rig is {1e3 * self.delay:.3g} ms late"
         rebound = "" if math.isnan(self.restitution) else f", e* {self.restitution:.3g}"
-        text = (
-            f"{name}: effective mass {self.effective_mass:.4g} kg at the first touch; in space a contact of "
-        )
-        text += f"{self.frequency:.3g} Hz, peak force {self.peak_force:.3g} N{rebound}; "
-        text += f"the rig is {1e3 * self.delay:.3g} ms late"
+        kind = "a latch holds" if math.isnan(self.frequency) else f"a contact of {self.frequency:.3g} Hz"
+        text = f"{name}: effective mass {self.effective_mass:.4g} kg at the first touch; in space {kind}, "
+        text += f"peak force {self.peak_force:.3g} N{rebound}; the rig is {1e3 * self.delay:.3g} ms late"
         if not math.isnan(self.slip_limit):
             text += f", friction steady there from a slip of {self.slip_limit:.2g} m/s on"
         return text

@@ -1,5 +1,6 @@
 """One run of a mechanism of six axes: what became of each episode, and every tick of the way there."""
 
+import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -135,8 +136,9 @@ def _result(
     )
     bad = [episode.status for episode in episodes if episode.status not in GOOD]
     first = episodes[0]
+    held = bool(metrics.reference_captured[0, 0])
     means = meaning(
-        mechanism, first.effective_mass, float(tangential[0]), first.reference_duration,
+        mechanism, first.effective_mass, float(tangential[0]), math.nan if held else first.reference_duration,
         first.reference_peak_force, first.reference_restitution,
     )  # fmt: skip
     status = [*bad, episodes[-1].status][0]

@@ -131,9 +131,9 @@ def setting(compensator: str, value: Any) -> None:
     """The compensator has a setting of that name, if one is given. Imports jax then."""
     if value is None:
         return
-    from jaxhil.compensators import COMPENSATORS
+    from jaxhil.compensators import compensator_of
 
-    names = COMPENSATORS[compensator].settings
+    names = compensator_of(compensator).settings
     if value not in names:
         allowed = ", ".join(names) or f"none, {compensator} has no settings"
         raise ArgumentError("setting", shown(value), allowed)

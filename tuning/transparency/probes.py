@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.compensators import compensator_of
 from jaxhil.contact.laws import LAWS
 from jaxhil.contact.reference import Reference
 from jaxhil.mechanism.structs import Mechanism
@@ -54,7 +54,7 @@ def default_weights(compensator: str) -> dict[str, float]:
     dear: what such a law is late by it can pay back by a kick, which the error alone rewards. Where a law can
     but pass on what it measures, neither counts.
     """
-    return dict(ANTICIPATING) if COMPENSATORS[compensator].anticipates else {}
+    return dict(ANTICIPATING) if compensator_of(compensator).anticipates else {}
 
 
 def are_probes(lanes: int) -> np.ndarray:
