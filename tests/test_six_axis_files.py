@@ -112,7 +112,7 @@ LEGS = "hydraulic-hexapod"
 @pytest.mark.parametrize(
     ("name", "changes", "reason"),
     [
-        ("ring-capture", {"latch.hooks.depth": None}, "hooks.depth: found nothing, allowed a number, or"),
+        ("ring-capture", {"latch.hooks.depth": None}, "found nothing, allowed a number >= 0 m, or latched"),
         ("ring-capture", {"latch.hooks.latched": True}, "latched: found true, allowed false: an approach"),
         ("ring-capture", {"latch.hooks.stiffness": None}, "stiffness: found nothing, allowed six numbers"),
         ("ring-capture", {"latch.hooks.stiffness_matrix": SPRING}, "stiffness_matrix beside it, allowed"),
