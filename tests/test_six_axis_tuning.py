@@ -1,7 +1,6 @@
 """Six axes tuned and swept from end to end: gain file, store, report; and what says that six axes lack it."""
 
 import json
-import shutil
 
 import jax
 import numpy as np
@@ -15,7 +14,6 @@ from jaxhil.mechanism.file import load_any
 from jaxhil.simulation.gain_file import load_gain_file
 from tuning.front_door import arguments
 from tuning.front_door.tune import TuneOptions
-from tuning.gain_file import build_document
 
 SMALL = {"scenarios": 8, "starts": 2, "steps": 4, "validation": 15}
 
@@ -153,22 +151,6 @@ def test_sweep_and_report(tuned, jaxhil, tmp_path):
     assert "|error|" in text and "|e - e*|" not in text
     ran = jaxhil("replay", store, 3)
     assert ran.code == 2 and "found a sweep of six axes" in ran.err
-
-
-@pytest.mark.slow
-def test_a_sweep_that_was_cut_short_ends_with_the_same_rows(tmp_path):
-    mechanism, law = load_any("probe-drogue").mechanism, "phase_lead_per_axis"
-    document = build_document(law, literature_gains(mechanism, law), mechanism, "0" * 64, {}, {}, 0, {})
-    path, few = tmp_path / "gains.json", {"scenarios": 48, "chunk": 16, "limit": 0.3}
-    path.write_text(json.dumps(document))
-    whole = tuning.sweep(path, folder=tmp_path / "whole", **few)
-    shutil.copytree(tmp_path / "whole", tmp_path / "cut")
-    _, *lost = sorted((tmp_path / "cut" / "parts").iterdir())
-    for part in (*lost, tmp_path / "cut" / "verdict.json"):
-        part.unlink()
-    resumed = tuning.sweep(path, folder=tmp_path / "cut", resume=True, **few)
-    assert len(lost) == 2 and resumed.table.equals(whole.table)
-    assert resumed.failure_probability == whole.failure_probability
 
 
 @pytest.mark.slow
