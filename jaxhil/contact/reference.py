@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
-from scipy.special import zeta
 
 from jaxhil.contact.reference_closed_form import arccosine_over_sine, chained_oscillators
 
@@ -131,7 +130,20 @@ def piecewise_linear(
 # s coth(s) - 1 = sum_k COTANGENT[k-1] s^(2k), radius of convergence pi.
 _ORDER = np.arange(1, 9)
 _SERIES_LIMIT = 0.3
-_COTANGENT = 2 * (-1.0) ** (_ORDER + 1) * zeta(2 * _ORDER) / np.pi ** (2 * _ORDER)
+# Riemann's zeta(2), zeta(4), ...: SciPy, which has them, takes long to import.
+_ZETA = np.array(
+    [
+        1.6449340668482264,
+        1.0823232337111381,
+        1.0173430619844492,
+        1.0040773561979444,
+        1.000994575127818,
+        1.000246086553308,
+        1.0000612481350588,
+        1.0000152822594086,
+    ]
+)
+_COTANGENT = 2 * (-1.0) ** (_ORDER + 1) * _ZETA / np.pi ** (2 * _ORDER)
 # s coth(s) - 1 + log(sinh(s) / s), the first integral in terms of s.
 _POTENTIAL = _COTANGENT * (1 + 1 / (2 * _ORDER))
 

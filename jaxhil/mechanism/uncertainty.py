@@ -25,7 +25,6 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from scipy import special
 
 from jaxhil.mechanism.correlation import correlated
 from jaxhil.mechanism.six_axes import SixAxisMechanism, numeric_keys_of
@@ -195,6 +194,8 @@ def _truncated_normal(mean: np.ndarray, std: float, allowed: Range) -> Callable[
 
     Accurate since the mean is an allowed value, so that neither end is far in the other's tail.
     """
+    from scipy import special  # takes long to import, and most files need none
+
     with np.errstate(over="ignore"):
         below = special.ndtr((allowed.low - mean) / std)
         above = special.ndtr((allowed.high - mean) / std)

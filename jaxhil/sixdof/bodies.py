@@ -7,6 +7,7 @@ not change, while the angular velocity does.
 
 from typing import NamedTuple
 
+import jax
 from jaxtyping import Array, Float
 
 from jaxhil.sixdof.rotations import Quaternion, compose, exponential, normalise, rotate, rotate_back
@@ -77,6 +78,7 @@ def angular_momentum(body: Body, state: State) -> Vector:
     return cross(state.position, linear_momentum(body, state)) + state.spin
 
 
+@jax.jit
 def kick_drift(
     body: Body, state: State, load: Load, period: Float[Array, "..."], share: Float[Array, "..."] | float
 ) -> State:

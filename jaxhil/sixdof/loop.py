@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, UInt32
 
@@ -112,9 +113,9 @@ class Tick(NamedTuple):
 
 def build_loop(scenario: Scenario, **static: Any) -> Loop:
     """The loop of a batch of scenarios; `static` are the fields of `Loop`, without the ring."""
-    sensor, period = scenario.sensor, scenario.control_period
-    slowest = jnp.maximum(sensor.delay, sensor.position_delay)[None] + scenario.simulator.delay
-    intervals = int(jnp.max(slowest / period[None])) + 2
+    sensor, period = scenario.sensor, np.asarray(scenario.control_period)
+    slowest = np.maximum(sensor.delay, sensor.position_delay)[None] + np.asarray(scenario.simulator.delay)
+    intervals = int(np.max(slowest / period[None])) + 2
     return Loop(ring=1 << intervals.bit_length(), **static)
 
 

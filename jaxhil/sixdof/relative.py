@@ -76,6 +76,7 @@ class States(NamedTuple):
     chaser: State
 
 
+@jax.jit
 def interface_frame(body: Body, state: State) -> Frame:
     """A body's interface frame."""
     angular = rotate(state.attitude, angular_velocity(body, state))
@@ -97,6 +98,7 @@ def relative_motion(target: Frame, chaser: Frame) -> tuple[Pose, Twist]:
     return pose, Twist(rotate_back(target.attitude, velocity), rotate_back(target.attitude, angular))
 
 
+@jax.jit
 def relative(bodies: Pair, states: States) -> tuple[Pose, Twist]:
     """Pose and twist of C against T."""
     target, chaser = (interface_frame(*one) for one in zip(bodies, states, strict=True))

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from math import factorial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -30,6 +31,7 @@ def identity(like: Float[Array, "*batch"]) -> Quaternion:
     return Quaternion(zero + 1, Vector(zero, zero, zero))
 
 
+@jax.jit
 def compose(second: Quaternion, first: Quaternion) -> Quaternion:
     """The rotation `first`, then the rotation `second`: their product."""
     (a, u), (b, v) = second, first
@@ -41,6 +43,7 @@ def reverse(rotation: Quaternion) -> Quaternion:
     return Quaternion(rotation.w, -rotation.v)
 
 
+@jax.jit
 def rotate(rotation: Quaternion, vector: Vector) -> Vector:
     """R vector."""
     along = 2 * cross(rotation.v, vector)
@@ -52,18 +55,21 @@ def rotate_back(rotation: Quaternion, vector: Vector) -> Vector:
     return rotate(reverse(rotation), vector)
 
 
+@jax.jit
 def normalise(rotation: Quaternion) -> Quaternion:
     """The same rotation, of norm 1 to rounding."""
     share = 1 / jnp.sqrt(rotation.w**2 + dot(rotation.v, rotation.v))
     return Quaternion(share * rotation.w, share * rotation.v)
 
 
+@jax.jit
 def exponential(theta: Vector) -> Quaternion:
     """The rotation whose rotation vector is theta [rad]."""
     square = dot(theta, theta) / 4
     return Quaternion(_cosine(square), (_sine(square) / 2) * theta)
 
 
+@jax.jit
 def logarithm(rotation: Quaternion) -> Vector:
     """Rotation vector [rad] of at most pi; of a half turn, either of its two."""
     sign = jnp.where(rotation.w < 0, -1, 1).astype(rotation.w.dtype)
@@ -79,6 +85,7 @@ def logarithm(rotation: Quaternion) -> Vector:
     return (2 * half) * v
 
 
+@jax.jit
 def left_jacobian(theta: Vector, rate: Vector) -> Vector:
     """Jl(theta) rate: the angular velocity [rad/s], in the axes to which exp(theta) leads, of a rotation
     vector that changes at `rate` [rad/s]."""
@@ -87,6 +94,7 @@ def left_jacobian(theta: Vector, rate: Vector) -> Vector:
     return rate + _versine(square) * once + _cubic(square) * cross(theta, once)
 
 
+@jax.jit
 def inverse_left_jacobian(theta: Vector, angular_velocity: Vector) -> Vector:
     """Jl(theta)^-1 w: the rate [rad/s] of the rotation vector at the angular velocity w [rad/s]; |theta| is
     less than a whole turn."""

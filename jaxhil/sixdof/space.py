@@ -234,7 +234,7 @@ def choose(condition: Array, one: Any, other: Any) -> Any:
     """Lane by lane, one or the other; lanes are the last axes."""
 
     def either(a: Array, b: Array) -> Array:
-        return jnp.where(condition.reshape(*[1] * (a.ndim - condition.ndim), *condition.shape), a, b)
+        return lax.select(jnp.broadcast_to(condition, a.shape), a, b)
 
     return jax.tree.map(either, one, other)
 

@@ -6,12 +6,13 @@ given lengths is found by Newton's method, from a pose that is near.
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from jaxhil.sixdof.axes import Motion
 from jaxhil.sixdof.kinematics import Kinematics
-from jaxhil.sixdof.rotations import exponential, rotate
-from jaxhil.sixdof.vectors import Vector, norm, vector
+from jaxhil.sixdof.rotations import exponential, left_jacobian, rotate
+from jaxhil.sixdof.vectors import Vector, cross, direction, norm, vector
 
 NEWTON_STEPS = 3  # squared each: from 1e-3 to rounding
 
@@ -35,19 +36,17 @@ class Stewart(Kinematics):
         return jnp.all((axes >= shortest) & (axes <= longest), axis=0)
 
     def command(self, coordinates):
-        position, theta = (vector(part[:, None]) for part in (coordinates[:3], coordinates[3:]))
-        height = jax.tree.map(lambda part: part[None], self.height)
-        return norm(height + position + rotate(exponential(theta), self.platform) - self.base)
+        leg, *_ = _legs(self, coordinates)
+        return norm(leg)
 
     def coordinates(self, motion, near):
-        def newton(at: Array) -> Array:
-            return at + solve(jacobian(self, at), motion.position - self.command(at))
+        def newton(at: Array, lengths: Array) -> Array:
+            return at + solve(jacobian(self, at), lengths - self.command(at))
 
-        at = near
-        for _ in range(NEWTON_STEPS - 1):
-            at = newton(at)
+        lengths, near = lax.stop_gradient((motion.position, near))
+        at = lax.fori_loop(0, NEWTON_STEPS - 1, lambda _, at: newton(at, lengths), near)
         # The last step alone is differentiated: derivatives of the pose, not of the way to it.
-        at = newton(jax.lax.stop_gradient(at))
+        at = newton(at, motion.position)
         slopes = jacobian(self, at)
         rate = solve(slopes, motion.rate)
         if motion.acceleration is None:
@@ -61,10 +60,12 @@ class Stewart(Kinematics):
 
 
 def jacobian(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "6 6 *batch"]:
-    """How fast each leg (row) grows with each coordinate [m, rad] at coordinates."""
-    unit = jnp.broadcast_to(jnp.eye(6, dtype=at.dtype).reshape(6, 6, *[1] * (at.ndim - 1)), (6, *at.shape))
-    _, slope = jax.linearize(hexapod.command, at)
-    return jnp.moveaxis(jax.vmap(slope)(unit), 0, 1)
+    """How fast each leg (row) grows with each coordinate [m, rad] at coordinates: with p as its direction u,
+    with theta as Jl(theta)^T (R b x u), b the joint on the platform."""
+    leg, arm, theta = _legs(hexapod, at)
+    along = direction(leg)
+    turning = left_jacobian(-theta, cross(arm, along))
+    return jnp.stack(jax.tree.leaves((along, turning)), axis=1)
 
 
 def condition(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "*batch"]:
@@ -77,3 +78,11 @@ def solve(matrix: Float[Array, "6 6 *batch"], right: Float[Array, "6 *batch"]) -
     rows = jnp.moveaxis(matrix, (0, 1), (-2, -1))
     found = jnp.linalg.solve(rows, jnp.moveaxis(right, 0, -1)[..., None])
     return jnp.moveaxis(found[..., 0], -1, 0)
+
+
+def _legs(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> tuple[Vector, Vector, Vector]:
+    """The legs and the joints from the platform's origin, (6, *batch) each, in T axes [m]; theta [rad]."""
+    position, theta = (vector(part[:, None]) for part in (at[:3], at[3:]))
+    height = jax.tree.map(lambda part: part[None], hexapod.height)
+    arm = rotate(exponential(theta), hexapod.platform)
+    return height + position + arm - hexapod.base, arm, theta

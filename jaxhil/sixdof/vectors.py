@@ -5,6 +5,7 @@ every tick.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -86,6 +87,7 @@ def root(square: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)
 
 
+@jax.jit
 def inverse(a: Matrix) -> Matrix:
     """Inverse of a regular matrix, by its cofactors."""
     columns = cross(a.y, a.z), cross(a.z, a.x), cross(a.x, a.y)

@@ -1,0 +1,80 @@
+"""How soon a first result in six axes is there: the first `jaxhil simulate`, and programs of many candidates.
+
+Processor seconds, so that what else runs on the machine does not count. Run with
+`pytest -m benchmark -s tests/benchmarks/test_six_axes_start.py`.
+"""
+
+import os
+import resource
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+
+from jaxhil.mechanism.file import load_any
+from jaxhil.simulation.environment import ONCE, known_options
+from jaxhil.sixdof.building import build_scenarios, loop_of
+from jaxhil.sixdof.metrics import evaluate
+
+pytestmark = pytest.mark.benchmark
+COLD, WARM = 20.0, 6.0  # s; the aim is 12 and 4
+FORWARD, DERIVATIVES = 30.0, 90.0  # s; the aim is 15 and 45
+BUILT_IN = ("probe-drogue", "petals", "ring-capture", "claw-two-arms", "hydraulic-hexapod")
+
+
+def seconds_of(name, folder):
+    """Processor seconds of one command."""
+    ours = {key: value for key, value in os.environ.items() if key not in ("XLA_FLAGS", "NPROC")}
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    command = [sys.executable, "-m", "tuning", "simulate", name]
+    subprocess.run(command, env=ours | {"JAXHIL_CACHE": str(folder)}, stdout=subprocess.DEVNULL, check=False)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_first_simulate(name, tmp_path, capsys):
+    cold, warm = (seconds_of(name, tmp_path) for _ in range(2))
+    with capsys.disabled():
+        print(f"\n{name}: first simulate {cold:.1f} s, then {warm:.1f} s of the processor")
+    assert cold <= COLD and warm <= WARM
+
+
+@pytest.fixture
+def nothing_kept():
+    """Programs are compiled, whatever was before."""
+    folder = jax.config.jax_compilation_cache_dir
+    for now in (None, folder):
+        jax.config.update("jax_compilation_cache_dir", now)
+        compilation_cache.reset_cache()
+        if now is None:
+            yield
+
+
+@pytest.mark.usefixtures("nothing_kept")
+def test_twelve_candidates_compile(capsys):
+    """Twelve candidates of two kinds, the second time with derivatives by six leads."""
+    mechanism = load_any("petals", []).mechanism
+    scenario = build_scenarios(mechanism)
+    assert sum(group.parameters.damping.shape[0] for group in scenario.groups) == 12
+    loop = loop_of(mechanism, "phase_lead", scenario)
+
+    def errors(leads):
+        gains = {"phase_lead": leads[:, None], "lead_filter": jnp.array(1e-3)}
+        metrics = evaluate(loop, gains, scenario).metrics
+        return jnp.stack([metrics.energy_error, metrics.twist_error])
+
+    for what, function, bar in (
+        ("figures", errors, FORWARD),
+        ("with derivatives", jax.jacfwd(errors), DERIVATIVES),
+    ):
+        started = time.process_time()
+        jax.jit(function, compiler_options=known_options(ONCE)).lower(jnp.full(6, 2e-3)).compile()
+        took = time.process_time() - started
+        with capsys.disabled():
+            print(f"\ntwelve candidates, {what}: compiled in {took:.1f} s of the processor")
+        assert took <= bar
