@@ -90,13 +90,7 @@ def as_arrays(gains: Mapping[str, Any]) -> dict[str, jax.Array]:
 
 def join(scenarios: Iterable[Scenario]) -> Scenario:
     """Scenarios of one form as the lanes of one batch, as JAX arrays."""
-
-    def joined(*leaves):
-        if jnp.issubdtype(leaves[0].dtype, jax.dtypes.prng_key):
-            return jnp.concatenate(leaves)
-        return jnp.asarray(np.concatenate([np.asarray(leaf) for leaf in leaves], axis=-1))
-
-    return jax.tree.map(joined, *scenarios)
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves, axis=-1)), *scenarios)
 
 
 def spread(parsed: Mechanism, lanes: int, **leaves: Any) -> Scenario:
@@ -105,19 +99,17 @@ def spread(parsed: Mechanism, lanes: int, **leaves: Any) -> Scenario:
     A name of two parts, such as contact__damping, is a leaf of a part. What is given broadcasts over the
     lanes and over successive contacts.
     """
-    scenario = jax.tree.map(
-        lambda leaf: jnp.repeat(jnp.asarray(leaf), lanes, axis=-1), join([build_scenarios(parsed)])
-    )
+    scenario = jax.tree.map(lambda leaf: np.repeat(leaf, lanes, axis=-1), build_scenarios(parsed))
     for name, value in leaves.items():
         part, _, leaf = name.rpartition("__")
         owner = getattr(scenario, part) if part else scenario
         old = getattr(owner, leaf)
-        value = jnp.asarray(np.array(value), old.dtype)
+        value = np.asarray(value, old.dtype)
         if leaf not in ("numerator", "denominator"):
-            value = jnp.broadcast_to(value, old.shape)
+            value = np.broadcast_to(value, old.shape)
         owner = owner._replace(**{leaf: value})
         scenario = scenario._replace(**{part: owner}) if part else owner
-    return scenario
+    return jax.tree.map(jnp.asarray, scenario)
 
 
 def grid(*axes: Any) -> list[np.ndarray]:
@@ -127,7 +119,7 @@ def grid(*axes: Any) -> list[np.ndarray]:
 
 def per_lane(gains: Mapping[str, Any], lanes: int) -> dict[str, jax.Array]:
     """Gains, scalars or one number per lane, as arrays over the lanes."""
-    return {name: jnp.broadcast_to(jnp.asarray(value, float), (lanes,)) for name, value in gains.items()}
+    return {name: jnp.asarray(np.full(lanes, value, float)) for name, value in gains.items()}
 
 
 def first_contact(

@@ -245,10 +245,7 @@ def test_random_ticks(name, lanes):
 
 @pytest.mark.parametrize(
     "mechanism_name",
-    [
-        pytest.param(name, marks=() if number % 4 == 1 else pytest.mark.slow)
-        for number, name in enumerate(builtin_names())
-    ],
+    [pytest.param(name, marks=() if name == "varying" else pytest.mark.slow) for name in builtin_names()],
 )
 def test_recorded_ticks(mechanism_name):
     mechanism, sha256, _ = load(mechanism_name)

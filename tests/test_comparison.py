@@ -2,12 +2,13 @@
 
 from typing import ClassVar, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from continuous import delayed_restitution
 from jaxtyping import Array
-from lanes import IDEAL, mechanism, validated
+from lanes import IDEAL, QUICK, mechanism, validated
 
 from jaxhil import compensators
 from jaxhil.compensators.base import Compensator, Gain
@@ -44,7 +45,7 @@ def judged(raw, law, gains=None, number=LANES):
 
 def test_an_ideal_rig_is_honest():
     """No delay, T -> 0: error 0, transparency 1, slope 1, peak ratio 1."""
-    figures = judged(mechanism({}, IDEAL, 0.0, period=2.5e-5), "none")
+    figures = judged(mechanism({}, IDEAL, 0.0, period=5e-5), "none")
     assert figures["rms"].value < 1e-3 and figures["worst"].value < 1e-3
     for name in ("early", "late", "slope", "peak"):
         assert figures[name].value == pytest.approx(1, abs=1e-3), name
@@ -129,7 +130,8 @@ def test_damped_twins_span_a_third_of_the_speed(name):
             *(jnp.asarray(leaf)[0] if leaf is not None else None for leaf in batch.contact)
         )
         mass, velocity = jnp.asarray(batch.equivalent_mass), jnp.asarray(batch.velocity)
-        lossy.append(np.asarray(LAWS[one.contact.law].reference(contact, mass, velocity).restitution))
+        of_law = jax.jit(LAWS[one.contact.law].reference, compiler_options=QUICK)
+        lossy.append(np.asarray(of_law(contact, mass, velocity).restitution))
     before, after = lossy
     lost = 1 - after / before
     assert np.all(lost >= -1e-9) and np.min(lost) < 0.02

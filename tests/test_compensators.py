@@ -240,17 +240,19 @@ def test_runs_begin_anew(name):
     reset nothing is left."""
     law, gains = COMPENSATORS[name], some_gains(name)
     signals, constants = readings((), GAP)
-    first = jax.tree.map(lambda leaf: leaf[60], signals)
-    fresh = law.init(gains, constants, RING)
-    used = fresh
-    step = jax.jit(
-        lambda state, tick: law.step(law.prepare(gains, constants), state, first, tick)[1],
-        compiler_options=QUICK,
-    )
-    for tick in range(4):
-        used = step(used, jnp.asarray(tick))
-    no, yes = jnp.asarray(False), jnp.asarray(True)
-    for goes_on in (law.restart(gains, used, no, no), law.restart(gains, used, no, yes)):
+    first = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[60]), signals)
+
+    @functools.partial(jax.jit, compiler_options=QUICK)
+    def restarted(begins, fresh):
+        prepared, ticks = law.prepare(gains, constants), jnp.arange(4, dtype=jnp.int32)
+        start = law.init(gains, constants, RING)
+        used, _ = jax.lax.scan(
+            lambda state, tick: (law.step(prepared, state, first, tick)[1], None), start, ticks
+        )
+        return used, law.restart(gains, used, begins, fresh)
+
+    for fresh in (False, True):
+        used, goes_on = restarted(np.False_, np.bool_(fresh))
         jax.tree.map(np.testing.assert_array_equal, goes_on, used)
     rows = [row for row in zip(*(np.asarray(leaf).tolist() for leaf in signals[:4]), strict=True)]
     values = {gain: entry["value"] for gain, entry in GAINS[name].items()}

@@ -20,14 +20,14 @@ def contact(**values):
     numbers = {"stiffness": STIFFNESS, "damping": 0.0, "exponent": 1.5}
     numbers |= {"reference_depth": 2e-4, "unloading_ratio": 1.0, "preload": 0.0, "friction": 0.0}
     lanes = {
-        name: jnp.broadcast_to(jnp.asarray(values.get(name, n), float), (LANES,))
+        name: jnp.asarray(np.broadcast_to(np.asarray(values.get(name, n), float), LANES))
         for name, n in numbers.items()
     }
     return ContactParameters(**lanes, depths=jnp.zeros((0, LANES)), tension=jnp.zeros(LANES, bool))
 
 
 def reference(name, **values):
-    mass, velocity = (jnp.full((LANES,), value) for value in (MASS, VELOCITY))
+    mass, velocity = (jnp.asarray(np.full(LANES, value)) for value in (MASS, VELOCITY))
     run = jax.jit(LAWS[name].reference, compiler_options=QUICK)
     return run(contact(**values), mass, velocity)
 
@@ -50,7 +50,7 @@ def test_depth_damped_that_is_hunt_and_crossley_s(exponent, damping):
     stiffness = 1e7 if exponent > 1 else STIFFNESS
     found = reference("depth_damped", stiffness=stiffness, exponent=exponent, damping=damping)
     parameters = MASS, stiffness, exponent, damping / (1.5 * 2e-4 * stiffness), VELOCITY
-    expected = hunt_crossley(*(jnp.full((LANES,), value) for value in parameters))
+    expected = jax.jit(hunt_crossley, compiler_options=QUICK)(*(np.full(LANES, one) for one in parameters))
     for got, wanted in zip(found, expected, strict=True):
         np.testing.assert_allclose(got, wanted, rtol=1e-8)
 
@@ -59,7 +59,7 @@ def test_elastoplastic_in_closed_form_and_integrated():
     ratio = np.array([1.0, 1.1, 1.5, 2.0, 4.0, 25.0])
     found = reference("elastoplastic", unloading_ratio=ratio)
     np.testing.assert_allclose(found.restitution, ratio**-0.5, rtol=1e-15)
-    mass, velocity = (jnp.full((LANES,), value) for value in (MASS, VELOCITY))
+    mass, velocity = (jnp.asarray(np.full(LANES, value)) for value in (MASS, VELOCITY))
     law = LAWS["elastoplastic"]
     run = jax.jit(lambda c: integrate_contact(law, c, mass, velocity), compiler_options=QUICK)
     for got, wanted in zip(run(contact(unloading_ratio=ratio))[:3], found, strict=True):
@@ -82,7 +82,7 @@ def test_preloaded_in_closed_form_and_integrated():
     np.testing.assert_allclose(found.restitution, np.sqrt(out / energy), rtol=1e-12)
     np.testing.assert_allclose(found.peak_force, inward + STIFFNESS * deepest, rtol=1e-12)
     np.testing.assert_allclose(found.duration[0], np.pi * np.sqrt(MASS / STIFFNESS), rtol=1e-12)
-    mass, velocity = (jnp.full((LANES,), value) for value in (MASS, VELOCITY))
+    mass, velocity = (jnp.asarray(np.full(LANES, value)) for value in (MASS, VELOCITY))
     law = LAWS["preloaded"]
     run = jax.jit(lambda c: integrate_contact(law, c, mass, velocity), compiler_options=QUICK)
     for got, wanted in zip(run(contact(preload=preload, friction=friction))[:3], found, strict=True):

@@ -118,8 +118,8 @@ def test_both_recursions_agree():
     """Three contacts, the last in part hidden by a dead zone; what is carried as well."""
     rng = np.random.default_rng(1)
     bank, zero = plain(), jnp.zeros(())
-    prior = force_depth_map.prior(*(zero + value for value in PRIOR.values()))
-    ours, begin, learn = in_jax.no_bank(prior), jax.jit(in_jax.begin), jax.jit(in_jax.learn)
+    prior = jax.jit(force_depth_map.prior)(*(zero + value for value in PRIOR.values()))
+    ours, begin, learn = jax.jit(in_jax.no_bank)(prior), jax.jit(in_jax.begin), jax.jit(in_jax.learn)
     known = zero + SPREAD, zero + TOLD, zero + PRIOR["damping"] ** 2
     for delay, zone, met in (
         (0.0004, 0.0, meeting(2e-6)), (0.0004, 0.0, meeting(1e-4, 0.8)), (-0.0007, 1.0, meeting()),

@@ -15,7 +15,7 @@ from tuning.gains.tune import neutral_gains
 pytestmark = pytest.mark.users_options
 
 
-def setting(compensator="response_error", lanes=40, name="varying", seed=1, overrides=()):
+def setting(compensator="response_error", lanes=70, name="varying", seed=1, overrides=()):
     mechanism = load(name, overrides).mechanism
     scenarios = build_scenarios(mechanism, draw(mechanism, lanes, seed))
     gains = {g.name: float(g.nominal(mechanism)) for g in COMPENSATORS[compensator].gains}
@@ -33,7 +33,7 @@ def take(leaf, lanes):
 
 
 def test_a_lane_does_not_depend_on_its_batch():
-    loop, gains, scenarios = setting(lanes=70)
+    loop, gains, scenarios = setting()
     whole = evaluate(loop, gains, scenarios)
     some = np.array([63, 2, 17])
     part = evaluate(loop, gains, lanes_of(scenarios, some))
@@ -63,18 +63,18 @@ def test_neutral_gains_are_no_compensation(compensator):
 
 
 def test_other_mechanism_seed_and_number_reuse_the_program():
-    loop, gains, scenarios = setting(lanes=40)
+    loop, gains, scenarios = setting()
     evaluate(loop, gains, scenarios)
     programs = programs_of("_run_tiles")
-    other, other_gains, other_scenarios = setting(name="claw-350kg", seed=7, lanes=35)
+    other, other_gains, other_scenarios = setting(name="claw-350kg", seed=7, lanes=65)
     assert other == loop
     evaluate(other, other_gains, other_scenarios)
-    evaluate(*setting(seed=3, lanes=64, overrides=("bodies.equivalent_mass=200",)))
+    evaluate(*setting(seed=3, lanes=128, overrides=("bodies.equivalent_mass=200",)))
     assert programs_of("_run_tiles") == programs > 0
 
 
 def test_every_contact_is_set_beside_its_own_reference():
-    loop, gains, scenarios = setting("none", lanes=5)
+    loop, gains, scenarios = setting("none")
     outcome = evaluate(loop, gains, scenarios)
     damping_ratio = scenarios.contact.damping / (
         2 * np.sqrt(scenarios.contact.stiffness * scenarios.equivalent_mass)

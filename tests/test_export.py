@@ -30,7 +30,7 @@ ALWAYS = {
 }
 # Beside those whose files have something of their own.
 LIKE_OTHERS = {"dead_zone_observer", "multi_parameter_lead", "passivity", "phase_lead", "smith_hybrid"}
-LIKE_OTHERS |= {"retrospective_delay_bank", "smith_predictor", "virtual_contact"}
+LIKE_OTHERS |= {"retrospective_delay_bank", "retrospective_reference", "smith_predictor", "virtual_contact"}
 
 
 @pytest.fixture

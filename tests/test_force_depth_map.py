@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lanes import QUICK
 from scipy import stats
 
 from jaxhil.compensators import force_depth_map as in_jax
@@ -33,6 +34,11 @@ PRIOR = {
 LOST = ("damping", "depth_damping", "unloading", "friction")
 # Slopes of a map that pulls down to 15 ms and pushes from there on [1/s^2].
 LATE = np.where(np.array(KNOTS) < 0.015, -50.0, 400.0)
+
+
+def quickly(function):
+    """As one program, not operation by operation."""
+    return jax.jit(function, compiler_options=QUICK)
 
 
 def turning(speed):
@@ -97,12 +103,13 @@ def test_map_is_the_posterior_of_all_readings():
 
     contact = ForceDepthMap(Prior(**PRIOR))
     like = jnp.zeros(())
-    ours, update = in_jax.prior(*(like + value for value in PRIOR.values())), jax.jit(in_jax.update)
+    ours = quickly(in_jax.prior)(*(like + value for value in PRIOR.values()))
+    regressors, update, force_of = map(quickly, (in_jax.features, in_jax.update, in_jax.force))
     np.testing.assert_allclose(ours.mean, mean, rtol=1e-14)
     np.testing.assert_allclose(ours.covariance, covariance, rtol=1e-13)
     for depth, speed, deepest, force in zip(*readings, strict=True):
         contact.update(float(depth), float(speed), float(deepest), float(force), variance)
-        regressor = in_jax.features(like + depth, like + speed, like + deepest)
+        regressor = regressors(like + depth, like + speed, like + deepest)
         ours = update(
             ours, regressor, like + force, like + variance, jnp.asarray(True), jnp.asarray(speed > 0)
         )
@@ -110,7 +117,7 @@ def test_map_is_the_posterior_of_all_readings():
     np.testing.assert_allclose(ours.mean, expected, rtol=0, atol=1e-9 * scale)
     np.testing.assert_allclose(contact.curve.slopes, expected[:SEGMENTS], rtol=0, atol=1e-9 * scale)
     assert contact.curve.at_knots[0] == pytest.approx(expected[-1], abs=1e-9 * scale)
-    counts = in_jax.curve(ours)
+    counts = quickly(in_jax.curve)(ours)
     for place, name in enumerate(LOST, start=SEGMENTS):
         value = positive_mean(expected[place], left[place, place])
         assert getattr(contact.curve, name) == pytest.approx(value, rel=1e-6)
@@ -119,10 +126,10 @@ def test_map_is_the_posterior_of_all_readings():
     for depth, speed, deepest in ((0.004, 0.9, 0.004), (0.03, -0.2, 0.05), (0.3, 0.5, 0.3)):
         value = features(depth, speed, deepest) @ theta
         assert contact.curve.force(depth, speed, deepest) == pytest.approx(value, rel=1e-6)
-        seen = in_jax.force(counts, like + depth, like + speed, like + deepest)
+        seen = force_of(counts, like + depth, like + speed, like + deepest)
         assert float(seen) == pytest.approx(value, rel=1e-6)
     assert contact.curve.force(-0.001, 1.0, 0.0) == 0
-    assert float(in_jax.force(counts, like - 0.001, like + 1, like)) == 0
+    assert float(force_of(counts, like - 0.001, like + 1, like)) == 0
 
 
 def test_slopes_wander_ever_less_far_out():
@@ -154,11 +161,11 @@ def test_predicted_peak_force(slopes, preload, peak):
     both = jax.tree.map(
         lambda a, b: jnp.stack([a, b], axis=-1), in_lanes(slopes, preload), in_lanes(np.full(12, 400.0))
     )
-    np.testing.assert_allclose(in_jax.peak_force(both), [peak, 20.0], rtol=1e-12)
+    np.testing.assert_allclose(quickly(in_jax.peak_force)(both), [peak, 20.0], rtol=1e-12)
 
 
 def test_derivative_of_the_predicted_peak_force_beyond_knots_that_pull():
-    found = jax.grad(lambda slopes: in_jax.peak_force(in_lanes(slopes)))(jnp.asarray(LATE))
+    found = quickly(jax.grad(lambda slopes: in_jax.peak_force(in_lanes(slopes))))(jnp.asarray(LATE))
     each = 1e-4 * np.eye(12)
     steps = [curve_of(LATE + step).peak_force() - curve_of(LATE - step).peak_force() for step in each]
     np.testing.assert_allclose(found, np.array(steps) / 2e-4, rtol=1e-6, atol=1e-9)

@@ -33,6 +33,7 @@ NAMES = (*(gain.name for gain in GAINS), *PHYSICAL)
 OFFSETS = np.array([-2.0, -1.0, 1.0, 2.0])
 WEIGHTS = np.array([1.0, -8.0, 8.0, -1.0]) / 12  # error of fourth order in the step
 STEPS = (1e-6, 1e-5)  # of the scale of each parameter
+AGREEING = 48  # pairs of a parameter and a scenario, of those that agree, whose runs are recorded
 
 MECHANISM = load("varying").mechanism
 PERIOD = MECHANISM.rig.control_period
@@ -94,7 +95,7 @@ def derivatives(loop, scenario, values):
 
 
 def chosen(scenario, lanes):
-    return jax.tree.map(lambda leaf: jnp.take(leaf, lanes, axis=-1), scenario)
+    return jax.tree.map(lambda leaf: jnp.asarray(np.take(leaf, lanes, axis=-1)), scenario)
 
 
 @pytest.fixture(scope="module")
@@ -110,12 +111,13 @@ def study():
         "stiffness": scenario.contact.stiffness[0],
         "damping": scenario.contact.damping[0],
     }
-    values = {name: jnp.asarray(values[name]) for name in NAMES}
+    # As many lanes as the differences have: one program serves.
+    lanes = np.resize(np.arange(number), len(OFFSETS) * SCENARIOS)
     loop = build_loop(MECHANISM, "response_error", scenario)
-    ticks = np.asarray(evaluate(loop, scenario, values)[1])
+    ticks = np.asarray(evaluate(loop, *chosen((scenario, values), lanes))[1])[:number]
     good = np.flatnonzero(ticks < LONGEST)[:SCENARIOS]
     assert len(good) == SCENARIOS
-    scenario, values = chosen(scenario, good), {name: value[good] for name, value in values.items()}
+    scenario, values = chosen((scenario, {name: values[name] for name in NAMES}), good)
     loop = build_loop(MECHANISM, "response_error", scenario)
     plain = {name: np.asarray(value) for name, value in values.items()}
     scale = scales(plain)
@@ -129,8 +131,8 @@ def differences(study, step):
     lanes = np.tile(np.arange(SCENARIOS), len(OFFSETS))
     copies, found = chosen(scenario, lanes), []
     for name in NAMES:
-        moved = {other: jnp.asarray(value[lanes]) for other, value in values.items()}
-        moved[name] += jnp.asarray(step * np.repeat(OFFSETS, SCENARIOS) * scale[name][lanes])
+        moved = {other: value[lanes] for other, value in values.items()}
+        moved[name] += step * np.repeat(OFFSETS, SCENARIOS) * scale[name][lanes]
         found.append(np.asarray(evaluate(loop, copies, moved)[0]).reshape(len(OFFSETS), SCENARIOS))
     return np.einsum("o,pos->ps", WEIGHTS, np.stack(found)) / step
 
@@ -233,7 +235,8 @@ def events(loop, scenario, values):
 def named_events(study, pairs, step):
     """For every pair, the names of the events that differ between the runs of its difference."""
     loop, scenario, values, scale, _ = study
-    offsets = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    offsets, asked = np.array([-2.0, -1.0, 0.0, 1.0, 2.0]), len(pairs)
+    pairs = np.resize(pairs, (max(asked, AGREEING), 2))  # one program serves
     lanes = np.repeat(pairs[:, 1], len(offsets))
     moved = {name: value[lanes] for name, value in values.items()}
     for row, (parameter, lane) in enumerate(pairs):
@@ -246,7 +249,7 @@ def named_events(study, pairs, step):
         differ = (runs != runs[..., :1]).any(axis=-1)
         for row in np.flatnonzero(differ.any(axis=0) if differ.ndim == 2 else differ):
             names[row].add(name)
-    return names
+    return names[:asked]
 
 
 @pytest.mark.parametrize("step", STEPS)
@@ -271,5 +274,5 @@ def test_runs_that_agree_have_no_event(study, disagreements):
     step = STEPS[0]
     parted = {(p, s) for p, s in disagreements[step]}
     pairs = np.array([(p, s) for p in range(len(NAMES)) for s in range(SCENARIOS) if (p, s) not in parted])
-    names = named_events(study, np.random.default_rng(0).choice(pairs, 48, replace=False), step)
+    names = named_events(study, np.random.default_rng(0).choice(pairs, AGREEING, replace=False), step)
     assert not any(names)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from laws_from_elsewhere import ScaledLead, ScaledLeadOnTheRig, SquaredSpring
-from test_front_door import TWO, refusal
+from test_front_door import KEYS, TWO, refusal
 
 import jaxhil
 
@@ -29,7 +29,8 @@ def test_a_compensator_from_elsewhere_is_simulated(registered):
     filtered = jaxhil.simulate(mechanism, "phase_lead").contacts[0].error
     assert run.contacts[0].error == pytest.approx(filtered, abs=2e-3)
     assert run.contacts[0].error < none.contacts[0].error - 0.1
-    slope = jaxhil.jacobian(mechanism, "scaled_lead", by="gains.toy_lead")["gains.toy_lead"]
+    by = ["gains.toy_lead"] * len(KEYS)  # as many as elsewhere
+    slope = jaxhil.jacobian(mechanism, "scaled_lead", by=by)["gains.toy_lead"]
     step = 1e-6
     high, low = (
         np.array(

@@ -135,9 +135,10 @@ def test_pieces_of_other_files_and_options_are_not_used(jaxhil, files, tmp_path)
         shutil.rmtree(tmp_path / "fresh")
 
 
-def test_a_result_kept_is_the_result(tmp_path):
+@pytest.mark.parametrize("number", [1, pytest.param(FILES, marks=pytest.mark.slow)])
+def test_a_result_kept_is_the_result(tmp_path, number):
     """All of it, to the bit, what pictures are made of too."""
-    mechanisms = [load("rig-300kg", [f"name=m{i}"]).mechanism for i in range(FILES)]
+    mechanisms = [load("rig-300kg", [f"name=m{i}"]).mechanism for i in range(number)]
     made = dict(tune_all(mechanisms, "phase_lead", SETTINGS, pieces=Pieces(tmp_path)))
     read = dict(tune_all(mechanisms, "phase_lead", SETTINGS, pieces=Pieces(tmp_path, resume=True)))
     assert made.keys() == read.keys()

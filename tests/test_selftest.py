@@ -16,7 +16,7 @@ from bundles import TICKS, run_selftest, signed, small_files
 from tuning.bundle import selftest
 from tuning.bundle.manifest import is_text
 
-MUTATIONS = 80  # of each text file
+MUTATIONS = 50  # of each text file
 OWN_MUTATIONS = 40  # of the self-test itself, each in a process of its own
 
 

@@ -38,7 +38,8 @@ def repeated(name, probability, repeats):
     return [subset_simulation(performance, inputs, limit(probability), seed) for seed in range(repeats)]
 
 
-@pytest.mark.parametrize("probability", (1e-4, 1e-6))
+# On the way to 1e-6 it passes 1e-4.
+@pytest.mark.parametrize("probability", (pytest.param(1e-4, marks=pytest.mark.slow), 1e-6))
 @pytest.mark.parametrize("name", LIMIT_STATES)
 def test_the_interval_contains_the_probability(name, probability, capsys):
     results = repeated(name, probability, 20)

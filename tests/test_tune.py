@@ -28,7 +28,7 @@ from tuning.gains.validation import build_validation
 from tuning.optimisation.levenberg_marquardt import STATUSES
 from tuning.optimisation.unit_box import to_coordinates, to_gains
 
-SMALL = TuneSettings(scenarios=16, starts=2, steps=12, validation=63)
+SMALL = TuneSettings(scenarios=16, starts=2, steps=12, validation=63, scanned=64)
 
 
 @pytest.fixture(scope="module")

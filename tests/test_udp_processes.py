@@ -84,7 +84,7 @@ def test_rig_under_injected_faults_ends_safely(jaxhil, tmp_path):
     limits |= {"held_readings": 3.0, "missed_in_a_row": 5.0, "retreat_velocity": 0.01}
     limits |= {"limited_in_a_row": 5.0, "force_limit": 200.0}
     path = gain_file(tmp_path, limits=limits)
-    ran = jaxhil("rig", path, "--duration", 1, "--drops", 0.01, "--jitter", 0.002, "--limit", "inf")
+    ran = jaxhil("rig", path, "--duration", 0.3, "--drops", 0.01, "--jitter", 0.002, "--limit", "inf")
     assert "injected" in ran.out and "missed" in ran.out
     ran = jaxhil("rig", path, "--duration", 1, "--drops", 0.2, "--delay", 0.003, "--limit", "inf", "--json")
     found = ran.document
@@ -97,7 +97,7 @@ def test_rig_under_injected_faults_ends_safely(jaxhil, tmp_path):
 def test_rig_trips_without_injection_and_is_bad(jaxhil, tmp_path):
     limits = {"force_limit": 5.0, "retreat_velocity": 0.01, "deceleration": 1.0}
     path = gain_file(tmp_path, limits=limits)
-    ran = jaxhil("rig", path.parent, "--duration", 5, "--limit", "inf")
+    ran = jaxhil("rig", path.parent, "--duration", 2, "--limit", "inf")
     assert ran.code == 1
     assert "tripped: force_limit" in ran.out and "though no faults were injected" in ran.out
 
@@ -120,7 +120,7 @@ def test_rig_interrupted_says_what_it_measured(tmp_path):
         if "empty loop" in line:
             break
     # While the empty loop lasts: the run is never reached.
-    time.sleep(2.0)
+    time.sleep(0.5)
     process.send_signal(signal.SIGINT)
     out, error = process.communicate(timeout=60)
     assert process.returncode == 130, (seen, error)

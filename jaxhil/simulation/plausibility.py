@@ -175,14 +175,14 @@ def _in_space(mechanism: Mechanism, scenarios: Scenario) -> Reference:
     shape = scenarios.phase.shape
     mass, velocity = (np.broadcast_to(one, shape) for one in (scenarios.equivalent_mass, scenarios.velocity))
     law = LAWS[mechanism.contact.law]
-    found = _reference(law, parameters_by_slot(scenarios.contact), mass, velocity)
+    found = _reference(law, scenarios.contact, mass, velocity)
     numbers: Any = [np.asarray(leaf)[: mechanism.approach.contacts] for leaf in found]
     return Reference(*numbers)
 
 
 @partial(jax.jit, static_argnums=0)
 def _reference(law: ContactLaw, parameters: ContactParameters, mass: Any, velocity: Any) -> Reference:
-    return law.reference(parameters, mass, velocity)
+    return law.reference(parameters_by_slot(parameters), mass, velocity)
 
 
 def _contacts(mechanism: Mechanism, reference: Reference) -> tuple[ContactFigures, ...]:

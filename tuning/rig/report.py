@@ -20,7 +20,6 @@ def reference_restitutions(mechanism: Mechanism, contacts: Sequence[ContactResul
 
     prepare()
     import jax
-    import jax.numpy as jnp
 
     from jaxhil.contact.laws import LAWS
     from jaxhil.simulation.evaluation import parameters_by_slot
@@ -28,15 +27,13 @@ def reference_restitutions(mechanism: Mechanism, contacts: Sequence[ContactResul
 
     scenario = build_scenarios(mechanism)
     number = np.array([one.number for one in contacts])
-    # What differs between contacts is the trailing axis.
-    table = jax.tree.map(lambda leaf: leaf[number][..., 0], scenario.contact)
-    parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf)[..., None], table)
+    parameters = jax.tree.map(lambda leaf: leaf[number], scenario.contact)
     speeds = [one.approach_velocity for one in contacts]
-    velocity = jnp.array([speed if speed > 0.0 else 1.0 for speed in speeds])[:, None]
-    mass = jnp.broadcast_to(jnp.asarray(scenario.equivalent_mass), velocity.shape)
+    velocity = np.array([speed if speed > 0.0 else 1.0 for speed in speeds])[:, None]
+    mass = np.broadcast_to(scenario.equivalent_mass, velocity.shape)
     law = LAWS[mechanism.contact.law]
-    reference = law.reference(parameters_by_slot(parameters), mass, velocity)
-    return [float(value) for value in np.asarray(reference.restitution)[:, 0]]
+    in_space = jax.jit(lambda contact, *entered: law.reference(parameters_by_slot(contact), *entered))
+    return [float(value) for value in np.asarray(in_space(parameters, mass, velocity).restitution)[:, 0]]
 
 
 def stalled(contact: ContactResult, setup: Setup, run: LoopReport | None) -> bool:
