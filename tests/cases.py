@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from lanes import (
     IDEAL,
@@ -68,7 +67,7 @@ def build_batch(cases: Mapping[str, Case]) -> Batch:
     return Batch(
         tuple(cases),
         build_loop(longest, compensator, scenario, energies=True, chatter=True),
-        {name: jnp.array([lane[name] for lane in gains]) for name in gains[0]},
+        {name: np.array([lane[name] for lane in gains]) for name in gains[0]},
         scenario,
     )
 

@@ -1,4 +1,7 @@
-"""Mechanisms, gains and scenarios for tests: many lanes, each with numbers of its own, in one program."""
+"""Mechanisms, gains and scenarios for tests: many lanes, each with numbers of its own, in one program.
+
+Arrays are NumPy's: each that JAX makes of them is a small program to compile.
+"""
 
 import copy
 from collections.abc import Iterable, Mapping
@@ -6,7 +9,6 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from compiling import QUICK
 
@@ -83,14 +85,14 @@ def nominal_gains(mechanism: Mechanism, compensator: str, **values: float) -> di
     return gains | values
 
 
-def as_arrays(gains: Mapping[str, Any]) -> dict[str, jax.Array]:
+def as_arrays(gains: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Gains as float64 arrays."""
-    return {name: jnp.asarray(value, float) for name, value in gains.items()}
+    return {name: np.asarray(value, float) for name, value in gains.items()}
 
 
 def join(scenarios: Iterable[Scenario]) -> Scenario:
-    """Scenarios of one form as the lanes of one batch, as JAX arrays."""
-    return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves, axis=-1)), *scenarios)
+    """Scenarios of one form as the lanes of one batch."""
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *scenarios)
 
 
 def spread(parsed: Mechanism, lanes: int, **leaves: Any) -> Scenario:
@@ -109,7 +111,7 @@ def spread(parsed: Mechanism, lanes: int, **leaves: Any) -> Scenario:
             value = np.broadcast_to(value, old.shape)
         owner = owner._replace(**{leaf: value})
         scenario = scenario._replace(**{part: owner}) if part else owner
-    return jax.tree.map(jnp.asarray, scenario)
+    return scenario
 
 
 def grid(*axes: Any) -> list[np.ndarray]:
@@ -117,9 +119,9 @@ def grid(*axes: Any) -> list[np.ndarray]:
     return [axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")]
 
 
-def per_lane(gains: Mapping[str, Any], lanes: int) -> dict[str, jax.Array]:
+def per_lane(gains: Mapping[str, Any], lanes: int) -> dict[str, np.ndarray]:
     """Gains, scalars or one number per lane, as arrays over the lanes."""
-    return {name: jnp.asarray(np.full(lanes, value, float)) for name, value in gains.items()}
+    return {name: np.full(lanes, value, float) for name, value in gains.items()}
 
 
 def first_contact(

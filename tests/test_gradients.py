@@ -95,7 +95,7 @@ def derivatives(loop, scenario, values):
 
 
 def chosen(scenario, lanes):
-    return jax.tree.map(lambda leaf: jnp.asarray(np.take(leaf, lanes, axis=-1)), scenario)
+    return jax.tree.map(lambda leaf: np.take(leaf, lanes, axis=-1), scenario)
 
 
 @pytest.fixture(scope="module")

@@ -24,9 +24,7 @@ def blows_up(static, gains, arguments):
 def solved(residuals, targets, starts, steps):
     bounds = Bounds(*(np.tile(leaf, (len(starts), 1)) for leaf in BOUNDS))
     coordinates = to_coordinates(np.array(starts), bounds)
-    return solve(
-        residuals, 10.0, np.array(targets), bounds, coordinates, np.array(steps), longest=64, tile=2
-    )
+    return solve(residuals, 10.0, np.array(targets), bounds, coordinates, np.array(steps), longest=64, tile=2)
 
 
 def test_every_problem_finds_its_own_minimum():

@@ -325,8 +325,9 @@ def noisy_run():
 def noise():
     """What is added to force [N] and position [m], each (contacts, ticks, lanes)."""
     scenario = noisy_batch(6)[2]
-    age = jnp.broadcast_to(jnp.arange(400)[:, None], (400, 6))
-    drawn = [draw_noise(True, True, scenario, jnp.full(6, contact), age) for contact in range(2)]
+    age = np.broadcast_to(np.arange(400)[:, None], (400, 6))
+    both = jax.jit(draw_noise, static_argnums=(0, 1), compiler_options=QUICK)
+    drawn = [both(True, True, scenario, np.full(6, contact), age) for contact in range(2)]
     return tuple(np.stack(values) for values in zip(*drawn, strict=True))
 
 

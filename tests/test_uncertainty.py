@@ -191,7 +191,7 @@ def test_no_draws_and_negative_arguments():
 
 
 @pytest.mark.parametrize("path", sorted(set(numeric_keys()) - POLYNOMIALS))
-@settings(deadline=None)
+@settings(deadline=None, max_examples=30)
 @given(nominal=st.just(0.0) | st.floats(1e-9, 1e4), std=st.floats(*MAGNITUDES))
 def test_normal_draws_are_allowed_values(path, nominal, std):
     allowed = numeric_keys()[path]

@@ -64,10 +64,8 @@ def test_hardware_that_touches_late_is_waited_for():
     assert found.contacts[0].status == "ok" and found.contacts[0].peak_force > 0
 
 
-@pytest.mark.parametrize(
-    "compensator",
-    ["retrospective_reference", pytest.param("retrospective_delay_bank", marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("compensator", ["retrospective_reference", "retrospective_delay_bank"])
 @pytest.mark.parametrize("setting", ["sharp", "gentle"])
 def test_our_laws_make_no_contact_of_their_own(compensator, setting):
     """In front of a surface that a run does not reach."""
