@@ -1,5 +1,7 @@
 """Contact laws whose reference is integrated or which remember: closed forms, SciPy, works, derivatives."""
 
+from functools import partial
+
 import continuous
 import jax
 import jax.numpy as jnp
@@ -20,14 +22,13 @@ def contact(**values):
     numbers = {"stiffness": STIFFNESS, "damping": 0.0, "exponent": 1.5}
     numbers |= {"reference_depth": 2e-4, "unloading_ratio": 1.0, "preload": 0.0, "friction": 0.0}
     lanes = {
-        name: jnp.asarray(np.broadcast_to(np.asarray(values.get(name, n), float), LANES))
-        for name, n in numbers.items()
+        name: np.broadcast_to(np.asarray(values.get(name, n), float), LANES) for name, n in numbers.items()
     }
-    return ContactParameters(**lanes, depths=jnp.zeros((0, LANES)), tension=jnp.zeros(LANES, bool))
+    return ContactParameters(**lanes, depths=np.zeros((0, LANES)), tension=np.zeros(LANES, bool))
 
 
 def reference(name, **values):
-    mass, velocity = (jnp.asarray(np.full(LANES, value)) for value in (MASS, VELOCITY))
+    mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))
     run = jax.jit(LAWS[name].reference, compiler_options=QUICK)
     return run(contact(**values), mass, velocity)
 
@@ -59,10 +60,10 @@ def test_elastoplastic_in_closed_form_and_integrated():
     ratio = np.array([1.0, 1.1, 1.5, 2.0, 4.0, 25.0])
     found = reference("elastoplastic", unloading_ratio=ratio)
     np.testing.assert_allclose(found.restitution, ratio**-0.5, rtol=1e-15)
-    mass, velocity = (jnp.asarray(np.full(LANES, value)) for value in (MASS, VELOCITY))
+    mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))
     law = LAWS["elastoplastic"]
-    run = jax.jit(lambda c: integrate_contact(law, c, mass, velocity), compiler_options=QUICK)
-    for got, wanted in zip(run(contact(unloading_ratio=ratio))[:3], found, strict=True):
+    run = jax.jit(partial(integrate_contact, law), compiler_options=QUICK)
+    for got, wanted in zip(run(contact(unloading_ratio=ratio), mass, velocity)[:3], found, strict=True):
         np.testing.assert_allclose(got, wanted, rtol=1e-8)
 
 
@@ -82,10 +83,12 @@ def test_preloaded_in_closed_form_and_integrated():
     np.testing.assert_allclose(found.restitution, np.sqrt(out / energy), rtol=1e-12)
     np.testing.assert_allclose(found.peak_force, inward + STIFFNESS * deepest, rtol=1e-12)
     np.testing.assert_allclose(found.duration[0], np.pi * np.sqrt(MASS / STIFFNESS), rtol=1e-12)
-    mass, velocity = (jnp.asarray(np.full(LANES, value)) for value in (MASS, VELOCITY))
+    mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))
     law = LAWS["preloaded"]
-    run = jax.jit(lambda c: integrate_contact(law, c, mass, velocity), compiler_options=QUICK)
-    for got, wanted in zip(run(contact(preload=preload, friction=friction))[:3], found, strict=True):
+    run = jax.jit(partial(integrate_contact, law), compiler_options=QUICK)
+    for got, wanted in zip(
+        run(contact(preload=preload, friction=friction), mass, velocity)[:3], found, strict=True
+    ):
         np.testing.assert_allclose(got, wanted, rtol=1e-7)
     stuck = reference("preloaded", preload=0.0, friction=1e4)
     assert np.all(stuck.restitution == 0) and np.all(np.isinf(stuck.duration))

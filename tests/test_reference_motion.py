@@ -41,12 +41,12 @@ def contact(dtype=float, **values):
     """Parameters of every lane, by name; what is not named is nominal."""
 
     def lanes(value):
-        return jnp.asarray(np.broadcast_to(np.asarray(value, dtype), (*np.shape(value)[:-1], LANES)))
+        return np.broadcast_to(np.asarray(value, dtype), (*np.shape(value)[:-1], LANES))
 
     defaults = {"stiffness": STIFFNESS, "damping": 0.0, "exponent": 1.5, "depths": np.zeros((0, 1))}
     defaults |= {"reference_depth": 1.0, "unloading_ratio": 1.0, "preload": 0.0, "friction": 0.0}
     numbers = {name: values.get(name, default) for name, default in defaults.items()}
-    tension = jnp.asarray(np.full(LANES, values.get("tension", False)))
+    tension = np.full(LANES, values.get("tension", False))
     return ContactParameters(**{n: lanes(v) for n, v in numbers.items()}, tension=tension)
 
 
@@ -63,14 +63,14 @@ def closed_form(law, parameters, mass, velocity):
 
 
 def integrated(name, values, tolerance=TOLERANCE, **options):
-    mass, velocity = (jnp.asarray(np.full(LANES, value)) for value in (MASS, VELOCITY))
+    mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))
     law = LAWS[name]
     parameters = contact(**values)
     if options:
         run = jax.jit(lambda c, m, v: integrate_contact(law, c, m, v, **options), compiler_options=QUICK)
         found = run(parameters, mass, velocity)
     else:
-        found = within(law, parameters, mass, velocity, jnp.asarray(tolerance, float))
+        found = within(law, parameters, mass, velocity, np.asarray(tolerance, float))
     return found, closed_form(law, parameters, mass, velocity)
 
 
@@ -180,7 +180,7 @@ def test_derivatives_of_the_closed_forms(case, tolerance):
     """Where a step has a kink inside, its derivative is that of a force a bit off: short as it is."""
     name, values = CASES[case]
     law, parameters = LAWS[name], contact(**values)
-    mass, velocity = (jnp.asarray(np.full(LANES, value)) for value in (MASS, VELOCITY))
+    mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))
 
     def derivatives(reference):
         def function(scales):
@@ -200,7 +200,7 @@ def test_derivatives_of_the_closed_forms(case, tolerance):
 
 def test_single_precision_and_vmap():
     law, parameters = LAWS["kelvin_voigt"], contact(np.float32, **KELVIN_VOIGT)
-    mass, velocity = (jnp.asarray(np.full(LANES, value, np.float32)) for value in (MASS, VELOCITY))
+    mass, velocity = (np.full(LANES, value, np.float32) for value in (MASS, VELOCITY))
 
     def run(damping, mass, velocity):
         scalar = jax.tree.map(lambda leaf: leaf[..., 0], parameters)
