@@ -86,9 +86,8 @@ def test_preloaded_in_closed_form_and_integrated():
     mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))
     law = LAWS["preloaded"]
     run = jax.jit(partial(integrate_contact, law), compiler_options=QUICK)
-    for got, wanted in zip(
-        run(contact(preload=preload, friction=friction), mass, velocity)[:3], found, strict=True
-    ):
+    integrated = run(contact(preload=preload, friction=friction), mass, velocity)[:3]
+    for got, wanted in zip(integrated, found, strict=True):
         np.testing.assert_allclose(got, wanted, rtol=1e-7)
     stuck = reference("preloaded", preload=0.0, friction=1e4)
     assert np.all(stuck.restitution == 0) and np.all(np.isinf(stuck.duration))

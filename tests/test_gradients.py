@@ -95,7 +95,7 @@ def derivatives(loop, scenario, values):
 
 
 def chosen(scenario, lanes):
-    return jax.tree.map(lambda leaf: np.take(leaf, lanes, axis=-1), scenario)
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[..., lanes], scenario)
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +103,7 @@ def study():
     """(loop, scenario, values by name, scales by name, derivatives in units of the scales)."""
     number = SCENARIOS + SPARE
     scenario = join([build_scenarios(MECHANISM, draw(MECHANISM, number, seed=11))])
-    scenario = scenario._replace(contacts=jnp.ones(number, jnp.int32))
+    scenario = scenario._replace(contacts=np.ones(number, np.int32))
     values = random_gains(number) | {
         "force_delay": scenario.force_sensor.delay,
         # Nominal is a whole number of periods: every step would cross it.
@@ -166,7 +166,7 @@ def sweep():
     in fine steps over more than two periods."""
     delay = np.arange(2.7, 5.3, 0.005) * PERIOD
     scenario = join([build_scenarios(MECHANISM, {"approach.phase": np.full(len(delay), 0.4)})])
-    scenario = scenario._replace(contacts=jnp.ones(len(delay), jnp.int32))
+    scenario = scenario._replace(contacts=np.ones(len(delay), np.int32))
     loop = build_loop(MECHANISM, "response_error", scenario)
     gains = {gain.name: jnp.full(len(delay), gain.nominal(MECHANISM)) for gain in GAINS}
 
