@@ -52,7 +52,7 @@ ORACLE = {"quantum": {"noise_level": 0.5}}
 # Each of these is the first of a program of its own; what they add is tested elsewhere, one by one.
 SELDOM = ("rattling, elastoplastic", "rattling against layers", "depth-damped", "layers", "damped layers")
 SELDOM += ("transfer function with latency", "third order with latency", "position lead", "first order")
-SELDOM += ("hardening", "rattling, lag")
+SELDOM += ("hardening", "damped hardening", "elastoplastic", "rattling, lag")
 slow_if_seldom = [
     pytest.param(name, marks=pytest.mark.slow if name.startswith(SELDOM) else ()) for name in CASES
 ]
