@@ -111,7 +111,7 @@ def test_derivatives_of_integrated_references():
         law = LAWS[name]
         parameters = contact(**values, stiffness=1e7 if name == "depth_damped" else STIFFNESS)
 
-        def function(scales, law=law, parameters=parameters):
+        def function(scales, parameters, law=law):
             changed = parameters._replace(
                 stiffness=parameters.stiffness * (1 + scales[0]), damping=parameters.damping * (1 + scales[1])
             )
@@ -120,14 +120,14 @@ def test_derivatives_of_integrated_references():
             return jnp.stack(found)
 
         both = jax.jit(
-            lambda scales, function=function: (function(scales), jax.jacfwd(function)(scales)),
+            lambda *given, function=function: (function(*given), jax.jacfwd(function)(*given)),
             compiler_options=QUICK,
         )
-        value, derivative = both(jnp.zeros(3))
+        value, derivative = both(np.zeros(3), parameters)
         for index in range(3):
             step = np.zeros(3)
             step[index] = 1e-3
-            up, down = (both(jnp.asarray(sign * step))[0] for sign in (1, -1))
+            up, down = (both(sign * step, parameters)[0] for sign in (1, -1))
             error = np.abs((up - down) / 2e-3 - derivative[..., index]) / value
             assert error.max() < 1e-5
 

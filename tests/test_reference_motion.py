@@ -183,14 +183,14 @@ def test_derivatives_of_the_closed_forms(case, tolerance):
     mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))
 
     def derivatives(reference):
-        def function(scales):
+        def function(scales, parameters):
             stiffness = parameters.stiffness * (1 + scales[0])
             # Without any damping the derivative by it has a side.
             damping = parameters.damping + 10 + CRITICAL * scales[1] / 10
             changed = parameters._replace(stiffness=stiffness, damping=damping)
             return jnp.stack(reference(changed, mass * (1 + scales[2]), velocity * (1 + scales[3]))[:3])
 
-        return jax.jit(jax.jacfwd(function), compiler_options=QUICK)(jnp.zeros(4))
+        return jax.jit(jax.jacfwd(function), compiler_options=QUICK)(np.zeros(4), parameters)
 
     found = derivatives(lambda c, m, v: integrate_contact(law, c, m, v))
     expected = derivatives(law.reference)
