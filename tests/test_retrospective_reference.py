@@ -94,7 +94,7 @@ def test_derivatives_against_differences():
     """By every gain that tuning moves, of every scenario's restitution error."""
     mechanism = load("suite-damped").mechanism
     lanes = 8
-    scenario = join([build_scenarios(mechanism, draw(mechanism, lanes, 3), 3)])
+    scenario = jax.tree.map(jnp.asarray, build_scenarios(mechanism, draw(mechanism, lanes, 3), 3))
     loop = build_loop(mechanism, NAME, scenario)
     nominal = nominal_gains(mechanism, NAME)
     names = [gain.name for gain in COMPENSATORS[NAME].gains if gain.tuned(mechanism)]
