@@ -173,7 +173,7 @@ def test_contacts_without_a_force_are_over_though_the_law_s_output_hardly_decays
 
 def test_limits_of_the_rig_s_own_stay_and_count():
     small = {"force_limit": 1e-3, "command_lowest": -0.05}
-    found = calibrate(ONE_SIDED, scenarios=2 * LANES, limit=LIMIT, lanes=LANES, replaced=small)
+    found = calibrate(ONE_SIDED, scenarios=64, limit=LIMIT, replaced=small)
     assert {name: found.limits[name] for name in small} == small
     # A limit that no run keeps stops the good ones too.
     rate = found.rates["false_alarms"]

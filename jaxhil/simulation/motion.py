@@ -118,16 +118,16 @@ def _split(lane: Lane, scenarios: Scenario) -> list[Curve]:
 
 def _space(mechanism: Mechanism, scenarios: Scenario, first: int, velocity: float, end: float) -> Curve:
     """The reference's motion from contact `first` on, from 0.02 s before the touch to `end` [s]."""
-    lane = jax.tree.map(lambda leaf: np.asarray(leaf)[..., 0], scenarios)
+    lane = jax.tree.map(lambda leaf: jnp.asarray(leaf[..., 0]), scenarios)
     step = (end + APPROACH) / STEPS
     force, position = _integrate(
         LAWS[mechanism.contact.law],
         lane.contact,
-        np.asarray(first),
+        jnp.asarray(first),
         lane.clearance,
         lane.equivalent_mass,
-        np.asarray(velocity),
-        np.asarray(step),
+        jnp.asarray(velocity),
+        jnp.asarray(step),
     )
     keep = slice(None, None, STEPS // POINTS)
     time = -APPROACH + step * np.arange(STEPS)
