@@ -248,6 +248,16 @@ def test_a_flight_without_a_contact(jaxhil, tmp_path):
     np.testing.assert_allclose(ticks["desired_ry"], 0.5 * ticks["time"], atol=1e-12)
 
 
+@pytest.mark.slow
+def test_bodies_at_rest_do_not_diverge():
+    """Noise alone moves them: more than the energy of the start, which is none."""
+    rest = {"attitude": [1, 0, 0, 0], "velocity": [0, 0, 0], "angular_velocity": [0, 0, 0]}
+    bodies = {"target": {"position": [0, 0, 0], **rest}, "chaser": {"position": [0, 0, 3], **rest}}
+    given = {"approach": None, "start": {"duration": 0.2, **bodies}, "uncertainty": {}}
+    run = package.simulate(package.load("probe-drogue", given))
+    assert run.status == "miss" and run.final.time == pytest.approx(0.2)
+
+
 def test_what_six_axes_do_not_have_is_said_in_one_line(jaxhil, tmp_path):
     for arguments, reason in (
         (["simulate", "petals", "--setting", "x"], "--setting: found 'x', allowed none: in six axes"),

@@ -25,6 +25,7 @@ from jaxhil.sixdof.space import choose
 from jaxhil.sixdof.vectors import dot, norm
 
 STRETCH = 16  # ticks between looks at what began and ended
+SLOW = 1e-3  # m/s: of what enters more slowly, growth is reckoned from here on
 MISS, REBOUNDED, CAPTURED, JAMMED, TIMEOUT, DIVERGED, NON_FINITE, REACH = range(8)
 STATUS_NAMES = ("miss", "rebounded", "captured", "jammed", "timeout", "diverged", "non-finite", "reach")
 
@@ -225,6 +226,8 @@ def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progres
 
 def _failure(rig: Rig, watch: Watch, run: RunState, energy: Array) -> Array:
     """DIVERGED, NON_FINITE, or REACH where an axis is to be where it cannot be; else MISS."""
-    wild = jnp.where(energy > RUNAWAY**2 * watch.entry_energy, DIVERGED, MISS)
+    share = 1 / rig.bodies.target.mass + 1 / rig.bodies.chaser.mass
+    entry = jnp.maximum(watch.entry_energy, SLOW**2 / share)
+    wild = jnp.where(energy > RUNAWAY**2 * entry, DIVERGED, MISS)
     wild = jnp.where(rig.kinematics.reaches(run.hardware.commands[0]), wild, REACH)
     return jnp.where(jnp.isfinite(energy), wild, NON_FINITE).astype(jnp.int32)
