@@ -50,6 +50,19 @@ class Cluster:
         process.wait()
 
 
+def killed_meanwhile(monkeypatch, module, cluster, worker):
+    """The `worker` is killed once the first piece that the module hands to workers is done."""
+    handed = module.on_workers
+
+    def killing(*asked):
+        for number, one in enumerate(handed(*asked)):
+            if number == 0:
+                cluster.kill(worker)
+            yield one
+
+    monkeypatch.setattr(module, "on_workers", killing)
+
+
 @contextmanager
 def started(folder):
     pytest.importorskip("distributed")

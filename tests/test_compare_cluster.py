@@ -3,7 +3,7 @@
 from typing import Any
 
 import pytest
-from clusters import started
+from clusters import killed_meanwhile, started
 
 import jaxhil
 import tuning
@@ -32,15 +32,7 @@ def test_the_same_figures_though_a_worker_is_killed(tmp_path, monkeypatch):
         first, _ = cluster.worker(), cluster.worker()
         from tuning.benchmark import study
 
-        piece_of = study.on_workers
-
-        def killing(*asked):
-            for number, one in enumerate(piece_of(*asked)):
-                if number == 0:
-                    cluster.kill(first)
-                yield one
-
-        monkeypatch.setattr(study, "on_workers", killing)
+        killed_meanwhile(monkeypatch, study, cluster, first)
         there = tuning.compare(mechanisms, LAWS, scheduler=cluster.address, **FEW)
         assert first.poll() is not None
     assert [figures(one) for one in there] == [figures(one) for one in here]

@@ -1,5 +1,9 @@
 """Batches on every core: order, padding and tiles change no result, and most calls reuse a program."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from compiling import programs_of
@@ -8,6 +12,7 @@ from jaxhil.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.environment import DEVICES
 from jaxhil.simulation.evaluation import evaluate
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gains.tune import neutral_gains
@@ -99,3 +104,29 @@ def test_to_the_bit_a_lane_does_not_depend_on_its_batch(name):
         for ours, theirs in zip(part.metrics, whole.metrics, strict=True):
             np.testing.assert_array_equal(ours, theirs[..., some])
         np.testing.assert_array_equal(part.error, whole.error[..., some])
+
+
+DIGEST = """
+import hashlib, os, sys
+if sys.argv[1] == "1" and hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+from jaxhil.simulation.environment import prepare
+prepare()
+import jax
+from test_evaluation import evaluate, setting
+content = b"".join(leaf.tobytes() for leaf in jax.tree.leaves(evaluate(*setting(lanes=100))))
+print(jax.device_count(), hashlib.sha256(content).hexdigest())
+"""
+
+
+@pytest.mark.slow
+def test_to_the_bit_a_lane_does_not_depend_on_the_number_of_cores():
+    found = {}
+    for cores in 1, 2, 3:
+        flags = "" if cores == 1 else f"{DEVICES}={cores}"
+        given = {**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": os.pathsep.join(sys.path)}
+        command = [sys.executable, "-c", DIGEST, str(cores)]
+        ran = subprocess.run(command, env=given, capture_output=True, text=True, check=True)
+        devices, found[cores] = ran.stdout.split()
+        assert int(devices) == max(2, cores)
+    assert len(set(found.values())) == 1

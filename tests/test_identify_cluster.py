@@ -3,7 +3,7 @@
 import campaigns
 import numpy as np
 import pytest
-from clusters import started
+from clusters import killed_meanwhile, started
 
 from jaxhil.errors import InputError
 from tuning.identification import bootstrap
@@ -37,15 +37,7 @@ def test_the_same_draws_though_a_worker_is_killed(fit, tmp_path, monkeypatch):
     here = bootstrap.bootstrap(fit, 20)
     with started(tmp_path) as cluster:
         first, _ = cluster.worker(), cluster.worker(OMP_NUM_THREADS="2", OPENBLAS_NUM_THREADS="2")
-        piece_of = bootstrap.on_workers
-
-        def killing(*asked):
-            for number, one in enumerate(piece_of(*asked)):
-                if number == 0:
-                    cluster.kill(first)
-                yield one
-
-        monkeypatch.setattr(bootstrap, "on_workers", killing)
+        killed_meanwhile(monkeypatch, bootstrap, cluster, first)
         there = bootstrap.bootstrap(fit, 20, scheduler=cluster.address)
         assert first.poll() is not None
     assert there.resampled == here.resampled

@@ -121,6 +121,7 @@ def test_other_gains_and_other_code_differ():
 def test_only_flags_that_may_change_a_result_count():
     ours = rounding_flags("--xla_force_host_platform_device_count=8 --b=1 --a=2")
     assert ours == rounding_flags("--a=2 --b=1") == "--a=2 --b=1"
+    assert rounding_flags("--xla_force_host_platform_device_count=1 --b=1") != rounding_flags("--b=1")
 
 
 def test_every_sobol_replicate_has_a_scenario():

@@ -21,6 +21,9 @@ CACHE = "JAXHIL_CACHE"
 # what goes wrong in it comes as an exception anyway.
 LOG, FATAL = "TF_CPP_MIN_LOG_LEVEL", "3"
 DEVICES = "--xla_force_host_platform_device_count"
+FEWEST_DEVICES = (
+    2  # for one alone, the compiler orders sums otherwise: the last bits differ from those of more
+)
 # Tracing makes objects by the million, few of them in cycles: looking for those takes a tenth of the time of
 # a short command.
 RARELY = 100_000, 50, 50
@@ -41,8 +44,8 @@ _started_with: list[str] = []  # XLA_FLAGS that jax was started with, once `star
 
 
 def prepare() -> None:
-    """For the rest of the process: float64, one device per usable core, quick compilation, compiled programs
-    kept between calls.
+    """For the rest of the process: float64, one device per usable core and two at least, quick compilation,
+    compiled programs kept between calls.
 
     What the user says in XLA_FLAGS stands. Flags have no effect once jax runs, and are left alone then.
     """
@@ -152,14 +155,15 @@ def xla_flags() -> str:
 
 
 def rounding_flags(flags: str) -> str:
-    """What of XLA_FLAGS may change the last bits of a result: all but the number of devices."""
-    return " ".join(sorted(flag for flag in flags.split() if "device_count" not in flag))
+    """What of XLA_FLAGS may change the last bits of a result: all but how many devices, from two on."""
+    alone = f"{DEVICES}=1"
+    return " ".join(sorted(flag for flag in flags.split() if DEVICES not in flag or flag == alone))
 
 
 def flags(given: str) -> str:
     """XLA_FLAGS: what the user gave, and what of ours it does not settle."""
     ours = {
-        DEVICES: usable_cores(),
+        DEVICES: max(FEWEST_DEVICES, usable_cores()),
         # A third of the compile time, for programs that run as fast.
         "--xla_backend_optimization_level": 1,
         # The tick's loop as one function, its arrays computed several at a time, instead of some 60 calls a

@@ -87,12 +87,22 @@ def record(
     )
 
 
+def motion(bodies: Pair, states: States) -> tuple[Any, ...]:
+    """Coordinates, twist, and the motion of target and chaser as [start] has it, (..., lanes)."""
+    pose, twist = relative(bodies, states)
+    each = (
+        (one.position, one.attitude, one.velocity, angular_velocity(body, one))
+        for body, one in zip(bodies, states, strict=True)
+    )
+    return tuple(_stacked(parts, 0) for parts in (coordinates(pose, twist)[0], twist, *each))
+
+
 @partial(jax.jit, static_argnums=(0, 1))
 def _run(loop: Loop, ticks: int, gains: dict[str, Any], scenario: Scenario) -> dict[str, Any]:
     _, seen = run(loop, gains, scenario, ticks)
     space, period = Space(scenario.bodies, scenario.groups, scenario.latches), scenario.control_period
     _, free = follow(space, scenario.start, period, ticks, period)
-    desired, twist, target, chaser = jax.vmap(lambda states: _motion(scenario.bodies, states))(seen.states)
+    desired, twist, target, chaser = jax.vmap(lambda states: motion(scenario.bodies, states))(seen.states)
     found = {
         "desired": desired,
         "actual": _stacked(coordinates(seen.pose, seen.twist)[0], 1),
@@ -129,16 +139,6 @@ def _of_candidates(forces: Forces) -> dict[str, Any]:
 def _components(place: Vector) -> Any:
     """(ticks, candidates, 3, lanes)"""
     return jnp.stack([place.x, place.y, place.z], axis=2)
-
-
-def _motion(bodies: Pair, states: States) -> tuple[Any, ...]:
-    """Coordinates, twist, and the motion of target and chaser as [start] has it, (..., lanes)."""
-    pose, twist = relative(bodies, states)
-    each = (
-        (one.position, one.attitude, one.velocity, angular_velocity(body, one))
-        for body, one in zip(bodies, states, strict=True)
-    )
-    return tuple(_stacked(parts, 0) for parts in (coordinates(pose, twist)[0], twist, *each))
 
 
 def _stacked(parts: Any, axis: int) -> Any:

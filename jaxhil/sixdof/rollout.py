@@ -175,9 +175,13 @@ def _higher(peak: Peak, now: Array) -> Peak:
 def _look(rig: Rig, states: States) -> tuple[Array, Array]:
     """Whether the numerical model is free, and the energy of its relative motion [J], coupling left out."""
     pose, (linear, angular) = relative(rig.bodies, states)
-    share = 1 / rig.bodies.target.mass + 1 / rig.bodies.chaser.mass
-    energy = dot(linear, linear) / share + dot(angular, rig.bodies.chaser.inertia @ angular)
+    energy = dot(linear, linear) / _share(rig) + dot(angular, rig.bodies.chaser.inertia @ angular)
     return deepest(rig.groups, pose) < 0, energy
+
+
+def _share(rig: Rig) -> Array:
+    """One over the reduced mass [1/kg]."""
+    return 1 / rig.bodies.target.mass + 1 / rig.bodies.chaser.mass
 
 
 def quiet_time(sensor: Sensor, period: Array) -> Array:
@@ -226,8 +230,7 @@ def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progres
 
 def _failure(rig: Rig, watch: Watch, run: RunState, energy: Array) -> Array:
     """DIVERGED, NON_FINITE, or REACH where an axis is to be where it cannot be; else MISS."""
-    share = 1 / rig.bodies.target.mass + 1 / rig.bodies.chaser.mass
-    entry = jnp.maximum(watch.entry_energy, SLOW**2 / share)
+    entry = jnp.maximum(watch.entry_energy, SLOW**2 / _share(rig))
     wild = jnp.where(energy > RUNAWAY**2 * entry, DIVERGED, MISS)
     wild = jnp.where(rig.kinematics.reaches(run.hardware.commands[0]), wild, REACH)
     return jnp.where(jnp.isfinite(energy), wild, NON_FINITE).astype(jnp.int32)

@@ -18,17 +18,16 @@ from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.environment import ONCE, computing, known_options
 from jaxhil.simulation.gain_choice import choose_gains
 from jaxhil.simulation.run import check_seed
-from jaxhil.sixdof.bodies import angular_velocity
 from jaxhil.sixdof.building import build_scenarios, loop_of
 from jaxhil.sixdof.loop import Loop
 from jaxhil.sixdof.meaning import Meaning, meaning
 from jaxhil.sixdof.metrics import Metrics, evaluate, reference_final
 from jaxhil.sixdof.plausibility import check_scenario
-from jaxhil.sixdof.recording import Recorded, record, table
-from jaxhil.sixdof.relative import Pair, States, coordinates, effective_mass, relative
+from jaxhil.sixdof.recording import Recorded, motion, record, table
+from jaxhil.sixdof.relative import Pair, States, effective_mass
 from jaxhil.sixdof.rollout import STATUS_NAMES
 from jaxhil.sixdof.scenario import Scenario
-from jaxhil.sixdof.vectors import Vector, components, cross, direction, vector
+from jaxhil.sixdof.vectors import Vector, cross, direction, vector
 
 GOOD = ("rebounded", "captured")  # how an episode may end
 
@@ -191,14 +190,5 @@ def _tangential_mass(scenario: Scenario, metrics: Metrics) -> Any:
 
 def _motion(bodies: Pair, states: States) -> tuple[Any, ...]:
     """What `Final` says but the time, each along a leading axis."""
-    pose, twist = relative(bodies, states)
-    at, _ = coordinates(pose, twist)
-    target, chaser = (
-        (components(one.velocity), components(angular_velocity(body, one)))
-        for body, one in zip(bodies, states, strict=True)
-    )
-    return _six(at), _six(twist), *target, *chaser
-
-
-def _six(pair: Any) -> Any:
-    return jnp.stack(jax.tree.leaves(pair))
+    at, twist, *each = motion(bodies, states)
+    return at, twist, *(part for one in each for part in (one[7:10], one[10:]))

@@ -1,7 +1,7 @@
 """The comparison itself: each law tuned to its own best, all judged on the same scenarios and probes.
 
 Laws, and groups of mechanisms that share a program, go to as many processes as there are cores, each with
-one device: compiling takes most of the time, and one process compiles on one core. No figure depends on
+few devices: compiling takes most of the time, and one process compiles on one core. No figure depends on
 which process computes it. What is found of a law on a group is kept at once, where there is a place for it
 (`tuning.caches.pieces`).
 """
@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from jaxhil.errors import one_line
 from jaxhil.mechanism.file import to_builtins
 from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.environment import DEVICES, FEWEST_DEVICES, prepare
 from tuning.caches.cluster import Piece, on_workers
 from tuning.caches.pieces import NOTHING_KEPT, Pieces, digest_of
 from tuning.caches.worker import setting
@@ -289,7 +290,7 @@ _heard: Any = None  # the parent's queue, in a worker
 
 
 def _begin(heard: Any) -> None:
-    """A worker: one device, so that as many workers as there are cores share the machine."""
+    """A worker: few devices, so that as many workers as there are cores share the machine."""
     import os
     import signal
 
@@ -298,7 +299,5 @@ def _begin(heard: Any) -> None:
     # The parent hears of an interruption, and ends the workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     given = os.environ.get("XLA_FLAGS", "")
-    os.environ["XLA_FLAGS"] = f"{given} --xla_force_host_platform_device_count=1".strip()
-    from jaxhil.simulation.environment import prepare
-
+    os.environ["XLA_FLAGS"] = f"{given} {DEVICES}={FEWEST_DEVICES}".strip()
     prepare()
