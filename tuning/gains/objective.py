@@ -259,13 +259,13 @@ def metrics_of(outcome: Outcome, number: int, contacts: int, probed: bool) -> Sc
 
 def objective_value(
     objective: Objective,
-    errors: Float[np.ndarray, "contacts"],
-    excesses: Float[np.ndarray, "contacts"] | None = None,
-    amplification: float = 1.0,
-    chatter: Float[np.ndarray, "contacts"] | None = None,
-    probe_errors: Float[np.ndarray, "contacts"] | None = None,
-    value: float | None = None,
-) -> float:
+    errors: Float[np.ndarray, "*points contacts"],
+    excesses: Float[np.ndarray, "*points contacts"] | None = None,
+    amplification: float | Float[np.ndarray, "*points"] = 1.0,
+    chatter: Float[np.ndarray, "*points contacts"] | None = None,
+    probe_errors: Float[np.ndarray, "*points contacts"] | None = None,
+    value: Float[np.ndarray, "*points"] | None = None,
+) -> Float[np.ndarray, "*points"]:
     """J [1] of `Objective`, exactly, for all three names: what a table of results is made of.
 
     `errors`, `excesses` and `chatter` (none: no part in it) are those of `contact_terms`, of the contacts
@@ -275,20 +275,33 @@ def objective_value(
     given = errors, excesses, chatter, probe_errors
     error, excess, swings, blindness = (
         np.where(np.isfinite(term), term, FAILED)
-        for term in (np.zeros(1) if term is None else np.ravel(term) for term in given)
+        for term in (np.zeros(1) if term is None else term for term in given)
     )
-    size = np.sort(np.abs(np.where(error > 0, math.sqrt(objective.divergence_weight) * error, error)))
-    figure = {
-        "rms": np.sqrt(np.mean(size**2)),
-        "cvar": np.mean(size[-_tail(len(size)) :]),
-        "worst": size[-1],
-    }[objective.name]
-    figure = figure if value is None else value
-    command = objective.command_weight * np.sqrt(np.mean(excess**2))
-    restless = objective.chatter_weight * np.sqrt(np.mean(swings**2))
-    noise = objective.noise_weight * max(0.0, float(amplification) - 1)
-    blind = objective.transparency_weight * np.sqrt(np.mean(blindness**2))
-    return math.hypot(figure, command, restless, noise, blind)
+    figure = _figure(objective, error) if value is None else value
+    parts = (
+        figure,
+        objective.command_weight * _rms(excess),
+        objective.chatter_weight * _rms(swings),
+        objective.noise_weight * np.maximum(0.0, np.asarray(amplification) - 1),
+        objective.transparency_weight * _rms(blindness),
+    )
+    return np.sqrt(sum(part**2 for part in parts))
+
+
+def _figure(
+    objective: Objective, error: Float[np.ndarray, "*points contacts"]
+) -> Float[np.ndarray, "*points"]:
+    """Of errors alone."""
+    size = np.abs(np.where(error > 0, math.sqrt(objective.divergence_weight) * error, error))
+    if objective.name == "rms":
+        return _rms(size)
+    if objective.name == "worst":
+        return np.max(size, axis=-1)
+    return np.mean(np.sort(size, axis=-1)[..., -_tail(size.shape[-1]) :], axis=-1)
+
+
+def _rms(term: Float[np.ndarray, "*points contacts"]) -> Float[np.ndarray, "*points"]:
+    return np.sqrt(np.mean(term**2, axis=-1))
 
 
 def _tail(count):

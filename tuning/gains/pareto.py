@@ -285,7 +285,7 @@ def _point(
         gains=gains,
         weight=weight,
         cost=cost,
-        error=objective_value(rest, errors, excesses, quiet, chatter, probe_errors),
+        error=float(objective_value(rest, errors, excesses, quiet, chatter, probe_errors)),
         figures=figures(fresh),
         nominal=figures(nominal),
         intervals=error_intervals(fresh.error, fresh.good),

@@ -155,7 +155,8 @@ def inverse_hessian(
 def _finished(problem: _Problem, names: tuple[str, ...], bounds: Bounds, task: TuneTask) -> Start:
     history = [float(value) for value in SCALE * np.sqrt(2 * np.array(problem.history))]
     status = problem.status if isinstance(problem.status, str) else STATUSES[problem.status]
-    gains = gains_at(task, names, bounds, problem.coordinates)
+    found = gains_at(task, names, bounds, problem.coordinates)
+    gains = {name: float(gain) for name, gain in found.items()}
     return Start(status, len(history), history[-1], history, gains, problem.coordinates, problem.curvature)
 
 

@@ -160,13 +160,16 @@ def gain_bounds(task: TuneTask, names: tuple[str, ...]) -> Bounds:
 
 
 def gains_at(
-    task: TuneTask, names: tuple[str, ...], bounds: Bounds, coordinates: Float[np.ndarray, "gains"]
-) -> dict[str, float]:
+    task: TuneTask, names: tuple[str, ...], bounds: Bounds, coordinates: Float[np.ndarray, "*points gains"]
+) -> dict[str, Float[np.ndarray, "*points"]]:
     """All of the compensator's gains: `names` at `coordinates` of their ranges, as far as tuned for the
     task."""
     moved = {gain.name for gain in task.tuned}
-    found = zip(names, to_gains(coordinates, bounds), strict=True)
-    return {**task.literature, **{name: float(gain) for name, gain in found if name in moved}}
+    found = dict(zip(names, np.moveaxis(to_gains(coordinates, bounds), -1, 0), strict=True))
+    return {
+        name: found[name] if name in moved else np.full(coordinates.shape[:-1], literature)
+        for name, literature in task.literature.items()
+    }
 
 
 def spread_points(first: np.ndarray, number: int, seed: int | tuple[int, ...]) -> np.ndarray:

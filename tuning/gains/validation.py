@@ -6,6 +6,7 @@ call.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any
 
 import jax
@@ -98,33 +99,40 @@ class Validation:
             wanted = outcome.wanted.reshape(terms[0].shape)
             probes = are_probes(number) & self.tasks[0].probed
             values = self._values_of(objectives[which[0]], outcome, len(some))
-            for k, (i, point) in enumerate(some):
-                asked = wanted[:, k]
-                excess, chatter = (term[:, k][asked] for term in terms[1:])
-                error, probe_errors = (terms[0][:, k][asked & ones] for ones in (~probes, probes))
-                own = objectives[which[i]]
-                of_probes = probe_errors if self.tasks[0].probed else None
-                found[i, point] = objective_value(
-                    own, error, excess, amplification[k], chatter, of_probes, values[k]
+            begin = 0
+            for i, group in groupby(some, key=lambda pair: pair[0]):
+                own = [point for _, point in group]
+                here = slice(begin, begin := begin + len(own))
+                asked = wanted[:, here.start]  # a contact is asked for at every point
+                error, excess, chatter = (np.moveaxis(term[:, here], 1, 0) for term in terms)
+                found[i, own] = objective_value(
+                    objectives[which[i]],
+                    error[:, asked & ~probes],
+                    excess[:, asked],
+                    amplification[here],
+                    chatter[:, asked],
+                    error[:, asked & probes] if self.tasks[0].probed else None,
+                    None if values is None else values[here],
                 )
         return found
 
     def _values_of(
         self, objective: Objective, outcome: Outcome, pairs: int
-    ) -> Sequence[float] | Sequence[None]:
+    ) -> Float[np.ndarray, "pairs"] | None:
         """Of the user's function, if there is one, for every pair of task and point."""
         if objective.function is None:
-            return [None] * pairs
+            return None
         task = self.tasks[0]
-        return objective.function.numbers(metrics_of(outcome, pairs, task.contacts, task.probed)).tolist()
+        return objective.function.numbers(metrics_of(outcome, pairs, task.contacts, task.probed))
 
     def _begin(
         self, noise, which, coordinates, some, number, lanes
     ) -> Callable[[], tuple[Outcome, np.ndarray]]:
         """Start some pairs; what is returned waits for their outcome and noise amplification."""
         index = np.array([which[i] for i, _ in some])
-        rows = [self.gains(which[i], coordinates[i, point]) for i, point in some]
-        values = {name: np.repeat([row[name] for row in rows], number) for name in rows[0]}
+        gains = {i: self._gains(which[i], coordinates[i]) for i in dict.fromkeys(i for i, _ in some)}
+        names = self.tasks[0].literature
+        values = {name: np.repeat([gains[i][name][point] for i, point in some], number) for name in names}
 
         def side_by_side(leaf):
             picked = np.moveaxis(leaf[index][..., :number], 0, -2)
@@ -142,6 +150,11 @@ class Validation:
 
     def gains(self, task: int, coordinates: Float[np.ndarray, "gains"]) -> dict[str, float]:
         """All of the compensator's gains at a point of the unit box."""
+        return {name: float(gain) for name, gain in self._gains(task, coordinates).items()}
+
+    def _gains(
+        self, task: int, coordinates: Float[np.ndarray, "*points gains"]
+    ) -> dict[str, Float[np.ndarray, "*points"]]:
         return gains_at(self.tasks[task], self.names, self.bounds[task], coordinates)
 
     def coordinates(
