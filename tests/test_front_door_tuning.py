@@ -72,6 +72,10 @@ def test_a_study_that_keeps_nothing_is_the_stored_one(tuned, tmp_path, monkeypat
     assert study.interval.low <= study.failure_probability <= study.interval.high
     with study.store() as one, kept.store() as other:
         assert one.manifest.sha256 == other.manifest.sha256
+    again = tuning.sweep(tuned, scenarios=40, chunk=32, limit=0.5, folder="store", resume=True)
+    max(Path("store", "parts").iterdir()).unlink()
+    with pytest.raises(jaxhil.InputError, match="store: found 32 scenarios, allowed the study's 40"):
+        _ = again.table
 
 
 @pytest.mark.slow

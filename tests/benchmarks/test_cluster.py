@@ -1,15 +1,22 @@
-"""What a cluster costs: two to eight workers beside one process on the same cores.
+"""What a cluster costs: two to eight workers beside one process on the same cores, and the scheduler under a
+thousand of them.
 
-Run with `pytest -m benchmark -s tests/benchmarks/test_cluster.py` on a quiet machine.
+Run with `pytest -m benchmark -s tests/benchmarks/test_cluster.py`.
 """
 
+import os
+import subprocess
+import sys
 import time
+from pathlib import Path
 
+import numpy as np
 import pytest
 from clusters import started
 from test_sweep import default_gains
 
 from jaxhil.simulation.gain_file import check_document
+from tuning.caches.cluster import Piece, on_workers
 from tuning.sweeps.chunks import run_parts
 from tuning.sweeps.cluster import on_cluster
 from tuning.sweeps.manifest import Choices, build_manifest
@@ -19,6 +26,8 @@ from tuning.sweeps.store import open_store, read_part
 
 pytestmark = pytest.mark.benchmark
 CHUNK, PARTS, REPEATS = 4096, 32, 3
+THOUSAND, PIECES = 1000, 4000
+STUBS = Path(__file__).with_name("stub_workers.py")
 
 
 def swept(folder, manifest, computer=run_parts):
@@ -52,3 +61,37 @@ def test_workers_beside_one_process_on_the_same_cores(workers, tmp_path, capsys)
             f" pieces of {workers * min(there[1:]) / PARTS:.2f} s)"
         )
     assert efficiency >= 0.5
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="times of other processes are Linux's")
+def test_the_scheduler_carries_a_thousand_workers(tmp_path, capsys):
+    """Pieces that take no time: what each costs the scheduler and the command, in seconds of processor."""
+    distributed = pytest.importorskip("distributed")
+    with started(tmp_path) as cluster:
+        command = [sys.executable, str(STUBS), cluster.address, str(THOUSAND)]
+        stubs = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.DEVNULL, start_new_session=True)
+        cluster.processes.append(stubs)
+        with distributed.Client(cluster.address, set_as_default=False) as client:
+            while client.scheduler_info(n_workers=0)["n_workers"] < THOUSAND:
+                assert stubs.poll() is None
+                time.sleep(1.0)
+        scheduler, ours, begin = spent(cluster.processes[0]), time.process_time(), time.perf_counter()
+        pieces = (Piece(i, (-i,)) for i in range(PIECES))
+        found = dict(on_workers(cluster.address, abs, pieces, None, "stubs"))
+        took, ours = time.perf_counter() - begin, time.process_time() - ours
+        scheduler = spent(cluster.processes[0]) - scheduler
+    np.testing.assert_array_equal([found[i] for i in range(PIECES)], np.arange(PIECES))
+    busy = THOUSAND * max(scheduler, ours) / PIECES
+    with capsys.disabled():
+        print(
+            f"\n{THOUSAND} idle workers in one process: {PIECES / took:.3g} pieces/s; of processor"
+            f" a piece costs the scheduler {1e3 * scheduler / PIECES:.2f} ms, the command"
+            f" {1e3 * ours / PIECES:.2f} ms: pieces of {busy:.2g} s keep {THOUSAND} workers busy"
+        )
+    assert busy <= 10.0
+
+
+def spent(process):
+    """Seconds of processor of a process until now."""
+    fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

@@ -10,10 +10,11 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jaxhil.errors import InputError, shown
+from jaxhil.errors import InputError, one_line, shown
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.runtime import digest
 from jaxhil.simulation.environment import computing
@@ -43,17 +44,35 @@ class SweepStudy:
     """What `sweep` returns.
 
     document: all that is known, as `jaxhil sweep --json` prints it.
-    table: the rows, one a scenario, as an Arrow table; units and meanings are its fields' metadata.
     manifest: everything that the rows follow from.
     folder: where the rows are kept; None if they are not.
+    rows: those that are kept in no folder.
     unwritten: what could not be written beside the rows, and why.
     """
 
     document: dict[str, Any]
-    table: "pyarrow.Table"
     manifest: "Manifest"
     folder: Path | None
+    rows: "pyarrow.Table | None"
     unwritten: list[InputError] = field(default_factory=list)
+
+    @cached_property
+    def table(self) -> "pyarrow.Table":
+        """The rows, one a scenario, as an Arrow table; units and meanings are its fields' metadata.
+
+        Those in a folder are read when they are first asked for: there may be more than memory holds. Raises
+        `InputError` where they are no longer there.
+        """
+        from tuning.sweeps.store import read_store
+
+        if self.rows is not None:
+            return self.rows
+        assert self.folder is not None
+        table = _table(read_store(self.folder))
+        if table.num_rows != (there := self.document["scenarios"]):
+            found = f"found {table.num_rows} scenarios, allowed the study's {there}"
+            raise InputError(f"{one_line(str(self.folder))}: {found}")
+        return table
 
     @property
     def failure_probability(self) -> float:
@@ -243,7 +262,9 @@ def run_study(
             if not keep:
                 document["store"] = None
             unwritten = _complete(options, store, done, document, progress, keep)
-            return SweepStudy(document, _table(store), manifest, folder if keep else None, unwritten)
+            if keep:
+                return SweepStudy(document, manifest, folder, None, unwritten)
+            return SweepStudy(document, manifest, None, _table(store), unwritten)
 
 
 def _complete(

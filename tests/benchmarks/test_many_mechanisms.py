@@ -1,0 +1,76 @@
+"""Many mechanisms tuned in one call, beside as many calls once programs are compiled.
+
+Run with `pytest -m benchmark -s tests/benchmarks/test_many_mechanisms.py`.
+"""
+
+import re
+import time
+
+import numpy as np
+import pytest
+from test_start_up import run
+
+import jaxhil
+import tuning
+from jaxhil.mechanism.file import builtin_path
+
+pytestmark = pytest.mark.benchmark
+NUMBER, SINGLE = 64, 6
+MASSES = np.geomspace(150.0, 600.0, NUMBER)
+# Of a call in a process that computes already, more than a third is the runs themselves, which are as many
+# however they are called.
+COMMANDS, CALLS = 0.25, 0.6
+
+
+def test_many_in_one_command_beside_as_many_commands(tmp_path, capsys):
+    content = builtin_path("varying").read_text()
+    for i, mass in enumerate(MASSES):
+        other = re.sub(r"(?m)^equivalent_mass = \S+", f"equivalent_mass = {mass:.1f}", content)
+        other = re.sub(r"(?m)^name = .*", f'name = "mass-{i}"', other)
+        (tmp_path / f"{i}.toml").write_text(other)
+    every = [f"{i}.toml" for i in range(NUMBER)]
+    singles = every[:: NUMBER // SINGLE][:SINGLE]
+
+    def seconds(some, out):
+        return run(("tune", *some, "-o", out), tmp_path, tmp_path / "programs")[0]
+
+    seconds(every[:1], "compiled")
+    seconds(every, "compiled together")
+    before = [seconds([name], name[:-5]) for name in singles[::2]]
+    together = seconds(every, "together")
+    one = float(np.mean([*before, *(seconds([name], name[:-5]) for name in singles[1::2])]))
+    share = together / (NUMBER * one)
+    with capsys.disabled():
+        print(
+            f"\n{NUMBER} mechanisms in one `jaxhil tune` take {together:.1f} s, {share:.2f} of {NUMBER}"
+            f" commands that find their programs compiled, {one:.2f} s each"
+        )
+    assert share <= COMMANDS
+
+
+@pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
+def test_many_in_one_call_beside_as_many_calls(compensator, capsys):
+    every = [
+        jaxhil.load("varying", {"bodies.equivalent_mass": float(mass), "name": f"mass {i}"})
+        for i, mass in enumerate(MASSES)
+    ]
+
+    def seconds(some):
+        begin = time.perf_counter()
+        tuning.tune(some, compensator)
+        return time.perf_counter() - begin
+
+    # Programs of one mechanism, and of as many as are tuned together.
+    seconds(every[0])
+    seconds(every[: NUMBER // 2])
+    singles = every[:: NUMBER // SINGLE][:SINGLE]
+    before = [seconds(one) for one in singles[::2]]
+    together = seconds(every)
+    one = float(np.mean([*before, *(seconds(one) for one in singles[1::2])]))
+    share = together / (NUMBER * one)
+    with capsys.disabled():
+        print(
+            f"\n{compensator}: {NUMBER} mechanisms in one call of Python take {together:.1f} s,"
+            f" {share:.2f} of {NUMBER} calls once compiled, {one:.2f} s each"
+        )
+    assert share <= CALLS

@@ -1,0 +1,56 @@
+"""How long commands take that find their programs compiled, and how long compiling takes without any kept.
+
+Each is a process of its own, as users start it, and tells with `--timings` where the time went. Run with
+`pytest -m benchmark -s tests/benchmarks/test_start_up.py` on a quiet machine.
+"""
+
+import os
+import re
+import subprocess
+import sys
+import time
+
+import pytest
+from clusters import ROOT
+
+from jaxhil.compensators import COMPENSATORS
+
+pytestmark = pytest.mark.benchmark
+REPEATS = 4
+COMMANDS = {"tune": (("tune", "varying"), 5.0), "simulate": (("simulate", "varying"), 1.2)}
+COMPILING = 15.0  # s, of all programs of a law's tuning, derivatives among them, on two cores
+
+
+def run(arguments, folder, programs):
+    """Seconds of a command, and what it says of them."""
+    ours = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "NPROC")}
+    begin = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-m", "tuning", *arguments, "--timings"],
+        env={**ours, "PYTHONPATH": str(ROOT), "JAXHIL_CACHE": str(programs)},
+        cwd=folder, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    took = time.perf_counter() - begin
+    (said,) = re.findall(r"took: (.*)", done.stderr)
+    return took, said
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_that_ran_before_begins_soon(name, tmp_path, capsys):
+    arguments, most = COMMANDS[name]
+    first, *others = (run(arguments, tmp_path, tmp_path / "programs") for _ in range(1 + REPEATS))
+    took, said = min(others)
+    with capsys.disabled():
+        print(f"\njaxhil {' '.join(arguments)}: at first {first[0]:.1f} s, then {took:.2f} s ({said})")
+    assert took <= most
+
+
+@pytest.mark.parametrize("compensator", [name for name, law in COMPENSATORS.items() if law.gains])
+def test_a_law_with_derivatives_compiles_soon(compensator, tmp_path, capsys):
+    """One solver step is enough for all of a tuning's programs."""
+    few = "--starts", "1", "--steps", "1", "--validation", "15", "--compensator", compensator
+    took, said = run(("tune", "varying", *few), tmp_path, tmp_path / "programs")
+    parts = {part: float(seconds) for part, seconds in re.findall(r"(\w+) ([\d.]+) s", said)}
+    with capsys.disabled():
+        print(f"\n{compensator}: compiling {parts['compiling']:.1f} s of {took:.1f} s ({said})")
+    assert parts["compiling"] <= COMPILING
