@@ -14,7 +14,15 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxhil.compensators.base import Gains
 from jaxhil.sixdof.bodies import kinetic_energy
 from jaxhil.sixdof.loop import Loop
-from jaxhil.sixdof.reference import Meeting, Passage, glide, meet, meeting_mass, pass_through
+from jaxhil.sixdof.reference import (
+    Meeting,
+    Passage,
+    glide,
+    meet,
+    meeting_mass,
+    over_time,
+    pass_through,
+)
 from jaxhil.sixdof.relative import Pair, Pose, States, Twist, mass_matrix, relative
 from jaxhil.sixdof.rollout import CAPTURED, MISS, REBOUNDED, Episode, quiet_time, rollout
 from jaxhil.sixdof.scenario import Scenario
@@ -104,26 +112,25 @@ def judge(scenario: Scenario, episodes: Episode) -> Metrics:
     lasted = jnp.where(
         episodes.status == REBOUNDED, duration - episodes.entry_time, episodes.end_time - episodes.entry_time
     )
-    passage = pass_through(
-        space, episodes.entry, quiet_time(sensor, period), jnp.where(lasted > 0, lasted, 0), LONGEST * period
-    )
-    return _compare(space, episodes, passage)
+    quiet = quiet_time(sensor, period)
+    passage = pass_through(space, episodes.entry, quiet, jnp.where(lasted > 0, lasted, 0), LONGEST * period)
+    return _compare(space, episodes, passage, quiet)
 
 
-def _compare(space: Space, episodes: Episode, passage: Passage) -> Metrics:
+def _compare(space: Space, episodes: Episode, passage: Passage, quiet: Array) -> Metrics:
     bodies, meeting = space.bodies, meet(space, passage)
-    ended = episodes.end_time - episodes.entry_time
-    both = jnp.maximum(ended, passage.flight.time)
+    ended, over = (time - episodes.entry_time for time in (episodes.end_time, episodes.over_time))
+    both = jnp.maximum(over, over_time(passage, quiet))
     flown = [
         (episodes.entry, 0 * both),
         (episodes.end, both - ended),
         (passage.flight.states, both - passage.flight.time),
     ]
     start, end, expected = _later(bodies, flown)
-    mass, (there, _) = meeting_mass(bodies, meeting), relative(bodies, meeting.states)
-    speed = _closing(there, meeting, start.twist)
+    mass, (there, before) = meeting_mass(bodies, meeting), relative(bodies, meeting.states)
+    speed = _closing(there, meeting, before)
     change, changed = end.energy - start.energy, expected.energy - start.energy
-    parts = _twist_parts(expected.mass, end.twist, expected.twist, start.twist)
+    parts = _twist_parts(expected.mass, end.twist, expected.twist, before)
     met = (episodes.status != MISS) & (passage.touches > 0)
     once, only = met & (episodes.touches == 1), met & (passage.touches == 1)
 
@@ -145,9 +152,9 @@ def _compare(space: Space, episodes: Episode, passage: Passage) -> Metrics:
         energy_change=change,
         reference_energy_change=changed,
         peak_force=episodes.peak_force,
-        reference_peak_force=passage.peak_force,
+        reference_peak_force=passage.force.largest,
         peak_moment=episodes.peak_moment,
-        reference_peak_moment=passage.peak_moment,
+        reference_peak_moment=passage.moment.largest,
         duration=episodes.duration,
         reference_duration=passage.touched,
         touches=episodes.touches,

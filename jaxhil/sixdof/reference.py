@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.sixdof.bodies import Load, kick_drift
 from jaxhil.sixdof.candidates import Touch, motion_at
+from jaxhil.sixdof.peaks import Peak, higher, no_peak
 from jaxhil.sixdof.relative import Pair, States, effective_mass, relative
 from jaxhil.sixdof.space import Flight, Instant, Space, advance_flight, choose, scale, start_flight
 from jaxhil.sixdof.vectors import Vector, norm
@@ -35,8 +36,8 @@ class Passage(NamedTuple):
     left: Float[Array, "*batch"]  # since when nothing touches [s]
     before: States  # the last ones before the first touch
     depths: tuple[Float[Array, "candidates *batch"], ...]  # of the candidates soon after it [m]
-    peak_force: Float[Array, "*batch"]  # [N]
-    peak_moment: Float[Array, "*batch"]  # about T's origin [N m]
+    force: Peak  # [N]
+    moment: Peak  # about T's origin [N m]
     active: Bool[Array, "*batch"]
 
 
@@ -50,7 +51,9 @@ def pass_through(
     zero, none = jnp.zeros_like(until), jnp.zeros(until.shape, jnp.int32)
     depths = tuple(jnp.zeros_like(group.parameters.damping) for group in space.groups)
     touching = tuple(depth > 0 for depth in depths)
-    start = Passage(flight, touching, none, zero, zero, states, depths, zero, zero, until > 0)
+    start = Passage(
+        flight, touching, none, zero, zero, states, depths, no_peak(zero), no_peak(zero), until > 0
+    )
 
     def body(passage: Passage) -> Passage:
         left = until - passage.flight.time
@@ -63,6 +66,12 @@ def pass_through(
         return choose(passage.active, going._replace(active=~done), passage)
 
     return lax.while_loop(lambda passage: jnp.any(passage.active), body, start)
+
+
+def over_time(passage: Passage, quiet: Array) -> Float[Array, "*batch"]:
+    """When [s] the episode was over: where nothing touches at its end, `quiet` [s] after the last touch."""
+    free = (passage.touches > 0) & ~_touches(passage)
+    return jnp.minimum(passage.flight.time, jnp.where(free, passage.left + quiet, jnp.inf))
 
 
 def meet(space: Space, passage: Passage) -> Meeting:
@@ -133,14 +142,19 @@ def _seen(passage: Passage, after: Flight, now: Instant) -> Passage:
         touches = touches + jnp.sum(one & ~before, axis=0, dtype=touches.dtype)
     ahead = passage._replace(flight=after, touching=touching, touches=touches)
     first = (passage.touches == 0) & (touches > 0)
-    touched = passage.touched + jnp.where(_touches(passage), after.time - passage.flight.time, 0)
+    step = after.time - passage.flight.time
+    # What begins or ceases to touch makes the force jump or bend.
+    bends = jnp.zeros(step.shape, bool)
+    for one, before in zip(touching, passage.touching, strict=True):
+        bends = bends | jnp.any(one != before, axis=0)
+    touched = passage.touched + jnp.where(_touches(passage), step, 0)
     return ahead._replace(
         touched=touched,
         left=jnp.where(_touches(ahead), after.time, passage.left),
         before=choose(touches == 0, now.states, passage.before),
         depths=choose(first, depths, passage.depths),
-        peak_force=jnp.maximum(passage.peak_force, norm(now.wrench.force)),
-        peak_moment=jnp.maximum(passage.peak_moment, norm(now.wrench.moment)),
+        force=higher(passage.force, norm(now.wrench.force), step, bends),
+        moment=higher(passage.moment, norm(now.wrench.moment), step, bends),
     )
 
 

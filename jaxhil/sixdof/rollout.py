@@ -18,6 +18,7 @@ from jaxhil.simulation.metrics import RUNAWAY
 from jaxhil.simulation.watch import FADED, LONGEST_FADING
 from jaxhil.sixdof.forces import deepest
 from jaxhil.sixdof.loop import Loop, Rig, RunState, Tick, begin, build_rig, tick
+from jaxhil.sixdof.peaks import Peak, higher, no_peak
 from jaxhil.sixdof.relative import States, relative
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.sensor import Sensor
@@ -28,13 +29,6 @@ STRETCH = 16  # ticks between looks at what began and ended
 SLOW = 1e-3  # m/s: of what enters more slowly, growth is reckoned from here on
 MISS, REBOUNDED, CAPTURED, JAMMED, TIMEOUT, DIVERGED, NON_FINITE, REACH = range(8)
 STATUS_NAMES = ("miss", "rebounded", "captured", "jammed", "timeout", "diverged", "non-finite", "reach")
-
-
-class Peak(NamedTuple):
-    """Largest size of something sampled, between samples that of the parabola through three of them."""
-
-    largest: Float[Array, "*batch"]
-    before: tuple[Array, Array]  # the last two samples
 
 
 class Watch(NamedTuple):
@@ -51,8 +45,9 @@ class Watch(NamedTuple):
     caught: Bool[Array, "*batch"]  # whether a latch holds
     force: Peak  # of the real contact [N]
     moment: Peak  # about T's origin [N m]
-    command: tuple[Array, Array]  # size of the force [N] and of the moment [N m] on the numerical model
-    highest: tuple[Array, Array]  # largest of them
+    # Largest sizes of the force [N] and of the moment [N m] on the numerical model.
+    highest: tuple[Array, Array]
+    faded: Int[Array, "*batch"]  # ticks since it died out
 
 
 class Episode(NamedTuple):
@@ -62,6 +57,7 @@ class Episode(NamedTuple):
     end: States  # of the numerical model at the end
     entry_time: Float[Array, "episodes *batch"]  # [s]
     end_time: Float[Array, "episodes *batch"]  # [s]
+    over_time: Float[Array, "episodes *batch"]  # at which it was over, which is looked at now and then [s]
     touches: Int[Array, "episodes *batch"]
     duration: Float[Array, "episodes *batch"]  # in which something touched [s]
     peak_force: Float[Array, "episodes *batch"]  # [N]
@@ -116,17 +112,19 @@ def _start(loop: Loop, rig: Rig, states: States) -> Progress:
     slots: Any = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (loop.episodes, *leaf.shape)), states)
     numbers = jnp.zeros((loop.episodes, *like.shape), like.dtype)
     counts = numbers.astype(jnp.int32)
-    episodes = Episode(slots, slots, numbers, numbers, counts, numbers, numbers, numbers, counts + MISS)
+    episodes = Episode(
+        slots, slots, numbers, numbers, numbers, counts, numbers, numbers, numbers, counts + MISS
+    )
     return Progress(run, watch, episodes, none, none == 0, run.tick)
 
 
 def _fresh(rig: Rig, states: States, now: Array, energy: Array) -> Watch:
     zero, none = jnp.zeros_like(rig.period), jnp.zeros(rig.period.shape, jnp.int32)
-    peak = Peak(zero, (zero, zero))
+    peak = no_peak(zero)
     touching = tuple(group.parameters.damping > jnp.inf for group in rig.groups)
     return Watch(
         none > 0, states, now, energy, touching, none, none, none, none > 0, peak, peak,
-        (zero, zero), (zero, zero),
+        (zero, zero), none,
     )  # fmt: skip
 
 
@@ -135,11 +133,11 @@ def _tick(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progress:
     run, watch = progress.run, progress.watch
     after, seen = tick(loop, rig, run)
     goes = progress.active & (run.tick - progress.first < last)
-    watched = choose(goes, _watch(watch, seen), watch)
+    watched = choose(goes, _watch(rig, watch, seen), watch)
     return progress._replace(run=after._replace(states=choose(goes, after.states, run.states)), watch=watched)
 
 
-def _watch(watch: Watch, seen: Tick) -> Watch:
+def _watch(rig: Rig, watch: Watch, seen: Tick) -> Watch:
     touching = tuple(forces.touch.depth > 0 for forces in seen.forces)
     caught = watch.caught
     for held in seen.held:
@@ -150,6 +148,11 @@ def _watch(watch: Watch, seen: Tick) -> Watch:
         touches = touches + jnp.sum(one & ~before, axis=0, dtype=touches.dtype)
     command = norm(seen.command.force), norm(seen.command.moment)
     highest = tuple(jnp.maximum(a, b) for a, b in zip(watch.highest, command, strict=True))
+    noise = 3 * rig.sensor.noise_std
+    levels = jnp.max(noise[:3], axis=0), jnp.max(noise[3:], axis=0)
+    faded = jnp.ones(rig.period.shape, bool)
+    for size, peak, level in zip(command, highest, levels, strict=True):
+        faded = faded & (size <= jnp.maximum(FADED * peak, level))
     return watch._replace(
         begun=watch.begun | now,
         touching=touching,
@@ -157,19 +160,11 @@ def _watch(watch: Watch, seen: Tick) -> Watch:
         touched=watch.touched + now.astype(touches.dtype),
         quiet=jnp.where(now, 0, watch.quiet + 1),
         caught=caught,
-        force=_higher(watch.force, norm(seen.contact.force)),
-        moment=_higher(watch.moment, norm(seen.contact.moment)),
-        command=command,
+        force=higher(watch.force, norm(seen.contact.force), rig.period),
+        moment=higher(watch.moment, norm(seen.contact.moment), rig.period),
         highest=(highest[0], highest[1]),
+        faded=jnp.where(faded, watch.faded + 1, 0),
     )
-
-
-def _higher(peak: Peak, now: Array) -> Peak:
-    first, middle = peak.before
-    bend = 2 * middle - first - now
-    crest = (middle >= first) & (middle >= now) & (bend > 0) & (first > 0) & (now > 0)
-    vertex = middle + (now - first) ** 2 / (8 * jnp.where(crest, bend, 1))
-    return Peak(jnp.maximum(peak.largest, jnp.where(crest, vertex, now)), (middle, now))
 
 
 def _look(rig: Rig, states: States) -> tuple[Array, Array]:
@@ -196,21 +191,21 @@ def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progres
     age = run.tick - progress.first
     still = jnp.floor(quiet_time(rig.sensor, period) / period + 1e-9).astype(jnp.int32) + 1
     patience = still + jnp.ceil(LONGEST_FADING / period).astype(jnp.int32)
-    noise = 3 * rig.sensor.noise_std
-    levels = jnp.max(noise[:3], axis=0), jnp.max(noise[3:], axis=0)
-    faded = jnp.ones(period.shape, bool)
-    for now, highest, level in zip(watch.command, watch.highest, levels, strict=True):
-        faded = faded & (now <= jnp.maximum(FADED * highest, level))
-    over = watch.begun & (watch.quiet >= still) & free
-    over = over & (faded | (watch.quiet >= patience)) & progress.active
+    # For how many ticks it has been over.
+    since = jnp.maximum(jnp.minimum(watch.quiet - still, watch.faded - 1), watch.quiet - patience)
+    over = watch.begun & free & (since >= 0) & progress.active
     status = _failure(rig, watch, run, energy)
     out = (age >= last) | (status != MISS)
     held = jnp.where(watch.caught, CAPTURED, jnp.where(watch.quiet < still, JAMMED, TIMEOUT))
     status = jnp.where(status != MISS, status, jnp.where(over, REBOUNDED, jnp.where(watch.begun, held, MISS)))
     ends = progress.active & (over | out)
-    time = jnp.minimum(age, last).astype(period.dtype) * period
+    ended = jnp.minimum(age, last)
+    time, over_time, entry_time = (
+        ticks.astype(period.dtype) * period
+        for ticks in (ended, ended - jnp.where(over, since, 0), watch.entry_tick)
+    )
     found = Episode(
-        watch.entry, run.states, watch.entry_tick.astype(period.dtype) * period, time, watch.touches,
+        watch.entry, run.states, entry_time, time, over_time, watch.touches,
         watch.touched.astype(period.dtype) * period, watch.force.largest, watch.moment.largest, status,
     )  # fmt: skip
     slot = jnp.arange(loop.episodes, dtype=jnp.int32).reshape(-1, *[1] * period.ndim)
