@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 from compiling import programs_of
@@ -13,7 +14,7 @@ from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.environment import DEVICES
-from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.evaluation import TILE, evaluate, expected_duration, shard, whole_delays
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gains.tune import neutral_gains
 
@@ -90,6 +91,27 @@ def test_every_contact_is_set_beside_its_own_reference():
     np.testing.assert_allclose(outcome.reference_restitution[wanted], expected[wanted], rtol=1e-12)
     np.testing.assert_array_equal(wanted.sum(axis=0), scenarios.contacts)
     assert outcome.good[wanted].all()
+
+
+def tiled(scenarios):
+    """Whole delays and durations expected of the lanes as they are dealt out, (tiles in turn, lanes)."""
+    _, _, dealt = shard(scenarios, {})
+
+    def in_turn(leaf):
+        rows = np.moveaxis(leaf, (1, 0), (-3, -2))
+        return rows.reshape(*rows.shape[:-3], np.prod(rows.shape[-3:]))
+
+    lanes = jax.tree.map(in_turn, dealt)
+    return (row.reshape(-1, TILE) for row in (whole_delays(lanes), expected_duration(lanes)))
+
+
+def test_lanes_of_a_tile_look_back_alike_and_take_as_long():
+    """But where one delay's lanes end, and where there would be but a few tiles of each delay."""
+    delays, durations = tiled(setting("none", lanes=4096)[2])
+    assert np.sum(np.ptp(delays, axis=-1) > 0) < len(np.unique(delays)) == 2
+    assert np.mean(np.ptp(durations, axis=-1)) < 0.1 * np.ptp(durations)
+    delays, durations = tiled(setting("none", lanes=512)[2])
+    assert np.all(np.ptp(delays, axis=-1) > 0) and np.all(np.diff(durations.ravel()) <= 0)
 
 
 @pytest.mark.slow

@@ -22,6 +22,17 @@ def test_a_ring_gives_back_its_last_samples(extra, ticks):
     np.testing.assert_array_equal(read, history[newest - np.array(ticks), np.arange(LANES)])
 
 
+@given(st.integers(0, 40), st.integers(0, SAMPLES - 1), st.integers(0, SAMPLES - 1))
+def test_what_is_not_known_is_otherwise(newest, ticks, last):
+    """Where all lanes look back alike, and where one does not."""
+    ring = jnp.asarray(np.random.default_rng(newest).normal(size=(SAMPLES, LANES)))
+    ticks, known = np.array([ticks, ticks, last], np.int32), np.array([True, False, True])
+    otherwise = np.arange(LANES, dtype=float)
+    read = look_back(ring, jnp.array(newest, jnp.int32), jnp.asarray(ticks), jnp.asarray(known), otherwise)
+    samples = np.asarray(ring)[(newest - ticks) % SAMPLES, np.arange(LANES)]
+    np.testing.assert_array_equal(read, np.where(known, samples, otherwise))
+
+
 def test_written_in_turn_or_at_once_is_the_same():
     generator = np.random.default_rng(1)
     rings = {name: jnp.asarray(generator.normal(size=(SAMPLES, LANES))) for name in "abc"}

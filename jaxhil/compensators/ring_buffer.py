@@ -10,15 +10,34 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 
 def look_back(
-    ring: Float[Array, "samples *batch"], tick: Int[Array, ""], ticks: Int[Array, "*batch"]
+    ring: Float[Array, "samples *batch"],
+    tick: Int[Array, ""],
+    ticks: Int[Array, "*batch"],
+    known: Bool[Array, "*batch"] | bool = True,
+    otherwise: Any = 0,
 ) -> Float[Array, "*batch"]:
-    """The sample written `ticks` before `tick`; only the last `samples` ones are there."""
-    index = (tick - ticks) & (ring.shape[0] - 1)
-    return jnp.take_along_axis(ring, index[None], axis=0, mode="promise_in_bounds")[0]
+    """The sample written `ticks` before `tick`, where it is `known`; only the last `samples` ones are there.
+
+    Where all lanes look back alike, that is one row of the ring: much less work than to fetch a number for
+    every lane.
+    """
+    first, mask = ticks.reshape(-1)[0], ring.shape[0] - 1
+
+    def row(ring):
+        return lax.dynamic_index_in_dim(ring, (tick - first) & mask, 0, keepdims=False)
+
+    def lane_by_lane(ring):
+        index = (tick - ticks) & mask
+        return jnp.take_along_axis(ring, index[None], axis=0, mode="promise_in_bounds")[0]
+
+    def chosen(read):
+        return lambda ring: read(ring) if known is True else jnp.where(known, read(ring), otherwise)
+
+    return lax.cond(jnp.all(ticks == first), chosen(row), chosen(lane_by_lane), ring)
 
 
 def write(

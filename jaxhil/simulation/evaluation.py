@@ -1,8 +1,8 @@
 """Batches of any size, on every core: runs with their errors against the undelayed reference.
 
-Lanes are sorted by how long they will take and cut into tiles, each of which ends with its own slowest lane;
-tiles are dealt out to the devices in turn. Batches are padded to a few sizes, so that most calls reuse a
-compiled program.
+Lanes are sorted and cut into tiles: by their delays, as lanes that look back alike are read at once, and by
+how long they will take, as a tile ends with its own slowest lane. Tiles are dealt out to the devices in turn.
+Batches are padded to a few sizes, so that most calls reuse a compiled program.
 """
 
 from collections.abc import Callable, Mapping
@@ -25,6 +25,7 @@ from jaxhil.simulation.scenario import Scenario
 
 TILE = 64  # lanes computed side by side on a device: more leave its first cache
 SMALLEST_TILE = 16
+TILES_OF_A_DELAY = 8  # at least, to sort by: with fewer, tiles would wait longer for their slowest lanes
 
 
 class Outcome(NamedTuple):
@@ -93,16 +94,15 @@ def begin_evaluation(
     loop: Any, gains: Mapping[str, Any], scenarios: Any, at_least: int = 1
 ) -> Callable[[], Outcome]:
     """Like `evaluate`, without waiting: what is returned waits for the outcome and returns it."""
-    number = lanes_of(scenarios)
-    order = _by_duration(scenarios)
-    running = run_tiles(loop, *shard(scenarios, gains, at_least))
+    dealt = _deal(scenarios, at_least)
+    running = run_tiles(loop, *_fold(dealt, scenarios, gains))
+    place = np.empty_like(dealt.lane, shape=lanes_of(scenarios))
+    place[dealt.lane[~dealt.idle]] = np.flatnonzero(~dealt.idle)
 
     def unfold(leaf):
-        leaf = np.moveaxis(leaf, (0, 1), (-2, -3))
-        leaf = leaf.reshape(*leaf.shape[:-3], -1)
-        back = np.empty_like(leaf[..., :number])
-        back[..., order] = leaf[..., :number]
-        return back
+        # (devices, tiles, ..., tile) -> (..., lanes).
+        rows = np.moveaxis(leaf, (0, 1), (-3, -2))
+        return np.take(rows.reshape(*rows.shape[:-3], -1), place, axis=-1)
 
     return lambda: jax.tree.map(unfold, jax.device_get(running))
 
@@ -111,7 +111,18 @@ def shard(
     scenarios: Any, gains: Mapping[str, Any], at_least: int = 1
 ) -> tuple[dict[str, Any], dict[str, Any], Any]:
     """Arguments of `run_tiles`: gains common to all lanes, gains per lane and scenarios as
-    (devices, tiles, ..., lanes of a tile), sorted by expected duration and padded with idle lanes."""
+    (devices, tiles, ..., lanes of a tile), dealt out and padded with idle lanes."""
+    return _fold(_deal(scenarios, at_least), scenarios, gains)
+
+
+class _Dealt(NamedTuple):
+    """Lanes dealt out to tiles, (devices, tiles, lanes of a tile)."""
+
+    lane: np.ndarray  # which one
+    idle: np.ndarray  # whether it is there but to fill the tile
+
+
+def _deal(scenarios, at_least):
     number = lanes_of(scenarios)
     room = max(number, at_least)
     devices = jax.device_count()
@@ -122,26 +133,34 @@ def shard(
     tiles = -(-room // (tile * devices))
     tiles = 1 << (tiles - 1).bit_length() if tiles <= 16 else -(-tiles // 16) * 16
     lanes = tiles * tile * devices
-    padded = np.resize(_by_duration(scenarios), lanes)
-    idle = np.arange(lanes) >= number
-    scenarios = jax.tree.map(lambda leaf: np.asarray(leaf)[..., padded], scenarios)
-    scenarios = at_rest(scenarios, idle)
+
+    def fold(order):
+        # Neighbours in time fall to different devices.
+        return order.reshape(tiles, devices, tile).swapaxes(0, 1)
+
+    return _Dealt(fold(np.resize(_in_turn(scenarios), lanes)), fold(np.arange(lanes) >= number))
+
+
+def _in_turn(scenarios):
+    """Lanes by their delays, unless there would be but a few tiles of each, then by their duration."""
+    duration, delays = expected_duration(scenarios), whole_delays(scenarios)
+    if TILES_OF_A_DELAY * TILE * len(np.unique(delays)) > len(delays):
+        delays = np.zeros_like(delays)
+    return np.lexsort((-duration, delays))
+
+
+def _fold(dealt, scenarios, gains):
+    """Gains common to all lanes, gains per lane and scenarios as they were dealt out."""
+
+    def fold(leaf):
+        return np.moveaxis(np.take(leaf, dealt.lane, axis=-1), (-3, -2), (0, 1))
+
     # The scenarios' precision is that of the program.
     precision = scenarios.control_period.dtype
     values = {name: np.asarray(value, precision) for name, value in gains.items()}
-    per_lane = {name: value[padded] for name, value in values.items() if value.ndim}
     common = {name: value for name, value in values.items() if not value.ndim}
-
-    def fold(leaf):
-        # (..., lanes) -> (devices, tiles, ..., tile): neighbours in time fall to different devices.
-        leaf = leaf.reshape(*leaf.shape[:-1], tiles, devices, tile)
-        return np.moveaxis(leaf, (-2, -3), (0, 1))
-
-    return common, *jax.tree.map(fold, (per_lane, scenarios))
-
-
-def _by_duration(scenarios):
-    return np.argsort(-expected_duration(scenarios), kind="stable")
+    per_lane = {name: fold(value) for name, value in values.items() if value.ndim}
+    return common, per_lane, at_rest(jax.tree.map(fold, scenarios), dealt.idle)
 
 
 def lanes_of(scenarios: Any) -> int:
@@ -174,6 +193,18 @@ def expected_duration(scenarios: Any) -> np.ndarray:
     slots = np.arange(len(stiffness))[:, None] < np.asarray(scenarios.contacts)
     periods = np.sqrt(np.asarray(scenarios.equivalent_mass) / np.maximum(stiffness, 1e-9))
     return np.sum(np.where(slots, periods, 0), axis=0)
+
+
+@singledispatch
+def whole_delays(scenarios: Any) -> np.ndarray:
+    """A number that differs where the whole periods of a delay do; for sorting only."""
+    simulator = np.asarray(scenarios.simulator.delay)
+    period = np.asarray(scenarios.control_period)
+    force, position = (
+        np.floor((simulator + np.asarray(sensor.delay)) / period + 1e-9)
+        for sensor in (scenarios.force_sensor, scenarios.position_sensor)
+    )
+    return force + position / (1 + np.max(position))
 
 
 def run_tiles(loop: Any, common: Any, per_lane: Any, scenarios: Any) -> Outcome:

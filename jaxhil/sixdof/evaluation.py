@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhil.simulation import metrics as one_axis
-from jaxhil.simulation.evaluation import Outcome, at_rest, expected_duration, run_lanes
+from jaxhil.simulation.evaluation import Outcome, at_rest, expected_duration, run_lanes, whole_delays
 from jaxhil.sixdof.loop import Loop
 from jaxhil.sixdof.metrics import Metrics, evaluate
 from jaxhil.sixdof.rollout import CAPTURED, JAMMED, MISS, NON_FINITE, REBOUNDED, TIMEOUT
@@ -45,6 +45,12 @@ def at_rest_in_space(scenarios: Scenario, idle: np.ndarray) -> Scenario:
 @expected_duration.register
 def expected_duration_in_space(scenarios: Scenario) -> np.ndarray:
     """All the same: nothing is known beforehand."""
+    return np.zeros(np.shape(scenarios.duration))
+
+
+@whole_delays.register
+def whole_delays_in_space(scenarios: Scenario) -> np.ndarray:
+    """All the same: lanes are read one by one."""
     return np.zeros(np.shape(scenarios.duration))
 
 
