@@ -102,6 +102,15 @@ def some_gains(name, shape=()):
     return {gain: jnp.full(shape, entry["value"]) for gain, entry in GAINS[name].items()}
 
 
+@pytest.mark.parametrize("name", bank_seldom(LAWS))
+def test_what_a_law_reads(name):
+    """The measured position, or nothing of it."""
+    signals, constants = readings()
+    blind = signals._replace(position_measured=jnp.full_like(signals.position_measured, jnp.nan))
+    seeing, unseeing = (commands(name, each, some_gains(name), constants) for each in (signals, blind))
+    assert np.array_equal(seeing, unseeing) == (not COMPENSATORS[name].reads_position)
+
+
 def on_the_rig(name, signals):
     """The runtime's commands on readings of one lane."""
     gains = {gain: entry["value"] for gain, entry in GAINS[name].items()}

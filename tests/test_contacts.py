@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from lanes import IDEAL, MASS, QUICK, VELOCITY, first_contact, grid, mechanism, spread, validated
 
-from jaxhil.contact.laws import LAWS, ContactParameters
+from jaxhil.contact.laws import LAWS, ContactParameters, two_sided
 from jaxhil.contact.reference import hunt_crossley
 from jaxhil.contact.reference_motion import integrate_contact
 
@@ -44,6 +44,19 @@ def test_undamped_hardening():
     np.testing.assert_allclose(found.peak_force[:-1], peak[:-1], rtol=1e-8)
     np.testing.assert_allclose(found.peak_force[-1], VELOCITY * np.sqrt(STIFFNESS * MASS), rtol=1e-8)
     np.testing.assert_allclose(found.duration[-1], np.pi * np.sqrt(MASS / STIFFNESS), rtol=1e-8)
+
+
+@pytest.mark.parametrize("name", [name for name in LAWS if name != "piecewise_linear"])
+def test_one_surface_is_the_nearer_of_two_that_are_infinitely_apart(name):
+    law, parameters = LAWS[name], contact(damping=260.0, preload=3.0, friction=2.0)
+    position, velocity = np.array([-1e-3, -0.0, 1e-5, 2e-4, 2e-4, np.nan]), np.array([1, -1, 2, -3, 0, 1e-3])
+    state = law.init(jnp.asarray(position))
+    one, two = (
+        two_sided(law, parameters, state, jnp.asarray(position), jnp.asarray(velocity), clearance)
+        for clearance in (None, jnp.full(LANES, jnp.inf))
+    )
+    jax.tree.map(np.testing.assert_array_equal, one, two)
+    assert one[0][2] > 0
 
 
 @pytest.mark.parametrize("exponent, damping", [(1.5, 0.0), (2.2, 0.0), (1.0, 600.0)])

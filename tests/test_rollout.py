@@ -4,6 +4,8 @@ Where nothing but linear systems and samples of a memoryless law is involved the
 is read off between samples (peak, work, a sensor's lag) has the errors stated below.
 """
 
+from functools import partial
+
 import cases
 import jax
 import jax.numpy as jnp
@@ -27,9 +29,12 @@ from lanes import (
     validated,
 )
 
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop import build_rig_constants
 from jaxhil.simulation.metrics import DIVERGED, NON_FINITE, NOT_REACHED, OK, TIMEOUT
-from jaxhil.simulation.rollout import rollout, stretch_length
+from jaxhil.simulation.rollout import rollout, run_contacts, stretch_length
 from jaxhil.simulation.scenario import build_scenarios
 from jaxhil.simulation.sensors import draw_noise
 
@@ -252,6 +257,21 @@ def test_status_of_every_lane(mixed):
     assert metrics.restitution[0, 0] == pytest.approx(
         cases.run_oracle(LANES["plain"])[0]["restitution"], abs=1e-11
     )
+
+
+@pytest.mark.parametrize("name", ["varying", "rattling"])
+def test_a_position_that_nobody_reads_changes_no_bit(name):
+    drawn = load(name).mechanism
+    scenario = build_scenarios(drawn, draw(drawn, 5, 1))
+    loop = build_loop(drawn, "none", scenario)
+
+    @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
+    def run(measured, scenario):
+        return run_contacts(loop, {}, build_rig_constants(loop, scenario, measured))
+
+    metrics = run(False, scenario)
+    assert np.all(metrics.status[: scenario.contacts[0]] == OK)
+    jax.tree.map(np.testing.assert_array_equal, metrics, run(True, scenario))
 
 
 def test_padding_is_inert(mixed):

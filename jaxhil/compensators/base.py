@@ -90,6 +90,8 @@ class Compensator(eqx.Module):
     estimates_delay: ClassVar[bool] = False
     # Whether it finds where the surface is: `contact_plane`.
     finds_plane: ClassVar[bool] = False
+    # Whether it reads the measured position.
+    reads_position: ClassVar[bool] = True
     # Whether it works out a motion of its own that it could follow whatever the hardware does.
     anticipates: ClassVar[bool] = False
 

@@ -10,6 +10,7 @@ class NoCompensator(Compensator):
 
     name: ClassVar[str] = "none"
     knows: ClassVar[tuple[str, ...]] = ()
+    reads_position: ClassVar[bool] = False
     gains: ClassVar[tuple[Gain, ...]] = ()
 
     def step(self, prepared, state, signals, tick):

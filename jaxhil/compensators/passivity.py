@@ -21,6 +21,7 @@ class Passivity(Compensator):
 
     name: ClassVar[str] = "passivity"
     knows: ClassVar[tuple[str, ...]] = ()
+    reads_position: ClassVar[bool] = False
     gains: ClassVar[tuple[Gain, ...]] = ()
 
     def prepare(self, gains, constants):

@@ -57,6 +57,7 @@ class VirtualContact(Compensator):
 
     name: ClassVar[str] = "virtual_contact"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY, SIMULATOR_LAG, STIFFNESS, CONTACT_FREQUENCY)
+    reads_position: ClassVar[bool] = False
     gains: ClassVar[tuple[Gain, ...]] = (
         rig_gain(
             "virtual_stiffness", lambda m: -typical_stiffness(m), typical_stiffness, lambda m: 0.0,

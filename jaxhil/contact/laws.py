@@ -44,15 +44,21 @@ LAWS: dict[str, ContactLaw] = {
 }
 
 
-def deflection(position: Array, clearance: Array) -> Array:
-    """Signed deflection [m] of the mechanism: x at x > 0, x + c at x < -c, else 0 (c may be inf)."""
+def deflection(position: Array, clearance: Array | None) -> Array:
+    """Signed deflection [m] of the mechanism: x at x > 0, x + c at x < -c, else 0 (c may be inf; None where
+    there is but one surface)."""
+    if clearance is None:
+        return jnp.where(position > 0, position, 0)
     far = position + clearance
     return jnp.where(position > 0, position, jnp.where(far < 0, far, 0))
 
 
 def two_sided(law, parameters, state, position, velocity, clearance):
-    """Signed force [N] at either surface: law(d, d') with d = x, or -law(d, d') with d = -c - x."""
+    """Signed force [N] at either surface: law(d, d') with d = x, or -law(d, d') with d = -c - x; at one
+    surface (`clearance` None) the former alone."""
     signed = deflection(position, clearance)
+    if clearance is None:
+        return law.step(parameters, state, signed, jnp.where(signed > 0, velocity, 0))
     side = jnp.sign(signed)
     force, state = law.step(parameters, state, side * signed, side * velocity)
     return side * force, state

@@ -64,7 +64,7 @@ class Surfaces(NamedTuple):
     law: ContactLaw  # the contact law
     parameters: ContactParameters  # its parameters
     state: tuple[Any, ...]  # its state
-    clearance: Array  # between two surfaces [m]; infinite for one
+    clearance: Array | None  # between two surfaces [m]; None for one
 
     def force(self, motion: Motion) -> tuple[Array, tuple[Any, ...]]:
         """Signed force [N] and the law's next state."""
@@ -89,10 +89,15 @@ class Surfaces(NamedTuple):
         """Side (1, -1, or 0 for none) and position [m] of the surface that a stretch touches."""
         signed = deflection(start.position, self.clearance)
         side = jnp.sign(jnp.where(signed == 0, deflection(end.position, self.clearance), signed))
-        return side, jnp.where(side < 0, -self.clearance, 0)
+        return side, jnp.zeros_like(side) if self.clearance is None else jnp.where(
+            side < 0, -self.clearance, 0
+        )
 
     def sample(self, motion: Motion, force: Array) -> "ContactSample":
         """A sample of the contact, whose force is known."""
+        if self.clearance is None:
+            edge = self.law.edge(self.parameters, motion.velocity)
+            return ContactSample(motion.position, force, edge, jnp.ones_like(edge))
         far = -self.clearance - motion.position
         beyond = jnp.where(far > motion.position, far, motion.position)
         side = jnp.where(far > motion.position, -1, 1).astype(far.dtype)

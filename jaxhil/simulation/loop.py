@@ -19,7 +19,7 @@ from jaxhil.simulation.motion_simulator import (
     Delay,
     Propagation,
     propagation,
-    read,
+    read_measured,
     split_delay,
     steady_state,
 )
@@ -92,8 +92,11 @@ class RigConstants(NamedTuple):
     inverse_mass: Float[Array, "*batch"]  # [1/kg], of the equivalent mass
 
 
-def build_rig_constants(loop: Loop, scenario: Scenario) -> RigConstants:
-    """Discretise the linear parts exactly and split every delay into sampling intervals and a fraction."""
+def build_rig_constants(loop: Loop, scenario: Scenario, measured: bool = True) -> RigConstants:
+    """Discretise the linear parts exactly and split every delay into sampling intervals and a fraction.
+
+    Unless its position is `measured`, a run has none to read: less to work out at every tick.
+    """
     period, simulator = scenario.control_period, scenario.simulator
     delays = split_delays(scenario, loop.is_two_sided)
     return RigConstants(
@@ -103,7 +106,7 @@ def build_rig_constants(loop: Loop, scenario: Scenario) -> RigConstants:
             simulator.denominator,
             period,
             delays.force.fraction,
-            delays.position.fraction,
+            delays.position.fraction if measured else None,
             loop.hold,
             ends=loop.follows_intervals,
         ),
@@ -149,9 +152,7 @@ def enter(
     drive = commands[-1] if loop.hold == "linear" else commands[-1] + stride
     start = drive - stride
     end = drive if loop.hold == "linear" else start
-    first_position = read(
-        rig.propagation.measured_position, steady_state(rig.propagation, start, stride), start, end
-    )
+    first_position = read_measured(rig.propagation, steady_state(rig.propagation, start, stride), start, end)
     return state._replace(
         position=position,
         velocity=velocity,

@@ -34,7 +34,8 @@ class Rings(NamedTuple):
     plant_signals: PlantSignals  # of the contact, without the sensors
     # what a lagging sensor makes of the force [N]; None without lag
     reading: Float[Array, "samples *batch"] | None
-    position: Float[Array, "samples *batch"]  # of the mechanism, where its sensor samples it [m]
+    # of the mechanism, where its sensor samples it [m]; None where nobody reads it
+    position: Float[Array, "samples *batch"] | None
     # sampling intervals whose contact is still to come; None with one surface
     interval: SamplingInterval | None
 
@@ -45,7 +46,8 @@ class Sensed(NamedTuple):
     rings: Any  # delay lines (`Rings`; None where they are held apart)
     last: ContactSample  # last sample of the contact
     lagged: Array  # reading of a lagging force sensor at the end of its sampling interval [N]
-    first_position: Array  # position sample of the sampling interval before the run [m]
+    # position sample of the sampling interval before the run [m]; None where nobody reads it
+    first_position: Array | None
 
 
 class LoopState(NamedTuple):

@@ -37,7 +37,8 @@ class Propagation(NamedTuple):
     transition: Float[Array, "order columns *batch"]  # rows of the state one period later
     position: Float[Array, "columns *batch"]  # row at the force sensor's place in the sampling interval [m]
     velocity: Float[Array, "columns *batch"]  # row there [m/s]
-    measured_position: Float[Array, "columns *batch"]  # row at the position sensor's place [m]
+    # row at the position sensor's place [m]; None where nobody reads it
+    measured_position: Float[Array, "columns *batch"] | None
     # rows of position and velocity at the interval's start, from within, where asked for
     start: tuple[Array, Array] | None
     end: tuple[Array, Array] | None  # at its end, likewise
@@ -57,7 +58,7 @@ def propagation(
     denominator: Float[Array, "order_plus_1 *batch"],
     control_period: Float[Array, "*batch"],
     force_fraction: Float[Array, "*batch"],
-    position_fraction: Float[Array, "*batch"],
+    position_fraction: Float[Array, "*batch"] | None,
     hold: str,
     ends: bool = False,
 ) -> Propagation:
@@ -75,7 +76,12 @@ def propagation(
     generator[order - 1][order] = one
     generator += [[zero] * (order + 1) + [one], [zero] * (order + 2)]
     generator = jnp.stack([jnp.stack(row) for row in generator])
-    fractions = jnp.stack([one, force_fraction, position_fraction, zero][: 4 if ends else 3])
+    places = [one, force_fraction]
+    if ends:
+        places.append(zero)
+    if position_fraction is not None:
+        places.append(position_fraction)
+    fractions = jnp.stack(places)
     # Axes: row, column, place in the interval, batch.
     rows = exponential(generator[:, :, None] * fractions[None, None])[: order + 1]
     # Columns for (z, u(0), u(1)) instead of (z, u(0), u(1) - u(0)).
@@ -93,8 +99,8 @@ def propagation(
         transition=state[:, :, 0],
         position=position,
         velocity=velocity,
-        measured_position=_combine(output, state[:, :, 2]),
-        start=motion(3) if ends else None,
+        measured_position=None if position_fraction is None else _combine(output, state[:, :, -1]),
+        start=motion(2) if ends else None,
         end=motion(0) if ends else None,
         steady_command=steady_command,
         steady_velocity=_steady_velocity(system, state[:, :, 0], steady_command, hold),
@@ -131,6 +137,11 @@ def read(row: Array, state: State, start: Array, end: Array) -> Array:
     for i, component in enumerate(state):
         total = total + row[i] * component
     return total
+
+
+def read_measured(plant: Propagation, state: State, start: Array, end: Array) -> Array | None:
+    """Position [m] at its sensor's place in the sampling interval; None where nobody reads it."""
+    return None if plant.measured_position is None else read(plant.measured_position, state, start, end)
 
 
 def rate_row(
@@ -172,7 +183,7 @@ def _ideal(control_period, force_fraction, position_fraction, hold, ends):
         transition=jnp.zeros((0, 2, *control_period.shape), control_period.dtype),
         position=position(force_fraction),
         velocity=velocity,
-        measured_position=position(position_fraction),
+        measured_position=None if position_fraction is None else position(position_fraction),
         start=(position(zero), velocity) if ends else None,
         end=(position(zero + 1), velocity) if ends else None,
         steady_command=empty,

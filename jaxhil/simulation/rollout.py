@@ -31,7 +31,8 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Metrics:
     `gains` are scalars or of the batch shape: many gains at once are many lanes, not a `jax.vmap`, under
     which the loop's condition and the rings' pointer would be the lanes' own.
     """
-    return run_contacts(loop, gains, build_rig_constants(loop, scenario))
+    rig = build_rig_constants(loop, scenario, measured=loop.compensator.reads_position)
+    return run_contacts(loop, gains, rig)
 
 
 def run_contacts(loop: Loop, gains: Gains, rig: RigConstants) -> Metrics:
@@ -66,13 +67,14 @@ def start(loop: Loop, rig: RigConstants, gains: Gains) -> RunState:
     index = jnp.zeros(like.shape, jnp.int32)
     ring = jnp.zeros((loop.ring, *like.shape), like.dtype)
     order = rig.propagation.steady_command.shape[0]
+    measured = rig.propagation.measured_position is not None
     state = LoopState(
         position=zeros,
         velocity=zeros,
         plant=Plant(
             (zeros,) * (loop.latency + 1), zeros, (zeros,) * order, zeros if loop.has_limits else None
         ),
-        sensed=Sensed(_rings(loop, ring), no_contact(like), zeros, zeros),
+        sensed=Sensed(_rings(loop, ring, measured), no_contact(like), zeros, zeros if measured else None),
         law=loop.law.init(zeros),
         controller=loop.compensator.init(gains, rig.constants, loop.controller_ring),
         parameters=_entry(scenario.contact, index),
@@ -180,7 +182,7 @@ def _resumed(run, evolving):
     return run._replace(state=state, watch=watch, tick=now)
 
 
-def _rings(loop, ring):
+def _rings(loop, ring, measured):
     """Empty delay lines of what the loop has."""
     interval = None
     if loop.is_two_sided:
@@ -190,7 +192,8 @@ def _rings(loop, ring):
     plant_signals = PlantSignals(
         ring, (ring, ring) if loop.energies else None, ring if loop.has_corners else None
     )
-    return Rings(plant_signals, ring if loop.has_lag else None, ring, interval)
+    reading = ring if loop.has_lag else None
+    return Rings(plant_signals, reading, ring if measured else None, interval)
 
 
 def _pending(rig, run):
@@ -246,7 +249,7 @@ def _restart(loop, gains, state, entered, begins, fresh):
     sensed = rings._replace(
         last=_choose(begins, rings.last, state.sensed.last),
         lagged=jnp.where(begins, rings.lagged, state.sensed.lagged),
-        first_position=jnp.where(begins, rings.first_position, state.sensed.first_position),
+        first_position=_choose(begins, rings.first_position, state.sensed.first_position),
     )
     return chosen._replace(
         sensed=sensed,

@@ -33,7 +33,7 @@ from jaxhil.simulation.integrators import INTEGRATORS
 from jaxhil.simulation.loop import Loop, RigConstants
 from jaxhil.simulation.loop_state import LoopState, Plant, Rings
 from jaxhil.simulation.metrics import Metrics
-from jaxhil.simulation.motion_simulator import advance, read
+from jaxhil.simulation.motion_simulator import advance, read, read_measured
 from jaxhil.simulation.probe import Probe
 from jaxhil.simulation.probing import probe_beside
 from jaxhil.simulation.rate_limits import limit_command
@@ -87,7 +87,8 @@ class Actuated(NamedTuple):
 
     plant: Plant  # drives and motion simulator after the control period
     controller: Any  # state of the compensator
-    position: Float[Array, "*batch"]  # of the mechanism where its sensor samples it [m]
+    # of the mechanism where its sensor samples it [m]; None where nobody reads it
+    position: Float[Array, "*batch"] | None
     interval: SamplingInterval  # motion whose contact happens now
     # ring of the motions whose contact is still to come; None with one surface
     under_way: SamplingInterval | None
@@ -141,11 +142,7 @@ def sense(
     if loop.has_sample_effects:
         force = sample_force(force, sensor.quantum, sensor.dead_zone, sensor.range)
 
-    intervals = delays.position.intervals
-    stride = rig.constants.control_period * state.entry_velocity
-    before = sensed.first_position + (age - intervals).astype(stride.dtype) * stride
-    after = look_back(rings.position, now - 1, intervals)
-    position = jnp.where(age <= intervals, before, after)
+    position = _recall_position(rig, state, now, age)
     if noise.position is not None:
         position = position + noise.position
     if loop.has_sample_effects:
@@ -190,7 +187,7 @@ def actuate(
     return Actuated(
         plant=Plant(commands[: loop.latency + 1], step, simulator, wanted),
         controller=controller,
-        position=read(rows.measured_position, state.plant.state, start, end),
+        position=read_measured(rows, state.plant.state, start, end),
         interval=interval,
         under_way=under_way,
     )
@@ -199,7 +196,8 @@ def actuate(
 def contact_force(loop: Loop, rig: RigConstants, state: LoopState, interval: SamplingInterval) -> Contact:
     """Stage 5: the real contact during the sampling interval that happens now."""
     scenario, period = rig.scenario, rig.constants.control_period
-    surfaces = Surfaces(loop.law, state.parameters, state.law, scenario.clearance)
+    clearance = scenario.clearance if loop.is_two_sided else None
+    surfaces = Surfaces(loop.law, state.parameters, state.law, clearance)
     until = rig.delays.force.fraction * period
     if loop.law.remembers:
         loaded = surfaces.after(interval.start, interval.sample, until)
@@ -244,7 +242,17 @@ def next_state(
 
 def _recall(ring, now, age, intervals):
     """The sample so many sampling intervals before the newest; before the run there was no force."""
-    return jnp.where(age > intervals, look_back(ring, now - 1, intervals), 0)
+    return look_back(ring, now - 1, intervals, age > intervals)
+
+
+def _recall_position(rig, state, now, age):
+    """The position of the mechanism a delay ago, of uniform motion before the run; NaN if nobody reads it."""
+    ring, intervals = state.sensed.rings.position, rig.delays.position.intervals
+    if ring is None:
+        return jnp.full_like(state.position, jnp.nan)
+    stride = rig.constants.control_period * state.entry_velocity
+    before = state.sensed.first_position + (age - intervals).astype(stride.dtype) * stride
+    return look_back(ring, now - 1, intervals, age > intervals, before)
 
 
 def _limited(rig, plant, command):
@@ -274,6 +282,4 @@ def _interval(rows, state, start, end, plane):
 def _arrived(rig, under_way, now, age):
     """The interval that happens now; before the run, at rest at the surface, which does not push."""
     intervals = rig.delays.contact
-    return jax.tree.map(
-        lambda ring: jnp.where(age >= intervals, look_back(ring, now, intervals), 0), under_way
-    )
+    return jax.tree.map(lambda ring: look_back(ring, now, intervals, age >= intervals), under_way)

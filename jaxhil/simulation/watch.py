@@ -113,7 +113,7 @@ def record_contact(
     # The hardware may follow the numerical model late.
     quiet = jnp.where(touching | (begun & (watch.elapsed == 0)), 0, watch.quiet + 1)
     in_contact = jnp.where(touching, watch.in_contact + 1, watch.in_contact)
-    ends = _ends(rules, begun, signals, side, quiet, magnitude, peak_command)
+    ends = _ends(loop, rules, begun, signals, side, quiet, magnitude, peak_command)
     lasts = begun & ~watch.over
     return Watch(
         elapsed=jnp.where(begun, watch.elapsed + 1, watch.elapsed),
@@ -160,11 +160,14 @@ def _side(rules, watch, signals):
     return jnp.where(watch.elapsed == 0, near, watch.side)
 
 
-def _ends(rules, begun, signals, side, quiet, magnitude, peak_command):
+def _ends(loop, rules, begun, signals, side, quiet, magnitude, peak_command):
     """Where the model moves away, without a force for long enough, and the command died out."""
     velocity = signals.velocity_desired
     away = velocity < 0 if side is None else side * velocity < 0
-    faded = magnitude <= jnp.maximum(FADED * peak_command, rules.level)
+    level = FADED * peak_command
+    if loop.reads_always or loop.has_sample_effects:
+        level = jnp.maximum(level, rules.level)
+    faded = magnitude <= level
     return begun & away & (quiet >= rules.quiet) & (faded | (quiet >= rules.patience))
 
 

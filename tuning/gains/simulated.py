@@ -71,7 +71,9 @@ def has_foreign_law(scenarios: Any) -> bool:
 
 def prepared(loop: Any, scenarios: Any) -> Any:
     """What `outcome` needs of scenarios, worked out once for all gains."""
-    return build_rig_constants(loop, scenarios) if isinstance(loop, Loop) else scenarios
+    if isinstance(loop, Loop):
+        return build_rig_constants(loop, scenarios, measured=loop.compensator.reads_position)
+    return scenarios
 
 
 def outcome(loop: Any, gains: Gains, rig: Any) -> Outcome:
