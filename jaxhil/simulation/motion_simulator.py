@@ -74,7 +74,6 @@ def propagation(
     zero, one = jnp.zeros_like(control_period), jnp.ones_like(control_period)
     generator = [[*row, zero, zero] for row in system]
     generator[order - 1][order] = one
-    generator += [[zero] * (order + 1) + [one], [zero] * (order + 2)]
     generator = jnp.stack([jnp.stack(row) for row in generator])
     places = [one, force_fraction]
     if ends:
@@ -83,7 +82,7 @@ def propagation(
         places.append(position_fraction)
     fractions = jnp.stack(places)
     # Axes: row, column, place in the interval, batch.
-    rows = exponential(generator[:, :, None] * fractions[None, None])[: order + 1]
+    rows = exponential(generator[:, :, None] * fractions[None, None], fractions)
     # Columns for (z, u(0), u(1)) instead of (z, u(0), u(1) - u(0)).
     rows = rows.at[:, order].add(-rows[:, order + 1])
     state = rows[:order]
@@ -107,23 +106,42 @@ def propagation(
     )
 
 
-def exponential(matrices: Float[Array, "size size *batch"]) -> Float[Array, "size size *batch"]:
-    """Matrix exponential by scaling, Taylor and squaring, to rounding for norms up to 64.
+def exponential(
+    upper: Float[Array, "order order_plus_2 *batch"], ramp: Float[Array, "*batch"]
+) -> Float[Array, "order_plus_1 order_plus_2 *batch"]:
+    """First order + 1 rows of the matrix exponential of [[A, B, 0], [0, 0, r], [0, 0, 0]], whose first rows
+    are `upper` and whose r is `ramp`: by scaling, Taylor and squaring, to rounding for norms up to 64.
 
-    Matrix axes come first, so that every product is a few vector operations over the batch; a library
-    call per lane costs more than the whole contact.
+    Its last rows are (0, 1, r) and (0, 0, 1): they are not worked out. Matrix axes come first, so that every
+    product is a few vector operations over the batch; a library call per lane costs more than the whole
+    contact.
     """
-    size = matrices.shape[0]
-    identity = jnp.eye(size, dtype=matrices.dtype).reshape(size, size, *[1] * (matrices.ndim - 2))
-    scaled = matrices / 2**SQUARINGS
-    start = jnp.broadcast_to(identity, matrices.shape)
+    order, size = upper.shape[:2]
+    units = jnp.eye(size, dtype=upper.dtype).reshape(size, size, *[1] * ramp.ndim)
+    scaled = upper / 2**SQUARINGS
+
+    def ramp_row(ramp):
+        return units[order] + units[order + 1] * ramp[None]
+
+    def product(left, right, ramp):
+        """Upper rows of a product of two such matrices, or their powers."""
+        total = _product(left[:, :order], right)
+        driven = left[:, order, None] * ramp_row(ramp)[None]
+        return total + driven + left[:, order + 1, None] * units[None, order + 1]
 
     # Loops, not unrolled: fused into one another the products would be computed over and over.
-    def horner(step, total):
-        return identity + _product(scaled, total) / jnp.asarray(TERMS - step, total.dtype)
+    def horner(step, carry):
+        terms = jnp.asarray(TERMS - step, ramp.dtype)
+        return units[:order] + product(scaled, *carry) / terms, ramp / 2**SQUARINGS / terms
 
-    total = jax.lax.fori_loop(0, TERMS, horner, start)
-    return jax.lax.fori_loop(0, SQUARINGS, lambda _, total: _product(total, total), total)
+    def square(_, carry):
+        total, ramp = carry
+        return product(total, total, ramp), 2 * ramp
+
+    carry = jnp.broadcast_to(units[:order], upper.shape), jnp.zeros_like(ramp)
+    carry = jax.lax.fori_loop(0, TERMS, horner, carry)
+    total, ramp = jax.lax.fori_loop(0, SQUARINGS, square, carry)
+    return jnp.concatenate([total, ramp_row(ramp)[None]])
 
 
 def advance(transition: Array, state: State, start: Array, end: Array) -> State:
