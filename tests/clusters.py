@@ -50,17 +50,17 @@ class Cluster:
         process.wait()
 
 
-def killed_meanwhile(monkeypatch, module, cluster, worker):
-    """The `worker` is killed once the first piece that the module hands to workers is done."""
-    handed = module.on_workers
+def killed_meanwhile(monkeypatch, holder, cluster, worker, name="on_workers"):
+    """The `worker` is killed once the first piece that the holder's function hands to workers is done."""
+    handed = getattr(holder, name)
 
     def killing(*asked):
-        for number, one in enumerate(handed(*asked)):
-            if number == 0:
+        for one in handed(*asked):
+            if worker.poll() is None:
                 cluster.kill(worker)
             yield one
 
-    monkeypatch.setattr(module, "on_workers", killing)
+    monkeypatch.setattr(holder, name, killing)
 
 
 @contextmanager

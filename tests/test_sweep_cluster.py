@@ -3,14 +3,17 @@
 import os
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
-from clusters import ROOT, awaited, started
-from sweep_cases import case, manifest
+from clusters import ROOT, awaited, killed_meanwhile, started
+from sweep_cases import NOISY, case, manifest
 
+import tuning
 from jaxhil.errors import InputError
-from tuning.caches.cluster import Piece, on_workers
+from tuning.caches.cluster import Piece, Workers, on_workers
+from tuning.gain_file import write_gain_file
 from tuning.sweeps.cluster import on_cluster, run_part
 from tuning.sweeps.manifest import encode
 from tuning.sweeps.parts import same_rows
@@ -147,3 +150,24 @@ def test_a_sweep_stops_at_the_same_look(tmp_path):
         cluster.worker("--nworkers", "2", "--nthreads", "1")
         rows, again = rows_of(tmp_path / "store", on_cluster(cluster.address), label=until)
     assert 64 < tally.scenarios < 300 and again == tally and same_rows(rows, here) == []
+
+
+@pytest.mark.slow
+def test_studies_are_the_same_though_a_worker_is_killed(tmp_path, monkeypatch):
+    monkeypatch.setattr("tuning.sweeps.points.FEWEST", 16)
+    gains, folder = tmp_path / "gains.json", tmp_path / "store"
+    write_gain_file(gains, case(force_sensor=NOISY))
+    asked: dict[str, Any] = {"scenarios": 100, "chunk": 64, "limit": 1.5}
+    studies = {"drivers": 64, "rare": 1.6}
+    here = tuning.sweep(gains, **asked, **studies).document
+    tuning.sweep(gains, **asked, folder=folder)
+    with started(tmp_path) as cluster:
+        first, _ = cluster.worker(), cluster.worker("--nthreads", "2")
+        killed_meanwhile(monkeypatch, Workers, cluster, first, "run")
+        there = tuning.sweep(
+            gains, **asked, **studies, folder=folder, resume=True, scheduler=cluster.address
+        ).document
+        assert first.poll() is not None
+    assert not (folder / ".pieces").exists()
+    for name in ("drivers", "rare", "failure_probability", "worst"):
+        assert there[name] == here[name]

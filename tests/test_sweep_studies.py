@@ -7,12 +7,12 @@ from sweep_cases import NOISY, UNCERTAIN, case, manifest
 from jaxhil.mechanism.uncertainty import dimensions
 from tuning.statistics.sobol_indices import evaluations
 from tuning.sweeps.chunks import build_sweep, run_chunk
+from tuning.sweeps.points import Running, run_points
 from tuning.sweeps.studies import (
     NOISE,
     error_indices,
     independent_inputs,
     rare_failure,
-    run_points,
     spread_beyond_formula,
 )
 from tuning.sweeps.tally import add_rows, empty_tally, error_sizes, failure_probability
@@ -38,7 +38,7 @@ def whole():
 def test_an_input_that_does_nothing_drives_nothing(whole):
     sweep, _ = whole
     ran = []
-    found = error_indices(sweep, 128, ran.append)
+    found = error_indices(sweep, 128, Running(ran.append))
     assert found.evaluations == sum(ran) == evaluations(4, 128) == 768
     assert {one.input for one in found.inputs} == set(dimensions(sweep.mechanism))
     totals = [one.total for one in found.inputs]

@@ -29,45 +29,66 @@ class Piece(NamedTuple):
 def on_workers(
     address: str, function: Callable[..., Any], pieces: Iterable[Piece], setting: Setting | None, what: str
 ) -> Generator[tuple[Any, Any], None, None]:
-    """(name, result of `function`) of every piece, in the order in which workers finish them; a few are under
-    way per worker, of those that join later too.
+    """`Workers.run` of those of the scheduler at this address."""
+    with connected(address) as workers:
+        yield from workers.run(function, pieces, setting, what)
 
-    `function` is one of a module, and is called on workers that are as `setting` says; with None it has to
-    see to that itself. `what` names the work, differently from any other under way.
 
-    Raises `InputError`, one line, where there is no cluster, where it is lost, and where a worker is not as
-    `setting` says; and whatever the function raises.
-    """
-    with _client(address) as client, _connected(address):
-        from cloudpickle import dumps  # pyright: ignore[reportMissingImports]
+@contextmanager
+def connected(address: str) -> Iterator["Workers"]:
+    """The workers of the scheduler at this address. Raises `InputError`, one line, where there is none."""
+    with _client(address) as client:
+        yield Workers(address, client)
 
-        waiting, running = iter(pieces), {}
-        ended: SimpleQueue[Any] = SimpleQueue()
 
-        def submit(number: int) -> None:
-            for piece in islice(waiting, number):
-                # As bytes: what is in it may import jax, which is to start as a command starts it.
-                asked = dumps((function, piece.arguments))
-                future = client.submit(run, asked, setting, key=f"jaxhil-{what}-{piece.name}", pure=False)
-                running[future] = piece
-                future.add_done_callback(ended.put)
+class Workers:
+    """Those of a scheduler that is connected."""
 
-        workers, counted = _workers(client), time.monotonic()
-        submit(max(2, EACH * workers))
-        while running:
-            future, found = _next(ended), None
-            if time.monotonic() - counted > RECOUNT or future is None:
-                workers, counted = _workers(client), time.monotonic()
-            if future is not None and future in running:
-                found = _found(future)
-            elif future is None and not workers:
-                future = next(iter(running))
-                future.cancel()
-            else:
-                continue
-            piece = running.pop(future)
-            submit(max(1, EACH * workers - len(running)))
-            yield piece.name, function(*piece.arguments) if found is None else found[0]
+    def __init__(self, address: str, client: Any):
+        self._address, self._client = address, client
+
+    def run(
+        self, function: Callable[..., Any], pieces: Iterable[Piece], setting: Setting | None, what: str
+    ) -> Generator[tuple[Any, Any], None, None]:
+        """(name, result of `function`) of every piece, in the order in which workers finish them; a few are
+        under way per worker, of those that join later too.
+
+        `function` is one of a module, and is called on workers that are as `setting` says; with None it has
+        to see to that itself. `what` names the work, differently from any other under way.
+
+        Raises `InputError`, one line, where the cluster is lost, and where a worker is not as `setting` says;
+        and whatever the function raises.
+        """
+        with _connected(self._address):
+            from cloudpickle import dumps  # pyright: ignore[reportMissingImports]
+
+            client, waiting, running = self._client, iter(pieces), {}
+            ended: SimpleQueue[Any] = SimpleQueue()
+
+            def submit(number: int) -> None:
+                for piece in islice(waiting, number):
+                    # As bytes: what is in it may import jax, which is to start as a command starts it.
+                    asked = dumps((function, piece.arguments))
+                    future = client.submit(run, asked, setting, key=f"jaxhil-{what}-{piece.name}", pure=False)
+                    running[future] = piece
+                    future.add_done_callback(ended.put)
+
+            workers, counted = _workers(client), time.monotonic()
+            submit(max(2, EACH * workers))
+            while running:
+                future, found = _next(ended), None
+                if time.monotonic() - counted > RECOUNT or future is None:
+                    workers, counted = _workers(client), time.monotonic()
+                if future is not None and future in running:
+                    found = _found(future)
+                elif future is None and not workers:
+                    future = next(iter(running))
+                    future.cancel()
+                else:
+                    continue
+                piece = running.pop(future)
+                submit(max(1, EACH * workers - len(running)))
+                yield piece.name, function(*piece.arguments) if found is None else found[0]
 
 
 def _workers(client: Any) -> int:

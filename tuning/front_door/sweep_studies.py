@@ -1,7 +1,7 @@
 """The studies that `tuning.sweep` runs beside its sweep, or finds in the store where it resumes."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +23,11 @@ def drivers(options: Any, store, sweep, unwritten: list[InputError], progress: b
         return found._asdict()
     # Noise, if there is any, adds an input; the bar need not know.
     total = evaluations(len(independent_inputs(sweep.mechanism)), number)
-    with terminal.progress(total, "scenarios", progress) as bar:
-        bar.say("drivers")
-        found = error_indices(sweep, number, lambda more: bar.advance(more, "drivers"))
+    with _running(options, store, total, "scenarios", "drivers", progress) as running:
+        found = error_indices(sweep, number, running)
     with put_off(unwritten):
         write_study(store, request, found)
+        running.kept.remove()
     return found._asdict()
 
 
@@ -42,12 +42,31 @@ def rare(options: Any, store, sweep, unwritten: list[InputError], progress: bool
     if found is not None:
         _say_kept("subset simulation", study_path(store, request), progress)
         return _rare_document(limit, found)
-    with terminal.progress(most_scenarios(), "scenarios at most", progress) as bar:
-        bar.say("subset simulation")
-        found = rare_failure(sweep, limit, lambda more: bar.advance(more))
+    name = "subset simulation"
+    with _running(options, store, most_scenarios(), "scenarios at most", name, progress) as running:
+        found = rare_failure(sweep, limit, running)
     with put_off(unwritten):
         write_study(store, request, found)
+        running.kept.remove()
     return _rare_document(limit, found)
+
+
+@contextmanager
+def _running(options: Any, store, total: int, unit: str, study: str, progress: bool) -> Iterator[Any]:
+    """How a study's scenarios are run: here or by a cluster's workers, finished pieces kept in the store."""
+    from tuning.caches.cluster import connected
+    from tuning.caches.pieces import FOLDER, Pieces
+    from tuning.sweeps.cluster import SEVERAL, points_on
+    from tuning.sweeps.points import Running
+
+    with terminal.progress(total, unit, progress) as bar, ExitStack() as cluster:
+        bar.say(study)
+        kept = Pieces(store.folder / FOLDER, options.resume)
+        running = Running(lambda more: bar.advance(more, study), bar.skip, kept)
+        if options.scheduler is not None:
+            workers = cluster.enter_context(connected(options.scheduler))
+            running = running._replace(computer=points_on(workers), several=SEVERAL)
+        yield running
 
 
 @contextmanager

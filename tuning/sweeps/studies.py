@@ -5,16 +5,13 @@ through the sweep's own program. The sensors' noise is one more uncertain input,
 chosen: its realisation is addressed by an index.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxhil.mechanism.correlation import correlated_groups
 from jaxhil.mechanism.file import AnyMechanism
-from jaxhil.mechanism.uncertainty import at_points, dimensions
-from jaxhil.simulation.evaluation import evaluate
-from tuning.gains.simulated import scenarios_of
+from jaxhil.mechanism.uncertainty import dimensions
 from tuning.statistics.sobol_indices import saltelli_design, sobol_indices
 from tuning.statistics.subset_simulation import (
     LEVELS,
@@ -23,8 +20,9 @@ from tuning.statistics.subset_simulation import (
     subset_simulation,
     to_uniform,
 )
-from tuning.sweeps.chunks import Rows, Sweep, in_precision
-from tuning.sweeps.columns import OUTCOMES, SATURATED, rows_of
+from tuning.sweeps.chunks import Sweep
+from tuning.sweeps.columns import OUTCOMES, SATURATED
+from tuning.sweeps.points import HERE, Running, run_points
 from tuning.sweeps.tally import error_sizes
 
 NOISE = "sensor noise"
@@ -33,8 +31,6 @@ CAP_LIMITS = 10.0  # largest error that drivers look at, over the limit
 CAP_UNLIMITED = 10.0  # the same where there is no limit
 SAMPLES, REPLICATES = 1000, 10  # of subset simulation: per level and replicate, and how often it runs
 FAR_ABOVE = 2.0  # replicates that spread so much more than the formula says have not seen the same failures
-
-Done = Callable[[int], None]  # called with the number of scenarios that were run
 
 
 class InputIndices(NamedTuple):
@@ -58,7 +54,7 @@ class ErrorIndices(NamedTuple):
     capped: int  # how many of them reached the cap or had no error
 
 
-def error_indices(sweep: Sweep, number: int, done: Done = lambda _: None) -> ErrorIndices:
+def error_indices(sweep: Sweep, number: int, running: Running = HERE) -> ErrorIndices:
     """Sobol indices of the worst |error|, from `number` (a power of two) times inputs + 2 scenarios.
 
     An input is a key of the mechanism's uncertainty, with all its entries; keys that are correlated are one,
@@ -76,7 +72,7 @@ def error_indices(sweep: Sweep, number: int, done: Done = lambda _: None) -> Err
     points = saltelli_design(entries, number, sweep.manifest.seed)[:, order]
     block, row = np.divmod(np.arange(len(points)), number)
     of_b = (block == 1) | ((block == len(points) // number - 1) & _noisy(sweep))
-    sizes = error_sizes(run_points(sweep, points, row + number * of_b, done))
+    sizes = error_sizes(run_points(sweep, points, row + number * of_b, running))
     limit = sweep.manifest.limit
     cap = CAP_LIMITS * limit if limit else CAP_UNLIMITED
     indices = sobol_indices(sizes, entries, number, sweep.manifest.seed, cap=cap)
@@ -106,7 +102,7 @@ def most_scenarios(samples: int = SAMPLES, replicates: int = REPLICATES) -> int:
 def rare_failure(
     sweep: Sweep,
     limit: float,
-    done: Done = lambda _: None,
+    running: Running = HERE,
     samples: int = SAMPLES,
     replicates: int = REPLICATES,
 ) -> SubsetSimulation:
@@ -121,7 +117,7 @@ def rare_failure(
     def performance(normals: np.ndarray) -> np.ndarray:
         nonlocal run
         indices = np.arange(run, run + len(normals))
-        rows = run_points(sweep, to_uniform(normals), indices, done)
+        rows = run_points(sweep, to_uniform(normals), indices, running)
         run += len(normals)
         return np.where(rows["outcome"] >= saturated, np.inf, error_sizes(rows))
 
@@ -132,26 +128,6 @@ def rare_failure(
 def spread_beyond_formula(rare: SubsetSimulation) -> bool:
     """Whether replicates differ by far more than one run's chains can explain."""
     return rare.coefficient_of_variation > FAR_ABOVE * rare.formula_coefficient_of_variation
-
-
-def run_points(sweep: Sweep, points: np.ndarray, noise: np.ndarray, done: Done = lambda _: None) -> Rows:
-    """`outcome` and `worst_error` of the scenarios at points (number, inputs) of the unit box, in order.
-
-    `noise` (number,) are indices of realisations. They run in chunks of the sweep's, by its program.
-    """
-    manifest = sweep.manifest
-    found: list[Rows] = []
-    for start in range(0, len(points), manifest.chunk):
-        part = slice(start, start + manifest.chunk)
-        draws = at_points(sweep.mechanism, points[part])
-        scenarios = scenarios_of(sweep.mechanism, draws, manifest.seed)
-        key = np.stack([scenarios.key[0], noise[part].astype(np.uint32)])
-        scenarios = in_precision(scenarios._replace(key=key), manifest.precision)
-        outcome = evaluate(sweep.loop, sweep.gains, scenarios, at_least=manifest.chunk)
-        rows = rows_of(sweep.mechanism, 0, {}, scenarios, outcome, manifest.largest_error, manifest.works)
-        found.append({name: rows[name] for name in ("outcome", "worst_error")})
-        done(len(rows["outcome"]))
-    return {name: np.concatenate([rows[name] for rows in found]) for name in found[0]}
 
 
 def _noisy(sweep: Sweep) -> bool:

@@ -1,0 +1,61 @@
+"""Points of a sweep's studies: in pieces of any size, kept when finished, the same to the bit."""
+
+import numpy as np
+import pytest
+from sweep_cases import case, manifest
+
+from tuning.caches.pieces import Pieces
+from tuning.sweeps import points
+from tuning.sweeps.chunks import build_sweep
+from tuning.sweeps.parts import same_rows
+from tuning.sweeps.points import HERE, Running, run_here, run_points
+
+NUMBER = 100
+
+
+@pytest.fixture(scope="module")
+def asked():
+    """A sweep, points, realisations of noise, and what they give."""
+    sweep = build_sweep(manifest(case(force_sensor={"noise_std": 1.0})))
+    inputs = np.random.default_rng(0).uniform(size=(NUMBER, 3))
+    noise = np.arange(NUMBER) % 7
+    return sweep, inputs, noise, run_points(sweep, inputs, noise)
+
+
+def test_pieces_that_were_finished_are_not_run_again(asked, tmp_path, monkeypatch):
+    monkeypatch.setattr(points, "FEWEST", 8)
+    *what, rows = asked
+    ran, found = [], []
+
+    def interrupted(sweep, pieces):
+        # As of a cluster: in any order, and none twice.
+        for number, one in enumerate(run_here(sweep, list(pieces)[::-1])):
+            if number == 3:
+                raise KeyboardInterrupt
+            yield one
+
+    running = Running(ran.append, found.append, Pieces(tmp_path / "kept"), interrupted, several=10)
+    with pytest.raises(KeyboardInterrupt):
+        run_points(*what, running)
+    again = running._replace(kept=Pieces(tmp_path / "kept", resume=True), computer=run_here)
+    assert same_rows(run_points(*what, again), rows) == []
+    assert len(found) == 3 and sum(ran) == NUMBER and sum(found) == sum(ran[:3])
+    assert again.kept.other == []
+
+
+def test_other_noise_is_another_piece(asked, tmp_path):
+    sweep, inputs, noise, rows = asked
+    running = HERE._replace(kept=Pieces(tmp_path / "kept", resume=True))
+    run_points(sweep, inputs, noise, running)
+    other = run_points(sweep, inputs, noise + 1, running)
+    assert np.any(other["worst_error"] != rows["worst_error"])
+
+
+def test_equal_points_are_run_once(asked):
+    sweep, inputs, noise, rows = asked
+    ran = []
+    twice = run_points(
+        sweep, np.tile(inputs[:32], (3, 1)), np.tile(noise[:32], 3), HERE._replace(done=ran.append)
+    )
+    assert ran == [32]
+    np.testing.assert_array_equal(twice["worst_error"], np.tile(rows["worst_error"][:32], 3))
