@@ -147,6 +147,10 @@ def test_starts_that_cannot_be_run():
         assert str(caught.value).startswith(f"{name}: {reason}")
     for changes, reason in (
         ({"approach.offset": [9.0, 0.0]}, "approach.offset: found nothing to touch"),
+        (
+            {"approach.velocity": [0, 0, -5.0]},
+            "approach.velocity: found shapes of contact.tip that pass at 5 m/s, allowed at most 1.25 m/s",
+        ),
         ({"approach.duration": 999.0, "rig.control_period": 1e-5}, "approach.duration: found 999.02 s"),
         (
             {**APART, "start.chaser.position": [0, 0, 2.2]},
@@ -246,6 +250,38 @@ def test_a_flight_without_a_contact(jaxhil, tmp_path):
     ticks = np.genfromtxt(files["--log"], delimiter=",", names=True)
     assert len(ticks) == 200 and not any(name.startswith("depth") for name in ticks.dtype.names)
     np.testing.assert_allclose(ticks["desired_ry"], 0.5 * ticks["time"], atol=1e-12)
+
+
+@pytest.mark.slow
+def test_friction_that_cannot_be_followed_is_named():
+    """In space its steps would be of 1e-9 s."""
+    stiff = {"contact.tip.friction.coefficient": 10.0, "contact.tip.friction.slip": 1e-9, "uncertainty": {}}
+    with pytest.raises(InputError, match=r"^probe-drogue: contact\.tip\.friction\.slip: found 1e-09 m/s"):
+        package.simulate(package.load("probe-drogue", stiff))
+
+
+@pytest.mark.slow
+def test_shapes_that_go_through_each_other_are_told_of():
+    soft = {"contact.tip.stiffness": 3e4, "approach.velocity": [0, 0, -0.5], "uncertainty": {}}
+    run = package.simulate(package.load("probe-drogue", soft))
+    assert run.episodes[0].penetration > 0.9 and "of the size of its shapes" in run.meaning.warnings[-1]
+    gentle = package.simulate(package.load("probe-drogue"))
+    assert gentle.episodes[0].penetration < 0.1 and not gentle.meaning.warnings
+
+
+@pytest.mark.slow
+def test_a_leg_ends_a_run_at_the_tick_at_which_it_is_too_long():
+    free = {**APART, "start.duration": 0.2, "start.chaser.position": [0.0, 0.0, 6.3]}
+    free |= {"start.chaser.velocity": [0.0, 0.0, 0.5], "contact": {}, "rig.simulator.stroke": [1.6, 2.17]}
+    mechanism = load_any("hydraulic-hexapod", free).mechanism
+    run = simulate_six_axes(mechanism)
+    simulator = mechanism.rig.simulator
+    legs = [
+        np.linalg.norm(np.array(simulator.platform) + simulator.height + at[:3] - simulator.base, axis=1)
+        for at in (*run.ticks.desired, np.array(run.final.pose))
+    ]
+    assert run.status == "reach" and np.all(run.ticks.desired[:, 3:] == 0)
+    assert np.max(legs[-1]) > 2.17 >= np.max(legs[:-1])
 
 
 @pytest.mark.slow

@@ -36,6 +36,11 @@ class Candidates(eqx.Module):
     def touch(self, pose: Pose) -> Touch:
         """The pairs at a pose, whose leaves have a leading axis of length 1."""
 
+    @property
+    @abc.abstractmethod
+    def size(self) -> Float[Array, "candidates *batch"]:
+        """Depth [m] at which the shapes have gone through each other; infinite where they cannot."""
+
 
 class ChaserSpheres(Candidates):
     """Spheres of the chaser, against one kind of the target's shapes. Radius 0 is a point."""
@@ -43,6 +48,10 @@ class ChaserSpheres(Candidates):
     centre: Vector  # in C axes [m]
     radius: Float[Array, "candidates *batch"]  # [m]
     shape: Shape  # in T axes
+
+    @property
+    def size(self):
+        return self.radius + self.shape.thickness
 
     def touch(self, pose):
         centre = pose.position + rotate(pose.attitude, self.centre)
@@ -57,6 +66,10 @@ class TargetSpheres(Candidates):
     radius: Float[Array, "candidates *batch"]  # [m]
     shape: Shape  # in C axes
 
+    @property
+    def size(self):
+        return self.radius + self.shape.thickness
+
     def touch(self, pose):
         centre = rotate_back(pose.attitude, self.centre - pose.position)
         distance, normal = self.shape.surface(centre)
@@ -69,6 +82,10 @@ class Capsules(Candidates):
 
     chaser: Capsule
     target: Capsule
+
+    @property
+    def size(self):
+        return self.chaser.radius + self.target.radius
 
     def touch(self, pose):
         start, end = (

@@ -34,7 +34,7 @@ class Kinematics(eqx.Module):
 
     def reaches(self, axes: Float[Array, "axes *batch"]) -> Bool[Array, "*batch"]:
         """Whether the axes can be there."""
-        return jnp.all(jnp.isfinite(axes), axis=0)
+        return jnp.ones(axes.shape[1:], bool)
 
     @abc.abstractmethod
     def command(self, coordinates: Float[Array, "6 *batch"]) -> Float[Array, "axes *batch"]:

@@ -54,9 +54,10 @@ class Metrics(NamedTuple):
     peak_moment: Float[Array, "..."]  # about T's origin, of the real contact [N m]
     reference_peak_moment: Float[Array, "..."]  # in space [N m]
     duration: Float[Array, "..."]  # in touch [s]
-    reference_duration: Float[Array, "..."]  # likewise in space [s]
+    reference_duration: Float[Array, "..."]  # likewise in space; NaN where it was not followed to its end [s]
     touches: Int[Array, "..."]  # candidates that began to touch
     reference_touches: Int[Array, "..."]  # likewise in space
+    penetration: Float[Array, "..."]  # largest depth on the rig, over the size of its shapes [1]
     captured: Bool[Array, "..."]  # whether a latch holds
     reference_captured: Bool[Array, "..."]  # likewise in space
     status: Int[Array, "..."]  # index of `rollout.STATUS_NAMES`
@@ -156,9 +157,10 @@ def _compare(space: Space, episodes: Episode, passage: Passage, quiet: Array) ->
         peak_moment=episodes.peak_moment,
         reference_peak_moment=passage.moment.largest,
         duration=episodes.duration,
-        reference_duration=passage.touched,
+        reference_duration=of(jnp.isfinite(passage.flight.time), passage.touched),
         touches=episodes.touches,
         reference_touches=passage.touches,
+        penetration=episodes.penetration,
         captured=episodes.status == CAPTURED,
         reference_captured=held,
         status=episodes.status,

@@ -10,16 +10,21 @@ from jaxtyping import Array, Bool, Float
 from jaxhil.errors import InputError
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.sixdof.approach import FAR
+from jaxhil.sixdof.building_contacts import candidate_names
+from jaxhil.sixdof.candidates import motion_at
 from jaxhil.sixdof.forces import deepest
 from jaxhil.sixdof.latch import init_latch, latch_wrench
 from jaxhil.sixdof.loop import command_of
 from jaxhil.sixdof.relative import relative
+from jaxhil.sixdof.rollout import STRETCH
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.stewart import Stewart, condition
+from jaxhil.sixdof.vectors import dot
 
 MOST_TICKS = 1e7  # of a run
 LARGEST_ATTITUDE = 1.0  # rad, of C against T at the start
 LARGEST_CONDITION = 100.0  # of a hexapod's legs, lengths in m
+BLIND = STRETCH  # control periods in which shapes must not go through each other
 
 
 class Beginning(NamedTuple):
@@ -27,6 +32,8 @@ class Beginning(NamedTuple):
 
     coordinates: Float[Array, "6 *batch"]
     depth: Float[Array, "*batch"]  # of the mechanisms in each other [m]
+    # Of each candidate: how fast its shapes pass [m/s], and their size [m].
+    passing: tuple[tuple[Float[Array, "candidates *batch"], Float[Array, "candidates *batch"]], ...]
     caught: tuple[Bool[Array, "latches *batch"], ...]  # by latches
     legs: tuple[Float[Array, "6 *batch"], ...]  # [m]
     conditions: tuple[Float[Array, "*batch"], ...]  # of their Jacobian
@@ -60,12 +67,25 @@ def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
         key = "start.chaser.position" if mechanism.start else "approach.angular_velocity"
         found = f"{key}: found a start that is in touch already, {depth:.3g} m deep"
         raise InputError(f"{mechanism.name}: {found}, allowed one apart: move the chaser along z of T")
+    _check_speed(mechanism, begins, float(scenario.control_period[0]))
     for (name, latch), caught in zip(mechanism.latch.items(), begins.caught, strict=True):
         if caught.any() and not latch.latched:
             found = f"latch.{name}.depth: found {latch.depth:g} m, deep enough at the start already"
             allowed = "a depth or an angle that is not yet met there, or latched = true"
             raise InputError(f"{mechanism.name}: {found}, allowed {allowed}")
     _check_legs(mechanism, begins)
+
+
+def _check_speed(mechanism: SixAxisMechanism, begins: Beginning, period: float) -> None:
+    """No shapes are so fast that they can go through each other before anything is noticed."""
+    speeds, sizes = (np.concatenate([one[part][:, 0] for one in begins.passing] or [[]]) for part in (0, 1))
+    for name, speed, size in zip(candidate_names(mechanism), speeds, sizes, strict=True):
+        most = size / (BLIND * period)
+        if speed > most:
+            key = "start.chaser.velocity" if mechanism.start else "approach.velocity"
+            found = f"{key}: found shapes of contact.{name} that pass at {speed:.3g} m/s"
+            allowed = f"at most {most:.3g} m/s: their size of {size:.3g} m in {BLIND} control periods"
+            raise InputError(f"{mechanism.name}: {found}, allowed {allowed}")
 
 
 def _check_legs(mechanism: SixAxisMechanism, begins: Beginning) -> None:
@@ -98,4 +118,12 @@ def _beginning(scenario: Scenario) -> Beginning:
         poses = at, jnp.zeros_like(at)
         legs = tuple(hexapod.command(one) for one in poses)
         conditions = tuple(condition(hexapod, one) for one in poses)
-    return Beginning(at, deepest(scenario.groups, pose), caught, legs, conditions)
+    lifted, moving = jax.tree.map(lambda leaf: leaf[None], (pose, twist))
+    passing = []
+    for group in scenario.groups:
+        touch = group.candidates.touch(lifted)
+        rate, slip = motion_at(touch, lifted, moving)
+        passing.append(
+            (jnp.sqrt(rate**2 + dot(slip, slip)), jnp.broadcast_to(group.candidates.size, rate.shape))
+        )
+    return Beginning(at, deepest(scenario.groups, pose), tuple(passing), caught, legs, conditions)

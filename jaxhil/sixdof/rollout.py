@@ -48,6 +48,8 @@ class Watch(NamedTuple):
     # Largest sizes of the force [N] and of the moment [N m] on the numerical model.
     highest: tuple[Array, Array]
     faded: Int[Array, "*batch"]  # ticks since it died out
+    penetration: Float[Array, "*batch"]  # largest depth, over the size of its shapes
+    beyond: Bool[Array, "*batch"]  # whether an axis was sent where it cannot be
 
 
 class Episode(NamedTuple):
@@ -62,6 +64,7 @@ class Episode(NamedTuple):
     duration: Float[Array, "episodes *batch"]  # in which something touched [s]
     peak_force: Float[Array, "episodes *batch"]  # [N]
     peak_moment: Float[Array, "episodes *batch"]  # about T's origin [N m]
+    penetration: Float[Array, "episodes *batch"]  # largest depth, over the size of its shapes
     status: Int[Array, "episodes *batch"]  # index of `STATUS_NAMES`
 
 
@@ -73,7 +76,7 @@ class Progress(NamedTuple):
     episodes: Episode
     index: Int[Array, "*batch"]  # of the episode under way or ahead
     active: Bool[Array, "*batch"]
-    first: Int[Array, ""]  # tick at which the run began
+    lasted: Int[Array, "*batch"]  # ticks that each has run
 
 
 class Outcome(NamedTuple):
@@ -95,12 +98,7 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
 
     start = _start(loop, rig, scenario.start)
     ended = lax.while_loop(lambda progress: jnp.any(progress.active), body, start)
-    age = jnp.minimum(ended.run.tick - start.first, last)
-    # A lane that ended early has stood still since.
-    early = jnp.max(ended.episodes.end_time, axis=0)
-    time = age.astype(rig.period.dtype) * rig.period
-    if not loop.whole:
-        time = jnp.where(ended.index >= loop.episodes, early, time)
+    time = ended.lasted.astype(rig.period.dtype) * rig.period
     return Outcome(ended.episodes, ended.run.states, time)
 
 
@@ -113,9 +111,9 @@ def _start(loop: Loop, rig: Rig, states: States) -> Progress:
     numbers = jnp.zeros((loop.episodes, *like.shape), like.dtype)
     counts = numbers.astype(jnp.int32)
     episodes = Episode(
-        slots, slots, numbers, numbers, numbers, counts, numbers, numbers, numbers, counts + MISS
+        slots, slots, numbers, numbers, numbers, counts, numbers, numbers, numbers, numbers, counts + MISS
     )
-    return Progress(run, watch, episodes, none, none == 0, run.tick)
+    return Progress(run, watch, episodes, none, none == 0, none)
 
 
 def _fresh(rig: Rig, states: States, now: Array, energy: Array) -> Watch:
@@ -124,7 +122,7 @@ def _fresh(rig: Rig, states: States, now: Array, energy: Array) -> Watch:
     touching = tuple(group.parameters.damping > jnp.inf for group in rig.groups)
     return Watch(
         none > 0, states, now, energy, touching, none, none, none, none > 0, peak, peak,
-        (zero, zero), none,
+        (zero, zero), none, zero, none > 0,
     )  # fmt: skip
 
 
@@ -132,9 +130,14 @@ def _tick(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progress:
     """One tick; where the run is over the bodies stand still."""
     run, watch = progress.run, progress.watch
     after, seen = tick(loop, rig, run)
-    goes = progress.active & (run.tick - progress.first < last)
-    watched = choose(goes, _watch(rig, watch, seen), watch)
-    return progress._replace(run=after._replace(states=choose(goes, after.states, run.states)), watch=watched)
+    goes = progress.active & (progress.lasted < last) & ~watch.beyond
+    beyond = ~rig.kinematics.reaches(after.hardware.commands[0])
+    watched = choose(goes, _watch(rig, watch, seen)._replace(beyond=beyond), watch)
+    return progress._replace(
+        run=after._replace(states=choose(goes, after.states, run.states)),
+        watch=watched,
+        lasted=progress.lasted + goes.astype(jnp.int32),
+    )
 
 
 def _watch(rig: Rig, watch: Watch, seen: Tick) -> Watch:
@@ -146,6 +149,10 @@ def _watch(rig: Rig, watch: Watch, seen: Tick) -> Watch:
     for one, before in zip(touching, watch.touching, strict=True):
         now = now | jnp.any(one, axis=0)
         touches = touches + jnp.sum(one & ~before, axis=0, dtype=touches.dtype)
+    penetration = watch.penetration
+    for group, forces in zip(rig.groups, seen.forces, strict=True):
+        share = jnp.max(forces.touch.depth / group.candidates.size, axis=0)
+        penetration = jnp.maximum(penetration, share)
     command = norm(seen.command.force), norm(seen.command.moment)
     highest = tuple(jnp.maximum(a, b) for a, b in zip(watch.highest, command, strict=True))
     noise = 3 * rig.sensor.noise_std
@@ -164,6 +171,7 @@ def _watch(rig: Rig, watch: Watch, seen: Tick) -> Watch:
         moment=higher(watch.moment, norm(seen.contact.moment), rig.period),
         highest=(highest[0], highest[1]),
         faded=jnp.where(faded, watch.faded + 1, 0),
+        penetration=penetration,
     )
 
 
@@ -188,25 +196,25 @@ def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progres
     """Enter the episodes that are over; where the model is free and none is under way, one may begin."""
     watch, run, period = progress.watch, progress.run, rig.period
     free, energy = _look(rig, run.states)
-    age = run.tick - progress.first
+    age = progress.lasted
     still = jnp.floor(quiet_time(rig.sensor, period) / period + 1e-9).astype(jnp.int32) + 1
     patience = still + jnp.ceil(LONGEST_FADING / period).astype(jnp.int32)
     # For how many ticks it has been over.
     since = jnp.maximum(jnp.minimum(watch.quiet - still, watch.faded - 1), watch.quiet - patience)
     over = watch.begun & free & (since >= 0) & progress.active
-    status = _failure(rig, watch, run, energy)
+    status = _failure(rig, watch, energy)
     out = (age >= last) | (status != MISS)
     held = jnp.where(watch.caught, CAPTURED, jnp.where(watch.quiet < still, JAMMED, TIMEOUT))
     status = jnp.where(status != MISS, status, jnp.where(over, REBOUNDED, jnp.where(watch.begun, held, MISS)))
     ends = progress.active & (over | out)
-    ended = jnp.minimum(age, last)
     time, over_time, entry_time = (
         ticks.astype(period.dtype) * period
-        for ticks in (ended, ended - jnp.where(over, since, 0), watch.entry_tick)
+        for ticks in (age, age - jnp.where(over, since, 0), watch.entry_tick)
     )
     found = Episode(
         watch.entry, run.states, entry_time, time, over_time, watch.touches,
-        watch.touched.astype(period.dtype) * period, watch.force.largest, watch.moment.largest, status,
+        watch.touched.astype(period.dtype) * period, watch.force.largest, watch.moment.largest,
+        watch.penetration, status,
     )  # fmt: skip
     slot = jnp.arange(loop.episodes, dtype=jnp.int32).reshape(-1, *[1] * period.ndim)
     here = (slot == progress.index[None]) & (ends & (status != MISS))[None]
@@ -215,17 +223,16 @@ def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progres
     active = progress.active & ~out
     if not loop.whole:
         active = active & (index < loop.episodes)
-    now = jnp.broadcast_to(age, index.shape)
-    fresh = _fresh(rig, run.states, now, energy)._replace(touching=watch.touching)
+    fresh = _fresh(rig, run.states, age, energy)._replace(touching=watch.touching)
     watch = choose(over, fresh, watch)
-    ahead = watch._replace(entry=run.states, entry_tick=now, entry_energy=energy)
+    ahead = watch._replace(entry=run.states, entry_tick=age, entry_energy=energy)
     watch = choose(free & ~watch.begun & active, ahead, watch)
     return progress._replace(watch=watch, episodes=episodes, index=index, active=active)
 
 
-def _failure(rig: Rig, watch: Watch, run: RunState, energy: Array) -> Array:
+def _failure(rig: Rig, watch: Watch, energy: Array) -> Array:
     """DIVERGED, NON_FINITE, or REACH where an axis is to be where it cannot be; else MISS."""
     entry = jnp.maximum(watch.entry_energy, SLOW**2 / _share(rig))
     wild = jnp.where(energy > RUNAWAY**2 * entry, DIVERGED, MISS)
-    wild = jnp.where(rig.kinematics.reaches(run.hardware.commands[0]), wild, REACH)
+    wild = jnp.where(watch.beyond, REACH, wild)
     return jnp.where(jnp.isfinite(energy), wild, NON_FINITE).astype(jnp.int32)

@@ -30,6 +30,7 @@ from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.vectors import Vector, cross, direction, vector
 
 GOOD = ("rebounded", "captured")  # how an episode may end
+DEEP = 0.5  # penetration from which on shapes are said to go through each other
 
 
 class Episode(NamedTuple):
@@ -54,6 +55,7 @@ class Episode(NamedTuple):
     reference_duration: float  # in space [s]
     touches: int  # candidates that began to touch
     reference_touches: int  # in space
+    penetration: float  # largest depth of the real contact, over the size of its shapes [1]
     status: str  # how it ended
 
 
@@ -128,6 +130,8 @@ def _result(
     mechanism: SixAxisMechanism, compensator: str, gains: dict[str, float], seed: int, found: Any
 ) -> SixAxisRun:
     metrics, time, final, tangential = found
+    if not np.all(np.isfinite(metrics.reference_duration)):
+        raise InputError(f"{mechanism.name}: {_stiffest(mechanism)}")
     episodes = tuple(
         _episode(metrics, slot)
         for slot in range(metrics.status.shape[0])
@@ -140,10 +144,29 @@ def _result(
         mechanism, first.effective_mass, float(tangential[0]), math.nan if held else first.reference_duration,
         first.reference_peak_force, first.reference_restitution,
     )  # fmt: skip
+    deep = max(episode.penetration for episode in episodes)
+    if deep > DEEP:
+        expected = f"at most {DEEP:g}: shapes that are too soft, or meet too fast, go through each other"
+        warning = f"contact: found a depth of {deep:.2g} of the size of its shapes, expected {expected}"
+        means = means._replace(warnings=(*means.warnings, warning))
     status = [*bad, episodes[-1].status][0]
     return SixAxisRun(
         mechanism, compensator, gains, seed, episodes, status, _final(float(time[0]), final), means
     )
+
+
+def _stiffest(mechanism: SixAxisMechanism) -> str:
+    """What to change where a contact in space takes too many steps."""
+    rubbing = {name: contact.friction for name, contact in mechanism.contact.items() if contact.friction}
+    slips = {name: one.slip / max(one.coefficient, 1e-9) for name, one in rubbing.items() if one.slip}
+    if slips:
+        name = min(slips, key=slips.__getitem__)
+        found = f"contact.{name}.friction.slip: found {rubbing[name].slip:g} m/s"
+        allowed = "a larger one, or friction = { law = 'bristle', ... }"
+    else:
+        name = next(iter(mechanism.contact))
+        found, allowed = f"contact.{name}: found forces", "a softer contact"
+    return f"{found} that take too many steps to follow in space, allowed {allowed}"
 
 
 def _episode(metrics: Metrics, slot: int) -> Episode:

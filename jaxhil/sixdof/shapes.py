@@ -31,6 +31,11 @@ class Shape(eqx.Module):
     def surface(self, point: Vector) -> Surface:
         """Distance of `point` [m] from the surface, and the normal."""
 
+    @property
+    def thickness(self) -> Float[Array, "..."] | float:
+        """How far behind the surface [m] one is on the other side of the shape."""
+        return jnp.inf
+
 
 class Plane(Shape):
     """All that is behind a point, seen along a normal."""
@@ -51,6 +56,10 @@ class Ball(Shape):
     def surface(self, point):
         apart = point - self.centre
         return Surface(norm(apart) - self.radius, direction(apart))
+
+    @property
+    def thickness(self):
+        return self.radius
 
 
 class Cavity(Shape):
@@ -108,6 +117,10 @@ class Shell(Drogue):
         distance = jnp.where(beyond, edge.distance, side * signed)
         return Surface(distance, _either(beyond, edge.normal, side * inward))
 
+    @property
+    def thickness(self):
+        return 0.0
+
 
 class Rim(Shape):
     """A ring about z, of round section: the rim of a drogue's mouth."""
@@ -124,6 +137,10 @@ class Rim(Shape):
         zero = jnp.zeros_like(along)
         normal = (share * across) * outward + Vector(zero, zero, share * along)
         return Surface(apart - self.radius, normal)
+
+    @property
+    def thickness(self):
+        return self.radius
 
 
 class Capsule(Shape):
@@ -146,6 +163,10 @@ class Capsule(Shape):
         along = self.end - self.start
         square = dot(along, along)
         return jnp.clip(dot(along, point - self.start) / jnp.where(square > 0, square, 1), 0, 1)
+
+    @property
+    def thickness(self):
+        return self.radius
 
 
 class Box(Shape):
@@ -173,6 +194,10 @@ class Box(Shape):
         signed = Vector(sign.x * normal.x, sign.y * normal.y, sign.z * normal.z)
         depth = jnp.where(first, x, jnp.where(second, y, z))
         return Surface(jnp.where(inside, depth, apart) - self.rounding, rotate(self.attitude, signed))
+
+    @property
+    def thickness(self):
+        return jnp.minimum(jnp.minimum(*_parts(self.half_lengths)[:2]), self.half_lengths.z)
 
 
 def _parts(vector: Vector) -> tuple[Array, Array, Array]:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.sixdof.bodies import Body, Load, State, angular_velocity
 from jaxhil.sixdof.forces import ContactGroup, Forces, Memory, contact_wrench
@@ -33,6 +33,7 @@ TOLERANCE = 1e-10  # of a step's error, per the relative speed
 SHORTEST = 1e-9  # s: a step that is accepted whatever its error
 EVENT = 1e-6  # s: within which the time is found at which something begins or ceases to touch, or is caught
 REMEMBERING = 1e-4  # s: longest step of laws with a memory
+MOST_STEPS = 200_000  # of a motion, unless its steps are long
 SMALLEST, LARGEST = 0.1, 4.0  # change of the length from one step to the next
 # Dormand and Prince 1980: nodes, coefficients of the stages, the last of which is the solution of order 5,
 # and the error, solution of order 5 less that of order 4.
@@ -82,6 +83,7 @@ class Flight(NamedTuple):
     touching: tuple[Bool[Array, "candidates *batch"], ...]  # now, of each group
     memories: Memories
     states: States  # of the bodies
+    tries: Int[Array, "*batch"]  # of steps so far
 
 
 class Step(NamedTuple):
@@ -99,7 +101,7 @@ def start_flight(space: Space, states: States, length: Float[Array, "*batch"]) -
         pose, _ = relative(space.bodies, states)
         memories = memories._replace(held=tuple(init_latch(latch, pose) for latch in space.latches))
     touching = tuple(jnp.zeros_like(group.parameters.damping, bool) for group in space.groups)
-    return Flight(0 * length, length, touching, memories, states)
+    return Flight(0 * length, length, touching, memories, states, jnp.zeros(length.shape, jnp.int32))
 
 
 def instant(
@@ -120,7 +122,8 @@ def advance_flight(
     space: Space, flight: Flight, longest: Float[Array, "*batch"], speed: Float[Array, "*batch"]
 ) -> tuple[Flight, Step]:
     """One try of a step no longer than `longest` [s], at a relative speed [m/s] that scales its error: the
-    motion at its end or, where it was not accepted, at its start, with a shorter step ahead."""
+    motion at its end or, where it was not accepted, at its start, with a shorter step ahead. What is not a
+    number, or takes too many steps, has no more to come: its time is infinite."""
     if _remembers(space):
         longest = jnp.minimum(longest, REMEMBERING)
     length = lax.stop_gradient(jnp.minimum(flight.length, longest))
@@ -139,10 +142,14 @@ def advance_flight(
     cut = accepted & (length < flight.length)
     proposed = jnp.where(cut, jnp.maximum(flight.length, proposed), proposed)
     ahead = lax.stop_gradient(jnp.where(late, length / 4, proposed))
-    # Of what is not a number, there is no more to come.
+    tries = flight.tries + 1
     time = jnp.where(jnp.isfinite(error), flight.time + length, jnp.inf)
-    moved = Flight(time, ahead, touching, memories, now.states)
-    return choose(accepted, moved, flight._replace(length=ahead)), Step(now, memories, accepted)
+    moved = Flight(time, ahead, touching, memories, now.states, tries)
+    after: Flight = choose(accepted, moved, flight._replace(length=ahead, tries=tries))
+    # So many steps of less than a thousandth of the longest, on the mean, have no end in sight.
+    endless = (tries > MOST_STEPS) & (after.time < 1e-3 * tries.astype(length.dtype) * longest)
+    time = jnp.where(endless, jnp.inf, after.time)
+    return after._replace(time=time), Step(now, memories, accepted | endless)
 
 
 def take_step(
@@ -197,7 +204,7 @@ def follow(
     speed = scale(space, states)
 
     def body(flight, _):
-        flight = flight._replace(time=0 * flight.time)
+        flight = flight._replace(time=0 * period, tries=0 * flight.tries)
         seen, _ = instant(space, flight.states, flight.memories, flight.time)
         return fly(space, flight, period, longest, speed), seen
 
