@@ -60,6 +60,7 @@ def test_six_numbers_may_be_said_as_one_or_two():
         ("target.inertia=[0, 0, 0]", "nothing but zeros, in kg m^2, allowed positive principal moments"),
         ("target.inertia=[1, 1, 3]", "principal moments 1, 1 and 3 kg m^2, allowed those of a body"),
         ("target.inertia=[1, 1, -1]", "principal moment of -1 kg m^2, allowed positive"),
+        ("target.inertia=[1, 1, 1e-7]", "moments from 1e-07 to 1 kg m^2, allowed those of a body: none less"),
         ("target.inertia=[[1, 2, 0], [1, 2, 0], [0, 0, 2]]", "2 at row 1, column 2, 1 there transposed"),
         ("target.inertia=[[1, 0, 0], 2, 3]", "three moments, or three rows"),
         ("chaser.interface=[0, 0, 1.0]", "allowed one beyond C, at positive z"),

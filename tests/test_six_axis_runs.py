@@ -151,6 +151,10 @@ def test_starts_that_cannot_be_run():
             {"approach.velocity": [0, 0, -5.0]},
             "approach.velocity: found shapes of contact.tip that pass at 5 m/s, allowed at most 1.25 m/s",
         ),
+        (
+            {"rig.simulator.natural_frequency": {"translation": 14.0, "rotation": 2e4}},
+            "rig.simulator: found a pole of 1.26e+05 rad/s at a control period of 0.001 s, allowed at most",
+        ),
         ({"approach.duration": 999.0, "rig.control_period": 1e-5}, "approach.duration: found 999.02 s"),
         (
             {**APART, "start.chaser.position": [0, 0, 2.2]},

@@ -25,6 +25,7 @@ __all__ = ["check_legs", "check_named", "check_six_axes", "inertia_matrix"]
 
 LARGEST_ATTITUDE = 1.0  # rad, of C against T at the start
 MOMENTS = 1e-9  # by how much of itself a moment of inertia may exceed the sum of the others
+SLIMMEST = 1e-6  # of the largest moment of inertia, the smallest
 UNIT = 1e-6  # by how much a quaternion's norm may differ from 1
 # Keys of each kind of axes of the motion simulator: those it needs, and those it may have.
 KEYS_OF_SPACES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -114,6 +115,9 @@ def _check_inertia(path: Path, inertia: Inertia, *, massless: bool = False) -> N
     first, second, third = (float(one) for one in np.linalg.eigvalsh(matrix / size) * size)
     if not first > 0:
         raise KeyProblem(path, f"a principal moment of {first:g} kg m^2", "positive principal moments")
+    if first < SLIMMEST * third:
+        found = f"principal moments from {first:g} to {third:g} kg m^2"
+        raise KeyProblem(path, found, f"those of a body: none less than {SLIMMEST:g} of the largest")
     if third > (first + second) * (1 + MOMENTS):
         found = f"principal moments {first:.6g}, {second:.6g} and {third:.6g} kg m^2"
         allowed = "those of a body: none more than the sum of the other two"

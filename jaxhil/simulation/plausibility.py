@@ -103,8 +103,22 @@ def check_run(mechanism: Mechanism, label: str | None = None, drawn: bool = Fals
     `label` is what an error calls the mechanism. Raises `InputError`.
     """
     name = label or mechanism.name
-    _check_poles(name, build_scenarios(mechanism, _corners(mechanism, _POLES) if drawn else None))
+    lanes = build_scenarios(mechanism, _corners(mechanism, _POLES) if drawn else None)
+    check_poles(name, lanes.simulator.denominator, lanes.control_period)
     _check_ticks(name, mechanism, build_scenarios(mechanism, _corners(mechanism, _TICKS) if drawn else None))
+
+
+def check_poles(name: str, denominator: Any, control_period: Any) -> None:
+    """No pole of motion simulators, (order + 1, lanes), is beyond `FASTEST_POLE`. Raises `InputError`."""
+    for lane, period in enumerate(control_period):
+        coefficients = np.asarray(denominator)[:, lane]
+        with np.errstate(all="ignore"):
+            monic = coefficients / coefficients[0] * period ** np.arange(len(coefficients))
+        fastest = np.max(np.abs(np.roots(monic)), initial=0.0) if np.all(np.isfinite(monic)) else math.inf
+        if fastest > FASTEST_POLE:
+            allowed = f"at most {FASTEST_POLE:g} / control_period; a faster one is ideal"
+            pole = f"a pole of {fastest / period:.3g} rad/s at a control period of {period:g} s"
+            raise InputError(f"{name}: rig.simulator: found {pole}, allowed {allowed}")
 
 
 def bandwidth(simulator: MotionSimulator) -> float:
@@ -125,18 +139,6 @@ def bandwidth(simulator: MotionSimulator) -> float:
     roots = np.roots(excess)
     squares = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
     return float(unit * math.sqrt(min(squares)) / (2 * math.pi)) if len(squares) else math.nan
-
-
-def _check_poles(name: str, scenarios: Scenario) -> None:
-    for lane, period in enumerate(scenarios.control_period):
-        denominator = np.asarray(scenarios.simulator.denominator)[:, lane]
-        with np.errstate(all="ignore"):
-            monic = denominator / denominator[0] * period ** np.arange(len(denominator))
-        fastest = np.max(np.abs(np.roots(monic)), initial=0.0) if np.all(np.isfinite(monic)) else math.inf
-        if fastest > FASTEST_POLE:
-            allowed = f"at most {FASTEST_POLE:g} / control_period; a faster one is ideal"
-            pole = f"a pole of {fastest / period:.3g} rad/s at a control period of {period:g} s"
-            raise InputError(f"{name}: rig.simulator: found {pole}, allowed {allowed}")
 
 
 def _check_ticks(name: str, mechanism: Mechanism, scenarios: Scenario) -> None:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.six_axes_rig import Simulator, TargetRobot
+from jaxhil.sixdof.units import unit_warnings
 
 FASTEST = 0.1  # contact frequency over control rate, of files that can be meant
 
@@ -45,7 +46,7 @@ def meaning(
     rig = mechanism.rig
     delay = rig.force_sensor.delay + rig.force_sensor.time_constant + _lateness(rig.simulator)
     frequency = 1 / (2 * duration) if duration > 0 else math.nan
-    found = []
+    found = list(unit_warnings(mechanism))
     rate = 1 / rig.control_period
     if frequency > FASTEST * rate:
         found.append(

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxhil.errors import InputError
 from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.simulation.plausibility import check_poles
 from jaxhil.sixdof.approach import FAR
 from jaxhil.sixdof.building_contacts import candidate_names
 from jaxhil.sixdof.candidates import motion_at
@@ -50,12 +51,14 @@ def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
     if not ticks <= MOST_TICKS:
         found = f"{where}.duration: found {scenario.duration[0]:g} s, {ticks:.2g} control periods"
         raise InputError(f"{mechanism.name}: {found}, allowed at most {MOST_TICKS:.0e}")
+    denominator = np.asarray(scenario.simulator.denominator)[..., 0]
+    check_poles(mechanism.name, denominator, np.full(denominator.shape[1], scenario.control_period[0]))
     begins: Beginning = jax.tree.map(np.asarray, _beginning(scenario))
     at = begins.coordinates[:, 0]
     if not np.all(np.isfinite(at)):
         found = f"nothing to touch below {FAR:g} m: it goes past the target"
         raise InputError(
-            f"{mechanism.name}: approach.offset: found {found}, allowed an approach that touches"
+            f"{mechanism.name}: approach.offset: found {found}, allowed an approach that touches, in m"
         )
     angle = float(np.linalg.norm(at[3:]))
     if angle > LARGEST_ATTITUDE:

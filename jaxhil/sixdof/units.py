@@ -1,0 +1,55 @@
+"""Numbers of a mechanism file of six axes that can hardly be meant: most are in another unit than asked."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.mechanism.six_axes_rules import inertia_matrix
+
+LARGEST_VELOCITY = 1.0  # m/s, of an approach
+LARGEST_ANGLE = 0.3  # rad, of a docking: that of C against T at the first touch
+LARGEST_RATE = 0.1  # rad/s, of the chaser against the target
+GRAVITY = 10.0  # m/s^2, on the ground
+LONGEST_TOOL = 2.0  # m, from C to the tool's centre of mass
+FAR = 20.0  # of the radius of gyration, from a centre of mass to the interface
+WIDE = 10.0  # of the interface's distance, or of 1 m: a radius of gyration
+
+
+def unit_warnings(mechanism: SixAxisMechanism) -> tuple[str, ...]:
+    """What is far from any docking mechanism: key, what was found, what is expected, with the unit."""
+    return tuple(_found(mechanism))
+
+
+def _found(mechanism: SixAxisMechanism) -> Iterator[str]:
+    for name, body in (("target", mechanism.target), ("chaser", mechanism.chaser)):
+        moment = float(np.linalg.eigvalsh(inertia_matrix(body.inertia))[-1])
+        radius, distance = (moment / body.mass) ** 0.5, float(np.linalg.norm(body.interface))
+        if distance > FAR * radius:
+            found = f"{name}.interface: found {distance:.3g} m for a radius of gyration of {radius:.3g} m"
+            yield f"{found}, expected at most {FAR:g} times that: lengths in m, inertia in kg m^2"
+        if radius > WIDE * max(distance, 1.0):
+            found = f"{name}.inertia: found a radius of gyration of {radius:.3g} m"
+            yield f"{found}, expected the size of the body: mass in kg, inertia in kg m^2"
+    approach = mechanism.approach
+    if approach is not None:
+        for key, most, unit in (
+            ("attitude", LARGEST_ANGLE, "rad"),
+            ("velocity", LARGEST_VELOCITY, "m/s"),
+            ("angular_velocity", LARGEST_RATE, "rad/s"),
+        ):
+            size = float(np.linalg.norm(getattr(approach, key)))
+            if size > most:
+                yield f"approach.{key}: found {size:.3g} {unit}, expected at most {most:g} {unit}"
+    sensor = mechanism.rig.force_sensor
+    gravity, path = float(np.linalg.norm(sensor.gravity)), "rig.force_sensor"
+    if gravity > GRAVITY:
+        yield f"{path}.gravity: found {gravity:.4g} m/s^2, expected at most {GRAVITY:g} m/s^2"
+    if sensor.tool is not None:
+        most = min(mechanism.target.mass, mechanism.chaser.mass)
+        if sensor.tool.mass > most:
+            expected = f"expected at most {most:.4g} kg, the lighter body's"
+            yield f"{path}.tool.mass: found {sensor.tool.mass:.4g} kg, {expected}"
+        length = float(np.linalg.norm(sensor.tool.com))
+        if length > LONGEST_TOOL:
+            yield f"{path}.tool.com: found {length:.3g} m, expected at most {LONGEST_TOOL:g} m"
