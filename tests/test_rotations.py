@@ -82,6 +82,19 @@ def test_left_jacobian_is_the_mean_rotation(found):
     np.testing.assert_allclose(found[4], RATE, rtol=1e-12, atol=1e-13)
 
 
+def test_turns_of_many_radians():
+    """Where series end and half turns are counted: twice half a turn and more, and next to each."""
+    angles = np.r_[np.pi * np.arange(1, 9) + 1e-7, np.pi * np.arange(1, 9) - 1e-7, np.linspace(3, 400, 24)]
+    found = [np.asarray(part) for part in everything(jnp.asarray(AXES * angles), jnp.asarray(RATE))]
+    turns = Rotation.from_rotvec((AXES * angles).T)
+    sign = np.sign(np.sum(np.roll(turns.as_quat(), 1, axis=1).T * found[0], axis=0))
+    np.testing.assert_allclose(sign * found[0], np.roll(turns.as_quat(), 1, axis=1).T, atol=5e-14)
+    crossed = np.cross(AXES.T, RATE.T).T
+    along = AXES * np.sum(AXES * RATE, axis=0)
+    mean = along + np.sin(angles) / angles * (RATE - along) + (1 - np.cos(angles)) / angles * crossed
+    np.testing.assert_allclose(found[3], mean, atol=1e-13)
+
+
 @pytest.mark.slow
 def test_derivatives_at_no_rotation_are_those_of_the_series():
     rate = Vector(*jnp.asarray([0.3, -0.2, 0.5]))

@@ -45,7 +45,7 @@ from jaxhil.sixdof.sensor import (
     undo_moving,
     weight,
 )
-from jaxhil.sixdof.vectors import vector
+from jaxhil.sixdof.vectors import assembled, vector
 
 SIDES = ("fixed", "moving")  # of the force sensor
 HISTORY = 256  # ticks before a run in which axes follow what is no straight line to them
@@ -195,7 +195,7 @@ def tick(loop: Loop, rig: Rig, state: RunState) -> tuple[RunState, Tick]:
 def command_of(bodies: Pair, states: States) -> tuple[Array, Array]:
     """Coordinates (6, *batch) of C against T in the numerical model, and their rates."""
     at, rates = coordinates(*relative(bodies, states))
-    return jnp.stack(jax.tree.leaves(at)), jnp.stack(jax.tree.leaves(rates))
+    return assembled(at), assembled(rates)
 
 
 def _sense(

@@ -11,11 +11,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from jaxhil.sixdof.vectors import Vector, cross, dot
 
-NEAR = 0.25  # of t^2, up to where series are summed: eight terms are exact to rounding
+PI = 3.141592653589793, 1.2246467991473532e-16  # their sum has twice the digits
+NEAR = (PI[0] / 2) ** 2  # of t^2, up to where series are summed: eleven terms are exact to rounding
 
 
 class Quaternion(NamedTuple):
@@ -74,15 +76,11 @@ def logarithm(rotation: Quaternion) -> Vector:
     """Rotation vector [rad] of at most pi; of a half turn, either of its two."""
     sign = jnp.where(rotation.w < 0, -1, 1).astype(rotation.w.dtype)
     w, v = sign * rotation.w, sign * rotation.v
-    sine_square = dot(v, v)
-    # t/2 = atan(sin/cos) is a series in tan^2 near 0, and atan2 beyond.
-    near = sine_square < _TANGENT_NEAR * w**2
-    tangent_square = jnp.where(near, sine_square, 0) / jnp.where(near, w, 1) ** 2
-    sine = jnp.sqrt(jnp.where(near, 1, sine_square))
-    half = jnp.where(
-        near, _sum(_ARCTANGENT, tangent_square) / jnp.where(near, w, 1), jnp.arctan2(sine, w) / sine
-    )
-    return (2 * half) * v
+    # From tan(t/2) to tan(t/8), which is less than 1/2, by tan(a/2) = tan(a)/(1 + sqrt(1 + tan(a)^2)).
+    square = dot(v, v)
+    share = 1 / (w + jnp.sqrt(w**2 + square))
+    share = share / (1 + jnp.sqrt(1 + share**2 * square))
+    return (8 * share * _sum(_ARCTANGENT, share**2 * square)) * v
 
 
 @jax.jit
@@ -103,38 +101,72 @@ def inverse_left_jacobian(theta: Vector, angular_velocity: Vector) -> Vector:
 
 
 def _sum(coefficients, x):
-    total = jnp.zeros_like(x)
-    for coefficient in reversed(coefficients):
+    total = jnp.full_like(x, coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
         total = coefficient + x * total
     return total
 
 
 def _alternating(first: int) -> tuple[float, ...]:
     """(-1)^k / (2k + first)!"""
-    return tuple((-1) ** k / factorial(2 * k + first) for k in range(8))
+    return tuple((-1) ** k / factorial(2 * k + first) for k in range(11))
 
 
-def _function(series: tuple[float, ...], closed: Callable[[Array], Array]) -> Callable[[Array], Array]:
-    """A function of t^2: its series near 0, and beyond what `closed` makes of t."""
-
-    def function(square):
-        near = square < NEAR
-        angle = jnp.sqrt(jnp.where(near, 1, square))
-        return jnp.where(near, _sum(series, jnp.where(near, square, 0)), closed(angle))
-
-    return function
+def _cosine(square: Array) -> Array:
+    """cos t, of t^2."""
+    _, turned, sign = _reduced(square)
+    return sign * _sum(_COSINE, turned)
 
 
-_TANGENT_NEAR = 0.01  # of tan^2(t/2)
-_ARCTANGENT = tuple((-1) ** k / (2 * k + 1) for k in range(8))
+def _sine(square: Array) -> Array:
+    """sin(t)/t, of t^2."""
+    share, turned, sign = _reduced(square)
+    return sign * share * _sum(_SINE, turned)
+
+
+def _reduced(square: Array) -> tuple[Array, Array, Array]:
+    """Of t = r + k pi with |r| <= pi/2: r/t, r^2 and (-1)^k.
+
+    Not the library's sine and cosine, which are called number by number.
+    """
+    near = square <= NEAR
+    safe = jnp.where(near, 1, square)
+    share = lax.rsqrt(safe)
+    half_turns = lax.stop_gradient(jnp.round(safe * share / PI[0]))
+    rest = safe * share - half_turns * PI[0] - half_turns * PI[1]
+    odd = half_turns - 2 * jnp.floor(half_turns / 2)
+    return (
+        jnp.where(near, 1, rest * share),
+        jnp.where(near, square, rest**2),
+        jnp.where(near, 1, 1 - 2 * odd),
+    )
+
+
+def _versine(square: Array) -> Array:
+    """(1 - cos t)/t^2."""
+    return _sine(square / 4) ** 2 / 2
+
+
+def _cubic(square: Array) -> Array:
+    """(t - sin t)/t^3."""
+    return _near(_CUBIC, NEAR, square, lambda x: (1 - _sine(x)) / x)
+
+
+def _cotangent(square: Array) -> Array:
+    """(1 - t/2 cot(t/2))/t^2."""
+    return _near(_BERNOULLI, 0.25, square, lambda x: (1 - _cosine(x / 4) / _sine(x / 4)) / x)
+
+
+def _near(series: tuple[float, ...], limit: float, square: Array, beyond: Callable[[Array], Array]) -> Array:
+    """A function of t^2: its series up to a limit, and what is `beyond`."""
+    near = square <= limit
+    return jnp.where(near, _sum(series, jnp.where(near, square, 0)), beyond(jnp.where(near, limit, square)))
+
+
+_COSINE, _SINE, _CUBIC = _alternating(0), _alternating(1), _alternating(3)
+_ARCTANGENT = tuple((-1) ** k / (2 * k + 1) for k in range(20))
 # Bernoulli's numbers |B_2k| / (2k)!
 _BERNOULLI = (
     1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160,
     691 / 1307674368000, 1 / 74724249600, 3617 / 10670622842880000,
 )  # fmt: skip
-
-_cosine = _function(_alternating(0), jnp.cos)
-_sine = _function(_alternating(1), lambda t: jnp.sin(t) / t)
-_versine = _function(_alternating(2), lambda t: (1 - jnp.cos(t)) / t**2)
-_cubic = _function(_alternating(3), lambda t: (t - jnp.sin(t)) / t**3)
-_cotangent = _function(_BERNOULLI, lambda t: (1 - t / 2 / jnp.tan(t / 2)) / t**2)

@@ -4,9 +4,12 @@ Each component is an array of the batch shape: an axis of three would be taken a
 every tick.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 
@@ -52,6 +55,16 @@ def vector(components: Float[Array, "3 *batch"]) -> Vector:
 def components(vector: Vector) -> Float[Array, "3 *batch"]:
     """The components of a vector along a leading axis."""
     return jnp.stack([vector.x, vector.y, vector.z])
+
+
+def assembled(parts: Any) -> Float[Array, "components *batch"]:
+    """The leaves of `parts` along a leading axis, written one after the other: a stack of them the compiler
+    would work out number by number, together with what they come from."""
+    leaves = jax.tree.leaves(parts)
+    whole = jnp.zeros((len(leaves), *leaves[0].shape), leaves[0].dtype)
+    for index, leaf in enumerate(leaves):
+        whole = lax.dynamic_update_index_in_dim(whole, leaf, index, 0)
+    return whole
 
 
 def matrix(entries: Float[Array, "3 3 *batch"]) -> Matrix:
