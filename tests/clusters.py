@@ -11,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from tuning.caches.cluster import connected
+from tuning.sweeps.cluster import parts_on
+
 ROOT = Path(__file__).parent.parent
 
 
@@ -73,6 +76,16 @@ def started(folder):
         for process in cluster.processes:
             if process.poll() is None:
                 cluster.kill(process)
+
+
+def on_cluster(address):
+    """Parts of a sweep computed by the workers of the scheduler at this address."""
+
+    def run(sweep, parts):
+        with connected(address) as workers:
+            yield from parts_on(workers)(sweep, parts)
+
+    return run
 
 
 def awaited(seconds):

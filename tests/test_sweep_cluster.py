@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from clusters import ROOT, awaited, killed_meanwhile, started
+from clusters import ROOT, awaited, killed_meanwhile, on_cluster, started
 from sweep_cases import NOISY, case, manifest
 
 import tuning
 from jaxhil.errors import InputError
 from tuning.caches.cluster import Piece, Workers, on_workers
 from tuning.gain_file import write_gain_file
-from tuning.sweeps.cluster import on_cluster, run_part
+from tuning.sweeps.cluster import run_part
 from tuning.sweeps.manifest import encode
 from tuning.sweeps.parts import same_rows
 from tuning.sweeps.run import run_sweep
@@ -40,10 +40,12 @@ def whole(tmp_path_factory):
     return rows_of(tmp_path_factory.mktemp("whole") / "store")
 
 
-def test_a_scheduler_that_is_not_there_is_one_line(tmp_path):
+def test_a_scheduler_that_is_not_there_is_one_line_and_leaves_nothing(tmp_path):
     pytest.importorskip("distributed")
+    write_gain_file(tmp_path / "gains.json", case())
     with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
-        rows_of(tmp_path / "store", on_cluster("nowhere://x"))
+        tuning.sweep(tmp_path / "gains.json", folder=tmp_path / "store", scheduler="nowhere://x")
+    assert not (tmp_path / "store").exists()
 
 
 def test_a_worker_imports_no_jax_before_its_flags_are_set():

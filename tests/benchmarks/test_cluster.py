@@ -12,13 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from clusters import started
+from clusters import on_cluster, started
 from test_sweep import default_gains
 
 from jaxhil.simulation.gain_file import check_document
 from tuning.caches.cluster import Piece, on_workers
 from tuning.sweeps.chunks import run_parts
-from tuning.sweeps.cluster import on_cluster
 from tuning.sweeps.manifest import Choices, build_manifest
 from tuning.sweeps.parts import same_rows
 from tuning.sweeps.run import run_sweep

@@ -4,9 +4,10 @@ A worker that dies costs the time of the pieces that it had. A piece of which se
 while there are no workers, is computed here.
 """
 
+import logging
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from itertools import islice
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple
 from jaxhil.errors import InputError, one_line, shown
 from tuning.caches.worker import Setting, run
 
+WAIT = 10  # s for a scheduler to answer
 PATIENCE = 20.0  # s without a piece done, after which it is asked whether there are workers
 RECOUNT = 2.0  # s, after which it is asked how many there are
 EACH = 2  # pieces under way per worker
@@ -37,8 +39,35 @@ def on_workers(
 @contextmanager
 def connected(address: str) -> Iterator["Workers"]:
     """The workers of the scheduler at this address. Raises `InputError`, one line, where there is none."""
-    with _client(address) as client:
+    with ExitStack() as stack:
+        try:
+            import distributed  # pyright: ignore[reportMissingImports]
+        except ImportError:
+            missing = "nothing installed for it, allowed once `pip install jaxhil[distributed]` was done"
+            raise InputError(f"--scheduler: found {missing}") from None
+        stack.enter_context(_quiet())
+        try:
+            client = stack.enter_context(distributed.Client(address, timeout=WAIT, set_as_default=False))
+        except (OSError, ValueError, TimeoutError) as error:
+            reason = one_line(str(error), 100)
+            raise InputError(
+                f"--scheduler: found {shown(address)}, allowed a scheduler's: {reason}"
+            ) from None
         yield Workers(address, client)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """A scheduler that is lost is told in one line: what the package logs of it is not shown."""
+    loggers = [logging.getLogger(name) for name in logging.root.manager.loggerDict if "distributed" in name]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 class Workers:
@@ -103,19 +132,6 @@ def _next(ended: "SimpleQueue[Any]") -> Any:
         return None
 
 
-def _client(address: str) -> Any:
-    try:
-        from distributed import Client  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        missing = "nothing installed for it, allowed once `pip install jaxhil[distributed]` was done"
-        raise InputError(f"--scheduler: found {missing}") from None
-    try:
-        return Client(address, timeout=10, set_as_default=False)
-    except (OSError, ValueError, TimeoutError) as error:
-        reason = one_line(str(error), 100)
-        raise InputError(f"--scheduler: found {shown(address)}, allowed a scheduler's: {reason}") from None
-
-
 def _found(future: Any) -> tuple[Any] | None:
     """What a worker found of a piece; None if several died of it."""
     from distributed import KilledWorker  # pyright: ignore[reportMissingImports]
@@ -139,6 +155,6 @@ def _connected(address: str) -> Iterator[None]:
     try:
         yield
     except (CancelledError, OSError) as error:
-        reason = one_line(f"{type(error).__name__}: {error}", 100)
-        kept = "what is there is kept, --resume goes on"
+        reason = one_line(str(getattr(error, "reason", None) or error) or type(error).__name__, 100)
+        kept = "what is finished is kept, --resume goes on"
         raise InputError(f"--scheduler: {one_line(address)}: lost, {reason}; {kept}") from None

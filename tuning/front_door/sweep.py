@@ -8,7 +8,7 @@ import math
 import os
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -26,6 +26,7 @@ from tuning.sweeps import LARGEST_CHUNK, LARGEST_SEED, MOST, PRECISIONS, SAMPLIN
 if TYPE_CHECKING:
     import pyarrow
 
+    from tuning.caches.cluster import Workers
     from tuning.sweeps.manifest import Manifest
     from tuning.sweeps.store import Store
 
@@ -225,9 +226,9 @@ def run_study(
 ) -> SweepStudy:
     """Compute what the store in the folder lacks; what is to `keep` gets pictures and the document too."""
     path = gains if hasattr(gains, "document") else arguments.readable_gain_file(gains)
-    with computing():
+    with computing(), _cluster(options.scheduler) as workers:
         from tuning.statistics.intervals import scenarios_needed
-        from tuning.sweeps.cluster import on_cluster
+        from tuning.sweeps.cluster import parts_on
         from tuning.sweeps.manifest import Choices, build_manifest
         from tuning.sweeps.run import run_parts, run_sweep
         from tuning.sweeps.store import locked, open_store
@@ -256,19 +257,32 @@ def run_study(
                     store,
                     lambda rows, _: bar.skip(rows),
                     lambda rows, tally: bar.advance(rows, so_far(tally)),
-                    run_parts if options.scheduler is None else on_cluster(options.scheduler),
+                    run_parts if workers is None else parts_on(workers),
                 )
             document = _document(options, store, done, tally, bar.rate)
             if not keep:
                 document["store"] = None
-            unwritten = _complete(options, store, done, document, progress, keep)
+            unwritten = _complete(options, store, done, document, progress, keep, workers)
             if keep:
                 return SweepStudy(document, manifest, folder, None, unwritten)
             return SweepStudy(document, manifest, None, _table(store), unwritten)
 
 
+def _cluster(address: str | None) -> AbstractContextManager["Workers | None"]:
+    """The workers of a cluster; None where everything is computed here."""
+    from tuning.caches.cluster import connected
+
+    return nullcontext() if address is None else connected(address)
+
+
 def _complete(
-    options: SweepOptions, store: "Store", done, document: dict[str, Any], progress: bool, keep: bool
+    options: SweepOptions,
+    store: "Store",
+    done,
+    document: dict[str, Any],
+    progress: bool,
+    keep: bool,
+    workers: "Workers | None",
 ) -> list[InputError]:
     """Add what belongs beside the verdict, and keep all that is known in the store after every step.
 
@@ -295,9 +309,9 @@ def _complete(
     if store.manifest.precision == "float32":
         steps["float32"] = lambda: compare_precisions(done)._asdict()
     if options.drivers is not None:
-        steps["drivers"] = lambda: sweep_studies.drivers(options, store, done, unwritten, progress)
+        steps["drivers"] = lambda: sweep_studies.drivers(options, store, done, unwritten, progress, workers)
     if options.rare is not None:
-        steps["rare"] = lambda: sweep_studies.rare(options, store, done, unwritten, progress)
+        steps["rare"] = lambda: sweep_studies.rare(options, store, done, unwritten, progress, workers)
     write()
     for key, step in steps.items():
         document[key] = step()

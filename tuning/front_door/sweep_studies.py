@@ -1,7 +1,7 @@
 """The studies that `tuning.sweep` runs beside its sweep, or finds in the store where it resumes."""
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,9 @@ from jaxhil.errors import InputError, one_line
 from tuning import terminal
 
 
-def drivers(options: Any, store, sweep, unwritten: list[InputError], progress: bool) -> dict[str, Any]:
+def drivers(
+    options: Any, store, sweep, unwritten: list[InputError], progress: bool, workers: Any = None
+) -> dict[str, Any]:
     """What of the document says which input drives the error. `unwritten`: see `put_off`."""
     from tuning.statistics.sobol_indices import evaluations
     from tuning.sweeps.stored_studies import IndicesRequest, read_study, study_path, write_study
@@ -23,7 +25,7 @@ def drivers(options: Any, store, sweep, unwritten: list[InputError], progress: b
         return found._asdict()
     # Noise, if there is any, adds an input; the bar need not know.
     total = evaluations(len(independent_inputs(sweep.mechanism)), number)
-    with _running(options, store, total, "scenarios", "drivers", progress) as running:
+    with _running(options, store, total, "scenarios", "drivers", progress, workers) as running:
         found = error_indices(sweep, number, running)
     with put_off(unwritten):
         write_study(store, request, found)
@@ -31,7 +33,9 @@ def drivers(options: Any, store, sweep, unwritten: list[InputError], progress: b
     return found._asdict()
 
 
-def rare(options: Any, store, sweep, unwritten: list[InputError], progress: bool) -> dict[str, Any]:
+def rare(
+    options: Any, store, sweep, unwritten: list[InputError], progress: bool, workers: Any = None
+) -> dict[str, Any]:
     """What of the document says how probable an error beyond a limit is. `unwritten`: see `put_off`."""
     from tuning.sweeps.stored_studies import RareRequest, read_study, study_path, write_study
     from tuning.sweeps.studies import most_scenarios, rare_failure
@@ -43,7 +47,7 @@ def rare(options: Any, store, sweep, unwritten: list[InputError], progress: bool
         _say_kept("subset simulation", study_path(store, request), progress)
         return _rare_document(limit, found)
     name = "subset simulation"
-    with _running(options, store, most_scenarios(), "scenarios at most", name, progress) as running:
+    with _running(options, store, most_scenarios(), "scenarios at most", name, progress, workers) as running:
         found = rare_failure(sweep, limit, running)
     with put_off(unwritten):
         write_study(store, request, found)
@@ -52,19 +56,19 @@ def rare(options: Any, store, sweep, unwritten: list[InputError], progress: bool
 
 
 @contextmanager
-def _running(options: Any, store, total: int, unit: str, study: str, progress: bool) -> Iterator[Any]:
+def _running(
+    options: Any, store, total: int, unit: str, study: str, progress: bool, workers: Any
+) -> Iterator[Any]:
     """How a study's scenarios are run: here or by a cluster's workers, finished pieces kept in the store."""
-    from tuning.caches.cluster import connected
     from tuning.caches.pieces import FOLDER, Pieces
     from tuning.sweeps.cluster import SEVERAL, points_on
     from tuning.sweeps.points import Running
 
-    with terminal.progress(total, unit, progress) as bar, ExitStack() as cluster:
+    with terminal.progress(total, unit, progress) as bar:
         bar.say(study)
         kept = Pieces(store.folder / FOLDER, options.resume)
         running = Running(lambda more: bar.advance(more, study), bar.skip, kept)
-        if options.scheduler is not None:
-            workers = cluster.enter_context(connected(options.scheduler))
+        if workers is not None:
             running = running._replace(computer=points_on(workers), several=SEVERAL)
         yield running
 

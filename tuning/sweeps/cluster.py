@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from tuning.caches.cluster import Piece, Workers, on_workers
+from tuning.caches.cluster import Piece, Workers
 from tuning.caches.worker import differs
 from tuning.sweeps import points
 from tuning.sweeps.chunks import Rows, Sweep, build_sweep, run_chunk
@@ -15,9 +15,16 @@ from tuning.sweeps.run import Computer
 SEVERAL = 64  # pieces that points are cut into, whatever the workers
 
 
-def on_cluster(address: str) -> Computer:
-    """Parts computed by the workers of the scheduler at this address."""
-    return lambda sweep, parts: _run(sweep, parts, address)
+def parts_on(workers: Workers) -> Computer:
+    """Parts computed by these workers."""
+
+    def run(sweep: Sweep, parts: Iterable[int]) -> Generator[tuple[int, Rows], None, None]:
+        content = encode(sweep.manifest)
+        asked = (Piece(part, (content, part)) for part in parts)
+        # The manifest says what a worker has to be like.
+        return workers.run(run_part, asked, None, sweep.manifest.sha256[:16])
+
+    return run
 
 
 def points_on(workers: Workers) -> points.Computer:
@@ -41,13 +48,6 @@ def run_part(content: bytes, part: int) -> Rows:
 def run_points(content: bytes, at: np.ndarray, noise: np.ndarray) -> Rows:
     """A piece of a study, likewise (`tuning.sweeps.points.run_piece`)."""
     return points.run_piece(_sweep(content), at, noise)
-
-
-def _run(sweep: Sweep, parts: Iterable[int], address: str) -> Generator[tuple[int, Rows], None, None]:
-    content = encode(sweep.manifest)
-    pieces = (Piece(part, (content, part)) for part in parts)
-    # The manifest says what a worker has to be like.
-    return on_workers(address, run_part, pieces, None, sweep.manifest.sha256[:16])
 
 
 @lru_cache(maxsize=2)
