@@ -20,6 +20,7 @@ from jaxhil.sixdof.relative import Pair
 from jaxhil.sixdof.rotations import exponential
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.shapes import Drogue, Plane
+from jaxhil.sixdof.space import Space, follow
 from jaxhil.sixdof.vectors import vector
 
 pytestmark = pytest.mark.slow
@@ -28,6 +29,7 @@ LANES = 2 * DRAWS  # of a probe, then of a ring
 STEP = 2e-5  # of each number, relative: few touches begin at another tick for it
 BY = ("stiffness", "dissipation", "friction", "force delay", "axes' delays", "axes' frequencies")
 POINTS = np.array([[1.0, -0.5, -0.5], [0.0, 0.866, -0.866], [0.0, 0.0, 0.0]])  # of the ring, for radius 1
+HALF_ANGLE = 0.75  # rad, of the drogue
 AWAY = 10.0  # m: where candidates are that the lane does not have
 
 
@@ -45,7 +47,7 @@ def contact(scales):
 
     one = jnp.ones((1, LANES))
     return (
-        group(np.zeros((3, 1)), is_ring, Drogue(0.75 * one, 0.04 * one, 0 * one)),
+        group(np.zeros((3, 1)), is_ring, Drogue(HALF_ANGLE * one, 0.04 * one, 0 * one)),
         group(0.3 * POINTS, ~is_ring, Plane(place([0, 0, 0], (3, LANES)), place([0, 0, 1], (3, LANES)))),
     )
 
@@ -90,8 +92,21 @@ def scenario(scales, start):
     )  # fmt: skip
 
 
+@jax.jit
+def passes_over(start):
+    """Lanes whose probe goes from the drogue's bottom to its wall, or back, while it touches in space: there
+    the surface's curvature jumps, and steps see it to 1e-8 of the energy, a hundred times worse than else."""
+    space = Space(bodies(), contact(np.ones(3)), ())
+    _, seen = follow(space, start, jnp.full(LANES, PERIOD), 300, jnp.full(LANES, 2 * PERIOD))
+    at, (probe, _) = seen.pose.position, seen.forces
+    on_wall = jnp.hypot(at.x, at.y) * np.sin(HALF_ANGLE) + at.z * np.cos(HALF_ANGLE) > 0
+    touches = probe.touch.depth[:, 0] > 0
+    return (touches & on_wall).any(axis=0) & (touches & ~on_wall).any(axis=0)
+
+
 def test_both_errors_have_derivatives():
-    """Those of central differences, of order four, to 1e-4 on 98 % of lanes; none is NaN."""
+    """Those of central differences, of order four, to 1e-4 on 98 % of lanes; an event is known of the others,
+    and none is NaN."""
     ones, start = jnp.ones(len(BY)), started(*drawn())
     static = {"integrator": "semi_implicit_euler", "hold": "linear", "latency": 0}
     loop = build_loop(scenario(ones, start), **static)
@@ -119,7 +134,11 @@ def test_both_errors_have_derivatives():
         fault = (np.abs(slopes[..., index] - expected) / size).max(axis=0)
         print(f"{by}: fault at most {np.max(fault):.1e}, median {np.median(fault):.1e}")
         good &= fault < 1e-4
+    over = np.asarray(passes_over(start))
+    assert np.sum(over) < 8
     for name, part in (("probe", slice(DRAWS)), ("ring", slice(DRAWS, None))):
-        share, moved = np.mean(good[part]), np.sum(~good[part] & ~same[part])
-        print(f"{name}: within 1e-4 on {share:.1%} of {DRAWS} draws; a touch moved on {moved} others")
-        assert share >= 0.98
+        share, bad = np.mean(good[part]), ~good[part]
+        moved, passed = np.sum(bad & ~same[part]), np.sum(bad & same[part] & over[part])
+        print(f"{name}: within 1e-4 on {share:.1%} of {DRAWS}; of {np.sum(bad)} others a touch moved on "
+              f"{moved}, and {passed} passed over from the drogue's bottom to its wall")  # fmt: skip
+        assert share >= 0.98 and moved + passed == np.sum(bad)

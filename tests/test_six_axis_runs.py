@@ -190,6 +190,11 @@ def test_simulate_a_builtin(jaxhil, tmp_path, name):
     in_space.append(mechanism.chaser.mass * np.array(document["reference_final"]["v2"]))
     np.testing.assert_allclose(sum(momenta), sum(in_space), rtol=1e-9)
     assert picture.read_bytes().startswith(b"\x89PNG")
+    alone = json.loads(jaxhil("simulate", name, "--reference", "--json").out)
+    in_space = alone["episodes"][0]
+    assert alone["status"] == episode["status"] and "energy_error" not in in_space
+    for figure in ("effective_mass", "point", "reference_peak_force", "reference_peak_moment"):
+        np.testing.assert_allclose(in_space[figure], episode[figure], rtol=1e-3, atol=1e-6, err_msg=figure)
     film = tmp_path / "run.gif"
     ran = jaxhil("simulate", name, "--json", "--compensator", "phase_lead", "--animate", film)
     assert ran.code == 1, ran.err
@@ -247,6 +252,11 @@ def test_a_flight_without_a_contact(jaxhil, tmp_path):
     ran = jaxhil("simulate", "ring-capture", *changes, *written, "--json")
     assert ran.code == 1 and ran.err.count("wrote ") == 3, ran.err
     document, turned = json.loads(ran.out), Rotation.from_rotvec([0, 0.1, 0])
+    ran = jaxhil("simulate", "ring-capture", *changes, "--reference", "--json")
+    assert ran.code == 1 and json.loads(ran.out) == {
+        **{key: document[key] for key in ("mechanism", "axes", "reference_final", "status")},
+        "episodes": [],
+    }
     assert document["status"] == "miss" and document["final"]["time"] == 0.2
     place = np.array([-0.05, 0.02, 1.8]) + turned.apply([0.01, 0.04, -1.0])
     for final in ("final", "reference_final"):
@@ -306,6 +316,8 @@ def test_what_six_axes_do_not_have_is_said_in_one_line(jaxhil, tmp_path):
             "--animate: found 'x.avi', allowed a name that ends in .gif",
         ),
         (["simulate", "petals", "--compensator", "response_error"], "phase_lead_per_axis: in six axes"),
+        (["simulate", "petals", "--reference", "--plot", "x.png"], "allowed none beside --reference"),
+        (["simulate", "rig-300kg", "--reference"], "--reference: found one axis, allowed a mechanism of six"),
         (
             ["simulate", "rig-300kg", "--animate", "x.gif"],
             "allowed none: there is an animation of six axes only",

@@ -87,9 +87,7 @@ class SixAxisRun:
     @cached_property
     def reference_final(self) -> Final:
         """The motion of two free bodies in space, from the same start on, at the time of `final`."""
-        with computing():
-            scenario = build_scenarios(self.mechanism, seed=self.seed)
-            return _final(self.final.time, jax.device_get(_in_space(scenario, np.array([self.final.time]))))
+        return final_in_space(self.mechanism, self.final.time)
 
     @cached_property
     def ticks(self) -> Recorded:
@@ -130,8 +128,7 @@ def _result(
     mechanism: SixAxisMechanism, compensator: str, gains: dict[str, float], seed: int, found: Any
 ) -> SixAxisRun:
     metrics, time, final, tangential = found
-    if not np.all(np.isfinite(metrics.reference_duration)):
-        raise InputError(f"{mechanism.name}: {_stiffest(mechanism)}")
+    check_followed(mechanism, metrics)
     episodes = tuple(
         _episode(metrics, slot)
         for slot in range(metrics.status.shape[0])
@@ -153,6 +150,19 @@ def _result(
     return SixAxisRun(
         mechanism, compensator, gains, seed, episodes, status, _final(float(time[0]), final), means
     )
+
+
+def final_in_space(mechanism: SixAxisMechanism, time: float) -> Final:
+    """The motion of two free bodies in space, from a mechanism's start on, at a time [s]."""
+    with computing():
+        scenario = build_scenarios(mechanism)
+        return _final(time, jax.device_get(_in_space(scenario, np.array([time]))))
+
+
+def check_followed(mechanism: SixAxisMechanism, metrics: Metrics) -> None:
+    """The contact in space was followed to its end. Raises `InputError`."""
+    if not np.all(np.isfinite(metrics.reference_duration)):
+        raise InputError(f"{mechanism.name}: {_stiffest(mechanism)}")
 
 
 def _stiffest(mechanism: SixAxisMechanism) -> str:

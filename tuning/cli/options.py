@@ -128,6 +128,9 @@ class Simulate:
         str | None,
         text("FILE", "Write every tick to a CSV file; of one axis it is a rig's log, which identify reads."),
     ] = None
+    reference: Annotated[
+        bool, arg(help="Of a mechanism of six axes: the two bodies in space alone, without the rig.")
+    ] = False
     limit: Limit = 0.01
     seed: Annotated[int, number("Seed of the sensor noise.")] = 0
     json: Json = False

@@ -39,6 +39,9 @@ def run(options: Simulate) -> int:
     if options.animate is not None:
         allowed = "none: there is an animation of six axes only"
         raise InputError(f"--animate: found {shown(options.animate)}, allowed {allowed}")
+    if options.reference:
+        allowed = "a mechanism of six axes: of one axis the table has e* beside e"
+        raise InputError(f"--reference: found one axis, allowed {allowed}")
     prepare()
     from jaxhil.simulation.run import simulate
 

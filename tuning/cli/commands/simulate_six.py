@@ -22,6 +22,11 @@ def check(options: Simulate) -> None:
     if options.setting is not None:
         found = f"--setting: found {shown(options.setting)}"
         raise InputError(f"{found}, allowed none: in six axes there is none so far")
+    if options.reference:
+        for key in ("compensator", "gains", "plot", "animate", "log"):
+            value = getattr(options, key)
+            if value is not None:
+                raise InputError(f"--{key}: found {shown(str(value))}, allowed none beside --reference")
     if options.animate is not None:
         _check_film(options.animate)
 
@@ -39,6 +44,8 @@ def _check_film(path: str) -> None:
 
 def run(options: Simulate, mechanism: SixAxisMechanism) -> int:
     """Run the episodes, report each; 0 if both errors of each are within the limit, else 1."""
+    if options.reference:
+        return _run_in_space(options, mechanism)
     from jaxhil.sixdof.run import simulate_six_axes
 
     gains = None if options.gains is None else Path(options.gains)
@@ -52,6 +59,35 @@ def run(options: Simulate, mechanism: SixAxisMechanism) -> int:
         terminal.emit_line(done.meaning.line(mechanism.name))
         _print(options, done, good)
     return 0 if good else 1
+
+
+def _run_in_space(options: Simulate, mechanism: SixAxisMechanism) -> int:
+    """Follow the bodies without a rig, and report them; 0 if something touches, else 1."""
+    from jaxhil.sixdof.alone import simulate_in_space
+
+    done = simulate_in_space(mechanism)
+    episode = done.episode
+    if options.json:
+        episodes = [episode._asdict()] if episode.reference_touches else []
+        document = {"mechanism": mechanism.name, "axes": 6, "episodes": episodes}
+        terminal.emit_json(document | {"reference_final": done.final._asdict(), "status": done.status})
+    else:
+        headings = ["m_n [kg]", "approach [mm/s]", "e*", "peak [N]", "peak [N m]", "in touch [ms]", "touches"]
+        row = [
+            episode.effective_mass,
+            1e3 * episode.approach_velocity,
+            episode.reference_restitution,
+            episode.reference_peak_force,
+            episode.reference_peak_moment,
+            1e3 * episode.reference_duration,
+            episode.reference_touches,
+            done.status,
+        ]
+        table = terminal.table(f"{mechanism.name}, in space", [*headings, "status"], [row], texts=(7,))
+        speed, turning = ([f"{part:.4g}" for part in done.final.twist[at : at + 3]] for at in (0, 3))
+        after = f"After {done.final.time:.4g} s: velocity ({', '.join(speed)}) m/s, "
+        terminal.emit(table, after + f"angular velocity ({', '.join(turning)}) rad/s of C against T.")
+    return 0 if episode.reference_touches else 1
 
 
 def _worst(episode: "Episode") -> float:
