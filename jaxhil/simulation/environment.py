@@ -29,11 +29,12 @@ FEWEST_DEVICES = (
 RARELY = 100_000, 50, 50
 # What compiled programs are kept under: all that takes longer to compile than to read.
 KEEPING = {"jax_persistent_cache_min_compile_time_secs": 0.1, "jax_persistent_cache_min_entry_size_bytes": 0}
-# Options of one program, by this compiler's names: vectors as wide as the processor has, and for what runs a
-# batch without derivatives each array computed on its own, twice as fast together. A Jacobian would take
-# three times as long like that.
-WIDE = {"xla_cpu_prefer_vector_width": 512}
-ROLLOUT = {**WIDE, "xla_disable_hlo_passes": "cpu_multi_output_fusion"}
+# Options of programs that run ticks, by this compiler's names: vectors as wide as the processor has, and
+# fewer copies of what one tick hands to the next.
+TICKS = {"xla_cpu_prefer_vector_width": 512, "xla_cpu_copy_insertion_use_region_analysis": True}
+# For a batch without derivatives each array is computed on its own, besides: twice as fast together. A
+# Jacobian would take three times as long like that.
+ROLLOUT = {**TICKS, "xla_disable_hlo_passes": "cpu_multi_output_fusion"}
 # Of what runs once and is soon done: compiled in half the time.
 ONCE = {
     "xla_backend_optimization_level": 0,

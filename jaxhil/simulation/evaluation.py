@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import AxisType, PartitionSpec
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float
 
 from jaxhil.contact.laws import ContactParameters
@@ -25,6 +25,7 @@ from jaxhil.simulation.scenario import Scenario
 
 TILE = 64  # lanes computed side by side on a device: more leave its first cache
 SMALLEST_TILE = 16
+OWN = PartitionSpec("device")  # each device has its own tiles
 TILES_OF_A_DELAY = 8  # at least, to sort by: with fewer, tiles would wait longer for their slowest lanes
 
 
@@ -113,6 +114,12 @@ def shard(
     """Arguments of `run_tiles`: gains common to all lanes, gains per lane and scenarios as
     (devices, tiles, ..., lanes of a tile), dealt out and padded with idle lanes."""
     return _fold(_deal(scenarios, at_least), scenarios, gains)
+
+
+def place(common: Any, per_lane: Any, scenarios: Any) -> tuple[Any, Any, Any]:
+    """What `shard` made, on its devices: for what runs it several times."""
+    devices, everywhere = (NamedSharding(_mesh(), spec) for spec in (OWN, PartitionSpec()))
+    return jax.device_put(common, everywhere), *jax.device_put((per_lane, scenarios), devices)
 
 
 class _Dealt(NamedTuple):
@@ -217,9 +224,11 @@ def _compiled() -> Callable[..., Outcome]:
     return jax.jit(_run_tiles, static_argnums=0, compiler_options=known_options(ROLLOUT))
 
 
-def _run_tiles(loop: Any, common: Any, per_lane: Any, scenarios: Any) -> Outcome:
-    mesh = jax.make_mesh((jax.device_count(),), ("device",), axis_types=(AxisType.Auto,))
+def _mesh():
+    return jax.make_mesh((jax.device_count(),), ("device",), axis_types=(AxisType.Auto,))
 
+
+def _run_tiles(loop: Any, common: Any, per_lane: Any, scenarios: Any) -> Outcome:
     def one_device(common, arguments):
         def one_tile(arguments):
             gains, scenario = arguments
@@ -228,8 +237,8 @@ def _run_tiles(loop: Any, common: Any, per_lane: Any, scenarios: Any) -> Outcome
         own = jax.tree.map(lambda leaf: leaf[0], arguments)
         return jax.tree.map(lambda leaf: leaf[None], jax.lax.map(one_tile, own))
 
-    own, everywhere = PartitionSpec("device"), PartitionSpec()
     # Each device ends its tiles in its own time; nothing is exchanged.
-    return jax.shard_map(one_device, mesh=mesh, in_specs=(everywhere, own), out_specs=own, check_vma=False)(
+    specs = PartitionSpec(), OWN
+    return jax.shard_map(one_device, mesh=_mesh(), in_specs=specs, out_specs=OWN, check_vma=False)(
         common, (per_lane, scenarios)
     )

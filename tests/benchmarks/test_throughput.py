@@ -81,7 +81,8 @@ def test_rollout_beside_the_compiled_baseline(compensator, names, capsys):
     loop, gains, scenarios = case(compensator, LANES, names)
     on_device = jax.tree.map(jnp.asarray, scenarios)
     rig = jax.jit(build_rig_constants, static_argnums=0)(loop, on_device)
-    arguments = evaluation.shard(scenarios, gains)
+    # C++ too finds its numbers in place.
+    arguments = evaluation.place(*evaluation.shard(scenarios, gains))
     ticks = np.asarray(evaluation.run_tiles(loop, *arguments).metrics.ticks).max(axis=-2)
     # A tile runs as long as its slowest lane: (devices, tiles, tile) lanes.
     lane_steps = int(np.sum(ticks.max(axis=-1) * ticks.shape[-1]))

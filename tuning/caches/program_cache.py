@@ -20,7 +20,7 @@ from jax import export
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from jaxhil.files import read_sealed, remove_stale, write_sealed
-from jaxhil.simulation.environment import WIDE, known_options
+from jaxhil.simulation.environment import TICKS, known_options
 from tuning.caches.sources import PACKAGES, sources_sha256, versions
 
 # Calls into LAPACK have no promise to mean the same in other versions; the name has the version in it.
@@ -61,7 +61,7 @@ def _program(function, static, structure, shapes, folder):
     def flat(*leaves):
         return tuple(function(static, jax.tree.unflatten(structure, leaves)))
 
-    compiled = partial(jax.jit, compiler_options=known_options(WIDE))
+    compiled = partial(jax.jit, compiler_options=known_options(TICKS))
     if folder is None:
         return compiled(flat)
     path = Path(folder) / f"{_name(function, static, structure, shapes)}.program"
