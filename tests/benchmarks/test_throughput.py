@@ -19,10 +19,12 @@ from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation import evaluation
 from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.environment import TICKS, known_options
 from jaxhil.simulation.loop import build_rig_constants
 from jaxhil.simulation.rollout import run_contacts
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.batches import join
+from tuning.gains.rounds import TILE
 
 pytestmark = pytest.mark.benchmark
 LANES = 8192
@@ -35,7 +37,8 @@ INTEL = "GenuineIntel" in INFORMATION
 # Intel Xeon (model 207) made 0.38 to 0.46 and 0.46 to 0.52 of the C++ loop's lane-steps/s.
 LANE_STEPS = {"none": 0.33, "response_error": 0.4} if INTEL else {"none": 0.5, "response_error": 0.5}
 LANE_STEPS_16 = {"none": 0.33, "response_error": 0.43} if INTEL else {"none": 0.65, "response_error": 0.65}
-SCENARIOS = {"none": 0.4, "response_error": 0.45} if INTEL else {"none": 1.0, "response_error": 1.0}
+JACOBIAN = 0.85  # of the time without options
+SCENARIOS = {"none": 0.4, "response_error": 0.45} if INTEL else {"none": 0.93, "response_error": 0.85}
 
 
 # The built-in mechanisms that the baseline can run: 1, 1, 1 and 3 contacts.
@@ -108,6 +111,35 @@ def test_rollout_beside_the_compiled_baseline(compensator, names, capsys):
         )
     assert ours >= LANE_STEPS[compensator] * cpp_steps and at_16 >= LANE_STEPS_16[compensator]
     assert cpp_time >= SCENARIOS[compensator] * jax_time
+
+
+def jacobian(lanes, options):
+    """Timed Jacobian of the restitutions of so many lanes by all gains of response_error."""
+    loop, gains, scenarios = case("response_error", lanes)
+    rig = jax.jit(build_rig_constants, static_argnums=0)(loop, jax.tree.map(jnp.asarray, scenarios))
+
+    def restitution(values):
+        return run_contacts(loop, dict(zip(gains, values, strict=True)), rig).restitution
+
+    program = jax.jit(jax.jacfwd(restitution), compiler_options=options)
+    values = jnp.array(list(gains.values()))
+    assert len(values) == 12
+    jax.block_until_ready(program(values))
+    return timed(partial(program, values))
+
+
+def test_jacobian_with_and_without_its_options_and_tiles(capsys):
+    """Time a lane, in the tiles of tuning and twice as many lanes at once."""
+    tuned = best(
+        jacobian(TILE, known_options(TICKS)), jacobian(2 * TILE, known_options(TICKS)), jacobian(2 * TILE, {})
+    )
+    ours, wide, plain = (time / lanes for time, lanes in zip(tuned, (TILE, 2 * TILE, 2 * TILE), strict=True))
+    with capsys.disabled():
+        print(
+            f"\n{PROCESSOR}, Jacobian over 12 gains, time a lane in tiles of {TILE} over {2 * TILE} at once"
+            f" without options: {ours / plain:.2f} (with them {wide / plain:.2f})"
+        )
+    assert ours <= JACOBIAN * plain
 
 
 @pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
