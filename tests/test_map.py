@@ -14,6 +14,7 @@ import jaxhil
 import tuning
 from jaxhil.compensators import COMPENSATORS, literature_gains
 from jaxhil.simulation.scenario import build_scenarios
+from tuning.reporting import map_grid
 from tuning.reporting.closed_forms import characteristic_root, critical_delay, series
 from tuning.reporting.contact_growth import LINEAR_COMPENSATORS, growth
 
@@ -217,3 +218,26 @@ def test_on_a_cluster_it_is_the_same_to_the_bit(tmp_path):
         cluster.worker()
         there = tuning.map("varying", scheduler=cluster.address, **asked)
     assert there.document == here.document
+
+
+def test_an_interrupted_map_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(map_grid, "PART", 128)
+    asked = {"x": "rig.force_sensor.delay", "y": "contact.stiffness", "points": 8}
+    whole = tuning.map("varying", **asked, folder=tmp_path / "whole")
+    run_part, runs = map_grid.run_part, []
+
+    def interrupted(*part):
+        if len(runs) == 2:
+            raise KeyboardInterrupt
+        runs.append(part)
+        return run_part(*part)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(map_grid, "run_part", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            tuning.map("varying", **asked, folder=tmp_path / "map")
+    monkeypatch.setattr(map_grid, "run_part", lambda *part: runs.append(part) or run_part(*part))
+    again = tuning.map("varying", **asked, folder=tmp_path / "map", resume=True)
+    assert again.document == whole.document
+    assert len(runs) == -(-map_grid.runs(8) // 128)
+    assert not (tmp_path / "map" / ".pieces").exists()

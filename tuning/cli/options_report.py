@@ -11,6 +11,7 @@ from tuning.cli.options import (
     Json,
     OptionalFile,
     Overrides,
+    Resume,
     Scheduler,
     Setting,
     Timings,
@@ -50,6 +51,7 @@ class Map:
     points: Annotated[int, number("Points along either axis.")] = 100
     output: Annotated[str, folder("Folder for what is written.")] = "jaxhil-out/map"
     limit: Annotated[float, arg(metavar="NUMBER", help="Restitution error to which margins are told.")] = 0.01
+    resume: Resume = False
     scheduler: Scheduler = None
     seed: Annotated[int, number("Seed of the sensor noise, the same at every point.")] = 0
     json: Json = False

@@ -59,6 +59,7 @@ def map(
     points: int = 100,
     seed: int = 0,
     folder: str | os.PathLike[str] | None = None,
+    resume: bool = False,
     scheduler: str | None = None,
     progress: bool = False,
 ) -> StabilityMap:
@@ -80,6 +81,7 @@ def map(
         points: along either axis.
         seed: of the sensors' noise, the same at every point.
         folder: where to write map.json and map.png; None writes nothing.
+        resume: go on with a map into the folder that was interrupted.
         scheduler: address of a dask.distributed cluster's scheduler, whose workers then run the contacts.
         progress: say on standard error what is going on.
 
@@ -89,11 +91,14 @@ def map(
     arguments.integers(2, MOST_POINTS, points=points)
     arguments.integers(0, seed=seed)
     arguments.limit(limit)
-    arguments.flags(progress=progress)
+    arguments.flags(progress=progress, resume=resume)
+    if resume and folder is None:
+        raise arguments.ArgumentError("resume", "without a folder", "with that of a map")
     checked, target = as_mechanism(mechanism), None if folder is None else arguments.folder("folder", folder)
     with computing():
         from jaxhil.compensators import COMPENSATORS
         from jaxhil.simulation.gain_choice import choose_gains
+        from tuning.caches.pieces import FOLDER, Pieces
         from tuning.reporting.map_axes import check_axes, parse_axis
         from tuning.reporting.map_grid import compute_map, runs
 
@@ -107,11 +112,13 @@ def map(
             raise
         meaning.check(checked)
         with terminal.progress(runs(points), "runs", progress) as bar:
-            found = compute_map(checked, name, values, axes, points, limit, seed, bar.tell, scheduler)
+            kept = Pieces(None if target is None else target / FOLDER, resume)
+            found = compute_map(checked, name, values, axes, points, limit, seed, bar.tell, scheduler, kept)
         document = _document(checked, name, values, found, limit, seed)
         made = StabilityMap(document, found.x, found.y, found.error, found.restitution, found)
         if target is not None:
             _write(made, target)
+            kept.remove()
     return made
 
 

@@ -5,7 +5,7 @@ Gains stay what they are over the whole map: it shows what a controller meets th
 and two lines through the nominal one, are lanes of one program.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -18,7 +18,7 @@ from jaxhil.simulation.evaluation import Outcome, evaluate, expected_duration
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.caches.cluster import Piece, on_workers
-from tuning.caches.pieces import digest_of
+from tuning.caches.pieces import NOTHING_KEPT, Pieces, digest_of
 from tuning.caches.worker import setting
 from tuning.reporting.closed_forms import ClosedForms, closed_forms
 from tuning.reporting.contact_growth import Growth, cost, growth, no_growth, spectral_radii
@@ -79,9 +79,11 @@ def compute_map(
     seed: int,
     tell: Callable[[str, float], None],
     scheduler: str | None = None,
+    kept: Pieces = NOTHING_KEPT,
 ) -> Map:
     """The map of so many points along either axis; `tell` is called with what is going on, and how many of
-    all `runs` are done. With a `scheduler` the workers of a cluster run the contacts."""
+    all `runs` are done. With a `scheduler` the workers of a cluster run the contacts; parts of them are
+    `kept` when finished."""
 
     def batch(values: np.ndarray) -> tuple[dict[str, Any], Scenario]:
         return _gains(gains, axes, values), _scenarios(mechanism, axes, values, seed)
@@ -92,7 +94,7 @@ def compute_map(
     across, up = np.repeat(middle, LINE, axis=0), np.repeat(middle, LINE, axis=0)
     across[:, 0], up[:, 1] = lines
     own, scenarios = batch(np.concatenate([_grid(x, y), across, up, middle]))
-    restitution, error = _run(mechanism, compensator, own, scenarios, tell, scheduler)
+    restitution, error = _run(mechanism, compensator, own, scenarios, tell, scheduler, kept)
     size = points**2
 
     tell("eigenvalues of the loop in contact", runs(points))
@@ -145,30 +147,41 @@ def _run(
     scenarios: Scenario,
     tell: Callable[[str, float], None],
     scheduler: str | None,
+    kept: Pieces,
 ) -> np.ndarray:
     """e and e - e* of each lane, part by part: each part has lanes that take long and lanes that do not."""
     loop, order = build_loop(mechanism, compensator, scenarios), np.argsort(expected_duration(scenarios))
     found = np.empty((2, len(order)))
     parts = -(-len(order) // PART)
     lanes = [order[number::parts] for number in range(parts)]
+    inputs = digest_of((to_builtins(mechanism), compensator, gains, jax.tree.leaves(scenarios)))
+    done = 0
+    tell("running the contacts", done)
 
-    def asked() -> Iterator[Piece]:
-        for number, part in enumerate(lanes):
+    def take(number: int, values: np.ndarray) -> None:
+        nonlocal done
+        found[:, lanes[number]] = values
+        done += len(lanes[number])
+        tell("running the contacts", done)
+
+    def asked(numbers: Iterable[int]) -> Iterator[Piece]:
+        for number in numbers:
+            part = lanes[number]
             own = {name: value[part] if np.ndim(value) else value for name, value in gains.items()}
             some = jax.tree.map(lambda leaf, part=part: np.asarray(leaf)[..., part], scenarios)
             yield Piece(number, (loop, own, some, len(lanes[0])))
 
+    missing = []
+    for number in range(parts):
+        known = kept.read(f"part {number}", (inputs, number), np.ndarray)
+        missing.append(number) if known is None else take(number, known)
     if scheduler is None:
-        computed = ((number, run_part(*arguments)) for number, arguments in asked())
+        computed = ((number, run_part(*arguments)) for number, arguments in asked(missing))
     else:
-        inputs = to_builtins(mechanism), compensator, gains, jax.tree.leaves(scenarios)
-        computed = on_workers(scheduler, run_part, asked(), setting(), f"map-{digest_of(inputs)[:16]}")
-    done = 0
-    tell("running the contacts", done)
+        computed = on_workers(scheduler, run_part, asked(missing), setting(), f"map-{inputs[:16]}")
     for number, values in computed:
-        found[:, lanes[number]] = values
-        done += len(lanes[number])
-        tell("running the contacts", done)
+        kept.write(f"part {number}", (inputs, number), values)
+        take(number, values)
     return found
 
 

@@ -28,7 +28,7 @@ def run(options: Map) -> int:
     made = map(
         mechanism, options.x, options.y, compensator, gains,
         limit=options.limit, points=options.points, seed=options.seed, folder=target,
-        scheduler=options.scheduler, progress=True,
+        resume=options.resume, scheduler=options.scheduler, progress=True,
     )  # fmt: skip
     meaning.say(mechanism, None if options.json else terminal.emit_line)
     if options.json:
