@@ -1,0 +1,112 @@
+"""Commands on a cluster that go wrong: one line, exit code 2 or 130, and `--resume` ends with the same."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from clusters import ROOT, started
+from sweep_cases import case
+
+import tuning
+from jaxhil.errors import InputError
+from tuning.gain_file import write_gain_file
+
+pytestmark = [pytest.mark.users_options, pytest.mark.slow]
+MANY, STUDY = ("--scenarios", "20000", "--chunk", "512", "--limit", "1.5"), ("--drivers", "4096")
+
+
+def begin(*arguments, folder):
+    """A command as a user starts it."""
+    command = [sys.executable, "-m", "tuning", *map(str, arguments), "--json"]
+    ours = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "NPROC")}
+    return subprocess.Popen(
+        command, env={**ours, "PYTHONPATH": str(ROOT)}, cwd=folder, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+
+
+def ended(process):
+    """Exit code, standard output, and what standard error says but for progress."""
+    out, err = process.communicate(timeout=600)
+    said = [line for line in err.splitlines() if not line.startswith(tuple("0123456789"))]
+    return process.returncode, out, said
+
+
+def wait(process, folder, pattern, number):
+    while len([*folder.glob(pattern)]) < number:
+        assert process.poll() is None
+        time.sleep(0.02)
+
+
+def same(one, other):
+    return all(one[name] == other[name] for name in ("failure_probability", "worst", "drivers"))
+
+
+def test_a_scheduler_that_dies_and_ctrl_c_lose_nothing_that_was_finished(tmp_path):
+    write_gain_file(tmp_path / "gains.json", case())
+    asked = "sweep", "gains.json", *MANY, *STUDY
+    code, out, _ = ended(begin(*asked, "-o", "here", folder=tmp_path))
+    assert code == 1
+    whole, store = json.loads(out), tmp_path / "store"
+    with started(tmp_path) as cluster:
+        cluster.worker()
+        on = *asked, "-o", "store", "--scheduler", cluster.address
+        process = begin(*on, folder=tmp_path)
+        wait(process, store, "parts/*.parquet", 3)
+        os.kill(process.pid, signal.SIGINT)
+        code, out, said = ended(process)
+        assert (code, out, said) == (130, "", ["jaxhil: interrupted"])
+        kept = {path: path.stat().st_mtime_ns for path in store.glob("parts/*.parquet")}
+        process = begin(*on, "--resume", folder=tmp_path)
+        wait(process, store, ".pieces/*.piece", 2)
+        cluster.kill(cluster.processes[0])
+        code, out, said = ended(process)
+        assert code == 2 and out == "" and len(said) == 1
+        assert said[0].startswith(f"jaxhil: --scheduler: {cluster.address}: lost, ")
+        assert said[0].endswith("; what is finished is kept, --resume goes on")
+    (tmp_path / "later").mkdir()
+    with started(tmp_path / "later") as cluster:
+        cluster.worker()
+        on = *asked, "-o", "store", "--scheduler", cluster.address, "--resume"
+        code, out, said = ended(begin(*on, folder=tmp_path))
+    assert code == 1 and said == [] and same(json.loads(out), whole)
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+
+
+def test_a_worker_of_another_version_is_refused(tmp_path):
+    write_gain_file(tmp_path / "gains.json", case())
+    for package in ("jaxhil", "tuning"):
+        shutil.copytree(ROOT / package, tmp_path / "other" / package)
+    with open(tmp_path / "other" / "jaxhil" / "errors.py", "a") as source:
+        source.write("# another\n")
+    with started(tmp_path) as cluster:
+        cluster.worker(PYTHONPATH=str(tmp_path / "other"))
+        refused = pytest.raises(InputError, match=r"a worker: sources_sha256: found .* results would differ")
+        on = {"scheduler": cluster.address}
+        with refused:
+            tuning.sweep(tmp_path / "gains.json", scenarios=64, folder=tmp_path / "store", **on)
+        with refused:
+            tuning.tune("varying", scenarios=4, starts=1, steps=1, validation=15, **on)
+        with refused:
+            tuning.map("varying", "rig.force_sensor.delay", "contact.stiffness", points=4, **on)
+        with refused:
+            tuning.compare("varying", ["none"], untuned=True, judged=16, **on)
+
+
+def test_six_axes_are_swept_and_tuned_by_workers_too(tmp_path):
+    few = {"scenarios": 4, "starts": 1, "steps": 1, "validation": 15}
+    swept = {"scenarios": 24, "chunk": 8, "limit": 1.0, "drivers": 2}
+    here = tuning.tune("probe-drogue", "phase_lead", **few)
+    study = tuning.sweep(here, **swept)
+    with started(tmp_path) as cluster:
+        cluster.worker()
+        cluster.worker()
+        there = tuning.tune("probe-drogue", "phase_lead", scheduler=cluster.address, **few)
+        other = tuning.sweep(there, scheduler=cluster.address, **swept)
+    assert there.gains == here.gains and there.figures == here.figures and there.parts == here.parts
+    assert other.table.equals(study.table) and same(other.document, study.document)
