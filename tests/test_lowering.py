@@ -13,9 +13,13 @@ from jaxhil.mechanism.file import load_any
 from jaxhil.simulation import environment
 from jaxhil.simulation.environment import ROLLOUT, flags, known_options
 from jaxhil.simulation.evaluation import _run_tiles, shard
+from tuning.caches import program_cache
 from tuning.gains import simulated
+from tuning.gains.rounds import prepare_solver
+from tuning.gains.tasks import build_task
 
 LEVEL = "--xla_backend_optimization_level"
+CHOLESKY = {"cusolver_potrf_ffi"}
 LINEAR_EQUATIONS = {"cusolver_getrf_ffi", "cu_lu_pivots_to_permutation"}
 ONE_AXIS = [(name, law) for law in COMPENSATORS for name in ("varying", "suite-rattling")]
 
@@ -57,6 +61,16 @@ def jacobian(name, compensator):
 
 def test_a_batch_lowers_for_cuda_and_calls_nothing_outside():
     assert batch("varying", "none") == set()
+
+
+def test_what_tuning_runs_lowers_for_cuda(monkeypatch):
+    """The whole solver; its steps are worked out by the card's own Cholesky decomposition."""
+    programs = []
+    monkeypatch.setattr(program_cache, "prepare", lambda *program: programs.append(program))
+    prepare_solver([build_task(load_any("varying").mechanism, "phase_lead", 4, 0)], starts=1)
+    ((function, static, arguments, _),) = programs
+    found = calls(lambda arguments: tuple(function(static, arguments)), arguments)
+    assert found == CHOLESKY
 
 
 def test_what_calls_back_into_python_would_be_seen():
