@@ -67,9 +67,7 @@ def _judged(scenario: Scenario) -> Metrics:
     start = jax.tree.map(lambda leaf: leaf[None], scenario.start)
     zero = jnp.zeros_like(scenario.duration)[None]
     none = zero.astype(jnp.int32)
-    return judge(
-        scenario, Episode(start, start, zero, zero, zero, none, zero, zero, zero, zero, none + REBOUNDED)
-    )
+    return judge(scenario, Episode(start, start, zero, zero, none, zero, zero, zero, zero, none + REBOUNDED))
 
 
 _compiled = jax.jit(_judged, compiler_options=known_options(ONCE))

@@ -5,6 +5,7 @@ the numerical model by it, and sends their relative pose to the motion simulator
 The wrench is formed on the hardware's pose, in T axes about T's origin, and acts at the model's T.
 """
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -63,6 +64,7 @@ class Loop(eqx.Module):
     compensator: str = eqx.field(static=True, default="none")  # one of `SIX_AXES`
     episodes: int = eqx.field(static=True, default=1)  # that are judged
     whole: bool = eqx.field(static=True, default=False)  # whether a run lasts its whole duration
+    pushed: bool = eqx.field(static=True, default=False)  # whether readings without a contact are not 0
 
 
 class Rig(NamedTuple):
@@ -112,11 +114,13 @@ class Tick(NamedTuple):
 
 
 def build_loop(scenario: Scenario, **static: Any) -> Loop:
-    """The loop of a batch of scenarios; `static` are the fields of `Loop`, without the ring."""
+    """The loop of a batch of scenarios; `static` are the fields of `Loop`, without the ring and `pushed`."""
     sensor, period = scenario.sensor, np.asarray(scenario.control_period)
     slowest = np.maximum(sensor.delay, sensor.position_delay)[None] + np.asarray(scenario.simulator.delay)
     intervals = int(np.max(slowest / period[None])) + 2
-    return Loop(ring=1 << intervals.bit_length(), **static)
+    loop = Loop(ring=1 << intervals.bit_length(), **static)
+    biased = bool(np.any(np.asarray(sensor.errors.bias) != np.asarray(sensor.assumed_bias)))
+    return replace(loop, pushed=loop.side == "moving" or loop.has_noise or biased)
 
 
 def build_rig(loop: Loop, gains: Gains, scenario: Scenario) -> Rig:

@@ -120,8 +120,8 @@ def judge(scenario: Scenario, episodes: Episode) -> Metrics:
 
 def _compare(space: Space, episodes: Episode, passage: Passage, quiet: Array) -> Metrics:
     bodies, meeting = space.bodies, meet(space, passage)
-    ended, over = (time - episodes.entry_time for time in (episodes.end_time, episodes.over_time))
-    both = jnp.maximum(over, over_time(passage, quiet))
+    ended = episodes.end_time - episodes.entry_time
+    both = jnp.maximum(ended, over_time(passage, quiet))
     flown = [
         (episodes.entry, 0 * both),
         (episodes.end, both - ended),

@@ -16,10 +16,11 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxhil.compensators.base import Gains
 from jaxhil.simulation.metrics import RUNAWAY
 from jaxhil.simulation.watch import FADED, LONGEST_FADING
+from jaxhil.sixdof.bodies import SHARES
 from jaxhil.sixdof.forces import deepest
 from jaxhil.sixdof.loop import Loop, Rig, RunState, Tick, begin, build_rig, tick
 from jaxhil.sixdof.peaks import Peak, higher, no_peak
-from jaxhil.sixdof.relative import States, relative
+from jaxhil.sixdof.relative import States, Wrench, advance, relative
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.sensor import Sensor
 from jaxhil.sixdof.space import choose
@@ -48,6 +49,7 @@ class Watch(NamedTuple):
     # Largest sizes of the force [N] and of the moment [N m] on the numerical model.
     highest: tuple[Array, Array]
     faded: Int[Array, "*batch"]  # ticks since it died out
+    end: States  # of the numerical model, at the tick since which nothing of it is left
     penetration: Float[Array, "*batch"]  # largest depth, over the size of its shapes
     beyond: Bool[Array, "*batch"]  # whether an axis was sent where it cannot be
 
@@ -59,7 +61,6 @@ class Episode(NamedTuple):
     end: States  # of the numerical model at the end
     entry_time: Float[Array, "episodes *batch"]  # [s]
     end_time: Float[Array, "episodes *batch"]  # [s]
-    over_time: Float[Array, "episodes *batch"]  # at which it was over, which is looked at now and then [s]
     touches: Int[Array, "episodes *batch"]
     duration: Float[Array, "episodes *batch"]  # in which something touched [s]
     peak_force: Float[Array, "episodes *batch"]  # [N]
@@ -92,9 +93,15 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
     rig = build_rig(loop, gains, scenario)
     last = jnp.round(scenario.duration / rig.period).astype(jnp.int32)
 
+    def one(progress: Progress, _) -> tuple[Progress, Wrench | None]:
+        after, command = _tick(loop, rig, last, progress)
+        return after, command if loop.pushed else None
+
     def body(progress: Progress) -> Progress:
-        progress, _ = lax.scan(lambda now, _: (_tick(loop, rig, last, now), None), progress, None, STRETCH)
-        return _turn_over(loop, rig, last, progress)
+        after, commands = lax.scan(one, progress, None, STRETCH)
+        if commands is not None:
+            after = _enter_late(loop, rig, progress, after, commands)
+        return _turn_over(loop, rig, last, after)
 
     start = _start(loop, rig, scenario.start)
     ended = lax.while_loop(lambda progress: jnp.any(progress.active), body, start)
@@ -111,7 +118,7 @@ def _start(loop: Loop, rig: Rig, states: States) -> Progress:
     numbers = jnp.zeros((loop.episodes, *like.shape), like.dtype)
     counts = numbers.astype(jnp.int32)
     episodes = Episode(
-        slots, slots, numbers, numbers, numbers, counts, numbers, numbers, numbers, numbers, counts + MISS
+        slots, slots, numbers, numbers, counts, numbers, numbers, numbers, numbers, counts + MISS
     )
     return Progress(run, watch, episodes, none, none == 0, none)
 
@@ -122,22 +129,46 @@ def _fresh(rig: Rig, states: States, now: Array, energy: Array) -> Watch:
     touching = tuple(group.parameters.damping > jnp.inf for group in rig.groups)
     return Watch(
         none > 0, states, now, energy, touching, none, none, none, none > 0, peak, peak,
-        (zero, zero), none, zero, none > 0,
+        (zero, zero), none, states, zero, none > 0,
     )  # fmt: skip
 
 
-def _tick(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progress:
-    """One tick; where the run is over the bodies stand still."""
+def _tick(loop: Loop, rig: Rig, last: Array, progress: Progress) -> tuple[Progress, Wrench]:
+    """One tick, and the wrench that moved the model; where the run is over the bodies stand still."""
     run, watch = progress.run, progress.watch
     after, seen = tick(loop, rig, run)
     goes = progress.active & (progress.lasted < last) & ~watch.beyond
     beyond = ~rig.kinematics.reaches(after.hardware.commands[0])
-    watched = choose(goes, _watch(rig, watch, seen)._replace(beyond=beyond), watch)
-    return progress._replace(
+    end = choose(_since(rig, watch) < 0, after.states, watch.end)
+    watched = choose(goes, _watch(rig, watch, seen)._replace(end=end, beyond=beyond), watch)
+    moved = progress._replace(
         run=after._replace(states=choose(goes, after.states, run.states)),
         watch=watched,
         lasted=progress.lasted + goes.astype(jnp.int32),
     )
+    return moved, seen.command
+
+
+def _enter_late(loop: Loop, rig: Rig, before: Progress, after: Progress, commands: Wrench) -> Progress:
+    """Where the model came into contact in a stretch, the entry is the last tick at which it was free.
+
+    Readings that are not 0 without a contact move it up to there.
+    """
+    free, _ = _look(rig, after.run.states)
+    comes = after.active & ~free & (after.watch.entry_tick == before.lasted)
+
+    def follow(watch: Watch) -> Watch:
+        def step(carry: tuple[States, Array, Array], command: Wrench):
+            states, ticks, still = carry
+            moved = advance(rig.bodies, states, command, rig.period, SHARES[loop.integrator])
+            still = still & (deepest(rig.groups, relative(rig.bodies, moved)[0]) < 0)
+            return (choose(still, moved, states), ticks + still.astype(ticks.dtype), still), None
+
+        start = watch.entry, watch.entry_tick, comes
+        (entry, ticks, _), _ = lax.scan(step, start, commands)
+        return watch._replace(entry=entry, entry_tick=ticks)
+
+    return after._replace(watch=lax.cond(jnp.any(comes), follow, lambda watch: watch, after.watch))
 
 
 def _watch(rig: Rig, watch: Watch, seen: Tick) -> Watch:
@@ -192,27 +223,35 @@ def quiet_time(sensor: Sensor, period: Array) -> Array:
     return sensor.delay + 20 * sensor.time_constant + 2 * period
 
 
+def _still(rig: Rig) -> Array:
+    """Ticks without a touch after which a contact is over."""
+    return jnp.floor(quiet_time(rig.sensor, rig.period) / rig.period + 1e-9).astype(jnp.int32) + 1
+
+
+def _since(rig: Rig, watch: Watch) -> Array:
+    """For how many ticks nothing has been left of a contact on the hardware; negative as long as there is."""
+    still = _still(rig)
+    patience = still + jnp.ceil(LONGEST_FADING / rig.period).astype(jnp.int32)
+    return jnp.maximum(jnp.minimum(watch.quiet - still, watch.faded - 1), watch.quiet - patience)
+
+
 def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progress:
     """Enter the episodes that are over; where the model is free and none is under way, one may begin."""
     watch, run, period = progress.watch, progress.run, rig.period
     free, energy = _look(rig, run.states)
     age = progress.lasted
-    still = jnp.floor(quiet_time(rig.sensor, period) / period + 1e-9).astype(jnp.int32) + 1
-    patience = still + jnp.ceil(LONGEST_FADING / period).astype(jnp.int32)
-    # For how many ticks it has been over.
-    since = jnp.maximum(jnp.minimum(watch.quiet - still, watch.faded - 1), watch.quiet - patience)
+    since = _since(rig, watch)
     over = watch.begun & free & (since >= 0) & progress.active
     status = _failure(rig, watch, energy)
     out = (age >= last) | (status != MISS)
-    held = jnp.where(watch.caught, CAPTURED, jnp.where(watch.quiet < still, JAMMED, TIMEOUT))
+    held = jnp.where(watch.caught, CAPTURED, jnp.where(watch.quiet < _still(rig), JAMMED, TIMEOUT))
     status = jnp.where(status != MISS, status, jnp.where(over, REBOUNDED, jnp.where(watch.begun, held, MISS)))
     ends = progress.active & (over | out)
-    time, over_time, entry_time = (
-        ticks.astype(period.dtype) * period
-        for ticks in (age, age - jnp.where(over, since, 0), watch.entry_tick)
+    entry_time, end_time = (
+        ticks.astype(period.dtype) * period for ticks in (watch.entry_tick, age - jnp.where(over, since, 0))
     )
     found = Episode(
-        watch.entry, run.states, entry_time, time, over_time, watch.touches,
+        watch.entry, choose(over, watch.end, run.states), entry_time, end_time, watch.touches,
         watch.touched.astype(period.dtype) * period, watch.force.largest, watch.moment.largest,
         watch.penetration, status,
     )  # fmt: skip
