@@ -38,7 +38,7 @@ INTEL = "GenuineIntel" in INFORMATION
 LANE_STEPS = {"none": 0.33, "response_error": 0.4} if INTEL else {"none": 0.5, "response_error": 0.5}
 LANE_STEPS_16 = {"none": 0.33, "response_error": 0.43} if INTEL else {"none": 0.65, "response_error": 0.65}
 JACOBIAN = 0.85  # of the time without options
-SCENARIOS = {"none": 0.4, "response_error": 0.45} if INTEL else {"none": 0.93, "response_error": 0.85}
+SCENARIOS = {"none": 0.4, "response_error": 0.45} if INTEL else {"none": 0.85, "response_error": 0.8}
 
 
 # The built-in mechanisms that the baseline can run: 1, 1, 1 and 3 contacts.
