@@ -96,17 +96,3 @@ def test_a_worker_of_another_version_is_refused(tmp_path):
             tuning.map("varying", "rig.force_sensor.delay", "contact.stiffness", points=4, **on)
         with refused:
             tuning.compare("varying", ["none"], untuned=True, judged=16, **on)
-
-
-def test_six_axes_are_swept_and_tuned_by_workers_too(tmp_path):
-    few = {"scenarios": 4, "starts": 1, "steps": 1, "validation": 15}
-    swept = {"scenarios": 24, "chunk": 8, "limit": 1.0, "drivers": 2}
-    here = tuning.tune("probe-drogue", "phase_lead", **few)
-    study = tuning.sweep(here, **swept)
-    with started(tmp_path) as cluster:
-        cluster.worker()
-        cluster.worker()
-        there = tuning.tune("probe-drogue", "phase_lead", scheduler=cluster.address, **few)
-        other = tuning.sweep(there, scheduler=cluster.address, **swept)
-    assert there.gains == here.gains and there.figures == here.figures and there.parts == here.parts
-    assert other.table.equals(study.table) and same(other.document, study.document)
