@@ -86,7 +86,7 @@ def test_response_error_with_the_true_stiffness_has_no_rig_in_it():
     simulator = second_order(lanes([14.0, 13.0, 12.0, 11.0, 10.0, 9.0], BATCH), 0.8, lanes(UNEQUAL, BATCH))
     axes = build_axes(simulator, 0 * period, 0 * period, period, "linear")
     at, rates = command_of(bodies, start)
-    hardware = enter(axes, at, rates * PERIOD, period, "linear", 0, 64, False)
+    hardware = enter(axes, at, rates * PERIOD, period, "linear", 0, 64)
     still = init_latch(one, pose)
 
     def pulled(share):

@@ -75,7 +75,7 @@ def moved(kinematics, axes, amplitude):
     zero, period = jnp.zeros(BATCH), PERIOD + jnp.zeros(BATCH)
     plant = build_axes(second_order(axes + 0 * late, 0.8 + 0 * late, late), zero, zero, period, "linear")
     start = kinematics.command(0 * shape)
-    hardware = enter(plant, start, 0 * start, period, "linear", 0, RING, False)
+    hardware = enter(plant, start, 0 * start, period, "linear", 0, RING)
 
     def body(hardware, tick):
         seen = kinematics.coordinates(sampled(plant, hardware, tick).motion, 0 * shape)

@@ -47,8 +47,9 @@ def begin(bodies: Pair, pose: Pose, twist: Twist, before: Float[Array, "*batch"]
     zero = jnp.zeros_like(before)
     still = Vector(zero, zero, zero)
     target = build_state(bodies.target, still, still, identity(before), still)
-    body, to_world = bodies.chaser, bodies.target.interface_attitude
-    attitude = compose(compose(to_world, pose.attitude), reverse(body.interface_attitude))
+    body = bodies.chaser
+    to_world, own = (body.interface_attitude or identity(before) for body in bodies)
+    attitude = compose(compose(to_world, pose.attitude), reverse(own))
     angular = rotate(to_world, twist.angular)
     arm = rotate(attitude, body.interface)
     chaser = build_state(

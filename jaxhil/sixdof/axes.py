@@ -6,13 +6,13 @@ hardware's pose at one time needs every axis at that time: as each has its own d
 own place in a sampling interval, and looked up as many intervals back as its delay is long.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxhil.compensators.ring_buffer import look_back, write_in_turn
 from jaxhil.simulation.motion_simulator import (
     Delay,
     Propagation,
@@ -20,6 +20,7 @@ from jaxhil.simulation.motion_simulator import (
     propagation,
     rate_row,
     read,
+    read_measured,
     split_delay,
     steady_state,
 )
@@ -30,7 +31,8 @@ class Axes(NamedTuple):
     """Axes of a motion simulator, discretised, and where the sensors sample them."""
 
     propagation: Propagation  # of each axis, (..., axes, *batch)
-    acceleration: Float[Array, "columns axes *batch"]  # row at the force sensor's place [1/s^2]
+    # row at the force sensor's place [1/s^2]; None where no tool is weighed
+    acceleration: Float[Array, "columns axes *batch"] | None
     force: Delay  # of each axis and the force sensor together, (axes, *batch)
     position: Delay  # of each axis and the position sensor together, (axes, *batch)
 
@@ -55,9 +57,7 @@ class Hardware(NamedTuple):
 
     commands: tuple[Array, ...]  # c(n), c(n-1), ... as sent to the drives, (axes, *batch) each
     state: tuple[Array, ...]  # of the axes
-    samples: Samples  # ring of the samples of each sampling interval, (samples, axes, *batch)
-    before: Samples  # of the sampling interval before the run
-    stride: Float[Array, "axes *batch"]  # growth in a period, before the run
+    ring: Float[Array, "rows *batch"]  # what each interval has been sampled for: samples, kinds, axes in one
 
 
 def build_axes(
@@ -66,62 +66,56 @@ def build_axes(
     position_delay: Float[Array, "*batch"],
     control_period: Float[Array, "*batch"],
     hold: str,
+    weighed: bool = False,
 ) -> Axes:
-    """Axes without limits, leaves (..., axes, *batch), sampled by sensors with delays [s]."""
+    """Axes without limits, leaves (..., axes, *batch), sampled by sensors with delays [s]. Accelerations and
+    measured positions are followed where a tool is `weighed`."""
     period = jnp.broadcast_to(control_period[None], simulator.delay.shape)
     force, position = (
         split_delay(simulator.delay + delay[None], period) for delay in (force_delay, position_delay)
     )
-    exact = propagation(
-        simulator.numerator, simulator.denominator, period, force.fraction, position.fraction, hold
-    )
-    return Axes(exact, rate_row(exact.velocity, simulator.denominator, period), force, position)
+    measured = position.fraction if weighed else None
+    exact = propagation(simulator.numerator, simulator.denominator, period, force.fraction, measured, hold)
+    acceleration = rate_row(exact.velocity, simulator.denominator, period) if weighed else None
+    return Axes(exact, acceleration, force, position)
 
 
 def enter(
-    axes: Axes, at: Array, stride: Array, period: Array, hold: str, latency: int, ring: int, weighed: bool
+    axes: Axes, at: Array, stride: Array, period: Array, hold: str, latency: int, ring: int
 ) -> Hardware:
     """The hardware in uniform motion, `at` now and growing by `stride` in a control period [s], both
-    (axes, *batch); `ring`, a power of two, is longer than any delay in periods. Accelerations and measured
-    positions are followed where a tool is `weighed`."""
+    (axes, *batch); `ring`, a power of two, is longer than any delay in periods."""
     commands = tuple(at - back * stride for back in range(latency + 1))
     drive = commands[-1] if hold == "linear" else commands[-1] + stride
     start = drive - stride
     end = drive if hold == "linear" else start
     rows = axes.propagation
     settled = steady_state(rows, start, stride)
-    still = jnp.zeros_like(stride) if weighed else None
-    motion = Motion(read(rows.position, settled, start, end), stride / period[None], still)
-    before = Samples(motion, read(rows.measured_position, settled, start, end) if weighed else None)
+    position, measured = read(rows.position, settled, start, end), read_measured(rows, settled, start, end)
+    newest = _samples(axes, position, stride / period[None], 0 * stride, measured)
+    growth = _samples(axes, stride, 0 * stride, 0 * stride, stride)
+    # The past fills the ring, one interval after the other.
+    back = jnp.arange(1 - ring, 1, dtype=jnp.int32).astype(stride.dtype).reshape(-1, 1, *[1] * stride.ndim)
+    newest, growth = (jnp.stack(jax.tree.leaves(samples))[None] for samples in (newest, growth))
     return Hardware(
-        commands=commands,
-        state=steady_state(rows, drive, stride),
-        samples=jax.tree.map(lambda leaf: jnp.zeros((ring, *leaf.shape), leaf.dtype), before),
-        before=before,
-        stride=stride,
+        commands, steady_state(rows, drive, stride), (newest + back * growth).reshape(-1, *period.shape)
     )
 
 
 def sampled(axes: Axes, hardware: Hardware, tick: Int[Array, ""]) -> Samples:
     """What the sensors meet that read at `tick`, counted from the start of the run."""
-    stride, before = hardware.stride, hardware.before
-
-    def look(delay: Delay, ring: Array | None, steady: Array | None, growth: Array) -> Array | None:
-        if ring is None or steady is None:
-            return None
-        # Rings are read up to one ring behind: an index below 0 wraps, and is not taken.
-        found = look_back(ring, tick - 1, delay.intervals)
-        uniform = steady + (tick - delay.intervals).astype(growth.dtype) * growth
-        return jnp.where(tick > delay.intervals, found, uniform)
-
-    at, now = hardware.samples, before.motion
-    position, rate, acceleration = (
-        look(axes.force, ring, steady, growth)
-        for ring, steady, growth in zip(at.motion, now, (stride, 0 * stride, 0 * stride), strict=True)
-    )
-    assert position is not None and rate is not None
-    measured = look(axes.position, at.measured, before.measured, stride)
-    return Samples(Motion(position, rate, acceleration), measured)
+    force = axes.force.intervals
+    delays, structure = jax.tree.flatten(_samples(axes, force, force, force, axes.position.intervals))
+    size = force.size
+    ring = hardware.ring.reshape(-1)
+    last = ring.size // (len(delays) * size) - 1
+    lane = jnp.arange(size, dtype=force.dtype).reshape(force.shape)
+    found = []
+    for kind, delay in enumerate(delays):
+        # A ring is read up to one ring behind: an index below 0 wraps.
+        place = ((tick - 1 - delay) & last) * (len(delays) * size) + (kind * size + lane)
+        found.append(ring.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False))
+    return structure.unflatten(found)
 
 
 def actuate(
@@ -131,20 +125,17 @@ def actuate(
     commands = (command, *hardware.commands)
     end = commands[latency]
     start = commands[latency + 1] if hold == "linear" else end
-    rows, state = axes.propagation, hardware.state
+    exact, state, ring = axes.propagation, hardware.state, hardware.ring
+    rows = _samples(axes, exact.position, exact.velocity, axes.acceleration, exact.measured_position)
+    kinds = jax.tree.leaves(rows)
+    last = ring.size // (len(kinds) * command.size) - 1
+    for kind, row in enumerate(kinds):
+        place = ((tick & last) * len(kinds) + kind) * len(command)
+        ring = lax.dynamic_update_slice_in_dim(ring, read(row, state, start, end), place, 0)
+    return Hardware(commands[: latency + 1], advance(exact.transition, state, start, end), ring)
 
-    def at(row: Array, wanted: Array | None) -> Array | None:
-        return None if wanted is None else read(row, state, start, end)
 
-    before = hardware.before
-    motion = Motion(
-        read(rows.position, state, start, end),
-        read(rows.velocity, state, start, end),
-        at(axes.acceleration, before.motion.acceleration),
-    )
-    sample = Samples(motion, at(rows.measured_position, before.measured))
-    return hardware._replace(
-        commands=commands[: latency + 1],
-        state=advance(rows.transition, state, start, end),
-        samples=write_in_turn(hardware.samples, tick, sample),
-    )
+def _samples(axes: Axes, position: Any, rate: Any, acceleration: Any, measured: Any) -> Samples:
+    """Of all that may be sampled what is."""
+    weighed = axes.acceleration is not None
+    return Samples(Motion(position, rate, acceleration if weighed else None), measured if weighed else None)

@@ -24,7 +24,7 @@ class Body(NamedTuple):
     inertia: Matrix  # about the centre of mass, in body axes [kg m^2]
     inverse_inertia: Matrix  # [1/(kg m^2)]
     interface: Vector  # origin of the interface frame, from the centre of mass, in body axes [m]
-    interface_attitude: Quaternion  # from interface axes to body axes
+    interface_attitude: Quaternion | None  # from interface axes to body axes; None where they are the same
 
 
 class State(NamedTuple):
@@ -44,7 +44,7 @@ class Load(NamedTuple):
 
 
 def build_body(
-    mass: Float[Array, "..."], inertia: Matrix, interface: Vector, interface_attitude: Quaternion
+    mass: Float[Array, "..."], inertia: Matrix, interface: Vector, interface_attitude: Quaternion | None
 ) -> Body:
     """A body of `mass` [kg] and `inertia` [kg m^2], symmetric and positive definite."""
     return Body(mass, inertia, inverse(inertia), interface, interface_attitude)

@@ -84,11 +84,12 @@ def loop_of(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -
 
 
 def _body(numbers: Values, name: str) -> Body:
+    turned = f"{name}.interface_rotation"
     return build_body(
         jnp.asarray(numbers(f"{name}.mass")),
         numbers.matrix(numbers.inertia(f"{name}.inertia")),
         numbers.vector(numbers(f"{name}.interface")),
-        numbers.rotation(numbers(f"{name}.interface_rotation")),
+        None if numbers.nothing(turned) else numbers.rotation(numbers(turned)),
     )
 
 
@@ -174,12 +175,10 @@ def _simulator(mechanism: SixAxisMechanism, numbers: Values) -> MotionSimulator:
 
 def _sensor(mechanism: SixAxisMechanism, numbers: Values) -> sensor.Sensor:
     path = "rig.force_sensor."
-    zero = numbers.constant(0.0)
-    still = numbers.vector([zero, zero, zero])
     nothing: Any = np.zeros((6, numbers.number))
     tool = _tool(mechanism, numbers)
     errors = sensor.SampleErrors(
-        np.eye(6)[:, :, None] + numbers(path + "crosstalk"),
+        None if numbers.nothing(path + "crosstalk") else np.eye(6)[:, :, None] + numbers(path + "crosstalk"),
         *(numbers(path + key) for key in ("bias", "quantum", "dead_zone", "range")),
     )
     gravity = numbers.vector(numbers(path + "gravity"))
@@ -188,7 +187,7 @@ def _sensor(mechanism: SixAxisMechanism, numbers: Values) -> sensor.Sensor:
         time_constant=numbers(path + "time_constant"),
         errors=errors,
         noise_std=numbers(path + "noise_std"),
-        mounting=Pose(still, Quaternion(jnp.asarray(zero + 1), still)),
+        mounting=None,
         tool=tool,
         gravity=gravity,
         assumed_tool=_tool(mechanism, numbers, "_assumed"),

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhil.contact.laws import LAWS, ContactParameters
+from jaxhil.contact.laws import LAWS, ContactLaw, ContactParameters, HuntCrossley
 from jaxhil.mechanism import six_axes
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.sixdof.candidates import Candidates, Capsules, ChaserSpheres, TargetSpheres
@@ -28,7 +28,7 @@ class Candidate(NamedTuple):
 
     name: str  # of its table, and which of its copies it is
     pair: Candidates
-    law: str
+    law: ContactLaw
     parameters: ContactParameters
     friction: Friction
 
@@ -61,7 +61,7 @@ def build_groups(mechanism: SixAxisMechanism, numbers: Values) -> tuple[ContactG
     return tuple(
         ContactGroup(
             jax.tree.map(stacked, *(one.pair for one in group)),
-            LAWS[group[0].law],
+            group[0].law,
             jax.tree.map(stacked, *(one.parameters for one in group)),
             jax.tree.map(stacked, *(one.friction for one in group)),
         )
@@ -112,7 +112,7 @@ def _candidate(contact: six_axes.Contact, numbers: Values, name: str, copy: int,
     return Candidate(
         name if count == 1 else f"{name}[{copy}]",
         _pair(chaser, target),
-        contact.law,
+        _law(contact, numbers, path),
         _parameters(contact, numbers, path),
         _friction(contact.friction, numbers, f"{path}.friction"),
     )
@@ -146,6 +146,11 @@ def _shape(shape: six_axes.Shape, numbers: Values, path: str, turn: Any) -> Shap
         about_z = numbers.rotation(numbers.np.stack([0 * turn, 0 * turn, turn]))
         return Box(place("centre"), compose(about_z, own), numbers.vector(of("half_lengths")), of("rounding"))
     return (Cavity if shape.inside else Ball)(place("centre"), of("radius"))
+
+
+def _law(contact: six_axes.Contact, numbers: Values, path: str) -> ContactLaw:
+    known = not numbers.drawn(f"{path}.exponent") and contact.exponent in HuntCrossley.QUICK
+    return HuntCrossley(contact.exponent) if known and contact.law == "hunt_crossley" else LAWS[contact.law]
 
 
 def _parameters(contact: six_axes.Contact, numbers: Values, path: str) -> ContactParameters:

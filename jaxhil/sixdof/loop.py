@@ -61,6 +61,8 @@ class Loop(eqx.Module):
     ring: int = eqx.field(static=True)  # samples that are kept, a power of two beyond the longest delay
     side: str = eqx.field(static=True, default="fixed")  # of the force sensor, one of `SIDES`
     has_noise: bool = eqx.field(static=True, default=False)  # whether the force sensor has noise
+    has_lag: bool = eqx.field(static=True, default=True)  # whether it has a lag
+    has_sample_effects: bool = eqx.field(static=True, default=True)  # quantum, dead zone or range
     compensator: str = eqx.field(static=True, default="none")  # one of `SIX_AXES`
     episodes: int = eqx.field(static=True, default=1)  # that are judged
     whole: bool = eqx.field(static=True, default=False)  # whether a run lasts its whole duration
@@ -84,8 +86,9 @@ class Rig(NamedTuple):
 class Channels(NamedTuple):
     """The force sensor's channels and the controller's memory of them."""
 
-    raw: Wrench  # reading of the last tick, before the lag
-    lagged: Wrench  # behind the lag
+    lag: (
+        tuple[Wrench, Wrench] | None
+    )  # reading of the last tick before the lag and behind it; None without one
     controller: tuple[Any, ...]  # state of the compensator of each channel
 
 
@@ -114,19 +117,30 @@ class Tick(NamedTuple):
 
 
 def build_loop(scenario: Scenario, **static: Any) -> Loop:
-    """The loop of a batch of scenarios; `static` are the fields of `Loop`, without the ring and `pushed`."""
+    """The loop of a batch of scenarios; `static` are the fields of `Loop` that those do not tell."""
     sensor, period = scenario.sensor, np.asarray(scenario.control_period)
+    errors = sensor.errors
     slowest = np.maximum(sensor.delay, sensor.position_delay)[None] + np.asarray(scenario.simulator.delay)
     intervals = int(np.max(slowest / period[None])) + 2
-    loop = Loop(ring=1 << intervals.bit_length(), **static)
-    biased = bool(np.any(np.asarray(sensor.errors.bias) != np.asarray(sensor.assumed_bias)))
+    loop = Loop(
+        ring=1 << intervals.bit_length(),
+        has_lag=bool(np.any(np.asarray(sensor.time_constant) > 0)),
+        has_sample_effects=bool(
+            np.any(np.asarray(errors.quantum) > 0)
+            or np.any(np.asarray(errors.dead_zone) > 0)
+            or np.any(np.isfinite(errors.range))
+        ),
+        **static,
+    )
+    biased = bool(np.any(np.asarray(errors.bias) != np.asarray(sensor.assumed_bias)))
     return replace(loop, pushed=loop.side == "moving" or loop.has_noise or biased)
 
 
 def build_rig(loop: Loop, gains: Gains, scenario: Scenario) -> Rig:
     """Discretise the axes; `gains` are scalars, or of the batch shape, or (6, *batch)."""
     sensor, period = scenario.sensor, scenario.control_period
-    axes = build_axes(scenario.simulator, sensor.delay, sensor.position_delay, period, loop.hold)
+    weighed = loop.side == "moving"
+    axes = build_axes(scenario.simulator, sensor.delay, sensor.position_delay, period, loop.hold, weighed)
     return Rig(
         scenario.bodies, axes, scenario.kinematics, scenario.groups, scenario.latches, sensor, period,
         scenario.key, {name: _six(jnp.asarray(value), period) for name, value in gains.items()},
@@ -141,9 +155,7 @@ def begin(loop: Loop, rig: Rig, states: States) -> RunState:
     history = 0 if rig.kinematics.is_linear else HISTORY
     first = at - history * stride
     legs, leg_rates = jax.jvp(rig.kinematics.command, (first,), (stride,))
-    hardware = enter(
-        rig.axes, legs, leg_rates, rig.period, loop.hold, loop.latency, loop.ring, loop.side == "moving"
-    )
+    hardware = enter(rig.axes, legs, leg_rates, rig.period, loop.hold, loop.latency, loop.ring)
 
     def before(hardware, tick):
         command = rig.kinematics.command(first + (tick + 1).astype(at.dtype) * stride)
@@ -160,7 +172,7 @@ def begin(loop: Loop, rig: Rig, states: States) -> RunState:
         hardware,
         tuple(group.init() for group in rig.groups),
         tuple(init_latch(latch, pose) for latch in rig.latches),
-        Channels(nothing, nothing, controllers),
+        Channels((nothing, nothing) if loop.has_lag else None, controllers),
         jnp.array(history, jnp.int32),
     )
 
@@ -212,18 +224,9 @@ def _sense(
     else:
         load = tool_load(sensor.tool, here.pose, here.twist, here.acceleration, sensor.gravity)
         raw = read_moving(contact, load, here.pose)
-    first = state.tick == (0 if rig.kinematics.is_linear else HISTORY)
-    never = jnp.zeros_like(rig.period)
-
-    def late(now: Array, before: Array, lagged: Array) -> Array:
-        """Behind the lag, of a reading that is a straight line between two ticks."""
-        before, lagged = jnp.where(first, now, before), jnp.where(first, now, lagged)
-        middle = (before + now) / 2
-        return lag(lagged, never, rig.period, never, [before, middle, now], sensor.time_constant)
-
-    lagged: Wrench = jax.tree.map(late, raw, channels.raw, channels.lagged)
-    noise = _noise(rig, state.tick) if loop.has_noise else jnp.zeros_like(sensor.noise_std)
-    reading = sample(lagged, sensor.errors, noise)
+    lagged = raw if channels.lag is None else _behind_lag(rig, state.tick, raw, *channels.lag)
+    noise = _noise(rig, state.tick) if loop.has_noise else None
+    reading = sample(lagged, sensor.errors, noise, loop.has_sample_effects)
     given: Wrench = jax.tree.map(jnp.subtract, reading, _wrench(sensor.assumed_bias))
     if measured is None:
         found = undo_fixed(given, sensor.mounting)
@@ -231,7 +234,20 @@ def _sense(
         load = weight(sensor.assumed_tool, measured.attitude, sensor.assumed_gravity)
         found = undo_moving(given, load, measured)
     command, controller = _compensate(loop, rig, found, channels.controller, state.tick)
-    return command, Channels(raw, lagged, controller)
+    return command, Channels(None if channels.lag is None else (raw, lagged), controller)
+
+
+def _behind_lag(rig: Rig, now: Array, raw: Wrench, last: Wrench, lagged: Wrench) -> Wrench:
+    """Behind the sensor's lag, of a reading that is a straight line between two ticks."""
+    first, never = now == (0 if rig.kinematics.is_linear else HISTORY), jnp.zeros_like(rig.period)
+
+    def late(now: Array, before: Array, lagged: Array) -> Array:
+        before, lagged = jnp.where(first, now, before), jnp.where(first, now, lagged)
+        middle = (before + now) / 2
+        return lag(lagged, never, rig.period, never, [before, middle, now], rig.sensor.time_constant)
+
+    found: Wrench = jax.tree.map(late, raw, last, lagged)
+    return found
 
 
 def _compensate(loop: Loop, rig: Rig, found: Wrench, states: tuple, now: Array) -> tuple[Wrench, tuple]:

@@ -81,9 +81,10 @@ def interface_frame(body: Body, state: State) -> Frame:
     """A body's interface frame."""
     angular = rotate(state.attitude, angular_velocity(body, state))
     offset = rotate(state.attitude, body.interface)
+    turned = body.interface_attitude
     return Frame(
         position=state.position + offset,
-        attitude=compose(state.attitude, body.interface_attitude),
+        attitude=state.attitude if turned is None else compose(state.attitude, turned),
         velocity=state.velocity + cross(angular, offset),
         angular_velocity=angular,
     )

@@ -5,7 +5,6 @@ times the angle t = |theta| [rad]. What depends on t is a power series in t^2, a
 summed: values and derivatives of any order are right there too.
 """
 
-from collections.abc import Callable
 from math import factorial
 from typing import NamedTuple
 
@@ -149,18 +148,19 @@ def _versine(square: Array) -> Array:
 
 def _cubic(square: Array) -> Array:
     """(t - sin t)/t^3."""
-    return _near(_CUBIC, NEAR, square, lambda x: (1 - _sine(x)) / x)
+    sine = _sine(square / 4) * _cosine(square / 4)
+    return _near(_CUBIC, NEAR, square, 1 - sine)
 
 
 def _cotangent(square: Array) -> Array:
     """(1 - t/2 cot(t/2))/t^2."""
-    return _near(_BERNOULLI, 0.25, square, lambda x: (1 - _cosine(x / 4) / _sine(x / 4)) / x)
+    return _near(_BERNOULLI, 0.25, square, 1 - _cosine(square / 4) / _sine(square / 4))
 
 
-def _near(series: tuple[float, ...], limit: float, square: Array, beyond: Callable[[Array], Array]) -> Array:
-    """A function of t^2: its series up to a limit, and what is `beyond`."""
+def _near(series: tuple[float, ...], limit: float, square: Array, beyond: Array) -> Array:
+    """A function of t^2: its series up to a limit, and t^-2 of what is `beyond`."""
     near = square <= limit
-    return jnp.where(near, _sum(series, jnp.where(near, square, 0)), beyond(jnp.where(near, limit, square)))
+    return jnp.where(near, _sum(series, jnp.where(near, square, 0)), beyond / jnp.where(near, 1, square))
 
 
 _COSINE, _SINE, _CUBIC = _alternating(0), _alternating(1), _alternating(3)

@@ -28,7 +28,8 @@ class Tool(NamedTuple):
 class SampleErrors(NamedTuple):
     """What becomes of a sample; per channel (fx, fy, fz, mx, my, mz), in N and N m."""
 
-    crosstalk: Float[Array, "6 6 *batch"]  # what each channel (row) reads of each component [1]
+    # what each channel (row) reads of each component [1]; None where each reads its own
+    crosstalk: Float[Array, "6 6 *batch"] | None
     bias: Float[Array, "6 *batch"]
     quantum: Float[Array, "6 *batch"]  # 0 for none
     dead_zone: Float[Array, "6 *batch"]
@@ -42,7 +43,7 @@ class Sensor(NamedTuple):
     time_constant: Float[Array, "*batch"]  # of the lag of all channels [s]; 0 for none
     errors: SampleErrors
     noise_std: Float[Array, "6 *batch"]  # [N, N m]
-    mounting: Pose  # of a sensor on the fixed side: its frame against T
+    mounting: Pose | None  # of a sensor on the fixed side: its frame against T; None where it is T
     tool: Tool  # on the moving side
     gravity: Vector  # in T axes [m/s^2]
     assumed_tool: Tool  # the controller's
@@ -84,32 +85,44 @@ def undo_moving(reading: Wrench, load: Wrench, pose: Pose) -> Wrench:
     return Wrench(force, moment - load.moment + cross(pose.position, force))
 
 
-def read_fixed(wrench: Wrench, mounting: Pose) -> Wrench:
+def read_fixed(wrench: Wrench, mounting: Pose | None) -> Wrench:
     """Reading of a sensor on the fixed side, about its own origin, in its own axes: the reaction.
 
-    `mounting` is the pose of its frame against T.
+    `mounting` is the pose of its frame against T, None where it is T.
     """
+    if mounting is None:
+        return Wrench(-wrench.force, -wrench.moment)
     at, attitude = mounting
     moment = wrench.moment - cross(at, wrench.force)
     return Wrench(*(-rotate_back(attitude, part) for part in (wrench.force, moment)))
 
 
-def undo_fixed(reading: Wrench, mounting: Pose) -> Wrench:
+def undo_fixed(reading: Wrench, mounting: Pose | None) -> Wrench:
     """The contact's wrench, from a reading on the fixed side."""
+    if mounting is None:
+        return Wrench(-reading.force, -reading.moment)
     at, attitude = mounting
     force, moment = (-rotate(attitude, part) for part in reading)
     return Wrench(force, moment + cross(at, force))
 
 
-def sample(reading: Wrench, errors: SampleErrors, noise: Float[Array, "6 *batch"]) -> Wrench:
-    """A sample of a reading: cross-talk, bias, noise [N, N m]; then quantum, dead zone and range."""
+def sample(
+    reading: Wrench, errors: SampleErrors, noise: Float[Array, "6 *batch"] | None, has_effects: bool = True
+) -> Wrench:
+    """A sample of a reading: cross-talk, bias, noise [N, N m]; then, where there are any, quantum, dead zone
+    and range."""
     # Component by component: slices of what was stacked are worked out over and over.
     components, structure = jax.tree.flatten(reading)
 
     def channel(row: int) -> Array:
-        mixed = errors.bias[row] + noise[row]
-        for column, component in enumerate(components):
-            mixed = mixed + errors.crosstalk[row, column] * component
+        mixed = errors.bias[row] if noise is None else errors.bias[row] + noise[row]
+        if errors.crosstalk is None:
+            mixed = mixed + components[row]
+        else:
+            for column, component in enumerate(components):
+                mixed = mixed + errors.crosstalk[row, column] * component
+        if not has_effects:
+            return mixed
         return sample_force(mixed, errors.quantum[row], errors.dead_zone[row], errors.range[row])
 
     return structure.unflatten([channel(row) for row in range(6)])

@@ -38,6 +38,14 @@ class Values:
         """Whether the file says it."""
         return value_at(self._mechanism, path) is not None
 
+    def drawn(self, path: str) -> bool:
+        """Whether lanes have values of their own."""
+        return path in self._draws
+
+    def nothing(self, path: str) -> bool:
+        """Whether it is 0 in every lane."""
+        return not self.drawn(path) and not np.any(np.asarray(value_at(self._mechanism, path), float))
+
     def constant(self, value: float) -> Any:
         """The same number in every lane."""
         return np.full(self.number, value)

@@ -1,7 +1,7 @@
 // The six-axis contact loop of jaxhil written by hand: what plain C++ makes of the same physics.
 //
 // A sphere in a drogue, Hunt and Crossley's force, regularised friction; six second-order axes with delays of their
-// own, linear hold, latency 0; semi-implicit Euler on both bodies; a sensor on the fixed side, mixed, biased and cut,
+// own, linear hold, latency 0; semi-implicit Euler on both bodies; a sensor on the fixed side with a bias,
 // without noise and lag; no compensator. The discretised axes, the delays and the first state are input:
 // jaxhil.sixdof.loop makes them.
 //
@@ -33,10 +33,6 @@ struct Load { Vector force, torque; };
 inline V all(double x) { return V{} + x; }
 inline V root(V a) {
     for (int l = 0; l < W; ++l) a[l] = std::sqrt(a[l]);
-    return a;
-}
-inline V rounded(V a) {
-    for (int l = 0; l < W; ++l) a[l] = std::nearbyint(a[l]);
     return a;
 }
 inline Vector operator+(Vector a, Vector b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
@@ -125,11 +121,11 @@ struct Problem {
     const double *transition;        // [2, 4, 6, lanes]
     const double *rows;              // [2, 4, 6, lanes]: position, velocity at the force sensor's place
     double *axes;                    // [2, 6, lanes]: state
-    const double *before;            // [2, 6, lanes]: position and rate of the interval before the run
-    const double *stride, *command;  // [6, lanes]: growth in a period; as sent
+    const double *samples;           // [ring, 2, 6, lanes]: position and rate of the intervals before the run
+    const double *command;           // [6, lanes]: as sent
     const int64_t *intervals;        // [6, lanes]
     const double *contact;           // [10, lanes]: radius, drogue, stiffness, damping, friction, slip; sphere's centre
-    const double *errors;            // [6, 10, lanes]: mixing row, bias, quantum, dead zone, range
+    const double *bias;              // [6, lanes]
 };
 
 namespace {
@@ -157,7 +153,7 @@ void block(const Problem& p, int64_t lane, int64_t ticks) {
         s[b] = {triple(p.states, from), triple(p.states, from + 3),
                 {get(p.states, from + 6), triple(p.states, from + 7)}, triple(p.states, from + 10)};
     }
-    V transition[2][4][6], rows[2][4][6], axis[2][6], before[2][6], stride[6], sent[6], errors[6][10];
+    V transition[2][4][6], rows[2][4][6], axis[2][6], sent[6], bias[6];
     int64_t intervals[6][W];
     for (int a = 0; a < 6; ++a) {
         for (int i = 0; i < 2; ++i) {
@@ -166,11 +162,9 @@ void block(const Problem& p, int64_t lane, int64_t ticks) {
                 rows[i][c][a] = get(p.rows, (i * 4 + c) * 6 + a);
             }
             axis[i][a] = get(p.axes, i * 6 + a);
-            before[i][a] = get(p.before, i * 6 + a);
         }
-        stride[a] = get(p.stride, a);
         sent[a] = get(p.command, a);
-        for (int c = 0; c < 10; ++c) errors[a][c] = get(p.errors, a * 10 + c);
+        bias[a] = get(p.bias, a);
         for (int l = 0; l < W; ++l) intervals[a][l] = p.intervals[a * p.lanes + lane + l];
     }
     const V period = get(p.period, 0), radius = get(p.contact, 0);
@@ -180,20 +174,15 @@ void block(const Problem& p, int64_t lane, int64_t ticks) {
     const Vector centre = triple(p.contact, 9);
     const int64_t mask = p.ring - 1;
     std::vector<V> ring(p.ring * 12);
+    for (int64_t row = 0; row < p.ring * 12; ++row) ring[row] = get(p.samples, row);
 
     for (int64_t tick = 0; tick < ticks; ++tick) {
         V at[6], rate[6];
         for (int a = 0; a < 6; ++a)
             for (int l = 0; l < W; ++l) {
-                const int64_t late = intervals[a][l];
-                if (tick > late) {
-                    const V* sample = &ring[((tick - 1 - late) & mask) * 12];
-                    at[a][l] = sample[a][l];
-                    rate[a][l] = sample[6 + a][l];
-                } else {
-                    at[a][l] = before[0][a][l] + double(tick - late) * stride[a][l];
-                    rate[a][l] = before[1][a][l];
-                }
+                const V* sample = &ring[((tick - 1 - intervals[a][l]) & mask) * 12];
+                at[a][l] = sample[a][l];
+                rate[a][l] = sample[6 + a][l];
             }
         // The contact, on the hardware.
         const Vector place{at[0], at[1], at[2]}, theta{at[3], at[4], at[5]};
@@ -210,19 +199,10 @@ void block(const Problem& p, int64_t lane, int64_t ticks) {
         const V normal = push > 0 ? push : all(0);
         const V share = friction * normal / root(dot(slip, slip) + slip_speed * slip_speed);
         const Vector force = normal * n - share * slip, moment = cross(point, force);
-        // The sensor: mixed, biased, rounded, cut; it reads the reaction.
+        // The sensor reads the reaction.
         const V given[6] = {-force.x, -force.y, -force.z, -moment.x, -moment.y, -moment.z};
         V read[6];
-        for (int row = 0; row < 6; ++row) {
-            V mixed = errors[row][6];
-            for (int c = 0; c < 6; ++c) mixed += errors[row][c] * given[c];
-            const V quantum = errors[row][7], zone = errors[row][8], most = errors[row][9];
-            const V safe = quantum > 0 ? quantum : all(1);
-            mixed = quantum > 0 ? safe * rounded(mixed / safe) : mixed;
-            const V beyond = (mixed < 0 ? -mixed : mixed) - zone, cut = beyond > 0 ? beyond : all(0);
-            mixed = zone > 0 ? (mixed < 0 ? -cut : cut) : mixed;
-            read[row] = mixed > most ? most : (mixed < -most ? -most : mixed);
-        }
+        for (int row = 0; row < 6; ++row) read[row] = bias[row] + given[row];
         // The numerical model.
         const Vector offset = rotate(s[0].q, body[0].interface), origin = s[0].r + offset;
         const Vector f = rotate(s[0].q, {-read[0], -read[1], -read[2]});
