@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.compensators.base import Gains
 from jaxhil.sixdof.bodies import kinetic_energy
+from jaxhil.sixdof.equations import square_root
 from jaxhil.sixdof.loop import Loop
 from jaxhil.sixdof.reference import (
     Meeting,
@@ -30,7 +31,6 @@ from jaxhil.sixdof.space import Space, fly, scale, start_flight
 from jaxhil.sixdof.vectors import components, cross, dot, root
 
 LONGEST = 2.0  # control periods: the longest step in space
-ROOT_STEPS = 24  # of the iteration for a matrix's square root
 
 
 class Metrics(NamedTuple):
@@ -200,24 +200,10 @@ def _twist_parts(matrix: Array, after: Twist, expected: Twist, before: Twist) ->
 
     size = root(square(impulse))
     scale_ = 1 / jnp.where(size > 0, size, jnp.nan)
-    half = _square_root(matrix)
+    half = square_root(matrix)
     weighed, along = (jnp.sum(half * vector[None], axis=1) for vector in (error, scale_[None] * impulse))
     normal = jnp.sum(weighed * along, axis=0)
     rest = weighed - normal[None] * along
     lateral, rotational = (root(jnp.sum(part**2, axis=0)) for part in (rest[:3], rest[3:]))
     total = root(square(error))
     return total * scale_, normal * scale_, lateral * scale_, rotational * scale_
-
-
-def _square_root(matrix: Array) -> Array:
-    """Symmetric root of a positive definite matrix (Denman and Beavers)."""
-    rows = jnp.moveaxis(matrix, (0, 1), (-2, -1))
-    size = jnp.trace(rows, axis1=-2, axis2=-1)[..., None, None]
-    unit = jnp.broadcast_to(jnp.eye(6, dtype=matrix.dtype), rows.shape)
-
-    def body(_, pair: tuple[Array, Array]) -> tuple[Array, Array]:
-        one, other = pair
-        return (one + jnp.linalg.inv(other)) / 2, (other + jnp.linalg.inv(one)) / 2
-
-    found, _ = lax.fori_loop(0, ROOT_STEPS, body, (rows / size, unit))
-    return jnp.moveaxis(found * jnp.sqrt(size), (-2, -1), (0, 1))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxhil.sixdof.bodies import Body, Load, State, angular_velocity, kick_drift
+from jaxhil.sixdof.equations import solve
 from jaxhil.sixdof.rotations import (
     Quaternion,
     compose,
@@ -184,8 +185,7 @@ def mass_matrix(bodies: Pair, states: States) -> Float[Array, "6 6 *batch"]:
     bodies, states = jax.tree.map(lambda leaf: leaf[None], (bodies, states))
     twist = acceleration(bodies, states, Wrench(vector(unit[:3]), vector(unit[3:])))
     inverse = jnp.stack(jax.tree.leaves(twist))
-    found = jnp.linalg.inv(jnp.moveaxis(inverse, (0, 1), (-2, -1)))
-    return jnp.moveaxis(found, (-2, -1), (0, 1))
+    return solve(inverse, unit)
 
 
 def effective_mass(bodies: Pair, states: States, point: Vector, normal: Vector) -> Float[Array, "..."]:

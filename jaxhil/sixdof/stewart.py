@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxhil.sixdof.axes import Motion
+from jaxhil.sixdof.equations import solve
 from jaxhil.sixdof.kinematics import Kinematics
 from jaxhil.sixdof.rotations import exponential, left_jacobian, rotate
 from jaxhil.sixdof.vectors import Vector, cross, direction, norm, vector
@@ -41,14 +42,14 @@ class Stewart(Kinematics):
 
     def coordinates(self, motion, near):
         def newton(at: Array, lengths: Array) -> Array:
-            return at + solve(jacobian(self, at), lengths - self.command(at))
+            return at + solve(jacobian(self, at), (lengths - self.command(at))[:, None])[:, 0]
 
         lengths, near = lax.stop_gradient((motion.position, near))
         at = lax.fori_loop(0, NEWTON_STEPS - 1, lambda _, at: newton(at, lengths), near)
         # The last step alone is differentiated: derivatives of the pose, not of the way to it.
         at = newton(at, motion.position)
         slopes = jacobian(self, at)
-        rate = solve(slopes, motion.rate)
+        rate = solve(slopes, motion.rate[:, None])[:, 0]
         if motion.acceleration is None:
             return Motion(at, rate, None)
 
@@ -56,7 +57,7 @@ class Stewart(Kinematics):
             return jax.jvp(self.command, (at,), (rate,))[1]
 
         bent = jax.jvp(leg_rates, (at,), (rate,))[1]
-        return Motion(at, rate, solve(slopes, motion.acceleration - bent))
+        return Motion(at, rate, solve(slopes, (motion.acceleration - bent)[:, None])[:, 0])
 
 
 def jacobian(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "6 6 *batch"]:
@@ -71,13 +72,6 @@ def jacobian(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "6 
 def condition(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "*batch"]:
     """Condition number of the legs' Jacobian, lengths in m: large where a pose is hardly held."""
     return jnp.linalg.cond(jnp.moveaxis(jacobian(hexapod, at), (0, 1), (-2, -1)))
-
-
-def solve(matrix: Float[Array, "6 6 *batch"], right: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
-    """matrix^-1 right."""
-    rows = jnp.moveaxis(matrix, (0, 1), (-2, -1))
-    found = jnp.linalg.solve(rows, jnp.moveaxis(right, 0, -1)[..., None])
-    return jnp.moveaxis(found[..., 0], -1, 0)
 
 
 def _legs(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> tuple[Vector, Vector, Vector]:

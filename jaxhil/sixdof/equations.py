@@ -1,0 +1,69 @@
+"""Linear equations and roots of small matrices, of all lanes at once; a library would be called lane by lane.
+
+Matrices are (rows, columns, *batch).
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+ROOT_STEPS = 32  # to rounding for eigenvalues down to 1e-9 of their sum: small ones grow by 9/4 a step
+
+
+@jax.custom_jvp
+def solve(
+    matrix: Float[Array, "size size *batch"], right: Float[Array, "size columns *batch"]
+) -> Float[Array, "size columns *batch"]:
+    """matrix^-1 right, by the modified process of Gram and Schmidt on the columns of both."""
+    size = len(matrix)
+
+    def project(k: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        table, triangle = carry
+        column = lax.dynamic_index_in_dim(table, k, 1)
+        square = product(jnp.swapaxes(column, 0, 1), column)
+        unit = column * lax.rsqrt(square)
+        along = product(jnp.swapaxes(unit, 0, 1), table)
+        return table - unit * along, lax.dynamic_update_slice_in_dim(triangle, along, k, 0)
+
+    table = jnp.concatenate([matrix, right], axis=1)
+    _, triangle = lax.fori_loop(0, size, project, (table, jnp.zeros_like(table)))
+
+    def substitute(step: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        rest, found = carry
+        k = size - 1 - step
+        column = lax.dynamic_index_in_dim(triangle, k, 1)
+        row = lax.dynamic_index_in_dim(rest, k, 0) / lax.dynamic_index_in_dim(column, k, 0)
+        return rest - column * row, lax.dynamic_update_slice_in_dim(found, row, k, 0)
+
+    return lax.fori_loop(0, size, substitute, (triangle[:, size:], jnp.zeros_like(right)))[1]
+
+
+@solve.defjvp
+def _solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    (matrix, right), (slope, right_slope) = primals, tangents
+    found = solve(matrix, right)
+    return found, solve(matrix, right_slope - product(slope, found))
+
+
+def product(one: Float[Array, "rows inner *batch"], other: Float[Array, "inner columns *batch"]) -> Array:
+    """one @ other."""
+    total = one[:, 0, None] * other[None, 0]
+    for k in range(1, len(other)):
+        total = total + one[:, k, None] * other[None, k]
+    return total
+
+
+def square_root(matrix: Float[Array, "size size *batch"]) -> Float[Array, "size size *batch"]:
+    """Symmetric root of symmetric positive definite matrices: Newton and Schulz's iteration, of products
+    alone."""
+    unit = jnp.eye(len(matrix), dtype=matrix.dtype).reshape(*matrix.shape[:2], *[1] * (matrix.ndim - 2))
+    size = jnp.sum(unit * matrix, axis=(0, 1), keepdims=True)
+
+    def step(_, pair: tuple[Array, Array]) -> tuple[Array, Array]:
+        root, inverse = pair
+        share = (3 * unit - product(inverse, root)) / 2
+        return product(root, share), product(share, inverse)
+
+    start = matrix / size, jnp.broadcast_to(unit, matrix.shape)
+    return lax.fori_loop(0, ROOT_STEPS, step, start)[0] * jnp.sqrt(size)
