@@ -192,6 +192,12 @@ def run_lanes(loop: Any, gains: Any, scenario: Any) -> Outcome:
 
 
 @singledispatch
+def compiler_options(loop: Any) -> Mapping[str, int | str]:
+    """Options of the compiler for batches."""
+    return ROLLOUT
+
+
+@singledispatch
 def expected_duration(scenarios: Any) -> np.ndarray:
     """Order of a run's duration [s]: half a period sqrt(M/k) per contact; for sorting only."""
     stiffness = np.asarray(scenarios.contact.stiffness)
@@ -216,12 +222,12 @@ def whole_delays(scenarios: Any) -> np.ndarray:
 
 def run_tiles(loop: Any, common: Any, per_lane: Any, scenarios: Any) -> Outcome:
     """Outcome of what `shard` made, each leaf (devices, tiles, ..., lanes of a tile)."""
-    return _compiled()(loop, common, per_lane, scenarios)
+    return _compiled(frozenset(compiler_options(loop).items()))(loop, common, per_lane, scenarios)
 
 
 @cache
-def _compiled() -> Callable[..., Outcome]:
-    return jax.jit(_run_tiles, static_argnums=0, compiler_options=known_options(ROLLOUT))
+def _compiled(options: frozenset) -> Callable[..., Outcome]:
+    return jax.jit(_run_tiles, static_argnums=0, compiler_options=known_options(dict(options)))
 
 
 def _mesh():

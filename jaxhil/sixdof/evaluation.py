@@ -4,6 +4,7 @@ Importing this teaches `jaxhil.simulation.evaluation` scenarios and loops of six
 errors; both are rows of the outcome, those of the energy before those of the twist.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -11,7 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhil.simulation import metrics as one_axis
-from jaxhil.simulation.evaluation import Outcome, at_rest, expected_duration, run_lanes, whole_delays
+from jaxhil.simulation.environment import SIX_AXES
+from jaxhil.simulation.evaluation import (
+    Outcome,
+    at_rest,
+    compiler_options,
+    expected_duration,
+    run_lanes,
+    whole_delays,
+)
 from jaxhil.sixdof.loop import Loop
 from jaxhil.sixdof.metrics import Metrics, evaluate
 from jaxhil.sixdof.rollout import CAPTURED, JAMMED, MISS, NON_FINITE, REBOUNDED, TIMEOUT
@@ -33,6 +42,12 @@ STATUSES = {
 def run_in_space(loop: Loop, gains: Any, scenario: Scenario) -> Outcome:
     """Outcome of lanes, rows (errors of the energy, then of the twist; *batch)."""
     return outcome_of(evaluate(loop, gains, scenario).metrics, scenario)
+
+
+@compiler_options.register
+def options_in_space(loop: Loop) -> Mapping[str, int | str]:
+    """Options of the compiler for batches in six axes."""
+    return SIX_AXES
 
 
 @at_rest.register
