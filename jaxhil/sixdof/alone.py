@@ -1,5 +1,7 @@
 """Two bodies in space alone, without a rig: their first episode, and where it leads."""
 
+from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -46,7 +48,7 @@ def simulate_in_space(mechanism: SixAxisMechanism) -> SpaceRun:
     with computing():
         scenario = build_scenarios(mechanism)
         check_scenario(mechanism, scenario)
-        found = jax.device_get(_compiled(scenario))
+        found = jax.device_get(_compiled()(scenario))
     check_followed(mechanism, found)
 
     def value(name: str) -> Any:
@@ -70,4 +72,6 @@ def _judged(scenario: Scenario) -> Metrics:
     return judge(scenario, Episode(start, start, zero, zero, none, zero, zero, zero, zero, none + REBOUNDED))
 
 
-_compiled = jax.jit(_judged, compiler_options=known_options(ONCE))
+@cache
+def _compiled() -> Callable[[Scenario], Metrics]:
+    return jax.jit(_judged, compiler_options=known_options(ONCE))

@@ -1,5 +1,7 @@
 """Whether the nominal run of a mechanism of six axes can begin: apart, in reach, and soon over."""
 
+from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -9,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxhil.errors import InputError
 from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.simulation.environment import ONCE, known_options
 from jaxhil.simulation.plausibility import check_poles
 from jaxhil.sixdof.approach import FAR
 from jaxhil.sixdof.building_contacts import candidate_names
@@ -53,7 +56,7 @@ def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
         raise InputError(f"{mechanism.name}: {found}, allowed at most {MOST_TICKS:.0e}")
     denominator = np.asarray(scenario.simulator.denominator)[..., 0]
     check_poles(mechanism.name, denominator, np.full(denominator.shape[1], scenario.control_period[0]))
-    begins: Beginning = jax.tree.map(np.asarray, _beginning(scenario))
+    begins: Beginning = jax.tree.map(np.asarray, _compiled()(scenario))
     at = begins.coordinates[:, 0]
     if not np.all(np.isfinite(at)):
         found = f"nothing to touch below {FAR:g} m: it goes past the target"
@@ -107,7 +110,11 @@ def _check_legs(mechanism: SixAxisMechanism, begins: Beginning) -> None:
             raise InputError(f"{mechanism.name}: {found} with {pose}, allowed {allowed}")
 
 
-@jax.jit
+@cache
+def _compiled() -> Callable[[Scenario], Beginning]:
+    return jax.jit(_beginning, compiler_options=known_options(ONCE))
+
+
 def _beginning(scenario: Scenario) -> Beginning:
     pose, twist = relative(scenario.bodies, scenario.start)
     at, _ = command_of(scenario.bodies, scenario.start)
