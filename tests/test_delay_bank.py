@@ -12,12 +12,14 @@ from scipy import stats
 
 from jaxhil.compensators import delay_bank as in_jax
 from jaxhil.compensators import force_depth_map
+from jaxhil.compensators.lagged_onset import Window
 from jaxhil.compensators.meeting import Meeting as MeetingInJax
 from jaxhil.compensators.reintegration import Scales
 from jaxhil.runtime import Controller
 from jaxhil.runtime.laws.contact_plane import Meeting
-from jaxhil.runtime.laws.delay_bank import HYPOTHESES, UNLIKELY, USUAL, WHOLE, DelayBank
+from jaxhil.runtime.laws.delay_bank import DELAYS, HYPOTHESES, LAGGING, UNLIKELY, USUAL, WHOLE, DelayBank
 from jaxhil.runtime.laws.force_depth_map import KNOTS, ForceDepthMap, Prior
+from jaxhil.runtime.laws.lagged_onset import lagged_onsets
 from jaxhil.runtime.laws.onset import Onset
 
 LAW, PERIOD, SPREAD, VARIANCE = "retrospective_delay_bank", 1e-3, 1e-3, 0.1**2
@@ -32,7 +34,10 @@ PRIOR = {
     "friction": 0.0,
     "preload": 0.3,
 }
-OFFSETS = SPREAD * np.linspace(-1, 1, HYPOTHESES)
+OFFSETS = SPREAD * np.linspace(-1, 1, DELAYS)
+LAGS = 0.00025 * np.arange(1, HYPOTHESES - DELAYS + 1)
+OLDER = np.append(OFFSETS, LAGS)
+UNSEEN: tuple[list[float], list[float], float] = ([], [], VARIANCE)  # no readings about the onset
 
 
 def contact(rng, ticks=170, begins=-0.02, lasts=0.13, delay=0.0, hides=0.0):
@@ -48,7 +53,7 @@ def contact(rng, ticks=170, begins=-0.02, lasts=0.13, delay=0.0, hides=0.0):
 
 
 def plain(spread=SPREAD, plane_spread=TOLD):
-    return DelayBank(spread, plane_spread, Prior(**PRIOR))
+    return DelayBank(spread, plane_spread, Prior(**PRIOR), PERIOD)
 
 
 def meeting(place=0.0, pace=1.0):
@@ -87,7 +92,7 @@ def test_likelihood_is_the_root_of_the_density_of_all_readings():
     rng = np.random.default_rng(0)
     depths, speeds, forces, _ = contact(rng, ticks=60, begins=0.002)
     bank = plain()
-    bank.begin(meeting())
+    bank.begin(meeting(), *UNSEEN)
     for depth, speed, force in zip(depths.tolist(), speeds.tolist(), forces.tolist(), strict=True):
         bank.learn(depth, speed, force, VARIANCE, False, 0.0)
     knots = np.array(KNOTS)
@@ -109,7 +114,7 @@ def test_likelihood_is_the_root_of_the_density_of_all_readings():
         phi = np.column_stack([phi, speeds / np.hypot(speeds, 0.03), np.ones_like(x)])
         spread = phi @ covariance @ phi.T + VARIANCE * np.eye(len(x))
         exact.append(0.5 * stats.multivariate_normal.logpdf(forces, phi @ mean, spread))
-    found = np.log(bank._likelihood)
+    found = np.log(bank._likelihood[:DELAYS])
     np.testing.assert_allclose(found - found[4], np.array(exact) - exact[4], atol=0.02)
     assert np.ptp(exact) > 0.1
 
@@ -124,8 +129,10 @@ def test_both_recursions_agree():
     for delay, zone, met in (
         (0.0004, 0.0, meeting(2e-6)), (0.0004, 0.0, meeting(1e-4, 0.8)), (-0.0007, 1.0, meeting()),
     ):  # fmt: skip
-        earlier = bank.begin(met)
-        ours, as_early = begin(ours, prior, in_arrays(met), zero + PERIOD, *known)
+        about = contact(rng, ticks=40, delay=delay)
+        earlier = bank.begin(met, about[0].tolist(), about[2].tolist(), VARIANCE)
+        window = Window(*(jnp.asarray(each) for each in (about[0], about[2], ~about[3])), zero + VARIANCE)
+        ours, as_early = begin(ours, prior, in_arrays(met), window, zero + PERIOD, *known)
         assert int(as_early) == earlier
         for depth, speed, force, hidden in zip(*contact(rng, delay=delay, hides=zone), strict=True):
             bank.learn(float(depth), float(speed), float(force), VARIANCE, bool(hidden), zone)
@@ -133,7 +140,7 @@ def test_both_recursions_agree():
                 zero + depth, zero + speed, zero + force, zero + VARIANCE, jnp.asarray(bool(hidden)),
                 zero + zone, jnp.asarray(True),
             )  # fmt: skip
-            ours, curve = learn(ours, reading, zero + SPREAD, zero + PRIOR["damping"] ** 2)
+            ours, curve = learn(ours, reading, zero + PERIOD, known[0], known[2])
         assert float(ours.shift) == pytest.approx(bank.shift, rel=1e-9, abs=1e-14)
         assert float(ours.deeper) == pytest.approx(bank.deeper, rel=1e-9, abs=1e-14)
         np.testing.assert_allclose(curve.slopes, bank.curve.slopes, rtol=1e-8)
@@ -147,15 +154,17 @@ def test_both_recursions_agree():
 def test_where_all_delays_are_the_same_it_is_one_map():
     depths, speeds, forces, _ = contact(np.random.default_rng(2), begins=0.002, lasts=0.2)
     bank, alone = plain(0.0, 1e-12), ForceDepthMap(Prior(**PRIOR))
-    bank.begin(meeting())
+    bank.begin(meeting(), *UNSEEN)
     deepest = 0.0
     for depth, speed, force in zip(depths.tolist(), speeds.tolist(), forces.tolist(), strict=True):
         deepest = max(deepest, depth)
         bank.learn(depth, speed, force, VARIANCE, False, 0.0)
         alone.update(depth, speed, deepest, force, VARIANCE)
-    np.testing.assert_allclose(weights_of(bank), 1 / HYPOTHESES, rtol=1e-12)
-    np.testing.assert_allclose(bank.curve.slopes, alone.curve.slopes, rtol=1e-9)
-    assert bank.curve.damping == pytest.approx(alone.curve.damping, rel=1e-9) and bank.shift == 0
+    weights = weights_of(bank)
+    np.testing.assert_allclose(weights[:DELAYS], weights[0], rtol=1e-12)
+    for h in range(DELAYS):
+        np.testing.assert_allclose(bank._estimate[:, h], alone._estimate, rtol=1e-9, atol=1e-12)
+    assert np.sum(weights[:DELAYS]) > 0.9
 
 
 def test_contacts_narrow_the_delay_and_a_reset_forgets_it():
@@ -164,11 +173,11 @@ def test_contacts_narrow_the_delay_and_a_reset_forgets_it():
     for _ in range(8):
         # The ticks fall elsewhere on every contact: of damped contact that is what tells a delay.
         depths, speeds, forces, _ = contact(rng, begins=-0.02 + PERIOD * rng.random(), delay=delay)
-        bank.begin(meeting())
+        bank.begin(meeting(), *UNSEEN)
         for depth, speed, force in zip(depths.tolist(), speeds.tolist(), forces.tolist(), strict=True):
             bank.learn(depth, speed, force, VARIANCE, False, 0.0)
         weights = weights_of(bank)
-        spreads.append(math.sqrt(np.sum(weights * (OFFSETS - bank.shift) ** 2)))
+        spreads.append(math.sqrt(np.sum(weights * (OLDER - bank.shift) ** 2)))
     assert abs(bank.shift - delay) < 1.5e-4 and spreads[-1] < 0.6 * spreads[0]
     bank.reset()
     np.testing.assert_array_equal(weights_of(bank), weights_of(plain()))
@@ -180,7 +189,7 @@ def test_a_jump_between_two_hypotheses_rules_neither_out():
     rng, bank, delay = np.random.default_rng(7), plain(plane_spread=1e-9), 0.5 * (OFFSETS[11] + OFFSETS[12])
     for beside in (-3e-5, 3e-5) * 2:
         depths, speeds, forces, _ = contact(rng, begins=delay + beside - 20 * PERIOD, delay=delay)
-        bank.begin(meeting())
+        bank.begin(meeting(), *UNSEEN)
         for depth, speed, force in zip(depths.tolist(), speeds.tolist(), forces.tolist(), strict=True):
             bank.learn(depth, speed, force, VARIANCE, False, 0.0)
     assert bank.shift == pytest.approx(delay, abs=1e-4)
@@ -197,16 +206,23 @@ def test_a_jump_between_two_hypotheses_rules_neither_out():
 )
 def test_surface_lies_between_where_it_was_told_and_where_it_was_met(plane_spread, place, share):
     bank, pace = plain(plane_spread=plane_spread), 0.5
-    earlier = bank.begin(meeting(place, pace))
-    # Depth when it was met: X_0 - d v_0 less p_h = g (X_0 - d v_0).
-    depth = (1 - share) * (place - OFFSETS * SPEED) / SPEED * pace
-    np.testing.assert_allclose(-bank._below - OFFSETS * pace, depth, atol=1e-6)
-    assert earlier == min(math.ceil(max(depth.max() / (PERIOD * pace) - 1e-2, 0)), 30)
-    away = (place - OFFSETS * SPEED) ** 2 / (plane_spread**2 + FOUND**2)
-    weights = np.maximum(np.exp(-0.5 * away), UNLIKELY)
+    earlier = bank.begin(meeting(place, pace), *UNSEEN)
+    # Depth when it was met: X_0 - d v_0 less p_h = g (X_0 - d v_0), X_0 later with a lag.
+    later, around = lagged_onsets(LAGS * pace, *UNSEEN, PERIOD * pace)
+    met = place + np.append(0 * OFFSETS, later * SPEED / pace)
+    both = plane_spread**2 + FOUND**2 + np.append(0 * OFFSETS, around * (SPEED / pace) ** 2)
+    offsets = np.append(OFFSETS, 0 * LAGS)
+    depth = (place - offsets * SPEED) / SPEED * pace - share * (met - offsets * SPEED) / SPEED * pace
+    delayed = slice(0, DELAYS)
+    np.testing.assert_allclose((-bank._below - offsets * pace)[delayed], depth[delayed], atol=1e-6)
+    away = (met - offsets * SPEED) ** 2 / both
+    entered = (-bank._below - offsets * pace).max() / (PERIOD * pace)
+    assert earlier == min(math.ceil(max(entered - 1e-2, 0)), 30)
+    weights = np.append(np.ones(DELAYS), np.full(len(LAGS), LAGGING))
+    weights *= np.maximum(np.exp(-0.5 * away), UNLIKELY)
     weights /= np.sum(weights)
     np.testing.assert_allclose(weights_of(bank), weights, rtol=0.03)
-    assert bank.shift == pytest.approx(weights @ OFFSETS, abs=1e-5)
+    assert bank.shift == pytest.approx(weights @ OLDER, abs=1e-5)
     assert bank.deeper == pytest.approx(weights @ bank._below, abs=1e-5)
 
 
@@ -218,7 +234,7 @@ def test_where_a_contact_bends_does_not_tell_its_delay(bends, delay):
     bank = plain(plane_spread=1e-3)
     phase = (0.5e-3 - 0.002 + PERIOD * np.arange(150)) * math.pi / 0.15
     depths, speeds = 0.15 / math.pi * np.sin(phase), np.cos(phase)
-    bank.begin(meeting(place=delay * SPEED)._replace(variance=1e-13))
+    bank.begin(meeting(place=delay * SPEED)._replace(variance=1e-13), *UNSEEN)
     for depth, speed in zip(depths.tolist(), speeds.tolist(), strict=True):
         # A force that is `delay` older, of depths that begin where the hardware then was.
         x = depth - delay * (speed - 1)

@@ -1,17 +1,19 @@
-"""Hypotheses of the force delay side by side, each with a map of its own, weighed by what they explain.
+"""Hypotheses of the force delay and of a lag side by side, each with a map of its own, weighed by what they
+explain.
 
 Hypothesis h takes the force to be d_h [s] older than assumed: it belongs to the depth X - d_h V - p_h, to
 first order in d_h. The surface was met at X_0; by this hypothesis it lies at p_h = g (X_0 - d_h v_0) beyond
-where it was told, g = spread^2/(spread^2 + found^2) by how uncertain either is, or 1 where they disagree.
-Each identifies a `force_depth_map` of its own and says beforehand what it expects to read, f_h with a
-variance s_h (0 with the noise's own variance r out of contact, and where what it expects while the contact
-opens is not positive). Its weight is the product of the likelihood of all readings y of this contact and of
-those before, in each (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), of how well its damping goes with what is known
-of contacts (`plausibility`), and of how likely its surface is there: see
-notebooks/guide/retrospective_reference.md section 7. The exponentials are (1 + u/n)^-n: algebraic, the same
-on every machine. What counts is the mean over all hypotheses, of their maps, delays and surfaces. Their maps
-bend at the same places, wherever they have the surface: which fits best is not to be decided by what a
-contact that bends between two knots leaves.
+where it was told, g = spread^2/(spread^2 + found^2) by how uncertain either is, or 1 where they disagree. As
+many others take the sensor to lag by l_h [s]: what the force is linear in is smoothed alike, and the surface
+was met where `lagged_onset` has it. To first order a lag is a delay: these count as l_h older. Each
+identifies a `force_depth_map` of its own and says beforehand what it expects to read, f_h with a variance s_h
+(0 with the noise's own variance r out of contact, and where what it expects while the contact opens is not
+positive). Its weight is the product of the likelihood of all readings y of this contact and of those before,
+in each (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), of how well its damping goes with what is known of contacts
+(`plausibility`), and of how likely its surface is there: see notebooks/guide/retrospective_reference.md
+section 7. The exponentials are (1 + u/n)^-n: algebraic, the same on every machine. What counts is the mean
+over all hypotheses, of their maps, delays and surfaces. Their maps bend at the same places, wherever they
+have the surface: which fits best is not to be decided by what a contact that bends between two knots leaves.
 """
 
 import math
@@ -23,6 +25,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxhil.compensators.force_depth_map import (
     DAMPING,
+    FRICTION,
     KNOTS,
     PLACES,
     PRELOAD,
@@ -37,11 +40,16 @@ from jaxhil.compensators.force_depth_map import (
     predict,
     tells,
 )
+from jaxhil.compensators.lagged_onset import Window, lagged_onsets
 from jaxhil.compensators.meeting import Meeting
 from jaxhil.compensators.onset import SQUARINGS, exponential
 
-HYPOTHESES = 17
-OFFSETS = np.linspace(-1, 1, HYPOTHESES)  # of their delays, in terms of the farthest
+DELAYS = LAGS = 17
+HYPOTHESES = DELAYS + LAGS
+DELAYED = np.arange(HYPOTHESES) < DELAYS
+OFFSETS = np.append(np.linspace(-1, 1, DELAYS), np.zeros(LAGS))  # of delays, in terms of the farthest
+LAG = np.where(DELAYED, 0, 0.00025 * (np.arange(HYPOTHESES) - DELAYS + 1.0))  # s
+LAGGING = 0.01  # of a delay's probability, that of each lag
 ELASTIC = 0.5  # probability that a contact has no damping
 BROADENING = 2.0  # of the variance of the damping
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
@@ -73,15 +81,20 @@ class Bank(NamedTuple):
     deeper: Float[Array, "*batch"]  # mean of `below` [s]
     farther: Float[Array, "hypotheses *batch"]  # by how much farther in each has its knots than usual [s]
     likely: Float[Array, "hypotheses *batch"]  # how likely the surface is there
+    held: Float[Array, "parameters lags *batch"]  # what the force is linear in as a lagging sensor shows it
+    before: Float[Array, "parameters lags *batch"]  # and as it was at the reading before
+    pushed: Float[Array, "lags *batch"]  # whether (1) the contact then pushed
 
 
 def no_bank(prior: Map) -> Bank:
     """Before the first contact."""
     zero = jnp.zeros_like(prior.mean[0])
     each = jnp.stack([zero] * HYPOTHESES)
+    carried = each + _column(np.where(DELAYED, 1, LAGGING), each)
+    held = jnp.stack([each[:LAGS]] * len(prior.mean))
     return Bank(
-        _repeated(prior), each, each + 1, each + 1, each, each, zero, zero, each, zero + 1, zero, zero,
-        each, each + 1,
+        _repeated(prior), each, each + 1, carried, each, each, zero, zero, each, zero + 1, zero, zero,
+        each, each + 1, held, held, held[0],
     )  # fmt: skip
 
 
@@ -89,6 +102,7 @@ def begin(
     old: Bank,
     prior: Map,
     meeting: Meeting,
+    window: Window,
     period: Array,
     farthest: Array,
     plane_spread: Array,
@@ -97,7 +111,8 @@ def begin(
     """Where a contact begins: the one before is added to what is carried, and the maps are the prior; from
     how many ticks before it was met on to learn from the readings.
 
-    `period` [s] is that of control, `farthest` [s] the largest d_h, `plane_spread` [m] how uncertain it is
+    `window`: the newest readings; `period` [s] is that of control, `farthest` [s] the largest d_h,
+    `plane_spread` [m] how uncertain it is
     where the surface was told, `damping` [1/s^2] the prior variance s_0^2 of the damping.
     """
     begins = meeting.found
@@ -107,10 +122,11 @@ def begin(
     variance = old.maps.covariance[DAMPING, DAMPING] * per_second[None]
     precision = 1 / jnp.where(variance > 0, variance, 1)
     speed, pace = (jnp.where(begins, each, 1) for each in (meeting.scales.speed, meeting.scales.pace))
-    offsets = _offsets(speed) * farthest[None]
-    placed = _place(meeting, offsets, speed / pace, speed, plane_spread)
-    first = jnp.max(-placed.below - offsets * pace[None], axis=0)
+    offsets = _column(OFFSETS, speed[None]) * farthest[None]
     tick = period * pace
+    lags = _column(LAG[DELAYS:], speed[None]) * pace[None]
+    placed = _place(meeting, offsets, speed / pace, speed, plane_spread, lagged_onsets(lags, window, tick))
+    first = jnp.max(-placed.below - offsets * pace[None], axis=0)
     earlier = jnp.minimum(jnp.ceil(jnp.where(first > SURFACE, first, 0) / tick), EARLIER).astype(jnp.int32)
     fresh = _repeated(prior)
     fresh = fresh._replace(covariance=fresh.covariance.at[PRELOAD, PRELOAD].add(placed.preload))
@@ -130,6 +146,9 @@ def begin(
         farther=jnp.where(begins[None], placed.farther, old.farther),
         likely=jnp.where(begins[None], placed.likely, old.likely),
         pace=jnp.where(begins, pace, old.pace),
+        held=jnp.where(begins[None, None], 0, old.held),
+        before=jnp.where(begins[None, None], 0, old.before),
+        pushed=jnp.where(begins[None], 0, old.pushed),
     )
     means = _means(now, weigh(now, damping), offsets)
     shift, deeper = (
@@ -138,19 +157,23 @@ def begin(
     return now._replace(shift=shift, deeper=deeper), jnp.where(begins, earlier, 0)
 
 
-def learn(old: Bank, reading: Reading, farthest: Array, damping: Array) -> tuple[Bank, Curve]:
+def learn(old: Bank, reading: Reading, period: Array, farthest: Array, damping: Array) -> tuple[Bank, Curve]:
     """The bank with one reading more, and the mean of its maps.
 
-    `farthest` [s] is the largest d_h, `damping` [1/s^2] the prior variance s_0^2 of the damping.
+    `period` [s] is that of control, `farthest` [s] the largest d_h, `damping` [1/s^2] the prior variance
+    s_0^2 of the damping.
     """
-    offsets = _offsets(reading.depth) * farthest[None]
+    offsets = _column(OFFSETS, reading.depth[None]) * farthest[None]
     rate = reading.rate[None] + jnp.zeros_like(offsets)
     depth = reading.depth[None] - offsets * old.pace[None] * rate - old.below
     counts, hidden, zone = reading.counts[None], reading.hidden[None], reading.zone[None]
     deepest = jnp.where(counts & (depth > old.deepest), depth, old.deepest)
     noise = (reading.variance + jnp.where(reading.hidden, reading.zone**2 / 12, 0))[None]
-    inside = depth > SURFACE
+    delayed = _column(DELAYED, depth) > 0
+    inside = ~delayed | (depth > SURFACE)
     phi = features(depth, rate, deepest, knots_of(old))
+    held, pushes = _smooth(old, depth[DELAYS:], rate[DELAYS:], phi[:, DELAYS:], period)
+    before, phi = phi[:, DELAYS:], jnp.concatenate([phi[:, :DELAYS], held], axis=1)
     predicted = predict(old.maps, phi, noise)
     # Hidden, a force is known to be small: half of the zone, where the map expects more than all of it.
     tight = hidden & (predicted.force <= zone)
@@ -160,8 +183,9 @@ def learn(old: Bank, reading: Reading, farthest: Array, damping: Array) -> tuple
     closes = rate > 0
     # On which side of the surface it was, between two delays, is not known.
     near = float(0.5 * (OFFSETS[1] - OFFSETS[0])) * farthest[None] * old.pace[None]
-    beside = (depth < near) & (depth > -near)
-    used = counts & inside & ~beside & ~tight & (closes | tells(predicted, force, noise))
+    beside = delayed & (depth < near) & (depth > -near)
+    pushed = jnp.concatenate([jnp.ones_like(pushes), pushes])
+    used = counts & inside & pushed & ~beside & ~tight & (closes | tells(predicted, force, noise))
     maps = correct(old.maps, predicted, force, used)
 
     nothing = ~inside | tight | (~closes & (predicted.force <= 0))
@@ -178,9 +202,33 @@ def learn(old: Bank, reading: Reading, farthest: Array, damping: Array) -> tuple
         deepest=deepest,
         likelihood=jnp.where(counts, likelihood, old.likelihood),
         learning=jnp.where(reading.counts, 1, old.learning),
+        held=jnp.where(counts[None], held, old.held),
+        before=jnp.where(counts[None], before, old.before),
+        pushed=jnp.where(counts, pushes.astype(old.pushed.dtype), old.pushed),
     )
     weights = weigh(now, damping)
     return _means(now, weights, offsets), average(maps, weights, knots_of(now))
+
+
+def _smooth(old: Bank, depth: Array, rate: Array, now: Array, period: Array) -> tuple[Array, Array]:
+    """What the force is linear in as sensors that lag show it: its mean over the tick, from the entry on
+    where that is within it, as long as the contact pushes; whether it pushes."""
+    lag = _column(LAG[DELAYS:], depth)
+    closes = rate > 0
+    raw = jnp.sum(now * old.maps.mean[:, DELAYS:], axis=0)
+    pushes = (depth > SURFACE) & (closes | (raw > 0))
+    was = old.pushed > 0
+    enters = pushes & ~was
+    tick = (period * old.pace)[None]
+    since = jnp.where(closes, depth / jnp.where(closes, rate, 1), 0)
+    since = jnp.where(enters & (since < tick), since, tick)
+    kept = exponential(period[None] / lag, SQUARINGS)
+    lost = jnp.where(enters, exponential(since / (lag * old.pace[None]), SQUARINGS), kept)
+    jumps = np.isin(np.arange(len(now)), (DAMPING, FRICTION, PRELOAD))
+    entering = jnp.where(_column(jumps, now) > 0, now, 0)
+    before = jnp.where(enters[None], entering, old.before)
+    fresh = (1 - lost)[None] * (0.5 * (before + now))
+    return kept[None] * old.held + jnp.where((pushes | was)[None], fresh, 0), pushes
 
 
 def weigh(bank: Bank, damping: Array) -> Float[Array, "hypotheses *batch"]:
@@ -235,7 +283,8 @@ def average(maps: Map, weights: Float[Array, "hypotheses *batch"], knots: Array)
 
 def _means(bank: Bank, weights: Array, offsets: Array) -> Bank:
     """With the mean delay and surface."""
-    shift = jnp.sum(weights * offsets, axis=0)
+    older = offsets + _column(LAG, offsets)
+    shift = jnp.sum(weights * older, axis=0)
     shift = jnp.where((shift > LEAST_SHIFT) | (shift < -LEAST_SHIFT), shift, 0)
     return bank._replace(shift=shift, deeper=jnp.sum(weights * bank.below, axis=0))
 
@@ -249,24 +298,34 @@ class _Placed(NamedTuple):
     preload: Array  # variance of the force at the entry [1/s^2]
 
 
-def _place(meeting: Meeting, offsets: Array, length: Array, speed: Array, plane_spread: Array) -> _Placed:
-    """Between where it was met and where it was told, or, where these disagree, where it was met; there the
-    force at the entry is known to what the stiffness makes of the uncertain place. A second is `length`
-    [m]."""
-    known = plane_spread**2
-    away = meeting.place[None] - offsets * speed[None]
-    both = known + meeting.variance
-    elsewhere = away * away > (NOT_THERE * both)[None]
-    share = jnp.where(elsewhere, 1, (known / both)[None])
-    likely = exponential(0.5 * (away * away / both[None]), DENSITY_SQUARINGS)
+def _place(
+    meeting: Meeting,
+    offsets: Array,
+    length: Array,
+    speed: Array,
+    plane_spread: Array,
+    lagged: tuple[Array, Array],
+) -> _Placed:
+    """Between where it was met, with a lag so much later and so uncertain [s, s^2], and where it was told,
+    or, where these disagree, where it was met; there the force at the entry is known to what the stiffness
+    makes of the uncertain place. A second is `length` [m]."""
+    known = (plane_spread**2)[None]
+    none = jnp.zeros_like(offsets[:DELAYS])
+    met = meeting.place[None] + jnp.concatenate([none, lagged[0] * length[None]])
+    around = meeting.variance[None] + jnp.concatenate([none, lagged[1] * (length * length)[None]])
+    away = met - offsets * speed[None]
+    both = known + around
+    elsewhere = away * away > NOT_THERE * both
+    share = jnp.where(elsewhere, 1, known / both)
+    likely = exponential(0.5 * (away * away / both), DENSITY_SQUARINGS)
     place = share * away
-    positive = meeting.variance > 0
-    spread = jnp.where(positive, jnp.sqrt(jnp.where(positive, meeting.variance, 1)), 0) / length
+    positive = around > 0
+    spread = jnp.where(positive, jnp.sqrt(jnp.where(positive, around, 1)), 0) / length[None]
     return _Placed(
         below=(place - meeting.scales.plane[None]) / length[None],
         farther=jnp.clip((meeting.place[None] - place) / length[None], -FARTHEST, FARTHEST),
         likely=jnp.where(likely > UNLIKELY, likely, UNLIKELY),
-        preload=(USUAL * (share * (meeting.stiffness * spread)[None])) ** 2,
+        preload=(USUAL * (share * (meeting.stiffness[None] * spread))) ** 2,
     )
 
 
@@ -283,5 +342,6 @@ def _repeated(prior: Map) -> Map:
     )
 
 
-def _offsets(like: Array) -> Array:
-    return jnp.asarray(OFFSETS.reshape(-1, *[1] * like.ndim), like.dtype)
+def _column(values: np.ndarray, like: Array) -> Array:
+    """One of each hypothesis, or lag, or parameter, along the first axis of the like."""
+    return jnp.asarray(values.reshape(-1, *[1] * (like.ndim - 1)), like.dtype)

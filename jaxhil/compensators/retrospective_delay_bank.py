@@ -15,6 +15,8 @@ micrometres: only what the mechanism file says of that is believed, and no more 
 from collections.abc import Mapping
 from typing import ClassVar
 
+import jax.numpy as jnp
+
 from jaxhil.compensators.base import Gain, rig_gain
 from jaxhil.compensators.delay_bank import begin, learn, no_bank
 from jaxhil.compensators.estimates import (
@@ -25,6 +27,9 @@ from jaxhil.compensators.estimates import (
     force_delay_spread,
     preload,
 )
+from jaxhil.compensators.history import reading_at, recall
+from jaxhil.compensators.lagged_onset import WINDOW, Window
+from jaxhil.compensators.reintegration import beyond
 from jaxhil.compensators.retrospective_reference import RetrospectiveReference
 
 MOST = 0.004  # s: beyond it hypotheses are too far apart, and too far off for the first order in d
@@ -75,14 +80,31 @@ class RetrospectiveDelayBank(RetrospectiveReference):
     def moved(self, learnt):
         return learnt.shift * learnt.pace, learnt.deeper
 
-    def begin(self, prepared, learnt, meeting):
+    def begin(self, prepared, learnt, meeting, history, variance):
         gains, period = prepared.gains, prepared.constants.control_period
+        window = _newest(prepared, meeting, history, variance)
         known = gains["delay_spread"], gains["plane_spread"], gains["prior_damping_spread"] ** 2
-        return begin(learnt, prepared.prior, meeting, period, *known)
+        return begin(learnt, prepared.prior, meeting, window, period, *known)
 
     def learn(self, prepared, learnt, reading, deepest):
-        gains = prepared.gains
-        return learn(learnt, reading, gains["delay_spread"], gains["prior_damping_spread"] ** 2)
+        gains, period = prepared.gains, prepared.constants.control_period
+        return learn(learnt, reading, period, gains["delay_spread"], gains["prior_damping_spread"] ** 2)
 
     def force_delay(self, gains, state):
         return gains["identification_delay"] + state.learnt.shift
+
+
+def _newest(prepared, meeting, history, variance) -> Window:
+    """The newest readings, where a surface is met; the noise of the force [N^2]."""
+    scales, found, clearance = meeting.scales, meeting.found, prepared.constants.clearance
+    speed, pace, weight = (jnp.where(found, each, 1) for each in (scales.speed, scales.pace, scales.weight))
+    depths, forces, kept = [], [], []
+    for age in range(WINDOW - 1, -1, -1):
+        index = jnp.maximum(history.age - age, 0)
+        force, shown = reading_at(history, index)
+        position = recall(history, index).position
+        depths.append((beyond(scales.side, clearance, position) - meeting.place) / (speed / pace))
+        forces.append(scales.side * (force - scales.bias) / weight)
+        kept.append(shown & (history.age >= age))
+    floor = prepared.gains["force_noise_floor"] ** 2
+    return Window(jnp.stack(depths), jnp.stack(forces), jnp.stack(kept), floor + variance / weight**2)

@@ -149,8 +149,11 @@ class RetrospectiveReference(Compensator):
         None: neither is."""
         return None
 
-    def begin(self, prepared: Prepared, learnt: Any, meeting: Meeting) -> tuple[Any, Int[Array, "*batch"]]:
-        """What is known where a contact begins; from how many ticks before it on to learn from readings."""
+    def begin(
+        self, prepared: Prepared, learnt: Any, meeting: Meeting, history: History, variance: Array
+    ) -> tuple[Any, Int[Array, "*batch"]]:
+        """What is known where a contact begins; from how many ticks before it on to learn from readings. The
+        force's variance is in N^2."""
         found = meeting.found
         mean = jnp.where(found[None], prepared.prior.mean, learnt.mean)
         covariance = jnp.where(found[None, None], prepared.prior.covariance, learnt.covariance)
@@ -237,7 +240,7 @@ class RetrospectiveReference(Compensator):
         def begun():
             meeting = meet(gains, clearance, scales, state.planes, history, way, speed, found)
             safe = _safe(meeting.scales, meeting.found)
-            learnt, earlier = self.begin(prepared, state.learnt, meeting)
+            learnt, earlier = self.begin(prepared, state.learnt, meeting, history, read.variance)
             depth = depth_of(safe, clearance, signals.position_desired)
             moved = self.moved(learnt)
             depth = depth if moved is None else depth - moved[1]

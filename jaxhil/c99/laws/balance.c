@@ -3,8 +3,7 @@
  * W, the energy that the contact took, is the integral of the force that was read over the way, less what the map
  * stores between the ends of that; L is what the map dissipates. With p the map's peak force, no contact that is
  * known explains that
- * - W and L differ by more than 0.014 and chance, or half of that where all that is known leans to a force older or newer
- *   than may be;
+ * - W and L differ by more than 0.014 and chance;
  * - W is beyond that, no more than a force delay wrong by 4 ms makes of it, and the force at the onset is less than 0.7
  *   of a damper's that takes W: it is taken without a jump at the onset;
  * - as the hardware turns, until its speed is -0.15, readings are less than expected by 0.045 p in the mean and chance:
@@ -97,15 +96,15 @@ static void jaxhil_balance_take(jaxhil_balance *balance, const jaxhil_curve *cur
 }
 
 /* Whether the energy of a contact that is nearly over is not explained, its force older by `shift` [s] than it was
- * taken for, on a scale of time slower by `pace`; whether it `leans` to one older or newer than may be. */
+ * taken for, on a scale of time slower by `pace`. */
 static bool jaxhil_balance_unequal(const jaxhil_balance *balance, const jaxhil_curve *curve, double peak,
-                                   double shift, double pace, bool leans) {
+                                   double shift, double pace) {
     const double between =
         jaxhil_curve_stored(curve, balance->last) - jaxhil_curve_stored(curve, balance->first);
     const double taken = balance->work - shift * balance->gained - between;
     const double dissipated = curve->damping * balance->lost[0] + curve->depth_damping * balance->lost[1] +
                               curve->unloading * balance->lost[2] + curve->friction * balance->lost[3];
-    const double off = (leans ? 0.5 : 1.0) * jaxhil_balance_off + 3.0 * sqrt(balance->variance);
+    const double off = jaxhil_balance_off + 3.0 * sqrt(balance->variance);
     const double onset = curve->at_knots[0] + curve->damping + curve->friction;
     const double damper = 2.0 / jaxhil_map_pi * (taken * peak);
     const double most = 0.5 * jaxhil_map_pi * (peak * (jaxhil_balance_delay * pace));
@@ -115,9 +114,9 @@ static bool jaxhil_balance_unequal(const jaxhil_balance *balance, const jaxhil_c
 
 /* Whether the map that makes this curve, its peak force given, does not explain what was read. */
 static bool jaxhil_balance_unexplained(const jaxhil_balance *balance, const jaxhil_curve *curve, double peak,
-                                       double deepest, double shift, double pace, bool leans) {
+                                       double deepest, double shift, double pace) {
     const bool over = balance->begun && balance->rate < 0.0 &&
                       (balance->released || balance->last < jaxhil_balance_shallow * deepest);
     const double missing = jaxhil_balance_missing * (peak * balance->turned) + 3.0 * sqrt(balance->spread);
-    return balance->missing > missing || (over && jaxhil_balance_unequal(balance, curve, peak, shift, pace, leans));
+    return balance->missing > missing || (over && jaxhil_balance_unequal(balance, curve, peak, shift, pace));
 }

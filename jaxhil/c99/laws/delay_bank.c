@@ -1,8 +1,10 @@
-/* Hypotheses of the force delay side by side, each with a map of its own, weighed by what they explain.
+/* Hypotheses of the force delay and of a lag side by side, each with a map of its own, weighed by what they explain.
  * Hypothesis h takes the force to be d_h older than given: it belongs to the depth X - d_h V - p_h. The surface was met
  * at X_0, with a variance s^2; by this hypothesis it lies at p_h = g (X_0 - d_h v_0) beyond where it was told, with
  * g = spread^2/(spread^2 + s^2), or 1 where the two disagree. It expects to read f_h with a variance s_h (0 with the
- * noise's own variance r out of contact, and where what it expects while the contact opens is not positive). Its weight
+ * noise's own variance r out of contact, and where what it expects while the contact opens is not positive). As many
+ * others take the sensor to lag by l_h: what the force is linear in is smoothed alike, and the surface was met where
+ * lagged_onset.c has it; to first order a lag is a delay, and these count as l_h older. A hypothesis' weight
  * is the product of the likelihoods of all readings of this contact and of those before, (r/s_h)^(1/4)
  * exp(-(y - f_h)^2/(4 s_h)), of how well its damping, of mean B and variance s^2, goes with what is known of contacts:
  * p (s_0/s) exp(-t^2/2) + (1 - p) 2 Phi(t), t = B/s, p = 1/2, and of how likely
@@ -17,21 +19,28 @@
 #include "contact_plane.c"
 #include "force_depth_map.c"
 #include "gains_table.c"
+#include "history.c"
+#include "lagged_onset.c"
 #include "onset.c"
 #include "plausible_damping.c"
-#include "smoothed_jump.c"
+#include "reintegration.c"
 
 /* == Declarations == */
 
-enum { JAXHIL_HYPOTHESES = 17 };
+enum { JAXHIL_DELAYS = 17, JAXHIL_LAGS = 17, JAXHIL_HYPOTHESES = JAXHIL_DELAYS + JAXHIL_LAGS };
 
 /* Of each hypothesis its delay, by how much [s] it has the surface deeper than it was met and its knots farther in than
  * usual, how likely it is that the surface is there, map, deepest point, the likelihoods of this contact and of those
  * before; sums over these of the damping's precision and of precision times mean, their number `met`; whether this
  * contact is to be added to them. The mean of the maps and, `shift` [s] and `below` [s], of the delays and of how much
- * deeper; the delays' standard deviation [s]; the delay that was `given`. */
+ * deeper; the delays' standard deviation [s]; the largest weight of what may lie beyond, `edge`; the delay that was
+ * `given`. Of each lag [s] what is kept after a tick of what a sensor shows; what is smoothed, `held`, as it was before
+ * that, and whether the contact then pushed. */
 typedef struct {
-    double given, shift, open, below, met, variance, pace, plane_spread;
+    double given, shift, open, edge, below, met, variance, pace, plane_spread, period;
+    double lags[JAXHIL_LAGS], kept[JAXHIL_LAGS];
+    double held[JAXHIL_LAGS][JAXHIL_PARAMETERS], before[JAXHIL_LAGS][JAXHIL_PARAMETERS];
+    bool pushed[JAXHIL_LAGS];
     double known[JAXHIL_HYPOTHESES];
     jaxhil_force_depth_map prior;
     double offsets[JAXHIL_HYPOTHESES], deeper[JAXHIL_HYPOTHESES], deepest[JAXHIL_HYPOTHESES];
@@ -41,7 +50,6 @@ typedef struct {
     double estimate[JAXHIL_HYPOTHESES][JAXHIL_PARAMETERS];
     double covariance[JAXHIL_HYPOTHESES][JAXHIL_PARAMETERS][JAXHIL_PARAMETERS];
     jaxhil_curve curve;
-    jaxhil_jump jump;
     bool learning;
 } jaxhil_learnt;
 
@@ -55,7 +63,9 @@ static const double jaxhil_bank_least_carried = 1e-12;
 static const double jaxhil_bank_least_shift = 1e-12; /* s: where nothing tells delays apart, rounding does not */
 static const double jaxhil_bank_elsewhere = 9.0; /* times the variance of where it is expected: it is not there */
 static const double jaxhil_bank_unlikely = 0.1;  /* that it is not, at least */
-static const double jaxhil_bank_leaning = 0.5;   /* of the farthest delay */
+static const double jaxhil_bank_lag_step = 0.00025; /* s from lag to lag */
+static const double jaxhil_bank_lagging = 0.01;  /* of a delay's probability, that of each lag */
+static const double jaxhil_bank_edge = 0.6;      /* probability of a farthest delay or the longest lag: it may lie beyond */
 static const double jaxhil_bank_open = 0.0075;   /* of a restitution of 1, that what is open of the delay makes */
 static const double jaxhil_bank_usual = 0.5;     /* stiffness, of the most that it may be */
 static const double jaxhil_bank_farthest = 0.004; /* s, by which knots are moved, */
@@ -87,6 +97,13 @@ static void jaxhil_bank_restart(jaxhil_learnt *bank) {
         bank->known[h] = 0.0;
         bank->likelihood[h] = 1.0;
     }
+    for (int l = 0; l < JAXHIL_LAGS; l++) {
+        for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
+            bank->held[l][i] = 0.0;
+            bank->before[l][i] = 0.0;
+        }
+        bank->pushed[l] = false;
+    }
     bank->learning = false;
     bank->variance = 0.0;
 }
@@ -97,7 +114,7 @@ static void jaxhil_learnt_reset(jaxhil_learnt *bank) {
         bank->deeper[h] = 0.0;
         bank->farther[h] = 0.0;
         bank->likely[h] = 1.0;
-        bank->carried[h] = 1.0;
+        bank->carried[h] = h < JAXHIL_DELAYS ? 1.0 : jaxhil_bank_lagging;
         bank->precision[h] = 0.0;
         bank->weighted[h] = 0.0;
     }
@@ -105,15 +122,20 @@ static void jaxhil_learnt_reset(jaxhil_learnt *bank) {
     bank->shift = 0.0;
     bank->below = 0.0;
     bank->open = 0.0;
+    bank->edge = 0.0;
     bank->pace = 1.0;
-    jaxhil_jump_reset(&bank->jump);
 }
 
 static void jaxhil_learnt_init(jaxhil_learnt *bank, const jaxhil_gains *gains) {
     bank->given = gains->identification_delay;
     jaxhil_force_depth_map_init(&bank->prior, gains);
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
-        bank->offsets[h] = (0.125 * (double)h - 1.0) * gains->delay_spread;
+        bank->offsets[h] = h < JAXHIL_DELAYS ? (0.125 * (double)h - 1.0) * gains->delay_spread : 0.0;
+    }
+    bank->period = gains->control_period;
+    for (int l = 0; l < JAXHIL_LAGS; l++) {
+        bank->lags[l] = jaxhil_bank_lag_step * (double)(l + 1);
+        bank->kept[l] = jaxhil_exponential(bank->period / bank->lags[l], JAXHIL_SQUARINGS);
     }
     bank->plane_spread = gains->plane_spread;
     bank->curve = bank->prior.curve;
@@ -138,14 +160,9 @@ static double jaxhil_learnt_deeper(const jaxhil_learnt *bank) {
     return bank->below;
 }
 
-/* Whether the force is likely to be older or newer than any hypothesis has it. */
-static bool jaxhil_learnt_leans(const jaxhil_learnt *bank) {
-    return fabs(bank->shift) > jaxhil_bank_leaning * bank->offsets[JAXHIL_HYPOTHESES - 1];
-}
-
-/* Whether the delay is left open, the restitution by it [pi/2 p d], or the sensor is likely to lag. */
+/* Whether the delay is left open, the restitution by it [pi/2 p d], or may well lie beyond all hypotheses. */
 static bool jaxhil_learnt_open(const jaxhil_learnt *bank, double peak) {
-    return jaxhil_jump_smoothed(&bank->jump) ||
+    return bank->edge > jaxhil_bank_edge ||
            0.5 * jaxhil_map_pi * (peak * (bank->open * bank->pace)) > jaxhil_bank_open;
 }
 
@@ -206,11 +223,16 @@ static void jaxhil_bank_average(jaxhil_learnt *bank, const double *weights) {
     }
 }
 
+/* By how much hypothesis h has the force older than by the given delay [s]. */
+static double jaxhil_bank_older(const jaxhil_learnt *bank, int h) {
+    return h < JAXHIL_DELAYS ? bank->offsets[h] : bank->lags[h - JAXHIL_DELAYS];
+}
+
 /* The mean over the hypotheses, by their weights: the delay, and what counts of the maps. */
 static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
     jaxhil_curve *curve = &bank->curve;
     double lost[4] = {0.0, 0.0, 0.0, 0.0};
-    double shift = 0.0, square = 0.0;
+    double shift = 0.0, square = 0.0, lagging = 0.0;
     jaxhil_bank_average(bank, weights);
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         for (int k = 0; k < 4; k++) {
@@ -219,7 +241,7 @@ static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
                 jaxhil_positive_mean(bank->estimate[h][place], bank->covariance[h][place][place]) * weights[h];
             lost[k] = h > 0 ? lost[k] + mean : mean;
         }
-        const double delay = weights[h] * bank->offsets[h];
+        const double delay = weights[h] * jaxhil_bank_older(bank, h);
         const double known = weights[h] * bank->known[h];
         shift = h > 0 ? shift + delay : delay;
         const double below = weights[h] * bank->deeper[h];
@@ -227,10 +249,17 @@ static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
         bank->variance = h > 0 ? bank->variance + known : known;
     }
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
-        const double off = bank->offsets[h] - shift;
+        const double off = jaxhil_bank_older(bank, h) - shift;
         square += weights[h] * (off * off);
+        lagging += h < JAXHIL_DELAYS ? 0.0 : weights[h];
     }
-    bank->open = sqrt(square);
+    /* Between two lags neither is right. */
+    bank->open = sqrt(square + 0.5 * (jaxhil_bank_lag_step * jaxhil_bank_lag_step) * lagging);
+    const int edges[] = {0, JAXHIL_DELAYS - 1, JAXHIL_HYPOTHESES - 1};
+    bank->edge = weights[0];
+    for (int i = 1; i < 3; i++) {
+        bank->edge = weights[edges[i]] > bank->edge ? weights[edges[i]] : bank->edge;
+    }
     bank->shift = shift > jaxhil_bank_least_shift || shift < -jaxhil_bank_least_shift ? shift : 0.0;
     curve->damping = lost[0];
     curve->depth_damping = lost[1];
@@ -252,23 +281,29 @@ static void jaxhil_bank_finish(jaxhil_learnt *bank) {
     bank->met += 1.0;
 }
 
-/* Each hypothesis has the surface between where it was met and where it was told, or, where these disagree, where it
- * was met; there the force at the entry is known to what the stiffness makes of the uncertain place. How far [s] the
- * hardware was in, by the first to enter, as it was met. */
-static double jaxhil_bank_place(jaxhil_learnt *bank, const jaxhil_meeting *meeting) {
+/* Each hypothesis has the surface between where it was met, with a lag by the newest readings, and where it was told,
+ * or, where these disagree, where it was met; there the force at the entry is known to what the stiffness makes of the
+ * uncertain place. How far [s] the hardware was in, by the first to enter, as it was met. */
+static double jaxhil_bank_place(jaxhil_learnt *bank, const jaxhil_meeting *meeting, const jaxhil_window *window) {
     const double length = meeting->speed / meeting->pace;
     const double known = bank->plane_spread * bank->plane_spread;
-    const double both = known + meeting->variance;
-    const double spread = sqrt(meeting->variance) / length;
     double first = jaxhil_map_surface;
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
-        const double away = meeting->place - bank->offsets[h] * meeting->speed;
+        double met = meeting->place, around = meeting->variance;
+        if (h >= JAXHIL_DELAYS) {
+            double later, square;
+            jaxhil_lagged_onset(window, bank->lags[h - JAXHIL_DELAYS] * meeting->pace, meeting->tick, &later, &square);
+            met = meeting->place + later * length;
+            around = square * (length * length) + meeting->variance;
+        }
+        const double both = known + around;
+        const double away = met - bank->offsets[h] * meeting->speed;
         const bool elsewhere = away * away > jaxhil_bank_elsewhere * both;
         const double share = elsewhere ? 1.0 : known / both;
         const double likely = jaxhil_exponential(0.5 * (away * away / both), JAXHIL_DENSITY_SQUARINGS);
         const double place = share * away;
         const double farther = (meeting->place - place) / length;
-        const double off = jaxhil_bank_usual * (share * (meeting->stiffness * spread));
+        const double off = jaxhil_bank_usual * (share * (meeting->stiffness * (sqrt(around) / length)));
         const double depth = (meeting->plane - place) / length;
         const double inside = depth - bank->offsets[h] * meeting->pace;
         bank->deeper[h] = -depth;
@@ -282,17 +317,37 @@ static double jaxhil_bank_place(jaxhil_learnt *bank, const jaxhil_meeting *meeti
     return first > jaxhil_map_surface ? first : 0.0;
 }
 
+/* The newest readings, of noise with this variance [1/s^2]. */
+static void jaxhil_bank_look(const jaxhil_meeting *meeting, const jaxhil_history *history, const jaxhil_scales *scales,
+                             double variance, jaxhil_window *window) {
+    const long first = history->newest - JAXHIL_WINDOW + 1;
+    window->number = 0;
+    window->variance = variance;
+    for (long tick = first > 0 ? first : 0; tick <= history->newest; tick++) {
+        const long slot = tick % JAXHIL_SLOTS;
+        if (history->shows[slot]) {
+            const double position = jaxhil_history_recall(history, tick)->position;
+            const double beyond = jaxhil_scales_beyond(scales, position) - meeting->place;
+            window->depths[window->number] = beyond / scales->length;
+            window->forces[window->number] = jaxhil_scales_force(scales, history->forces[slot]);
+            window->number++;
+        }
+    }
+}
+
 /* A contact begins: the one before is added to what is carried, and the maps are the prior. How many ticks before the
  * meeting readings count. */
-static long jaxhil_learnt_begin(jaxhil_learnt *bank, const jaxhil_meeting *meeting) {
+static long jaxhil_learnt_begin(jaxhil_learnt *bank, const jaxhil_meeting *meeting, const jaxhil_history *history,
+                                const jaxhil_scales *scales, double variance) {
     double weights[JAXHIL_HYPOTHESES];
+    jaxhil_window window;
     if (bank->learning) {
         jaxhil_bank_finish(bank);
     }
     bank->pace = meeting->pace;
     jaxhil_bank_restart(bank);
-    jaxhil_jump_begin(&bank->jump, meeting->tick, meeting->pace);
-    const double ticks = ceil(jaxhil_bank_place(bank, meeting) / meeting->tick);
+    jaxhil_bank_look(meeting, history, scales, variance, &window);
+    const double ticks = ceil(jaxhil_bank_place(bank, meeting, &window) / meeting->tick);
     jaxhil_bank_weigh(bank, weights);
     jaxhil_bank_conclude(bank, weights);
     return ticks < (double)jaxhil_bank_earlier ? (long)ticks : jaxhil_bank_earlier;
@@ -316,6 +371,38 @@ static void jaxhil_bank_features(const jaxhil_learnt *bank, int h, double x, dou
     phi[JAXHIL_PRELOAD] = 1.0;
 }
 
+/* As a sensor that lags shows it: of phi the mean over the tick, from the entry on where that is within it, as long as
+ * the contact pushes. */
+static void jaxhil_bank_smooth(jaxhil_learnt *bank, int h, double depth, double rate, double *phi) {
+    const int l = h - JAXHIL_DELAYS;
+    double *held = bank->held[l], *before = bank->before[l];
+    const double tick = bank->period * bank->pace, kept = bank->kept[l];
+    double raw = 0.0;
+    for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
+        raw += phi[i] * bank->estimate[h][i];
+    }
+    const bool pushes = depth > jaxhil_map_surface && (rate > 0.0 || raw > 0.0);
+    const bool enters = pushes && !bank->pushed[l];
+    double lost = kept;
+    if (enters) {
+        const double entered = rate > 0.0 ? depth / rate : 0.0;
+        const double since = entered < tick ? entered : tick;
+        lost = jaxhil_exponential(since / (bank->lags[l] * bank->pace), JAXHIL_SQUARINGS);
+    }
+    for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
+        const double now = phi[i];
+        if (enters) {
+            const bool jumps = i == JAXHIL_DAMPING || i == JAXHIL_FRICTION || i == JAXHIL_PRELOAD;
+            before[i] = jumps ? now : 0.0;
+        }
+        const double fresh = (1.0 - lost) * (0.5 * (before[i] + now));
+        held[i] = kept * held[i] + (pushes || bank->pushed[l] ? fresh : 0.0);
+        before[i] = now;
+        phi[i] = held[i];
+    }
+    bank->pushed[l] = pushes;
+}
+
 /* Hypothesis h reads: the square of what it missed, over its variance, times a quarter; how sharply it knew. Nearer to
  * its surface than half of the step to the next delay it cannot tell on which side the reading was: that counts as one
  * that is a standard deviation off. */
@@ -325,7 +412,8 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
     double *estimate = bank->estimate[h];
     double phi[JAXHIL_PARAMETERS], g[JAXHIL_PARAMETERS];
     const double x = depth - bank->offsets[h] * bank->pace * rate - bank->deeper[h];
-    const double near = 0.5 * (bank->offsets[1] - bank->offsets[0]) * bank->pace;
+    const bool lags = h >= JAXHIL_DELAYS;
+    const double near = lags ? 0.0 : 0.5 * (bank->offsets[1] - bank->offsets[0]) * bank->pace;
     const bool beside = x < near && x > -near;
     const double read = hidden ? 0.0 : force;
     const double noise = hidden ? variance + zone * zone / 12.0 : variance;
@@ -334,6 +422,9 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
         bank->deepest[h] = x;
     }
     jaxhil_bank_features(bank, h, x, rate, phi);
+    if (lags) {
+        jaxhil_bank_smooth(bank, h, x, rate, phi);
+    }
     double expected = 0.0, s = 0.0;
     for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
         double product = 0.0;
@@ -345,7 +436,8 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
         s += phi[i] * product;
     }
     s = noise + s;
-    const bool inside = x > jaxhil_map_surface && (!hidden || expected > zone);
+    const bool inside = (lags || x > jaxhil_map_surface) && (!hidden || expected > zone);
+    const bool pushed = !lags || bank->pushed[h - JAXHIL_DELAYS];
     const bool closes = rate > 0.0;
     const bool nothing = !inside || (!closes && !(expected > 0.0));
     const double innovation = seen - expected;
@@ -353,7 +445,7 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
     wide = wide > 0.0 ? wide : 1.0;
     const double missed = nothing ? read : innovation;
     *sharpness = sqrt(sqrt(wide > noise ? noise / wide : 1.0));
-    if (inside && !beside && s > 0.0 &&
+    if (inside && pushed && !beside && s > 0.0 &&
         (closes || expected > 0.0 || seen * seen > jaxhil_map_outlying * noise)) {
         const double share = 1.0 / s;
         bank->known[h] = noise * ((s - noise) * share);
@@ -379,9 +471,6 @@ static void jaxhil_learnt_read(jaxhil_learnt *bank, double depth, double rate, d
     double surprise[JAXHIL_HYPOTHESES], sharpness[JAXHIL_HYPOTHESES], weights[JAXHIL_HYPOTHESES];
     double least = INFINITY;
     (void)deepest;
-    if (!hidden) {
-        jaxhil_jump_take(&bank->jump, depth, rate, force, variance);
-    }
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         surprise[h] = jaxhil_bank_read(bank, h, depth, rate, force, variance, hidden, zone, &sharpness[h]);
         /* What is not a number stays. */

@@ -4,6 +4,8 @@
 #include "contact_plane.c"
 #include "force_depth_map.c"
 #include "gains_table.c"
+#include "history.c"
+#include "reintegration.c"
 
 /* == Declarations == */
 
@@ -24,8 +26,12 @@ static void jaxhil_learnt_reset(jaxhil_learnt *learnt) {
 }
 
 /* A contact begins. How many ticks before the meeting readings count. */
-static long jaxhil_learnt_begin(jaxhil_learnt *learnt, const jaxhil_meeting *meeting) {
+static long jaxhil_learnt_begin(jaxhil_learnt *learnt, const jaxhil_meeting *meeting, const jaxhil_history *history,
+                                const jaxhil_scales *scales, double variance) {
     (void)meeting;
+    (void)history;
+    (void)scales;
+    (void)variance;
     jaxhil_force_depth_map_restart(&learnt->map);
     return 0;
 }
@@ -50,12 +56,7 @@ static double jaxhil_learnt_deeper(const jaxhil_learnt *learnt) {
     return 0.0;
 }
 
-/* Whether the force is likely to be older or newer than it may be, and whether its delay is left open: not told. */
-static bool jaxhil_learnt_leans(const jaxhil_learnt *learnt) {
-    (void)learnt;
-    return false;
-}
-
+/* Whether its delay is left open: it is told. */
 static bool jaxhil_learnt_open(const jaxhil_learnt *learnt, double peak) {
     (void)learnt;
     (void)peak;

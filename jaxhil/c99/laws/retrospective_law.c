@@ -184,8 +184,7 @@ static double jaxhil_law_follow(jaxhil_law *law, double x, double v, double dept
         own = felt;
     }
     law->doubts.unexplained =
-        jaxhil_balance_unexplained(&law->balance, curve, peak, law->learnt_deepest, reference->shift,
-                                   law->pace, jaxhil_learnt_leans(&law->learnt)) ||
+        jaxhil_balance_unexplained(&law->balance, curve, peak, law->learnt_deepest, reference->shift, law->pace) ||
         jaxhil_learnt_open(&law->learnt, peak);
     const double middle = v - 0.5 * reference->period * own;
     const double correction = jaxhil_law_repayment(law, peak, *separated ? 0.0 : own, middle, zone);
@@ -226,7 +225,9 @@ static void jaxhil_law_meet(jaxhil_law *law, double side, double reach, double s
     const double met = 0.5 * (low + high) - found.earlier * width;
     const double around = width * width * (1.0 / 12.0 + found.variance);
     const jaxhil_meeting meeting = {scales->plane, met, around, speed, law->pace, tick, stiffness};
-    const long earlier = jaxhil_learnt_begin(&law->learnt, &meeting);
+    const double variance =
+        law->floor * law->floor + jaxhil_force_noise_variance(&law->noise) / (scales->weight * scales->weight);
+    const long earlier = jaxhil_learnt_begin(&law->learnt, &meeting, history, scales, variance);
     const double depth = (reach - scales->plane) / scales->length - jaxhil_learnt_deeper(&law->learnt);
     const double far = jaxhil_far * law->plane_spread;
     const double place = jaxhil_law_contact_plane(law);

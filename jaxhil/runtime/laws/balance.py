@@ -4,8 +4,7 @@ W, the energy that the contact took, is the integral of the force that was read 
 map stores between the ends of that; L is what the map dissipates. With p the map's peak force, no contact
 that is known explains that
 
-- W and L differ by more than OFF and chance, or half of that where all that is known leans to a force older
-  or newer than may be: the restitution errs by their difference;
+- W and L differ by more than OFF and chance: the restitution errs by their difference;
 - W is beyond that, no more than a force delay wrong by DELAY makes of it, and the force at the onset is less
   than DAMPER of a damper's that takes W: it is taken without a jump at the onset;
 - as the hardware turns, until its speed is TURNING, readings are less than expected by MISSING p in the mean
@@ -99,17 +98,14 @@ class Balance:
             self._spread += variance + known if known > 0.0 else variance
             self._turned += 1.0
 
-    def unexplained(
-        self, curve: Curve, peak: float, deepest: float, shift: float, pace: float, leans: bool
-    ) -> bool:
+    def unexplained(self, curve: Curve, peak: float, deepest: float, shift: float, pace: float) -> bool:
         """Whether the map that makes this curve, of this peak force [1/s], does not explain what was read;
-        the force is older by `shift` [s] than it was taken for, time slower by `pace` than usual; whether
-        all that is known `leans` to a force older or newer than may be."""
+        the force is older by `shift` [s] than it was taken for, time slower by `pace` than usual."""
         over = self._begun and self._rate < 0.0 and (self._released or self._last < SHALLOW * deepest)
         missing = MISSING * (peak * self._turned) + 3.0 * sqrt(self._spread)
-        return self._missing > missing or (over and self._unequal(curve, peak, shift, pace, leans))
+        return self._missing > missing or (over and self._unequal(curve, peak, shift, pace))
 
-    def _unequal(self, curve: Curve, peak: float, shift: float, pace: float, leans: bool) -> bool:
+    def _unequal(self, curve: Curve, peak: float, shift: float, pace: float) -> bool:
         """Whether the energy of a contact that is nearly over is not explained."""
         between = curve.stored(self._last) - curve.stored(self._first)
         taken = self._work - shift * self._gained - between
@@ -120,7 +116,7 @@ class Balance:
             + curve.unloading * lost[2]
             + curve.friction * lost[3]
         )
-        off = (0.5 if leans else 1.0) * OFF + 3.0 * sqrt(self._variance)
+        off = OFF + 3.0 * sqrt(self._variance)
         onset = curve.at_knots[0] + curve.damping + curve.friction
         damper = 2.0 / pi * (taken * peak)
         most = 0.5 * pi * (peak * (DELAY * pace))

@@ -1,8 +1,11 @@
-"""Hypotheses of the force delay side by side, each with a force-depth map, weighed by what they explain.
+"""Hypotheses of the force delay and of a lag side by side, each with a force-depth map, weighed by what they
+explain.
 
 Hypothesis h takes the force to be d_h [s] older than given: it belongs to the depth X - d_h V - p_h. The
 surface was met at X_0; by this hypothesis it lies at p_h = g (X_0 - d_h v_0) beyond where it was told,
-g = spread^2/(spread^2 + found^2) by how uncertain either is, or 1 where they disagree. Each identifies a
+g = spread^2/(spread^2 + found^2) by how uncertain either is, or 1 where they disagree. As many others take
+the sensor to lag by l_h [s]: what the force is linear in is smoothed alike, and the surface was met where
+`lagged_onset` has it. To first order a lag is a delay: these count as l_h older. Each identifies a
 force-depth map (`force_depth_map`); its weight is the product of the likelihoods of all readings of this
 contact and of those before, of how well its damping goes with what is known of contacts, and of how likely
 its surface is there (notebooks/guide/retrospective_reference.md section 7). What counts is the mean over all
@@ -32,10 +35,13 @@ from .force_depth_map import (
     Prior,
     turning,
 )
+from .lagged_onset import lagged_onsets
 from .onset import SQUARINGS, exponential
-from .smoothed_jump import SmoothedJump
 
-HYPOTHESES = 17
+DELAYS = LAGS = 17
+HYPOTHESES = DELAYS + LAGS
+LAG_STEP = 0.00025  # s from lag to lag
+LAGGING = 0.01  # of a delay's probability, that of each lag
 ELASTIC = 0.5  # probability that a contact has no damping
 BROADENING = 2.0  # of the variance of the damping, as the delay lies between two hypotheses
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
@@ -48,7 +54,7 @@ UNLIKELY = 0.1  # that it is not, at least
 USUAL = 0.5  # stiffness, of the most that it may be
 FARTHEST, WHOLE = 0.004, 0.015  # s by which knots are moved, from what depth [s] on; before it less
 EARLIER = 30  # ticks before it was met, whose readings count
-LEANING = 0.5  # of the farthest delay
+EDGE = 0.6  # probability that it is a farthest delay or the longest lag: then it may lie beyond
 OPEN = 0.0075  # of a restitution of 1, that what is open of the delay makes
 
 _KNOTS = np.array(KNOTS)[:, None]
@@ -56,34 +62,44 @@ _GAPS = np.diff(KNOTS)
 _MOVED = np.minimum(np.array(KNOTS) / WHOLE, 1.0)[:, None]
 # Beside an array, a number takes longer than an array does.
 _0, _1 = np.zeros(HYPOTHESES), np.ones(HYPOTHESES)
+_LAGS = LAG_STEP * np.arange(1.0, LAGS + 1.0)
+_DELAYED = np.arange(HYPOTHESES) < DELAYS
+# What the force is linear in that begins with a jump.
+_JUMPS = np.isin(np.arange(PARAMETERS), (DAMPING, FRICTION, PRELOAD))[:, None]
 
 
 class DelayBank:
     """The bank, made of how far [s] the farthest hypotheses lie from the given delay, of how uncertain it is
-    where the surface was told [m], and of the map's prior."""
+    where the surface was told [m], of the map's prior, and of the control period [s]."""
 
     __slots__ = (
-        "_below", "_carried", "_covariance", "_damping", "_deepest", "_estimate", "_jump", "_knots", "_known",
-        "_learning", "_likelihood", "_likely", "_met", "_off", "_offsets", "_pace", "_past", "_plane_spread",
-        "_precision", "_prior_covariance", "_prior_estimate", "_weighted", "_widths", "curve", "deeper",
-        "shift", "variance",
+        "_before", "_below", "_carried", "_covariance", "_damping", "_deepest", "_edge", "_estimate", "_held",
+        "_kept", "_knots", "_known", "_learning", "_likelihood", "_likely", "_met", "_near", "_off",
+        "_offsets", "_older", "_pace", "_past", "_period", "_plane_spread", "_precision",
+        "_prior_covariance", "_prior_estimate", "_pushed", "_weighted", "_widths", "curve", "deeper", "shift",
+        "variance",
     )  # fmt: skip
 
-    def __init__(self, spread: float, plane_spread: float, prior: Prior) -> None:
-        self._offsets = np.array([0.125 * step - 1.0 for step in range(HYPOTHESES)]) * spread
+    def __init__(self, spread: float, plane_spread: float, prior: Prior, period: float) -> None:
+        delays = np.array([0.125 * step - 1.0 for step in range(DELAYS)]) * spread
+        self._offsets = np.append(delays, np.zeros(LAGS))
+        self._older = np.append(delays, _LAGS)
+        # On which side of the surface it was, between two delays, is not known.
+        self._near = np.where(_DELAYED, 0.5 * float(delays[1] - delays[0]), 0.0)
+        self._period = period
+        self._kept = exponential(period / _LAGS, SQUARINGS)  # of what a lagging sensor shows, after a tick
         self._plane_spread = plane_spread
         self._damping = prior.damping * prior.damping
         estimate, covariance = prior.moments()
         self._prior_estimate = np.repeat(np.array(estimate)[:, None], HYPOTHESES, axis=1)
         self._prior_covariance = np.repeat(np.array(covariance)[:, :, None], HYPOTHESES, axis=2)
         self.curve = Curve()  # the mean of the maps
-        self._jump = SmoothedJump()
         self.reset()
 
     def reset(self) -> None:
         """Forget all contacts."""
         self._restart()
-        self._carried = np.ones(HYPOTHESES)
+        self._carried = np.where(_DELAYED, 1.0, LAGGING)
         self._precision = np.zeros(HYPOTHESES)
         self._weighted = np.zeros(HYPOTHESES)
         self._below = np.zeros(HYPOTHESES)  # by how much deeper each has the surface than it was met [s]
@@ -92,26 +108,27 @@ class DelayBank:
         self._met = 0.0
         self._pace = 1.0
         self._off = 0.0  # standard deviation of the delays [s]
-        self._jump.reset()
+        self._edge = 0.0  # the largest weight of what may lie beyond
         self.shift = 0.0  # the mean of the hypotheses' delays [s]
         self.deeper = 0.0  # and of how much deeper the surface is [s], on the contact's scale of time
 
     @np.errstate(all="ignore")
-    def begin(self, meeting: Meeting) -> int:
+    def begin(self, meeting: Meeting, depths: list[float], forces: list[float], variance: float) -> int:
         """A contact begins: the one before is added to what is carried, and the maps are the prior. From how
-        many ticks before the meeting on to learn from the readings."""
+        many ticks before the meeting on to learn from the readings; the newest of them, at depths [s] beyond
+        where the surface was met, forces [1/s] with a variance [1/s^2]."""
         if self._learning:
             pace = self._pace
-            variance = self._covariance[DAMPING, DAMPING] * (pace * pace)
-            precision = 1.0 / np.where(variance > 0.0, variance, 1.0)
+            own = self._covariance[DAMPING, DAMPING] * (pace * pace)
+            precision = 1.0 / np.where(own > 0.0, own, 1.0)
             self._carried = _shares(self._carried * self._likelihood, LEAST_CARRIED)
             self._precision = self._precision + precision
             self._weighted = self._weighted + precision * (self._estimate[DAMPING] * pace)
             self._met += 1.0
         self._pace = meeting.pace
         self._restart()
-        self._jump.begin(meeting.tick, meeting.pace)
-        first = self._place(meeting)
+        lagged = lagged_onsets(_LAGS * meeting.pace, depths, forces, variance, meeting.tick)
+        first = self._place(meeting, *lagged)
         self._conclude(self._weigh())
         return min(ceil((first if first > SURFACE else 0.0) / meeting.tick), EARLIER)
 
@@ -121,34 +138,30 @@ class DelayBank:
     ) -> None:
         """One reading: depth [s] and speed as old as the force by the given delay, force [1/s], its variance
         [1/s^2], whether the sensor's dead zone hides it, that zone [1/s]."""
-        if not hidden:
-            self._jump.take(depth, rate, force, variance)
         self._read(depth, rate, force, variance, hidden, zone)
         self._conclude(self._weigh())
 
-    @property
-    def leans(self) -> bool:
-        """Whether the force is likely to be older or newer than any hypothesis has it."""
-        return abs(self.shift) > LEANING * self._offsets[-1]
-
     def leaves_open(self, peak: float) -> bool:
         """Whether the delay is left open, the restitution of a contact of this peak force [1/s] by it
-        [pi/2 p d], or the sensor is likely to lag."""
-        return self._jump.smoothed or 0.5 * pi * (peak * (self._off * self._pace)) > OPEN
+        [pi/2 p d], or may well lie beyond all hypotheses."""
+        return self._edge > EDGE or 0.5 * pi * (peak * (self._off * self._pace)) > OPEN
 
-    def _place(self, meeting: Meeting) -> float:
-        """Each hypothesis has the surface between where it was met and where it was told, or, where these
-        disagree, where it was met; there the force at the entry is known to what the stiffness makes of the
-        uncertain place. How far [s] the hardware was in, by the first to enter, as it was met."""
+    def _place(self, meeting: Meeting, later: np.ndarray, spreads: np.ndarray) -> float:
+        """Each hypothesis has the surface between where it was met, with a lag so much `later` [s] and with a
+        variance [s^2] of its own, and where it was told, or, where these disagree, where it was met; there
+        the force at the entry is known to what the stiffness makes of the uncertain place. How far [s] the
+        hardware was in, by the first to enter, as it was met."""
         length = meeting.speed / meeting.pace
         known = self._plane_spread * self._plane_spread
-        away = meeting.place - self._offsets * meeting.speed
-        both = known + meeting.variance
+        met = np.append(_1[:DELAYS] * meeting.place, meeting.place + later * length)
+        around = np.append(_1[:DELAYS] * meeting.variance, spreads * (length * length) + meeting.variance)
+        away = met - self._offsets * meeting.speed
+        both = known + around
         elsewhere = away * away > NOT_THERE * both
         share = np.where(elsewhere, 1.0, known / both)
         likely = exponential(0.5 * (away * away / both), DENSITY_SQUARINGS)
         places = share * away
-        off = USUAL * (share * (meeting.stiffness * (sqrt(meeting.variance) / length)))
+        off = USUAL * (share * (meeting.stiffness * (np.sqrt(around) / length)))
         depths = (meeting.plane - places) / length
         self._below = -depths
         self._bend(np.minimum(np.maximum((meeting.place - places) / length, -FARTHEST), FARTHEST))
@@ -168,6 +181,9 @@ class DelayBank:
         self._estimate = self._prior_estimate.copy()
         self._covariance = self._prior_covariance.copy()
         self._deepest = np.zeros(HYPOTHESES)
+        # What is smoothed, as it was before that, and whether the contact then pushed.
+        self._held = self._before = np.zeros((PARAMETERS, LAGS))
+        self._pushed = np.zeros(LAGS, dtype=bool)
         self._known = np.zeros(HYPOTHESES)
         self.variance = 0.0  # of the force that each expects where it was read last [1/s^2]
         self._likelihood = np.ones(HYPOTHESES)
@@ -179,6 +195,7 @@ class DelayBank:
         depths = depth - self._offsets * self._pace * rate - self._below
         deepest = np.fmax(self._deepest, depths)
         phi = self._features(depths, rate, deepest)
+        self._smooth(depths[DELAYS:], rate, phi)
         read = force
         noise = variance
         if hidden:
@@ -190,14 +207,15 @@ class DelayBank:
         expected = np.add.reduce(phi * estimate, axis=0)
         s = noise + np.add.reduce(phi * g, axis=0)
         inside = depths > SURFACE
+        inside[DELAYS:] = True
         if hidden:
             inside &= expected > zone
-        # On which side of the surface it was, between two delays, is not known.
-        near = 0.5 * float(self._offsets[1] - self._offsets[0]) * self._pace
+        near = self._near * self._pace
         beside = (depths < near) & (depths > -near)
         positive = expected > _0
         closes = rate > 0.0
         used = inside & (s > _0) & ~beside
+        used[DELAYS:] &= self._pushed
         if not closes and not force * force > OUTLYING * noise:
             used &= positive
         nothing = ~inside
@@ -236,6 +254,27 @@ class DelayBank:
         phi[PRELOAD] = 1.0
         return phi
 
+    def _smooth(self, depths: np.ndarray, rate: float, phi: np.ndarray) -> None:
+        """As a sensor that lags shows it: of phi the mean over the tick, from the entry on where that is
+        within it, as long as the contact pushes."""
+        now = phi[:, DELAYS:].copy()
+        pushes = depths > SURFACE
+        since = self._period * self._pace
+        if rate > 0.0:
+            since = np.fmin(depths / rate, since)
+        else:
+            since = _0[:LAGS]
+            pushes &= np.add.reduce(now * self._estimate[:, DELAYS:], axis=0) > 0.0
+        enters = pushes & ~self._pushed
+        kept = self._kept
+        lost = np.where(enters, exponential(since / (_LAGS * self._pace), SQUARINGS), kept)
+        before = np.where(enters, np.where(_JUMPS, now, 0.0), self._before)
+        fresh = (1.0 - lost) * (0.5 * (before + now))
+        self._held = kept * self._held + np.where(pushes | self._pushed, fresh, 0.0)
+        phi[:, DELAYS:] = self._held
+        self._before = now
+        self._pushed = pushes
+
     def _weigh(self) -> np.ndarray:
         """Weights of the hypotheses; their sum is 1."""
         pace = self._pace
@@ -251,9 +290,12 @@ class DelayBank:
 
     def _conclude(self, weights: np.ndarray) -> None:
         """The mean over the hypotheses, by their weights."""
-        shift = float(_total(weights * self._offsets))
-        off = self._offsets - shift
-        self._off = sqrt(_total(weights * (off * off)))
+        shift = float(_total(weights * self._older))
+        off = self._older - shift
+        # Between two lags neither is right.
+        between = 0.5 * (LAG_STEP * LAG_STEP) * _total(weights[DELAYS:])
+        self._off = sqrt(_total(weights * (off * off)) + between)
+        self._edge = max(float(weights[0]), float(weights[DELAYS - 1]), float(weights[-1]))
         self.shift = shift if shift > LEAST_SHIFT or shift < -LEAST_SHIFT else 0.0
         self.deeper = float(_total(weights * self._below))
         self.variance = float(_total(weights * self._known))

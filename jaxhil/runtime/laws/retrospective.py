@@ -311,7 +311,7 @@ class Retrospective(Compensator):
         if own > felt:
             own = felt
         self._doubts.unexplained = self._balance.unexplained(
-            curve, peak, self._learnt_deepest, reference.shift, self._pace, self._leans()
+            curve, peak, self._learnt_deepest, reference.shift, self._pace
         ) or self._open(peak)
         middle = v - 0.5 * reference.period * own
         correction = self._repayment(peak, 0.0 if separated else own, middle, zone)
@@ -398,10 +398,6 @@ class Retrospective(Compensator):
     def _variance(self) -> float:
         """Of the force that is expected where it was read last [1/s^2]."""
         raise NotImplementedError
-
-    def _leans(self) -> bool:
-        """Whether the force is likely to be older or newer than it may be."""
-        return False
 
     def _open(self, peak: float) -> bool:
         """Whether what is not known of the delay matters in a contact of this peak force [1/s]."""

@@ -1,9 +1,9 @@
 """The retrospective reference where the force delay is hardly known: a bank of delays, weighed as one goes.
 
 `retrospective_reference` with a `delay_bank` in the place of its one map: hypotheses lie evenly within
-`delay_spread` of `identification_delay`. What was learnt of the delay, and of whether there is any damping,
-is carried from contact to contact; maps are not. With d the mean of the hypotheses' delays on the tick
-before, the depth as old as the force is X - d V.
+`delay_spread` of `identification_delay`, or the force sensor lags by up to 4.25 ms. What was learnt of the
+delay, and of whether there is any damping, is carried from contact to contact; maps are not. With d the mean
+of the hypotheses' delays and lags on the tick before, the depth as old as the force is X - d V.
 """
 
 from collections.abc import Mapping
@@ -13,6 +13,7 @@ from ..registry import GainSpecification, register
 from .contact_plane import Meeting
 from .delay_bank import DelayBank
 from .force_depth_map import Prior
+from .lagged_onset import WINDOW
 from .retrospective import Retrospective
 
 
@@ -42,11 +43,22 @@ class RetrospectiveDelayBank(Retrospective):
 
     def _prepare(self, gains: Mapping[str, float], prior: Prior) -> None:
         self._given_delay = gains["identification_delay"]
-        self._bank = DelayBank(gains["delay_spread"], gains["plane_spread"], prior)
+        self._bank = DelayBank(gains["delay_spread"], gains["plane_spread"], prior, self._period)
         self._curve = self._bank.curve
 
     def _begin(self, meeting: Meeting) -> int:
-        earlier = self._bank.begin(meeting)
+        history = self._history
+        scales = self._scales
+        depths = []
+        forces = []
+        for tick in range(max(0, history.newest - WINDOW + 1), history.newest + 1):
+            force, shown = history.reading(tick)
+            if shown:
+                beyond = scales.beyond(history.recall(tick).position) - meeting.place
+                depths.append(beyond / scales.length)
+                forces.append(scales.force(force))
+        noise = self._noise.variance / (scales.weight * scales.weight)
+        earlier = self._bank.begin(meeting, depths, forces, self._floor * self._floor + noise)
         self._take_means(meeting.pace)
         return earlier
 
@@ -60,9 +72,6 @@ class RetrospectiveDelayBank(Retrospective):
 
     def _variance(self) -> float:
         return self._bank.variance
-
-    def _leans(self) -> bool:
-        return self._bank.leans
 
     def _open(self, peak: float) -> bool:
         return self._bank.leaves_open(peak)
