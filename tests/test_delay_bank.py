@@ -131,7 +131,8 @@ def test_both_recursions_agree():
     ):  # fmt: skip
         about = contact(rng, ticks=40, delay=delay)
         earlier = bank.begin(met, about[0].tolist(), about[2].tolist(), VARIANCE)
-        window = Window(*(jnp.asarray(each) for each in (about[0], about[2], ~about[3])), zero + VARIANCE)
+        depths, forces, shown = (jnp.asarray(each) for each in (about[0], about[2], ~about[3]))
+        window = Window(depths, forces, shown, zero + VARIANCE)
         ours, as_early = begin(ours, prior, in_arrays(met), window, zero + PERIOD, *known)
         assert int(as_early) == earlier
         for depth, speed, force, hidden in zip(*contact(rng, delay=delay, hides=zone), strict=True):

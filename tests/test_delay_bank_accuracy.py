@@ -128,8 +128,7 @@ def test_what_it_leaves_of_damped_contacts_at_one_speed(case, changes, first, ei
 @pytest.mark.parametrize("delay", ["uncertain by 4 ms", "told"])
 @pytest.mark.parametrize("suite", SUITES)
 def test_what_a_lag_of_3_ms_that_is_not_told_leaves(suite, delay, capsys):
-    """Of elastic contact a lag is a delay, and found where the delay may be so far off. A damper's jump it
-    smooths, which no delay does: that is said, but where the lag hides the damper (`test_smoothed_jump`)."""
+    """The first damped contact cannot be met with 1 % (`test_delay_bounds`)."""
     uncertain = 'uncertainty."rig.force_sensor.delay"={distribution="uniform",low=0.004,high=0.012}'
     told = load(f"suite-{suite}", [PLANES, *([uncertain] if delay != "told" else [])]).mechanism
     errors, _, said = errors_at_one_speed(told, suite, [PLANES, "rig.force_sensor.time_constant=0.003"], 16)
@@ -141,9 +140,8 @@ def test_what_a_lag_of_3_ms_that_is_not_told_leaves(suite, delay, capsys):
             f"\n{suite}, lag of 3 ms, delay {delay}: rms [%], contacts 1, 2, 4, 8:",
             *np.round(rms[[0, 1, 3, 7]], 2), counts,
         )  # fmt: skip
-    if suite != "damped":
-        assert odd == 0 and (delay == "told" or (rms[0] <= 1.0 and rms[7] <= 1.0))
-    assert odd <= (0.25 if delay == "told" else 0.5)
+    assert rms[0] <= (1.0 if suite != "damped" else 5.0) and rms[7] <= 1.0
+    assert odd == 0
 
 
 def test_what_an_unknown_delay_leaves_of_damped_contact_is_the_control_periods(capsys):
