@@ -52,11 +52,7 @@ def test_draws_are_lanes():
         scenario.groups[0].candidates.chaser.start.x[0], drawn["contact.edge_left.chaser.from"][:, 0]
     )
     np.testing.assert_array_equal(scenario.simulator.delay, drawn["rig.simulator.delay"].T)
-    assert np.all(scenario.bodies.chaser.mass == 420.0) and scenario.sensor.errors.crosstalk.shape == (
-        6,
-        6,
-        5,
-    )
+    assert np.all(scenario.bodies.chaser.mass == 420.0) and scenario.sensor.errors.bias.shape == (6, 5)
 
 
 def test_latches_and_robots_are_built_as_said():

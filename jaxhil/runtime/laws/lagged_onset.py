@@ -45,13 +45,13 @@ def lagged_onsets(
     explained = 0.5 * ((c * y * y - 2.0 * (b * y * z) + a * z * z) / determinant)
     most = np.fmax.reduce(explained, axis=1, initial=-np.inf)[:, None]
     likely = exponential(most - explained, SQUARINGS) / np.sqrt(determinant)
-    total = _total(likely)
-    mean = _total(likely * places) / total
-    square = _total(likely * (places * places)) / total
+    total = _of_places(likely)
+    mean = _of_places(likely * places) / total
+    square = _of_places(likely * (places * places)) / total
     step = width[:, 0] / (PLACES - 1)
     return mean, square - mean * mean + step * step / 12.0
 
 
-def _total(values: np.ndarray) -> np.ndarray:
-    """Of each lag, one place after another."""
+def _of_places(values: np.ndarray) -> np.ndarray:
+    """The sum of each lag, one place after another."""
     return np.add.accumulate(values, axis=1)[:, -1]
