@@ -7,7 +7,7 @@ import pytest
 from jax import lax
 
 from jaxhil.sixdof.friction import Bristle, Regularised, Touching
-from jaxhil.sixdof.vectors import components, norm, vector
+from jaxhil.sixdof.vectors import components, dot, norm, vector
 
 COEFFICIENT, STIFFNESS, DAMPING, SLIP = 0.3, 2e6, 300.0, 1e-3
 PERIOD = 1e-3
@@ -62,6 +62,44 @@ def test_neither_law_leaves_the_cone():
     assert 0.999 < norm(force)[0, 0] / (COEFFICIENT * 50) < 1
     opposite = -norm(force)[0, 0] / norm(slip)[0, 0]
     np.testing.assert_allclose(components(force), opposite * np.asarray(components(slip)), rtol=1e-12)
+
+
+def touched(count, seed):
+    """Random forces, slips in random tangent planes, and deflections; of every eleventh one is 0."""
+    generator = np.random.default_rng(seed)
+    normal = generator.normal(size=(3, count, 1))
+    normal /= np.linalg.norm(normal, axis=0)
+    slip, deflection = (np.cross(normal, generator.normal(size=(3, count, 1)), axis=0) for _ in range(2))
+    slip *= 10 ** generator.uniform(-9, 1, (count, 1))
+    deflection *= 10 ** generator.uniform(-9, -3, (count, 1))
+    force = 10 ** generator.uniform(-3, 3, (count, 1))
+    for number, part in enumerate((force, slip, deflection)):
+        part[..., number::11, :] = 0
+    normal, slip, deflection = (vector(jnp.asarray(part)) for part in (normal, slip, deflection))
+    return Touching(jnp.asarray(force), normal, slip, of_one(PERIOD)), deflection
+
+
+def test_regularised_friction_takes_its_power():
+    """-f_t.t = mu F |t|^2/sqrt(|t|^2 + v_s^2), never negative."""
+    touching, _ = touched(3000, 1)
+    force, _ = REGULARISED.step(touching, ())
+    taken = np.asarray(-dot(force, touching.slip))
+    slip = np.linalg.norm(components(touching.slip), axis=0)
+    expected = COEFFICIENT * touching.force * slip**2 / np.sqrt(slip**2 + SLIP**2)
+    np.testing.assert_allclose(taken, expected, rtol=1e-12)
+    assert np.all(taken >= 0) and np.count_nonzero(taken) > 2000
+
+
+def test_a_bristle_takes_what_it_does_not_store():
+    """-f_t.t less the rate of k_t z^2/2 over a step is never negative, however far the bristle was bent."""
+    touching, before = touched(3000, 2)
+    force, (after,) = BRISTLE.step(touching, (before,))
+    given = np.asarray(-PERIOD * dot(force, touching.slip))
+    stored = [np.asarray(STIFFNESS / 2 * dot(bent, bent)) for bent in (before, after)]
+    taken = given - (stored[1] - stored[0])
+    assert np.all(taken >= -1e-12 * (np.abs(given) + stored[0] + stored[1]))
+    # It gives back and stores as well.
+    assert np.any(given < 0) and np.any(stored[1] > stored[0]) and np.count_nonzero(taken > 0) > 2000
 
 
 @pytest.mark.slow
