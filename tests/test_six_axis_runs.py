@@ -137,6 +137,8 @@ def test_starts_that_cannot_be_run():
         ("hydraulic-hexapod", above | legs, "rig.simulator.base: found legs that hardly hold the platform"),
         ("ring-capture", {**APART, "contact": {}, "start.chaser.position": [0.04, 0.06, 2.19]},
          "latch.hooks.depth: found 0.0002 m, deep enough at the start already"),
+        ("ring-capture", {"approach.angular_velocity": [0, 60, 0]},
+         "approach.angular_velocity: found a rotation by 1.22 rad at the start, allowed at most 1 rad"),
     ):  # fmt: skip
         with pytest.raises(InputError) as caught:
             simulate_six_axes(load_any(name, changes).mechanism)

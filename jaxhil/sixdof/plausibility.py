@@ -66,13 +66,15 @@ def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
     angle = float(np.linalg.norm(at[3:]))
     if angle > LARGEST_ATTITUDE:
         allowed = f"at most {LARGEST_ATTITUDE:g} rad between C and T (interface_rotation counts)"
-        found = f"start.chaser.attitude: found a rotation by {angle:.3g} rad"
+        key = "start.chaser.attitude" if mechanism.start else "approach.angular_velocity"
+        found = f"{key}: found a rotation by {angle:.3g} rad at the start"
         raise InputError(f"{mechanism.name}: {found}, allowed {allowed}")
     depth = float(begins.depth[0])
     if depth > 0:
         key = "start.chaser.position" if mechanism.start else "approach.angular_velocity"
+        change = "move the chaser along z of T" if mechanism.start else "turn or move sideways less"
         found = f"{key}: found a start that is in touch already, {depth:.3g} m deep"
-        raise InputError(f"{mechanism.name}: {found}, allowed one apart: move the chaser along z of T")
+        raise InputError(f"{mechanism.name}: {found}, allowed one apart: {change}")
     _check_speed(mechanism, begins, float(scenario.control_period[0]))
     for (name, latch), caught in zip(mechanism.latch.items(), begins.caught, strict=True):
         if caught.any() and not latch.latched:
