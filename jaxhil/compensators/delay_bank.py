@@ -49,7 +49,7 @@ HYPOTHESES = DELAYS + LAGS
 DELAYED = np.arange(HYPOTHESES) < DELAYS
 OFFSETS = np.append(np.linspace(-1, 1, DELAYS), np.zeros(LAGS))  # of delays, in terms of the farthest
 LAG = np.where(DELAYED, 0, 0.00025 * (np.arange(HYPOTHESES) - DELAYS + 1.0))  # s
-LAGGING = 0.01  # of a delay's probability, that of each lag
+LAGGING = 0.0001  # of a delay's probability, that of each lag
 ELASTIC = 0.5  # probability that a contact has no damping
 BROADENING = 2.0  # of the variance of the damping
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.

@@ -41,7 +41,7 @@ from .onset import SQUARINGS, exponential
 DELAYS = LAGS = 17
 HYPOTHESES = DELAYS + LAGS
 LAG_STEP = 0.00025  # s from lag to lag
-LAGGING = 0.01  # of a delay's probability, that of each lag
+LAGGING = 0.0001  # of a delay's probability, that of each lag
 ELASTIC = 0.5  # probability that a contact has no damping
 BROADENING = 2.0  # of the variance of the damping, as the delay lies between two hypotheses
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
