@@ -86,9 +86,8 @@ class Rig(NamedTuple):
 class Channels(NamedTuple):
     """The force sensor's channels and the controller's memory of them."""
 
-    lag: (
-        tuple[Wrench, Wrench] | None
-    )  # reading of the last tick before the lag and behind it; None without one
+    # reading of the last tick before the lag and behind it; None without one
+    lag: tuple[Wrench, Wrench] | None
     controller: tuple[Any, ...]  # state of the compensator of each channel
 
 

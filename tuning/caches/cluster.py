@@ -88,7 +88,7 @@ class Workers:
         Raises `InputError`, one line, where the cluster is lost, and where a worker is not as `setting` says;
         and whatever the function raises.
         """
-        with _connected(self._address):
+        with _told_if_lost(self._address):
             from cloudpickle import dumps  # pyright: ignore[reportMissingImports]
 
             client, waiting, running = self._client, iter(pieces), {}
@@ -148,7 +148,7 @@ def _found(future: Any) -> tuple[Any] | None:
 
 
 @contextmanager
-def _connected(address: str) -> Iterator[None]:
+def _told_if_lost(address: str) -> Iterator[None]:
     """A scheduler that is lost is an `InputError`, one line."""
     from distributed import CancelledError  # pyright: ignore[reportMissingImports]
 
