@@ -45,7 +45,7 @@ def persistent(
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def _begin(loop, gains, scenario):
     rig = build_rig_constants(loop, scenario)
-    return rig, start(loop, rig, gains)
+    return rig, start(loop, rig, gains, skip_flight=False)
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)

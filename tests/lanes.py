@@ -41,7 +41,7 @@ def run_record(loop: Loop, gains: Gains, scenario: Scenario, ticks: int) -> tupl
         return turn_over(loop, rig, gains, run, skip_flight=False), seen
 
     stretches = -(-ticks // stretch_length(loop))
-    run, seen = jax.lax.scan(body, start(loop, rig, gains), None, length=stretches)
+    run, seen = jax.lax.scan(body, start(loop, rig, gains, skip_flight=False), None, length=stretches)
     return run.metrics, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), seen)
 
 

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from lanes import IDEAL, SECOND_ORDER, mechanism, nominal_gains, run_rollout, validated
+from lanes import IDEAL, SECOND_ORDER, mechanism, nominal_gains, run_record, run_rollout, validated
 from scipy.integrate import quad
 
 from jaxhil.simulation.building import build_loop
@@ -36,24 +36,33 @@ def test_without_lag_the_sensor_reads_the_push():
         assert float(reading) == float(PUSH.force(jnp.array(time)))
 
 
-def run(parsed, size=0.0, share=0.25, depth=None, span=0.1):
+def run(parsed, *push, **table):
     """Metrics of a run with a push of so many newtons at 0.06 s of the contact."""
-    scenarios = build_scenarios(parsed)
+    probed = with_push(build_scenarios(parsed), *push, **table)
+    return run_rollout(build_loop(parsed, "none", probed), nominal_gains(parsed, "none"), probed)
+
+
+def recorded(parsed, scenarios):
+    """Metrics of a run whose approach is flown, probed or not."""
+    loop = build_loop(parsed, "none", scenarios)
+    return run_record(loop, nominal_gains(parsed, "none"), scenarios, 400)[0]
+
+
+def with_push(scenarios, size=0.0, share=0.25, depth=None, span=0.1):
+    """Scenarios probed with a push of so many newtons at this share of 0.16 s."""
     shape = scenarios.phase.shape
     full = np.full(shape, 1.0)
     push = Push(size * full, share * 0.16 * full, 0.02 * full)
     table = np.zeros((shape[0], 5, shape[1])) if depth is None else depth
-    probed = scenarios._replace(probe=Probe(push, table, span * full))
-    loop = build_loop(parsed, "none", probed)
-    return run_rollout(loop, nominal_gains(parsed, "none"), probed)
+    return scenarios._replace(probe=Probe(push, table, span * full))
 
 
 @pytest.mark.parametrize("simulator", [IDEAL, SECOND_ORDER], ids=["ideal", "second order"])
 def test_a_push_of_nothing_changes_nothing(simulator):
     parsed = validated(mechanism({}, simulator, 0.004))
     scenarios = build_scenarios(parsed)
-    plain = run_rollout(build_loop(parsed, "none", scenarios), nominal_gains(parsed, "none"), scenarios)
-    probed = run(parsed)
+    plain = recorded(parsed, scenarios)
+    probed = recorded(parsed, with_push(scenarios))
     for name in ("restitution", "peak_force", "peak_command", "duration", "approach_velocity"):
         np.testing.assert_array_equal(getattr(probed, name), getattr(plain, name), err_msg=name)
 

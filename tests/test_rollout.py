@@ -123,7 +123,7 @@ def test_work_of_the_real_force(name):
 )
 def test_first_contact_is_over_at_the_oracles_tick(name):
     ticks, length = cases.loop_contacts(name)[0]["ticks"], stretch_length(cases.batches()[name].loop)
-    assert ticks == length * (oracle(name)[0]["end_tick"] // length + 1)
+    assert 0 < ticks - oracle(name)[0]["end_tick"] <= length
 
 
 @pytest.mark.slow

@@ -88,6 +88,7 @@ class DeadZoneObserver(Compensator):
 
     name: ClassVar[str] = "dead_zone_observer"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY, STIFFNESS, DEAD_ZONE)
+    waits_for_contact: ClassVar[bool] = True
     gains: ClassVar[tuple[Gain, ...]] = (
         PHASE_LEAD,
         LEAD_FILTER,

@@ -10,6 +10,7 @@ class NoCompensator(Compensator):
 
     name: ClassVar[str] = "none"
     knows: ClassVar[tuple[str, ...]] = ()
+    waits_for_contact: ClassVar[bool] = True
     reads_position: ClassVar[bool] = False
     gains: ClassVar[tuple[Gain, ...]] = ()
 

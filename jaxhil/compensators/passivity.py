@@ -21,6 +21,7 @@ class Passivity(Compensator):
 
     name: ClassVar[str] = "passivity"
     knows: ClassVar[tuple[str, ...]] = ()
+    waits_for_contact: ClassVar[bool] = True
     reads_position: ClassVar[bool] = False
     gains: ClassVar[tuple[Gain, ...]] = ()
 

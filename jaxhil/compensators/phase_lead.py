@@ -73,6 +73,7 @@ class PhaseLead(Compensator):
 
     name: ClassVar[str] = "phase_lead"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY,)
+    waits_for_contact: ClassVar[bool] = True
     reads_position: ClassVar[bool] = False
     gains: ClassVar[tuple[Gain, ...]] = (PHASE_LEAD, LEAD_FILTER)
 

@@ -22,6 +22,7 @@ class PositionLead(Compensator):
 
     name: ClassVar[str] = "position_lead"
     knows: ClassVar[tuple[str, ...]] = (SIMULATOR_DYNAMICS,)
+    waits_for_contact: ClassVar[bool] = True
     reads_position: ClassVar[bool] = False
     # Of an ideal simulator under commands held in jumps, or of one with zeros, either may be below 0.
     gains: ClassVar[tuple[Gain, ...]] = (

@@ -90,6 +90,7 @@ class ResponseError(Compensator):
 
     name: ClassVar[str] = "response_error"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY,)
+    waits_for_contact: ClassVar[bool] = True
     gains: ClassVar[tuple[Gain, ...]] = (
         PHASE_LEAD,
         LEAD_FILTER._replace(tuned=_never),

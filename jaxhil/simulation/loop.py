@@ -59,6 +59,18 @@ class Loop(eqx.Module):
         return self.has_force_noise or self.has_force_bias
 
     @property
+    def is_idle_in_flight(self) -> bool:
+        """Whether nothing happens in flight before the hardware touches: drives that can follow, no noise,
+        bias or steps of a reading, a law that waits for the contact, no probe that counts from x_d = 0."""
+        uneven = self.reads_always or self.has_position_noise or self.has_sample_effects or self.has_limits
+        return self.compensator.waits_for_contact and not (uneven or self.probed)
+
+    @property
+    def first_tick(self) -> int:
+        """The number that ticks begin with: rings are read up to one ring behind."""
+        return max(self.ring, self.controller_ring)
+
+    @property
     def has_corners(self) -> bool:
         """Whether the real force's peak may be a corner, at a tick or where the motion turns."""
         return self.first_break in (1, 2) or (self.first_break > 0 and self.law.jumps)

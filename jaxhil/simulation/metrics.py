@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.probe import root_mean_square
 from jaxhil.simulation.scenario import LONGEST_CONTACT, Scenario
-from jaxhil.simulation.watch import Watch
+from jaxhil.simulation.watch import RUNAWAY, Watch
 
 NOT_REACHED, OK, TIMEOUT, DIVERGED, NON_FINITE = -1, 0, 1, 2, 3
 STATUS_NAMES = {
@@ -18,7 +18,6 @@ STATUS_NAMES = {
     DIVERGED: "diverged",
     NON_FINITE: "non-finite",
 }
-RUNAWAY = 1e3  # of the first approach speed: no rig survives it
 # What a status says in a sentence, of those with which a run ends badly.
 STATUS_REASONS = {
     "not reached": "the numerical model turned back without a measured force: the hardware did not touch, or "
@@ -61,7 +60,7 @@ class Metrics(NamedTuple):
     # by how much the surface is deeper than told, as the compensator found it [m]; 0 unless it does
     contact_plane: Float[Array, "slots *batch"]
     status: Int[Array, "slots *batch"]  # one of `STATUS_NAMES`
-    ticks: Int[Array, "slots *batch"]  # run by then
+    ticks: Int[Array, "slots *batch"]  # run by then, and skipped on approaches
 
 
 def empty_metrics(loop: Loop, slots: int, like: Array) -> Metrics:

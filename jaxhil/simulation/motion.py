@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 
 from jaxhil.contact.laws import LAWS, ContactLaw, ContactParameters, two_sided
 from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.free_flight import APPROACH
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.recording import Lane, prepare_recording, record_lanes
-from jaxhil.simulation.rollout import APPROACH
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 
 STEPS = 8000  # of the integration in space

@@ -19,7 +19,7 @@ from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import dimensions, quantiles
 from jaxhil.simulation.environment import computing
 from jaxhil.simulation.evaluation import parameters_by_slot
-from jaxhil.simulation.rollout import APPROACH
+from jaxhil.simulation.free_flight import APPROACH
 from jaxhil.simulation.scenario import LONGEST_CONTACT, MotionSimulator, Scenario, build_scenarios
 
 MOST_TICKS = 1e7  # of a contact

@@ -119,7 +119,7 @@ def _lane(seen: Tick, zeroed: bool) -> Lane:
 
 def _begin(loop: Loop, gains: Gains, scenario: Scenario) -> tuple[RigConstants, RunState]:
     rig = build_rig_constants(loop, scenario)
-    return rig, start(loop, rig, gains)
+    return rig, start(loop, rig, gains, skip_flight=False)
 
 
 def _record_chunk(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) -> tuple[RunState, Tick]:

@@ -1,7 +1,7 @@
 """Rollout: a batch of scenarios through the loop, from the first approach until the last contact is over.
 
 Ticks run in short stretches; between stretches, contacts that are over are entered into the metrics, the next
-ones begin, and free flight towards the other surface is skipped. The program ends with its slowest lane:
+ones begin, and free flight is skipped where nothing happens in it. The program ends with its slowest lane:
 nothing is computed for a fixed horizon. Forward-mode derivatives pass through to every array leaf.
 """
 
@@ -11,7 +11,8 @@ from jax import lax
 
 from jaxhil.compensators.base import Gains
 from jaxhil.simulation.contact_force import Motion, PlantSignals, SamplingInterval, no_contact
-from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants, enter
+from jaxhil.simulation.free_flight import arrival, begin_approach
+from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants
 from jaxhil.simulation.loop_state import LoopState, Plant, Rings, Sensed
 from jaxhil.simulation.metrics import OK, Metrics, collect, empty_metrics, judge
 from jaxhil.simulation.probe import before_contact
@@ -19,10 +20,6 @@ from jaxhil.simulation.scenario import Scenario
 from jaxhil.simulation.sensors import Noise, draw_noise
 from jaxhil.simulation.tick import Prepared, RunState, Tick, tick
 from jaxhil.simulation.watch import FADED, build_rules, fresh_watch
-
-APPROACH = 0.02  # s of free approach before a contact, besides its phase
-SETTLED = 1e-6  # of the distance flown in a period: the motion simulator follows uniformly
-STILL = 1e-12  # of the speed, per period: nothing pushes the numerical model any more
 
 
 def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Metrics:
@@ -37,6 +34,11 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Metrics:
 
 def run_contacts(loop: Loop, gains: Gains, rig: RigConstants) -> Metrics:
     """`rollout` on a rig built before, for when many gains are tried on it."""
+    return run_to_its_end(loop, gains, rig).metrics
+
+
+def run_to_its_end(loop: Loop, gains: Gains, rig: RigConstants) -> RunState:
+    """The run when all its lanes are done."""
 
     def body(run):
         run, _ = stretch(loop, rig, gains, run, record=False)
@@ -52,7 +54,7 @@ def run_contacts(loop: Loop, gains: Gains, rig: RigConstants) -> Metrics:
         return light._replace(state=light.state._replace(sensed=light.state.sensed._replace(rings=rings)))
 
     run = start(loop, rig, gains)
-    return lax.while_loop(lambda run: jnp.any(run.active), body, run).metrics
+    return lax.while_loop(lambda run: jnp.any(run.active), body, run)
 
 
 def stretch_length(loop: Loop) -> int:
@@ -60,8 +62,8 @@ def stretch_length(loop: Loop) -> int:
     return 1 if loop.is_two_sided else 16
 
 
-def start(loop: Loop, rig: RigConstants, gains: Gains) -> RunState:
-    """All lanes on their first approach."""
+def start(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool = True) -> RunState:
+    """All lanes on their first approach, or at its end where nothing happens on it."""
     scenario, like = rig.scenario, rig.scenario.velocity
     zeros = jnp.zeros_like(like)
     index = jnp.zeros(like.shape, jnp.int32)
@@ -83,8 +85,9 @@ def start(loop: Loop, rig: RigConstants, gains: Gains) -> RunState:
         first_contact=before_contact(zeros) if loop.probed else None,
     )
     # Rings are read up to one ring behind: start there, so that no index is negative.
-    tick = jnp.array(_first_tick(loop), jnp.int32)
-    state = enter(loop, rig, gains, state, *_approach(rig, index, like), tick)
+    tick = jnp.array(loop.first_tick, jnp.int32)
+    phase = _entry(scenario.phase, _slot(rig, index))
+    state, skipped = begin_approach(loop, rig, gains, state, phase, like, tick, skip_flight)
     slots = scenario.phase.shape[0]
     return RunState(
         state=state,
@@ -93,6 +96,7 @@ def start(loop: Loop, rig: RigConstants, gains: Gains) -> RunState:
         index=index,
         active=scenario.contacts > 0,
         tick=tick,
+        skipped=skipped,
     )
 
 
@@ -131,11 +135,11 @@ def noise_ahead(loop: Loop, rig: RigConstants, run: RunState, ticks: int) -> Noi
 def turn_over(
     loop: Loop, rig: RigConstants, gains: Gains, run: RunState, skip_flight: bool = True
 ) -> RunState:
-    """Enter contacts that are over, begin the next, skip the free flight between two surfaces."""
+    """Enter contacts that are over, begin the next, skip free flight."""
     watch, state, scenario = run.watch, run.state, rig.scenario
     status = judge(scenario, watch, run.tick - state.entry_tick)
     over = _pending(rig, run)
-    ticks = jnp.broadcast_to(run.tick - _first_tick(loop), run.index.shape)
+    ticks = run.tick - loop.first_tick + run.skipped
     law = loop.compensator
     delay = law.force_delay(gains, state.controller) if law.estimates_delay else None
     plane = law.contact_plane(state.controller) if law.finds_plane else None
@@ -162,11 +166,15 @@ def turn_over(
                 first_contact=_choose(over, before_contact(watch.approach), state.first_contact)
             )
         if skip_flight:
-            state = _skip_flight(loop, rig, gains, state, watch, run.tick)
+            arrived, skipped = arrival(loop, rig, gains, state, watch, run.tick)
+            state = _restart(loop, gains, state, arrived, skipped, jnp.zeros_like(skipped))
     else:
         state = state._replace(parameters=_choose(over, entry, state.parameters))
-        position, velocity = _approach(rig, index, watch.rebound)
-        entered = enter(loop, rig, gains, state, position, velocity, run.tick)
+        phase = _entry(scenario.phase, _slot(rig, index))
+        entered, skipped = begin_approach(
+            loop, rig, gains, state, phase, watch.rebound, run.tick, skip_flight
+        )
+        run = run._replace(skipped=run.skipped + jnp.where(over, skipped, 0))
         state = _restart(loop, gains, state, entered, over, over)
         watch = _choose(over, blank, watch)
     return run._replace(state=state, watch=watch, metrics=metrics, index=index, active=active)
@@ -200,40 +208,6 @@ def _pending(rig, run):
     """Lanes whose contact is over, or has failed."""
     status = judge(rig.scenario, run.watch, run.tick - run.state.entry_tick)
     return (run.watch.over | (status != OK)) & run.active
-
-
-def _first_tick(loop):
-    return max(loop.ring, loop.controller_ring)
-
-
-def _approach(rig, index, velocity):
-    """Where a run of the schedule starts: x_d(0) = min(plane, 0) - v (0.02 s + phi T)."""
-    phase = _entry(rig.scenario.phase, _slot(rig, index))
-    nearer = jnp.minimum(rig.scenario.contact_plane, 0)
-    return nearer - velocity * (APPROACH + phase * rig.constants.control_period), velocity
-
-
-def _skip_flight(loop, rig, gains, state, watch, tick):
-    """Move lanes in settled free flight by whole periods to shortly before the other surface."""
-    scenario, period = rig.scenario, rig.constants.control_period
-    velocity, position = state.velocity, state.position
-    stride = period * velocity
-    left = jnp.where(velocity > 0, -position, position + scenario.clearance)
-    spare = left - APPROACH * jnp.abs(velocity) - jnp.abs(scenario.contact_plane)
-    strides = spare / jnp.where(stride != 0, jnp.abs(stride), 1)
-    periods = lax.stop_gradient(jnp.floor(jnp.where(stride != 0, strides, 0)))
-    arrived = enter(loop, rig, gains, state, position + periods * stride, velocity, tick)
-    here = enter(loop, rig, gains, state, position, velocity, tick)
-    follows = (watch.elapsed == 0) & (watch.quiet > _first_tick(loop))
-    for component, steady in zip(state.plant.state, here.plant.state, strict=True):
-        # Components of the state are in periods, hence of like size.
-        scale = jnp.abs(rig.propagation.steady_command[0] * stride)
-        follows = follows & (jnp.abs(component - steady) <= SETTLED * scale)
-    # A force that still moves the model, noise for one, makes the flight an event.
-    push = jnp.abs(watch.command) * period / scenario.equivalent_mass
-    still = push <= STILL * jnp.abs(velocity)
-    skipped = follows & still & (periods >= 1)
-    return _restart(loop, gains, state, arrived, skipped, jnp.zeros_like(skipped))
 
 
 def _restart(loop, gains, state, entered, begins, fresh):

@@ -50,6 +50,7 @@ class RunState(NamedTuple):
     index: Int[Array, "*batch"]  # of the contact under way, from 0
     active: Bool[Array, "*batch"]  # whether the lane still has contacts to come
     tick: Int[Array, ""]  # the number of ticks run, common to all lanes
+    skipped: Int[Array, "*batch"]  # ticks of approaches, in which nothing happens
 
 
 class Tick(NamedTuple):

@@ -18,6 +18,7 @@ from jaxhil.simulation.scenario import Scenario
 
 LONGEST_FADING = 0.1  # s, waited for the compensator's command to die out
 FADED = 1e-6  # of the command's peak
+RUNAWAY = 1e3  # of the first approach speed: no rig survives it
 
 
 class Swings(NamedTuple):
@@ -59,6 +60,7 @@ class Rules(NamedTuple):
     # ticks without a real force after which the command need not have died out
     patience: Float[Array, "*batch"]
     level: Float[Array, "*batch"]  # below which the command has died out [N]
+    fastest: Float[Array, "*batch"]  # speed beyond which the run has diverged [m/s]
     clearance: Float[Array, "*batch"]  # between two surfaces [m]; infinite for one
 
 
@@ -67,7 +69,8 @@ def build_rules(scenario: Scenario) -> Rules:
     sensor, period = scenario.force_sensor, scenario.control_period
     quiet = jnp.floor((sensor.delay + 20 * sensor.time_constant) / period + (2 + 1e-9)) + 1
     level = 3 * sensor.noise_std + jnp.abs(sensor.bias) + sensor.quantum
-    return Rules(quiet, quiet + jnp.ceil(LONGEST_FADING / period), level, scenario.clearance)
+    patience = quiet + jnp.ceil(LONGEST_FADING / period)
+    return Rules(quiet, patience, level, RUNAWAY * scenario.velocity, scenario.clearance)
 
 
 def fresh_watch(loop: Loop, like: Array) -> Watch:
@@ -118,9 +121,10 @@ def record_contact(
     return Watch(
         elapsed=jnp.where(begun, watch.elapsed + 1, watch.elapsed),
         over=watch.over | ends,
-        # Each speed stops being followed at its event; the approach's is that of the tick before.
+        # Each speed stops being followed at its event, which for the rebound's is the end or divergence; the
+        # approach's is that of the tick before.
         approach=jnp.where(begun | watch.over, watch.approach, speed),
-        rebound=jnp.where(watch.over, watch.rebound, speed),
+        rebound=jnp.where(watch.over | (watch.rebound > rules.fastest), watch.rebound, speed),
         peak_force=jnp.maximum(watch.peak_force, _peak_force(loop, watch, plant_signals, force)),
         peak_command=peak_command,
         recent=(watch.recent[1], force),

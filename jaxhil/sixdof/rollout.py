@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.compensators.base import Gains
-from jaxhil.simulation.metrics import RUNAWAY
+from jaxhil.simulation.watch import RUNAWAY
 from jaxhil.simulation.watch import FADED, LONGEST_FADING
 from jaxhil.sixdof.bodies import SHARES
 from jaxhil.sixdof.forces import deepest

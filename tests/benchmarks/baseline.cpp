@@ -6,7 +6,8 @@
 //
 // Lanes (scenarios) run in blocks of LANES, tick by tick; each variable of a block is an array over its lanes, so
 // that the compiler turns the loops over lanes into vector instructions. Blocks are dealt out to the threads in turn.
-// Delay lines begin a run filled with uniform motion: no reading asks whether it precedes the run.
+// Delay lines begin a run filled with uniform motion: no reading asks whether it precedes the run. An approach is
+// skipped until shortly before the mechanism touches.
 
 #include <chrono>
 #include <cmath>
@@ -206,19 +207,29 @@ private:
         }
     }
 
+    // Component i of the motion simulator's state in uniform motion.
+    double steady(int i, int l, double command, double stride) const {
+        return b.steady_command[i][l] * command + b.steady_velocity[i][l] * stride;
+    }
+
     // The run of lane l that begins at `tick`, on the contact b.index[l], at speed `velocity`.
     void approach(int l, double velocity, int64_t tick) {
         const int64_t n = number(l), entry = (b.index[l] < p.slots ? b.index[l] : p.slots - 1) * p.lanes + n;
         const double period = b.period[l], stride = period * velocity;
-        const double position = -velocity * (APPROACH + p.phase[entry] * period), start = position - stride;
+        const double from = -velocity * (APPROACH + p.phase[entry] * period);
+        // Nothing happens until two periods before the mechanism touches: the flight until then is skipped.
+        const double sample = dot(b.position_row, l, steady(0, l, from - stride, stride),
+                                  steady(1, l, from - stride, stride), from - stride, from);
+        const double periods = stride > 0 ? std::floor(-sample / stride) - 2 : 0;
+        const double position = from + (periods > 0 ? periods : 0) * stride, start = position - stride;
         b.stiffness[l] = p.stiffness[entry];
         b.damping[l] = p.damping[entry];
         b.position[l] = b.command[l] = position;
         b.velocity[l] = velocity;
         double past[2];
         for (int i = 0; i < 2; ++i) {
-            past[i] = b.steady_command[i][l] * start + b.steady_velocity[i][l] * stride;
-            b.plant[i][l] = b.steady_command[i][l] * position + b.steady_velocity[i][l] * stride;
+            past[i] = steady(i, l, start, stride);
+            b.plant[i][l] = steady(i, l, position, stride);
         }
         const double first_position = dot(b.measured_row, l, past[0], past[1], start, position);
         force_line.fill(l, tick - 1, 0, 0);

@@ -21,7 +21,7 @@ from jaxhil.simulation import evaluation
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.environment import TICKS, known_options
 from jaxhil.simulation.loop import build_rig_constants
-from jaxhil.simulation.rollout import run_contacts
+from jaxhil.simulation.rollout import run_contacts, run_to_its_end
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.batches import join
 from tuning.gains.rounds import TILE
@@ -57,6 +57,17 @@ def case(compensator, lanes, names=("varying",)):
     return build_loop(mechanism, compensator, scenarios), gains, scenarios
 
 
+@partial(jax.jit, static_argnums=0)
+def ticks_run(loop, common, per_lane, scenarios):
+    """Ticks that each tile of `shard`'s ran, (devices, tiles): as many as its slowest lane takes."""
+
+    def of_tile(arguments):
+        gains, scenario = arguments
+        return run_to_its_end(loop, {**common, **gains}, build_rig_constants(loop, scenario)).tick
+
+    return jax.lax.map(lambda device: jax.lax.map(of_tile, device), (per_lane, scenarios)) - loop.first_tick
+
+
 def best(*calls, repeats=REPEATS):
     """Shortest time of each call, the calls taking turns."""
     times = [[] for _ in calls]
@@ -86,10 +97,10 @@ def test_rollout_beside_the_compiled_baseline(compensator, names, capsys):
     rig = jax.jit(build_rig_constants, static_argnums=0)(loop, on_device)
     # C++ too finds its numbers in place.
     arguments = evaluation.place(*evaluation.shard(scenarios, gains))
-    ticks = np.asarray(evaluation.run_tiles(loop, *arguments).metrics.ticks).max(axis=-2)
-    # A tile runs as long as its slowest lane: (devices, tiles, tile) lanes.
-    lane_steps = int(np.sum(ticks.max(axis=-1) * ticks.shape[-1]))
-    horizon = int(ticks.max())
+    tiles = ticks_run(loop, *arguments)
+    lane_steps = int(np.sum(tiles)) * arguments[-1].velocity.shape[-1]
+    # The last tick at which a lane of the C++ loop ends.
+    horizon = int(baselines[0].run(loop, rig, gains, on_device, 4000)["ticks"].max())
     jax_time, whole, *cpp_times = best(
         timed(lambda: evaluation.run_tiles(loop, *arguments)),
         timed(lambda: evaluation.evaluate(loop, gains, scenarios)),
