@@ -14,8 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.compensators.base import Gains
-from jaxhil.simulation.watch import RUNAWAY
-from jaxhil.simulation.watch import FADED, LONGEST_FADING
+from jaxhil.simulation.watch import FADED, LONGEST_FADING, RUNAWAY
 from jaxhil.sixdof.bodies import SHARES
 from jaxhil.sixdof.forces import deepest
 from jaxhil.sixdof.loop import Loop, Rig, RunState, Tick, begin, build_rig, tick

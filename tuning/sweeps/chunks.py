@@ -66,18 +66,15 @@ def run_chunk(sweep: Sweep, first: int, number: int, precision: str | None = Non
 
 def run_parts(sweep: Sweep, parts: Iterable[int]) -> Generator[tuple[int, Rows], None, None]:
     """Part by part its number and rows. While the caller uses them, the next part is computed already."""
-    held = None
-    waiting = iter(parts)
-    drawn = _draw_part(sweep, next(waiting, None))
-    while drawn is not None:
-        part, batch = drawn
-        rows = _begin(sweep, batch)
-        drawn = _draw_part(sweep, next(waiting, None))
-        if held is not None:
-            yield held
-        held = part, rows()
-    if held is not None:
-        yield held
+    running = None
+    for part in parts:
+        # It waits its turn behind the one that runs, so that no core does.
+        begun = part, _begin(sweep, _draw(sweep, *sweep.manifest.part_rows(part), None))
+        if running is not None:
+            yield _finished(running)
+        running = begun
+    if running is not None:
+        yield _finished(running)
 
 
 def in_precision(scenarios: Any, precision: str) -> Any:
@@ -96,13 +93,14 @@ def _draw(sweep: Sweep, first: int, number: int, precision: str | None) -> _Batc
     return _Batch(first, draws, in_precision(scenarios, precision or manifest.precision))
 
 
-def _draw_part(sweep: Sweep, part: int | None) -> tuple[int, _Batch] | None:
-    return None if part is None else (part, _draw(sweep, *sweep.manifest.part_rows(part), None))
-
-
 def _begin(sweep: Sweep, batch: _Batch) -> Callable[[], Rows]:
     """Start computing; what is returned waits for the rows."""
     manifest = sweep.manifest
     outcome = begin_evaluation(sweep.loop, sweep.gains, batch.scenarios, at_least=manifest.chunk)
     limit, works = manifest.largest_error, manifest.works
     return lambda: rows_of(sweep.mechanism, *batch, outcome(), limit, works)
+
+
+def _finished(running: tuple[int, Callable[[], Rows]]) -> tuple[int, Rows]:
+    part, rows = running
+    return part, rows()

@@ -1,0 +1,57 @@
+"""Approaches that are skipped, beside the same ones flown tick by tick."""
+
+import numpy as np
+import pytest
+from lanes import as_arrays, nominal_gains, run_record, run_rollout
+
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.rollout import stretch_length
+from jaxhil.simulation.scenario import build_scenarios
+
+LANES, TICKS = 5, 1200
+WAITING = sorted(name for name, law in COMPENSATORS.items() if law.waits_for_contact)
+EVERYDAY = "none", "response_error"  # each law is two programs
+
+
+def case(law, mechanism="varying", overrides=()):
+    drawn = load(mechanism, overrides).mechanism
+    scenarios = build_scenarios(drawn, draw(drawn, LANES, 1))
+    return build_loop(drawn, law, scenarios), as_arrays(nominal_gains(drawn, law)), scenarios
+
+
+@pytest.mark.parametrize(
+    "law", [pytest.param(law, marks=() if law in EVERYDAY else pytest.mark.slow) for law in WAITING]
+)
+def test_a_skipped_approach_changes_no_figure(law):
+    loop, gains, scenarios = case(law)
+    assert loop.is_idle_in_flight
+    found = run_rollout(loop, gains, scenarios)
+    flown, seen = run_record(loop, gains, scenarios, TICKS)
+    assert not np.any(seen.active[-1])
+    for name in set(found._fields) - {"ticks"}:
+        np.testing.assert_allclose(getattr(found, name), getattr(flown, name), rtol=1e-9, err_msg=name)
+    # Figures are entered at the end of a stretch, which comes at other ticks.
+    later = np.asarray(found.ticks) - np.asarray(flown.ticks)
+    assert np.all(np.abs(later) < stretch_length(loop) * scenarios.contacts)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["rig.force_sensor.noise_std=0.1"],
+        ["rig.position_sensor.noise_std=1e-6"],
+        ["rig.position_sensor.quantum=1e-6"],
+        ["rig.simulator.velocity_limit=0.004"],
+    ],
+)
+def test_what_happens_in_flight_is_flown(overrides):
+    loop, _, _ = case("none", overrides=overrides)
+    assert not loop.is_idle_in_flight
+
+
+def test_a_law_that_acts_before_the_contact_is_flown():
+    loop, _, _ = case("virtual_contact")
+    assert not loop.is_idle_in_flight
