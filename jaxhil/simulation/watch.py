@@ -34,7 +34,7 @@ class Watch(NamedTuple):
     """The contact under way."""
 
     elapsed: Float[Array, "*batch"]  # ticks since it began; 0 before
-    over: Bool[Array, "*batch"]  # whether it is over
+    over: Bool[Array, "*batch"]  # whether it is over, or the run has diverged
     approach: Float[Array, "*batch"]  # speed of the numerical model before it [m/s]
     rebound: Float[Array, "*batch"]  # speed of the numerical model now [m/s]
     peak_force: Float[Array, "*batch"]  # of the real force [N]
@@ -120,11 +120,11 @@ def record_contact(
     lasts = begun & ~watch.over
     return Watch(
         elapsed=jnp.where(begun, watch.elapsed + 1, watch.elapsed),
-        over=watch.over | ends,
-        # Each speed stops being followed at its event, which for the rebound's is the end or divergence; the
-        # approach's is that of the tick before.
+        # What runs away may come back: it is over at once.
+        over=watch.over | ends | (speed > rules.fastest),
+        # Each speed stops being followed at its event; the approach's is that of the tick before.
         approach=jnp.where(begun | watch.over, watch.approach, speed),
-        rebound=jnp.where(watch.over | (watch.rebound > rules.fastest), watch.rebound, speed),
+        rebound=jnp.where(watch.over, watch.rebound, speed),
         peak_force=jnp.maximum(watch.peak_force, _peak_force(loop, watch, plant_signals, force)),
         peak_command=peak_command,
         recent=(watch.recent[1], force),

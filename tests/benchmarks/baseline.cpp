@@ -6,8 +6,8 @@
 //
 // Lanes (scenarios) run in blocks of LANES, tick by tick; each variable of a block is an array over its lanes, so
 // that the compiler turns the loops over lanes into vector instructions. Blocks are dealt out to the threads in turn.
-// Delay lines begin a run filled with uniform motion: no reading asks whether it precedes the run. An approach is
-// skipped until shortly before the mechanism touches.
+// Delay lines begin a run filled with uniform motion: no reading asks whether it precedes the run. With SKIPS an
+// approach is skipped until shortly before the mechanism touches.
 
 #include <chrono>
 #include <cmath>
@@ -20,6 +20,9 @@
 
 #ifndef LANES
 #define LANES 16
+#endif
+#ifndef SKIPS
+#define SKIPS 1
 #endif
 
 namespace {
@@ -220,7 +223,7 @@ private:
         // Nothing happens until two periods before the mechanism touches: the flight until then is skipped.
         const double sample = dot(b.position_row, l, steady(0, l, from - stride, stride),
                                   steady(1, l, from - stride, stride), from - stride, from);
-        const double periods = stride > 0 ? std::floor(-sample / stride) - 2 : 0;
+        const double periods = SKIPS && stride > 0 ? std::floor(-sample / stride) - 2 : 0;
         const double position = from + (periods > 0 ? periods : 0) * stride, start = position - stride;
         b.stiffness[l] = p.stiffness[entry];
         b.damping[l] = p.damping[entry];

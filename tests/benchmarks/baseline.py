@@ -95,19 +95,19 @@ class Baseline(NamedTuple):
         return results | {"seconds": seconds}
 
 
-def compile_baseline(block_lanes: int | None = None) -> Baseline | None:
+def compile_baseline(block_lanes: int | None = None, skips: bool = True) -> Baseline | None:
     """Build and load baseline.cpp; None where there is no g++.
 
-    `block_lanes` overrides the lanes per block. Raises `subprocess.CalledProcessError` when it does
-    not compile.
+    `block_lanes` overrides the lanes per block; unless it `skips` them, approaches are flown. Raises
+    `subprocess.CalledProcessError` when it does not compile.
     """
     compiler = shutil.which("g++")
     if compiler is None:
         return None
-    width = () if block_lanes is None else (f"-DLANES={block_lanes}",)
+    defined = [f"-DSKIPS={int(skips)}"] + ([] if block_lanes is None else [f"-DLANES={block_lanes}"])
     with tempfile.TemporaryDirectory(prefix="jaxhil-baseline-") as folder:
         path = Path(folder) / "baseline.so"
-        command = [compiler, *FLAGS, *width, "-shared", "-fPIC", str(SOURCE), "-o", str(path)]
+        command = [compiler, *FLAGS, *defined, "-shared", "-fPIC", str(SOURCE), "-o", str(path)]
         subprocess.run(command, check=True)
         # The loaded library stays mapped after its file is gone.
         library = ctypes.CDLL(str(path))
