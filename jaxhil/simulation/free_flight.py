@@ -46,10 +46,10 @@ def begin_approach(
 
 
 def arrival(
-    loop: Loop, rig: RigConstants, gains: Gains, state: LoopState, watch: Watch, tick: Array
+    loop: Loop, rig: RigConstants, gains: Gains, state: LoopState, watch: Watch, command: Array, tick: Array
 ) -> tuple[LoopState, Bool[Array, "*batch"]]:
     """Between two surfaces: the state whole periods later, shortly before the other one, and on which lanes
-    there is settled free flight until then."""
+    there is settled free flight until then; |F_c| is `command` [N]."""
     scenario, period = rig.scenario, rig.constants.control_period
     velocity, position = state.velocity, state.position
     stride = period * velocity
@@ -65,7 +65,7 @@ def arrival(
         scale = jnp.abs(rig.propagation.steady_command[0] * stride)
         follows = follows & (jnp.abs(component - steady) <= SETTLED * scale)
     # A force that still moves the model, noise for one, makes the flight an event.
-    push = jnp.abs(watch.command) * period / scenario.equivalent_mass
+    push = command * period / scenario.equivalent_mass
     still = push <= STILL * jnp.abs(velocity)
     return arrived, follows & still & (periods >= 1)
 

@@ -166,7 +166,7 @@ def turn_over(
                 first_contact=_choose(over, before_contact(watch.approach), state.first_contact)
             )
         if skip_flight:
-            arrived, skipped = arrival(loop, rig, gains, state, watch, run.tick)
+            arrived, skipped = arrival(loop, rig, gains, state, watch, watch.command, run.tick)
             state = _restart(loop, gains, state, arrived, skipped, jnp.zeros_like(skipped))
     else:
         state = state._replace(parameters=_choose(over, entry, state.parameters))
