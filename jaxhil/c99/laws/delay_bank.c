@@ -33,11 +33,11 @@ enum { JAXHIL_DELAYS = 17, JAXHIL_LAGS = 17, JAXHIL_HYPOTHESES = JAXHIL_DELAYS +
  * usual, how likely it is that the surface is there, map, deepest point, the likelihoods of this contact and of those
  * before; sums over these of the damping's precision and of precision times mean, their number `met`; whether this
  * contact is to be added to them. The mean of the maps and, `shift` [s] and `below` [s], of the delays and of how much
- * deeper; the delays' standard deviation [s]; the largest weight of what may lie beyond, `edge`; the delay that was
- * `given`. Of each lag [s] what is kept after a tick of what a sensor shows; what is smoothed, `held`, as it was before
+ * deeper; the delays' standard deviation [s]; the largest weight of what may lie beyond, `edge`, and that of all lags; the
+ * delay that was `given`. Of each lag [s] what is kept after a tick of what a sensor shows; what is smoothed, `held`, as it was before
  * that, and whether the contact then pushed. */
 typedef struct {
-    double given, shift, open, edge, below, met, variance, pace, plane_spread, period;
+    double given, shift, open, edge, lagging, below, met, variance, pace, plane_spread, period;
     double lags[JAXHIL_LAGS], kept[JAXHIL_LAGS];
     double held[JAXHIL_LAGS][JAXHIL_PARAMETERS], before[JAXHIL_LAGS][JAXHIL_PARAMETERS];
     bool pushed[JAXHIL_LAGS];
@@ -67,6 +67,7 @@ static const double jaxhil_bank_lag_step = 0.00025; /* s from lag to lag */
 static const double jaxhil_bank_lagging = 0.0001; /* of a delay's probability, that of each lag */
 static const double jaxhil_bank_edge = 0.6;      /* probability of a farthest delay or the longest lag: it may lie beyond */
 static const double jaxhil_bank_open = 0.0075;   /* of a restitution of 1, that what is open of the delay makes */
+static const double jaxhil_bank_settled = 0.99;  /* probability from which on it is a lag */
 static const double jaxhil_bank_usual = 0.5;     /* stiffness, of the most that it may be */
 static const double jaxhil_bank_farthest = 0.004; /* s, by which knots are moved, */
 static const double jaxhil_bank_whole = 0.015;    /* from this depth [s] on, and less before */
@@ -123,6 +124,7 @@ static void jaxhil_learnt_reset(jaxhil_learnt *bank) {
     bank->below = 0.0;
     bank->open = 0.0;
     bank->edge = 0.0;
+    bank->lagging = 0.0;
     bank->pace = 1.0;
 }
 
@@ -160,9 +162,12 @@ static double jaxhil_learnt_deeper(const jaxhil_learnt *bank) {
     return bank->below;
 }
 
-/* Whether the delay is left open, the restitution by it [pi/2 p d], or may well lie beyond all hypotheses. */
+/* Whether the delay is left open, the restitution by it [pi/2 p d], may well lie beyond all hypotheses, or be a lag:
+ * readings that speak for one, if not so clearly that its being rare is outweighed. */
 static bool jaxhil_learnt_open(const jaxhil_learnt *bank, double peak) {
-    return bank->edge > jaxhil_bank_edge ||
+    const double lagging = bank->lagging;
+    const bool doubtful = jaxhil_bank_settled > lagging && lagging > jaxhil_bank_lagging * (1.0 - lagging);
+    return doubtful || bank->edge > jaxhil_bank_edge ||
            0.5 * jaxhil_map_pi * (peak * (bank->open * bank->pace)) > jaxhil_bank_open;
 }
 
@@ -254,6 +259,7 @@ static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
         lagging += h < JAXHIL_DELAYS ? 0.0 : weights[h];
     }
     /* Between two lags neither is right. */
+    bank->lagging = lagging;
     bank->open = sqrt(square + 0.5 * (jaxhil_bank_lag_step * jaxhil_bank_lag_step) * lagging);
     const int edges[] = {0, JAXHIL_DELAYS - 1, JAXHIL_HYPOTHESES - 1};
     bank->edge = weights[0];

@@ -56,6 +56,7 @@ FARTHEST, WHOLE = 0.004, 0.015  # s by which knots are moved, from what depth [s
 EARLIER = 30  # ticks before it was met, whose readings count
 EDGE = 0.6  # probability that it is a farthest delay or the longest lag: then it may lie beyond
 OPEN = 0.0075  # of a restitution of 1, that what is open of the delay makes
+SETTLED = 0.99  # probability from which on it is a lag
 
 _KNOTS = np.array(KNOTS)[:, None]
 _GAPS = np.diff(KNOTS)
@@ -74,7 +75,7 @@ class DelayBank:
 
     __slots__ = (
         "_before", "_below", "_carried", "_covariance", "_damping", "_deepest", "_edge", "_estimate", "_held",
-        "_kept", "_knots", "_known", "_learning", "_likelihood", "_likely", "_met", "_near", "_off",
+        "_kept", "_knots", "_known", "_lagging", "_learning", "_likelihood", "_likely", "_met", "_near", "_off",
         "_offsets", "_older", "_pace", "_past", "_period", "_plane_spread", "_precision",
         "_prior_covariance", "_prior_estimate", "_pushed", "_weighted", "_widths", "curve", "deeper", "shift",
         "variance",
@@ -109,6 +110,7 @@ class DelayBank:
         self._pace = 1.0
         self._off = 0.0  # standard deviation of the delays [s]
         self._edge = 0.0  # the largest weight of what may lie beyond
+        self._lagging = 0.0  # the weight of all lags
         self.shift = 0.0  # the mean of the hypotheses' delays [s]
         self.deeper = 0.0  # and of how much deeper the surface is [s], on the contact's scale of time
 
@@ -143,8 +145,11 @@ class DelayBank:
 
     def leaves_open(self, peak: float) -> bool:
         """Whether the delay is left open, the restitution of a contact of this peak force [1/s] by it
-        [pi/2 p d], or may well lie beyond all hypotheses."""
-        return self._edge > EDGE or 0.5 * pi * (peak * (self._off * self._pace)) > OPEN
+        [pi/2 p d], may well lie beyond all hypotheses, or be a lag: readings that speak for one, if not so
+        clearly that its being rare is outweighed."""
+        lagging = self._lagging
+        doubtful = SETTLED > lagging > LAGGING * (1.0 - lagging)
+        return doubtful or self._edge > EDGE or 0.5 * pi * (peak * (self._off * self._pace)) > OPEN
 
     def _place(self, meeting: Meeting, later: np.ndarray, spreads: np.ndarray) -> float:
         """Each hypothesis has the surface between where it was met, with a lag so much `later` [s] and with a
@@ -292,8 +297,9 @@ class DelayBank:
         """The mean over the hypotheses, by their weights."""
         shift = float(_total(weights * self._older))
         off = self._older - shift
+        self._lagging = float(_total(weights[DELAYS:]))
         # Between two lags neither is right.
-        between = 0.5 * (LAG_STEP * LAG_STEP) * _total(weights[DELAYS:])
+        between = 0.5 * (LAG_STEP * LAG_STEP) * self._lagging
         self._off = sqrt(_total(weights * (off * off)) + between)
         self._edge = max(float(weights[0]), float(weights[DELAYS - 1]), float(weights[-1]))
         self.shift = shift if shift > LEAST_SHIFT or shift < -LEAST_SHIFT else 0.0
