@@ -1,8 +1,12 @@
 """Sweeps on a dask.distributed cluster whose workers were started by hand: the same rows, whoever dies."""
 
 import os
+import socket
 import subprocess
 import sys
+import time
+from contextlib import suppress
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -46,6 +50,32 @@ def test_a_scheduler_that_is_not_there_is_one_line_and_leaves_nothing(tmp_path):
     with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
         tuning.sweep(tmp_path / "gains.json", folder=tmp_path / "store", scheduler="nowhere://x")
     assert not (tmp_path / "store").exists()
+
+
+@pytest.mark.parametrize(
+    ("says", "reason"),
+    ((b"", "nothing that answers within"), (b"HTTP/1.1 400 Bad", "something else answers")),
+)
+def test_a_port_on_which_no_scheduler_answers_is_one_line(monkeypatch, says, reason):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("tuning.caches.cluster.WAIT", 0.5)
+    held = []
+
+    def accept(listening):
+        with suppress(OSError):
+            while True:
+                held.append(listening.accept()[0])
+                held[-1].sendall(says)
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        Thread(target=accept, args=(listening,), daemon=True).start()
+        address, begun = f"tcp://127.0.0.1:{listening.getsockname()[1]}", time.monotonic()
+        with pytest.raises(InputError, match=f"--scheduler: found '{address}', .*{reason}"):
+            list(on_workers(address, awaited, [Piece(0, (0.0,))], None, "never"))
+        assert time.monotonic() - begun < 5.0
+        listening.shutdown(socket.SHUT_RDWR)
+    for one in held:
+        one.close()
 
 
 def test_a_worker_imports_no_jax_before_its_flags_are_set():

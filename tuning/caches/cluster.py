@@ -4,9 +4,12 @@ A worker that dies costs the time of the pieces that it had. A piece of which se
 while there are no workers, is computed here.
 """
 
+import asyncio
 import logging
+import struct
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from itertools import islice
 from queue import Empty, SimpleQueue
@@ -47,13 +50,33 @@ def connected(address: str) -> Iterator["Workers"]:
             raise InputError(f"--scheduler: found {missing}") from None
         stack.enter_context(_quiet())
         try:
+            with ThreadPoolExecutor(1) as thread:  # the caller's may have a loop of its own
+                thread.submit(asyncio.run, _answered(address)).result()
             client = stack.enter_context(distributed.Client(address, timeout=WAIT, set_as_default=False))
-        except (OSError, ValueError, TimeoutError) as error:
+        except (OSError, ValueError, TypeError) as error:  # a TimeoutError is an OSError
             reason = one_line(str(error), 100)
             raise InputError(
                 f"--scheduler: found {shown(address)}, allowed a scheduler's: {reason}"
             ) from None
         yield Workers(address, client)
+
+
+async def _answered(address: str) -> None:
+    """Something there greets as schedulers do, in time: a client would wait for that without end. Raises
+    `OSError` or `ValueError` where it does not."""
+    from distributed import Security  # pyright: ignore[reportMissingImports]
+    from distributed.comm.core import connect  # pyright: ignore[reportMissingImports]
+
+    try:
+        async with asyncio.timeout(WAIT):
+            greeted = await connect(address, timeout=WAIT, **Security().get_connection_args("client"))
+    except TypeError:
+        return  # how to encrypt, a client's configuration may tell
+    except TimeoutError:
+        raise TimeoutError(f"nothing that answers within {WAIT} s") from None
+    except (MemoryError, struct.error):  # the length and the content of a greeting
+        raise OSError("something else answers") from None
+    await greeted.close()
 
 
 @contextmanager
