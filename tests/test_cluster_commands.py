@@ -8,7 +8,9 @@ import subprocess
 import sys
 import time
 
+import campaigns
 import pytest
+from campaign_logs import logs, write
 from clusters import ROOT, started
 from sweep_cases import case
 
@@ -76,6 +78,29 @@ def test_a_scheduler_that_dies_and_ctrl_c_lose_nothing_that_was_finished(tmp_pat
         code, out, said = ended(begin(*on, folder=tmp_path))
     assert code == 1 and said == [] and same(json.loads(out), whole)
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
+
+
+def test_a_bootstrap_whose_scheduler_dies_goes_on(jaxhil, tmp_path):
+    write(tmp_path, campaigns.campaign("clean", 0, speeds=(0.006, 0.012) * 4, seconds=10.0))
+    asked = "identify", *logs(tmp_path), "--map", "map.toml", "--law", "kelvin_voigt", "--bootstrap", 40
+    guess = jaxhil("identify", "--guess", *logs(tmp_path)).out
+    (tmp_path / "map.toml").write_text(guess.replace("# [b", "[b").replace("# equiv", "equiv"))
+    assert ended(begin(*asked, "-o", "here", folder=tmp_path))[0] == 0
+    with started(tmp_path) as cluster:
+        cluster.worker()
+        process = begin(*asked, "-o", "there", "--scheduler", cluster.address, folder=tmp_path)
+        wait(process, tmp_path / "there", ".pieces/*.piece", 2)
+        cluster.kill(cluster.processes[0])
+        code, out, said = ended(process)
+    assert code == 2 and out == "" and len(said) == 1
+    assert said[0].startswith(f"jaxhil: --scheduler: {cluster.address}: lost, ")
+    kept = len([*tmp_path.glob("there/.pieces/*.piece")])
+    assert 2 <= kept < 8 and not (tmp_path / "there" / "mechanism.toml").exists()
+    process = begin(*asked, "-o", "there", "--resume", folder=tmp_path)
+    wait(process, tmp_path / "there", ".pieces/*.piece", kept + 1)
+    assert ended(process)[0] == 0 and not (tmp_path / "there" / ".pieces").exists()
+    for name in ("mechanism.toml", "identification.json"):
+        assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
 
 
 def test_a_worker_of_another_version_is_refused(tmp_path):

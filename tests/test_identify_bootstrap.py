@@ -1,5 +1,6 @@
 """Fits to contacts drawn again: as wide as stated where noise is all, and wider where contacts differ."""
 
+from copy import copy
 from dataclasses import replace
 
 import campaigns
@@ -7,7 +8,8 @@ import numpy as np
 import pytest
 
 import jaxhil
-from tuning.identification.bootstrap import bootstrap
+from tuning.caches.pieces import Pieces
+from tuning.identification import bootstrap
 from tuning.identification.contact import estimate
 from tuning.identification.contact_laws import kelvin_voigt
 from tuning.identification.estimate import Options, identify
@@ -31,17 +33,22 @@ def of(campaign, repeats):
     return identify(campaign, options=Options(law="kelvin_voigt", order=2, bootstrap=repeats, hold_out=0.0))
 
 
-@pytest.mark.parametrize("times", (1.2, 3.0))
-def test_draws_scatter_as_the_fits_do_where_those_scatter_more(monkeypatch, times):
+@pytest.fixture(scope="module")
+def fit():
+    """Of eight contacts that are alike."""
     kind, timing = campaigns.KINDS["clean"], campaigns.campaign("clean", 0, (), 0, 0).timing
     runs = campaigns._touch_runs(kind, np.random.default_rng(0), (0.006, 0.012) * 4)
     model = Model(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
-    fit = estimate(runs, model, timing, None, kelvin_voigt())
+    return estimate(runs, model, timing, None, kelvin_voigt())
+
+
+@pytest.mark.parametrize("times", (1.2, 3.0))
+def test_draws_scatter_as_the_fits_do_where_those_scatter_more(fit, monkeypatch, times):
     had = fit.posterior.draws
     monkeypatch.setattr(
         "tuning.identification.bootstrap.fits", lambda *_: had.mean(axis=0) + times * (had - had.mean(axis=0))
     )
-    found = bootstrap(fit, 20)
+    found = bootstrap.bootstrap(fit, 20)
     # Of n fits' scatter about their own mean n / (n - 1) is that about the truth.
     expected = times * np.sqrt(8.0 / 7.0) if times > 1.5 else 1.0
     np.testing.assert_allclose(found.draws().std(axis=0), expected * had.std(axis=0), rtol=0.05)
@@ -61,6 +68,56 @@ def test_where_contacts_differ_intervals_widen_to_match():
     assert wide["contact.stiffness.0"].value == pytest.approx(stated["contact.stiffness.0"].value, rel=1e-9)
     written = wide.mechanism["uncertainty"]["contact.stiffness"]["std"]
     assert written == pytest.approx(wide["contact.stiffness.0"].std, rel=0.01)
+
+
+def test_an_interrupted_bootstrap_goes_on_with_the_same_draws(fit, tmp_path, monkeypatch):
+    done, said, most = [], [], 2
+
+    def means(drawn, problem, readings, seed, near):
+        """Numbers that scatter, in place of fits."""
+        if len(done) == most:
+            raise KeyboardInterrupt
+        done.append(drawn)
+        spread = np.array([readings.force[:, lanes].std() for lanes in drawn]) + seed
+        return np.outer(spread, np.arange(1.0, 1.0 + fit.posterior.draws.shape[1]))
+
+    monkeypatch.setattr(bootstrap, "means", means)
+    with pytest.raises(KeyboardInterrupt):
+        bootstrap.bootstrap(fit, 20, kept=Pieces(tmp_path))
+    most = 100
+    again = bootstrap.bootstrap(fit, 20, kept=Pieces(tmp_path, resume=True), say=said.append)
+    assert len(done) == 4 and said == ["fits to contacts drawn again: 15 of 20"]
+    whole = bootstrap.bootstrap(fit, 20)
+    assert again.resampled == whole.resampled
+    np.testing.assert_array_equal(again.posterior.draws, whole.posterior.draws)
+
+
+def test_fits_are_kept_for_the_same_problem_alone(fit, tmp_path, monkeypatch):
+    monkeypatch.setattr(bootstrap, "means", lambda drawn, *_: np.zeros((len(drawn), 3)))
+
+    def anew(one, seed=0):
+        """How many of four pieces that are kept for `fit` do not fit."""
+        bootstrap.fits(fit, 20, 0, None, Pieces(tmp_path), said.append)
+        kept = Pieces(tmp_path, resume=True)
+        bootstrap.fits(one, 20, seed, None, kept, said.append)
+        return len(kept.other)
+
+    def changed(owner, **values):
+        problem = copy(fit.problem)
+        target = problem if owner == "problem" else copy(getattr(problem, owner))
+        for name, value in values.items():
+            object.__setattr__(target, name, value)
+        if owner != "problem":
+            setattr(problem, owner, target)
+        return replace(fit, problem=problem)
+
+    said = []
+    assert anew(fit) == anew(changed("problem")) == 0
+    assert anew(fit, seed=1) == 4
+    assert anew(changed("problem", plane=1e-6)) == 4
+    assert anew(changed("readings", force=fit.readings.force * (1.0 + 1e-15))) == 4
+    assert anew(changed("motion", delay=fit.problem.motion.delay + 1e-15)) == 4
+    assert anew(changed("law", shape={"exponent": 1.5})) == 4
 
 
 def test_what_it_cannot_say_is_said():

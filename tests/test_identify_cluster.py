@@ -23,10 +23,11 @@ def fit():
     return estimate(runs, model, timing, None, kelvin_voigt())
 
 
-def test_a_scheduler_that_has_nothing_to_do_is_one_line(jaxhil):
-    found = jaxhil("identify", "x.csv", "--scheduler", "tcp://127.0.0.1:1")
+@pytest.mark.parametrize("asked", (("--scheduler", "tcp://127.0.0.1:1"), ("--resume",)))
+def test_what_is_of_the_bootstrap_alone_is_one_line_without(jaxhil, asked):
+    found = jaxhil("identify", "x.csv", *asked)
     assert found.code == 2
-    assert "--scheduler: found no --bootstrap, allowed beside one" in found.err
+    assert f"{asked[0]}: found no --bootstrap, allowed beside one" in found.err
 
 
 @pytest.mark.slow

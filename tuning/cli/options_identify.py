@@ -71,6 +71,10 @@ class Identify:
     scheduler: Annotated[
         str | None, text("ADDRESS", "With --bootstrap: a dask.distributed cluster whose workers do its fits.")
     ] = None
+    resume: Annotated[
+        FlagCreatePairsOff[bool],
+        text(None, "With --bootstrap: go on after an interruption; what is finished is not done again."),
+    ] = False
     seed: Annotated[int, number("Seed of the draws behind intervals.")] = 0
     json: Json = False
     timings: Timings = False

@@ -31,7 +31,7 @@ from tuning.identification.result import Identification, confounded
 SHORTEST_REST = 200  # rows from which a run at rest says what a sensor's noise is
 USUAL_FREQUENCY = 3.0  # Hz, of contacts, where none was made
 TOUCHING = ("contact", "press", "tap")
-STAGES = 3  # free motion, contact, validation; one more with a bootstrap
+STAGES = 3  # free motion, contact, validation; with a bootstrap one more for each piece of its fits
 Say = Callable[[str], None]  # told what begins
 FORCE_DELAY = "rig.force_sensor.delay"
 STIFFNESS, POSITION_DELAY = "contact.stiffness.", "rig.position_sensor.delay"
@@ -49,7 +49,7 @@ def identify(
 
     `prior` gives what the logs do not tell. Where neither does for a number that a mechanism file must have,
     there is no mechanism and the verdict is bad. `say` is called with what begins, in words, `STAGES` times
-    at most, once more with a bootstrap. Raises `InputError` for options that cannot be."""
+    at most, once more for each piece of a bootstrap. Raises `InputError` for options that cannot be."""
     options = options or Options()
     check(options, prior)
     runs = {kind: [run for run in campaign.runs if run.kind == kind] for kind in ("rest", "free", *TOUCHING)}
@@ -171,7 +171,7 @@ def _contact(
     fit = contacts.estimate(runs, model, campaign.timing, force, options.law, plane, options.seed)
     if options.bootstrap:
         say(f"fitting {options.bootstrap} times to contacts drawn again")
-        fit = bootstrap(fit, options.bootstrap, options.seed, options.scheduler)
+        fit = bootstrap(fit, options.bootstrap, options.seed, options.scheduler, options.kept, say)
     say("judging the fit by touches left out of it")
     held = held_out(runs, options.hold_out)
     judged = fit if not held.any() else contacts.without(fit, held, options.seed)

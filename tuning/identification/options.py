@@ -8,6 +8,7 @@ from typing import Any
 
 from jaxhil.errors import InputError, shown
 from jaxhil.mechanism.structs import Mechanism
+from tuning.caches.pieces import NOTHING_KEPT, Pieces
 from tuning.identification.law_choice import NAMES
 from tuning.identification.rational import STRUCTURES
 
@@ -27,6 +28,7 @@ class Options:
     clock: float = 2e-5  # s, uncertainty of a delay that no log shows
     seed: int = 0
     scheduler: str | None = None  # address of that of a cluster whose workers do the bootstrap's fits
+    kept: Pieces = NOTHING_KEPT  # of the bootstrap, those that are done
 
 
 FEWEST_FITS = 20  # whose scatter says something

@@ -15,6 +15,7 @@ from jaxhil.runtime import digest
 from tuning import terminal
 from tuning.caches.sources import versions
 from tuning.cli.commands import checks, identify_design
+from tuning.cli.commands.resuming import pieces_in, say_of_pieces
 from tuning.cli.options_identify import Identify
 from tuning.front_door import arguments
 from tuning.identification.records import Campaign
@@ -38,8 +39,11 @@ def run(options: Identify) -> int:
         raise InputError(f"--hold-out: found {options.hold_out}, allowed a share from 0 to below 1")
     if options.bayes and options.prior is None:
         raise InputError("--bayes: found no prior, allowed --prior with a normal entry in [uncertainty]")
-    if options.scheduler is not None and not options.bootstrap:
-        raise InputError("--scheduler: found no --bootstrap, allowed beside one: it is what workers do")
+    for name in ("scheduler", "resume"):
+        if getattr(options, name) and not options.bootstrap:
+            raise InputError(
+                f"--{name}: found no --bootstrap, allowed beside one: its fits are what takes long"
+            )
     if options.check:
         return _check(options, logs)
     fixed, order = _fixed(options), _order(options)
@@ -47,9 +51,11 @@ def run(options: Identify) -> int:
     folder = Path(options.output)
     checks.output(folder)
     checks.own_results(folder / DOCUMENT, "estimates", (MECHANISM, *PICTURES))
+    from tuning.identification.bootstrap import FITS
     from tuning.identification.estimate import STAGES, Options, identify
     from tuning.identification.mechanism_file import to_toml
 
+    kept = pieces_in(options.output, options.resume)
     asked = Options(
         order=order,
         law=options.law,
@@ -60,8 +66,9 @@ def run(options: Identify) -> int:
         limit=options.limit,
         seed=options.seed,
         scheduler=options.scheduler,
+        kept=kept,
     )
-    with terminal.stages(STAGES + 2 + (options.bootstrap > 0)) as stages:
+    with terminal.stages(STAGES + 2 + -(-options.bootstrap // FITS)) as stages:
         stages.turn_to("reading the logs")
         campaign = _of_stage(read_logs(logs, options.map, prior), options.stage)
         found = identify(campaign, prior, asked, stages.turn_to)
@@ -75,6 +82,8 @@ def run(options: Identify) -> int:
                 write_whole(folder / MECHANISM, to_toml(found.mechanism, found.verdict).encode())
             stages.turn_to("drawing")
             _draw(found, document, folder)
+        kept.remove()
+    say_of_pieces(kept)
     terminal.warn([*campaign.notes, *found.notes])
     if options.json:
         terminal.emit_json(document)
