@@ -1,7 +1,7 @@
 """A run of six axes, tick by tick, as NumPy arrays of one lane; beside it the same contact in space."""
 
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Callable, Mapping
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.simulation.environment import ONCE, known_options
 from jaxhil.sixdof.bodies import angular_velocity
 from jaxhil.sixdof.building import build_scenarios, loop_of
 from jaxhil.sixdof.building_contacts import candidate_names
 from jaxhil.sixdof.forces import ContactGroup, Forces
 from jaxhil.sixdof.loop import Loop, run
 from jaxhil.sixdof.relative import Pair, States, coordinates, relative
+from jaxhil.sixdof.rollout import rollout
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.space import Space, follow
 from jaxhil.sixdof.vectors import Vector
@@ -75,16 +77,40 @@ def record(
 ) -> Recorded:
     """The nominal run of a mechanism for so long [s]."""
     scenario = build_scenarios(mechanism, seed=seed)
-    period = mechanism.rig.control_period
+    return _recorded(mechanism, loop_of(mechanism, compensator, scenario), gains, scenario, duration)
+
+
+def record_scenario(
+    mechanism: SixAxisMechanism, loop: Loop, gains: dict[str, Any], scenario: Scenario
+) -> Recorded:
+    """The run of a scenario of a mechanism, a batch of one lane, until it is over."""
+    (duration,) = np.asarray(_lasted()(loop, gains, scenario))
+    return _recorded(mechanism, loop, gains, scenario, float(duration))
+
+
+def _recorded(
+    mechanism: SixAxisMechanism, loop: Loop, gains: dict[str, Any], scenario: Scenario, duration: float
+) -> Recorded:
+    period = float(scenario.control_period[0])
     ticks = max(round(duration / period), 2)
     length = max(LEAST_TICKS, 1 << (ticks - 1).bit_length())
-    found = _run(loop_of(mechanism, compensator, scenario), length, gains, scenario)
+    found = _run(loop, length, gains, scenario)
     return Recorded(
         time=np.arange(ticks) * period,
         names=candidate_names(mechanism),
         groups=scenario.groups,
         **{name: np.asarray(value, float)[:ticks, ..., 0] for name, value in found.items()},
     )
+
+
+@cache
+def _lasted() -> Callable[..., Any]:
+    """How long a run lasts [s], (lanes,)."""
+
+    def time(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> Any:
+        return rollout(loop, gains, scenario).final_time
+
+    return jax.jit(time, static_argnums=0, compiler_options=known_options(ONCE))
 
 
 def motion(bodies: Pair, states: States) -> tuple[Any, ...]:

@@ -173,7 +173,7 @@ def _commands(results: Results) -> Iterator[str]:
                    "acceptable": sweep.acceptable}  # fmt: skip
         studies = (["--drivers"] if sweep.drivers else []) + (["--rare"] if sweep.rare else [])
         yield _command("sweep", gains, "-o", "again", *_options(options), *studies)
-        for one in sweep.worst[:1] if results.axes == 1 else ():
+        for one in sweep.worst[:1]:
             yield _command("replay", paths["sweep"], str(one.index), "--plot", "worst.png")
     name = subject.mechanism.name if subject is not None else "MECHANISM"
     if (compared := results.comparison) is not None:

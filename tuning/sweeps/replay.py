@@ -1,18 +1,23 @@
-"""Replay: one scenario of a store again, to the bit, and its motion for a picture."""
+"""Replay: one scenario of a store again, to the bit, and a picture of its motion."""
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 
-from jaxhil.errors import InputError, one_line
 from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.simulation.contact_plot import contact_plot
 from jaxhil.simulation.motion import Piece, scenario_motion
 from tuning.sweeps.chunks import Sweep, build_sweep, run_chunk
 from tuning.sweeps.draws import drawn_scenarios
 from tuning.sweeps.manifest import loaded_gains
 from tuning.sweeps.parts import same_rows
 from tuning.sweeps.store import Store, read_row
+
+if TYPE_CHECKING:
+    from jaxhil.sixdof.recording import Recorded
 
 
 class Replay(NamedTuple):
@@ -29,20 +34,39 @@ def replay(store: Store, index: int) -> Replay:
 
     Raises `InputError` for an index that the store does not hold.
     """
-    if isinstance(loaded_gains(store.manifest).mechanism, SixAxisMechanism):
-        found, allowed = "a sweep of six axes", "one of one axis: jaxhil simulate runs six, --set says which"
-        raise InputError(f"{one_line(str(store.folder))}: found {found}, allowed {allowed}")
     stored = read_row(store, index)
     sweep = build_sweep(store.manifest)
     again = run_chunk(sweep, index, 1)
     return Replay(sweep, stored, again, same_rows(stored, again))
 
 
+def picture_of(sweep: Sweep, index: int, title: str) -> Figure:
+    """The scenario's motion tick by tick, of one axis or of six."""
+    if not isinstance(sweep.mechanism, SixAxisMechanism):
+        return contact_plot(motion_of(sweep, index), title, sensors="rig")
+    from tuning.pictures.six_axes import six_axes_plot
+
+    return six_axes_plot(recorded(sweep, index), title)
+
+
 def motion_of(sweep: Sweep, index: int) -> list[Piece]:
-    """The scenario's motion tick by tick, for plots, in float64."""
-    manifest = sweep.manifest
-    _, scenarios = drawn_scenarios(sweep.mechanism, manifest.sampling, manifest.seed, index, 1)
-    loaded = loaded_gains(manifest)
+    """The motion of a scenario of one axis tick by tick, for plots, in float64."""
+    loaded = loaded_gains(sweep.manifest)
     gains: Any = {name: np.full(1, value) for name, value in loaded.gains.items()}
-    lane = jax.tree.map(np.asarray, scenarios)
+    lane = jax.tree.map(np.asarray, _scenario(sweep, index))
     return scenario_motion(loaded._replace(gains=gains), lane)
+
+
+def recorded(sweep: Sweep, index: int) -> "Recorded":
+    """Every tick of a scenario of six axes."""
+    from jaxhil.sixdof.recording import record_scenario
+
+    assert isinstance(sweep.mechanism, SixAxisMechanism)
+    lane = jax.tree.map(jnp.asarray, _scenario(sweep, index))
+    return record_scenario(sweep.mechanism, sweep.loop, sweep.gains, lane)
+
+
+def _scenario(sweep: Sweep, index: int) -> Any:
+    """A batch of one lane, in float64."""
+    manifest = sweep.manifest
+    return drawn_scenarios(sweep.mechanism, manifest.sampling, manifest.seed, index, 1)[1]

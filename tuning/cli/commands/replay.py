@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.files import follow
+from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.environment import prepare
 from tuning import terminal
 from tuning.cli.commands import checks
@@ -21,7 +22,7 @@ def run(options: Replay) -> int:
         checks.picture(options.plot)
     prepare()
     from tuning.sweeps.manifest import unlike_here
-    from tuning.sweeps.replay import motion_of, replay
+    from tuning.sweeps.replay import picture_of, replay
     from tuning.sweeps.store import read_store
 
     store = read_store(Path(options.store))
@@ -29,10 +30,10 @@ def run(options: Replay) -> int:
     document = _document(options, store, found)
     document["unlike"] = unlike_here(store.manifest)
     if options.plot is not None:
-        from jaxhil.simulation.contact_plot import contact_plot, save
+        from jaxhil.simulation.contact_plot import save
 
         title = f"{document['mechanism']}, scenario {options.index} of {store.folder.resolve().name}"
-        save(contact_plot(motion_of(found.sweep, options.index), title, sensors="rig"), follow(options.plot))
+        save(picture_of(found.sweep, options.index, title), follow(options.plot))
         terminal.note(f"wrote {options.plot}")
     if options.json:
         terminal.emit_json(document)
@@ -42,24 +43,28 @@ def run(options: Replay) -> int:
 
 
 def _document(options: Replay, store, found) -> dict[str, Any]:
-    from tuning.sweeps.columns import texts_of
+    from tuning.gains.simulated import compensator_name
+    from tuning.sweeps.columns import ERRORS_IN_SPACE, PER_EPISODE, slots, texts_of
 
     row = {
         name: texts_of(name)[int(values[0])] if name.startswith(("status_", "outcome")) else values[0].item()
         for name, values in found.again.items()
     }
-    contacts = range(1, found.sweep.mechanism.approach.contacts + 1)
+    mechanism = found.sweep.mechanism
+    what, keys = "contacts", KEYS
+    if isinstance(mechanism, SixAxisMechanism):
+        what, keys = "episodes", (*ERRORS_IN_SPACE, *PER_EPISODE)
     return {
         "store": str(store.folder),
         "index": options.index,
-        "mechanism": found.sweep.mechanism.name,
-        "compensator": found.sweep.loop.compensator.name,
+        "mechanism": mechanism.name,
+        "compensator": compensator_name(found.sweep.loop),
         "inputs": {
             column.name: row[column.name] for column in store.manifest.columns if column.kind == "input"
         },
-        "contacts": [
-            {**{key: row[f"{key}_{number}"] for key in KEYS}, "status": row[f"status_{number}"]}
-            for number in contacts
+        what: [
+            {**{key: row[f"{key}_{number}"] for key in keys}, "status": row[f"status_{number}"]}
+            for number in sorted({slot.number for slot in slots(mechanism)})
         ],
         "outcome": row["outcome"],
         "different": found.different,
@@ -73,21 +78,29 @@ def _print(document: dict[str, Any]) -> None:
         ["input", "drawn"],
         [(name, terminal.figure(value, 6)) for name, value in document["inputs"].items()],
     )
-    rows = []
-    for number, contact in enumerate(document["contacts"], start=1):
-        rows.append(
-            (
-                *(number, contact["restitution"], contact["reference_restitution"]),
-                terminal.signed(contact["error"]),
-                *(contact["peak_force"], 1e3 * contact["duration"], 1e3 * contact["approach_velocity"]),
-                contact["status"],
-            )
-        )
-    headings = ["contact", "e", "e*", "error", "peak force [N]", "duration [ms]", "approach [mm/s]", "status"]
     lines = [f"Outcome: {document['outcome']}."]
     if document["verdict"] == "good":
         lines.append("Good: every number is the stored one, to the bit.")
     else:
         lines.append(f"Bad: differs from what is stored in {', '.join(document['different'][:8])}.")
     lines += [f"The store was made elsewhere: {difference}." for difference in document["unlike"]]
-    terminal.emit(inputs, terminal.table("Contacts", headings, rows, texts=(7,)), *lines)
+    terminal.emit(inputs, _contacts(document), *lines)
+
+
+def _contacts(document: dict[str, Any]) -> Any:
+    """The table of contacts, or of episodes."""
+    if "contacts" in document:
+        what, runs, errors = "contact", document["contacts"], ["error"]
+        told = [[terminal.signed(one["error"])] for one in runs]
+    else:
+        what, runs, errors = "episode", document["episodes"], ["energy error", "twist error"]
+        told = [[terminal.signed(one["energy_error"]), one["twist_error"]] for one in runs]
+    rows = [
+        (
+            *(number, one["restitution"], one["reference_restitution"], *error, one["peak_force"]),
+            *(1e3 * one["duration"], 1e3 * one["approach_velocity"], one["status"]),
+        )
+        for number, (one, error) in enumerate(zip(runs, told, strict=True), start=1)
+    ]
+    headings = [what, "e", "e*", *errors, "peak force [N]", "duration [ms]", "approach [mm/s]", "status"]
+    return terminal.table(f"{what.capitalize()}s", headings, rows, texts=(len(headings) - 1,))

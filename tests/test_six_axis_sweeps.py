@@ -1,0 +1,85 @@
+"""Six axes swept: a scenario again to the bit, and the same rows and gains on a cluster, whoever dies."""
+
+import json
+
+import numpy as np
+import pytest
+from clusters import killed_meanwhile, started
+
+import jaxhil as package
+import tuning
+from jaxhil.compensators import literature_gains
+from jaxhil.mechanism.file import load_any
+from jaxhil.simulation.environment import computing
+from tuning.caches.cluster import Workers
+from tuning.gain_file import build_document, write_gain_file
+from tuning.gains import tune_all
+from tuning.sweeps.chunks import build_sweep
+from tuning.sweeps.replay import recorded
+from tuning.sweeps.store import read_row, read_store
+
+pytestmark = [pytest.mark.slow, pytest.mark.users_options]
+NAME, LAW = "probe-drogue", "phase_lead"
+ASKED = {"scenarios": 32, "chunk": 4, "limit": 1.2}
+
+
+@pytest.fixture(scope="module")
+def gains(tmp_path_factory):
+    """The literature's gains."""
+    mechanism, path = load_any(NAME).mechanism, tmp_path_factory.mktemp("gains") / "gains.json"
+    found = literature_gains(mechanism, LAW)
+    write_gain_file(path, build_document(LAW, found, mechanism, "0" * 64, {}, {}, 0, {}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def here(gains):
+    """Swept here."""
+    return tuning.sweep(gains, **ASKED, folder=gains.parent / "store")
+
+
+def test_a_scenario_runs_again_to_the_bit(here, jaxhil, tmp_path):
+    ran = jaxhil("replay", here.folder, 7, "--json", "--plot", tmp_path / "7.png")
+    assert ran.code == 0, ran.err
+    document, row = json.loads(ran.out), read_row(read_store(here.folder), 7)
+    assert ran.code == 0 and document["verdict"] == "good" and (tmp_path / "7.png").stat().st_size > 10_000
+    [episode] = document["episodes"]
+    for name in ("energy_error", "twist_error", "peak_force", "duration"):
+        assert episode[name] == row[f"{name}_1"][0]
+    ran = jaxhil("replay", here.folder, 31)
+    assert ran.code == 0 and "Episodes" in ran.out and "to the bit" in ran.out
+
+    # What is drawn is that scenario, and no other, until it is over.
+    with computing():
+        ticks = recorded(build_sweep(here.manifest), 7)
+    touching = ticks.depth.max(axis=1) > 0
+    force = np.linalg.norm(ticks.wrench[:, :3], axis=1)
+    np.testing.assert_allclose(force.max(), row["peak_force_1"][0], rtol=1e-3)
+    assert abs(touching.sum() * (ticks.time[1] - ticks.time[0]) - row["duration_1"][0]) < 1e-9
+    assert not touching[-1]
+
+
+def test_a_cluster_makes_the_same_rows_though_a_worker_is_killed(here, gains, tmp_path, monkeypatch):
+    with started(tmp_path) as cluster:
+        first, _ = cluster.worker(), cluster.worker()
+        killed_meanwhile(monkeypatch, Workers, cluster, first, "run")
+        there = tuning.sweep(gains, **ASKED, scheduler=cluster.address)
+        assert first.poll() is not None
+    assert there.table.equals(here.table)
+    for name in ("outcomes", "worst", "failure_probability", "error_quantiles"):
+        assert there.document[name] == here.document[name]
+
+
+def test_a_cluster_tunes_to_the_same_gains_though_a_worker_is_killed(tmp_path, monkeypatch):
+    monkeypatch.setattr(tune_all, "BLOCK", 1)
+    mechanisms = [package.load(NAME, {"target.mass": mass, "name": f"{mass}"}) for mass in (1e3, 2e3, 3e3)]
+    few = {"scenarios": 4, "starts": 1, "steps": 1, "validation": 15}
+    here = tuning.tune(mechanisms, LAW, **few)
+    with started(tmp_path) as cluster:
+        first, _ = cluster.worker(), cluster.worker()
+        killed_meanwhile(monkeypatch, tune_all, cluster, first)
+        there = tuning.tune(mechanisms, LAW, scheduler=cluster.address, **few)
+        assert first.poll() is not None
+    for own, other in zip(here, there, strict=True):
+        assert other.gains == own.gains and other.figures == own.figures and other.parts == own.parts
+        assert other.found.starts[0].history == own.found.starts[0].history
