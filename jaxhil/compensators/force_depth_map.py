@@ -165,7 +165,8 @@ def update(
 
 def curve(old: Map) -> Curve:
     """What counts of the map."""
-    lost = (positive_mean(old.mean[i], old.covariance[i, i]) for i in PLACES[:-1])
+    variances = jnp.stack([old.covariance[i, i] for i in PLACES[:-1]])
+    lost = positive_mean(old.mean[DAMPING:PRELOAD], variances)
     return Curve(old.mean[:SEGMENTS], *lost, preload=old.mean[PRELOAD])
 
 

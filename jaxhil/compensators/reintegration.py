@@ -158,11 +158,9 @@ def follow(old: Reintegration, curve: Curve, measured: Measured) -> Reintegratio
 
     behind, reached = lax.fori_loop(0, STRIDE, one, (behind, old.reached))
     done = reached == present
-    arrived = _advance(curve_behind, behind, measured, present, entry.beyond)
-    live = _advance(curve, old.live, measured, present, jnp.ones_like(period))
-    return Reintegration(
-        _choose(done, arrived, live), behind, jnp.where(done, entry.tick, reached), curve_behind, entry
-    )
+    newest, motion = _choose(done, (curve_behind, behind), (curve, old.live))
+    live = _advance(newest, motion, measured, present, jnp.where(done, entry.beyond, 1))
+    return Reintegration(live, behind, jnp.where(done, entry.tick, reached), curve_behind, entry)
 
 
 def _enter(entry: Entry, curve: Curve) -> ReferenceState:

@@ -61,6 +61,7 @@ from jaxhil.contact.laws import deflection
 FAREWELL = 0.006  # s for which it goes on after the hardware has left the surface
 MOST = 1.2  # of the peak force, that the model is to feel of the map
 LEAST_WEIGHT = 1e-9  # kg m/s, mass times approach speed: at less nothing is scaled by it
+READINGS = 2  # that are learnt from in a tick at most
 MISFIT_TIME = 0.001  # s, over which a force may be off by the law's `misfit`
 
 
@@ -283,7 +284,7 @@ class RetrospectiveReference(Compensator):
         teaching = _Teaching(
             history, scales, clearance, gains["force_noise_floor"] ** 2 + spread, slow, zone, usable
         )
-        learnt, known, next_, learnt_deepest = self._catch_up(prepared, learnt, teaching, old)
+        learnt, known, next_, learnt_deepest = self._catch_up(prepared, learnt, reference.curve, teaching, old)
         expected = force(known, depth, rate, hardware_deepest)
         guess = jnp.where(expected > zone, zone, jnp.where(expected > 0, expected, 0))
         seen = jnp.where(read.shown, side * (read.force - scales.bias) / scales.weight, guess)
@@ -316,12 +317,17 @@ class RetrospectiveReference(Compensator):
         )
         return jnp.where((side != 0) & ~over, command, 0), episode, learnt, reference
 
-    def _catch_up(self, prepared, learnt, teaching, old):
-        """What is known with up to two of the readings since the surface was met more, and what counts of it;
-        the reading to learn from next, and the deepest point of those learnt from."""
+    def _catch_up(self, prepared, learnt, known, teaching, old):
+        """What is known with up to two of the readings since the surface was met more, and what counts of it
+        in place of what is `known`; the reading to learn from next, and the deepest point of those learnt
+        from."""
         history, scales = teaching.history, teaching.scales
 
-        def read(learnt, index, farthest):
+        def goes_on(carry):
+            return carry[0] & (carry[1] < READINGS)
+
+        def read(carry):
+            _, number, learnt, _, index, farthest = carry
             counts = teaching.usable & (index <= history.age)
             at = jnp.minimum(index, history.age)
             sample, (force_then, shown) = recall(history, at), reading_at(history, at)
@@ -338,12 +344,13 @@ class RetrospectiveReference(Compensator):
                 counts,
             )
             learnt, known = self.learn(prepared, learnt, reading, farthest)
-            return learnt, known, index + jnp.where(counts, 1, 0), farthest
+            index = index + jnp.where(counts, 1, 0)
+            behind = jnp.any(teaching.usable & (index <= history.age))
+            return behind, number + 1, learnt, known, index, farthest
 
-        first = read(learnt, old.next, old.learnt_deepest)
-        behind = jnp.any(teaching.usable & (first[2] <= history.age))
-        # Where no lane has to catch up, the effort is spared.
-        return lax.cond(behind, lambda: read(first[0], first[2], first[3]), lambda: first)
+        # Where no lane has to catch up, the effort is spared; one function of the program serves all readings.
+        begin = jnp.array(True), jnp.array(0), learnt, known, old.next, old.learnt_deepest
+        return lax.while_loop(goes_on, read, begin)[2:]
 
 
 class _Read(NamedTuple):
