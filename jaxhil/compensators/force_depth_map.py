@@ -16,6 +16,7 @@ from functools import reduce
 from operator import add
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -172,7 +173,22 @@ def curve(old: Map) -> Curve:
 
 def elastic(now: Curve, depth: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Force [1/s] that does not depend on how the contact came there, 0 out of contact."""
-    return jnp.where(depth > 0, now.preload + _product(now.slopes, ramps(depth)), 0)
+    return jnp.where(depth > 0, now.preload + _pressed(now.slopes, depth), 0)
+
+
+@jax.custom_jvp
+def _pressed(slopes: Array, depth: Array) -> Array:
+    """sum_j slope_j clip(x - kappa_j, 0, kappa_{j+1} - kappa_j) [1/s]."""
+    return _product(slopes, ramps(depth))
+
+
+@_pressed.defjvp
+def _pressed_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    (slopes, depth), (rates, rate) = primals, tangents
+    beyond = depth[None] - _column(KNOTS, depth)
+    here = jnp.where((beyond > 0) & (beyond <= _column(WIDTHS, depth)), slopes, 0)
+    pressed = ramps(depth)
+    return _product(slopes, pressed), _product(rates, pressed) + reduce(add, here) * rate
 
 
 def force(now: Curve, depth: Array, speed: Array, deepest: Array) -> Float[Array, "*batch"]:

@@ -284,7 +284,8 @@ class RetrospectiveReference(Compensator):
         teaching = _Teaching(
             history, scales, clearance, gains["force_noise_floor"] ** 2 + spread, slow, zone, usable
         )
-        learnt, known, next_, learnt_deepest = self._catch_up(prepared, learnt, reference.curve, teaching, old)
+        before = learnt, reference.curve
+        learnt, known, next_, learnt_deepest = self._catch_up(prepared, before, teaching, old)
         expected = force(known, depth, rate, hardware_deepest)
         guess = jnp.where(expected > zone, zone, jnp.where(expected > 0, expected, 0))
         seen = jnp.where(read.shown, side * (read.force - scales.bias) / scales.weight, guess)
@@ -317,10 +318,9 @@ class RetrospectiveReference(Compensator):
         )
         return jnp.where((side != 0) & ~over, command, 0), episode, learnt, reference
 
-    def _catch_up(self, prepared, learnt, known, teaching, old):
-        """What is known with up to two of the readings since the surface was met more, and what counts of it
-        in place of what is `known`; the reading to learn from next, and the deepest point of those learnt
-        from."""
+    def _catch_up(self, prepared, before, teaching, old):
+        """What is known with up to two of the readings since the surface was met more, and what counts of it,
+        as they were `before`; the reading to learn from next, and the deepest point of those learnt from."""
         history, scales = teaching.history, teaching.scales
 
         def goes_on(carry):
@@ -348,8 +348,8 @@ class RetrospectiveReference(Compensator):
             behind = jnp.any(teaching.usable & (index <= history.age))
             return behind, number + 1, learnt, known, index, farthest
 
-        # Where no lane has to catch up, the effort is spared; one function of the program serves all readings.
-        begin = jnp.array(True), jnp.array(0), learnt, known, old.next, old.learnt_deepest
+        # Where no lane has to catch up, the effort is spared. A loop, because it is compiled but once.
+        begin = jnp.array(True), jnp.array(0), *before, old.next, old.learnt_deepest
         return lax.while_loop(goes_on, read, begin)[2:]
 
 

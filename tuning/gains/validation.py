@@ -55,7 +55,9 @@ class Validation:
         if compensator is not None:
             loop = simulated.with_compensator(loop, compensator)
         values = {name: np.repeat([one[name] for one in gains], self.lanes) for name in gains[0]}
-        every = cut(evaluate(loop, values, self.judged), self.lanes)
+        # Where few are judged, they share the program of the training scenarios.
+        outcome = evaluate(loop, values, self.judged, at_least=lanes_of(self.training))
+        every = cut(outcome, self.lanes)
         self.work.ran(self.lanes * len(self.tasks))
         if not self.tasks[0].probed:
             return [(own, None) for own in every]
