@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 
+from jaxhil.simulation import environment
 from jaxhil.simulation.environment import ROLLOUT, known_options
 
 
@@ -14,3 +15,10 @@ def test_options_that_the_compiler_lacks_are_left_out():
     # It would not compile otherwise.
     with pytest.raises(jax.errors.JaxRuntimeError):
         jax.jit(lambda x: x + 1, compiler_options=unknown)(np.ones(3))
+
+
+def test_an_option_of_llvm_is_given_to_versions_that_know_it_alone(monkeypatch):
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    for version, given in (("0.10.7", True), ("0.11.0", False), ("0.100.0", False)):
+        monkeypatch.setattr(environment, "version", lambda name, version=version: version)
+        assert (environment.WHOLE in environment.flags("")) == given

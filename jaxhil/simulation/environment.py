@@ -11,6 +11,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from functools import cache
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -43,6 +44,9 @@ ONCE = {
     "xla_llvm_disable_expensive_passes": True,
     "xla_cpu_use_fusion_emitters": False,
 }
+# An option of LLVM's own, to unroll loops as a whole or not at all, and the compiler's versions that it was
+# tried with: an option that LLVM does not know ends the process.
+WHOLE, TRIED = "-unroll-allow-partial=false", ("0.10.",)
 _started_with: list[str] = []  # XLA_FLAGS that jax was started with, once `start` did it
 
 
@@ -177,6 +181,10 @@ def flags(given: str) -> str:
     if find_spec("jax_plugins") and os.environ.get("JAX_PLATFORMS") != "cpu":
         # A graphics card's programs would be optimised less, too; the other flags they do not know.
         del ours["--xla_backend_optimization_level"]
+    elif version("jaxlib").startswith(TRIED):
+        # After every loop that LLVM unrolls in part it forgets what it knows of all others around: with a law
+        # of a thousand loops that is a third of the compile time, for programs that run as fast.
+        ours["--xla_backend_extra_options"] += f",{WHOLE}"
     named = {flag.split("=")[0] for flag in given.split()}
     added = [f"{name}={value}" for name, value in ours.items() if name not in named]
     return " ".join([*given.split(), *added])
