@@ -85,7 +85,8 @@ def least(period, known, number=100):
 
 @pytest.mark.parametrize(("known", "name"), [(1.0, "unknown"), (LEAST_PLANE_SPREAD, "told")])
 def test_what_noise_and_control_period_leave_of_damped_contact(known, name, capsys):
-    """At 1 ms the first contact cannot be met with 0.75 %, nor at 0.25 ms with 0.3 %."""
+    """Where nothing is known of the delay beforehand (that it lies within 1 ms: `test_delay_posterior`). At
+    0.25 ms the bar of 0.3 % is less than what can be."""
     for period, bar in ((0.001, 0.75), (0.00025, 0.3)):
         noise, onset, eighth = least(period, known)
         both = math.hypot(noise, onset)
