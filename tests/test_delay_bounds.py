@@ -9,6 +9,7 @@ likelier than another; that a contact may well have none helps where it has next
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -148,10 +149,16 @@ def test_what_noise_leaves_of_damped_contact_behind_a_lag(capsys):
         assert found > 1.0 or name == "told"
 
 
-def nearest(stiffness, damping, noise, phase, lag=0.003, after=0.0, period=1e-3):
-    """Of damped contact behind a lag, and the contact with less of a lag or none that reads most like it: the
-    least mean square error of e, by the readings until `after` [s] the force has ended. The delay is told to
-    0.1 ms, the surface is not."""
+class Alike(NamedTuple):
+    """A contact that reads like another."""
+
+    error: float  # by which its e differs [1]
+    away: float  # how many standard deviations its readings lie from the other's
+
+
+def alike(stiffness, damping, noise, phase, lag, behind, after, period=1e-3):
+    """Contacts behind a lag of `behind` [s] that read like damped contact behind `lag`, by the readings until
+    `after` [s] the force has ended. The delay is told to 0.1 ms, the surface is not."""
     time, depth, rate = (values[::5] for values in evenly(stiffness, damping))
     step = 5 * FINE
     ends = len(path(stiffness, damping)[0]) * FINE
@@ -167,21 +174,27 @@ def nearest(stiffness, damping, noise, phase, lag=0.003, after=0.0, period=1e-3)
 
     true = read(stiffness, damping, lag, 0, 0)
 
-    def off(values, behind):
+    def off(values):
         k, b, delay, place = values * np.array([stiffness, 1, 1e-3, 1e-3])
         return np.append((read(k, b, behind, delay, place) - true) / noise, [delay / 1e-4, place / 0.2])
 
-    pairs = []
-    for behind in (0, lag / 2):
-        for place in (0.1, 1.2):
-            start = [1, max(damping - stiffness * (lag - behind), 0) + 0.02, 0, place]
-            found = least_squares(
-                off, start, bounds=([0.5, 0, -5, -5], [2, 8, 5, 5]), args=(behind,),
-                diff_step=[1e-3, 1e-3, 0.02, 0.02], x_scale=[1e-2, 0.1, 0.3, 0.3], max_nfev=8,
-            )  # fmt: skip
-            error = restitution(found.x[0] * stiffness, found.x[1]) - restitution(stiffness, damping)
-            pairs.append(error**2 * share_of_two(math.sqrt(2 * found.cost)))
-    return max(pairs)
+    for place in (0.1, 1.2):
+        start = [1, max(damping - stiffness * (lag - behind), 0) + 0.02, 0, place]
+        found = least_squares(
+            off, start, bounds=([0.5, 0, -5, -5], [2, 8, 5, 5]),
+            diff_step=[1e-3, 1e-3, 0.02, 0.02], x_scale=[1e-2, 0.1, 0.3, 0.3], max_nfev=8,
+        )  # fmt: skip
+        error = restitution(found.x[0] * stiffness, found.x[1]) - restitution(stiffness, damping)
+        yield Alike(error, math.sqrt(2 * found.cost))
+
+
+def nearest(stiffness, damping, noise, phase, lag=0.003, after=0.0):
+    """The least mean square error of e where a contact, or one with less of a lag or none that reads like it,
+    was met."""
+    found = (
+        one for behind in (0, lag / 2) for one in alike(stiffness, damping, noise, phase, lag, behind, after)
+    )
+    return max(one.error**2 * share_of_two(one.away) for one in found)
 
 
 def share_of_two(away):
@@ -207,3 +220,23 @@ def test_until_it_ends_a_lag_hides_dampers(capsys):
             f"what is read until the force ends, {found[1]:.2f} by 4 ms more"
         )
     assert found[0] > 1 and found[1] < 0.6 * found[0]
+
+
+def test_a_small_lag_reads_like_a_damper_to_any_status(capsys):
+    """Behind 1 ms of a lag, more than one damped contact in a hundred reads like one without a lag, to a
+    standard deviation, whose e is off by more than 1.5 %. Who calls that one identified calls both so."""
+    each, noise, _ = contacts(24)
+    phases = np.random.default_rng(0).random(24)
+    for lag in (0.0005, 0.001):
+        pairs = [
+            min(alike(*one, noise, phase, lag, 0.0, 0.004), key=lambda pair: pair.away)
+            for one, phase in zip(each, phases, strict=True)
+        ]
+        errors, away = 100 * np.abs([pair.error for pair in pairs]), np.array([pair.away for pair in pairs])
+        shares = [np.mean((errors > 1.5) & (away < most)) for most in (1, 2)]
+        with capsys.disabled():
+            print(
+                f"\ndamped, lag of {1e3 * lag} ms not told: {shares[0]:.0%} of contacts read like one without a "
+                f"lag and an e off by more than 1.5 %, to a standard deviation; to two {shares[1]:.0%}"
+            )
+    assert shares[0] > 0.01
