@@ -236,7 +236,7 @@ def test_a_small_lag_reads_like_a_damper_to_any_status(capsys):
         shares = [np.mean((errors > 1.5) & (away < most)) for most in (1, 2)]
         with capsys.disabled():
             print(
-                f"\ndamped, lag of {1e3 * lag} ms not told: {shares[0]:.0%} of contacts read like one without a "
-                f"lag and an e off by more than 1.5 %, to a standard deviation; to two {shares[1]:.0%}"
+                f"\ndamped, lag of {1e3 * lag} ms not told: {shares[0]:.0%} of contacts read like one "
+                f"without a lag and an e off by more than 1.5 %, to a deviation; to two {shares[1]:.0%}"
             )
     assert shares[0] > 0.01

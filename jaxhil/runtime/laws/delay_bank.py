@@ -75,8 +75,8 @@ class DelayBank:
 
     __slots__ = (
         "_before", "_below", "_carried", "_covariance", "_damping", "_deepest", "_edge", "_estimate", "_held",
-        "_kept", "_knots", "_known", "_lagging", "_learning", "_likelihood", "_likely", "_met", "_near", "_off",
-        "_offsets", "_older", "_pace", "_past", "_period", "_plane_spread", "_precision",
+        "_kept", "_knots", "_known", "_lagging", "_learning", "_likelihood", "_likely", "_met", "_near",
+        "_off", "_offsets", "_older", "_pace", "_past", "_period", "_plane_spread", "_precision",
         "_prior_covariance", "_prior_estimate", "_pushed", "_weighted", "_widths", "curve", "deeper", "shift",
         "variance",
     )  # fmt: skip
