@@ -172,6 +172,19 @@ def test_derivative_of_the_predicted_peak_force_beyond_knots_that_pull():
     assert np.count_nonzero(found) == 8  # up to 76 ms
 
 
+@pytest.mark.parametrize("depth", [0.001, 0.02, 0.07, 0.3])
+def test_derivatives_of_the_elastic_force_are_the_slope_there_and_how_far_segments_are_pressed_in(depth):
+    slopes = np.linspace(100.0, 320.0, SEGMENTS)
+
+    def elastic(slopes, depth):
+        return in_jax.elastic(in_jax.Curve(slopes, *jnp.zeros(5)), depth)
+
+    by_slopes, by_depth = quickly(jax.jacfwd(elastic, argnums=(0, 1)))(jnp.array(slopes), jnp.array(depth))
+    ends = np.append(KNOTS[1:], np.inf)
+    np.testing.assert_allclose(by_slopes, np.clip(np.minimum(depth, ends) - KNOTS, 0, None), atol=1e-15)
+    assert by_depth == slopes[np.searchsorted(KNOTS, depth) - 1]
+
+
 @pytest.mark.parametrize("ratio", [-30.0, -3.0, -0.5, 0.0, 0.3, 1.0, 2.5, 8.0])
 def test_damping_that_counts_is_the_truncated_mean(ratio):
     density, share = stats.norm.pdf(ratio), stats.norm.cdf(ratio)
