@@ -1,18 +1,23 @@
 """Approaches that are skipped, beside the same ones flown tick by tick."""
 
+from typing import ClassVar
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from lanes import as_arrays, nominal_gains, run_record, run_rollout
 
 from jaxhil.compensators import COMPENSATORS
+from jaxhil.compensators.none import NoCompensator
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.rollout import stretch_length
 from jaxhil.simulation.scenario import build_scenarios
 
 LANES, TICKS = 5, 1200
-WAITING = sorted(name for name, law in COMPENSATORS.items() if law.waits_for_contact)
+WAITING = sorted(name for name, law in COMPENSATORS.items() if vars(type(law)).get("waits_for_contact"))
 EVERYDAY = "none", "response_error"  # each law is two programs
 
 
@@ -52,6 +57,18 @@ def test_what_happens_in_flight_is_flown(overrides):
     assert not loop.is_idle_in_flight
 
 
+class Early(NoCompensator):
+    """Acts on what the numerical model is in by."""
+
+    name: ClassVar[str] = "early"
+
+    def step(self, prepared, state, signals, tick):
+        return signals.force_measured + jnp.maximum(signals.position_desired, 0), state
+
+
 def test_a_law_that_acts_before_the_contact_is_flown():
+    """One that is made of a law that waits, too."""
     loop, _, _ = case("virtual_contact")
     assert not loop.is_idle_in_flight
+    waiting, _, _ = case("none")
+    assert not Loop(**{**vars(waiting), "compensator": Early()}).is_idle_in_flight

@@ -93,7 +93,7 @@ class Compensator(eqx.Module):
     # Whether it reads the measured position.
     reads_position: ClassVar[bool] = True
     # Whether, without noise, its F_c is 0 and its state such as a run begins with until the hardware touches:
-    # the approach may then be skipped.
+    # the approach may then be skipped. Each law says so itself: it is not inherited.
     waits_for_contact: ClassVar[bool] = False
     # Whether it works out a motion of its own that it could follow whatever the hardware does.
     anticipates: ClassVar[bool] = False

@@ -71,6 +71,7 @@ class MultiParameterLead(PhaseLead):
 
     name: ClassVar[str] = "multi_parameter_lead"
     knows: ClassVar[tuple[str, ...]] = (CONTACT_FREQUENCY, FORCE_DELAY, SIMULATOR_LAG)
+    waits_for_contact: ClassVar[bool] = True
     # Beyond a quarter of an oscillation of delay a is negative, beyond half of one b is.
     gains: ClassVar[tuple[Gain, ...]] = (
         rig_gain(

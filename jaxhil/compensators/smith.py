@@ -32,7 +32,6 @@ class Smith(Compensator):
     """F_c from the force led and the force led and predicted; both filters by Tustin's rule."""
 
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY, SIMULATOR_LAG)
-    waits_for_contact: ClassVar[bool] = True
     reads_position: ClassVar[bool] = False
     gains: ClassVar[tuple[Gain, ...]] = (PHASE_LEAD, LEAD_FILTER, LAG)
     # A/(T_s/2) of the law's own transfer function behind the lead, (1 + A s)/(1 + T_s s/2).

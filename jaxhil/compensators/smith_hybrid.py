@@ -13,6 +13,7 @@ class SmithHybrid(Smith):
     """F_c = (F_smith + F_lead)/2; see the module's text."""
 
     name: ClassVar[str] = "smith_hybrid"
+    waits_for_contact: ClassVar[bool] = True
     # 1 + (1/2) T_s s/(1 + T_s s/2) = (1 + T_s s)/(1 + T_s s/2).
     excess: ClassVar[float] = 2.0
 

@@ -15,6 +15,7 @@ class SmithPredictor(Smith):
     """F_c = (1 + T_s s/(1 + T_s s/2)) (1 + T_l s) F; see the module's text."""
 
     name: ClassVar[str] = "smith_predictor"
+    waits_for_contact: ClassVar[bool] = True
     excess: ClassVar[float] = 3.0
 
     def combined(self, led, predicted):

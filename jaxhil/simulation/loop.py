@@ -63,7 +63,8 @@ class Loop(eqx.Module):
         """Whether nothing happens in flight before the hardware touches: drives that can follow, no noise,
         bias or steps of a reading, a law that waits for the contact, no probe that counts from x_d = 0."""
         uneven = self.reads_always or self.has_position_noise or self.has_sample_effects or self.has_limits
-        return self.compensator.waits_for_contact and not (uneven or self.probed)
+        waits = vars(type(self.compensator)).get("waits_for_contact", False)
+        return waits and not (uneven or self.probed)
 
     @property
     def first_tick(self) -> int:
