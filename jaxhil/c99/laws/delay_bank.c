@@ -33,9 +33,9 @@ enum { JAXHIL_DELAYS = 17, JAXHIL_LAGS = 17, JAXHIL_HYPOTHESES = JAXHIL_DELAYS +
  * usual, how likely it is that the surface is there, map, deepest point, the likelihoods of this contact and of those
  * before; sums over these of the damping's precision and of precision times mean, their number `met`; whether this
  * contact is to be added to them. The mean of the maps and, `shift` [s] and `below` [s], of the delays and of how much
- * deeper; the delays' standard deviation [s]; the largest weight of what may lie beyond, `edge`, and that of all lags; the
- * delay that was `given`. Of each lag [s] what is kept after a tick of what a sensor shows; what is smoothed, `held`, as it was before
- * that, and whether the contact then pushed. */
+ * deeper; the delays' standard deviation [s]; the largest weight of what may lie beyond, `edge`, and that of all
+ * lags; the delay that was `given`. Of each lag [s] what is kept after a tick of what a sensor shows; what is
+ * smoothed, `held`, as it was before that, and whether the contact then pushed. */
 typedef struct {
     double given, shift, open, edge, lagging, below, met, variance, pace, plane_spread, period;
     double lags[JAXHIL_LAGS], kept[JAXHIL_LAGS];
