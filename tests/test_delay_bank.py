@@ -19,7 +19,7 @@ from jaxhil.runtime import Controller
 from jaxhil.runtime.laws.contact_plane import Meeting
 from jaxhil.runtime.laws.delay_bank import DELAYS, HYPOTHESES, LAGGING, UNLIKELY, USUAL, WHOLE, DelayBank
 from jaxhil.runtime.laws.force_depth_map import KNOTS, ForceDepthMap, Prior
-from jaxhil.runtime.laws.lagged_onset import lagged_onsets
+from jaxhil.runtime.laws.lagged_onsets import lagged_onsets
 from jaxhil.runtime.laws.onset import Onset
 
 LAW, PERIOD, SPREAD, VARIANCE = "retrospective_delay_bank", 1e-3, 1e-3, 0.1**2

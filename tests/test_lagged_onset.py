@@ -23,8 +23,9 @@ from jaxhil.runtime.laws.lagged_onset import (
     DAMPING_VARIANCE,
     PLACES,
     WINDOW,
-    lagged_onsets,
+    lagged_onset,
 )
+from jaxhil.runtime.laws.lagged_onsets import lagged_onsets
 from jaxhil.runtime.laws.onset import STIFFNESS, STIFFNESS_VARIANCE
 from jaxhil.runtime.limits import NO_LIMITS
 
@@ -75,6 +76,13 @@ def test_a_surface_is_found_behind_its_lag(lag, damping):
         assert variance[0] > 0
         errors.append(mean[0] - place)
     assert np.sqrt(np.mean(np.square(errors))) < 8e-4
+
+
+def test_one_lag_is_as_many():
+    depths, forces = (values.tolist() for values in readings(300.0, 1.5, 0.002, -0.001))
+    means, variances = lagged_onsets(LAGS, depths, forces, NOISE**2, PERIOD)
+    one = [lagged_onset(lag, depths, forces, NOISE**2, PERIOD) for lag in LAGS.tolist()]
+    np.testing.assert_allclose(np.array(one).T, [means, variances], rtol=1e-12)
 
 
 def test_both_agree_and_hidden_readings_do_not_count():

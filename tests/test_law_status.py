@@ -66,6 +66,10 @@ KINDS = {
     "noisy force": Kind("noisy", ("rig.force_sensor.noise_std=2.667",), {}, "noisy"),
     "dead zone": Kind("noisy", ("rig.force_sensor.dead_zone=12.0",), {}, "noisy"),
     "force 1 ms older than told": Kind("noisy", (), {"identification_delay": 0.007}, "unexplained"),
+    "damped behind a lag of 3 ms untold": Kind(
+        "damped", ("rig.force_sensor.time_constant=3e-3", "contact.damping=[600.0]"), {}, "unexplained"
+    ),
+    "damped": Kind("damped", ("contact.damping=[600.0]",), {}, "identified"),
     "dry friction untold": Kind("friction", (), {"prior_friction_spread": 0.0}, "unexplained"),
 }
 WATCHED = {"settling": 0.02, "free_force": 20.0}

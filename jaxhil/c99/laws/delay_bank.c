@@ -68,9 +68,6 @@ static const double jaxhil_bank_lagging = 0.0001; /* of a delay's probability, t
 static const double jaxhil_bank_edge = 0.6;      /* probability of a farthest delay or the longest lag: it may lie beyond */
 static const double jaxhil_bank_open = 0.0075;   /* of a restitution of 1, that what is open of the delay makes */
 static const double jaxhil_bank_settled = 0.99;  /* probability from which on it is a lag */
-static const double jaxhil_bank_usual = 0.5;     /* stiffness, of the most that it may be */
-static const double jaxhil_bank_farthest = 0.004; /* s, by which knots are moved, */
-static const double jaxhil_bank_whole = 0.015;    /* from this depth [s] on, and less before */
 static const long jaxhil_bank_earlier = 30;  /* ticks before it was met, whose readings count */
 
 /* Of their sum, at least so much. */
@@ -171,6 +168,17 @@ static bool jaxhil_learnt_open(const jaxhil_learnt *bank, double peak) {
            0.5 * jaxhil_map_pi * (peak * (bank->open * bank->pace)) > jaxhil_bank_open;
 }
 
+/* Nothing else is asked of the readings. */
+static void jaxhil_learnt_check(jaxhil_learnt *bank, const jaxhil_history *history, const jaxhil_scales *scales,
+                                long entry, double variance, int readings) {
+    (void)bank;
+    (void)history;
+    (void)scales;
+    (void)entry;
+    (void)variance;
+    (void)readings;
+}
+
 /* Weights of the hypotheses; their sum is 1. */
 static void jaxhil_bank_weigh(const jaxhil_learnt *bank, double *weights) {
     const double pace = bank->pace;
@@ -194,14 +202,6 @@ static void jaxhil_bank_weigh(const jaxhil_learnt *bank, double *weights) {
     }
 }
 
-/* Where the knots of hypothesis h are [s]. */
-static void jaxhil_bank_knots(const jaxhil_learnt *bank, int h, double *knots) {
-    for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
-        const double share = jaxhil_knots[j] / jaxhil_bank_whole;
-        knots[j] = jaxhil_knots[j] + bank->farther[h] * (share < 1.0 ? share : 1.0);
-    }
-}
-
 /* The mean of the maps, of the force at the usual knots. */
 static void jaxhil_bank_average(jaxhil_learnt *bank, const double *weights) {
     jaxhil_curve *curve = &bank->curve;
@@ -210,7 +210,7 @@ static void jaxhil_bank_average(jaxhil_learnt *bank, const double *weights) {
         const double *slopes = bank->estimate[h];
         double knots[JAXHIL_SEGMENTS];
         double reached = slopes[JAXHIL_PRELOAD];
-        jaxhil_bank_knots(bank, h, knots);
+        jaxhil_lagged_knots(bank->farther[h], knots);
         for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
             if (j > 0) {
                 reached += slopes[j - 1] * (knots[j] - knots[j - 1]);
@@ -309,36 +309,18 @@ static double jaxhil_bank_place(jaxhil_learnt *bank, const jaxhil_meeting *meeti
         const double likely = jaxhil_exponential(0.5 * (away * away / both), JAXHIL_DENSITY_SQUARINGS);
         const double place = share * away;
         const double farther = (meeting->place - place) / length;
-        const double off = jaxhil_bank_usual * (share * (meeting->stiffness * (sqrt(around) / length)));
+        const double off = jaxhil_lagged_usual * (share * (meeting->stiffness * (sqrt(around) / length)));
         const double depth = (meeting->plane - place) / length;
         const double inside = depth - bank->offsets[h] * meeting->pace;
         bank->deeper[h] = -depth;
-        bank->farther[h] = farther > jaxhil_bank_farthest
-                               ? jaxhil_bank_farthest
-                               : (farther < -jaxhil_bank_farthest ? -jaxhil_bank_farthest : farther);
+        bank->farther[h] = farther > jaxhil_lagged_farthest
+                               ? jaxhil_lagged_farthest
+                               : (farther < -jaxhil_lagged_farthest ? -jaxhil_lagged_farthest : farther);
         bank->likely[h] = likely > jaxhil_bank_unlikely ? likely : jaxhil_bank_unlikely;
         bank->covariance[h][JAXHIL_PRELOAD][JAXHIL_PRELOAD] += off * off;
         first = inside > first ? inside : first;
     }
     return first > jaxhil_map_surface ? first : 0.0;
-}
-
-/* The newest readings, of noise with this variance [1/s^2]. */
-static void jaxhil_bank_look(const jaxhil_meeting *meeting, const jaxhil_history *history, const jaxhil_scales *scales,
-                             double variance, jaxhil_window *window) {
-    const long first = history->newest - JAXHIL_WINDOW + 1;
-    window->number = 0;
-    window->variance = variance;
-    for (long tick = first > 0 ? first : 0; tick <= history->newest; tick++) {
-        const long slot = tick % JAXHIL_SLOTS;
-        if (history->shows[slot]) {
-            const double position = jaxhil_history_recall(history, tick)->position;
-            const double beyond = jaxhil_scales_beyond(scales, position) - meeting->place;
-            window->depths[window->number] = beyond / scales->length;
-            window->forces[window->number] = jaxhil_scales_force(scales, history->forces[slot]);
-            window->number++;
-        }
-    }
 }
 
 /* A contact begins: the one before is added to what is carried, and the maps are the prior. How many ticks before the
@@ -352,7 +334,7 @@ static long jaxhil_learnt_begin(jaxhil_learnt *bank, const jaxhil_meeting *meeti
     }
     bank->pace = meeting->pace;
     jaxhil_bank_restart(bank);
-    jaxhil_bank_look(meeting, history, scales, variance, &window);
+    jaxhil_lagged_newest(meeting, history, scales, variance, &window);
     const double ticks = ceil(jaxhil_bank_place(bank, meeting, &window) / meeting->tick);
     jaxhil_bank_weigh(bank, weights);
     jaxhil_bank_conclude(bank, weights);
@@ -362,7 +344,7 @@ static long jaxhil_learnt_begin(jaxhil_learnt *bank, const jaxhil_meeting *meeti
 /* What the force is linear in, at a depth [s] and speed, by hypothesis h. */
 static void jaxhil_bank_features(const jaxhil_learnt *bank, int h, double x, double rate, double *phi) {
     double knots[JAXHIL_SEGMENTS];
-    jaxhil_bank_knots(bank, h, knots);
+    jaxhil_lagged_knots(bank->farther[h], knots);
     for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
         const double beyond = x - knots[j];
         phi[j] = beyond > 0.0 ? beyond : 0.0;

@@ -27,9 +27,15 @@ typedef struct {
     double variance; /* [1/s^2] of the force that it expects where it was read last */
 } jaxhil_force_depth_map;
 
-/* One reading in contact, with noise of a `variance` [1/s^2]. */
-void jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, double speed, double deepest,
-                                   double force, double variance);
+/* One reading, with noise of a `variance` [1/s^2], if the contact `closes`, or the map or the reading tells of contact;
+ * `number` segments are pressed in so far, `others` is what else the force is linear in. By how much it was missed,
+ * squared and over its variance; while nothing is expected, over the noise's. */
+double jaxhil_force_depth_map_learn(jaxhil_force_depth_map *map, const double *pressed, int number,
+                                    const double *others, bool closes, double force, double variance);
+
+/* One reading in contact, likewise. */
+double jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, double speed, double deepest,
+                                     double force, double variance);
 
 /* == Definitions == */
 
@@ -108,7 +114,8 @@ static double jaxhil_map_wandered(double depth) {
     return depth > jaxhil_map_wide ? jaxhil_map_wide * (4.0 - ratio * ratio * ratio) / 3.0 : depth;
 }
 
-static void jaxhil_force_depth_map_restart(jaxhil_force_depth_map *map) {
+/* The prior, to the spread of whose preload so much [1/s] is added. */
+static void jaxhil_force_depth_map_restart(jaxhil_force_depth_map *map, double preload) {
     for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
         for (int j = 0; j < JAXHIL_PARAMETERS; j++) {
             map->covariance[i][j] = 0.0;
@@ -127,7 +134,7 @@ static void jaxhil_force_depth_map_restart(jaxhil_force_depth_map *map) {
     map->covariance[JAXHIL_DEPTH_DAMPING][JAXHIL_DEPTH_DAMPING] = map->depth_damping;
     map->covariance[JAXHIL_UNLOADING][JAXHIL_UNLOADING] = map->unloading;
     map->covariance[JAXHIL_FRICTION][JAXHIL_FRICTION] = map->friction;
-    map->covariance[JAXHIL_PRELOAD][JAXHIL_PRELOAD] = map->preload;
+    map->covariance[JAXHIL_PRELOAD][JAXHIL_PRELOAD] = map->preload + preload * preload;
     jaxhil_force_depth_map_conclude(map);
 }
 
@@ -141,7 +148,7 @@ static void jaxhil_force_depth_map_init(jaxhil_force_depth_map *map, const jaxhi
     map->unloading = gains->prior_unloading_spread * gains->prior_unloading_spread;
     map->friction = gains->prior_friction_spread * gains->prior_friction_spread;
     map->preload = gains->prior_preload_spread * gains->prior_preload_spread;
-    jaxhil_force_depth_map_restart(map);
+    jaxhil_force_depth_map_restart(map, 0.0);
 }
 
 /* Which way the speed goes, from -1 to 1. */
@@ -150,11 +157,9 @@ static double jaxhil_turning(double speed) {
     return ratio / sqrt(1.0 + ratio * ratio);
 }
 
-void jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, double speed, double deepest,
-                                   double force, double variance) {
-    double pressed[JAXHIL_SEGMENTS], g[JAXHIL_PARAMETERS];
-    const int number = jaxhil_pressed(depth, pressed);
-    const double others[] = {speed, depth * speed / jaxhil_map_reach, depth - deepest, jaxhil_turning(speed), 1.0};
+/* phi.theta: the force [1/s] where `number` segments are pressed in so far, and what else it is linear in. */
+static double jaxhil_force_depth_map_expected(const jaxhil_force_depth_map *map, const double *pressed, int number,
+                                              const double *others) {
     double expected = 0.0;
     for (int j = 0; j < number; j++) {
         expected += pressed[j] * map->estimate[j];
@@ -162,8 +167,16 @@ void jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, do
     for (int k = 0; k < JAXHIL_PARAMETERS - JAXHIL_SEGMENTS; k++) {
         expected += others[k] * map->estimate[JAXHIL_SEGMENTS + k];
     }
-    if (!(speed > 0.0 || expected > 0.0 || force * force > jaxhil_map_outlying * variance)) {
-        return;
+    return expected;
+}
+
+double jaxhil_force_depth_map_learn(jaxhil_force_depth_map *map, const double *pressed, int number,
+                                    const double *others, bool closes, double force, double variance) {
+    double g[JAXHIL_PARAMETERS];
+    const double expected = jaxhil_force_depth_map_expected(map, pressed, number, others);
+    const bool nothing = !(closes || expected > 0.0);
+    if (nothing && !(force * force > jaxhil_map_outlying * variance)) {
+        return force * force / variance;
     }
     double s = variance;
     for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
@@ -184,7 +197,7 @@ void jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, do
         s += others[k] * g[JAXHIL_SEGMENTS + k];
     }
     if (!(s > 0.0)) {
-        return;
+        return 0.0;
     }
     const double share = 1.0 / s;
     map->variance = variance * ((s - variance) * share);
@@ -196,7 +209,18 @@ void jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, do
             map->covariance[i][j] -= scaled * g[j];
         }
     }
+    return nothing ? force * force / variance : innovation * innovation * share;
+}
+
+double jaxhil_force_depth_map_update(jaxhil_force_depth_map *map, double depth, double speed, double deepest,
+                                     double force, double variance) {
+    double pressed[JAXHIL_SEGMENTS];
+    const int number = jaxhil_pressed(depth, pressed);
+    const double others[] = {speed, depth * speed / jaxhil_map_reach, depth - deepest, jaxhil_turning(speed), 1.0};
+    const double surprise =
+        jaxhil_force_depth_map_learn(map, pressed, number, others, speed > 0.0, force, variance);
     jaxhil_force_depth_map_conclude(map);
+    return surprise;
 }
 
 /* Force [1/s] that does not depend on how the contact came there, 0 out of contact. */

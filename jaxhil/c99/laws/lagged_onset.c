@@ -7,7 +7,11 @@
  */
 #include <math.h>
 
+#include "contact_plane.c"
+#include "force_depth_map.c"
+#include "history.c"
 #include "onset.c"
+#include "reintegration.c"
 
 /* == Declarations == */
 
@@ -24,6 +28,36 @@ typedef struct {
 
 static const double jaxhil_lagged_before = 3.0, jaxhil_lagged_after = 1.0; /* ticks */
 static const double jaxhil_lagged_damping_variance = 1.0;                  /* of B [1/s^2] */
+/* Of a map that has its surface elsewhere than where it was met, the preload is as uncertain as this share of the most
+ * that the stiffness may be makes it, and the knots are moved by up to `farthest` [s], from the depth `whole` [s] on
+ * wholly, before it less: all maps bend at the same places. */
+static const double jaxhil_lagged_usual = 0.5, jaxhil_lagged_farthest = 0.004, jaxhil_lagged_whole = 0.015;
+
+/* Where the knots of a map are that are moved by so much [s]. */
+static void jaxhil_lagged_knots(double farther, double *knots) {
+    for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
+        const double share = jaxhil_knots[j] / jaxhil_lagged_whole;
+        knots[j] = jaxhil_knots[j] + farther * (share < 1.0 ? share : 1.0);
+    }
+}
+
+/* The newest readings, of noise with this variance [1/s^2]. */
+static void jaxhil_lagged_newest(const jaxhil_meeting *meeting, const jaxhil_history *history,
+                                 const jaxhil_scales *scales, double variance, jaxhil_window *window) {
+    const long first = history->newest - JAXHIL_WINDOW + 1;
+    window->number = 0;
+    window->variance = variance;
+    for (long tick = first > 0 ? first : 0; tick <= history->newest; tick++) {
+        const long slot = tick % JAXHIL_SLOTS;
+        if (history->shows[slot]) {
+            const double position = jaxhil_history_recall(history, tick)->position;
+            const double beyond = jaxhil_scales_beyond(scales, position) - meeting->place;
+            window->depths[window->number] = beyond / scales->length;
+            window->forces[window->number] = jaxhil_scales_force(scales, history->forces[slot]);
+            window->number++;
+        }
+    }
+}
 
 /* Of the readings, met at this place [s], how likely they are: ln of that but for sqrt(determinant). */
 static double jaxhil_lagged_evidence(const jaxhil_window *window, double lag, double place, double *determinant) {

@@ -10,8 +10,9 @@
 #include <math.h>
 #include <stdbool.h>
 
-#include "contact_plane.c"
 #include "balance.c"
+#include "contact_plane.c"
+#include "contact_readings.c"
 #include "doubts.c"
 #include "gains_table.c"
 #include "history.c"
@@ -46,7 +47,6 @@ static const double jaxhil_farewell = 0.006;  /* s for which it goes on after th
 static const double jaxhil_usual_pace = 14.0; /* 1/s: slower contact is followed on a slower scale of time */
 static const double jaxhil_slowest = 0.01;    /* of that */
 static const double jaxhil_most = 1.2;        /* of the peak force, that the model is to feel of the map */
-static const double jaxhil_misfit_time = 0.001; /* s, over which a force may be off by the law's misfit */
 static const double jaxhil_margin = 0.0625;   /* of the stretch between two samples, off whose end the surface is */
 static const double jaxhil_least_weight = 1e-9; /* kg m/s, mass times approach speed: less does not scale */
 enum { JAXHIL_READINGS = 2 };                 /* per tick that the map learns from, while it has to catch up */
@@ -123,29 +123,23 @@ static double jaxhil_law_repayment(jaxhil_law *law, double peak, double own, dou
 /* The map learns from the readings since the surface was met, one after the other; noise of a `variance` [1/s^2],
  * the dead zone [1/s]. */
 static void jaxhil_law_learn(jaxhil_law *law, double variance, double zone) {
-    const jaxhil_history *history = &law->history;
-    const jaxhil_scales *scales = &law->reference.scales;
-    for (int i = 0; i < JAXHIL_READINGS && law->next <= history->newest; i++, law->next++) {
-        const jaxhil_sample *sample = jaxhil_history_recall(history, law->next);
-        const long slot = law->next % JAXHIL_SLOTS;
-        const double depth = jaxhil_scales_depth(scales, sample->position);
-        const double rate = jaxhil_scales_rate(scales, sample->velocity);
-        const double force = jaxhil_scales_force(scales, history->forces[slot]);
-        const bool hidden = !history->shows[slot];
-        if (depth > law->learnt_deepest) {
-            law->learnt_deepest = depth;
+    const jaxhil_reference_motion *reference = &law->reference;
+    for (int i = 0; i < JAXHIL_READINGS && law->next <= law->history.newest; i++, law->next++) {
+        const jaxhil_reading one = jaxhil_reading_at(&law->history, &reference->scales, law->next, variance,
+                                                     jaxhil_misfit, reference->period);
+        if (one.depth > law->learnt_deepest) {
+            law->learnt_deepest = one.depth;
         }
-        law->doubts.readings += depth > 0.0 && !hidden;
-        const double off = jaxhil_misfit * force;
-        const double misfit = off * off * (jaxhil_misfit_time / law->reference.period);
-        if (!hidden) {
-            jaxhil_balance_take(&law->balance, jaxhil_learnt_curve(&law->learnt), depth,
-                                law->reference.shift * rate + law->reference.deeper, rate, law->learnt_deepest,
-                                force, variance + misfit, jaxhil_learnt_variance(&law->learnt));
+        law->doubts.readings += one.depth > 0.0 && one.shown;
+        if (one.shown) {
+            jaxhil_balance_take(&law->balance, jaxhil_learnt_curve(&law->learnt), one.depth,
+                                reference->shift * one.rate + reference->deeper, one.rate, law->learnt_deepest,
+                                one.force, one.variance, jaxhil_learnt_variance(&law->learnt));
         }
-        jaxhil_learnt_read(&law->learnt, depth, rate, law->learnt_deepest, force, variance + misfit,
-                           hidden, zone);
+        jaxhil_learnt_read(&law->learnt, one.depth, one.rate, law->learnt_deepest, one.force, one.variance,
+                           !one.shown, zone);
     }
+    jaxhil_learnt_check(&law->learnt, &law->history, &reference->scales, reference->entry, variance, JAXHIL_READINGS);
 }
 
 /* The command over M v0 [1/s]; whether the numerical model has separated. */

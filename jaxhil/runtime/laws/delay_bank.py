@@ -23,6 +23,7 @@ from .force_depth_map import (
     DAMPING,
     DEPTH_DAMPING,
     FRICTION,
+    JUMPS,
     KNOTS,
     OUTLYING,
     PARAMETERS,
@@ -35,7 +36,8 @@ from .force_depth_map import (
     Prior,
     turning,
 )
-from .lagged_onset import lagged_onsets
+from .lagged_onset import FARTHEST, USUAL, WHOLE
+from .lagged_onsets import lagged_onsets
 from .onset import SQUARINGS, exponential
 
 DELAYS = LAGS = 17
@@ -51,8 +53,6 @@ DENSITY_SQUARINGS = 8
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
 NOT_THERE = 9.0  # times the variance of where the surface is expected: it is not there
 UNLIKELY = 0.1  # that it is not, at least
-USUAL = 0.5  # stiffness, of the most that it may be
-FARTHEST, WHOLE = 0.004, 0.015  # s by which knots are moved, from what depth [s] on; before it less
 EARLIER = 30  # ticks before it was met, whose readings count
 EDGE = 0.6  # probability that it is a farthest delay or the longest lag: then it may lie beyond
 OPEN = 0.0075  # of a restitution of 1, that what is open of the delay makes
@@ -65,8 +65,7 @@ _MOVED = np.minimum(np.array(KNOTS) / WHOLE, 1.0)[:, None]
 _0, _1 = np.zeros(HYPOTHESES), np.ones(HYPOTHESES)
 _LAGS = LAG_STEP * np.arange(1.0, LAGS + 1.0)
 _DELAYED = np.arange(HYPOTHESES) < DELAYS
-# What the force is linear in that begins with a jump.
-_JUMPS = np.isin(np.arange(PARAMETERS), (DAMPING, FRICTION, PRELOAD))[:, None]
+_JUMPS = np.isin(np.arange(PARAMETERS), JUMPS)[:, None]
 
 
 class DelayBank:

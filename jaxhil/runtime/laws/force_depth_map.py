@@ -9,6 +9,7 @@ the sums.
 """
 
 from bisect import bisect_left
+from collections.abc import Sequence
 from math import pi, sqrt
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ SEGMENTS = len(KNOTS)
 DAMPING, DEPTH_DAMPING, UNLOADING, FRICTION, PRELOAD = range(SEGMENTS, SEGMENTS + 5)
 OTHERS = 5
 PARAMETERS = SEGMENTS + OTHERS
+JUMPS = (DAMPING, FRICTION, PRELOAD)  # what begins with a jump
 WANDERING = 0.03  # s of depth over which a slope wanders by its spread
 BROAD = 0.092  # s of depth, beyond which slopes wander less and less
 SLOW = 0.03  # speed at which friction turns
@@ -141,27 +143,43 @@ class ForceDepthMap:
         self.curve = Curve()
         self.restart()
 
-    def restart(self) -> None:
-        """Return to the prior."""
+    def restart(self, preload: float = 0.0) -> None:
+        """Return to the prior, to the spread of whose preload so much [1/s] is added."""
         self._estimate = list(self._prior_estimate)
         self._covariance = [list(row) for row in self._prior_covariance]
+        self._covariance[PRELOAD][PRELOAD] += preload * preload
         self.variance = 0.0
         self._conclude()
 
-    def update(self, depth: float, speed: float, deepest: float, force: float, variance: float) -> None:
-        """One reading in contact, its noise of a `variance` [1/s^2], if the map or the reading tells of
-        contact: g = P phi, s = variance + phi.g, theta += g (f - phi.theta)/s, P -= g g'/s."""
+    def update(self, depth: float, speed: float, deepest: float, force: float, variance: float) -> float:
+        """One reading in contact, its noise of a `variance` [1/s^2]; `learn` of it."""
+        others = (speed, depth * speed / REACH, depth - deepest, turning(speed), 1.0)
+        surprise = self.learn(_pressed(depth), others, speed > 0.0, force, variance)
+        self._conclude()
+        return surprise
+
+    def expected(self, pressed: Sequence[float], others: Sequence[float]) -> float:
+        """phi.theta: the force [1/s] where segments are pressed in so far, as many as there are, and what
+        else it is linear in."""
+        total = 0.0
+        for ramp, value in zip(pressed, self._estimate, strict=False):
+            total += ramp * value
+        for other, value in zip(others, self._estimate[SEGMENTS:], strict=True):
+            total += other * value
+        return total
+
+    def learn(
+        self, pressed: Sequence[float], others: Sequence[float], closes: bool, force: float, variance: float
+    ) -> float:
+        """One reading, if the contact `closes`, or the map or the reading tells of contact: g = P phi,
+        s = variance + phi.g, theta += g (f - phi.theta)/s, P -= g g'/s. By how much it was missed, squared
+        and over s; while nothing is expected, over the noise's variance."""
         estimate = self._estimate
         covariance = self._covariance
-        pressed = _pressed(depth)
-        others = (speed, depth * speed / REACH, depth - deepest, turning(speed), 1.0)
-        expected = 0.0
-        for ramp, value in zip(pressed, estimate, strict=False):
-            expected += ramp * value
-        for other, value in zip(others, estimate[SEGMENTS:], strict=True):
-            expected += other * value
-        if not (speed > 0.0 or expected > 0.0 or force * force > OUTLYING * variance):
-            return
+        expected = self.expected(pressed, others)
+        nothing = not (closes or expected > 0.0)
+        if nothing and not force * force > OUTLYING * variance:
+            return force * force / variance
         g = []
         for row in covariance:
             product = 0.0
@@ -176,7 +194,7 @@ class ForceDepthMap:
         for other, value in zip(others, g[SEGMENTS:], strict=True):
             s += other * value
         if not s > 0.0:
-            return
+            return 0.0
         share = 1.0 / s
         self.variance = variance * ((s - variance) * share)
         innovation = force - expected
@@ -184,7 +202,7 @@ class ForceDepthMap:
             scaled = share * g[i]
             estimate[i] += scaled * innovation
             covariance[i] = [entry - scaled * other for entry, other in zip(row, g, strict=True)]
-        self._conclude()
+        return force * force / variance if nothing else innovation * innovation * share
 
     def _conclude(self) -> None:
         estimate = self._estimate

@@ -4,54 +4,83 @@ Since the surface was met, s ago, contact pushes with B + K s; through a sensor 
 B g + K (s - l g), g = 1 - exp(-s/l), and looks as if it were met later. Of each lag, PLACES places from
 l + BEFORE ticks before where it was met by the readings alone until AFTER ticks behind that are tried, with
 B ~ N(0, 1) and K as the onset has it: the likelihood of the readings has a closed form in five sums over
-them. Depths in s, forces in 1/s. In NumPy, all lags and places at a time.
+them. Depths in s, forces in 1/s.
 """
 
-import numpy as np
+from math import inf, nan, sqrt
 
+from .history import History
 from .onset import SQUARINGS, STIFFNESS, STIFFNESS_VARIANCE, exponential
+from .reintegration import Scales
 
 WINDOW = 40  # newest readings that count
 PLACES = 8
 BEFORE, AFTER = 3.0, 1.0  # ticks
 DAMPING_VARIANCE = 1.0  # of B [1/s^2]
+# Of a map that has its surface elsewhere than where it was met, the preload is as uncertain as this share of
+# the most that the stiffness may be makes it, and the knots are moved by up to FARTHEST [s], from the depth
+# WHOLE [s] on wholly, before it less: all maps bend at the same places.
+USUAL = 0.5
+FARTHEST, WHOLE = 0.004, 0.015
 
-_STEPS = np.arange(PLACES, dtype=float) / (PLACES - 1)
 
-
-def lagged_onsets(
-    lags: np.ndarray, depths: list[float], forces: list[float], variance: float, tick: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Of each lag [s] the mean and the variance of the place [s], from readings at depths beyond where the
-    surface was met by them alone; the forces' variance [1/s^2], a tick [s]."""
-    lag = lags[:, None]
+def lagged_onset(
+    lag: float, depths: list[float], forces: list[float], variance: float, tick: float
+) -> tuple[float, float]:
+    """The mean [s] and the variance [s^2] of the place, from readings at depths beyond where the surface was
+    met by them alone; the forces' variance [1/s^2], a tick [s]. NaN where that takes too large numbers."""
     first = lag + BEFORE * tick
     width = first + AFTER * tick
-    places = width * _STEPS - first
-    s = np.array(depths)[:, None, None] - places
-    force = np.array(forces)[:, None, None]
-    beyond = s > 0.0
-    s = np.where(beyond, s, 0.0)
-    g = 1.0 - exponential(s / lag, SQUARINGS)
-    q = s - lag * g
-    weighted, weight = g / variance, q / variance
-    # Sums over the readings, one after another; no force may be none of a number.
-    a = 1.0 / DAMPING_VARIANCE + np.add.reduce(weighted * g, axis=0)
-    b = np.add.reduce(weighted * q, axis=0)
-    c = 1.0 / STIFFNESS_VARIANCE + np.add.reduce(weight * q, axis=0)
-    y = np.add.reduce(np.where(beyond, weighted * force, 0.0), axis=0)
-    z = STIFFNESS / STIFFNESS_VARIANCE + np.add.reduce(np.where(beyond, weight * force, 0.0), axis=0)
+    places = [width * (float(j) / float(PLACES - 1)) - first for j in range(PLACES)]
+    found = [_evidence(lag, place, depths, forces, variance) for place in places]
+    most = -inf
+    for explained, _ in found:
+        most = explained if explained > most else most
+    total = once = twice = 0.0
+    for place, (explained, determinant) in zip(places, found, strict=True):
+        likely = exponential(most - explained, SQUARINGS) / sqrt(determinant) if determinant > 0.0 else nan
+        total += likely
+        once += likely * place
+        twice += likely * (place * place)
+    mean = once / total
+    step = width / float(PLACES - 1)
+    return mean, twice / total - mean * mean + step * step / 12.0
+
+
+def newest(history: History, scales: Scales, place: float) -> tuple[list[float], list[float]]:
+    """The newest readings: depths [s] beyond the place [m] where a surface was met, and forces [1/s]."""
+    depths = []
+    forces = []
+    for tick in range(max(0, history.newest - WINDOW + 1), history.newest + 1):
+        force, shown = history.reading(tick)
+        if shown:
+            depths.append((scales.beyond(history.recall(tick).position) - place) / scales.length)
+            forces.append(scales.force(force))
+    return depths, forces
+
+
+def _evidence(
+    lag: float, place: float, depths: list[float], forces: list[float], variance: float
+) -> tuple[float, float]:
+    """ln of how likely the readings are, met at this place [s], but for sqrt of a determinant; that."""
+    gg = b = qq = y = qy = 0.0
+    for depth, force in zip(depths, forces, strict=True):
+        s = depth - place
+        if not s > 0.0:
+            continue
+        g = 1.0 - exponential(s / lag, SQUARINGS)
+        q = s - lag * g
+        weighted = g / variance
+        weight = q / variance
+        gg += weighted * g
+        b += weighted * q
+        qq += weight * q
+        y += weighted * force
+        qy += weight * force
+    a = 1.0 / DAMPING_VARIANCE + gg
+    c = 1.0 / STIFFNESS_VARIANCE + qq
+    z = STIFFNESS / STIFFNESS_VARIANCE + qy
     determinant = a * c - b * b
-    explained = 0.5 * ((c * y * y - 2.0 * (b * y * z) + a * z * z) / determinant)
-    most = np.fmax.reduce(explained, axis=1, initial=-np.inf)[:, None]
-    likely = exponential(most - explained, SQUARINGS) / np.sqrt(determinant)
-    total = _of_places(likely)
-    mean = _of_places(likely * places) / total
-    square = _of_places(likely * (places * places)) / total
-    step = width[:, 0] / (PLACES - 1)
-    return mean, square - mean * mean + step * step / 12.0
-
-
-def _of_places(values: np.ndarray) -> np.ndarray:
-    """The sum of each lag, one place after another."""
-    return np.add.accumulate(values, axis=1)[:, -1]
+    if not determinant > 0.0:
+        return nan, determinant
+    return 0.5 * ((c * y * y - 2.0 * (b * y * z) + a * z * z) / determinant), determinant

@@ -321,29 +321,32 @@ class Retrospective(Compensator):
     def _catch_up(self, variance: float, zone: float) -> None:
         """Learn from the readings since the surface was met, one after the other; noise of a `variance`
         [1/s^2], the dead zone [1/s]."""
-        history = self._history
-        scales = self._scales
         reference = self._reference
         for _ in range(READINGS):
-            if self._next > history.newest:
+            if self._next > self._history.newest:
                 break
-            sample = history.recall(self._next)
-            read, shown = history.reading(self._next)
-            depth = scales.depth(sample.position)
-            rate = scales.rate(sample.velocity)
-            force = scales.force(read)
+            depth, rate, force, noise, shown = self._reading(self._next, variance)
             if depth > self._learnt_deepest:
                 self._learnt_deepest = depth
             if depth > 0.0 and shown:
                 self._doubts.readings += 1
-            off = self.misfit * force
-            misfit = off * off * (MISFIT_TIME / reference.period)
-            one = rate, self._learnt_deepest, force, variance + misfit
+            one = rate, self._learnt_deepest, force, noise
             if shown:
                 moved = reference.shift * rate + reference.deeper
                 self._balance.take(self._curve, depth, moved, *one, self._variance())
             self._learn(depth, *one, not shown, zone)
             self._next += 1
+
+    def _reading(self, tick: int, variance: float) -> tuple[float, float, float, float, bool]:
+        """What was read at a tick of this contact: depth [s] and speed as old as the force by the given
+        delay, force [1/s], its variance [1/s^2] with noise of a `variance`, whether the sensor showed it."""
+        sample = self._history.recall(tick)
+        read, shown = self._history.reading(tick)
+        scales = self._scales
+        force = scales.force(read)
+        off = self.misfit * force
+        misfit = off * off * (MISFIT_TIME / self._reference.period)
+        return scales.depth(sample.position), scales.rate(sample.velocity), force, variance + misfit, shown
 
     def _pass_on(self, force: float, position_desired: float, position: float) -> tuple[float, bool]:
         """The force as it is read [N], in a run that begins in contact, and whether the model has

@@ -13,7 +13,7 @@ from ..registry import GainSpecification, register
 from .contact_plane import Meeting
 from .delay_bank import DelayBank
 from .force_depth_map import Prior
-from .lagged_onset import WINDOW
+from .lagged_onset import newest
 from .retrospective import Retrospective
 
 
@@ -47,18 +47,10 @@ class RetrospectiveDelayBank(Retrospective):
         self._curve = self._bank.curve
 
     def _begin(self, meeting: Meeting) -> int:
-        history = self._history
         scales = self._scales
-        depths = []
-        forces = []
-        for tick in range(max(0, history.newest - WINDOW + 1), history.newest + 1):
-            force, shown = history.reading(tick)
-            if shown:
-                beyond = scales.beyond(history.recall(tick).position) - meeting.place
-                depths.append(beyond / scales.length)
-                forces.append(scales.force(force))
+        readings = newest(self._history, scales, meeting.place)
         noise = self._noise.variance / (scales.weight * scales.weight)
-        earlier = self._bank.begin(meeting, depths, forces, self._floor * self._floor + noise)
+        earlier = self._bank.begin(meeting, *readings, self._floor * self._floor + noise)
         self._take_means(meeting.pace)
         return earlier
 
