@@ -1,4 +1,4 @@
-"""Whether a lag is told from a damper: a spring and a damper in closed form, read through a lagging sensor."""
+"""Whether a lag is told from a damper: spring and damper in closed form, read through a lagging sensor."""
 
 import math
 
