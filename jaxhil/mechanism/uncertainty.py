@@ -23,6 +23,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -118,11 +119,15 @@ def _uniform(path: str, count: int, number: int, seed: int, first: int) -> np.nd
     """Uniform numbers, shape (number, count), rows `first` on of an endless table of this path."""
     start = first // BLOCK
     blocks = [np.empty((0, count))]
+    philox = np.random.Philox(key=0)
+    fresh: Any = philox.state
     for block in range(start, math.ceil((first + number) / BLOCK)):
         digest = hashlib.sha256(f"{seed} {block} {path}".encode()).digest()
-        generator = np.random.Generator(np.random.Philox(key=int.from_bytes(digest[:16], "little")))
+        # As a new generator with this key, which would ask the system for a seed first.
+        fresh["state"]["key"] = np.frombuffer(digest[:16], "<u8")
+        philox.state = fresh
         # Column by column, so that further columns leave the first ones as they are.
-        blocks.append(generator.random((count, BLOCK)).T)
+        blocks.append(np.random.Generator(philox).random((count, BLOCK)).T)
     skipped = first - start * BLOCK
     return np.concatenate(blocks)[skipped : skipped + number]
 

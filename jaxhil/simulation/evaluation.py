@@ -6,7 +6,7 @@ Batches are padded to a few sizes, so that most calls reuse a compiled program.
 """
 
 from collections.abc import Callable, Mapping
-from functools import cache, singledispatch
+from functools import cache, lru_cache, singledispatch
 from typing import Any, NamedTuple
 
 import jax
@@ -92,20 +92,27 @@ def evaluate(loop: Any, gains: Mapping[str, Any], scenarios: Any, at_least: int 
 
 
 def begin_evaluation(
-    loop: Any, gains: Mapping[str, Any], scenarios: Any, at_least: int = 1
-) -> Callable[[], Outcome]:
-    """Like `evaluate`, without waiting: what is returned waits for the outcome and returns it."""
+    loop: Any,
+    gains: Mapping[str, Any],
+    scenarios: Any,
+    at_least: int = 1,
+    wanted: Callable[[Outcome], Any] = lambda outcome: outcome,
+) -> Callable[[], Any]:
+    """Like `evaluate`, without waiting: what is returned waits for what is `wanted` of the outcome."""
     dealt = _deal(scenarios, at_least)
-    running = run_tiles(loop, *_fold(dealt, scenarios, gains))
+    running = wanted(run_tiles(loop, *_fold(dealt, scenarios, gains)))
     place = np.empty_like(dealt.lane, shape=lanes_of(scenarios))
     place[dealt.lane[~dealt.idle]] = np.flatnonzero(~dealt.idle)
 
     def unfold(leaf):
-        # (devices, tiles, ..., tile) -> (..., lanes).
-        rows = np.moveaxis(leaf, (0, 1), (-3, -2))
-        return np.take(rows.reshape(*rows.shape[:-3], -1), place, axis=-1)
+        # (devices, tiles, ..., tile) -> (..., lanes), each device's part read where it is.
+        devices, tiles, *slots, tile = leaf.shape
+        rows = np.empty((*slots, devices, tiles, tile), leaf.dtype)
+        for part in leaf.addressable_shards:
+            rows[..., part.index[0], :, :] = np.moveaxis(np.asarray(part.data), (0, 1), (-3, -2))
+        return np.take(rows.reshape(*slots, -1), place, axis=-1)
 
-    return lambda: jax.tree.map(unfold, jax.device_get(running))
+    return lambda: jax.tree.map(unfold, running)
 
 
 def shard(
@@ -153,13 +160,17 @@ def _in_turn(scenarios):
     duration, delays = expected_duration(scenarios), whole_delays(scenarios)
     if TILES_OF_A_DELAY * TILE * len(np.unique(delays)) > len(delays):
         delays = np.zeros_like(delays)
-    return np.lexsort((-duration, delays))
+    order = np.argsort(-duration)
+    return order[np.argsort(delays[order], kind="stable")]
 
 
 def _fold(dealt, scenarios, gains):
     """Gains common to all lanes, gains per lane and scenarios as they were dealt out."""
 
     def fold(leaf):
+        if leaf.strides[-1] == 0:
+            same = leaf[..., 0]
+            return _in_every_lane(same.tobytes(), same.dtype, same.shape, dealt.lane.shape)
         return np.moveaxis(np.take(leaf, dealt.lane, axis=-1), (-3, -2), (0, 1))
 
     # The scenarios' precision is that of the program.
@@ -168,6 +179,14 @@ def _fold(dealt, scenarios, gains):
     common = {name: value for name, value in values.items() if not value.ndim}
     per_lane = {name: fold(value) for name, value in values.items() if value.ndim}
     return common, per_lane, at_rest(jax.tree.map(fold, scenarios), dealt.idle)
+
+
+@lru_cache(maxsize=128)  # leaves: a few batches of like scenarios have no more
+def _in_every_lane(content, dtype, slots, lanes):
+    """On its devices, what all lanes have in common: it is not sent there again with every batch."""
+    devices, tiles, tile = lanes
+    same = np.frombuffer(content, dtype).reshape(1, 1, *slots, 1)
+    return jax.device_put(np.broadcast_to(same, (devices, tiles, *slots, tile)), NamedSharding(_mesh(), OWN))
 
 
 def lanes_of(scenarios: Any) -> int:

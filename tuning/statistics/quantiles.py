@@ -61,8 +61,9 @@ def counts(values: ArrayLike) -> np.ndarray:
     Bin 0 is [0, EDGES[0]), bin i is [EDGES[i - 1], EDGES[i]), the last one from EDGES[-1] on.
     """
     size = np.abs(np.asarray(values, float)).ravel()
-    size = np.where(np.isfinite(size), size, np.inf)
-    return np.bincount(np.searchsorted(EDGES, size, side="right"), minlength=BINS).astype(np.int64)
+    size = np.sort(np.where(np.isfinite(size), size, np.inf))
+    # Every edge is looked for among the values, which are more.
+    return np.diff(np.searchsorted(size, EDGES), prepend=0, append=len(size)).astype(np.int64)
 
 
 def binned_quantile(

@@ -5,6 +5,7 @@ for what a chunk happens to draw, so that a scenario's rows are the same to the 
 """
 
 from collections.abc import Callable, Generator, Iterable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +16,7 @@ from jaxhil.mechanism.uncertainty import extremes
 from jaxhil.simulation.evaluation import begin_evaluation
 from jaxhil.simulation.gain_file import LoadedGains
 from tuning.gains.simulated import loop_of, scenarios_of
-from tuning.sweeps.columns import rows_of
+from tuning.sweeps.columns import read_of, rows_of
 from tuning.sweeps.draws import drawn_scenarios
 from tuning.sweeps.manifest import Manifest, loaded_gains
 
@@ -82,7 +83,11 @@ def in_precision(scenarios: Any, precision: str) -> Any:
 
     def cast(leaf: Any) -> Any:
         leaf = np.asarray(leaf)
-        return leaf.astype(precision) if leaf.dtype.kind == "f" else leaf
+        if leaf.dtype.kind != "f":
+            return leaf
+        # What all lanes have in common stays one number.
+        own = leaf[..., :1] if leaf.strides[-1] == 0 else leaf
+        return np.broadcast_to(own.astype(precision, copy=False), leaf.shape)
 
     return jax.tree.map(cast, scenarios)
 
@@ -96,8 +101,9 @@ def _draw(sweep: Sweep, first: int, number: int, precision: str | None) -> _Batc
 def _begin(sweep: Sweep, batch: _Batch) -> Callable[[], Rows]:
     """Start computing; what is returned waits for the rows."""
     manifest = sweep.manifest
-    outcome = begin_evaluation(sweep.loop, sweep.gains, batch.scenarios, at_least=manifest.chunk)
     limit, works = manifest.largest_error, manifest.works
+    read = partial(read_of, sweep.mechanism, works)
+    outcome = begin_evaluation(sweep.loop, sweep.gains, batch.scenarios, manifest.chunk, read)
     return lambda: rows_of(sweep.mechanism, *batch, outcome(), limit, works)
 
 

@@ -179,6 +179,15 @@ def input_names(mechanism: AnyMechanism, path: str) -> list[str]:
     return [path + "".join(f"_{place + 1}" for place in index) for index in np.ndindex(*shape)]
 
 
+def read_of(mechanism: AnyMechanism, works: bool, outcome: Outcome) -> Any:
+    """What `rows_of` reads of an outcome; None in the place of all else."""
+    names = {"status", "restitution", "approach_velocity", *(one.name for one in _kept(mechanism, works))}
+    metrics = outcome.metrics
+    other: Any = dict.fromkeys(set(metrics._fields) - names)
+    unread: Any = dict.fromkeys(("reference_peak_force", "chatter", "wanted", "good"))
+    return outcome._replace(metrics=metrics._replace(**other), **unread)
+
+
 def rows_of(
     mechanism: AnyMechanism,
     first: int,

@@ -87,7 +87,10 @@ def add_rows(tally: Tally, rows: Mapping[str, np.ndarray]) -> Tally:
     # Within the limit or beyond it, the error itself says how bad it is.
     badness = np.where(outcome <= OUTCOMES.index(BEYOND), 0, outcome)
     error = np.nan_to_num(np.abs(rows["worst_error"].astype(float)), nan=-1.0, posinf=np.inf)
-    first = np.lexsort((index, -error, -badness.astype(int)))[:WORST]
+    # Only those are sorted that may be among the worst.
+    size = np.where(badness > 0, np.inf, error)
+    few = np.flatnonzero(size >= np.partition(size, -WORST)[-WORST] if len(size) > WORST else size >= -1)
+    first = few[np.lexsort((index[few], -error[few], -badness[few].astype(int)))[:WORST]]
     found = [(int(badness[i]), float(error[i]), int(index[i])) for i in first]
     looks = tally.looks
     return Tally(
