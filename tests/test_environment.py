@@ -1,11 +1,13 @@
-"""Options of the compiler that need not be there in its next version."""
+"""Options of the compiler that need not be there in its next version; cores in turn."""
+
+import os
 
 import jax
 import numpy as np
 import pytest
 
 from jaxhil.simulation import environment
-from jaxhil.simulation.environment import ROLLOUT, known_options
+from jaxhil.simulation.environment import ROLLOUT, known_options, on_half_the_cores
 
 
 def test_options_that_the_compiler_lacks_are_left_out():
@@ -22,3 +24,16 @@ def test_an_option_of_llvm_is_given_to_versions_that_know_it_alone(monkeypatch):
     for version, given in (("0.10.7", True), ("0.11.0", False), ("0.100.0", False)):
         monkeypatch.setattr(environment, "version", lambda name, version=version: version)
         assert (environment.WHOLE in environment.flags("")) == given
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system cannot be told")
+def test_halves_of_the_cores_are_left_again():
+    usable = os.sched_getaffinity(0)
+    halves = []
+    for half in (0, 1):
+        with pytest.raises(ZeroDivisionError), on_half_the_cores(half):
+            halves.append(os.sched_getaffinity(0))
+            raise ZeroDivisionError
+        assert os.sched_getaffinity(0) == usable
+    assert halves[0] | halves[1] == usable
+    assert len(usable) == 1 or not halves[0] & halves[1]

@@ -218,6 +218,24 @@ def usable_cores() -> int:
     return os.cpu_count() or 1
 
 
+@contextmanager
+def on_half_the_cores(half: int) -> Iterator[None]:
+    """This thread runs on one half of the usable cores meanwhile, 0 or 1, where the system can be told so.
+
+    The system leaves a thread on the core where it was. Work beside a program of all devices delays the same
+    device again and again then, for which the others wait; in turns on both halves it delays all alike.
+    """
+    usable = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
+    own = sorted(usable)[half::2]
+    try:
+        if own:
+            os.sched_setaffinity(0, own)
+        yield
+    finally:
+        if own:
+            os.sched_setaffinity(0, usable)
+
+
 def cache_folder() -> Path | None:
     """$JAXHIL_CACHE or ~/.cache/jaxhil, made if need be; None where it cannot be written."""
     try:

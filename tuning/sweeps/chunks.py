@@ -5,6 +5,7 @@ for what a chunk happens to draw, so that a scenario's rows are the same to the 
 """
 
 from collections.abc import Callable, Generator, Iterable
+from contextlib import nullcontext
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.uncertainty import extremes
+from jaxhil.simulation.environment import on_half_the_cores
 from jaxhil.simulation.evaluation import begin_evaluation
 from jaxhil.simulation.gain_file import LoadedGains
 from tuning.gains.simulated import loop_of, scenarios_of
@@ -69,8 +71,10 @@ def run_parts(sweep: Sweep, parts: Iterable[int]) -> Generator[tuple[int, Rows],
     """Part by part its number and rows. While the caller uses them, the next part is computed already."""
     running = None
     for part in parts:
-        # It waits its turn behind the one that runs, so that no core does.
-        begun = part, _begin(sweep, _draw(sweep, *sweep.manifest.part_rows(part), None))
+        # It waits its turn behind the one that runs, so that no core does. The first one starts threads, to
+        # which all are open.
+        with on_half_the_cores(0) if running is not None else nullcontext():
+            begun = part, _begin(sweep, _draw(sweep, *sweep.manifest.part_rows(part), None))
         if running is not None:
             yield _finished(running)
         running = begun
@@ -109,4 +113,5 @@ def _begin(sweep: Sweep, batch: _Batch) -> Callable[[], Rows]:
 
 def _finished(running: tuple[int, Callable[[], Rows]]) -> tuple[int, Rows]:
     part, rows = running
-    return part, rows()
+    with on_half_the_cores(0):
+        return part, rows()

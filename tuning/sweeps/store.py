@@ -25,6 +25,7 @@ import numpy as np
 
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.files import is_temporary, lock, make_folder, open_plain, remove_stale, write_whole, writing
+from jaxhil.simulation.environment import on_half_the_cores
 from tuning import terminal
 from tuning.sweeps.manifest import NAME, Manifest, differences, encode, other_code, read_manifest
 from tuning.sweeps.parts import decode_part, encode_part
@@ -102,9 +103,9 @@ def locked(folder: Path) -> Iterator[None]:
 def write_part(store: Store, part: int, rows: Mapping[str, np.ndarray]) -> None:
     """Write a part, whole or not at all. Raises `InputError` when it cannot be written."""
     path = store.part_path(part)
-    content = encode_part(store.manifest, rows)
-    with writing(path):
-        write_whole(path, content)
+    # The next part is computed meanwhile, prepared on the other half.
+    with on_half_the_cores(1), writing(path):
+        write_whole(path, encode_part(store.manifest, rows))
 
 
 def read_part(store: Store, part: int) -> dict[str, np.ndarray] | None:
