@@ -17,7 +17,17 @@ from jaxhil.compensators.meeting import Meeting as MeetingInJax
 from jaxhil.compensators.reintegration import Scales
 from jaxhil.runtime import Controller
 from jaxhil.runtime.laws.contact_plane import Meeting
-from jaxhil.runtime.laws.delay_bank import DELAYS, HYPOTHESES, LAGGING, UNLIKELY, USUAL, WHOLE, DelayBank
+from jaxhil.runtime.laws.delay_bank import (
+    DELAYS,
+    FIRST_LAG,
+    HYPOTHESES,
+    LAGGING,
+    STEADY,
+    UNLIKELY,
+    USUAL,
+    WHOLE,
+    DelayBank,
+)
 from jaxhil.runtime.laws.force_depth_map import KNOTS, ForceDepthMap, Prior
 from jaxhil.runtime.laws.lagged_onsets import lagged_onsets
 from jaxhil.runtime.laws.onset import Onset
@@ -35,8 +45,10 @@ PRIOR = {
     "preload": 0.3,
 }
 OFFSETS = SPREAD * np.linspace(-1, 1, DELAYS)
-LAGS = 0.00025 * np.arange(1, HYPOTHESES - DELAYS + 1)
-OLDER = np.append(OFFSETS, LAGS)
+LAGS = 0.00025 * np.arange(1, HYPOTHESES - FIRST_LAG + 1)
+NO_DELAY, NO_LAG = np.zeros(len(LAGS)), np.zeros(FIRST_LAG)
+DELAYED = np.concatenate([OFFSETS, OFFSETS, NO_DELAY])
+OLDER = np.append(DELAYED[:FIRST_LAG], LAGS)
 UNSEEN: tuple[list[float], list[float], float] = ([], [], VARIANCE)  # no readings about the onset
 
 
@@ -96,16 +108,16 @@ def test_likelihood_is_the_root_of_the_density_of_all_readings():
     for depth, speed, force in zip(depths.tolist(), speeds.tolist(), forces.tolist(), strict=True):
         bank.learn(depth, speed, force, VARIANCE, False, 0.0)
     knots = np.array(KNOTS)
+    wanders = PRIOR["wandering"] ** 2 * np.minimum.outer(knots, knots) / 0.03
     covariance = np.zeros((17, 17))
-    covariance[:12, :12] = PRIOR["common"] ** 2
-    covariance[:12, :12] += PRIOR["wandering"] ** 2 * np.minimum.outer(knots, knots) / 0.03
     for place, name in enumerate(("damping", "depth_damping", "unloading", "friction", "preload"), start=12):
         covariance[place, place] = PRIOR[name] ** 2
     mean = np.r_[np.full(12, PRIOR["stiffness"]), np.zeros(5)]
     share = TOLD**2 / (TOLD**2 + FOUND**2)
     covariance[16, 16] += (USUAL * share * STIFFNESS * FOUND / SPEED) ** 2
     exact = []
-    for offset in OFFSETS:
+    for h, offset in enumerate(DELAYED[:FIRST_LAG]):
+        covariance[:12, :12] = PRIOR["common"] ** 2 + wanders * (1 if h < DELAYS else STEADY**2)
         x = depths - offset * (speeds - share)
         assert np.all(x > 0)
         moved = knots + share * offset * np.minimum(knots / WHOLE, 1)
@@ -114,7 +126,7 @@ def test_likelihood_is_the_root_of_the_density_of_all_readings():
         phi = np.column_stack([phi, speeds / np.hypot(speeds, 0.03), np.ones_like(x)])
         spread = phi @ covariance @ phi.T + VARIANCE * np.eye(len(x))
         exact.append(0.5 * stats.multivariate_normal.logpdf(forces, phi @ mean, spread))
-    found = np.log(bank._likelihood[:DELAYS])
+    found = np.log(bank._likelihood[:FIRST_LAG])
     np.testing.assert_allclose(found - found[4], np.array(exact) - exact[4], atol=0.02)
     assert np.ptp(exact) > 0.1
 
@@ -165,7 +177,31 @@ def test_where_all_delays_are_the_same_it_is_one_map():
     np.testing.assert_allclose(weights[:DELAYS], weights[0], rtol=1e-12)
     for h in range(DELAYS):
         np.testing.assert_allclose(bank._estimate[:, h], alone._estimate, rtol=1e-9, atol=1e-12)
-    assert np.sum(weights[:DELAYS]) > 0.9
+    assert np.sum(weights[:FIRST_LAG]) > 0.9
+
+
+@pytest.mark.parametrize(("bend", "steady"), [(0.0, True), (2000.0, False)])
+def test_contacts_decide_whether_slopes_wander_but_not_thereby_on_lags(bend, steady):
+    """Once the first is over, linear contact speaks for steady slopes, contact that hardens against them.
+    Lags, whose slopes wander, have the share that they would have beside delays whose slopes do."""
+    bank = plain()
+    for number in range(3):
+        depths, speeds, forces, _ = contact(np.random.default_rng(number), lasts=0.15)
+        bank.begin(meeting(), *UNSEEN)
+        before = bank._carried
+        for depth, speed, force in zip(depths.tolist(), speeds.tolist(), forces.tolist(), strict=True):
+            bank.learn(depth, speed, force + bend * max(depth - 0.02, 0), VARIANCE, False, 0.0)
+        weights, either = weights_of(bank), before[:DELAYS] + before[DELAYS:FIRST_LAG]
+        shares = [np.sum(weights[:DELAYS]), np.sum(weights[DELAYS:FIRST_LAG])]
+        assert shares[1] == 0 if number == 0 else shares[steady] > 3 * shares[not steady]
+        lagging = before[FIRST_LAG:] * bank._likelihood[FIRST_LAG:]
+        bank._carried = np.concatenate([either, 0 * either, before[FIRST_LAG:]])
+        np.testing.assert_allclose(weights[FIRST_LAG:], weights_of(bank)[FIRST_LAG:], rtol=1e-12)
+        bank._carried = before
+    delayed = np.sum(either * bank._likelihood[:DELAYS])
+    bank.begin(meeting(), *UNSEEN)
+    shares = lagging / (np.sum(lagging) + delayed)
+    np.testing.assert_allclose(bank._carried[FIRST_LAG:], np.maximum(shares, 1e-12), rtol=1e-9)
 
 
 def test_contacts_narrow_the_delay_and_a_reset_forgets_it():
@@ -210,16 +246,15 @@ def test_surface_lies_between_where_it_was_told_and_where_it_was_met(plane_sprea
     earlier = bank.begin(meeting(place, pace), *UNSEEN)
     # Depth when it was met: X_0 - d v_0 less p_h = g (X_0 - d v_0), X_0 later with a lag.
     later, around = lagged_onsets(LAGS * pace, *UNSEEN, PERIOD * pace)
-    met = place + np.append(0 * OFFSETS, later * SPEED / pace)
-    both = plane_spread**2 + FOUND**2 + np.append(0 * OFFSETS, around * (SPEED / pace) ** 2)
-    offsets = np.append(OFFSETS, 0 * LAGS)
-    depth = (place - offsets * SPEED) / SPEED * pace - share * (met - offsets * SPEED) / SPEED * pace
-    delayed = slice(0, DELAYS)
-    np.testing.assert_allclose((-bank._below - offsets * pace)[delayed], depth[delayed], atol=1e-6)
-    away = (met - offsets * SPEED) ** 2 / both
-    entered = (-bank._below - offsets * pace).max() / (PERIOD * pace)
+    met = place + np.append(NO_LAG, later * SPEED / pace)
+    both = plane_spread**2 + FOUND**2 + np.append(NO_LAG, around * (SPEED / pace) ** 2)
+    depth = (place - DELAYED * SPEED) / SPEED * pace - share * (met - DELAYED * SPEED) / SPEED * pace
+    delayed = slice(0, FIRST_LAG)
+    np.testing.assert_allclose((-bank._below - DELAYED * pace)[delayed], depth[delayed], atol=1e-6)
+    away = (met - DELAYED * SPEED) ** 2 / both
+    entered = (-bank._below - DELAYED * pace).max() / (PERIOD * pace)
     assert earlier == min(math.ceil(max(entered - 1e-2, 0)), 30)
-    weights = np.append(np.ones(DELAYS), np.full(len(LAGS), LAGGING))
+    weights = np.concatenate([np.ones(DELAYS), np.zeros(DELAYS), np.full(len(LAGS), LAGGING)])
     weights *= np.maximum(np.exp(-0.5 * away), UNLIKELY)
     weights /= np.sum(weights)
     np.testing.assert_allclose(weights_of(bank), weights, rtol=0.03)

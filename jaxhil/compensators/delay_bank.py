@@ -5,15 +5,17 @@ Hypothesis h takes the force to be d_h [s] older than assumed: it belongs to the
 first order in d_h. The surface was met at X_0; by this hypothesis it lies at p_h = g (X_0 - d_h v_0) beyond
 where it was told, g = spread^2/(spread^2 + found^2) by how uncertain either is, or 1 where they disagree. As
 many others take the sensor to lag by l_h [s]: what the force is linear in is smoothed alike, and the surface
-was met where `lagged_onset` has it. To first order a lag is a delay: these count as l_h older. Each
-identifies a `force_depth_map` of its own and says beforehand what it expects to read, f_h with a variance s_h
-(0 with the noise's own variance r out of contact, and where what it expects while the contact opens is not
-positive). Its weight is the product of the likelihood of all readings y of this contact and of those before,
-in each (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), of how well its damping goes with what is known of contacts
-(`plausibility`), and of how likely its surface is there: see notebooks/guide/retrospective_reference.md
-section 7. The exponentials are (1 + u/n)^-n: algebraic, the same on every machine. What counts is the mean
-over all hypotheses, of their maps, delays and surfaces. Their maps bend at the same places, wherever they
-have the surface: which fits best is not to be decided by what a contact that bends between two knots leaves.
+was met where `lagged_onset` has it. To first order a lag is a delay: these count as l_h older. Each delay is
+there twice, by slopes that wander and by slopes that hardly do: how much they do is for the contacts to
+decide. Each hypothesis identifies a `force_depth_map` of its own and says beforehand what it expects to read,
+f_h with a variance s_h (0 with the noise's own variance r out of contact, and where what it expects while the
+contact opens is not positive). Its weight is the product of the likelihood of all readings y of this contact
+and of those before, in each (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), of how well its damping goes with what
+is known of contacts (`plausibility`), and of how likely its surface is there: see
+notebooks/guide/retrospective_reference.md section 7. The exponentials are (1 + u/n)^-n: algebraic, the same
+on every machine. What counts is the mean over all hypotheses, of their maps, delays and surfaces. Their maps
+bend at the same places, wherever they have the surface: which fits best is not to be decided by what a
+contact that bends between two knots leaves.
 """
 
 import math
@@ -21,6 +23,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxhil.compensators.force_depth_map import (
@@ -45,11 +48,16 @@ from jaxhil.compensators.meeting import Meeting
 from jaxhil.compensators.onset import SQUARINGS, exponential
 
 DELAYS = LAGS = 17
-HYPOTHESES = DELAYS + LAGS
-DELAYED = np.arange(HYPOTHESES) < DELAYS
-OFFSETS = np.append(np.linspace(-1, 1, DELAYS), np.zeros(LAGS))  # of delays, in terms of the farthest
-LAG = np.where(DELAYED, 0, 0.00025 * (np.arange(HYPOTHESES) - DELAYS + 1.0))  # s
+FIRST_LAG = 2 * DELAYS  # each delay by slopes that wander, then by steady ones
+HYPOTHESES = FIRST_LAG + LAGS
+DELAYED = np.arange(HYPOTHESES) < FIRST_LAG
+OFFSETS = np.concatenate([np.linspace(-1, 1, DELAYS)] * 2 + [np.zeros(LAGS)])  # in terms of the farthest
+LAG = np.where(DELAYED, 0, 0.00025 * (np.arange(HYPOTHESES) - FIRST_LAG + 1.0))  # s
+STEADY = 0.125  # of the spread by which slopes wander, where they hardly do
 LAGGING = 0.0001  # of a delay's probability, that of each lag
+# What is carried before the first contact, and what where it is over: only then its slopes tell how they are.
+FIRST = np.where(DELAYED, np.arange(HYPOTHESES) < DELAYS, LAGGING)
+EITHER = np.where(DELAYED, 0.5, LAGGING)
 ELASTIC = 0.5  # probability that a contact has no damping
 BROADENING = 2.0  # of the variance of the damping
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
@@ -90,10 +98,10 @@ def no_bank(prior: Map) -> Bank:
     """Before the first contact."""
     zero = jnp.zeros_like(prior.mean[0])
     each = jnp.stack([zero] * HYPOTHESES)
-    carried = each + _column(np.where(DELAYED, 1, LAGGING), each)
+    carried = each + _column(FIRST, each)
     held = jnp.stack([each[:LAGS]] * len(prior.mean))
     return Bank(
-        _repeated(prior), each, each + 1, carried, each, each, zero, zero, each, zero + 1, zero, zero,
+        _priors(prior), each, each + 1, carried, each, each, zero, zero, each, zero + 1, zero, zero,
         each, each + 1, held, held, held[0],
     )  # fmt: skip
 
@@ -124,11 +132,12 @@ def begin(
     speed, pace = (jnp.where(begins, each, 1) for each in (meeting.scales.speed, meeting.scales.pace))
     offsets = _column(OFFSETS, speed[None]) * farthest[None]
     tick = period * pace
-    lags = _column(LAG[DELAYS:], speed[None]) * pace[None]
+    lags = _column(LAG[FIRST_LAG:], speed[None]) * pace[None]
     placed = _place(meeting, offsets, speed / pace, speed, plane_spread, lagged_onsets(lags, window, tick))
     first = jnp.max(-placed.below - offsets * pace[None], axis=0)
     earlier = jnp.minimum(jnp.ceil(jnp.where(first > SURFACE, first, 0) / tick), EARLIER).astype(jnp.int32)
-    fresh = _repeated(prior)
+    carried = jnp.where(old.met[None] > 0, old.carried, _column(EITHER, old.carried))
+    fresh = _priors(prior)
     fresh = fresh._replace(covariance=fresh.covariance.at[PRELOAD, PRELOAD].add(placed.preload))
     now = old._replace(
         maps=Map(
@@ -137,7 +146,7 @@ def begin(
         ),
         deepest=jnp.where(begins[None], 0, old.deepest),
         likelihood=jnp.where(begins[None], 1, old.likelihood),
-        carried=jnp.where(ends[None], _shares(old.carried * old.likelihood, LEAST_CARRIED), old.carried),
+        carried=jnp.where(ends[None], _shares(_weighed(carried, old.likelihood), LEAST_CARRIED), old.carried),
         precision=old.precision + jnp.where(ends[None], precision, 0),
         weighted=old.weighted + jnp.where(ends[None], precision * mean, 0),
         met=old.met + jnp.where(ends, 1, 0),
@@ -172,8 +181,8 @@ def learn(old: Bank, reading: Reading, period: Array, farthest: Array, damping: 
     delayed = _column(DELAYED, depth) > 0
     inside = ~delayed | (depth > SURFACE)
     phi = features(depth, rate, deepest, knots_of(old))
-    held, pushes = _smooth(old, depth[DELAYS:], rate[DELAYS:], phi[:, DELAYS:], period)
-    before, phi = phi[:, DELAYS:], jnp.concatenate([phi[:, :DELAYS], held], axis=1)
+    held, pushes = _smooth(old, depth[FIRST_LAG:], rate[FIRST_LAG:], phi[:, FIRST_LAG:], period)
+    before, phi = phi[:, FIRST_LAG:], jnp.concatenate([phi[:, :FIRST_LAG], held], axis=1)
     predicted = predict(old.maps, phi, noise)
     # Hidden, a force is known to be small: half of the zone, where the map expects more than all of it.
     tight = hidden & (predicted.force <= zone)
@@ -184,7 +193,7 @@ def learn(old: Bank, reading: Reading, period: Array, farthest: Array, damping: 
     # On which side of the surface it was, between two delays, is not known.
     near = float(0.5 * (OFFSETS[1] - OFFSETS[0])) * farthest[None] * old.pace[None]
     beside = delayed & (depth < near) & (depth > -near)
-    pushed = jnp.concatenate([jnp.ones_like(pushes), pushes])
+    pushed = jnp.concatenate([jnp.ones_like(depth[:FIRST_LAG], dtype=bool), pushes])
     used = counts & inside & pushed & ~beside & ~tight & (closes | tells(predicted, force, noise))
     maps = correct(old.maps, predicted, force, used)
 
@@ -213,9 +222,9 @@ def learn(old: Bank, reading: Reading, period: Array, farthest: Array, damping: 
 def _smooth(old: Bank, depth: Array, rate: Array, now: Array, period: Array) -> tuple[Array, Array]:
     """What the force is linear in as sensors that lag show it: its mean over the tick, from the entry on
     where that is within it, as long as the contact pushes; whether it pushes."""
-    lag = _column(LAG[DELAYS:], depth)
+    lag = _column(LAG[FIRST_LAG:], depth)
     closes = rate > 0
-    raw = jnp.sum(now * old.maps.mean[:, DELAYS:], axis=0)
+    raw = jnp.sum(now * old.maps.mean[:, FIRST_LAG:], axis=0)
     pushes = (depth > SURFACE) & (closes | (raw > 0))
     was = old.pushed > 0
     enters = pushes & ~was
@@ -241,8 +250,20 @@ def weigh(bank: Bank, damping: Array) -> Float[Array, "hypotheses *batch"]:
     variance = BROADENING * (bank.met[None] + 1) / total
     plausible = plausibility(mean, variance, damping[None] * per_second)
     plausible = jnp.where(own > 0, jnp.where(plausible > LEAST_CARRIED, plausible, LEAST_CARRIED), 1)
-    weights = bank.likelihood * bank.carried * (plausible * bank.likely)
+    weights = _weighed(bank.carried, bank.likelihood * (plausible * bank.likely))
     return weights / jnp.sum(weights, axis=0, keepdims=True)
+
+
+def _weighed(carried: Array, evidence: Array) -> Float[Array, "hypotheses *batch"]:
+    """What is carried, by this contact's evidence. Whether it is a lag only maps whose slopes wander decide,
+    as those of lags do: the sum over delays is what it would be if all were such."""
+    weights = carried * evidence
+    wandering, steady = carried[:DELAYS], carried[DELAYS:FIRST_LAG]
+    delayed, as_lags = weights[:FIRST_LAG], (wandering + steady) * evidence[:DELAYS]
+    # Next to a lag all of them may be next to nothing, whose square is none.
+    most = lax.stop_gradient(jnp.max(delayed, axis=0, keepdims=True))
+    ratio = jnp.sum(as_lags / most, axis=0) / jnp.sum(delayed / most, axis=0)
+    return jnp.concatenate([delayed * ratio[None], weights[FIRST_LAG:]])
 
 
 def plausibility(mean: Array, variance: Array, prior: Array) -> Float[Array, "*batch"]:
@@ -310,7 +331,7 @@ def _place(
     or, where these disagree, where it was met; there the force at the entry is known to what the stiffness
     makes of the uncertain place. A second is `length` [m]."""
     known = (plane_spread**2)[None]
-    none = jnp.zeros_like(offsets[:DELAYS])
+    none = jnp.zeros_like(offsets[:FIRST_LAG])
     met = meeting.place[None] + jnp.concatenate([none, lagged[0] * length[None]])
     around = meeting.variance[None] + jnp.concatenate([none, lagged[1] * (length * length)[None]])
     away = met - offsets * speed[None]
@@ -336,10 +357,14 @@ def _shares(values: Array, least: float) -> Array:
     return jnp.where(shares > least, shares, least)
 
 
-def _repeated(prior: Map) -> Map:
-    return Map(
-        jnp.stack([prior.mean] * HYPOTHESES, axis=1), jnp.stack([prior.covariance] * HYPOTHESES, axis=2)
-    )
+def _priors(prior: Map) -> Map:
+    """Of each hypothesis, as its slopes wander or hardly do; at depth 0 they are as uncertain either way."""
+    slopes = np.arange(len(prior.mean)) < SEGMENTS
+    share = np.where(np.outer(slopes, slopes), STEADY**2, 1.0)
+    share = jnp.asarray(share.reshape(*share.shape, *[1] * (prior.mean.ndim - 1)), prior.mean.dtype)
+    steady = share * prior.covariance + (1 - share) * prior.covariance[:1, :1]
+    covariance = [prior.covariance] * DELAYS + [steady] * DELAYS + [prior.covariance] * LAGS
+    return Map(jnp.stack([prior.mean] * HYPOTHESES, axis=1), jnp.stack(covariance, axis=2))
 
 
 def _column(values: np.ndarray, like: Array) -> Array:

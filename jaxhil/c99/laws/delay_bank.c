@@ -4,7 +4,8 @@
  * g = spread^2/(spread^2 + s^2), or 1 where the two disagree. It expects to read f_h with a variance s_h (0 with the
  * noise's own variance r out of contact, and where what it expects while the contact opens is not positive). As many
  * others take the sensor to lag by l_h: what the force is linear in is smoothed alike, and the surface was met where
- * lagged_onset.c has it; to first order a lag is a delay, and these count as l_h older. A hypothesis' weight
+ * lagged_onset.c has it; to first order a lag is a delay, and these count as l_h older. Each delay is there twice, by
+ * slopes that wander and by slopes that hardly do. A hypothesis' weight
  * is the product of the likelihoods of all readings of this contact and of those before, (r/s_h)^(1/4)
  * exp(-(y - f_h)^2/(4 s_h)), of how well its damping, of mean B and variance s^2, goes with what is known of contacts:
  * p (s_0/s) exp(-t^2/2) + (1 - p) 2 Phi(t), t = B/s, p = 1/2, and of how likely
@@ -27,7 +28,13 @@
 
 /* == Declarations == */
 
-enum { JAXHIL_DELAYS = 17, JAXHIL_LAGS = 17, JAXHIL_HYPOTHESES = JAXHIL_DELAYS + JAXHIL_LAGS };
+/* Each delay by slopes that wander, then by steady ones; then the lags. */
+enum {
+    JAXHIL_DELAYS = 17,
+    JAXHIL_LAGS = 17,
+    JAXHIL_FIRST_LAG = 2 * JAXHIL_DELAYS,
+    JAXHIL_HYPOTHESES = JAXHIL_FIRST_LAG + JAXHIL_LAGS
+};
 
 /* Of each hypothesis its delay, by how much [s] it has the surface deeper than it was met and its knots farther in than
  * usual, how likely it is that the surface is there, map, deepest point, the likelihoods of this contact and of those
@@ -42,7 +49,7 @@ typedef struct {
     double held[JAXHIL_LAGS][JAXHIL_PARAMETERS], before[JAXHIL_LAGS][JAXHIL_PARAMETERS];
     bool pushed[JAXHIL_LAGS];
     double known[JAXHIL_HYPOTHESES];
-    jaxhil_force_depth_map prior;
+    jaxhil_force_depth_map prior, steady;
     double offsets[JAXHIL_HYPOTHESES], deeper[JAXHIL_HYPOTHESES], deepest[JAXHIL_HYPOTHESES];
     double farther[JAXHIL_HYPOTHESES], likely[JAXHIL_HYPOTHESES];
     double likelihood[JAXHIL_HYPOTHESES], carried[JAXHIL_HYPOTHESES];
@@ -64,6 +71,7 @@ static const double jaxhil_bank_least_shift = 1e-12; /* s: where nothing tells d
 static const double jaxhil_bank_elsewhere = 9.0; /* times the variance of where it is expected: it is not there */
 static const double jaxhil_bank_unlikely = 0.1;  /* that it is not, at least */
 static const double jaxhil_bank_lag_step = 0.00025; /* s from lag to lag */
+static const double jaxhil_bank_steady = 0.125; /* of the spread by which slopes wander, where they hardly do */
 static const double jaxhil_bank_lagging = 0.0001; /* of a delay's probability, that of each lag */
 static const double jaxhil_bank_edge = 0.6;      /* probability of a farthest delay or the longest lag: it may lie beyond */
 static const double jaxhil_bank_open = 0.0075;   /* of a restitution of 1, that what is open of the delay makes */
@@ -85,11 +93,13 @@ static void jaxhil_bank_shares(double *values, double least) {
 
 static void jaxhil_bank_restart(jaxhil_learnt *bank) {
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        const bool steady = h >= JAXHIL_DELAYS && h < JAXHIL_FIRST_LAG;
+        const jaxhil_force_depth_map *prior = steady ? &bank->steady : &bank->prior;
         for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
             for (int j = 0; j < JAXHIL_PARAMETERS; j++) {
-                bank->covariance[h][i][j] = bank->prior.covariance[i][j];
+                bank->covariance[h][i][j] = prior->covariance[i][j];
             }
-            bank->estimate[h][i] = bank->prior.estimate[i];
+            bank->estimate[h][i] = prior->estimate[i];
         }
         bank->deepest[h] = 0.0;
         bank->known[h] = 0.0;
@@ -112,7 +122,7 @@ static void jaxhil_learnt_reset(jaxhil_learnt *bank) {
         bank->deeper[h] = 0.0;
         bank->farther[h] = 0.0;
         bank->likely[h] = 1.0;
-        bank->carried[h] = h < JAXHIL_DELAYS ? 1.0 : jaxhil_bank_lagging;
+        bank->carried[h] = h < JAXHIL_DELAYS ? 1.0 : (h < JAXHIL_FIRST_LAG ? 0.0 : jaxhil_bank_lagging);
         bank->precision[h] = 0.0;
         bank->weighted[h] = 0.0;
     }
@@ -126,10 +136,14 @@ static void jaxhil_learnt_reset(jaxhil_learnt *bank) {
 }
 
 static void jaxhil_learnt_init(jaxhil_learnt *bank, const jaxhil_gains *gains) {
+    jaxhil_gains steady = *gains;
+    steady.prior_slope_spread = jaxhil_bank_steady * gains->prior_slope_spread;
     bank->given = gains->identification_delay;
     jaxhil_force_depth_map_init(&bank->prior, gains);
+    jaxhil_force_depth_map_init(&bank->steady, &steady);
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
-        bank->offsets[h] = h < JAXHIL_DELAYS ? (0.125 * (double)h - 1.0) * gains->delay_spread : 0.0;
+        const double step = (double)(h % JAXHIL_DELAYS);
+        bank->offsets[h] = h < JAXHIL_FIRST_LAG ? (0.125 * step - 1.0) * gains->delay_spread : 0.0;
     }
     bank->period = gains->control_period;
     for (int l = 0; l < JAXHIL_LAGS; l++) {
@@ -179,9 +193,30 @@ static void jaxhil_learnt_check(jaxhil_learnt *bank, const jaxhil_history *histo
     (void)readings;
 }
 
+/* Evidence of this contact, weighed by what is carried. Whether it is a lag only maps whose slopes wander decide, as
+ * those of lags do: the sum over delays is what it would be if all were such. */
+static void jaxhil_bank_weighed(const jaxhil_learnt *bank, const double *evidence, double *weights) {
+    double total = 0.0, as_lags = 0.0;
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        weights[h] = bank->carried[h] * evidence[h];
+    }
+    for (int h = 0; h < JAXHIL_DELAYS; h++) {
+        const double wandering = (bank->carried[h] + bank->carried[h + JAXHIL_DELAYS]) * evidence[h];
+        as_lags = h > 0 ? as_lags + wandering : wandering;
+    }
+    for (int h = 0; h < JAXHIL_FIRST_LAG; h++) {
+        total = h > 0 ? total + weights[h] : weights[h];
+    }
+    const double ratio = as_lags / total;
+    for (int h = 0; h < JAXHIL_FIRST_LAG; h++) {
+        weights[h] *= ratio;
+    }
+}
+
 /* Weights of the hypotheses; their sum is 1. */
 static void jaxhil_bank_weigh(const jaxhil_learnt *bank, double *weights) {
     const double pace = bank->pace;
+    double evidence[JAXHIL_HYPOTHESES];
     double total = 0.0;
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         const double own = bank->covariance[h][JAXHIL_DAMPING][JAXHIL_DAMPING] * (pace * pace);
@@ -194,7 +229,10 @@ static void jaxhil_bank_weigh(const jaxhil_learnt *bank, double *weights) {
             plausible = jaxhil_plausible_damping(mean, variance, bank->prior.damping * (pace * pace));
             plausible = plausible > jaxhil_bank_least_carried ? plausible : jaxhil_bank_least_carried;
         }
-        weights[h] = bank->likelihood[h] * bank->carried[h] * (plausible * bank->likely[h]);
+        evidence[h] = bank->likelihood[h] * (plausible * bank->likely[h]);
+    }
+    jaxhil_bank_weighed(bank, evidence, weights);
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         total = h > 0 ? total + weights[h] : weights[h];
     }
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
@@ -230,7 +268,7 @@ static void jaxhil_bank_average(jaxhil_learnt *bank, const double *weights) {
 
 /* By how much hypothesis h has the force older than by the given delay [s]. */
 static double jaxhil_bank_older(const jaxhil_learnt *bank, int h) {
-    return h < JAXHIL_DELAYS ? bank->offsets[h] : bank->lags[h - JAXHIL_DELAYS];
+    return h < JAXHIL_FIRST_LAG ? bank->offsets[h] : bank->lags[h - JAXHIL_FIRST_LAG];
 }
 
 /* The mean over the hypotheses, by their weights: the delay, and what counts of the maps. */
@@ -256,15 +294,15 @@ static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         const double off = jaxhil_bank_older(bank, h) - shift;
         square += weights[h] * (off * off);
-        lagging += h < JAXHIL_DELAYS ? 0.0 : weights[h];
+        lagging += h < JAXHIL_FIRST_LAG ? 0.0 : weights[h];
     }
     /* Between two lags neither is right. */
     bank->lagging = lagging;
     bank->open = sqrt(square + 0.5 * (jaxhil_bank_lag_step * jaxhil_bank_lag_step) * lagging);
-    const int edges[] = {0, JAXHIL_DELAYS - 1, JAXHIL_HYPOTHESES - 1};
-    bank->edge = weights[0];
-    for (int i = 1; i < 3; i++) {
-        bank->edge = weights[edges[i]] > bank->edge ? weights[edges[i]] : bank->edge;
+    bank->edge = weights[JAXHIL_HYPOTHESES - 1];
+    for (int h = 0; h < JAXHIL_DELAYS; h += JAXHIL_DELAYS - 1) {
+        const double farthest = weights[h] + weights[h + JAXHIL_DELAYS];
+        bank->edge = farthest > bank->edge ? farthest : bank->edge;
     }
     bank->shift = shift > jaxhil_bank_least_shift || shift < -jaxhil_bank_least_shift ? shift : 0.0;
     curve->damping = lost[0];
@@ -276,10 +314,16 @@ static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
 /* The contact that is over is added to what is carried. */
 static void jaxhil_bank_finish(jaxhil_learnt *bank) {
     const double pace = bank->pace;
+    double weights[JAXHIL_HYPOTHESES];
+    /* Only where the first contact is over its slopes tell how they are. */
+    for (int h = 0; h < JAXHIL_FIRST_LAG && !(bank->met > 0.0); h++) {
+        bank->carried[h] = 0.5;
+    }
+    jaxhil_bank_weighed(bank, bank->likelihood, weights);
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        bank->carried[h] = weights[h];
         const double variance = bank->covariance[h][JAXHIL_DAMPING][JAXHIL_DAMPING] * (pace * pace);
         const double precision = 1.0 / (variance > 0.0 ? variance : 1.0);
-        bank->carried[h] = bank->carried[h] * bank->likelihood[h];
         bank->precision[h] = bank->precision[h] + precision;
         bank->weighted[h] = bank->weighted[h] + precision * (bank->estimate[h][JAXHIL_DAMPING] * pace);
     }
@@ -296,9 +340,9 @@ static double jaxhil_bank_place(jaxhil_learnt *bank, const jaxhil_meeting *meeti
     double first = jaxhil_map_surface;
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         double met = meeting->place, around = meeting->variance;
-        if (h >= JAXHIL_DELAYS) {
+        if (h >= JAXHIL_FIRST_LAG) {
             double later, square;
-            jaxhil_lagged_onset(window, bank->lags[h - JAXHIL_DELAYS] * meeting->pace, meeting->tick, &later, &square);
+            jaxhil_lagged_onset(window, bank->lags[h - JAXHIL_FIRST_LAG] * meeting->pace, meeting->tick, &later, &square);
             met = meeting->place + later * length;
             around = square * (length * length) + meeting->variance;
         }
@@ -362,7 +406,7 @@ static void jaxhil_bank_features(const jaxhil_learnt *bank, int h, double x, dou
 /* As a sensor that lags shows it: of phi the mean over the tick, from the entry on where that is within it, as long as
  * the contact pushes. */
 static void jaxhil_bank_smooth(jaxhil_learnt *bank, int h, double depth, double rate, double *phi) {
-    const int l = h - JAXHIL_DELAYS;
+    const int l = h - JAXHIL_FIRST_LAG;
     double *held = bank->held[l], *before = bank->before[l];
     const double tick = bank->period * bank->pace, kept = bank->kept[l];
     double raw = 0.0;
@@ -400,7 +444,7 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
     double *estimate = bank->estimate[h];
     double phi[JAXHIL_PARAMETERS], g[JAXHIL_PARAMETERS];
     const double x = depth - bank->offsets[h] * bank->pace * rate - bank->deeper[h];
-    const bool lags = h >= JAXHIL_DELAYS;
+    const bool lags = h >= JAXHIL_FIRST_LAG;
     const double near = lags ? 0.0 : 0.5 * (bank->offsets[1] - bank->offsets[0]) * bank->pace;
     const bool beside = x < near && x > -near;
     const double read = hidden ? 0.0 : force;
@@ -425,7 +469,7 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
     }
     s = noise + s;
     const bool inside = (lags || x > jaxhil_map_surface) && (!hidden || expected > zone);
-    const bool pushed = !lags || bank->pushed[h - JAXHIL_DELAYS];
+    const bool pushed = !lags || bank->pushed[h - JAXHIL_FIRST_LAG];
     const bool closes = rate > 0.0;
     const bool nothing = !inside || (!closes && !(expected > 0.0));
     const double innovation = seen - expected;

@@ -2,16 +2,17 @@
 explain.
 
 Hypothesis h takes the force to be d_h [s] older than given: it belongs to the depth X - d_h V - p_h. The
-surface was met at X_0; by this hypothesis it lies at p_h = g (X_0 - d_h v_0) beyond where it was told,
-g = spread^2/(spread^2 + found^2) by how uncertain either is, or 1 where they disagree. As many others take
-the sensor to lag by l_h [s]: what the force is linear in is smoothed alike, and the surface was met where
-`lagged_onset` has it. To first order a lag is a delay: these count as l_h older. Each identifies a
-force-depth map (`force_depth_map`); its weight is the product of the likelihoods of all readings of this
-contact and of those before, of how well its damping goes with what is known of contacts, and of how likely
-its surface is there (notebooks/guide/retrospective_reference.md section 7). What counts is the mean over all
-hypotheses, of their maps, delays and surfaces. Their maps bend at the same places, wherever they have the
-surface: which fits best is not to be decided by what a contact that bends between two knots leaves. In NumPy,
-all hypotheses at a time; sums are taken one term after another.
+surface was met at X_0; by this hypothesis it lies at p_h = g (X_0 - d_h v_0) beyond where it was told, g =
+spread^2/(spread^2 + found^2) by how uncertain either is, or 1 where they disagree. As many others take the
+sensor to lag by l_h [s]: what the force is linear in is smoothed alike, and the surface was met where
+`lagged_onset` has it. To first order a lag is a delay: these count as l_h older. Each delay is there twice,
+by slopes that wander and by slopes that hardly do. Each hypothesis identifies a force-depth map
+(`force_depth_map`); its weight is the product of the likelihoods of all readings of this contact and of those
+before, of how well its damping goes with what is known of contacts, and of how likely its surface is there
+(notebooks/guide/retrospective_reference.md section 7). What counts is the mean over all hypotheses, of their
+maps, delays and surfaces. Their maps bend at the same places, wherever they have the surface: which fits best
+is not to be decided by what a contact that bends between two knots leaves. In NumPy, all hypotheses at a
+time; sums are taken one term after another.
 """
 
 from math import ceil, pi, sqrt
@@ -41,7 +42,9 @@ from .lagged_onsets import lagged_onsets
 from .onset import SQUARINGS, exponential
 
 DELAYS = LAGS = 17
-HYPOTHESES = DELAYS + LAGS
+FIRST_LAG = 2 * DELAYS  # each delay by slopes that wander, then by steady ones
+HYPOTHESES = FIRST_LAG + LAGS
+STEADY = 0.125  # of the spread by which slopes wander, where they hardly do
 LAG_STEP = 0.00025  # s from lag to lag
 LAGGING = 0.0001  # of a delay's probability, that of each lag
 ELASTIC = 0.5  # probability that a contact has no damping
@@ -64,7 +67,10 @@ _MOVED = np.minimum(np.array(KNOTS) / WHOLE, 1.0)[:, None]
 # Beside an array, a number takes longer than an array does.
 _0, _1 = np.zeros(HYPOTHESES), np.ones(HYPOTHESES)
 _LAGS = LAG_STEP * np.arange(1.0, LAGS + 1.0)
-_DELAYED = np.arange(HYPOTHESES) < DELAYS
+_DELAYED = np.arange(HYPOTHESES) < FIRST_LAG
+# What is carried before the first contact, and what where it is over: only then its slopes tell how they are.
+_FIRST = np.where(_DELAYED, np.arange(HYPOTHESES) < DELAYS, LAGGING)
+_EITHER = np.where(_DELAYED, 0.5, LAGGING)
 _JUMPS = np.isin(np.arange(PARAMETERS), JUMPS)[:, None]
 
 
@@ -82,8 +88,8 @@ class DelayBank:
 
     def __init__(self, spread: float, plane_spread: float, prior: Prior, period: float) -> None:
         delays = np.array([0.125 * step - 1.0 for step in range(DELAYS)]) * spread
-        self._offsets = np.append(delays, np.zeros(LAGS))
-        self._older = np.append(delays, _LAGS)
+        self._offsets = np.concatenate((delays, delays, np.zeros(LAGS)))
+        self._older = np.concatenate((delays, delays, _LAGS))
         # On which side of the surface it was, between two delays, is not known.
         self._near = np.where(_DELAYED, 0.5 * float(delays[1] - delays[0]), 0.0)
         self._period = period
@@ -92,14 +98,16 @@ class DelayBank:
         self._damping = prior.damping * prior.damping
         estimate, covariance = prior.moments()
         self._prior_estimate = np.repeat(np.array(estimate)[:, None], HYPOTHESES, axis=1)
+        steady = prior._replace(wandering=STEADY * prior.wandering).moments()[1]
         self._prior_covariance = np.repeat(np.array(covariance)[:, :, None], HYPOTHESES, axis=2)
+        self._prior_covariance[:, :, DELAYS:FIRST_LAG] = np.array(steady)[:, :, None]
         self.curve = Curve()  # the mean of the maps
         self.reset()
 
     def reset(self) -> None:
         """Forget all contacts."""
         self._restart()
-        self._carried = np.where(_DELAYED, 1.0, LAGGING)
+        self._carried = _FIRST
         self._precision = np.zeros(HYPOTHESES)
         self._weighted = np.zeros(HYPOTHESES)
         self._below = np.zeros(HYPOTHESES)  # by how much deeper each has the surface than it was met [s]
@@ -122,7 +130,8 @@ class DelayBank:
             pace = self._pace
             own = self._covariance[DAMPING, DAMPING] * (pace * pace)
             precision = 1.0 / np.where(own > 0.0, own, 1.0)
-            self._carried = _shares(self._carried * self._likelihood, LEAST_CARRIED)
+            carried = self._carried if self._met else _EITHER
+            self._carried = _shares(_weighed(carried, self._likelihood), LEAST_CARRIED)
             self._precision = self._precision + precision
             self._weighted = self._weighted + precision * (self._estimate[DAMPING] * pace)
             self._met += 1.0
@@ -157,8 +166,8 @@ class DelayBank:
         hardware was in, by the first to enter, as it was met."""
         length = meeting.speed / meeting.pace
         known = self._plane_spread * self._plane_spread
-        met = np.append(_1[:DELAYS] * meeting.place, meeting.place + later * length)
-        around = np.append(_1[:DELAYS] * meeting.variance, spreads * (length * length) + meeting.variance)
+        met = np.append(_1[:FIRST_LAG] * meeting.place, meeting.place + later * length)
+        around = np.append(_1[:FIRST_LAG] * meeting.variance, spreads * (length * length) + meeting.variance)
         away = met - self._offsets * meeting.speed
         both = known + around
         elsewhere = away * away > NOT_THERE * both
@@ -199,7 +208,7 @@ class DelayBank:
         depths = depth - self._offsets * self._pace * rate - self._below
         deepest = np.fmax(self._deepest, depths)
         phi = self._features(depths, rate, deepest)
-        self._smooth(depths[DELAYS:], rate, phi)
+        self._smooth(depths[FIRST_LAG:], rate, phi)
         read = force
         noise = variance
         if hidden:
@@ -211,7 +220,7 @@ class DelayBank:
         expected = np.add.reduce(phi * estimate, axis=0)
         s = noise + np.add.reduce(phi * g, axis=0)
         inside = depths > SURFACE
-        inside[DELAYS:] = True
+        inside[FIRST_LAG:] = True
         if hidden:
             inside &= expected > zone
         near = self._near * self._pace
@@ -219,7 +228,7 @@ class DelayBank:
         positive = expected > _0
         closes = rate > 0.0
         used = inside & (s > _0) & ~beside
-        used[DELAYS:] &= self._pushed
+        used[FIRST_LAG:] &= self._pushed
         if not closes and not force * force > OUTLYING * noise:
             used &= positive
         nothing = ~inside
@@ -261,21 +270,21 @@ class DelayBank:
     def _smooth(self, depths: np.ndarray, rate: float, phi: np.ndarray) -> None:
         """As a sensor that lags shows it: of phi the mean over the tick, from the entry on where that is
         within it, as long as the contact pushes."""
-        now = phi[:, DELAYS:].copy()
+        now = phi[:, FIRST_LAG:].copy()
         pushes = depths > SURFACE
         since = self._period * self._pace
         if rate > 0.0:
             since = np.fmin(depths / rate, since)
         else:
             since = _0[:LAGS]
-            pushes &= np.add.reduce(now * self._estimate[:, DELAYS:], axis=0) > 0.0
+            pushes &= np.add.reduce(now * self._estimate[:, FIRST_LAG:], axis=0) > 0.0
         enters = pushes & ~self._pushed
         kept = self._kept
         lost = np.where(enters, exponential(since / (_LAGS * self._pace), SQUARINGS), kept)
         before = np.where(enters, np.where(_JUMPS, now, 0.0), self._before)
         fresh = (1.0 - lost) * (0.5 * (before + now))
         self._held = kept * self._held + np.where(pushes | self._pushed, fresh, 0.0)
-        phi[:, DELAYS:] = self._held
+        phi[:, FIRST_LAG:] = self._held
         self._before = now
         self._pushed = pushes
 
@@ -289,18 +298,19 @@ class DelayBank:
         variance = BROADENING * (self._met + 1.0) / total
         plausible = _plausibility(mean, variance, self._damping * (pace * pace))
         plausible = np.where(own > _0, np.fmax(plausible, LEAST_CARRIED), _1)
-        weights = self._likelihood * self._carried * (plausible * self._likely)
+        weights = _weighed(self._carried, self._likelihood * (plausible * self._likely))
         return weights / _total(weights)
 
     def _conclude(self, weights: np.ndarray) -> None:
         """The mean over the hypotheses, by their weights."""
         shift = float(_total(weights * self._older))
         off = self._older - shift
-        self._lagging = float(_total(weights[DELAYS:]))
+        self._lagging = float(_total(weights[FIRST_LAG:]))
         # Between two lags neither is right.
         between = 0.5 * (LAG_STEP * LAG_STEP) * self._lagging
         self._off = sqrt(_total(weights * (off * off)) + between)
-        self._edge = max(float(weights[0]), float(weights[DELAYS - 1]), float(weights[-1]))
+        farthest = weights[:DELAYS] + weights[DELAYS:FIRST_LAG]
+        self._edge = max(float(weights[-1]), float(farthest[0]), float(farthest[-1]))
         self.shift = shift if shift > LEAST_SHIFT or shift < -LEAST_SHIFT else 0.0
         self.deeper = float(_total(weights * self._below))
         self.variance = float(_total(weights * self._known))
@@ -352,6 +362,15 @@ def _positive_mean(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
     density = tail / sqrt(2.0 * pi)
     above = positive + density / (1.0 - density * mills)
     return np.where(known, spread * np.where(above_0, above, below), np.fmax(mean, _0))
+
+
+def _weighed(carried: np.ndarray, evidence: np.ndarray) -> np.ndarray:
+    """What is carried, by this contact's evidence. Whether it is a lag only maps whose slopes wander decide,
+    as those of lags do: the sum over delays is what it would be if all were such."""
+    weights = carried * evidence
+    as_lags = (carried[:DELAYS] + carried[DELAYS:FIRST_LAG]) * evidence[:DELAYS]
+    weights[:FIRST_LAG] *= _total(as_lags) / _total(weights[:FIRST_LAG])
+    return weights
 
 
 def _shares(values: np.ndarray, least: float) -> np.ndarray:
