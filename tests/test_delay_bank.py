@@ -204,6 +204,22 @@ def test_contacts_decide_whether_slopes_wander_but_not_thereby_on_lags(bend, ste
     np.testing.assert_allclose(bank._carried[FIRST_LAG:], np.maximum(shares, 1e-12), rtol=1e-9)
 
 
+def test_derivatives_are_finite_where_delays_are_next_to_nothing_beside_a_lag():
+    prior = force_depth_map.prior(*(jnp.asarray(value) for value in PRIOR.values()))
+    small = jnp.where(jnp.arange(HYPOTHESES) < FIRST_LAG, 1e-200, 1.0)
+    bank = in_jax.no_bank(prior)._replace(carried=jnp.maximum(small, 1e-12), likelihood=small)
+
+    def weights(share):
+        return in_jax.weigh(bank._replace(likelihood=bank.likelihood * share), jnp.asarray(1.9**2))
+
+    share, rates = jnp.ones(HYPOTHESES), jnp.zeros(HYPOTHESES).at[-1].set(1.0)
+    value, rate = jax.jvp(weights, (share,), (rates,))
+    step = 1e-4
+    exact = (weights(share + step * rates) - weights(share - step * rates)) / (2 * step)
+    np.testing.assert_allclose(rate, exact, atol=1e-6)
+    assert np.sum(value[FIRST_LAG:]) == pytest.approx(1) and rate[-1] > 0.01
+
+
 def test_contacts_narrow_the_delay_and_a_reset_forgets_it():
     rng, bank, delay = np.random.default_rng(3), plain(), 0.0006
     spreads = []
