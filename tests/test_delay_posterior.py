@@ -115,7 +115,7 @@ def least(known, slope_spread, turns=8, period=1e-3, number=100):
 
 def test_what_eight_damped_contacts_tell_of_the_delay(capsys):
     """Of a surface told to 3 um the eighth contact cannot be met with 0.3 % by slopes that wander as the
-    bank's; it could, if they hardly did."""
+    bank's may; it could, if they hardly did, as the bank supposes as well."""
     eighth = {}
     for slopes, spread in (("the bank's", WIDE["prior_slope_spread"]), ("few", SHARP["prior_slope_spread"])):
         for name, known in (("told", LEAST_PLANE_SPREAD), ("unknown", 1e-3)):
