@@ -100,9 +100,10 @@ def begin_evaluation(
 ) -> Callable[[], Any]:
     """Like `evaluate`, without waiting: what is returned waits for what is `wanted` of the outcome."""
     dealt = _deal(scenarios, at_least)
-    running = wanted(run_tiles(loop, *_fold(dealt, scenarios, gains)))
-    place = np.empty_like(dealt.lane, shape=lanes_of(scenarios))
-    place[dealt.lane[~dealt.idle]] = np.flatnonzero(~dealt.idle)
+    # All of it is placed: where a leaf comes from makes no other program.
+    running = wanted(run_tiles(loop, *place(*_fold(dealt, scenarios, gains))))
+    places = np.empty_like(dealt.lane, shape=lanes_of(scenarios))
+    places[dealt.lane[~dealt.idle]] = np.flatnonzero(~dealt.idle)
 
     def unfold(leaf):
         # (devices, tiles, ..., tile) -> (..., lanes), each device's part read where it is.
@@ -110,7 +111,7 @@ def begin_evaluation(
         rows = np.empty((*slots, devices, tiles, tile), leaf.dtype)
         for part in leaf.addressable_shards:
             rows[..., part.index[0], :, :] = np.moveaxis(np.asarray(part.data), (0, 1), (-3, -2))
-        return np.take(rows.reshape(*slots, -1), place, axis=-1)
+        return np.take(rows.reshape(*slots, -1), places, axis=-1)
 
     return lambda: jax.tree.map(unfold, running)
 
