@@ -17,7 +17,7 @@ from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.contact_plot import STYLES, contact_plot, save
 from jaxhil.simulation.evaluation import Outcome, parameters_by_slot
 from jaxhil.simulation.metrics import Metrics
-from jaxhil.simulation.motion import Curve, Piece, _space
+from jaxhil.simulation.motion import Curve, Piece, _in_space
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gains.pareto import Front, Point
 from tuning.gains.rounds import Start
@@ -197,7 +197,8 @@ def test_motion_in_space_is_the_reference(name):
     mechanism = load(name).mechanism
     scenarios = build_scenarios(mechanism, {"approach.phase": np.full(1, 0.5)})
     velocity = 0.007
-    curve = _space(mechanism, scenarios, 0, velocity, 0.4)
+    until = Curve(velocity, np.array([0.4]), np.zeros(1), np.zeros(1), None, None)
+    (curve,) = _in_space(mechanism, scenarios, [until])
     contact = parameters_by_slot(jax.tree.map(jax.numpy.asarray, scenarios.contact))
     like = jax.numpy.full(scenarios.phase.shape, velocity)
     of_law = jax.jit(LAWS[mechanism.contact.law].reference, compiler_options=QUICK)

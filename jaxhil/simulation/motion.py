@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxhil.contact.laws import LAWS, ContactLaw, ContactParameters, two_sided
 from jaxhil.mechanism.structs import Mechanism
@@ -86,9 +86,8 @@ def _pieces(mechanism: Mechanism, scenarios: Scenario, runs: dict[str, list[Curv
     two = bool(np.isfinite(clearance))
     surfaces = (0.0, -clearance) if two else (0.0,)
     pieces = []
-    for number, curve in enumerate(leading):
+    for number, space in enumerate(_in_space(mechanism, scenarios, leading)):
         others = {name: run[number] for name, run in runs.items() if number < len(run)}
-        space = _space(mechanism, scenarios, number, curve.velocity, float(curve.time[-1]))
         name = f"{mechanism.approach.contacts} contacts" if two else f"contact {number + 1}"
         pieces.append(Piece(name, surfaces, {"in space": space, **others}))
     return pieces
@@ -116,43 +115,55 @@ def _split(lane: Lane, scenarios: Scenario) -> list[Curve]:
     return pieces
 
 
-def _space(mechanism: Mechanism, scenarios: Scenario, first: int, velocity: float, end: float) -> Curve:
-    """The reference's motion from contact `first` on, from 0.02 s before the touch to `end` [s]."""
-    lane = jax.tree.map(lambda leaf: jnp.asarray(leaf[..., 0]), scenarios)
-    step = (end + APPROACH) / STEPS
-    force, position = _integrate(
+def _in_space(mechanism: Mechanism, scenarios: Scenario, entered: list[Curve]) -> list[Curve]:
+    """The reference's motion from each contact on, from 0.02 s before the touch to the end of that curve."""
+    velocity = np.array([curve.velocity for curve in entered])
+    step = (np.array([curve.time[-1] for curve in entered]) + APPROACH) / STEPS
+    forces, positions = _integrate(
         LAWS[mechanism.contact.law],
-        lane.contact,
-        jnp.asarray(first),
-        lane.clearance,
-        lane.equivalent_mass,
-        jnp.asarray(velocity),
-        jnp.asarray(step),
+        jax.tree.map(lambda leaf: leaf[..., 0], scenarios.contact),
+        scenarios.clearance[0],
+        scenarios.equivalent_mass[0],
+        np.arange(len(entered)),
+        velocity,
+        step,
     )
     keep = slice(None, None, STEPS // POINTS)
-    time = -APPROACH + step * np.arange(STEPS)
-    return Curve(velocity, time[keep], np.asarray(force)[keep], np.asarray(position)[keep], None, None)
+    times = -APPROACH + step[:, None] * np.arange(STEPS)[None]
+    motions = zip(times, np.asarray(forces), np.asarray(positions), strict=True)
+    return [
+        Curve(curve.velocity, time[keep], force[keep], position[keep], None, None)
+        for curve, (time, force, position) in zip(entered, motions, strict=True)
+    ]
 
 
 @partial(jax.jit, static_argnums=0)
 def _integrate(
-    law: ContactLaw, contacts: ContactParameters, first: Array, clearance: Array, mass: Array, velocity, step
-) -> tuple[Float[Array, "steps"], Float[Array, "steps"]]:
+    law: ContactLaw,
+    contacts: ContactParameters,
+    clearance: Array,
+    mass: Array,
+    firsts: Int[Array, "runs"],
+    velocities: Float[Array, "runs"],
+    steps: Float[Array, "runs"],
+) -> tuple[Float[Array, "runs steps"], Float[Array, "runs steps"]]:
     """Force [N] and position [m] of M x'' = -F by semi-implicit Euler, in steps too small to see.
 
-    The next contact's parameters hold once a contact is left.
+    Runs begin with the contacts `firsts`. The next contact's parameters hold once a contact is left.
     """
     last = contacts.damping.shape[0] - 1
 
-    def advance(carry, _):
-        position, speed, index, touched, state = carry
-        parameters = jax.tree.map(lambda leaf: leaf[jnp.minimum(index, last)], contacts)
-        force, state = two_sided(law, parameters, state, position, speed, clearance)
-        touching = (position > 0) | (position < -clearance)
-        index = jnp.where(touched & ~touching, index + 1, index)
-        speed = speed - step * force / mass
-        return (position + step * speed, speed, index, touching, state), (force, position)
+    def one(first, velocity, step):
+        def advance(carry, _):
+            position, speed, index, touched, state = carry
+            parameters = jax.tree.map(lambda leaf: leaf[jnp.minimum(index, last)], contacts)
+            force, state = two_sided(law, parameters, state, position, speed, clearance)
+            touching = (position > 0) | (position < -clearance)
+            index = jnp.where(touched & ~touching, index + 1, index)
+            speed = speed - step * force / mass
+            return (position + step * speed, speed, index, touching, state), (force, position)
 
-    start = (-velocity * APPROACH, velocity, first, jnp.array(False), law.init(velocity))
-    _, (force, position) = lax.scan(advance, start, None, length=STEPS)
-    return force, position
+        start = (-velocity * APPROACH, velocity, first, jnp.array(False), law.init(velocity))
+        return lax.scan(advance, start, None, length=STEPS)[1]
+
+    return jax.vmap(one)(firsts, velocities, steps)
