@@ -58,9 +58,9 @@ def prepare() -> None:
     """
     if "jax" not in sys.modules:
         os.environ.update(settings(os.environ))
+    gc.set_threshold(*RARELY)
     import jax
 
-    gc.set_threshold(*RARELY)
     jax.config.update("jax_enable_x64", True)
     named = program_folder()
     folder = named or cache_folder()

@@ -17,6 +17,8 @@ from jaxhil.compensators import COMPENSATORS
 
 pytestmark = pytest.mark.benchmark
 REPEATS = 4
+# Of a session's environment: flags of tests, and that modules are to be compiled anew by every process.
+NOT_A_USERS = "XLA_FLAGS", "NPROC", "PYTHONDONTWRITEBYTECODE"
 COMMANDS = {"tune": (("tune", "varying"), 5.0), "simulate": (("simulate", "varying"), 1.2)}
 COMPILING = 15.0  # s, of all programs of a law's tuning, derivatives among them, on two cores
 # Of laws of thousands of equations, which miss that: no more than was reached.
@@ -26,7 +28,7 @@ SLOW = "one step of its solver, in 34 hypotheses a lane, runs for longer than a 
 
 def run(arguments, folder, programs):
     """Seconds of a command, and what it says of them."""
-    ours = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "NPROC")}
+    ours = {name: value for name, value in os.environ.items() if name not in NOT_A_USERS}
     begin = time.perf_counter()
     done = subprocess.run(
         [sys.executable, "-m", "tuning", *arguments, "--timings"],
