@@ -7,7 +7,8 @@ import pytest
 from lanes import QUICK
 from scipy.optimize import lsq_linear
 
-from tuning.optimisation.levenberg_marquardt import STATUSES, _with_jacobian, solve
+from tuning.optimisation.levenberg_marquardt import _with_jacobian, solve
+from tuning.optimisation.solution import STATUSES
 from tuning.optimisation.unit_box import Bounds, to_coordinates, to_gains
 
 BOUNDS = Bounds(np.array([0.0, 1e-3]), np.array([2.0, 10.0]), np.array([0.0, 1.0]))

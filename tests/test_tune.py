@@ -25,7 +25,7 @@ from tuning.gains.tasks import (
 from tuning.gains.tune import figures, uncompensated
 from tuning.gains.tune_all import tune
 from tuning.gains.validation import build_validation
-from tuning.optimisation.levenberg_marquardt import STATUSES
+from tuning.optimisation.solution import STATUSES
 from tuning.optimisation.unit_box import to_coordinates, to_gains
 
 SMALL = TuneSettings(scenarios=16, starts=2, steps=12, validation=63, scanned=64)

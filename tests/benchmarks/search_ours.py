@@ -18,7 +18,8 @@ from tuning.gains.objective import RMS, SCALE, common_terms, residuals
 from tuning.gains.rounds import FIRST_ROUND, inverse_hessian
 from tuning.gains.tasks import spread_points
 from tuning.optimisation.derivative_free import apart, polish
-from tuning.optimisation.levenberg_marquardt import Solution, solve
+from tuning.optimisation.levenberg_marquardt import solve
+from tuning.optimisation.solution import Solution
 
 SCANNED, DESCENTS, GO_ON = 64, 6, 3  # points looked at, those descended from, those that go on; of a batch
 STEPS = 25  # of Levenberg-Marquardt

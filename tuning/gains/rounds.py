@@ -22,7 +22,7 @@ from tuning.gains import simulated
 from tuning.gains.objective import RMS, SCALE, Objective, Problem, common_terms, one_each, residuals
 from tuning.gains.tasks import TuneTask, common_loop, gain_bounds, gains_at, tuned_names
 from tuning.gains.work import Work
-from tuning.optimisation.levenberg_marquardt import STATUSES, Solution, solve
+from tuning.optimisation.solution import STATUSES, Solution
 from tuning.optimisation.unit_box import Bounds
 from tuning.transparency.probes import LANES_PER_SCENARIO
 
@@ -269,6 +269,9 @@ def _take(problem: _Problem, one: _Advanced) -> None:
 
 
 def _advance(static: tuple[Any, int, int], arguments: Any) -> Solution:
+    # Takes long to import, and a kept program needs none of it.
+    from tuning.optimisation.levenberg_marquardt import solve
+
     what, longest, tile = static
     loop = what[0]
     scenarios, fixed, weights, bounds, starts, limit = arguments

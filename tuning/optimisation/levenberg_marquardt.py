@@ -19,24 +19,12 @@ from jax.scipy.linalg import cho_solve
 from jax.sharding import AxisType, PartitionSpec
 from jaxtyping import Array, Float, Int
 
+from tuning.optimisation.solution import Solution
 from tuning.optimisation.unit_box import Bounds, to_gains
-
-
-class Solution(NamedTuple):
-    """Where the starts ended."""
-
-    coordinates: Float[Array, "starts gains"]  # unit coordinates of the gains
-    curvature: Float[Array, "starts gains gains"]  # J^T J there, J the residuals' Jacobian by the coordinates
-    loss: Float[Array, "starts"]  # half the sum of squared residuals
-    history: Float[Array, "starts steps"]  # loss after every step, the last repeated
-    steps: Int[Array, "starts"]  # steps taken
-    status: Int[Array, "starts"]  # an index into `STATUSES`
-
 
 DAMPING = 0.1  # of the first step, relative to the mean diagonal of J^T J
 STANDSTILL = 1e-6  # of the box: a step no longer than that is the end
 PATIENCE, PROGRESS = 5, 1e-3  # steps in which the loss must fall by that share of itself
-STATUSES = ("converged", "step limit", "not finite", "failed")
 
 
 @partial(jax.jit, static_argnames=("residuals", "static", "longest", "tile"))
