@@ -125,6 +125,16 @@ def test_a_start_alone_is_the_literature_s_and_polished(tasks, validation):
         assert one.best.rms == pytest.approx(value(validation, index, one.best), rel=1e-9)
 
 
+def test_other_work_is_done_while_the_solver_compiles(validation, monkeypatch):
+    """Once, before the first round."""
+    done = []
+    monkeypatch.setattr(multistart, "solve_tasks", lambda *_: done.append("round") or [[], [], []])
+    monkeypatch.setattr(multistart, "prepare_solver", lambda *_: None)
+    monkeypatch.setattr(multistart, "program_folder", lambda: "somewhere")
+    find_gains(validation, searched(1, 2, 0), meanwhile=lambda: done.append("other"))
+    assert done == ["other", "round"]
+
+
 @pytest.mark.slow
 def test_the_best_is_the_best_by_the_objective_itself(tasks, validation):
     """The solver lowers a norm in place of the mean of the worst contacts; what counts is that mean."""

@@ -97,6 +97,8 @@ class Compensator(eqx.Module):
     waits_for_contact: ClassVar[bool] = False
     # Whether it works out a motion of its own that it could follow whatever the hardware does.
     anticipates: ClassVar[bool] = False
+    # Whether its step is so large that a solver is compiled apart from its runs.
+    is_large: ClassVar[bool] = False
 
     def prepare(self, gains: Gains, constants: Constants) -> Any:
         """What `step` needs of the gains, worked out once per run; the gains themselves by default."""

@@ -107,6 +107,7 @@ class RetrospectiveReference(Compensator):
     knows: ClassVar[tuple[str, ...]] = (EQUIVALENT_MASS, FORCE_DELAY, FORCE_NOISE, DEAD_ZONE)
     settings: ClassVar[Mapping[str, Mapping[str, float]]] = {"sharp": SHARP, "gentle": GENTLE}
     anticipates: ClassVar[bool] = True
+    is_large: ClassVar[bool] = True
     finds_plane: ClassVar[bool] = True
     misfit: ClassVar[float] = 0.003  # of a force, by which a map may be wrong
     gains: ClassVar[tuple[Gain, ...]] = GAINS

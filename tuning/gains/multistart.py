@@ -63,18 +63,20 @@ def find_gains(
     validation: Validation,
     settings: TuneSettings,
     first: Sequence[Sequence[Mapping[str, float]]] | None = None,
+    meanwhile: Callable[[], object] = lambda: None,
 ) -> list[MultistartResult]:
     """The best gains of every task of `validation`.
 
     `first` has, of each task, gains to start at, in the places of the last starts of its first batch, never
-    of the literature's. One start alone is the literature's, and the only batch.
+    of the literature's. One start alone is the literature's, and the only batch. `meanwhile` is done while
+    the solver's program compiles.
     """
     tasks, objective = validation.tasks, settings.objective
     probed = tasks[0].probed
     agreed = PROBED_AGREED if probed else AGREED
     searches = [_Search() for _ in tasks]
     _check_function(validation, objective)
-    going = _solve_batches(validation, settings, first, agreed, searches)
+    going = _solve_batches(validation, settings, first, agreed, searches, meanwhile)
     if probed or objective.function is not None:
         for i, own in enumerate(searches):
             own.starts, more = _freed(validation, i, own.starts, agreed, settings.seed, objective)
@@ -102,7 +104,9 @@ def expected_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
     return len(tasks) * (scan + solve + settings.polish * len(names) * lanes)
 
 
-def _solve_batches(validation, settings, first, agreed, searches: list[_Search]) -> list[int]:
+def _solve_batches(
+    validation, settings, first, agreed, searches: list[_Search], meanwhile: Callable[[], object]
+) -> list[int]:
     """Solve batch after batch of starts; the tasks whose starts do not agree even so."""
     tasks, objective, work = validation.tasks, settings.objective, validation.work
     given = [len(own) for own in first] if first else [0 for _ in tasks]
@@ -112,6 +116,7 @@ def _solve_batches(validation, settings, first, agreed, searches: list[_Search])
         number,
         objective,
         lambda: choose_starts(validation, number, settings.seed, objective, first, settings.scanned),
+        meanwhile,
     )
     going = list(range(len(tasks)))
     for batch in range(BATCHES if number > 1 else 1):
@@ -231,14 +236,17 @@ def _exactly(validation: Validation, task: int, starts: list[Start], objective: 
     return [start._replace(rms=float(value)) for start, value in zip(starts, values, strict=True)]
 
 
-def _while_compiling(validation: Validation, number: int, objective: Objective, work: Callable):
-    """Do some work while the solver's program compiles: each takes one core. Only one program runs: programs
-    on several devices could wait for one another for ever."""
+def _while_compiling(
+    validation: Validation, number: int, objective: Objective, work: Callable, more: Callable[[], object]
+):
+    """Do some work, and then more, while the solver's program compiles: each takes one core. Only one program
+    runs: programs on several devices could wait for one another for ever."""
     if program_folder() is None:
         return work()
-    with ThreadPoolExecutor(1) as meanwhile:
-        ready = meanwhile.submit(_prepare, validation, number, objective)
+    with ThreadPoolExecutor(1) as beside:
+        ready = beside.submit(_prepare, validation, number, objective)
         done = work()
+        more()
         ready.result()
         return done
 

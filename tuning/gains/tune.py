@@ -1,7 +1,7 @@
 """Tuning of mechanisms: scenarios, starts, solve, and judgement on scenarios that tuning never saw."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -85,14 +85,19 @@ def tune_block(
 ) -> list[TuneResult]:
     """What is found for mechanisms of one program, each of which starts from gains `near` it as well."""
     clock, validation = _Clock(), build_validation(tasks, settings.validation, settings.seed, work)
-    judging = _judging_runs(tasks, settings)
-    work.later += judging
-    found = work.step("search", list[MultistartResult], lambda: _search(validation, settings, near))
-    work.later -= judging
+    judging, beforehand = _judging_runs(tasks, settings), _known_runs(tasks, settings)
+    work.later += judging - beforehand
+    known: dict[str, list] = {}
+    found = work.step(
+        "search",
+        list[MultistartResult],
+        lambda: _search(validation, settings, near, lambda: known.update(_judge_known(validation))),
+    )
+    work.later -= judging - beforehand
     clock.lap("tune")
-    work.begin(f"judging on {settings.validation} fresh scenarios", judging)
+    work.begin(f"judging on {settings.validation} fresh scenarios", judging - (beforehand if known else 0))
     best = [one.best.gains if one.best else task.literature for one, task in zip(found, tasks, strict=True)]
-    judged = _judge(validation, best)
+    judged = {**(known or _judge_known(validation)), "tuned": validation.judge(best)}
     clock.lap("judge")
     comparisons: list[GlobalComparison | None] = [None for _ in tasks]
     if settings.global_search and settings.setting is None:
@@ -148,36 +153,44 @@ def _search_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
 
 def _judging_runs(tasks: list[TuneTask], settings: TuneSettings) -> float:
     """Those of the judgement and, if one is asked for, of the search everywhere."""
-    judged = 3 * len(tasks) * judged_runs(settings.validation, tasks[0].probed)
+    judged = 1.5 * _known_runs(tasks, settings)
     everywhere = FACTOR * _search_runs(tasks, settings) if settings.global_search else 0
     return judged + everywhere
 
 
+def _known_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
+    """Those of the judgement that do not wait for what is found."""
+    return 2 * len(tasks) * judged_runs(settings.validation, tasks[0].probed)
+
+
 def _search(
-    validation: Validation, settings: TuneSettings, near: list[list[Tuned]]
+    validation: Validation,
+    settings: TuneSettings,
+    near: list[list[Tuned]],
+    meanwhile: Callable[[], object],
 ) -> list[MultistartResult]:
-    """The best gains of every task; none where there are none to tune, or a setting is judged as it is."""
+    """The best gains of every task; none where there are none to tune, or a setting is judged as it is. What
+    is done `meanwhile`, as the solver compiles, is the judgement of what is known beforehand."""
     tasks = validation.tasks
     if settings.setting is not None or not any(task.tuned for task in tasks):
         return [MultistartResult(None, [], 0) for _ in tasks]
     compensator = tasks[0].compensator
     text = f"tuning {compensator} on {tasks[0].number} scenarios each"
-    validation.work.begin(text, expected_runs(tasks, settings))
+    validation.work.begin(text, expected_runs(tasks, settings) + _known_runs(tasks, settings))
     first = [
         [carry_over(compensator, one.gains, one.mechanism, task.mechanism) for one in own]
         for task, own in zip(tasks, near, strict=True)
     ]
-    return find_gains(validation, settings, first)
+    return find_gains(validation, settings, first, meanwhile)
 
 
-def _judge(validation: Validation, best: list[dict[str, float]]) -> dict[str, list]:
-    """What `Validation.judge` says of no compensation, of the literature's gains and of the `best`."""
+def _judge_known(validation: Validation) -> dict[str, list]:
+    """What `Validation.judge` says of no compensation and of the literature's gains, known beforehand."""
     literature = [task.literature for task in validation.tasks]
     plain = [uncompensated(validation.tasks[0].compensator, gains) for gains in literature]
     return {
         "before": validation.judge([gains for _, gains in plain], plain[0][0]),
         "literature": validation.judge(literature),
-        "tuned": validation.judge(best),
     }
 
 

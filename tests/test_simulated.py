@@ -1,0 +1,44 @@
+"""What tuning runs: one of a large law is compiled apart from the loops around it, and computes the same."""
+
+import re
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from cases import CASES
+from lanes import spread, validated
+
+from jaxhil.compensators.none import NoCompensator
+from jaxhil.simulation.building import build_loop
+from tuning.gains.simulated import outcome, prepared, with_compensator
+
+
+class LargeLaw(NoCompensator):
+    """No compensation, said to take a large step."""
+
+    waits_for_contact: ClassVar[bool] = True
+    is_large: ClassVar[bool] = True
+
+
+def test_runs_of_a_large_law_are_compiled_apart(monkeypatch):
+    monkeypatch.setattr("tuning.gains.simulated.COMPENSATORS", {"none": NoCompensator(), "large": LargeLaw()})
+    parsed = validated(next(iter(CASES.values())).mechanism)
+    scenarios = jax.tree.map(jnp.asarray, spread(parsed, 4))
+    plain = build_loop(parsed, "none", scenarios)
+    found, loops_left = [], []
+    for name in ("none", "large"):
+        loop = with_compensator(plain, name)
+
+        def tiles(scenarios, loop=loop):
+            tiled = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), scenarios)
+            return jax.lax.map(lambda one: outcome(loop, {}, prepared(loop, one)), tiled)
+
+        program = jax.jit(tiles).lower(scenarios).compile()
+        found.append(program(scenarios))
+        text = program.as_text() or ""
+        loops_left.append(len(re.findall(r" while\(", text[text.index("\nENTRY") :])))
+    # The compiler makes a loop of small laws a function, with all that is in it.
+    assert loops_left == [0, 1]
+    for a, b in zip(*map(jax.tree.leaves, found), strict=True):
+        np.testing.assert_array_equal(a, b)
