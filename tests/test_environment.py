@@ -26,7 +26,10 @@ def test_an_option_of_llvm_is_given_to_versions_that_know_it_alone(monkeypatch):
         assert (environment.WHOLE in environment.flags("")) == given
 
 
-@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system cannot be told")
+AFFINITY = pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system cannot be told")
+
+
+@AFFINITY
 def test_halves_of_the_cores_are_left_again():
     usable = os.sched_getaffinity(0)
     halves = []
@@ -37,3 +40,13 @@ def test_halves_of_the_cores_are_left_again():
         assert os.sched_getaffinity(0) == usable
     assert halves[0] | halves[1] == usable
     assert len(usable) == 1 or not halves[0] & halves[1]
+
+
+@AFFINITY
+def test_where_the_system_forbids_halves_all_cores_are_used(monkeypatch):
+    def forbidden(*_):
+        raise PermissionError
+
+    monkeypatch.setattr(os, "sched_setaffinity", forbidden)
+    with on_half_the_cores(0):
+        pass

@@ -8,8 +8,8 @@ the environment are the caller's again.
 import gc
 import os
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -228,12 +228,17 @@ def on_half_the_cores(half: int) -> Iterator[None]:
     usable = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
     own = sorted(usable)[half::2]
     try:
-        if own:
-            os.sched_setaffinity(0, own)
+        _run_on(own)
         yield
     finally:
-        if own:
-            os.sched_setaffinity(0, usable)
+        _run_on(usable if own else ())
+
+
+def _run_on(cores: Collection[int]) -> None:
+    """This thread runs on these cores, if there are any and the system allows it."""
+    with suppress(OSError):
+        if cores:
+            os.sched_setaffinity(0, cores)
 
 
 def cache_folder() -> Path | None:
