@@ -29,11 +29,14 @@ def forces(time: np.ndarray, damping: float, lag: float) -> np.ndarray:
     return np.where(time > 0.0, started * np.exp(-np.maximum(time - end, 0.0) / lag), 0.0)
 
 
-def favours_lag(damping: float, lag: float, seed: int, phase: float = 0.5) -> float:
-    """By how much less the lag is charged, met the share `phase` of a tick before a reading."""
+def charges(
+    damping: float, lag: float, phase: float = 0.5, seed: int = 0, noise: float = NOISE
+) -> tuple[float, float]:
+    """What the map and what the lag is charged, met the share `phase` of a tick before a reading; readings
+    have this noise [1/s], and are taken to have that of `NOISE`."""
     time = PERIOD * (np.arange(-BEFORE, math.ceil(math.pi / RATE / PERIOD) + 6) + phase)
     depth, rate = np.sin(RATE * time) / RATE, np.cos(RATE * time)
-    force = forces(time, damping, lag) + NOISE * np.random.default_rng(seed).standard_normal(len(time))
+    force = forces(time, damping, lag) + noise * np.random.default_rng(seed).standard_normal(len(time))
     # Found after 6 ticks, the surface in the middle of the stretch in which it was met.
     plane = depth[BEFORE] - 0.5 * (depth[BEFORE] - depth[BEFORE - 1])
     meeting = Meeting(plane, plane, PERIOD**2 / 12, 1.0, 1.0, PERIOD, 400.0)
@@ -49,7 +52,13 @@ def favours_lag(damping: float, lag: float, seed: int, phase: float = 0.5) -> fl
             charged += one.update(x, v, deepest, y, variance)
         elif x <= -PERIOD:
             charged += y * y / variance
-    return charged - check.surprise
+    return charged, check.surprise
+
+
+def favours_lag(damping: float, lag: float, seed: int, phase: float = 0.5) -> float:
+    """By how much less the lag is charged."""
+    without, with_lag = charges(damping, lag, phase, seed)
+    return without - with_lag
 
 
 @pytest.mark.parametrize("lag", [1e-4, 1e-3, 3e-3])
@@ -80,6 +89,15 @@ def test_a_damper_behind_a_lag_is_not(lag, phase):
     damping = RATE**2 * lag + 1.5
     found = [favours_lag(damping, lag, seed, phase) for seed in range(20)]
     assert np.mean(np.array(found) > LIKELIER) >= 0.95, found
+
+
+@pytest.mark.parametrize("phase", [0.1, 0.5, 0.9])
+@pytest.mark.parametrize("damping", [0.5, 2.0, 4.0])
+def test_a_lag_of_its_own_is_charged_little_but_for_what_the_prior_did_not_expect(damping, phase):
+    """Of readings without noise; where the onset is and what is smoothed is known to a fraction of a tick."""
+    without, with_lag = charges(damping, LAG, phase, noise=0.0)
+    unexpected = ((RATE**2 - PRIOR.stiffness) / PRIOR.common) ** 2 + (damping / PRIOR.damping) ** 2
+    assert with_lag - unexpected < 50.0, (without, with_lag)
 
 
 def test_a_lag_that_takes_all_of_the_damping_looks_like_a_spring():
