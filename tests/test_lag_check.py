@@ -7,7 +7,7 @@ import pytest
 
 from jaxhil.runtime.laws.contact_plane import Meeting
 from jaxhil.runtime.laws.force_depth_map import ForceDepthMap, Prior
-from jaxhil.runtime.laws.lag_check import LAG, LIKELIER, LagCheck
+from jaxhil.runtime.laws.lag_check import LAG, LIKELIER, MATTERS, LagCheck
 
 PERIOD = 1e-3
 RATE = 15.0  # of the spring's motion [1/s]: its peak force, and the root of its stiffness
@@ -104,6 +104,14 @@ def test_a_lag_that_takes_all_of_the_damping_looks_like_a_spring():
     """To first order; what is left is less than the noise."""
     found = [favours_lag(RATE**2 * 1e-3, 1e-3, seed) for seed in range(20)]
     assert np.mean(np.array(found) > LIKELIER) <= 0.25, found
+
+
+@pytest.mark.parametrize(("peak", "pace"), [(MATTERS / (math.pi / 2 * LAG), 1.0), (15.0, 0.53)])
+def test_a_lag_matters_by_what_the_restitution_errs(peak, pace):
+    """A force older by l takes pi/2 p l; on a contact's slower time l is less."""
+    check = LagCheck(PRIOR, PERIOD)
+    check.begin(Meeting(0.0, 0.0, 1e-7, 1.0, pace, pace * PERIOD, 400.0), [1e-3], [0.5], NOISE**2)
+    assert check.matters(1.01 * peak) and not check.matters(0.99 * peak)
 
 
 def test_readings_that_the_sensor_does_not_show_count_for_neither():

@@ -417,3 +417,15 @@ def test_of_damped_contacts_behind_a_lag_few_are_called_identified(lag, most):
     print(f"  {contacts} identified, of these {wrong} wrong by more than 1.5 %")
     assert wrong <= most * contacts
     assert lag or np.mean(identified) >= 0.9
+
+
+@pytest.mark.slow
+def test_slow_contacts_are_identified():
+    """Of 0.4 to 1.4 Hz: where the surface was met is known to many ticks, and what a lag would explain of
+    that matters little."""
+    changes = ("contact.stiffness=[8000.0]",)
+    told = load("suite-noisy", list(changes)).mechanism
+    for place, mechanism in enumerate(contacts_of("noisy", 9, 25, changes)):
+        law = controller(mechanism, LAW, literature_gains(told, LAW))
+        run(mechanism, law, place)
+        assert law.last_contact.status == "identified", place

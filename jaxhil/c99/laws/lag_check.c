@@ -5,7 +5,8 @@
  * sensor with a time constant of 2 ms would show it: what the force is linear in is smoothed alike, and the surface was
  * met where lagged_onset.c has it. Either is charged for every reading since before the surface was met with
  * (y - f)^2/s, f what it expects and s the variance of that and of the noise. Where the lag is charged less by more than
- * `likelier`, twice the logarithm of odds, the map is not believed.
+ * `likelier`, twice the logarithm of odds, the map is not believed, if such a lag makes the restitution err: in slow
+ * contact, whose onset is hardly known, it does not.
  */
 #include <math.h>
 #include <stdbool.h>
@@ -36,12 +37,18 @@ typedef struct {
 
 static const double jaxhil_check_lag = 0.002; /* s */
 static const double jaxhil_likelier = 6.0;
+static const double jaxhil_lag_matters = 0.025; /* of a restitution of 1 */
 
 static void jaxhil_lag_check_init(jaxhil_lag_check *check, const jaxhil_gains *gains) {
     check->period = gains->control_period;
     check->kept = jaxhil_exponential(check->period / jaxhil_check_lag, JAXHIL_SQUARINGS);
     check->earlier = (long)ceil(jaxhil_check_lag / check->period) + (long)jaxhil_lagged_before;
     jaxhil_force_depth_map_init(&check->map, gains);
+}
+
+/* Whether such a lag makes the restitution of a contact of this peak force [1/s] err, by pi/2 p l. */
+static bool jaxhil_lag_check_matters(const jaxhil_lag_check *check, double peak) {
+    return 0.5 * jaxhil_map_pi * (peak * check->lag) > jaxhil_lag_matters;
 }
 
 /* A contact begins; the newest readings. */

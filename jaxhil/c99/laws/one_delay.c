@@ -68,10 +68,10 @@ static double jaxhil_learnt_deeper(const jaxhil_learnt *learnt) {
     return 0.0;
 }
 
-/* Whether a lag would explain the readings better. */
+/* Whether a lag would explain the readings better, if it makes the restitution err. */
 static bool jaxhil_learnt_open(const jaxhil_learnt *learnt, double peak) {
-    (void)peak;
-    return learnt->all && learnt->surprise - learnt->check.surprise > jaxhil_likelier;
+    const bool likelier = learnt->all && learnt->surprise - learnt->check.surprise > jaxhil_likelier;
+    return likelier && jaxhil_lag_check_matters(&learnt->check, peak);
 }
 
 /* A reading out of contact, for which the map is charged: the surface is known to a tick. */

@@ -5,12 +5,13 @@ all but how the force begins and ends, which is gradual. So the contact is ident
 same prior, as a sensor with the time constant LAG would show it: what the force is linear in is smoothed
 alike, and the surface was met where `lagged_onset` has it. Either is charged for every reading since before
 the surface was met with (y - f)^2/s, f what it expects and s the variance of that and of the noise. Where the
-lag is charged less by more than LIKELIER, twice the logarithm of odds, the map is not believed. Scaled as in
-`force_depth_map`.
+lag is charged less by more than LIKELIER, twice the logarithm of odds, the map is not believed, if such a lag
+makes the restitution err by more than MATTERS: in slow contact, whose onset is hardly known, it does not.
+Scaled as in `force_depth_map`.
 """
 
 from bisect import bisect_left
-from math import ceil, inf, sqrt
+from math import ceil, inf, pi, sqrt
 
 from .contact_plane import Meeting
 from .force_depth_map import (
@@ -29,6 +30,7 @@ from .onset import SQUARINGS, exponential
 
 LAG = 0.002  # s
 LIKELIER = 6.0
+MATTERS = 0.025  # of a restitution of 1
 
 _SHARES = [min(knot / WHOLE, 1.0) for knot in KNOTS]
 
@@ -47,6 +49,10 @@ class LagCheck:
         self._map = ForceDepthMap(prior)
         self.earlier = ceil(LAG / period) + int(BEFORE)  # ticks before it was met, whose readings count
         self.surprise = 0.0  # what it is charged
+
+    def matters(self, peak: float) -> bool:
+        """Whether such a lag makes the restitution of contact of this peak force [1/s] err, by pi/2 p l."""
+        return 0.5 * pi * (peak * self._lag) > MATTERS
 
     def begin(self, meeting: Meeting, depths: list[float], forces: list[float], variance: float) -> None:
         """A contact begins; the newest readings, at depths [s] beyond where the surface was met, forces [1/s]

@@ -42,9 +42,8 @@ class RetrospectiveReference(Retrospective):
 
     def _catch_up(self, variance: float, zone: float) -> None:
         super()._catch_up(variance, zone)
-        entry = self._reference.entry
         for _ in range(READINGS):
-            tick = entry + 1 - self._check.earlier + self._checked
+            tick = self._unchecked
             if tick > self._history.newest:
                 break
             self._checked += 1
@@ -52,7 +51,7 @@ class RetrospectiveReference(Retrospective):
                 continue
             depth, rate, force, noise, shown = self._reading(tick, variance)
             self._check.take(depth, rate, force, noise, shown)
-            if shown and tick <= entry:
+            if shown and tick <= self._reference.entry:
                 self._miss(depth, force, noise)
 
     def _miss(self, depth: float, force: float, variance: float) -> None:
@@ -64,5 +63,10 @@ class RetrospectiveReference(Retrospective):
         return self._map.variance
 
     def _open(self, peak: float) -> bool:
-        newest = self._reference.entry + 1 - self._check.earlier + self._checked > self._history.newest
-        return newest and self._surprise - self._check.surprise > LIKELIER
+        likelier = self._unchecked > self._history.newest and self._surprise - self._check.surprise > LIKELIER
+        return likelier and self._check.matters(peak)
+
+    @property
+    def _unchecked(self) -> int:
+        """The tick whose reading is to be checked next."""
+        return self._reference.entry + 1 - self._check.earlier + self._checked
