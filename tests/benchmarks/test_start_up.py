@@ -10,17 +10,25 @@ import subprocess
 import sys
 import time
 
+import jax
+import jax.numpy as jnp
 import pytest
 from clusters import ROOT
+from jax.experimental.compilation_cache.compilation_cache import reset_cache
+from test_throughput import PROCESSOR, case
 
 from jaxhil.compensators import COMPENSATORS
+from jaxhil.simulation.environment import TICKS, known_options
+from jaxhil.simulation.loop import build_rig_constants
+from jaxhil.simulation.rollout import run_contacts
+from tuning.gains.rounds import TILE
 
 pytestmark = pytest.mark.benchmark
 REPEATS = 4
 # Of a session's environment: flags of tests, and that modules are to be compiled anew by every process.
 NOT_A_USERS = "XLA_FLAGS", "NPROC", "PYTHONDONTWRITEBYTECODE"
 COMMANDS = {"tune": (("tune", "varying"), 5.0), "simulate": (("simulate", "varying"), 1.2)}
-COMPILING = 15.0  # s, of all programs of a law's tuning, derivatives among them, on two cores
+COMPILING = 15.0  # s, on two cores: of a law with derivatives, and of all programs of its tuning
 # Of laws of thousands of equations, which miss that: no more than was reached.
 REACHED = {"retrospective_reference": 40.0}
 SLOW = "one step of its solver, in 34 hypotheses a lane, runs for longer than a quarter of an hour"
@@ -48,6 +56,42 @@ def test_a_command_that_ran_before_begins_soon(name, tmp_path, capsys):
     with capsys.disabled():
         print(f"\njaxhil {' '.join(arguments)}: at first {first[0]:.1f} s, then {took:.2f} s ({said})")
     assert took <= most
+
+
+@pytest.fixture
+def nothing_kept():
+    """No compiled programs are kept meanwhile."""
+    before = jax.config.jax_enable_compilation_cache
+    jax.config.update("jax_enable_compilation_cache", False)
+    reset_cache()
+    yield
+    jax.config.update("jax_enable_compilation_cache", before)
+    reset_cache()
+
+
+@pytest.mark.parametrize("compensator", [name for name, law in COMPENSATORS.items() if law.gains])
+def test_the_rollouts_of_a_law_compile_soon_with_derivatives(compensator, nothing_kept, capsys):
+    """A tile's restitutions and their derivatives by all gains, as the solver asks for them."""
+    loop, gains, scenarios = case(compensator, TILE)
+    rig = jax.jit(build_rig_constants, static_argnums=0)(loop, jax.tree.map(jnp.asarray, scenarios))
+
+    def with_derivatives(values):
+        def along(direction):
+            return jax.jvp(restitution, (values,), (jnp.broadcast_to(direction, values.shape),))
+
+        return jax.vmap(along, out_axes=(None, -1))(jnp.eye(len(gains)))
+
+    def restitution(values):
+        return run_contacts(loop, dict(zip(gains, values.T, strict=True)), rig).restitution
+
+    values = jnp.tile(jnp.array(list(gains.values())), (TILE, 1))
+    program = jax.jit(with_derivatives, compiler_options=known_options(TICKS)).lower(values)
+    begin = time.perf_counter()
+    program.compile()
+    took = time.perf_counter() - begin
+    with capsys.disabled():
+        print(f"\n{PROCESSOR}, {compensator}, derivatives by {len(gains)} gains: compiled in {took:.1f} s")
+    assert took <= COMPILING
 
 
 @pytest.mark.parametrize(
