@@ -29,6 +29,7 @@ REPEATS = 4
 NOT_A_USERS = "XLA_FLAGS", "NPROC", "PYTHONDONTWRITEBYTECODE"
 COMMANDS = {"tune": (("tune", "varying"), 5.0), "simulate": (("simulate", "varying"), 1.2)}
 COMPILING = 15.0  # s, on two cores: of a law with derivatives, and of all programs of its tuning
+KEEPING = "jax_enable_compilation_cache"
 # Of laws of thousands of equations, which miss that: no more than was reached.
 REACHED = {"retrospective_reference": 40.0}
 SLOW = "one step of its solver, in 34 hypotheses a lane, runs for longer than a quarter of an hour"
@@ -61,11 +62,11 @@ def test_a_command_that_ran_before_begins_soon(name, tmp_path, capsys):
 @pytest.fixture
 def nothing_kept():
     """No compiled programs are kept meanwhile."""
-    before = jax.config.jax_enable_compilation_cache
-    jax.config.update("jax_enable_compilation_cache", False)
+    before = jax.config.values[KEEPING]
+    jax.config.update(KEEPING, False)
     reset_cache()
     yield
-    jax.config.update("jax_enable_compilation_cache", before)
+    jax.config.update(KEEPING, before)
     reset_cache()
 
 
