@@ -1,0 +1,40 @@
+"""Rollout in tiles and vectors of other widths beside those in use: the same bits, and how fast.
+
+Run with `pytest -m benchmark -s tests/benchmarks/test_tiles.py`.
+"""
+
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+from test_throughput import LANES, PROCESSOR, best, case, timed
+
+from jaxhil.simulation import evaluation
+from jaxhil.simulation.environment import ROLLOUT
+
+pytestmark = pytest.mark.benchmark
+OURS = evaluation.TILE, ROLLOUT["xla_cpu_prefer_vector_width"]
+OTHERS = [(32, 512), (128, 512), (256, 512), (64, 256)]
+
+
+@pytest.mark.parametrize("compensator", ["none", "response_error"])
+def test_no_other_tiles_and_vectors_are_faster(compensator, monkeypatch, capsys):
+    loop, gains, scenarios = case(compensator, LANES)
+    runs, outcomes = [], []
+    for tile, width in (OURS, *OTHERS):
+        options = {**ROLLOUT, "xla_cpu_prefer_vector_width": width}
+        monkeypatch.setattr(evaluation, "TILE", tile)
+        monkeypatch.setattr(evaluation, "compiler_options", lambda _, options=options: options)
+        outcomes.append(evaluation.evaluate(loop, gains, scenarios))
+        arguments = evaluation.place(*evaluation.shard(scenarios, gains))
+        program = evaluation._compiled(frozenset(options.items()))
+        runs.append(timed(partial(program, loop, *arguments)))
+    ours, *others = best(*runs)
+    rates = {own: ours / time for own, time in zip(OTHERS, others, strict=True)}
+    with capsys.disabled():
+        shown = ", ".join(f"{tile}/{width} {rate:.2f}" for (tile, width), rate in rates.items())
+        print(f"\n{PROCESSOR}, {compensator}: speed of tile/vector width over {OURS}: {shown}")
+    for other in outcomes[1:]:
+        jax.tree.map(np.testing.assert_array_equal, other, outcomes[0])
+    assert max(rates.values()) <= 1.03
