@@ -30,10 +30,10 @@ REPEATS = 4
 NOT_A_USERS = "XLA_FLAGS", "NPROC", "PYTHONDONTWRITEBYTECODE"
 COMMANDS = {"tune": (("tune", "varying"), 5.0), "simulate": (("simulate", "varying"), 1.2)}
 COMPILING = 15.0  # s, on two cores: of a law with derivatives, and of all programs of its tuning
-KEEPING = "jax_enable_compilation_cache"
-# Of laws of thousands of equations, which miss that: no more than was reached.
+# Of laws of thousands of equations, which miss the latter: no more than was reached.
 REACHED = {"retrospective_reference": 40.0}
-SLOW = "one step of its solver, in 34 hypotheses a lane, runs for longer than a quarter of an hour"
+SLOW = "one step of its solver, in 51 hypotheses a lane, runs for longer than a quarter of an hour"
+KEEPING = "jax_enable_compilation_cache"  # whether compiled programs are kept
 
 
 def run(arguments, folder, programs):
