@@ -79,6 +79,14 @@ def _laws_of_the_package_alone():
     CONTACT_LAWS[:] = names
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _traced():
+    """What is tested is traced, its shapes checked, and not run as a process before compiled it."""
+    from jaxhil.simulation import kept_programs
+
+    kept_programs.compiled = lambda made_of, made, arguments, folder: made()
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _shapes_checked(request):
     everyday = "not slow" in request.config.option.markexpr

@@ -8,7 +8,7 @@ import numpy
 
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.contact.laws import LAWS
-from tuning.caches.sources import sources_sha256, versions
+from jaxhil.simulation.sources import sources_sha256, versions
 
 LAW = """
 import dataclasses

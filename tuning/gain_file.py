@@ -29,7 +29,7 @@ from jaxhil.runtime import digest
 from jaxhil.runtime.gain_file import SCHEMA
 from jaxhil.simulation.gain_file import bounds_of, check_names, look_up
 from jaxhil.simulation.scenario import Scenario
-from tuning.caches.sources import versions
+from jaxhil.simulation.sources import versions
 
 VERSIONED = ("jaxhil", "jax", "numpy", "optimistix")
 

@@ -6,7 +6,7 @@ Batches are padded to a few sizes, so that most calls reuse a compiled program.
 """
 
 from collections.abc import Callable, Mapping
-from functools import cache, lru_cache, singledispatch
+from functools import lru_cache, singledispatch
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +17,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxhil.contact.laws import ContactParameters
 from jaxhil.contact.reference import Reference
-from jaxhil.simulation.environment import ROLLOUT, known_options
+from jaxhil.simulation import kept_programs
+from jaxhil.simulation.environment import ROLLOUT, program_folder
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.metrics import OK, Metrics
 from jaxhil.simulation.rollout import rollout
@@ -241,13 +242,9 @@ def whole_delays(scenarios: Any) -> np.ndarray:
 
 
 def run_tiles(loop: Any, common: Any, per_lane: Any, scenarios: Any) -> Outcome:
-    """Outcome of what `shard` made, each leaf (devices, tiles, ..., lanes of a tile)."""
-    return _compiled(frozenset(compiler_options(loop).items()))(loop, common, per_lane, scenarios)
-
-
-@cache
-def _compiled(options: frozenset) -> Callable[..., Outcome]:
-    return jax.jit(_run_tiles, static_argnums=0, compiler_options=known_options(dict(options)))
+    """Outcome of what `shard` made and `place` placed, each leaf (devices, tiles, ..., lanes of a tile)."""
+    arguments = common, per_lane, scenarios
+    return kept_programs.run(_run_tiles, loop, arguments, compiler_options(loop), program_folder())
 
 
 def _mesh():

@@ -22,7 +22,7 @@ import numpy as np
 from jaxhil.errors import InputError
 from jaxhil.files import make_folder, read_sealed, remove_stale, write_sealed, writing
 from jaxhil.simulation.environment import rounding_flags, xla_flags
-from tuning.caches.sources import sources_sha256, versions
+from jaxhil.simulation.sources import sources_sha256, versions
 
 FOLDER = ".pieces"  # beside the results of a command
 SUFFIX = ".piece"

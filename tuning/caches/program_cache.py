@@ -5,7 +5,6 @@ all it depends on: the sources, the versions of what they stand on, static argum
 sealed: a bit that flipped in it could crash the process that reads it, or change what it computes.
 """
 
-import dataclasses
 import hashlib
 import os
 from collections.abc import Callable
@@ -20,8 +19,10 @@ from jax import export
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from jaxhil.files import read_sealed, remove_stale, write_sealed
+from jaxhil.simulation import kept_programs
 from jaxhil.simulation.environment import TICKS, known_options
-from tuning.caches.sources import PACKAGES, sources_sha256, versions
+from jaxhil.simulation.kept_programs import is_foreign
+from jaxhil.simulation.sources import sources_sha256, versions
 
 # Calls into LAPACK have no promise to mean the same in other versions; the name has the version in it.
 LAPACK = ("lapack_dpotrf_ffi", "lapack_dtrsm_ffi")
@@ -45,13 +46,14 @@ def prepare(
 ) -> None:
     """Trace and compile what `run` will run on such arguments, into `folder` and the compile cache."""
     program, leaves = _look_up(function, static, arguments, folder)
-    program.lower(*leaves).compile()
+    if not isinstance(program, jax.stages.Compiled):
+        program.lower(*leaves).compile()
 
 
 def _look_up(function, static, arguments, folder):
     leaves, structure = jax.tree.flatten(arguments)
     shapes = tuple((leaf.shape, str(leaf.dtype)) for leaf in leaves)
-    return _program(function, static, structure, shapes, None if _is_foreign(static) else folder), leaves
+    return _program(function, static, structure, shapes, None if is_foreign(static) else folder), leaves
 
 
 @cache
@@ -61,32 +63,26 @@ def _program(function, static, structure, shapes, folder):
     def flat(*leaves):
         return tuple(function(static, jax.tree.unflatten(structure, leaves)))
 
-    compiled = partial(jax.jit, compiler_options=known_options(TICKS))
     if folder is None:
-        return compiled(flat)
-    path = Path(folder) / f"{_name(function, static, structure, shapes)}.program"
+        return jax.jit(flat, compiler_options=known_options(TICKS))
+    name = _name(function, static, structure, shapes)
+    like = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes]
+    return kept_programs.compiled(name, partial(_traced, name, flat, like, folder), like, folder)
+
+
+def _traced(name, flat, like, folder):
+    path = Path(folder) / f"{name}.program"
     exported = _read(path)
     if exported is None:
-        like = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes]
         checks = [export.DisabledSafetyCheck.custom_call(name) for name in LAPACK]
         exported = export.export(jax.jit(flat), disabled_checks=checks)(*like)
         _write(path, exported.serialize())
+    compiled = partial(jax.jit, compiler_options=known_options(TICKS))
     if exported.nr_devices == 1:
         return compiled(exported.call)
     devices = jax.devices()[: exported.nr_devices]
     mesh = jax.make_mesh((len(devices),), ("device",), axis_types=(AxisType.Auto,), devices=devices)
     return compiled(exported.call, in_shardings=NamedSharding(mesh, PartitionSpec()))
-
-
-def _is_foreign(value: Any) -> bool:
-    """Whether anything of another package is in it, or what its text does not tell: an array, a function."""
-    if isinstance(value, tuple):
-        return any(_is_foreign(entry) for entry in value)
-    if not dataclasses.is_dataclass(value):
-        return not (value is None or isinstance(value, (str, bool, int, float)))
-    home = type(value).__module__.split(".")[0]
-    fields = (getattr(value, field.name) for field in dataclasses.fields(value))
-    return home not in PACKAGES or any(_is_foreign(field) for field in fields)
 
 
 def _name(function, static, structure, shapes) -> str:

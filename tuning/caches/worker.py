@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from jaxhil.errors import InputError
 from jaxhil.simulation.environment import prepare, rounding_flags, xla_flags
-from tuning.caches.sources import sources_sha256, versions
+from jaxhil.simulation.sources import sources_sha256, versions
 
 PRELOAD = "dask worker ADDRESS --preload tuning.caches.worker"
 

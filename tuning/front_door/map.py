@@ -132,7 +132,7 @@ def _write(made: StabilityMap, folder: Path) -> None:
 def _document(
     mechanism: Mechanism, compensator: str, gains: Mapping[str, float], found: "Map", limit: float, seed: int
 ) -> dict[str, Any]:
-    from tuning.caches.sources import versions
+    from jaxhil.simulation.sources import versions
     from tuning.gain_file import VERSIONED, plain
 
     closed, radii, nominal = found.closed, found.radii, found.nominal

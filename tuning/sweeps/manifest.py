@@ -21,7 +21,7 @@ from jaxhil.files import open_plain
 from jaxhil.runtime import digest
 from jaxhil.simulation.environment import rounding_flags, xla_flags
 from jaxhil.simulation.gain_file import LoadedGains, check_document
-from tuning.caches.sources import sources_sha256, versions
+from jaxhil.simulation.sources import sources_sha256, versions
 from tuning.sweeps import LARGEST_CHUNK, LARGEST_SEED, MOST
 from tuning.sweeps.columns import Column, sweep_columns
 from tuning.sweeps.draws import REPLICATES

@@ -12,8 +12,8 @@ from jaxhil.mechanism.file import from_builtins, load
 from jaxhil.mechanism.overrides import parse_override
 from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.runtime import digest
+from jaxhil.simulation.sources import versions
 from tuning import terminal
-from tuning.caches.sources import versions
 from tuning.cli.commands import checks, identify_design
 from tuning.cli.commands.resuming import pieces_in, say_of_pieces
 from tuning.cli.options_identify import Identify

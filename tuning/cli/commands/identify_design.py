@@ -14,8 +14,8 @@ from jaxhil.mechanism.file import load
 from jaxhil.mechanism.structs import numeric_keys
 from jaxhil.runtime import digest
 from jaxhil.simulation.environment import computing
+from jaxhil.simulation.sources import versions
 from tuning import terminal
-from tuning.caches.sources import versions
 from tuning.cli.commands import checks
 from tuning.cli.options_identify import Identify
 from tuning.front_door import arguments

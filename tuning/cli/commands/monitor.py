@@ -5,8 +5,8 @@ from typing import Any
 
 from jaxhil.mechanism.file import load
 from jaxhil.runtime import digest
+from jaxhil.simulation.sources import versions
 from tuning import terminal
-from tuning.caches.sources import versions
 from tuning.cli.commands.identify import read_logs
 from tuning.cli.options_identify import Monitor
 from tuning.identification.monitor.figures import FIGURES

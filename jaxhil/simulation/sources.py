@@ -14,12 +14,15 @@ STANDS_ON = ("jax", "jaxlib", "optimistix", "equinox", "lineax", "numpy", "scipy
 
 
 def sources_sha256(*laws: object) -> str:
-    """SHA-256 of the names and contents of the packages' Python files, as they were when first asked for.
+    """SHA-256 of the names and contents of the Python files of the packages that are imported, as they were
+    when first asked for.
 
     With `laws`, compensators and contact laws, also of those among them that are from elsewhere: their fields
     and the module that they are in, as far as it has a source.
     """
-    own = _digest(tuple(Path(str(sys.modules[name].__file__)).parent for name in PACKAGES))
+    own = _digest(
+        tuple(Path(str(sys.modules[name].__file__)).parent for name in PACKAGES if name in sys.modules)
+    )
     foreign = [law for law in laws if type(law).__module__.partition(".")[0] not in PACKAGES]
     if not foreign:
         return own

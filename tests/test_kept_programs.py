@@ -1,0 +1,211 @@
+"""Compiled programs kept in files: the same bits, not traced again, remade when what they depend on
+changes."""
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import programs_of
+
+from jaxhil.compensators import literature_gains
+from jaxhil.contact.laws import HuntCrossley, KelvinVoigt
+from jaxhil.files import read_sealed
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation import evaluation, kept_programs, sources
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.compile_cache import ENDING
+from jaxhil.simulation.environment import TICKS, program_folder
+from jaxhil.simulation.kept_programs import compiled
+from jaxhil.simulation.scenario import build_scenarios
+
+pytestmark = pytest.mark.users_options
+
+
+class Sums(NamedTuple):
+    total: jax.Array
+    parts: tuple[jax.Array, ...]
+
+
+traced = []
+
+
+def sums(static, values, more) -> Sums:
+    traced.append(static)
+    factor = 2.0 if isinstance(static[0], KelvinVoigt) else 3.0
+    return Sums(jnp.sum(factor * values) + static[1], (values * more["factor"],))
+
+
+def calls_back(static, values):
+    traced.append(static)
+    return jax.pure_callback(lambda x: 2 * x, jax.ShapeDtypeStruct((4,), float), values)
+
+
+STATIC = (KelvinVoigt(), 1)
+VALUES = np.array([1.0, 2.0, 4.0, 8.0])
+
+
+@pytest.fixture(autouse=True)
+def as_for_users(monkeypatch):
+    monkeypatch.setattr(kept_programs, "compiled", compiled)
+    traced.clear()
+    yield
+    kept_programs._programs.clear()
+
+
+def run(folder, static=STATIC, values=VALUES, options=TICKS, function=sums):
+    """What a new process would find."""
+    kept_programs._programs.clear()
+    more = ({"factor": jnp.array(3.0)},) if function is sums else ()
+    return kept_programs.run(function, static, (jnp.asarray(values), *more), options, folder)
+
+
+def check(result, total=31.0):
+    assert isinstance(result, Sums) and float(result.total) == total
+    np.testing.assert_array_equal(result.parts[0], 3 * VALUES)
+
+
+def test_a_program_is_traced_once_and_gives_the_same_numbers(tmp_path):
+    check(run(None))
+    assert len(traced) == 1
+    for _ in range(3):
+        check(run(tmp_path))
+    assert len(traced) == 2 and len(list(tmp_path.iterdir())) == 1
+
+
+def test_code_that_came_from_the_compile_cache_is_kept_as_well(tmp_path):
+    """Of that, jax itself writes what ends in an error."""
+    for name in ("first", "second"):
+        folder = tmp_path / name
+        folder.mkdir()
+        check(run(folder))
+        check(run(folder))
+    assert len(traced) == 2
+
+
+@pytest.mark.parametrize("spoil", [lambda content: b"", lambda content: content[:-100], lambda c: b"no" + c])
+def test_a_spoilt_file_is_made_anew(tmp_path, spoil):
+    run(tmp_path)
+    (file,) = tmp_path.iterdir()
+    whole = file.read_bytes()
+    file.write_bytes(spoil(whole))
+    check(run(tmp_path))
+    assert len(traced) == 2 and file.read_bytes()[:64] == whole[:64]
+
+
+def test_a_flipped_bit_costs_only_the_time_to_trace(tmp_path):
+    run(tmp_path)
+    (file,) = tmp_path.iterdir()
+    whole = file.read_bytes()
+    for bit in np.random.default_rng(0).integers(0, 8 * len(whole), 10):
+        traced.clear()
+        harmed = bytearray(whole)
+        harmed[bit // 8] ^= 1 << int(bit % 8)
+        file.write_bytes(harmed)
+        check(run(tmp_path))
+        assert traced and read_sealed(file) is not None
+
+
+def test_a_program_whose_code_is_gone_is_made_anew(tmp_path):
+    run(tmp_path)
+    for file in Path(str(program_folder())).glob(f"jit_sums-*{ENDING}"):
+        file.unlink()
+    check(run(tmp_path))
+    assert len(traced) == 2
+    check(run(tmp_path))
+    assert len(traced) == 2
+
+
+def test_whatever_a_program_follows_from_makes_it_another(tmp_path, monkeypatch):
+    check(run(tmp_path))
+    check(run(tmp_path, (HuntCrossley(), 1)), 46.0)
+    check(run(tmp_path, (KelvinVoigt(), 2)), 32.0)
+    assert float(run(tmp_path, values=VALUES[:2]).total) == 7.0
+    check(run(tmp_path, options={}))
+    with jax.default_matmul_precision("highest"):
+        check(run(tmp_path))
+    monkeypatch.setattr(kept_programs, "versions", lambda: {"jax": "another"})
+    check(run(tmp_path))
+    monkeypatch.setattr(kept_programs, "versions", sources.versions)
+    monkeypatch.setattr(kept_programs, "xla_flags", lambda: "--xla_cpu_enable_fast_min_max=true")
+    check(run(tmp_path))
+    assert len(traced) == len(list(tmp_path.iterdir())) == 8
+
+
+@pytest.mark.parametrize("changed", ["jaxhil", "tuning"])
+def test_changed_sources_are_another_program(tmp_path, monkeypatch, changed):
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    importlib.import_module("tuning")
+    run(kept)
+    package = tmp_path / "package"
+    package.mkdir()
+    (package / "__init__.py").write_text("changed = True\n")
+    monkeypatch.setattr(importlib.import_module(changed), "__file__", str(package / "__init__.py"))
+    check(run(kept))
+    assert len(traced) == 2
+
+
+def test_a_law_from_elsewhere_is_not_kept(tmp_path):
+    class Mine(KelvinVoigt):
+        pass
+
+    for _ in range(2):
+        check(run(tmp_path, (Mine(), 1)))
+    assert len(traced) == 2 and not list(tmp_path.iterdir())
+
+
+def test_what_calls_back_into_its_process_is_not_kept(tmp_path):
+    for _ in range(2):
+        np.testing.assert_array_equal(run(tmp_path, function=calls_back), 2 * VALUES)
+    assert len(traced) == 2 and not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_written_costs_no_result(tmp_path):
+    check(run(tmp_path / "missing"))
+
+
+SOLVES = """
+import sys
+from pathlib import Path
+from jaxhil.simulation.environment import prepare
+prepare()
+import jax, jax.numpy as jnp, numpy as np
+from jaxhil.simulation import kept_programs
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+def solved(static, matrix):
+    print("traced")
+    return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix), True), jnp.ones(2))
+print(kept_programs.run(solved, 1, (np.diag([4.0, 0.5]),), {}, sys.argv[1]))
+"""
+
+
+def test_a_kept_program_solves_equations_in_a_process_that_traced_none(tmp_path):
+    script = tmp_path / "solves.py"
+    script.write_text(SOLVES)
+    command = [sys.executable, str(script), str(tmp_path)]
+    said = [subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2)]
+    assert said == ["traced\n[0.25 2.  ]\n", "[0.25 2.  ]\n"]
+
+
+@pytest.mark.parametrize("lanes", [(), (20,)])
+def test_a_kept_batch_has_the_same_bits_and_is_not_compiled_again(tmp_path, monkeypatch, lanes):
+    mechanism = load("varying").mechanism
+    scenarios = build_scenarios(mechanism, draw(mechanism, 20, 0))
+    loop = build_loop(mechanism, "phase_lead", scenarios)
+    gains = {name: np.full(lanes, value) for name, value in literature_gains(mechanism, "phase_lead").items()}
+    wanted = evaluation.evaluate(loop, gains, scenarios)
+    monkeypatch.setattr(evaluation, "program_folder", lambda: str(tmp_path))
+    made = []
+    for _ in range(3):
+        kept_programs._programs.clear()
+        outcome = evaluation.evaluate(loop, gains, scenarios)
+        jax.tree.map(np.testing.assert_array_equal, outcome, wanted)
+        made.append(programs_of("_run_tiles"))
+    assert made[0] == made[1] == made[2] > 0
