@@ -2,8 +2,10 @@
 changes."""
 
 import importlib
+import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +23,7 @@ from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation import evaluation, kept_programs, sources
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.compile_cache import ENDING
-from jaxhil.simulation.environment import TICKS, program_folder
+from jaxhil.simulation.environment import CACHE, TICKS, program_folder
 from jaxhil.simulation.kept_programs import compiled
 from jaxhil.simulation.scenario import build_scenarios
 
@@ -54,6 +56,7 @@ VALUES = np.array([1.0, 2.0, 4.0, 8.0])
 @pytest.fixture(autouse=True)
 def as_for_users(monkeypatch):
     monkeypatch.setattr(kept_programs, "compiled", compiled)
+    monkeypatch.setattr(kept_programs, "program_folder", program_folder)
     traced.clear()
     yield
     kept_programs._programs.clear()
@@ -62,8 +65,9 @@ def as_for_users(monkeypatch):
 def run(folder, static=STATIC, values=VALUES, options=TICKS, function=sums):
     """What a new process would find."""
     kept_programs._programs.clear()
+    kept_programs.program_folder = lambda: folder
     more = ({"factor": jnp.array(3.0)},) if function is sums else ()
-    return kept_programs.run(function, static, (jnp.asarray(values), *more), options, folder)
+    return kept_programs.run(function, static, jnp.asarray(values), *more, options=options)
 
 
 def check(result, total=31.0):
@@ -173,6 +177,7 @@ def test_a_folder_that_cannot_be_written_costs_no_result(tmp_path):
 
 SOLVES = """
 import sys
+from functools import partial
 from pathlib import Path
 from jaxhil.simulation.environment import prepare
 prepare()
@@ -182,15 +187,15 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 def solved(static, matrix):
     print("traced")
     return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix), True), jnp.ones(2))
-print(kept_programs.run(solved, 1, (np.diag([4.0, 0.5]),), {}, sys.argv[1]))
+print(kept_programs.run(solved, 1, np.diag([4.0, 0.5])))
 """
 
 
 def test_a_kept_program_solves_equations_in_a_process_that_traced_none(tmp_path):
     script = tmp_path / "solves.py"
     script.write_text(SOLVES)
-    command = [sys.executable, str(script), str(tmp_path)]
-    said = [subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2)]
+    run = partial(subprocess.run, [sys.executable, str(script)], capture_output=True, text=True, check=True)
+    said = [run(env={**os.environ, CACHE: str(tmp_path)}).stdout for _ in range(2)]
     assert said == ["traced\n[0.25 2.  ]\n", "[0.25 2.  ]\n"]
 
 
@@ -201,7 +206,7 @@ def test_a_kept_batch_has_the_same_bits_and_is_not_compiled_again(tmp_path, monk
     loop = build_loop(mechanism, "phase_lead", scenarios)
     gains = {name: np.full(lanes, value) for name, value in literature_gains(mechanism, "phase_lead").items()}
     wanted = evaluation.evaluate(loop, gains, scenarios)
-    monkeypatch.setattr(evaluation, "program_folder", lambda: str(tmp_path))
+    monkeypatch.setattr(kept_programs, "program_folder", lambda: str(tmp_path))
     made = []
     for _ in range(3):
         kept_programs._programs.clear()

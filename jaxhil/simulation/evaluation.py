@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from jaxhil.contact.laws import ContactParameters
 from jaxhil.contact.reference import Reference
 from jaxhil.simulation import kept_programs
-from jaxhil.simulation.environment import ROLLOUT, program_folder
+from jaxhil.simulation.environment import ROLLOUT
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.metrics import OK, Metrics
 from jaxhil.simulation.rollout import rollout
@@ -243,8 +243,7 @@ def whole_delays(scenarios: Any) -> np.ndarray:
 
 def run_tiles(loop: Any, common: Any, per_lane: Any, scenarios: Any) -> Outcome:
     """Outcome of what `shard` made and `place` placed, each leaf (devices, tiles, ..., lanes of a tile)."""
-    arguments = common, per_lane, scenarios
-    return kept_programs.run(_run_tiles, loop, arguments, compiler_options(loop), program_folder())
+    return kept_programs.run(_run_tiles, loop, common, per_lane, scenarios, options=compiler_options(loop))
 
 
 def _mesh():

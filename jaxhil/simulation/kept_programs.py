@@ -19,13 +19,14 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jax
 
 from jaxhil.files import read_sealed, remove_stale, write_sealed
 from jaxhil.simulation import compile_cache
-from jaxhil.simulation.environment import known_options, rounding_flags, xla_flags
+from jaxhil.simulation.environment import known_options, program_folder, rounding_flags, xla_flags
 from jaxhil.simulation.sources import PACKAGES, sources_sha256, versions
 
 ENDING = ".compiled"  # of the files' names
@@ -41,17 +42,34 @@ _programs: dict[Any, Callable[..., Any]] = {}  # of this process
 def run(
     function: Callable[..., Any],
     static: Any,
-    arguments: tuple[Any, ...],
-    options: Mapping[str, int | str],
-    folder: str | os.PathLike[str] | None,
+    *arguments: Any,
+    options: Mapping[str, int | str] = MappingProxyType({}),
 ) -> Any:
     """`function(static, *arguments)`, compiled with the compiler's `options`.
 
     `function` is one of a module; its result is made of arrays, tuples and named tuples. `static` is
     hashable, and its `repr` tells all of it; `arguments` are pytrees of arrays, those of equal shapes placed
-    alike. Programs are kept in `folder`; none without one, and none of what is foreign.
+    alike. Programs are kept beside the compiled ones, but for those of what is foreign.
     """
+    program, leaves = _look_up(function, static, arguments, options)
+    return program(*leaves)
+
+
+def prepare(function: Callable[..., Any], static: Any, *arguments: Any) -> None:
+    """Make what `run` will run on such arguments."""
+    program, leaves = _look_up(function, static, arguments, {})
+    make(program, leaves)
+
+
+def make(program: Any, arguments: Iterable[Any]) -> None:
+    """Compile what `compiled` returned, if it is not."""
+    if not isinstance(program, jax.stages.Compiled):
+        program.lower(*arguments).compile()
+
+
+def _look_up(function, static, arguments, options):
     leaves, structure = jax.tree.flatten(arguments)
+    folder = program_folder()
     shapes = tuple([(leaf.shape, leaf.dtype) for leaf in leaves])
     key = function, static, structure, shapes, frozenset(options.items()), folder
     program = _programs.get(key)
@@ -67,9 +85,9 @@ def run(
         placed = [(leaf.shape, str(leaf.dtype), str(getattr(leaf, "sharding", None))) for leaf in leaves]
         named = function.__module__, function.__qualname__
         made_of = (*named, static, structure, placed, sorted(options.items()))
-        kept = None if is_foreign(static) else folder
-        program = _programs[key] = compiled(made_of, made, leaves, kept)
-    return program(*leaves)
+        program = compiled(made_of, made, leaves, None if is_foreign(static) else folder)
+        _programs[key] = program
+    return program, leaves
 
 
 def compiled(

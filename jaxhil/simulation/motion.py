@@ -1,7 +1,6 @@
 """The nominal run tick by tick, and the same contacts in space: what plots are drawn from."""
 
 from collections.abc import Iterator, Mapping
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -12,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxhil.contact.laws import LAWS, ContactLaw, ContactParameters, two_sided
 from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation import kept_programs
 from jaxhil.simulation.free_flight import APPROACH
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.recording import Lane, prepare_recording, record_lanes
@@ -119,7 +119,8 @@ def _in_space(mechanism: Mechanism, scenarios: Scenario, entered: list[Curve]) -
     """The reference's motion from each contact on, from 0.02 s before the touch to the end of that curve."""
     velocity = np.array([curve.velocity for curve in entered])
     step = (np.array([curve.time[-1] for curve in entered]) + APPROACH) / STEPS
-    forces, positions = _integrate(
+    forces, positions = kept_programs.run(
+        _integrate,
         LAWS[mechanism.contact.law],
         jax.tree.map(lambda leaf: leaf[..., 0], scenarios.contact),
         scenarios.clearance[0],
@@ -137,7 +138,6 @@ def _in_space(mechanism: Mechanism, scenarios: Scenario, entered: list[Curve]) -
     ]
 
 
-@partial(jax.jit, static_argnums=0)
 def _integrate(
     law: ContactLaw,
     contacts: ContactParameters,

@@ -6,10 +6,8 @@ them follow the warnings of what can hardly be meant, and how many ticks a run t
 
 import itertools
 import math
-from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from jaxhil.contact.laws import LAWS, ContactLaw, ContactParameters
@@ -17,6 +15,7 @@ from jaxhil.contact.reference import Reference
 from jaxhil.errors import InputError
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import dimensions, quantiles
+from jaxhil.simulation import kept_programs
 from jaxhil.simulation.environment import computing
 from jaxhil.simulation.evaluation import parameters_by_slot
 from jaxhil.simulation.free_flight import APPROACH
@@ -177,12 +176,11 @@ def _in_space(mechanism: Mechanism, scenarios: Scenario) -> Reference:
     shape = scenarios.phase.shape
     mass, velocity = (np.broadcast_to(one, shape) for one in (scenarios.equivalent_mass, scenarios.velocity))
     law = LAWS[mechanism.contact.law]
-    found = _reference(law, scenarios.contact, mass, velocity)
+    found = kept_programs.run(_reference, law, scenarios.contact, mass, velocity)
     numbers: Any = [np.asarray(leaf)[: mechanism.approach.contacts] for leaf in found]
     return Reference(*numbers)
 
 
-@partial(jax.jit, static_argnums=0)
 def _reference(law: ContactLaw, parameters: ContactParameters, mass: Any, velocity: Any) -> Reference:
     return law.reference(parameters_by_slot(parameters), mass, velocity)
 

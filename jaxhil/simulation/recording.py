@@ -4,8 +4,7 @@ A run's pictures and time series, the vectors of a bundle for the rig and what v
 of it.
 """
 
-from collections.abc import Callable, Mapping
-from functools import lru_cache, partial
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -17,6 +16,7 @@ from jaxtyping import Array
 from jaxhil.compensators import Gains, Signals
 from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation import kept_programs
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants
@@ -70,36 +70,24 @@ def record_lanes(loaded: LoadedGains, batch: Scenario) -> tuple[Metrics, list[La
 def record_ticks(loop: Loop, gains: Mapping[str, Any], batch: Scenario) -> tuple[Metrics, Tick]:
     """Run the loop with jax until every lane is done: metrics (slots, lanes), every tick (ticks, lanes)."""
     arrays = as_arrays(gains)
-    program = recorder(loop)
-    rig, run = program.begin(arrays, batch)
+    rig, run = begin(loop, arrays, batch)
     chunks = []
     while np.any(run.active):
-        run, ticks = program.record_chunk(rig, arrays, run)
+        run, ticks = kept_programs.run(_record_chunk, loop, rig, arrays, run)
         chunks.append(jax.device_get(ticks))
     return jax.device_get(run.metrics), jax.tree.map(lambda *parts: np.concatenate(parts), *chunks)
 
 
 def prepare_recording(loaded: LoadedGains, batch: Scenario) -> None:
-    """Compile what `record_lanes` will run on such arguments, without running it."""
-    program = recorder(build_loop(loaded.mechanism, loaded.compensator, batch))
-    gains = as_arrays(loaded.gains)
-    rig, run = jax.eval_shape(program.begin, gains, batch)
-    program.begin.lower(gains, batch).compile()
-    program.record_chunk.lower(rig, gains, run).compile()
+    """Compile what `record_lanes` will run on such arguments, without running it to its end."""
+    loop, gains = build_loop(loaded.mechanism, loaded.compensator, batch), as_arrays(loaded.gains)
+    rig, run = begin(loop, gains, batch)
+    kept_programs.prepare(_record_chunk, loop, rig, gains, run)
 
 
-class Recorder(NamedTuple):
-    """The programs that record one loop, compiled when first called: a batch of scenarios begins under its
-    gains, then a chunk of ticks is recorded at a time."""
-
-    begin: Callable[..., tuple[RigConstants, RunState]]
-    record_chunk: Callable[..., tuple[RunState, Tick]]
-
-
-@lru_cache(maxsize=32)
-def recorder(loop: Loop) -> Recorder:
-    """The programs of `loop`."""
-    return Recorder(jax.jit(partial(_begin, loop)), jax.jit(partial(_record_chunk, loop)))
+def begin(loop: Loop, gains: Gains, batch: Scenario) -> tuple[RigConstants, RunState]:
+    """How a batch of scenarios begins under its gains, before the first tick."""
+    return kept_programs.run(_begin, loop, gains, batch)
 
 
 def as_arrays(gains: Mapping[str, Any]) -> Gains:

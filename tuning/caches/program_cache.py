@@ -46,8 +46,7 @@ def prepare(
 ) -> None:
     """Trace and compile what `run` will run on such arguments, into `folder` and the compile cache."""
     program, leaves = _look_up(function, static, arguments, folder)
-    if not isinstance(program, jax.stages.Compiled):
-        program.lower(*leaves).compile()
+    kept_programs.make(program, leaves)
 
 
 def _look_up(function, static, arguments, folder):

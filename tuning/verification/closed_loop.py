@@ -21,7 +21,7 @@ from jaxhil.simulation.contact_force import PlantSignals
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.loop import Loop, RigConstants
 from jaxhil.simulation.metrics import Metrics
-from jaxhil.simulation.recording import as_arrays, recorder
+from jaxhil.simulation.recording import as_arrays, begin
 from jaxhil.simulation.rollout import noise_ahead, stretch_length, turn_over
 from jaxhil.simulation.scenario import Scenario
 from jaxhil.simulation.tick import Model, RunState, actuate, contact_force, integrate, next_state, sense
@@ -37,7 +37,7 @@ def run_closed_loop(loaded: LoadedGains, gain_file: GainFile, batch: Scenario) -
     loop = build_loop(loaded.mechanism, loaded.compensator, batch)
     gains = as_arrays(loaded.gains)
     # A batch begins as it does with the jax controller in the loop, which is then compiled already.
-    rig, run = _first_lane(recorder(loop).begin(gains, batch))
+    rig, run = _first_lane(begin(loop, gains, batch))
     program = _compiled(dataclasses.replace(loop, compensator=OnTheRig(loop.compensator)))
     zeroed = loop.has_force_noise or loop.has_force_bias
     controller = Controller(gain_file)
