@@ -29,7 +29,7 @@ FEWEST_DEVICES = (
 # a short command.
 RARELY = 100_000, 50, 50
 # What compiled programs are kept under: all that takes longer to compile than to read.
-KEEPING = {"jax_persistent_cache_min_compile_time_secs": 0.1, "jax_persistent_cache_min_entry_size_bytes": 0}
+KEEPING = {"jax_persistent_cache_min_compile_time_secs": 0.05, "jax_persistent_cache_min_entry_size_bytes": 0}
 # Options of programs that run ticks, by this compiler's names: vectors as wide as the processor has, and
 # fewer copies of what one tick hands to the next.
 TICKS = {"xla_cpu_prefer_vector_width": 512, "xla_cpu_copy_insertion_use_region_analysis": True}

@@ -165,12 +165,12 @@ def _write(path: Path, program: Any, key: str | None, calls: set[str]) -> None:
 def _to_bytes(program, key, calls_lapack):
     from jax.experimental import serialize_executable
 
+    content, unloaded = io.BytesIO(), program._executable._unloaded_executable
+
     class Pickler(serialize_executable._JaxPjrtPickler):
         def persistent_id(self, obj):
-            found = super().persistent_id(obj)
-            return (CODE, key) if found and found[0] == CODE else found
+            return (CODE, key) if obj is unloaded.xla_executable else super().persistent_id(obj)
 
-    content, unloaded = io.BytesIO(), program._executable._unloaded_executable
     pickle.dump((calls_lapack, [device.id for device in unloaded.device_list]), content)
     Pickler(content).dump((unloaded, program.args_info, program.out_tree, program._no_kwargs))
     return content.getvalue()
