@@ -171,6 +171,16 @@ def test_what_calls_back_into_its_process_is_not_kept(tmp_path):
     assert len(traced) == 2 and not list(tmp_path.iterdir())
 
 
+def test_a_jax_that_does_not_tell_of_the_processor_keeps_nothing(tmp_path, monkeypatch):
+    def not_there(made_of):
+        raise AttributeError
+
+    monkeypatch.setattr(kept_programs, "_name", not_there)
+    for _ in range(2):
+        check(run(tmp_path))
+    assert len(traced) == 2 and not list(tmp_path.iterdir())
+
+
 def test_a_folder_that_cannot_be_written_costs_no_result(tmp_path):
     check(run(tmp_path / "missing"))
 
