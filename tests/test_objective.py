@@ -127,6 +127,7 @@ def test_the_sum_of_squares_is_the_stated_value_or_just_above(outcomes, name):
     objective = of_name(name)
     for gains, outcome in zip(GAINS, outcomes, strict=True):
         terms = contact_terms(outcome)
+        jax.tree.map(np.testing.assert_array_equal, terms, contact_terms(jax.tree.map(jnp.asarray, outcome)))
         error, excess, swings = (np.asarray(term)[outcome.wanted] for term in terms)
         noise = amplification(gains)
         value = objective_value(objective, error, excess, noise, swings)

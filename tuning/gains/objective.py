@@ -232,18 +232,19 @@ def weigh(
 
 def contact_terms(
     outcome: Outcome,
-) -> tuple[Float[Array, "slots *batch"], Float[Array, "slots *batch"], Float[Array, "slots *batch"]]:
+) -> tuple[Float[Any, "slots *batch"], Float[Any, "slots *batch"], Float[Any, "slots *batch"]]:
     """Per contact the restitution error, the command's excess over the reference's peak force, relative to
-    it, and the chatter: `FAILED` for contacts that failed, 0 for those not asked for."""
+    it, and the chatter: `FAILED` for contacts that failed, 0 for those not asked for. NumPy in, NumPy out."""
+    xp = jnp if isinstance(outcome.error, jax.Array) else np
     # The inner `where` keeps what a failed contact leaves behind out of the derivative.
-    usable = outcome.good & jnp.isfinite(outcome.error) & jnp.isfinite(outcome.peak_ratio)
-    usable = usable & jnp.isfinite(outcome.chatter)
-    error = jnp.where(usable, outcome.error, FAILED)
-    beyond = jnp.where(usable, outcome.peak_ratio, 1 + FAILED) - 1
-    excess = jnp.where(beyond > 0, beyond, 0)
-    chatter = jnp.where(usable, outcome.chatter, FAILED)
+    usable = outcome.good & xp.isfinite(outcome.error) & xp.isfinite(outcome.peak_ratio)
+    usable = usable & xp.isfinite(outcome.chatter)
+    error = xp.where(usable, outcome.error, FAILED)
+    beyond = xp.where(usable, outcome.peak_ratio, 1 + FAILED) - 1
+    excess = xp.where(beyond > 0, beyond, 0)
+    chatter = xp.where(usable, outcome.chatter, FAILED)
     wanted = outcome.wanted
-    return jnp.where(wanted, error, 0), jnp.where(wanted, excess, 0), jnp.where(wanted, chatter, 0)
+    return xp.where(wanted, error, 0), xp.where(wanted, excess, 0), xp.where(wanted, chatter, 0)
 
 
 def metrics_of(outcome: Outcome, number: int, contacts: int, probed: bool) -> ScenarioMetrics:
