@@ -100,11 +100,36 @@ def begin_evaluation(
     wanted: Callable[[Outcome], Any] = lambda outcome: outcome,
 ) -> Callable[[], Any]:
     """Like `evaluate`, without waiting: what is returned waits for what is `wanted` of the outcome."""
+    return begin_batch(loop, gains, place_batch(scenarios, at_least), wanted)
+
+
+class Batch(NamedTuple):
+    """Scenarios on the devices, to be run under one set of gains after another; see `place_batch`."""
+
+    scenarios: Any  # dealt out, on the devices
+    dealt: "_Dealt"  # which lanes are where
+    places: np.ndarray  # where each lane is among those dealt out
+
+
+def place_batch(scenarios: Any, at_least: int = 1) -> Batch:
+    """Scenarios as `evaluate` takes them, dealt out to the devices."""
     dealt = _deal(scenarios, at_least)
-    # All of it is placed: where a leaf comes from makes no other program.
-    running = wanted(run_tiles(loop, *place(*_fold(dealt, scenarios, gains))))
     places = np.empty_like(dealt.lane, shape=lanes_of(scenarios))
     places[dealt.lane[~dealt.idle]] = np.flatnonzero(~dealt.idle)
+    # All of it is placed: where a leaf comes from makes no other program.
+    return Batch(_placed(_fold(dealt, scenarios), OWN), dealt, places)
+
+
+def begin_batch(
+    loop: Any,
+    gains: Mapping[str, Any],
+    batch: Batch,
+    wanted: Callable[[Outcome], Any] = lambda outcome: outcome,
+) -> Callable[[], Any]:
+    """`begin_evaluation` of scenarios that are placed already."""
+    common, per_lane = _fold_gains(batch.dealt, batch.scenarios, gains)
+    placed = _placed(common, PartitionSpec()), _placed(per_lane, OWN)
+    running = wanted(run_tiles(loop, *placed, batch.scenarios))
 
     def unfold(leaf):
         # (devices, tiles, ..., tile) -> (..., lanes), each device's part read where it is.
@@ -112,7 +137,7 @@ def begin_evaluation(
         rows = np.empty((*slots, devices, tiles, tile), leaf.dtype)
         for part in leaf.addressable_shards:
             rows[..., part.index[0], :, :] = np.moveaxis(np.asarray(part.data), (0, 1), (-3, -2))
-        return np.take(rows.reshape(*slots, -1), places, axis=-1)
+        return np.take(rows.reshape(*slots, -1), batch.places, axis=-1)
 
     return lambda: jax.tree.map(unfold, running)
 
@@ -122,13 +147,17 @@ def shard(
 ) -> tuple[dict[str, Any], dict[str, Any], Any]:
     """Arguments of `run_tiles`: gains common to all lanes, gains per lane and scenarios as
     (devices, tiles, ..., lanes of a tile), dealt out and padded with idle lanes."""
-    return _fold(_deal(scenarios, at_least), scenarios, gains)
+    dealt = _deal(scenarios, at_least)
+    return *_fold_gains(dealt, scenarios, gains), _fold(dealt, scenarios)
 
 
 def place(common: Any, per_lane: Any, scenarios: Any) -> tuple[Any, Any, Any]:
     """What `shard` made, on its devices: for what runs it several times."""
-    devices, everywhere = (NamedSharding(_mesh(), spec) for spec in (OWN, PartitionSpec()))
-    return jax.device_put(common, everywhere), *jax.device_put((per_lane, scenarios), devices)
+    return _placed(common, PartitionSpec()), _placed(per_lane, OWN), _placed(scenarios, OWN)
+
+
+def _placed(tree: Any, spec: PartitionSpec) -> Any:
+    return jax.device_put(tree, NamedSharding(_mesh(), spec))
 
 
 class _Dealt(NamedTuple):
@@ -166,21 +195,28 @@ def _in_turn(scenarios):
     return order[np.argsort(delays[order], kind="stable")]
 
 
-def _fold(dealt, scenarios, gains):
-    """Gains common to all lanes, gains per lane and scenarios as they were dealt out."""
+def _fold(dealt, scenarios):
+    """Scenarios as they were dealt out."""
 
     def fold(leaf):
         if leaf.strides[-1] == 0:
             same = leaf[..., 0]
             return _in_every_lane(same.tobytes(), same.dtype, same.shape, dealt.lane.shape)
-        return np.moveaxis(np.take(leaf, dealt.lane, axis=-1), (-3, -2), (0, 1))
+        return _by_lane(dealt, leaf)
 
+    return at_rest(jax.tree.map(fold, scenarios), dealt.idle)
+
+
+def _fold_gains(dealt, scenarios, gains):
+    """Gains common to all lanes, and gains per lane as they were dealt out."""
     # The scenarios' precision is that of the program.
-    precision = scenarios.control_period.dtype
-    values = {name: np.asarray(value, precision) for name, value in gains.items()}
+    values = {name: np.asarray(value, scenarios.control_period.dtype) for name, value in gains.items()}
     common = {name: value for name, value in values.items() if not value.ndim}
-    per_lane = {name: fold(value) for name, value in values.items() if value.ndim}
-    return common, per_lane, at_rest(jax.tree.map(fold, scenarios), dealt.idle)
+    return common, {name: _by_lane(dealt, value) for name, value in values.items() if value.ndim}
+
+
+def _by_lane(dealt, leaf):
+    return np.moveaxis(np.take(leaf, dealt.lane, axis=-1), (-3, -2), (0, 1))
 
 
 @lru_cache(maxsize=128)  # leaves: a few batches of like scenarios have no more

@@ -6,7 +6,7 @@ call.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import jax
@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.evaluation import Outcome, begin_evaluation, evaluate, lanes_of
+from jaxhil.simulation.evaluation import Batch, Outcome, begin_batch, lanes_of, place_batch
 from tuning.batches import cut, join
 from tuning.gains import simulated
 from tuning.gains.objective import Objective, contact_terms, metrics_of, objective_value, one_each
@@ -55,8 +55,7 @@ class Validation:
         if compensator is not None:
             loop = simulated.with_compensator(loop, compensator)
         values = {name: np.repeat([one[name] for one in gains], self.lanes) for name in gains[0]}
-        # Where few are judged, they share the program of the training scenarios.
-        outcome = evaluate(loop, values, self.judged, at_least=lanes_of(self.training))
+        outcome = begin_batch(loop, values, self._judged)()
         every = cut(outcome, self.lanes)
         self.work.ran(self.lanes * len(self.tasks))
         if not self.tasks[0].probed:
@@ -86,35 +85,43 @@ class Validation:
         number = lanes_of(self.training)
         number = min(scenarios or number, number)
         points = coordinates.shape[1]
-        pairs = [(i, point) for i in range(len(which)) for point in range(points)]
         found = np.empty((len(which), points))
         lanes = max(lanes, self.lanes * len(self.tasks))
         at_once = max(1, lanes // number)
-        parts = [pairs[begin : begin + at_once] for begin in range(0, len(pairs), at_once)]
+        # As many points of all tasks in every part: the same scenarios serve all.
+        together = min(len(which), at_once)
+        each = at_once // together
+        parts = [
+            (slice(first, first + together), slice(point, point + each))
+            for first in range(0, len(which), together)
+            for point in range(0, points, each)
+        ]
         # A part is prepared, and another one looked through, while one between them runs.
-        running = [self._begin(noise, which, coordinates, some, number, lanes) for some in parts]
-        for some, ended in zip(parts, running, strict=True):
+        read = _of_terms if objectives[which[0]].function is None else _everything
+        running = [
+            self._begin(noise, which[some], coordinates[some, own], number, lanes, read)
+            for some, own in parts
+        ]
+        for (some, own), ended in zip(parts, running, strict=True):
             outcome, amplification = ended()
-            self.work.ran(len(some) * number)
-            # (slots, pairs, scenarios)
-            terms = [np.asarray(term).reshape(-1, len(some), number) for term in contact_terms(outcome)]
+            shape, pairs = amplification.shape, amplification.size
+            self.work.ran(pairs * number)
+            # (slots, tasks, points, scenarios)
+            terms = [term.reshape(-1, *shape, number) for term in contact_terms(outcome)]
             wanted = outcome.wanted.reshape(terms[0].shape)
             probes = are_probes(number) & self.tasks[0].probed
-            values = self._values_of(objectives[which[0]], outcome, len(some))
-            begin = 0
-            for i, group in groupby(some, key=lambda pair: pair[0]):
-                own = [point for _, point in group]
-                here = slice(begin, begin := begin + len(own))
-                asked = wanted[:, here.start]  # a contact is asked for at every point
-                error, excess, chatter = (np.moveaxis(term[:, here], 1, 0) for term in terms)
-                found[i, own] = objective_value(
-                    objectives[which[i]],
+            values = self._values_of(objectives[which[0]], outcome, pairs)
+            for place, task in enumerate(which[some]):
+                asked = wanted[:, place, 0]  # a contact is asked for at every point
+                error, excess, chatter = (np.moveaxis(term[:, place], 1, 0) for term in terms)
+                found[some.start + place, own] = objective_value(
+                    objectives[task],
                     error[:, asked & ~probes],
                     excess[:, asked],
-                    amplification[here],
+                    amplification[place],
                     chatter[:, asked],
                     error[:, asked & probes] if self.tasks[0].probed else None,
-                    None if values is None else values[here],
+                    None if values is None else values.reshape(shape)[place],
                 )
         return found
 
@@ -128,27 +135,33 @@ class Validation:
         return objective.function.numbers(metrics_of(outcome, pairs, task.contacts, task.probed))
 
     def _begin(
-        self, noise, which, coordinates, some, number, lanes
-    ) -> Callable[[], tuple[Outcome, np.ndarray]]:
-        """Start some pairs; what is returned waits for their outcome and noise amplification."""
-        index = np.array([which[i] for i, _ in some])
-        gains = {i: self._gains(which[i], coordinates[i]) for i in dict.fromkeys(i for i, _ in some)}
-        names = self.tasks[0].literature
-        values = {name: np.repeat([gains[i][name][point] for i, point in some], number) for name in names}
-
-        def side_by_side(leaf):
-            picked = np.moveaxis(leaf[index][..., :number], 0, -2)
-            return picked.reshape(*picked.shape[:-2], picked.shape[-2] * picked.shape[-1])
-
-        scenarios = jax.tree.map(side_by_side, self.training)
-        ended = begin_evaluation(self.loop, values, scenarios, at_least=lanes)
+        self, noise, which, coordinates, number, lanes, read
+    ) -> Callable[[], tuple[Outcome, Float[np.ndarray, "which points"]]]:
+        """Start as many points of each task; what is returned waits for what is `read` of their outcome, and
+        for the noise's amplification."""
+        gains = [self._gains(task, own) for task, own in zip(which, coordinates, strict=True)]
+        values = {name: np.repeat([own[name] for own in gains], number) for name in self.tasks[0].literature}
+        shape = coordinates.shape[:2]
+        scenarios, batch = self._placed(tuple(which), shape[1], number, lanes)
+        ended = begin_batch(self.loop, values, batch, read)
         if not noise:
-            return lambda: (ended(), np.ones(len(some)))
+            return lambda: (ended(), np.ones(shape))
         # The mean over the scenarios, as `tuning.gains.objective.residuals` has it.
         constants = simulated.constants_of(scenarios)
         own: Any = {name: jax.numpy.asarray(value) for name, value in values.items()}
         amplification = np.asarray(self.loop.compensator.noise_amplification(own, constants))
-        return lambda: (ended(), np.mean(amplification.reshape(len(some), number), axis=1))
+        return lambda: (ended(), np.mean(amplification.reshape(*shape, number), axis=-1))
+
+    @cached_property
+    def _judged(self) -> Batch:
+        # Where few are judged, they share the program of the training scenarios.
+        return place_batch(self.judged, at_least=lanes_of(self.training))
+
+    @cached_property
+    def _placed(self) -> Callable[[tuple[int, ...], int, int, int], tuple[Any, Batch]]:
+        """Training scenarios of tasks, the first so many of each, once for each of so many points; the same
+        on the devices. The last few are kept: a search asks for them again and again."""
+        return lru_cache(maxsize=4)(partial(_placed, self.training))
 
     def gains(self, task: int, coordinates: Float[np.ndarray, "gains"]) -> dict[str, float]:
         """All of the compensator's gains at a point of the unit box."""
@@ -165,6 +178,24 @@ class Validation:
         """The points of the unit box where several sets of gains are."""
         gains = np.array([[one[name] for name in self.names] for one in several])
         return to_coordinates(gains.reshape(len(several), len(self.names)), self.bounds[task])
+
+
+def _everything(outcome: Outcome) -> Outcome:
+    return outcome
+
+
+def _of_terms(outcome: Any) -> Any:
+    """What `contact_terms` needs of an outcome."""
+    return outcome._replace(metrics=None, reference_restitution=None, reference_peak_force=None)
+
+
+def _placed(training: Any, which: tuple[int, ...], points: int, number: int, lanes: int) -> tuple[Any, Batch]:
+    def side_by_side(leaf):
+        picked = np.moveaxis(leaf[np.repeat(which, points)][..., :number], 0, -2)
+        return picked.reshape(*picked.shape[:-2], picked.shape[-2] * picked.shape[-1])
+
+    scenarios = jax.tree.map(side_by_side, training)
+    return scenarios, place_batch(scenarios, at_least=lanes)
 
 
 def build_validation(
