@@ -4,14 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-from lead_cases import lead_tasks
+from lead_cases import lead_task, lead_tasks
 
-from tuning.gains import multistart
+from tuning.gains import multistart, scan
 from tuning.gains.multistart import BATCHES, choose_starts, find_gains, finish
 from tuning.gains.objective import RMS, Objective
 from tuning.gains.rounds import Start, solve_tasks
 from tuning.gains.settings import TuneSettings
-from tuning.gains.tasks import spread_points
+from tuning.gains.tasks import build_task, spread_points
 from tuning.gains.validation import build_validation
 from tuning.gains.work import Work
 
@@ -62,6 +62,20 @@ def test_starts_are_the_literature_and_the_best_of_a_scan(tasks, validation):
         assert (np.diff(values[1:]) >= 0).all()
         apart = np.linalg.norm(points[:, None] - points, axis=-1)[np.triu_indices(4, 1)]
         assert (apart >= 0.1 * np.sqrt(points.shape[1]) - 1e-12).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_scan_tries_poor_points_on_a_part_and_chooses_as_if_on_all_scenarios(seed, monkeypatch):
+    runs = []
+    work = Work()
+    monkeypatch.setattr(work, "ran", runs.append)
+    task = build_task(lead_task().mechanism, "phase_lead", 32, 0)
+    validation = build_validation([task], 15, 0, work)
+    chosen = choose_starts(validation, 4, seed)[0]
+    some, runs[:] = sum(runs), []
+    monkeypatch.setattr(scan, "_sums_squares", lambda *_: False)
+    np.testing.assert_array_equal(chosen, choose_starts(validation, 4, seed)[0])
+    assert some < 0.8 * sum(runs)
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ global optimization methods" (1987).
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -23,12 +23,12 @@ from jaxhil.simulation.environment import float64, program_folder
 from tuning.gains.metrics_function import ALLOWED
 from tuning.gains.objective import RMS, Objective
 from tuning.gains.rounds import Start, inverse_hessian, prepare_solver, solve_tasks, step_runs
+from tuning.gains.scan import SCENARIOS, scan, scan_evaluations
 from tuning.gains.settings import TuneSettings
-from tuning.gains.tasks import TuneTask, spread_points, tuned_names
+from tuning.gains.tasks import TuneTask, tuned_names
 from tuning.gains.validation import Validation
-from tuning.optimisation.derivative_free import apart, polish
+from tuning.optimisation.derivative_free import polish
 
-SCAN_SCENARIOS = 32  # on which the points of a scan are tried
 KINKED = 3  # times as many evaluations without derivatives for a user's function
 BATCHES = 4  # of starts, at most
 SURE = 3  # starts that have to agree: two may have met in a poor basin
@@ -47,7 +47,7 @@ class MultistartResult(NamedTuple):
     best: Start | None  # the best of its starts, improved without derivatives; None if all failed
     starts: list[Start]  # all of them, batch by batch
     # of the objective, that it took. A Jacobian over P gains counts as 1 + P of them, a point of a scan as
-    # the share of the scenarios it was tried on.
+    # the share of the scenarios it may be tried on.
     evaluations: int
 
 
@@ -99,9 +99,9 @@ def find_gains(
 def expected_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
     """Simulated runs that a search takes, of tasks that are alike, where starts agree and none ends early."""
     names, lanes = tuned_names(tasks), tasks[0].lanes
-    scan = settings.scanned * min(SCAN_SCENARIOS, lanes) if settings.starts > 1 else 0
+    scanning = settings.scanned * min(SCENARIOS, lanes) if settings.starts > 1 else 0
     solve = settings.starts * settings.steps * step_runs(tasks, names)
-    return len(tasks) * (scan + solve + settings.polish * len(names) * lanes)
+    return len(tasks) * (scanning + solve + settings.polish * len(names) * lanes)
 
 
 def _solve_batches(
@@ -125,7 +125,7 @@ def _solve_batches(
             work.begin(text, expected_runs([tasks[i] for i in going], settings))
             seed = settings.seed, batch
             chosen = [np.empty((0, len(validation.names)))] * len(tasks)
-            scans = _scan(validation, going, number, seed, objective, settings.scanned)
+            scans = scan(validation, going, number, seed, objective, settings.scanned)
             for i, points in zip(going, scans, strict=True):
                 chosen[i] = points
         ended = solve_tasks(tasks, chosen, settings.steps, objective, work)
@@ -134,7 +134,7 @@ def _solve_batches(
             own.starts += _exactly(validation, i, ended[i], objective)
             own.evaluations += (1 + len(validation.names)) * sum(start.steps for start in ended[i])
             if batch > 0 or number > 1 + given[i]:
-                own.evaluations += _scan_evaluations(validation, number, settings.scanned)
+                own.evaluations += scan_evaluations(validation, number, settings.scanned)
         going = [i for i in going if not _agree(searches[i].starts, agreed)]
         if not going:
             break
@@ -157,7 +157,7 @@ def choose_starts(
     usual = [max(starts - len(own), 1) for own in given]
     literature = [validation.coordinates(i, [validation.tasks[i].literature]) for i in tasks]
     if max(usual) > 1:
-        further = _scan(validation, list(tasks), max(usual) - 1, seed, objective, scanned, literature)
+        further = scan(validation, list(tasks), max(usual) - 1, seed, objective, scanned, literature)
         literature = [np.concatenate(both) for both in zip(literature, further, strict=True)]
     return [np.concatenate([literature[i][: usual[i]], given[i]]) for i in tasks]
 
@@ -255,39 +255,6 @@ def _prepare(validation: Validation, number: int, objective: Objectives) -> None
     # A thread has jax's settings from the process, not from the caller.
     with float64():
         prepare_solver(validation.tasks, number, objective)
-
-
-def _scan(
-    validation: Validation,
-    which: list[int],
-    number: int,
-    seed: int | tuple[int, ...],
-    objective: Objectives,
-    scanned: int,
-    beside: list[np.ndarray] | None = None,
-) -> list[Float[np.ndarray, "number gains"]]:
-    """The best points of a scan of the tasks `which`, so many that lie apart, and from those `beside`."""
-    around = [validation.coordinates(i, [validation.tasks[i].literature])[0] for i in which]
-    points = np.stack([spread_points(own, max(scanned, 2 * number), seed)[1:] for own in around])
-    for own, i in zip(points, which, strict=True):
-        task = validation.tasks[i]
-        for gain in task.tuned:
-            if gain.begins is not None:
-                mechanism: Any = task.mechanism
-                place, begins = validation.names.index(gain.name), {gain.name: gain.begins(mechanism)}
-                own[:, place] = validation.coordinates(i, [{**task.literature, **begins}])[0, place]
-    values = validation.losses(objective, which, points, SCAN_SCENARIOS)
-    order = np.argsort(np.where(np.isfinite(values), values, np.inf), axis=1, kind="stable")
-    best = []
-    for place, i in enumerate(which):
-        known = beside[i] if beside else np.empty((0, len(validation.names)))
-        best.append(apart(points[place][order[place]], known, len(known) + number)[len(known) :])
-    return best
-
-
-def _scan_evaluations(validation: Validation, number: int, scanned: int) -> int:
-    scenarios = validation.tasks[0].lanes
-    return -(-max(scanned, 2 * number) * min(SCAN_SCENARIOS, scenarios) // scenarios)
 
 
 def _moved(validation: Validation, task: int, start: Start, point: np.ndarray, loss: float) -> Start:

@@ -16,6 +16,7 @@ CANDIDATES = 16  # of a generation of `polish`
 PER_BASIN = 32  # of a generation of `search_globally`, for each basin of its first round
 BASINS = 8  # that `search_globally` goes down into at once
 SCAN = 8  # the part of its budget that is the scan
+APART = 0.1  # of the box's diagonal
 REACHES = 0.1, 0.2, 0.01  # of its first round, of those between, of the last
 # What a failed evaluation counts as: worse than all others, and still a number.
 WORST = np.finfo(float).max
@@ -256,15 +257,22 @@ def apart(ranked, known, number):
 
     Apart is a tenth of the box's diagonal, less where there are not enough of them.
     """
-    known = np.zeros((0, ranked.shape[-1])) if known is None else np.clip(known, 0, 1)
-    distance = 0.1 * np.sqrt(ranked.shape[-1])
+    known = np.zeros((0, ranked.shape[-1])) if known is None else known
+    distance = APART * np.sqrt(ranked.shape[-1])
     while True:
-        chosen = list(known[:number])
-        for point in ranked:
-            if len(chosen) == number:
-                return np.array(chosen)
-            if all(np.linalg.norm(point - other) >= distance for other in chosen):
-                chosen.append(point)
+        chosen = far_apart(ranked, known, number, distance)
         if len(chosen) == number:
-            return np.array(chosen)
+            return chosen
         distance = distance / 2 if len(ranked) > number and distance > 1e-9 else 0.0
+
+
+def far_apart(ranked, known, number, distance=None):
+    """The same, but fewer where no more lie so far apart, by default a tenth of the diagonal."""
+    distance = APART * np.sqrt(ranked.shape[-1]) if distance is None else distance
+    chosen = list(np.clip(known[:number], 0, 1))
+    for point in ranked:
+        if len(chosen) == number:
+            break
+        if all(np.linalg.norm(point - other) >= distance for other in chosen):
+            chosen.append(point)
+    return np.array(chosen)
