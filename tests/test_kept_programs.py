@@ -1,6 +1,7 @@
 """Compiled programs kept in files: the same bits, not traced again, remade when what they depend on
 changes."""
 
+import errno
 import importlib
 import os
 import subprocess
@@ -28,6 +29,9 @@ from jaxhil.simulation.kept_programs import compiled
 from jaxhil.simulation.scenario import build_scenarios
 
 pytestmark = pytest.mark.users_options
+where_kept = pytest.mark.skipif(
+    jax.__version_info__ < (0, 10), reason="older ones do not tell of the processor"
+)
 
 
 class Sums(NamedTuple):
@@ -75,6 +79,7 @@ def check(result, total=31.0):
     np.testing.assert_array_equal(result.parts[0], 3 * VALUES)
 
 
+@where_kept
 def test_a_program_is_traced_once_and_gives_the_same_numbers(tmp_path):
     check(run(None))
     assert len(traced) == 1
@@ -83,6 +88,7 @@ def test_a_program_is_traced_once_and_gives_the_same_numbers(tmp_path):
     assert len(traced) == 2 and len(list(tmp_path.iterdir())) == 1
 
 
+@where_kept
 def test_code_that_came_from_the_compile_cache_is_kept_as_well(tmp_path):
     """Of that, jax itself writes what ends in an error."""
     for name in ("first", "second"):
@@ -93,6 +99,7 @@ def test_code_that_came_from_the_compile_cache_is_kept_as_well(tmp_path):
     assert len(traced) == 2
 
 
+@where_kept
 @pytest.mark.parametrize("spoil", [lambda content: b"", lambda content: content[:-100], lambda c: b"no" + c])
 def test_a_spoilt_file_is_made_anew(tmp_path, spoil):
     run(tmp_path)
@@ -103,6 +110,7 @@ def test_a_spoilt_file_is_made_anew(tmp_path, spoil):
     assert len(traced) == 2 and file.read_bytes()[:64] == whole[:64]
 
 
+@where_kept
 def test_a_flipped_bit_costs_only_the_time_to_trace(tmp_path):
     run(tmp_path)
     (file,) = tmp_path.iterdir()
@@ -116,6 +124,7 @@ def test_a_flipped_bit_costs_only_the_time_to_trace(tmp_path):
         assert traced and read_sealed(file) is not None
 
 
+@where_kept
 def test_a_program_whose_code_is_gone_is_made_anew(tmp_path):
     run(tmp_path)
     for file in Path(str(program_folder())).glob(f"jit_sums-*{ENDING}"):
@@ -126,6 +135,7 @@ def test_a_program_whose_code_is_gone_is_made_anew(tmp_path):
     assert len(traced) == 2
 
 
+@where_kept
 def test_whatever_a_program_follows_from_makes_it_another(tmp_path, monkeypatch):
     check(run(tmp_path))
     check(run(tmp_path, (HuntCrossley(), 1)), 46.0)
@@ -142,6 +152,7 @@ def test_whatever_a_program_follows_from_makes_it_another(tmp_path, monkeypatch)
     assert len(traced) == len(list(tmp_path.iterdir())) == 8
 
 
+@where_kept
 @pytest.mark.parametrize("changed", ["jaxhil", "tuning"])
 def test_changed_sources_are_another_program(tmp_path, monkeypatch, changed):
     kept = tmp_path / "kept"
@@ -185,6 +196,47 @@ def test_a_folder_that_cannot_be_written_costs_no_result(tmp_path):
     check(run(tmp_path / "missing"))
 
 
+def test_settings_that_change_between_calls_make_another_program(tmp_path, monkeypatch):
+    """In one process, which keeps what it has read."""
+    monkeypatch.setattr(kept_programs, "program_folder", lambda: tmp_path)
+    again = partial(kept_programs.run, sums, STATIC, jnp.asarray(VALUES), {"factor": jnp.array(3.0)})
+    for precision in ("highest", "default"):
+        with jax.default_matmul_precision(precision):
+            check(again())
+            check(again())
+    assert len(traced) == 2
+
+
+def test_a_named_tuple_from_elsewhere_is_foreign():
+    assert kept_programs.is_foreign((1, Sums(1, (2,))))  # pyright: ignore[reportArgumentType]
+    assert not kept_programs.is_foreign((1, ("two", None, KelvinVoigt())))
+
+
+def test_every_call_of_a_program_is_seen():
+    text = """%0 = stablehlo.custom_call @lapack_dpotrf_ffi(%1)
+    %2 = stablehlo.custom_call @xla.sdy.Sharding(%0)
+    %3 = stablehlo.custom_call @"my-own, one"(%2) %4 = stablehlo.custom_call @cu$other(%3)"""
+    assert kept_programs.calls_of(text) == {
+        "lapack_dpotrf_ffi",
+        "xla.sdy.Sharding",
+        "my-own, one",
+        "cu$other",
+    }
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENOSPC, "full"), TypeError("cannot pickle"), KeyError("private")]
+)
+@pytest.mark.parametrize("step", ["remove_stale", "_to_bytes", "write_sealed"])
+def test_what_cannot_be_kept_costs_no_result(tmp_path, monkeypatch, step, error):
+    def fails(*arguments, **named):
+        raise error
+
+    monkeypatch.setattr(kept_programs, step, fails)
+    check(run(tmp_path))
+    assert not list(tmp_path.iterdir())
+
+
 SOLVES = """
 import sys
 from functools import partial
@@ -201,6 +253,7 @@ print(kept_programs.run(solved, 1, np.diag([4.0, 0.5])))
 """
 
 
+@where_kept
 def test_a_kept_program_solves_equations_in_a_process_that_traced_none(tmp_path):
     script = tmp_path / "solves.py"
     script.write_text(SOLVES)
@@ -209,6 +262,7 @@ def test_a_kept_program_solves_equations_in_a_process_that_traced_none(tmp_path)
     assert said == ["traced\n[0.25 2.  ]\n", "[0.25 2.  ]\n"]
 
 
+@where_kept
 @pytest.mark.parametrize("lanes", [(), (20,)])
 def test_a_kept_batch_has_the_same_bits_and_is_not_compiled_again(tmp_path, monkeypatch, lanes):
     mechanism = load("varying").mechanism

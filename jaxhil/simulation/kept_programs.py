@@ -4,7 +4,8 @@ That takes longer than running a short batch. What jax knows of a compiled progr
 name is made of all it depends on: the sources, the versions of what they stand on, static arguments, shapes,
 the settings of jax, the compiler's flags and options, and the processor. The machine code stays in the
 compile cache and is named by its key there: jax can write code whole, but what it has read itself it writes
-so that it ends in an error when it runs.
+so that it ends in an error when it runs. As with that cache, whoever may write into the folder may run code
+in the process that reads it: files are sealed against damage, not against their author.
 
 Not all that is used of jax here is public. Where it is not there, and on graphics cards, nothing is kept.
 """
@@ -71,7 +72,7 @@ def _look_up(function, static, arguments, options):
     leaves, structure = jax.tree.flatten(arguments)
     folder = program_folder()
     shapes = tuple([(leaf.shape, leaf.dtype) for leaf in leaves])
-    key = function, static, structure, shapes, frozenset(options.items()), folder
+    key = function, static, structure, shapes, frozenset(options.items()), folder, _settings()
     program = _programs.get(key)
     if program is None:
 
@@ -104,36 +105,52 @@ def compiled(
         return made()
     try:
         path = Path(folder) / f"{_name(made_of)}{ENDING}"
-    except (ImportError, AttributeError):
+    except Exception:
+        # A jax that does not tell all that the name is made of.
         return made()
     program = _read(path)
     if program is None:
         lowered = made().lower(*arguments)
         program, key = compile_cache.compiled(lowered)
-        _write(path, program, key, set(re.findall(r"custom_call @([\w.]+)", lowered.as_text())))
+        if key is not None:
+            _write(path, program, key, calls_of(lowered.as_text()))
     return program
+
+
+def calls_of(text: str) -> set[str]:
+    """The names of all that a lowered program calls."""
+    return {quoted or plain for quoted, plain in re.findall(r'custom_call @(?:"([^"]*)"|([^\s(]+))', text)}
 
 
 def is_foreign(value: Any) -> bool:
     """Whether anything of another package is in it, or what its text does not tell: an array, a function."""
+    if value is None or isinstance(value, (str, bool, int, float)):
+        return False
+    if type(value) is not tuple and type(value).__module__.split(".")[0] not in PACKAGES:
+        return True
     if isinstance(value, tuple):
         return any(is_foreign(entry) for entry in value)
     if not dataclasses.is_dataclass(value):
-        return not (value is None or isinstance(value, (str, bool, int, float)))
-    home = type(value).__module__.split(".")[0]
-    fields = (getattr(value, field.name) for field in dataclasses.fields(value))
-    return home not in PACKAGES or any(is_foreign(field) for field in fields)
+        return True
+    return any(is_foreign(getattr(value, field.name)) for field in dataclasses.fields(value))
 
 
 def _name(made_of) -> str:
     from jax._src.lib import xla_client  # pyright: ignore[reportPrivateImportUsage]
 
     processor = xla_client.get_topology_for_devices(jax.devices()).fingerprint()
-    known = jax.config.values
-    settings = [(name, getattr(jax.config, name, known[name])) for name in known if not name.endswith("_dir")]
+    settings = _settings()
+    if not settings:
+        raise LookupError("settings")
     here = processor, jax.device_count(), rounding_flags(xla_flags()), sorted(settings)
     text = repr((made_of, here, sources_sha256(), versions()))
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _settings() -> tuple[tuple[str, Any], ...]:
+    """What jax is set to in this thread now, but for folders; nothing where it does not tell."""
+    known = getattr(jax.config, "values", {})
+    return tuple([(name, getattr(jax.config, name, known[name])) for name in known if name[-4:] != "_dir"])
 
 
 def _read(path: Path) -> Any:
@@ -151,12 +168,12 @@ def _read(path: Path) -> Any:
         return None
 
 
-def _write(path: Path, program: Any, key: str | None, calls: set[str]) -> None:
+def _write(path: Path, program: Any, key: str, calls: set[str]) -> None:
     """All or nothing; a folder that has become full or read-only, and a jax that cannot do it, cost only the
     next call's time."""
-    if key is None or not all(CALLS.fullmatch(name) for name in calls):
+    if not all(CALLS.fullmatch(name) for name in calls):
         return
-    with suppress(OSError, ImportError, AttributeError):
+    with suppress(Exception):
         content = _to_bytes(program, key, any(name.startswith("lapack") for name in calls))
         remove_stale(path.parent)
         write_sealed(path, content, lasting=False)
