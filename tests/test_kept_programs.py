@@ -1,6 +1,7 @@
 """Compiled programs kept in files: the same bits, not traced again, remade when what they depend on
 changes."""
 
+import dataclasses
 import errno
 import importlib
 import os
@@ -19,7 +20,7 @@ from compiling import programs_of
 from jaxhil.compensators import literature_gains
 from jaxhil.contact.laws import HuntCrossley, KelvinVoigt
 from jaxhil.files import read_sealed
-from jaxhil.mechanism.file import load
+from jaxhil.mechanism.file import load, load_any
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation import evaluation, kept_programs, sources
 from jaxhil.simulation.building import build_loop
@@ -27,6 +28,7 @@ from jaxhil.simulation.compile_cache import ENDING
 from jaxhil.simulation.environment import CACHE, TICKS, program_folder
 from jaxhil.simulation.kept_programs import compiled
 from jaxhil.simulation.scenario import build_scenarios
+from jaxhil.sixdof.building import build_scenarios as six_axes_scenarios
 
 pytestmark = pytest.mark.users_options
 where_kept = pytest.mark.skipif(
@@ -37,6 +39,10 @@ where_kept = pytest.mark.skipif(
 class Sums(NamedTuple):
     total: jax.Array
     parts: tuple[jax.Array, ...]
+
+
+class Mine(KelvinVoigt):
+    """A law from elsewhere."""
 
 
 traced = []
@@ -168,9 +174,6 @@ def test_changed_sources_are_another_program(tmp_path, monkeypatch, changed):
 
 
 def test_a_law_from_elsewhere_is_not_kept(tmp_path):
-    class Mine(KelvinVoigt):
-        pass
-
     for _ in range(2):
         check(run(tmp_path, (Mine(), 1)))
     assert len(traced) == 2 and not list(tmp_path.iterdir())
@@ -205,6 +208,23 @@ def test_settings_that_change_between_calls_make_another_program(tmp_path, monke
             check(again())
             check(again())
     assert len(traced) == 2
+
+
+def phases(static, scenarios):
+    traced.append(static)
+    return 2 * scenarios.duration
+
+
+@pytest.mark.parametrize("law", [Mine(), pytest.param(HuntCrossley(), marks=where_kept)])
+def test_a_law_from_elsewhere_that_arguments_carry_is_not_kept(tmp_path, monkeypatch, law):
+    """As those of scenarios in six axes do."""
+    scenarios = six_axes_scenarios(load_any("petals").mechanism)
+    groups = tuple(dataclasses.replace(group, law=law) for group in scenarios.groups)
+    monkeypatch.setattr(kept_programs, "program_folder", lambda: tmp_path)
+    for _ in range(2):
+        kept_programs._programs.clear()
+        kept_programs.run(phases, 1, scenarios._replace(groups=groups))
+    assert (len(traced), len(list(tmp_path.iterdir()))) == ((2, 0) if isinstance(law, Mine) else (1, 1))
 
 
 def test_a_named_tuple_from_elsewhere_is_foreign():

@@ -86,7 +86,9 @@ def _look_up(function, static, arguments, options):
         placed = [(leaf.shape, str(leaf.dtype), str(getattr(leaf, "sharding", None))) for leaf in leaves]
         named = function.__module__, function.__qualname__
         made_of = (*named, static, structure, placed, sorted(options.items()))
-        program = compiled(made_of, made, leaves, None if is_foreign(static) else folder)
+        # Arguments may have laws in their structure.
+        foreign = is_foreign((static, jax.tree.unflatten(structure, [None] * len(leaves))))
+        program = compiled(made_of, made, leaves, None if foreign else folder)
         _programs[key] = program
     return program, leaves
 
@@ -126,10 +128,10 @@ def is_foreign(value: Any) -> bool:
     """Whether anything of another package is in it, or what its text does not tell: an array, a function."""
     if value is None or isinstance(value, (str, bool, int, float)):
         return False
-    if type(value) is not tuple and type(value).__module__.split(".")[0] not in PACKAGES:
+    if type(value) not in (tuple, list, dict) and type(value).__module__.split(".")[0] not in PACKAGES:
         return True
-    if isinstance(value, tuple):
-        return any(is_foreign(entry) for entry in value)
+    if isinstance(value, (tuple, list, dict)):
+        return any(is_foreign(entry) for entry in (value.values() if isinstance(value, dict) else value))
     if not dataclasses.is_dataclass(value):
         return True
     return any(is_foreign(getattr(value, field.name)) for field in dataclasses.fields(value))
