@@ -117,11 +117,12 @@ def test_a_spoilt_file_is_made_anew(tmp_path, spoil):
 
 
 @where_kept
-def test_a_flipped_bit_costs_only_the_time_to_trace(tmp_path):
+@pytest.mark.parametrize("number", [10, pytest.param(1000, marks=pytest.mark.slow)])
+def test_a_flipped_bit_costs_only_the_time_to_trace(tmp_path, number):
     run(tmp_path)
     (file,) = tmp_path.iterdir()
     whole = file.read_bytes()
-    for bit in np.random.default_rng(0).integers(0, 8 * len(whole), 10):
+    for bit in np.random.default_rng(0).integers(0, 8 * len(whole), number):
         traced.clear()
         harmed = bytearray(whole)
         harmed[bit // 8] ^= 1 << int(bit % 8)
