@@ -84,6 +84,20 @@ def in_arrays(met):
     )  # fmt: skip
 
 
+def farthest(pace=1.0):
+    """By how much [s] the surface may lie elsewhere than where it was met."""
+    return (3 * math.sqrt((FOUND / (SPEED * PERIOD)) ** 2 - 1 / 12) + 1.5) * PERIOD * pace
+
+
+def found(depths, forces, delay):
+    """The surface, met between two ticks, and the readings until 8 ticks later."""
+    met = int(np.argmax(depths > delay))
+    middle = 0.5 * (depths[met - 1] + depths[met])
+    newest = slice(max(met - 32, 0), met + 8)
+    met_at = meeting()._replace(place=middle * SPEED, variance=(PERIOD * SPEED) ** 2 / 12)
+    return met_at, (depths[newest] - middle).tolist(), forces[newest].tolist(), VARIANCE
+
+
 def weights_of(bank):
     return bank._weigh()
 
@@ -114,7 +128,7 @@ def test_likelihood_is_the_root_of_the_density_of_all_readings():
         covariance[place, place] = PRIOR[name] ** 2
     mean = np.r_[np.full(12, PRIOR["stiffness"]), np.zeros(5)]
     share = TOLD**2 / (TOLD**2 + FOUND**2)
-    covariance[16, 16] += (USUAL * share * STIFFNESS * FOUND / SPEED) ** 2
+    covariance[16, 16] += (STIFFNESS * farthest()) ** 2
     exact = []
     for h, offset in enumerate(DELAYED[:FIRST_LAG]):
         covariance[:12, :12] = PRIOR["common"] ** 2 + wanders * (1 if h < DELAYS else STEADY**2)
@@ -166,7 +180,8 @@ def test_both_recursions_agree():
 
 def test_where_all_delays_are_the_same_it_is_one_map():
     depths, speeds, forces, _ = contact(np.random.default_rng(2), begins=0.002, lasts=0.2)
-    bank, alone = plain(0.0, 1e-12), ForceDepthMap(Prior(**PRIOR))
+    uncertain = math.hypot(PRIOR["preload"], STIFFNESS * farthest())
+    bank, alone = plain(0.0, 1e-12), ForceDepthMap(Prior(**{**PRIOR, "preload": uncertain}))
     bank.begin(meeting(), *UNSEEN)
     deepest = 0.0
     for depth, speed, force in zip(depths.tolist(), speeds.tolist(), forces.tolist(), strict=True):
@@ -198,7 +213,7 @@ def test_contacts_decide_whether_slopes_wander_but_not_thereby_on_lags(bend, ste
         bank._carried = np.concatenate([either, 0 * either, before[FIRST_LAG:]])
         np.testing.assert_allclose(weights[FIRST_LAG:], weights_of(bank)[FIRST_LAG:], rtol=1e-12)
         bank._carried = before
-    delayed = np.sum(either * bank._likelihood[:DELAYS])
+    delayed = np.sum(either * bank._likelihood[:DELAYS] * bank._likely[:DELAYS])
     bank.begin(meeting(), *UNSEEN)
     shares = lagging / (np.sum(lagging) + delayed)
     np.testing.assert_allclose(bank._carried[FIRST_LAG:], np.maximum(shares, 1e-12), rtol=1e-9)
@@ -226,12 +241,12 @@ def test_contacts_narrow_the_delay_and_a_reset_forgets_it():
     for _ in range(8):
         # The ticks fall elsewhere on every contact: of damped contact that is what tells a delay.
         depths, speeds, forces, _ = contact(rng, begins=-0.02 + PERIOD * rng.random(), delay=delay)
-        bank.begin(meeting(), *UNSEEN)
+        bank.begin(*found(depths, forces, delay))
         for depth, speed, force in zip(depths.tolist(), speeds.tolist(), forces.tolist(), strict=True):
             bank.learn(depth, speed, force, VARIANCE, False, 0.0)
         weights = weights_of(bank)
         spreads.append(math.sqrt(np.sum(weights * (OLDER - bank.shift) ** 2)))
-    assert abs(bank.shift - delay) < 1.5e-4 and spreads[-1] < 0.6 * spreads[0]
+    assert abs(bank.shift - delay) < 1e-4 and spreads[-1] < 0.6 * spreads[0]
     bank.reset()
     np.testing.assert_array_equal(weights_of(bank), weights_of(plain()))
 
@@ -242,7 +257,7 @@ def test_a_jump_between_two_hypotheses_rules_neither_out():
     rng, bank, delay = np.random.default_rng(7), plain(plane_spread=1e-9), 0.5 * (OFFSETS[11] + OFFSETS[12])
     for beside in (-3e-5, 3e-5) * 2:
         depths, speeds, forces, _ = contact(rng, begins=delay + beside - 20 * PERIOD, delay=delay)
-        bank.begin(meeting(), *UNSEEN)
+        bank.begin(*found(depths, forces, delay))
         for depth, speed, force in zip(depths.tolist(), speeds.tolist(), forces.tolist(), strict=True):
             bank.learn(depth, speed, force, VARIANCE, False, 0.0)
     assert bank.shift == pytest.approx(delay, abs=1e-4)
@@ -251,8 +266,8 @@ def test_a_jump_between_two_hypotheses_rules_neither_out():
 @pytest.mark.parametrize(
     ("plane_spread", "place", "share"),
     [
-        (1e-7, 4e-6, 0.0),  # told: hypotheses enter one after the other
-        (1e3, 4e-6, 1.0),  # unknown: all enter where it was met
+        (1e-7, 4e-6, 0.0),  # told
+        (1e3, 4e-6, 1.0),  # unknown
         (1e-7, 4e-4, 1.0),  # told, and not there
         (FOUND, 4e-6, 0.5),
     ],
@@ -268,10 +283,19 @@ def test_surface_lies_between_where_it_was_told_and_where_it_was_met(plane_sprea
     delayed = slice(0, FIRST_LAG)
     np.testing.assert_allclose((-bank._below - DELAYED * pace)[delayed], depth[delayed], atol=1e-6)
     away = (met - DELAYED * SPEED) ** 2 / both
-    entered = (-bank._below - DELAYED * pace).max() / (PERIOD * pace)
+    entered = -bank._below[FIRST_LAG:].min() / (PERIOD * pace)
     assert earlier == min(math.ceil(max(entered - 1e-2, 0)), 30)
     weights = np.concatenate([np.ones(DELAYS), np.zeros(DELAYS), np.full(len(LAGS), LAGGING)])
     weights *= np.maximum(np.exp(-0.5 * away), UNLIKELY)
+    # Of a delay, the place that its map's preload makes, in the mean where it has the surface.
+    length, wide = SPEED / pace, STIFFNESS * farthest(pace)
+    placed = wide**2 / (wide**2 + PRIOR["preload"] ** 2)
+    known, own = (plane_spread / length) ** 2, placed * wide**2 + placed * PRIOR["preload"] ** 2
+    own = own / PRIOR["stiffness"] ** 2
+    off = share * (met - DELAYED * SPEED)[delayed] / length
+    there = np.exp(-0.5 * off**2 / (known + own)) * math.sqrt(known / (known + own))
+    weights[delayed] = np.where(weights[delayed] > 0, 1, 0) * np.maximum(there, UNLIKELY)
+    weights[delayed] *= farthest(pace) * length / (USUAL * FOUND)
     weights /= np.sum(weights)
     np.testing.assert_allclose(weights_of(bank), weights, rtol=0.03)
     assert bank.shift == pytest.approx(weights @ OLDER, abs=1e-5)

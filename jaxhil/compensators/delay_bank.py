@@ -18,7 +18,6 @@ bend at the same places, wherever they have the surface: which fits best is not 
 contact that bends between two knots leaves.
 """
 
-import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -26,6 +25,17 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxhil.compensators.entry import (
+    DENSITY_SQUARINGS,
+    NOT_THERE,
+    UNLIKELY,
+    USUAL,
+    Entry,
+    agree,
+    cumulative,
+    enter,
+    no_entry,
+)
 from jaxhil.compensators.force_depth_map import (
     DAMPING,
     FRICTION,
@@ -41,7 +51,6 @@ from jaxhil.compensators.force_depth_map import (
     features,
     positive_mean,
     predict,
-    tells,
 )
 from jaxhil.compensators.lagged_onset import Window, lagged_onsets
 from jaxhil.compensators.meeting import Meeting
@@ -58,17 +67,14 @@ LAGGING = 0.0001  # of a delay's probability, that of each lag
 # What is carried before the first contact, and what where it is over: only then its slopes tell how they are.
 FIRST = np.where(DELAYED, np.arange(HYPOTHESES) < DELAYS, LAGGING)
 EITHER = np.where(DELAYED, 0.5, LAGGING)
-ELASTIC = 0.5  # probability that a contact has no damping
+ELASTIC = 0.35  # probability that a contact has no damping
 BROADENING = 2.0  # of the variance of the damping
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
 LEAST, LEAST_CARRIED = 1e-200, 1e-12
 NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, some do not
-DENSITY_SQUARINGS = 8  # n = 2^8 of what is known of damping
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
-NOT_THERE = 9.0  # times the variance of where the surface is expected: it is not there
-UNLIKELY = 0.1  # that it is not, at least
-USUAL = 0.5  # stiffness, of the most that it may be
 FARTHEST, WHOLE = 0.004, 0.015  # s by which knots are moved, from what depth [s] on; before it less
+BEYOND_NOISE = 9.0  # times its variance: a force that is more than noise
 EARLIER = 30  # ticks before it was met, whose readings count
 
 
@@ -92,6 +98,8 @@ class Bank(NamedTuple):
     held: Float[Array, "parameters lags *batch"]  # what the force is linear in as a lagging sensor shows it
     before: Float[Array, "parameters lags *batch"]  # and as it was at the reading before
     pushed: Float[Array, "lags *batch"]  # whether (1) the contact then pushed
+    entry: Entry  # of this contact, by delays
+    within: Float[Array, "delays *batch"]  # how deep the surface is, by the maps of delays [s]
 
 
 def no_bank(prior: Map) -> Bank:
@@ -102,7 +110,7 @@ def no_bank(prior: Map) -> Bank:
     held = jnp.stack([each[:LAGS]] * len(prior.mean))
     return Bank(
         _priors(prior), each, each + 1, carried, each, each, zero, zero, each, zero + 1, zero, zero,
-        each, each + 1, held, held, held[0],
+        each, each + 1, held, held, held[0], no_entry(zero, FIRST_LAG), each[:FIRST_LAG],
     )  # fmt: skip
 
 
@@ -133,10 +141,13 @@ def begin(
     offsets = _column(OFFSETS, speed[None]) * farthest[None]
     tick = period * pace
     lags = _column(LAG[FIRST_LAG:], speed[None]) * pace[None]
-    placed = _place(meeting, offsets, speed / pace, speed, plane_spread, lagged_onsets(lags, window, tick))
-    first = jnp.max(-placed.below - offsets * pace[None], axis=0)
+    true = prior.covariance[PRELOAD, PRELOAD]
+    lagged = lagged_onsets(lags, window, tick)
+    placed = _place(meeting, window, offsets, speed, pace, tick, plane_spread, true, lagged)
+    first = jnp.max(-placed.below[FIRST_LAG:], axis=0)
     earlier = jnp.minimum(jnp.ceil(jnp.where(first > SURFACE, first, 0) / tick), EARLIER).astype(jnp.int32)
     carried = jnp.where(old.met[None] > 0, old.carried, _column(EITHER, old.carried))
+    evidence = old.likelihood * jnp.where(_column(DELAYED, old.likely) > 0, old.likely, 1)
     fresh = _priors(prior)
     fresh = fresh._replace(covariance=fresh.covariance.at[PRELOAD, PRELOAD].add(placed.preload))
     now = old._replace(
@@ -146,7 +157,7 @@ def begin(
         ),
         deepest=jnp.where(begins[None], 0, old.deepest),
         likelihood=jnp.where(begins[None], 1, old.likelihood),
-        carried=jnp.where(ends[None], _shares(_weighed(carried, old.likelihood), LEAST_CARRIED), old.carried),
+        carried=jnp.where(ends[None], _shares(_weighed(carried, evidence), LEAST_CARRIED), old.carried),
         precision=old.precision + jnp.where(ends[None], precision, 0),
         weighted=old.weighted + jnp.where(ends[None], precision * mean, 0),
         met=old.met + jnp.where(ends, 1, 0),
@@ -158,7 +169,9 @@ def begin(
         held=jnp.where(begins[None, None], 0, old.held),
         before=jnp.where(begins[None, None], 0, old.before),
         pushed=jnp.where(begins[None], 0, old.pushed),
+        entry=Entry(*(jnp.where(begins, *both) for both in zip(placed.entry, old.entry, strict=True))),
     )
+    now = _entered(now)
     means = _means(now, weigh(now, damping), offsets)
     shift, deeper = (
         jnp.where(begins, a, b) for a, b in ((means.shift, old.shift), (means.deeper, old.deeper))
@@ -179,8 +192,14 @@ def learn(old: Bank, reading: Reading, period: Array, farthest: Array, damping: 
     deepest = jnp.where(counts & (depth > old.deepest), depth, old.deepest)
     noise = (reading.variance + jnp.where(reading.hidden, reading.zone**2 / 12, 0))[None]
     delayed = _column(DELAYED, depth) > 0
-    inside = ~delayed | (depth > SURFACE)
-    phi = features(depth, rate, deepest, knots_of(old))
+    # While a contact closes its force is not negative. Opening, nothing may be left of it before depth 0.
+    closes = rate > 0
+    own = depth - jnp.concatenate([old.within, jnp.zeros_like(depth[FIRST_LAG:])])
+    inside = ~delayed | (jnp.where(closes, (reading.depth - old.entry.met)[None], own) > SURFACE)
+    knots = knots_of(old)
+    phi = features(depth, rate, deepest, knots)
+    # Of a delay, the surface may lie before where its map has it.
+    phi = phi.at[0, :FIRST_LAG].set(jnp.minimum(depth, knots[1])[:FIRST_LAG])
     held, pushes = _smooth(old, depth[FIRST_LAG:], rate[FIRST_LAG:], phi[:, FIRST_LAG:], period)
     before, phi = phi[:, FIRST_LAG:], jnp.concatenate([phi[:, :FIRST_LAG], held], axis=1)
     predicted = predict(old.maps, phi, noise)
@@ -188,13 +207,9 @@ def learn(old: Bank, reading: Reading, period: Array, farthest: Array, damping: 
     tight = hidden & (predicted.force <= zone)
     force = jnp.where(reading.hidden, 0.5 * reading.zone, reading.force)[None]
     force = force + jnp.zeros_like(depth)
-    # While a contact closes its force is not negative. Opening, nothing may be left of it before depth 0.
-    closes = rate > 0
-    # On which side of the surface it was, between two delays, is not known.
-    near = float(0.5 * (OFFSETS[1] - OFFSETS[0])) * farthest[None] * old.pace[None]
-    beside = delayed & (depth < near) & (depth > -near)
+    tells = (predicted.force > 0) | (force**2 > BEYOND_NOISE * noise)
     pushed = jnp.concatenate([jnp.ones_like(depth[:FIRST_LAG], dtype=bool), pushes])
-    used = counts & inside & pushed & ~beside & ~tight & (closes | tells(predicted, force, noise))
+    used = counts & inside & pushed & ~tight & (closes | tells)
     maps = correct(old.maps, predicted, force, used)
 
     nothing = ~inside | tight | (~closes & (predicted.force <= 0))
@@ -202,9 +217,9 @@ def learn(old: Bank, reading: Reading, period: Array, farthest: Array, damping: 
     wide = jnp.where(wide > 0, wide, 1)
     read = jnp.where(reading.hidden, 0, reading.force)[None]
     missed = jnp.where(nothing, read, force - predicted.force)
-    surprise = jnp.where(beside, 0.25, 0.25 * missed**2 / wide)
+    surprise = 0.25 * missed**2 / wide
     surprise = surprise - jnp.min(surprise, axis=0, keepdims=True)
-    sharpness = jnp.where(beside, 1, jnp.sqrt(jnp.sqrt(jnp.where(wide > noise, noise / wide, 1))))
+    sharpness = jnp.sqrt(jnp.sqrt(jnp.where(wide > noise, noise / wide, 1)))
     likelihood = _shares(old.likelihood * sharpness * exponential(surprise, SQUARINGS), LEAST)
     now = old._replace(
         maps=maps,
@@ -215,8 +230,17 @@ def learn(old: Bank, reading: Reading, period: Array, farthest: Array, damping: 
         before=jnp.where(counts[None], before, old.before),
         pushed=jnp.where(counts, pushes.astype(old.pushed.dtype), old.pushed),
     )
+    now = _entered(now)
     weights = weigh(now, damping)
-    return _means(now, weights, offsets), average(maps, weights, knots_of(now))
+    return _means(now, weights, offsets), average(maps, weights, knots)
+
+
+def _entered(bank: Bank) -> Bank:
+    """With what the maps of delays say of the entry."""
+    maps = bank.maps
+    entered = agree(bank.entry, Map(maps.mean[:, :FIRST_LAG], maps.covariance[:, :, :FIRST_LAG]))
+    likely = jnp.concatenate([entered.likely, bank.likely[FIRST_LAG:]])
+    return bank._replace(likely=likely, within=entered.place)
 
 
 def _smooth(old: Bank, depth: Array, rate: Array, now: Array, period: Array) -> tuple[Array, Array]:
@@ -272,12 +296,8 @@ def plausibility(mean: Array, variance: Array, prior: Array) -> Float[Array, "*b
     spread = jnp.sqrt(variance)
     ratio = mean / spread
     density = exponential(0.5 * ratio**2, DENSITY_SQUARINGS)
-    size = jnp.where(ratio > 0, ratio, -ratio)
-    mills = math.pi / ((math.pi - 1) * size + jnp.sqrt(size**2 + 2 * math.pi))
-    beyond = density * mills * (2 / math.sqrt(2 * math.pi))
-    at_least_0 = jnp.where(ratio > 0, 2 - beyond, beyond)
     prior = jnp.where(prior > 0, prior, 1)
-    return ELASTIC * (jnp.sqrt(prior) / spread) * density + (1 - ELASTIC) * at_least_0
+    return ELASTIC * (jnp.sqrt(prior) / spread) * density + (1 - ELASTIC) * (2 * cumulative(ratio))
 
 
 def knots_of(bank: Bank) -> Float[Array, "segments hypotheses *batch"]:
@@ -317,36 +337,48 @@ class _Placed(NamedTuple):
     farther: Array  # by how much farther in its knots are than usual [s]
     likely: Array  # how likely it is there
     preload: Array  # variance of the force at the entry [1/s^2]
+    entry: Entry  # by delays
 
 
 def _place(
     meeting: Meeting,
+    window: Window,
     offsets: Array,
-    length: Array,
     speed: Array,
+    pace: Array,
+    tick: Array,
     plane_spread: Array,
+    true: Array,
     lagged: tuple[Array, Array],
 ) -> _Placed:
     """Between where it was met, with a lag so much later and so uncertain [s, s^2], and where it was told,
-    or, where these disagree, where it was met; there the force at the entry is known to what the stiffness
-    makes of the uncertain place. A second is `length` [m]."""
-    known = (plane_spread**2)[None]
+    or, where these disagree, where it was met. With a lag the force at the entry is known to what the
+    stiffness makes of the uncertain place; of delays the entry is weighed (`entry`). `true`: the variance of
+    a true preload [1/s^2]."""
+    length = speed / pace
+    known = plane_spread**2
     none = jnp.zeros_like(offsets[:FIRST_LAG])
     met = meeting.place[None] + jnp.concatenate([none, lagged[0] * length[None]])
     around = meeting.variance[None] + jnp.concatenate([none, lagged[1] * (length * length)[None]])
     away = met - offsets * speed[None]
-    both = known + around
+    both = known[None] + around
     elsewhere = away * away > NOT_THERE * both
-    share = jnp.where(elsewhere, 1, known / both)
+    share = jnp.where(elsewhere, 1, known[None] / both)
     likely = exponential(0.5 * (away * away / both), DENSITY_SQUARINGS)
     place = share * away
     positive = around > 0
     spread = jnp.where(positive, jnp.sqrt(jnp.where(positive, around, 1)), 0) / length[None]
+    step = (offsets[1] - offsets[0]) * pace
+    placed = (away - place)[:FIRST_LAG], place[:FIRST_LAG]
+    entry = enter(meeting, window, length, tick, *placed, known, true, step)
+    off = USUAL * (share * (meeting.stiffness[None] * spread))
+    off = jnp.concatenate([none + entry.preload[None], off[FIRST_LAG:]])
     return _Placed(
         below=(place - meeting.scales.plane[None]) / length[None],
         farther=jnp.clip((meeting.place[None] - place) / length[None], -FARTHEST, FARTHEST),
         likely=jnp.where(likely > UNLIKELY, likely, UNLIKELY),
-        preload=(USUAL * (share * (meeting.stiffness[None] * spread))) ** 2,
+        preload=off**2,
+        entry=entry,
     )
 
 

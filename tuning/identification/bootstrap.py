@@ -55,16 +55,18 @@ def bootstrap(
     if ratio[worst] <= WIDER:
         return replace(fit, resampled=f"{said}: intervals are those of noise")
     place = np.ix_(moving, moving)
-    had, wanted = (
-        np.linalg.cholesky(one[place] / np.outer(std, std) + 1e-9 * np.eye(len(moving)))
-        for one in (stated, spread)
-    )
+    had, wanted = (_root(one[place] / np.outer(std, std)) for one in (stated, spread))
     draws, mean = posterior.draws.copy(), posterior.mean[moving]
     draws[:, moving] = mean + ((draws[:, moving] - mean) / std) @ np.linalg.solve(had.T, wanted.T) * std
     positive = [2 + i for i in fit.problem.rate_like]
     draws[:, positive] = np.maximum(draws[:, positive], 0.0)
     widened = replace(posterior, draws=draws)
     return replace(fit, posterior=widened, resampled=f"{said}: intervals are the bootstrap's")
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """Of a covariance that may be singular: of fewer fits than there are numbers."""
+    return np.linalg.cholesky(covariance + 1e-9 * np.max(np.diag(covariance)) * np.eye(len(covariance)))
 
 
 def fits(

@@ -1,23 +1,23 @@
 /* Hypotheses of the force delay and of a lag side by side, each with a map of its own, weighed by what they explain.
- * Hypothesis h takes the force to be d_h older than given: it belongs to the depth X - d_h V - p_h. The surface was met
- * at X_0, with a variance s^2; by this hypothesis it lies at p_h = g (X_0 - d_h v_0) beyond where it was told, with
- * g = spread^2/(spread^2 + s^2), or 1 where the two disagree. It expects to read f_h with a variance s_h (0 with the
- * noise's own variance r out of contact, and where what it expects while the contact opens is not positive). As many
- * others take the sensor to lag by l_h: what the force is linear in is smoothed alike, and the surface was met where
- * lagged_onset.c has it; to first order a lag is a delay, and these count as l_h older. Each delay is there twice, by
- * slopes that wander and by slopes that hardly do. A hypothesis' weight
- * is the product of the likelihoods of all readings of this contact and of those before, (r/s_h)^(1/4)
- * exp(-(y - f_h)^2/(4 s_h)), of how well its damping, of mean B and variance s^2, goes with what is known of contacts:
- * p (s_0/s) exp(-t^2/2) + (1 - p) 2 Phi(t), t = B/s, p = 1/2, and of how likely
- * a surface is there, exp(-(X_0 - d_h v_0)^2/(2 (spread^2 + s^2))), at least 1/10. The
- * exponentials are (1 + u/n)^-n. What counts is the mean over all hypotheses, of their maps, delays and surfaces. Their
- * maps bend at the same places, wherever they have the surface: which fits best is not to be decided by what a contact
- * that bends between two knots leaves.
+ * Hypothesis h takes the force to be d_h older than given: it belongs to the depth X - d_h V - p_h. The surface was
+ * met at X_0, with a variance s^2; by this hypothesis it lies at p_h = g (X_0 - d_h v_0) beyond where it was told,
+ * with g = spread^2/(spread^2 + s^2), or 1 where the two disagree. It expects to read f_h with a variance s_h (0 with
+ * the noise's own variance r out of contact, and where what it expects while the contact opens is not positive). As
+ * many others take the sensor to lag by l_h: what the force is linear in is smoothed alike, and the surface was met
+ * where lagged_onset.c has it; to first order a lag is a delay, and these count as l_h older. Each delay is there
+ * twice, by slopes that wander and by slopes that hardly do. A hypothesis' weight is the product of the likelihoods of
+ * all readings of this contact and of those before, (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), of how well its damping,
+ * of mean B and variance s^2, goes with what is known of contacts: p (s_0/s) exp(-t^2/2) + (1 - p) 2 Phi(t), t = B/s,
+ * p = 0.35, and of how likely a surface is there: of a delay by entry.c, of a lag exp(-(X_0 - d_h v_0)^2/(2
+ * (spread^2 + s^2))), at least 1/10. The exponentials are (1 + u/n)^-n. What counts is the mean over all hypotheses, of their
+ * maps, delays and surfaces. Their maps bend at the same places, wherever they have the surface: which fits best is
+ * not to be decided by what a contact that bends between two knots leaves.
  */
 #include <math.h>
 #include <stdbool.h>
 
 #include "contact_plane.c"
+#include "entry.c"
 #include "force_depth_map.c"
 #include "gains_table.c"
 #include "history.c"
@@ -36,13 +36,14 @@ enum {
     JAXHIL_HYPOTHESES = JAXHIL_FIRST_LAG + JAXHIL_LAGS
 };
 
-/* Of each hypothesis its delay, by how much [s] it has the surface deeper than it was met and its knots farther in than
- * usual, how likely it is that the surface is there, map, deepest point, the likelihoods of this contact and of those
- * before; sums over these of the damping's precision and of precision times mean, their number `met`; whether this
- * contact is to be added to them. The mean of the maps and, `shift` [s] and `below` [s], of the delays and of how much
- * deeper; the delays' standard deviation [s]; the largest weight of what may lie beyond, `edge`, and that of all
- * lags; the delay that was `given`. Of each lag [s] what is kept after a tick of what a sensor shows; what is
- * smoothed, `held`, as it was before that, and whether the contact then pushed. */
+/* Of each hypothesis its delay, by how much [s] it has the surface deeper than told, its knots [s], how likely it is
+ * that the surface is there, map, deepest point, the likelihoods of this contact and of those before; how deep the
+ * surface was met, `met_at` [s], and of each delay how deep by its own surface it was met, it was told, and it is by
+ * its map, `within` [s]; sums over contacts of the damping's precision and of precision times mean, their number
+ * `met`; whether this contact is to be added to them. The mean of the maps and, `shift` [s] and `below` [s], of the
+ * delays and of how much deeper; the delays' standard deviation [s]; the largest weight of what may lie beyond,
+ * `edge`, and that of all lags; the delay that was `given`. Of each lag [s] what is kept after a tick of what a sensor
+ * shows; what is smoothed, `held`, as it was before that, and whether the contact then pushed. */
 typedef struct {
     double given, shift, open, edge, lagging, below, met, variance, pace, plane_spread, period;
     double lags[JAXHIL_LAGS], kept[JAXHIL_LAGS];
@@ -51,11 +52,13 @@ typedef struct {
     double known[JAXHIL_HYPOTHESES];
     jaxhil_force_depth_map prior, steady;
     double offsets[JAXHIL_HYPOTHESES], deeper[JAXHIL_HYPOTHESES], deepest[JAXHIL_HYPOTHESES];
-    double farther[JAXHIL_HYPOTHESES], likely[JAXHIL_HYPOTHESES];
+    double knots[JAXHIL_HYPOTHESES][JAXHIL_SEGMENTS], likely[JAXHIL_HYPOTHESES];
+    jaxhil_entry entry;
+    double met_at, met_deeper[JAXHIL_FIRST_LAG], told[JAXHIL_FIRST_LAG], within[JAXHIL_FIRST_LAG];
     double likelihood[JAXHIL_HYPOTHESES], carried[JAXHIL_HYPOTHESES];
     double precision[JAXHIL_HYPOTHESES], weighted[JAXHIL_HYPOTHESES];
     double estimate[JAXHIL_HYPOTHESES][JAXHIL_PARAMETERS];
-    double covariance[JAXHIL_HYPOTHESES][JAXHIL_PARAMETERS][JAXHIL_PARAMETERS];
+    double covariance[JAXHIL_HYPOTHESES][JAXHIL_PARAMETERS][JAXHIL_COLUMNS];
     jaxhil_curve curve;
     bool learning;
 } jaxhil_learnt;
@@ -68,14 +71,13 @@ static const double jaxhil_bank_least = 1e-200;
 static const double jaxhil_bank_nothing = 1e-300; /* a smaller product is none: some machines keep such numbers */
 static const double jaxhil_bank_least_carried = 1e-12;
 static const double jaxhil_bank_least_shift = 1e-12; /* s: where nothing tells delays apart, rounding does not */
-static const double jaxhil_bank_elsewhere = 9.0; /* times the variance of where it is expected: it is not there */
-static const double jaxhil_bank_unlikely = 0.1;  /* that it is not, at least */
 static const double jaxhil_bank_lag_step = 0.00025; /* s from lag to lag */
 static const double jaxhil_bank_steady = 0.125; /* of the spread by which slopes wander, where they hardly do */
 static const double jaxhil_bank_lagging = 0.0001; /* of a delay's probability, that of each lag */
 static const double jaxhil_bank_edge = 0.6;      /* probability of a farthest delay or the longest lag: it may lie beyond */
 static const double jaxhil_bank_open = 0.0075;   /* of a restitution of 1, that what is open of the delay makes */
 static const double jaxhil_bank_settled = 0.99;  /* probability from which on it is a lag */
+static const double jaxhil_bank_beyond_noise = 9.0; /* times its variance: a force that is more than noise */
 static const long jaxhil_bank_earlier = 30;  /* ticks before it was met, whose readings count */
 
 /* Of their sum, at least so much. */
@@ -96,8 +98,8 @@ static void jaxhil_bank_restart(jaxhil_learnt *bank) {
         const bool steady = h >= JAXHIL_DELAYS && h < JAXHIL_FIRST_LAG;
         const jaxhil_force_depth_map *prior = steady ? &bank->steady : &bank->prior;
         for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
-            for (int j = 0; j < JAXHIL_PARAMETERS; j++) {
-                bank->covariance[h][i][j] = prior->covariance[i][j];
+            for (int j = 0; j < JAXHIL_COLUMNS; j++) {
+                bank->covariance[h][i][j] = j < JAXHIL_PARAMETERS ? prior->covariance[i][j] : 0.0;
             }
             bank->estimate[h][i] = prior->estimate[i];
         }
@@ -120,12 +122,16 @@ static void jaxhil_learnt_reset(jaxhil_learnt *bank) {
     jaxhil_bank_restart(bank);
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         bank->deeper[h] = 0.0;
-        bank->farther[h] = 0.0;
+        jaxhil_lagged_knots(0.0, bank->knots[h]);
         bank->likely[h] = 1.0;
         bank->carried[h] = h < JAXHIL_DELAYS ? 1.0 : (h < JAXHIL_FIRST_LAG ? 0.0 : jaxhil_bank_lagging);
         bank->precision[h] = 0.0;
         bank->weighted[h] = 0.0;
     }
+    for (int h = 0; h < JAXHIL_FIRST_LAG; h++) {
+        bank->within[h] = 0.0;
+    }
+    bank->met_at = 0.0;
     bank->met = 0.0;
     bank->shift = 0.0;
     bank->below = 0.0;
@@ -213,11 +219,34 @@ static void jaxhil_bank_weighed(const jaxhil_learnt *bank, const double *evidenc
     }
 }
 
+/* What the maps of delays say of the entry: where their surface is, and how likely. */
+static void jaxhil_bank_enter(jaxhil_learnt *bank) {
+    const jaxhil_entry *entry = &bank->entry;
+    jaxhil_entered entered[JAXHIL_FIRST_LAG];
+    double since[JAXHIL_FIRST_LAG][JAXHIL_BESIDE + 1], began[JAXHIL_FIRST_LAG];
+    double most = 0.0, likeliest = -INFINITY;
+    for (int h = 0; h < JAXHIL_FIRST_LAG; h++) {
+        entered[h] = jaxhil_entry_place(entry, bank->told[h], bank->estimate[h], bank->covariance[h]);
+        bank->within[h] = jaxhil_entry_near(entry, entered[h].place);
+        most = jaxhil_entry_since(entry, &entered[h], bank->met_deeper[h], most, since[h]);
+    }
+    for (int h = 0; h < JAXHIL_FIRST_LAG; h++) {
+        began[h] = jaxhil_entry_began(entry, &entered[h], bank->met_deeper[h], most, since[h]);
+        likeliest = began[h] > likeliest || began[h] != began[h] ? began[h] : likeliest;
+    }
+    for (int h = 0; h < JAXHIL_FIRST_LAG; h++) {
+        const double share = began[h] / likeliest;
+        const double agreed = share > jaxhil_entry_least ? share : jaxhil_entry_least;
+        bank->likely[h] = entry->level * (agreed * entered[h].there);
+    }
+}
+
 /* Weights of the hypotheses; their sum is 1. */
-static void jaxhil_bank_weigh(const jaxhil_learnt *bank, double *weights) {
+static void jaxhil_bank_weigh(jaxhil_learnt *bank, double *weights) {
     const double pace = bank->pace;
     double evidence[JAXHIL_HYPOTHESES];
     double total = 0.0;
+    jaxhil_bank_enter(bank);
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         const double own = bank->covariance[h][JAXHIL_DAMPING][JAXHIL_DAMPING] * (pace * pace);
         const double precision = 1.0 / (own > 0.0 ? own : 1.0);
@@ -246,9 +275,8 @@ static void jaxhil_bank_average(jaxhil_learnt *bank, const double *weights) {
     const int last = JAXHIL_SEGMENTS - 1;
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         const double *slopes = bank->estimate[h];
-        double knots[JAXHIL_SEGMENTS];
+        const double *knots = bank->knots[h];
         double reached = slopes[JAXHIL_PRELOAD];
-        jaxhil_lagged_knots(bank->farther[h], knots);
         for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
             if (j > 0) {
                 reached += slopes[j - 1] * (knots[j] - knots[j - 1]);
@@ -314,12 +342,15 @@ static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
 /* The contact that is over is added to what is carried. */
 static void jaxhil_bank_finish(jaxhil_learnt *bank) {
     const double pace = bank->pace;
-    double weights[JAXHIL_HYPOTHESES];
+    double evidence[JAXHIL_HYPOTHESES], weights[JAXHIL_HYPOTHESES];
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        evidence[h] = h < JAXHIL_FIRST_LAG ? bank->likelihood[h] * bank->likely[h] : bank->likelihood[h];
+    }
     /* Only where the first contact is over its slopes tell how they are. */
     for (int h = 0; h < JAXHIL_FIRST_LAG && !(bank->met > 0.0); h++) {
         bank->carried[h] = 0.5;
     }
-    jaxhil_bank_weighed(bank, bank->likelihood, weights);
+    jaxhil_bank_weighed(bank, evidence, weights);
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         bank->carried[h] = weights[h];
         const double variance = bank->covariance[h][JAXHIL_DAMPING][JAXHIL_DAMPING] * (pace * pace);
@@ -332,12 +363,16 @@ static void jaxhil_bank_finish(jaxhil_learnt *bank) {
 }
 
 /* Each hypothesis has the surface between where it was met, with a lag by the newest readings, and where it was told,
- * or, where these disagree, where it was met; there the force at the entry is known to what the stiffness makes of the
- * uncertain place. How far [s] the hardware was in, by the first to enter, as it was met. */
+ * or, where these disagree, where it was met. With a lag the force at the entry is known to what the stiffness makes
+ * of the uncertain place; of delays the entry is weighed. How far [s] the hardware was in, by the first to enter, as
+ * it was met. */
 static double jaxhil_bank_place(jaxhil_learnt *bank, const jaxhil_meeting *meeting, const jaxhil_window *window) {
     const double length = meeting->speed / meeting->pace;
     const double known = bank->plane_spread * bank->plane_spread;
     double first = jaxhil_map_surface;
+    jaxhil_entry_of(&bank->entry, meeting, window, known, bank->prior.covariance[JAXHIL_PRELOAD][JAXHIL_PRELOAD],
+                    (bank->offsets[1] - bank->offsets[0]) * meeting->pace);
+    bank->met_at = (meeting->place - meeting->plane) / length;
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         double met = meeting->place, around = meeting->variance;
         if (h >= JAXHIL_FIRST_LAG) {
@@ -348,21 +383,28 @@ static double jaxhil_bank_place(jaxhil_learnt *bank, const jaxhil_meeting *meeti
         }
         const double both = known + around;
         const double away = met - bank->offsets[h] * meeting->speed;
-        const bool elsewhere = away * away > jaxhil_bank_elsewhere * both;
+        const bool elsewhere = away * away > jaxhil_entry_elsewhere * both;
         const double share = elsewhere ? 1.0 : known / both;
         const double likely = jaxhil_exponential(0.5 * (away * away / both), JAXHIL_DENSITY_SQUARINGS);
         const double place = share * away;
         const double farther = (meeting->place - place) / length;
-        const double off = jaxhil_lagged_usual * (share * (meeting->stiffness * (sqrt(around) / length)));
-        const double depth = (meeting->plane - place) / length;
-        const double inside = depth - bank->offsets[h] * meeting->pace;
-        bank->deeper[h] = -depth;
-        bank->farther[h] = farther > jaxhil_lagged_farthest
-                               ? jaxhil_lagged_farthest
-                               : (farther < -jaxhil_lagged_farthest ? -jaxhil_lagged_farthest : farther);
-        bank->likely[h] = likely > jaxhil_bank_unlikely ? likely : jaxhil_bank_unlikely;
+        double off = bank->entry.preload;
+        if (h < JAXHIL_FIRST_LAG) {
+            bank->met_deeper[h] = (away - place) / length;
+            bank->told[h] = -place / length;
+        } else {
+            const double inside = (meeting->plane - place) / length;
+            off = jaxhil_lagged_usual * (share * (meeting->stiffness * (sqrt(around) / length)));
+            /* What is not a number stays. */
+            first = inside > first || inside != inside ? inside : first;
+        }
+        bank->deeper[h] = (place - meeting->plane) / length;
+        jaxhil_lagged_knots(farther > jaxhil_lagged_farthest
+                                ? jaxhil_lagged_farthest
+                                : (farther < -jaxhil_lagged_farthest ? -jaxhil_lagged_farthest : farther),
+                            bank->knots[h]);
+        bank->likely[h] = likely > jaxhil_entry_unlikely ? likely : jaxhil_entry_unlikely;
         bank->covariance[h][JAXHIL_PRELOAD][JAXHIL_PRELOAD] += off * off;
-        first = inside > first ? inside : first;
     }
     return first > jaxhil_map_surface ? first : 0.0;
 }
@@ -387,11 +429,11 @@ static long jaxhil_learnt_begin(jaxhil_learnt *bank, const jaxhil_meeting *meeti
 
 /* What the force is linear in, at a depth [s] and speed, by hypothesis h. */
 static void jaxhil_bank_features(const jaxhil_learnt *bank, int h, double x, double rate, double *phi) {
-    double knots[JAXHIL_SEGMENTS];
-    jaxhil_lagged_knots(bank->farther[h], knots);
+    const double *knots = bank->knots[h];
     for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
         const double beyond = x - knots[j];
-        phi[j] = beyond > 0.0 ? beyond : 0.0;
+        /* Of a delay, the surface may lie before where its map has it. */
+        phi[j] = beyond > 0.0 || (j == 0 && h < JAXHIL_FIRST_LAG) ? beyond : 0.0;
         if (j < JAXHIL_SEGMENTS - 1 && beyond > knots[j + 1] - knots[j]) {
             phi[j] = knots[j + 1] - knots[j];
         }
@@ -435,18 +477,14 @@ static void jaxhil_bank_smooth(jaxhil_learnt *bank, int h, double depth, double 
     bank->pushed[l] = pushes;
 }
 
-/* Hypothesis h reads: the square of what it missed, over its variance, times a quarter; how sharply it knew. Nearer to
- * its surface than half of the step to the next delay it cannot tell on which side the reading was: that counts as one
- * that is a standard deviation off. */
+/* Hypothesis h reads: the square of what it missed, over its variance, times a quarter; how sharply it knew. */
 static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double rate, double force,
                                double variance, bool hidden, double zone, double *sharpness) {
-    double(*covariance)[JAXHIL_PARAMETERS] = bank->covariance[h];
+    double(*covariance)[JAXHIL_COLUMNS] = bank->covariance[h];
     double *estimate = bank->estimate[h];
-    double phi[JAXHIL_PARAMETERS], g[JAXHIL_PARAMETERS];
+    double phi[JAXHIL_PARAMETERS], g[JAXHIL_COLUMNS] = {0.0}, scaled[JAXHIL_COLUMNS];
     const double x = depth - bank->offsets[h] * bank->pace * rate - bank->deeper[h];
     const bool lags = h >= JAXHIL_FIRST_LAG;
-    const double near = lags ? 0.0 : 0.5 * (bank->offsets[1] - bank->offsets[0]) * bank->pace;
-    const bool beside = x < near && x > -near;
     const double read = hidden ? 0.0 : force;
     const double noise = hidden ? variance + zone * zone / 12.0 : variance;
     const double seen = hidden ? 0.5 * zone : force;
@@ -459,45 +497,44 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
     }
     double expected = 0.0, s = 0.0;
     for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
-        double product = 0.0;
-        for (int j = 0; j < JAXHIL_PARAMETERS; j++) {
-            product += covariance[i][j] * phi[j];
+        for (int j = 0; j < JAXHIL_COLUMNS; j++) {
+            g[j] += covariance[i][j] * phi[i];
         }
-        g[i] = product;
+    }
+    for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
         expected += phi[i] * estimate[i];
-        s += phi[i] * product;
+        s += phi[i] * g[i];
     }
     s = noise + s;
-    const bool inside = (lags || x > jaxhil_map_surface) && (!hidden || expected > zone);
-    const bool pushed = !lags || bank->pushed[h - JAXHIL_FIRST_LAG];
     const bool closes = rate > 0.0;
+    const bool pushed = !lags || bank->pushed[h - JAXHIL_FIRST_LAG];
+    const double within = lags ? 0.0 : (closes ? depth - bank->met_at : x - bank->within[h]);
+    const bool inside = (lags || within > jaxhil_map_surface) && (!hidden || expected > zone);
     const bool nothing = !inside || (!closes && !(expected > 0.0));
     const double innovation = seen - expected;
     double wide = nothing ? noise : s;
     wide = wide > 0.0 ? wide : 1.0;
     const double missed = nothing ? read : innovation;
     *sharpness = sqrt(sqrt(wide > noise ? noise / wide : 1.0));
-    if (inside && pushed && !beside && s > 0.0 &&
-        (closes || expected > 0.0 || seen * seen > jaxhil_map_outlying * noise)) {
+    if (inside && pushed && s > 0.0 &&
+        (closes || expected > 0.0 || seen * seen > jaxhil_bank_beyond_noise * noise)) {
         const double share = 1.0 / s;
         bank->known[h] = noise * ((s - noise) * share);
+        for (int j = 0; j < JAXHIL_COLUMNS; j++) {
+            scaled[j] = share * g[j];
+        }
         for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
-            const double scaled = share * g[i];
-            estimate[i] += scaled * innovation;
-            for (int j = 0; j < JAXHIL_PARAMETERS; j++) {
-                covariance[i][j] -= scaled * g[j];
+            estimate[i] += scaled[i] * innovation;
+            for (int j = 0; j < JAXHIL_COLUMNS; j++) {
+                covariance[i][j] -= g[i] * scaled[j];
             }
         }
-    }
-    if (beside) {
-        *sharpness = 1.0;
-        return 0.25;
     }
     return 0.25 * (missed * missed) / wide;
 }
 
-/* One reading: depth [s] and speed as old as the force by the given delay, force [1/s], its variance [1/s^2], whether the
- * sensor's dead zone hides it, that zone [1/s]. */
+/* One reading: depth [s] and speed as old as the force by the given delay, force [1/s], its variance [1/s^2], whether
+ * the sensor's dead zone hides it, that zone [1/s]. */
 static void jaxhil_learnt_read(jaxhil_learnt *bank, double depth, double rate, double deepest, double force,
                                double variance, bool hidden, double zone) {
     double surprise[JAXHIL_HYPOTHESES], sharpness[JAXHIL_HYPOTHESES], weights[JAXHIL_HYPOTHESES];

@@ -20,13 +20,21 @@ from math import ceil, pi, sqrt
 import numpy as np
 
 from .contact_plane import Meeting
+from .entry import (
+    DENSITY_SQUARINGS,
+    NOT_THERE,
+    UNLIKELY,
+    Entry,
+    Readings,
+    agree,
+    cumulative,
+)
 from .force_depth_map import (
     DAMPING,
     DEPTH_DAMPING,
     FRICTION,
     JUMPS,
     KNOTS,
-    OUTLYING,
     PARAMETERS,
     PRELOAD,
     REACH,
@@ -47,15 +55,13 @@ HYPOTHESES = FIRST_LAG + LAGS
 STEADY = 0.125  # of the spread by which slopes wander, where they hardly do
 LAG_STEP = 0.00025  # s from lag to lag
 LAGGING = 0.0001  # of a delay's probability, that of each lag
-ELASTIC = 0.5  # probability that a contact has no damping
+ELASTIC = 0.35  # probability that a contact has no damping
 BROADENING = 2.0  # of the variance of the damping, as the delay lies between two hypotheses
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
 LEAST, LEAST_CARRIED = 1e-200, 1e-12
 NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, some do not
-DENSITY_SQUARINGS = 8
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
-NOT_THERE = 9.0  # times the variance of where the surface is expected: it is not there
-UNLIKELY = 0.1  # that it is not, at least
+BEYOND_NOISE = 9.0  # times its variance: a force that is more than noise
 EARLIER = 30  # ticks before it was met, whose readings count
 EDGE = 0.6  # probability that it is a farthest delay or the longest lag: then it may lie beyond
 OPEN = 0.0075  # of a restitution of 1, that what is open of the delay makes
@@ -79,19 +85,18 @@ class DelayBank:
     where the surface was told [m], of the map's prior, and of the control period [s]."""
 
     __slots__ = (
-        "_before", "_below", "_carried", "_covariance", "_damping", "_deepest", "_edge", "_estimate", "_held",
-        "_kept", "_knots", "_known", "_lagging", "_learning", "_likelihood", "_likely", "_met", "_near",
-        "_off", "_offsets", "_older", "_pace", "_past", "_period", "_plane_spread", "_precision",
-        "_prior_covariance", "_prior_estimate", "_pushed", "_weighted", "_widths", "curve", "deeper", "shift",
-        "variance",
+        "_before", "_below", "_carried", "_covariance", "_damping", "_deepest", "_edge", "_entry",
+        "_estimate", "_held", "_kept", "_knots", "_known", "_lagging", "_learning", "_likelihood", "_likely",
+        "_met", "_met_at", "_off", "_offsets", "_older", "_pace", "_past", "_period", "_plane_spread",
+        "_precision", "_prior_covariance", "_prior_estimate", "_pushed", "_step", "_weighted", "_widths",
+        "_within", "curve", "deeper", "shift", "variance",
     )  # fmt: skip
 
     def __init__(self, spread: float, plane_spread: float, prior: Prior, period: float) -> None:
         delays = np.array([0.125 * step - 1.0 for step in range(DELAYS)]) * spread
         self._offsets = np.concatenate((delays, delays, np.zeros(LAGS)))
         self._older = np.concatenate((delays, delays, _LAGS))
-        # On which side of the surface it was, between two delays, is not known.
-        self._near = np.where(_DELAYED, 0.5 * float(delays[1] - delays[0]), 0.0)
+        self._step = float(delays[1] - delays[0])
         self._period = period
         self._kept = exponential(period / _LAGS, SQUARINGS)  # of what a lagging sensor shows, after a tick
         self._plane_spread = plane_spread
@@ -112,6 +117,9 @@ class DelayBank:
         self._weighted = np.zeros(HYPOTHESES)
         self._below = np.zeros(HYPOTHESES)  # by how much deeper each has the surface than it was met [s]
         self._likely = np.ones(HYPOTHESES)  # how likely it is there
+        self._within = np.zeros(HYPOTHESES)  # how deep it is by the map [s]
+        self._met_at = 0.0  # how deep it was met [s]
+        self._entry = None
         self._bend(np.zeros(HYPOTHESES))
         self._met = 0.0
         self._pace = 1.0
@@ -131,14 +139,14 @@ class DelayBank:
             own = self._covariance[DAMPING, DAMPING] * (pace * pace)
             precision = 1.0 / np.where(own > 0.0, own, 1.0)
             carried = self._carried if self._met else _EITHER
-            self._carried = _shares(_weighed(carried, self._likelihood), LEAST_CARRIED)
+            evidence = self._likelihood * np.where(_DELAYED, self._likely, 1.0)
+            self._carried = _shares(_weighed(carried, evidence), LEAST_CARRIED)
             self._precision = self._precision + precision
             self._weighted = self._weighted + precision * (self._estimate[DAMPING] * pace)
             self._met += 1.0
         self._pace = meeting.pace
         self._restart()
-        lagged = lagged_onsets(_LAGS * meeting.pace, depths, forces, variance, meeting.tick)
-        first = self._place(meeting, *lagged)
+        first = self._place(meeting, depths, forces, variance)
         self._conclude(self._weigh())
         return min(ceil((first if first > SURFACE else 0.0) / meeting.tick), EARLIER)
 
@@ -159,12 +167,13 @@ class DelayBank:
         doubtful = SETTLED > lagging > LAGGING * (1.0 - lagging)
         return doubtful or self._edge > EDGE or 0.5 * pi * (peak * (self._off * self._pace)) > OPEN
 
-    def _place(self, meeting: Meeting, later: np.ndarray, spreads: np.ndarray) -> float:
-        """Each hypothesis has the surface between where it was met, with a lag so much `later` [s] and with a
-        variance [s^2] of its own, and where it was told, or, where these disagree, where it was met; there
-        the force at the entry is known to what the stiffness makes of the uncertain place. How far [s] the
-        hardware was in, by the first to enter, as it was met."""
+    def _place(self, meeting: Meeting, depths: list[float], forces: list[float], variance: float) -> float:
+        """Each hypothesis has the surface between where it was met, with a lag so much later and with a
+        variance of its own, and where it was told, or, where these disagree, where it was met. With a lag the
+        force at the entry is known to what the stiffness makes of the uncertain place; of delays the entry is
+        weighed (`entry`). How far [s] the hardware was in, by the first to enter, as it was met."""
         length = meeting.speed / meeting.pace
+        later, spreads = lagged_onsets(_LAGS * meeting.pace, depths, forces, variance, meeting.tick)
         known = self._plane_spread * self._plane_spread
         met = np.append(_1[:FIRST_LAG] * meeting.place, meeting.place + later * length)
         around = np.append(_1[:FIRST_LAG] * meeting.variance, spreads * (length * length) + meeting.variance)
@@ -175,12 +184,17 @@ class DelayBank:
         likely = exponential(0.5 * (away * away / both), DENSITY_SQUARINGS)
         places = share * away
         off = USUAL * (share * (meeting.stiffness * (np.sqrt(around) / length)))
-        depths = (meeting.plane - places) / length
-        self._below = -depths
+        self._entry = Entry.of(
+            meeting, Readings(depths, forces, variance), (away - places)[:FIRST_LAG], places[:FIRST_LAG],
+            known, float(self._prior_covariance[PRELOAD, PRELOAD, 0]), self._step * meeting.pace,
+        )  # fmt: skip
+        off[:FIRST_LAG] = self._entry.preload
+        self._covariance[PRELOAD, PRELOAD] += off * off
+        self._below = (places - meeting.plane) / length
         self._bend(np.minimum(np.maximum((meeting.place - places) / length, -FARTHEST), FARTHEST))
         self._likely = np.where(likely > UNLIKELY, likely, UNLIKELY)
-        self._covariance[PRELOAD, PRELOAD] += off * off
-        return float(np.maximum.reduce(depths - self._offsets * meeting.pace))
+        self._met_at = (meeting.place - meeting.plane) / length
+        return float(np.maximum.reduce((meeting.plane - places[FIRST_LAG:]) / length))
 
     def _bend(self, farther: np.ndarray) -> None:
         """The knots of each map lie so much farther in [s] than usual."""
@@ -208,6 +222,8 @@ class DelayBank:
         depths = depth - self._offsets * self._pace * rate - self._below
         deepest = np.fmax(self._deepest, depths)
         phi = self._features(depths, rate, deepest)
+        # Of a delay, the surface may lie before where its map has it.
+        phi[0, :FIRST_LAG] = np.minimum(depths, self._widths[0])[:FIRST_LAG]
         self._smooth(depths[FIRST_LAG:], rate, phi)
         read = force
         noise = variance
@@ -219,17 +235,17 @@ class DelayBank:
         g = np.add.reduce(self._covariance * phi[:, None], axis=0)
         expected = np.add.reduce(phi * estimate, axis=0)
         s = noise + np.add.reduce(phi * g, axis=0)
-        inside = depths > SURFACE
+        positive = expected > _0
+        closes = rate > 0.0
+        inside = depths - self._within > SURFACE
+        if closes:
+            inside[:FIRST_LAG] = depth - self._met_at > SURFACE
         inside[FIRST_LAG:] = True
         if hidden:
             inside &= expected > zone
-        near = self._near * self._pace
-        beside = (depths < near) & (depths > -near)
-        positive = expected > _0
-        closes = rate > 0.0
-        used = inside & (s > _0) & ~beside
+        used = inside & (s > _0)
         used[FIRST_LAG:] &= self._pushed
-        if not closes and not force * force > OUTLYING * noise:
+        if not closes and not force * force > BEYOND_NOISE * noise:
             used &= positive
         nothing = ~inside
         if not closes:
@@ -238,9 +254,9 @@ class DelayBank:
         wide = np.where(nothing, noise, s)
         wide = np.where(wide > _0, wide, _1)
         missed = np.where(nothing, read, innovation)
-        surprise = np.where(beside, 0.25, 0.25 * (missed * missed) / wide)
+        surprise = 0.25 * (missed * missed) / wide
         surprise -= np.minimum.reduce(surprise)
-        sharpness = np.where(beside, _1, np.sqrt(np.sqrt(np.fmin(noise / wide, _1))))
+        sharpness = np.sqrt(np.sqrt(np.fmin(noise / wide, _1)))
         likelihood = self._likelihood * sharpness * exponential(surprise, SQUARINGS)
         self._likelihood = _shares(likelihood, LEAST)
         self._deepest = deepest
@@ -298,8 +314,17 @@ class DelayBank:
         variance = BROADENING * (self._met + 1.0) / total
         plausible = _plausibility(mean, variance, self._damping * (pace * pace))
         plausible = np.where(own > _0, np.fmax(plausible, LEAST_CARRIED), _1)
+        self._enter()
         weights = _weighed(self._carried, self._likelihood * (plausible * self._likely))
         return weights / _total(weights)
+
+    def _enter(self) -> None:
+        """What the maps of delays say of the entry."""
+        if self._entry is not None:
+            delays = self._estimate[:, :FIRST_LAG], self._covariance[:, :, :FIRST_LAG]
+            entered = agree(self._entry, *delays)
+            self._within[:FIRST_LAG] = entered.place
+            self._likely[:FIRST_LAG] = entered.likely
 
     def _conclude(self, weights: np.ndarray) -> None:
         """The mean over the hypotheses, by their weights."""
@@ -338,12 +363,8 @@ def _plausibility(mean: np.ndarray, variance: np.ndarray, prior: float) -> np.nd
     spread = np.sqrt(variance)
     ratio = mean / spread
     density = exponential(0.5 * (ratio * ratio), DENSITY_SQUARINGS)
-    size = np.abs(ratio)
-    mills = pi / ((pi - 1.0) * size + np.sqrt(size * size + 2.0 * pi))
-    beyond = density * mills * (2.0 / sqrt(2.0 * pi))
-    at_least_0 = np.where(ratio > _0, 2.0 - beyond, beyond)
     known = sqrt(prior if prior > 0.0 else 1.0)
-    return ELASTIC * (known / spread) * density + (1.0 - ELASTIC) * at_least_0
+    return ELASTIC * (known / spread) * density + (1.0 - ELASTIC) * (2.0 * cumulative(ratio))
 
 
 def _positive_mean(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
