@@ -11,7 +11,7 @@ decide. Each hypothesis identifies a `force_depth_map` of its own and says befor
 f_h with a variance s_h (0 with the noise's own variance r out of contact, and where what it expects while the
 contact opens is not positive). Its weight is the product of the likelihood of all readings y of this contact
 and of those before, in each (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), of how well its damping goes with what
-is known of contacts (`plausibility`), and of how likely its surface is there: see
+is known of contacts (`plausibility`), and of how likely its surface is there, of delays by `entry`: see
 notebooks/guide/retrospective_reference.md section 7. The exponentials are (1 + u/n)^-n: algebraic, the same
 on every machine. What counts is the mean over all hypotheses, of their maps, delays and surfaces. Their maps
 bend at the same places, wherever they have the surface: which fits best is not to be decided by what a

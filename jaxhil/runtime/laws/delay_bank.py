@@ -8,11 +8,11 @@ sensor to lag by l_h [s]: what the force is linear in is smoothed alike, and the
 `lagged_onset` has it. To first order a lag is a delay: these count as l_h older. Each delay is there twice,
 by slopes that wander and by slopes that hardly do. Each hypothesis identifies a force-depth map
 (`force_depth_map`); its weight is the product of the likelihoods of all readings of this contact and of those
-before, of how well its damping goes with what is known of contacts, and of how likely its surface is there
-(notebooks/guide/retrospective_reference.md section 7). What counts is the mean over all hypotheses, of their
-maps, delays and surfaces. Their maps bend at the same places, wherever they have the surface: which fits best
-is not to be decided by what a contact that bends between two knots leaves. In NumPy, all hypotheses at a
-time; sums are taken one term after another.
+before, of how well its damping goes with what is known of contacts, and of how likely its surface is there,
+of delays by `entry` (notebooks/guide/retrospective_reference.md section 7). What counts is the mean over all
+hypotheses, of their maps, delays and surfaces. Their maps bend at the same places, wherever they have the
+surface: which fits best is not to be decided by what a contact that bends between two knots leaves. In
+NumPy, all hypotheses at a time; sums are taken one term after another.
 """
 
 from math import ceil, pi, sqrt
