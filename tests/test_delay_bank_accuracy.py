@@ -128,7 +128,8 @@ def test_what_it_leaves_of_damped_contacts_at_one_speed(case, changes, first, ei
 @pytest.mark.parametrize("suite", SUITES)
 def test_what_a_lag_of_3_ms_that_is_not_told_leaves(suite, delay, capsys):
     """The first damped contact cannot be met with 1 % (`test_delay_bounds`), least of all where what looks
-    like a lag may as well be a delay."""
+    like a lag may as well be a delay. Of the first that hardens it is one of 16 that exceeds it by far, and
+    says `unexplained`."""
     uncertain = 'uncertainty."rig.force_sensor.delay"={distribution="uniform",low=0.004,high=0.012}'
     told = load(f"suite-{suite}", [PLANES, *([uncertain] if delay != "told" else [])]).mechanism
     errors, _, said = errors_at_one_speed(told, suite, [PLANES, "rig.force_sensor.time_constant=0.003"], 16)
@@ -140,8 +141,9 @@ def test_what_a_lag_of_3_ms_that_is_not_told_leaves(suite, delay, capsys):
             f"\n{suite}, lag of 3 ms, delay {delay}: rms [%], contacts 1, 2, 4, 8:",
             *np.round(rms[[0, 1, 3, 7]], 2), counts,
         )  # fmt: skip
-    first = {"told": 5.0, "uncertain by 4 ms": 7.0}[delay] if suite == "damped" else 1.0
-    assert rms[0] <= first and rms[7] <= 1.0
+    damped = {"told": (5.6, 1.6), "uncertain by 4 ms": (7.0, 1.0)}[delay]
+    first, eighth = {"damped": damped, "hardening": (1.3, 1.0)}.get(suite, (1.0, 1.0))
+    assert rms[0] <= first and rms[7] <= eighth
     assert odd == 0
 
 
