@@ -84,17 +84,17 @@ def enter(
     farthest = (APART * jnp.where(wide, jnp.sqrt(jnp.where(wide, ticks, 1)), 0) + TICKS_APART) * tick
     near = jnp.minimum(farthest, TICKS_BESIDE * tick)[None]
     chosen = window.shown & (window.depth > -near) & (window.depth < near)
-    slots = jnp.argmax(chosen, axis=0)[None] + jnp.arange(MOST_BESIDE).reshape(-1, *[1] * tick.ndim)
-    last = len(window.depth) - 1
-    depths, forces, counts = (
-        jnp.take_along_axis(each, jnp.minimum(slots, last), axis=0)
-        for each in (window.depth, window.force, chosen)
+    rank = jnp.cumsum(chosen, axis=0)
+    slots = jnp.arange(1, MOST_BESIDE + 1).reshape(-1, *[1] * rank.ndim)
+    picked = chosen[None] & (rank[None] == slots)
+    depths, forces = (
+        jnp.sum(jnp.where(picked, each[None], 0), axis=1) for each in (window.depth, window.force)
     )
     preload = meeting.stiffness * farthest
     square = preload * preload
     steep = square > 0
     return Entry(
-        depths, forces, counts & (slots <= last), window.variance,
+        depths, forces, jnp.any(picked, axis=1), window.variance,
         (meeting.place - meeting.scales.plane) / length, farthest, deeper / length[None],
         -places / length[None], known / (length * length), preload,
         jnp.where(steep, square / jnp.where(steep, square + true, 1), 1), true, step * step / 12,
@@ -143,7 +143,7 @@ def _began(entry: Entry, maps: Map, place: Array, spread: Array) -> Float[Array,
     missed = forces - (jumps[None] + mean[0][None] * depths)
     better = jnp.where(counts, 0.5 * (forces * forces / noise - missed * missed / wide), 0)
     sharp = jnp.where(counts, jnp.sqrt(noise / wide), 1)
-    below = cumulative((depths - place[None]) / spread[None])
+    below = jnp.where(counts, cumulative((depths - place[None]) / spread[None]), 1)
     none, one = jnp.zeros_like(depths[:1]), jnp.ones_like(depths[:1])
     since = jnp.concatenate([jnp.cumsum(better[::-1], axis=0)[::-1], none])
     sharpness = jnp.concatenate([jnp.cumprod(sharp[::-1], axis=0)[::-1], one])
