@@ -86,5 +86,6 @@ def _sums_squares(
 
 
 def scan_evaluations(validation: Validation, number: int, scanned: int) -> int:
+    """How many evaluations of all scenarios a scan of so many points for so many starts counts as."""
     scenarios = validation.tasks[0].lanes
     return -(-max(scanned, 2 * number) * min(SCENARIOS, scenarios) // scenarios)
