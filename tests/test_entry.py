@@ -55,7 +55,7 @@ def entry_of(read, met, told, true=0.0, step=1.25e-4):
 
 def exact(entry, estimate, covariance, told, places):
     """How likely, by scipy's normal distribution."""
-    likely = np.empty(HYPOTHESES)
+    began, agreed, greatest = np.empty(HYPOTHESES), np.empty(HYPOTHESES), 0.0
     for h in range(HYPOTHESES):
         slope, preload = estimate[0, h], estimate[PRELOAD, h]
         gradient = np.array([preload / slope**2, -1 / slope])
@@ -77,24 +77,41 @@ def exact(entry, estimate, covariance, told, places):
         phi[:, 0], phi[:, DAMPING], phi[:, PRELOAD] = x, 1, 1
         wide = np.sqrt(NOISE**2 + np.einsum("ia,ab,ib->i", phi, covariance[:, :, h], phi))
         edges = np.concatenate([[-np.inf], x, [np.inf]])
-        total = 0.0
+        began[h] = 0.0
         for j in range(len(x) + 1):
             density = np.sum(norm.logpdf(y[j:], begun[j:], wide[j:])) + np.sum(norm.logpdf(y[:j], 0, NOISE))
-            total += math.exp(density) * np.ptp(norm.cdf(edges[j : j + 2], place, spread))
-        likely[h] = total * max(there, 0.1)
-    return likely
+            began[h] += math.exp(density) * np.ptp(norm.cdf(edges[j : j + 2], place, spread))
+            greatest = max(greatest, math.exp(density))
+        agreed[h] = max(there, 0.1)
+    best = np.max(began)
+    return entry.level * agreed * (began / best) * math.sqrt(best / greatest)
 
 
 @pytest.mark.parametrize("told", TOLD)
-@pytest.mark.parametrize("jump", [0.0, 1.5])
-def test_entries_are_as_likely_as_normal_densities_say(jump, told):
+@pytest.mark.parametrize(("jump", "behind"), [(0.0, 0.0), (1.5, 0.0), (1.5, 0.4e-3)])
+def test_entries_are_as_likely_as_normal_densities_say(jump, behind, told):
+    """The last of maps that expect what is read of a surface that by them lies deeper, as behind a lag."""
     rng = np.random.default_rng(int(10 * jump))
     estimate, covariance = maps(rng, jump)
+    estimate[PRELOAD] -= behind * estimate[0]
+    estimate[DAMPING] += behind * estimate[0]
     entry, _, places = entry_of(readings(rng, jump, 0.2e-3), meeting(), told)
     found = np.log(agree(entry, estimate, covariance).likely)
     wanted = np.log(exact(entry, estimate, covariance, told, places))
     assert 4 <= len(entry.depths) <= 8 and np.ptp(wanted) > 0.3
-    np.testing.assert_allclose(found - found[0], wanted - wanted[0], atol=0.15)
+    np.testing.assert_allclose(found, wanted, atol=0.15)
+
+
+def test_a_surface_that_is_not_where_readings_begin_makes_all_less_likely():
+    likely = []
+    for behind in (0.0, 2e-3):
+        rng = np.random.default_rng(4)
+        estimate, covariance = maps(rng, 1.5)
+        estimate[PRELOAD] -= behind * estimate[0]
+        estimate[DAMPING] += behind * estimate[0]
+        entry, _, _ = entry_of(readings(rng, 1.5, 0.0), meeting(), 1e-3)
+        likely.append(np.max(agree(entry, estimate, covariance).likely) / entry.level)
+    assert likely[1] < 0.01 * likely[0]
 
 
 def test_a_true_preload_that_may_be_tells_of_no_place():

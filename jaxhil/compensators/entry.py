@@ -4,7 +4,9 @@ Near the entry a map expects f(x) = f_0 + K x at depth x, by its own surface, an
 preload P is undone, at x = -P/K; of P, what is known of a true preload beforehand counts as one. Where a
 surface was told, the place is the mean of both by how certain either is. Readings y_i at depths x_1 < x_2 <
 .. about the tick: if the surface lies between x_(j-1) and x_j, those from j on are f(x_i), those before 0.
-With L_j their likelihood, a hypothesis is as likely as sum_j L_j P(x_(j-1) < place < x_j).
+With L_j their likelihood, a hypothesis is as likely as sum_j L_j P(x_(j-1) < place < x_j). Where none of them
+has its surface where the readings begin, as behind a lag, all are less likely, by the root of what the best
+has of the greatest L_j: a root, as the likelihood of all other readings.
 """
 
 import math
@@ -130,7 +132,8 @@ def agree(entry: Entry, maps: Map) -> Entered:
 
 
 def _began(entry: Entry, maps: Map, place: Array, spread: Array) -> Float[Array, "delays *batch"]:
-    """sum_j L_j P(x_(j-1) < place < x_j), in terms of the greatest."""
+    """sum_j L_j P(x_(j-1) < place < x_j), in terms of the greatest, times the root of that over the greatest
+    L_j."""
     mean, covariance = maps
     jumps = mean[PRELOAD] + mean[DAMPING] + mean[FRICTION]
     of_jumps = covariance[PRELOAD, PRELOAD] + covariance[DAMPING, DAMPING] + 2 * covariance[DAMPING, PRELOAD]
@@ -150,10 +153,13 @@ def _began(entry: Entry, maps: Map, place: Array, spread: Array) -> Float[Array,
     within = jnp.concatenate([below, one]) - jnp.concatenate([none, below])
     within = jnp.where(within > 0, within, 0)  # none where the hardware went back
     most = lax.stop_gradient(jnp.max(since, axis=(0, 1), keepdims=True))
-    likely = jnp.sum(exponential(most - since, SQUARINGS) * sharpness * within, axis=0)
+    each = exponential(most - since, SQUARINGS) * sharpness
+    likely = jnp.sum(each * within, axis=0)
     best = jnp.max(likely, axis=0, keepdims=True)
+    agreed = best / jnp.max(each, axis=(0, 1), keepdims=True)[0]
+    agreed = jnp.sqrt(jnp.where(agreed > LEAST_AGREED, agreed, LEAST_AGREED))
     likely = likely / jnp.where(best > 0, best, 1)
-    return jnp.where(likely > LEAST_AGREED, likely, LEAST_AGREED)
+    return jnp.where(likely > LEAST_AGREED, likely, LEAST_AGREED) * agreed
 
 
 def cumulative(ratio: Array) -> Float[Array, "*batch"]:

@@ -4,7 +4,9 @@
  * P is undone, at x = -P/K; of P, what is known of a true preload beforehand counts as one. Where a surface was told,
  * the place is the mean of both by how certain either is. Readings y_i at depths x_1 < x_2 < .. about the tick: if the
  * surface lies between x_(j-1) and x_j, those from j on are f(x_i), those before 0. With L_j their likelihood, a
- * hypothesis is as likely as sum_j L_j P(x_(j-1) < place < x_j).
+ * hypothesis is as likely as sum_j L_j P(x_(j-1) < place < x_j). Where none of them has its surface where the readings
+ * begin, as behind a lag, all are less likely, by the root of what the best has of the greatest L_j: a root, as the
+ * likelihood of all other readings.
  */
 #include <math.h>
 #include <stdbool.h>
@@ -154,9 +156,10 @@ static double jaxhil_entry_since(const jaxhil_entry *entry, const jaxhil_entered
     return most;
 }
 
-/* sum_j L_j P(x_(j-1) < place < x_j), in terms of what is the `most` likely. */
+/* sum_j L_j P(x_(j-1) < place < x_j), in terms of what is the `most` likely; the `greatest` L_j in these terms, so far.
+ */
 static double jaxhil_entry_began(const jaxhil_entry *entry, const jaxhil_entered *one, double deeper, double most,
-                                 const double *since) {
+                                 const double *since, double *greatest) {
     const bool finite = most < INFINITY && entry->variance > 0.0 && entry->variance < INFINITY;
     double sharpness[JAXHIL_BESIDE + 1];
     double total = 0.0, before = 0.0;
@@ -171,10 +174,12 @@ static double jaxhil_entry_began(const jaxhil_entry *entry, const jaxhil_entered
             const double ratio = (entry->depths[i] + deeper - one->place) / one->spread;
             below = ratio > jaxhil_entry_certain ? 1.0 : jaxhil_cumulative(ratio, jaxhil_density(ratio));
         }
-        /* None where the hardware went back; of none, no exponential. */
+        /* None where the hardware went back; an exponential is not formed where it counts for nothing. */
         const double within = below > before ? below - before : 0.0;
-        if (within > 0.0 || !finite) {
-            total += jaxhil_exponential(most - since[i], JAXHIL_SQUARINGS) * sharpness[i] * within;
+        if (within > 0.0 || sharpness[i] > *greatest || !finite) {
+            const double likely = jaxhil_exponential(most - since[i], JAXHIL_SQUARINGS) * sharpness[i];
+            total += likely * within;
+            *greatest = likely > *greatest || likely != likely ? likely : *greatest;
         }
         before = below;
     }

@@ -4,8 +4,9 @@ Near the entry a map expects f(x) = f_0 + K x at depth x, by its own surface, an
 preload P is undone, at x = -P/K; of P, what is known of a true preload beforehand counts as one. Where a
 surface was told, the place is the mean of both by how certain either is. Readings y_i at depths x_1 < x_2 <
 .. about the tick: if the surface lies between x_(j-1) and x_j, those from j on are f(x_i), those before 0.
-With L_j their likelihood, a hypothesis is as likely as sum_j L_j P(x_(j-1) < place < x_j). In NumPy, all
-hypotheses at a time.
+With L_j their likelihood, a hypothesis is as likely as sum_j L_j P(x_(j-1) < place < x_j). Where none of them
+has its surface where the readings begin, as behind a lag, all are less likely, by the root of what the best
+has of the greatest L_j: a root, as the likelihood of all other readings. In NumPy, all hypotheses at a time.
 """
 
 from math import pi, sqrt
@@ -117,7 +118,8 @@ def agree(entry: Entry, estimate: np.ndarray, covariance: np.ndarray) -> Entered
 
 
 def _began(entry: Entry, estimate: np.ndarray, covariance: np.ndarray, place, spread) -> np.ndarray:
-    """sum_j L_j P(x_(j-1) < place < x_j), in terms of the greatest."""
+    """sum_j L_j P(x_(j-1) < place < x_j), in terms of the greatest, times the root of that over the greatest
+    L_j."""
     number = len(entry.depths)
     if number == 0:
         return np.ones_like(place)
@@ -142,9 +144,11 @@ def _began(entry: Entry, estimate: np.ndarray, covariance: np.ndarray, place, sp
     sharpness = np.concatenate((np.multiply.accumulate(sharp[::-1], axis=0)[::-1], one))
     # None where the hardware went back.
     within = np.fmax(np.concatenate((below, one)) - np.concatenate((gained, below)), 0.0)
-    likely = exponential(np.maximum.reduce(since, axis=None) - since, SQUARINGS) * sharpness * within
-    likely = np.add.accumulate(likely, axis=0)[-1]
-    return np.fmax(likely / np.maximum.reduce(likely), LEAST_AGREED)
+    each = exponential(np.maximum.reduce(since, axis=None) - since, SQUARINGS) * sharpness
+    likely = np.add.accumulate(each * within, axis=0)[-1]
+    best = np.maximum.reduce(likely)
+    agreed = np.fmax(best / np.maximum.reduce(each, axis=None), LEAST_AGREED)
+    return np.fmax(likely / best, LEAST_AGREED) * np.sqrt(agreed)
 
 
 def cumulative(ratio: np.ndarray) -> np.ndarray:
