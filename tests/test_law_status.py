@@ -92,6 +92,7 @@ def run(mechanism: Mechanism, law: Controller, seed: int = 0) -> Ran:
     """One contact in lock-step with the rig's plant, until both have been outside for a while."""
     plant, model = Plant(mechanism, seed), NumericalModel(to_builtins(mechanism))
     period, quiet, entered = law.control_period, 0, False
+    surface = min(mechanism.rig.contact_plane, 0.0)
     position, velocity = model.start
     model.place(position, velocity)
     plant.begin(position, velocity, law.position_command(position, velocity, 0.0), 0)
@@ -106,7 +107,7 @@ def run(mechanism: Mechanism, law: Controller, seed: int = 0) -> Ran:
         rows.append([c99_cases.TICK, *readings, 1.0, *motion])
         faults.append(law.faults)
         said.append(law.law_status)
-        touching = readings[1] > 0.0 or measured > 0.0
+        touching = readings[1] > surface or measured > surface
         entered, quiet = entered or touching, 0 if touching else quiet + 1
         if entered and quiet > AFTER:
             break
