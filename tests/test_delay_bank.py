@@ -12,23 +12,15 @@ from scipy import stats
 
 from jaxhil.compensators import delay_bank as in_jax
 from jaxhil.compensators import force_depth_map
+from jaxhil.compensators.hypotheses import suppose
 from jaxhil.compensators.lagged_onset import Window
 from jaxhil.compensators.meeting import Meeting as MeetingInJax
 from jaxhil.compensators.reintegration import Scales
 from jaxhil.runtime import Controller
 from jaxhil.runtime.laws.contact_plane import Meeting
-from jaxhil.runtime.laws.delay_bank import (
-    DELAYS,
-    FIRST_LAG,
-    HYPOTHESES,
-    LAGGING,
-    STEADY,
-    UNLIKELY,
-    USUAL,
-    WHOLE,
-    DelayBank,
-)
+from jaxhil.runtime.laws.delay_bank import STEADY, UNLIKELY, USUAL, WHOLE, DelayBank
 from jaxhil.runtime.laws.force_depth_map import KNOTS, ForceDepthMap, Prior
+from jaxhil.runtime.laws.hypotheses import DELAYS, FIRST_LAG, HYPOTHESES, LAGGING
 from jaxhil.runtime.laws.lagged_onsets import lagged_onsets
 from jaxhil.runtime.laws.onset import Onset
 
@@ -64,8 +56,8 @@ def contact(rng, ticks=170, begins=-0.02, lasts=0.13, delay=0.0, hides=0.0):
     return depths, speeds, np.where(hidden, 0, forces), hidden
 
 
-def plain(spread=SPREAD, plane_spread=TOLD):
-    return DelayBank(spread, plane_spread, Prior(**PRIOR), PERIOD)
+def plain(spread=SPREAD, plane_spread=TOLD, sensor_lag=0.0):
+    return DelayBank(spread, sensor_lag, plane_spread, Prior(**PRIOR), PERIOD)
 
 
 def meeting(place=0.0, pace=1.0):
@@ -145,13 +137,15 @@ def test_likelihood_is_the_root_of_the_density_of_all_readings():
     assert np.ptp(exact) > 0.1
 
 
-def test_both_recursions_agree():
-    """Three contacts, the last in part hidden by a dead zone; what is carried as well."""
+@pytest.mark.parametrize("sensor_lag", [0.0, 0.0012])
+def test_both_recursions_agree(sensor_lag):
+    """Three contacts, the last in part hidden by a dead zone, a lag told or not; what is carried as well."""
     rng = np.random.default_rng(1)
-    bank, zero = plain(), jnp.zeros(())
+    bank, zero = plain(sensor_lag=sensor_lag), jnp.zeros(())
     prior = jax.jit(force_depth_map.prior)(*(zero + value for value in PRIOR.values()))
     ours, begin, learn = jax.jit(in_jax.no_bank)(prior), jax.jit(in_jax.begin), jax.jit(in_jax.learn)
-    known = zero + SPREAD, zero + TOLD, zero + PRIOR["damping"] ** 2
+    supposed = jax.jit(suppose)(zero + SPREAD, zero + sensor_lag)
+    known = supposed, zero + TOLD, zero + PRIOR["damping"] ** 2
     for delay, zone, met in (
         (0.0004, 0.0, meeting(2e-6)), (0.0004, 0.0, meeting(1e-4, 0.8)), (-0.0007, 1.0, meeting()),
     ):  # fmt: skip

@@ -52,21 +52,19 @@ from jaxhil.compensators.force_depth_map import (
     positive_mean,
     predict,
 )
+from jaxhil.compensators.hypotheses import (
+    DELAYED,
+    DELAYS,
+    FIRST_LAG,
+    HYPOTHESES,
+    LAGS,
+    Supposed,
+)
 from jaxhil.compensators.lagged_onset import Window, lagged_onsets
 from jaxhil.compensators.meeting import Meeting
 from jaxhil.compensators.onset import SQUARINGS, exponential
 
-DELAYS = LAGS = 17
-FIRST_LAG = 2 * DELAYS  # each delay by slopes that wander, then by steady ones
-HYPOTHESES = FIRST_LAG + LAGS
-DELAYED = np.arange(HYPOTHESES) < FIRST_LAG
-OFFSETS = np.concatenate([np.linspace(-1, 1, DELAYS)] * 2 + [np.zeros(LAGS)])  # in terms of the farthest
-LAG = np.where(DELAYED, 0, 0.00025 * (np.arange(HYPOTHESES) - FIRST_LAG + 1.0))  # s
 STEADY = 0.125  # of the spread by which slopes wander, where they hardly do
-LAGGING = 0.0001  # of a delay's probability, that of each lag
-# What is carried before the first contact, and what where it is over: only then its slopes tell how they are.
-FIRST = np.where(DELAYED, np.arange(HYPOTHESES) < DELAYS, LAGGING)
-EITHER = np.where(DELAYED, 0.5, LAGGING)
 ELASTIC = 0.35  # probability that a contact has no damping
 BROADENING = 2.0  # of the variance of the damping
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
@@ -84,7 +82,7 @@ class Bank(NamedTuple):
     maps: Map  # of each hypothesis
     deepest: Float[Array, "hypotheses *batch"]  # point of this contact [s]
     likelihood: Float[Array, "hypotheses *batch"]  # of this contact's readings
-    carried: Float[Array, "hypotheses *batch"]  # likelihood of the readings of the contacts before
+    carried: Float[Array, "hypotheses *batch"]  # likelihood of the readings of the contacts before, once met
     precision: Float[Array, "hypotheses *batch"]  # sum of the damping's 1/s^2 over the contacts before [s^2]
     weighted: Float[Array, "hypotheses *batch"]  # sum of B/s^2 over them [s]
     met: Float[Array, "*batch"]  # how many they are
@@ -106,10 +104,9 @@ def no_bank(prior: Map) -> Bank:
     """Before the first contact."""
     zero = jnp.zeros_like(prior.mean[0])
     each = jnp.stack([zero] * HYPOTHESES)
-    carried = each + _column(FIRST, each)
     held = jnp.stack([each[:LAGS]] * len(prior.mean))
     return Bank(
-        _priors(prior), each, each + 1, carried, each, each, zero, zero, each, zero + 1, zero, zero,
+        _priors(prior), each, each + 1, each + 1, each, each, zero, zero, each, zero + 1, zero, zero,
         each, each + 1, held, held, held[0], no_entry(zero, FIRST_LAG), each[:FIRST_LAG],
     )  # fmt: skip
 
@@ -120,15 +117,14 @@ def begin(
     meeting: Meeting,
     window: Window,
     period: Array,
-    farthest: Array,
+    supposed: Supposed,
     plane_spread: Array,
     damping: Array,
 ) -> tuple[Bank, Int[Array, "*batch"]]:
     """Where a contact begins: the one before is added to what is carried, and the maps are the prior; from
     how many ticks before it was met on to learn from the readings.
 
-    `window`: the newest readings; `period` [s] is that of control, `farthest` [s] the largest d_h,
-    `plane_spread` [m] how uncertain it is
+    `window`: the newest readings; `period` [s] is that of control, `plane_spread` [m] how uncertain it is
     where the surface was told, `damping` [1/s^2] the prior variance s_0^2 of the damping.
     """
     begins = meeting.found
@@ -138,15 +134,15 @@ def begin(
     variance = old.maps.covariance[DAMPING, DAMPING] * per_second[None]
     precision = 1 / jnp.where(variance > 0, variance, 1)
     speed, pace = (jnp.where(begins, each, 1) for each in (meeting.scales.speed, meeting.scales.pace))
-    offsets = _column(OFFSETS, speed[None]) * farthest[None]
     tick = period * pace
-    lags = _column(LAG[FIRST_LAG:], speed[None]) * pace[None]
     true = prior.covariance[PRELOAD, PRELOAD]
-    lagged = lagged_onsets(lags, window, tick)
-    placed = _place(meeting, window, offsets, speed, pace, tick, plane_spread, true, lagged)
+    lagged = lagged_onsets(supposed.lags * pace[None], window, tick)
+    placed = _place(meeting, window, supposed.offsets, speed, pace, tick, plane_spread, true, lagged)
     first = jnp.max(-placed.below[FIRST_LAG:], axis=0)
     earlier = jnp.minimum(jnp.ceil(jnp.where(first > SURFACE, first, 0) / tick), EARLIER).astype(jnp.int32)
-    carried = jnp.where(old.met[None] > 0, old.carried, _column(EITHER, old.carried))
+    before, carried = (
+        jnp.where(old.met[None] > 0, old.carried, each) for each in (supposed.first, supposed.either)
+    )
     evidence = old.likelihood * jnp.where(_column(DELAYED, old.likely) > 0, old.likely, 1)
     fresh = _priors(prior)
     fresh = fresh._replace(covariance=fresh.covariance.at[PRELOAD, PRELOAD].add(placed.preload))
@@ -157,7 +153,7 @@ def begin(
         ),
         deepest=jnp.where(begins[None], 0, old.deepest),
         likelihood=jnp.where(begins[None], 1, old.likelihood),
-        carried=jnp.where(ends[None], _shares(_weighed(carried, evidence), LEAST_CARRIED), old.carried),
+        carried=jnp.where(ends[None], _shares(_weighed(carried, evidence), LEAST_CARRIED), before),
         precision=old.precision + jnp.where(ends[None], precision, 0),
         weighted=old.weighted + jnp.where(ends[None], precision * mean, 0),
         met=old.met + jnp.where(ends, 1, 0),
@@ -172,22 +168,22 @@ def begin(
         entry=Entry(*(jnp.where(begins, *both) for both in zip(placed.entry, old.entry, strict=True))),
     )
     now = _entered(now)
-    means = _means(now, weigh(now, damping), offsets)
+    means = _means(now, weigh(now, damping), supposed)
     shift, deeper = (
         jnp.where(begins, a, b) for a, b in ((means.shift, old.shift), (means.deeper, old.deeper))
     )
     return now._replace(shift=shift, deeper=deeper), jnp.where(begins, earlier, 0)
 
 
-def learn(old: Bank, reading: Reading, period: Array, farthest: Array, damping: Array) -> tuple[Bank, Curve]:
+def learn(
+    old: Bank, reading: Reading, period: Array, supposed: Supposed, damping: Array
+) -> tuple[Bank, Curve]:
     """The bank with one reading more, and the mean of its maps.
 
-    `period` [s] is that of control, `farthest` [s] the largest d_h, `damping` [1/s^2] the prior variance
-    s_0^2 of the damping.
+    `period` [s] is that of control, `damping` [1/s^2] the prior variance s_0^2 of the damping.
     """
-    offsets = _column(OFFSETS, reading.depth[None]) * farthest[None]
-    rate = reading.rate[None] + jnp.zeros_like(offsets)
-    depth = reading.depth[None] - offsets * old.pace[None] * rate - old.below
+    rate = reading.rate[None] + jnp.zeros_like(old.below)
+    depth = reading.depth[None] - supposed.offsets * old.pace[None] * rate - old.below
     counts, hidden, zone = reading.counts[None], reading.hidden[None], reading.zone[None]
     deepest = jnp.where(counts & (depth > old.deepest), depth, old.deepest)
     noise = (reading.variance + jnp.where(reading.hidden, reading.zone**2 / 12, 0))[None]
@@ -200,7 +196,9 @@ def learn(old: Bank, reading: Reading, period: Array, farthest: Array, damping: 
     phi = features(depth, rate, deepest, knots)
     # Of a delay, the surface may lie before where its map has it.
     phi = phi.at[0, :FIRST_LAG].set(jnp.minimum(depth, knots[1])[:FIRST_LAG])
-    held, pushes = _smooth(old, depth[FIRST_LAG:], rate[FIRST_LAG:], phi[:, FIRST_LAG:], period)
+    held, pushes = _smooth(
+        old, supposed.lags, depth[FIRST_LAG:], rate[FIRST_LAG:], phi[:, FIRST_LAG:], period
+    )
     before, phi = phi[:, FIRST_LAG:], jnp.concatenate([phi[:, :FIRST_LAG], held], axis=1)
     predicted = predict(old.maps, phi, noise)
     # Hidden, a force is known to be small: half of the zone, where the map expects more than all of it.
@@ -232,7 +230,7 @@ def learn(old: Bank, reading: Reading, period: Array, farthest: Array, damping: 
     )
     now = _entered(now)
     weights = weigh(now, damping)
-    return _means(now, weights, offsets), average(maps, weights, knots)
+    return _means(now, weights, supposed), average(maps, weights, knots)
 
 
 def _entered(bank: Bank) -> Bank:
@@ -243,10 +241,11 @@ def _entered(bank: Bank) -> Bank:
     return bank._replace(likely=likely, within=entered.place)
 
 
-def _smooth(old: Bank, depth: Array, rate: Array, now: Array, period: Array) -> tuple[Array, Array]:
+def _smooth(
+    old: Bank, lag: Array, depth: Array, rate: Array, now: Array, period: Array
+) -> tuple[Array, Array]:
     """What the force is linear in as sensors that lag show it: its mean over the tick, from the entry on
     where that is within it, as long as the contact pushes; whether it pushes."""
-    lag = _column(LAG[FIRST_LAG:], depth)
     closes = rate > 0
     raw = jnp.sum(now * old.maps.mean[:, FIRST_LAG:], axis=0)
     pushes = (depth > SURFACE) & (closes | (raw > 0))
@@ -322,10 +321,9 @@ def average(maps: Map, weights: Float[Array, "hypotheses *batch"], knots: Array)
     return Curve(slopes, *lost, preload=at_knots[0])
 
 
-def _means(bank: Bank, weights: Array, offsets: Array) -> Bank:
+def _means(bank: Bank, weights: Array, supposed: Supposed) -> Bank:
     """With the mean delay and surface."""
-    older = offsets + _column(LAG, offsets)
-    shift = jnp.sum(weights * older, axis=0)
+    shift = jnp.sum(weights * supposed.older, axis=0)
     shift = jnp.where((shift > LEAST_SHIFT) | (shift < -LEAST_SHIFT), shift, 0)
     return bank._replace(shift=shift, deeper=jnp.sum(weights * bank.below, axis=0))
 

@@ -28,6 +28,7 @@ from jaxhil.compensators.estimates import (
     preload,
 )
 from jaxhil.compensators.history import reading_at, recall
+from jaxhil.compensators.hypotheses import suppose
 from jaxhil.compensators.lagged_onset import WINDOW, Window
 from jaxhil.compensators.reintegration import beyond
 from jaxhil.compensators.retrospective_reference import RetrospectiveReference
@@ -72,6 +73,13 @@ class RetrospectiveDelayBank(RetrospectiveReference):
             nominal=lambda m: min(force_delay_spread(m), MOST),
             tuned=lambda m: False,
         ),
+        rig_gain(
+            "sensor_lag",
+            lower=lambda m: 0.0,
+            upper=lambda m: 2 * m.rig.force_sensor.time_constant + 0.02,
+            nominal=lambda m: m.rig.force_sensor.time_constant,
+            tuned=lambda m: False,
+        ),
     )
 
     def unlearnt(self, prior):
@@ -83,12 +91,14 @@ class RetrospectiveDelayBank(RetrospectiveReference):
     def begin(self, prepared, learnt, meeting, history, variance):
         gains, period = prepared.gains, prepared.constants.control_period
         window = _newest(prepared, meeting, history, variance)
-        known = gains["delay_spread"], gains["plane_spread"], gains["prior_damping_spread"] ** 2
+        supposed = suppose(gains["delay_spread"], gains["sensor_lag"])
+        known = supposed, gains["plane_spread"], gains["prior_damping_spread"] ** 2
         return begin(learnt, prepared.prior, meeting, window, period, *known)
 
     def learn(self, prepared, learnt, reading, deepest):
         gains, period = prepared.gains, prepared.constants.control_period
-        return learn(learnt, reading, period, gains["delay_spread"], gains["prior_damping_spread"] ** 2)
+        supposed = suppose(gains["delay_spread"], gains["sensor_lag"])
+        return learn(learnt, reading, period, supposed, gains["prior_damping_spread"] ** 2)
 
     def force_delay(self, gains, state):
         return gains["identification_delay"] + state.learnt.shift

@@ -21,6 +21,7 @@
 #include "force_depth_map.c"
 #include "gains_table.c"
 #include "history.c"
+#include "hypotheses.c"
 #include "lagged_onset.c"
 #include "onset.c"
 #include "plausible_damping.c"
@@ -28,30 +29,23 @@
 
 /* == Declarations == */
 
-/* Each delay by slopes that wander, then by steady ones; then the lags. */
-enum {
-    JAXHIL_DELAYS = 17,
-    JAXHIL_LAGS = 17,
-    JAXHIL_FIRST_LAG = 2 * JAXHIL_DELAYS,
-    JAXHIL_HYPOTHESES = JAXHIL_FIRST_LAG + JAXHIL_LAGS
-};
-
-/* Of each hypothesis its delay, by how much [s] it has the surface deeper than told, its knots [s], how likely it is
+/* Of each hypothesis by how much [s] it has the surface deeper than told, its knots [s], how likely it is
  * that the surface is there, map, deepest point, the likelihoods of this contact and of those before; how deep the
  * surface was met, `met_at` [s], and of each delay how deep by its own surface it was met, it was told, and it is by
  * its map, `within` [s]; sums over contacts of the damping's precision and of precision times mean, their number
  * `met`; whether this contact is to be added to them. The mean of the maps and, `shift` [s] and `below` [s], of the
  * delays and of how much deeper; the delays' standard deviation [s]; the largest weight of what may lie beyond,
- * `edge`, and that of all lags; the delay that was `given`. Of each lag [s] what is kept after a tick of what a sensor
- * shows; what is smoothed, `held`, as it was before that, and whether the contact then pushed. */
+ * `edge`, and that of all lags that are not told; the delay that was `given`. Of each lag what is kept after a tick of
+ * what a sensor shows; what is smoothed, `held`, as it was before that, and whether the contact then pushed. */
 typedef struct {
     double given, shift, open, edge, lagging, below, met, variance, pace, plane_spread, period;
-    double lags[JAXHIL_LAGS], kept[JAXHIL_LAGS];
+    double kept[JAXHIL_LAGS];
+    jaxhil_supposed supposed;
     double held[JAXHIL_LAGS][JAXHIL_PARAMETERS], before[JAXHIL_LAGS][JAXHIL_PARAMETERS];
     bool pushed[JAXHIL_LAGS];
     double known[JAXHIL_HYPOTHESES];
     jaxhil_force_depth_map prior, steady;
-    double offsets[JAXHIL_HYPOTHESES], deeper[JAXHIL_HYPOTHESES], deepest[JAXHIL_HYPOTHESES];
+    double deeper[JAXHIL_HYPOTHESES], deepest[JAXHIL_HYPOTHESES];
     double knots[JAXHIL_HYPOTHESES][JAXHIL_SEGMENTS], likely[JAXHIL_HYPOTHESES];
     jaxhil_entry entry;
     double met_at, met_deeper[JAXHIL_FIRST_LAG], told[JAXHIL_FIRST_LAG], within[JAXHIL_FIRST_LAG];
@@ -71,9 +65,7 @@ static const double jaxhil_bank_least = 1e-200;
 static const double jaxhil_bank_nothing = 1e-300; /* a smaller product is none: some machines keep such numbers */
 static const double jaxhil_bank_least_carried = 1e-12;
 static const double jaxhil_bank_least_shift = 1e-12; /* s: where nothing tells delays apart, rounding does not */
-static const double jaxhil_bank_lag_step = 0.00025; /* s from lag to lag */
 static const double jaxhil_bank_steady = 0.125; /* of the spread by which slopes wander, where they hardly do */
-static const double jaxhil_bank_lagging = 0.0001; /* of a delay's probability, that of each lag */
 static const double jaxhil_bank_edge = 0.6;      /* probability of a farthest delay or the longest lag: it may lie beyond */
 static const double jaxhil_bank_open = 0.0075;   /* of a restitution of 1, that what is open of the delay makes */
 static const double jaxhil_bank_settled = 0.99;  /* probability from which on it is a lag */
@@ -124,12 +116,15 @@ static void jaxhil_learnt_reset(jaxhil_learnt *bank) {
         bank->deeper[h] = 0.0;
         jaxhil_lagged_knots(0.0, bank->knots[h]);
         bank->likely[h] = 1.0;
-        bank->carried[h] = h < JAXHIL_DELAYS ? 1.0 : (h < JAXHIL_FIRST_LAG ? 0.0 : jaxhil_bank_lagging);
+        bank->carried[h] = h < JAXHIL_DELAYS ? 1.0 : 0.0;
         bank->precision[h] = 0.0;
         bank->weighted[h] = 0.0;
     }
     for (int h = 0; h < JAXHIL_FIRST_LAG; h++) {
         bank->within[h] = 0.0;
+    }
+    for (int l = 0; l < JAXHIL_LAGS; l++) {
+        bank->carried[JAXHIL_FIRST_LAG + l] = bank->supposed.likely[l];
     }
     bank->met_at = 0.0;
     bank->met = 0.0;
@@ -147,14 +142,10 @@ static void jaxhil_learnt_init(jaxhil_learnt *bank, const jaxhil_gains *gains) {
     bank->given = gains->identification_delay;
     jaxhil_force_depth_map_init(&bank->prior, gains);
     jaxhil_force_depth_map_init(&bank->steady, &steady);
-    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
-        const double step = (double)(h % JAXHIL_DELAYS);
-        bank->offsets[h] = h < JAXHIL_FIRST_LAG ? (0.125 * step - 1.0) * gains->delay_spread : 0.0;
-    }
+    jaxhil_suppose(&bank->supposed, gains);
     bank->period = gains->control_period;
     for (int l = 0; l < JAXHIL_LAGS; l++) {
-        bank->lags[l] = jaxhil_bank_lag_step * (double)(l + 1);
-        bank->kept[l] = jaxhil_exponential(bank->period / bank->lags[l], JAXHIL_SQUARINGS);
+        bank->kept[l] = jaxhil_exponential(bank->period / bank->supposed.lags[l], JAXHIL_SQUARINGS);
     }
     bank->plane_spread = gains->plane_spread;
     bank->curve = bank->prior.curve;
@@ -183,7 +174,7 @@ static double jaxhil_learnt_deeper(const jaxhil_learnt *bank) {
  * readings that speak for one, if not so clearly that its being rare is outweighed. */
 static bool jaxhil_learnt_open(const jaxhil_learnt *bank, double peak) {
     const double lagging = bank->lagging;
-    const bool doubtful = jaxhil_bank_settled > lagging && lagging > jaxhil_bank_lagging * (1.0 - lagging);
+    const bool doubtful = jaxhil_bank_settled > lagging && lagging > jaxhil_lagging * (1.0 - lagging);
     return doubtful || bank->edge > jaxhil_bank_edge ||
            0.5 * jaxhil_map_pi * (peak * (bank->open * bank->pace)) > jaxhil_bank_open;
 }
@@ -296,13 +287,9 @@ static void jaxhil_bank_average(jaxhil_learnt *bank, const double *weights) {
     }
 }
 
-/* By how much hypothesis h has the force older than by the given delay [s]. */
-static double jaxhil_bank_older(const jaxhil_learnt *bank, int h) {
-    return h < JAXHIL_FIRST_LAG ? bank->offsets[h] : bank->lags[h - JAXHIL_FIRST_LAG];
-}
-
 /* The mean over the hypotheses, by their weights: the delay, and what counts of the maps. */
 static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
+    const jaxhil_supposed *supposed = &bank->supposed;
     jaxhil_curve *curve = &bank->curve;
     double lost[4] = {0.0, 0.0, 0.0, 0.0};
     double shift = 0.0, square = 0.0, lagging = 0.0;
@@ -314,7 +301,7 @@ static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
                 jaxhil_positive_mean(bank->estimate[h][place], bank->covariance[h][place][place]) * weights[h];
             lost[k] = h > 0 ? lost[k] + mean : mean;
         }
-        const double delay = weights[h] * jaxhil_bank_older(bank, h);
+        const double delay = weights[h] * supposed->older[h];
         const double known = weights[h] * bank->known[h];
         shift = h > 0 ? shift + delay : delay;
         const double below = weights[h] * bank->deeper[h];
@@ -322,16 +309,19 @@ static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
         bank->variance = h > 0 ? bank->variance + known : known;
     }
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
-        const double off = jaxhil_bank_older(bank, h) - shift;
+        const double off = supposed->older[h] - shift;
         square += weights[h] * (off * off);
-        lagging += h < JAXHIL_FIRST_LAG ? 0.0 : weights[h];
+        lagging += h < supposed->untold ? 0.0 : weights[h];
     }
     /* Between two lags neither is right. */
     bank->lagging = lagging;
-    bank->open = sqrt(square + 0.5 * (jaxhil_bank_lag_step * jaxhil_bank_lag_step) * lagging);
+    bank->open = sqrt(square + 0.5 * (supposed->lag_step * supposed->lag_step) * lagging);
     bank->edge = weights[JAXHIL_HYPOTHESES - 1];
     for (int h = 0; h < JAXHIL_DELAYS; h += JAXHIL_DELAYS - 1) {
-        const double farthest = weights[h] + weights[h + JAXHIL_DELAYS];
+        double farthest = weights[h] + weights[h + JAXHIL_DELAYS];
+        if (supposed->untold > JAXHIL_FIRST_LAG) {
+            farthest += weights[h == 0 ? JAXHIL_FIRST_LAG : supposed->untold - 1];
+        }
         bank->edge = farthest > bank->edge ? farthest : bank->edge;
     }
     bank->shift = shift > jaxhil_bank_least_shift || shift < -jaxhil_bank_least_shift ? shift : 0.0;
@@ -373,18 +363,19 @@ static double jaxhil_bank_place(jaxhil_learnt *bank, const jaxhil_meeting *meeti
     const double known = bank->plane_spread * bank->plane_spread;
     double first = jaxhil_map_surface;
     jaxhil_entry_of(&bank->entry, meeting, window, known, bank->prior.covariance[JAXHIL_PRELOAD][JAXHIL_PRELOAD],
-                    (bank->offsets[1] - bank->offsets[0]) * meeting->pace);
+                    (bank->supposed.offsets[1] - bank->supposed.offsets[0]) * meeting->pace);
     bank->met_at = (meeting->place - meeting->plane) / length;
     for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
         double met = meeting->place, around = meeting->variance;
         if (h >= JAXHIL_FIRST_LAG) {
             double later, square;
-            jaxhil_lagged_onset(window, bank->lags[h - JAXHIL_FIRST_LAG] * meeting->pace, meeting->tick, &later, &square);
+            jaxhil_lagged_onset(window, bank->supposed.lags[h - JAXHIL_FIRST_LAG] * meeting->pace, meeting->tick, &later,
+                                &square);
             met = meeting->place + later * length;
             around = square * (length * length) + meeting->variance;
         }
         const double both = known + around;
-        const double away = met - bank->offsets[h] * meeting->speed;
+        const double away = met - bank->supposed.offsets[h] * meeting->speed;
         const bool elsewhere = away * away > jaxhil_entry_elsewhere * both;
         const double share = elsewhere ? 1.0 : known / both;
         const double likely = jaxhil_exponential(0.5 * (away * away / both), JAXHIL_DENSITY_SQUARINGS);
@@ -463,7 +454,7 @@ static void jaxhil_bank_smooth(jaxhil_learnt *bank, int h, double depth, double 
     if (enters) {
         const double entered = rate > 0.0 ? depth / rate : 0.0;
         const double since = entered < tick ? entered : tick;
-        lost = jaxhil_exponential(since / (bank->lags[l] * bank->pace), JAXHIL_SQUARINGS);
+        lost = jaxhil_exponential(since / (bank->supposed.lags[l] * bank->pace), JAXHIL_SQUARINGS);
     }
     for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
         const double now = phi[i];
@@ -485,7 +476,7 @@ static double jaxhil_bank_read(jaxhil_learnt *bank, int h, double depth, double 
     double(*covariance)[JAXHIL_COLUMNS] = bank->covariance[h];
     double *estimate = bank->estimate[h];
     double phi[JAXHIL_PARAMETERS], g[JAXHIL_COLUMNS] = {0.0}, scaled[JAXHIL_COLUMNS];
-    const double x = depth - bank->offsets[h] * bank->pace * rate - bank->deeper[h];
+    const double x = depth - bank->supposed.offsets[h] * bank->pace * rate - bank->deeper[h];
     const bool lags = h >= JAXHIL_FIRST_LAG;
     const double read = hidden ? 0.0 : force;
     const double noise = hidden ? variance + zone * zone / 12.0 : variance;

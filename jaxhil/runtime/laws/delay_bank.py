@@ -45,16 +45,12 @@ from .force_depth_map import (
     Prior,
     turning,
 )
+from .hypotheses import DELAYED, DELAYS, FIRST_LAG, HYPOTHESES, LAGGING, LAGS, suppose
 from .lagged_onset import FARTHEST, USUAL, WHOLE
 from .lagged_onsets import lagged_onsets
 from .onset import SQUARINGS, exponential
 
-DELAYS = LAGS = 17
-FIRST_LAG = 2 * DELAYS  # each delay by slopes that wander, then by steady ones
-HYPOTHESES = FIRST_LAG + LAGS
 STEADY = 0.125  # of the spread by which slopes wander, where they hardly do
-LAG_STEP = 0.00025  # s from lag to lag
-LAGGING = 0.0001  # of a delay's probability, that of each lag
 ELASTIC = 0.35  # probability that a contact has no damping
 BROADENING = 2.0  # of the variance of the damping, as the delay lies between two hypotheses
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
@@ -72,33 +68,29 @@ _GAPS = np.diff(KNOTS)
 _MOVED = np.minimum(np.array(KNOTS) / WHOLE, 1.0)[:, None]
 # Beside an array, a number takes longer than an array does.
 _0, _1 = np.zeros(HYPOTHESES), np.ones(HYPOTHESES)
-_LAGS = LAG_STEP * np.arange(1.0, LAGS + 1.0)
-_DELAYED = np.arange(HYPOTHESES) < FIRST_LAG
-# What is carried before the first contact, and what where it is over: only then its slopes tell how they are.
-_FIRST = np.where(_DELAYED, np.arange(HYPOTHESES) < DELAYS, LAGGING)
-_EITHER = np.where(_DELAYED, 0.5, LAGGING)
 _JUMPS = np.isin(np.arange(PARAMETERS), JUMPS)[:, None]
 
 
 class DelayBank:
-    """The bank, made of how far [s] the farthest hypotheses lie from the given delay, of how uncertain it is
-    where the surface was told [m], of the map's prior, and of the control period [s]."""
+    """The bank, made of how far [s] the farthest hypotheses lie from the given delay, of the lag [s] of the
+    force sensor that is told, of how uncertain it is where the surface was told [m], of the map's prior, and
+    of the control period [s]."""
 
     __slots__ = (
         "_before", "_below", "_carried", "_covariance", "_damping", "_deepest", "_edge", "_entry",
         "_estimate", "_held", "_kept", "_knots", "_known", "_lagging", "_learning", "_likelihood", "_likely",
-        "_met", "_met_at", "_off", "_offsets", "_older", "_pace", "_past", "_period", "_plane_spread",
-        "_precision", "_prior_covariance", "_prior_estimate", "_pushed", "_step", "_weighted", "_widths",
-        "_within", "curve", "deeper", "shift", "variance",
+        "_met", "_met_at", "_off", "_pace", "_past", "_period", "_plane_spread", "_precision",
+        "_prior_covariance", "_prior_estimate", "_pushed", "_supposed", "_weighted", "_widths", "_within",
+        "curve", "deeper", "shift", "variance",
     )  # fmt: skip
 
-    def __init__(self, spread: float, plane_spread: float, prior: Prior, period: float) -> None:
-        delays = np.array([0.125 * step - 1.0 for step in range(DELAYS)]) * spread
-        self._offsets = np.concatenate((delays, delays, np.zeros(LAGS)))
-        self._older = np.concatenate((delays, delays, _LAGS))
-        self._step = float(delays[1] - delays[0])
+    def __init__(
+        self, spread: float, sensor_lag: float, plane_spread: float, prior: Prior, period: float
+    ) -> None:
+        self._supposed = suppose(spread, sensor_lag)
         self._period = period
-        self._kept = exponential(period / _LAGS, SQUARINGS)  # of what a lagging sensor shows, after a tick
+        # Of what a lagging sensor shows, after a tick.
+        self._kept = exponential(period / self._supposed.lags, SQUARINGS)
         self._plane_spread = plane_spread
         self._damping = prior.damping * prior.damping
         estimate, covariance = prior.moments()
@@ -112,7 +104,7 @@ class DelayBank:
     def reset(self) -> None:
         """Forget all contacts."""
         self._restart()
-        self._carried = _FIRST
+        self._carried = self._supposed.first
         self._precision = np.zeros(HYPOTHESES)
         self._weighted = np.zeros(HYPOTHESES)
         self._below = np.zeros(HYPOTHESES)  # by how much deeper each has the surface than it was met [s]
@@ -125,7 +117,7 @@ class DelayBank:
         self._pace = 1.0
         self._off = 0.0  # standard deviation of the delays [s]
         self._edge = 0.0  # the largest weight of what may lie beyond
-        self._lagging = 0.0  # the weight of all lags
+        self._lagging = 0.0  # the weight of all lags that are not told
         self.shift = 0.0  # the mean of the hypotheses' delays [s]
         self.deeper = 0.0  # and of how much deeper the surface is [s], on the contact's scale of time
 
@@ -138,8 +130,8 @@ class DelayBank:
             pace = self._pace
             own = self._covariance[DAMPING, DAMPING] * (pace * pace)
             precision = 1.0 / np.where(own > 0.0, own, 1.0)
-            carried = self._carried if self._met else _EITHER
-            evidence = self._likelihood * np.where(_DELAYED, self._likely, 1.0)
+            carried = self._carried if self._met else self._supposed.either
+            evidence = self._likelihood * np.where(DELAYED, self._likely, 1.0)
             self._carried = _shares(_weighed(carried, evidence), LEAST_CARRIED)
             self._precision = self._precision + precision
             self._weighted = self._weighted + precision * (self._estimate[DAMPING] * pace)
@@ -173,11 +165,13 @@ class DelayBank:
         force at the entry is known to what the stiffness makes of the uncertain place; of delays the entry is
         weighed (`entry`). How far [s] the hardware was in, by the first to enter, as it was met."""
         length = meeting.speed / meeting.pace
-        later, spreads = lagged_onsets(_LAGS * meeting.pace, depths, forces, variance, meeting.tick)
+        later, spreads = lagged_onsets(
+            self._supposed.lags * meeting.pace, depths, forces, variance, meeting.tick
+        )
         known = self._plane_spread * self._plane_spread
         met = np.append(_1[:FIRST_LAG] * meeting.place, meeting.place + later * length)
         around = np.append(_1[:FIRST_LAG] * meeting.variance, spreads * (length * length) + meeting.variance)
-        away = met - self._offsets * meeting.speed
+        away = met - self._supposed.offsets * meeting.speed
         both = known + around
         elsewhere = away * away > NOT_THERE * both
         share = np.where(elsewhere, 1.0, known / both)
@@ -186,7 +180,8 @@ class DelayBank:
         off = USUAL * (share * (meeting.stiffness * (np.sqrt(around) / length)))
         self._entry = Entry.of(
             meeting, Readings(depths, forces, variance), (away - places)[:FIRST_LAG], places[:FIRST_LAG],
-            known, float(self._prior_covariance[PRELOAD, PRELOAD, 0]), self._step * meeting.pace,
+            known, float(self._prior_covariance[PRELOAD, PRELOAD, 0]),
+            self._supposed.step * meeting.pace,
         )  # fmt: skip
         off[:FIRST_LAG] = self._entry.preload
         self._covariance[PRELOAD, PRELOAD] += off * off
@@ -219,7 +214,7 @@ class DelayBank:
         self, depth: float, rate: float, force: float, variance: float, hidden: bool, zone: float
     ) -> None:
         estimate = self._estimate
-        depths = depth - self._offsets * self._pace * rate - self._below
+        depths = depth - self._supposed.offsets * self._pace * rate - self._below
         deepest = np.fmax(self._deepest, depths)
         phi = self._features(depths, rate, deepest)
         # Of a delay, the surface may lie before where its map has it.
@@ -296,7 +291,7 @@ class DelayBank:
             pushes &= np.add.reduce(now * self._estimate[:, FIRST_LAG:], axis=0) > 0.0
         enters = pushes & ~self._pushed
         kept = self._kept
-        lost = np.where(enters, exponential(since / (_LAGS * self._pace), SQUARINGS), kept)
+        lost = np.where(enters, exponential(since / (self._supposed.lags * self._pace), SQUARINGS), kept)
         before = np.where(enters, np.where(_JUMPS, now, 0.0), self._before)
         fresh = (1.0 - lost) * (0.5 * (before + now))
         self._held = kept * self._held + np.where(pushes | self._pushed, fresh, 0.0)
@@ -328,14 +323,19 @@ class DelayBank:
 
     def _conclude(self, weights: np.ndarray) -> None:
         """The mean over the hypotheses, by their weights."""
-        shift = float(_total(weights * self._older))
-        off = self._older - shift
-        self._lagging = float(_total(weights[FIRST_LAG:]))
+        supposed = self._supposed
+        shift = float(_total(weights * supposed.older))
+        off = supposed.older - shift
+        self._lagging = float(_total(weights[supposed.untold :]))
         # Between two lags neither is right.
-        between = 0.5 * (LAG_STEP * LAG_STEP) * self._lagging
+        between = 0.5 * (supposed.lag_step * supposed.lag_step) * self._lagging
         self._off = sqrt(_total(weights * (off * off)) + between)
-        farthest = weights[:DELAYS] + weights[DELAYS:FIRST_LAG]
-        self._edge = max(float(weights[-1]), float(farthest[0]), float(farthest[-1]))
+        newest = float(weights[0] + weights[DELAYS])
+        oldest = float(weights[DELAYS - 1] + weights[FIRST_LAG - 1])
+        if supposed.untold > FIRST_LAG:
+            newest += float(weights[FIRST_LAG])
+            oldest += float(weights[supposed.untold - 1])
+        self._edge = max(float(weights[-1]), newest, oldest)
         self.shift = shift if shift > LEAST_SHIFT or shift < -LEAST_SHIFT else 0.0
         self.deeper = float(_total(weights * self._below))
         self.variance = float(_total(weights * self._known))

@@ -1,7 +1,7 @@
 """The retrospective reference where the force delay is hardly known: a bank of delays, weighed as one goes.
 
 `retrospective_reference` with a `delay_bank` in the place of its one map: hypotheses lie evenly within
-`delay_spread` of `identification_delay`, or the force sensor lags by up to 4.25 ms. What was learnt of the
+`delay_spread` of `identification_delay`, or the force sensor lags (`hypotheses`). What was learnt of the
 delay, and of whether there is any damping, is carried from contact to contact; maps are not. With d the mean
 of the hypotheses' delays and lags on the tick before, the depth as old as the force is X - d V.
 """
@@ -9,6 +9,7 @@ of the hypotheses' delays and lags on the tick before, the depth as old as the f
 from collections.abc import Mapping
 from typing import ClassVar
 
+from ..bounds import TIMES
 from ..registry import GainSpecification, register
 from .contact_plane import Meeting
 from .delay_bank import DelayBank
@@ -27,6 +28,7 @@ class RetrospectiveDelayBank(Retrospective):
     gains: ClassVar[Mapping[str, GainSpecification]] = {
         **Retrospective.gains,
         "delay_spread": GainSpecification("s", 0.0, 0.004),
+        "sensor_lag": GainSpecification("s", *TIMES),
     }
 
     @property
@@ -43,7 +45,8 @@ class RetrospectiveDelayBank(Retrospective):
 
     def _prepare(self, gains: Mapping[str, float], prior: Prior) -> None:
         self._given_delay = gains["identification_delay"]
-        self._bank = DelayBank(gains["delay_spread"], gains["plane_spread"], prior, self._period)
+        told = gains["delay_spread"], gains["sensor_lag"], gains["plane_spread"]
+        self._bank = DelayBank(*told, prior, self._period)
         self._curve = self._bank.curve
 
     def _begin(self, meeting: Meeting) -> int:
