@@ -141,15 +141,15 @@ def _began(entry: Entry, maps: Map, place: Array, spread: Array) -> Float[Array,
     depths = entry.depths[:, None] + entry.deeper[None]
     uncertain = of_jumps[None] + depths * (2 * of_both[None] + depths * covariance[0, 0][None])
     noise = entry.variance[None, None]
-    wide = noise + jnp.where(uncertain > 0, uncertain, 0)
+    precision = 1 / (noise + jnp.where(uncertain > 0, uncertain, 0))
     forces, counts = entry.forces[:, None], entry.counts[:, None]
     missed = forces - (jumps[None] + mean[0][None] * depths)
-    better = jnp.where(counts, 0.5 * (forces * forces / noise - missed * missed / wide), 0)
-    sharp = jnp.where(counts, jnp.sqrt(noise / wide), 1)
+    better = jnp.where(counts, 0.5 * (forces * forces / noise - missed * missed * precision), 0)
+    known = jnp.where(counts, noise * precision, 1)
     below = jnp.where(counts, cumulative((depths - place[None]) / spread[None]), 1)
     none, one = jnp.zeros_like(depths[:1]), jnp.ones_like(depths[:1])
     since = jnp.concatenate([jnp.cumsum(better[::-1], axis=0)[::-1], none])
-    sharpness = jnp.concatenate([jnp.cumprod(sharp[::-1], axis=0)[::-1], one])
+    sharpness = jnp.sqrt(jnp.concatenate([jnp.cumprod(known[::-1], axis=0)[::-1], one]))
     within = jnp.concatenate([below, one]) - jnp.concatenate([none, below])
     within = jnp.where(within > 0, within, 0)  # none where the hardware went back
     most = lax.stop_gradient(jnp.max(since, axis=(0, 1), keepdims=True))

@@ -214,15 +214,17 @@ static void jaxhil_bank_weighed(const jaxhil_learnt *bank, const double *evidenc
 static void jaxhil_bank_enter(jaxhil_learnt *bank) {
     const jaxhil_entry *entry = &bank->entry;
     jaxhil_entered entered[JAXHIL_FIRST_LAG];
-    double since[JAXHIL_FIRST_LAG][JAXHIL_BESIDE + 1], began[JAXHIL_FIRST_LAG];
+    double since[JAXHIL_FIRST_LAG][JAXHIL_BESIDE + 1], known[JAXHIL_FIRST_LAG][JAXHIL_BESIDE + 1];
+    double began[JAXHIL_FIRST_LAG];
     double most = 0.0, greatest = 0.0, likeliest = -INFINITY;
     for (int h = 0; h < JAXHIL_FIRST_LAG; h++) {
         entered[h] = jaxhil_entry_place(entry, bank->told[h], bank->estimate[h], bank->covariance[h]);
         bank->within[h] = jaxhil_entry_near(entry, entered[h].place);
-        most = jaxhil_entry_since(entry, &entered[h], bank->met_deeper[h], most, since[h]);
+        most = jaxhil_entry_since(entry, &entered[h], bank->met_deeper[h], most, since[h], known[h]);
     }
     for (int h = 0; h < JAXHIL_FIRST_LAG; h++) {
-        began[h] = jaxhil_entry_began(entry, &entered[h], bank->met_deeper[h], most, since[h], &greatest);
+        began[h] =
+            jaxhil_entry_began(entry, &entered[h], bank->met_deeper[h], most, since[h], known[h], &greatest);
         likeliest = began[h] > likeliest || began[h] != began[h] ? began[h] : likeliest;
     }
     const double of_best = likeliest / greatest;

@@ -47,6 +47,7 @@ static const double jaxhil_entry_gentlest = 1.0;   /* 1/s^2: what has less of a 
 static const double jaxhil_entry_elsewhere = 9.0;  /* times the variance of where it is expected: it is not there */
 static const double jaxhil_entry_unlikely = 0.1;   /* that it is not, at least */
 static const double jaxhil_entry_least = 1e-12;    /* of the likelihood of the best: what is ruled out can come back */
+static const double jaxhil_entry_close = 0.999;    /* of a square: the root may be the same, but for rounding */
 static const double jaxhil_entry_certain = 10.0;   /* deviations from which on Phi is rounded to 1 */
 
 /* Phi, the normal distribution, of which the density is given but for sqrt(2 pi); Mills' ratio as in positive_mean. */
@@ -135,22 +136,19 @@ static double jaxhil_entry_near(const jaxhil_entry *entry, double place) {
     return place > farthest ? farthest : (place < -farthest ? -farthest : place);
 }
 
-/* Variance [1/s^2] of a reading at a depth [s]. */
-static double jaxhil_entered_variance(const jaxhil_entered *one, double depth, double noise) {
-    const double uncertain = one->of_jumps + depth * (one->of_both + depth * one->of_slope);
-    return noise + (uncertain > 0.0 ? uncertain : 0.0);
-}
-
-/* Met so much `deeper` [s]: ln L_j but for what is sharp, `since` each reading and since none; the greatest of these
- * and of `most`. What is not a number stays. */
+/* Met so much `deeper` [s]: ln L_j but for what is sharp, `since` each reading and since none, and the square of that,
+ * `known`; the greatest ln L_j and `most`. What is not a number stays. */
 static double jaxhil_entry_since(const jaxhil_entry *entry, const jaxhil_entered *one, double deeper, double most,
-                                 double *since) {
+                                 double *since, double *known) {
     since[entry->number] = 0.0;
+    known[entry->number] = 1.0;
     for (int i = entry->number - 1; i >= 0; i--) {
         const double depth = entry->depths[i] + deeper;
-        const double wide = jaxhil_entered_variance(one, depth, entry->variance);
+        const double uncertain = one->of_jumps + depth * (one->of_both + depth * one->of_slope);
+        const double precision = 1.0 / (entry->variance + (uncertain > 0.0 ? uncertain : 0.0));
         const double missed = entry->forces[i] - (one->jumps + one->slope * depth);
-        since[i] = since[i + 1] + 0.5 * (entry->squares[i] - missed * missed / wide);
+        since[i] = since[i + 1] + 0.5 * (entry->squares[i] - missed * missed * precision);
+        known[i] = known[i + 1] * (entry->variance * precision);
         most = since[i] > most || since[i] != since[i] ? since[i] : most;
     }
     return most;
@@ -159,15 +157,9 @@ static double jaxhil_entry_since(const jaxhil_entry *entry, const jaxhil_entered
 /* sum_j L_j P(x_(j-1) < place < x_j), in terms of what is the `most` likely; the `greatest` L_j in these terms, so far.
  */
 static double jaxhil_entry_began(const jaxhil_entry *entry, const jaxhil_entered *one, double deeper, double most,
-                                 const double *since, double *greatest) {
+                                 const double *since, const double *known, double *greatest) {
     const bool finite = most < INFINITY && entry->variance > 0.0 && entry->variance < INFINITY;
-    double sharpness[JAXHIL_BESIDE + 1];
     double total = 0.0, before = 0.0;
-    sharpness[entry->number] = 1.0;
-    for (int i = entry->number - 1; i >= 0; i--) {
-        const double wide = jaxhil_entered_variance(one, entry->depths[i] + deeper, entry->variance);
-        sharpness[i] = sharpness[i + 1] * sqrt(entry->variance / wide);
-    }
     for (int i = 0; i <= entry->number; i++) {
         double below = 1.0;
         if (i < entry->number) {
@@ -176,8 +168,8 @@ static double jaxhil_entry_began(const jaxhil_entry *entry, const jaxhil_entered
         }
         /* None where the hardware went back; an exponential is not formed where it counts for nothing. */
         const double within = below > before ? below - before : 0.0;
-        if (within > 0.0 || sharpness[i] > *greatest || !finite) {
-            const double likely = jaxhil_exponential(most - since[i], JAXHIL_SQUARINGS) * sharpness[i];
+        if (within > 0.0 || known[i] > jaxhil_entry_close * (*greatest * *greatest) || !finite) {
+            const double likely = jaxhil_exponential(most - since[i], JAXHIL_SQUARINGS) * sqrt(known[i]);
             total += likely * within;
             *greatest = likely > *greatest || likely != likely ? likely : *greatest;
         }

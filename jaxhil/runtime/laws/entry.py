@@ -132,16 +132,16 @@ def _began(entry: Entry, estimate: np.ndarray, covariance: np.ndarray, place, sp
     )
     of_both = covariance[0, PRELOAD] + covariance[0, DAMPING]
     uncertain = of_jumps + depths * (2.0 * of_both + depths * of_slope)
-    wide = entry.variance + np.where(uncertain > 0.0, uncertain, 0.0)
+    precision = 1.0 / (entry.variance + np.where(uncertain > 0.0, uncertain, 0.0))
     forces = entry.forces[:, None]
     missed = forces - (jumps + k * depths)
-    better = 0.5 * (forces * forces / entry.variance - missed * missed / wide)
-    sharp = np.sqrt(entry.variance / wide)
+    better = 0.5 * (forces * forces / entry.variance - missed * missed * precision)
+    known = entry.variance * precision
     below = cumulative((depths - place) / spread)
     gained = np.zeros_like(depths[:1])
     one = np.ones_like(depths[:1])
     since = np.concatenate((np.add.accumulate(better[::-1], axis=0)[::-1], gained))
-    sharpness = np.concatenate((np.multiply.accumulate(sharp[::-1], axis=0)[::-1], one))
+    sharpness = np.sqrt(np.concatenate((np.multiply.accumulate(known[::-1], axis=0)[::-1], one)))
     # None where the hardware went back.
     within = np.fmax(np.concatenate((below, one)) - np.concatenate((gained, below)), 0.0)
     each = exponential(np.maximum.reduce(since, axis=None) - since, SQUARINGS) * sharpness
