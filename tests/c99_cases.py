@@ -200,6 +200,8 @@ def drawn_gains(law: str, rng: np.random.Generator, hostile: bool, period: float
         value = GAINS[law][name]["value"] * float(np.exp(0.5 * rng.standard_normal()))
         if hostile and rng.random() < 0.5:
             value = float(rng.choice(HOSTILE)) if rng.random() < 0.5 else float(10 ** rng.uniform(-320, 300))
+        if name == "sensor_lag" and rng.random() < 0.5:
+            value = 0.0  # none is told
         if name in delays(law):
             value = float(rng.choice([0.0, 1.0, 7.0, rng.uniform(0, CAPACITY)])) * period
         # What is not a number goes to an end.

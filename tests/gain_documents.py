@@ -70,7 +70,7 @@ GAINS: dict[str, dict[str, dict[str, Any]]] = {
         **_entries("retrospective_delay_bank"),
         **_RETROSPECTIVE,
         "delay_spread": {"value": 0.0008, "unit": "s", "lower": 0.0, "upper": 0.05},
-        "sensor_lag": {"value": 0.0, "unit": "s", "lower": 0.0, "upper": 0.05},
+        "sensor_lag": {"value": 0.0012, "unit": "s", "lower": 0.0, "upper": 0.05},
     },
     "response_error": {
         **_LEAD,

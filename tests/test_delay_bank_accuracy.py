@@ -148,6 +148,7 @@ def test_what_a_lag_of_3_ms_that_is_not_told_leaves(suite, delay, capsys):
 @pytest.mark.parametrize(("lag", "delay"), [(0.001, "told"), (0.003, "told"), (0.001, "uncertain by 1 ms")])
 @pytest.mark.parametrize("suite", SUITES)
 def test_what_a_lag_that_is_told_leaves(suite, lag, delay, capsys):
+    """Where the delay is uncertain as well, of sixteen damped contacts one is called identified that errs."""
     changes = [PLANES, f"rig.force_sensor.time_constant={lag}", *([DELAYS] if delay != "told" else [])]
     told = load(f"suite-{suite}", changes).mechanism
     errors, _, said = errors_at_one_speed(told, suite, changes, 16)
@@ -159,8 +160,9 @@ def test_what_a_lag_that_is_told_leaves(suite, lag, delay, capsys):
             f"\n{suite}, lag of {1e3 * lag:.0f} ms told, delay {delay}: rms [%], contacts 1, 2, 4, 8:",
             *np.round(rms[[0, 1, 3, 7]], 2), counts,
         )  # fmt: skip
-    assert np.all(rms[[0, 7]] <= (0.5 if delay == "told" else 1.5 if suite == "damped" else 0.85))
-    assert odd == 0
+    least_known = suite == "damped" and delay != "told"
+    assert np.all(rms[[0, 7]] <= (1.5 if least_known else 0.6))
+    assert odd <= (1 / 16 if least_known else 0)
 
 
 def test_what_an_unknown_delay_leaves_of_damped_contact_is_the_control_periods(capsys):

@@ -19,7 +19,7 @@ def test_where_no_lag_is_told_lags_have_the_given_delay_and_are_rare():
     assert supposed.untold == FIRST_LAG
 
 
-@pytest.mark.parametrize("lag", [1e-6, 0.0004, 0.003, 0.02])
+@pytest.mark.parametrize("lag", [2e-6, 0.0004, 0.003, 0.02])
 def test_a_lag_that_is_told_has_the_delays_that_are_supposed(lag):
     """Its delays are without the lag, which is part of the given one; longer ones are rare."""
     supposed = suppose(SPREAD, lag)
@@ -32,7 +32,7 @@ def test_a_lag_that_is_told_has_the_delays_that_are_supposed(lag):
     assert np.all(supposed.first[longer] < 1e-3 * supposed.first[0])
 
 
-@pytest.mark.parametrize("lag", [0.0, 1e-6, 0.0004, 0.003])
+@pytest.mark.parametrize("lag", [0.0, 1e-320, 2e-6, 0.0004, 0.003])
 def test_both_languages_suppose_the_same(lag):
     ours, theirs = suppose(SPREAD, lag), in_jax.suppose(jnp.full((2,), SPREAD), jnp.full((2,), lag))
     for name in theirs._fields:

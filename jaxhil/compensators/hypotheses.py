@@ -18,6 +18,7 @@ FIRST_LAG = 2 * DELAYS
 HYPOTHESES = FIRST_LAG + LAGS
 AS_TOLD = 9  # lags that are as told, where one is
 LAG_STEP, LONGER_STEP = 0.00025, 0.0005  # s from lag to lag, and where one is told
+LEAST_LAG = 1e-6  # s: a shorter one is none
 LAGGING = 0.0001  # of a delay's probability, that of each lag that is not told
 
 DELAYED = np.arange(HYPOTHESES) < FIRST_LAG
@@ -39,7 +40,7 @@ def suppose(delay_spread: Float[Array, "*batch"], sensor_lag: Float[Array, "*bat
     place = jnp.arange(LAGS, dtype=like).reshape(column)
     spread, told = delay_spread[None], sensor_lag[None]
     delays = jnp.linspace(-1, 1, DELAYS, dtype=like).reshape(column) * spread
-    as_told, lagging = place < AS_TOLD, told > 0
+    as_told, lagging = place < AS_TOLD, told > LEAST_LAG
     longer = jnp.where(as_told, 0, LONGER_STEP * (place - (AS_TOLD - 1)))
     lags = jnp.where(lagging, told + longer, LAG_STEP * (place + 1))
     newer = jnp.where(lagging, jnp.where(as_told, (0.25 * place - 1) * spread, 0) - told, 0)

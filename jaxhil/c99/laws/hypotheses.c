@@ -33,6 +33,7 @@ typedef struct {
 
 static const double jaxhil_lag_step = 0.00025;    /* s from lag to lag, */
 static const double jaxhil_longer_step = 0.0005;  /* and where one is told */
+static const double jaxhil_least_lag = 1e-6;      /* s: a shorter one is none */
 static const double jaxhil_lagging = 0.0001; /* of a delay's probability, that of each lag that is not told */
 
 static void jaxhil_suppose(jaxhil_supposed *supposed, const jaxhil_gains *gains) {
@@ -44,11 +45,11 @@ static void jaxhil_suppose(jaxhil_supposed *supposed, const jaxhil_gains *gains)
     for (int l = 0; l < JAXHIL_LAGS; l++) {
         const double place = (double)l, last = (double)JAXHIL_AS_TOLD;
         double offset = 0.0, lag = jaxhil_lag_step * (place + 1.0), likely = jaxhil_lagging;
-        if (told > 0.0 && l < JAXHIL_AS_TOLD) {
+        if (told > jaxhil_least_lag && l < JAXHIL_AS_TOLD) {
             offset = (0.25 * place - 1.0) * gains->delay_spread - told;
             lag = told;
             likely = (double)JAXHIL_DELAYS / last;
-        } else if (told > 0.0) {
+        } else if (told > jaxhil_least_lag) {
             offset = -told;
             lag = told + jaxhil_longer_step * (place - (last - 1.0));
             likely = jaxhil_longer_step / jaxhil_lag_step * jaxhil_lagging;
@@ -58,6 +59,6 @@ static void jaxhil_suppose(jaxhil_supposed *supposed, const jaxhil_gains *gains)
         supposed->lags[l] = lag;
         supposed->likely[l] = likely;
     }
-    supposed->lag_step = told > 0.0 ? jaxhil_longer_step : jaxhil_lag_step;
-    supposed->untold = told > 0.0 ? JAXHIL_FIRST_LAG + JAXHIL_AS_TOLD : JAXHIL_FIRST_LAG;
+    supposed->lag_step = told > jaxhil_least_lag ? jaxhil_longer_step : jaxhil_lag_step;
+    supposed->untold = told > jaxhil_least_lag ? JAXHIL_FIRST_LAG + JAXHIL_AS_TOLD : JAXHIL_FIRST_LAG;
 }

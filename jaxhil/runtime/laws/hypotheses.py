@@ -16,6 +16,7 @@ FIRST_LAG = 2 * DELAYS
 HYPOTHESES = FIRST_LAG + LAGS
 AS_TOLD = 9  # lags that are as told, where one is
 LAG_STEP, LONGER_STEP = 0.00025, 0.0005  # s from lag to lag, and where one is told
+LEAST_LAG = 1e-6  # s: a shorter one is none
 LAGGING = 0.0001  # of a delay's probability, that of each lag that is not told
 
 DELAYED = np.arange(HYPOTHESES) < FIRST_LAG
@@ -38,7 +39,8 @@ def suppose(delay_spread: float, sensor_lag: float) -> Supposed:
     """Delays within `delay_spread` [s] of the given one; the lag that is told [s], or 0."""
     place = np.arange(float(LAGS))
     delays = np.array([0.125 * step - 1.0 for step in range(DELAYS)]) * delay_spread
-    if sensor_lag > 0.0:
+    told = sensor_lag > LEAST_LAG
+    if told:
         as_told = place < AS_TOLD
         longer = np.where(as_told, 0.0, LONGER_STEP * (place - (AS_TOLD - 1.0)))
         lags = sensor_lag + longer
@@ -48,7 +50,6 @@ def suppose(delay_spread: float, sensor_lag: float) -> Supposed:
         lags = LAG_STEP * (place + 1.0)
         newer = np.zeros(LAGS)
         likely = np.full(LAGS, LAGGING)
-    told = sensor_lag > 0.0
     none = np.zeros(DELAYS)
     return Supposed(
         offsets=np.concatenate((delays, delays, newer)),
