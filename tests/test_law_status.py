@@ -365,6 +365,7 @@ WRONG = {
     "force 1 ms older than told": Wrong(("rig.force_sensor.delay=0.009",)),
     "sensor lag of 1 ms untold": Wrong(("rig.force_sensor.time_constant=1e-3",)),
     "sensor lag of 3 ms untold": Wrong(("rig.force_sensor.time_constant=3e-3",)),
+    "sensor lag of 3 ms told": Wrong(known=("rig.force_sensor.time_constant=3e-3",)),
     "position noise of 1 ms x v0": Wrong(known=("rig.position_sensor.noise_std=5e-6",)),
     "force noise of 9 %, dead zone of 12 N": Wrong(
         known=("rig.force_sensor.noise_std=2.667", "rig.force_sensor.dead_zone=12.0")
