@@ -125,6 +125,12 @@ def test_tune_reports_tables_or_json(jaxhil, table, tmp_path):
     assert json.loads((tmp_path / "rig-300kg" / "gains.json").read_text())["sha256"] == again["sha256"]
 
 
+def test_tune_says_in_json_that_there_is_sensor_noise(jaxhil, tmp_path):
+    ran = jaxhil("tune", "suite-noisy", "--compensator", "none", "-o", tmp_path, "--json", *TINY)
+    (entry,) = ran.document["mechanisms"]
+    assert entry["sensor_noise"] is True
+
+
 def test_bad_files_do_not_stop_the_others(jaxhil, tmp_path):
     files = ["nowhere.toml", "rig-300kg", builtin_path("rig-300kg")]
     arguments = ["--compensator", "none", "-o", tmp_path, "--json", "--limit", "inf", *TINY]

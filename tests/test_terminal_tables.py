@@ -1,5 +1,8 @@
-"""Tables as they are printed: on any width no digit is lost and no name is broken."""
+"""What is printed: tables, of which on any width no digit is lost and no name is broken, and JSON."""
 
+import json
+
+import numpy as np
 import pytest
 
 from tuning import terminal
@@ -27,3 +30,13 @@ def test_long_texts_are_folded_between_words(monkeypatch, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 60
     assert set(" ".join(lines).split()) >= {LAW, *text.split(), "1.25"}
+
+
+def test_json_has_numbers_of_numpy_as_numbers_and_null_for_what_is_not_finite():
+    said = {
+        "yes": np.bool_(True),
+        "three": np.int64(3),
+        "half": np.float32(0.5),
+        "each": np.array([1.0, np.nan]),
+    }
+    assert json.loads(terminal.as_json(said)) == {"yes": True, "three": 3, "half": 0.5, "each": [1.0, None]}

@@ -93,7 +93,7 @@ def signed(value: float | None) -> str:
 
 
 def finite(value: Any) -> Any:
-    """Mappings, lists, named tuples and numbers, with None for what is not finite."""
+    """Mappings, lists, named tuples and numbers, NumPy's as Python's, with None for what is not finite."""
     if isinstance(value, Mapping):
         return {str(key): finite(entry) for key, entry in value.items()}
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
@@ -102,7 +102,7 @@ def finite(value: Any) -> Any:
         return [finite(entry) for entry in value]
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
-    return value
+    return finite(value.tolist()) if hasattr(value, "tolist") else value
 
 
 class Progress:

@@ -111,9 +111,8 @@ def has_sensor_noise(mechanism: AnyMechanism) -> bool:
     paths = "rig.force_sensor.noise_std", "rig.position_sensor.noise_std"
     # In six axes the position sensor has none.
     position = getattr(rig.position_sensor, "noise_std", 0.0)
-    return max(np.max(rig.force_sensor.noise_std), position) > 0 or any(
-        path in mechanism.uncertainty for path in paths
-    )
+    noisy = bool(max(np.max(rig.force_sensor.noise_std), position) > 0)
+    return noisy or any(path in mechanism.uncertainty for path in paths)
 
 
 def alike(loops: list[Any], scenarios: list[Any]) -> list[list[int]]:
