@@ -172,6 +172,19 @@ def test_both_recursions_agree(sensor_lag):
     np.testing.assert_allclose(ours.weighted, bank._weighted, rtol=1e-8)
 
 
+@pytest.mark.parametrize("sensor_lag", [0.002, 0.004])
+def test_behind_a_lag_that_is_told_readings_count_since_it_was_entered(sensor_lag):
+    """The surface is met a lag after it was entered, by readings of a damper and a spring through it. Lags
+    that are longer by up to 4 ms have it earlier still."""
+    depths = PERIOD * np.arange(-30, 10)
+    since = np.maximum(depths + sensor_lag, 0)
+    shown = 1 - np.exp(-since / sensor_lag)
+    forces = 2 * shown + 500 * (since - sensor_lag * shown)
+    bank = plain(plane_spread=1e-3, sensor_lag=sensor_lag)
+    earlier = bank.begin(meeting(), depths.tolist(), forces.tolist(), VARIANCE)
+    assert 0 <= earlier - sensor_lag / PERIOD <= 8
+
+
 def test_where_all_delays_are_the_same_it_is_one_map():
     depths, speeds, forces, _ = contact(np.random.default_rng(2), begins=0.002, lasts=0.2)
     uncertain = math.hypot(PRIOR["preload"], STIFFNESS * farthest())

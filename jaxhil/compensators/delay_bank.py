@@ -138,7 +138,7 @@ def begin(
     true = prior.covariance[PRELOAD, PRELOAD]
     lagged = lagged_onsets(supposed.lags * pace[None], window, tick)
     placed = _place(meeting, window, supposed.offsets, speed, pace, tick, plane_spread, true, lagged)
-    first = jnp.max(-placed.below[FIRST_LAG:], axis=0)
+    first = jnp.max((-placed.below - supposed.offsets * pace[None])[FIRST_LAG:], axis=0)
     earlier = jnp.minimum(jnp.ceil(jnp.where(first > SURFACE, first, 0) / tick), EARLIER).astype(jnp.int32)
     before, carried = (
         jnp.where(old.met[None] > 0, old.carried, each) for each in (supposed.first, supposed.either)

@@ -388,7 +388,7 @@ static double jaxhil_bank_place(jaxhil_learnt *bank, const jaxhil_meeting *meeti
             bank->met_deeper[h] = (away - place) / length;
             bank->told[h] = -place / length;
         } else {
-            const double inside = (meeting->plane - place) / length;
+            const double inside = (meeting->plane - place - bank->supposed.offsets[h] * meeting->speed) / length;
             off = jaxhil_lagged_usual * (share * (meeting->stiffness * (sqrt(around) / length)));
             /* What is not a number stays. */
             first = inside > first || inside != inside ? inside : first;

@@ -189,7 +189,8 @@ class DelayBank:
         self._bend(np.minimum(np.maximum((meeting.place - places) / length, -FARTHEST), FARTHEST))
         self._likely = np.where(likely > UNLIKELY, likely, UNLIKELY)
         self._met_at = (meeting.place - meeting.plane) / length
-        return float(np.maximum.reduce((meeting.plane - places[FIRST_LAG:]) / length))
+        inside = meeting.plane - places - self._supposed.offsets * meeting.speed
+        return float(np.maximum.reduce(inside[FIRST_LAG:] / length))
 
     def _bend(self, farther: np.ndarray) -> None:
         """The knots of each map lie so much farther in [s] than usual."""
