@@ -9,9 +9,9 @@
  * all readings of this contact and of those before, (r/s_h)^(1/4) exp(-(y - f_h)^2/(4 s_h)), of how well its damping,
  * of mean B and variance s^2, goes with what is known of contacts: p (s_0/s) exp(-t^2/2) + (1 - p) 2 Phi(t), t = B/s,
  * p = 0.35, and of how likely a surface is there: of a delay by entry.c, of a lag exp(-(X_0 - d_h v_0)^2/(2
- * (spread^2 + s^2))), at least 1/10. The exponentials are (1 + u/n)^-n. What counts is the mean over all hypotheses, of their
- * maps, delays and surfaces. Their maps bend at the same places, wherever they have the surface: which fits best is
- * not to be decided by what a contact that bends between two knots leaves.
+ * (spread^2 + s^2))), at least 1/10. The exponentials are (1 + u/n)^-n. What counts is the mean over all hypotheses, of
+ * their maps, delays and surfaces. Their maps bend at the same places, wherever they have the surface: which fits best
+ * is not to be decided by what a contact that bends between two knots leaves.
  */
 #include <math.h>
 #include <stdbool.h>
