@@ -10,8 +10,8 @@ import pytest
 from gain_documents import gain_document
 from scipy import stats
 
-from jaxhil.compensators import bank_weights, force_depth_map
 from jaxhil.compensators import delay_bank as in_jax
+from jaxhil.compensators import force_depth_map
 from jaxhil.compensators.hypotheses import suppose
 from jaxhil.compensators.lagged_onset import Window
 from jaxhil.compensators.meeting import Meeting as MeetingInJax
@@ -98,10 +98,10 @@ def test_exponential_and_plausibility_are_nearly_those_of_the_normal_distributio
     u = np.linspace(0, 20, 41)
     np.testing.assert_allclose(in_jax.exponential(jnp.asarray(u), in_jax.SQUARINGS), np.exp(-u), rtol=0.25)
     mean, spread, prior = np.linspace(-2, 4, 25), 0.7, 1.9
-    found = bank_weights.plausibility(jnp.asarray(mean), jnp.asarray(spread**2), jnp.asarray(prior**2))
+    found = in_jax.plausibility(jnp.asarray(mean), jnp.asarray(spread**2), jnp.asarray(prior**2))
     # The posterior's density at 0 over the prior's, and its share from 0 on over the prior's half.
     elastic = stats.norm.pdf(0, mean, spread) / stats.norm.pdf(0, 0, prior)
-    exact = bank_weights.ELASTIC * elastic + (1 - bank_weights.ELASTIC) * 2 * stats.norm.cdf(mean / spread)
+    exact = in_jax.ELASTIC * elastic + (1 - in_jax.ELASTIC) * 2 * stats.norm.cdf(mean / spread)
     np.testing.assert_allclose(found, exact, rtol=0.06, atol=1e-5)
 
 

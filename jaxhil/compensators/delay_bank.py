@@ -22,9 +22,9 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxhil.compensators.bank_weights import average, floored_shares, plausibility, weighed
 from jaxhil.compensators.entry import (
     DENSITY_SQUARINGS,
     NOT_THERE,
@@ -32,6 +32,7 @@ from jaxhil.compensators.entry import (
     USUAL,
     Entry,
     agree,
+    cumulative,
     enter,
     no_entry,
 )
@@ -39,6 +40,7 @@ from jaxhil.compensators.force_depth_map import (
     DAMPING,
     FRICTION,
     KNOTS,
+    PLACES,
     PRELOAD,
     SEGMENTS,
     SURFACE,
@@ -47,6 +49,7 @@ from jaxhil.compensators.force_depth_map import (
     Reading,
     correct,
     features,
+    positive_mean,
     predict,
 )
 from jaxhil.compensators.hypotheses import (
@@ -62,9 +65,11 @@ from jaxhil.compensators.meeting import Meeting
 from jaxhil.compensators.onset import SQUARINGS, exponential
 
 STEADY = 0.125  # of the spread by which slopes wander, where they hardly do
+ELASTIC = 0.35  # probability that a contact has no damping
 BROADENING = 2.0  # of the variance of the damping
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
 LEAST, LEAST_CARRIED = 1e-200, 1e-12
+NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, some do not
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
 FARTHEST, WHOLE = 0.004, 0.015  # s by which knots are moved, from what depth [s] on; before it less
 BEYOND_NOISE = 9.0  # times its variance: a force that is more than noise
@@ -148,7 +153,7 @@ def begin(
         ),
         deepest=jnp.where(begins[None], 0, old.deepest),
         likelihood=jnp.where(begins[None], 1, old.likelihood),
-        carried=jnp.where(ends[None], floored_shares(weighed(carried, evidence), LEAST_CARRIED), before),
+        carried=jnp.where(ends[None], _shares(_weighed(carried, evidence), LEAST_CARRIED), before),
         precision=old.precision + jnp.where(ends[None], precision, 0),
         weighted=old.weighted + jnp.where(ends[None], precision * mean, 0),
         met=old.met + jnp.where(ends, 1, 0),
@@ -213,7 +218,7 @@ def learn(
     surprise = 0.25 * missed**2 / wide
     surprise = surprise - jnp.min(surprise, axis=0, keepdims=True)
     sharpness = jnp.sqrt(jnp.sqrt(jnp.where(wide > noise, noise / wide, 1)))
-    likelihood = floored_shares(old.likelihood * sharpness * exponential(surprise, SQUARINGS), LEAST)
+    likelihood = _shares(old.likelihood * sharpness * exponential(surprise, SQUARINGS), LEAST)
     now = old._replace(
         maps=maps,
         deepest=deepest,
@@ -268,14 +273,52 @@ def weigh(bank: Bank, damping: Array) -> Float[Array, "hypotheses *batch"]:
     variance = BROADENING * (bank.met[None] + 1) / total
     plausible = plausibility(mean, variance, damping[None] * per_second)
     plausible = jnp.where(own > 0, jnp.where(plausible > LEAST_CARRIED, plausible, LEAST_CARRIED), 1)
-    weights = weighed(bank.carried, bank.likelihood * (plausible * bank.likely))
+    weights = _weighed(bank.carried, bank.likelihood * (plausible * bank.likely))
     return weights / jnp.sum(weights, axis=0, keepdims=True)
+
+
+def _weighed(carried: Array, evidence: Array) -> Float[Array, "hypotheses *batch"]:
+    """What is carried, by this contact's evidence. Whether it is a lag only maps whose slopes wander decide,
+    as those of lags do: the sum over delays is what it would be if all were such."""
+    weights = carried * evidence
+    wandering, steady = carried[:DELAYS], carried[DELAYS:FIRST_LAG]
+    delayed, as_lags = weights[:FIRST_LAG], (wandering + steady) * evidence[:DELAYS]
+    # Next to a lag all of them may be next to nothing, whose square is none.
+    most = lax.stop_gradient(jnp.max(delayed, axis=0, keepdims=True))
+    ratio = jnp.sum(as_lags / most, axis=0) / jnp.sum(delayed / most, axis=0)
+    return jnp.concatenate([delayed * ratio[None], weights[FIRST_LAG:]])
+
+
+def plausibility(mean: Array, variance: Array, prior: Array) -> Float[Array, "*batch"]:
+    """How much better a damping N(mean, variance) [1/s] goes with one that is 0 or not negative than one
+    N(0, prior) does; Phi as in `positive_mean`."""
+    spread = jnp.sqrt(variance)
+    ratio = mean / spread
+    density = exponential(0.5 * ratio**2, DENSITY_SQUARINGS)
+    prior = jnp.where(prior > 0, prior, 1)
+    return ELASTIC * (jnp.sqrt(prior) / spread) * density + (1 - ELASTIC) * (2 * cumulative(ratio))
 
 
 def knots_of(bank: Bank) -> Float[Array, "segments hypotheses *batch"]:
     """Where the knots of each map are [s]."""
     usual = jnp.asarray(KNOTS.reshape(-1, *[1] * bank.farther.ndim), bank.farther.dtype)
     return usual + bank.farther[None] * jnp.minimum(usual / WHOLE, 1)
+
+
+def average(maps: Map, weights: Float[Array, "hypotheses *batch"], knots: Array) -> Curve:
+    """What counts of the maps, by their weights; of the force at the usual knots."""
+    own, preload = maps.mean[:SEGMENTS], maps.mean[PRELOAD]
+    usual = jnp.asarray(KNOTS.reshape(-1, *[1] * weights.ndim), weights.dtype)
+    reached = jnp.concatenate([preload[None], own[:-1] * jnp.diff(knots, axis=0)])
+    past = usual - knots
+    there = jnp.where(past < 0, jnp.concatenate([own[:1], own[:-1]]), own)
+    at_knots = jnp.sum(weights[None] * (jnp.cumsum(reached, axis=0) + past * there), axis=1)
+    slopes = jnp.diff(at_knots, axis=0) / jnp.diff(usual[:, 0], axis=0)
+    slopes = jnp.concatenate([slopes, jnp.sum(weights * own[-1], axis=0)[None]])
+    lost = (
+        jnp.sum(positive_mean(maps.mean[i], maps.covariance[i, i]) * weights, axis=0) for i in PLACES[:-1]
+    )
+    return Curve(slopes, *lost, preload=at_knots[0])
 
 
 def _means(bank: Bank, weights: Array, supposed: Supposed) -> Bank:
@@ -335,6 +378,13 @@ def _place(
         preload=off**2,
         entry=entry,
     )
+
+
+def _shares(values: Array, least: float) -> Array:
+    """Of their sum, at least so much."""
+    values = jnp.where(values < NOTHING, 0, values)
+    shares = values / jnp.sum(values, axis=0, keepdims=True)
+    return jnp.where(shares > least, shares, least)
 
 
 def _priors(prior: Map) -> Map:

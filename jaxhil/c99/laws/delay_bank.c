@@ -16,8 +16,6 @@
 #include <math.h>
 #include <stdbool.h>
 
-#include "bank.c"
-#include "bank_weights.c"
 #include "contact_plane.c"
 #include "entry.c"
 #include "force_depth_map.c"
@@ -26,17 +24,133 @@
 #include "hypotheses.c"
 #include "lagged_onset.c"
 #include "onset.c"
+#include "plausible_damping.c"
 #include "reintegration.c"
+
+/* == Declarations == */
+
+/* Of each hypothesis by how much [s] it has the surface deeper than told, its knots [s], how likely it is
+ * that the surface is there, map, deepest point, the likelihoods of this contact and of those before; how deep the
+ * surface was met, `met_at` [s], and of each delay how deep by its own surface it was met, it was told, and it is by
+ * its map, `within` [s]; sums over contacts of the damping's precision and of precision times mean, their number
+ * `met`; whether this contact is to be added to them. The mean of the maps and, `shift` [s] and `below` [s], of the
+ * delays and of how much deeper; the delays' standard deviation [s]; the largest weight of what may lie beyond,
+ * `edge`, and that of all lags that are not told; the delay that was `given`. Of each lag what is kept after a tick of
+ * what a sensor shows; what is smoothed, `held`, as it was before that, and whether the contact then pushed. */
+typedef struct {
+    double given, shift, open, edge, lagging, below, met, variance, pace, plane_spread, period;
+    double kept[JAXHIL_LAGS];
+    jaxhil_supposed supposed;
+    double held[JAXHIL_LAGS][JAXHIL_PARAMETERS], before[JAXHIL_LAGS][JAXHIL_PARAMETERS];
+    bool pushed[JAXHIL_LAGS];
+    double known[JAXHIL_HYPOTHESES];
+    jaxhil_force_depth_map prior, steady;
+    double deeper[JAXHIL_HYPOTHESES], deepest[JAXHIL_HYPOTHESES];
+    double knots[JAXHIL_HYPOTHESES][JAXHIL_SEGMENTS], likely[JAXHIL_HYPOTHESES];
+    jaxhil_entry entry;
+    double met_at, met_deeper[JAXHIL_FIRST_LAG], told[JAXHIL_FIRST_LAG], within[JAXHIL_FIRST_LAG];
+    double likelihood[JAXHIL_HYPOTHESES], carried[JAXHIL_HYPOTHESES];
+    double precision[JAXHIL_HYPOTHESES], weighted[JAXHIL_HYPOTHESES];
+    double estimate[JAXHIL_HYPOTHESES][JAXHIL_PARAMETERS];
+    double covariance[JAXHIL_HYPOTHESES][JAXHIL_PARAMETERS][JAXHIL_COLUMNS];
+    jaxhil_curve curve;
+    bool learning;
+} jaxhil_learnt;
 
 /* == Definitions == */
 
 static const double jaxhil_misfit = 0.01; /* of a force, by which a map may be wrong */
+static const double jaxhil_bank_broadening = 2.0;
 static const double jaxhil_bank_least = 1e-200;
+static const double jaxhil_bank_nothing = 1e-300; /* a smaller product is none: some machines keep such numbers */
+static const double jaxhil_bank_least_carried = 1e-12;
+static const double jaxhil_bank_least_shift = 1e-12; /* s: where nothing tells delays apart, rounding does not */
+static const double jaxhil_bank_steady = 0.125; /* of the spread by which slopes wander, where they hardly do */
 static const double jaxhil_bank_edge = 0.6;      /* probability of a farthest delay or the longest lag: it may lie beyond */
 static const double jaxhil_bank_open = 0.0075;   /* of a restitution of 1, that what is open of the delay makes */
 static const double jaxhil_bank_settled = 0.99;  /* probability from which on it is a lag */
 static const double jaxhil_bank_beyond_noise = 9.0; /* times its variance: a force that is more than noise */
 static const long jaxhil_bank_earlier = 30;  /* ticks before it was met, whose readings count */
+
+/* Of their sum, at least so much. */
+static void jaxhil_bank_shares(double *values, double least) {
+    double total = 0.0;
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        values[h] = values[h] < jaxhil_bank_nothing ? 0.0 : values[h];
+        total = h > 0 ? total + values[h] : values[h];
+    }
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        const double share = values[h] / total;
+        values[h] = share > least ? share : least;
+    }
+}
+
+static void jaxhil_bank_restart(jaxhil_learnt *bank) {
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        const bool steady = h >= JAXHIL_DELAYS && h < JAXHIL_FIRST_LAG;
+        const jaxhil_force_depth_map *prior = steady ? &bank->steady : &bank->prior;
+        for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
+            for (int j = 0; j < JAXHIL_COLUMNS; j++) {
+                bank->covariance[h][i][j] = j < JAXHIL_PARAMETERS ? prior->covariance[i][j] : 0.0;
+            }
+            bank->estimate[h][i] = prior->estimate[i];
+        }
+        bank->deepest[h] = 0.0;
+        bank->known[h] = 0.0;
+        bank->likelihood[h] = 1.0;
+    }
+    for (int l = 0; l < JAXHIL_LAGS; l++) {
+        for (int i = 0; i < JAXHIL_PARAMETERS; i++) {
+            bank->held[l][i] = 0.0;
+            bank->before[l][i] = 0.0;
+        }
+        bank->pushed[l] = false;
+    }
+    bank->learning = false;
+    bank->variance = 0.0;
+}
+
+static void jaxhil_learnt_reset(jaxhil_learnt *bank) {
+    jaxhil_bank_restart(bank);
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        bank->deeper[h] = 0.0;
+        jaxhil_lagged_knots(0.0, bank->knots[h]);
+        bank->likely[h] = 1.0;
+        bank->carried[h] = h < JAXHIL_DELAYS ? 1.0 : 0.0;
+        bank->precision[h] = 0.0;
+        bank->weighted[h] = 0.0;
+    }
+    for (int h = 0; h < JAXHIL_FIRST_LAG; h++) {
+        bank->within[h] = 0.0;
+    }
+    for (int l = 0; l < JAXHIL_LAGS; l++) {
+        bank->carried[JAXHIL_FIRST_LAG + l] = bank->supposed.likely[l];
+    }
+    bank->met_at = 0.0;
+    bank->met = 0.0;
+    bank->shift = 0.0;
+    bank->below = 0.0;
+    bank->open = 0.0;
+    bank->edge = 0.0;
+    bank->lagging = 0.0;
+    bank->pace = 1.0;
+}
+
+static void jaxhil_learnt_init(jaxhil_learnt *bank, const jaxhil_gains *gains) {
+    jaxhil_gains steady = *gains;
+    steady.prior_slope_spread = jaxhil_bank_steady * gains->prior_slope_spread;
+    bank->given = gains->identification_delay;
+    jaxhil_force_depth_map_init(&bank->prior, gains);
+    jaxhil_force_depth_map_init(&bank->steady, &steady);
+    jaxhil_suppose(&bank->supposed, gains);
+    bank->period = gains->control_period;
+    for (int l = 0; l < JAXHIL_LAGS; l++) {
+        bank->kept[l] = jaxhil_exponential(bank->period / bank->supposed.lags[l], JAXHIL_SQUARINGS);
+    }
+    bank->plane_spread = gains->plane_spread;
+    bank->curve = bank->prior.curve;
+    jaxhil_learnt_reset(bank);
+}
 
 /* Variance [1/s^2] of the force that is expected where it was read last. */
 static double jaxhil_learnt_variance(const jaxhil_learnt *bank) {
@@ -74,6 +188,172 @@ static void jaxhil_learnt_check(jaxhil_learnt *bank, const jaxhil_history *histo
     (void)entry;
     (void)variance;
     (void)readings;
+}
+
+/* Evidence of this contact, weighed by what is carried. Whether it is a lag only maps whose slopes wander decide, as
+ * those of lags do: the sum over delays is what it would be if all were such. */
+static void jaxhil_bank_weighed(const jaxhil_learnt *bank, const double *evidence, double *weights) {
+    double total = 0.0, as_lags = 0.0;
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        weights[h] = bank->carried[h] * evidence[h];
+    }
+    for (int h = 0; h < JAXHIL_DELAYS; h++) {
+        const double wandering = (bank->carried[h] + bank->carried[h + JAXHIL_DELAYS]) * evidence[h];
+        as_lags = h > 0 ? as_lags + wandering : wandering;
+    }
+    for (int h = 0; h < JAXHIL_FIRST_LAG; h++) {
+        total = h > 0 ? total + weights[h] : weights[h];
+    }
+    const double ratio = as_lags / total;
+    for (int h = 0; h < JAXHIL_FIRST_LAG; h++) {
+        weights[h] *= ratio;
+    }
+}
+
+/* What the maps of delays say of the entry: where their surface is, and how likely. */
+static void jaxhil_bank_enter(jaxhil_learnt *bank) {
+    const jaxhil_entry *entry = &bank->entry;
+    jaxhil_entered entered[JAXHIL_FIRST_LAG];
+    double since[JAXHIL_FIRST_LAG][JAXHIL_BESIDE + 1], known[JAXHIL_FIRST_LAG][JAXHIL_BESIDE + 1];
+    double began[JAXHIL_FIRST_LAG];
+    double most = 0.0, greatest = 0.0, likeliest = -INFINITY;
+    for (int h = 0; h < JAXHIL_FIRST_LAG; h++) {
+        entered[h] = jaxhil_entry_place(entry, bank->told[h], bank->estimate[h], bank->covariance[h]);
+        bank->within[h] = jaxhil_entry_near(entry, entered[h].place);
+        most = jaxhil_entry_since(entry, &entered[h], bank->met_deeper[h], most, since[h], known[h]);
+    }
+    for (int h = 0; h < JAXHIL_FIRST_LAG; h++) {
+        began[h] =
+            jaxhil_entry_began(entry, &entered[h], bank->met_deeper[h], most, since[h], known[h], &greatest);
+        likeliest = began[h] > likeliest || began[h] != began[h] ? began[h] : likeliest;
+    }
+    const double of_best = likeliest / greatest;
+    const double together = sqrt(of_best > jaxhil_entry_least ? of_best : jaxhil_entry_least);
+    for (int h = 0; h < JAXHIL_FIRST_LAG; h++) {
+        const double share = began[h] / likeliest;
+        const double agreed = share > jaxhil_entry_least ? share : jaxhil_entry_least;
+        bank->likely[h] = entry->level * (agreed * together * entered[h].there);
+    }
+}
+
+/* Weights of the hypotheses; their sum is 1. */
+static void jaxhil_bank_weigh(jaxhil_learnt *bank, double *weights) {
+    const double pace = bank->pace;
+    double evidence[JAXHIL_HYPOTHESES];
+    double total = 0.0;
+    jaxhil_bank_enter(bank);
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        const double own = bank->covariance[h][JAXHIL_DAMPING][JAXHIL_DAMPING] * (pace * pace);
+        const double precision = 1.0 / (own > 0.0 ? own : 1.0);
+        const double sum = bank->precision[h] + precision;
+        const double mean = (bank->weighted[h] + precision * (bank->estimate[h][JAXHIL_DAMPING] * pace)) / sum;
+        const double variance = jaxhil_bank_broadening * (bank->met + 1.0) / sum;
+        double plausible = 1.0;
+        if (own > 0.0) {
+            plausible = jaxhil_plausible_damping(mean, variance, bank->prior.damping * (pace * pace));
+            plausible = plausible > jaxhil_bank_least_carried ? plausible : jaxhil_bank_least_carried;
+        }
+        evidence[h] = bank->likelihood[h] * (plausible * bank->likely[h]);
+    }
+    jaxhil_bank_weighed(bank, evidence, weights);
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        total = h > 0 ? total + weights[h] : weights[h];
+    }
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        weights[h] = weights[h] / total;
+    }
+}
+
+/* The mean of the maps, of the force at the usual knots. */
+static void jaxhil_bank_average(jaxhil_learnt *bank, const double *weights) {
+    jaxhil_curve *curve = &bank->curve;
+    const int last = JAXHIL_SEGMENTS - 1;
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        const double *slopes = bank->estimate[h];
+        const double *knots = bank->knots[h];
+        double reached = slopes[JAXHIL_PRELOAD];
+        for (int j = 0; j < JAXHIL_SEGMENTS; j++) {
+            if (j > 0) {
+                reached += slopes[j - 1] * (knots[j] - knots[j - 1]);
+            }
+            const double past = jaxhil_knots[j] - knots[j];
+            const double force = weights[h] * (reached + past * (past < 0.0 ? slopes[j - 1] : slopes[j]));
+            curve->at_knots[j] = h > 0 ? curve->at_knots[j] + force : force;
+        }
+        const double slope = weights[h] * slopes[last];
+        curve->slopes[last] = h > 0 ? curve->slopes[last] + slope : slope;
+    }
+    for (int j = 0; j < last; j++) {
+        curve->slopes[j] =
+            (curve->at_knots[j + 1] - curve->at_knots[j]) / (jaxhil_knots[j + 1] - jaxhil_knots[j]);
+    }
+}
+
+/* The mean over the hypotheses, by their weights: the delay, and what counts of the maps. */
+static void jaxhil_bank_conclude(jaxhil_learnt *bank, const double *weights) {
+    const jaxhil_supposed *supposed = &bank->supposed;
+    jaxhil_curve *curve = &bank->curve;
+    double lost[4] = {0.0, 0.0, 0.0, 0.0};
+    double shift = 0.0, square = 0.0, lagging = 0.0;
+    jaxhil_bank_average(bank, weights);
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        for (int k = 0; k < 4; k++) {
+            const int place = JAXHIL_SEGMENTS + k;
+            const double mean =
+                jaxhil_positive_mean(bank->estimate[h][place], bank->covariance[h][place][place]) * weights[h];
+            lost[k] = h > 0 ? lost[k] + mean : mean;
+        }
+        const double delay = weights[h] * supposed->older[h];
+        const double known = weights[h] * bank->known[h];
+        shift = h > 0 ? shift + delay : delay;
+        const double below = weights[h] * bank->deeper[h];
+        bank->below = h > 0 ? bank->below + below : below;
+        bank->variance = h > 0 ? bank->variance + known : known;
+    }
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        const double off = supposed->older[h] - shift;
+        square += weights[h] * (off * off);
+        lagging += h < supposed->untold ? 0.0 : weights[h];
+    }
+    /* Between two lags neither is right. */
+    bank->lagging = lagging;
+    bank->open = sqrt(square + 0.5 * (supposed->lag_step * supposed->lag_step) * lagging);
+    bank->edge = weights[JAXHIL_HYPOTHESES - 1];
+    for (int h = 0; h < JAXHIL_DELAYS; h += JAXHIL_DELAYS - 1) {
+        double farthest = weights[h] + weights[h + JAXHIL_DELAYS];
+        if (supposed->untold > JAXHIL_FIRST_LAG) {
+            farthest += weights[h == 0 ? JAXHIL_FIRST_LAG : supposed->untold - 1];
+        }
+        bank->edge = farthest > bank->edge ? farthest : bank->edge;
+    }
+    bank->shift = shift > jaxhil_bank_least_shift || shift < -jaxhil_bank_least_shift ? shift : 0.0;
+    curve->damping = lost[0];
+    curve->depth_damping = lost[1];
+    curve->unloading = lost[2];
+    curve->friction = lost[3];
+}
+
+/* The contact that is over is added to what is carried. */
+static void jaxhil_bank_finish(jaxhil_learnt *bank) {
+    const double pace = bank->pace;
+    double evidence[JAXHIL_HYPOTHESES], weights[JAXHIL_HYPOTHESES];
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        evidence[h] = h < JAXHIL_FIRST_LAG ? bank->likelihood[h] * bank->likely[h] : bank->likelihood[h];
+    }
+    /* Only where the first contact is over its slopes tell how they are. */
+    for (int h = 0; h < JAXHIL_FIRST_LAG && !(bank->met > 0.0); h++) {
+        bank->carried[h] = 0.5;
+    }
+    jaxhil_bank_weighed(bank, evidence, weights);
+    for (int h = 0; h < JAXHIL_HYPOTHESES; h++) {
+        bank->carried[h] = weights[h];
+        const double variance = bank->covariance[h][JAXHIL_DAMPING][JAXHIL_DAMPING] * (pace * pace);
+        const double precision = 1.0 / (variance > 0.0 ? variance : 1.0);
+        bank->precision[h] = bank->precision[h] + precision;
+        bank->weighted[h] = bank->weighted[h] + precision * (bank->estimate[h][JAXHIL_DAMPING] * pace);
+    }
+    jaxhil_bank_shares(bank->carried, jaxhil_bank_least_carried);
+    bank->met += 1.0;
 }
 
 /* Each hypothesis has the surface between where it was met, with a lag by the newest readings, and where it was told,

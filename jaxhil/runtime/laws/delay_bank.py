@@ -19,7 +19,6 @@ from math import ceil, pi, sqrt
 
 import numpy as np
 
-from .bank_weights import floored_shares, plausibility, positive_mean, sum_in_order, weighed
 from .contact_plane import Meeting
 from .entry import (
     DENSITY_SQUARINGS,
@@ -28,6 +27,7 @@ from .entry import (
     Entry,
     Readings,
     agree,
+    cumulative,
 )
 from .force_depth_map import (
     DAMPING,
@@ -51,9 +51,11 @@ from .lagged_onsets import lagged_onsets
 from .onset import SQUARINGS, exponential
 
 STEADY = 0.125  # of the spread by which slopes wander, where they hardly do
+ELASTIC = 0.35  # probability that a contact has no damping
 BROADENING = 2.0  # of the variance of the damping, as the delay lies between two hypotheses
 # The least share of a likelihood, within a contact and of those before: what they rule out can come back.
 LEAST, LEAST_CARRIED = 1e-200, 1e-12
+NOTHING = 1e-300  # a smaller product is none: some machines keep such numbers, some do not
 LEAST_SHIFT = 1e-12  # s: where nothing tells delays apart, rounding does not either
 BEYOND_NOISE = 9.0  # times its variance: a force that is more than noise
 EARLIER = 30  # ticks before it was met, whose readings count
@@ -130,7 +132,7 @@ class DelayBank:
             precision = 1.0 / np.where(own > 0.0, own, 1.0)
             carried = self._carried if self._met else self._supposed.either
             evidence = self._likelihood * np.where(DELAYED, self._likely, 1.0)
-            self._carried = floored_shares(weighed(carried, evidence), LEAST_CARRIED)
+            self._carried = _shares(_weighed(carried, evidence), LEAST_CARRIED)
             self._precision = self._precision + precision
             self._weighted = self._weighted + precision * (self._estimate[DAMPING] * pace)
             self._met += 1.0
@@ -252,7 +254,7 @@ class DelayBank:
         surprise -= np.minimum.reduce(surprise)
         sharpness = np.sqrt(np.sqrt(np.fmin(noise / wide, _1)))
         likelihood = self._likelihood * sharpness * exponential(surprise, SQUARINGS)
-        self._likelihood = floored_shares(likelihood, LEAST)
+        self._likelihood = _shares(likelihood, LEAST)
         self._deepest = deepest
         self._learning = True
         share = _1 / np.where(used, s, _1)
@@ -306,11 +308,11 @@ class DelayBank:
         total = self._precision + precision
         mean = (self._weighted + precision * (self._estimate[DAMPING] * pace)) / total
         variance = BROADENING * (self._met + 1.0) / total
-        plausible = plausibility(mean, variance, self._damping * (pace * pace))
+        plausible = _plausibility(mean, variance, self._damping * (pace * pace))
         plausible = np.where(own > _0, np.fmax(plausible, LEAST_CARRIED), _1)
         self._enter()
-        weights = weighed(self._carried, self._likelihood * (plausible * self._likely))
-        return weights / sum_in_order(weights)
+        weights = _weighed(self._carried, self._likelihood * (plausible * self._likely))
+        return weights / _total(weights)
 
     def _enter(self) -> None:
         """What the maps of delays say of the entry."""
@@ -323,12 +325,12 @@ class DelayBank:
     def _conclude(self, weights: np.ndarray) -> None:
         """The mean over the hypotheses, by their weights."""
         supposed = self._supposed
-        shift = float(sum_in_order(weights * supposed.older))
+        shift = float(_total(weights * supposed.older))
         off = supposed.older - shift
-        self._lagging = float(sum_in_order(weights[supposed.untold :]))
+        self._lagging = float(_total(weights[supposed.untold :]))
         # Between two lags neither is right.
         between = 0.5 * (supposed.lag_step * supposed.lag_step) * self._lagging
-        self._off = sqrt(sum_in_order(weights * (off * off)) + between)
+        self._off = sqrt(_total(weights * (off * off)) + between)
         newest = float(weights[0] + weights[DELAYS])
         oldest = float(weights[DELAYS - 1] + weights[FIRST_LAG - 1])
         if supposed.untold > FIRST_LAG:
@@ -336,8 +338,8 @@ class DelayBank:
             oldest += float(weights[supposed.untold - 1])
         self._edge = max(float(weights[-1]), newest, oldest)
         self.shift = shift if shift > LEAST_SHIFT or shift < -LEAST_SHIFT else 0.0
-        self.deeper = float(sum_in_order(weights * self._below))
-        self.variance = float(sum_in_order(weights * self._known))
+        self.deeper = float(_total(weights * self._below))
+        self.variance = float(_total(weights * self._known))
         estimate = self._estimate
         # The force at each map's own knots, then at the usual ones.
         slopes = estimate[:SEGMENTS]
@@ -345,12 +347,61 @@ class DelayBank:
         there = np.where(self._past < _0, np.concatenate((slopes[:1], slopes[:-1])), slopes)
         forces = weights * (np.add.accumulate(steps, axis=0) + self._past * there)
         at_knots = np.add.accumulate(forces, axis=1)[:, -1]
-        last = float(sum_in_order(weights * slopes[-1]))
+        last = float(_total(weights * slopes[-1]))
         # Without a copy.
         diagonal = self._covariance.reshape(-1, HYPOTHESES)[:: PARAMETERS + 1]
-        lost = positive_mean(estimate[DAMPING:PRELOAD], diagonal[DAMPING:PRELOAD]) * weights
+        lost = _positive_mean(estimate[DAMPING:PRELOAD], diagonal[DAMPING:PRELOAD]) * weights
         curve = self.curve
         curve.slopes = [*((at_knots[1:] - at_knots[:-1]) / _GAPS).tolist(), last]
         curve.at_knots = at_knots.tolist()
         losses = np.add.accumulate(lost, axis=1)[:, -1].tolist()
         curve.damping, curve.depth_damping, curve.unloading, curve.friction = losses
+
+
+def _plausibility(mean: np.ndarray, variance: np.ndarray, prior: float) -> np.ndarray:
+    """How much better a damping N(mean, variance) goes with one that is 0 or not negative than one
+    N(0, prior) does; Phi as in `force_depth_map.positive_mean`."""
+    spread = np.sqrt(variance)
+    ratio = mean / spread
+    density = exponential(0.5 * (ratio * ratio), DENSITY_SQUARINGS)
+    known = sqrt(prior if prior > 0.0 else 1.0)
+    return ELASTIC * (known / spread) * density + (1.0 - ELASTIC) * (2.0 * cumulative(ratio))
+
+
+def _positive_mean(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """`force_depth_map.positive_mean` of many."""
+    known = variance > _0
+    spread = np.sqrt(np.where(known, variance, _1))
+    ratio = mean / spread
+    root = np.sqrt(ratio * ratio + 2.0 * pi)
+    below = 2.0 / (root - ratio)
+    above_0 = ratio > _0
+    positive = np.where(above_0, ratio, _0)
+    mills = pi / ((pi - 1.0) * positive + root)
+    tail = 1.0 / (1.0 + positive * positive / 512.0)
+    for _ in range(8):
+        tail *= tail
+    density = tail / sqrt(2.0 * pi)
+    above = positive + density / (1.0 - density * mills)
+    return np.where(known, spread * np.where(above_0, above, below), np.fmax(mean, _0))
+
+
+def _weighed(carried: np.ndarray, evidence: np.ndarray) -> np.ndarray:
+    """What is carried, by this contact's evidence. Whether it is a lag only maps whose slopes wander decide,
+    as those of lags do: the sum over delays is what it would be if all were such."""
+    weights = carried * evidence
+    as_lags = (carried[:DELAYS] + carried[DELAYS:FIRST_LAG]) * evidence[:DELAYS]
+    weights[:FIRST_LAG] *= _total(as_lags) / _total(weights[:FIRST_LAG])
+    return weights
+
+
+def _shares(values: np.ndarray, least: float) -> np.ndarray:
+    """Of their sum, at least so much."""
+    values = np.where(values < NOTHING, 0.0, values)
+    shares = values / _total(values)
+    return np.fmax(shares, least)
+
+
+def _total(values: np.ndarray) -> float:
+    """The sum, one term after another."""
+    return np.add.accumulate(values)[-1]
