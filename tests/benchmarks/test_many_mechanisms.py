@@ -18,8 +18,8 @@ from jaxhil.simulation.environment import usable_cores
 pytestmark = pytest.mark.benchmark
 NUMBER, SINGLE = 64, 6
 MASSES = np.geomspace(150.0, 600.0, NUMBER)
-# Of as many single ones: of commands the whole, of calls in a process that computes already all but the runs.
-# These take more than a third of a single call's time on all cores, and are as many however they are called.
+# Of as many single ones: of commands the whole, of calls in a process that computes already all but the runs,
+# which are as many however they are called: three tenths of a single call's time or more, on all cores.
 SHARE = 0.25
 
 
