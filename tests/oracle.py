@@ -53,9 +53,8 @@ def simulate(
     The compensator has `reset()` and `step(force, x_d, v_d, x_measured)`; with
     `position_command(x, v, a)` it leads the command, and `next_contact()`, if there, replaces
     `reset()` between contacts. `force_noise` [N] and `position_noise` [m] are sequences indexed by
-    tick (a list of sequences: one per fresh run). `noise_level` [N]: below it a command has died
-    out (3 noise_std + |bias| unless given). `first_force_zero`: tick 0 commands F_c = 0 whatever
-    it reads.
+    tick (a list of sequences: one per fresh run). `first_force_zero`: tick 0 commands F_c = 0
+    whatever it reads.
 
     `index_waits_for_exit`: with clearance, the next stiffness acts only once x_a has left the
     surface (damped contact separates at F = 0 inside it, where a stiffer next entry would push
@@ -113,7 +112,6 @@ class _Run:
         index,
         noise,
         *,
-        noise_level=None,
         first_force_zero=True,
         index_waits_for_exit=True,
         time_limit=10.0,
@@ -139,7 +137,6 @@ class _Run:
         self.lag_state = 0.0
         std, bias = sensor.get("noise_std", 0.0), sensor.get("bias", 0.0)
         self.noisy = std != 0.0 or bias != 0.0 or self.force_noise is not None
-        self.noise_level = 3.0 * std + abs(bias) if noise_level is None else noise_level
         self.quiet_ticks = self.force_delay + 20.0 * self.lag / T + 2.0
         position_sensor = rig.get("position_sensor", {})
         self.position_quantum = position_sensor.get("quantum", 0.0)
@@ -237,8 +234,11 @@ class _Run:
         quiet = n - self.last_force_end >= self.quiet_ticks - TIME_TOLERANCE
         if quiet and self.v * self.last_side < 0.0:
             contact.waiting = n if contact.waiting is None else contact.waiting
-            level = max(1e-6 * contact.peak_command, self.noise_level)
-            if abs(command) <= level or (n - contact.waiting) * T >= 0.1 - TIME_TOLERANCE * T:
+            level = 1e-6 * contact.peak_command
+            waited = (n - contact.waiting) * T >= 0.1 - TIME_TOLERANCE * T
+            # Between two surfaces a contact is over in the middle of the gap at the latest.
+            crossed = self.last_side != (1 if self.x > -self.law.clearance / 2.0 else -1)
+            if abs(command) <= level or waited or crossed:
                 contact.status, self.died_out = "over", max(level, abs(command))
                 self.armed = False
         else:

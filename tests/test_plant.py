@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 import pytest
-from cases import CASES, oracle_contacts, run_oracle
+from cases import CASES, oracle_contacts
 from lanes import as_arrays, join, nominal_gains, run_rollout, validated
 from rig_lock_step import closed_loop
 
@@ -40,8 +40,7 @@ def test_every_contact_against_the_oracle(name):
     mechanism = validated(case.mechanism)
     gains = nominal_gains(mechanism, case.compensator, **case.gains)
     found, shortfalls = closed_loop(mechanism, case.compensator, gains)
-    # The oracle does not know that a quantum is a level below which a command has died out.
-    expected = run_oracle(case, noise_level=0.5) if name == "quantum" else oracle_contacts(name)
+    expected = oracle_contacts(name)
     assert len(found) == len(expected) == mechanism.approach.contacts
     # So does a cubic for the motion on which the deepest point is found.
     case_lags = mechanism.rig.force_sensor.time_constant > 0

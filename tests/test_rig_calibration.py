@@ -159,16 +159,16 @@ def test_contacts_without_a_force_are_over_though_the_law_s_output_hardly_decays
     """In and out of contact, out for less time than the output is given to die out."""
     limits = {name: value for name, value in calibrated[0].limits.items() if value is not None}
 
-    def faults(fading):
-        watchdog = Watchdog(complete({**limits, "fading": fading}), 1e-3, math.inf)
+    def faults(output):
+        watchdog = Watchdog(complete(limits), 1e-3, math.inf)
         found, rate = set(), 2 * math.pi / 0.15
         for tick in range(2000):
-            phase, given = rate * 1e-3 * tick, 1e-9 * 0.99999**tick
+            phase, given = rate * 1e-3 * tick, output * 0.99999**tick
             position, velocity = 1e-4 * (math.sin(phase) - 0.5), 1e-4 * rate * math.cos(phase)
             found.add(watchdog.tick(given, UNSTATED, 0.0, position, velocity, position))
         return found
 
-    assert CONTACT_TOO_LONG in faults(0.0) and CONTACT_TOO_LONG not in faults(limits["fading"])
+    assert CONTACT_TOO_LONG in faults(1e-3) and CONTACT_TOO_LONG not in faults(1e-9)
 
 
 def test_limits_of_the_rig_s_own_stay_and_count():

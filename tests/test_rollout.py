@@ -51,8 +51,6 @@ WORK_ACCURACY = {
     "rattling against layers": 1e-4,
     "rattling, the next touch at once": 3e-4,
 }
-# The oracle does not know that a quantum is a level below which a command has died out.
-ORACLE = {"quantum": {"noise_level": 0.5}}
 
 # Each of these is the first of a program of its own; what they add is tested elsewhere, one by one.
 SELDOM = ("rattling, elastoplastic", "rattling against layers", "depth-damped", "layers", "damped layers")
@@ -66,11 +64,7 @@ every_case = pytest.mark.parametrize("name", slow_if_seldom)
 
 def both(name):
     """(contact of the loop, contact of the oracle) for every contact of a case."""
-    return zip(cases.loop_contacts(name), oracle(name), strict=True)
-
-
-def oracle(name):
-    return cases.run_oracle(CASES[name], **ORACLE[name]) if name in ORACLE else cases.oracle_contacts(name)
+    return zip(cases.loop_contacts(name), cases.oracle_contacts(name), strict=True)
 
 
 @every_case
@@ -123,7 +117,7 @@ def test_work_of_the_real_force(name):
 )
 def test_first_contact_is_over_at_the_oracles_tick(name):
     ticks, length = cases.loop_contacts(name)[0]["ticks"], stretch_length(cases.batches()[name].loop)
-    assert 0 < ticks - oracle(name)[0]["end_tick"] <= length
+    assert 0 < ticks - cases.oracle_contacts(name)[0]["end_tick"] <= length
 
 
 @pytest.mark.slow
@@ -166,7 +160,7 @@ def recorded():
 def test_every_tick_of_the_first_contact(recorded, name):
     batch, _, ticks = recorded
     lane = batch.names.index(name)
-    expected = cases.run_oracle(CASES[name], contacts=1, record=True, **ORACLE.get(name, {}))[0]["signals"]
+    expected = cases.run_oracle(CASES[name], contacts=1, record=True)[0]["signals"]
     count = int(np.sum(ticks.active[:, lane] & (ticks.contact[:, lane] == 0)))
     assert count >= 90
     for found, key, scale in (

@@ -44,6 +44,14 @@ def test_hardware_that_never_touches_is_not_reached(noise):
         assert all(math.isnan(number) for number in contact[:9])
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_model_turned_back_by_a_bias_alone_is_not_reached(noise):
+    """A bias of 70 N turns the model back 0.09 mm before the surface, one of 40 N behind it: after 0.2 mm."""
+    for bias in (70.0, 40.0):
+        found = run(rig(1.2 * DEEPEST, bias=bias, noise_std=noise))
+        assert found.status == "not reached" and math.isnan(found.contacts[0].restitution)
+
+
 def test_a_dead_zone_that_hides_the_whole_contact_hides_it():
     largest = STIFFNESS * 0.5 * DEEPEST
     hidden = run(rig(0.5 * DEEPEST, dead_zone=1.01 * largest))

@@ -28,7 +28,7 @@ typedef struct {
     jaxhil_contact_record record;
     bool on, stated, known, open, measured;
     double clearance, middle, period, mass, quiet_ticks, faded, longest, fading, margin, tolerance;
-    double entry, side, velocity, force, aligned, peak, work;
+    double entry, side, velocity, force, aligned, peak, unfelt, work;
     double sxx, sxv, svv, sxf, svf;
     int64_t quiet, ticks;
     jaxhil_contact_record statuses;
@@ -39,13 +39,14 @@ typedef struct {
 
 /* == Definitions == */
 
-#define JAXHIL_FADED 1e-6   /* of the largest force of the contact */
+#define JAXHIL_FADED 1e-6   /* of the largest force, and impulse of the rest over that of the approach */
 #define JAXHIL_PATIENCE 0.1 /* s, that the force is given to die out */
 
 static void jaxhil_watchdog_clear(jaxhil_watchdog *watchdog) {
     watchdog->quiet = 0;
     watchdog->ticks = 0;
     watchdog->peak = 0.0;
+    watchdog->unfelt = 0.0;
     watchdog->work = 0.0;
     watchdog->measured = false;
     watchdog->statuses = jaxhil_contact_record_begin(0, JAXHIL_UNSTATED);
@@ -204,7 +205,7 @@ static uint32_t jaxhil_watchdog_follow(jaxhil_watchdog *watchdog, double given, 
     if (size > watchdog->peak) {
         watchdog->peak = size;
     }
-    const bool faded = size <= JAXHIL_FADED * watchdog->peak || size <= watchdog->fading ||
+    const bool faded = size <= JAXHIL_FADED * watchdog->peak || size <= watchdog->unfelt ||
                        (double)watchdog->quiet >= watchdog->faded;
     const bool outside = !in_contact && (double)watchdog->quiet >= watchdog->quiet_ticks;
     const bool leaving = outside && watchdog->side * velocity < 0.0 && faded;
@@ -237,6 +238,7 @@ static uint32_t jaxhil_watchdog_tick(jaxhil_watchdog *watchdog, double given, in
         jaxhil_watchdog_clear(watchdog);
         watchdog->open = true;
         watchdog->entry = before;
+        watchdog->unfelt = JAXHIL_FADED * watchdog->mass * fabs(before) / JAXHIL_PATIENCE;
         watchdog->side = side;
     }
     if (watchdog->open) {

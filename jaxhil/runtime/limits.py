@@ -69,7 +69,7 @@ LIMITS: dict[str, Limit] = {
     "deceleration": Limit("m/s^2", DECELERATIONS[1], *DECELERATIONS, "braking and starting after a trip"),
     "retreat_velocity": Limit("m/s", 0.0, *SPEEDS, "speed of the way out of contact after a trip"),
     "equivalent_mass": Limit("kg", 0.0, 0.0, MASSES[1], "the model's; 0: no energies are audited"),
-    "fading": Limit("N", 0.0, *FORCES, "force on the numerical model that counts as died out"),
+    "fading": Limit("N", 0.0, *FORCES, "force reading that counts as no contact"),
     "longest_contact": Limit("s", 1e5, 0.0, 1e5, "longest contact"),
     "energy_balance": Limit("1", RATIOS[1], *RATIOS, "energy out of balance, of the approach's"),
     "restitution_margin": Limit("1", RATIOS[1], *RATIOS, "largest difference from the expected restitution"),

@@ -1,9 +1,10 @@
 """The watchdog: an energy audit of every contact, from the motion of the numerical model.
 
-A contact begins on the tick on which the model's or the measured position is beyond a surface as told, or the
-law acts, which may find it nearer. It is audited once that has not been so for `settling`, the model moves
-away and the force on it has died out; at the latest in the middle of the gap or when the next contact is
-announced, so always before the next begins.
+A contact begins on the tick on which the model's or the measured position is beyond a specified surface, or
+the law acts, which may find the surface nearer. It is audited once that has not been so for `settling`, the
+model moves away and the force on it has died out, which is waited for at most `PATIENCE`. No threshold
+depends on the noise: a noisy force that happens to be small may not have given all of its impulse. A contact
+is audited at the latest in the middle of the gap or when the next one is announced.
 With v_in the model's velocity on the tick before the contact and v now, the audit asks:
 
 - Is the energy balanced? M (v^2 - v_in^2)/2 must be the work -T sum F_c(n) (v(n) + v(n+1))/2 of the force
@@ -33,7 +34,7 @@ from .filters import DelayLine
 from .law_status import OUT_OF_CONTACT, UNSTATED, ContactRecord, StatusCount
 from .surfaces import deflection
 
-FADED = 1e-6  # of the largest force of the contact
+FADED = 1e-6  # of the largest force, and impulse of the rest over that of the approach
 PATIENCE = 0.1  # s, that the force is given to die out
 
 
@@ -49,8 +50,8 @@ class Watchdog:
         "_aligned", "_alignment", "_clearance", "_entry", "_expectation", "_faded", "_fading", "_force",
         "_known", "_longest", "_margin", "_mass", "_measured", "_middle", "_open", "_peak", "_period",
         "_quiet", "_quiet_ticks", "_side", "_stated", "_statuses", "_svf", "_svv", "_sxf", "_sxv", "_sxx",
-        "_ticks", "_tolerance", "_velocity", "_work", "balance", "contacts", "expected", "on", "record",
-        "restitution",
+        "_ticks", "_tolerance", "_unfelt", "_velocity", "_work", "balance", "contacts", "expected", "on",
+        "record", "restitution",
     )  # fmt: skip
 
     def __init__(
@@ -87,6 +88,7 @@ class Watchdog:
         self._force = 0.0
         self._aligned = 0.0
         self._peak = 0.0
+        self._unfelt = 0.0
         self._work = 0.0
         self._measured = False
         self._statuses.restart()
@@ -134,7 +136,7 @@ class Watchdog:
             if size > self._peak:
                 self._peak = size
             self._regress(force, aligned)
-            faded = size <= FADED * self._peak or size <= self._fading or self._quiet >= self._faded
+            faded = size <= FADED * self._peak or size <= self._unfelt or self._quiet >= self._faded
             outside = not in_contact and self._quiet >= self._quiet_ticks
             leaving = outside and self._side * velocity < 0.0 and faded
             if leaving or side != self._side:
@@ -167,6 +169,7 @@ class Watchdog:
     def _begin(self, entry: float, side: float) -> None:
         self._open = True
         self._entry = entry
+        self._unfelt = FADED * self._mass * abs(entry) / PATIENCE
         self._side = side
         self._quiet = 0
         self._ticks = 0

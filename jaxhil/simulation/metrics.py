@@ -96,7 +96,9 @@ def judge(scenario: Scenario, watch: Watch, age: Array) -> Array:
     waiting = (watch.elapsed == 0) & (age.astype(period.dtype) > patience)
     late = (watch.elapsed > limit) | waiting
     # Without a measured force there is no contact, whatever made the numerical model turn back.
-    status = jnp.where(watch.over, jnp.where(watch.measured, OK, NOT_REACHED), jnp.where(late, TIMEOUT, OK))
+    ended = jnp.where(watch.measured, OK, NOT_REACHED)
+    cut = jnp.where(watch.in_contact > 0, TIMEOUT, NOT_REACHED)
+    status = jnp.where(watch.over, ended, jnp.where(late, cut, OK))
     status = jnp.where(watch.rebound > RUNAWAY * scenario.velocity, DIVERGED, status)
     finite = jnp.isfinite(watch.rebound) & jnp.isfinite(watch.peak_command)
     return jnp.where(finite, status, NON_FINITE).astype(jnp.int32)

@@ -16,7 +16,7 @@ from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.probe import Deviation, no_deviation
 from jaxhil.simulation.scenario import Scenario
 
-LONGEST_FADING = 0.1  # s, waited for the compensator's command to die out
+LONGEST_FADING = 0.1  # s, waited for the compensator's command to die out, which a noisy one never does
 FADED = 1e-6  # of the command's peak
 RUNAWAY = 1e3  # of the first approach speed: no rig survives it
 
@@ -59,18 +59,16 @@ class Rules(NamedTuple):
     quiet: Float[Array, "*batch"]  # ticks without a real force
     # ticks without a real force after which the command need not have died out
     patience: Float[Array, "*batch"]
-    level: Float[Array, "*batch"]  # below which the command has died out [N]
     fastest: Float[Array, "*batch"]  # speed beyond which the run has diverged [m/s]
     clearance: Float[Array, "*batch"]  # between two surfaces [m]; infinite for one
 
 
 def build_rules(scenario: Scenario) -> Rules:
-    """h = tau_f + 20 sensor time constants + 2 T without force; 0.1 s more for the command to fade."""
+    """Return the waits: h = tau_f + 20 sensor time constants + 2 T; 0.1 s more for the command."""
     sensor, period = scenario.force_sensor, scenario.control_period
     quiet = jnp.floor((sensor.delay + 20 * sensor.time_constant) / period + (2 + 1e-9)) + 1
-    level = 3 * sensor.noise_std + jnp.abs(sensor.bias) + sensor.quantum
     patience = quiet + jnp.ceil(LONGEST_FADING / period)
-    return Rules(quiet, patience, level, RUNAWAY * scenario.velocity, scenario.clearance)
+    return Rules(quiet, patience, RUNAWAY * scenario.velocity, scenario.clearance)
 
 
 def fresh_watch(loop: Loop, like: Array) -> Watch:
@@ -116,7 +114,7 @@ def record_contact(
     # The hardware may follow the numerical model late.
     quiet = jnp.where(touching | (begun & (watch.elapsed == 0)), 0, watch.quiet + 1)
     in_contact = jnp.where(touching, watch.in_contact + 1, watch.in_contact)
-    ends = _ends(loop, rules, begun, signals, side, quiet, magnitude, peak_command)
+    ends = begun & _ends(rules, signals, side, quiet, magnitude, peak_command)
     lasts = begun & ~watch.over
     return Watch(
         elapsed=jnp.where(begun, watch.elapsed + 1, watch.elapsed),
@@ -160,19 +158,26 @@ def _side(rules, watch, signals):
     if watch.side is None:
         return None
     position = signals.position_desired
-    near = jnp.where(position > -rules.clearance / 2, 1, -1).astype(position.dtype)
-    return jnp.where(watch.elapsed == 0, near, watch.side)
+    return jnp.where(watch.elapsed == 0, _nearer(rules, position), watch.side)
 
 
-def _ends(loop, rules, begun, signals, side, quiet, magnitude, peak_command):
-    """Where the model moves away, without a force for long enough, and the command died out."""
+def _nearer(rules, position):
+    """1 or -1, the nearer of two surfaces."""
+    return jnp.where(position > -rules.clearance / 2, 1, -1).astype(position.dtype)
+
+
+def _ends(rules, signals, side, quiet, magnitude, peak_command):
+    """Return where a contact ends: the model moves away, without a force for long enough, the command gone.
+
+    No threshold depends on the noise: a command that happens to be small while its mean is not would end the
+    contact before all of its impulse is in.
+    """
     velocity = signals.velocity_desired
-    away = velocity < 0 if side is None else side * velocity < 0
-    level = FADED * peak_command
-    if loop.reads_always or loop.has_sample_effects:
-        level = jnp.maximum(level, rules.level)
-    faded = magnitude <= level
-    return begun & away & (quiet >= rules.quiet) & (faded | (quiet >= rules.patience))
+    faded = (magnitude <= FADED * peak_command) | (quiet >= rules.patience)
+    if side is None:
+        return (velocity < 0) & (quiet >= rules.quiet) & faded
+    faded |= _nearer(rules, signals.position_desired) != side
+    return (side * velocity < 0) & (quiet >= rules.quiet) & faded
 
 
 def _peak_force(loop, watch, plant_signals, force):

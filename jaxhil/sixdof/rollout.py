@@ -185,11 +185,8 @@ def _watch(rig: Rig, watch: Watch, seen: Tick) -> Watch:
         penetration = jnp.maximum(penetration, share)
     command = norm(seen.command.force), norm(seen.command.moment)
     highest = tuple(jnp.maximum(a, b) for a, b in zip(watch.highest, command, strict=True))
-    noise = 3 * rig.sensor.noise_std
-    levels = jnp.max(noise[:3], axis=0), jnp.max(noise[3:], axis=0)
-    faded = jnp.ones(rig.period.shape, bool)
-    for size, peak, level in zip(command, highest, levels, strict=True):
-        faded = faded & (size <= jnp.maximum(FADED * peak, level))
+    # No threshold depends on the noise: see `jaxhil.simulation.watch`.
+    faded = (command[0] <= FADED * highest[0]) & (command[1] <= FADED * highest[1])
     return watch._replace(
         begun=watch.begun | now,
         touching=touching,

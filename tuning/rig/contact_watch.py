@@ -39,7 +39,6 @@ class ContactWatch:
         lag = (sensor.delay + 20 * sensor.time_constant) / self._period
         self._quiet_ticks = math.floor(lag + 2 + 1e-9) + 1
         self._patience = self._quiet_ticks + math.ceil(LONGEST_FADING / self._period)
-        self._level = 3 * sensor.noise_std + abs(sensor.bias) + sensor.quantum
         self._noisy = sensor.noise_std != 0.0 or sensor.bias != 0.0
         self._limit = LONGEST_CONTACT / self._period
         self._waiting = self._limit
@@ -82,8 +81,10 @@ class ContactWatch:
         self._measured = self._measured or (self._contact_ticks > 0 and reading != 0.0)
         self._quiet = 0 if in_contact else self._quiet + 1
         self._tick += 1
-        faded = magnitude <= max(FADED * self._peak_command, self._level)
-        quiet = self._quiet >= self._quiet_ticks and (faded or self._quiet >= self._patience)
+        faded = magnitude <= FADED * self._peak_command or self._quiet >= self._patience
+        # Between two surfaces a contact is over in the middle of the gap at the latest.
+        faded = faded or self._side != (1.0 if position > -self._clearance / 2 else -1.0)
+        quiet = self._quiet >= self._quiet_ticks and faded
         if self._begun >= 0 and self._side * velocity < 0.0 and quiet:
             left = max(FADED * self._peak_command, magnitude)
             return self._end("ok" if self._measured else "not reached", left)
@@ -102,7 +103,9 @@ class ContactWatch:
             late = self._tick - self._begun > self._limit
         else:
             late = self._tick > self._waiting
-        return self._end("timeout", 0.0) if late else None
+        if not late:
+            return None
+        return self._end("timeout" if self._contact_ticks > 0 else "not reached", 0.0)
 
     def _end(self, status: str, left: float) -> ContactResult:
         approach = self._approach

@@ -23,7 +23,7 @@ class Rules(NamedTuple):
     mass: float  # equivalent mass [kg]
     alignment: float  # delay of the force reading against the position reading [s]
     settling: float  # time that force and command need to die out [s]
-    fading: float  # command that counts as died out [N]
+    fading: float  # force reading that counts as none [N]
     finds_plane: bool = False  # whether the law looks for the surface, and commands nothing before
 
 
@@ -148,7 +148,8 @@ def audit_contacts(signals: Signals, rules: Rules, slots: int) -> Audited:
                 f = np.where(inside, own * (force + force_before) * 0.5, 0.0)
                 for name, product in zip(SUMS, (x * x, x * v, v * v, x * f, v * f), strict=True):
                     state.sums[name] += product
-                faded = (size <= FADED * state.peak) | (size <= rules.fading) | (state.quiet >= patience)
+                unfelt = FADED * mass * np.abs(state.entry) / PATIENCE
+                faded = (size <= FADED * state.peak) | (size <= unfelt) | (state.quiet >= patience)
                 leaves = ~in_contact & (state.quiet >= quiet_ticks) & (own * velocity < 0) & faded
                 over = going & (leaves | (side != own))
                 if np.any(over):

@@ -16,7 +16,6 @@ from jaxhil.compensators import COMPENSATORS
 from jaxhil.errors import InputError
 from jaxhil.mechanism.uncertainty import extremes
 from jaxhil.runtime.limits import LIMITS
-from jaxhil.runtime.watchdog import FADED, PATIENCE
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.scenario import build_scenarios
@@ -118,8 +117,6 @@ def watchdog_rules(loaded: LoadedGains) -> tuple[Rules, float]:
     # The loop's own wait for the force to die out, with a margin that a drawn delay cannot use up.
     wait = drawn["force_delay"] + 20 * drawn["force_lag"] + 2 * period
     mass = mechanism.bodies.mass
-    # A force that could not change the velocity in all of that time has died out, however slowly it goes.
-    unfelt = FADED * mass * mechanism.approach.velocity / PATIENCE
     noise = 3 * drawn["force_noise"] + drawn["force_bias"] + drawn["force_quantum"]
     rules = Rules(
         period=period,
@@ -127,7 +124,7 @@ def watchdog_rules(loaded: LoadedGains) -> tuple[Rules, float]:
         mass=mass,
         alignment=max(0.0, force.delay + force.time_constant - position.delay),
         settling=MARGIN * wait,
-        fading=max(noise, unfelt),
+        fading=noise,
         finds_plane=COMPENSATORS[loaded.compensator].finds_plane,
     )
     error = 6 * drawn["position_noise"] + drawn["position_quantum"] + max(0.0, drawn["nearer"])
