@@ -273,7 +273,7 @@ def cases(draw):
         gains[name] = draw(st.floats(0.0, CAPACITY * PERIOD) if name in c99_cases.delays(law) else finite)
     clearance = draw(st.one_of(st.just(math.inf), st.floats(*DISTANCES)))
     number = st.tuples(
-        st.sampled_from([0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0]),
+        st.sampled_from([c99_cases.TICK] * 3 + list(c99_cases.EVENTS)),
         *[any_float] * 5,
         st.sampled_from([0.0, 1.0]),
         *[any_float] * 3,

@@ -46,9 +46,19 @@ bool jaxhil_tare(jaxhil_controller *controller, double force_measured);
 double jaxhil_step(jaxhil_controller *controller, double force_measured, double position_desired,
                    double velocity_desired, double position_measured, const double *time);
 
-/* The position [m] to command, from the numerical model's motion [m, m/s, m/s^2] after this tick's step. */
+/* The position [m] to command, from the numerical model's motion [m, m/s, m/s^2] after this tick's step. Whatever it
+ * is given, the command changes by at most `velocity_limit` times the period: from the last command, or, at the
+ * beginning of a run, from the position measured last. With neither, before the first step, it is the numerical
+ * model's position, if that is out of contact and within the stroke. */
 double jaxhil_position_command(jaxhil_controller *controller, double position, double velocity,
                                double acceleration);
+
+/* Take over drives that follow the numerical model's uniform motion [m, m/s] already, before a run. Drives in motion
+ * read behind their command: without this call the run begins from where they read, and its first commands are cut
+ * to `velocity_limit` until they have caught up. With it, the first one goes on from what the law commands for this
+ * motion. Refused, with false, once tripped, once the run has a command, if the model is in contact, and if the
+ * command is outside the stroke. */
+bool jaxhil_take_over(jaxhil_controller *controller, double position, double velocity);
 
 /* Tell the controller the state of the rig's emergency stop: active, it trips, and the force and the position
  * command come to rest; then `jaxhil_at_rest` and the drives may be switched off. Released, the trip stays
@@ -56,11 +66,13 @@ double jaxhil_position_command(jaxhil_controller *controller, double position, d
 void jaxhil_emergency_stop(jaxhil_controller *controller, bool active);
 
 /* Restart everything but the tare: filters, identified parameters, a trip, the count of ticks. Without a
- * bump. Refused, with false, while the emergency stop is active. */
+ * bump: force and position command go on from the last ones. If the drives have been moved since by other means,
+ * call jaxhil_next_contact as well. Refused, with false, while the emergency stop is active. */
 bool jaxhil_reset(jaxhil_controller *controller);
 
-/* Begin a fresh run for the next contact, the rig having been brought to its start. Identified parameters
- * carry over, a trip stays latched. A contact still under way is audited first: what that finds is in `faults`
+/* Begin a fresh run for the next contact, the rig having been brought to its start: the first position command goes
+ * on from where the drives then read, not from the last command. Identified parameters carry over, a trip stays
+ * latched. A contact still under way is audited first: what that finds is in `faults`
  * until the next step. */
 void jaxhil_next_contact(jaxhil_controller *controller);
 
@@ -161,6 +173,7 @@ double jaxhil_step(jaxhil_controller *controller, double force_measured, double 
     uint32_t faults = 0;
     uint32_t fatal = 0;
     controller->faults = 0;
+    jaxhil_input_guard_locate(inputs, position_measured);
     if (controller->cause) {
         jaxhil_force_guard_fade(forces);
         return forces->output;
@@ -196,14 +209,19 @@ double jaxhil_step(jaxhil_controller *controller, double force_measured, double 
     return forces->output;
 }
 
+/* The law's position command [m] for a motion; not a number if that has none. */
+static double jaxhil_sent(jaxhil_controller *controller, double position, double velocity, double acceleration) {
+    const bool finite = isfinite(position) && isfinite(velocity) && isfinite(acceleration);
+    return finite ? jaxhil_law_position_command(&controller->law, position, velocity, acceleration) : NAN;
+}
+
 double jaxhil_position_command(jaxhil_controller *controller, double position, double velocity,
                                double acceleration) {
     jaxhil_position_guard *positions = &controller->positions;
+    const double measured = controller->inputs.located;
     if (!controller->cause) {
-        const bool finite = isfinite(position) && isfinite(velocity) && isfinite(acceleration);
-        const double command =
-            finite ? jaxhil_law_position_command(&controller->law, position, velocity, acceleration) : NAN;
-        const uint32_t faults = jaxhil_position_guard_limit(positions, command);
+        const double command = jaxhil_sent(controller, position, velocity, acceleration);
+        const uint32_t faults = jaxhil_position_guard_limit(positions, command, measured);
         controller->faults |= faults;
         controller->seen |= faults;
         if (!positions->fatal) {
@@ -211,9 +229,14 @@ double jaxhil_position_command(jaxhil_controller *controller, double position, d
         }
         jaxhil_fail(controller, positions->fatal);
     }
-    /* Nothing was commanded yet: the drives are where the numerical model is, or else where they read. */
-    jaxhil_position_guard_retreat(positions, isfinite(position) ? position : controller->inputs.measured);
+    jaxhil_position_guard_retreat(positions, measured, position);
     return positions->output;
+}
+
+bool jaxhil_take_over(jaxhil_controller *controller, double position, double velocity) {
+    return !controller->cause &&
+           jaxhil_position_guard_take_over(&controller->positions, position,
+                                           jaxhil_sent(controller, position, velocity, 0.0));
 }
 
 void jaxhil_emergency_stop(jaxhil_controller *controller, bool active) {

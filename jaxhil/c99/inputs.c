@@ -11,11 +11,13 @@
 
 /* == Declarations == */
 
-/* The times of the ticks: which came late, and how many were missed. */
+/* The times of the ticks: which came early or late, and how many were missed. `drift` are the periods by which
+ * the clock has gone ahead of the ticks, with those missed; `awaited` ticks counted as missed that may yet come;
+ * `in_a_row` ticks missed since the last one in time. */
 typedef struct {
-    double period, missing, late_gap, tolerated;
-    double time;
-    int64_t missed, late;
+    double period, missing, late_gap, early_gap, tolerated;
+    double time, drift;
+    int64_t missed, late, awaited, in_a_row;
     bool fatal;
 } jaxhil_clock;
 
@@ -28,14 +30,14 @@ typedef struct {
 } jaxhil_bias_tare;
 
 /* The readings of one tick, checked one by one: `force` [N] without bias and `measured` [m] are what the law
- * is to use, `fatal` the faults that trip. */
+ * is to use, `fatal` the faults that trip. `located` [m] is where the drives were read last, NAN before. */
 typedef struct {
     double clearance, range, lowest, highest, held, force_stuck, position_stuck;
     double free_distance, free_force, settling;
-    double force_reading, force_travel, position_travel, desired, force, measured;
+    double force_reading, force_travel, position_travel, desired, force, measured, located;
     int64_t bad_forces, bad_positions, forces_in_flight, flight;
     uint32_t fatal;
-    bool known;
+    bool known, trusted;
 } jaxhil_input_guard;
 
 /* == Definitions == */
@@ -43,8 +45,16 @@ typedef struct {
 /* Periods counted for one gap, so that a wild clock stays a small number. */
 #define JAXHIL_MOST_MISSED 1000000
 
+static const double jaxhil_missing = 1.5;       /* periods since the last tick beyond which a tick is missing */
+static const double jaxhil_drift_kept = 0.99;   /* of the drift, from one tick to the next */
+static const double jaxhil_most_drift = 1.0;    /* periods */
+static const double jaxhil_tare_rounding = 1e-9; /* of a reading */
+
 static void jaxhil_clock_pause(jaxhil_clock *clock) {
     clock->time = -INFINITY;
+    clock->drift = 0.0;
+    clock->awaited = 0;
+    clock->in_a_row = 0;
     clock->fatal = false;
 }
 
@@ -56,10 +66,27 @@ static void jaxhil_clock_reset(jaxhil_clock *clock) {
 
 static void jaxhil_clock_init(jaxhil_clock *clock, const jaxhil_limits *limits, double period) {
     clock->period = period;
-    clock->missing = 1.5 * period;
+    clock->missing = jaxhil_missing * period;
     clock->late_gap = (1.0 + limits->late_fraction) * period;
+    clock->early_gap = (1.0 - limits->late_fraction) * period;
     clock->tolerated = limits->missed_in_a_row;
     jaxhil_clock_reset(clock);
+}
+
+/* Count the ticks missed in a gap of so many periods; the fault. */
+static uint32_t jaxhil_clock_miss(jaxhil_clock *clock, double periods) {
+    int64_t left_out = JAXHIL_MOST_MISSED - 1;
+    if (periods > JAXHIL_MOST_MISSED) {
+        clock->drift = 0.0;
+    } else {
+        left_out = (int64_t)(periods + 0.5) - 1;
+        clock->drift = jaxhil_drift_kept * clock->drift + (periods - 1.0 - (double)left_out);
+    }
+    clock->missed += left_out;
+    clock->awaited = left_out;
+    clock->in_a_row += left_out;
+    clock->fatal = (double)clock->in_a_row > clock->tolerated;
+    return JAXHIL_MISSED_TICK;
 }
 
 static uint32_t jaxhil_clock_tick(jaxhil_clock *clock, double time) {
@@ -78,18 +105,33 @@ static uint32_t jaxhil_clock_tick(jaxhil_clock *clock, double time) {
         return JAXHIL_CLOCK;
     }
     clock->time = time;
+    const double periods = gap / clock->period;
     if (gap > clock->missing) {
-        const double periods = gap / clock->period + 0.5;
-        const int64_t left_out = (periods > JAXHIL_MOST_MISSED ? JAXHIL_MOST_MISSED : (int64_t)periods) - 1;
-        clock->missed += left_out;
-        clock->fatal = (double)left_out > clock->tolerated;
-        return JAXHIL_MISSED_TICK;
+        return jaxhil_clock_miss(clock, periods);
     }
-    if (gap > clock->late_gap) {
-        clock->late++;
-        return JAXHIL_LATE_TICK;
+    clock->in_a_row = 0;
+    double drift = jaxhil_drift_kept * clock->drift + (periods - 1.0);
+    uint32_t fault = 0;
+    if (gap < clock->early_gap) {
+        fault = JAXHIL_EARLY_TICK;
+        if (clock->awaited > 0) {
+            /* It was late by more than half a period, not missed. */
+            clock->awaited--;
+            drift += 1.0;
+        }
+    } else {
+        clock->awaited = 0;
+        if (gap > clock->late_gap) {
+            clock->late++;
+            fault = JAXHIL_LATE_TICK;
+        }
     }
-    return 0;
+    clock->drift = drift;
+    if (fabs(drift) > jaxhil_most_drift) {
+        clock->fatal = true;
+        return JAXHIL_CLOCK;
+    }
+    return fault;
 }
 
 static void jaxhil_bias_tare_begin(jaxhil_bias_tare *tare) {
@@ -142,6 +184,7 @@ static bool jaxhil_bias_tare_take(jaxhil_bias_tare *tare, double reading) {
 
 static void jaxhil_input_guard_restart(jaxhil_input_guard *guard) {
     guard->known = false;
+    guard->trusted = false;
     guard->bad_forces = 0;
     guard->bad_positions = 0;
     guard->forces_in_flight = 0;
@@ -167,11 +210,26 @@ static void jaxhil_input_guard_init(jaxhil_input_guard *guard, const jaxhil_limi
     guard->free_distance = limits->free_distance;
     guard->free_force = limits->free_force;
     guard->settling = limits->settling / period;
+    guard->located = NAN;
     jaxhil_input_guard_restart(guard);
 }
 
-/* Take this tick's position in [m], the numerical model's being `desired` [m]; its fault. */
-static uint32_t jaxhil_input_guard_position(jaxhil_input_guard *guard, double position, double desired) {
+/* Take note of where the drives read [m], also once tripped. Before a run's first reading in range, any that a
+ * rig can have is better than none. */
+static void jaxhil_input_guard_locate(jaxhil_input_guard *guard, double position) {
+    if (guard->lowest <= position && position <= guard->highest) {
+        guard->trusted = true;
+        guard->located = position;
+    } else if (!guard->trusted && jaxhil_no_limits.measured_lowest <= position &&
+               position <= jaxhil_no_limits.measured_highest) {
+        guard->located = position;
+    }
+}
+
+/* Take this tick's position in [m], the numerical model's being `desired` [m]; its fault. On the first tick there
+ * is no good one to go on with, and nobody knows where the drives are. */
+static uint32_t jaxhil_input_guard_position(jaxhil_input_guard *guard, double position, double desired,
+                                            bool first) {
     uint32_t fault = 0;
     if (isfinite(position) && guard->lowest <= position && position <= guard->highest) {
         guard->bad_positions = 0;
@@ -186,9 +244,23 @@ static uint32_t jaxhil_input_guard_position(jaxhil_input_guard *guard, double po
     } else {
         fault = isfinite(position) ? JAXHIL_POSITION_OUT_OF_RANGE : JAXHIL_POSITION_NOT_FINITE;
         guard->bad_positions++;
-        guard->fatal |= (double)guard->bad_positions > guard->held ? fault : 0;
+        guard->fatal |= first || (double)guard->bad_positions > guard->held ? fault : 0;
     }
     guard->desired = desired;
+    return fault;
+}
+
+/* The force reads as before, in contact, while the measured position went so much deeper [m]; the fault. */
+static uint32_t jaxhil_input_guard_same_force(jaxhil_input_guard *guard, double deeper) {
+    if (fabs(guard->force) <= jaxhil_tare_rounding * fabs(guard->force_reading)) {
+        /* A damped mechanism comes out without a force, but none can be pressed in without one. */
+        const double travel = guard->force_travel + deeper;
+        guard->force_travel = travel > 0.0 ? travel : 0.0;
+    } else {
+        guard->force_travel += fabs(deeper);
+    }
+    const uint32_t fault = guard->force_travel > guard->force_stuck ? JAXHIL_FORCE_STUCK : 0;
+    guard->fatal |= fault;
     return fault;
 }
 
@@ -198,15 +270,13 @@ static uint32_t jaxhil_input_guard_force(jaxhil_input_guard *guard, double readi
     uint32_t fault = 0;
     if (isfinite(reading) && fabs(reading) < guard->range) {
         guard->bad_forces = 0;
+        guard->force = reading - bias;
         if (reading == guard->force_reading && (measured > 0.0 || measured < -guard->clearance)) {
-            guard->force_travel += fabs(measured - before);
-            fault = guard->force_travel > guard->force_stuck ? JAXHIL_FORCE_STUCK : 0;
-            guard->fatal |= fault;
+            fault = jaxhil_input_guard_same_force(guard, measured > 0.0 ? measured - before : before - measured);
         } else {
             guard->force_travel = 0.0;
         }
         guard->force_reading = reading;
-        guard->force = reading - bias;
     } else {
         fault = isfinite(reading) ? JAXHIL_FORCE_OUT_OF_RANGE : JAXHIL_FORCE_NOT_FINITE;
         guard->bad_forces++;
@@ -223,7 +293,8 @@ static uint32_t jaxhil_input_guard_check(jaxhil_input_guard *guard, double readi
         return JAXHIL_MODEL_NOT_FINITE;
     }
     guard->fatal = 0;
-    if (!guard->known) {
+    const bool first = !guard->known;
+    if (first) {
         /* Before the first tick there is no good reading: no force, and the position as desired. */
         guard->known = true;
         guard->desired = desired;
@@ -231,7 +302,7 @@ static uint32_t jaxhil_input_guard_check(jaxhil_input_guard *guard, double readi
         guard->force_reading = INFINITY;
     }
     const double before = guard->measured;
-    uint32_t faults = jaxhil_input_guard_position(guard, position, desired);
+    uint32_t faults = jaxhil_input_guard_position(guard, position, desired, first);
     faults |= jaxhil_input_guard_force(guard, reading, before, bias);
     const double measured = guard->measured;
     if (measured < -guard->free_distance && measured > guard->free_distance - guard->clearance) {

@@ -1,6 +1,8 @@
 /* What goes out, limited: the force on the numerical model and the position command to the drives.
  *
- * Both guards hold the last value that they let out, so that nothing jumps: not on a trip, not on a reset.
+ * Both guards hold the last value that they let out, so that nothing jumps: not on a trip, not on a reset. Where a
+ * run begins, the position command goes on from where the drives read, or from the command that they follow
+ * already.
  */
 #include <math.h>
 #include <stdbool.h>
@@ -8,6 +10,7 @@
 
 #include "faults_table.c"
 #include "limits_table.c"
+#include "surfaces.c"
 
 /* == Declarations == */
 
@@ -19,7 +22,9 @@ typedef struct {
     uint32_t fatal;
 } jaxhil_force_guard;
 
-/* The position command within the stroke, its change within `velocity_limit`; the retreat after a trip. */
+/* The position command within the stroke, its change within `velocity_limit`; the retreat after a trip. No command
+ * is further from the last one, or from where the drives read if there is none, than the velocity limit allows in a
+ * period; it is outside the stroke only on the way back from there. */
 typedef struct {
     double clearance, lowest, highest, most, braking, retreat, distance, cut_tolerated;
     double output, rate;
@@ -115,8 +120,42 @@ static void jaxhil_position_guard_release(jaxhil_position_guard *guard) {
     jaxhil_position_guard_restart(guard);
 }
 
-/* Let the command [m] out as far as the limits allow; the faults of that. */
-static uint32_t jaxhil_position_guard_limit(jaxhil_position_guard *guard, double command) {
+/* Begin where the drives read; if they never were, where the model is, but free and in the stroke. */
+static void jaxhil_position_guard_stand(jaxhil_position_guard *guard, double measured, double position) {
+    guard->known = true;
+    guard->output = measured;
+    if (isfinite(measured)) {
+        return;
+    }
+    double start = position;
+    if (!isfinite(position) || position > 0.0) {
+        start = -guard->distance;
+    } else if (position < -guard->clearance) {
+        start = guard->distance - guard->clearance;
+    }
+    if (start < guard->lowest) {
+        start = guard->lowest;
+    } else if (start > guard->highest) {
+        start = guard->highest;
+    }
+    guard->output = start;
+}
+
+/* Go on from a `command` [m] that the drives follow already, the model being at `position` [m]. Refused once there
+ * is a command, in contact, and outside the stroke. */
+static bool jaxhil_position_guard_take_over(jaxhil_position_guard *guard, double position, double command) {
+    const bool is_free = jaxhil_deflection(position, guard->clearance) == 0.0;
+    if (guard->known || !is_free || !(guard->lowest <= command && command <= guard->highest)) {
+        return false;
+    }
+    guard->known = true;
+    guard->output = command;
+    return true;
+}
+
+/* Let the command [m] out as far as the limits allow; the faults of that. `measured` [m] is where the drives were
+ * read last, NAN if they never were. */
+static uint32_t jaxhil_position_guard_limit(jaxhil_position_guard *guard, double command, double measured) {
     guard->fatal = 0;
     if (!isfinite(command)) {
         guard->fatal = JAXHIL_MODEL_NOT_FINITE;
@@ -127,10 +166,7 @@ static uint32_t jaxhil_position_guard_limit(jaxhil_position_guard *guard, double
         return JAXHIL_STROKE;
     }
     if (!guard->known) {
-        guard->known = true;
-        guard->engaged = true;
-        guard->output = command;
-        return 0;
+        jaxhil_position_guard_stand(guard, measured, command);
     }
     const double before = guard->output;
     if (fabs(command - before) <= guard->most) {
@@ -152,12 +188,11 @@ static uint32_t jaxhil_position_guard_limit(jaxhil_position_guard *guard, double
     return JAXHIL_VELOCITY_LIMIT;
 }
 
-/* One period of the way to rest out of contact; from `start` [m] if nothing was let out yet. */
-static void jaxhil_position_guard_retreat(jaxhil_position_guard *guard, double start) {
+/* One period of the way to rest out of contact, from where the drives are. `measured` [m] as above, `position` [m]
+ * the numerical model's. */
+static void jaxhil_position_guard_retreat(jaxhil_position_guard *guard, double measured, double position) {
     if (!guard->known) {
-        const double raised = guard->lowest > start ? guard->lowest : start;
-        guard->known = true;
-        guard->output = guard->highest < raised ? guard->highest : raised;
+        jaxhil_position_guard_stand(guard, measured, position);
     }
     const double output = guard->output;
     double wanted = 0.0;
@@ -176,15 +211,12 @@ static void jaxhil_position_guard_retreat(jaxhil_position_guard *guard, double s
         rate = wanted;
     }
     double moved = output + rate;
-    if (!isfinite(moved)) { /* after a step from one end of what a double can be to the other */
-        moved = output;
+    /* What begins outside the stroke may come back, and goes no further out. */
+    if (moved < guard->lowest && rate < 0.0) {
+        moved = output < guard->lowest ? output : guard->lowest;
         rate = 0.0;
-    }
-    if (moved < guard->lowest) {
-        moved = guard->lowest;
-        rate = 0.0;
-    } else if (moved > guard->highest) {
-        moved = guard->highest;
+    } else if (moved > guard->highest && rate > 0.0) {
+        moved = output > guard->highest ? output : guard->highest;
         rate = 0.0;
     }
     guard->rate = rate;

@@ -5,10 +5,12 @@ which of them trip; `force` and `measured` are then what the law is to use.
 """
 
 from collections.abc import Mapping
-from math import inf, isfinite
+from math import inf, isfinite, nan
 
+from .bounds import POSITIONS
 from .faults import (
     CLOCK,
+    EARLY_TICK,
     FORCE_IN_FLIGHT,
     FORCE_NOT_FINITE,
     FORCE_OUT_OF_RANGE,
@@ -22,20 +24,28 @@ from .faults import (
 )
 
 MOST_MISSED = 1_000_000  # periods counted for one gap, so that a wild clock stays a small number
+MISSING = 1.5  # periods since the last tick beyond which a tick is missing
+DRIFT_KEPT = 0.99  # of the clock's drift from one tick to the next: it is forgotten over 100 ticks
+MOST_DRIFT = 1.0  # periods: a clock that runs 1 % fast or slow comes to it, jitter does not
+TARE_ROUNDING = 1e-9  # of a reading: what the mean of 1e6 equal readings may differ from them by
 
 
 class Clock:
-    """The times of the ticks: which came late, and how many were missed.
+    """The times of the ticks: which came early or late, and how many were missed.
 
     Attributes: `missed` and `late`, ticks counted; `fatal`, whether the last tick's fault trips.
     """
 
-    __slots__ = ("_late", "_missing", "_period", "_time", "_tolerated", "fatal", "late", "missed")
+    __slots__ = (
+        "_awaited", "_drift", "_early", "_in_a_row", "_late", "_missing", "_period", "_time", "_tolerated",
+        "fatal", "late", "missed",
+    )  # fmt: skip
 
     def __init__(self, limits: Mapping[str, float], period: float) -> None:
         self._period = period
-        self._missing = 1.5 * period
+        self._missing = MISSING * period
         self._late = (1.0 + limits["late_fraction"]) * period
+        self._early = (1.0 - limits["late_fraction"]) * period
         self._tolerated = limits["missed_in_a_row"]
         self.reset()
 
@@ -48,6 +58,9 @@ class Clock:
     def pause(self) -> None:
         """Let the time until the next tick be any."""
         self._time = -inf
+        self._drift = 0.0  # periods by which the clock has gone ahead of the ticks, with those missed
+        self._awaited = 0  # ticks counted as missed that may yet come
+        self._in_a_row = 0  # ticks missed since the last one in time
         self.fatal = False
 
     def tick(self, time: float) -> int:
@@ -64,16 +77,41 @@ class Clock:
             self.fatal = True
             return CLOCK
         self._time = time
+        periods = gap / self._period
         if gap > self._missing:
-            periods = gap / self._period + 0.5
-            left_out = (MOST_MISSED if periods > MOST_MISSED else int(periods)) - 1
-            self.missed += left_out
-            self.fatal = left_out > self._tolerated
-            return MISSED_TICK
-        if gap > self._late:
-            self.late += 1
-            return LATE_TICK
-        return 0
+            return self._miss(periods)
+        self._in_a_row = 0
+        drift = DRIFT_KEPT * self._drift + (periods - 1.0)
+        fault = 0
+        if gap < self._early:
+            fault = EARLY_TICK
+            if self._awaited:
+                # It was late by more than half a period, not missed.
+                self._awaited -= 1
+                drift += 1.0
+        else:
+            self._awaited = 0
+            if gap > self._late:
+                self.late += 1
+                fault = LATE_TICK
+        self._drift = drift
+        if abs(drift) > MOST_DRIFT:
+            self.fatal = True
+            return CLOCK
+        return fault
+
+    def _miss(self, periods: float) -> int:
+        """Count the ticks missed in a gap of so many periods; the fault."""
+        if periods > MOST_MISSED:
+            left_out, self._drift = MOST_MISSED - 1, 0.0
+        else:
+            left_out = int(periods + 0.5) - 1
+            self._drift = DRIFT_KEPT * self._drift + (periods - 1.0 - left_out)
+        self.missed += left_out
+        self._awaited = left_out
+        self._in_a_row += left_out
+        self.fatal = self._in_a_row > self._tolerated
+        return MISSED_TICK
 
 
 class Tare:
@@ -134,14 +172,14 @@ class InputGuard:
     """The readings of one tick, checked one by one; see `faults.FAULTS` for what each check means.
 
     Attributes, of the last tick: `force` [N] without bias and `measured` [m], what the law is to use;
-    `fatal`, the faults that trip.
+    `fatal`, the faults that trip. `located` [m] is where the drives were read last, not a number before.
     """
 
     __slots__ = (
         "_bad_forces", "_bad_positions", "_clearance", "_desired", "_flight", "_force_limit",
         "_force_reading", "_force_stuck", "_force_travel", "_forces_in_flight", "_free_distance",
         "_free_force", "_held", "_highest", "_known", "_lowest", "_position_stuck", "_position_travel",
-        "_range", "_settling", "fatal", "force", "measured",
+        "_range", "_settling", "_trusted", "fatal", "force", "located", "measured",
     )  # fmt: skip
 
     def __init__(self, limits: Mapping[str, float], period: float, clearance: float) -> None:
@@ -155,11 +193,13 @@ class InputGuard:
         self._free_distance = limits["free_distance"]
         self._free_force = limits["free_force"]
         self._settling = limits["settling"] / period
+        self.located = nan
         self.restart()
 
     def restart(self) -> None:
-        """Forget the readings so far."""
+        """Forget the readings so far, but not where the drives were read last."""
         self._known = False
+        self._trusted = False
         self._bad_forces = 0
         self._bad_positions = 0
         self._forces_in_flight = 0
@@ -172,6 +212,17 @@ class InputGuard:
         self.measured = 0.0
         self.fatal = 0
 
+    def locate(self, position: float) -> None:
+        """Take note of where the drives read [m], also once tripped.
+
+        Before a run's first reading in range, any that a rig can have is better than none.
+        """
+        if self._lowest <= position <= self._highest:
+            self._trusted = True
+            self.located = position
+        elif not self._trusted and POSITIONS[0] <= position <= POSITIONS[1]:
+            self.located = position
+
     def check(self, reading: float, desired: float, velocity: float, position: float, bias: float) -> int:
         """The faults of the readings of a tick: force [N], the model's motion [m, m/s], position [m]."""
         if not (isfinite(desired) and isfinite(velocity)):
@@ -179,7 +230,8 @@ class InputGuard:
             return MODEL_NOT_FINITE
         faults = 0
         self.fatal = 0
-        if not self._known:
+        first = not self._known
+        if first:
             # Before the first tick there is no good reading: no force, and the position as desired.
             self._known = True
             self._desired = desired
@@ -195,18 +247,18 @@ class InputGuard:
                 self._position_travel = 0.0
             self.measured = position
         else:
-            faults = self._bad_position(position)
+            faults = self._bad_position(position, first)
         self._desired = desired
         measured = self.measured
 
         if isfinite(reading) and abs(reading) < self._range:
             self._bad_forces = 0
+            self.force = reading - bias
             if reading == self._force_reading and (measured > 0.0 or measured < -self._clearance):
-                faults |= self._same_force(abs(measured - before))
+                faults |= self._same_force(measured - before if measured > 0.0 else before - measured)
             else:
                 self._force_travel = 0.0
             self._force_reading = reading
-            self.force = reading - bias
         else:
             faults |= self._bad_force(reading)
 
@@ -224,10 +276,11 @@ class InputGuard:
 
     # What only a tick that is not as it should be needs stands in functions of its own, which cost it alone.
 
-    def _bad_position(self, position: float) -> int:
+    def _bad_position(self, position: float, first: bool) -> int:
+        # On the first tick there is no good one to go on with, and nobody knows where the drives are.
         fault = POSITION_OUT_OF_RANGE if isfinite(position) else POSITION_NOT_FINITE
         self._bad_positions += 1
-        self.fatal |= fault if self._bad_positions > self._held else 0
+        self.fatal |= fault if first or self._bad_positions > self._held else 0
         return fault
 
     def _bad_force(self, reading: float) -> int:
@@ -243,9 +296,14 @@ class InputGuard:
         self.fatal |= fault
         return fault
 
-    def _same_force(self, travel: float) -> int:
-        """The force reads as before, in contact, while the measured position has travelled so far [m]."""
-        self._force_travel += travel
+    def _same_force(self, deeper: float) -> int:
+        """The force reads as before, in contact, while the measured position went so much deeper [m]."""
+        if abs(self.force) <= TARE_ROUNDING * abs(self._force_reading):
+            # A damped mechanism comes out without a force, but none can be pressed in without one.
+            travel = self._force_travel + deeper
+            self._force_travel = travel if travel > 0.0 else 0.0
+        else:
+            self._force_travel += abs(deeper)
         fault = FORCE_STUCK if self._force_travel > self._force_stuck else 0
         self.fatal |= fault
         return fault

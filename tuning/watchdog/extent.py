@@ -87,7 +87,10 @@ def _stuck(signals: Signals, clearance: float):
         now, before = signals.measured[tick], signals.measured[tick - 1]
         in_contact = (now > 0) | (now < -clearance)
         same = counted & in_contact & (signals.force[tick] == signals.force[tick - 1])
-        force_travel = np.where(same, force_travel + np.abs(now - before), 0.0)
+        deeper = np.where(now > 0, now - before, before - now)
+        # Without a force only a way deeper counts: a damped mechanism comes out without one.
+        pressed = np.where(signals.force[tick] == 0, np.maximum(force_travel + deeper, 0.0), np.inf)
+        force_travel = np.where(same, np.minimum(pressed, force_travel + np.abs(deeper)), 0.0)
         moved = np.abs(signals.position[tick] - signals.position[tick - 1])
         position_travel = np.where(counted & (now == before), position_travel + moved, 0.0)
         most_force = np.maximum(most_force, force_travel)
