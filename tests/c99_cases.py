@@ -37,8 +37,8 @@ RESULT = (
     *("force_delay", "contact_plane"),
 )
 STATUS_NAMES = tuple(status.name for status in STATUSES)
-TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, TAKE_OVER, COMMAND_FIRST = map(float, range(8))
-EVENTS = (TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, TAKE_OVER, COMMAND_FIRST)
+TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, COMMAND_FIRST, STEP_ONLY = map(float, range(8))
+EVENTS = (TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, COMMAND_FIRST, STEP_ONLY)
 PERIOD = 0.001
 CAPACITY = 64  # periods of delay, of those drawn
 LINES = DelayLine.LONGEST  # periods of delay that the compiled laws hold
@@ -350,7 +350,7 @@ def controller_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
     for row, result in zip(rows.tolist(), results, strict=True):
         answer = _event(controller, row)
         result[0] = controller.step(*row[1:5], row[5] if row[6] else None)
-        result[1] = controller.position_command(*row[7:])
+        result[1] = 0.0 if row[0] == STEP_ONLY else controller.position_command(*row[7:])
         result[2:4] = controller.identified
         result[4] = STATUS_NAMES.index(controller.law_status)
         result[5:8] = controller.faults, controller.seen, controller.cause
@@ -371,8 +371,6 @@ def _event(controller: Controller, row: list[float]) -> float:
         return controller.reset()
     if code == TARE:
         return controller.tare(row[1])
-    if code == TAKE_OVER:
-        return controller.take_over(*row[2:4])
     if code == COMMAND_FIRST:
         return controller.position_command(*row[7:])
     if code == NEXT_CONTACT:

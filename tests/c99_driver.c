@@ -11,7 +11,7 @@
 /* A row: event, force, desired position and velocity, measured position, time, whether it is given, the
  * model's position, velocity and acceleration. A result: see `result`. */
 enum { ROW = 10, RESULT = 28 };
-enum { TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, TAKE_OVER, COMMAND_FIRST };
+enum { TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, COMMAND_FIRST, STEP_ONLY };
 enum { GAINS = sizeof(jaxhil_gains) / sizeof(double), LIMITS = sizeof(jaxhil_limits) / sizeof(double) };
 
 size_t driver_size(void);
@@ -62,9 +62,6 @@ static double event(jaxhil_controller *controller, const double *row) {
     if (code == TARE) {
         return jaxhil_tare(controller, row[1]);
     }
-    if (code == TAKE_OVER) {
-        return jaxhil_take_over(controller, row[2], row[3]);
-    }
     if (code == COMMAND_FIRST) {
         return jaxhil_position_command(controller, row[7], row[8], row[9]);
     }
@@ -82,7 +79,7 @@ void driver_run(jaxhil_controller *controller, size_t count, const double *rows,
         const double answer = event(controller, rows);
         const double *time = rows[6] != 0.0 ? &rows[5] : NULL;
         *result++ = jaxhil_step(controller, rows[1], rows[2], rows[3], rows[4], time);
-        *result++ = jaxhil_position_command(controller, rows[7], rows[8], rows[9]);
+        *result++ = rows[0] == STEP_ONLY ? 0.0 : jaxhil_position_command(controller, rows[7], rows[8], rows[9]);
         jaxhil_identified(controller, result, result + 1);
         result += 2;
         *result++ = jaxhil_law_status(controller);

@@ -51,7 +51,6 @@ def closed_loop(
     while len(results) < mechanism.approach.contacts:
         number, tick, shortfall = len(results), 0, []
         model.place(position, velocity)
-        law.take_over(position, velocity)
         plant.begin(position, velocity, law.position_command(position, velocity, 0.0), number)
         watch.begin(number)
         while len(results) < mechanism.approach.contacts:

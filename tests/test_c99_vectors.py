@@ -13,7 +13,7 @@ from c99_cases import (
 )
 from gain_documents import gain_document, sign
 
-from jaxhil.runtime import COMPENSATORS, Controller
+from jaxhil.runtime import COMPENSATORS
 from jaxhil.runtime.gain_file import check_gain_document
 from jaxhil.runtime.limits import LIMITS
 
@@ -41,18 +41,16 @@ def vectors(*kinds: str) -> list[str]:
         "acceleration,force_command,position_command,faults,force_simulated"
     ]
     for run, kind in enumerate(kinds):
-        controller = Controller(gain_file)
-        for n, row in enumerate(drawn_rows(kind, 200, np.random.default_rng([9, run]), PERIOD).tolist()):
-            event = {0: 1, 100: 2}.get(n, 0)
-            if event == 2:
-                controller.next_contact()
-            if event:
-                controller.take_over(*row[2:4])
+        rows = drawn_rows(kind, 200, np.random.default_rng([9, run]), PERIOD)
+        rows[:, 0] = c99_cases.TICK
+        rows[100, 0] = c99_cases.NEXT_CONTACT
+        results = c99_cases.controller_in_python(gain_file, rows)
+        for n, (row, result) in enumerate(zip(rows.tolist(), results.tolist(), strict=True)):
+            event = 1 if n == 0 else int(row[0])
             readings = [repr(number) for number in row[1:6]]
             if not row[6]:
                 readings[-1] = ""
-            force = controller.step(*row[1:5], row[5] if row[6] else None)
-            numbers = [*row[7:], force, controller.position_command(*row[7:]), controller.faults, math.nan]
+            numbers = [*row[7:], *result[:2], int(result[c99_cases.RESULT.index("faults")]), math.nan]
             lines.append(",".join([str(run), str(event), *readings, *(repr(number) for number in numbers)]))
     return lines
 

@@ -47,18 +47,13 @@ double jaxhil_step(jaxhil_controller *controller, double force_measured, double 
                    double velocity_desired, double position_measured, const double *time);
 
 /* The position [m] to command, from the numerical model's motion [m, m/s, m/s^2] after this tick's step. Whatever it
- * is given, the command changes by at most `velocity_limit` times the period: from the last command, or, at the
- * beginning of a run, from the position measured last. With neither, before the first step, it is the numerical
- * model's position, if that is out of contact and within the stroke. */
+ * is given, it is at most `velocity_limit` times the period from the last command. A run's first command is as near
+ * to the measured position; out of contact, where drives in motion follow late, it may be within `start_distance` of
+ * it. Before a run's first step, the model's position, if it is out of contact, is taken for where the rig has been
+ * brought to. A trip leads away from the last command, without one from the position measured last, without either
+ * from a place out of contact. */
 double jaxhil_position_command(jaxhil_controller *controller, double position, double velocity,
                                double acceleration);
-
-/* Take over drives that follow the numerical model's uniform motion [m, m/s] already, before a run. Drives in motion
- * read behind their command: without this call the run begins from where they read, and its first commands are cut
- * to `velocity_limit` until they have caught up. With it, the first one goes on from what the law commands for this
- * motion. Refused, with false, once tripped, once the run has a command, if the model is in contact, and if the
- * command is outside the stroke. */
-bool jaxhil_take_over(jaxhil_controller *controller, double position, double velocity);
 
 /* Tell the controller the state of the rig's emergency stop: active, it trips, and the force and the position
  * command come to rest; then `jaxhil_at_rest` and the drives may be switched off. Released, the trip stays
@@ -221,7 +216,8 @@ double jaxhil_position_command(jaxhil_controller *controller, double position, d
     const double measured = controller->inputs.located;
     if (!controller->cause) {
         const double command = jaxhil_sent(controller, position, velocity, acceleration);
-        const uint32_t faults = jaxhil_position_guard_limit(positions, command, measured);
+        const uint32_t faults = jaxhil_position_guard_limit(positions, command, position, measured,
+                                                            controller->inputs.is_located);
         controller->faults |= faults;
         controller->seen |= faults;
         if (!positions->fatal) {
@@ -231,12 +227,6 @@ double jaxhil_position_command(jaxhil_controller *controller, double position, d
     }
     jaxhil_position_guard_retreat(positions, measured, position);
     return positions->output;
-}
-
-bool jaxhil_take_over(jaxhil_controller *controller, double position, double velocity) {
-    return !controller->cause &&
-           jaxhil_position_guard_take_over(&controller->positions, position,
-                                           jaxhil_sent(controller, position, velocity, 0.0));
 }
 
 void jaxhil_emergency_stop(jaxhil_controller *controller, bool active) {
@@ -271,6 +261,7 @@ void jaxhil_next_contact(jaxhil_controller *controller) {
     jaxhil_law_next_contact(&controller->law);
     jaxhil_clock_pause(&controller->clock);
     jaxhil_input_guard_restart(&controller->inputs);
+    controller->inputs.is_located = false;
     jaxhil_watchdog_restart(&controller->watchdog);
     jaxhil_position_guard_release(&controller->positions);
 }

@@ -30,14 +30,15 @@ typedef struct {
 } jaxhil_bias_tare;
 
 /* The readings of one tick, checked one by one: `force` [N] without bias and `measured` [m] are what the law
- * is to use, `fatal` the faults that trip. `located` [m] is where the drives were read last, NAN before. */
+ * is to use, `fatal` the faults that trip. `located` [m] is where the drives were read last, NAN before;
+ * `is_located`, whether a reading in range of this run said so. */
 typedef struct {
     double clearance, range, lowest, highest, held, force_stuck, position_stuck;
     double free_distance, free_force, settling;
     double force_reading, force_travel, position_travel, desired, force, measured, located;
     int64_t bad_forces, bad_positions, forces_in_flight, flight;
     uint32_t fatal;
-    bool known, trusted;
+    bool known, is_located;
 } jaxhil_input_guard;
 
 /* == Definitions == */
@@ -45,9 +46,9 @@ typedef struct {
 /* Periods counted for one gap, so that a wild clock stays a small number. */
 #define JAXHIL_MOST_MISSED 1000000
 
-static const double jaxhil_missing = 1.5;       /* periods since the last tick beyond which a tick is missing */
-static const double jaxhil_drift_kept = 0.99;   /* of the drift, from one tick to the next */
-static const double jaxhil_most_drift = 1.0;    /* periods */
+static const double jaxhil_longest_gap = 1.5; /* periods since the last tick beyond which a tick is missing */
+static const double jaxhil_drift_kept = 0.99; /* of the clock's drift, from one tick to the next */
+static const double jaxhil_most_drift = 1.0; /* periods */
 static const double jaxhil_tare_rounding = 1e-9; /* of a reading */
 
 static void jaxhil_clock_pause(jaxhil_clock *clock) {
@@ -66,7 +67,7 @@ static void jaxhil_clock_reset(jaxhil_clock *clock) {
 
 static void jaxhil_clock_init(jaxhil_clock *clock, const jaxhil_limits *limits, double period) {
     clock->period = period;
-    clock->missing = jaxhil_missing * period;
+    clock->missing = jaxhil_longest_gap * period;
     clock->late_gap = (1.0 + limits->late_fraction) * period;
     clock->early_gap = (1.0 - limits->late_fraction) * period;
     clock->tolerated = limits->missed_in_a_row;
@@ -184,7 +185,6 @@ static bool jaxhil_bias_tare_take(jaxhil_bias_tare *tare, double reading) {
 
 static void jaxhil_input_guard_restart(jaxhil_input_guard *guard) {
     guard->known = false;
-    guard->trusted = false;
     guard->bad_forces = 0;
     guard->bad_positions = 0;
     guard->forces_in_flight = 0;
@@ -211,6 +211,7 @@ static void jaxhil_input_guard_init(jaxhil_input_guard *guard, const jaxhil_limi
     guard->free_force = limits->free_force;
     guard->settling = limits->settling / period;
     guard->located = NAN;
+    guard->is_located = false;
     jaxhil_input_guard_restart(guard);
 }
 
@@ -218,9 +219,9 @@ static void jaxhil_input_guard_init(jaxhil_input_guard *guard, const jaxhil_limi
  * rig can have is better than none. */
 static void jaxhil_input_guard_locate(jaxhil_input_guard *guard, double position) {
     if (guard->lowest <= position && position <= guard->highest) {
-        guard->trusted = true;
+        guard->is_located = true;
         guard->located = position;
-    } else if (!guard->trusted && jaxhil_no_limits.measured_lowest <= position &&
+    } else if (!guard->is_located && jaxhil_no_limits.measured_lowest <= position &&
                position <= jaxhil_no_limits.measured_highest) {
         guard->located = position;
     }

@@ -1,8 +1,7 @@
 /* What goes out, limited: the force on the numerical model and the position command to the drives.
  *
  * Both guards hold the last value that they let out, so that nothing jumps: not on a trip, not on a reset. Where a
- * run begins, the position command goes on from where the drives read, or from the command that they follow
- * already.
+ * run begins, the position command goes on from where the drives read.
  */
 #include <math.h>
 #include <stdbool.h>
@@ -23,10 +22,11 @@ typedef struct {
 } jaxhil_force_guard;
 
 /* The position command within the stroke, its change within `velocity_limit`; the retreat after a trip. No command
- * is further from the last one, or from where the drives read if there is none, than the velocity limit allows in a
- * period; it is outside the stroke only on the way back from there. */
+ * is further from the last one than the velocity limit allows in a period. A run's first one is as near to where the
+ * drives read; out of contact, where they follow late, within `start_distance` of it. A command is outside the
+ * stroke only on the way back from there. */
 typedef struct {
-    double clearance, lowest, highest, most, braking, retreat, distance, cut_tolerated;
+    double clearance, lowest, highest, most, braking, retreat, distance, start, cut_tolerated;
     double output, rate;
     int64_t cut;
     uint32_t fatal;
@@ -109,6 +109,7 @@ static void jaxhil_position_guard_init(jaxhil_position_guard *guard, const jaxhi
     guard->retreat = limits->retreat_velocity * period;
     guard->distance = distance < middle ? distance : middle;
     guard->cut_tolerated = limits->limited_in_a_row;
+    guard->start = limits->start_distance;
     guard->output = 0.0;
     guard->known = false;
     jaxhil_position_guard_restart(guard);
@@ -141,21 +142,11 @@ static void jaxhil_position_guard_stand(jaxhil_position_guard *guard, double mea
     guard->output = start;
 }
 
-/* Go on from a `command` [m] that the drives follow already, the model being at `position` [m]. Refused once there
- * is a command, in contact, and outside the stroke. */
-static bool jaxhil_position_guard_take_over(jaxhil_position_guard *guard, double position, double command) {
-    const bool is_free = jaxhil_deflection(position, guard->clearance) == 0.0;
-    if (guard->known || !is_free || !(guard->lowest <= command && command <= guard->highest)) {
-        return false;
-    }
-    guard->known = true;
-    guard->output = command;
-    return true;
-}
-
-/* Let the command [m] out as far as the limits allow; the faults of that. `measured` [m] is where the drives were
- * read last, NAN if they never were. */
-static uint32_t jaxhil_position_guard_limit(jaxhil_position_guard *guard, double command, double measured) {
+/* Let the command [m] out as far as the limits allow; the faults of that. `position` [m] is the numerical model's;
+ * `measured` [m] is where the drives were read last, NAN if they never were; `is_fresh`, whether that was in this
+ * run. */
+static uint32_t jaxhil_position_guard_limit(jaxhil_position_guard *guard, double command, double position,
+                                            double measured, bool is_fresh) {
     guard->fatal = 0;
     if (!isfinite(command)) {
         guard->fatal = JAXHIL_MODEL_NOT_FINITE;
@@ -166,7 +157,14 @@ static uint32_t jaxhil_position_guard_limit(jaxhil_position_guard *guard, double
         return JAXHIL_STROKE;
     }
     if (!guard->known) {
-        jaxhil_position_guard_stand(guard, measured, command);
+        /* Drives in motion follow late. Without a reading they have been brought to where the model is. */
+        const bool near = fabs(command - (is_fresh ? measured : position)) <= guard->start;
+        if (near && jaxhil_deflection(position, guard->clearance) == 0.0) {
+            guard->known = true;
+            guard->output = command;
+        } else {
+            jaxhil_position_guard_stand(guard, measured, position);
+        }
     }
     const double before = guard->output;
     if (fabs(command - before) <= guard->most) {
@@ -188,8 +186,7 @@ static uint32_t jaxhil_position_guard_limit(jaxhil_position_guard *guard, double
     return JAXHIL_VELOCITY_LIMIT;
 }
 
-/* One period of the way to rest out of contact, from where the drives are. `measured` [m] as above, `position` [m]
- * the numerical model's. */
+/* One period of the way to rest out of contact, from where the drives are; positions as above. */
 static void jaxhil_position_guard_retreat(jaxhil_position_guard *guard, double measured, double position) {
     if (!guard->known) {
         jaxhil_position_guard_stand(guard, measured, position);

@@ -77,21 +77,18 @@ static int replay(const char *name, long number, const double *row, const int *g
     return is_same(faults, row[FAULTS]) ? 0 : differs(name, number, "faults", faults, row[FAULTS]);
 }
 
-/* What comes before the row's tick: a run begins (1), the next contact does (2), either with drives that follow the
- * numerical model already; nothing (0). */
-static int begin(const char *name, long number, const double *row, int *begun) {
-    if (row[EVENT] == 1.0) {
+/* What comes before the row's tick: a run begins (1), the next contact does (2), nothing (0). */
+static int begin(const char *name, long number, double event, int *begun) {
+    if (event == 1.0) {
         *begun = 1;
-        if (!jaxhil_init(&controller, &jaxhil_exported_gains, &jaxhil_exported_limits)) {
-            return unreadable(name, number, "the controller refuses its own gains");
-        }
-    } else if (row[EVENT] == 2.0 && *begun) {
-        jaxhil_next_contact(&controller);
-    } else if (row[EVENT] != 0.0 || !*begun) {
-        return unreadable(name, number, "an unknown event, or a tick before a run");
+        return jaxhil_init(&controller, &jaxhil_exported_gains, &jaxhil_exported_limits)
+                   ? 0
+                   : unreadable(name, number, "the controller refuses its own gains");
     }
-    if (row[EVENT] != 0.0) {
-        jaxhil_take_over(&controller, row[POSITION_DESIRED], row[VELOCITY_DESIRED]);
+    if (event == 2.0 && *begun) {
+        jaxhil_next_contact(&controller);
+    } else if (event != 0.0 || !*begun) {
+        return unreadable(name, number, "an unknown event, or a tick before a run");
     }
     return 0;
 }
@@ -115,7 +112,7 @@ int main(int count, char **arguments) {
             failed = strcmp(line, header) != 0 ? unreadable(name, number, "unknown columns") : 0;
             continue;
         }
-        failed = read_row(line, row, given) ? begin(name, number, row, &begun)
+        failed = read_row(line, row, given) ? begin(name, number, row[EVENT], &begun)
                                             : unreadable(name, number, "not a row of numbers");
         failed = failed ? failed : replay(name, number, row, given);
     }

@@ -219,15 +219,18 @@ class Controller:
 
         Position in m, velocity in m/s, acceleration in m/s^2. Once tripped, the way to rest out of contact.
 
-        Whatever it is given, the command changes by at most `velocity_limit` times the period: from the last
-        command, or, at the beginning of a run, from the position measured last. With neither, before the
-        first `step`, it is the numerical model's position, if that is out of contact and within the stroke.
+        Whatever it is given, it is at most `velocity_limit` times the period from the last command. A run's
+        first command is as near to the measured position; out of contact, where drives in motion follow late,
+        it may be within `start_distance` of it. Before a run's first `step`, the model's position, if it is
+        out of contact, is taken for where the rig has been brought to. A trip leads away from the last
+        command, without one from the position measured last, without either from a place out of contact.
         """
-        positions, measured = self._positions, self._inputs.located
+        positions, inputs = self._positions, self._inputs
+        measured = inputs.located
         position = _float(position)
         if not self.cause:
             command = self._sent(position, _float(velocity), _float(acceleration))
-            faults = positions.limit(command, measured)
+            faults = positions.limit(command, position, measured, inputs.is_located)
             self.faults |= faults
             self.seen |= faults
             if not positions.fatal:
@@ -235,26 +238,6 @@ class Controller:
             self._fail(positions.fatal, "" if isfinite(command) else "the numerical model's motion")
         positions.retreat(measured, position)
         return positions.output
-
-    def take_over(self, position: float, velocity: float) -> bool:
-        """Take over drives that follow the numerical model's uniform motion already, before a run.
-
-        Drives in motion read behind their command: without this call the run begins from where they read,
-        and its first commands are cut to `velocity_limit` until they have caught up. With it, the first one
-        goes on from what the law commands for this motion.
-
-        Args:
-            position: the numerical model's before the run's first tick [m].
-            velocity: the model's [m/s].
-
-        Returns:
-            Whether the run begins from there. False, and nothing is changed, once tripped, once the run has
-            a command, if the model is in contact, and if the command is outside the stroke.
-        """
-        position = _float(position)
-        return not self.cause and self._positions.take_over(
-            position, self._sent(position, _float(velocity), 0.0)
-        )
 
     def _sent(self, position: float, velocity: float, acceleration: float) -> float:
         """The law's position command [m] for a motion; not a number if that has none."""
@@ -302,10 +285,9 @@ class Controller:
         """Begin a fresh run for the next contact: filters, delay lines and covariance restart.
 
         To be called when the rig has been brought to the start of the run: the first position command goes
-        on from where the drives then read (see `take_over` for drives in motion), not from the last
-        command. Identified parameters carry over, a trip stays latched, and the time until the
-        next tick does not count as missed. A contact still under way is audited first: what that finds is in
-        `faults` until the next `step`.
+        on from where the drives then read, not from the last command. Identified parameters carry over, a
+        trip stays latched, and the time until the next tick does not count as missed. A contact still under
+        way is audited first: what that finds is in `faults` until the next `step`.
         """
         if self.cause:
             return
@@ -319,6 +301,7 @@ class Controller:
         self._compensator.next_contact()
         self._clock.pause()
         self._inputs.restart()
+        self._inputs.is_located = False
         self._watchdog.restart()
         self._positions.release()
 

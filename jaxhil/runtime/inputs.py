@@ -24,7 +24,7 @@ from .faults import (
 )
 
 MOST_MISSED = 1_000_000  # periods counted for one gap, so that a wild clock stays a small number
-MISSING = 1.5  # periods since the last tick beyond which a tick is missing
+LONGEST_GAP = 1.5  # periods since the last tick beyond which a tick is missing
 DRIFT_KEPT = 0.99  # of the clock's drift from one tick to the next: it is forgotten over 100 ticks
 MOST_DRIFT = 1.0  # periods: a clock that runs 1 % fast or slow comes to it, jitter does not
 TARE_ROUNDING = 1e-9  # of a reading: what the mean of 1e6 equal readings may differ from them by
@@ -43,7 +43,7 @@ class Clock:
 
     def __init__(self, limits: Mapping[str, float], period: float) -> None:
         self._period = period
-        self._missing = MISSING * period
+        self._missing = LONGEST_GAP * period
         self._late = (1.0 + limits["late_fraction"]) * period
         self._early = (1.0 - limits["late_fraction"]) * period
         self._tolerated = limits["missed_in_a_row"]
@@ -172,14 +172,15 @@ class InputGuard:
     """The readings of one tick, checked one by one; see `faults.FAULTS` for what each check means.
 
     Attributes, of the last tick: `force` [N] without bias and `measured` [m], what the law is to use;
-    `fatal`, the faults that trip. `located` [m] is where the drives were read last, not a number before.
+    `fatal`, the faults that trip. `located` [m] is where the drives were read last, not a number before;
+    `is_located`, whether a reading in range of this run said so.
     """
 
     __slots__ = (
         "_bad_forces", "_bad_positions", "_clearance", "_desired", "_flight", "_force_limit",
         "_force_reading", "_force_stuck", "_force_travel", "_forces_in_flight", "_free_distance",
         "_free_force", "_held", "_highest", "_known", "_lowest", "_position_stuck", "_position_travel",
-        "_range", "_settling", "_trusted", "fatal", "force", "located", "measured",
+        "_range", "_settling", "fatal", "force", "is_located", "located", "measured",
     )  # fmt: skip
 
     def __init__(self, limits: Mapping[str, float], period: float, clearance: float) -> None:
@@ -194,12 +195,12 @@ class InputGuard:
         self._free_force = limits["free_force"]
         self._settling = limits["settling"] / period
         self.located = nan
+        self.is_located = False
         self.restart()
 
     def restart(self) -> None:
         """Forget the readings so far, but not where the drives were read last."""
         self._known = False
-        self._trusted = False
         self._bad_forces = 0
         self._bad_positions = 0
         self._forces_in_flight = 0
@@ -218,9 +219,9 @@ class InputGuard:
         Before a run's first reading in range, any that a rig can have is better than none.
         """
         if self._lowest <= position <= self._highest:
-            self._trusted = True
+            self.is_located = True
             self.located = position
-        elif not self._trusted and POSITIONS[0] <= position <= POSITIONS[1]:
+        elif not self.is_located and POSITIONS[0] <= position <= POSITIONS[1]:
             self.located = position
 
     def check(self, reading: float, desired: float, velocity: float, position: float, bias: float) -> int:

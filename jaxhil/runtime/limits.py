@@ -68,6 +68,9 @@ LIMITS: dict[str, Limit] = {
     "command_lowest": Limit("m", POSITIONS[0], *POSITIONS, "least position command"),
     "command_highest": Limit("m", POSITIONS[1], *POSITIONS, "largest position command"),
     "velocity_limit": Limit("m/s", SPEEDS[1], *SPEEDS, "fastest change of the position command"),
+    "start_distance": Limit(
+        "m", 0.0, *DISTANCES, "distance of a run's first command from where the drives read, out of contact"
+    ),
     "deceleration": Limit("m/s^2", DECELERATIONS[1], *DECELERATIONS, "braking and starting after a trip"),
     "retreat_velocity": Limit("m/s", 0.0, *SPEEDS, "speed of the way out of contact after a trip"),
     "equivalent_mass": Limit("kg", 0.0, 0.0, MASSES[1], "the model's; 0: no energies are audited"),

@@ -1,9 +1,9 @@
 """What goes out, limited: the force on the numerical model and the position command to the drives.
 
 Both guards hold the last value that they let out, so that nothing jumps: not on a trip, not on a reset.
-Where a run begins, the position command goes on from where the drives read, or from the command that they
-follow already. After a trip the force is led to 0; the position command brakes, and where it is in contact
-or nearer to a surface than `free_distance` it moves away at `retreat_velocity`, and comes to rest.
+Where a run begins, the position command goes on from where the drives read. After a trip the force is led to
+0; the position command brakes, and where it is in contact or nearer to a surface than `free_distance` it
+moves away at `retreat_velocity`, and comes to rest.
 """
 
 from collections.abc import Mapping
@@ -61,15 +61,17 @@ class ForceGuard:
 class PositionGuard:
     """The position command within the stroke, its change within `velocity_limit`.
 
-    No command is further from the last one, or from where the drives read if there is none, than the
-    velocity limit allows in a period; it is outside the stroke only on the way back from there.
+    No command is further from the last one than the velocity limit allows in a period. A run's first one is
+    as near to where the drives read; out of contact, where they follow late, within `start_distance` of it.
+    A command is outside the stroke only on the way back from there.
+
     Attributes: `output` [m], the command let out last; `known`, whether there has been one; `at_rest`,
     whether the last one after a trip did not move; `fatal`, the faults that trip.
     """
 
     __slots__ = (
         "_braking", "_clearance", "_cut", "_cut_tolerated", "_distance", "_engaged", "_highest", "_lowest",
-        "_most", "_rate", "_retreat", "at_rest", "fatal", "known", "output",
+        "_most", "_rate", "_retreat", "_start", "at_rest", "fatal", "known", "output",
     )  # fmt: skip
 
     def __init__(self, limits: Mapping[str, float], period: float, clearance: float) -> None:
@@ -83,6 +85,7 @@ class PositionGuard:
         distance, middle = limits["free_distance"], 0.5 * clearance
         self._distance = distance if distance < middle else middle
         self._cut_tolerated = limits["limited_in_a_row"]
+        self._start = limits["start_distance"]
         self.output = 0.0
         self.known = False
         self.restart()
@@ -100,22 +103,11 @@ class PositionGuard:
         self.known = False
         self.restart()
 
-    def take_over(self, position: float, command: float) -> bool:
-        """Go on from a `command` [m] that the drives follow already, the model being at `position` [m].
-
-        Refused, with False, once there is a command, in contact, and outside the stroke.
-        """
-        free = deflection(position, self._clearance) == 0.0
-        if self.known or not free or not self._lowest <= command <= self._highest:
-            return False
-        self.known = True
-        self.output = command
-        return True
-
-    def limit(self, command: float, measured: float) -> int:
+    def limit(self, command: float, position: float, measured: float, is_fresh: bool) -> int:
         """Let the command [m] out as far as the limits allow; the faults of that.
 
-        `measured` [m] is where the drives were read last, not a number if they never were.
+        `position` [m] is the numerical model's; `measured` [m] is where the drives were read last, not a
+        number if they never were; `is_fresh`, whether that was in this run.
         """
         self.fatal = 0
         if not isfinite(command):
@@ -125,7 +117,13 @@ class PositionGuard:
             self.fatal = STROKE
             return STROKE
         if not self.known:
-            self._stand(measured, command)
+            # Drives in motion follow late. Without a reading they have been brought to where the model is.
+            near = abs(command - (measured if is_fresh else position)) <= self._start
+            if near and deflection(position, self._clearance) == 0.0:
+                self.known = True
+                self.output = command
+            else:
+                self._stand(measured, position)
         before = self.output
         if abs(command - before) <= self._most:
             self._engaged = True
@@ -143,10 +141,7 @@ class PositionGuard:
         return VELOCITY_LIMIT
 
     def retreat(self, measured: float, position: float) -> None:
-        """One period of the way to rest out of contact, from where the drives are.
-
-        `measured` [m] as in `limit`, `position` [m] the numerical model's.
-        """
+        """Go on for a period to rest out of contact, from where the drives are; positions as in `limit`."""
         if not self.known:
             self._stand(measured, position)
         output = self.output
@@ -176,7 +171,7 @@ class PositionGuard:
         self.at_rest = rate == 0.0 and wanted == 0.0
 
     def _stand(self, measured: float, position: float) -> None:
-        """Begin where the drives read; if they never were, where the model is, but free and in the stroke."""
+        """Begin where the drives read; if they never were, where the model is, but free and in stroke."""
         self.known = True
         self.output = measured
         if isfinite(measured):

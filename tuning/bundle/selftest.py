@@ -280,8 +280,6 @@ def replay(rows, gains, runtime):
             raise ValueError(f"line {number}: event {event!r}, expected 0, 1 or 2, the first tick's 1")
         elif event == 2:
             controller.next_contact()
-        if event:  # a run begins, with drives that follow the numerical model already
-            controller.take_over(position, velocity)
         command = controller.step(force, position, velocity, measured, time)
         # An integer in the file stands for the bits of the faults; all else are floats.
         found = command, controller.position_command(*motion), float(controller.faults)

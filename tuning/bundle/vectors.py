@@ -197,8 +197,6 @@ def _through(
     for one in inputs:
         if one.event == NEXT_CONTACT:
             controller.next_contact()
-        if one.event:
-            controller.take_over(one.position_desired, one.velocity_desired)
         force = controller.step(*one[2:6], one.time)
         if one.motion is None:
             acceleration = -(0.0 if one.zeroed else force) * inverse_mass

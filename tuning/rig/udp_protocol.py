@@ -291,7 +291,6 @@ class ControllerTask:
         if self._run >= 0 and not self._controller.tripped:
             self._controller.next_contact()
             faults = self._reported_faults()
-        self._controller.take_over(model.position, model.velocity)
         self._command = self._controller.position_command(model.position, model.velocity, model.acceleration)
         self._run, self._last, self._force = reading.run, None, 0.0
         return faults

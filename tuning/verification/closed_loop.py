@@ -49,8 +49,6 @@ def run_closed_loop(loaded: LoadedGains, gain_file: GainFile, batch: Scenario) -
             force, position, velocity, measured, age = (float(leaf[0]) for leaf in jax.device_get(signals))
             if age == 0 and started:
                 controller.next_contact()
-            if age == 0:
-                controller.take_over(position, velocity)
             command = controller.step(force, position, velocity, measured)
             if age == 0 and zeroed:
                 command = 0.0

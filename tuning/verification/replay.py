@@ -150,8 +150,6 @@ def replayed(controller: Controller, lane: Lane) -> tuple[np.ndarray, np.ndarray
     for tick, (force, position, velocity, measured, age) in enumerate(readings):
         if age == 0 and tick > 0:
             controller.next_contact()
-        if age == 0:
-            controller.take_over(position, velocity)
         command = controller.step(force, position, velocity, measured)
         identified, sent = controller.identified, math.nan
         if lane.sent is not None and tick + 1 < len(readings) and readings[tick + 1][4] == age + 1:

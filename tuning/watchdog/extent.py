@@ -18,6 +18,9 @@ class Extent(NamedTuple):
     sent_highest: Float[np.ndarray, "lanes"]  # position command [m]
     command: Float[np.ndarray, "lanes"]  # largest |F_c| [N]
     slew: Float[np.ndarray, "lanes"]  # its fastest change [N/s]
+    start: Float[
+        np.ndarray, "lanes"
+    ]  # largest distance of a run's first command from the measured position [m]
     sent_speed: Float[np.ndarray, "lanes"]  # fastest change of the position command [m/s]
     speed: Float[np.ndarray, "lanes"]  # fastest change of the desired position [m/s]
     acceleration: Float[np.ndarray, "lanes"]  # fastest change of the desired velocity [m/s^2]
@@ -56,6 +59,7 @@ def extent_of(
         sent_highest=-least(-sent),
         command=largest(np.abs(command), live),
         slew=largest(step, live) / period,
+        start=largest(np.abs(sent - measured), begins & live),
         sent_speed=largest(np.abs(np.diff(sent, axis=0)), goes_on) / period,
         speed=largest(np.abs(np.diff(position, axis=0)), goes_on) / period,
         acceleration=largest(np.abs(np.diff(velocity, axis=0)), goes_on) / period,
