@@ -194,7 +194,7 @@ def _rate(run: FaultRun, begin: int, rng: np.random.Generator) -> int:
     run.rows[begin:end, TIME] += PERIOD * wrong * np.arange(1, UNTIL_RESET + 1)
     run.rows[end:, TIME] += PERIOD * wrong * UNTIL_RESET
     tick, drift = begin, wrong
-    while abs(drift) <= 1.0:
+    while abs(drift) <= 1.5:
         tick, drift = tick + 1, 0.99 * drift + wrong
     run.faults[tick] |= CLOCK
     return tick

@@ -202,12 +202,26 @@ def test_model_that_is_no_number_at_first_leaves_the_drives_where_they_are(bad, 
     assert abs(results[0, POSITION] - drives) <= STEP
 
 
-def test_retreat_from_outside_the_stroke_comes_back_without_a_leap():
-    results = in_both(plain(), rows_of(*[{"measured": 0.02, "x": math.nan}] * 4000))
+@pytest.mark.parametrize(("drives", "way", "rest"), [(0.02, -1.0, -5e-4), (-0.046, 1.0, -0.0295)])
+def test_retreat_from_outside_the_stroke_comes_back_without_a_leap(drives, way, rest):
+    """From beyond either end, and either surface of a gap of 30 mm."""
+    gain_file = plain()._replace(clearance=0.03)
+    results = in_both(gain_file, rows_of(*[{"measured": drives, "x": math.nan}] * 4000))
     commands = results[:, POSITION]
-    assert commands[0] == pytest.approx(0.02, abs=STEP) and np.all(np.diff(commands) <= 0.0)
-    assert results[-1, RESULT.index("at_rest")] and commands[-1] < -LIMITED["free_distance"]
+    assert commands[0] == pytest.approx(drives, abs=STEP) and np.all(way * np.diff(commands) >= 0.0)
+    assert results[-1, RESULT.index("at_rest")] and 0.0 <= way * (commands[-1] - rest) < 1.2e-4
     assert np.all(np.abs(np.diff(commands)) <= LIMITED["retreat_velocity"] * PERIOD * (1 + 1e-9))
+
+
+def test_drives_brought_elsewhere_begin_the_next_run_there():
+    """Announced, and before a reading of the new run, the model says where: out of contact alone."""
+    controller = limited()
+    for model, expected in ((-0.03, -0.03), (5e-4, -0.01 + STEP), (0.02, -0.01)):
+        controller.reset()
+        controller.next_contact()
+        controller.step(0.0, -0.01, 0.0, -0.01)
+        controller.next_contact()
+        assert controller.position_command(model, 0.0, 0.0) == pytest.approx(expected, rel=1e-12)
 
 
 def test_first_reading_of_the_position_is_not_bridged():

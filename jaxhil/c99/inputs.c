@@ -48,7 +48,7 @@ typedef struct {
 
 static const double jaxhil_longest_gap = 1.5; /* periods since the last tick beyond which a tick is missing */
 static const double jaxhil_drift_kept = 0.99; /* of the clock's drift, from one tick to the next */
-static const double jaxhil_most_drift = 1.0; /* periods */
+static const double jaxhil_most_drift = 1.5; /* periods */
 static const double jaxhil_tare_rounding = 1e-9; /* of a reading */
 
 static void jaxhil_clock_pause(jaxhil_clock *clock) {
@@ -74,20 +74,29 @@ static void jaxhil_clock_init(jaxhil_clock *clock, const jaxhil_limits *limits, 
     jaxhil_clock_reset(clock);
 }
 
+/* Take note of the drift [periods]; the tick's fault, or that clock and ticks have parted. */
+static uint32_t jaxhil_clock_part(jaxhil_clock *clock, double drift, uint32_t fault) {
+    clock->drift = drift;
+    if (fabs(drift) > jaxhil_most_drift) {
+        clock->fatal = true;
+        return JAXHIL_CLOCK;
+    }
+    return fault;
+}
+
 /* Count the ticks missed in a gap of so many periods; the fault. */
 static uint32_t jaxhil_clock_miss(jaxhil_clock *clock, double periods) {
     int64_t left_out = JAXHIL_MOST_MISSED - 1;
-    if (periods > JAXHIL_MOST_MISSED) {
-        clock->drift = 0.0;
-    } else {
+    double drift = 0.0;
+    if (!(periods > JAXHIL_MOST_MISSED)) {
         left_out = (int64_t)(periods + 0.5) - 1;
-        clock->drift = jaxhil_drift_kept * clock->drift + (periods - 1.0 - (double)left_out);
+        drift = jaxhil_drift_kept * clock->drift + (periods - 1.0 - (double)left_out);
     }
     clock->missed += left_out;
     clock->awaited = left_out;
     clock->in_a_row += left_out;
     clock->fatal = (double)clock->in_a_row > clock->tolerated;
-    return JAXHIL_MISSED_TICK;
+    return jaxhil_clock_part(clock, drift, JAXHIL_MISSED_TICK);
 }
 
 static uint32_t jaxhil_clock_tick(jaxhil_clock *clock, double time) {
@@ -127,12 +136,7 @@ static uint32_t jaxhil_clock_tick(jaxhil_clock *clock, double time) {
             fault = JAXHIL_LATE_TICK;
         }
     }
-    clock->drift = drift;
-    if (fabs(drift) > jaxhil_most_drift) {
-        clock->fatal = true;
-        return JAXHIL_CLOCK;
-    }
-    return fault;
+    return jaxhil_clock_part(clock, drift, fault);
 }
 
 static void jaxhil_bias_tare_begin(jaxhil_bias_tare *tare) {

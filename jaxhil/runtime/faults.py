@@ -107,8 +107,8 @@ FAULTS = (
     Fault(
         CLOCK,
         "clock",
-        "the tick's time is not finite, or not after the last tick's; or over about 100 ticks the time has "
-        "parted from the ticks, with those missed, by more than one period",
+        "the tick's time is not finite, or not after the last tick's; or over about 100 ticks the time "
+        "has parted from the ticks, with those missed, by more than one and a half periods",
         _TRIPS,
     ),
     Fault(FORCE_LIMIT, "force_limit", "the compensated force is beyond `force_limit`", _TRIPS),

@@ -26,7 +26,7 @@ from .faults import (
 MOST_MISSED = 1_000_000  # periods counted for one gap, so that a wild clock stays a small number
 LONGEST_GAP = 1.5  # periods since the last tick beyond which a tick is missing
 DRIFT_KEPT = 0.99  # of the clock's drift from one tick to the next: it is forgotten over 100 ticks
-MOST_DRIFT = 1.0  # periods: a clock that runs 1 % fast or slow comes to it, jitter does not
+MOST_DRIFT = 1.5  # periods: a clock that runs 1.5 % fast or slow comes to it, jitter does not
 TARE_ROUNDING = 1e-9  # of a reading: what the mean of 1e6 equal readings may differ from them by
 
 
@@ -94,24 +94,28 @@ class Clock:
             if gap > self._late:
                 self.late += 1
                 fault = LATE_TICK
+        return self._part(drift, fault)
+
+    def _miss(self, periods: float) -> int:
+        """Count the ticks missed in a gap of so many periods; the fault."""
+        if periods > MOST_MISSED:
+            left_out, drift = MOST_MISSED - 1, 0.0
+        else:
+            left_out = int(periods + 0.5) - 1
+            drift = DRIFT_KEPT * self._drift + (periods - 1.0 - left_out)
+        self.missed += left_out
+        self._awaited = left_out
+        self._in_a_row += left_out
+        self.fatal = self._in_a_row > self._tolerated
+        return self._part(drift, MISSED_TICK)
+
+    def _part(self, drift: float, fault: int) -> int:
+        """Take note of the drift [periods]; the tick's fault, or that clock and ticks have parted."""
         self._drift = drift
         if abs(drift) > MOST_DRIFT:
             self.fatal = True
             return CLOCK
         return fault
-
-    def _miss(self, periods: float) -> int:
-        """Count the ticks missed in a gap of so many periods; the fault."""
-        if periods > MOST_MISSED:
-            left_out, self._drift = MOST_MISSED - 1, 0.0
-        else:
-            left_out = int(periods + 0.5) - 1
-            self._drift = DRIFT_KEPT * self._drift + (periods - 1.0 - left_out)
-        self.missed += left_out
-        self._awaited = left_out
-        self._in_a_row += left_out
-        self.fatal = self._in_a_row > self._tolerated
-        return MISSED_TICK
 
 
 class Tare:
