@@ -9,6 +9,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "clock.c"
 #include "faults_table.c"
 #include "inputs.c"
 #include "law_defaults.c"

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from math import isfinite, nan
 from typing import Any
 
+from .clock import Clock
 from .errors import refusal, shown
 from .faults import (
     CLOCK,
@@ -24,7 +25,7 @@ from .faults import (
     names,
 )
 from .gain_file import GainFile, check_gain_document, read_gain_document
-from .inputs import Clock, InputGuard, Tare
+from .inputs import InputGuard, Tare
 from .law_status import STATUSES, UNSTATED, ContactRecord
 from .outputs import ForceGuard, PositionGuard
 from .registry import COMPENSATORS
