@@ -37,7 +37,8 @@ RESULT = (
     *("force_delay", "contact_plane"),
 )
 STATUS_NAMES = tuple(status.name for status in STATUSES)
-TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE = (float(code) for code in range(6))
+TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, COMMAND_FIRST, STEP_ONLY = map(float, range(8))
+EVENTS = (TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, COMMAND_FIRST, STEP_ONLY)
 PERIOD = 0.001
 CAPACITY = 64  # periods of delay, of those drawn
 LINES = DelayLine.LONGEST  # periods of delay that the compiled laws hold
@@ -266,8 +267,7 @@ def drawn_rows(kind: str, count: int, rng: np.random.Generator, period: float) -
         taken = rng.random((count, 9)) < rng.choice([0.001, 0.03, 0.5])
         taken[:, 5] = False
         rows[:, 1:] = np.where(taken, rng.choice(HOSTILE, (count, 9)), rows[:, 1:])
-    events = [TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE]
-    rows[:, 0] = rng.choice(events, count, p=[0.9, 0.03, 0.02, 0.002, 0.01, 0.038])
+    rows[:, 0] = rng.choice(EVENTS, count, p=[0.87, 0.03, 0.02, 0.002, 0.01, 0.038, 0.02, 0.01])
     if rng.random() < 0.5:  # a rig that begins with a tare, and whose force sensor then resolves little
         rows[:6, 0] = TARE
         rows[:, 1] = np.where(np.abs(rows[:, 1]) < 1e6, 50.0 * np.round(rows[:, 1] / 50.0), rows[:, 1])
@@ -318,8 +318,7 @@ def drawn_exactly(law: str, count: int, rng: np.random.Generator) -> tuple[GainF
     gaps = rng.choice([1.0, 1.25, 1.5, 2.0, 3.0, 5.0, 1e6 - 0.5], count, p=[0.9, 0.03, 0.03, *[0.01] * 4])
     rows[:, 5] = period * np.cumsum(gaps)
     rows[:, 6] = 1.0
-    events = [TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE]
-    rows[:, 0] = rng.choice(events, count, p=[0.8, 0.08, 0.02, 0.005, 0.045, 0.05])
+    rows[:, 0] = rng.choice(EVENTS, count, p=[0.77, 0.08, 0.02, 0.005, 0.045, 0.05, 0.02, 0.01])
     if only_expected:  # no stop of the clock or of the rig either
         rows[:, 0] = np.where(rows[:, 0] == NEXT_CONTACT, NEXT_CONTACT, TICK)
         rows[:, 6] = 0.0
@@ -349,9 +348,9 @@ def controller_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
     watchdog = controller._watchdog
     results = np.zeros((len(rows), len(RESULT)))
     for row, result in zip(rows.tolist(), results, strict=True):
-        answer = _event(controller, row[0], row[1])
+        answer = _event(controller, row)
         result[0] = controller.step(*row[1:5], row[5] if row[6] else None)
-        result[1] = controller.position_command(*row[7:])
+        result[1] = 0.0 if row[0] == STEP_ONLY else controller.position_command(*row[7:])
         result[2:4] = controller.identified
         result[4] = STATUS_NAMES.index(controller.law_status)
         result[5:8] = controller.faults, controller.seen, controller.cause
@@ -366,11 +365,14 @@ def controller_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
     return results
 
 
-def _event(controller: Controller, code: float, force: float) -> bool:
+def _event(controller: Controller, row: list[float]) -> float:
+    code = row[0]
     if code == RESET:
         return controller.reset()
     if code == TARE:
-        return controller.tare(force)
+        return controller.tare(row[1])
+    if code == COMMAND_FIRST:
+        return controller.position_command(*row[7:])
     if code == NEXT_CONTACT:
         controller.next_contact()
     elif code in (STOP, RELEASE):

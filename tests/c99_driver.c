@@ -11,7 +11,7 @@
 /* A row: event, force, desired position and velocity, measured position, time, whether it is given, the
  * model's position, velocity and acceleration. A result: see `result`. */
 enum { ROW = 10, RESULT = 28 };
-enum { TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE };
+enum { TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, COMMAND_FIRST, STEP_ONLY };
 enum { GAINS = sizeof(jaxhil_gains) / sizeof(double), LIMITS = sizeof(jaxhil_limits) / sizeof(double) };
 
 size_t driver_size(void);
@@ -54,12 +54,16 @@ void driver_law(jaxhil_controller *controller, size_t count, const double *rows,
     }
 }
 
-static double event(jaxhil_controller *controller, double code, double force) {
+static double event(jaxhil_controller *controller, const double *row) {
+    const double code = row[0];
     if (code == RESET) {
         return jaxhil_reset(controller);
     }
     if (code == TARE) {
-        return jaxhil_tare(controller, force);
+        return jaxhil_tare(controller, row[1]);
+    }
+    if (code == COMMAND_FIRST) {
+        return jaxhil_position_command(controller, row[7], row[8], row[9]);
     }
     if (code == NEXT_CONTACT) {
         jaxhil_next_contact(controller);
@@ -72,10 +76,10 @@ static double event(jaxhil_controller *controller, double code, double force) {
 void driver_run(jaxhil_controller *controller, size_t count, const double *rows, double *results) {
     for (size_t n = 0; n < count; n++, rows += ROW, results += RESULT) {
         double *result = results;
-        const double answer = event(controller, rows[0], rows[1]);
+        const double answer = event(controller, rows);
         const double *time = rows[6] != 0.0 ? &rows[5] : NULL;
         *result++ = jaxhil_step(controller, rows[1], rows[2], rows[3], rows[4], time);
-        *result++ = jaxhil_position_command(controller, rows[7], rows[8], rows[9]);
+        *result++ = rows[0] == STEP_ONLY ? 0.0 : jaxhil_position_command(controller, rows[7], rows[8], rows[9]);
         jaxhil_identified(controller, result, result + 1);
         result += 2;
         *result++ = jaxhil_law_status(controller);

@@ -14,6 +14,7 @@ from gain_documents import gain_document, sign
 
 from jaxhil.runtime.faults import (
     CLOCK,
+    EARLY_TICK,
     FORCE_IN_FLIGHT,
     FORCE_LIMIT,
     FORCE_NOT_FINITE,
@@ -60,6 +61,7 @@ LIMITED: dict[str, float] = {
 }
 FORCE, DESIRED, VELOCITY, MEASURED, TIME, MODEL = 1, 2, 3, 4, 5, 7
 BETWEEN, UNTIL_RESET = 60, 20
+BEFORE = 60  # ticks of a contact's approach that a law needs to know the noise
 NOT_FINITE = (math.nan, math.inf, -math.inf)
 # Leads short enough that what is injected, and nothing else, takes a command to its limits.
 GENTLE = {
@@ -72,8 +74,8 @@ class FaultRun(NamedTuple):
     """Ticks and what they must raise, (ticks,); `tripped` says on which ticks the latch must hold.
 
     `catching_up` are ticks after a reset on which the command, which had been led elsewhere, comes back
-    within the velocity limit, and says so; `entered` those of a contact in which a reset fell, and a
-    while after: a law with a status does not know such a contact, and may say so.
+    within the velocity limit, and says so; `entered` those of a contact in which, or shortly before which, a
+    reset fell, and a while after: a law with a status does not know such a contact, and may say so.
     """
 
     rows: np.ndarray
@@ -122,7 +124,7 @@ def fault_run(ticks: int, seed: int, law: str) -> FaultRun:
             tripped[tick:end] = True
             rows[end, 0] = RESET
             run.catching_up[end : end + 10] = kind is _fast_position
-            if rows[end, DESIRED] > 0 or rows[end, MEASURED] > 0:
+            if np.any(rows[end : end + BEFORE, [DESIRED]] > 0) or rows[end, MEASURED] > 0:
                 run.entered[end : end + CYCLE // 2] = True
     return run
 
@@ -173,8 +175,29 @@ def _bad_model(column: int):
 
 
 def _late(run: FaultRun, begin: int, rng: np.random.Generator) -> None:
+    """The clock goes on as before: the next tick comes early after this one."""
     run.rows[begin, TIME] += PERIOD * rng.uniform(0.26, 0.49)
     run.faults[begin] |= LATE_TICK
+    run.faults[begin + 1] |= EARLY_TICK
+
+
+def _early(run: FaultRun, begin: int, rng: np.random.Generator) -> None:
+    run.rows[begin, TIME] -= PERIOD * rng.uniform(0.26, 0.49)
+    run.faults[begin] |= EARLY_TICK
+    run.faults[begin + 1] |= LATE_TICK
+
+
+def _rate(run: FaultRun, begin: int, rng: np.random.Generator) -> int:
+    """Ticks a little too fast or too slow, none of which is early or late by itself."""
+    wrong = _pick(rng, (-0.24, -0.21, -0.16, 0.16, 0.21, 0.24))
+    end = begin + UNTIL_RESET
+    run.rows[begin:end, TIME] += PERIOD * wrong * np.arange(1, UNTIL_RESET + 1)
+    run.rows[end:, TIME] += PERIOD * wrong * UNTIL_RESET
+    tick, drift = begin, wrong
+    while abs(drift) <= 1.5:
+        tick, drift = tick + 1, 0.99 * drift + wrong
+    run.faults[tick] |= CLOCK
+    return tick
 
 
 def _missed(run: FaultRun, begin: int, rng: np.random.Generator) -> int | None:
@@ -256,7 +279,7 @@ _EVERYWHERE = (
     _bad_reading(MEASURED, POSITION_OUT_OF_RANGE, (0.0101, -0.0101, 1e300)),
     *(_bad_model(column) for column in (DESIRED, VELOCITY, MODEL, MODEL + 1, MODEL + 2)),
     _stuck(MEASURED, DESIRED, "position_stuck_travel", POSITION_STUCK),
-    *(_late, _missed, _clock, _stroke, _fast_position),
+    *(_late, _early, _rate, _missed, _clock, _stroke, _fast_position),
 )
 _IN_CONTACT = (_stuck(FORCE, MEASURED, "force_stuck_travel", FORCE_STUCK),)
 _IN_FLIGHT = (_bias,)

@@ -1,6 +1,7 @@
 """The C99 controller as sources: no warning, no memory of its own, no more exported than needed."""
 
 import functools
+import platform
 import re
 import shutil
 import subprocess
@@ -14,7 +15,6 @@ from gain_documents import gain_document, sign
 
 from jaxhil.errors import InputError
 from jaxhil.runtime import COMPENSATORS, GainFileError
-from tuning.bundle import c99
 from tuning.bundle.c99 import c99_texts
 
 pytestmark = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
@@ -66,20 +66,90 @@ def test_controller_keeps_no_memory_of_its_own_and_calls_nothing_but_math(law, c
     assert all(name.startswith("jaxhil_") for name in visible)
 
 
-def test_header_can_be_used_from_cpp(tmp_path):
-    if shutil.which("c++") is None:
-        pytest.skip("no C++ compiler (c++) on this machine")
-    folder = c99_cases.write_sources(tmp_path, gain_document())
-    (folder / "use.cpp").write_text('#include "jaxhil_controller.h"\njaxhil_controller controller;\n')
-    command = ["c++", "-std=c++11", "-Wall", "-Wextra", "-Werror", "-pedantic", "-c", "use.cpp"]
-    assert subprocess.run(command, cwd=folder).returncode == 0
+def compilers(*names: str):
+    """The test once for each of these compilers; skipped where there is none of the name."""
+    cases = [
+        pytest.param(name, marks=pytest.mark.skipif(shutil.which(name) is None, reason=f"no {name} here"))
+        for name in names
+    ]
+    return pytest.mark.parametrize("compiler", cases)
 
 
-def test_unsafe_arithmetic_is_refused_by_the_header(tmp_path):
+USE = """\
+#include "jaxhil_controller.h"
+#include "jaxhil_gains.h"
+static jaxhil_controller controller;
+int main(void) {
+    return jaxhil_init(&controller, &jaxhil_exported_gains, &jaxhil_exported_limits) ? 0 : 1;
+}
+"""
+
+
+@compilers("g++", "clang++")
+@pytest.mark.parametrize("standard", ["c++11", "c++17"])
+def test_headers_can_be_used_from_cpp(compiler, standard, tmp_path):
+    """As ROS 2 builds: the controller in C, what calls it in C++17."""
     folder = c99_cases.write_sources(tmp_path, gain_document())
-    command = [str(c99_cases.COMPILER), *c99.FLAGS, "-ffast-math", "-fsyntax-only", "jaxhil_controller.c"]
+    (folder / "use.cpp").write_text(USE)
+    controller = compiled(folder, "jaxhil_controller.c", "controller.o", "-c", "-O2")
+    flags = [f"-std={standard}", "-Wall", "-Wextra", "-Werror", "-pedantic"]
+    command = [compiler, *flags, "use.cpp", str(controller), "-lm", "-o", "use"]
     ran = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-    assert ran.returncode != 0 and "-ffast-math loses" in ran.stderr
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert subprocess.run([str(folder / "use")]).returncode == 0
+
+
+@compilers("gcc", "clang")
+@pytest.mark.parametrize("standard", ["c99", "gnu99", "c11", "gnu17"])
+def test_sources_compile_without_a_warning(compiler, standard, tmp_path):
+    folder = c99_cases.write_sources(tmp_path, gain_document())
+    for source in ("jaxhil_controller.c", "test_vectors.c"):
+        command = [compiler, f"-std={standard}", "-O2", "-Wall", "-Wextra", "-pedantic", "-c", source]
+        ran = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+        assert (ran.returncode, ran.stderr) == (0, "")
+
+
+@compilers("gcc", "clang")
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["-ffast-math"],
+        ["-Ofast"],
+        ["-ffinite-math-only"],
+        ["-D_M_FP_FAST"],  # as MSVC says it
+        ["-fassociative-math", "-fno-signed-zeros", "-fno-trapping-math"],
+        ["-freciprocal-math"],
+    ],
+    ids=lambda flags: flags[0],
+)
+def test_unsafe_arithmetic_is_refused_by_the_header(compiler, flags, tmp_path):
+    folder = c99_cases.write_sources(tmp_path, gain_document())
+    told = subprocess.run(
+        [compiler, *flags, "-dM", "-E", "-"], input="", capture_output=True, text=True
+    ).stdout
+    if not re.search(r"FAST_MATH__|FINITE_MATH_ONLY__ 1|_M_FP_FAST|ASSOCIATIVE|RECIPROCAL", told):
+        pytest.skip("this compiler does not tell the code")
+    command = [compiler, "-std=c99", *flags, "-fsyntax-only", "test_vectors.c"]
+    ran = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert ran.returncode != 0 and re.search("error.*math", ran.stderr)
+
+
+@compilers("gcc", "clang")
+def test_multiplication_and_addition_are_never_fused(compiler, tmp_path):
+    """Neither where the rig's own flags allow it, for a processor that can."""
+    if platform.machine() != "x86_64":
+        pytest.skip("the names of the instructions are those of x86")
+    folder = c99_cases.write_sources(tmp_path, gain_document())
+    fusing = ["-std=gnu99", "-O2", "-mfma", "-S", "-o", "-"]
+    (folder / "fused.c").write_text("double f(double a, double b, double c) { return a * b + c; }\n")
+    probe = subprocess.run([compiler, *fusing, "fused.c"], cwd=folder, capture_output=True, text=True)
+    assert "vfmadd" in probe.stdout
+    ran = subprocess.run(
+        [compiler, *fusing, "jaxhil_controller.c"], cwd=folder, capture_output=True, text=True
+    )
+    assert (ran.returncode, ran.stderr) == (0, "")
+    # The vectoriser of GCC 12 makes a vfmaddsub of 2 a + b and 2 a - b, whatever it is told: 2 a is exact.
+    assert "mulsd" in ran.stdout and not re.search(r"vfn?m(add|sub)\d", ran.stdout)
 
 
 def test_only_what_the_law_needs_is_exported():

@@ -329,6 +329,7 @@ def test_the_extent_of_a_run():
         "sent_highest": 7.0,
         "command": 2.0,
         "slew": 6.0,
+        "start": 1.0,
         "sent_speed": 10.0,
         "speed": 8.0,
         "acceleration": 8.0,
@@ -338,6 +339,15 @@ def test_the_extent_of_a_run():
         "flight_spread": 0.0,
     }
     assert {name: float(values[0]) for name, values in found._asdict().items()} == expected
+
+
+@pytest.mark.parametrize(("force", "travel"), [(0.0, 1.5 + 0.5), (5.0, 1.5 + 0.5 + 0.5 + 0.3 + 0.5)])
+def test_extent_counts_no_force_only_on_the_way_into_a_contact(force, travel):
+    """As the runtime's guard does: a damped mechanism comes out of it without a force."""
+    flat = dict.fromkeys(("position", "velocity", "command", "sent"), [0.0] * 6)
+    made = signals(force=[force] * 6, measured=[-1.0, 0.5, 1.0, 0.5, 0.2, 0.7], **flat)
+    found = extent_of(made, period=0.5, clearance=math.inf, free_distance=2.0, settling=0.5)
+    assert float(found.force_stuck[0]) == pytest.approx(travel)
 
 
 def test_margins_are_on_good_runs_alone(calibrated):

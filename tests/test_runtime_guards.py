@@ -282,7 +282,8 @@ def test_without_limits_a_gain_file_gives_the_law_within_the_outermost_limits():
         for n in range(200):
             position = 9.9e-3 * n * (-1) ** (n // 100)
             controller.next_contact()
-            assert controller.step(9.9e5 * (-1) ** n, 1e3, 5.0, 0.0, 10.0**n / 1e200) == 9.9e5 * (-1) ** n
+            force = 9.9e5 * (-1) ** n
+            assert controller.step(force, 1e3, 5.0, position, 10.0**n / 1e200) == force
             assert controller.position_command(position, 5.0, 0.0) == position
         assert controller.status == "ok"
 

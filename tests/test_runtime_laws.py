@@ -159,6 +159,7 @@ def test_response_error_agrees_with_matrix_equations(delay, clearance):
 @pytest.mark.parametrize("name", sorted(set(GAINS) - {"position_lead"}))
 def test_a_law_that_leads_the_force_commands_the_position_itself(name):
     controller = Controller.from_dict(gain_document(name))
+    controller.step(0.0, 0.25, 3.0, 0.25)
     assert controller.position_command(0.25, 3.0, -7.0) == 0.25
 
 

@@ -278,7 +278,7 @@ def test_c_controller_is_compiled_and_run(files, folder, monkeypatch):
     assert good and re.search(rf"ok    c99: vectors.csv: {TICKS + 60} ticks, the same bit for bit", out), out
     document = json.loads(files["gains.json"])
     header = files["c99/jaxhil_gains.h"].decode()
-    value = re.search(r"[0-9]\.[0-9]+(e-[0-9]+)?", header)[0]
+    value = re.search(r"([-0-9.e]+), /\* phase_lead,", header)[1]
     for old, new, reason in [
         (value, str(2 * float(value)), r"FAIL  c99: vectors.csv:\d+: force_command: found"),
         ("#define", "#defin", "FAIL  c99: .*error"),

@@ -9,6 +9,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "clock.c"
 #include "faults_table.c"
 #include "inputs.c"
 #include "law_defaults.c"
@@ -46,7 +47,12 @@ bool jaxhil_tare(jaxhil_controller *controller, double force_measured);
 double jaxhil_step(jaxhil_controller *controller, double force_measured, double position_desired,
                    double velocity_desired, double position_measured, const double *time);
 
-/* The position [m] to command, from the numerical model's motion [m, m/s, m/s^2] after this tick's step. */
+/* The position [m] to command, from the numerical model's motion [m, m/s, m/s^2] after this tick's step. Whatever it
+ * is given, it is at most `velocity_limit` times the period from the last command. A run's first command is as near
+ * to the measured position; out of contact, where drives in motion follow late, it may be within `start_distance` of
+ * it. Before a run's first step, the model's position, if it is out of contact, is taken for where the rig has been
+ * brought to. A trip leads away from the last command, without one from the position measured last, without either
+ * from a place out of contact. */
 double jaxhil_position_command(jaxhil_controller *controller, double position, double velocity,
                                double acceleration);
 
@@ -56,11 +62,13 @@ double jaxhil_position_command(jaxhil_controller *controller, double position, d
 void jaxhil_emergency_stop(jaxhil_controller *controller, bool active);
 
 /* Restart everything but the tare: filters, identified parameters, a trip, the count of ticks. Without a
- * bump. Refused, with false, while the emergency stop is active. */
+ * bump: force and position command go on from the last ones. If the drives have been moved since by other means,
+ * call jaxhil_next_contact as well. Refused, with false, while the emergency stop is active. */
 bool jaxhil_reset(jaxhil_controller *controller);
 
-/* Begin a fresh run for the next contact, the rig having been brought to its start. Identified parameters
- * carry over, a trip stays latched. A contact still under way is audited first: what that finds is in `faults`
+/* Begin a fresh run for the next contact, the rig having been brought to its start: the first position command goes
+ * on from where the drives then read, not from the last command. Identified parameters carry over, a trip stays
+ * latched. A contact still under way is audited first: what that finds is in `faults`
  * until the next step. */
 void jaxhil_next_contact(jaxhil_controller *controller);
 
@@ -161,6 +169,7 @@ double jaxhil_step(jaxhil_controller *controller, double force_measured, double 
     uint32_t faults = 0;
     uint32_t fatal = 0;
     controller->faults = 0;
+    jaxhil_input_guard_locate(inputs, position_measured);
     if (controller->cause) {
         jaxhil_force_guard_fade(forces);
         return forces->output;
@@ -196,14 +205,20 @@ double jaxhil_step(jaxhil_controller *controller, double force_measured, double 
     return forces->output;
 }
 
+/* The law's position command [m] for a motion; not a number if that has none. */
+static double jaxhil_sent(jaxhil_controller *controller, double position, double velocity, double acceleration) {
+    const bool finite = isfinite(position) && isfinite(velocity) && isfinite(acceleration);
+    return finite ? jaxhil_law_position_command(&controller->law, position, velocity, acceleration) : NAN;
+}
+
 double jaxhil_position_command(jaxhil_controller *controller, double position, double velocity,
                                double acceleration) {
     jaxhil_position_guard *positions = &controller->positions;
+    const double measured = controller->inputs.located;
     if (!controller->cause) {
-        const bool finite = isfinite(position) && isfinite(velocity) && isfinite(acceleration);
-        const double command =
-            finite ? jaxhil_law_position_command(&controller->law, position, velocity, acceleration) : NAN;
-        const uint32_t faults = jaxhil_position_guard_limit(positions, command);
+        const double command = jaxhil_sent(controller, position, velocity, acceleration);
+        const uint32_t faults = jaxhil_position_guard_limit(positions, command, position, measured,
+                                                            controller->inputs.is_located);
         controller->faults |= faults;
         controller->seen |= faults;
         if (!positions->fatal) {
@@ -211,8 +226,7 @@ double jaxhil_position_command(jaxhil_controller *controller, double position, d
         }
         jaxhil_fail(controller, positions->fatal);
     }
-    /* Nothing was commanded yet: the drives are where the numerical model is, or else where they read. */
-    jaxhil_position_guard_retreat(positions, isfinite(position) ? position : controller->inputs.measured);
+    jaxhil_position_guard_retreat(positions, measured, position);
     return positions->output;
 }
 
@@ -248,6 +262,7 @@ void jaxhil_next_contact(jaxhil_controller *controller) {
     jaxhil_law_next_contact(&controller->law);
     jaxhil_clock_pause(&controller->clock);
     jaxhil_input_guard_restart(&controller->inputs);
+    controller->inputs.is_located = false;
     jaxhil_watchdog_restart(&controller->watchdog);
     jaxhil_position_guard_release(&controller->positions);
 }

@@ -1,4 +1,4 @@
-/* What comes in, checked: clock, sensor readings, the numerical model's motion.
+/* What comes in, checked: sensor readings, the numerical model's motion.
  *
  * A bad sensor reading is replaced by the last good one.
  */
@@ -11,14 +11,6 @@
 
 /* == Declarations == */
 
-/* The times of the ticks: which came late, and how many were missed. */
-typedef struct {
-    double period, missing, late_gap, tolerated;
-    double time;
-    int64_t missed, late;
-    bool fatal;
-} jaxhil_clock;
-
 /* The bias of the force sensor [N], as the mean of `tare_ticks` readings out of contact. */
 typedef struct {
     double ticks, spread, limit, range;
@@ -28,69 +20,20 @@ typedef struct {
 } jaxhil_bias_tare;
 
 /* The readings of one tick, checked one by one: `force` [N] without bias and `measured` [m] are what the law
- * is to use, `fatal` the faults that trip. */
+ * is to use, `fatal` the faults that trip. `located` [m] is where the drives were read last, NAN before;
+ * `is_located`, whether a reading in range of this run said so. */
 typedef struct {
     double clearance, range, lowest, highest, held, force_stuck, position_stuck;
     double free_distance, free_force, settling;
-    double force_reading, force_travel, position_travel, desired, force, measured;
+    double force_reading, force_travel, position_travel, desired, force, measured, located;
     int64_t bad_forces, bad_positions, forces_in_flight, flight;
     uint32_t fatal;
-    bool known;
+    bool known, is_located;
 } jaxhil_input_guard;
 
 /* == Definitions == */
 
-/* Periods counted for one gap, so that a wild clock stays a small number. */
-#define JAXHIL_MOST_MISSED 1000000
-
-static void jaxhil_clock_pause(jaxhil_clock *clock) {
-    clock->time = -INFINITY;
-    clock->fatal = false;
-}
-
-static void jaxhil_clock_reset(jaxhil_clock *clock) {
-    clock->missed = 0;
-    clock->late = 0;
-    jaxhil_clock_pause(clock);
-}
-
-static void jaxhil_clock_init(jaxhil_clock *clock, const jaxhil_limits *limits, double period) {
-    clock->period = period;
-    clock->missing = 1.5 * period;
-    clock->late_gap = (1.0 + limits->late_fraction) * period;
-    clock->tolerated = limits->missed_in_a_row;
-    jaxhil_clock_reset(clock);
-}
-
-static uint32_t jaxhil_clock_tick(jaxhil_clock *clock, double time) {
-    clock->fatal = false;
-    if (!isfinite(time)) {
-        clock->fatal = true;
-        return JAXHIL_CLOCK;
-    }
-    if (clock->time == -INFINITY) { /* the first tick */
-        clock->time = time;
-        return 0;
-    }
-    const double gap = time - clock->time;
-    if (!(gap > 0.0)) {
-        clock->fatal = true;
-        return JAXHIL_CLOCK;
-    }
-    clock->time = time;
-    if (gap > clock->missing) {
-        const double periods = gap / clock->period + 0.5;
-        const int64_t left_out = (periods > JAXHIL_MOST_MISSED ? JAXHIL_MOST_MISSED : (int64_t)periods) - 1;
-        clock->missed += left_out;
-        clock->fatal = (double)left_out > clock->tolerated;
-        return JAXHIL_MISSED_TICK;
-    }
-    if (gap > clock->late_gap) {
-        clock->late++;
-        return JAXHIL_LATE_TICK;
-    }
-    return 0;
-}
+static const double jaxhil_tare_rounding = 1e-9; /* of a reading */
 
 static void jaxhil_bias_tare_begin(jaxhil_bias_tare *tare) {
     tare->count = 0;
@@ -167,11 +110,27 @@ static void jaxhil_input_guard_init(jaxhil_input_guard *guard, const jaxhil_limi
     guard->free_distance = limits->free_distance;
     guard->free_force = limits->free_force;
     guard->settling = limits->settling / period;
+    guard->located = NAN;
+    guard->is_located = false;
     jaxhil_input_guard_restart(guard);
 }
 
-/* Take this tick's position in [m], the numerical model's being `desired` [m]; its fault. */
-static uint32_t jaxhil_input_guard_position(jaxhil_input_guard *guard, double position, double desired) {
+/* Take note of where the drives read [m], also once tripped. Before a run's first reading in range, any that a
+ * rig can have is better than none. */
+static void jaxhil_input_guard_locate(jaxhil_input_guard *guard, double position) {
+    if (guard->lowest <= position && position <= guard->highest) {
+        guard->is_located = true;
+        guard->located = position;
+    } else if (!guard->is_located && jaxhil_no_limits.measured_lowest <= position &&
+               position <= jaxhil_no_limits.measured_highest) {
+        guard->located = position;
+    }
+}
+
+/* Take this tick's position in [m], the numerical model's being `desired` [m]; its fault. On the first tick there
+ * is no good one to go on with, and nobody knows where the drives are. */
+static uint32_t jaxhil_input_guard_position(jaxhil_input_guard *guard, double position, double desired,
+                                            bool first) {
     uint32_t fault = 0;
     if (isfinite(position) && guard->lowest <= position && position <= guard->highest) {
         guard->bad_positions = 0;
@@ -186,9 +145,23 @@ static uint32_t jaxhil_input_guard_position(jaxhil_input_guard *guard, double po
     } else {
         fault = isfinite(position) ? JAXHIL_POSITION_OUT_OF_RANGE : JAXHIL_POSITION_NOT_FINITE;
         guard->bad_positions++;
-        guard->fatal |= (double)guard->bad_positions > guard->held ? fault : 0;
+        guard->fatal |= first || (double)guard->bad_positions > guard->held ? fault : 0;
     }
     guard->desired = desired;
+    return fault;
+}
+
+/* The force reads as before, in contact, while the measured position went so much deeper [m]; the fault. */
+static uint32_t jaxhil_input_guard_same_force(jaxhil_input_guard *guard, double deeper) {
+    if (fabs(guard->force) <= jaxhil_tare_rounding * fabs(guard->force_reading)) {
+        /* A damped mechanism comes out without a force, but none can be pressed in without one. */
+        const double travel = guard->force_travel + deeper;
+        guard->force_travel = travel > 0.0 ? travel : 0.0;
+    } else {
+        guard->force_travel += fabs(deeper);
+    }
+    const uint32_t fault = guard->force_travel > guard->force_stuck ? JAXHIL_FORCE_STUCK : 0;
+    guard->fatal |= fault;
     return fault;
 }
 
@@ -198,15 +171,13 @@ static uint32_t jaxhil_input_guard_force(jaxhil_input_guard *guard, double readi
     uint32_t fault = 0;
     if (isfinite(reading) && fabs(reading) < guard->range) {
         guard->bad_forces = 0;
+        guard->force = reading - bias;
         if (reading == guard->force_reading && (measured > 0.0 || measured < -guard->clearance)) {
-            guard->force_travel += fabs(measured - before);
-            fault = guard->force_travel > guard->force_stuck ? JAXHIL_FORCE_STUCK : 0;
-            guard->fatal |= fault;
+            fault = jaxhil_input_guard_same_force(guard, measured > 0.0 ? measured - before : before - measured);
         } else {
             guard->force_travel = 0.0;
         }
         guard->force_reading = reading;
-        guard->force = reading - bias;
     } else {
         fault = isfinite(reading) ? JAXHIL_FORCE_OUT_OF_RANGE : JAXHIL_FORCE_NOT_FINITE;
         guard->bad_forces++;
@@ -223,7 +194,8 @@ static uint32_t jaxhil_input_guard_check(jaxhil_input_guard *guard, double readi
         return JAXHIL_MODEL_NOT_FINITE;
     }
     guard->fatal = 0;
-    if (!guard->known) {
+    const bool first = !guard->known;
+    if (first) {
         /* Before the first tick there is no good reading: no force, and the position as desired. */
         guard->known = true;
         guard->desired = desired;
@@ -231,7 +203,7 @@ static uint32_t jaxhil_input_guard_check(jaxhil_input_guard *guard, double readi
         guard->force_reading = INFINITY;
     }
     const double before = guard->measured;
-    uint32_t faults = jaxhil_input_guard_position(guard, position, desired);
+    uint32_t faults = jaxhil_input_guard_position(guard, position, desired, first);
     faults |= jaxhil_input_guard_force(guard, reading, before, bias);
     const double measured = guard->measured;
     if (measured < -guard->free_distance && measured > guard->free_distance - guard->clearance) {

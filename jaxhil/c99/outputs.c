@@ -1,6 +1,7 @@
 /* What goes out, limited: the force on the numerical model and the position command to the drives.
  *
- * Both guards hold the last value that they let out, so that nothing jumps: not on a trip, not on a reset.
+ * Both guards hold the last value that they let out, so that nothing jumps: not on a trip, not on a reset. Where a
+ * run begins, the position command goes on from where the drives read.
  */
 #include <math.h>
 #include <stdbool.h>
@@ -8,6 +9,7 @@
 
 #include "faults_table.c"
 #include "limits_table.c"
+#include "surfaces.c"
 
 /* == Declarations == */
 
@@ -19,9 +21,12 @@ typedef struct {
     uint32_t fatal;
 } jaxhil_force_guard;
 
-/* The position command within the stroke, its change within `velocity_limit`; the retreat after a trip. */
+/* The position command within the stroke, its change within `velocity_limit`; the retreat after a trip. No command
+ * is further from the last one than the velocity limit allows in a period. A run's first one is as near to where the
+ * drives read; out of contact, where they follow late, within `start_distance` of it. A command is outside the
+ * stroke only on the way back from there. */
 typedef struct {
-    double clearance, lowest, highest, most, braking, retreat, distance, cut_tolerated;
+    double clearance, lowest, highest, most, braking, retreat, distance, start, cut_tolerated;
     double output, rate;
     int64_t cut;
     uint32_t fatal;
@@ -104,6 +109,7 @@ static void jaxhil_position_guard_init(jaxhil_position_guard *guard, const jaxhi
     guard->retreat = limits->retreat_velocity * period;
     guard->distance = distance < middle ? distance : middle;
     guard->cut_tolerated = limits->limited_in_a_row;
+    guard->start = limits->start_distance;
     guard->output = 0.0;
     guard->known = false;
     jaxhil_position_guard_restart(guard);
@@ -115,8 +121,32 @@ static void jaxhil_position_guard_release(jaxhil_position_guard *guard) {
     jaxhil_position_guard_restart(guard);
 }
 
-/* Let the command [m] out as far as the limits allow; the faults of that. */
-static uint32_t jaxhil_position_guard_limit(jaxhil_position_guard *guard, double command) {
+/* Begin where the drives read; if they never were, where the model is, but free and in the stroke. */
+static void jaxhil_position_guard_stand(jaxhil_position_guard *guard, double measured, double position) {
+    guard->known = true;
+    guard->output = measured;
+    if (isfinite(measured)) {
+        return;
+    }
+    double start = position;
+    if (!isfinite(position) || position > 0.0) {
+        start = -guard->distance;
+    } else if (position < -guard->clearance) {
+        start = guard->distance - guard->clearance;
+    }
+    if (start < guard->lowest) {
+        start = guard->lowest;
+    } else if (start > guard->highest) {
+        start = guard->highest;
+    }
+    guard->output = start;
+}
+
+/* Let the command [m] out as far as the limits allow; the faults of that. `position` [m] is the numerical model's;
+ * `measured` [m] is where the drives were read last, NAN if they never were; `is_fresh`, whether that was in this
+ * run. */
+static uint32_t jaxhil_position_guard_limit(jaxhil_position_guard *guard, double command, double position,
+                                            double measured, bool is_fresh) {
     guard->fatal = 0;
     if (!isfinite(command)) {
         guard->fatal = JAXHIL_MODEL_NOT_FINITE;
@@ -127,10 +157,14 @@ static uint32_t jaxhil_position_guard_limit(jaxhil_position_guard *guard, double
         return JAXHIL_STROKE;
     }
     if (!guard->known) {
-        guard->known = true;
-        guard->engaged = true;
-        guard->output = command;
-        return 0;
+        /* Drives in motion follow late. Without a reading they have been brought to where the model is. */
+        const bool near = fabs(command - (is_fresh ? measured : position)) <= guard->start;
+        if (near && jaxhil_deflection(position, guard->clearance) == 0.0) {
+            guard->known = true;
+            guard->output = command;
+        } else {
+            jaxhil_position_guard_stand(guard, measured, position);
+        }
     }
     const double before = guard->output;
     if (fabs(command - before) <= guard->most) {
@@ -152,12 +186,10 @@ static uint32_t jaxhil_position_guard_limit(jaxhil_position_guard *guard, double
     return JAXHIL_VELOCITY_LIMIT;
 }
 
-/* One period of the way to rest out of contact; from `start` [m] if nothing was let out yet. */
-static void jaxhil_position_guard_retreat(jaxhil_position_guard *guard, double start) {
+/* One period of the way to rest out of contact, from where the drives are; positions as above. */
+static void jaxhil_position_guard_retreat(jaxhil_position_guard *guard, double measured, double position) {
     if (!guard->known) {
-        const double raised = guard->lowest > start ? guard->lowest : start;
-        guard->known = true;
-        guard->output = guard->highest < raised ? guard->highest : raised;
+        jaxhil_position_guard_stand(guard, measured, position);
     }
     const double output = guard->output;
     double wanted = 0.0;
@@ -176,15 +208,12 @@ static void jaxhil_position_guard_retreat(jaxhil_position_guard *guard, double s
         rate = wanted;
     }
     double moved = output + rate;
-    if (!isfinite(moved)) { /* after a step from one end of what a double can be to the other */
-        moved = output;
+    /* What begins outside the stroke may come back, and goes no further out. */
+    if (moved < guard->lowest && rate < 0.0) {
+        moved = output < guard->lowest ? output : guard->lowest;
         rate = 0.0;
-    }
-    if (moved < guard->lowest) {
-        moved = guard->lowest;
-        rate = 0.0;
-    } else if (moved > guard->highest) {
-        moved = guard->highest;
+    } else if (moved > guard->highest && rate > 0.0) {
+        moved = output > guard->highest ? output : guard->highest;
         rate = 0.0;
     }
     guard->rate = rate;

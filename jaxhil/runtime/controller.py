@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from math import isfinite, nan
 from typing import Any
 
+from .clock import Clock
 from .errors import refusal, shown
 from .faults import (
     CLOCK,
@@ -24,7 +25,7 @@ from .faults import (
     names,
 )
 from .gain_file import GainFile, check_gain_document, read_gain_document
-from .inputs import Clock, InputGuard, Tare
+from .inputs import InputGuard, Tare
 from .law_status import STATUSES, UNSTATED, ContactRecord
 from .outputs import ForceGuard, PositionGuard
 from .registry import COMPENSATORS
@@ -168,6 +169,10 @@ class Controller:
         """
         forces = self._forces
         self.faults = 0
+        # Only what is no float yet takes time to be made one: the rig's numbers are.
+        measured = position_measured if type(position_measured) is float else _float(position_measured)
+        inputs = self._inputs
+        inputs.locate(measured)
         if self.cause:
             forces.fade()
             return forces.output
@@ -177,12 +182,9 @@ class Controller:
             faults = self._clock.tick(_float(time))
             if self._clock.fatal:
                 fatal = faults
-        # Only what is no float yet takes time to be made one: the rig's numbers are.
         reading = force_measured if type(force_measured) is float else _float(force_measured)
         position = position_desired if type(position_desired) is float else _float(position_desired)
         velocity = velocity_desired if type(velocity_desired) is float else _float(velocity_desired)
-        measured = position_measured if type(position_measured) is float else _float(position_measured)
-        inputs = self._inputs
         faults |= inputs.check(reading, position, velocity, measured, self._tare.bias)
         fatal |= inputs.fatal
         compensator = self._compensator
@@ -195,7 +197,7 @@ class Controller:
         if not fatal:
             try:
                 command = compensator.step(inputs.force, position, velocity, inputs.measured)
-            except ArithmeticError:
+            except Exception:  # a law's; the rig must not be left without a command
                 command = nan
             faults |= forces.limit(command)
             fatal = forces.fatal
@@ -217,27 +219,35 @@ class Controller:
         """The position [m] to command, from the numerical model's motion after this tick's step.
 
         Position in m, velocity in m/s, acceleration in m/s^2. Once tripped, the way to rest out of contact.
+
+        Whatever it is given, it is at most `velocity_limit` times the period from the last command. A run's
+        first command is as near to the measured position; out of contact, where drives in motion follow late,
+        it may be within `start_distance` of it. Before a run's first `step`, the model's position, if it is
+        out of contact, is taken for where the rig has been brought to. A trip leads away from the last
+        command, without one from the position measured last, without either from a place out of contact.
         """
-        positions = self._positions
+        positions, inputs = self._positions, self._inputs
+        measured = inputs.located
+        position = _float(position)
         if not self.cause:
-            position, velocity, acceleration = _float(position), _float(velocity), _float(acceleration)
-            finite = isfinite(position) and isfinite(velocity) and isfinite(acceleration)
-            command = nan
-            if finite:
-                try:
-                    command = self._compensator.position_command(position, velocity, acceleration)
-                except ArithmeticError:
-                    command = nan
-            faults = positions.limit(command)
+            command = self._sent(position, _float(velocity), _float(acceleration))
+            faults = positions.limit(command, position, measured, inputs.is_located)
             self.faults |= faults
             self.seen |= faults
             if not positions.fatal:
                 return positions.output
-            self._fail(positions.fatal, "the numerical model's motion" if not finite else "")
-        # Nothing was commanded yet: the drives are where the numerical model is, or else where they read.
-        start = _float(position)
-        positions.retreat(start if isfinite(start) else self._inputs.measured)
+            self._fail(positions.fatal, "" if isfinite(command) else "the numerical model's motion")
+        positions.retreat(measured, position)
         return positions.output
+
+    def _sent(self, position: float, velocity: float, acceleration: float) -> float:
+        """The law's position command [m] for a motion; not a number if that has none."""
+        if not (isfinite(position) and isfinite(velocity) and isfinite(acceleration)):
+            return nan
+        try:
+            return self._compensator.position_command(position, velocity, acceleration)
+        except Exception:  # a law's; the rig must not be left without a command
+            return nan
 
     def emergency_stop(self, active: bool) -> None:
         """Tell the controller the state of the rig's emergency stop; active, it trips.
@@ -253,8 +263,9 @@ class Controller:
     def reset(self) -> bool:
         """Restart everything but the tare: filters, identified parameters, a trip, the count of ticks.
 
-        Without a bump: force and position command go on from where they are, within their limits. Refused,
-        with False, while the emergency stop is active.
+        Without a bump: force and position command go on from the last ones, within their limits. If the
+        drives have been moved since by other means, call `next_contact` as well. Refused, with False, while
+        the emergency stop is active.
         """
         if self._stopped:
             return False
@@ -274,10 +285,10 @@ class Controller:
     def next_contact(self) -> None:
         """Begin a fresh run for the next contact: filters, delay lines and covariance restart.
 
-        To be called when the rig has been brought to the start of the run: the first position command is
-        then where it begins. Identified parameters carry over, a trip stays latched, and the time until the
-        next tick does not count as missed. A contact still under way is audited first: what that finds is in
-        `faults` until the next `step`.
+        To be called when the rig has been brought to the start of the run: the first position command goes
+        on from where the drives then read, not from the last command. Identified parameters carry over, a
+        trip stays latched, and the time until the next tick does not count as missed. A contact still under
+        way is audited first: what that finds is in `faults` until the next `step`.
         """
         if self.cause:
             return
@@ -291,6 +302,7 @@ class Controller:
         self._compensator.next_contact()
         self._clock.pause()
         self._inputs.restart()
+        self._inputs.is_located = False
         self._watchdog.restart()
         self._positions.release()
 

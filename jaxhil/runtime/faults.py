@@ -40,13 +40,20 @@ CONTACT_TOO_LONG = 0x40000
 EMERGENCY_STOP = 0x80000
 TARE = 0x100000
 LAW_IN_DOUBT = 0x200000
+EARLY_TICK = 0x400000
 
 _HELD = "the last good reading is used; more than `held_readings` in a row trip"
+_HELD_AFTER_THE_FIRST = f"{_HELD}, and so does one on a run's first tick"
 _TRIPS = "trips"
 
 FAULTS = (
     Fault(FORCE_NOT_FINITE, "force_not_finite", "the measured force is not a finite number", _HELD),
-    Fault(POSITION_NOT_FINITE, "position_not_finite", "the measured position is not a finite number", _HELD),
+    Fault(
+        POSITION_NOT_FINITE,
+        "position_not_finite",
+        "the measured position is not a finite number",
+        _HELD_AFTER_THE_FIRST,
+    ),
     Fault(
         MODEL_NOT_FINITE,
         "model_not_finite",
@@ -60,13 +67,13 @@ FAULTS = (
         POSITION_OUT_OF_RANGE,
         "position_out_of_range",
         "the measured position is outside `measured_lowest` to `measured_highest`",
-        _HELD,
+        _HELD_AFTER_THE_FIRST,
     ),
     Fault(
         FORCE_STUCK,
         "force_stuck",
         "in contact, the force reading has stayed the same to the bit while the measured position moved "
-        "by more than `force_stuck_travel`",
+        "by more than `force_stuck_travel`; a reading of no force, while it moved deeper by as much",
         _TRIPS,
     ),
     Fault(
@@ -86,16 +93,24 @@ FAULTS = (
     Fault(
         LATE_TICK,
         "late_tick",
-        "the tick comes later than the period by more than `late_fraction` of it",
+        "the time since the last tick is longer than the period by more than `late_fraction` of it, and at "
+        "most one and a half periods",
         "flagged and counted",
     ),
     Fault(
         MISSED_TICK,
         "missed_tick",
         "more than one and a half periods have passed since the last tick",
-        "flagged and counted, the law is stepped once; more than `missed_in_a_row` trip",
+        "flagged and counted, the law is stepped once; more than `missed_in_a_row` without a tick in time "
+        "between them trip",
     ),
-    Fault(CLOCK, "clock", "the tick's time is not finite, or not after the last tick's", _TRIPS),
+    Fault(
+        CLOCK,
+        "clock",
+        "the tick's time is not finite, or not after the last tick's; or over about 100 ticks the time "
+        "has parted from the ticks, with those missed, by more than one and a half periods",
+        _TRIPS,
+    ),
     Fault(FORCE_LIMIT, "force_limit", "the compensated force is beyond `force_limit`", _TRIPS),
     Fault(
         FORCE_SLEW,
@@ -108,8 +123,8 @@ FAULTS = (
         VELOCITY_LIMIT,
         "velocity_limit",
         "the position command changes faster than `velocity_limit`",
-        "the change is cut to the limit; more than `limited_in_a_row` ticks trip, but for the way back "
-        "to the numerical model after `reset`",
+        "the change is cut to the limit; more than `limited_in_a_row` ticks trip, but for the way to the "
+        "numerical model at the beginning of a run and after `reset`",
     ),
     Fault(COMMAND_NOT_FINITE, "command_not_finite", "the compensated force is not a finite number", _TRIPS),
     Fault(
@@ -145,6 +160,13 @@ FAULTS = (
         "watchdog: a contact is over of which the law says that it was unsure, too short, displaced or noisy "
         "on more than two fifths of its ticks, or the correction at its limit on more than half",
         "flagged; `last_contact` says which",
+    ),
+    Fault(
+        EARLY_TICK,
+        "early_tick",
+        "the time since the last tick is shorter than the period by more than `late_fraction` of it: a "
+        "repeated tick, or one that follows a late one",
+        "flagged",
     ),
 )
 

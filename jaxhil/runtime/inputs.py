@@ -1,79 +1,25 @@
-"""What comes in, checked: clock, sensor readings, the numerical model's motion.
+"""What comes in, checked: sensor readings, the numerical model's motion.
 
 A bad sensor reading is replaced by the last good one. `InputGuard.check` says which faults a tick has and
 which of them trip; `force` and `measured` are then what the law is to use.
 """
 
 from collections.abc import Mapping
-from math import inf, isfinite
+from math import inf, isfinite, nan
 
+from .bounds import POSITIONS
 from .faults import (
-    CLOCK,
     FORCE_IN_FLIGHT,
     FORCE_NOT_FINITE,
     FORCE_OUT_OF_RANGE,
     FORCE_STUCK,
-    LATE_TICK,
-    MISSED_TICK,
     MODEL_NOT_FINITE,
     POSITION_NOT_FINITE,
     POSITION_OUT_OF_RANGE,
     POSITION_STUCK,
 )
 
-MOST_MISSED = 1_000_000  # periods counted for one gap, so that a wild clock stays a small number
-
-
-class Clock:
-    """The times of the ticks: which came late, and how many were missed.
-
-    Attributes: `missed` and `late`, ticks counted; `fatal`, whether the last tick's fault trips.
-    """
-
-    __slots__ = ("_late", "_missing", "_period", "_time", "_tolerated", "fatal", "late", "missed")
-
-    def __init__(self, limits: Mapping[str, float], period: float) -> None:
-        self._period = period
-        self._missing = 1.5 * period
-        self._late = (1.0 + limits["late_fraction"]) * period
-        self._tolerated = limits["missed_in_a_row"]
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the last tick and the counts."""
-        self.missed = 0
-        self.late = 0
-        self.pause()
-
-    def pause(self) -> None:
-        """Let the time until the next tick be any."""
-        self._time = -inf
-        self.fatal = False
-
-    def tick(self, time: float) -> int:
-        """The fault of a tick at `time` [s], 0 if it comes as it should."""
-        self.fatal = False
-        if not isfinite(time):
-            self.fatal = True
-            return CLOCK
-        if self._time == -inf:  # the first tick
-            self._time = time
-            return 0
-        gap = time - self._time
-        if not gap > 0.0:
-            self.fatal = True
-            return CLOCK
-        self._time = time
-        if gap > self._missing:
-            periods = gap / self._period + 0.5
-            left_out = (MOST_MISSED if periods > MOST_MISSED else int(periods)) - 1
-            self.missed += left_out
-            self.fatal = left_out > self._tolerated
-            return MISSED_TICK
-        if gap > self._late:
-            self.late += 1
-            return LATE_TICK
-        return 0
+TARE_ROUNDING = 1e-9  # of a reading: what the mean of 1e6 equal readings may differ from them by
 
 
 class Tare:
@@ -134,14 +80,15 @@ class InputGuard:
     """The readings of one tick, checked one by one; see `faults.FAULTS` for what each check means.
 
     Attributes, of the last tick: `force` [N] without bias and `measured` [m], what the law is to use;
-    `fatal`, the faults that trip.
+    `fatal`, the faults that trip. `located` [m] is where the drives were read last, not a number before;
+    `is_located`, whether a reading in range of this run said so.
     """
 
     __slots__ = (
         "_bad_forces", "_bad_positions", "_clearance", "_desired", "_flight", "_force_limit",
         "_force_reading", "_force_stuck", "_force_travel", "_forces_in_flight", "_free_distance",
         "_free_force", "_held", "_highest", "_known", "_lowest", "_position_stuck", "_position_travel",
-        "_range", "_settling", "fatal", "force", "measured",
+        "_range", "_settling", "fatal", "force", "is_located", "located", "measured",
     )  # fmt: skip
 
     def __init__(self, limits: Mapping[str, float], period: float, clearance: float) -> None:
@@ -155,10 +102,12 @@ class InputGuard:
         self._free_distance = limits["free_distance"]
         self._free_force = limits["free_force"]
         self._settling = limits["settling"] / period
+        self.located = nan
+        self.is_located = False
         self.restart()
 
     def restart(self) -> None:
-        """Forget the readings so far."""
+        """Forget the readings so far, but not where the drives were read last."""
         self._known = False
         self._bad_forces = 0
         self._bad_positions = 0
@@ -172,6 +121,17 @@ class InputGuard:
         self.measured = 0.0
         self.fatal = 0
 
+    def locate(self, position: float) -> None:
+        """Take note of where the drives read [m], also once tripped.
+
+        Before a run's first reading in range, any that a rig can have is better than none.
+        """
+        if self._lowest <= position <= self._highest:
+            self.is_located = True
+            self.located = position
+        elif not self.is_located and POSITIONS[0] <= position <= POSITIONS[1]:
+            self.located = position
+
     def check(self, reading: float, desired: float, velocity: float, position: float, bias: float) -> int:
         """The faults of the readings of a tick: force [N], the model's motion [m, m/s], position [m]."""
         if not (isfinite(desired) and isfinite(velocity)):
@@ -179,7 +139,8 @@ class InputGuard:
             return MODEL_NOT_FINITE
         faults = 0
         self.fatal = 0
-        if not self._known:
+        first = not self._known
+        if first:
             # Before the first tick there is no good reading: no force, and the position as desired.
             self._known = True
             self._desired = desired
@@ -195,18 +156,18 @@ class InputGuard:
                 self._position_travel = 0.0
             self.measured = position
         else:
-            faults = self._bad_position(position)
+            faults = self._bad_position(position, first)
         self._desired = desired
         measured = self.measured
 
         if isfinite(reading) and abs(reading) < self._range:
             self._bad_forces = 0
+            self.force = reading - bias
             if reading == self._force_reading and (measured > 0.0 or measured < -self._clearance):
-                faults |= self._same_force(abs(measured - before))
+                faults |= self._same_force(measured - before if measured > 0.0 else before - measured)
             else:
                 self._force_travel = 0.0
             self._force_reading = reading
-            self.force = reading - bias
         else:
             faults |= self._bad_force(reading)
 
@@ -224,10 +185,11 @@ class InputGuard:
 
     # What only a tick that is not as it should be needs stands in functions of its own, which cost it alone.
 
-    def _bad_position(self, position: float) -> int:
+    def _bad_position(self, position: float, first: bool) -> int:
+        # On the first tick there is no good one to go on with, and nobody knows where the drives are.
         fault = POSITION_OUT_OF_RANGE if isfinite(position) else POSITION_NOT_FINITE
         self._bad_positions += 1
-        self.fatal |= fault if self._bad_positions > self._held else 0
+        self.fatal |= fault if first or self._bad_positions > self._held else 0
         return fault
 
     def _bad_force(self, reading: float) -> int:
@@ -243,9 +205,14 @@ class InputGuard:
         self.fatal |= fault
         return fault
 
-    def _same_force(self, travel: float) -> int:
-        """The force reads as before, in contact, while the measured position has travelled so far [m]."""
-        self._force_travel += travel
+    def _same_force(self, deeper: float) -> int:
+        """The force reads as before, in contact, while the measured position went so much deeper [m]."""
+        if abs(self.force) <= TARE_ROUNDING * abs(self._force_reading):
+            # A damped mechanism comes out without a force, but none can be pressed in without one.
+            travel = self._force_travel + deeper
+            self._force_travel = travel if travel > 0.0 else 0.0
+        else:
+            self._force_travel += abs(deeper)
         fault = FORCE_STUCK if self._force_travel > self._force_stuck else 0
         self.fatal |= fault
         return fault

@@ -53,7 +53,9 @@ LIMITS: dict[str, Limit] = {
     "free_distance": Limit("m", 0.0, *DISTANCES, "distance from a surface that counts as out of contact"),
     "settling": Limit("s", 0.0, 0.0, 100.0, "time that force and command need to die out after contact"),
     "free_force": Limit("N", FORCES[1], *FORCES, "largest force reading out of contact"),
-    "late_fraction": Limit("1", 0.5, 0.0, 1.0, "lateness of a tick, in periods, that is flagged"),
+    "late_fraction": Limit(
+        "1", 0.25, 0.0, 1.0, "lateness or earliness of a tick, in periods, that is flagged; late: below 0.5"
+    ),
     "missed_in_a_row": Limit("1", COUNTED[1], *COUNTED, "missed ticks in a row that are bridged"),
     "tare_ticks": Limit("1", 0.0, *COUNTED, "readings that a tare averages"),
     "tare_spread": Limit("N", FORCES[1], *FORCES, "largest difference between readings of a tare"),
@@ -66,6 +68,9 @@ LIMITS: dict[str, Limit] = {
     "command_lowest": Limit("m", POSITIONS[0], *POSITIONS, "least position command"),
     "command_highest": Limit("m", POSITIONS[1], *POSITIONS, "largest position command"),
     "velocity_limit": Limit("m/s", SPEEDS[1], *SPEEDS, "fastest change of the position command"),
+    "start_distance": Limit(
+        "m", 0.0, *DISTANCES, "distance of a run's first command from where the drives read, out of contact"
+    ),
     "deceleration": Limit("m/s^2", DECELERATIONS[1], *DECELERATIONS, "braking and starting after a trip"),
     "retreat_velocity": Limit("m/s", 0.0, *SPEEDS, "speed of the way out of contact after a trip"),
     "equivalent_mass": Limit("kg", 0.0, 0.0, MASSES[1], "the model's; 0: no energies are audited"),

@@ -1,14 +1,16 @@
 """What goes out, limited: the force on the numerical model and the position command to the drives.
 
 Both guards hold the last value that they let out, so that nothing jumps: not on a trip, not on a reset.
-After a trip the force is led to 0; the position command brakes, and where it is in contact or nearer to a
-surface than `free_distance` it moves away at `retreat_velocity`, and comes to rest.
+Where a run begins, the position command goes on from where the drives read. After a trip the force is led to
+0; the position command brakes, and where it is in contact or nearer to a surface than `free_distance` it
+moves away at `retreat_velocity`, and comes to rest.
 """
 
 from collections.abc import Mapping
 from math import isfinite
 
 from .faults import COMMAND_NOT_FINITE, FORCE_LIMIT, FORCE_SLEW, MODEL_NOT_FINITE, STROKE, VELOCITY_LIMIT
+from .surfaces import deflection
 
 
 class ForceGuard:
@@ -59,13 +61,17 @@ class ForceGuard:
 class PositionGuard:
     """The position command within the stroke, its change within `velocity_limit`.
 
+    No command is further from the last one than the velocity limit allows in a period. A run's first one is
+    as near to where the drives read; out of contact, where they follow late, within `start_distance` of it.
+    A command is outside the stroke only on the way back from there.
+
     Attributes: `output` [m], the command let out last; `known`, whether there has been one; `at_rest`,
     whether the last one after a trip did not move; `fatal`, the faults that trip.
     """
 
     __slots__ = (
         "_braking", "_clearance", "_cut", "_cut_tolerated", "_distance", "_engaged", "_highest", "_lowest",
-        "_most", "_rate", "_retreat", "at_rest", "fatal", "known", "output",
+        "_most", "_rate", "_retreat", "_start", "at_rest", "fatal", "known", "output",
     )  # fmt: skip
 
     def __init__(self, limits: Mapping[str, float], period: float, clearance: float) -> None:
@@ -79,6 +85,7 @@ class PositionGuard:
         distance, middle = limits["free_distance"], 0.5 * clearance
         self._distance = distance if distance < middle else middle
         self._cut_tolerated = limits["limited_in_a_row"]
+        self._start = limits["start_distance"]
         self.output = 0.0
         self.known = False
         self.restart()
@@ -96,8 +103,12 @@ class PositionGuard:
         self.known = False
         self.restart()
 
-    def limit(self, command: float) -> int:
-        """Let the command [m] out as far as the limits allow; the faults of that."""
+    def limit(self, command: float, position: float, measured: float, is_fresh: bool) -> int:
+        """Let the command [m] out as far as the limits allow; the faults of that.
+
+        `position` [m] is the numerical model's; `measured` [m] is where the drives were read last, not a
+        number if they never were; `is_fresh`, whether that was in this run.
+        """
         self.fatal = 0
         if not isfinite(command):
             self.fatal = MODEL_NOT_FINITE
@@ -106,10 +117,13 @@ class PositionGuard:
             self.fatal = STROKE
             return STROKE
         if not self.known:
-            self.known = True
-            self._engaged = True
-            self.output = command
-            return 0
+            # Drives in motion follow late. Without a reading they have been brought to where the model is.
+            near = abs(command - (measured if is_fresh else position)) <= self._start
+            if near and deflection(position, self._clearance) == 0.0:
+                self.known = True
+                self.output = command
+            else:
+                self._stand(measured, position)
         before = self.output
         if abs(command - before) <= self._most:
             self._engaged = True
@@ -126,11 +140,10 @@ class PositionGuard:
         self._rate = self.output - before
         return VELOCITY_LIMIT
 
-    def retreat(self, start: float) -> None:
-        """One period of the way to rest out of contact; from `start` [m] if nothing was let out yet."""
+    def retreat(self, measured: float, position: float) -> None:
+        """Go on for a period to rest out of contact, from where the drives are; positions as in `limit`."""
         if not self.known:
-            self.known = True
-            self.output = min(max(start, self._lowest), self._highest)
+            self._stand(measured, position)
         output = self.output
         wanted = 0.0
         if output > -self._distance:
@@ -146,18 +159,33 @@ class PositionGuard:
         else:
             rate = wanted
         moved = output + rate
-        if not isfinite(moved):  # after a step from one end of what a float can be to the other
-            moved = output
+        # What begins outside the stroke may come back, and goes no further out.
+        if moved < self._lowest and rate < 0.0:
+            moved = output if output < self._lowest else self._lowest
             rate = 0.0
-        if moved < self._lowest:
-            moved = self._lowest
-            rate = 0.0
-        elif moved > self._highest:
-            moved = self._highest
+        elif moved > self._highest and rate > 0.0:
+            moved = output if output > self._highest else self._highest
             rate = 0.0
         self._rate = rate
         self.output = moved
         self.at_rest = rate == 0.0 and wanted == 0.0
+
+    def _stand(self, measured: float, position: float) -> None:
+        """Begin where the drives read; if they never were, where the model is, but free and in stroke."""
+        self.known = True
+        self.output = measured
+        if isfinite(measured):
+            return
+        start = position
+        if not isfinite(position) or position > 0.0:
+            start = -self._distance
+        elif position < -self._clearance:
+            start = self._distance - self._clearance
+        if start < self._lowest:
+            start = self._lowest
+        elif start > self._highest:
+            start = self._highest
+        self.output = start
 
 
 def _towards(start: float, target: float, most: float) -> float:

@@ -38,16 +38,22 @@ _HEADER = """\
  *     static jaxhil_controller controller;
  *     jaxhil_init(&controller, &jaxhil_exported_gains, &jaxhil_exported_limits);
  *
- * Compile with -ffp-contract=off (and never -ffast-math): the results then are those of the runtime in
- * Python bit for bit, which test_vectors.c checks.
+ * Compile with -ffp-contract=off (and never -ffast-math, nor a part of it): the results then are those of the
+ * runtime in Python bit for bit, which test_vectors.c checks. The headers are C++ too, from C++11 on.
  */
 #ifndef JAXHIL_CONTROLLER_H
 #define JAXHIL_CONTROLLER_H
 
 #include <float.h>
 {includes}
-#ifdef __FAST_MATH__
-#error "-ffast-math loses what is not finite, and the controller with it"
+#if defined(__FAST_MATH__) || defined(_M_FP_FAST)
+#error "-ffast-math loses what is not finite, and the controller with it (of MSVC: /fp:precise)"
+#endif
+#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
+#error "-ffinite-math-only loses what is not finite, and the controller with it"
+#endif
+#if defined(__ASSOCIATIVE_MATH__) || defined(__RECIPROCAL_MATH__)
+#error "-fassociative-math and -freciprocal-math compute something else"
 #endif
 #if FLT_RADIX != 2 || DBL_MANT_DIG != 53 || DBL_MAX_EXP != 1024
 #error "a double has to be one of IEEE 754"
@@ -72,7 +78,12 @@ _SOURCE = """\
 /* See jaxhil_controller.h. */
 #include "jaxhil_controller.h"
 
-#ifdef __clang__
+/* No a * b + c with one rounding. GCC does not know the pragma of C99, and warns of it. */
+#if defined(_MSC_VER) && !defined(__clang__)
+#pragma fp_contract(off)
+#elif defined(__GNUC__) && !defined(__clang__)
+#pragma GCC optimize("fp-contract=off")
+#else
 #pragma STDC FP_CONTRACT OFF
 #endif
 

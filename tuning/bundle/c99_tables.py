@@ -62,7 +62,10 @@ def limits_table() -> Table:
         for name, limit in LIMITS.items()
     ]
     checks = [_within(name, limit.lowest, limit.highest, "limits") for name, limit in LIMITS.items()]
-    defaults = "".join(f"    .{name} = {decimal(limit.default)},\n" for name, limit in LIMITS.items())
+    defaults = _values(
+        {name: limit.default for name, limit in LIMITS.items()},
+        {name: limit.unit for name, limit in LIMITS.items()},
+    )
     return Table(
         "/* The limits of the controller, each within bounds that no gain file can move. */\n",
         _struct("jaxhil_limits", entries),
@@ -130,7 +133,8 @@ def constants(gain_file: GainFile) -> str:
 
 
 def _values(values: Mapping[str, float], units: Mapping[str, str]) -> str:
-    return "".join(f"    .{name} = {decimal(value)}, /* {units[name]} */\n" for name, value in values.items())
+    """The fields in the order of the struct: C++ has no names for them before C++20."""
+    return "".join(f"    {decimal(value)}, /* {name}, {units[name]} */\n" for name, value in values.items())
 
 
 def _struct(name: str, entries: Iterable[tuple[str, str]]) -> str:

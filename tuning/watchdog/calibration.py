@@ -179,6 +179,7 @@ def guard_limits(
         "command_lowest": sent[0],
         "command_highest": sent[1],
         "velocity_limit": speed,
+        "start_distance": MARGIN * most["start"],
         "deceleration": min(acceleration, limited),
         "retreat_velocity": min(loaded.mechanism.approach.velocity, speed),
         "equivalent_mass": rules.mass,

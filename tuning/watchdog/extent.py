@@ -18,6 +18,9 @@ class Extent(NamedTuple):
     sent_highest: Float[np.ndarray, "lanes"]  # position command [m]
     command: Float[np.ndarray, "lanes"]  # largest |F_c| [N]
     slew: Float[np.ndarray, "lanes"]  # its fastest change [N/s]
+    start: Float[
+        np.ndarray, "lanes"
+    ]  # largest distance of a run's first command from the measured position [m]
     sent_speed: Float[np.ndarray, "lanes"]  # fastest change of the position command [m/s]
     speed: Float[np.ndarray, "lanes"]  # fastest change of the desired position [m/s]
     acceleration: Float[np.ndarray, "lanes"]  # fastest change of the desired velocity [m/s^2]
@@ -56,6 +59,7 @@ def extent_of(
         sent_highest=-least(-sent),
         command=largest(np.abs(command), live),
         slew=largest(step, live) / period,
+        start=largest(np.abs(sent - measured), begins & live),
         sent_speed=largest(np.abs(np.diff(sent, axis=0)), goes_on) / period,
         speed=largest(np.abs(np.diff(position, axis=0)), goes_on) / period,
         acceleration=largest(np.abs(np.diff(velocity, axis=0)), goes_on) / period,
@@ -87,7 +91,10 @@ def _stuck(signals: Signals, clearance: float):
         now, before = signals.measured[tick], signals.measured[tick - 1]
         in_contact = (now > 0) | (now < -clearance)
         same = counted & in_contact & (signals.force[tick] == signals.force[tick - 1])
-        force_travel = np.where(same, force_travel + np.abs(now - before), 0.0)
+        deeper = np.where(now > 0, now - before, before - now)
+        # Without a force only a way deeper counts: a damped mechanism comes out without one.
+        pressed = np.where(signals.force[tick] == 0, np.maximum(force_travel + deeper, 0.0), np.inf)
+        force_travel = np.where(same, np.minimum(pressed, force_travel + np.abs(deeper)), 0.0)
         moved = np.abs(signals.position[tick] - signals.position[tick - 1])
         position_travel = np.where(counted & (now == before), position_travel + moved, 0.0)
         most_force = np.maximum(most_force, force_travel)
