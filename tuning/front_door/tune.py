@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -91,24 +92,27 @@ class TuneOptions:
 
     @property
     def wants_quiet(self) -> bool:
-        """Whether nothing else is asked to be minimised than what `tune` minimises by default."""
+        """Whether there is a limit, and nothing else is asked to be minimised than what is by default."""
         weights = self.command_weight, self.noise_weight, self.chatter_weight, self.transparency_weight
-        return self.objective == "rms" and self.divergence_weight == 1 and weights == (None,) * 4
+        usual = self.objective == "rms" and self.divergence_weight == 1 and weights == (None,) * 4
+        return usual and 0 < self.limit < math.inf
 
     def _objective(self) -> "Objective":
         """What is asked for and, where nothing is, what the compensator's kind calls for."""
         from tuning.gains.objective import WEIGHTS, Objective
         from tuning.transparency.probes import default_weights
 
+        # Where no error is too large, or any is, the usual limit is the unit of the weights.
+        limit = float(self.limit) if 0 < self.limit < math.inf else TuneOptions.limit
         given = {name: getattr(self, name) for name in WEIGHTS}
         stated = {name: weight for name, weight in given.items() if weight is not None}
         if not callable(self.objective):
             weights = {**default_weights(self.compensator), **stated}
-            return Objective(self.objective, **weights, limit=float(self.limit))
+            return Objective(self.objective, **weights, limit=limit)
         from tuning.gains.metrics_function import MetricsFunction
 
         # What the user wants small is all that he says it is.
-        return Objective(**stated, function=MetricsFunction(self.objective), limit=float(self.limit))
+        return Objective(**stated, function=MetricsFunction(self.objective), limit=limit)
 
     def known(self) -> "list[Tuned]":
         """What the gain files to start from hold. Raises `InputError`; imports jax."""

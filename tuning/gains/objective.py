@@ -98,6 +98,8 @@ class Objective:
             if not (0 < weight < math.inf or (may_be_0 and weight == 0)):
                 allowed = f"allowed finite numbers {'>=' if may_be_0 else '>'} 0"
                 raise InputError(f"objective: {name}: found {shown(weight)}, {allowed}")
+        if not 0 < self.limit < math.inf:
+            raise InputError(f"objective: limit: found {shown(self.limit)}, allowed finite numbers > 0")
 
     def unit(self, weight: str) -> float:
         """Return the error [1] that a weight of 1 stands for; `weight` is a field's name."""
