@@ -230,4 +230,5 @@ def test_tune_of_a_noisy_mechanism_records_its_noise_free_error_and_warnings():
     one = tuning.tune("suite-noisy", LAW, **small)
     written = one.document["figures"]
     assert written["without_noise"]["rms"] == one.without_noise.rms
-    assert written.get("warnings", []) == list(one.warnings)
+    assert written["command"]["peak_p99"] == one.command.peak_p99
+    assert written["warnings"] == list(one.warnings)
