@@ -3,11 +3,12 @@
 import math
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 
 import tuning
-from jaxhil.mechanism.file import load
+from jaxhil.mechanism.file import load, load_any
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import evaluate
@@ -16,6 +17,7 @@ from tuning.caches import program_cache
 from tuning.caches.pieces import Pieces
 from tuning.front_door import tune_verdict
 from tuning.front_door.tune import TuneOptions
+from tuning.gains import simulated
 from tuning.gains.noise import amplification
 from tuning.gains.objective import Objective, objective_value
 from tuning.gains.quiet import is_quiet, tolerance_of
@@ -232,3 +234,19 @@ def test_tune_of_a_noisy_mechanism_records_its_noise_free_error_and_warnings():
     assert written["without_noise"]["rms"] == one.without_noise.rms
     assert written["command"]["peak_p99"] == one.command.peak_p99
     assert written["warnings"] == list(one.warnings)
+
+
+@pytest.mark.parametrize("name", ["suite-noisy", "petals"])
+def test_scenarios_without_noise_differ_in_their_noise_alone(name):
+    sensor = {} if name != "petals" else {"rig.force_sensor.noise_std": {"force": 0.5, "torque": 0.05}}
+    mechanism = load_any(name, {**sensor, "rig.force_sensor.delay": 0.003}).mechanism
+    scenarios = simulated.scenarios_of(mechanism)
+    silent = simulated.without_noise(scenarios)
+    noisy = jax.tree.leaves(scenarios)
+    changed = [
+        (before, after)
+        for before, after in zip(noisy, jax.tree.leaves(silent), strict=True)
+        if not np.array_equal(before, after)
+    ]
+    ((before, after),) = changed
+    assert np.any(before > 0) and not np.any(after) and before.shape == after.shape

@@ -44,7 +44,7 @@ def command_warnings(result: "TuneResult", command: CommandFigures) -> tuple[str
     if command.peak_p99 > MAX_PEAK_RATIO:
         found.append(
             f"the force command peaks at {command.peak_p99:.3g} times the ideal contact's peak force "
-            f"(99th percentile), expected at most {MAX_PEAK_RATIO:g}; --command-weight lowers it"
+            f"(99th percentile), expected at most {MAX_PEAK_RATIO:g}; --command-weight 1 lowers it"
         )
     amplified = command.noise_amplification or 0.0
     if result.without_noise is not None and amplified > MAX_NOISE_AMPLIFICATION:
