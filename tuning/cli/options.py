@@ -143,8 +143,9 @@ class Tune:
 
     Example: jaxhil tune rig-300kg varying --output study --starts 16
 
-    Writes DIR/NAME/gains.json and plots. Exit code 1 if a tuned rms error exceeds the limit, with sensor noise
-    or without. Warns of commands that peak beyond 1.5 ideal peaks, and of noise amplified more than twice.
+    Writes DIR/NAME/gains.json and plots. Exit code 1 if a tuned rms error exceeds the limit, with the noise
+    of the sensors or without. Warns of commands that peak beyond 1.5 ideal peaks, and of noise amplified
+    more than twice.
     """
 
     files: Files = ()
