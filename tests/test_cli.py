@@ -93,7 +93,9 @@ def test_tune_writes_gains_and_plots(jaxhil, tuned):
     document = json.loads((tuned / "gains.json").read_text())
     assert document["compensator"] == "phase_lead"
     figures = document["figures"]
-    assert figures.keys() == {"nominal", "robust", "tuned_intervals"}
+    judged = {"nominal", "robust", "tuned_intervals"}
+    assert figures.keys() == judged | {"without_noise", "command", "warnings"}
+    assert figures["without_noise"] is None and figures["command"]["noise_amplification"] > 1
     for name in ("nominal", "robust"):
         assert figures[name].keys() == {"before", "literature", "tuned"}
     for name in ("rms", "p99"):

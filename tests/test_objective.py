@@ -22,6 +22,7 @@ from tuning.gains.objective import (
     OBJECTIVES,
     POWERS,
     SCALE,
+    TOLERATED,
     Objective,
     Problem,
     Terms,
@@ -38,7 +39,7 @@ GAINS = np.array([[0.004, 0.001], [0.0077, 0.0031], [0.002, 0.0008]])
 SCENARIOS = 6
 SLOTS = 144
 SHORT = 2  # the scenario whose time is too short for its contacts
-STATED = Objective("rms", 2.0, 0.3, 0.004, 0.05)
+STATED = Objective("rms", 2.0, 0.3, 0.004, 0.05, limit=1.0)
 
 
 def of_name(name):
@@ -140,7 +141,7 @@ def test_the_sum_of_squares_is_the_stated_value_or_just_above(outcomes, name):
 
 def test_every_problem_has_weights_of_its_own(batch):
     """In one program each has the residuals that it has where all are weighed alike."""
-    several = [STATED, Objective("rms", 1.0, 0.2, 0.02, 0.3), Objective("rms", 5.0, 0.1, 0.001, 0.01)]
+    several = [STATED, replace(STATED, noise_weight=0.02, limit=0.7), Objective("rms", 5.0, 10.0, 0.1, 1.0)]
     together = run(batch, objective=several)[0]
     for i, objective in enumerate(several):
         np.testing.assert_allclose(together[i], run(batch, objective=objective)[0][i], rtol=1e-13)
@@ -154,6 +155,52 @@ def test_a_part_of_weight_0_is_no_part():
     plain, _ = weighed(Terms("rms", False, False, False), stacked([Objective()]), terms, none)
     assert len(whole) == 3 * len(plain) + 1 and not whole[len(plain) :].any()
     np.testing.assert_array_equal(whole[: len(plain)], plain)
+
+
+def test_weights_are_multiples_of_the_limit():
+    """A weight w of a figure X costs the error at most sqrt(J_0^2 - figure_0^2) = w limit X_0."""
+    errors, excesses, swings = np.array([0.01, -0.02]), np.array([0.3, 0.5]), np.array([0.7, 0.1])
+    for limit in (0.003, 0.01, 0.2):
+        for name, value in (("command", excesses), ("chatter", swings), ("noise", np.array([2.5]))):
+            objective = Objective(**{f"{name}_weight": 0.4}, limit=limit)
+            whole = objective_value(objective, errors, excesses, 3.5, swings)
+            share = np.sqrt(whole**2 - objective_value(Objective(), errors) ** 2)
+            assert share == pytest.approx(0.4 * limit * np.sqrt(np.mean(value**2)), rel=1e-9)
+            assert (
+                float(getattr(objective.weights, name))
+                == 0.4 * limit
+                == 0.4 * objective.unit(f"{name}_weight")
+            )
+    assert Objective(transparency_weight=0.4, limit=0.2).unit("transparency_weight") == 1
+    with pytest.raises(InputError, match="objective: limit: found 0"):
+        Objective(limit=0.0)
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 0.004, 0.02, 1.0])
+def test_errors_within_the_tolerance_count_next_to_nothing(tolerance):
+    errors, excesses = np.random.default_rng(3).normal(scale=0.01, size=45), np.full(45, 0.4)
+    objective = Objective("rms", 2.0, 0.2, 0.1, tolerance=tolerance)
+    size = objective_value(Objective("rms", 2.0), errors)
+    counted = size if tolerance == 0 else max(size - tolerance, TOLERATED * size)
+    expected = np.sqrt(counted**2 + (0.01 * 0.2 * 0.4) ** 2 + (0.01 * 0.1 * 2.0) ** 2)
+    assert objective_value(objective, errors, excesses, 3.0) == pytest.approx(expected, rel=1e-13)
+    assert sum_of_squares(objective, errors, excesses, 3.0) == pytest.approx(expected**2, rel=1e-12)
+    # Its derivative along the errors themselves, at which the size grows in proportion.
+    _, slopes = alone(objective, errors, excesses, 3.0, (), (errors, (), (), 0.0))
+    values, _ = alone(objective, errors, excesses, 3.0)
+    grown = counted if counted <= TOLERATED * size or tolerance == 0 else size
+    assert SCALE**2 * np.sum(values * slopes) == pytest.approx(counted * grown, rel=1e-12)
+
+
+def test_a_tolerance_of_0_is_no_other_objective_in_the_program_of_any():
+    terms = common_terms([Objective(tolerance=0.0)])
+    assert terms == common_terms([Objective(command_weight=0.1, noise_weight=0.2, tolerance=0.5)])
+    assert terms == Terms("rms", True, True, False, tolerance=True)
+    errors = np.random.default_rng(4).normal(size=45)
+    values, _ = alone(Objective(tolerance=0.0), errors, np.ones(45), 7.0)
+    plain, _ = alone(Objective(), errors)
+    np.testing.assert_array_equal(values[: len(plain)], plain)
+    assert not values[len(plain) :].any()
 
 
 def test_terms_are_those_of_any():
@@ -270,7 +317,7 @@ def test_known_errors_have_known_figures():
     for name in ("cvar", "worst"):
         assert objective_value(Objective(name, 2.0), errors) == pytest.approx(np.sqrt(2) * 0.03, rel=1e-14)
     assert objective_value(Objective("worst"), np.array([0.1, np.nan])) == FAILED
-    stated = Objective("worst", 1.0, 0.1, 0.01)
+    stated = Objective("worst", 1.0, 0.1, 0.01, limit=1.0)
     excesses = np.array([0.1, 0.3])
     whole = np.sqrt(0.04**2 + 0.01 * (0.01 + 0.09) / 2 + 0.01**2 * 9)
     assert objective_value(stated, errors, excesses, 4.0) == pytest.approx(whole, rel=1e-14)

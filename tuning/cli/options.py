@@ -143,7 +143,9 @@ class Tune:
 
     Example: jaxhil tune rig-300kg varying --output study --starts 16
 
-    Writes DIR/NAME/gains.json and plots. Exit code 1 if a tuned rms error exceeds the limit.
+    Writes DIR/NAME/gains.json and plots. Exit code 1 if a tuned rms error exceeds the limit, with the noise
+    of the sensors or without. Warns of commands that peak beyond 1.5 ideal peaks, and of noise amplified
+    more than twice.
     """
 
     files: Files = ()
@@ -175,16 +177,25 @@ class Tune:
         float | None,
         text(
             "NUMBER",
-            "Restitution error that weighs as much as a command one reference peak too high; by default "
-            "0.003 for retrospective_reference, 0 for others.",
+            "How many times the limit a command is worth that peaks one ideal peak too high; by default 0.3 "
+            "for retrospective_reference, 0 for others.",
         ),
     ] = None
     noise_weight: Annotated[
-        float, number("Restitution error that weighs as much as one time the sensor noise more.")
-    ] = 0.0
+        float | None,
+        text(
+            "NUMBER",
+            "How many times the limit it is worth to amplify sensor noise once more. Where sensors are noisy "
+            "and no weight is given: the quietest gains within the limit; 0: the least error.",
+        ),
+    ] = None
     chatter_weight: Annotated[
-        float, number("Restitution error that weighs as much as a command that swings once too often.")
-    ] = 0.0
+        float | None,
+        text(
+            "NUMBER",
+            "How many times the limit a command is worth that swings once too often by the ideal peak force.",
+        ),
+    ] = None
     transparency_weight: Annotated[
         float | None,
         text(

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -12,9 +13,10 @@ from jaxhil.mechanism.file import AnyMechanism, LoadedAny, LoadedMechanism
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.environment import computing
 from tuning import terminal
-from tuning.front_door import arguments, meaning, tune_pareto
+from tuning.front_door import arguments, meaning, tune_pareto, tune_verdict
 from tuning.front_door.arguments import ArgumentError
 from tuning.front_door.tune_pareto import TradedGains
+from tuning.front_door.tune_verdict import CommandFigures
 
 if TYPE_CHECKING:
     from jaxhil.simulation.plausibility import Meaning
@@ -39,8 +41,8 @@ class TuneOptions:
     objective: str | Callable[[Any], Any] = "rms"
     divergence_weight: float = 1.0
     command_weight: float | None = None
-    noise_weight: float = 0.0
-    chatter_weight: float = 0.0
+    noise_weight: float | None = None
+    chatter_weight: float | None = None
     transparency_weight: float | None = None
     global_search: bool = False
     seed: int = 0
@@ -84,22 +86,33 @@ class TuneOptions:
             self._objective(),
             global_search=self.global_search,
             setting=self.setting,
+            quiet=self.wants_quiet,
             judge_transparency=self.pareto_against == "honesty",
         )
+
+    @property
+    def wants_quiet(self) -> bool:
+        """Whether there is a limit, and nothing else is asked to be minimised than what is by default."""
+        weights = self.command_weight, self.noise_weight, self.chatter_weight, self.transparency_weight
+        usual = self.objective == "rms" and self.divergence_weight == 1 and weights == (None,) * 4
+        return usual and 0 < self.limit < math.inf
 
     def _objective(self) -> "Objective":
         """What is asked for and, where nothing is, what the compensator's kind calls for."""
         from tuning.gains.objective import WEIGHTS, Objective
         from tuning.transparency.probes import default_weights
 
+        # Where no error is too large, or any is, the usual limit is the unit of the weights.
+        limit = float(self.limit) if 0 < self.limit < math.inf else TuneOptions.limit
         given = {name: getattr(self, name) for name in WEIGHTS}
         stated = {name: weight for name, weight in given.items() if weight is not None}
         if not callable(self.objective):
-            return Objective(self.objective, **{**default_weights(self.compensator), **stated})
+            weights = {**default_weights(self.compensator), **stated}
+            return Objective(self.objective, **weights, limit=limit)
         from tuning.gains.metrics_function import MetricsFunction
 
         # What the user wants small is all that he says it is.
-        return Objective(**stated, function=MetricsFunction(self.objective))
+        return Objective(**stated, function=MetricsFunction(self.objective), limit=limit)
 
     def known(self) -> "list[Tuned]":
         """What the gain files to start from hold. Raises `InputError`; imports jax."""
@@ -167,10 +180,26 @@ class TunedGains:
 
     @property
     def verdict(self) -> str:
-        """ "good" if every contact ended with the tuned gains, and their rms error is within the limit, else
-        "bad"."""
-        tuned = self.figures["tuned"]
-        return "good" if tuned.failed == 0 and tuned.rms <= self.limit else "bad"
+        """ "good" if every contact ended with the tuned gains, and their rms error is within the limit, with
+        the sensors' noise and without, else "bad"."""
+        return "good" if tune_verdict.is_good(self.found, self.limit) else "bad"
+
+    @property
+    def without_noise(self) -> "ErrorFigures | None":
+        """Errors of the tuned gains on the same scenarios without the sensors' noise; None where the
+        mechanism has none."""
+        return self.found.without_noise
+
+    @functools.cached_property
+    def command(self) -> CommandFigures:
+        """What the tuned gains do to the force command: `peak_p99`, the 99th percentile of its peak over the
+        ideal contact's peak force, and `noise_amplification` [1]."""
+        return tune_verdict.command_figures(self.found)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for each figure of `command` beyond its bound."""
+        return tune_verdict.command_warnings(self.found, self.command)
 
     @functools.cached_property
     def meaning(self) -> "Meaning | None":
@@ -204,6 +233,9 @@ class TunedGains:
                 "robust": found.figures,
                 "tuned_intervals": found.intervals.plain() if found.intervals else None,
                 **self.parts,
+                "without_noise": found.without_noise,
+                "command": self.command,
+                "warnings": self.warnings,
                 **({"honesty": found.transparency, "transparency": PUSHES} if found.transparency else {}),
             },
             found.settings.seed,
@@ -232,8 +264,8 @@ def tune(
     objective: str | Callable[[Any], Any] = "rms",
     divergence_weight: float = 1.0,
     command_weight: float | None = None,
-    noise_weight: float = 0.0,
-    chatter_weight: float = 0.0,
+    noise_weight: float | None = None,
+    chatter_weight: float | None = None,
     transparency_weight: float | None = None,
     global_search: bool = False,
     pareto: int = 0,
@@ -262,16 +294,19 @@ def tune(
         objective: of the errors e - e*: "rms", "cvar" (mean of the worst 5 percent) or "worst"; or a
             function of the metrics of all scenarios, which returns a number >= 0 to be made small.
         divergence_weight: how much more a squared divergence counts than a squared convergence.
-        command_weight: of commands beyond the reference's peak; None: what the law calls for.
-        noise_weight: of amplified sensor noise.
-        chatter_weight: of commands that swing too often.
+        command_weight: how many times the limit a command is worth that peaks one ideal peak too high; None:
+            what the law calls for.
+        noise_weight: the same of an amplification of sensor noise one too large. Where sensors are noisy, and
+            neither a weight nor another objective is given, the quietest gains whose error is within the
+            limit are sought, and those of least error if there are none; 0: those of least error.
+        chatter_weight: the same of a command that swings once too often by the ideal peak force.
         transparency_weight: of the errors of pushed and damped scenarios; None: what the law calls for.
         global_search: also search all gains' whole ranges, with 50 times the evaluations.
         pareto: also so many gains that trade the error for something else.
         pareto_against: for what: "noise", "peak" (of the command) or "honesty"; by default "noise", or "peak"
             where the law anticipates.
         seed: of scenarios and starts.
-        limit: the rms error [1] that is still good.
+        limit: the rms error [1] that is still good, and the unit of the three weights.
         scheduler: address of a dask.distributed cluster's scheduler, whose workers then tune.
         progress: say on standard error what is going on.
 

@@ -40,7 +40,7 @@ def compare_with_global_search(
         return None
 
     def losses(points):
-        return validation.losses(settings.objective, [task], points[None], lanes=LANES)[0]
+        return validation.losses(found.quiet or settings.objective, [task], points[None], lanes=LANES)[0]
 
     budget = factor * found.evaluations
     everywhere = search_globally(losses, len(validation.names), budget, seed=settings.seed + 1)

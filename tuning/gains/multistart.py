@@ -12,7 +12,7 @@ global optimization methods" (1987).
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +21,8 @@ from jaxtyping import Float
 from jaxhil.errors import InputError
 from jaxhil.simulation.environment import float64, program_folder
 from tuning.gains.metrics_function import ALLOWED
-from tuning.gains.objective import RMS, Objective
+from tuning.gains.objective import RMS, Objective, one_each
+from tuning.gains.quiet import begin_at, is_quiet, least_error, loudness_of, quietest, tolerance_of
 from tuning.gains.rounds import Start, inverse_hessian, prepare_solver, solve_tasks, step_runs
 from tuning.gains.scan import SCENARIOS, scan, scan_evaluations
 from tuning.gains.settings import TuneSettings
@@ -49,6 +50,8 @@ class MultistartResult(NamedTuple):
     # of the objective, that it took. A Jacobian over P gains counts as 1 + P of them, a point of a scan as
     # the share of the scenarios it may be tried on.
     evaluations: int
+    # of the search for quieter gains, whose value the best start has; None where there was none
+    quiet: Objective | None = None
 
 
 @dataclass
@@ -71,7 +74,9 @@ def find_gains(
     of the literature's. One start alone is the literature's, and the only batch. `meanwhile` is done while
     the solver's program compiles.
     """
-    tasks, objective = validation.tasks, settings.objective
+    tasks, quiet = validation.tasks, is_quiet(validation.tasks[0], settings)
+    objective = least_error(settings.objective) if quiet else settings.objective
+    settings = replace(settings, objective=objective)
     probed = tasks[0].probed
     agreed = PROBED_AGREED if probed else AGREED
     searches = [_Search() for _ in tasks]
@@ -86,14 +91,59 @@ def find_gains(
     if objective.function is not None:
         # It may have kinks everywhere, as a largest magnitude has.
         polishing *= KINKED
+    objectives, ends = one_each(objective, len(tasks)), [own.starts for own in searches]
+    quieter = _quieten(validation, settings, first, searches) if quiet else {}
+    for i, (own, found) in quieter.items():
+        objectives[i], ends[i] = own, found
     if polishing:
         runs = polishing * len(tasks) * tasks[0].lanes
         validation.work.begin("searching on without derivatives", runs)
-    best = finish(validation, [own.starts for own in searches], polishing, settings.seed, objective)
+    best = finish(validation, ends, polishing, settings.seed, objectives)
     return [
-        MultistartResult(top, own.starts, own.evaluations + (polishing if top else 0))
-        for top, own in zip(best, searches, strict=True)
+        MultistartResult(
+            top,
+            own.starts,
+            own.evaluations + (polishing if top else 0),
+            objectives[i] if i in quieter else None,
+        )
+        for i, (top, own) in enumerate(zip(best, searches, strict=True))
     ]
+
+
+def _quieten(
+    validation: Validation,
+    settings: TuneSettings,
+    first: Sequence[Sequence[Mapping[str, float]]] | None,
+    searches: list[_Search],
+) -> dict[int, tuple[Objective, list[Start]]]:
+    """Search from the gains of least error for quieter ones, of every task whose error is within the limit;
+    the objective of each such task, and the ends of its starts.
+
+    As many starts as in the first batch of the first search, so that its program serves.
+    """
+    tasks, objective = validation.tasks, settings.objective
+    best = [ranked[0] if (ranked := _ranked(own.starts)) else None for own in searches]
+    tolerance = tolerance_of(objective.limit, tasks[0].number)
+    accurate = {i: top for i, top in enumerate(best) if top and top.rms <= tolerance}
+    if not accurate:
+        return {}
+    number, steps = _starts_of_batch(settings, first), settings.steps
+    begun = [np.empty((0, len(validation.names)))] * len(tasks)
+    objectives = [objective] * len(tasks)
+    for i, top in accurate.items():
+        begun[i] = begin_at(searches[i].starts, number)
+        objectives[i] = quietest(objective, tasks[i].number, loudness_of(validation, i, top, objective))
+    runs = len(accurate) * number * steps * step_runs(tasks, validation.names)
+    validation.work.begin(f"searching for quieter gains, {len(accurate)} of {len(tasks)} mechanisms", runs)
+    ended = solve_tasks(tasks, begun, steps, objectives, validation.work)
+    for i in accurate:
+        searches[i].evaluations += (1 + len(validation.names)) * sum(start.steps for start in ended[i])
+    return {i: (objectives[i], ended[i]) for i in accurate}
+
+
+def _starts_of_batch(settings: TuneSettings, first: Sequence[Sequence[Mapping[str, float]]] | None) -> int:
+    """Return the number of starts of a batch: as asked for, and the literature's beside those given."""
+    return max(settings.starts, 1 + max(map(len, first))) if first else settings.starts
 
 
 def expected_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
@@ -110,7 +160,7 @@ def _solve_batches(
     """Solve batch after batch of starts; the tasks whose starts do not agree even so."""
     tasks, objective, work = validation.tasks, settings.objective, validation.work
     given = [len(own) for own in first] if first else [0 for _ in tasks]
-    number = max(settings.starts, 1 + max(given))
+    number = _starts_of_batch(settings, first)
     chosen = _while_compiling(
         validation,
         number,

@@ -7,8 +7,8 @@ With e - e* of every contact, divergence weighted against convergence (`Objectiv
     worst   the largest magnitude
 
 and the penalties a command that peaks above the reference's force, one that chatters, and a compensator that
-amplifies the noise of the force sensor, all in one unit, that of a restitution error. `objective_value` has
-them exactly.
+amplifies the noise of the force sensor. Each penalty is a dimensionless number; its weight says how many
+limits of the error that number is worth. `objective_value` has them exactly.
 
 Levenberg-Marquardt wants smooth sums of squares. That of `residuals` is the square of the norm
 
@@ -44,6 +44,10 @@ TAIL = 20  # cvar: the worst one in so many contacts, at least one
 POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # of the norms in the residuals; even
 OBJECTIVES = tuple(POWERS)
 WEIGHTS = tuple(f"{name}_weight" for name in ("divergence", "command", "noise", "chatter", "transparency"))
+IN_LIMITS = ("command_weight", "noise_weight", "chatter_weight")  # weights in multiples of the limit
+# By what share of itself an error within the tolerance still counts: of equally quiet gains the most
+# accurate are wanted.
+TOLERATED = 0.02
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,7 @@ class Objective:
     """What to minimise: J with
 
         J^2 = figure(E)^2 + (transparency_weight rms(H))^2
-          + (command_weight rms(C))^2 + (chatter_weight rms(S))^2 + (noise_weight N)^2
+          + limit^2 ((command_weight rms(C))^2 + (chatter_weight rms(S))^2 + (noise_weight N)^2)
 
         E  per contact the restitution error e - e* [1], times sqrt(divergence_weight) where it is positive
         H  the same of the transparency probes, e* their own (`tuning.transparency.probes`)
@@ -61,20 +65,30 @@ class Objective:
         N  max(0, A - 1) [1], A the amplification of the force sensor's white noise, from the gains alone
            (`Compensator.noise_amplification`); a command quieter than the measured force earns nothing
 
+    With w the weight of X, one of C, S and N, minimising J raises the figure to at most
+    sqrt(figure^2 + (w limit X)^2), both taken at the gains of the least figure: what a weight costs is known
+    in multiples of the limit, whatever the rig.
+
+    With a `tolerance`, max(figure - tolerance, `TOLERATED` figure) takes the figure's place: gains whose
+    error is within it are compared by the penalties.
+
     Raises `InputError` for another name or a weight that is negative or not finite, or 0 for divergence.
     """
 
     name: str = "rms"  # of the figure, one of `OBJECTIVES`
     # how much more a squared divergence (e > e*) counts than a squared convergence [1]
     divergence_weight: float = 1.0
-    # restitution error that weighs as much as a command one reference peak too high [1]
+    # how many limits of the error a command is worth that peaks one reference peak too high [1]
     command_weight: float = 0.0
-    noise_weight: float = 0.0  # as much as an amplification one too large [1]
-    chatter_weight: float = 0.0  # as much as one swing over the reference's peak too many [1]
+    noise_weight: float = 0.0  # the same of an amplification one too large [1]
+    chatter_weight: float = 0.0  # the same of one swing over the reference's peak too many [1]
     transparency_weight: float = 0.0  # with 1, probes' errors count as much as those of the scenarios [1]
     # a function of the user's own in the figure's place, of the metrics of all scenarios but the probes;
     # divergence_weight has no part in it
     function: MetricsFunction | None = None
+    limit: float = 0.01  # of the error [1]: the unit of the weights of command, noise and chatter
+    # up to which the figure is good enough [1]; None: no error is, and the program has no such part
+    tolerance: float | None = None
 
     def __post_init__(self):
         if self.name not in OBJECTIVES:
@@ -84,11 +98,18 @@ class Objective:
             if not (0 < weight < math.inf or (may_be_0 and weight == 0)):
                 allowed = f"allowed finite numbers {'>=' if may_be_0 else '>'} 0"
                 raise InputError(f"objective: {name}: found {shown(weight)}, {allowed}")
+        if not 0 < self.limit < math.inf:
+            raise InputError(f"objective: limit: found {shown(self.limit)}, allowed finite numbers > 0")
+
+    def unit(self, weight: str) -> float:
+        """Return the error [1] that a weight of 1 stands for; `weight` is a field's name."""
+        return self.limit if weight in IN_LIMITS else 1.0
 
     @property
     def weights(self) -> "Weights":
-        """The numbers in it, each a scalar array."""
-        return Weights(*(jnp.asarray(float(getattr(self, name))) for name in WEIGHTS))
+        """The numbers in it, each a scalar array, those of penalties in the unit of an error."""
+        numbers = [float(getattr(self, name)) * self.unit(name) for name in WEIGHTS]
+        return Weights(*map(jnp.asarray, numbers), tolerance=jnp.asarray(float(self.tolerance or 0.0)))
 
 
 RMS = Objective()
@@ -104,6 +125,7 @@ class Terms(NamedTuple):
     transparency: bool = False  # whether the scenarios come with probes
     function: MetricsFunction | None = None  # the user's, in the place of the figure, if any
     contacts: int = 0  # how many the user's function gets
+    tolerance: bool = False  # whether errors within a tolerance, which may be 0, are good enough
 
 
 class Weights(NamedTuple):
@@ -114,6 +136,7 @@ class Weights(NamedTuple):
     noise: Float[Array, "*problems"]  # of the amplification beyond 1 [1]
     chatter: Float[Array, "*problems"]  # of the chatter [1]
     transparency: Float[Array, "*problems"]  # of the probes' errors [1]
+    tolerance: Float[Array, "*problems"]  # of the figure [1]
 
 
 class Problem(NamedTuple):
@@ -136,14 +159,17 @@ def common_terms(objectives: Sequence[Objective], probed: bool = False, contacts
     Raises ValueError for objectives of several names or functions.
     """
     [(name, function)] = {(objective.name, objective.function) for objective in objectives}
+    tolerance = any(objective.tolerance is not None for objective in objectives)
     return Terms(
         name,
-        any(objective.command_weight > 0 for objective in objectives),
-        any(objective.noise_weight > 0 for objective in objectives),
+        # What is tolerated makes room for a quieter command.
+        tolerance or any(objective.command_weight > 0 for objective in objectives),
+        tolerance or any(objective.noise_weight > 0 for objective in objectives),
         any(objective.chatter_weight > 0 for objective in objectives),
         probed,
         function,
         contacts if function else 0,
+        tolerance,
     )
 
 
@@ -217,9 +243,12 @@ def weigh(
     diverging = jnp.sqrt(weights.divergence)[:, None] * error
     number = {"rms": plain, "cvar": _tail(plain), "worst": jnp.ones_like(plain)}[terms.name]
     if figure is None:
-        parts = [_norm(jnp.where(error > 0, diverging, error), number, POWERS[terms.name]), *blindness]
+        own = _norm(jnp.where(error > 0, diverging, error), number, POWERS[terms.name])
     else:
-        parts = [figure[:, None], *blindness]
+        own = figure[:, None]
+    if terms.tolerance:
+        own = own * _untolerated(own, weights.tolerance[:, None])
+    parts = [own, *blindness]
     if terms.command:
         parts.append(weights.command[:, None] * _norm(excess, count, 2))
     if terms.chatter:
@@ -228,6 +257,15 @@ def weigh(
         beyond = amplification - 1
         parts.append((weights.noise * jnp.where(beyond > 0, beyond, 0))[:, None])
     return jnp.concatenate(parts, axis=1) / SCALE
+
+
+def _untolerated(
+    terms: Float[Array, "problems terms"], tolerance: Float[Array, "problems 1"]
+) -> Float[Array, "problems 1"]:
+    """Return the share of the norm of `terms` that counts: max(1 - tolerance / norm, `TOLERATED`)."""
+    square = jnp.sum(terms**2, axis=1, keepdims=True)
+    norm = jnp.sqrt(jnp.where(square > 0, square, 1))
+    return jnp.where(tolerance > 0, jnp.maximum(1 - tolerance / norm, TOLERATED), 1)
 
 
 def contact_terms(
@@ -279,11 +317,13 @@ def objective_value(
         for term in (np.zeros(1) if term is None else term for term in given)
     )
     figure = _figure(objective, error) if value is None else value
+    if objective.tolerance:
+        figure = np.maximum(figure - objective.tolerance, TOLERATED * figure)
     parts = (
         figure,
-        objective.command_weight * _rms(excess),
-        objective.chatter_weight * _rms(swings),
-        objective.noise_weight * np.maximum(0.0, np.asarray(amplification) - 1),
+        objective.limit * objective.command_weight * _rms(excess),
+        objective.limit * objective.chatter_weight * _rms(swings),
+        objective.limit * objective.noise_weight * np.maximum(0.0, np.asarray(amplification) - 1),
         objective.transparency_weight * _rms(blindness),
     )
     return np.sqrt(sum(part**2 for part in parts))

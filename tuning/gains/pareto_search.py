@@ -7,15 +7,14 @@ until none gets better.
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
-from jaxhil.compensators import COMPENSATORS, Compensator, Constants
+from jaxhil.compensators import COMPENSATORS
 from tuning.gains.multistart import choose_starts
+from tuning.gains.noise import amplification, has_trade_off
 from tuning.gains.objective import FAILED, Objective
 from tuning.gains.rounds import Start, solve_tasks, step_runs
 from tuning.gains.settings import TuneSettings
@@ -50,19 +49,6 @@ TRANSPARENCY = Axis(
 AXES = {axis.name: axis for axis in (NOISE, PEAK, TRANSPARENCY)}
 
 
-def has_trade_off(compensator: str) -> bool:
-    """Whether a compensator's gains change how much sensor noise it passes on."""
-    return type(COMPENSATORS[compensator]).noise_amplification is not Compensator.noise_amplification
-
-
-def amplification(mechanism: Any, compensator: str, gains: Mapping[str, float]) -> float:
-    """A [1], nominally: `Compensator.noise_amplification`."""
-    period, clearance = mechanism.rig.control_period, mechanism.contact.clearance
-    constants = Constants(jnp.asarray(period), jnp.asarray(clearance))
-    values = {name: jnp.asarray(value) for name, value in gains.items()}
-    return float(COMPENSATORS[compensator].noise_amplification(values, constants))
-
-
 def default_axis(compensator: str) -> Axis | None:
     """What a compensator's error is traded against unless something is asked for; None: nothing."""
     if has_trade_off(compensator):
@@ -77,7 +63,7 @@ def ladder(
     ends: tuple[float, float] = ENDS,
     least: float = LEAST_EXCESS,
 ) -> np.ndarray:
-    """(number,) weights [1]: 0, then evenly on a logarithmic scale.
+    """(number,) weights [1], in the unit of an error: 0, then evenly on a logarithmic scale.
 
     `error` and `excess` are J and what is weighed, A - 1 or the like, of accurate gains: the weights at the
     ends make that term so many times their error.
@@ -107,8 +93,9 @@ def solve_ladders(
     settings: TuneSettings,
     axis: Axis = NOISE,
 ) -> list[list[tuple[float, dict[str, float]]]]:
-    """Weight and gains of every point of every task."""
-    weight = getattr(settings.objective, axis.weight)
+    """Weight, as `Objective` has it, and gains of every point of every task."""
+    unit = settings.objective.unit(axis.weight)
+    weight = unit * getattr(settings.objective, axis.weight)
     pools = [
         _reached(validation, i, axis, settings.objective, weight, one.starts) for i, one in enumerate(tuned)
     ]
@@ -130,7 +117,10 @@ def solve_ladders(
         if turn > 0 and not _improved(before, after, ladders):
             break
     return [
-        [(float(weight), one.gains) for weight, one in zip(weights, _picked(pool, weights), strict=True)]
+        [
+            (float(weight) / unit, one.gains)
+            for weight, one in zip(weights, _picked(pool, weights), strict=True)
+        ]
         for pool, weights in zip(pools, ladders, strict=True)
     ]
 
@@ -148,7 +138,8 @@ def _fitting_ladder(pool: list[_Found], number: int, ends: tuple[float, float], 
 
 
 def weighed(objective: Objective, axis: Axis, weight: float) -> Objective:
-    return dataclasses.replace(objective, **{axis.weight: float(weight)})
+    """Return the objective with another weight of the axis, given in the unit of an error."""
+    return dataclasses.replace(objective, **{axis.weight: float(weight) / objective.unit(axis.weight)})
 
 
 def _anywhere(
@@ -179,7 +170,12 @@ def _search(validation: Validation, starts, objectives, settings, axis: Axis) ->
     solved = solve_tasks(every, list(chain(*starts)), settings.steps, own, validation.work)
     found = [
         _reached(
-            validation, place // number, axis, settings.objective, getattr(objective, axis.weight), ended
+            validation,
+            place // number,
+            axis,
+            settings.objective,
+            objective.unit(axis.weight) * getattr(objective, axis.weight),
+            ended,
         )
         for place, (objective, ended) in enumerate(zip(own, solved, strict=True))
     ]

@@ -82,7 +82,10 @@ def _sums_squares(
     if validation.tasks[0].probed or not isinstance(validation.tasks[0].mechanism, Mechanism):
         return False
     own = [one_each(objective, len(validation.tasks))[i] for i in which]
-    return all(one.name == "rms" and one.noise_weight == 0 and one.function is None for one in own)
+    return all(
+        one.name == "rms" and one.noise_weight == 0 and not one.tolerance and one.function is None
+        for one in own
+    )
 
 
 def scan_evaluations(validation: Validation, number: int, scanned: int) -> int:

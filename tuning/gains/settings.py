@@ -23,6 +23,8 @@ class TuneSettings:
     scanned: int = 256  # points of a scan, the best of which become starts
     # name of the compensator's gains that are judged as they are, in the place of tuning
     setting: str | None = None
+    # whether the quietest gains within the objective's limit are wanted, where sensors are noisy
+    quiet: bool = False
     # whether to judge transparency even where the objective does not weigh it
     judge_transparency: bool = False
 

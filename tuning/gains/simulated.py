@@ -45,6 +45,18 @@ def loop_of(mechanism: AnyMechanism, compensator: str, scenarios: Any, **parts: 
     return build_loop(mechanism, compensator, scenarios, **parts)
 
 
+def without_noise(scenarios: Any) -> Any:
+    """Return the scenarios with sensors that have no noise."""
+
+    def silent(sensor: Any) -> Any:
+        return sensor._replace(noise_std=np.zeros_like(sensor.noise_std))
+
+    if hasattr(scenarios, "sensor"):  # six axes
+        return scenarios._replace(sensor=silent(scenarios.sensor))
+    force, position = silent(scenarios.force_sensor), silent(scenarios.position_sensor)
+    return scenarios._replace(force_sensor=force, position_sensor=position)
+
+
 def with_compensator(loop: Any, compensator: str) -> Any:
     """The loop with another compensator."""
     law = COMPENSATORS[compensator] if isinstance(loop, Loop) else compensator

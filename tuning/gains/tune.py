@@ -17,7 +17,7 @@ from tuning.gains.multistart import MultistartResult, expected_runs, find_gains
 from tuning.gains.objective import SCALE
 from tuning.gains.rounds import Start
 from tuning.gains.settings import TuneSettings
-from tuning.gains.tasks import TuneTask
+from tuning.gains.tasks import TuneTask, has_sensor_noise
 from tuning.gains.transfer import Tuned, carry_over
 from tuning.gains.validation import (
     Validation,
@@ -73,6 +73,9 @@ class TuneResult:
     global_comparison: GlobalComparison | None = None  # how far from the best anywhere, if that was searched
     # transparency, slope and peak of each, where the scenarios are probed
     transparency: dict[str, dict[str, Estimate]] = field(default_factory=dict)
+    # of the tuned gains on the same fresh scenarios without the sensors' noise; None where there is none
+    without_noise: ErrorFigures | None = None
+    quiet: bool = False  # whether these are the quietest gains within the limit, not those of least error
 
     @property
     def usual_starts(self) -> int:
@@ -98,6 +101,8 @@ def tune_block(
     work.begin(f"judging on {settings.validation} fresh scenarios", judging - (beforehand if known else 0))
     best = [one.best.gains if one.best else task.literature for one, task in zip(found, tasks, strict=True)]
     judged = {**(known or _judge_known(validation)), "tuned": validation.judge(best)}
+    noisy = [has_sensor_noise(task.mechanism) for task in tasks]
+    noiseless = validation.judge(best, noise=False) if any(noisy) else []
     clock.lap("judge")
     comparisons: list[GlobalComparison | None] = [None for _ in tasks]
     if settings.global_search and settings.setting is None:
@@ -131,6 +136,8 @@ def tune_block(
             freedom=_freedom(task, validation.names, found[i].best),
             global_comparison=comparisons[i],
             transparency=_transparency(validation, i, {key: every[i][1] for key, every in judged.items()}),
+            without_noise=figures(split_nominal(noiseless[i][0])[0]) if noisy[i] else None,
+            quiet=found[i].quiet is not None,
         )
         results.append(result)
     return results
@@ -153,7 +160,8 @@ def _search_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
 
 def _judging_runs(tasks: list[TuneTask], settings: TuneSettings) -> float:
     """Those of the judgement and, if one is asked for, of the search everywhere."""
-    judged = 1.5 * _known_runs(tasks, settings)
+    noisy = any(has_sensor_noise(task.mechanism) for task in tasks)
+    judged = (2.0 if noisy else 1.5) * _known_runs(tasks, settings)
     everywhere = FACTOR * _search_runs(tasks, settings) if settings.global_search else 0
     return judged + everywhere
 

@@ -51,6 +51,8 @@ class _Kept(NamedTuple):
     freedom: dict[str, Freedom]
     global_comparison: GlobalComparison | None
     transparency: dict[str, dict[str, Estimate]]
+    without_noise: ErrorFigures | None
+    quiet: bool
 
 
 def tune(

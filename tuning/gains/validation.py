@@ -46,16 +46,16 @@ class Validation:
     work: Work  # hears of every run
 
     def judge(
-        self, gains: list[dict[str, float]], compensator: str | None = None
+        self, gains: list[dict[str, float]], compensator: str | None = None, noise: bool = True
     ) -> list[tuple[Outcome, Outcome | None]]:
         """Of every task under its gains: outcome on fresh scenarios, the nominal run last; where tasks are
         probed, outcome (slots, scenarios, `LANES_PER_SCENARIO`) of the fresh scenarios with their probes.
-        Of another `compensator` than that of the tasks, if one is given."""
+        Of another `compensator` than that of the tasks, if one is given; or without the sensors' noise."""
         loop = self.loop
         if compensator is not None:
             loop = simulated.with_compensator(loop, compensator)
         values = {name: np.repeat([one[name] for one in gains], self.lanes) for name in gains[0]}
-        outcome = begin_batch(loop, values, self._judged)()
+        outcome = begin_batch(loop, values, self._judged if noise else self._judged_without_noise)()
         every = cut(outcome, self.lanes)
         self.work.ran(self.lanes * len(self.tasks))
         if not self.tasks[0].probed:
@@ -156,6 +156,11 @@ class Validation:
     def _judged(self) -> Batch:
         # Where few are judged, they share the program of the training scenarios.
         return place_batch(self.judged, at_least=lanes_of(self.training))
+
+    @cached_property
+    def _judged_without_noise(self) -> Batch:
+        # The same program: its noise is multiplied by 0.
+        return place_batch(simulated.without_noise(self.judged), at_least=lanes_of(self.training))
 
     @cached_property
     def _placed(self) -> Callable[[tuple[int, ...], int, int, int], tuple[Any, Batch]]:

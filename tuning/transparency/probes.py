@@ -35,7 +35,7 @@ from tuning.transparency.pushes import EARLY, LATE, in_space, probed
 
 LANES_PER_SCENARIO = 4  # lanes of a scenario: plain, early, late, damped
 # Weights of the objective of a law that anticipates, unless others are given.
-ANTICIPATING = {"transparency_weight": 1.0, "command_weight": 0.003}
+ANTICIPATING = {"transparency_weight": 1.0, "command_weight": 0.3}
 
 
 class ProbedScenarios(NamedTuple):

@@ -177,6 +177,7 @@ def _tune_all(
                     terminal.note(f"jaxhil: {error}")
                     continue
                 done[index] = result
+                terminal.warn(f"{result.mechanism.name}: {text}" for text in result.warnings)
                 if not options.json and drawn:
                     print_one(options, result.found, entries[index])
         if options.pareto and done:
@@ -238,6 +239,10 @@ def _finish(
         "figures": found.figures,
         **result.parts,
         "nominal": found.nominal,
+        "without_noise": result.without_noise,
+        **result.command._asdict(),
+        "quietest_within_limit": found.quiet,
+        "warnings": result.warnings,
         "tuned_intervals": found.intervals.plain() if found.intervals else None,
         "honesty": found.transparency,
         "starts": [_start(start) for start in found.starts],

@@ -5,6 +5,7 @@ from typing import Any
 
 from tuning import terminal
 from tuning.cli.options import Tune
+from tuning.front_door.tune_verdict import verdict_line
 
 
 def print_overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], drawn: bool) -> None:
@@ -48,19 +49,22 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
         tables = [_errors(options, result, entry["better_than_literature"])]
     tables += [_transparency(result)] if result.transparency else []
     tables += [*_gains(options, result), *([_starts(options, result)] if result.starts else [])]
-    closing = [f"wrote {path}" for path in (entry["gain_file"], *entry["plots"])]
+    closing = [*_aims(options, result)]
+    closing += [f"wrote {path}" for path in (entry["gain_file"], *entry["plots"])]
     if not entry["sensor_noise"]:
         noise = "'{force=0.5,torque=0.05}'" if "energy_error" in entry else "2.67"
         closing.append(f"No sensor noise in the mechanism; with it: --set rig.force_sensor.noise_std={noise}")
     closing.append("took: " + ", ".join(f"{stage} {time:.1f} s" for stage, time in result.timings.items()))
-    terminal.emit(*tables, *_how_sure(result), *closing, _verdict(options, result, entry["verdict"]), "")
+    terminal.emit(*tables, *_how_sure(result), *closing, verdict_line(result, options.limit), "")
 
 
 def _errors(options: Tune, result: Any, better: bool) -> Any:
     names = {"before": "before (uncompensated)", "literature": "literature's rule", "tuned": "tuned"}
-    rows = []
+    judged, rows = {**result.figures}, []
+    if result.without_noise is not None:
+        names["without noise"], judged["without noise"] = "tuned, without noise", result.without_noise
     for key, label in names.items():
-        one = result.figures[key]
+        one = judged[key]
         if key == "tuned" and not better:
             label = "tuned (NOT better than the literature's)"
         rows.append(
@@ -115,18 +119,15 @@ def _gains(options: Tune, result: Any) -> list[Any]:
     return [terminal.table(f"Gains of {options.compensator}", headings, rows, texts=(0, 1))] if rows else []
 
 
-def _verdict(options: Tune, result: Any, verdict: str) -> str:
-    tuned = result.figures["tuned"]
-    low, high = result.intervals.rms
-    sure = f" (95 %: {low:.2g} to {high:.2g})" if math.isfinite(low + high) else ""
-    if verdict == "good":
-        return f"Good: the tuned rms error {tuned.rms:.2g}{sure} is within {options.limit:g}."
-    if tuned.failed:
-        from jaxhil.simulation.scenario import LONGEST_CONTACT
-
-        ended = f"did not end well, at the latest after {LONGEST_CONTACT:g} s,"
-        return f"Bad: {tuned.failed} contacts {ended} with the tuned gains."
-    return f"Bad: the tuned rms error {tuned.rms:.2g}{sure} exceeds {options.limit:g}."
+def _aims(options: Tune, result: Any) -> list[str]:
+    """Say which gains were sought, where that depends on what was found."""
+    if not result.settings.quiet or result.without_noise is None or not result.starts:
+        return []
+    if result.quiet:
+        return [f"Quietest gains found within {options.limit:g}; of least error: --noise-weight 0."]
+    return [
+        f"Gains of least error: none were found well within {options.limit:g}, of which to take the quietest."
+    ]
 
 
 def _how_sure(result: Any) -> list[str]:

@@ -1,0 +1,252 @@
+"""The quietest gains within a limit: against a grid of all gains, beside the least error, in one program."""
+
+import math
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+import tuning
+from jaxhil.mechanism.file import load, load_any
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.scenario import build_scenarios
+from tuning.caches import program_cache
+from tuning.caches.pieces import Pieces
+from tuning.front_door import tune_verdict
+from tuning.front_door.tune import TuneOptions
+from tuning.gains import simulated
+from tuning.gains.noise import amplification
+from tuning.gains.objective import Objective, objective_value
+from tuning.gains.quiet import is_quiet, tolerance_of
+from tuning.gains.settings import TuneSettings
+from tuning.gains.tasks import build_task
+from tuning.gains.tune import figures
+from tuning.gains.tune_all import tune_all
+from tuning.gains.validation import VALIDATION_SEED, build_validation
+
+LAW = "phase_lead"
+LIMIT = 0.06
+SETTINGS = TuneSettings(
+    scenarios=16,
+    starts=2,
+    steps=12,
+    validation=64,
+    scanned=32,
+    polish=32,
+    objective=Objective(limit=LIMIT),
+    quiet=True,
+)
+
+
+def noisy(name, stiffness, delay, noise):
+    changes = [f"name='{name}'", "approach.contacts=1", f"contact.stiffness=[{stiffness}]"]
+    sensor = [f"rig.force_sensor.noise_std={noise}", f"rig.force_sensor.delay={delay}"]
+    return load("varying", [*changes, *sensor]).mechanism
+
+
+# Of the last one no gains are within the limit.
+RIGS = [("soft", 5e4, 0.004, 0.3), ("late", 2e5, 0.03, 3.0)]
+MECHANISMS = [noisy(*rig) for rig in RIGS]
+
+
+def tuned(settings, **options):
+    found = dict(tune_all(MECHANISMS, LAW, settings, **options))
+    return [found[index] for index in range(len(MECHANISMS))]
+
+
+@pytest.fixture(scope="module")
+def quiet():
+    """The quietest, and how many programs of the solver they took."""
+    program_cache._program.cache_clear()
+    found = tuned(SETTINGS)
+    return found, program_cache._program.cache_info().misses
+
+
+def noise_of(result, gains):
+    return amplification(result.mechanism, LAW, gains) - 1
+
+
+def most_accurate(result):
+    """The best of the starts of least error."""
+    return min(result.starts, key=lambda start: start.rms)
+
+
+def test_quiet_gains_are_within_the_limit_on_fresh_scenarios(quiet):
+    result = quiet[0][0]
+    accurate = most_accurate(result)
+    assert result.quiet and accurate.rms < tolerance_of(LIMIT, SETTINGS.scenarios or 0)
+    assert result.figures["tuned"].failed == 0 and result.figures["tuned"].rms <= LIMIT
+    assert noise_of(result, result.gains) < 0.8 * noise_of(result, accurate.gains)
+
+
+def test_gains_of_least_error_stay_where_none_are_within_the_limit(quiet, validation):
+    result = quiet[0][1]
+    accurate = most_accurate(result)
+    assert not result.quiet and accurate.rms > tolerance_of(LIMIT, SETTINGS.scenarios or 0)
+    found = validation.losses(Objective(), [1], validation.coordinates(1, [result.gains])[None])
+    assert found[0, 0] <= accurate.rms * (1 + 1e-9)
+
+
+@pytest.fixture(scope="module")
+def validation():
+    """The training scenarios of all."""
+    tasks = [build_task(one, LAW, SETTINGS.scenarios, SETTINGS.seed) for one in MECHANISMS]
+    return build_validation(tasks, SETTINGS.validation, SETTINGS.seed)
+
+
+def test_one_program_serves_both_searches(quiet):
+    assert quiet[1] == 1
+
+
+def test_no_gains_of_a_grid_are_quieter_within_the_tolerance(quiet, validation):
+    """By the measure of the module, with the weights that this task had: every pair of the two gains."""
+    result = quiet[0][0]
+    accurate = most_accurate(result).gains
+    side = np.linspace(0, 1, 24)
+    grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    points = np.concatenate([grid, validation.coordinates(0, [result.gains, accurate])])[None]
+    errors = validation.losses(Objective(), [0], points)[0]
+    beside = validation.losses(Objective(command_weight=1.0, limit=1.0), [0], points)[0]
+    peaks = np.sqrt(np.maximum(0, beside**2 - errors**2))
+    noise = np.array([max(0.0, noise_of(result, validation.gains(0, own))) for own in points[0]])
+    loudness = np.hypot(noise / max(noise[-1], 1), peaks / max(peaks[-1], 0.5))
+    tolerance = tolerance_of(LIMIT, SETTINGS.scenarios or 0)
+    assert errors[-2] <= 1.05 * tolerance
+    assert (errors[:-2] <= tolerance).any()
+    assert loudness[-2] <= 1.03 * loudness[:-2][errors[:-2] <= tolerance].min()
+
+
+def test_figures_without_noise_are_those_of_the_mechanism_without_noise(quiet):
+    for rig, result in zip(RIGS, quiet[0], strict=True):
+        silent = noisy(*rig[:-1], 0.0)
+        seed = SETTINGS.seed + VALIDATION_SEED
+        scenarios = build_scenarios(silent, draw(silent, SETTINGS.validation, seed), seed)
+        outcome = evaluate(build_loop(silent, LAW, scenarios), result.gains, scenarios)
+        expected = figures(outcome)
+        assert result.without_noise.rms == pytest.approx(expected.rms, rel=1e-9)
+        assert result.without_noise.failed == expected.failed
+        assert result.without_noise.rms != result.figures["tuned"].rms
+
+
+def test_mechanisms_without_noise_are_tuned_as_if_quiet_were_not_asked_for():
+    silent = load("varying").mechanism
+    assert not is_quiet(build_task(silent, LAW, 4, 0), SETTINGS)
+    assert not is_quiet(build_task(MECHANISMS[0], "position_lead", 4, 0), SETTINGS)
+    assert is_quiet(build_task(MECHANISMS[0], LAW, 4, 0), SETTINGS)
+
+
+@pytest.mark.slow
+def test_quiet_gains_that_were_kept_are_the_same(quiet, tmp_path):
+    made = tuned(SETTINGS, pieces=Pieces(tmp_path))
+    again = tuned(SETTINGS, pieces=Pieces(tmp_path, resume=True))
+    for one, other, known in zip(made, again, quiet[0], strict=True):
+        assert one.gains == other.gains == known.gains
+        assert one.quiet == other.quiet and one.without_noise == other.without_noise
+
+
+@pytest.mark.parametrize(
+    ("options", "wanted"),
+    [
+        ({}, True),
+        ({"limit": 0.5}, True),
+        ({"limit": 0.0}, False),
+        ({"limit": math.inf}, False),
+        ({"noise_weight": 0.0}, False),
+        ({"command_weight": 0.1}, False),
+        ({"chatter_weight": 0.1}, False),
+        ({"objective": "worst"}, False),
+        ({"objective": lambda metrics: metrics.error.max()}, False),
+        ({"divergence_weight": 2.0}, False),
+    ],
+)
+def test_what_is_asked_for_is_minimised(options, wanted):
+    settings = TuneOptions(**options).settings()
+    assert settings.quiet is wanted and settings.objective.tolerance is None
+
+
+# The verdict
+
+
+def result_of(rms=0.005, silent=0.004, failed=0, peaks=(1.0, 1.2), gains=(0.0, 0.001)):
+    """What the verdict reads of a result."""
+
+    def figures_of(rms, failed=0):
+        return SimpleNamespace(rms=rms, failed=failed)
+
+    outcome = SimpleNamespace(peak_ratio=np.array([*peaks, 99.0]), good=np.array([True, True, False]))
+    return SimpleNamespace(
+        figures={"tuned": figures_of(rms)},
+        without_noise=None if silent is None else figures_of(silent, failed),
+        outcomes={"tuned": outcome},
+        mechanism=MECHANISMS[0],
+        compensator=LAW,
+        gains=dict(zip(("phase_lead", "lead_filter"), gains, strict=True)),
+        intervals=None,
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "good", "words"),
+    [
+        ({}, True, "Good: the tuned rms error 0.005, 0.004 without noise, is within 0.01; peak ratio 1.2"),
+        ({"silent": None}, True, "Good: the tuned rms error 0.005 is within 0.01; peak ratio 1.2"),
+        ({"rms": 0.02}, False, "Bad: the tuned rms error 0.02, 0.004 without noise, exceeds 0.01; peak"),
+        ({"silent": 0.03}, False, "Bad: the tuned rms error 0.005, 0.03 without noise, exceeds 0.01; peak"),
+        ({"failed": 2}, False, "Bad: 2 contacts did not end well"),
+    ],
+)
+def test_verdict_says_what_it_looked_at(changes, good, words):
+    result = result_of(**changes)
+    line = tune_verdict.verdict_line(result, 0.01)
+    assert tune_verdict.is_good(result, 0.01) is good
+    assert line.startswith(words) and "sensor noise x 1" in line
+
+
+def test_warnings_name_peaks_and_noise_beyond_their_bounds():
+    def warned(**changes):
+        result = result_of(**changes)
+        return tune_verdict.command_warnings(result, tune_verdict.command_figures(result))
+
+    loud = {"gains": (0.004, 0.001)}
+    assert amplification(MECHANISMS[0], LAW, {"phase_lead": 0.004, "lead_filter": 0.001}) > 2
+    assert warned() == ()
+    (peaks,) = warned(peaks=(1.6, 1.6))
+    assert "1.6 times the ideal contact's peak force" in peaks and "at most 1.5" in peaks
+    (noise,) = warned(**loud)
+    assert "amplifies the sensor's noise" in noise and "at most 2" in noise
+    # Without noise there is none to amplify.
+    assert warned(**loud, silent=None) == ()
+
+
+def test_objective_value_of_quiet_gains_is_small_within_the_tolerance():
+    within = Objective(tolerance=0.01)
+    assert objective_value(within, np.array([0.005])) == pytest.approx(1e-4)
+
+
+@pytest.mark.slow
+def test_tune_of_a_noisy_mechanism_records_its_noise_free_error_and_warnings():
+    small = {"scenarios": 8, "starts": 1, "steps": 2, "validation": 16}
+    one = tuning.tune("suite-noisy", LAW, **small)
+    written = one.document["figures"]
+    assert written["without_noise"]["rms"] == one.without_noise.rms
+    assert written["command"]["peak_p99"] == one.command.peak_p99
+    assert written["warnings"] == list(one.warnings)
+
+
+@pytest.mark.parametrize("name", ["suite-noisy", "petals"])
+def test_scenarios_without_noise_differ_in_their_noise_alone(name):
+    sensor = {} if name != "petals" else {"rig.force_sensor.noise_std": {"force": 0.5, "torque": 0.05}}
+    mechanism = load_any(name, {**sensor, "rig.force_sensor.delay": 0.003}).mechanism
+    scenarios = simulated.scenarios_of(mechanism)
+    silent = simulated.without_noise(scenarios)
+    noisy = jax.tree.leaves(scenarios)
+    changed = [
+        (before, after)
+        for before, after in zip(noisy, jax.tree.leaves(silent), strict=True)
+        if not np.array_equal(before, after)
+    ]
+    ((before, after),) = changed
+    assert np.any(before > 0) and not np.any(after) and before.shape == after.shape

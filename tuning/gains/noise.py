@@ -1,0 +1,22 @@
+"""Amplification of the force sensor's noise by a compensator, from its gains alone."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+
+from jaxhil.compensators import COMPENSATORS, Compensator, Constants
+
+
+def has_trade_off(compensator: str) -> bool:
+    """Return whether a compensator's gains change how much sensor noise it passes on."""
+    law = COMPENSATORS.get(compensator)
+    return law is not None and type(law).noise_amplification is not Compensator.noise_amplification
+
+
+def amplification(mechanism: Any, compensator: str, gains: Mapping[str, float]) -> float:
+    """Return A [1] for the nominal mechanism of one axis (`Compensator.noise_amplification`)."""
+    period, clearance = mechanism.rig.control_period, mechanism.contact.clearance
+    constants = Constants(jnp.asarray(period), jnp.asarray(clearance))
+    values = {name: jnp.asarray(value) for name, value in gains.items()}
+    return float(COMPENSATORS[compensator].noise_amplification(values, constants))
