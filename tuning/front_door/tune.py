@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from tuning.gains.transfer import Tuned
     from tuning.gains.tune import ErrorFigures, TuneResult
 
+UNLIKE = 0.01  # share of the fresh contacts that may be unlike the ideal contact in peak force or duration
+
 
 @dataclass(frozen=True)
 class TuneOptions:
@@ -167,10 +169,12 @@ class TunedGains:
 
     @property
     def verdict(self) -> str:
-        """ "good" if every contact ended with the tuned gains, and their rms error is within the limit, else
+        """ "good" if every contact ended with the tuned gains, their rms error is within the limit, and at
+        most `UNLIKE` of the real contacts are harder, shorter or longer than the ideal contact allows, else
         "bad"."""
         tuned = self.figures["tuned"]
-        return "good" if tuned.failed == 0 and tuned.rms <= self.limit else "bad"
+        within = tuned.rms <= self.limit and tuned.unlike <= UNLIKE
+        return "good" if tuned.failed == 0 and within else "bad"
 
     @functools.cached_property
     def meaning(self) -> "Meaning | None":

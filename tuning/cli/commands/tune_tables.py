@@ -5,6 +5,7 @@ from typing import Any
 
 from tuning import terminal
 from tuning.cli.options import Tune
+from tuning.front_door.tune import UNLIKE
 
 
 def print_overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], drawn: bool) -> None:
@@ -66,13 +67,17 @@ def _errors(options: Tune, result: Any, better: bool) -> Any:
         rows.append(
             (
                 *(label, one.rms, one.p99, one.max, f"{one.mean:+.4f}", f"{100 * one.diverging:.0f} %"),
+                *(f"{one.peak_force_ratio:.3f}", f"{one.duration_ratio[1]:.3f}"),
                 *(f"{one.peak_ratio:.3f}", f"{one.chatter:.3f}", one.failed),
             )
         )
     count = int(result.outcomes["tuned"].wanted.sum())
     return terminal.table(
         f"{result.mechanism.name}: errors e - e* of {count} contacts in {options.validation} fresh scenarios",
-        ["gains", "rms", "99th pct", "max", "mean", "e > e*", "peak ratio", "chatter", "not ended"],
+        [
+            *("gains", "rms", "99th pct", "max", "mean", "e > e*", "real force", "duration", "peak ratio"),
+            *("chatter", "not ended"),
+        ],
         rows,
     )
 
@@ -116,16 +121,24 @@ def _gains(options: Tune, result: Any) -> list[Any]:
 
 
 def _verdict(options: Tune, result: Any, verdict: str) -> str:
+    from jaxhil.simulation.contact_bounds import LONGEST, MOST_FORCE, SHORTEST
+
     tuned = result.figures["tuned"]
     low, high = result.intervals.rms
     sure = f" (95 %: {low:.2g} to {high:.2g})" if math.isfinite(low + high) else ""
+    real = (
+        f"{100 * tuned.unlike:.2g} % of the real contacts are beyond {MOST_FORCE:g} times the ideal contact's"
+    )
+    real += f" peak force or {SHORTEST:g} to {LONGEST:g} times its duration"
     if verdict == "good":
-        return f"Good: the tuned rms error {tuned.rms:.2g}{sure} is within {options.limit:g}."
+        return f"Good: the tuned rms error {tuned.rms:.2g}{sure} is within {options.limit:g}; {real}."
     if tuned.failed:
         from jaxhil.simulation.scenario import LONGEST_CONTACT
 
         ended = f"did not end well, at the latest after {LONGEST_CONTACT:g} s,"
         return f"Bad: {tuned.failed} contacts {ended} with the tuned gains."
+    if tuned.unlike > UNLIKE:
+        return f"Bad: {real}, allowed {100 * UNLIKE:g} %."
     return f"Bad: the tuned rms error {tuned.rms:.2g}{sure} exceeds {options.limit:g}."
 
 
