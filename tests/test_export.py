@@ -136,11 +136,10 @@ def test_what_differs_from_the_simulation_is_not_written(jaxhil, gains, tmp_path
 
 def test_limits_that_stop_the_nominal_run_are_reported(jaxhil, gains, tmp_path):
     ran = jaxhil("export", gains, "-o", tmp_path / "bundle", "--set", "force_limit=1")
-    assert (
-        ran.code == 1
-        and "Bad: the nominal run, tick " in ran.out
-        and "the controller acts on force_limit" in ran.out
-    )
+    said = " ".join(ran.out.split())
+    assert ran.code == 1 and "Bad: the nominal run is stopped at " in said
+    assert "by the guard's check force_limit: " in said and ", force_limit 1 N; " in said
+    assert "--set force_limit=" in said and " lets this run pass" in said
     assert (tmp_path / "bundle" / "manifest.json").exists()
 
 

@@ -26,6 +26,7 @@ from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.metrics import OK, STATUS_NAMES, Metrics
 from jaxhil.simulation.recording import Lane, nominal_and_draws, record_lanes
 from tuning.verification.closed_loop import run_closed_loop
+from tuning.verification.stops import Stop
 
 REPLAY_LIMIT = 1e-11  # of the command's range
 CLOSED_LOOP_LIMIT = 1e-9  # of restitution
@@ -72,6 +73,7 @@ class VerificationReport(msgspec.Struct, frozen=True):
     closed_loop_limit: float  # allowed difference of a restitution
     replay: tuple[LaneReplay, ...]  # lane by lane
     closed_loop: tuple[ContactComparison, ...]  # contact by contact
+    stop: Stop | None = None  # what the gain file's limits acted on in closed loop, if on anything
 
 
 def verify(
@@ -100,10 +102,11 @@ def verify(
     progress(f"replaying {sum(len(lane.command) for lane in lanes)} ticks through the runtime")
     replays = [replay(lane, file) for lane, file in zip(lanes, gain_files, strict=True)]
     progress("running the nominal contacts with the runtime in the loop")
-    closed = run_closed_loop(loaded, gain_file, batch)
+    closed, stop = run_closed_loop(loaded, gain_file, batch)
     contacts = loaded.mechanism.approach.contacts
     comparisons = [_compare_contact(closed, metrics, contact) for contact in range(contacts)]
-    reasons = (*_replay_reasons(replays), *_closed_loop_reasons(comparisons))
+    stopped = [] if stop is None else [f"closed loop: {stop.text}"]
+    reasons = (*_replay_reasons(replays), *stopped, *_closed_loop_reasons(comparisons, stop))
     return VerificationReport(
         verdict=not reasons,
         reasons=reasons,
@@ -112,6 +115,7 @@ def verify(
         closed_loop_limit=CLOSED_LOOP_LIMIT,
         replay=tuple(replays),
         closed_loop=tuple(comparisons),
+        stop=stop,
     )
 
 
@@ -274,9 +278,13 @@ def _replay_reasons(replays: list[LaneReplay]) -> Iterator[str]:
         )
 
 
-def _closed_loop_reasons(comparisons: list[ContactComparison]) -> Iterator[str]:
+def _closed_loop_reasons(comparisons: list[ContactComparison], stop: Stop | None) -> Iterator[str]:
+    tripped = stop is not None and stop.tripped
     for number, contact in enumerate(comparisons, start=1):
         where = f"closed loop, contact {number}"
+        if tripped and contact.status == "not reached":
+            # What stopped the run is said already.
+            continue
         if contact.restitution is None or contact.simulated_restitution is None:
             yield f"{where}: found {contact.status}, simulated {contact.simulated_status}, allowed ok"
             continue
