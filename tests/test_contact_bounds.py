@@ -8,6 +8,9 @@ import pytest
 
 import jaxhil
 from jaxhil.simulation.contact_bounds import duration_off, too_hard, unlike_ideal
+from jaxhil.simulation.gain_file import check_document
+from tuning.gain_file import build_document
+from tuning.verification.replay import verify
 
 PERIOD = 1e-3
 LAW = "retrospective_reference"
@@ -73,6 +76,16 @@ def test_bad_run_names_status_or_error_first(slow_simulator):
     assert plain.reasons(limit=10.0) == []
     # What is beyond the limit is said beside what is unlike the ideal contact.
     assert len(slow_simulator.reasons(limit=1e-6)) == 3
+
+
+def test_verify_counts_the_real_contact_of_the_closed_loop(slow_simulator):
+    gains, mechanism = slow_simulator.gains, slow_simulator.mechanism
+    report = verify(check_document(build_document(LAW, gains, mechanism, "0" * 64, {}, {}, 0, {})), 1)
+    (contact,) = report.closed_loop
+    (simulated,) = slow_simulator.contacts
+    assert contact.peak_force_ratio == pytest.approx(simulated.peak_force_ratio, rel=1e-6)
+    assert contact.duration_ratio == simulated.duration_ratio
+    assert not report.verdict and report.reasons[0].startswith("closed loop, contact 1: real peak force 20.3")
 
 
 @pytest.mark.parametrize("frequency", [0.1, 30.0])

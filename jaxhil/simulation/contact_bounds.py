@@ -24,6 +24,7 @@ STATED = (
 )
 
 
+BRIEFLY = f"peak force at most {MOST_FORCE:g} times, duration {SHORTEST:g} to {LONGEST:g} times the ideal"
 # Of plain numbers, NumPy's and jax's arrays alike.
 
 

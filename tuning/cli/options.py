@@ -106,7 +106,8 @@ class Simulate:
 
     Example: jaxhil simulate rig-300kg --compensator phase_lead --set approach.velocity=0.01
 
-    Exit code 0 if every |e - e*| is within the limit, else 1.
+    Exit code 0 if every |e - e*| is within the limit, and every real contact's peak force at most 2 times and
+    its duration 0.5 to 2 times that of the ideal contact, else 1.
     """
 
     file: OptionalFile = None
@@ -143,7 +144,9 @@ class Tune:
 
     Example: jaxhil tune rig-300kg varying --output study --starts 16
 
-    Writes DIR/NAME/gains.json and plots. Exit code 1 if a tuned rms error exceeds the limit.
+    Writes DIR/NAME/gains.json and plots. Exit code 1 if a tuned rms error exceeds the limit,
+    or more than 1 % of the real contacts have more than 2 times the ideal contact's peak force, or less than
+    0.5 or more than 2 times its duration.
     """
 
     files: Files = ()

@@ -22,6 +22,9 @@ from jaxhil.compensators import Signals
 from jaxhil.runtime import Controller
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
 from jaxhil.runtime.limits import NO_LIMITS
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.contact_bounds import BRIEFLY
+from jaxhil.simulation.evaluation import Outcome, compare_with_reference
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.metrics import OK, STATUS_NAMES, Metrics
 from jaxhil.simulation.recording import Lane, nominal_and_draws, record_lanes
@@ -61,6 +64,10 @@ class ContactComparison(msgspec.Struct, frozen=True):
     simulated_restitution: float | None  # simulated as a whole
     status: str
     simulated_status: str
+    # with the runtime in the loop: largest real force over the ideal contact's peak force, and the duration
+    # over that contact's [1]
+    peak_force_ratio: float | None = None
+    duration_ratio: float | None = None
 
 
 class VerificationReport(msgspec.Struct, frozen=True):
@@ -104,9 +111,18 @@ def verify(
     progress("running the nominal contacts with the runtime in the loop")
     closed, stop = run_closed_loop(loaded, gain_file, batch)
     contacts = loaded.mechanism.approach.contacts
-    comparisons = [_compare_contact(closed, metrics, contact) for contact in range(contacts)]
+    nominal = jax.tree.map(lambda leaf: np.asarray(leaf)[..., :1], batch)
+    loop = build_loop(loaded.mechanism, loaded.compensator, nominal)
+    outcome = jax.device_get(compare_with_reference(loop, nominal, closed))
+    comparisons = [_compare_contact(outcome, metrics, contact) for contact in range(contacts)]
     stopped = [] if stop is None else [f"closed loop: {stop.text}"]
-    reasons = (*_replay_reasons(replays), *stopped, *_closed_loop_reasons(comparisons, stop))
+    unlike = [
+        f"closed loop, contact {number}: real peak force {one.peak_force_ratio:.3g} times, duration "
+        f"{one.duration_ratio:.3g} times the ideal contact's, allowed {BRIEFLY}"
+        for number, one in enumerate(comparisons, start=1)
+        if outcome.unlike[number - 1, 0]
+    ]
+    reasons = (*_replay_reasons(replays), *stopped, *_closed_loop_reasons(comparisons, stop), *unlike)
     return VerificationReport(
         verdict=not reasons,
         reasons=reasons,
@@ -241,12 +257,17 @@ def _aligned(signals: Signals, delay: float, period: float) -> np.ndarray:
     return np.where(age <= whole, uniform, between)
 
 
-def _compare_contact(closed: Metrics, simulated: Metrics, contact: int) -> ContactComparison:
+def _compare_contact(outcome: Outcome, simulated: Metrics, contact: int) -> ContactComparison:
+    closed = outcome.metrics
+    ended = closed.status[contact, 0] == OK
+    ratios = (outcome.peak_force_ratio, outcome.duration_ratio)
     return ContactComparison(
         restitution=_restitution(closed, contact),
         simulated_restitution=_restitution(simulated, contact),
         status=STATUS_NAMES[int(closed.status[contact, 0])],
         simulated_status=STATUS_NAMES[int(simulated.status[contact, 0])],
+        peak_force_ratio=float(ratios[0][contact, 0]) if ended else None,
+        duration_ratio=float(ratios[1][contact, 0]) if ended else None,
     )
 
 

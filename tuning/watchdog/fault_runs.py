@@ -109,7 +109,9 @@ def fault_rates(
 def scenarios_needed(allowed: float) -> int:
     """Return how many scenarios of a fault decide on a share `allowed`, a few missed or useless ones among
     them."""
-    needed = number_to_decide(0, 0, allowed) if 0 < allowed < 1 else None
+    if not 0 < allowed < 1:
+        return FEWEST if allowed >= 1 else MOST
+    needed = number_to_decide(0, 0, allowed)
     return MOST if needed is None else int(np.clip(2 * needed, FEWEST, MOST))
 
 

@@ -44,7 +44,7 @@ def _tables(document: dict[str, Any]) -> list[Any]:
 
 
 def _lines(document: dict[str, Any]) -> list[str]:
-    from jaxhil.simulation.contact_bounds import STATED
+    from jaxhil.simulation.contact_bounds import BRIEFLY
     from jaxhil.simulation.metrics import STATUS_REASONS
     from tuning.sweeps.columns import UNLIKE, UNLIKENESS
 
@@ -53,7 +53,8 @@ def _lines(document: dict[str, Any]) -> list[str]:
     lines = [
         f"Failure probability {probability['value']:.4g}, 95 % interval {probability['low']:.3g} to "
         f"{probability['high']:.3g} ({probability['method']}); {document['failed']} of {number} failed, "
-        f"{'energy and twist' if document['axes'] == 6 else 'restitution'} error allowed {within}; {STATED}."
+        f"{'energy and twist' if document['axes'] == 6 else 'restitution'} error allowed {within}, "
+        f"real contact: {BRIEFLY}."
     ]
     lines += _sequential(document)
     if UNLIKE in document["outcomes"]:
