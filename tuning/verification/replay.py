@@ -15,6 +15,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 
 import jax
+import jax.numpy as jnp
 import msgspec
 import numpy as np
 
@@ -111,9 +112,9 @@ def verify(
     progress("running the nominal contacts with the runtime in the loop")
     closed, stop = run_closed_loop(loaded, gain_file, batch)
     contacts = loaded.mechanism.approach.contacts
-    nominal = jax.tree.map(lambda leaf: np.asarray(leaf)[..., :1], batch)
-    loop = build_loop(loaded.mechanism, loaded.compensator, nominal)
-    outcome = jax.device_get(compare_with_reference(loop, nominal, closed))
+    loop = build_loop(loaded.mechanism, loaded.compensator, batch)
+    nominal = jax.tree.map(lambda leaf: jnp.asarray(leaf)[..., :1], batch)
+    outcome = jax.device_get(compare_with_reference(loop, nominal, jax.tree.map(jnp.asarray, closed)))
     comparisons = [_compare_contact(outcome, metrics, contact) for contact in range(contacts)]
     stopped = [] if stop is None else [f"closed loop: {stop.text}"]
     unlike = [
