@@ -62,10 +62,13 @@ def test_a_bundle_is_exported_signed_and_verified(jaxhil, gains, tmp_path):
     pair = Ed25519PrivateKey.generate()
     private.write_bytes(pair.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
     public.write_bytes(pair.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
-    ran = jaxhil("export", gains, "-o", folder, "--format", "csv,ros2", "--sign", private, "--json")
+    # With these gains every run diverges: a watchdog that is on would stop it.
+    blind = ("--set", "restitution_margin=none", "--missed", "1")
+    ran = jaxhil("export", gains, "-o", folder, "--format", "csv,ros2", "--sign", private, "--json", *blind)
     assert ran.code == 0, ran
     said = ran.document
-    assert said["verdict"] == "unknown" and not said["reasons"] and "a sweep of " in said["unknown"][0]
+    assert said["verdict"] == "unknown" and not said["reasons"] and said["stop"] is None
+    assert "runs is good: gains with smaller errors are needed" in said["unknown"][0]
     assert said["bundle"] == str(folder) and said["formats"] == ["ros2", "csv"]
     assert said["signed"] is True
     assert (
@@ -80,7 +83,7 @@ def test_a_bundle_is_exported_signed_and_verified(jaxhil, gains, tmp_path):
     assert ran.code == 0 and "Good: commands agree" in ran.out and "\nPASSED\n" in ran.out
     assert "Signature: by the key given." in ran.out
     # Once more onto itself, and not signed.
-    ran = jaxhil("export", folder, "-o", folder, "--format", "matlab")
+    ran = jaxhil("export", folder, "-o", folder, "--format", "matlab", *blind)
     assert ran.code == 0 and "\nNot known to be good: " in ran.out and "selftest.py" in ran.out
     assert "gains.mat" in files_of(folder) and not {"gains.csv", "manifest.sig"} & files_of(folder)
     ran = jaxhil("verify", folder, "--key", public, "--json")
@@ -136,11 +139,10 @@ def test_what_differs_from_the_simulation_is_not_written(jaxhil, gains, tmp_path
 
 def test_limits_that_stop_the_nominal_run_are_reported(jaxhil, gains, tmp_path):
     ran = jaxhil("export", gains, "-o", tmp_path / "bundle", "--set", "force_limit=1")
-    assert (
-        ran.code == 1
-        and "Bad: the nominal run, tick " in ran.out
-        and "the controller acts on force_limit" in ran.out
-    )
+    said = " ".join(ran.out.split())
+    assert ran.code == 1 and "Bad: the nominal run is stopped at " in said
+    assert "by the guard's check force_limit: " in said and ", force_limit 1 N; " in said
+    assert "--set force_limit=" in said and " lets this run pass" in said
     assert (tmp_path / "bundle" / "manifest.json").exists()
 
 
@@ -156,7 +158,8 @@ def test_limits_come_from_the_sweep_that_is_named(jaxhil, gains, tmp_path):
     assert rates["calibrated_on"]["scenarios"] == 40 and rates["calibrated_on"]["sweep_sha256"]
     alarms, runs = (rates["false_alarms"][name] for name in ("alarms", "runs"))
     assert 0 < runs < 40 and f"false alarms {alarms} of {runs} good runs (95 %: " in ran.out
-    assert rates["verdict"] == "unknown" and "\nUnknown: missed alarms: 95 % interval " in ran.out
+    assert rates["verdict"] == "unknown" and "\nUnknown: " in ran.out
+    assert {one["name"] for one in rates["fault_runs"]} >= {"force_delay", "simulator_delay"}
     limits = written["limits"]
     assert limits["command_lowest"] == {"value": -0.05, "unit": "m"}
     assert limits["force_range"] == {"value": None, "unit": "N"}

@@ -44,11 +44,13 @@ def result(error_size=(0.5, 0.05, 0.005)):
             metrics=Metrics(**numbers),
             reference_restitution=np.ones(shape),
             reference_peak_force=0.005 * np.sqrt(scenarios.contact.stiffness * scenarios.equivalent_mass),
+            reference_duration=np.ones(shape),
             error=size * generator.standard_normal(shape),
             peak_ratio=np.ones(shape),
             chatter=np.zeros(shape),
             wanted=wanted,
             good=wanted,
+            unlike=np.zeros(shape, bool),
         )
     summaries = {name: figures(outcome) for name, outcome in outcomes.items()}
     starts = [Start("converged", 3, 0.1 / n, [1.0, 0.5, 0.1 / n], {}) for n in (1, 3, 2)]

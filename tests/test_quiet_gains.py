@@ -170,11 +170,12 @@ def test_what_is_asked_for_is_minimised(options, wanted):
 # The verdict
 
 
-def result_of(rms=0.005, silent=0.004, failed=0, peaks=(1.0, 1.2), gains=(0.0, 0.001)):
+def result_of(rms=0.005, silent=0.004, failed=0, unlike=0.0, peaks=(1.0, 1.2), gains=(0.0, 0.001)):
     """What the verdict reads of a result."""
 
     def figures_of(rms, failed=0):
-        return SimpleNamespace(rms=rms, failed=failed)
+        shares = {"peak_force_ratio": 1.1, "duration_ratio": (0.9, 1.2), "unlike": unlike}
+        return SimpleNamespace(rms=rms, failed=failed, **shares)
 
     outcome = SimpleNamespace(peak_ratio=np.array([*peaks, 99.0]), good=np.array([True, True, False]))
     return SimpleNamespace(
@@ -196,13 +197,15 @@ def result_of(rms=0.005, silent=0.004, failed=0, peaks=(1.0, 1.2), gains=(0.0, 0
         ({"rms": 0.02}, False, "Bad: the tuned rms error 0.02, 0.004 without noise, exceeds 0.01; peak"),
         ({"silent": 0.03}, False, "Bad: the tuned rms error 0.005, 0.03 without noise, exceeds 0.01; peak"),
         ({"failed": 2}, False, "Bad: 2 contacts did not end well"),
+        ({"unlike": 0.02}, False, "Bad: too many real contacts are unlike the ideal one; the tuned rms"),
     ],
 )
 def test_verdict_says_what_it_looked_at(changes, good, words):
     result = result_of(**changes)
     line = tune_verdict.verdict_line(result, 0.01)
     assert tune_verdict.is_good(result, 0.01) is good
-    assert line.startswith(words) and "sensor noise x 1" in line
+    assert line.startswith(words)
+    assert "sensor noise x 1" in line or "Real contacts" in line
 
 
 def test_warnings_name_peaks_and_noise_beyond_their_bounds():

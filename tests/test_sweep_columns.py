@@ -9,14 +9,15 @@ from jaxhil.simulation.evaluation import Outcome
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.metrics import DIVERGED, NON_FINITE, NOT_REACHED, OK, TIMEOUT, Metrics
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.sweeps.columns import OUTCOMES, STATUSES, rows_of, sweep_columns, unit_of
+from tuning.sweeps.columns import OUTCOMES, STATUSES, contact_slots, judge, rows_of, sweep_columns, unit_of
 
 LIMIT = 0.01
 NAN = np.nan
 
 
-def rows(errors, status, peak_force=10.0, force_range=np.inf, shortfall=0.0):
-    """Rows of a sweep of two contacts; errors and status (2, lanes)."""
+def rows(errors, status, peak_force=10.0, force_range=np.inf, shortfall=0.0, ideal=(10.0, 1.0)):
+    """Rows of a sweep of two contacts; errors and status (2, lanes); `ideal` peak force [N] and duration [s],
+    beside `peak_force` and a duration of 1 s."""
     parsed = check_document(case(2, force_sensor={"range": 1e6})).mechanism
     errors, status = np.array(errors, float), np.array(status, np.int32)
     lanes = errors.shape[1]
@@ -41,7 +42,18 @@ def rows(errors, status, peak_force=10.0, force_range=np.inf, shortfall=0.0):
         status=status,
         ticks=status,
     )
-    outcome = Outcome(metrics, 0.9 * like, like, error, like, like, status == OK, status == OK)
+    outcome = Outcome(
+        metrics,
+        0.9 * like,
+        ideal[0] * like,
+        ideal[1] * like,
+        error,
+        like,
+        like,
+        status == OK,
+        status == OK,
+        status != status,
+    )
     return rows_of(parsed, 7, draws, scenarios, outcome, LIMIT, False)
 
 
@@ -86,6 +98,41 @@ def test_a_limit_of_the_motion_simulator_that_binds_is_saturation():
     assert outcomes(found) == ["saturated", "saturated", "timeout"] and found["failed"].all()
     np.testing.assert_array_equal(found["position_shortfall_2"], 1e-9)
     assert outcomes(rows(errors, status)) == ["good", "error beyond limit", "timeout"]
+
+
+@pytest.mark.parametrize(
+    ("ideal", "outcome"),
+    [
+        ((5.0, 1.0), "good"),
+        ((4.99, 1.0), "unlike the ideal contact"),
+        ((100.0, 1.0), "good"),  # softer than the ideal contact
+        ((10.0, 0.4981), "good"),  # two control periods of 2 ms are how a duration is counted
+        ((10.0, 0.4979), "unlike the ideal contact"),
+        ((10.0, 2.0079), "good"),
+        ((10.0, 2.0081), "unlike the ideal contact"),
+        ((10.0, np.inf), "good"),  # bodies that stick have no duration to compare with
+    ],
+)
+def test_real_contact_unlike_the_ideal_one_is_a_failure(ideal, outcome):
+    found = rows([[0.0], [0.0]], [[OK], [OK]], ideal=ideal)
+    assert outcomes(found) == [outcome] and found["failed"][0] == (outcome != "good")
+    np.testing.assert_array_equal(found["reference_peak_force_2"], ideal[0])
+    np.testing.assert_array_equal(found["reference_duration_1"], ideal[1])
+
+
+def test_unlike_contact_says_more_than_an_error_and_less_than_saturation():
+    errors, status = [[0.5, 0.5], [0.0, 0.0]], [[OK, OK], [OK, OK]]
+    assert outcomes(rows(errors, status, ideal=(1.0, 1.0))) == ["unlike the ideal contact"] * 2
+    assert outcomes(rows(errors, status, 10.0, 9.0, ideal=(1.0, 1.0))) == ["saturated"] * 2
+    unended = rows([[NAN], [0.0]], [[TIMEOUT], [NOT_REACHED]], ideal=(1.0, 0.1))
+    assert outcomes(unended) == ["timeout"]
+
+
+def test_outcomes_of_a_store_without_ideal_contacts_follow_from_errors_alone():
+    found = rows([[0.0], [0.0]], [[OK], [OK]], ideal=(1.0, 1.0))
+    old = {name: values for name, values in found.items() if not name.startswith("reference_")}
+    judged = judge(old, contact_slots(2), np.array(np.inf), np.array(2e-3), LIMIT)
+    assert outcomes(found) == ["unlike the ideal contact"] and outcomes(judged) == ["good"]
 
 
 def test_energies_are_kinetic_energies_of_the_numerical_model():

@@ -48,7 +48,7 @@ def made_up(part, label=MANIFEST, seed=0):
             rows[column.name] = generator.integers(0, len(texts), number).astype(np.int8)
         else:
             rows[column.name] = values
-    return {**rows, **judge(rows, contact_slots(2), np.array(np.inf), label.largest_error)}
+    return {**rows, **judge(rows, contact_slots(2), np.array(np.inf), np.array(1e-3), label.largest_error)}
 
 
 @pytest.fixture
@@ -130,11 +130,12 @@ def test_a_part_written_anew_by_something_else_is_not_taken(store):
 
 @pytest.mark.parametrize("column", ["outcome", "failed", "worst_error", "error_2", "status_1"])
 def test_outcomes_follow_from_errors(store, column):
-    good = {"status": 1, "error": 0.25, "position_shortfall": 0.0}
+    good = {"status": 1, "error": 0.25, "position_shortfall": 0.0, "peak_force": 1.0, "duration": 1.0}
+    good |= {f"reference_{name}": good[name] for name in ("peak_force", "duration")}
     rows = made_up(0)
     for name, value in good.items():
         rows[f"{name}_1"][5] = rows[f"{name}_2"][5] = value
-    rows = {**rows, **judge(rows, contact_slots(2), np.array(np.inf), MANIFEST.largest_error)}
+    rows = {**rows, **judge(rows, contact_slots(2), np.array(np.inf), np.array(1e-3), MANIFEST.largest_error)}
     assert OUTCOMES[rows["outcome"][5]] == "good" and not rows["failed"][5] and rows["worst_error"][5] == 0.25
     write_part(store, 0, rows)
     assert read_part(store, 0) is not None

@@ -130,7 +130,9 @@ def test_a_wrong_runtime_is_reported(varying, monkeypatch, runtime, start):
         worst = report.replay[0]
         assert 1e-9 < worst.difference < 1e-7 and worst.found != worst.expected
     if runtime is Failing:
-        assert "closed loop, contact 1: found not reached, simulated ok, allowed ok" in report.reasons
+        assert report.stop is not None and report.stop.contact == 1 and report.stop.limit is None
+        assert f"closed loop: {report.stop.text}" in report.reasons
+        assert "by the guard's check command_not_finite: the compensated force is not a" in report.stop.text
     if runtime is Leading:
         assert all(lane.difference <= 1e-13 for lane in report.replay)
         in_the_loop = [one for one in report.reasons if one.startswith("closed loop, contact 1: restitution")]

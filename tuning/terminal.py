@@ -92,6 +92,12 @@ def signed(value: float | None) -> str:
     return "-" if value is None or value != value else f"{value:+.4f}"
 
 
+def ratio(value: float, ideal: float) -> str:
+    """Return a number over that of the ideal contact, in three decimals; a dash where there is none."""
+    found = value / ideal if ideal else math.nan
+    return f"{found:.3f}" if math.isfinite(found) and math.isfinite(ideal) else "-"
+
+
 def finite(value: Any) -> Any:
     """Mappings, lists, named tuples and numbers, NumPy's as Python's, with None for what is not finite."""
     if isinstance(value, Mapping):

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 from jaxhil.contact.laws import ContactParameters
 from jaxhil.contact.reference import Reference
 from jaxhil.simulation import kept_programs
+from jaxhil.simulation.contact_bounds import unlike_ideal
 from jaxhil.simulation.environment import ROLLOUT
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.metrics import OK, Metrics
@@ -37,12 +38,26 @@ class Outcome(NamedTuple):
     # e* of the same contact in space, entered at the same speed [1]
     reference_restitution: Float[Array, "slots *batch"]
     reference_peak_force: Float[Array, "slots *batch"]  # of that contact [N]
+    # of that contact [s]; infinite if the bodies never separate
+    reference_duration: Float[Array, "slots *batch"]
     error: Float[Array, "slots *batch"]  # e - e* [1]
     peak_ratio: Float[Array, "slots *batch"]  # largest |F_c| over the reference's peak force [1]
     # excess variation of F_c (`Metrics`) over the reference's peak force [1]
     chatter: Float[Array, "slots *batch"]
     wanted: Bool[Array, "slots *batch"]  # whether the contact was asked for
     good: Bool[Array, "slots *batch"]  # whether it was reached and ended well
+    # whether its real force or its duration is beyond the bounds beside the ideal contact (`contact_bounds`)
+    unlike: Bool[Array, "slots *batch"]
+
+    @property
+    def peak_force_ratio(self) -> Any:
+        """Largest real contact force over the ideal contact's peak force [1]."""
+        return self.metrics.peak_force / self.reference_peak_force
+
+    @property
+    def duration_ratio(self) -> Any:
+        """Time with a real contact force over the ideal contact's duration [1]."""
+        return self.metrics.duration / self.reference_duration
 
 
 def compare_with_reference(loop: Loop, scenario: Scenario, metrics: Metrics) -> Outcome:
@@ -65,11 +80,20 @@ def compare_with_reference(loop: Loop, scenario: Scenario, metrics: Metrics) -> 
         metrics=metrics,
         reference_restitution=reference.restitution,
         reference_peak_force=reference.peak_force,
+        reference_duration=reference.duration,
         error=metrics.restitution - reference.restitution,
         peak_ratio=metrics.peak_command / reference.peak_force,
         chatter=metrics.excess_variation / reference.peak_force,
         wanted=wanted,
         good=good,
+        unlike=good
+        & unlike_ideal(
+            metrics.peak_force,
+            reference.peak_force,
+            metrics.duration,
+            reference.duration,
+            scenario.control_period[None],
+        ),
     )
 
 

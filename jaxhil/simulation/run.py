@@ -1,7 +1,7 @@
 """One run of a mechanism's contacts: what became of each contact, and every tick of the way there."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -14,11 +14,12 @@ from jaxhil.files import as_path, follow, write_csv, writing
 from jaxhil.mechanism.loading import as_mechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.contact_bounds import LONGEST, MOST_FORCE, SHORTEST, duration_off, too_hard
 from jaxhil.simulation.environment import computing
 from jaxhil.simulation.evaluation import Outcome, evaluate
 from jaxhil.simulation.gain_choice import choose_gains
 from jaxhil.simulation.gain_file import LoadedGains
-from jaxhil.simulation.metrics import NOT_REACHED, OK, STATUS_NAMES
+from jaxhil.simulation.metrics import NOT_REACHED, OK, STATUS_NAMES, STATUS_REASONS
 from jaxhil.simulation.plausibility import Meaning, check_run, meaning
 from jaxhil.simulation.recording import record_lanes
 from jaxhil.simulation.scenario import build_scenarios
@@ -33,10 +34,13 @@ class ContactResult(NamedTuple):
     reference_restitution: float  # e*, that of the same contact in space, entered at the same speed [1]
     error: float  # e - e* [1]; above 0 the contact diverges
     peak_force: float  # of the real contact force [N]
-    reference_peak_force: float  # of the same contact in space [N]
+    reference_peak_force: float  # of the ideal contact [N]
+    peak_force_ratio: float  # peak force over the ideal contact's [1]
     peak_command: float  # of |F_c|, the force on the numerical model [N]
     position_shortfall: float  # by which the motion simulator's limits cut the position command [m]
-    duration: float  # time in contact [s]
+    duration: float  # time with a real contact force [s]
+    reference_duration: float  # of the ideal contact [s]
+    duration_ratio: float  # duration over the ideal contact's [1]
     approach_velocity: float  # of the numerical model, on the tick before the contact [m/s]
     force_delay: float | None  # of the measurement, as the compensator estimates it [s]; None if it does not
     # by how much the surface is deeper than told, as the compensator finds it [m]; None if it does not
@@ -76,6 +80,16 @@ class Run:
     def meaning(self) -> Meaning:
         """What the mechanism means: mass, contacts in space, rates; `warnings` of what cannot be meant."""
         return meaning(self.mechanism)
+
+    def reasons(self, limit: float = 0.01) -> list[str]:
+        """Return why the run is bad, in words; an empty list if it is good.
+
+        A run is good if every contact ended, no restitution error is beyond `limit` [1], and every real
+        contact's peak force and duration are within `contact_bounds` of the ideal contact's.
+        """
+        if self.status != STATUS_NAMES[OK]:
+            return [f"the run ended with status '{self.status}': {STATUS_REASONS[self.status]}"]
+        return [*_error_reasons(self.contacts, limit), *_unlike(self.contacts, self.mechanism)]
 
     @cached_property
     def ticks(self) -> Ticks:
@@ -194,6 +208,30 @@ def check_seed(seed: Any) -> int:
     return number
 
 
+def _error_reasons(contacts: Sequence[ContactResult], limit: float) -> Iterator[str]:
+    """Name the largest restitution error, if it is beyond the limit."""
+    worst = max((contact.error for contact in contacts), key=abs)
+    if not abs(worst) <= limit:
+        kind = "divergence" if worst > 0 else "convergence"
+        yield f"the largest error is {worst:+.4f} ({kind}), allowed {limit:g}"
+
+
+def _unlike(contacts: Sequence[ContactResult], mechanism: Mechanism) -> Iterator[str]:
+    """Name the real contacts that are too hard, too short or too long."""
+    for number, one in enumerate(contacts, start=1):
+        if too_hard(one.peak_force, one.reference_peak_force):
+            yield (
+                f"contact {number}: real peak force {one.peak_force:.4g} N, {one.peak_force_ratio:.3g} times "
+                f"the ideal contact's {one.reference_peak_force:.4g} N, allowed {MOST_FORCE:g} times"
+            )
+        if duration_off(one.duration, one.reference_duration, mechanism.rig.control_period):
+            yield (
+                f"contact {number}: real contact of {1e3 * one.duration:.4g} ms, {one.duration_ratio:.3g} "
+                f"times the ideal contact's {1e3 * one.reference_duration:.4g} ms, allowed {SHORTEST:g} to "
+                f"{LONGEST:g} times"
+            )
+
+
 def _contact(outcome: Outcome, slot: int, law: Compensator) -> ContactResult:
     metrics = outcome.metrics
     status = int(metrics.status[slot, 0])
@@ -209,9 +247,12 @@ def _contact(outcome: Outcome, slot: int, law: Compensator) -> ContactResult:
         error=value(outcome.error, ended),
         peak_force=value(metrics.peak_force, reached),
         reference_peak_force=value(outcome.reference_peak_force, ended),
+        peak_force_ratio=value(outcome.peak_force_ratio, ended),
         peak_command=value(metrics.peak_command, reached),
         position_shortfall=value(metrics.position_shortfall, reached),
         duration=value(metrics.duration, reached),
+        reference_duration=value(outcome.reference_duration, ended),
+        duration_ratio=value(outcome.duration_ratio, ended),
         approach_velocity=value(metrics.approach_velocity, reached),
         force_delay=value(metrics.force_delay, reached) if law.estimates_delay else None,
         contact_plane=value(metrics.contact_plane, reached) if law.finds_plane else None,

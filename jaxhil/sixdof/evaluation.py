@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhil.simulation import metrics as one_axis
+from jaxhil.simulation.contact_bounds import unlike_ideal
 from jaxhil.simulation.environment import SIX_AXES
 from jaxhil.simulation.evaluation import (
     Outcome,
@@ -102,11 +103,20 @@ def outcome_of(found: Metrics, scenario: Scenario) -> Outcome:
         metrics=metrics,
         reference_restitution=found.reference_restitution,
         reference_peak_force=found.reference_peak_force,
+        reference_duration=found.reference_duration,
         error=found.energy_error,
         peak_ratio=ratio,
         chatter=zero,
         wanted=wanted,
         good=status == one_axis.OK,
+        unlike=(status == one_axis.OK)
+        & unlike_ideal(
+            found.peak_force,
+            found.reference_peak_force,
+            found.duration,
+            found.reference_duration,
+            scenario.control_period[None],
+        ),
     )
     rows: Outcome = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), both)
     return rows._replace(error=jnp.concatenate([found.energy_error, found.twist_error]))

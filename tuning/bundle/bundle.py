@@ -19,6 +19,7 @@ from jaxhil.runtime.limits import LIMITS
 from tuning.bundle import selftest
 from tuning.bundle.content import bundle_files
 from tuning.bundle.manifest import is_bundle
+from tuning.verification.stops import Stop
 
 
 class Bundle(NamedTuple):
@@ -31,6 +32,8 @@ class Bundle(NamedTuple):
     # what ended the comparison with the simulation in each recorded run; None: nothing
     ended: list[str | None]
     reasons: list[str]  # what disagrees, in words
+    stop: Stop | None  # what the limits act on in the nominal run; None: nothing
+    passing: dict[str, float] | None  # limits with which that run passes; None if there are none
 
 
 def build_bundle(
@@ -60,7 +63,8 @@ def build_bundle(
     if sign is not None:
         files[selftest.SIGNATURE] = sign(files[selftest.MANIFEST])
     runs = len({row.run for row in vectors.rows})
-    return Bundle(exported, files, len(vectors.rows), runs, vectors.ended, vectors.reasons)
+    found = vectors.ended, vectors.reasons, vectors.stop, vectors.passing
+    return Bundle(exported, files, len(vectors.rows), runs, *found)
 
 
 def with_limits(

@@ -215,7 +215,7 @@ def _watchdog(document: Mapping[str, Any]) -> Iterator[str]:
     rates = rates if isinstance(rates, Mapping) else {}
     if rates.get("verdict"):
         yield f"<p><b>{escape(_verdict(rates))}</b></p>"
-    rates_text = one_line("; ".join(alarm_rates(rates)), 800)
+    rates_text = one_line("; ".join(alarm_rates(rates)), 1500)
     rates_text = rates_text or "Rates of false and missed alarms are not known"
     yield f"<p>{escape(rates_text[0].upper() + rates_text[1:])}.</p>"
     fitted = sum(not is_shown(name) for name in given)
@@ -254,12 +254,29 @@ def alarm_rates(rates: Mapping[str, Any]) -> Iterator[str]:
             allowed = f", allowed {_number(one['allowed'], 2)}" if "allowed" in one else ""
             interval = f"95 %: {_number(one['low'], 2)} to {_number(one['high'], 2)}{allowed}"
             yield f"{name.replace('_', ' ')} {one['alarms']} of {one['runs']} {runs} ({interval})"
+    for one in rates.get("fault_runs", ()):
+        if isinstance(one, Mapping) and {"counted", "runs", "alarms", "low", "high", "error"} <= one.keys():
+            yield _faulty(one)
     noticed = rates.get("noticed_from")
     if isinstance(noticed, Mapping):
         yield from _noticed(noticed, rates)
     calibrated = rates.get("calibrated_on")
     if isinstance(calibrated, Mapping) and calibrated.get("runs") not in (None, "good"):
         yield "no run was good: the limits come from runs with errors beyond the limit"
+
+
+def _faulty(one: Mapping[str, Any]) -> str:
+    """Return in words how often a fault of known size is missed."""
+    unit = "" if one["unit"] == "1" else f" {one['unit']}"
+    if not one["counted"]:
+        most = f"up to {_number(one['largest_size'], 2)}{unit}"
+        usable = f"{one['runs']} of {one['scenarios']} runs are good without it and just bad with it"
+        return f"{one['meaning']}, {most}: not counted, {usable}"
+    interval = (
+        f"95 %: {_number(one['low'], 2)} to {_number(one['high'], 2)}, allowed {_number(one['allowed'], 2)}"
+    )
+    size = f"by {_number(one['size'], 2)}{unit}, error {_number(one['error'], 2)}"
+    return f"missed alarms {one['alarms']} of {one['runs']} runs with {one['meaning']}, {size} ({interval})"
 
 
 def _noticed(noticed: Mapping[str, Any], rates: Mapping[str, Any]) -> Iterator[str]:

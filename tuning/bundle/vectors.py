@@ -30,6 +30,7 @@ from tuning.verification.replay import (
     parting,
     relative_difference,
 )
+from tuning.verification.stops import Stop, find_stop, passing_limits
 
 BEGINS, NEXT_CONTACT = 1, 2  # events of a tick; 0 for none
 DRAWS = 3
@@ -82,6 +83,8 @@ class Recorded(NamedTuple):
     mass: float  # equivalent mass of the nominal run [kg]
     ended: list[str | None]  # of each run what ended the comparison with the simulation; None: nothing
     reasons: list[str]  # what disagrees, in words
+    stop: Stop | None  # what the limits act on in the nominal run; None: nothing
+    passing: dict[str, float] | None  # limits with which that run passes; None if there are none
 
 
 def recorded(loaded: LoadedGains, gain_file: GainFile, seed: int, draws: int = DRAWS) -> Recorded:
@@ -100,7 +103,9 @@ def recorded(loaded: LoadedGains, gain_file: GainFile, seed: int, draws: int = D
         ended.append(end)
         if reason:
             reasons.append(f"{'the nominal run' if run == 0 else f'draw {run}'}, {reason}")
-    return Recorded(rows, float(batch.equivalent_mass[0]), ended, reasons)
+    stop = find_stop(gain_file, lanes[0])
+    passing = None if stop is None else passing_limits(gain_file, lanes[0])
+    return Recorded(rows, float(batch.equivalent_mass[0]), ended, reasons, stop, passing)
 
 
 def hostile(

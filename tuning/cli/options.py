@@ -106,7 +106,8 @@ class Simulate:
 
     Example: jaxhil simulate rig-300kg --compensator phase_lead --set approach.velocity=0.01
 
-    Exit code 0 if every |e - e*| is within the limit, else 1.
+    Exit code 0 if every |e - e*| is within the limit, and every real contact's peak force at most 2 times and
+    its duration 0.5 to 2 times that of the ideal contact, else 1.
     """
 
     file: OptionalFile = None
@@ -144,8 +145,9 @@ class Tune:
     Example: jaxhil tune rig-300kg varying --output study --starts 16
 
     Writes DIR/NAME/gains.json and plots. Exit code 1 if a tuned rms error exceeds the limit, with the noise
-    of the sensors or without. Warns of commands that peak beyond 1.5 ideal peaks, and of noise amplified
-    more than twice.
+    of the sensors or without, or more than 1 % of the real contacts have more than 2 times the ideal
+    contact's peak force, or less than 0.5 or more than 2 times its duration. Warns of commands that peak
+    beyond 1.5 ideal peaks, and of noise amplified more than twice.
     """
 
     files: Files = ()

@@ -6,6 +6,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from msgspec import to_builtins
+
 from jaxhil.errors import shown
 from jaxhil.runtime.limits import LIMITS
 from jaxhil.simulation.environment import computing
@@ -112,9 +114,14 @@ def export(
 
 def _document(loaded, bundle, chosen, rates) -> dict[str, Any]:
     """What `jaxhil export --json` prints, but for where the bundle is."""
-    # A run that ends early in the bundle itself does so on the rig.
-    stopped = bundle.ended[0] if bundle.ended else None
-    stops = [f"the nominal run, {stopped}"] if stopped else []
+    from tuning.verification.stops import advice
+
+    stops = []
+    if bundle.stop is not None:
+        # What the limits stop here they stop on the rig.
+        stops = [f"the nominal run is {bundle.stop.text}; {advice(bundle.passing)}"]
+    elif bundle.ended and bundle.ended[0]:
+        stops = [f"the nominal run, {bundle.ended[0]}"]
     reasons = [*bundle.reasons, *stops, *rates["reasons"]]
     return {
         "bundle": None,
@@ -129,6 +136,7 @@ def _document(loaded, bundle, chosen, rates) -> dict[str, Any]:
         "ticks": bundle.ticks,
         "runs": bundle.runs,
         "ended": bundle.ended,
+        "stop": None if bundle.stop is None else {**to_builtins(bundle.stop), "passing": bundle.passing},
         "reasons": reasons,
         "unknown": rates["unknown"],
         "verdict": "bad" if reasons else rates["verdict"],
@@ -140,11 +148,13 @@ def _calibrated(
 ):
     """The limits for the rig, and what is known of the watchdog's alarms."""
     from tuning.watchdog.calibration import WITHOUT_STORE, calibrate, held_scenarios
+    from tuning.watchdog.fault_runs import FAULTS, scenarios_needed
     from tuning.watchdog.verdict import Allowed
 
+    faulty = scenarios_needed(allowed[1])
     with _store(sweep) as store:
         runs = WITHOUT_STORE if store is None else held_scenarios(store)
-        with terminal.progress(runs, "runs", progress) as bar:
+        with terminal.progress(runs + len(FAULTS) * faulty, "runs", progress) as bar:
             bar.reach(0, "working out the limits")
             return calibrate(
                 loaded,
@@ -152,6 +162,7 @@ def _calibrated(
                 replaced=replaced,
                 allowed=Allowed(*allowed),
                 progress=bar.advance,
+                faulty=faulty,
             )
 
 

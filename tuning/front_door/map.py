@@ -132,6 +132,7 @@ def _write(made: StabilityMap, folder: Path) -> None:
 def _document(
     mechanism: Mechanism, compensator: str, gains: Mapping[str, float], found: "Map", limit: float, seed: int
 ) -> dict[str, Any]:
+    from jaxhil.simulation.contact_bounds import BOUNDS
     from jaxhil.simulation.sources import versions
     from tuning.gain_file import VERSIONED, plain
 
@@ -150,6 +151,9 @@ def _document(
         "seed": seed,
         "error": found.error,
         "restitution": found.restitution,
+        "peak_force_ratio": found.peak_force_ratio,
+        "duration_ratio": found.duration_ratio,
+        "bounds": BOUNDS,
         "theory": {
             "series": closed.series,
             "characteristic_root": closed.characteristic_root,
@@ -163,6 +167,8 @@ def _document(
         "nominal": {
             "restitution": nominal.restitution,
             "error": nominal.error,
+            "peak_force_ratio": nominal.peak_force_ratio,
+            "duration_ratio": nominal.duration_ratio,
             "growth": nominal.growth,
             "margins": {
                 what: None
@@ -173,6 +179,7 @@ def _document(
                 }
                 for what, margins in (
                     ("error", nominal.error_margins),
+                    ("contact", nominal.contact_margins),
                     ("spectral_radius", nominal.radius_margins),
                 )
             },

@@ -180,8 +180,9 @@ class TunedGains:
 
     @property
     def verdict(self) -> str:
-        """ "good" if every contact ended with the tuned gains, and their rms error is within the limit, with
-        the sensors' noise and without, else "bad"."""
+        """ "good" if every contact ended with the tuned gains, their rms error is within the limit, and at
+        most 1 % of the real contacts are harder, shorter or longer than the ideal contact allows, with the
+        sensors' noise and without, else "bad"."""
         return "good" if tune_verdict.is_good(self.found, self.limit) else "bad"
 
     @property

@@ -8,7 +8,9 @@ import numpy as np
 from jaxhil.mechanism.structs import Mechanism
 
 if TYPE_CHECKING:
-    from tuning.gains.tune import TuneResult
+    from tuning.gains.tune import ErrorFigures, TuneResult
+
+UNLIKE = 0.01  # share of the fresh contacts that may be unlike the ideal contact in peak force or duration
 
 
 class CommandFigures(NamedTuple):
@@ -31,9 +33,13 @@ def command_figures(result: "TuneResult") -> CommandFigures:
 
 
 def is_good(result: "TuneResult", limit: float) -> bool:
-    """Return whether every contact ended and the rms error is within the limit, without noise too."""
-    judged = [result.figures["tuned"], *([result.without_noise] if result.without_noise else [])]
-    return all(one.failed == 0 and one.rms <= limit for one in judged)
+    """Return whether all contacts ended, like the ideal ones and within the limit, without noise too."""
+    return all(one.failed == 0 and one.rms <= limit and one.unlike <= UNLIKE for one in _judged(result))
+
+
+def _judged(result: "TuneResult") -> list["ErrorFigures"]:
+    """Return the figures with the sensors' noise, and without."""
+    return [result.figures["tuned"], *([result.without_noise] if result.without_noise else [])]
 
 
 def command_warnings(result: "TuneResult", command: CommandFigures) -> tuple[str, ...]:
@@ -56,7 +62,7 @@ def command_warnings(result: "TuneResult", command: CommandFigures) -> tuple[str
 
 
 def verdict_line(result: "TuneResult", limit: float) -> str:
-    """Return the verdict in one line: errors, limit, and the figures of the command."""
+    """Return the verdict: errors, limit, figures of the command and of the real contacts."""
     tuned, silent, command = result.figures["tuned"], result.without_noise, command_figures(result)
     low, high = result.intervals.rms if result.intervals else (math.nan, math.nan)
     sure = f" (95 %: {low:.2g} to {high:.2g})" if math.isfinite(low + high) else ""
@@ -74,6 +80,21 @@ def verdict_line(result: "TuneResult", limit: float) -> str:
     error = f"the tuned rms error {tuned.rms:.2g}{sure}"
     if silent is not None:
         error += f", {silent.rms:.2g} without noise,"
+    real = _real_contacts(max(_judged(result), key=lambda one: one.unlike))
     if is_good(result, limit):
-        return f"Good: {error} is within {limit:g}; {beside}."
-    return f"Bad: {error} exceeds {limit:g}; {beside}."
+        return f"Good: {error} is within {limit:g}; {beside}.\n{real}"
+    if all(one.rms <= limit for one in _judged(result)):
+        return f"Bad: too many real contacts are unlike the ideal one; {error} is within {limit:g}.\n{real}"
+    return f"Bad: {error} exceeds {limit:g}; {beside}.\n{real}"
+
+
+def _real_contacts(figures: "ErrorFigures") -> str:
+    """Return the line on peak force and duration of the real contacts beside the ideal ones."""
+    from jaxhil.simulation.contact_bounds import LONGEST, MOST_FORCE, SHORTEST
+
+    shortest, longest = figures.duration_ratio
+    return (
+        f"Real contacts, 98 in 100: peak force up to {figures.peak_force_ratio:.3g} times, duration "
+        f"{shortest:.3g} to {longest:.3g} times the ideal contact's; {100 * figures.unlike:.2g} % of all are "
+        f"beyond {MOST_FORCE:g} times or {SHORTEST:g} to {LONGEST:g} times, allowed {100 * UNLIKE:g} %."
+    )

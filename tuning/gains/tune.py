@@ -1,5 +1,6 @@
 """Tuning of mechanisms: scenarios, starts, solve, and judgement on scenarios that tuning never saw."""
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -43,6 +44,12 @@ class ErrorFigures(NamedTuple):
     peak_ratio: float  # largest |F_c| over the reference's peak force [1]
     chatter: float  # root mean square of the chatter [1] (`jaxhil.simulation.evaluation.Outcome`)
     failed: int  # contacts that did not end
+    # 99th percentile of the largest real force over the ideal contact's peak force [1]
+    peak_force_ratio: float = math.nan
+    # 1st and 99th percentile of the time with a real force over the ideal contact's duration [1]
+    duration_ratio: tuple[float, float] = (math.nan, math.nan)
+    # share of the contacts beyond the bounds on either (`jaxhil.simulation.contact_bounds`) [1]
+    unlike: float = 0.0
 
 
 class Freedom(NamedTuple):
@@ -241,7 +248,19 @@ def figures(outcome: Outcome) -> ErrorFigures:
         peak_ratio=float(np.max(outcome.peak_ratio[outcome.good])),
         chatter=float(np.sqrt(np.mean(outcome.chatter[outcome.good] ** 2))),
         failed=failed,
+        **_real_contacts(outcome),
     )
+
+
+def _real_contacts(outcome: Outcome) -> dict[str, Any]:
+    """Return what `ErrorFigures` says of the real contacts beside the ideal ones."""
+    good = outcome.good
+    lowest, highest = np.nanpercentile(outcome.duration_ratio[good], (1, 99))
+    return {
+        "peak_force_ratio": float(np.nanpercentile(outcome.peak_force_ratio[good], 99)),
+        "duration_ratio": (float(lowest), float(highest)),
+        "unlike": float(np.mean(outcome.unlike[good])),
+    }
 
 
 def figures_of_parts(result: TuneResult) -> dict[str, dict[str, ErrorFigures]]:

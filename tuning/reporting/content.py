@@ -155,18 +155,32 @@ def _of_sweep(results: Results) -> Iterator[Requirement]:
         f"{found.failed} of {found.scenarios}: {share.value:.4g} (95 %: {share.low:.3g} to {share.high:.3g})"
     )
     if found.acceptable is None:
-        required, margin = "none", "none" if found.failed == 0 else f"{found.failed} too many"
+        required, margin = "none", f"{found.failed} too many"
+        if found.failed == 0:
+            margin = _error_margin(found.limit, found.worst[0].worst_error if found.worst else None)
     else:
         required = f"95 % interval ends at or below {found.acceptable:g}"
         margin = f"{found.acceptable - share.high:+.3g}"
     yield Requirement(what, required, result, margin, _known(found.verdict))
 
 
+def _error_margin(limit: float | None, largest: float | None) -> str:
+    """Return how far the largest error of a sweep stays below its limit."""
+    if limit is None or largest is None:
+        return "none"
+    return f"{limit - abs(largest):+.2g} of the error"
+
+
 def _of_watchdog(results: Results) -> Iterator[Requirement]:
     rates = watchdog_rates(results)
-    for key, what in (("false_alarms", "good runs that the watchdog stops"),
-                      ("missed_alarms", "bad runs that it misses")):  # fmt: skip
-        one = rates.get(key)
+    faulty = [one for one in rates.get("fault_runs", ()) if isinstance(one, Mapping) and one.get("counted")]
+    kinds = [(rates.get("false_alarms"), "good runs that the watchdog stops")]
+    kinds += [(one, f"bad runs that it misses, with {one.get('meaning')}") for one in faulty]
+    drawn = rates.get("missed_alarms")
+    # What was drawn says little of missed alarms where faults were injected, unless it is bad.
+    if not faulty or (isinstance(drawn, Mapping) and drawn.get("low", 0) > drawn.get("allowed", 1)):
+        kinds.append((drawn, "bad runs that it misses"))
+    for one, what in kinds:
         if not isinstance(one, Mapping) or not isinstance(one.get("allowed"), (int, float)):
             continue
         low, high, allowed = one.get("low"), one.get("high"), one["allowed"]

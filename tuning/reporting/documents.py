@@ -238,6 +238,7 @@ class MarginsOfMap(Struct):
     """Along x and y by their names; None where the nominal point itself is beyond."""
 
     error: dict[str, MarginOfMap] | None = None
+    contact: dict[str, MarginOfMap] | None = None
     spectral_radius: dict[str, MarginOfMap] | None = None
 
 
@@ -247,6 +248,8 @@ class NominalOfMap(Struct):
     margins: MarginsOfMap
     restitution: float | None = None
     error: float | None = None
+    peak_force_ratio: float | None = None
+    duration_ratio: float | None = None
     growth: GrowthOfMap | None = None
 
 
@@ -265,3 +268,5 @@ class MapDocument(Struct):
     spectral_radius: RadiusOfMap
     nominal: NominalOfMap
     limit: float | None = None
+    peak_force_ratio: list[list[float | None]] | None = None
+    duration_ratio: list[list[float | None]] | None = None

@@ -214,14 +214,16 @@ def _map_of(found: MapDocument) -> Map:
     radii = None if radius.values is None else Radii(table(radius.x), table(radius.y), table(radius.values))
     margins = [
         None if one is None else tuple(Margin(one[axis].low, one[axis].high) for axis in "xy")
-        for one in (nominal.margins.error, nominal.margins.spectral_radius)
+        for one in (nominal.margins.error, nominal.margins.contact, nominal.margins.spectral_radius)
     ]
     grown = None
     if (own := nominal.growth) is not None:
         half = own.per_half_oscillation
         grown = Growth(own.spectral_radius, own.per_second, half, own.frequency, own.by_gain)
-    point = Nominal(nominal.restitution, nominal.error, grown, *margins)  # pyright: ignore[reportArgumentType]
+    ratios = nominal.peak_force_ratio, nominal.duration_ratio
+    point = Nominal(nominal.restitution, nominal.error, *ratios, grown, *margins)  # pyright: ignore[reportArgumentType]
     return Map(
         (axis(found.x), axis(found.y)), table(found.x.values), table(found.y.values),
-        table(found.restitution), table(found.error), closed, radii, radius.none_because, point,
+        table(found.restitution), table(found.error), table(found.peak_force_ratio),
+        table(found.duration_ratio), closed, radii, radius.none_because, point,
     )  # pyright: ignore[reportArgumentType]  # fmt: skip

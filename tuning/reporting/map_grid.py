@@ -50,8 +50,13 @@ class Nominal(NamedTuple):
 
     restitution: float | None  # e of the contact with the largest error [1]
     error: float | None  # its e - e* [1]; None where a contact did not end
+    # of all its contacts the largest real force over the ideal contact's peak force [1]; None likewise
+    peak_force_ratio: float | None
+    duration_ratio: float | None  # likewise of the duration, the one farthest from 1 [1]
     growth: Growth | None  # of a contact that lasts, where the loop in contact is linear
     error_margins: tuple[Margin, Margin] | None  # along x and y, to the limit; None where the error is beyond
+    # to the bounds on real peak force and duration; None where the nominal point is beyond
+    contact_margins: tuple[Margin, Margin] | None
     radius_margins: tuple[Margin, Margin] | None  # along x and y, to a spectral radius of 1
 
 
@@ -63,6 +68,8 @@ class Map(NamedTuple):
     y: np.ndarray  # (rows,)
     restitution: np.ndarray  # e of the contact with the largest error (rows, columns) [1]
     error: np.ndarray  # its e - e* (rows, columns) [1]; NaN where a contact did not end
+    peak_force_ratio: np.ndarray  # as of `Nominal` (rows, columns) [1]; NaN likewise
+    duration_ratio: np.ndarray  # likewise
     closed: ClosedForms  # each (rows, columns)
     radii: Radii | None  # of a contact that lasts
     no_growth: str | None  # why there are no radii
@@ -94,7 +101,8 @@ def compute_map(
     across, up = np.repeat(middle, LINE, axis=0), np.repeat(middle, LINE, axis=0)
     across[:, 0], up[:, 1] = lines
     own, scenarios = batch(np.concatenate([_grid(x, y), across, up, middle]))
-    restitution, error = _run(mechanism, compensator, own, scenarios, tell, scheduler, kept)
+    found = _run(mechanism, compensator, own, scenarios, tell, scheduler, kept)
+    restitution, error, force, duration, unlike = found
     size = points**2
 
     tell("eigenvalues of the loop in contact", runs(points))
@@ -107,26 +115,35 @@ def compute_map(
         grid = [axis.values(few) for axis in axes]
         values = np.concatenate([_grid(*grid), across, up])
         own, at = batch(values)
-        found = spectral_radii(mechanism, compensator, own, at)
-        radii = Radii(grid[0], grid[1], found[: few**2].reshape(few, few))
-        on_lines = found[few**2 :].reshape(2, LINE)
+        every = spectral_radii(mechanism, compensator, own, at)
+        radii = Radii(grid[0], grid[1], every[: few**2].reshape(few, few))
+        on_lines = every[few**2 :].reshape(2, LINE)
     closed = closed_forms(mechanism, compensator, batch(_grid(x, y))[1])
     ended = np.isfinite(error[-1])
     sizes = np.nan_to_num(np.abs(error[size:-1]), nan=np.inf).reshape(2, LINE)
     nominal = Nominal(
         restitution=float(restitution[-1]) if ended else None,
         error=float(error[-1]) if ended else None,
+        peak_force_ratio=float(force[-1]) if ended else None,
+        duration_ratio=float(duration[-1]) if ended else None,
         growth=grown,
         error_margins=_margins(axes, lines, sizes, limit) if ended and abs(error[-1]) <= limit else None,
+        contact_margins=(
+            _margins(axes, lines, np.nan_to_num(unlike[size:-1], nan=1.0).reshape(2, LINE), 0.5)
+            if ended and not unlike[-1]
+            else None
+        ),
         radius_margins=(
             _margins(axes, lines, on_lines, 1.0)
             if on_lines is not None and grown is not None and grown.spectral_radius <= 1
             else None
         ),
     )
+    shape = points, points
     return Map(
-        axes, x, y, restitution[:size].reshape(points, points), error[:size].reshape(points, points),
-        _reshaped(closed, points), radii, reason, nominal,
+        axes, x, y, restitution[:size].reshape(shape), error[:size].reshape(shape),
+        force[:size].reshape(shape), duration[:size].reshape(shape), _reshaped(closed, points), radii, reason,
+        nominal,
     )  # fmt: skip
 
 
@@ -136,7 +153,7 @@ def runs(points: int) -> int:
 
 
 def run_part(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least: int) -> np.ndarray:
-    """e and e - e* of each lane of a part, (2, lanes)."""
+    """Return what `_worst` says of each lane of a part, (5, lanes)."""
     return np.stack(_worst(evaluate(loop, gains, scenarios, at_least=at_least)))
 
 
@@ -149,9 +166,9 @@ def _run(
     scheduler: str | None,
     kept: Pieces,
 ) -> np.ndarray:
-    """e and e - e* of each lane, part by part: each part has lanes that take long and lanes that do not."""
+    """Return what `_worst` says of each lane, part by part: each has lanes that take long and that do not."""
     loop, order = build_loop(mechanism, compensator, scenarios), np.argsort(expected_duration(scenarios))
-    found = np.empty((2, len(order)))
+    found = np.empty((5, len(order)))
     parts = -(-len(order) // PART)
     lanes = [order[number::parts] for number in range(parts)]
     inputs = digest_of((to_builtins(mechanism), compensator, gains, jax.tree.leaves(scenarios)))
@@ -216,15 +233,29 @@ def _gains(gains: Mapping[str, float], axes: tuple[MapAxis, MapAxis], values: np
     return {name: moving.get(name, np.full(len(values), value)) for name, value in gains.items()}
 
 
-def _worst(outcome: Outcome) -> tuple[np.ndarray, np.ndarray]:
-    """e and e - e* of each lane's contact with the largest error; NaN where one did not end."""
-    size = np.where(outcome.wanted & outcome.good, np.abs(outcome.error), -1.0)
-    place = np.argmax(size, axis=0)[None]
+def _worst(outcome: Outcome) -> tuple[np.ndarray, ...]:
+    """Return of each lane e and e - e* of the contact with the largest error, the largest peak force ratio,
+    the duration ratio farthest from 1, and whether a contact is unlike the ideal one.
+
+    All are NaN where a contact did not end.
+    """
+    used = outcome.wanted & outcome.good
     ended = ~np.any(outcome.wanted & ~outcome.good, axis=0)
-    return tuple(
-        np.where(ended, np.take_along_axis(np.asarray(one), place, axis=0)[0], np.nan)
-        for one in (outcome.metrics.restitution, outcome.error)
-    )  # pyright: ignore[reportReturnType]
+
+    def at_largest(size: Any, *values: Any) -> Iterator[np.ndarray]:
+        place = np.argmax(np.where(used, np.nan_to_num(size), -1.0), axis=0)[None]
+        for one in values:
+            yield np.where(ended, np.take_along_axis(np.asarray(one, float), place, axis=0)[0], np.nan)
+
+    force, duration = outcome.peak_force_ratio, outcome.duration_ratio
+    with np.errstate(divide="ignore"):
+        apart = np.abs(np.log(duration))
+    return (
+        *at_largest(np.abs(outcome.error), outcome.metrics.restitution, outcome.error),
+        *at_largest(force, force),
+        *at_largest(apart, duration),
+        *at_largest(outcome.unlike.astype(float), outcome.unlike),
+    )
 
 
 def _margins(

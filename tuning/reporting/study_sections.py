@@ -4,6 +4,7 @@ import shlex
 from collections.abc import Callable, Iterator, Mapping
 
 from jaxhil.errors import one_line
+from jaxhil.simulation.contact_bounds import STATED
 from tuning.reporting.content import Section, Table, number
 from tuning.reporting.documents import Figure, MarginOfMap
 from tuning.reporting.drawings import TYPICAL, map_drawing, nominal_drawing, sweep_drawings
@@ -127,6 +128,11 @@ def stability_map(results: Results, say: Callable[[str], None]) -> Section | Non
     texts, rows = [], []
     if found.nominal.error is not None:
         texts.append(f"At the nominal point the largest error is {found.nominal.error:+.4f}.")
+    if found.nominal.peak_force_ratio is not None:
+        texts.append(
+            f"There the largest real force is {number(found.nominal.peak_force_ratio, 3)} times the ideal "
+            f"contact's, and its duration {number(found.nominal.duration_ratio, 3)} times."
+        )
     if (grown := found.nominal.growth) is not None:
         verb = "grows" if grown.per_second > 0 else "decays"
         texts.append(
@@ -136,6 +142,7 @@ def stability_map(results: Results, say: Callable[[str], None]) -> Section | Non
     margins = found.nominal.margins
     for what, own in (
         (f"|e - e*| within {number(found.limit)}", margins.error),
+        (STATED, margins.contact),
         ("spectral radius at most 1", margins.spectral_radius),
     ):
         for axis, key in (("x", found.x), ("y", found.y)):

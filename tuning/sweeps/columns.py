@@ -14,14 +14,25 @@ from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.six_axes import SixAxisMechanism, numeric_keys_of
 from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.mechanism.uncertainty import PHASE, dimensions
+from jaxhil.simulation.contact_bounds import LONGEST, MOST_FORCE, SHORTEST, unlike_ideal
 from jaxhil.simulation.evaluation import Outcome
 from jaxhil.simulation.metrics import DIVERGED, NON_FINITE, NOT_REACHED, OK, STATUS_NAMES, TIMEOUT
 
-GOOD, BEYOND, SATURATED = "good", "error beyond limit", "saturated"
+GOOD, BEYOND, UNLIKE, SATURATED = "good", "error beyond limit", "unlike the ideal contact", "saturated"
+UNLIKENESS = (
+    f"a real peak force beyond {MOST_FORCE:g} times, or a duration beyond {SHORTEST:g} to {LONGEST:g} times "
+    "that of the ideal contact"
+)
 SATURATION = "a force beyond the sensor's range, or a limit of the motion simulator that bound"
 STATUSES = tuple(STATUS_NAMES.values())
 # From harmless to worst; the status of a run that failed is a cause by itself.
-OUTCOMES = (GOOD, BEYOND, SATURATED, *(STATUS_NAMES[s] for s in (NOT_REACHED, TIMEOUT, DIVERGED, NON_FINITE)))
+OUTCOMES = (
+    GOOD,
+    BEYOND,
+    UNLIKE,
+    SATURATED,
+    *(STATUS_NAMES[s] for s in (NOT_REACHED, TIMEOUT, DIVERGED, NON_FINITE)),
+)
 
 Kind = Literal["integer", "input", "number", "flag", "text"]
 
@@ -48,17 +59,19 @@ PER_CONTACT = (
     PerContact("reference_restitution", "1", "that of the same contact in space"),
     PerContact("error", "1", "restitution less the reference's"),
     PerContact("peak_force", "N", "largest real contact force"),
+    PerContact("reference_peak_force", "N", "that of the ideal contact"),
     PerContact("peak_command", "N", "largest force on the numerical model"),
     PerContact("peak_ratio", "1", "peak command over the reference's peak force"),
     PerContact("position_shortfall", "m", "most that the motion simulator's limits took off its command"),
     PerContact("duration", "s", "time in touch"),
+    PerContact("reference_duration", "s", "that of the ideal contact; infinite if it never ends"),
     PerContact("approach_velocity", "m/s", "speed at which the contact was entered"),
     PerContact("energy_in", "J", "kinetic energy of the numerical model before the contact"),
     PerContact("energy_out", "J", "kinetic energy of the numerical model after the contact"),
 )
 # What episodes of six axes have of these, and in the place of the error both of theirs.
-PER_EPISODE = ("restitution", "reference_restitution", "peak_force", "peak_ratio", "duration")
-PER_EPISODE = (*PER_EPISODE, "approach_velocity")
+PER_EPISODE = ("restitution", "reference_restitution", "peak_force", "reference_peak_force", "peak_ratio")
+PER_EPISODE = (*PER_EPISODE, "duration", "reference_duration", "approach_velocity")
 ERRORS_IN_SPACE = {
     "energy_error": "kinetic energy gained beyond that in space, over that of the approach",
     "twist_error": "deviation of the twist from that in space, over the change there",
@@ -132,7 +145,10 @@ def sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
         *columns,
         Column("worst_error", "number", "1", f"the error of largest magnitude of all {what}s that ended"),
         Column(
-            "outcome", "text", "", f"good, or why the scenario counts as failed; {SATURATED}: {SATURATION}"
+            "outcome",
+            "text",
+            "",
+            f"good, or why the scenario counts as failed; {UNLIKE}: {UNLIKENESS}; {SATURATED}: {SATURATION}",
         ),
         Column("failed", "flag", "", "whether the scenario counts as failed"),
     ]
@@ -184,7 +200,7 @@ def read_of(mechanism: AnyMechanism, works: bool, outcome: Outcome) -> Any:
     names = {"status", "restitution", "approach_velocity", *(one.name for one in _kept(mechanism, works))}
     metrics = outcome.metrics
     other: Any = dict.fromkeys(set(metrics._fields) - names)
-    unread: Any = dict.fromkeys(("reference_peak_force", "chatter", "wanted", "good"))
+    unread: Any = dict.fromkeys(("chatter", "wanted", "good", "unlike"))
     return outcome._replace(metrics=metrics._replace(**other), **unread)
 
 
@@ -209,6 +225,8 @@ def rows_of(
     values = {
         **{name: getattr(metrics, name) for name in metrics._fields},
         "reference_restitution": outcome.reference_restitution,
+        "reference_peak_force": outcome.reference_peak_force,
+        "reference_duration": outcome.reference_duration,
         "peak_ratio": outcome.peak_ratio,
         **_energies(scenarios, metrics),
     }
@@ -220,7 +238,8 @@ def rows_of(
             rows[f"{name}_{slot.number}"] = np.where(known, values[name][place], np.nan)
         rows[slot.error] = np.where(ended[place], outcome.error[place], np.nan)
         rows[slot.status] = codes[place]
-    found = {**rows, **judge(rows, made, force_range(scenarios), limit)}
+    period = np.asarray(scenarios.control_period)
+    found = {**rows, **judge(rows, made, force_range(scenarios), period, limit)}
     names = [column.name for column in sweep_columns(mechanism, works)]
     return {name: found[name] for name in names if name in found}
 
@@ -242,11 +261,21 @@ def _energies(scenarios: Any, metrics: Any) -> dict[str, np.ndarray]:
 
 
 def judge(
-    rows: Mapping[str, np.ndarray], made: Sequence[Slot], force_range: np.ndarray, limit: float
+    rows: Mapping[str, np.ndarray],
+    made: Sequence[Slot],
+    force_range: np.ndarray,
+    period: np.ndarray,
+    limit: float,
 ) -> dict[str, np.ndarray]:
-    """`worst_error`, `outcome` and `failed`, which follow from the columns of every contact.
+    """Return `worst_error`, `outcome` and `failed`, which follow from the columns of every contact.
 
-    `force_range` [N] is the force sensor's, of every row or of all; `limit` [1] that of the error.
+    Args:
+        rows: columns by name. Those of a store that an earlier version wrote have no ideal contact's peak
+            force and duration: its outcomes say nothing of them.
+        made: contacts or episodes.
+        force_range: of the force sensor [N], of every row or of all.
+        period: control period [s], likewise.
+        limit: of the error [1].
     """
 
     def each(names: Iterable[str]) -> np.ndarray:
@@ -262,13 +291,28 @@ def judge(
     saturated = np.any(beyond_range, axis=0)
     for name in {f"position_shortfall_{slot.number}" for slot in made} & set(rows):
         saturated = saturated | (rows[name] > 0)
-    outcome = _outcomes(status, ~(np.abs(worst) <= limit), saturated)
+    unlike = _unlike(rows, {slot.number for slot in made}, period)
+    outcome = _outcomes(status, ~(np.abs(worst) <= limit), unlike, saturated)
     return {"worst_error": worst, "outcome": outcome, "failed": outcome != OUTCOMES.index(GOOD)}
 
 
-def _outcomes(status: np.ndarray, beyond: np.ndarray, saturated: np.ndarray) -> np.ndarray:
-    """The worst that can be said of every scenario, as its place in `OUTCOMES`."""
+def _unlike(rows: Mapping[str, np.ndarray], numbers: Iterable[int], period: np.ndarray) -> np.ndarray:
+    """Return which rows have a real contact that is too hard, too short or too long."""
+    found = np.zeros(len(rows["index"]), bool)
+    for number in numbers:
+        ideal = [rows.get(f"reference_{name}_{number}") for name in ("peak_force", "duration")]
+        if ideal[0] is not None and ideal[1] is not None:
+            force, duration = rows[f"peak_force_{number}"], rows[f"duration_{number}"]
+            found |= unlike_ideal(force, ideal[0], duration, ideal[1], period.astype(duration.dtype))
+    return found
+
+
+def _outcomes(
+    status: np.ndarray, beyond: np.ndarray, unlike: np.ndarray, saturated: np.ndarray
+) -> np.ndarray:
+    """Return the worst that can be said of every scenario, as its place in `OUTCOMES`."""
     found = np.where(beyond, OUTCOMES.index(BEYOND), OUTCOMES.index(GOOD))
+    found = np.where(unlike, OUTCOMES.index(UNLIKE), found)
     found = np.where(saturated, OUTCOMES.index(SATURATED), found)
     for code, name in STATUS_NAMES.items():
         if code != OK:

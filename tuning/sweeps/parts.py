@@ -20,6 +20,7 @@ SWEEP = b"jaxhil.sweep.sha256"
 SEAL = b"jaxhil.part.sha256"
 BLANK = b"0" * 64  # in the place of the seal while it is worked out
 FORCE_RANGE = "rig.force_sensor.range"
+PERIOD = "rig.control_period"
 
 
 def encode_part(manifest: Manifest, rows: Mapping[str, np.ndarray]) -> bytearray:
@@ -76,7 +77,8 @@ def _checked(manifest: Manifest, part: int, table: Any) -> dict[str, np.ndarray]
         force_range = np.min(np.broadcast_arrays(*(rows.get(name, own) for name, own in ranges)), axis=0)
     else:
         force_range = rows.get(FORCE_RANGE, np.array(mechanism.rig.force_sensor.range))
-    judged = judge(rows, slots(mechanism), force_range, manifest.largest_error)
+    period = rows.get(PERIOD, np.array(mechanism.rig.control_period))
+    judged = judge(rows, slots(mechanism), force_range, period, manifest.largest_error)
     return None if same_rows(judged, rows) else rows
 
 

@@ -21,7 +21,7 @@ from tuning.statistics.subset_simulation import (
     to_uniform,
 )
 from tuning.sweeps.chunks import Sweep
-from tuning.sweeps.columns import OUTCOMES, SATURATED
+from tuning.sweeps.columns import OUTCOMES, UNLIKE
 from tuning.sweeps.points import HERE, Running, run_points
 from tuning.sweeps.tally import error_sizes
 
@@ -112,14 +112,14 @@ def rare_failure(
     of its own in every scenario. A chain that accepts a scenario accepts its noise with it: that is a
     proposal of noise independent of the last, so that the chain is as valid as without noise.
     """
-    saturated, run = OUTCOMES.index(SATURATED), 0
+    unlike, run = OUTCOMES.index(UNLIKE), 0
 
     def performance(normals: np.ndarray) -> np.ndarray:
         nonlocal run
         indices = np.arange(run, run + len(normals))
         rows = run_points(sweep, to_uniform(normals), indices, running)
         run += len(normals)
-        return np.where(rows["outcome"] >= saturated, np.inf, error_sizes(rows))
+        return np.where(rows["outcome"] >= unlike, np.inf, error_sizes(rows))
 
     inputs = sum(dimensions(sweep.mechanism).values())
     return subset_simulation(performance, inputs, limit, sweep.manifest.seed, samples, replicates)

@@ -56,7 +56,8 @@ def judge(
     if np.any(plain.wanted & ~good):
         # What is said of the contacts that ended is no match for a law under which all of them do.
         ends = ErrorIntervals(NOWHERE, NOWHERE)
-    wrong = np.any((plain.wanted & ~good) | (good & (np.abs(plain.error) > limit)), axis=0)
+    beyond = good & ((np.abs(plain.error) > limit) | plain.unlike)
+    wrong = np.any((plain.wanted & ~good) | beyond, axis=0)
     found = {
         "rms": Estimate(_rms(size), *ends.rms),
         "p99": Estimate(_percentile(size, 99), *ends.p99),
@@ -64,6 +65,8 @@ def judge(
         "failures": share(wrong),
     }
     found |= transparency_figures(judged, pushed, in_space, seed)
+    found["peak_force_ratio"] = resampled(_highest, seed, good, plain.peak_force_ratio)
+    found["duration_ratio"] = resampled(_highest, seed, good, plain.duration_ratio)
     found["trajectory"] = resampled(_root_mean_square, seed, good, plain.metrics.trajectory_error / depth)
     found["noise"] = Estimate(amplification, np.nan, np.nan)
     return found

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxhil.compensators import Compensator, Gain, Gains, Signals
-from jaxhil.runtime import Controller
 from jaxhil.runtime.gain_file import GainFile
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.contact_force import PlantSignals
@@ -26,10 +25,13 @@ from jaxhil.simulation.rollout import noise_ahead, stretch_length, turn_over
 from jaxhil.simulation.scenario import Scenario
 from jaxhil.simulation.tick import Model, RunState, actuate, contact_force, integrate, next_state, sense
 from jaxhil.simulation.watch import build_rules, record_contact
+from tuning.verification.stops import Stop, Witness
 
 
-def run_closed_loop(loaded: LoadedGains, gain_file: GainFile, batch: Scenario) -> Metrics:
-    """Metrics (slots, 1) of the batch's first lane under the runtime's controller made of `gain_file`.
+def run_closed_loop(loaded: LoadedGains, gain_file: GainFile, batch: Scenario) -> tuple[Metrics, Stop | None]:
+    """Run the batch's first lane under the runtime's controller made of `gain_file`.
+
+    Returns its metrics (slots, 1), and what the controller's guards or its watchdog acted on first.
 
     Sensors, motion simulator, contact and bookkeeping are the loop's own, in jax; the controller and the
     position command from the numerical model are the runtime's, in plain Python, tick by tick as on the rig.
@@ -40,15 +42,18 @@ def run_closed_loop(loaded: LoadedGains, gain_file: GainFile, batch: Scenario) -
     rig, run = _first_lane(begin(loop, gains, batch))
     program = _compiled(dataclasses.replace(loop, compensator=OnTheRig(loop.compensator)))
     zeroed = loop.has_force_noise or loop.has_force_bias
-    controller = Controller(gain_file)
+    controller = Witness(gain_file)
     started = False
     # A controller that has tripped commands nothing any more: no contact of it would end.
-    while np.any(run.active) and controller.status == "ok":
+    while np.any(run.active) and not controller.controller.tripped:
         for _ in range(stretch_length(loop)):
             signals, plant_signals = program.sense(rig, run)
             force, position, velocity, measured, age = (float(leaf[0]) for leaf in jax.device_get(signals))
             if age == 0 and started:
                 controller.next_contact()
+            if age == 0:
+                # As a rig does that has been brought there: drives in motion are read behind the model.
+                controller.start(position, velocity)
             command = controller.step(force, position, velocity, measured)
             if age == 0 and zeroed:
                 command = 0.0
@@ -58,7 +63,9 @@ def run_closed_loop(loaded: LoadedGains, gain_file: GainFile, batch: Scenario) -
             run = program.advance(rig, gains, run, signals, plant_signals, force_command, np.array([sent]))
             started = True
         run = program.turn_over(rig, gains, run)
-    return jax.device_get(run.metrics)
+    # The last contact is audited too, as on a rig that goes on.
+    controller.next_contact()
+    return jax.device_get(run.metrics), controller.stop()
 
 
 class OnTheRig(Compensator):

@@ -15,6 +15,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 
 import jax
+import jax.numpy as jnp
 import msgspec
 import numpy as np
 
@@ -22,10 +23,14 @@ from jaxhil.compensators import Signals
 from jaxhil.runtime import Controller
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
 from jaxhil.runtime.limits import NO_LIMITS
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.contact_bounds import BRIEFLY
+from jaxhil.simulation.evaluation import Outcome, compare_with_reference
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.metrics import OK, STATUS_NAMES, Metrics
 from jaxhil.simulation.recording import Lane, nominal_and_draws, record_lanes
 from tuning.verification.closed_loop import run_closed_loop
+from tuning.verification.stops import Stop
 
 REPLAY_LIMIT = 1e-11  # of the command's range
 CLOSED_LOOP_LIMIT = 1e-9  # of restitution
@@ -60,6 +65,10 @@ class ContactComparison(msgspec.Struct, frozen=True):
     simulated_restitution: float | None  # simulated as a whole
     status: str
     simulated_status: str
+    # with the runtime in the loop: largest real force over the ideal contact's peak force, and the duration
+    # over that contact's [1]
+    peak_force_ratio: float | None = None
+    duration_ratio: float | None = None
 
 
 class VerificationReport(msgspec.Struct, frozen=True):
@@ -72,6 +81,7 @@ class VerificationReport(msgspec.Struct, frozen=True):
     closed_loop_limit: float  # allowed difference of a restitution
     replay: tuple[LaneReplay, ...]  # lane by lane
     closed_loop: tuple[ContactComparison, ...]  # contact by contact
+    stop: Stop | None = None  # what the gain file's limits acted on in closed loop, if on anything
 
 
 def verify(
@@ -100,10 +110,20 @@ def verify(
     progress(f"replaying {sum(len(lane.command) for lane in lanes)} ticks through the runtime")
     replays = [replay(lane, file) for lane, file in zip(lanes, gain_files, strict=True)]
     progress("running the nominal contacts with the runtime in the loop")
-    closed = run_closed_loop(loaded, gain_file, batch)
+    closed, stop = run_closed_loop(loaded, gain_file, batch)
     contacts = loaded.mechanism.approach.contacts
-    comparisons = [_compare_contact(closed, metrics, contact) for contact in range(contacts)]
-    reasons = (*_replay_reasons(replays), *_closed_loop_reasons(comparisons))
+    loop = build_loop(loaded.mechanism, loaded.compensator, batch)
+    nominal = jax.tree.map(lambda leaf: jnp.asarray(leaf)[..., :1], batch)
+    outcome = jax.device_get(compare_with_reference(loop, nominal, jax.tree.map(jnp.asarray, closed)))
+    comparisons = [_compare_contact(outcome, metrics, contact) for contact in range(contacts)]
+    stopped = [] if stop is None else [f"closed loop: {stop.text}"]
+    unlike = [
+        f"closed loop, contact {number}: real peak force {one.peak_force_ratio:.3g} times, duration "
+        f"{one.duration_ratio:.3g} times the ideal contact's, allowed {BRIEFLY}"
+        for number, one in enumerate(comparisons, start=1)
+        if outcome.unlike[number - 1, 0]
+    ]
+    reasons = (*_replay_reasons(replays), *stopped, *_closed_loop_reasons(comparisons, stop), *unlike)
     return VerificationReport(
         verdict=not reasons,
         reasons=reasons,
@@ -112,6 +132,7 @@ def verify(
         closed_loop_limit=CLOSED_LOOP_LIMIT,
         replay=tuple(replays),
         closed_loop=tuple(comparisons),
+        stop=stop,
     )
 
 
@@ -150,6 +171,9 @@ def replayed(controller: Controller, lane: Lane) -> tuple[np.ndarray, np.ndarray
     for tick, (force, position, velocity, measured, age) in enumerate(readings):
         if age == 0 and tick > 0:
             controller.next_contact()
+        if age == 0:
+            # As a rig does that has been brought there: drives in motion are read behind the model.
+            controller.position_command(position, velocity, 0.0)
         command = controller.step(force, position, velocity, measured)
         identified, sent = controller.identified, math.nan
         if lane.sent is not None and tick + 1 < len(readings) and readings[tick + 1][4] == age + 1:
@@ -237,12 +261,17 @@ def _aligned(signals: Signals, delay: float, period: float) -> np.ndarray:
     return np.where(age <= whole, uniform, between)
 
 
-def _compare_contact(closed: Metrics, simulated: Metrics, contact: int) -> ContactComparison:
+def _compare_contact(outcome: Outcome, simulated: Metrics, contact: int) -> ContactComparison:
+    closed = outcome.metrics
+    ended = closed.status[contact, 0] == OK
+    ratios = (outcome.peak_force_ratio, outcome.duration_ratio)
     return ContactComparison(
         restitution=_restitution(closed, contact),
         simulated_restitution=_restitution(simulated, contact),
         status=STATUS_NAMES[int(closed.status[contact, 0])],
         simulated_status=STATUS_NAMES[int(simulated.status[contact, 0])],
+        peak_force_ratio=float(ratios[0][contact, 0]) if ended else None,
+        duration_ratio=float(ratios[1][contact, 0]) if ended else None,
     )
 
 
@@ -274,9 +303,13 @@ def _replay_reasons(replays: list[LaneReplay]) -> Iterator[str]:
         )
 
 
-def _closed_loop_reasons(comparisons: list[ContactComparison]) -> Iterator[str]:
+def _closed_loop_reasons(comparisons: list[ContactComparison], stop: Stop | None) -> Iterator[str]:
+    tripped = stop is not None and stop.tripped
     for number, contact in enumerate(comparisons, start=1):
         where = f"closed loop, contact {number}"
+        if tripped and contact.status == "not reached":
+            # What stopped the run is said already.
+            continue
         if contact.restitution is None or contact.simulated_restitution is None:
             yield f"{where}: found {contact.status}, simulated {contact.simulated_status}, allowed ok"
             continue

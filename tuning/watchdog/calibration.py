@@ -24,6 +24,7 @@ from tuning.watchdog.alarms import JudgedRuns, features_of, good_runs, judge_chu
 from tuning.watchdog.audited import Rules
 from tuning.watchdog.expectation import Expectation, Features, fit_expectation
 from tuning.watchdog.extent import Extent
+from tuning.watchdog.fault_runs import fault_rates
 from tuning.watchdog.margin import restitution_margin
 from tuning.watchdog.recorded import LANES, Scenarios, recorded_chunks
 from tuning.watchdog.verdict import ALLOWED, Allowed, judged
@@ -31,7 +32,7 @@ from tuning.watchdog.verdict import ALLOWED, Allowed, judged
 MARGIN = 1.5  # on what good runs did
 FITTED = 2048  # runs that are enough to fit to: all others judge, at least 3 of 4 and at most 15 of 16
 SMALLEST = 0.02  # of the largest force reading: what a limit on forces leaves a sensor at least
-WITHOUT_STORE = 512  # draws
+WITHOUT_STORE = 2048  # draws: enough to bound false alarms if a third of the runs is good
 LIMIT = 0.01  # of the restitution error, where no sweep states one
 BRIDGED = 3  # ticks: bad readings, missed ticks, cut rates in a row
 TARE = 0.1  # s
@@ -57,15 +58,17 @@ def calibrate(
     replaced: Mapping[str, float | None] | None = None,
     allowed: Allowed = ALLOWED,
     progress: Callable[[int], None] = lambda runs: None,
+    faulty: int = 0,
 ) -> Calibration:
     """Limits for the rig, and the watchdog's rates of false and missed alarms, judged by what is `allowed`.
 
     Args: `loaded`, the gain file; `store`, a sweep's of that gain file, whose scenarios are run again, all of
-    them or the first so many `scenarios`; without a store so many draws of the file's own uncertainty (512).
+    them or the first so many `scenarios`; without a store so many draws of the file's own uncertainty (2048).
     `limit` of the restitution error: the store's own by default, else 0.01. `replaced` limits are as given,
     whatever the runs say, and the rates are under them. So many `lanes` are run at a time; `progress` is
-    given how many more runs are done. Raises `InputError` for a store of another gain file, or a number that
-    it does not hold.
+    given how many more runs are done. With `faulty` scenarios of every fault, faults are injected to count
+    missed alarms (`tuning.watchdog.fault_runs`). Raises `InputError` for a store of another gain file, or a
+    number that it does not hold.
     """
     chosen = _chosen(loaded, store, scenarios)
     if limit is None:
@@ -94,6 +97,9 @@ def calibrate(
     replaced = replaced or {}
     found = {name: limits.get(name) for name in LIMITS} | dict(replaced)
     rates = watchdog_rates(runs, expectation, found, limit, rules.mass, ~(fitted | margin.runs))
+    if faulty:
+        known = rules, free_distance, expectation, found
+        rates["fault_runs"] = fault_rates(loaded, *known, limit, faulty, chosen.seed, progress)
     rates = judged(rates, allowed, chosen.number)
     rates["widened_from"] = None if "restitution_margin" in replaced else margin.widened_from
     rates["calibrated_on"] = {

@@ -22,31 +22,64 @@ ALLOWED = Allowed()
 
 
 def judged(rates: Mapping[str, Any], allowed: Allowed, scenarios: int) -> dict[str, Any]:
-    """The rates that `tuning.watchdog.alarms.watchdog_rates` found among so many `scenarios`, each with what
-    is `allowed`, and the verdict: "good", "bad" with `reasons`, or "unknown" with what is not known."""
+    """Return the rates, each with what is `allowed`, and the verdict on them.
+
+    Missed alarms are judged by the runs with injected faults, where there are enough of those; by the drawn
+    runs besides where these say that too many are missed.
+
+    Args:
+        rates: what `tuning.watchdog.alarms.watchdog_rates` found, and `fault_runs` if faults were injected
+            (`tuning.watchdog.fault_runs`).
+        allowed: the largest acceptable rates.
+        scenarios: of the drawn runs.
+
+    Returns:
+        The rates with `verdict`: "good", "bad" with `reasons`, or "unknown" with what is not known.
+    """
     reasons, unknown = [], []
-    kinds = {}
-    for kind, most in allowed._asdict().items():
-        one = rates[kind]
-        kinds[kind] = {**one, "allowed": most}
-        name = f"{kind.replace('_', ' ')}: 95 % interval {one['low']:.2g} to {one['high']:.2g}"
-        if one["low"] > most:
-            reasons.append(f"{name}, allowed {most:g}")
-        elif one["high"] > most:
-            told = _what_tells(one, most, scenarios, rates["held_out_runs"])
-            unknown.append(f"{name}, allowed {most:g}; {told}")
+    kinds = {kind: {**rates[kind], "allowed": most} for kind, most in allowed._asdict().items()}
+    faulty = [{**one, "allowed": allowed.missed_alarms} for one in rates.get("fault_runs", ())]
+    counted = [one for one in faulty if one["counted"]]
+    for kind, one in kinds.items():
+        stated = f"{kind.replace('_', ' ')}: {_interval(one)}"
+        if one["low"] > one["allowed"]:
+            reasons.append(stated)
+        elif one["high"] > one["allowed"] and not (counted and kind == "missed_alarms"):
+            told = _what_tells(kind, one, scenarios, rates["held_out_runs"])
+            unknown.append(f"{stated}; {told}")
+    for one in counted:
+        stated = f"missed alarms with {one['meaning']}: {_interval(one)}"
+        if one["low"] > one["allowed"]:
+            reasons.append(stated)
+        elif one["high"] > one["allowed"]:
+            unknown.append(f"{stated}; {_what_faults_tell(one)}")
     verdict = "bad" if reasons else "unknown" if unknown else "good"
-    return {**rates, **kinds, "verdict": verdict, "reasons": reasons, "unknown": unknown}
+    found = {**rates, **kinds, "verdict": verdict, "reasons": reasons, "unknown": unknown}
+    return {**found, "fault_runs": faulty} if faulty else found
 
 
-def _what_tells(one: Mapping[str, Any], allowed: float, scenarios: int, held_out: int) -> str:
-    """In words, how large a sweep brings enough runs of the kind."""
-    runs = number_to_decide(one["alarms"], one["runs"], allowed)
+def _interval(one: Mapping[str, Any]) -> str:
+    return f"95 % interval {one['low']:.2g} to {one['high']:.2g}, allowed {one['allowed']:g}"
+
+
+def _what_faults_tell(one: Mapping[str, Any]) -> str:
+    """Return in words what would decide on a rate among runs with injected faults."""
+    runs = number_to_decide(one["alarms"], one["runs"], one["allowed"])
+    if runs is None:
+        return "at this rate no number of runs would tell"
+    return f"at this rate about {_rounded_up(runs)} such runs tell, there are {one['runs']}"
+
+
+def _what_tells(kind: str, one: Mapping[str, Any], scenarios: int, held_out: int) -> str:
+    """Return in words how large a sweep brings enough runs of the kind."""
+    runs = number_to_decide(one["alarms"], one["runs"], one["allowed"])
     if runs is None:
         return "at this rate no sweep would tell"
     if one["runs"]:
         return f"at this rate a sweep of about {_rounded_up(runs / one['runs'] * scenarios)} scenarios tells"
     share = float(binomial_interval(0, held_out).high)
+    if kind == "false_alarms" and held_out:
+        return f"none of {held_out} runs is good: gains with smaller errors are needed"
     return f"no such run among {held_out}: a sweep of at least {_rounded_up(runs / share)} scenarios tells"
 
 

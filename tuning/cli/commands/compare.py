@@ -111,6 +111,7 @@ def _print(
     options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence[Any]], document: dict[str, Any]
 ) -> None:
     from jaxhil.compensators import COMPENSATORS
+    from jaxhil.simulation.contact_bounds import LONGEST, MOST_FORCE, SHORTEST
     from tuning.benchmark.tables import leaderboard, least, mechanism_table
 
     for name in names:
@@ -128,7 +129,9 @@ def _print(
             rows,
             texts=(0, 1),
         ),
-        f"rms, p99, worst: |e - e*|. fail: scenarios beyond {100 * options.limit:g} %, or that do not end.",
+        f"rms, p99, worst: |e - e*|. fail: scenarios beyond {100 * options.limit:g} %, that do not end, or",
+        f"whose real contact is beyond {MOST_FORCE:g} times the ideal peak force or {SHORTEST:g} to "
+        f"{LONGEST:g} times the ideal duration.",
         f"early, late: transparency to {document['transparency']} (1: perfect, 0: blind).",
         "slope: of e against e* over damped twins. peak: command over the reference, 99th percentile.",
         "path: x_d off the reference. noise: amplification. *: better than every other law, tuned, by more",

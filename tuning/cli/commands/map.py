@@ -49,8 +49,15 @@ def _lines(document: Mapping[str, Any]) -> Iterator[str]:
         kind = "divergence" if error > 0 else "convergence"
         within = "within" if abs(error) <= limit else "beyond"
         yield f"Nominal: largest error {error:+.4f} ({kind}), {within} {limit:g}."
+        within = "beyond" if nominal["margins"]["contact"] is None else "within"
+        yield (
+            f"Nominal: real peak force {nominal['peak_force_ratio']:.3f} times, duration "
+            f"{nominal['duration_ratio']:.3f} times the ideal contact's, {within} {_allowed(document)}."
+        )
     if (margins := nominal["margins"]["error"]) is not None:
         yield from (f"{text}, within {limit:g}." for text in _margins(document, margins))
+    if (margins := nominal["margins"]["contact"]) is not None:
+        yield from (f"{text}, within {_allowed(document)}." for text in _margins(document, margins))
     growth = nominal["growth"]
     if growth is None:
         yield f"No spectral radius: {document['spectral_radius']['none_because']}."
@@ -70,6 +77,12 @@ def _lines(document: Mapping[str, Any]) -> Iterator[str]:
             )
     if (reason := document["theory"]["none_because"]) is not None:
         yield f"No closed form beside it: {reason}."
+
+
+def _allowed(document: Mapping[str, Any]) -> str:
+    """Return the bounds on real peak force and duration, in words."""
+    force, *duration = document["bounds"].values()
+    return f"{force:g} times the peak force and {duration[0]:g} to {duration[1]:g} times the duration"
 
 
 def _margins(document: Mapping[str, Any], margins: Mapping[str, Any]) -> Iterator[str]:

@@ -11,8 +11,9 @@ from tuning.cli.commands import checks
 from tuning.cli.options import Replay
 from tuning.front_door import arguments
 
-KEYS = ("restitution", "reference_restitution", "error", "peak_force", "peak_command", "duration")
-KEYS = (*KEYS, "position_shortfall", "approach_velocity", "energy_in", "energy_out")
+KEYS = ("restitution", "reference_restitution", "error", "peak_force", "reference_peak_force", "peak_command")
+KEYS = (*KEYS, "duration", "reference_duration", "position_shortfall", "approach_velocity")
+KEYS = (*KEYS, "energy_in", "energy_out")
 
 
 def run(options: Replay) -> int:
@@ -97,10 +98,13 @@ def _contacts(document: dict[str, Any]) -> Any:
         told = [[terminal.signed(one["energy_error"]), one["twist_error"]] for one in runs]
     rows = [
         (
-            *(number, one["restitution"], one["reference_restitution"], *error, one["peak_force"]),
-            *(1e3 * one["duration"], 1e3 * one["approach_velocity"], one["status"]),
+            *(number, one["restitution"], one["reference_restitution"], *error),
+            *(one["peak_force"], terminal.ratio(one["peak_force"], one["reference_peak_force"])),
+            *(1e3 * one["duration"], terminal.ratio(one["duration"], one["reference_duration"])),
+            *(1e3 * one["approach_velocity"], one["status"]),
         )
         for number, (one, error) in enumerate(zip(runs, told, strict=True), start=1)
     ]
-    headings = [what, "e", "e*", *errors, "peak force [N]", "duration [ms]", "approach [mm/s]", "status"]
+    headings = [what, "e", "e*", *errors, "peak [N]", "/ ideal", "duration [ms]", "/ ideal"]
+    headings += ["approach [mm/s]", "status"]
     return terminal.table(f"{what.capitalize()}s", headings, rows, texts=(len(headings) - 1,))

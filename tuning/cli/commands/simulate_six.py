@@ -51,6 +51,7 @@ def run(options: Simulate, mechanism: SixAxisMechanism) -> int:
     gains = None if options.gains is None else Path(options.gains)
     done = simulate_six_axes(mechanism, options.compensator or "none", gains, seed=options.seed)
     good = done.status in GOOD and all(_worst(episode) <= options.limit for episode in done.episodes)
+    good = good and not any(_unlike(done))
     terminal.warn(f"{mechanism.name}: {warning}" for warning in done.meaning.warnings)
     _write(options, done)
     if options.json:
@@ -92,6 +93,17 @@ def _run_in_space(options: Simulate, mechanism: SixAxisMechanism) -> int:
 
 def _worst(episode: "Episode") -> float:
     return max(abs(episode.energy_error), episode.twist_error)
+
+
+def _unlike(done: "SixAxisRun") -> list[bool]:
+    """Return of every episode whether its real contact is unlike the ideal one."""
+    from jaxhil.simulation.contact_bounds import unlike_ideal
+
+    period = done.mechanism.rig.control_period
+    return [
+        unlike_ideal(one.peak_force, one.reference_peak_force, one.duration, one.reference_duration, period)
+        for one in done.episodes
+    ]
 
 
 def _write(options: Simulate, done: "SixAxisRun") -> None:
@@ -171,12 +183,20 @@ def _more(number: int, episode: "Episode") -> str:
 
 
 def _verdict(options: Simulate, done: "SixAxisRun", good: bool) -> str:
+    from jaxhil.simulation.contact_bounds import BRIEFLY, STATED
+
     if done.status == "miss":
         return "Bad: nothing touched."
     if done.status not in GOOD:
         return f"Bad: the run ended with status '{done.status}'."
     if good:
-        return f"Good: every energy and twist error is within {options.limit:g}."
+        return f"Good: every energy and twist error is within {options.limit:g}, {STATED}."
+    if all(_worst(episode) <= options.limit for episode in done.episodes):
+        number = _unlike(done).index(True)
+        one = done.episodes[number]
+        force, time = one.peak_force / one.reference_peak_force, one.duration / one.reference_duration
+        what = f"real peak force {force:.3g} times, time in touch {time:.3g} times the ideal contact's"
+        return f"Bad: episode {number + 1}: {what}, allowed {BRIEFLY}."
     worst = max(done.episodes, key=_worst)
     errors = f"{worst.energy_error:+.4f} and {worst.twist_error:.4f}"
     return f"Bad: the largest energy and twist errors are {errors}, allowed {options.limit:g}."

@@ -44,16 +44,21 @@ def _tables(document: dict[str, Any]) -> list[Any]:
 
 
 def _lines(document: dict[str, Any]) -> list[str]:
+    from jaxhil.simulation.contact_bounds import BRIEFLY
     from jaxhil.simulation.metrics import STATUS_REASONS
+    from tuning.sweeps.columns import UNLIKE, UNLIKENESS
 
     probability, number, limit = (document[key] for key in ("failure_probability", "scenarios", "limit"))
     within = "nothing" if limit is None else f"{limit:g}"
     lines = [
         f"Failure probability {probability['value']:.4g}, 95 % interval {probability['low']:.3g} to "
         f"{probability['high']:.3g} ({probability['method']}); {document['failed']} of {number} failed, "
-        f"{'energy and twist' if document['axes'] == 6 else 'restitution'} error allowed {within}."
+        f"{'energy and twist' if document['axes'] == 6 else 'restitution'} error allowed {within}, "
+        f"real contact: {BRIEFLY}."
     ]
     lines += _sequential(document)
+    if UNLIKE in document["outcomes"]:
+        lines.append(f"{UNLIKE}: {UNLIKENESS}.")
     lines += [f"{name}: {STATUS_REASONS[name]}." for name in document["outcomes"] if name in STATUS_REASONS]
     if left_out := document["left_out_of_replicates"]:
         lines.append(

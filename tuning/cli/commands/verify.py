@@ -26,6 +26,8 @@ def _exponential(value: float | None) -> str:
 
 
 def _print(document: dict[str, Any]) -> None:
+    from jaxhil.simulation.contact_bounds import BRIEFLY
+
     tables: list[Any] = list(document.get("self_test", ()))
     if "signature" in document:
         tables.append(f"Signature: {document['signature']}.")
@@ -44,22 +46,24 @@ def _print(document: dict[str, Any]) -> None:
             ),
             terminal.table(
                 "Nominal contacts with the runtime in the loop",
-                ["contact", "e", "e simulated", "status", "status simulated"],
+                ["contact", "e", "e simulated", "force / ideal", "duration / ideal", "status", "simulated"],
                 [
                     (
                         *(number, terminal.figure(one["restitution"], 9)),
-                        *(terminal.figure(one["simulated_restitution"], 9), one["status"]),
+                        terminal.figure(one["simulated_restitution"], 9),
+                        *(terminal.figure(one["peak_force_ratio"]), terminal.figure(one["duration_ratio"])),
+                        one["status"],
                         one["simulated_status"],
                     )
                     for number, one in enumerate(document["closed_loop"], start=1)
                 ],
-                texts=(3, 4),
+                texts=(5, 6),
             ),
         ]
     if document["verdict"]:
         lines = [
             f"Good: commands agree to {document['replay_limit']:.0e} of their range, restitutions to "
-            f"{document['closed_loop_limit']:.0e}."
+            f"{document['closed_loop_limit']:.0e}; real contact: {BRIEFLY}."
         ]
     else:
         lines = [f"Bad: {reason}" for reason in document["reasons"]]

@@ -1,0 +1,136 @@
+"""Missed alarms are counted on runs with a fault injected, scaled until the true error is just too large."""
+
+import math
+
+import pytest
+
+from jaxhil.compensators import literature_gains
+from jaxhil.mechanism.file import load
+from jaxhil.simulation.gain_file import check_document
+from tuning.bundle.summary import alarm_rates
+from tuning.gain_file import build_document
+from tuning.reporting.content import _error_margin
+from tuning.watchdog.calibration import calibrate
+from tuning.watchdog.fault_runs import BAND, FAULTS, MOST, scenarios_needed
+from tuning.watchdog.verdict import ALLOWED, judged
+
+LIMIT, NUMBER = 0.02, 64
+# An undelayed, undamped contact: whatever goes wrong is what was injected.
+EXACT = (
+    'rig.simulator={model = "ideal"}',
+    "rig.force_sensor.delay=0",
+    "contact.damping=[0]",
+    'uncertainty={"contact.stiffness" = {distribution = "loguniform", factor = [0.8, 1.25]}}',
+)
+
+
+def loaded_gains(compensator, overrides=EXACT, name="claw-350kg"):
+    parsed = load(name, overrides).mechanism
+    gains = literature_gains(parsed, compensator)
+    return check_document(build_document(compensator, gains, parsed, "0" * 64, {}, {}, 0, {}))
+
+
+def calibrated(compensator="none", **replaced):
+    loaded = loaded_gains(compensator)
+    return calibrate(loaded, scenarios=64, limit=LIMIT, lanes=64, replaced=replaced, faulty=NUMBER).rates
+
+
+@pytest.fixture(scope="module")
+def rates():
+    return calibrated()
+
+
+def fault(rates, name):
+    (found,) = [one for one in rates["fault_runs"] if one["name"] == name]
+    return found
+
+
+def test_injected_delay_is_the_one_that_theory_asks_for(rates):
+    """e = exp(pi omega tau/2) of a force that is tau late, and the error is LIMIT to BAND times LIMIT."""
+    mechanism = load("claw-350kg", EXACT).mechanism
+    omega = math.sqrt(mechanism.contact.stiffness[0] / mechanism.bodies.mass)
+    for name in ("force_delay", "simulator_delay"):
+        one = fault(rates, name)
+        assert one["runs"] == one["scenarios"] == NUMBER and one["counted"] and one["unit"] == "s"
+        assert LIMIT < one["error"] <= BAND * LIMIT
+        # Of the median run; stiffness is spread evenly about the nominal one.
+        assert one["size"] == pytest.approx(2 / (math.pi * omega) * math.log1p(one["error"]), rel=0.05)
+
+
+def test_fault_that_changes_nothing_is_not_counted(rates):
+    # Without a compensator nobody reads the position; there are no gains to take away.
+    one = fault(rates, "position_delay")
+    assert one["runs"] == 0 and not one["counted"] and one["size"] is None
+    assert {one["name"] for one in rates["fault_runs"]} == {
+        "force_delay",
+        "position_delay",
+        "simulator_delay",
+    }
+    assert any("not counted" in text for text in alarm_rates(rates))
+
+
+def test_watchdog_that_sees_every_error_misses_none(rates):
+    for name in ("force_delay", "simulator_delay"):
+        assert fault(rates, name)["alarms"] == 0 and fault(rates, name)["high"] < 0.06
+    assert rates["missed_alarms"]["runs"] == 0  # no draw is bad: nothing could be counted on draws
+
+
+def test_watchdog_without_a_margin_misses_every_fault():
+    blind = calibrated(restitution_margin=None)
+    for name in ("force_delay", "simulator_delay"):
+        one = fault(blind, name)
+        assert one["alarms"] == one["runs"] > 0 and one["low"] > 0.9
+    assert blind["verdict"] == "bad"
+    assert any(text.startswith("missed alarms with the force measured later") for text in blind["reasons"])
+
+
+def test_gains_are_a_fault_of_laws_that_can_do_without(rates):
+    found = calibrated("phase_lead")
+    # Nothing is late here: the literature's lead is 0 already, and there is nothing to take away.
+    assert [one["name"] for one in found["fault_runs"]] == [one.name for one in FAULTS if one.name != "gains"]
+    assert fault(found, "force_delay")["runs"] == NUMBER
+
+
+@pytest.mark.parametrize(
+    ("alarms", "runs", "counted", "verdict"),
+    [
+        (0, 183, True, "good"),
+        (0, 182, True, "unknown"),
+        (20, 183, True, "bad"),
+        (0, 10, False, "unknown"),
+    ],
+)
+def test_verdict_on_missed_alarms_follows_from_fault_runs(alarms, runs, counted, verdict):
+    from tuning.statistics.intervals import binomial_interval
+
+    def rate(alarms, runs):
+        _, low, high = binomial_interval(alarms, runs)
+        return {"alarms": alarms, "runs": runs, "low": float(low), "high": float(high)}
+
+    one = {**rate(alarms, runs), "name": "force_delay", "meaning": "the force measured later than told"}
+    rates = {
+        "held_out_runs": 1000,
+        "false_alarms": rate(0, 500),
+        "missed_alarms": rate(0, 0),
+        "fault_runs": [{**one, "counted": counted}],
+    }
+    found = judged(rates, ALLOWED, 2048)
+    assert found["verdict"] == verdict and found["fault_runs"][0]["allowed"] == ALLOWED.missed_alarms
+    if verdict == "unknown":
+        tells = "about 190 such runs tell, there are 182" if counted else "a sweep of at least "
+        assert tells in found["unknown"][0]
+    # Drawn runs of which too many are missed are bad, whatever the injected ones say.
+    missed = judged({**rates, "missed_alarms": rate(50, 100)}, ALLOWED, 2048)
+    assert missed["verdict"] == "bad"
+
+
+def test_number_of_scenarios_follows_from_what_is_allowed():
+    assert scenarios_needed(0.02) == 2 * 183
+    assert scenarios_needed(0.5) == 64 == scenarios_needed(1.0) and scenarios_needed(
+        1e-6
+    ) == MOST == scenarios_needed(0.0)
+
+
+def test_good_sweep_has_a_positive_margin():
+    assert _error_margin(0.01, -0.004) == "+0.006 of the error"
+    assert _error_margin(None, 0.1) == "none"

@@ -1,0 +1,244 @@
+"""Runs with an injected fault, scaled until the true error is just too large: how many the watchdog misses.
+
+With good gains an error beyond the limit is so rare that runs drawn at random cannot bound the share that is
+missed. So a fault is injected of which neither controller nor watchdog knows, and scaled in every scenario
+until the restitution error lies just beyond the limit: up to `BAND` times it. That is the hardest case: a
+larger error is farther from what the watchdog expects. The rate is conditional on such a fault, not the
+probability that one occurs. Scenarios are fresh and independent, others for every fault, so that the exact
+binomial interval holds.
+
+In a scenario whose error is beyond the limit without the fault, or that no size of the fault up to
+`MOST_MULTIPLES` takes into the band, there is nothing to count. A fault that makes fewer than half of the
+scenarios bad is stated, but not counted: the gains are insensitive to it.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxhil.compensators import COMPENSATORS
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.evaluation import evaluate, lanes_of
+from jaxhil.simulation.gain_file import LoadedGains
+from jaxhil.simulation.metrics import OK
+from jaxhil.simulation.plausibility import meaning
+from jaxhil.simulation.scenario import Scenario
+from tuning.statistics.intervals import binomial_interval, number_to_decide
+from tuning.sweeps.draws import drawn_scenarios
+from tuning.watchdog.alarms import BAD_ERROR, alarms, judge_chunk
+from tuning.watchdog.audited import Rules, first_reached
+from tuning.watchdog.expectation import Expectation
+from tuning.watchdog.recorded import record_chunk
+
+BAND = 1.25  # of the limit: the largest error of a fault run
+COUNTED = 0.5  # share of the scenarios that a fault has to make bad for it to count
+FIRST = 2**31  # index of the first scenario: those before are a sweep's, or calibrate
+FEWEST, MOST = 64, 4096  # scenarios of a fault
+MOST_MULTIPLES = 32.0  # of the delay that alone, uncompensated, would make an error of the limit
+LADDER = tuple(MOST_MULTIPLES / 2.0**step for step in range(6, -1, -1))
+HALVINGS = 4  # of the interval between two steps of the ladder
+LONGEST = 0.5  # of the ideal contact's duration: the longest delay that is injected
+
+Sizes = Float[np.ndarray, "lanes"]
+
+
+class Fault(NamedTuple):
+    """A fault of one size, of which the controller does not know."""
+
+    name: str
+    meaning: str  # in words
+    unit: str  # of its size
+
+
+FORCE_DELAY = Fault("force_delay", "the force measured later than told", "s")
+POSITION_DELAY = Fault("position_delay", "the position measured later than told", "s")
+SIMULATOR_DELAY = Fault("simulator_delay", "the motion simulator later than told", "s")
+GAINS = Fault("gains", "the gains nearer to no compensation", "1")
+FAULTS = (FORCE_DELAY, POSITION_DELAY, SIMULATOR_DELAY, GAINS)
+
+
+class _Case(NamedTuple):
+    """A fault on scenarios of its own."""
+
+    fault: Fault
+    scenarios: Scenario
+    unit: float  # size of the fault that is one multiple
+    most: float  # largest size
+
+
+def fault_rates(
+    loaded: LoadedGains,
+    rules: Rules,
+    free_distance: float,
+    expectation: Expectation,
+    limits: Mapping[str, float | None],
+    limit: float,
+    number: int,
+    seed: int,
+    progress: Callable[[int], None] = lambda runs: None,
+) -> list[dict[str, Any]]:
+    """Return of every fault how many of its runs the watchdog misses, with an exact interval of 95 %.
+
+    Args:
+        loaded: the gain file.
+        rules: by what the watchdog audits; `free_distance` [m] likewise.
+        free_distance: see `rules`.
+        expectation: of the watchdog.
+        limits: of the gain file, by name.
+        limit: of the restitution error [1], beyond which a run has to be stopped.
+        number: of scenarios for each fault.
+        seed: of the scenarios.
+        progress: is given how many of the `number` x faults runs are done.
+    """
+    cases = _cases(loaded, limit, number, seed)
+    loop = _widest(loaded, cases)
+    found = []
+    for case in cases:
+        sizes, usable = _just_beyond(loop, loaded, case, limit)
+        found.append(
+            _rate(loop, loaded, case, sizes, usable, rules, free_distance, expectation, limits, limit)
+        )
+        progress(number)
+    return found
+
+
+def scenarios_needed(allowed: float) -> int:
+    """Return how many scenarios of a fault decide on a share `allowed`, a few missed or useless ones among
+    them."""
+    if not 0 < allowed < 1:
+        return FEWEST if allowed >= 1 else MOST
+    needed = number_to_decide(0, 0, allowed)
+    return MOST if needed is None else int(np.clip(2 * needed, FEWEST, MOST))
+
+
+def _cases(loaded: LoadedGains, limit: float, number: int, seed: int) -> list[_Case]:
+    """Return the faults that the compensator can have, each with fresh scenarios."""
+    cases, duration = [], _ideal_duration(loaded)
+    # e = exp(pi omega tau/2) - 1 of a net delay tau, and pi/omega is the duration.
+    delay = 2 * duration / math.pi**2 * math.log1p(limit)
+    for place, fault in enumerate(FAULTS):
+        if fault == GAINS and not _neutral(loaded):
+            continue
+        _, scenarios = drawn_scenarios(loaded.mechanism, "random", seed, FIRST + place * number, number)
+        unit, most = (1 / MOST_MULTIPLES, 1.0) if fault == GAINS else (delay, LONGEST * duration)
+        cases.append(_Case(fault, scenarios, unit, most))
+    return cases
+
+
+def _neutral(loaded: LoadedGains) -> dict[str, float]:
+    """Return the gains that can be neutral and are not, with their neutral values."""
+    own = COMPENSATORS[loaded.compensator].gains
+    return {
+        gain.name: float(gain.neutral)
+        for gain in own
+        if gain.neutral is not None and loaded.gains[gain.name] != gain.neutral
+    }
+
+
+def _ideal_duration(loaded: LoadedGains) -> float:
+    """Return the duration [s] of the first nominal ideal contact; where bodies stick, half an oscillation."""
+    first = meaning(loaded.mechanism).contacts[0]
+    return first.duration if math.isfinite(first.duration) else 0.5 / first.frequency
+
+
+def _injected(loaded: LoadedGains, case: _Case, sizes: Sizes) -> tuple[Mapping[str, Any], Scenario]:
+    """Return gains and scenarios with the fault of these sizes."""
+    scenarios, fault = case.scenarios, case.fault
+    gains = {name: np.full(len(sizes), value) for name, value in loaded.gains.items()}
+    if fault == GAINS:
+        moved = {name: gains[name] + sizes * (to - gains[name]) for name, to in _neutral(loaded).items()}
+        return {**gains, **moved}, scenarios
+    part = {
+        FORCE_DELAY: "force_sensor",
+        POSITION_DELAY: "position_sensor",
+        SIMULATOR_DELAY: "simulator",
+    }[fault]
+    own: Any = getattr(scenarios, part)
+    return gains, scenarios._replace(**{part: own._replace(delay=np.asarray(own.delay) + sizes)})
+
+
+def _widest(loaded: LoadedGains, cases: list[_Case]) -> Any:
+    """Return the loop that serves every fault at its largest."""
+    largest = [
+        _injected(loaded, case, _sizes(case, np.full(lanes_of(case.scenarios), MOST_MULTIPLES)))[1]
+        for case in cases
+    ]
+    every: Any = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *largest)
+    return build_loop(loaded.mechanism, loaded.compensator, every)
+
+
+def _sizes(case: _Case, multiples: Sizes) -> Sizes:
+    """Return the sizes of so many multiples, at most the largest."""
+    return np.minimum(multiples * case.unit, case.most)
+
+
+def _just_beyond(loop: Any, loaded: LoadedGains, case: _Case, limit: float) -> tuple[Sizes, np.ndarray]:
+    """Return of every scenario the size that takes its error just beyond the limit, and whether one does."""
+    number = lanes_of(case.scenarios)
+
+    def errors(multiples: Any) -> Sizes:
+        gains, scenarios = _injected(loaded, case, _sizes(case, multiples))
+        outcome = evaluate(loop, gains, scenarios)
+        size = np.where(outcome.good, np.abs(outcome.error), np.where(outcome.wanted, np.inf, 0.0))
+        return np.max(size, axis=0)
+
+    # What is within the limit so far, and what is beyond it.
+    below, above = np.zeros(number), np.full(number, np.nan)
+    beyond = np.full(number, np.inf)
+    usable = errors(np.zeros(number)) <= limit
+    for multiple in LADDER:
+        error = errors(np.full(number, multiple))
+        first = np.isnan(above) & (error > BAD_ERROR * limit)
+        above, beyond = np.where(first, multiple, above), np.where(first, error, beyond)
+        below = np.where(np.isnan(above), multiple, below)
+    usable &= ~np.isnan(above)
+    above = np.where(usable, above, MOST_MULTIPLES)
+    for _ in range(HALVINGS):
+        middle = np.where(below > 0, np.sqrt(below * above), above / 2)
+        error = errors(middle)
+        bad = error > BAD_ERROR * limit
+        above, beyond = np.where(bad, middle, above), np.where(bad, error, beyond)
+        below = np.where(bad, below, middle)
+    return _sizes(case, above), usable & (beyond <= BAND * limit)
+
+
+def _rate(
+    loop: Any,
+    loaded: LoadedGains,
+    case: _Case,
+    sizes: Sizes,
+    usable: np.ndarray,
+    rules: Rules,
+    free_distance: float,
+    expectation: Expectation,
+    limits: Mapping[str, float | None],
+    limit: float,
+) -> dict[str, Any]:
+    """Return what is said of a fault."""
+    gains, scenarios = _injected(loaded, case, sizes)
+    chunk = record_chunk(loop, loaded._replace(gains=gains), scenarios)  # pyright: ignore[reportArgumentType]
+    runs = judge_chunk(chunk, rules, free_distance)
+    bad = (runs.status != OK) | ~(np.abs(runs.error) <= BAD_ERROR * limit)
+    usable = usable & np.any(bad, axis=0)
+    alarmed = alarms(runs, expectation, limits, rules.mass)
+    missed = (first_reached(alarmed) > first_reached(bad))[usable]
+    number, count = int(np.sum(usable)), int(np.sum(missed))
+    _, low, high = binomial_interval(count, number)
+    error = np.nanmax(np.where(np.isfinite(runs.error), np.abs(runs.error), 0.0), axis=0)[usable]
+    return {
+        **case.fault._asdict(),
+        "scenarios": len(sizes),
+        "largest_size": min(MOST_MULTIPLES * case.unit, case.most),
+        "size": float(np.median(sizes[usable])) if number else None,
+        "error": float(np.median(error)) if number else None,
+        "runs": number,
+        "alarms": count,
+        "rate": count / number if number else None,
+        "low": float(low),
+        "high": float(high),
+        "counted": number >= COUNTED * len(sizes),
+    }
