@@ -65,6 +65,16 @@ def test_environment_variables_with_which_jax_does_not_start_are_refused(variabl
     assert ran.stdout == ""
 
 
+def test_flags_over_which_xla_ends_raise_in_python():
+    script = "import jaxhil; jaxhil.simulate('rig-300kg')"
+    variables = {**os.environ, "PYTHONPATH": ROOT, "XLA_FLAGS": "--xla_nonsense=1"}
+    ran = subprocess.run(
+        [sys.executable, "-c", script], env=variables,
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert "InputError: XLA_FLAGS: found '--xla_nonsense=1'" in ran.stderr
+
+
 def test_debugging_modes_and_displays_change_no_figure(jaxhil, tmp_path):
     ran = run("simulate", "rig-300kg", "--json", "--plot", str(tmp_path / "run.png"), **DEBUGGING)
     assert ran.returncode == 1, ran.stderr

@@ -108,7 +108,7 @@ def start() -> None:
     Raise `InputError` if jax cannot start.
     """
     startup.check_process()
-    ours = settings(os.environ) if "jax" in sys.modules else _checked_settings()
+    ours = _checked_settings()
     before = {name: os.environ.get(name) for name in ours}
     os.environ.update(ours)
     try:

@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+from functools import cache
 from importlib.metadata import version
 
 from jaxhil.errors import InputError, one_line, shown
@@ -20,6 +21,7 @@ _LOG_LINE = re.compile(r"[EF]\d{4} .*?\] (.*)|(xla: .*)")  # what XLA writes whe
 _processes: set[int] = set()  # in which a caller's jax was started: this one, or one that it was forked from
 
 
+@cache
 def check_flags(flags: str) -> None:
     """Raise `InputError` if XLA refuses the flags; another process, which it ends, tries them."""
     given = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "TF_CPP_"))}
