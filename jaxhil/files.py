@@ -77,9 +77,11 @@ def write_whole(path: Path, content: bytes | bytearray | memoryview, lasting: bo
             if lasting:
                 os.fsync(file.fileno())
             os.replace(temporary, path)
-        except BaseException:
+        except BaseException as error:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
+            if isinstance(error, OSError):
+                error.filename = os.fspath(path)  # a full disk names none
             raise
     if lasting:
         sync_folder(path.parent)
@@ -125,7 +127,23 @@ def read_sealed(path: Path) -> bytes | None:
 def open_plain(path: str | os.PathLike[str]) -> BinaryIO:
     """A plain file, to read. Raises OSError for a link, a pipe or a device, and waits for none."""
     _check_plain(os.lstat(path).st_mode)
-    descriptor = os.open(path, _PLAIN)
+    return _open_checked(path, _PLAIN)
+
+
+def open_input(path: str | os.PathLike[str]) -> BinaryIO:
+    """Open a file that a user names, to read; a link stands for its file.
+
+    Raise OSError for a pipe, a device or a folder, without waiting for one.
+    """
+    mode = os.stat(path).st_mode
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
+    _check_plain(mode)
+    return _open_checked(path, _PLAIN & ~os.O_NOFOLLOW)
+
+
+def _open_checked(path: str | os.PathLike[str], flags: int) -> BinaryIO:
+    descriptor = os.open(path, flags)
     try:
         _check_plain(os.fstat(descriptor).st_mode)
         return open(descriptor, "rb")

@@ -6,6 +6,8 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
+import hypothesis
+import hypothesis.strategies
 import msgspec
 import pytest
 from conftest import Ran
@@ -192,6 +194,19 @@ def test_names_become_folders():
     assert folder_name("rig-300kg") == "rig-300kg"
     assert folder_name("../a b/c") == "a_b_c"
     assert folder_name("..") == "mechanism"
+    for name in ("機構一", "стенд-2", "שלום", "हिन्दी", "é"):
+        assert folder_name(name) == name
+    assert folder_name("e\u0301") == "é"
+    assert folder_name("CON") != "CON" and folder_name("com1.rig") != "com1.rig"
+    long = [folder_name("機" * 90 + end) for end in "ab"]
+    assert long[0] != long[1] and all(len(name.encode()) <= 120 for name in long)
+
+
+@hypothesis.given(hypothesis.strategies.text(min_size=1, max_size=100).filter(str.isprintable))
+def test_folders_of_mechanisms_lie_where_they_should(name):
+    folder = folder_name(name)
+    assert folder not in ("", ".", "..") and "/" not in folder and folder.isprintable()
+    assert len(folder.encode()) <= 120 and not folder.startswith(".")
 
 
 def test_better_means_fewer_failures_then_smaller_errors():

@@ -1,8 +1,10 @@
 """`jaxhil export` writes a bundle as a whole or not at all; `jaxhil verify` knows a corrupt one."""
 
 import errno
+import html
 import json
 import os
+import re
 import shutil
 
 import pytest
@@ -11,14 +13,16 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
 from jaxhil.compensators import COMPENSATORS
+from jaxhil.errors import InputError
 from jaxhil.files import TEMPORARY
 from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
 from jaxhil.runtime.faults import FAULTS
 from jaxhil.runtime.laws import NEED_NUMPY
 from jaxhil.simulation.gain_file import load_gain_file
-from tuning.bundle.bundle import build_bundle, check_target, with_limits, write_bundle
+from tuning.bundle.bundle import build_bundle, check_mechanism, check_target, with_limits, write_bundle
 from tuning.bundle.checking import check_bundle
 from tuning.bundle.checking import run_selftest as run_selftest_alone
+from tuning.bundle.readme import readme_text
 from tuning.bundle.writers import WRITERS
 from tuning.gain_file import write_gain_file
 
@@ -330,6 +334,27 @@ def test_readme_has_the_runtime_s_faults_and_this_bundle_s_files():
     content = text.partition("## Before")[0]
     assert "`gains.mat`" in content and "`ros2.yaml`" in content and "`c99`" in content
     assert "$" not in text
+
+
+def test_readme_shows_a_mechanism_s_name_as_text():
+    """No HTML, no markup of Markdown: as a reader of either shows it, it is the name."""
+    name = "<img src=x onerror=a()> *a* _b_ `c` [d](e) | ~f~ \\ $g$ &amp; #"
+    made = document()
+    text = readme_text({**made, "mechanism": {**made["mechanism"], "name": name}}, ["gains.json"])
+    heading = text.splitlines()[0].removeprefix("# Controller for ")
+    assert "<" not in heading and not re.search(r"(?<!\\)(?:\\\\)*[`*_\[\]|~$#]", heading.replace("\\\\", ""))
+    assert html.unescape(re.sub(r"\\(.)", r"\1", heading)) == name
+
+
+def test_a_bundle_of_another_mechanism_is_not_replaced(tmp_path):
+    folder = placed(tmp_path / "bundle")
+    before = (folder / "gains.json").read_bytes()
+    check_mechanism(folder, json.loads(before)["mechanism"]["name"])
+    check_mechanism(tmp_path / "none", "another")
+    with pytest.raises(
+        InputError, match=r"bundle: found the bundle of mechanism .*, expected that of 'another'"
+    ):
+        check_mechanism(folder, "another")
 
 
 def test_every_format_has_its_files():

@@ -6,6 +6,7 @@ import os
 import pytest
 from sweep_cases import case
 
+from jaxhil.mechanism.file import builtin_path
 from tuning.gain_file import write_gain_file
 
 COMPARE = ("compare", "rig-300kg", "--untuned", "--compensators", "none", "--scenarios", "1", "--judged", "2")
@@ -68,6 +69,105 @@ def test_a_sweep_takes_no_folder_of_the_users(jaxhil, thesis, untouched, tmp_pat
     for more in ((), ("--resume",)):
         ran = jaxhil("sweep", tmp_path / "gains.json", "--scenarios", "2", "-o", thesis, *more)
         refused(ran, "thesis: found '.thesis.docx.1.tmp' and no sweep, allowed an empty folder, or a sweep")
+
+
+TUNE = (
+    "tune",
+    "--compensator",
+    "none",
+    "--scenarios",
+    "4",
+    "--starts",
+    "2",
+    "--steps",
+    "2",
+    "--validation",
+    "16",
+)
+
+
+def named(path, name):
+    """Write a mechanism file of that name and return its path."""
+    raw = builtin_path("rig-300kg").read_text(encoding="utf-8")
+    path.write_text(raw.replace('name = "rig-300kg"', f"name = '{name}'"), encoding="utf-8")
+    return path
+
+
+RESULTS = {  # of mechanism "a b": the command that would replace them, the document, its content
+    "tune": (("tune",), "a_b/gains.json", {"compensator": "none", "mechanism": {"name": "a b"}}),
+    "map": (("map", "--x", "rig.force_sensor.delay", "--y", "contact.stiffness"), "map.json",
+            {"theory": {}, "mechanism": "a b"}),
+    "compare": (("compare", "--untuned"), "compare.json",
+                {"mechanisms": [{"mechanism": "a_b"}, {"mechanism": "a b"}]}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", RESULTS)
+def test_results_of_another_mechanism_are_not_replaced(jaxhil, tmp_path, kind):
+    (command, *options), document, content = RESULTS[kind]
+    path = tmp_path / "out" / document
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps(content))
+    before = path.read_bytes()
+    file = named(tmp_path / "rig.toml", "a_b")
+    ran = jaxhil(command, file, *options, "-o", tmp_path / "out")
+    refused(ran, f"{document}: found results of mechanism 'a b', expected those of 'a_b'")
+    assert path.read_bytes() == before
+
+
+def test_identified_numbers_of_another_mechanism_are_not_replaced(jaxhil, tmp_path):
+    content = {"estimates": [], "mechanism": {"name": "a b"}}
+    (tmp_path / "identification.json").write_text(json.dumps(content))
+    ran = jaxhil("identify", "none.csv", "--prior", "rig-300kg", "-o", tmp_path)
+    refused(ran, "found results of mechanism 'a b', expected those of 'rig-300kg'")
+
+
+@pytest.mark.parametrize("names", [("a b", "a_b"), ("Rig", "rig"), ("..", "..."), ("é", "e\u0301")])
+def test_mechanisms_of_one_call_share_no_folder(jaxhil, tmp_path, names):
+    files = [named(tmp_path / f"{place}.toml", name) for place, name in enumerate(names)]
+    ran = jaxhil(*TUNE, *files, "-o", tmp_path / "out", "--json")
+    assert ran.code == 2 and "1.toml: name: found" in ran.err
+    [entry] = ran.document["mechanisms"]
+    assert entry["mechanism"] == names[0]
+
+
+def test_gains_of_another_mechanism_of_the_same_name_are_replaced_with_a_warning(jaxhil, tmp_path):
+    file = named(tmp_path / "rig.toml", "機構一")
+    options = (file, *TUNE[1:], "-o", tmp_path / "out")
+    assert "replaced" not in jaxhil(TUNE[0], *options).err
+    assert "replaced" not in jaxhil(TUNE[0], *options).err
+    ran = jaxhil(TUNE[0], *options, "--set", "bodies.equivalent_mass=301")
+    assert "warning: " in ran.err and "replaced: it is of another mechanism of the name '機構一'" in ran.err
+    assert (tmp_path / "out" / "機構一" / "gains.json").exists()
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("simulate",),
+        ("simulate", "--gains"),
+        ("tune", "rig-300kg", "--start"),
+        ("sweep",),
+        ("export",),
+        ("verify",),
+        ("rig",),
+        ("identify", "--prior", "rig-300kg"),
+        ("identify", "none.csv", "--map"),
+        ("monitor", "rig-300kg"),
+        ("report",),
+    ],
+    ids=" ".join,
+)
+def test_what_is_read_is_no_pipe_and_no_device(jaxhil, tmp_path, monkeypatch, command, kind):
+    """It would be waited for, or never end."""
+    monkeypatch.chdir(tmp_path)
+    place = tmp_path / "input.csv"
+    if kind == "pipe":
+        os.mkfifo(place)
+    else:
+        place.symlink_to("/dev/zero")
+    refused(jaxhil(*command, place), "input.csv", "found a")
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder"])

@@ -125,6 +125,24 @@ def test_messages_are_those_that_users_see(jaxhil, reference):
         assert any(pattern.match(said) for pattern in patterns), said
 
 
+def test_every_page_and_notebook_is_in_the_navigation():
+    """`mkdocs build` is strict: a file that the navigation lacks fails it."""
+
+    def leaves(entry):
+        if isinstance(entry, str):
+            return [entry]
+        inner = entry.values() if isinstance(entry, dict) else entry
+        return [path for one in inner for path in leaves(one)]
+
+    listed = leaves(yaml.safe_load((SITE / "mkdocs.yml").read_text(encoding="utf-8"))["nav"])
+    folder = ROOT / "notebooks"
+    there = {
+        path.relative_to(folder).as_posix() for path in [*folder.glob("*.ipynb"), *folder.glob("guide/*.md")]
+    }
+    assert len(listed) == len(set(listed))
+    assert there == {path for path in listed if (folder / path).exists()}
+
+
 def test_versions_agree():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))

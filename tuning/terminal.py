@@ -17,6 +17,8 @@ from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TextColu
 from rich.table import Column, Table
 from rich.text import Text
 
+from jaxhil.errors import InputError, one_line
+
 WIDTH = 110  # where there is no terminal to ask
 SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal for a bar
 SECONDS_OF_SILENCE = 20.0  # after which the last line is said again, with the time left by then
@@ -25,15 +27,13 @@ KNOWN_FROM = 0.05  # share of the work that has to be done before a rate is know
 
 def emit(*things: RenderableType, wrap: bool = True) -> None:
     """Print on standard output, long texts on several lines. A reader that has gone away is no error."""
-    try:
+    with _writing_output():
         for thing in things:
             console = _console(sys.stdout)
             if isinstance(thing, Table):
                 console.width = _fitted(thing, console)
             console.print(thing, soft_wrap=not wrap)
         sys.stdout.flush()
-    except BrokenPipeError:
-        _detach()
 
 
 def emit_line(text: str) -> None:
@@ -43,10 +43,8 @@ def emit_line(text: str) -> None:
 
 def emit_json(document: Mapping[str, Any]) -> None:
     """Print one JSON document, as `as_json` has it."""
-    try:
+    with _writing_output():
         print(as_json(document), end="", flush=True)
-    except BrokenPipeError:
-        _detach()
 
 
 def as_json(document: Mapping[str, Any]) -> str:
@@ -61,8 +59,11 @@ def warn(texts: Iterable[str]) -> None:
 
 
 def note(text: str) -> None:
-    """Say something on standard error."""
-    _console(sys.stderr).print(text, soft_wrap=True)
+    """Say something on standard error; the work goes on where that cannot be written."""
+    try:
+        _console(sys.stderr).print(text, soft_wrap=True)
+    except OSError:
+        _detach(sys.stderr)
 
 
 def table(
@@ -282,7 +283,7 @@ def _span(seconds: float) -> str:
 
 class _Console(Console):
     def on_broken_pipe(self) -> None:
-        _detach()
+        _detach(self.file)
 
 
 def _console(stream) -> Console:
@@ -293,9 +294,24 @@ def _console(stream) -> Console:
     return console
 
 
-def _detach() -> None:
+@contextmanager
+def _writing_output() -> Iterator[None]:
+    """Raise `InputError` if standard output cannot be written; a reader that has gone away is no error."""
+    try:
+        yield
+    except BrokenPipeError:
+        _detach(sys.stdout)
+    except OSError as error:
+        _detach(sys.stdout)
+        reason = one_line(error.strerror or str(error), 100)
+        raise InputError(f"standard output: cannot be written: {reason}") from None
+
+
+def _detach(stream: Any) -> None:
     """Let what is still printed go nowhere: the exit code remains the verdict."""
     try:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
     except (OSError, ValueError):
         pass

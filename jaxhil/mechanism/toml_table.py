@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError, one_line
+from jaxhil.files import open_input
 
 __all__ = ["parse_toml", "read_bytes"]
 
@@ -27,7 +28,7 @@ _TOKENS = re.compile(
 def read_bytes(path: Path, label: str, what: str) -> bytes:
     """The bytes of a file that says `what`, "a mechanism" say. Raises FileNotFoundError, or `InputError`."""
     try:
-        with path.open("rb") as file:
+        with open_input(path) as file:
             data = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
         raise

@@ -6,9 +6,11 @@ limits have to be within the file's bounds and within those of the code too (`bo
 SHA-256 of the document's canonical JSON without the date, the timings and the digest itself.
 """
 
+import errno
 import hashlib
 import json
 import os
+import stat
 from collections.abc import Mapping
 from math import inf, isfinite
 from typing import Any, NamedTuple
@@ -49,6 +51,10 @@ def read_gain_document(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The JSON object in the file, unchecked but for its form. Raises GainFileError."""
     source = os.fspath(path)
     try:
+        mode = os.stat(source).st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            # Reading a pipe waits for its writer, and a device may never end.
+            raise OSError(errno.EINVAL, "found a pipe or a device, expected a plain file")
         with open(source, "rb") as file:
             content = file.read(LARGEST + 1)
     except (OSError, ValueError) as error:

@@ -5,6 +5,7 @@ stays open, and equal data gives equal files.
 """
 
 import os
+import warnings
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -124,7 +125,9 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     fields = {"CreationDate": None} if target.suffix.lower() == ".pdf" else {}
     fields = {"Date": None} if target.suffix.lower() == ".svg" else fields
     fields = {"Software": None} if target.suffix.lower() == ".png" else fields
-    with rc_context({"svg.hashsalt": "jaxhil"}):
+    with rc_context({"svg.hashsalt": "jaxhil"}), warnings.catch_warnings():
+        # A name may have letters that the font lacks; they are drawn as boxes.
+        warnings.filterwarnings("ignore", r"Glyph \d+", UserWarning)
         figure.savefig(content, dpi=120, metadata=fields, format=target.suffix[1:].lower())
     write_whole(target, content.getvalue())
 

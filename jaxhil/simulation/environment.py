@@ -7,6 +7,7 @@ the environment are the caller's again.
 
 import gc
 import os
+import re
 import sys
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -15,6 +16,7 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
+from jaxhil.simulation import startup
 from jaxhil.simulation.compile_cache import keep_sealed
 
 CACHE = "JAXHIL_CACHE"
@@ -22,6 +24,7 @@ CACHE = "JAXHIL_CACHE"
 # what goes wrong in it comes as an exception anyway.
 LOG, FATAL = "TF_CPP_MIN_LOG_LEVEL", "3"
 DEVICES = "--xla_force_host_platform_device_count"
+SOME_DEVICES = re.compile(rf"{DEVICES}=[1-9]\d{{,2}}")
 FEWEST_DEVICES = (
     2  # for one alone, the compiler orders sums otherwise: the last bits differ from those of more
 )
@@ -47,6 +50,15 @@ ONCE = {
 # An option of LLVM's own, to unroll loops as a whole or not at all, and the compiler's versions that it was
 # tried with: an option that LLVM does not know ends the process.
 WHOLE, TRIED = "-unroll-allow-partial=false", ("0.10.",)
+# Modes for debugging, whatever JAX_... variables say: to them NaN would be a mistake, a program that is
+# compiled before it runs is not there, and every transfer has to be explicit.
+NO_DEBUGGING = {
+    "jax_debug_nans": False,
+    "jax_debug_infs": False,
+    "jax_disable_jit": False,
+    "jax_no_tracing": False,
+    "jax_transfer_guard": "allow",
+}
 _started_with: list[str] = []  # XLA_FLAGS that jax was started with, once `start` did it
 
 
@@ -54,14 +66,20 @@ def prepare() -> None:
     """For the rest of the process: float64, one device per usable core and two at least, quick compilation,
     compiled programs kept between calls.
 
-    What the user says in XLA_FLAGS stands. Flags have no effect once jax runs, and are left alone then.
+    What the user says in XLA_FLAGS stands. Flags have no effect once jax runs, and are left alone then. Raise
+    `InputError` if jax cannot be imported under the user's environment variables.
     """
     if "jax" not in sys.modules:
-        os.environ.update(settings(os.environ))
+        os.environ.update(_checked_settings())
     gc.set_threshold(*RARELY)
-    import jax
+    try:
+        import jax
+    except ValueError as error:
+        raise startup.as_input_error(error) from None
 
-    jax.config.update("jax_enable_x64", True)
+    for name, value in {"jax_enable_x64": True, **NO_DEBUGGING}.items():
+        if hasattr(jax.config, name):
+            jax.config.update(name, value)
     named = program_folder()
     folder = named or cache_folder()
     if folder is not None and keep_sealed(folder) and not named:
@@ -85,8 +103,12 @@ def computing() -> Iterator[None]:
 
 
 def start() -> None:
-    """Start jax as for a command, unless it runs already; the environment is then as it was."""
-    ours = settings(os.environ)
+    """Start jax as for a command, unless it runs already; the environment is then as it was.
+
+    Raise `InputError` if jax cannot start.
+    """
+    startup.check_process()
+    ours = _checked_settings()
     before = {name: os.environ.get(name) for name in ours}
     os.environ.update(ours)
     try:
@@ -97,6 +119,8 @@ def start() -> None:
         count, named = jax.device_count(), ours["XLA_FLAGS"]
         if not _started_with and f"{DEVICES}={count}" in named.split():
             _started_with.append(named)
+    except (AssertionError, RuntimeError, ValueError) as error:
+        raise startup.as_input_error(error) from None
     finally:
         for name, value in before.items():
             if value is None:
@@ -107,11 +131,14 @@ def start() -> None:
 
 @contextmanager
 def float64() -> Iterator[None]:
-    """Float64 in this thread, and none of jax's debugging modes, to which NaN would be a mistake."""
+    """Float64 in this thread, and none of jax's debugging modes."""
     import jax
 
     with ExitStack() as stack:
-        for setting in (jax.enable_x64(True), jax.debug_nans(False), jax.debug_infs(False)):
+        for setting in (
+            *(jax.enable_x64(True), jax.debug_nans(False), jax.debug_infs(False), jax.disable_jit(False)),
+            jax.transfer_guard("allow"),
+        ):
             stack.enter_context(setting)
         yield
 
@@ -156,6 +183,20 @@ def settings(given: Mapping[str, str]) -> dict[str, str]:
     return {"XLA_FLAGS": flags(given.get("XLA_FLAGS", "")), "NPROC": threads, LOG: given.get(LOG, FATAL)}
 
 
+def _checked_settings() -> dict[str, str]:
+    """`settings` of this process. Raise `InputError` for XLA_FLAGS over which XLA would end the process."""
+    ours = settings(os.environ)
+    harmless = flags("").split()
+    tried = [
+        flag
+        for flag in ours["XLA_FLAGS"].split()
+        if flag not in harmless and not SOME_DEVICES.fullmatch(flag)
+    ]
+    if tried:
+        startup.check_flags(" ".join(tried))
+    return ours
+
+
 def xla_flags() -> str:
     """The flags that programs are compiled with here, as far as is known."""
     return _started_with[0] if _started_with else os.environ.get("XLA_FLAGS", "")
@@ -168,7 +209,9 @@ def rounding_flags(flags: str) -> str:
 
 
 def flags(given: str) -> str:
-    """XLA_FLAGS: what the user gave, and what of ours it does not settle."""
+    """XLA_FLAGS: what the user gave, perhaps in a file, and what of ours it does not settle."""
+    if given and not given.startswith("-"):
+        given = startup.flags_of_file(given)
     ours = {
         DEVICES: max(FEWEST_DEVICES, usable_cores()),
         # A third of the compile time, for programs that run as fast.

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.files import TEMPORARY, exchange, remove_stale, sync_folder, temporary_name, writing
-from jaxhil.runtime import digest
+from jaxhil.runtime import GainFileError, digest
+from jaxhil.runtime.gain_file import read_gain_document
 from jaxhil.runtime.limits import LIMITS
 from tuning.bundle import selftest
 from tuning.bundle.content import bundle_files
@@ -102,6 +103,17 @@ def check_target(folder: Path) -> None:
         _own_files(folder)
     except OSError as error:
         raise InputError(f"{where}: cannot be read: {one_line(error.strerror or str(error))}") from None
+
+
+def check_mechanism(folder: Path, name: str) -> None:
+    """Check that a bundle there is of the mechanism of that name. Raise `InputError` otherwise."""
+    try:
+        there = read_gain_document(folder / "gains.json")["mechanism"]["name"]
+    except (GainFileError, KeyError, TypeError):
+        return  # nothing, or no bundle as it was exported, which `check_target` refuses
+    if there != name:
+        found = f"found the bundle of mechanism {shown(there)}, expected that of {shown(name)}"
+        raise InputError(f"{one_line(str(folder))}: {found}, or none: name another folder by --output")
 
 
 def write_bundle(folder: Path, files: Mapping[str, bytes]) -> None:

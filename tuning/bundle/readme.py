@@ -1,5 +1,7 @@
 """A bundle's README: the text in `bundle_readme.md`, filled with what this bundle is and holds."""
 
+import html
+import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from string import Template
@@ -34,7 +36,7 @@ def readme_text(document: Mapping[str, Any], files: Collection[str]) -> str:
     present = {*(name.partition("/")[0] for name in files), "manifest.json"}
     listed = [f"| `{name}` | {text} |" for name, text in CONTENT.items() if name in present]
     return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
-        mechanism=_cell(one_line(document["mechanism"]["name"], 80)),
+        mechanism=_text(one_line(document["mechanism"]["name"], 80)),
         compensator=document["compensator"],
         period=repr(document["control_period"]),
         digest=document["sha256"],
@@ -59,6 +61,11 @@ def fault_table() -> str:
         for fault in FAULTS
     ]
     return "\n".join(("| bit | fault | raised when | reaction |", "|---|---|---|---|", *rows))
+
+
+def _text(text: str) -> str:
+    """Return a user's text as Markdown shows it: no markup, no HTML."""
+    return re.sub(r"([\\`*_\[\]|~$#])", r"\\\1", html.escape(text, quote=False))
 
 
 def _cell(text: str) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError, one_line
+from jaxhil.files import open_input
 
 LARGEST = 65536  # bytes of a key's file
 
@@ -59,7 +60,7 @@ def _key(path: Path, allowed: str, load: Callable[[bytes], Any]) -> Any:
     from cryptography.exceptions import UnsupportedAlgorithm
 
     try:
-        with path.open("rb") as file:
+        with open_input(path) as file:
             text = file.read(LARGEST + 1)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)

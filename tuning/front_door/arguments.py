@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from jaxhil.errors import InputError, one_line, shown
+from jaxhil.files import open_input
 from jaxhil.mechanism.file import AnyMechanism, LoadedAny, LoadedMechanism, source_sha256
 from jaxhil.mechanism.loading import as_any_mechanism, as_mechanism
 from jaxhil.mechanism.six_axes import SixAxisMechanism
@@ -193,7 +194,7 @@ def readable_gain_file(given: Any, argument: str = "gains") -> Path:
         path = folder(argument, given)
         if path.is_dir():
             path = path / "gains.json"
-        with path.open("rb") as file:
+        with open_input(path) as file:
             file.read(1)
     except (OSError, ValueError) as error:
         if isinstance(error, InputError):

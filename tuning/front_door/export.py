@@ -89,7 +89,7 @@ def export(
     arguments.integers(0, seed=seed)
     arguments.flags(progress=progress)
     arguments.probabilities(false_alarms=false_alarms, missed=missed)
-    from tuning.bundle.bundle import build_bundle, check_target, write_bundle
+    from tuning.bundle.bundle import build_bundle, check_mechanism, check_target, write_bundle
     from tuning.bundle.signing import signer
 
     target = arguments.folder("folder", folder)
@@ -101,6 +101,7 @@ def export(
     with computing():
         loaded = arguments.gain_file(path)
         arguments.runtime(loaded.compensator)
+        check_mechanism(target, loaded.mechanism.name)
         chosen = _formats(formats, loaded.compensator)
         found = _calibrated(loaded, sweep, replaced, (false_alarms, missed), progress)
         with terminal.stages(2, progress) as stages:

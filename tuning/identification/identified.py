@@ -15,7 +15,7 @@ from tuning.identification.mechanism_file import put, uncertainty_tables
 from tuning.identification.options import Options
 from tuning.identification.parameters import SIMULATOR
 from tuning.identification.rational import Model
-from tuning.identification.records import Campaign
+from tuning.identification.records import UNNAMED, Campaign
 from tuning.identification.result import Estimate
 
 
@@ -30,7 +30,7 @@ def mechanism_of(
 ) -> dict[str, Any]:
     """As a mechanism file has it: what was found over what the prior says."""
     timing = campaign.timing
-    document: dict[str, Any] = {"schema": "jaxhil/mechanism/1", "name": "identified"}
+    document: dict[str, Any] = {"schema": "jaxhil/mechanism/1", "name": UNNAMED}
     document |= {} if prior is None else to_builtins(prior)
     speeds = [run.speed for run in campaign.runs if run.speed]
     values = {one.key: one.value for one in estimates}

@@ -17,6 +17,7 @@ Hold = Literal["zoh", "linear"]
 Row = Literal["tick", "sent", "after"]
 # Ticks by which the logged readings lag the logged command by the way a row is written: "sent" rows hold the
 # command of the next tick, "after" rows the readings of the next one.
+UNNAMED = "identified"  # name of a mechanism that no prior names
 ROW_SHIFT = {"tick": 0, "sent": 1, "after": -1}
 
 

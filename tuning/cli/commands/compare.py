@@ -26,12 +26,13 @@ def run(options: Compare) -> int:
     loaded = _load(options)
     folder = Path(options.output)
     checks.output(folder)
-    checks.own_results(folder / "compare.json", "mechanisms", PICTURES)
+    names = [one.mechanism.name for one in loaded]
+    checks.own_results(folder / "compare.json", "mechanisms", PICTURES, names)
     prepare()
     from tuning.benchmark.study import Failed
     from tuning.transparency.pushes import PUSHES
 
-    laws, names = asked.laws, [one.mechanism.name for one in loaded]
+    laws = asked.laws
     found: dict[str, dict[str, Any]] = {name: {} for name in names}
     interrupted, problems = False, []
     pieces = pieces_in(options.output, options.resume)

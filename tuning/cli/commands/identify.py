@@ -18,7 +18,7 @@ from tuning.cli.commands import checks, identify_design
 from tuning.cli.commands.resuming import pieces_in, say_of_pieces
 from tuning.cli.options_identify import Identify
 from tuning.front_door import arguments
-from tuning.identification.records import Campaign
+from tuning.identification.records import UNNAMED, Campaign
 
 SCHEMA = "jaxhil/identification/1"
 MOST_ORDER = 4
@@ -50,7 +50,8 @@ def run(options: Identify) -> int:
     prior = None if options.prior is None else load(options.prior).mechanism
     folder = Path(options.output)
     checks.output(folder)
-    checks.own_results(folder / DOCUMENT, "estimates", (MECHANISM, *PICTURES))
+    name = UNNAMED if prior is None else prior.name
+    checks.own_results(folder / DOCUMENT, "estimates", (MECHANISM, *PICTURES), [name])
     from tuning.identification.bootstrap import FITS
     from tuning.identification.estimate import STAGES, Options, identify
     from tuning.identification.mechanism_file import to_toml

@@ -22,9 +22,9 @@ def run(options: Map) -> int:
     mechanism = named(options)
     target = Path(options.output)
     checks.output(target)
-    checks.own_results(target / DOCUMENT, "theory", [PICTURE])
     prepare()
     mechanism, compensator, gains = chosen(options, mechanism)
+    checks.own_results(target / DOCUMENT, "theory", [PICTURE], [mechanism.name])
     made = map(
         mechanism, options.x, options.y, compensator, gains,
         limit=options.limit, points=options.points, seed=options.seed, folder=target,

@@ -1,19 +1,19 @@
 """`jaxhil tune`: gains for every mechanism file, judged on scenarios that tuning never saw."""
 
-import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxhil.errors import InputError, one_line
+from jaxhil.errors import InputError, one_line, shown
 from jaxhil.files import make_folder, remove_stale, writing
-from jaxhil.mechanism.file import LoadedAny, load_any
+from jaxhil.mechanism.file import AnyMechanism, LoadedAny, load_any, to_builtins
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.environment import prepare, program_folder
 from tuning import terminal
 from tuning.cli.commands import checks, tune_pareto
+from tuning.cli.commands.checks import folder_name
 from tuning.cli.commands.resuming import pieces_in, say_of_pieces
 from tuning.cli.commands.tune_tables import print_one, print_overview
 from tuning.cli.options import Tune
@@ -44,7 +44,7 @@ def run(options: Tune) -> int:
     entries, interrupted = [], False
     if loaded:
         # Before jax starts: a folder that cannot be written costs no tuning.
-        _check_output(Path(options.output), [folder_name(one.mechanism.name) for one in loaded])
+        _check_output(Path(options.output), [one.mechanism for one in loaded])
         loaded = _understood(options, asked, loaded, problems)
     if loaded:
         pieces = pieces_in(options.output, options.resume)
@@ -78,12 +78,20 @@ def run(options: Tune) -> int:
     return 0 if all(entry["verdict"] == "good" for entry in entries) else 1
 
 
-def _check_output(output: Path, names: list[str]) -> None:
-    """What is to be replaced there is of an earlier run. Raises `InputError`."""
+def _check_output(output: Path, mechanisms: list[AnyMechanism]) -> None:
+    """What is to be replaced there is of an earlier run for the same mechanisms. Raises `InputError`.
+
+    Warn where only the name is the same.
+    """
     checks.output(output)
-    for name in names:
-        checks.own_results(output / name / "gains.json", "compensator", PICTURES)
-    if len(names) > MOST_DRAWN and not any(output.glob("*/gains.json")):
+    for one in mechanisms:
+        path = output / folder_name(one.name) / "gains.json"
+        found = checks.own_results(path, "compensator", PICTURES, [one.name])
+        if found and found.get("mechanism") != to_builtins(one):
+            terminal.warn(
+                [f"{one_line(str(path))}: replaced: it is of another mechanism of the name {shown(one.name)}"]
+            )
+    if len(mechanisms) > MOST_DRAWN and not any(output.glob("*/gains.json")):
         checks.own_results(output / "gains.json", "compensator", [OVERVIEW])
 
 
@@ -100,12 +108,12 @@ def _load(options: Tune, asked: TuneOptions) -> tuple[list[LoadedAny], list[str]
             one = load_any(file, options.overrides, options.unset)
             asked.fits(one.mechanism)
             folder = folder_name(one.mechanism.name)
-            if folder in folders:
+            if (other := folders.get(folder.casefold())) is not None:
                 raise InputError(
-                    f"{one.label}: name: found {one_line(one.mechanism.name, 60)}, allowed a name whose "
-                    f"folder {folder} is not that of {folders[folder]}"
+                    f"{one.label}: name: found {shown(one.mechanism.name)}, allowed a name whose folder, "
+                    f"{one_line(folder)}, differs by more than capitals from that of {other}"
                 )
-            folders[folder] = one.label
+            folders[folder.casefold()] = one.label
             loaded.append(one)
         except InputError as error:
             problem = getattr(error, "option", str(error))
@@ -146,11 +154,6 @@ def _expand(files: tuple[str, ...], problems: list[str]) -> list[str | None]:
             terminal.note(f"jaxhil: {problems[-1]}")
         expanded.extend(found)
     return expanded if files else [None]
-
-
-def folder_name(name: str) -> str:
-    """A mechanism's name as the name of a folder."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._") or "mechanism"
 
 
 def _tune_all(

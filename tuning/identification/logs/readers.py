@@ -66,6 +66,8 @@ def open_log(path: Path, text: Text = PLAIN) -> Log:
         raise InputError(f"{label}: found a name that ends in {shown(suffix)}, allowed {', '.join(known)}")
     if path.is_dir() and suffix != ".db3":
         raise InputError(f"{label}: found a directory, allowed a log")
+    if not (path.is_file() or path.is_dir()):
+        raise InputError(f"{label}: found a pipe or a device, expected a log")
     with reading(label):
         if suffix in _TEXT:
             return _text_log(path, label, text)

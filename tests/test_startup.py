@@ -1,0 +1,142 @@
+"""Environment variables and standard streams under which a command starts, or says in one line why not."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from jaxhil import InputError
+from jaxhil.simulation import environment, startup
+from tuning import terminal
+
+pytestmark = pytest.mark.users_options
+
+COMMAND = [sys.executable, "-m", "tuning"]
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+DEBUGGING = {
+    **{
+        "JAX_DISABLE_JIT": "1",
+        "JAX_DEBUG_NANS": "1",
+        "JAX_ENABLE_X64": "0",
+        "JAX_TRANSFER_GUARD": "disallow",
+    },
+    **{
+        "MPLBACKEND": "none-such",
+        "PYTHONWARNINGS": "error",
+        "COLUMNS": "1",
+        "TERM": "dumb",
+        "HOME": "/nonexistent",
+    },
+}
+
+
+def run(*arguments, shell=None, **variables):
+    """A command as a process of its own; `shell` is what a shell puts after it."""
+    command = [*COMMAND, *arguments]
+    if shell is not None:
+        command = ["bash", "-c", f'"$@" {shell}', "bash", *command]
+    places = os.pathsep.join([ROOT, os.environ.get("PYTHONPATH", "")])
+    return subprocess.run(
+        command, env={**os.environ, "PYTHONPATH": places, **variables}, capture_output=True, text=True,
+        timeout=300, check=False,
+    )  # fmt: skip
+
+
+def refused(ran, *words):
+    assert ran.returncode == 2 and ran.stderr.count("\n") == 1 and "internal error" not in ran.stderr, ran
+    for word in words:
+        assert word in ran.stderr
+
+
+@pytest.mark.parametrize(
+    ("variables", "words"),
+    [
+        ({"XLA_FLAGS": "--xla_nonsense=1"}, ["XLA_FLAGS: found '--xla_nonsense=1'", "Unknown flag"]),
+        ({"XLA_FLAGS": "no-file"}, ["XLA_FLAGS: found 'no-file'", "a file of flags"]),
+        ({"JAX_PLATFORMS": "none-such"}, ["JAX_PLATFORMS=none-such"]),
+        ({"JAX_ENABLE_X64": "perhaps"}, ["JAX_ENABLE_X64=perhaps"]),
+    ],
+)
+def test_environment_variables_with_which_jax_does_not_start_are_refused(variables, words):
+    ran = run("simulate", "rig-300kg", "--json", **variables)
+    refused(ran, *words)
+    assert ran.stdout == ""
+
+
+def test_flags_over_which_xla_ends_raise_in_python():
+    script = "import jaxhil; jaxhil.simulate('rig-300kg')"
+    variables = {**os.environ, "PYTHONPATH": ROOT, "XLA_FLAGS": "--xla_nonsense=1"}
+    ran = subprocess.run(
+        [sys.executable, "-c", script], env=variables,
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert "InputError: XLA_FLAGS: found '--xla_nonsense=1'" in ran.stderr
+
+
+def test_debugging_modes_and_displays_change_no_figure(jaxhil, tmp_path):
+    ran = run("simulate", "rig-300kg", "--json", "--plot", str(tmp_path / "run.png"), **DEBUGGING)
+    assert ran.returncode == 1, ran.stderr
+    assert json.loads(ran.stdout) == jaxhil("simulate", "rig-300kg", "--json").document
+    assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_flags_are_tried_by_another_process():
+    startup.check_flags("--xla_cpu_ftz=true")
+    for flags, reason in (
+        ("--xla_backend_optimization_level=high", "interpret value high"),
+        ("--xla_backend_extra_options=-no-such-option", "Unknown command line argument"),
+    ):
+        with pytest.raises(InputError, match=f"XLA_FLAGS: found '{flags}'.*{reason}"):
+            startup.check_flags(flags)
+
+
+def test_flags_of_a_file_are_those_in_it(tmp_path):
+    (tmp_path / "flags").write_text("--xla_cpu_ftz=true\n--xla_backend_optimization_level=3\n")
+    given = "--xla_cpu_ftz=true --xla_backend_optimization_level=3"
+    assert environment.flags(str(tmp_path / "flags")) == environment.flags(given)
+
+
+def test_a_fork_of_a_process_in_which_jax_runs_is_refused(monkeypatch):
+    monkeypatch.setattr(startup, "_processes", set())
+    startup.check_process()
+    startup.check_process()
+    monkeypatch.setattr(os, "getpid", lambda: -1)
+    with pytest.raises(InputError, match="forked after jax had started, expected one begun by spawn"):
+        startup.check_process()
+
+
+def test_a_closed_standard_output_is_refused_before_any_work():
+    refused(run("simulate", shell=">&-"), "standard output: found it closed")
+
+
+def test_a_full_standard_output_is_told_in_one_line():
+    refused(run("mechanisms", "--json", shell="> /dev/full"), "standard output: cannot be written: No space")
+
+
+@pytest.mark.parametrize("shell", ["2>&- <&-", "2> /dev/full", "2> >(true)"])
+def test_without_standard_error_the_result_is_the_same(jaxhil, tmp_path, shell):
+    arguments = "simulate", "rig-300kg", "--json", "--log", str(tmp_path / "log.csv")
+    ran = run(*arguments, shell=shell)
+    assert (ran.returncode, ran.stderr) == (1, "")
+    assert json.loads(ran.stdout) == jaxhil(*arguments).document
+
+
+def test_a_reader_that_has_gone_away_is_no_error(tmp_path):
+    ran = run(
+        "simulate", "rig-300kg", "--log", str(tmp_path / "log.csv"), shell="| true; exit ${PIPESTATUS[0]}"
+    )
+    assert ran.returncode == 1 and "wrote" in ran.stderr and (tmp_path / "log.csv").exists()
+    ran = run("--help", shell="| true; exit ${PIPESTATUS[0]}")
+    assert (ran.returncode, ran.stderr) == (0, "")
+
+
+def test_notes_that_nobody_reads_cost_no_result(monkeypatch, capsys):
+    read, write = os.pipe()
+    os.close(read)
+    with open(write, "w") as broken:
+        monkeypatch.setattr(sys, "stderr", broken)
+        terminal.note("on the way")
+        terminal.emit_line("the result")
+    assert capsys.readouterr().out == "the result\n"
