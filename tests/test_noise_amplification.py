@@ -91,13 +91,14 @@ def test_amplification_is_that_of_the_loop_in_steady_contact():
 
 
 def test_a_young_contact_is_noisier_by_what_is_identified():
-    """The more, the larger the initial covariance, and by less than a quarter: a force above the contact
-    threshold is hardly ever noise."""
+    """The more, the larger the initial covariance, and in the first tenth of a contact alone: a force above
+    the contact threshold is hardly ever noise."""
 
     def noise(**values):
-        gains, command, force = noisy_contact(0.005, 300.0, **values)
-        touching = np.flatnonzero((force > 0).all(axis=1))
-        spans = np.array_split(np.std(command, axis=1)[touching[0] : touching[-1]], 10)
+        gains, command, force = noisy_contact(0.005, 300.0, lanes=128, ticks=400, **values)
+        first = np.flatnonzero((force > 0).all(axis=1))[0]
+        last = first + np.flatnonzero((force[first:] == 0).any(axis=1))[0]
+        spans = np.array_split(np.std(command, axis=1)[first : last - 1], 10)
         expected = amplified("response_error", gains)[0] * DEVIATION
         return gains, np.array([np.sqrt(np.mean(span**2)) for span in spans]) / expected
 
@@ -106,5 +107,5 @@ def test_a_young_contact_is_noisier_by_what_is_identified():
     gains, own = noise()
     covariance = gains["stiffness_covariance"]
     known, large, huge = (noise(stiffness_covariance=covariance * times)[1] for times in (0, 10, 1e4))
-    assert known[0] < 1 < 1.05 < own[0] < large[0] < huge[0] < 1.25
-    assert max(max(spans[1:]) for spans in (own, large, huge)) < 1.25
+    assert known[0] < 1 < 1.1 < own[0] < large[0] < huge[0] < 1.6
+    assert max(max(spans[1:]) for spans in (own, large, huge)) < 1.1

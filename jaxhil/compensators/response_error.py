@@ -219,8 +219,7 @@ class ResponseError(Compensator):
     def noise_amplification(self, gains, constants):
         # The lead filter's alone. Noise reaches k_hat too, whose part in F_c is smaller by (x_d - x_a)/depth
         # and by the root of the number of samples remembered: half a percent of the whole in steady contact.
-        # A young contact, whose k_hat rests on a few shallow samples, is noisier: by a sixth over its first
-        # tenth with the literature's covariance, by half with a very large one.
+        # A young contact, whose k_hat rests on a few shallow samples, is noisier in its first tenth.
         return lead_amplification(lead_filter(gains, constants))
 
     def identified(self, state):
