@@ -106,5 +106,5 @@ def _contacts(document: dict[str, Any]) -> Any:
         for number, (one, error) in enumerate(zip(runs, told, strict=True), start=1)
     ]
     headings = [what, "e", "e*", *errors, "peak [N]", "/ ideal", "duration [ms]", "/ ideal"]
-    headings += ["approach [mm/s]", "status"]
+    headings += ["speed [mm/s]", "status"]
     return terminal.table(f"{what.capitalize()}s", headings, rows, texts=(len(headings) - 1,))

@@ -123,7 +123,7 @@ def _print(options: Simulate, done: "Run", contacts: list[dict[str, Any]], reaso
         for number, contact in enumerate(contacts, start=1)
     ]
     headings = ["contact", "e", "e*", "error", "peak [N]", "/ ideal", "duration [ms]", "/ ideal"]
-    headings += ["approach [mm/s]"]
+    headings += ["speed [mm/s]"]
     headings += [*(ESTIMATES[name][0] for name in estimates), "status"]
     rule = "the gain file's gains" if options.gains is not None else "gains by the literature's rule"
     title = f"{done.mechanism.name}, compensation: {done.compensator}"
