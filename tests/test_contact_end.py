@@ -32,6 +32,7 @@ from jaxhil.simulation.sensors import white_noise
 from jaxhil.simulation.watch import LONGEST_FADING, build_rules
 from tuning.bundle.bundle import limits_section
 from tuning.gain_file import build_document
+from tuning.gains.tasks import build_task
 from tuning.rig.contact_watch import ContactWatch
 from tuning.rig.plant import Plant
 from tuning.rig.udp_protocol import NumericalModel
@@ -215,6 +216,14 @@ def test_exported_watchdog_alarms_as_rarely_as_stated(tmp_path):
     stated = found.rates["false_alarms"]
     assert stated["runs"] > 200
     assert binomial_interval(alarms, len(runs), 0.99)[0] <= stated["high"], (alarms, stated)
+
+
+def test_training_gives_noisy_contacts_time_for_their_end():
+    """A contact may last as long as without noise before it counts as failed."""
+    noisy, free = (
+        build_task(heavy(noise_std=std), "phase_lead", 8, 0).scenarios.time_limit for std in (1.0, 0.0)
+    )
+    np.testing.assert_allclose(noisy - free, LONGEST_FADING)
 
 
 def exported(parsed: Mechanism, gains: dict[str, float]) -> dict[str, Any]:

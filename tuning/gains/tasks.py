@@ -22,6 +22,7 @@ from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import quasi_random
 from jaxhil.simulation.evaluation import lanes_of, parameters_by_slot
 from jaxhil.simulation.scenario import Scenario
+from jaxhil.simulation.watch import LONGEST_FADING
 from tuning.gains import simulated
 from tuning.gains.common_program import CommonProgram
 from tuning.optimisation.unit_box import Bounds, to_gains
@@ -190,4 +191,7 @@ def _patience(law: ContactLaw, scenarios: Scenario) -> Float[Array, "*batch"]:
     velocity = jnp.broadcast_to(scenarios.velocity, shape)
     reference = law.reference(parameters_by_slot(scenarios.contact), mass, velocity)
     longest = PATIENCE * jnp.max(reference.duration, axis=0) + SHORTEST_PATIENCE
+    # A noisy command never dies out, so that a contact's end is waited for longer: gains do not pay for that.
+    sensor = scenarios.force_sensor
+    longest = longest + jnp.where((sensor.noise_std != 0) | (sensor.bias != 0), LONGEST_FADING, 0.0)
     return jnp.minimum(longest, scenarios.time_limit)
