@@ -94,7 +94,7 @@ def test_jitter_of_an_eighth_of_the_period_is_no_fault(jitter, period, start):
 
 
 def test_ordinary_jitter_never_trips():
-    """Of 5 % of the period, normally distributed: one tick in some thousand is flagged, none is a trip."""
+    """Jitter of 5 % of the period, normally distributed: one tick in some thousand is flagged, none trips."""
     late = 0.05 * np.random.default_rng(3).standard_normal(100_000)
     found = np.array(faults((1e-3 * (np.arange(100_000) + late)).tolist()))
     assert set(found) <= {OK, EARLY_TICK, LATE_TICK}
@@ -106,7 +106,7 @@ def test_late_tick_may_be_made_up_for():
 
 
 def test_one_repeated_tick_is_flagged_and_two_within_69_ticks_trip():
-    """Of the first one's period 0.99^n is left after n ticks: half of it after 69."""
+    """The drift of one repeated tick is 0.99^n periods after n ticks: half a period after 69."""
     assert faults(periods(1.0, 0.001, *[1.0] * 20)) == [OK, OK, EARLY_TICK, *[OK] * 20]
     assert faults(periods(0.001, *[1.0] * 67, 0.001))[-1] == CLOCK
     assert faults(periods(0.001, *[1.0] * 69, 0.001))[-1] == EARLY_TICK

@@ -75,7 +75,7 @@ TUNED = {
 
 
 def amplification(name: str, gains: dict[str, float], period: float) -> float:
-    """How many times the sensor's noise the command of a compensator has."""
+    """Return by how much a compensator amplifies the sensor's noise."""
     leaves = {key: jnp.asarray(value) for key, value in gains.items()}
     return float(COMPENSATORS[name].noise_amplification(leaves, Constants(jnp.asarray(period), jnp.inf)))
 

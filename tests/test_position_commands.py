@@ -45,7 +45,7 @@ POSITION, ANSWER, TRIPPED = (RESULT.index(name) for name in ("position", "answer
 
 
 def in_both(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
-    """What Python makes of the rows; where there is a compiler, C makes the same."""
+    """Return the results of the rows in Python; with a compiler, check that C has the same."""
     results = controller_in_python(gain_file, rows)
     if c99_cases.COMPILER is not None:
         made = c99_cases.loaded(gain_file.compensator)
@@ -64,7 +64,7 @@ def rows_of(*rows: dict[str, float]) -> np.ndarray:
 
 
 class Reference:
-    """Where a command may begin, and how far from it, worked out from the rows alone."""
+    """Place at which a run may begin, and the distance allowed from it, by the rows alone."""
 
     def __init__(self, gain_file: GainFile) -> None:
         self.limits, self.clearance = gain_file.limits, gain_file.clearance
@@ -273,7 +273,7 @@ def test_run_that_begins_off_the_drives_catches_up_within_the_velocity_limit():
 
 
 def test_after_reset_the_command_goes_on_from_the_last_one():
-    """Where the drives have been moved meanwhile, the next run begins from where they read."""
+    """A run begins from where the drives read, if they have been moved meanwhile."""
     here, there = {"desired": -0.01, "measured": -0.01, "x": -0.01}, {"measured": -0.03, "desired": -0.03}
     moved = {**there, "x": -0.03}
     rows = rows_of(here, {**here, "x": math.nan}, {**moved, "event": RESET}, {**moved, "event": NEXT_CONTACT})

@@ -102,7 +102,7 @@ def test_one_program_serves_both_searches(quiet):
 
 
 def test_no_gains_of_a_grid_are_quieter_within_the_tolerance(quiet, validation):
-    """By the measure of the module, with the weights that this task had: every pair of the two gains."""
+    """Return the measure of quietness of every pair of the two gains, with the weights of this task."""
     result = quiet[0][0]
     accurate = most_accurate(result).gains
     side = np.linspace(0, 1, 24)
@@ -171,7 +171,7 @@ def test_what_is_asked_for_is_minimised(options, wanted):
 
 
 def result_of(rms=0.005, silent=0.004, failed=0, unlike=0.0, peaks=(1.0, 1.2), gains=(0.0, 0.001)):
-    """What the verdict reads of a result."""
+    """Return a result with all that the verdict reads."""
 
     def figures_of(rms, failed=0):
         shares = {"peak_force_ratio": 1.1, "duration_ratio": (0.9, 1.2), "unlike": unlike}
