@@ -65,7 +65,7 @@ def test_every_built_in_mechanism_as_simulated(name):
     overrides = ()
     if name == "limited":
         name = "rattling"
-        overrides = ("rig.simulator.acceleration_limit=0.4", "rig.simulator.velocity_limit=0.0099")
+        overrides = ("rig.simulator.acceleration_limit=0.4", "rig.simulator.velocity_limit=0.012")
         overrides += ("approach.contacts=3", "rig.command_latency=1")
     mechanism = load(name, overrides).mechanism
     gains = literature_gains(mechanism, "response_error")
