@@ -278,8 +278,8 @@ CASES: dict[str, Case] = {
     ),
     "rattling, faster than the drives at first": Case(
         mechanism(
-            {"damping": [500.0], "clearance": 0.002},
-            {**RATTLING, "velocity_limit": 0.0098}, 0.003, 3, velocity=0.01,
+            {"damping": [100.0, 3000.0, 500.0], "clearance": 0.002},
+            {**RATTLING, "velocity_limit": 0.0102}, 0.003, 3, velocity=0.01,
         ),
         "response_error",
     ),

@@ -11,6 +11,7 @@ SI.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil, inf, isfinite
@@ -20,6 +21,8 @@ import numpy as np
 from numpy.polynomial.polynomial import polyder
 from oracle_contact import SMOOTH_NODES, SMOOTH_WEIGHTS, Law, Piece, Work, cut
 from oracle_motion import TIME_TOLERANCE, Motion, delay_in_ticks
+
+FORGOTTEN = 50.0  # time constants after which nothing of a force is left in a lagging reading
 
 
 class NoCompensator:
@@ -44,9 +47,9 @@ def simulate(
 ) -> list[dict[str, Any]]:
     """Run the contacts of a mechanism (the mechanism file, parsed); one dict per contact.
 
-    Keys: restitution, approach_velocity, peak_force [N], work_in, work_out [J], ticks (end_tick -
-    begin_tick), begin_tick, end_tick, peak_command [N], excess_variation of the command [N],
-    position_shortfall [m], what the velocity limit takes off the position command at most, status
+    Keys: restitution, approach_velocity, peak_force [N], duration [s], work_in, work_out [J],
+    ticks (end_tick - begin_tick), begin_tick, end_tick, peak_command [N], excess_variation [N] of the
+    command, position_shortfall [m], what the velocity limit takes off the position command at most, status
     ('over' or 'timeout'); `record=True` adds per-tick `signals` (of the whole run), among them the
     force just before the tick (`force`).
 
@@ -253,6 +256,7 @@ class _Run:
             "restitution": rebound / approach_velocity,
             "approach_velocity": approach_velocity,
             "peak_force": self.work.peak,
+            "duration": self.work.duration,
             "work_in": float(self.work.work_in),
             "work_out": float(self.work.work_out),
             "ticks": end - (end if begin is None else begin),
@@ -313,10 +317,8 @@ class _Run:
         """F just before `time` (ticks); 0 before t = 0."""
         if time <= TIME_TOLERANCE:
             return 0.0
-        for piece in reversed(self.pieces):
-            if piece.start < time - TIME_TOLERANCE:
-                return piece.force_at(time)
-        return 0.0
+        newest = bisect_left(self.pieces, time - TIME_TOLERANCE, key=lambda piece: piece.start)
+        return self.pieces[newest - 1].force_at(time) if newest else 0.0
 
     def _read_force(self, n):
         if self.lag > 0.0:
@@ -340,20 +342,18 @@ class _Run:
         while self.cursor < len(self.pieces) and self.pieces[self.cursor].end <= start:
             self.cursor += 1
         for piece in self.pieces[self.cursor :]:
-            a, b = max(piece.start, start), min(piece.end, end)
+            # Before that the sensor has forgotten the force.
+            a, b = max(piece.start, start, end - FORGOTTEN / rate), min(piece.end, end)
             if piece.start >= end:
                 break
             if piece.side == 0 or b <= a:
                 continue
-            parts = max(1, ceil((b - a) * rate))
-            edges = np.linspace(a, b, parts + 1)
-            for low, high in pairwise(edges):
-                if (end - high) * rate > 50.0:
-                    continue
-                times = low + (high - low) * SMOOTH_NODES
-                forces = piece.force((times - piece.origin) / piece.length)
-                kernel = rate * np.exp(-(end - times) * rate)
-                total += float(np.sum(forces * kernel * SMOOTH_WEIGHTS) * (high - low))
+            # In time constants before the end: of a short lag, times themselves would lose the digits.
+            edges = np.linspace((end - a) * rate, (end - b) * rate, max(1, ceil((b - a) * rate)) + 1)
+            for early, late in pairwise(edges):
+                ago = early + (late - early) * SMOOTH_NODES
+                forces = piece.force((end - ago / rate - piece.origin) / piece.length)
+                total += float(np.sum(forces * np.exp(-ago) * SMOOTH_WEIGHTS) * (early - late))
         self.lag_state = float(np.exp(-rate)) * self.lag_state + total
         return self.lag_state
 

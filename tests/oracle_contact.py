@@ -148,7 +148,7 @@ class Work:
         self.begin()
 
     def begin(self):
-        self.peak = self.work_in = self.work_out = 0.0
+        self.peak = self.work_in = self.work_out = self.duration = 0.0
 
     def jump(self, position, index):
         """Work along a jump of the position (ideal simulator, zoh hold, undamped law)."""
@@ -169,6 +169,7 @@ class Work:
 
     def add(self, piece):
         a, b = piece.theta
+        self.duration += (b - a) * piece.length * self.period
         theta = a + (b - a) * SMOOTH_NODES
         _, v = piece.motion(theta)
         power = piece.force(theta) * v * SMOOTH_WEIGHTS * (b - a) * piece.length * self.period
@@ -200,7 +201,11 @@ def cut(position, velocity, a, b, law, index):
     """
 
     x, v = polynomial(position), polynomial(velocity)
-
+    near, far = law.plane, law.plane - law.clearance
+    reach = float(np.sum(np.abs(position[1:])))
+    if far < position[0] - reach and position[0] + reach < near:
+        law.deepest = 0.0
+        return [((a, b), 0, False, 0.0)]
     turning = [a, *_roots(v, a, b), b]
     cuts = {a, b, *turning}
     for low, high in pairwise(turning):
@@ -219,7 +224,7 @@ def cut(position, velocity, a, b, law, index):
         clamped = side != 0 and law.clamped(index)
 
         def sign(s, side=side):
-            return float(law.sign_of(law.penetration(x(s), side), side * v(s), index, law.deepest))
+            return law.sign_of(law.penetration(x(s), side), side * v(s), index, law.deepest)
 
         if side == 0:
             law.deepest = 0.0
@@ -237,8 +242,8 @@ def cut(position, velocity, a, b, law, index):
 
 def _roots(function, a, b, samples=8):
     """Sign changes of a smooth function in (a, b), each refined to rounding."""
-    grid = [*(a + k * ((b - a) / samples) for k in range(samples)), b]
-    values = [function(s) for s in grid]
+    grid = np.array([*(a + k * ((b - a) / samples) for k in range(samples)), b])
+    values = function(grid)
     found = []
     for low, high, f_low, f_high in zip(grid[:-1], grid[1:], values[:-1], values[1:], strict=True):
         if f_low * f_high < 0.0:

@@ -57,6 +57,18 @@ def simulator_matrices(simulator) -> Any:
     return fastest * A, fastest * B, C / scaled[0]
 
 
+def taylor_rows(A, B, C, length):
+    """Rows that make the Taylor coefficients of y and the state after `length` of (state, u, ramp of u)."""
+    order = len(B)
+    terms = [np.eye(order, order + 2)]
+    for k in range(TAYLOR_ORDER):
+        following = length * (A @ terms[-1]) / (k + 1)
+        if k < 2:
+            following[:, order + k] += length * B / (k + 1)
+        terms.append(following)
+    return np.array([C @ term for term in terms]), np.sum(terms[::-1], axis=0)
+
+
 class Motion:
     """x_a(t) as polynomials: command c(m) -> latency, hold -> u(t) -> transport delay, G(s)."""
 
@@ -77,6 +89,7 @@ class Motion:
         if self.matrices is not None:
             A, B, _ = self.matrices
             self.substeps = max(1, ceil(2.0 * np.linalg.norm(A, 2) * period))
+            self.series, self.transition = taylor_rows(A, B, self.matrices[2], period / self.substeps)
             gain: Any = -np.linalg.solve(A, B)
             if self.hold == "linear":
                 start = self._command(self.first - self.latency)
@@ -108,16 +121,11 @@ class Motion:
         start = self._command(j - self.latency) if self.hold == "linear" else end
         if self.matrices is None:
             return [np.array([start, end - start])]
-        A, B, C = self.matrices
-        length, polynomials = self.period / self.substeps, []
+        ramp, polynomials = (end - start) / self.substeps, []
         for i in range(self.substeps):
-            ramp = (end - start) / self.substeps
-            drive = [start + ramp * i, ramp] + [0.0] * TAYLOR_ORDER
-            states = [self.state]
-            for k in range(TAYLOR_ORDER):
-                states.append(length * (A @ states[-1] + B * drive[k]) / (k + 1))
-            polynomials.append(np.array([C @ z for z in states]))
-            self.state = np.sum(states[::-1], axis=0)
+            drive = np.array([*self.state, start + ramp * i, ramp])
+            polynomials.append(self.series @ drive)
+            self.state = self.transition @ drive
         return polynomials
 
     def locate_left(self, time):

@@ -49,7 +49,7 @@ def test_a_skipped_approach_changes_no_figure(law):
         ["rig.force_sensor.noise_std=0.1"],
         ["rig.position_sensor.noise_std=1e-6"],
         ["rig.position_sensor.quantum=1e-6"],
-        ["rig.simulator.velocity_limit=0.004"],
+        ["rig.simulator.velocity_limit=0.5"],
     ],
 )
 def test_what_happens_in_flight_is_flown(overrides):

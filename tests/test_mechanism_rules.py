@@ -153,6 +153,19 @@ def test_both_positions_start_inside_the_gap(changes, lag):
     assert ": contact.clearance: found " in message and f"allowed a clearance > {start:g}" in message
 
 
+def test_velocity_limit_below_the_approach_speed_is_refused():
+    path = "rig.simulator.velocity_limit"
+    speed = value_at(from_builtins(changed({}), "f"), "approach.velocity")
+    said = f"allowed a number >= {speed:g} m/s, the approach speed"
+    assert from_builtins(changed({path: speed}), "f")
+    assert f": {path}: found {0.99 * speed!r}, {said}" in refusal(changed({path: 0.99 * speed}))
+    for drawn in (
+        {"approach.velocity": {"distribution": "uniform", "low": speed, "high": 1.01 * speed}},
+        {path: {"distribution": "loguniform", "factor": [0.99, 1.5]}},
+    ):
+        assert f": {path}: found " in refusal(changed({path: speed, "uncertainty": drawn}))
+
+
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_the_start_is_free_of_the_contact_plane(side):
     # Free approach and phase, then latency, transport delay and lag of x_a.

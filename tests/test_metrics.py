@@ -35,7 +35,7 @@ def excess(commands, touching):
         command, touches = now
         # It turns round at once, so that what ends the contact is the quiet after it.
         signals = Signals(zeros, zeros, zeros - 1, zeros, jnp.zeros(1, jnp.int32))
-        plant_signals = PlantSignals(jnp.where(touches, 10.0, 0.0)[None], None, None)
+        plant_signals = PlantSignals(jnp.where(touches, 10.0, 0.0)[None], None, None, None)
         return record_contact(LOOP, rules, watch, signals, plant_signals, command[None], None), None
 
     watch, _ = jax.lax.scan(tick, fresh_watch(LOOP, zeros), (commands, touching))

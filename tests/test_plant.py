@@ -64,7 +64,8 @@ def test_every_built_in_mechanism_as_simulated(name):
     overrides = ()
     if name == "limited":
         name = "rattling"
-        overrides = ("rig.simulator.acceleration_limit=0.4", "rig.simulator.velocity_limit=0.0099")
+        overrides = ("rig.simulator.acceleration_limit=0.1", "rig.simulator.velocity_limit=0.01")
+        overrides += ('uncertainty."approach.velocity".factor=[0.8, 1.0]',)
         overrides += ("approach.contacts=3", "rig.command_latency=1")
     mechanism = load(name, overrides).mechanism
     gains = literature_gains(mechanism, "response_error")

@@ -303,6 +303,15 @@ def test_poles_count_where_they_are_drawn():
     assert "rig.simulator: found a pole of " in refusal(rig(uncertainty=drawn), drawn=True)
 
 
+def test_velocity_limits_count_where_they_are_drawn():
+    normal = {"approach.velocity": {"distribution": "normal", "std": 1e-4}}
+    narrow = rig({"uncertainty": normal}, rig__simulator__velocity_limit=1.1 * SPEED)
+    check_run(narrow)
+    said = "rig.simulator.velocity_limit: found 0.0055, allowed a number >= 0.00559978 m/s"
+    assert said in refusal(narrow, drawn=True)
+    check_run(rig({"uncertainty": normal}, rig__simulator__velocity_limit=2 * SPEED), drawn=True)
+
+
 def test_every_function_refuses_what_would_not_end():
     endless = rig(rig__control_period=1e-9)
     for function in (jaxhil.simulate, tuning.tune, tuning.compare):

@@ -62,7 +62,7 @@ def test_a_dead_zone_that_hides_the_whole_contact_hides_it():
 
 def test_a_single_reading_is_a_contact():
     found = run(rig(0.99996 * DEEPEST))
-    assert found.contacts[0].status == "ok" and found.contacts[0].duration == pytest.approx(1e-3)
+    assert found.contacts[0].status == "ok" and 0 < found.contacts[0].duration < 2e-3
     assert np.count_nonzero(found.force_measured[found.contact == 0]) == 1
 
 

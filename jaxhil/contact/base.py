@@ -75,6 +75,10 @@ class ContactLaw(eqx.Module):
         """Smooth and positive as long as penetrated surfaces hold on to each other, else not: they let go
         where it goes through 0. The force before its clamp, or anything of its sign."""
 
+    def corners(self, parameters: ContactParameters, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        """Return the penetrations [m] at which the slope of the force changes; by default there are none."""
+        return ()
+
     def reference(self, parameters: ContactParameters, mass: Array, velocity: Array) -> Reference:
         """The same contact in space, entered at `velocity` [m/s]: see `jaxhil.contact.reference`. By default
         its motion is integrated (`jaxhil.contact.reference_motion`)."""

@@ -32,6 +32,9 @@ class Elastoplastic(ContactLaw):
         deepest = jnp.where(penetration > 0, deepest, 0)
         return jnp.where((penetration > 0) & (force > 0), force, 0), (deepest,)
 
+    def corners(self, parameters, state):
+        return state
+
     def edge(self, parameters, rate):
         return jnp.zeros_like(rate)
 

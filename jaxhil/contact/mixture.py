@@ -55,6 +55,10 @@ class AnyOf(ContactLaw):
         own = zip(self.laws, self._own(parameters), strict=True)
         return self._choose(parameters, [law.edge(one, rate) for law, one in own])
 
+    def corners(self, parameters, state: Any):
+        own = zip(self.laws, self._own(parameters), state, strict=True)
+        return tuple(corner for law, one, memory in own for corner in law.corners(one, memory))
+
     def hold(self, parameters, state: Any, penetration, rate):
         own = zip(self.laws, self._own(parameters), state, strict=True)
         return self._choose(

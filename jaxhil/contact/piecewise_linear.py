@@ -28,6 +28,9 @@ class PiecewiseLinear(ContactLaw):
             force = force + parameters.stiffness[i] * overlap
         return force
 
+    def corners(self, parameters, state):
+        return tuple(parameters.depths)
+
     def edge(self, parameters, rate):
         force = parameters.damping * rate
         return jnp.where(force > 0, force, 0)

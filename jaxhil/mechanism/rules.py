@@ -40,6 +40,7 @@ __all__ = [
     "check_model",
     "check_texts",
     "is_hurwitz",
+    "velocity_limit_allowed",
 ]
 
 # Keys of each model of the motion simulator.
@@ -76,6 +77,7 @@ def check(mechanism: Mechanism) -> None:
     _check_hold(mechanism)
     spans = {path: _check_uncertainty(mechanism, path) for path in mechanism.uncertainty}
     check_correlation(mechanism)
+    _check_velocity_limit(mechanism, spans)
     _check_gap(mechanism, spans)
 
 
@@ -231,15 +233,37 @@ def _check_hold(mechanism: Mechanism) -> None:
         raise KeyProblem(("rig", "command_hold"), shown(rig.command_hold), allowed)
 
 
-def _check_gap(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
-    # The approach starts at x_d = min(plane, 0) - v (0.02 s + phase T) with x_a behind by the motion
-    # simulator's delay and lag and the command's latency, and has to lie inside the gap. An unbounded
-    # distribution reaches every value, so that only the nominal one can be judged.
+def _extremes(mechanism: Mechanism, spans: Mapping[str, Span]) -> Callable[[str, int], Any]:
+    """Return a function of a path and an end, 0 or 1: the least and the greatest value at the path.
+
+    An unbounded distribution reaches every value, so that only the nominal one can be judged.
+    """
+
     def extreme(path: str, end: int) -> Any:
         uncertainty = mechanism.uncertainty.get(path)
         drawn = uncertainty is not None and uncertainty.distribution != "normal"
         return spans[path][end] if drawn else value_at(mechanism, path)
 
+    return extreme
+
+
+def _check_velocity_limit(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
+    # Drives that are slower than the approach have no steady state in which a run could begin.
+    extreme, path = _extremes(mechanism, spans), "rig.simulator.velocity_limit"
+    fastest, limit = float(extreme("approach.velocity", 1)), float(extreme(path, 0))
+    if limit < fastest:
+        raise KeyProblem(tuple(path.split(".")), shown(limit), velocity_limit_allowed(fastest))
+
+
+def velocity_limit_allowed(approach: float) -> str:
+    """Return what is allowed as velocity limit, in words, at an approach speed [m/s]."""
+    return f"a number >= {approach:g} m/s, the approach speed: slower drives cannot follow the approach"
+
+
+def _check_gap(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
+    # The approach starts at x_d = min(plane, 0) - v (0.02 s + phase T) with x_a behind by the motion
+    # simulator's delay and lag and the command's latency, and has to lie inside the gap.
+    extreme = _extremes(mechanism, spans)
     clearance = float(extreme("contact.clearance", 0))
     period = extreme("rig.control_period", 1)
     behind = extreme("rig.simulator.delay", 1) + mechanism.rig.command_latency * period

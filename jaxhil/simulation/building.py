@@ -9,18 +9,29 @@ import numpy as np
 from jaxhil.compensators import COMPENSATORS
 from jaxhil.contact.laws import LAWS
 from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.cells import FASTEST_POLE, NO_CELLS, CellCounts, count_cells, fastest_pole
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.scenario import Scenario
 
 SHORTEST_RING = 16
+# Greatest pole and contact frequency [rad per control period] at which samples say what is between them: peak
+# force to 1e-6, and of a lag or a dent, which the loop feels, 1e-7 of the restitution.
+SLOW, SLOW_BETWEEN = (0.3, 0.1), (0.15, 0.05)
+DAMPED = 2.0  # a damper's rate b/M counts as so many times a frequency: its force jumps at the touch
 
 
 def build_loop(
-    mechanism: Mechanism, compensator: str, scenarios: Scenario, energies: bool = False, chatter: bool = False
+    mechanism: Mechanism,
+    compensator: str,
+    scenarios: Scenario,
+    energies: bool = False,
+    chatter: bool = False,
+    exact: bool = False,
 ) -> Loop:
     """The loop of `mechanism` under the compensator called `compensator`, for all `scenarios` at once.
 
-    `energies` asks for the works of the real force, `chatter` for the command's excess variation.
+    `energies` asks for the works of the real force, `chatter` for the command's excess variation, `exact` for
+    peak force and duration as they are between samples, also where samples say them well.
     """
     rig, force, position = mechanism.rig, scenarios.force_sensor, scenarios.position_sensor
     simulator = scenarios.simulator
@@ -54,6 +65,7 @@ def build_loop(
             np.any(np.isfinite(simulator.velocity_limit)) or np.any(np.isfinite(simulator.acceleration_limit))
         ),
         first_break=_first_break(simulator.numerator, rig.command_hold),
+        cells=_cells(mechanism, scenarios, exact or energies),
         is_two_sided=is_two_sided,
         ring=samples(sensed),
         controller_ring=samples(max(aligned, default=0.0)),
@@ -61,6 +73,45 @@ def build_loop(
         probed=scenarios.probe is not None,
         chatter=chatter,
     )
+
+
+def _cells(mechanism: Mechanism, scenarios: Scenario, exact: bool) -> CellCounts:
+    """Cells for the fastest pole and the shortest lag of any lane, at the longest period; none where all is
+    slow and what samples say is enough."""
+    period = float(np.max(scenarios.control_period))
+    fastest = float(np.max(fastest_pole(scenarios.simulator.denominator))) * period
+    lags = np.asarray(scenarios.force_sensor.time_constant) / period
+    law = LAWS[mechanism.contact.law]
+    between = law.remembers or bool(np.any(lags > 0))
+    pole, contact = SLOW_BETWEEN if between else SLOW
+    quick_lag = np.any((lags > 0) & (lags < 1))
+    slow = fastest <= pole and not quick_lag and _fastest_contact(mechanism, scenarios) * period <= contact
+    if slow and not exact:
+        return NO_CELLS
+    return count_cells(min(fastest, FASTEST_POLE), lags)
+
+
+def _fastest_contact(mechanism: Mechanism, scenarios: Scenario) -> float:
+    """The largest frequency sqrt(F'/M) [rad/s] of a contact at its deepest, or rate F_d/(2 M) of its damping,
+    F_d the slope of the force against the rate at the touch; of any lane, entered at its first speed."""
+    law, contact = mechanism.contact.law, scenarios.contact
+    mass, velocity = scenarios.equivalent_mass, scenarios.velocity
+    stiffness, damping = contact.stiffness, contact.damping
+    with np.errstate(all="ignore"):
+        if law in ("hunt_crossley", "depth_damped"):
+            power = contact.exponent
+            depth = ((power + 1) * mass * velocity**2 / (2 * stiffness)) ** (1 / (power + 1))
+            slope, damping = power * stiffness * depth ** (power - 1), 0 * damping
+        elif law == "hardening":
+            scale = contact.reference_depth
+            energy = mass * velocity**2 / (stiffness * scale**2)
+            slope = stiffness * (1 + 3 * (np.sqrt(1 + 2 * energy) - 1))
+        elif law == "elastoplastic":
+            slope = stiffness * contact.unloading_ratio
+        else:
+            slope = stiffness
+        frequency = np.max(np.sqrt(slope / mass), initial=0.0)
+        return float(max(frequency, DAMPED * np.max(damping / mass)))
 
 
 def _first_break(numerator, hold: str) -> int:

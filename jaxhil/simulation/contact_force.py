@@ -2,9 +2,10 @@
 sensor makes of it.
 
 The motion simulator moves smoothly within a sampling interval (`jaxhil.simulation.motion_simulator`); its
-corners are the interval's ends. The force is read where the sensor will sample it, once per interval. What
-depends on the force in between follows it along the cubic through the exact position and velocity at the ends
-of each smooth stretch.
+corners are the interval's ends. The force is read where the sensor will sample it, once per interval. In a
+loop of slow motion, what depends on the force in between follows it along the cubic through the exact
+position and velocity at the ends of each smooth stretch; in others, along the exact motion
+(`jaxhil.simulation.contact_in_cells`).
 """
 
 from typing import Any, NamedTuple
@@ -15,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxhil.contact.laws import ContactLaw, ContactParameters, deflection, two_sided
+from jaxhil.simulation.cells import Course
 from jaxhil.simulation.sensors import lag, lag_decay
 
 ROOT_STEPS = 3  # of Newton's method, from a straight line's root
@@ -35,6 +37,7 @@ class SamplingInterval(NamedTuple):
     sample: Motion  # where the force is sampled
     start: Any  # at the interval's start, from within; None for loops that do not look between the samples
     end: Any  # at its end, likewise
+    course: Course | None  # what the motion in between follows from; None for loops that do not follow it
 
 
 class PlantSignals(NamedTuple):
@@ -45,6 +48,8 @@ class PlantSignals(NamedTuple):
     works: tuple[Array, Array] | None
     # of the force in the interval [N]; None unless the force has corners between samples
     peak: Float[Array, "*batch"] | None
+    # time with a force since the sample before [periods]; None where touching samples are counted
+    touched: Float[Array, "*batch"] | None
 
 
 class Contact(NamedTuple):
@@ -55,6 +60,8 @@ class Contact(NamedTuple):
     reading: Float[Array, "*batch"] | None
     lagged: Array  # its reading at the interval's end [N]
     last: "ContactSample"  # the sample of the contact
+    # time with a force after the sample [periods]; None where touching samples are counted
+    touched: Float[Array, "*batch"] | None
     law: tuple[Array, ...]  # state of the contact law at the interval's end
 
 
@@ -112,6 +119,14 @@ class ContactSample(NamedTuple):
     force: Float[Array, "*batch"]  # [N]
     edge: Float[Array, "*batch"]  # limit of the force at that surface [N]
     side: Float[Array, "*batch"]  # of that surface, 1 or -1
+
+    def position(self, clearance: Array | None) -> Array:
+        """Position of the mechanism [m]."""
+        if clearance is None:
+            return self.distance
+        # Before the first sample it is far from either surface.
+        distance = jnp.maximum(self.distance, -clearance / 2)
+        return jnp.where(self.side > 0, distance, -clearance - distance)
 
 
 def no_contact(like: Array) -> ContactSample:
@@ -194,7 +209,8 @@ def sensed_lag(
         return sample, sample * lag_decay(duration - until, time_constant)
 
     # Most of the time no lane touches.
-    outside = [deflection(motion.position, surfaces.clearance) == 0 for motion in interval]
+    motions = interval.sample, interval.start, interval.end
+    outside = [deflection(motion.position, surfaces.clearance) == 0 for motion in motions]
     return lax.cond(jnp.all(outside[0] & outside[1] & outside[2]), fade, follow, reading, interval)
 
 

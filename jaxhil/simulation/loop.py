@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxhil.compensators.base import Compensator, Constants, Gains
 from jaxhil.contact.laws import ContactLaw
+from jaxhil.simulation.cells import CellCounts, Cells, build_cells
 from jaxhil.simulation.contact_force import no_contact
 from jaxhil.simulation.loop_state import LoopState, Plant
 from jaxhil.simulation.motion_simulator import (
@@ -46,6 +47,7 @@ class Loop(eqx.Module):
     # the first derivative of the mechanism's position that jumps at the ticks (0: the position itself; 3
     # stands for all higher ones)
     first_break: int = eqx.field(static=True)
+    cells: CellCounts = eqx.field(static=True)  # of a sampling interval; `NO_CELLS` where samples suffice
     is_two_sided: bool = eqx.field(static=True)  # whether there is a second surface
     ring: int = eqx.field(static=True)  # samples in the delay lines of the sensors
     controller_ring: int = eqx.field(static=True)  # samples in the delay lines of the controller
@@ -81,6 +83,11 @@ class Loop(eqx.Module):
         """Whether the motion is needed between samples."""
         return self.has_lag or self.has_corners or self.energies or self.law.remembers
 
+    @property
+    def has_cells(self) -> bool:
+        """Whether the contact is followed along the exact motion between samples."""
+        return self.cells.part > 0
+
 
 class Delays(NamedTuple):
     """The delays of a loop in sampling intervals.
@@ -100,6 +107,7 @@ class RigConstants(NamedTuple):
 
     scenario: Scenario  # the lane's own numbers
     propagation: Propagation  # motion simulator, discretised
+    cells: Cells | None  # of a sampling interval; None for a loop without
     delays: Delays  # in sampling intervals
     constants: Constants  # what the controller knows of the rig
     inverse_mass: Float[Array, "*batch"]  # [1/kg], of the equivalent mass
@@ -112,6 +120,17 @@ def build_rig_constants(loop: Loop, scenario: Scenario, measured: bool = True) -
     """
     period, simulator = scenario.control_period, scenario.simulator
     delays = split_delays(scenario, loop.is_two_sided)
+    cells = None
+    if loop.has_cells:
+        time_constant = scenario.force_sensor.time_constant
+        cells = build_cells(
+            loop.cells,
+            simulator.numerator,
+            simulator.denominator,
+            period,
+            delays.force.fraction,
+            time_constant,
+        )
     return RigConstants(
         scenario=scenario,
         propagation=propagation(
@@ -121,8 +140,9 @@ def build_rig_constants(loop: Loop, scenario: Scenario, measured: bool = True) -
             delays.force.fraction,
             delays.position.fraction if measured else None,
             loop.hold,
-            ends=loop.follows_intervals,
+            ends=loop.follows_intervals and not loop.has_cells,
         ),
+        cells=cells,
         delays=delays,
         constants=Constants(period, scenario.clearance),
         inverse_mass=1 / scenario.equivalent_mass,
@@ -176,7 +196,10 @@ def enter(
             commands[0] if loop.has_limits else None,
         ),
         sensed=state.sensed._replace(
-            last=no_contact(position), lagged=jnp.zeros_like(position), first_position=first_position
+            last=no_contact(position),
+            touched=jnp.zeros_like(position) if loop.has_cells else None,
+            lagged=jnp.zeros_like(position),
+            first_position=first_position,
         ),
         law=loop.law.init(position),
         entry_velocity=velocity,

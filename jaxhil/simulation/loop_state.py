@@ -45,6 +45,8 @@ class Sensed(NamedTuple):
 
     rings: Any  # delay lines (`Rings`; None where they are held apart)
     last: ContactSample  # last sample of the contact
+    # time with a force since the last sample [periods]; None where touching samples are counted
+    touched: Array | None
     lagged: Array  # reading of a lagging force sensor at the end of its sampling interval [N]
     # position sample of the sampling interval before the run [m]; None where nobody reads it
     first_position: Array | None

@@ -21,7 +21,8 @@ STATUS_NAMES = {
 # What a status says in a sentence, of those with which a run ends badly.
 STATUS_REASONS = {
     "not reached": "the numerical model turned back without a measured force: the hardware did not touch, or "
-    "the force sensor did not show it",
+    "the force sensor did not show it; or the contact before left faster than velocity_limit, and the drives "
+    "cannot follow the next approach",
     "timeout": f"a contact was not over within {LONGEST_CONTACT:g} s, the limit of a contact",
     "diverged": f"the speed grew beyond {RUNAWAY:g} times that of the first approach",
     "non-finite": "a number was no longer finite",

@@ -72,9 +72,7 @@ def propagation(
         return _ideal(control_period, force_fraction, position_fraction, hold, ends)
     system, output = _companion(numerator, denominator, control_period)
     zero, one = jnp.zeros_like(control_period), jnp.ones_like(control_period)
-    generator = [[*row, zero, zero] for row in system]
-    generator[order - 1][order] = one
-    generator = jnp.stack([jnp.stack(row) for row in generator])
+    generator, _ = generator_rows(numerator, denominator, control_period)
     places = [one, force_fraction]
     if ends:
         places.append(zero)
@@ -104,6 +102,21 @@ def propagation(
         steady_command=steady_command,
         steady_velocity=_steady_velocity(system, state[:, :, 0], steady_command, hold),
     )
+
+
+def generator_rows(
+    numerator: Float[Array, "order *batch"],
+    denominator: Float[Array, "order_plus_1 *batch"],
+    control_period: Float[Array, "*batch"],
+) -> tuple[Float[Array, "order order_plus_2 *batch"], list[Array]]:
+    """Return the rows of (A, B, 0), with time in periods, and the weights with which the position is made of
+    the state; the order is at least 1."""
+    order = denominator.shape[0] - 1
+    system, output = _companion(numerator, denominator, control_period)
+    zero, one = jnp.zeros_like(control_period), jnp.ones_like(control_period)
+    generator = [[*row, zero, zero] for row in system]
+    generator[order - 1][order] = one
+    return jnp.stack([jnp.stack(row) for row in generator]), output
 
 
 def exponential(

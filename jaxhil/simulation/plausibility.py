@@ -13,9 +13,11 @@ import numpy as np
 from jaxhil.contact.laws import LAWS, ContactLaw, ContactParameters
 from jaxhil.contact.reference import Reference
 from jaxhil.errors import InputError
+from jaxhil.mechanism.rules import velocity_limit_allowed
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import dimensions, quantiles
 from jaxhil.simulation import kept_programs
+from jaxhil.simulation.cells import FASTEST_POLE
 from jaxhil.simulation.environment import computing
 from jaxhil.simulation.evaluation import parameters_by_slot
 from jaxhil.simulation.free_flight import APPROACH
@@ -23,7 +25,6 @@ from jaxhil.simulation.scenario import LONGEST_CONTACT, MotionSimulator, Scenari
 
 MOST_TICKS = 1e7  # of a contact
 MOST_TICKS_OF_A_RUN = 1e9  # they are counted in 32 bits
-FASTEST_POLE = 64.0  # of the motion simulator, times the control period: so far its exponential is exact
 
 FREQUENCIES = 0.05, 50.0  # Hz, of contacts that can be meant
 FASTEST = 0.1  # contact frequency over control rate, likewise
@@ -34,6 +35,7 @@ _SPRINGS = ("linear", "kelvin_voigt")  # laws with a frequency sqrt(k/M)/(2 pi) 
 _RARELY = 1e-9  # the share of draws beyond either end of what is taken to be drawn
 # Keys that decide on the number of ticks, and on the motion simulator's poles.
 _TICKS = ("bodies.", "approach.velocity", "contact.", "rig.contact_plane", "rig.control_period")
+_SPEEDS = ("approach.velocity", "rig.simulator.velocity_limit")
 _POLES = ("rig.simulator.", "rig.control_period")
 
 
@@ -96,15 +98,26 @@ def meaning(mechanism: Mechanism) -> Meaning:
 
 def check_run(mechanism: Mechanism, label: str | None = None, drawn: bool = False) -> None:
     """A run can be computed, nominally or also where the uncertain numbers are `drawn`: no contact takes more
-    than 1e7 ticks, its approach included, nor all of them more than 1e9, and no pole of the motion simulator
-    is beyond `FASTEST_POLE`.
+    than 1e7 ticks, its approach included, nor all of them more than 1e9, no pole of the motion simulator is
+    beyond `FASTEST_POLE`, and the drives can follow the first approach.
 
     `label` is what an error calls the mechanism. Raises `InputError`.
     """
     name = label or mechanism.name
     lanes = build_scenarios(mechanism, _corners(mechanism, _POLES) if drawn else None)
     check_poles(name, lanes.simulator.denominator, lanes.control_period)
+    _check_velocity_limit(name, build_scenarios(mechanism, _corners(mechanism, _SPEEDS) if drawn else None))
     _check_ticks(name, mechanism, build_scenarios(mechanism, _corners(mechanism, _TICKS) if drawn else None))
+
+
+def _check_velocity_limit(name: str, scenarios: Scenario) -> None:
+    limits = scenarios.simulator.velocity_limit
+    lane = int(np.argmax(scenarios.velocity - limits))
+    if limits[lane] < scenarios.velocity[lane]:
+        found = f"rig.simulator.velocity_limit: found {limits[lane]:g}"
+        raise InputError(
+            f"{name}: {found}, allowed {velocity_limit_allowed(float(scenarios.velocity[lane]))}"
+        )
 
 
 def check_poles(name: str, denominator: Any, control_period: Any) -> None:

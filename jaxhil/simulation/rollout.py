@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxhil.compensators.base import Gains
+from jaxhil.simulation.cells import Course
 from jaxhil.simulation.contact_force import Motion, PlantSignals, SamplingInterval, no_contact
 from jaxhil.simulation.free_flight import arrival, begin_approach
 from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants
@@ -76,7 +77,13 @@ def start(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool = True)
         plant=Plant(
             (zeros,) * (loop.latency + 1), zeros, (zeros,) * order, zeros if loop.has_limits else None
         ),
-        sensed=Sensed(_rings(loop, ring, measured), no_contact(like), zeros, zeros if measured else None),
+        sensed=Sensed(
+            rings=_rings(loop, ring, measured, order),
+            last=no_contact(like),
+            touched=zeros if loop.has_cells else None,
+            lagged=zeros,
+            first_position=zeros if measured else None,
+        ),
         law=loop.law.init(zeros),
         controller=loop.compensator.init(gains, rig.constants, loop.controller_ring),
         parameters=_entry(scenario.contact, index),
@@ -145,7 +152,11 @@ def turn_over(
     plane = law.contact_plane(state.controller) if law.finds_plane else None
     metrics = collect(scenario, run.metrics, watch, run.index, over, status, ticks, delay, plane)
     index = run.index + over.astype(jnp.int32)
-    active = run.active & ~(over & ((status != OK) | (index >= scenario.contacts)))
+    ends = (status != OK) | (index >= scenario.contacts)
+    if loop.has_limits and not loop.is_two_sided:
+        # No run begins in a uniform motion that the drives cannot follow.
+        ends = ends | (watch.rebound > scenario.simulator.velocity_limit)
+    active = run.active & ~(over & ends)
     blank = fresh_watch(loop, watch.approach)
     entry = _entry(scenario.contact, _slot(rig, index))
     if watch.command is not None:
@@ -190,15 +201,19 @@ def _resumed(run, evolving):
     return run._replace(state=state, watch=watch, tick=now)
 
 
-def _rings(loop, ring, measured):
+def _rings(loop, ring, measured, order):
     """Empty delay lines of what the loop has."""
     interval = None
     if loop.is_two_sided:
         motion = Motion(ring, ring)
-        ends = motion if loop.follows_intervals else None
-        interval = SamplingInterval(motion, ends, ends)
+        ends = motion if loop.follows_intervals and not loop.has_cells else None
+        course = Course((ring,) * order, ring, ring, ring) if loop.has_cells else None
+        interval = SamplingInterval(motion, ends, ends, course)
     plant_signals = PlantSignals(
-        ring, (ring, ring) if loop.energies else None, ring if loop.has_corners else None
+        force=ring,
+        works=(ring, ring) if loop.energies else None,
+        peak=ring if loop.has_corners or loop.has_cells else None,
+        touched=ring if loop.has_cells else None,
     )
     reading = ring if loop.has_lag else None
     return Rings(plant_signals, reading, ring if measured else None, interval)
@@ -213,7 +228,10 @@ def _pending(rig, run):
 def _restart(loop, gains, state, entered, begins, fresh):
     """Take over the entered run on the lanes where it `begins`; rings and the law's parameters stay."""
     rings = state.sensed._replace(
-        last=entered.sensed.last, lagged=entered.sensed.lagged, first_position=entered.sensed.first_position
+        last=entered.sensed.last,
+        touched=entered.sensed.touched,
+        lagged=entered.sensed.lagged,
+        first_position=entered.sensed.first_position,
     )
     chosen = _choose(
         begins,
@@ -222,6 +240,7 @@ def _restart(loop, gains, state, entered, begins, fresh):
     )
     sensed = rings._replace(
         last=_choose(begins, rings.last, state.sensed.last),
+        touched=_choose(begins, rings.touched, state.sensed.touched),
         lagged=jnp.where(begins, rings.lagged, state.sensed.lagged),
         first_position=_choose(begins, rings.first_position, state.sensed.first_position),
     )

@@ -193,7 +193,7 @@ def simulate(
     check_run(checked)
     with computing():
         scenarios = build_scenarios(checked, seed=number)
-        outcome = evaluate(build_loop(checked, name, scenarios), values, scenarios)
+        outcome = evaluate(build_loop(checked, name, scenarios, exact=True), values, scenarios)
     law = COMPENSATORS[name]
     contacts = tuple(_contact(outcome, slot, law) for slot in range(checked.approach.contacts))
     status = next((contact.status for contact in contacts if contact.status != STATUS_NAMES[OK]), "ok")

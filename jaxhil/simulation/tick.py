@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.compensators.base import Gains, Signals
 from jaxhil.compensators.ring_buffer import depend_on, look_back, write_in_turn
+from jaxhil.simulation.cells import Course, power_series
 from jaxhil.simulation.contact_force import (
     Contact,
     Motion,
@@ -29,6 +30,7 @@ from jaxhil.simulation.contact_force import (
     works_along,
     works_between,
 )
+from jaxhil.simulation.contact_in_cells import Touch, contact_in_cells, work_of_jump
 from jaxhil.simulation.integrators import INTEGRATORS
 from jaxhil.simulation.loop import Loop, RigConstants
 from jaxhil.simulation.loop_state import LoopState, Plant, Rings
@@ -179,7 +181,8 @@ def actuate(
     end = commands[loop.latency]
     start = commands[loop.latency + 1] if loop.hold == "linear" else end
     rows, simulator = rig.propagation, state.plant.state
-    interval = _interval(rows, simulator, start, end, rig.scenario.contact_plane)
+    course = Course(simulator, start, end, rig.scenario.contact_plane) if loop.has_cells else None
+    interval = _interval(rows, simulator, start, end, rig.scenario.contact_plane)._replace(course=course)
     under_way = state.sensed.rings.interval
     if under_way is not None:
         under_way = write_in_turn(under_way, now, interval)
@@ -196,6 +199,8 @@ def actuate(
 
 def contact_force(loop: Loop, rig: RigConstants, state: LoopState, interval: SamplingInterval) -> Contact:
     """Stage 5: the real contact during the sampling interval that happens now."""
+    if rig.cells is not None:
+        return _contact_in_cells(loop, rig, state, interval)
     scenario, period = rig.scenario, rig.constants.control_period
     clearance = scenario.clearance if loop.is_two_sided else None
     surfaces = Surfaces(loop.law, state.parameters, state.law, clearance)
@@ -219,7 +224,37 @@ def contact_force(loop: Loop, rig: RigConstants, state: LoopState, interval: Sam
         works = works_along(surfaces, interval.start, interval.end, period)
     if loop.has_corners:
         peak = largest_force(surfaces, interval.start, interval.end, period)
-    return Contact(PlantSignals(force, works, peak), reading, lagged, last, law)
+    return Contact(PlantSignals(force, works, peak, None), reading, lagged, last, None, law)
+
+
+def _contact_in_cells(loop: Loop, rig: RigConstants, state: LoopState, interval: SamplingInterval) -> Contact:
+    """Stage 5 along the exact motion between samples."""
+    scenario, period, cells = rig.scenario, rig.constants.control_period, rig.cells
+    assert cells is not None and interval.course is not None
+    clearance = scenario.clearance if loop.is_two_sided else None
+    touch = Touch(loop.law, state.parameters, clearance)
+    found = contact_in_cells(
+        touch,
+        state.law,
+        cells,
+        power_series(cells, interval.course),
+        period,
+        state.sensed.lagged,
+        scenario.force_sensor.time_constant if loop.has_lag else None,
+    )
+    surfaces = Surfaces(loop.law, state.parameters, found.at_sample, clearance)
+    force, _ = surfaces.force(interval.sample)
+    last, works = state.sensed.last, found.works if loop.energies else None
+    if loop.is_two_sided or loop.energies:
+        last = surfaces.sample(interval.sample, force)
+    if loop.energies and loop.first_break == 0:
+        before = state.sensed.last.position(clearance)
+        works = work_of_jump(touch, state.law, before, interval.sample.position)
+    reading = found.reading if loop.has_lag else None
+    before, after = found.touched
+    assert state.sensed.touched is not None
+    signals = PlantSignals(force, works, found.peak, state.sensed.touched + before)
+    return Contact(signals, reading, found.lagged, last, after, found.at_end)
 
 
 def next_state(
@@ -234,7 +269,10 @@ def next_state(
         velocity=model.velocity,
         plant=actuated.plant,
         sensed=state.sensed._replace(
-            rings=rings._replace(interval=actuated.under_way), last=contact.last, lagged=contact.lagged
+            rings=rings._replace(interval=actuated.under_way),
+            last=contact.last,
+            touched=contact.touched,
+            lagged=contact.lagged,
         ),
         law=contact.law,
         controller=actuated.controller,
@@ -276,8 +314,8 @@ def _interval(rows, state, start, end, plane):
 
     sample = motion(rows.position, rows.velocity)
     if rows.start is None:
-        return SamplingInterval(sample, None, None)
-    return SamplingInterval(sample, motion(*rows.start), motion(*rows.end))
+        return SamplingInterval(sample, None, None, None)
+    return SamplingInterval(sample, motion(*rows.start), motion(*rows.end), None)
 
 
 def _arrived(rig, under_way, now, age):

@@ -108,12 +108,17 @@ def record_contact(
     speed, magnitude = jnp.abs(signals.velocity_desired), jnp.abs(command)
     force = jnp.abs(plant_signals.force)
     touching = force > 0
+    if plant_signals.touched is not None:
+        # A touch between two samples that do not show it.
+        touching = touching | ((watch.recent[1] == 0) & (plant_signals.touched > 0))
     begun = _has_begun(loop, rules, watch, signals, touching, magnitude)
     side = _side(rules, watch, signals)
     peak_command = jnp.maximum(watch.peak_command, magnitude)
     # The hardware may follow the numerical model late.
     quiet = jnp.where(touching | (begun & (watch.elapsed == 0)), 0, watch.quiet + 1)
+    touched = plant_signals.touched
     in_contact = jnp.where(touching, watch.in_contact + 1, watch.in_contact)
+    in_contact = in_contact if touched is None else watch.in_contact + touched
     ends = begun & _ends(rules, signals, side, quiet, magnitude, peak_command)
     lasts = begun & ~watch.over
     return Watch(

@@ -20,6 +20,7 @@ from jaxhil.contact.reference import Reference
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import extremes
 from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.cells import CellCounts, join_counts
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 
@@ -44,6 +45,7 @@ class CommonProgram:
     parts: tuple[str, ...]  # names of the optional parts of the loop that some mechanism has
     first_break: int  # the first derivative that breaks at a tick
     ring: int  # samples in the delay lines
+    cells: CellCounts  # of a sampling interval
     beforehand: bool  # whether integrated references are computed beforehand, as every first contact's can be
 
     def law(self, beforehand: bool | None = None) -> AnyOf:
@@ -63,6 +65,7 @@ class CommonProgram:
             law=self.law(),
             first_break=self.first_break,
             ring=max(self.ring, loop.ring),
+            cells=join_counts([self.cells, loop.cells]),
             **parts,
         )
 
@@ -140,5 +143,6 @@ def _common(mechanisms, group, loops, batches) -> CommonProgram:
         parts=tuple(name for name in _PARTS if any(getattr(loops[i], name) for i in group)),
         first_break=min(loops[i].first_break for i in group),
         ring=max(loops[i].ring for i in group),
+        cells=join_counts([loops[i].cells for i in group]),
         beforehand=not _later(mechanisms[0]) and not all(loops[i].law.closed_form for i in group),
     )

@@ -1,0 +1,130 @@
+"""The contact between samples: lags behind fast motion simulators, derivatives, how many cells there are."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from lanes import QUICK, join, mechanism, run_rollout, spread, validated
+from oracle import simulate
+
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.cells import FASTEST_POLE, NO_CELLS, CellCounts, count_cells, fastest_pole, join_counts
+from jaxhil.simulation.metrics import OK
+from jaxhil.simulation.rollout import rollout
+from jaxhil.simulation.scenario import build_scenarios
+
+PERIOD = 4e-3
+
+
+def fast(simulator, time_constant=2e-3, **contact):
+    """350 kg at 4 ms, command held, behind a fast motion simulator."""
+    sensor = {"time_constant": time_constant}
+    return mechanism(
+        {"law": "linear", "stiffness": [124e3], **contact},
+        simulator,
+        0.0,
+        period=PERIOD,
+        command_hold="zoh",
+        force_sensor=sensor,
+    )
+
+
+def second_order(frequency):
+    return {"model": "second_order", "natural_frequency": frequency, "damping_ratio": 0.8}
+
+
+def test_lagging_sensor_tends_to_the_ideal_simulator():
+    """As the simulator gets faster, the restitution tends to that of the program's own ideal one."""
+    cases = [fast(second_order(frequency)) for frequency in (300.0, 600.0, 1200.0)]
+    parsed = [validated(case) for case in cases]
+    scenarios = join(build_scenarios(one) for one in parsed)
+    metrics = run_rollout(build_loop(parsed[0], "none", scenarios), {}, scenarios)
+    ideal = validated(fast({"model": "ideal"}))
+    scenario = join([build_scenarios(ideal)])
+    limit = run_rollout(build_loop(ideal, "none", scenario), {}, scenario)
+    assert np.all(np.asarray(metrics.status)[0] == OK) and np.asarray(limit.status)[0, 0] == OK
+    off = np.asarray(metrics.restitution)[0] - np.asarray(limit.restitution)[0, 0]
+    np.testing.assert_allclose(off[1:] / off[:-1], 0.5, atol=0.1)
+    assert np.asarray(metrics.restitution)[0, 0] == pytest.approx(
+        simulate(cases[0])[0]["restitution"], abs=1e-11
+    )
+
+
+def test_derivatives_of_a_lagging_contact_are_its_differences():
+    """Along a change of stiffness and lag together."""
+    parsed = validated(fast(second_order(60.0), law="kelvin_voigt", damping=[300.0]))
+    loop = build_loop(parsed, "none", join([build_scenarios(parsed)]), energies=True)
+    scenario = jax.tree.map(jax.numpy.asarray, join([build_scenarios(parsed)]))
+
+    def figures(change):
+        contact = scenario.contact._replace(stiffness=scenario.contact.stiffness * (1 + change))
+        lag = scenario.force_sensor.time_constant * (1 - change / 2)
+        sensor = scenario.force_sensor._replace(time_constant=lag)
+        found = rollout(loop, {}, scenario._replace(contact=contact, force_sensor=sensor))
+        figures = found.restitution, found.peak_force, found.work_in, found.duration
+        return jax.numpy.stack([figure[0, 0] for figure in figures])
+
+    point, step = np.array(0.0), 1e-5
+    both = jax.jit(lambda at: jax.jvp(figures, (at,), (jax.numpy.ones_like(at),)), compiler_options=QUICK)
+    (_, exact), (ahead, _), (behind, _) = (both(point + move) for move in (0.0, step, -step))
+    np.testing.assert_allclose(exact, (ahead - behind) / (2 * step), rtol=1e-5)
+
+
+def test_slow_mechanisms_are_read_off_their_samples():
+    slow = mechanism({"law": "kelvin_voigt", "damping": [300.0]}, second_order(12.0), period=1e-3)
+    stiff = mechanism({"law": "kelvin_voigt", "stiffness": [1e7]}, second_order(12.0), period=1e-3)
+    for raw, exact, cells in ((slow, False, False), (slow, True, True), (stiff, False, True)):
+        parsed = validated(raw)
+        loop = build_loop(parsed, "none", join([build_scenarios(parsed)]), exact=exact)
+        assert loop.has_cells == cells and (loop.cells != NO_CELLS) == cells
+
+
+def test_samples_of_a_slow_mechanism_say_the_same():
+    raw = mechanism({"law": "kelvin_voigt", "damping": [300.0]}, second_order(20.0), period=1e-3)
+    parsed = validated(raw)
+    scenarios = spread(parsed, 4, phase=np.arange(4) / 4)
+    loops = [build_loop(parsed, "none", scenarios, exact=exact) for exact in (False, True)]
+    sampled, exact = (run_rollout(loop, {}, scenarios) for loop in loops)
+    np.testing.assert_allclose(sampled.restitution[0], exact.restitution[0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(sampled.peak_force[0], exact.peak_force[0], rtol=1e-6)
+    np.testing.assert_allclose(sampled.duration[0], exact.duration[0], rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("fastest", [0.0, 0.1, 0.9, 5.0, FASTEST_POLE])
+@pytest.mark.parametrize("lag", [0.0, 1e-9, 0.01, 0.3, 5.0])
+def test_cells_are_a_radian_and_a_time_constant_long_at_most(fastest, lag):
+    counts = count_cells(fastest, np.array([lag]))
+    window = min(1.0, 40 * lag) if counts.plain else 1.0
+    if counts.plain:
+        assert fastest / counts.plain <= 1.01
+    if lag > 0:
+        assert window / counts.window <= 1.01 * min(lag, 1 / max(fastest, 1e-9))
+    assert counts.degree == (1 if fastest == 0 else 8 if fastest <= 0.12 else 16)
+
+
+def test_joined_counts_serve_each_of_them():
+    whole, windowed, plain = CellCounts(0, 16, 16), CellCounts(2, 64, 8), CellCounts(4, 0, 8)
+    assert join_counts([NO_CELLS, NO_CELLS]) == NO_CELLS
+    assert join_counts([NO_CELLS, plain]) == plain
+    assert join_counts([whole, CellCounts(0, 4, 8)]) == whole
+    assert join_counts([whole, plain]) == CellCounts(16, 64, 16)
+    assert join_counts([windowed, plain]) == CellCounts(4, 64, 8)
+
+
+def test_fastest_pole_of_every_order():
+    rng = np.random.default_rng(1)
+    for order in range(1, 7):
+        roots = -rng.uniform(1.0, 300.0, order)
+        denominator = 3.0 * np.poly(roots)[:, None]
+        np.testing.assert_allclose(fastest_pole(denominator), np.max(-roots), rtol=1e-9)
+    pair = np.array([[1.0], [2 * 0.3 * 50.0], [50.0**2]])
+    np.testing.assert_allclose(fastest_pole(pair), 50.0, rtol=1e-12)
+
+
+def test_loops_with_cells_and_without_differ_by_them_alone():
+    parsed = validated(mechanism({}, second_order(12.0), period=1e-3))
+    scenarios = join([build_scenarios(parsed)])
+    plain = build_loop(parsed, "none", scenarios)
+    exact = build_loop(parsed, "none", scenarios, exact=True)
+    assert dataclasses.replace(exact, cells=plain.cells) == plain

@@ -1,0 +1,53 @@
+"""Figures of a contact over the whole legal range of mechanisms, against the event-accurate oracle."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from drawn_mechanisms import BAR, FIGURES, Form, differences, oracle_figures
+from lanes import join, run_rollout, validated
+
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.metrics import OK
+from jaxhil.simulation.scenario import build_scenarios
+
+FORMS = 60
+LANES = 6
+
+
+def compare(form: Form, seed: int, lanes: int, longest: int) -> list[tuple[dict[str, Any], dict[str, float]]]:
+    """The mechanisms of a form that end well and that the oracle vouches for, and how far figures differ."""
+    rng = np.random.default_rng(seed)
+    drawn = [form.draw(rng, longest) for _ in range(lanes)]
+    mechanisms = [validated(one) for one in drawn]
+    scenarios = join(build_scenarios(one) for one in mechanisms)
+    loop = build_loop(mechanisms[0], "none", scenarios, energies=True)
+    metrics = run_rollout(loop, {}, scenarios)
+    compared = []
+    for lane, one in enumerate(drawn):
+        expected = oracle_figures(one) if np.asarray(metrics.status)[0, lane] == OK else None
+        if expected is not None:
+            found = {name: float(np.asarray(getattr(metrics, name))[0, lane]) for name in FIGURES}
+            compared.append((one, differences(found, expected)))
+    return compared
+
+
+@pytest.mark.parametrize("number", [33, pytest.param(38, marks=pytest.mark.slow)])
+def test_contacts_of_drawn_mechanisms(number):
+    compared = compare(Form(number), seed=number, lanes=3, longest=16)
+    assert len(compared) >= 2
+    for mechanism, difference in compared:
+        assert max(difference.values()) <= BAR, (difference, mechanism)
+
+
+@pytest.mark.slow
+def test_contacts_over_the_whole_legal_range():
+    """300 mechanisms that end well and that the oracle vouches for."""
+    compared = []
+    for number in range(FORMS):
+        compared += compare(Form(number), seed=number, lanes=LANES, longest=60)
+    worst = {name: max(difference[name] for _, difference in compared) for name in FIGURES}
+    print(len(compared), worst)
+    assert len(compared) >= 300
+    for mechanism, difference in compared:
+        assert max(difference.values()) <= BAR, (difference, mechanism)
