@@ -148,8 +148,7 @@ class Form:
 def oracle_figures(parsed: dict[str, Any]) -> dict[str, float] | None:
     """What the oracle says of the first contact; None if it is not over, or if its own figures move by more
     than the bar when an input moves by `NUDGE`."""
-    sensor = parsed["rig"]["force_sensor"]
-    found = simulate(parsed, noise_level=sensor.get("quantum", 0.0))[0]
+    found = simulate(parsed)[0]
     if found["status"] != "over":
         return None
     approach, bodies = parsed["approach"], parsed["bodies"]
@@ -158,7 +157,7 @@ def oracle_figures(parsed: dict[str, Any]) -> dict[str, float] | None:
         {"bodies": {"equivalent_mass": bodies["equivalent_mass"] * (1 + NUDGE)}},
     )
     for change in nudged:
-        moved = simulate(parsed | change, noise_level=sensor.get("quantum", 0.0))[0]
+        moved = simulate(parsed | change)[0]
         if moved["status"] != "over" or max(differences(moved, found).values()) > BAR:
             return None
     return {name: float(found[name]) for name in FIGURES}

@@ -84,7 +84,8 @@ def test_verify_counts_the_real_contact_of_the_closed_loop(slow_simulator):
     (contact,) = report.closed_loop
     (simulated,) = slow_simulator.contacts
     assert contact.peak_force_ratio == pytest.approx(simulated.peak_force_ratio, rel=1e-6)
-    assert contact.duration_ratio == simulated.duration_ratio
+    # The closed loop counts samples.
+    assert contact.duration_ratio == pytest.approx(simulated.duration_ratio, rel=1e-4)
     assert not report.verdict and report.reasons[0].startswith("closed loop, contact 1: real peak force 20.3")
 
 
