@@ -94,8 +94,9 @@ def _cells(mechanism: Mechanism, scenarios: Scenario, exact: bool) -> CellCounts
 def _fastest_contact(mechanism: Mechanism, scenarios: Scenario) -> float:
     """The largest frequency sqrt(F'/M) [rad/s] of a contact at its deepest, or rate F_d/(2 M) of its damping,
     F_d the slope of the force against the rate at the touch; of any lane, entered at its first speed."""
-    law, contact = mechanism.contact.law, scenarios.contact
-    mass, velocity = scenarios.equivalent_mass, scenarios.velocity
+    law, contact = mechanism.contact.law, type(scenarios.contact)(*map(np.asarray, scenarios.contact))
+    # Whatever arrays the scenarios are of: slots and lanes meet here.
+    mass, velocity = np.asarray(scenarios.equivalent_mass), np.asarray(scenarios.velocity)
     stiffness, damping = contact.stiffness, contact.damping
     with np.errstate(all="ignore"):
         if law in ("hunt_crossley", "depth_damped"):
