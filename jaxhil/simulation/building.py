@@ -98,6 +98,8 @@ def _fastest_contact(mechanism: Mechanism, scenarios: Scenario) -> float:
     # Whatever arrays the scenarios are of: slots and lanes meet here.
     mass, velocity = np.asarray(scenarios.equivalent_mass), np.asarray(scenarios.velocity)
     stiffness, damping = contact.stiffness, contact.damping
+    if stiffness.ndim > damping.ndim:  # segments between slots and lanes
+        stiffness = np.max(stiffness, axis=1)
     with np.errstate(all="ignore"):
         if law in ("hunt_crossley", "depth_damped"):
             power = contact.exponent
