@@ -5,7 +5,7 @@ import pytest
 from exact_quantile import quantile
 
 from tuning.statistics.intervals import Running, confidence_sequence, replicate_interval, updated
-from tuning.sweeps.columns import GOOD, OUTCOMES
+from tuning.sweeps.columns import GOOD, OUTCOMES, SATURATED
 from tuning.sweeps.tally import (
     ORDERS,
     WORST,
@@ -19,9 +19,9 @@ from tuning.sweeps.tally import (
 
 def made_up(number, seed=0, share=0.3):
     generator = np.random.default_rng(seed)
-    outcome = np.where(generator.random(number) < share, generator.integers(1, 7, number), 0)
+    outcome = np.where(generator.random(number) < share, generator.integers(1, len(OUTCOMES), number), 0)
     error = generator.normal(size=number)
-    error[outcome > 3] = np.nan
+    error[outcome > OUTCOMES.index("not reached")] = np.nan
     return {
         "index": np.arange(number),
         "outcome": outcome.astype(np.int8),
@@ -116,7 +116,9 @@ def test_looks_are_the_confidence_sequences():
 def test_quantiles_are_those_of_the_errors(replicates):
     rows = made_up(1600, share=0.01)
     sizes = error_sizes(rows)
-    assert np.array_equal(np.isinf(sizes), rows["outcome"] > 2) and np.any(np.isinf(sizes))
+    assert np.array_equal(np.isinf(sizes), rows["outcome"] > OUTCOMES.index(SATURATED)) and np.any(
+        np.isinf(sizes)
+    )
     found = error_quantiles(add_rows(empty_tally(replicates, 1600), rows))
     assert [one.order for one in found] == list(ORDERS)
     for one in found[:3]:

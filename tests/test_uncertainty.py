@@ -195,7 +195,8 @@ def test_no_draws_and_negative_arguments():
 @given(nominal=st.just(0.0) | st.floats(1e-9, 1e4), std=st.floats(*MAGNITUDES))
 def test_normal_draws_are_allowed_values(path, nominal, std):
     allowed = numeric_keys()[path]
-    nominal = float(np.clip(nominal, allowed.low + 1e-9, min(allowed.high, 1e4)))
+    lowest = BASE["approach"]["velocity"] if path.endswith("velocity_limit") else allowed.low + 1e-9
+    nominal = float(np.clip(nominal, lowest, min(allowed.high, 1e4)))
     raw = copy.deepcopy(BASE)
     if path.startswith("bodies.") and "equivalent" not in path:
         raw["bodies"] = {"chaser_mass": 1.0, "target_mass": 1.0}

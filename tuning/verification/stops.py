@@ -6,7 +6,7 @@ that once more. `find_stop` feeds it a recorded run, `passing_limits` says with 
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
@@ -15,7 +15,9 @@ from jaxhil.runtime.gain_file import GainFile
 from jaxhil.runtime.law_status import STATUSES
 from jaxhil.runtime.limits import LIMITS, NO_LIMITS
 from jaxhil.runtime.watchdog import Watchdog
-from jaxhil.simulation.recording import Lane
+
+if TYPE_CHECKING:  # it stands on JAX, which takes a second that an early refusal need not wait for
+    from jaxhil.simulation.recording import Lane
 
 WATCHDOG = faults.RESTITUTION | faults.ENERGY_BALANCE | faults.CONTACT_TOO_LONG
 # The limit of each fault that has one, or two of them: the lower and the upper.
@@ -233,7 +235,7 @@ class Witness:
         return force, before, sent
 
 
-def find_stop(gain_file: GainFile, lane: Lane) -> Stop | None:
+def find_stop(gain_file: GainFile, lane: "Lane") -> Stop | None:
     """Return what the controller acts on in a recorded run, its last contact audited too; None if nothing."""
     witness = Witness(gain_file)
     readings = list(zip(*(leaf.tolist() for leaf in lane.signals), strict=True))
@@ -252,7 +254,7 @@ def find_stop(gain_file: GainFile, lane: Lane) -> Stop | None:
     return witness.stop()
 
 
-def passing_limits(gain_file: GainFile, lane: Lane) -> dict[str, float] | None:
+def passing_limits(gain_file: GainFile, lane: "Lane") -> dict[str, float] | None:
     """Return the limits to change, and their values, for a recorded run to pass; None if no limits do it."""
     limits, changed = dict(gain_file.limits), {}
     for _ in range(MOST_LIMITS):
