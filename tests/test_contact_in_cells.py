@@ -71,24 +71,71 @@ def test_derivatives_of_a_lagging_contact_are_its_differences():
     np.testing.assert_allclose(exact, (ahead - behind) / (2 * step), rtol=1e-5)
 
 
-def test_slow_mechanisms_are_read_off_their_samples():
-    slow = mechanism({"law": "kelvin_voigt", "damping": [300.0]}, second_order(12.0), period=1e-3)
-    stiff = mechanism({"law": "kelvin_voigt", "stiffness": [1e7]}, second_order(12.0), period=1e-3)
-    for raw, exact, cells in ((slow, False, False), (slow, True, True), (stiff, False, True)):
-        parsed = validated(raw)
-        loop = build_loop(parsed, "none", join([build_scenarios(parsed)]), exact=exact)
-        assert loop.has_cells == cells and (loop.cells != NO_CELLS) == cells
-
-
-def test_samples_of_a_slow_mechanism_say_the_same():
-    raw = mechanism({"law": "kelvin_voigt", "damping": [300.0]}, second_order(20.0), period=1e-3)
+def loops_of(raw):
+    """Scenarios at eight phases of a tick, the loop of tuning and sweeps, and the exact one."""
     parsed = validated(raw)
-    scenarios = spread(parsed, 4, phase=np.arange(4) / 4)
-    loops = [build_loop(parsed, "none", scenarios, exact=exact) for exact in (False, True)]
+    scenarios = spread(parsed, 8, phase=np.arange(8) / 8)
+    return scenarios, *(build_loop(parsed, "none", scenarios, exact=exact) for exact in (False, True))
+
+
+LAYERED = {"law": "piecewise_linear", "stiffness": [[8e4, 9e4, 7e4]], "depths": [1e-5, 2e-5]}
+RIGID = {"law": "piecewise_linear", "stiffness": [[8e4, 1e7, 7e4]], "depths": [1e-5, 2e-5]}
+
+
+@pytest.mark.parametrize(
+    ("contact", "frequency", "lag", "cells"),
+    [
+        ({"law": "linear", "stiffness": [1e6]}, 150.0, 0.0, False),
+        ({"law": "linear", "stiffness": [1e6]}, 180.0, 0.0, True),
+        ({"law": "linear", "stiffness": [1e7]}, 12.0, 0.0, True),
+        ({"law": "linear", "stiffness": [8e5]}, 20.0, 1e-4, False),
+        ({"law": "linear", "stiffness": [8e5]}, 30.0, 1e-4, True),
+        (LAYERED, 20.0, 0.0, False),
+        (RIGID, 20.0, 0.0, True),
+        (LAYERED, 20.0, 1e-4, True),
+        ({"law": "preloaded", "preload": 3.0, "friction": 2.0}, 20.0, 1e-4, True),
+    ],
+)
+def test_slow_mechanisms_are_read_off_their_samples(contact, frequency, lag, cells):
+    sensor = {"time_constant": lag}
+    raw = mechanism(contact, second_order(frequency), period=1e-3, force_sensor=sensor)
+    _, sampled, exact = loops_of(raw)
+    assert exact.has_cells and sampled.has_cells == cells and (sampled.cells != NO_CELLS) == cells
+
+
+DAMPED = {"stiffness": [1e5], "damping": [6e3]}
+RUBBING = {"law": "preloaded", "stiffness": [8e5], "preload": 3.0, "friction": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("contact", "frequency", "lag", "hold"),
+    [
+        (DAMPED, 155.0, 0.0, "zoh"),
+        (DAMPED, 23.0, 2e-4, "zoh"),
+        *(
+            pytest.param(*case, hold, marks=pytest.mark.slow)
+            for hold in ("zoh", "linear")
+            for case in (
+                ({"stiffness": [1e6], "damping": [700.0]}, 155.0, 0.0),
+                (RUBBING, 155.0, 0.0),
+                ({"law": "hunt_crossley", "stiffness": [3e7], "damping": [1.0]}, 23.0, 5e-5),
+                ({"law": "elastoplastic", "stiffness": [3e5], "unloading_ratio": 1.5}, 23.0, 5e-5),
+            )
+        ),
+    ],
+)
+def test_samples_of_a_slow_mechanism_say_the_same(contact, frequency, lag, hold):
+    """To the bounds that the guide states, near the fastest numbers that it states."""
+    sensor = {"time_constant": lag}
+    raw = mechanism(contact, second_order(frequency), period=1e-3, command_hold=hold, force_sensor=sensor)
+    scenarios, *loops = loops_of(raw)
+    assert [loop.has_cells for loop in loops] == [False, True]
     sampled, exact = (run_rollout(loop, {}, scenarios) for loop in loops)
-    np.testing.assert_allclose(sampled.restitution[0], exact.restitution[0], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(sampled.peak_force[0], exact.peak_force[0], rtol=1e-6)
-    np.testing.assert_allclose(sampled.duration[0], exact.duration[0], rtol=0, atol=1e-3)
+    bound = 1e-5 if lag else 1e-12
+    np.testing.assert_allclose(sampled.restitution[0], exact.restitution[0], rtol=0, atol=bound)
+    np.testing.assert_allclose(sampled.peak_force[0], exact.peak_force[0], rtol=2e-3)
+    # Either end lies between two samples, and a damper lets go between steps of a held command.
+    np.testing.assert_allclose(sampled.duration[0], exact.duration[0], rtol=0, atol=4e-3)
 
 
 @pytest.mark.parametrize("fastest", [0.0, 0.1, 0.9, 5.0, FASTEST_POLE])

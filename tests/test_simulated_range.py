@@ -21,7 +21,7 @@ def compare(form: Form, seed: int, lanes: int, longest: int) -> list[tuple[dict[
     drawn = [form.draw(rng, longest) for _ in range(lanes)]
     mechanisms = [validated(one) for one in drawn]
     scenarios = join(build_scenarios(one) for one in mechanisms)
-    loop = build_loop(mechanisms[0], "none", scenarios, energies=True)
+    loop = build_loop(mechanisms[0], "none", scenarios, energies=True, exact=True)
     metrics = run_rollout(loop, {}, scenarios)
     compared = []
     for lane, one in enumerate(drawn):

@@ -50,6 +50,12 @@ class ContactLaw(eqx.Module):
         return False
 
     @property
+    def arcs(self) -> bool:
+        """Whether in contact the force over a quarter of a slow sampling interval is close to a parabola: its
+        slope does not change at a depth, nor the force at a turn, nor does it end at a power of the depth."""
+        return False
+
+    @property
     def closed_form(self) -> bool:
         """Whether the reference is quick enough to be worked out with every run; else it is integrated."""
         return type(self).reference is not ContactLaw.reference

@@ -25,6 +25,10 @@ class Elastoplastic(ContactLaw):
     def init(self, penetration):
         return (jnp.zeros_like(penetration),)
 
+    @property
+    def arcs(self):
+        return True
+
     def step(self, parameters, state, penetration, rate):
         (deepest,) = state
         force = self.hold(parameters, state, penetration, rate)

@@ -13,6 +13,10 @@ class Hardening(ContactLaw):
     deepest point, where the force is largest.
     """
 
+    @property
+    def arcs(self):
+        return True
+
     def step(self, parameters, state, penetration, rate):
         force = self.hold(parameters, state, penetration, rate)
         return jnp.where((penetration > 0) & (force > 0), force, 0), state

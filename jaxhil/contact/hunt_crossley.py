@@ -17,6 +17,10 @@ class HuntCrossley(ContactLaw):
     # n where it is one of those in every lane and nothing is differentiated by it
     exponent: float | None = eqx.field(static=True, default=None)
 
+    @property
+    def arcs(self):
+        return True
+
     def step(self, parameters, state, penetration, rate):
         # The inner `where` keeps the derivative of d^n finite at d <= 0.
         touching = penetration > 0

@@ -9,6 +9,10 @@ from jaxhil.contact.reference import kelvin_voigt
 class KelvinVoigt(ContactLaw):
     """F = k d + b d', clamped at 0 unless tension is allowed; with b = 0 the linear law F = k d."""
 
+    @property
+    def arcs(self):
+        return True
+
     def step(self, parameters, state, penetration, rate):
         force = parameters.stiffness * penetration + parameters.damping * rate
         force = jnp.where(parameters.tension | (force > 0), force, 0)

@@ -1,6 +1,6 @@
 """Roots of smooth functions between places at which their signs differ, and their derivatives.
 
-Newton's method within a bracket, in a fixed number of steps. Forward-mode derivatives pass by the implicit
+Newton's method within a bracket, until every lane has its root. Forward-mode derivatives pass by the implicit
 function theorem, not through the iteration.
 """
 
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-STEPS = 12
+MOST_STEPS = 60  # as many halvings reach rounding, whatever the function
 ROUNDING = 1e-9  # of a place, which is of order 1
 
 Function = Callable[[Any, Array], Array]  # of data and of a place
@@ -41,20 +41,28 @@ def _root(function: Function, data: Any, low: Array, high: Array) -> tuple[Array
     fixed, low, high = lax.stop_gradient((data, low, high))
     at_low, at_high = function(fixed, jnp.stack([low, high]))
     change = at_high - at_low
+    # A step that is as short as this is followed by one below rounding.
+    short = jnp.finfo(at_low.dtype).eps ** 0.6
 
-    def improve(_, carry):
-        low, high, place, _ = carry
+    def is_under_way(carry):
+        *_, sought, steps = carry
+        return jnp.any(sought) & (steps < MOST_STEPS)
+
+    def improve(carry):
+        low, high, place, _, _, steps = carry
         value, slope = jax.jvp(lambda s: function(fixed, s), (place,), (jnp.ones_like(place),))
         above = (value > 0) == (change > 0)
         low, high = jnp.where(above, low, place), jnp.where(above, place, high)
         step = place - value / jnp.where(slope != 0, slope, 1)
         # At the root itself rounding may put the step beyond the bracket.
         inside = (slope != 0) & (step >= low - ROUNDING) & (step <= high + ROUNDING)
-        return low, high, jnp.where(inside, jnp.clip(step, low, high), (low + high) / 2), slope
+        nearer = jnp.where(inside, jnp.clip(step, low, high), (low + high) / 2)
+        return low, high, nearer, slope, crosses & (jnp.abs(nearer - place) > short), steps + 1
 
-    secant = low - at_low * (high - low) / jnp.where(change != 0, change, 1)
-    carry = low, high, jnp.clip(secant, low, high), jnp.ones_like(secant)
-    _, _, root, slope = lax.fori_loop(0, STEPS, improve, carry)
+    crosses = (at_low > 0) != (at_high > 0)
+    secant = jnp.clip(low - at_low * (high - low) / jnp.where(change != 0, change, 1), low, high)
+    carry = low, high, secant, jnp.ones_like(secant), crosses, 0
+    _, _, root, slope, _, _ = lax.while_loop(is_under_way, improve, carry)
     # The derivative is that of one more step of Newton's method, whose value is left out.
     step = function(data, root) / jnp.where(slope != 0, slope, 1)
     return root - (step - lax.stop_gradient(step)), at_low, at_high

@@ -56,7 +56,7 @@ def widest_loop(loaded: LoadedGains, works: bool) -> Any:
         # The longest delay counted in the shortest periods.
         draws[PERIOD] = draws[PERIOD][::-1]
     scenarios = scenarios_of(loaded.mechanism, draws)
-    return loop_of(loaded.mechanism, loaded.compensator, scenarios, energies=works)
+    return loop_of(loaded.mechanism, loaded.compensator, scenarios, energies=works, exact=works)
 
 
 def run_chunk(sweep: Sweep, first: int, number: int, precision: str | None = None) -> Rows:
