@@ -28,8 +28,10 @@ from tuning.identification.logs.mapping import (
     own_mapping,
     si,
 )
+from tuning.identification.logs.model_motion import check_command
 from tuning.identification.logs.readers import Columns, open_log
 from tuning.identification.logs.rows import Stretch, stretches
+from tuning.identification.logs.scales import SMOOTH, check_velocity
 from tuning.identification.records import Campaign, Kind, Run, Timing
 
 NUMBERS = (
@@ -154,18 +156,17 @@ class _Reading:
         """The runs of a stretch, checked: one for each contact, or the whole."""
         period, force = self._timing.control_period, stretch.channels["force_measured"]
         self.notes += checks.check_motion(self.label, kind, stretch, period, self._timing.command_hold)
+        self._ignore(stretch, "velocity_desired", check_velocity(self.label, stretch, period))
         if kind not in ("press", *TOUCHING):
             return [self._run(stretch, kind, slice(None), None, None)]
         if force is None:
             allowed = "one where there is contact"
             raise InputError(f"{self.label}: force_measured: found no such channel, allowed {allowed}")
         touched = self._touched(stretch.tick, force)
-        self.notes += checks.check_force(self.label, kind, stretch, touched, period, self._mass)
+        holds = kind == "contact" and self._command_holds(stretch, touched)
+        self.notes += checks.check_force(self.label, kind, stretch, touched, period, self._mass, holds)
         if kind == "press":
             return [self._run(stretch, kind, slice(None), None, None)]
-        if kind == "contact" and stretch.channels["force_command"] is not None:
-            row = self._timing.row
-            self.notes += checks.check_command(self.label, stretch, period, self._mass, row, self._integrator)
         if not touched:
             self.notes.append(f"{self.label}: {len(stretch.tick)} rows without contact are left out")
         middles = [(one[1] + two[0]) // 2 for one, two in pairwise(touched)]
@@ -175,6 +176,26 @@ class _Reading:
             self._run(stretch, kind, part, one, min(first + number, self._last))
             for number, (part, one) in enumerate(zip(parts, touched, strict=False))
         ]
+
+    def _command_holds(self, stretch: Stretch, touched: list[tuple[int, int]]) -> bool:
+        """Whether there is a force command that moves the model; one that cannot is taken out with a note."""
+        if stretch.channels["force_command"] is None:
+            return False
+        timing = self._timing
+        holds, note = check_command(
+            self.label, stretch, touched, timing.control_period, self._mass, timing.row, self._integrator
+        )
+        if holds:
+            self.notes += [note] if note else []
+        else:
+            self._ignore(stretch, "force_command", note)
+        return holds
+
+    def _ignore(self, stretch: Stretch, channel: str, note: str | None) -> None:
+        """Take a channel out of a stretch where a note says why."""
+        if note is not None:
+            self.notes.append(note)
+            stretch.channels[channel] = None
 
     def _touched(self, tick: np.ndarray, force: np.ndarray) -> list[tuple[int, int]]:
         """The contacts of a stretch, and how many there were so far; one may go on over a gap."""
@@ -314,10 +335,10 @@ def _jumps(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
 def _speed(x: np.ndarray, begin: int, period: float) -> float | None:
     """Of the approach to a contact [m/s]."""
     # The force was there for some ticks before it was beyond the noise.
-    before = begin - checks.SMOOTH
-    if before < checks.SMOOTH:
+    before = begin - SMOOTH
+    if before < SMOOTH:
         return None
-    return float(x[before] - x[before - checks.SMOOTH]) / (checks.SMOOTH * period)
+    return float(x[before] - x[before - SMOOTH]) / (SMOOTH * period)
 
 
 def _sha256(path: Path) -> str:
