@@ -23,6 +23,7 @@ LOT = 256  # rows that share a phase
 MANY = 20_000  # rows that say as much as all
 RATE = 0.1  # share by which the rows' rate may differ from the control rate
 DRIFT = 1.5e-3  # the same over many rows: beyond it a lot of rows is half a turn of the phase
+STEADY = 0.15  # of the period, by which the distance of rows may scatter where it tells their rate
 SCATTER = 0.25  # of the stamps, in periods, beyond which ticks cannot be told from them
 
 
@@ -48,10 +49,14 @@ def ticks_of(stamps: np.ndarray, period: float, label: str, column: str = "time"
     return Ticks(tick - tick[0], clock)
 
 
-def regular(stamps: np.ndarray, label: str, column: str) -> np.ndarray:
-    """Return the times [s] at which rows were sampled: stamps without what scatters about a steady rate."""
-    first = float(stamps[0])
-    period = own_period(stamps)
+def regular(stamps: np.ndarray, period: float, label: str, column: str) -> np.ndarray:
+    """Return the times [s] at which rows were sampled: stamps without what scatters about a steady rate.
+
+    `period` is the rate's where stamps scatter too much to tell another one."""
+    first, own = float(stamps[0]), own_period(stamps)
+    if own is None and abs(float(np.median(np.diff(stamps))) / period - 1.0) > RATE:
+        return stamps
+    period = own or period
     left, phase, tick = _rounded(stamps, period, label, column)
     times = phase + period * tick
     if np.std(left - times) > SCATTER * period:
@@ -59,9 +64,12 @@ def regular(stamps: np.ndarray, label: str, column: str) -> np.ndarray:
     return first + times + float(np.mean(left - times))
 
 
-def own_period(stamps: np.ndarray) -> float:
-    """Return the distance of rows [s], over ever more rows: stamps scatter, and some rows may be lost."""
-    period, rows = float(np.median(np.diff(stamps))), 1
+def own_period(stamps: np.ndarray) -> float | None:
+    """Return the distance of rows [s], over ever more rows, since some may be lost; None if stamps scatter."""
+    steps = np.diff(stamps[:MANY])
+    period, rows = float(np.median(steps)), 1
+    if 1.4826 * float(np.median(np.abs(steps - period))) > STEADY * period:
+        return None
     while 4 * rows < len(stamps):
         rows *= 4
         every = len(stamps) // MANY + 1
@@ -115,7 +123,7 @@ def _check_rate(stamps: np.ndarray, steps: np.ndarray, period: float, label: str
         allowed = f"the control period, {period:g} s (is the unit of {column} right?)"
         raise InputError(f"{label}: {column}: found {found}, allowed {allowed}")
     own = own_period(stamps)
-    if abs(own / period - 1.0) > DRIFT:
+    if own is not None and abs(own / period - 1.0) > DRIFT:
         raise InputError(
             f"{label}: {column}: found rows {own:.6g} s apart, allowed the control period, {period:g} s"
         )

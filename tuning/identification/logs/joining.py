@@ -62,7 +62,7 @@ def join(
         _check_clock(label, named[name], stamps, len(columns[name]))
     master = clocks[MASTER]
     assert master is not None
-    times = clock.regular(master, label, _stamps_of(named[MASTER]))
+    times = clock.regular(master, period, label, _stamps_of(named[MASTER]))
     joined, notes, kept = {}, [], np.ones(len(times), bool)
     places: list[tuple[np.ndarray, _Places]] = []
     for name, values in columns.items():
@@ -122,7 +122,7 @@ class _Places:
             )
         self._rate = usual
         # Where stamps scatter the samples do not.
-        stamps = clock.regular(stamps, label, _stamps_of(column))
+        stamps = clock.regular(stamps, period, label, _stamps_of(column))
         self._begins = float(stamps[0] - times[0])
         place = np.interp(times, stamps, np.arange(len(stamps), dtype=float))
         slack = AT_A_ROW * usual
