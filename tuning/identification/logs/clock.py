@@ -65,7 +65,7 @@ def regular(stamps: np.ndarray, period: float, label: str, column: str) -> np.nd
 
 
 def own_period(stamps: np.ndarray) -> float | None:
-    """Return the distance of rows [s], over ever more rows, since some may be lost; None if stamps scatter."""
+    """Return the distance of rows [s], over ever more of them, some being lost; None if stamps scatter."""
     steps = np.diff(stamps[:MANY])
     period, rows = float(np.median(steps)), 1
     if 1.4826 * float(np.median(np.abs(steps - period))) > STEADY * period:
