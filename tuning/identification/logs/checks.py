@@ -11,9 +11,10 @@ import numpy as np
 
 from jaxhil.errors import InputError
 from tuning.identification.logs.rows import Stretch
-from tuning.identification.logs.scales import CLIPPED, SMOOTH, check_gain, check_impulse
+from tuning.identification.logs.scales import SMOOTH, check_gain, check_impulse
 
 FEWEST_ROWS = 200
+CLIPPED = 10  # repeats of the largest reading, from which it is a limit
 LARGEST_NUMBER = 1e30  # nanoseconds since an epoch are 1e18
 LARGEST_STROKE = 1.0  # m
 SMALLEST_STROKE = 1e-5  # m
@@ -81,10 +82,11 @@ def check_force(
         if np.corrcoef(found, measured)[0, 1] < -0.5:
             raise _wrong_sign(label, "falls where the hardware is pushed deeper")
         return _late(label, found)
-    check_impulse(label, kind, stretch, touched, period, mass, command_holds)
-    notes = _late(label, found)
     top = np.abs(found) >= np.max(np.abs(found))
-    if np.count_nonzero(top[1:] & top[:-1]) >= CLIPPED:
+    clipped = bool(np.count_nonzero(top[1:] & top[:-1]) >= CLIPPED)
+    check_impulse(label, kind, stretch, touched, period, mass, command_holds, clipped)
+    notes = _late(label, found)
+    if clipped:
         notes.append(
             f"{label}: force_measured: {np.count_nonzero(top)} rows at the largest reading, as if clipped"
         )

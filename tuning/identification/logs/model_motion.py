@@ -18,7 +18,7 @@ from tuning.identification.logs.scales import CERTAIN, likely_units, triangle
 WIDTHS = 1, 2, 4, 8, 16, 32  # rows, over which second differences are taken
 FEWEST = 50  # rows
 BESIDE = 40  # rows before and after a contact that are looked at
-SAMPLE = 200_000  # rows in contact that say as much as all
+SAMPLE = 20_000  # rows in contact that say as much as all
 EXPLAINED = 0.1  # of the motion, which the force command may leave unexplained
 SAME_MASS = 0.01  # relative error of the mass that changes no result
 OTHER_ROW = 1.2  # times the error of the better row convention, from which the other one is wrong
