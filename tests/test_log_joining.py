@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from log_cases import CHANNELS, mapping, read, touches, write_csv
 
 from jaxhil.errors import InputError
 from tuning.identification.logs.joining import join
@@ -112,3 +113,50 @@ def test_channels_that_hold_their_value_are_not_interpolated():
     clocks = {"position_desired": rows, "contact_index": rows - 4e-4, "mode": rows + 3e-4}
     found, _, _ = join("a", columns, clocks, {name: name for name in columns}, PERIOD)
     assert set(found["contact_index"]) == {0.0, 3.0} and set(found["mode"]) == {"free", "contact"}
+
+
+def separate(late, rows=580):
+    """A log whose force has stamps and a number of rows of its own."""
+    log = touches(1)
+    force = {"tF": 1e3 * (log["t"][:rows] + late), "F": log["F"][:rows]}
+    return log, {"tx": 1e3 * log["t"], **{name: log[name] for name in ("xd", "xm", "vd", "Fc")}}, force
+
+
+TIMES = {
+    "time": {"column": "x/tx", "unit": "ms"},
+    "force_measured": {"column": "f/F", "time": "f/tF"},
+    **{name: f"x/{column}" for name, column in CHANNELS.items() if name not in ("time", "force_measured")},
+}
+
+
+@pytest.mark.parametrize("late", [0.005, -0.012])
+def test_channel_with_stamps_that_the_mapping_names(tmp_path, late):
+    h5py = pytest.importorskip("h5py")
+    log, *groups = separate(late)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for group, columns in zip("xf", groups, strict=True):
+            for name, values in columns.items():
+                file[f"{group}/{name}"] = values
+    campaign = read(tmp_path / "a.h5", **TIMES)
+    (run,) = campaign.runs
+    shift, first = round(1e3 * late), np.flatnonzero(log["xd"] == run.position_desired[0])[0]
+    np.testing.assert_array_equal(run.force_measured, log["F"][first - shift : first - shift + len(run.tick)])
+    assert f"begins {abs(shift)} ms" in campaign.notes[0]
+    # By row numbers they do not go together.
+    with pytest.raises(InputError, match="found columns of unlike length"):
+        read(tmp_path / "a.h5", **TIMES | {"force_measured": "f/F"})
+    with pytest.raises(InputError, match=r"channels.force_measured.time is named"):
+        read(tmp_path / "a.h5", **TIMES, timing={"clock": "index"})
+
+
+def test_stamps_of_one_channel_need_stamps_of_the_rows():
+    with pytest.raises(InputError, match=r"channels.force_measured.time: found 'tF', allowed none"):
+        mapping(time={"rate": 1000.0}, force_measured={"column": "F", "time": "tF"})
+
+
+def test_text_of_the_same_length_is_joined_by_its_own_stamps(tmp_path):
+    log = touches(1)
+    path = write_csv(tmp_path / "a.csv", log | {"tF": log["t"] + 0.003})
+    (run,) = read(path, force_measured={"column": "F", "time": "tF"}).runs
+    np.testing.assert_array_equal(run.force_measured, log["F"][:-3])
+    np.testing.assert_array_equal(run.position_desired, log["xd"][3:])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -17,31 +17,22 @@ import numpy as np
 
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.mechanism.structs import Mechanism
-from tuning.identification.logs import checks, clock, joining, segments
+from tuning.identification.logs import checks, clock, segments
 from tuning.identification.logs.causality import check_rows_of, integrator_of_all
+from tuning.identification.logs.channels import NUMBERS, columns_of
 from tuning.identification.logs.mapping import (
     KINDS,
-    Channel,
     LogMapping,
     RunFiles,
     masses_of,
     own_mapping,
-    si,
 )
 from tuning.identification.logs.model_motion import check_command
-from tuning.identification.logs.readers import Columns, Log, open_log
+from tuning.identification.logs.readers import open_log
 from tuning.identification.logs.rows import Stretch, stretches
 from tuning.identification.logs.scales import SMOOTH, check_velocity
 from tuning.identification.records import Campaign, Kind, Run, Timing
 
-NUMBERS = (
-    "position_desired",
-    "position_measured",
-    "force_measured",
-    "velocity_desired",
-    "force_command",
-    "contact_index",
-)
 TOUCHING = ("tap", "contact")
 SCRAP = 50  # rows, fewer of which between two gaps say nothing
 JUMP = 0.5  # of the fastest motion, by which the velocity changes from a run to the next one in the same log
@@ -106,7 +97,7 @@ class _Reading:
         lists = () if prior is None else (prior.contact.stiffness, prior.contact.damping)
         self._last = max(map(len, lists)) - 1 if lists else sys.maxsize
         log = open_log(path, mapping.text)
-        columns, stamps, self._begin, notes = _columns(log, mapping, timing.control_period)
+        columns, stamps, self._begin, notes = columns_of(log, mapping, timing.control_period)
         self.notes += notes
         kept = _kept(stamps, entry, timing.control_period)
         if stamps is not None:
@@ -253,77 +244,6 @@ def _timing(mapping: LogMapping, prior: Mechanism | None) -> Timing:
     latency = said.command_latency if said.command_latency is not None else rig.command_latency if rig else 0
     late, separate = said.computing_delay, said.clock == "separate"
     return Timing(period, hold, latency, said.row, None, late, separate)
-
-
-def _columns(
-    log: Log, mapping: LogMapping, period: float
-) -> tuple[Columns, np.ndarray | None, float, list[str]]:
-    """The channels that are there, in SI units, the stamps [s] from the first, that one, and notes."""
-    channels = mapping.channels
-    wanted: dict[str, str] = {}
-    for name in (*NUMBERS, "mode"):
-        channel = getattr(channels, name)
-        required = name in ("position_desired", "position_measured")
-        if channel is not None and (required or channel.column in log.names):
-            wanted[name] = channel.column
-    time = channels.time
-    read = log.read(list(dict.fromkeys([*wanted.values(), *([time.column] if time.column else [])])))
-    columns: Columns = {}
-    for name, column in wanted.items():
-        values = read[column]
-        if name != "mode":
-            channel: Channel = getattr(channels, name)
-            if values.dtype == object:
-                raise InputError(
-                    f"{log.label}: column {shown(column)}: found {shown(values[0])}, allowed numbers"
-                )
-            factor, offset = si(channel, name)
-            values = values if (factor, offset) == (1.0, 0.0) else factor * values + offset
-        columns[name] = values
-    clocks = _clocks(log, mapping, wanted)
-    if clocks is None:
-        joining.check_lengths(
-            log.label, columns | ({"time": read[time.column]} if time.column else {}), wanted
-        )
-        return columns, *_stamps(log.label, read, mapping), []
-    columns, stamps, notes = joining.join(log.label, columns, clocks, wanted, period)
-    first = clocks[joining.MASTER]
-    begin = 0.0 if first is None else float(first[0])
-    return columns, stamps - begin, begin, notes
-
-
-def _clocks(log: Log, mapping: LogMapping, wanted: Mapping[str, str]) -> dict[str, np.ndarray | None] | None:
-    """Stamps of each channel where not all have the same; None where the rows of the log are those of all."""
-    own = log.clocks(list(wanted.values()))
-    clocks = {name: own.get(column) for name, column in wanted.items()}
-    master = clocks[joining.MASTER]
-    other = [wanted[name] for name, one in clocks.items() if not joining.same_clock(one, master)]
-    if not other:
-        return None
-    time, named = mapping.channels.time, f"{shown(other[0])} has a clock of its own"
-    if mapping.timing.clock == "index":
-        raise InputError(f'{log.label}: timing.clock: found "index", allowed "stamps", since {named}')
-    if time.column is not None and time.column not in log.stamps:
-        allowed = ", ".join(sorted(one_line(one, 40) for one in log.stamps)[:4])
-        found = f"column {shown(time.column)}"
-        raise InputError(f"{log.label}: time: found {found}, allowed one of {allowed}, since {named}")
-    return clocks
-
-
-def _stamps(label: str, read: Columns, mapping: LogMapping) -> tuple[np.ndarray | None, float]:
-    time = mapping.channels.time
-    if time.column is None:
-        return None, 0.0
-    stamps = read[time.column]
-    if time.time_format is not None:
-        return clock.parsed(stamps, time.time_format, label)
-    if stamps.dtype == object:
-        allowed = "numbers, or a time_format beside the column"
-        raise InputError(f"{label}: column {shown(time.column)}: found {shown(stamps[0])}, allowed {allowed}")
-    checks.check_rows(label, "time", stamps)
-    # The first stamp may count from an epoch: what is left has digits to spare.
-    factor = si(Channel(column=time.column, unit=time.unit), "time")[0]
-    return factor * (stamps - stamps[:1]), factor * float(stamps[0]) if len(stamps) else 0.0
 
 
 def _kept(stamps: np.ndarray | None, entry: RunFiles, period: float) -> slice:

@@ -86,7 +86,7 @@ def open_log(path: Path, text: Text = PLAIN) -> Log:
                 needs = f"{package}, which is not installed: python3 -m pip install 'jaxhil[logs]'"
                 raise InputError(f"{label}: a {suffix} file is read with {needs}") from None
         opened = getattr(importlib.import_module("tuning.identification.logs.foreign"), format)(path)
-        read = _checked(label, opened.names, opened.read, opened.clocks is None)
+        read = _checked(label, opened.names, opened.read)
         return Log(label, opened.names, read, _clocks(label, opened.clocks), opened.stamps)
 
 
@@ -113,10 +113,8 @@ def _clocks(label: str, clocks: Clocks | None) -> Clocks:
     return checked
 
 
-def _checked(
-    label: str, names: Sequence[str], read: Callable[[Sequence[str]], Columns], one_clock: bool = True
-):
-    """Return a function that reads columns that are there once, each as long as the others if `one_clock`."""
+def _checked(label: str, names: Sequence[str], read: Callable[[Sequence[str]], Columns]):
+    """Return a function that reads columns that are there once."""
 
     def checked(wanted: Sequence[str]) -> Columns:
         for name in wanted:
@@ -130,10 +128,6 @@ def _checked(
                 raise InputError(f"{label}: column {shown(name)}: found {names.count(name)}, allowed one")
         with reading(label):
             columns = read(wanted)
-        lengths = {len(column) for column in columns.values()}
-        if one_clock and len(lengths) > 1:
-            found = ", ".join(f"{len(column)} in {shown(name)}" for name, column in columns.items())
-            raise InputError(f"{label}: found columns of unlike length ({found}), allowed one row a tick")
         return columns
 
     return checked
