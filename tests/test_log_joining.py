@@ -160,3 +160,24 @@ def test_text_of_the_same_length_is_joined_by_its_own_stamps(tmp_path):
     (run,) = read(path, force_measured={"column": "F", "time": "tF"}).runs
     np.testing.assert_array_equal(run.force_measured, log["F"][:-3])
     np.testing.assert_array_equal(run.position_desired, log["xd"][3:])
+
+
+@pytest.mark.parametrize(("unit", "late"), [(1.0, 0.005), (1e3, 0.005), (1.0, 1e-4)])
+def test_stamps_of_a_group_that_are_not_those_of_the_rows_are_refused(tmp_path, unit, late):
+    h5py, log = pytest.importorskip("h5py"), touches(1)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["x/time"], file["f/time"], file["f/count"] = log["t"], unit * (log["t"] + late), 2.0 * log["t"]
+        for name in ("xd", "xm", "vd", "Fc"):
+            file[f"x/{name}"] = log[name]
+        file["f/F"] = log["F"]
+    said = TIMES | {"time": "x/time", "force_measured": "f/F"}
+    with pytest.raises(
+        InputError, match=r"'f/F': found stamps of its own in 'f/time' that are not those in 'x/time'"
+    ):
+        read(tmp_path / "a.h5", **said)
+    if unit == 1.0:
+        assert read(tmp_path / "a.h5", **said | {"force_measured": {"column": "f/F", "time": "f/time"}}).notes
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["f/time"][:] = unit * log["t"]
+    (run,) = read(tmp_path / "a.h5", **said).runs
+    np.testing.assert_array_equal(run.force_measured, log["F"])

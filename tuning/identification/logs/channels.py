@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -19,6 +20,8 @@ NUMBERS = (
     "force_command",
     "contact_index",
 )
+
+STAMPS = re.compile(r"^t$|^time$|stamp", re.IGNORECASE)  # names of columns of stamps in a group
 
 
 def columns_of(
@@ -64,6 +67,7 @@ def _clocks(
     named = {name: getattr(getattr(mapping.channels, name), "time", None) for name in wanted}
     if any(named.values()):
         return _named_clocks(log.label, mapping, named, read)
+    _check_stamps_beside(log, mapping, wanted)
     own = log.clocks(list(wanted.values()))
     clocks = {name: own.get(column) for name, column in wanted.items()}
     master = clocks[joining.MASTER]
@@ -78,6 +82,46 @@ def _clocks(
         found = f"column {shown(time.column)}"
         raise InputError(f"{log.label}: time: found {found}, allowed one of {allowed}, since {since}")
     return clocks
+
+
+def _check_stamps_beside(log: Log, mapping: LogMapping, wanted: Mapping[str, str]) -> None:
+    """Raise `InputError` if a group of columns has stamps of its own that are not those of the rows.
+
+    Groups are those of HDF5, MAT and TDMS, by the names of columns."""
+    time = mapping.channels.time
+    if time.column is None or log.stamps:
+        return
+    for name, column in wanted.items():
+        for stamps in _stamps_beside(column, time.column, log.names):
+            read = log.read([time.column, stamps])
+            rows, own = read[time.column], read[stamps]
+            if rows.dtype == object or own.dtype == object or min(len(rows), len(own)) < 2:
+                continue
+            step, other = float(np.median(np.diff(rows))), float(np.median(np.diff(own)))
+            if not (step > 0.0 and other > 0.0):
+                continue
+            # Stamps may be in another unit of time.
+            power = round(float(np.log10(other / step)) / 3.0)
+            own = own * 1000.0**-power
+            if abs(other * 1000.0**-power / step - 1.0) > clock.RATE:
+                continue  # of another kind, such as a count
+            if len(rows) == len(own) and np.max(np.abs(own - rows)) <= joining.AT_A_ROW * step:
+                continue
+            raise InputError(
+                f"{log.label}: column {shown(column)}: found stamps of its own in {shown(stamps)} that are "
+                f"not those in {shown(time.column)}, expected channels.{name}.time = {shown(stamps)}"
+            )
+
+
+def _stamps_beside(column: str, time: str, names: Sequence[str]) -> list[str]:
+    """Return columns named like stamps in the groups of a column that do not hold those of the rows."""
+    found = []
+    for other in names:
+        name = re.split(r"[/.]", other)[-1]
+        parent = other[: len(other) - len(name)]
+        if parent and column.startswith(parent) and not time.startswith(parent) and STAMPS.search(name):
+            found.append(other)
+    return [one for one in found if one != column]
 
 
 def _named_clocks(
