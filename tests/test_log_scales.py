@@ -210,3 +210,10 @@ def test_a_campaign_of_several_files_names_the_wrong_one(tmp_path):
     good, bad = write_csv(tmp_path / "a.csv", LOG), write_csv(tmp_path / "b.csv", scaled(LOG, F=1 / LBF))
     with pytest.raises(InputError, match=r"b.csv: force_measured: found 0.2"):
         read_campaign([good, bad], mapping())
+
+
+def test_a_note_of_several_logs_is_said_once(tmp_path):
+    log = LOG | {"vd": 0.0 * LOG["vd"]}  # as loggers write a channel that is not connected
+    paths = [write_csv(tmp_path / f"{name}.csv", log) for name in "abc"]
+    (note,) = read_campaign(paths, mapping()).notes
+    assert note.startswith(f"{paths[0]} and 2 more: velocity_desired: ignored")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -58,21 +58,31 @@ def read_campaign(
             patterns = ", ".join(shown(pattern) for entry in mapping.runs for pattern in entry.files)
             raise InputError(f"{one_line(str(path))}: found a log that no run names, allowed {patterns}")
     runs: list[Run] = []
-    notes: list[str] = []
+    notes: dict[str, list[str]] = {}  # which logs each is of
     clocks = []
     for entry in mapping.runs:
         for path in logs:
             if entry.names(path):
                 reading = _Reading(path, entry, mapping, timing, mass, prior)
                 runs += reading.runs
-                notes += reading.notes
+                for note in reading.notes:
+                    notes.setdefault(note.removeprefix(f"{reading.label}: "), []).append(reading.label)
                 clocks.append(reading.ticks.clock)
     integrator = integrator_of_all(runs, timing.control_period) or (prior and prior.rig.integrator)
     if not timing.two_clocks:
         check_rows_of(runs, timing, integrator)
     timing = replace(timing, clock=max(clocks, key=lambda one: one.jitter))
     sources = {path.name: _sha256(path) for path in logs}
-    return Campaign(tuple(runs), timing, mass, sources, tuple(dict.fromkeys(notes)), integrator)
+    return Campaign(tuple(runs), timing, mass, sources, _joined(notes), integrator)
+
+
+def _joined(notes: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
+    """Return each note once, after the name of the first log that it is of and the number of the others."""
+    found = []
+    for note, labels in notes.items():
+        more = len(set(labels)) - 1
+        found.append(f"{labels[0]}{f' and {more} more' * (more > 0)}: {note}")
+    return tuple(found)
 
 
 class _Reading:

@@ -205,9 +205,9 @@ def check_velocity(label: str, stretch: Stretch, period: float) -> str | None:
     moved, told = x[SMOOTH:] - x[:-SMOOTH], _window_sums(period * v)
     good = np.isfinite(told) & np.isfinite(moved)
     fit = scale(moved[good], told[good], SMOOTH)
-    if fit is None:
+    if not np.any(good) or not np.any(moved[good]):
         return None
-    if fit.left > EXPLAINED or fit.slope == 0.0:
+    if fit is None or fit.left > EXPLAINED or fit.slope == 0.0:
         return f"{label}: velocity_desired: ignored, since position_desired does not move by it"
     if abs(fit.slope - 1.0) <= SPEED_ERROR + CERTAIN * fit.error:
         return None
