@@ -181,3 +181,30 @@ def test_stamps_of_a_group_that_are_not_those_of_the_rows_are_refused(tmp_path, 
         file["f/time"][:] = unit * log["t"]
     (run,) = read(tmp_path / "a.h5", **said).runs
     np.testing.assert_array_equal(run.force_measured, log["F"])
+
+
+HOSTILE = st.one_of(
+    st.floats(),
+    st.sampled_from([np.nan, np.inf, -np.inf, 0.0, -0.0, 1e300, -1e300, 5e-324]),
+)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    place=st.integers(0, 299),
+    value=HOSTILE,
+    count=st.integers(0, 300),
+    rate=st.sampled_from([1e-9, 1e-4, 1e-3, 1.4e-3, 1e9]),
+    whose=st.sampled_from(["position_desired", "force_measured"]),
+)
+def test_any_clock_is_joined_or_refused_in_one_line(place, value, count, rate, whose):
+    rows = {"position_desired": PERIOD * np.arange(300), "force_measured": rate * np.arange(count)}
+    if len(rows[whose]):
+        rows[whose][place % len(rows[whose])] = value
+    columns = {name: np.zeros(len(one)) for name, one in rows.items()}
+    try:
+        found, times, notes = join("a", columns, rows, {name: name for name in rows}, PERIOD)
+    except InputError as error:
+        assert str(error).isprintable() and str(error).startswith("a: ")
+        return
+    assert all(len(one) == len(times) and np.all(np.isfinite(one)) for one in found.values()) and notes

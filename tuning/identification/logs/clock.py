@@ -20,6 +20,7 @@ from jaxhil.errors import InputError, shown
 from tuning.identification.records import Clock
 
 LOT = 256  # rows that share a phase
+LONGEST = 1e12  # periods of a log, beyond which ticks lose digits
 MANY = 20_000  # rows that say as much as all
 RATE = 0.1  # share by which the rows' rate may differ from the control rate
 DRIFT = 1.5e-3  # the same over many rows: beyond it a lot of rows is half a turn of the phase
@@ -89,6 +90,10 @@ def _rounded(
     if len(bad):
         row, found = int(bad[0]) + 2, f"{stamps[bad[0] + 1]:.9g} s after {stamps[bad[0]]:.9g} s"
         raise InputError(f"{label}: row {row}: {column}: found {found}, allowed time that increases")
+    if not stamps[-1] - stamps[0] < LONGEST * period:
+        row = int(np.argmax(steps)) + 2
+        found = f"{stamps[row - 1]:.9g} s after {stamps[row - 2]:.9g} s"
+        raise InputError(f"{label}: row {row}: {column}: found {found}, allowed at most {LONGEST:g} periods")
     _check_rate(stamps, steps, period, label, column)
     stamps = stamps - stamps[0]
     phase = _phase(stamps, period)
