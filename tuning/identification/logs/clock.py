@@ -20,6 +20,7 @@ from jaxhil.errors import InputError, shown
 from tuning.identification.records import Clock
 
 LOT = 256  # rows that share a phase
+SHORTEST = 1e-6  # periods between rows
 LONGEST = 1e12  # periods of a log, beyond which ticks lose digits
 MANY = 20_000  # rows that say as much as all
 RATE = 0.1  # share by which the rows' rate may differ from the control rate
@@ -54,6 +55,7 @@ def regular(stamps: np.ndarray, period: float, label: str, column: str) -> np.nd
     """Return the times [s] at which rows were sampled: stamps without what scatters about a steady rate.
 
     `period` is the rate's where stamps scatter too much to tell another one."""
+    _steps(stamps, period, label, column)
     first, own = float(stamps[0]), own_period(stamps)
     if own is None and abs(float(np.median(np.diff(stamps))) / period - 1.0) > RATE:
         return stamps
@@ -85,6 +87,15 @@ def _rounded(
     stamps: np.ndarray, period: float, label: str, column: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return stamps from the first one, their phases, and their ticks; raise `InputError` where none show."""
+    steps = _steps(stamps, period, label, column)
+    _check_rate(stamps, steps, period, label, column)
+    stamps = stamps - stamps[0]
+    phase = _phase(stamps, period)
+    return stamps, phase, _increasing(np.rint((stamps - phase) / period).astype(np.int64))
+
+
+def _steps(stamps: np.ndarray, period: float, label: str, column: str) -> np.ndarray:
+    """Return the distances of rows [s]; raise `InputError` unless they can be those of a log."""
     steps = np.diff(stamps)
     bad = np.flatnonzero(~(steps > 0))
     if len(bad):
@@ -94,10 +105,11 @@ def _rounded(
         row = int(np.argmax(steps)) + 2
         found = f"{stamps[row - 1]:.9g} s after {stamps[row - 2]:.9g} s"
         raise InputError(f"{label}: row {row}: {column}: found {found}, allowed at most {LONGEST:g} periods")
-    _check_rate(stamps, steps, period, label, column)
-    stamps = stamps - stamps[0]
-    phase = _phase(stamps, period)
-    return stamps, phase, _increasing(np.rint((stamps - phase) / period).astype(np.int64))
+    usual = float(np.median(steps[:MANY])) if len(steps) else period
+    if not usual > SHORTEST * period:
+        found = f"rows {usual:.4g} s apart"
+        raise InputError(f"{label}: {column}: found {found}, allowed the control period, {period:g} s")
+    return steps
 
 
 def counted(rows: int, period: float) -> Ticks:
