@@ -19,6 +19,7 @@ from tuning.identification.contact_profile import Posterior, profile
 from tuning.identification.law_choice import Judged, judge, quick
 from tuning.identification.motion import Motion
 from tuning.identification.noise import Noise
+from tuning.identification.press import known_bias
 from tuning.identification.rational import Model
 from tuning.identification.records import Run, Timing
 from tuning.identification.sensor_lag import sensor_lag
@@ -131,6 +132,9 @@ def estimate(
         readings = _noise_from_contact(motion, readings, plane)
     else:
         readings = _readings(runs, noise)
+    # A dead zone has the plane told, and no bias.
+    bias = None if hidden else known_bias(runs, motion, noise, plane)
+    readings = replace(readings, bias=bias)
     judged: tuple[Judged, ...] = ()
     near = None
     if law is None or isinstance(law, str):

@@ -15,6 +15,7 @@ import numpy as np
 from scipy import special
 from scipy.ndimage import uniform_filter1d
 
+from tuning.identification import press
 from tuning.identification.contact_problem import COARSE, LONGEST, Inner, Problem
 
 FINE = 2e-5  # s, between the next
@@ -94,6 +95,10 @@ def first_plane(problem: Problem, delay: float) -> float:
     """Where the mechanism was when the force first rose above its noise, the median of the runs [m]."""
     position, _ = problem.motion.at(delay)
     readings = problem.readings
+    if readings.bias is not None:
+        found = press.first_plane(position, readings.force, readings.counts, readings.bias)
+        if found is not None:
+            return found
     level = np.median(readings.force[readings.counts])
     loud = readings.counts & (np.abs(readings.force - level) > 5.0 * readings.std + readings.threshold)
     sustained = loud & np.roll(loud, -1, axis=0) & np.roll(loud, -2, axis=0)
