@@ -31,6 +31,7 @@ FIRST_ROWS, STEADY = 5, 0.01  # rows over which, and share by which, the speed o
 BEYOND = 4.0  # standard deviations beyond the dead zone from which a reading counts
 ROUGH = 21, 5  # delays and planes of the grid for the fit that is only judged
 UNKNOWN_NOISE = 0.01  # of the largest force, where nothing tells it
+LEAST_NOISE = 1e-6  # of the largest force: below it a log without noise differs by rounding alone
 SURE = 3.0  # standard deviations from which a dead zone is there
 UNEXPLAINED = 1.3  # chi-squared per degree of freedom above which intervals are widened by it
 
@@ -182,7 +183,8 @@ def _noise_from_contact(motion: Motion, readings: Readings, plane: float | None)
     for _ in range(3):
         problem = Problem(motion, found, kelvin_voigt(), plane)
         delay, at, misfit = quick(problem)
-        std = found.std * np.sqrt(misfit / max(len(problem.kept) - 5, 1))
+        std = found.std * np.sqrt(max(misfit, 0.0) / max(len(problem.kept) - 5, 1))
+        std = max(std, LEAST_NOISE * peak)
         counts = readings.counts
         if readings.threshold:
             predicted = problem.force(delay, at, problem.at(delay, at).coefficients)
