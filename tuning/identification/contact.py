@@ -90,6 +90,7 @@ class ContactFit:
     noise_error: float  # relative standard deviation of the noise that residuals are weighed by
     dead_zone: bool  # whether readings are those of a dead zone: "bias" is then less by it
     drift: Drift | None = None  # of a clock of the forces' own; the delay is then that and a constant
+    lag_share: float = 0.0  # posterior probability of a sensor's lag that is part of the delay
     resampled: str = ""  # what fits to other contacts say of the draws, in words, where they were asked for
 
     @property
@@ -143,12 +144,13 @@ def estimate(
     if lag is not None:
         problem = Problem(motion, readings, law, plane, lag.value)
         posterior = lag.posterior
+    averaged = lag.share if lag is not None and not lag.value else 0.0
     if hidden and not _hides(posterior):
         # A channel that is 0 out of contact is no sensor's.
         return estimate(runs, model, timing, None, law, told, seed)
     freedom = len(problem.kept) - len(posterior.names)
     error = 0.0 if noise is None or hidden else noise.std_std / max(noise.std, 1e-300)
-    return ContactFit(law, judged, problem, posterior, freedom, error, bool(hidden), apart)
+    return ContactFit(law, judged, problem, posterior, freedom, error, bool(hidden), apart, averaged)
 
 
 def _readings(runs: Sequence[Run], noise: Noise) -> Readings:
