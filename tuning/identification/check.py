@@ -20,12 +20,13 @@ from tuning.identification.motion import Motion
 from tuning.identification.noise import Noise, at_rest
 from tuning.identification.rational import Model
 from tuning.identification.records import Campaign, Run
-from tuning.identification.result import Identification
+from tuning.identification.result import UNCERTAINTY, Identification, experiment
+from tuning.identification.uncertain_effect import uncertain_effect
 
 CLOCK = 2e-5  # s, to which no delay is known better
 USUAL_FREQUENCY = 3.0  # Hz, of contacts, where none was made
-# Lines of fits alone: what is told has no sign to be found.
-OF_FITS = ("sign of the motion's delay", "sign of the force")
+# A line of fits alone: what is told has no sign to be found.
+OF_FITS = ("sign of the motion's delay",)
 
 
 def check(campaign: Campaign, mechanism: Mechanism, limit: float = 0.01) -> Identification:
@@ -36,12 +37,10 @@ def check(campaign: Campaign, mechanism: Mechanism, limit: float = 0.01) -> Iden
     two_clocks.refuse(campaign.timing)
     model = known.motion_model(mechanism)
     free = [run for run in campaign.runs if run.kind == "free"]
-    touching = [
-        piece
-        for run in campaign.runs
-        if run.kind in ("contact", "press", "tap")
-        for piece in contacts.pieces(run, campaign.timing.control_period)
-    ]
+    period = campaign.timing.control_period
+    whole = [run for run in campaign.runs if run.kind in ("contact", "press", "tap")]
+    whole = contacts.after_gaps(whole, model, period) if whole else []
+    touching = [piece for run in whole for piece in contacts.pieces(run, period)]
     motion = free_motion.of_known(free, campaign.timing, model)
     contact = None
     if touching:
@@ -55,6 +54,7 @@ def check(campaign: Campaign, mechanism: Mechanism, limit: float = 0.01) -> Iden
         lag = -float(np.angle(model.response(s)[0])) / (2.0 * np.pi * frequency) + contact.posterior.best[0]
         every = np.ones(len(touching), bool)
         lines += validation.of_contact(contact, touching, campaign.equivalent_mass, frequency, lag, every)
+    lines += _uncertainty(mechanism)
     return Identification(
         estimates=(),
         draws=np.zeros((0, 0)),
@@ -66,6 +66,18 @@ def check(campaign: Campaign, mechanism: Mechanism, limit: float = 0.01) -> Iden
         motion=motion,
         contact=contact,
     )
+
+
+def _uncertainty(mechanism: Mechanism) -> list[validation.Line]:
+    """What the file's own uncertainty can do, if an identification stated it."""
+    effect = uncertain_effect(mechanism)
+    if not effect.parts:
+        return []
+    largest = sorted(effect.parts, key=lambda key: -effect.parts[key])[:2]
+    found = f"{' and '.join(largest)} above all"
+    if len(largest) == 2:
+        found += f"; {experiment(*largest)} would tell them better"
+    return [validation.Line(UNCERTAINTY, found, True, effect.restitution, on_error=effect.error)]
 
 
 def _known_contact(runs: Sequence[Run], model: Model, campaign: Campaign, mechanism: Mechanism) -> ContactFit:

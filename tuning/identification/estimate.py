@@ -7,19 +7,26 @@ delay is shared with the position sensor's.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from jaxhil.errors import InputError
+from jaxhil.mechanism.file import from_builtins
 from jaxhil.mechanism.structs import Mechanism
 from tuning.identification import contact as contacts
 from tuning.identification import free_motion, knowledge, known, parameters, validation
 from tuning.identification.bootstrap import bootstrap
+from tuning.identification.check import check as check_file
 from tuning.identification.contact import ContactFit
 from tuning.identification.contact_profile import DRAWS
-from tuning.identification.estimates import combinations, estimates
+from tuning.identification.estimates import combinations, estimates, unit_of
 from tuning.identification.free_motion import FreeMotion
-from tuning.identification.identified import mechanism_of
+from tuning.identification.identified import mechanism_of, off_bound
+from tuning.identification.mechanism_file import to_toml
 from tuning.identification.noise import Noise, at_rest
 from tuning.identification.options import FIRST, Options, check
 from tuning.identification.order import VAGUE
@@ -58,15 +65,16 @@ def identify(
     say("fitting the motion simulator")
     motion = free_motion.estimate(runs["free"], campaign.timing, options.order)
     model = _told_model(prior) if motion is None else motion.model
-    contact, lines, frequency = None, [], USUAL_FREQUENCY
+    contact, left_out, frequency = None, [], USUAL_FREQUENCY
     whole = [run for run in campaign.runs if run.kind in TOUCHING]
     if whole and model is not None:
         whole = contacts.after_gaps(whole, model, period)
         touching = [piece for run in whole for piece in contacts.pieces(run, period)]
-        contact, lines = _contact(touching, model, campaign, force, options, say)
+        contact, left_out = _contact(touching, model, campaign, force, options, say)
         frequency = contacts.frequency(contact, mass)
-    if motion is not None:
-        lines = [*validation.of_motion(motion, frequency), *lines]
+    fitted = validation.of_motion(motion, frequency) if motion is not None else []
+    if contact is not None:
+        fitted += [validation.sign_of_force(contact)]
     apart = None if contact is None else contact.drift
     share = _position_delay(motion, None if apart else contact, prior, options)
     found = _draws(motion, contact, model, frequency, share, options.seed)
@@ -96,10 +104,15 @@ def identify(
         draws=table,
         combinations=combinations(found | told, told_contact),
         confounded=confounded(keys, table),
-        lines=tuple(lines),
+        lines=(*_verdict_lines(campaign, mechanism, fitted, left_out), *left_out),
         mechanism=mechanism,
         limit=options.limit,
-        notes=(*_notes(motion, contact, told_contact, force, vague), *_moved(fixed, options), *denied),
+        notes=(
+            *_notes(motion, contact, told_contact, force, vague),
+            *_moved(fixed, options),
+            *_at_bounds(found),
+            *denied,
+        ),
         missing=missing,
         motion=motion,
         contact=contact,
@@ -174,12 +187,39 @@ def _contact(
         fit = bootstrap(fit, options.bootstrap, options.seed, options.scheduler, options.kept, say)
     say("judging the fit by touches left out of it")
     held = held_out(runs, options.hold_out)
-    judged = fit if not held.any() else contacts.without(fit, held, options.seed)
-    frequency = contacts.frequency(fit, campaign.equivalent_mass)
-    s = np.array([2j * np.pi * frequency])
-    lag = -float(np.angle(model.response(s)[0])) / (2.0 * np.pi * frequency) + fit.posterior.best[0]
-    judging = held if held.any() else np.ones(len(runs), bool)
-    return fit, validation.of_contact(judged, runs, campaign.equivalent_mass, frequency, lag, judging)
+    if not held.any():
+        return fit, []
+    others = contacts.without(fit, held, options.seed)
+    return fit, validation.of_touches_left_out(others, runs, campaign.equivalent_mass, held)
+
+
+def _verdict_lines(
+    campaign: Campaign,
+    mechanism: dict[str, Any] | None,
+    fitted: list[validation.Line],
+    left_out: list[validation.Line],
+) -> list[validation.Line]:
+    """The checks of the mechanism file as it is written, whose verdict is that of `identify --check`.
+
+    Where no file is written, or none can be set against these logs, the checks of the fits stand."""
+    if mechanism is None or campaign.timing.two_clocks or not (fitted or left_out):
+        return fitted
+    try:
+        written = from_builtins(tomllib.loads(to_toml(mechanism)), "identified mechanism")
+    except InputError:
+        return fitted
+    signs = [replace(line, counts=False) for line in fitted if line.name.startswith("sign of")]
+    return [*check_file(campaign, written).lines, *signs]
+
+
+def _at_bounds(found: Mapping[str, np.ndarray]) -> list[str]:
+    """Name the numbers whose values in the file are 0 since the logs say that they are below."""
+    notes = []
+    for key, draws in found.items():
+        if off_bound(key, draws) > 0.0:
+            told = f"the logs say {draws.mean():.4g} +- {draws.std():.2g}, {unit_of(key)}"
+            notes.append(f"{key}: {told}: the file has its least value, 0, and the difference as uncertainty")
+    return notes
 
 
 def held_out(runs: Sequence[Run], share: float) -> np.ndarray:

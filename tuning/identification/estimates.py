@@ -22,6 +22,9 @@ def estimates(found, motion, contact, force, position, fixed) -> tuple[Estimate,
     elif contact is not None:
         std = contact.readings.std
         others.append(_plain("rig.force_sensor.noise_std", std, std / np.sqrt(2.0 * contact.freedom)))
+        if force is None:
+            bias = contact.posterior.draws[:, contact.posterior.names.index("bias")]
+            others.append(_plain("rig.force_sensor.bias", float(bias.mean()), float(bias.std())))
     if force is not None and force.quantum:
         others.append(_plain("rig.force_sensor.quantum", force.quantum, 0.0))
     if position is not None:

@@ -1,9 +1,9 @@
 """Which contact law a mechanism has: the simplest one that predicts touches it was not fitted to.
 
 Every law is fitted to the odd touches and judged on the even ones, and the other way round, by the log
-likelihood of whole touches. Laws within two standard errors of the best, touch by touch, are as good, and so is
-the one that the Bayesian information criterion prefers over all rows; the one with the fewest numbers is taken.
-With fewer than four touches the criterion alone judges.
+likelihood of whole touches. Laws within two standard errors of the best, touch by touch, are as good, and so
+is the one that the Bayesian information criterion prefers over all rows; the one with the fewest numbers is
+taken. With fewer than four touches the criterion alone judges.
 
 A law without damping is taken only where it is named. To first order a contact shows damping less stiffness
 times the age of the force: without damping the delay would take its place, with an interval that is far too

@@ -1,10 +1,10 @@
 """A lag of the force sensor beside its delay.
 
 To first order a lag is a delay, so their sum alone is known from slow contacts, and it is what the loop
-feels. A lag is added where it explains so much more that the Bayesian information criterion gains 6. Where the
-touches neither ask for a lag nor rule it out, it stays part of the delay, but the draws of delay and damping
-average over it (Bayesian model averaging, Hoeting et al. 1999): a lag blurs the onset, which is all that tells
-the delay from damping.
+feels. A lag is added where it explains so much more that the Bayesian information criterion gains 6. Where
+the touches neither ask for a lag nor rule it out, it stays part of the delay, but the draws of delay and
+damping average over it (Bayesian model averaging, Hoeting et al. 1999): a lag blurs the onset, which is all
+that tells the delay from damping.
 """
 
 from __future__ import annotations
@@ -77,8 +77,9 @@ def sensor_lag(problem: Problem, posterior: Posterior, seed: int = 0) -> Lag | N
 def _averaged(
     problem: Problem, posterior: Posterior, fit: Callable[[float], Fitted], seed: int
 ) -> Lag | None:
-    """Average over a lag that may be there or not, each as likely before the touches; the lag is uniform up to
-    the largest one, and is added to the delay."""
+    """Average over a lag that may be there or not, each as likely before the touches.
+
+    The lag is uniform up to the largest one, and is added to the delay."""
     heights = np.array([posterior.best[2].misfit, *(fit(value)[2] for value in TRIED)]) / -2.0
     inside = np.flatnonzero(heights[1:] > heights.max() - RULED_OUT)
     if not len(inside):
