@@ -20,7 +20,7 @@ from tuning.identification.motion import Motion
 from tuning.identification.noise import Noise, at_rest
 from tuning.identification.rational import Model
 from tuning.identification.records import Campaign, Run
-from tuning.identification.result import UNCERTAINTY, Identification, experiment
+from tuning.identification.result import PRESS, UNCERTAINTY, Identification, experiment
 from tuning.identification.uncertain_effect import uncertain_effect
 
 CLOCK = 2e-5  # s, to which no delay is known better
@@ -54,7 +54,7 @@ def check(campaign: Campaign, mechanism: Mechanism, limit: float = 0.01) -> Iden
         lag = -float(np.angle(model.response(s)[0])) / (2.0 * np.pi * frequency) + contact.posterior.best[0]
         every = np.ones(len(touching), bool)
         lines += validation.of_contact(contact, touching, campaign.equivalent_mass, frequency, lag, every)
-    lines += _uncertainty(mechanism)
+    lines += _uncertainty(mechanism, any(run.kind == "press" for run in campaign.runs))
     return Identification(
         estimates=(),
         draws=np.zeros((0, 0)),
@@ -68,15 +68,18 @@ def check(campaign: Campaign, mechanism: Mechanism, limit: float = 0.01) -> Iden
     )
 
 
-def _uncertainty(mechanism: Mechanism) -> list[validation.Line]:
-    """What the file's own uncertainty can do, if an identification stated it."""
+def _uncertainty(mechanism: Mechanism, pressed: bool) -> list[validation.Line]:
+    """Say what the file's own uncertainty can do, if an identification stated it, and what lessens it."""
     effect = uncertain_effect(mechanism)
     if not effect.parts:
         return []
     largest = sorted(effect.parts, key=lambda key: -effect.parts[key])[:2]
     found = f"{' and '.join(largest)} above all"
     if len(largest) == 2:
-        found += f"; {experiment(*largest)} would tell them better"
+        advice = experiment(*largest)
+        if pressed and advice == PRESS:
+            advice = "a longer press run, or a stronger one,"
+        found += f"; {advice} would tell them better"
     return [validation.Line(UNCERTAINTY, found, True, effect.restitution, on_error=effect.error)]
 
 

@@ -15,12 +15,13 @@ from tuning.identification.validation import Line
 UNCERTAINTY = "uncertainty of the numbers"  # name of its line
 CONFOUNDED = 0.95  # magnitude of a correlation from which two numbers are told apart badly
 
+PRESS = "a press run with a multisine to 45 Hz"
 WIDER = "a multisine to 1.5 times the bandwidth or more"
 # What would separate a pair, by the keys in it.
 EXPERIMENTS = {
-    ("rig.force_sensor.delay", "contact.damping"): "a press run with a multisine to 45 Hz",
-    ("rig.force_sensor.time_constant", "contact.damping"): "a press run with a multisine to 45 Hz",
-    ("rig.force_sensor.time_constant", "rig.force_sensor.delay"): "a press run with a multisine to 45 Hz",
+    ("rig.force_sensor.delay", "contact.damping"): PRESS,
+    ("rig.force_sensor.time_constant", "contact.damping"): PRESS,
+    ("rig.force_sensor.time_constant", "rig.force_sensor.delay"): PRESS,
     ("rig.contact_plane", "rig.force_sensor.delay"): "touches at speeds in the ratio 1:2:4, or a slow press",
     ("contact.stiffness", "rig.contact_plane"): "touches at speeds in the ratio 1:2:4, or a slow press",
     ("rig.simulator.damping_ratio", "rig.simulator.delay"): WIDER,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy import optimize, special
 
-from tuning.identification.contact_problem import Problem
+from tuning.identification.contact_problem import LONGEST, Problem
 from tuning.identification.contact_profile import DRAWS, Posterior, around
 from tuning.identification.law_choice import Fitted, quick
 
@@ -112,7 +112,7 @@ def _each(
     each = []
     for one in nodes:
         at, plane, _ = fit(one)
-        delays = np.unique(np.maximum(at + spread, problem.shortest))
+        delays = np.unique(np.clip(at + spread, problem.shortest, LONGEST))
         each.append(around(_lagging(problem, one), delays, plane, seed))
     return each
 
