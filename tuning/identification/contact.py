@@ -210,6 +210,12 @@ def frequency(contact: ContactFit, mass: float) -> float:
     return float(np.sqrt(max(secant.max(), 1e-9) / mass) / (2.0 * np.pi))
 
 
+def lag(contact: ContactFit, model: Model, frequency: float) -> float:
+    """Return the delay of the force's phase behind the command at a frequency [Hz], in s."""
+    angle = float(np.angle(model.response(np.array([2j * np.pi * frequency]))[0]))
+    return contact.posterior.best[0] - angle / (2.0 * np.pi * frequency)
+
+
 def without(fit: ContactFit, held: np.ndarray, seed: int = 0) -> ContactFit:
     """The same law fitted to the touches that are not `held`; its readings are still those of all."""
     readings, problem = fit.readings, fit.problem

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -65,16 +64,13 @@ def identify(
     say("fitting the motion simulator")
     motion = free_motion.estimate(runs["free"], campaign.timing, options.order)
     model = _told_model(prior) if motion is None else motion.model
-    contact, left_out, frequency = None, [], USUAL_FREQUENCY
+    contact, touching, left_out, frequency = None, [], [], USUAL_FREQUENCY
     whole = [run for run in campaign.runs if run.kind in TOUCHING]
     if whole and model is not None:
         whole = contacts.after_gaps(whole, model, period)
         touching = [piece for run in whole for piece in contacts.pieces(run, period)]
         contact, left_out = _contact(touching, model, campaign, force, options, say)
         frequency = contacts.frequency(contact, mass)
-    fitted = validation.of_motion(motion, frequency) if motion is not None else []
-    if contact is not None:
-        fitted += [validation.sign_of_force(contact)]
     apart = None if contact is None else contact.drift
     share = _position_delay(motion, None if apart else contact, prior, options)
     found = _draws(motion, contact, model, frequency, share, options.seed)
@@ -97,6 +93,9 @@ def identify(
     mechanism, missing = None, _missing(prior, model, told_contact, untold)
     if not missing:
         mechanism = mechanism_of(campaign, prior, model, told_contact, numbers, found, options)
+    lines = _of_file(campaign, mechanism, motion if options.order is None else None)
+    if lines is None:
+        lines = _of_fits(motion, contact, model, touching, mass)
     keys = list(found)
     table = np.array([found[key] for key in keys]).T if keys else np.zeros((DRAWS, 0))
     return Identification(
@@ -104,7 +103,7 @@ def identify(
         draws=table,
         combinations=combinations(found | told, told_contact),
         confounded=confounded(keys, table),
-        lines=(*_verdict_lines(campaign, mechanism, fitted, left_out), *left_out),
+        lines=(*lines, *left_out),
         mechanism=mechanism,
         limit=options.limit,
         notes=(
@@ -193,23 +192,43 @@ def _contact(
     return fit, validation.of_touches_left_out(others, runs, campaign.equivalent_mass, held)
 
 
-def _verdict_lines(
-    campaign: Campaign,
-    mechanism: dict[str, Any] | None,
-    fitted: list[validation.Line],
-    left_out: list[validation.Line],
-) -> list[validation.Line]:
-    """The checks of the mechanism file as it is written, whose verdict is that of `identify --check`.
+def _of_file(
+    campaign: Campaign, mechanism: dict[str, Any] | None, motion: FreeMotion | None
+) -> list[validation.Line] | None:
+    """Check the mechanism file as it is written, as `identify --check` would.
 
-    Where no file is written, or none can be set against these logs, the checks of the fits stand."""
-    if mechanism is None or campaign.timing.two_clocks or not (fitted or left_out):
-        return fitted
+    `motion`: fitted, of any order. Returns None where no file is written, or none can be checked."""
+    if mechanism is None or campaign.timing.two_clocks:
+        return None
+    if not any(run.kind in (*TOUCHING, "free") for run in campaign.runs):
+        return None
     try:
         written = from_builtins(tomllib.loads(to_toml(mechanism)), "identified mechanism")
+        return list(check_file(campaign, written, fitted=motion).lines)
     except InputError:
-        return fitted
-    signs = [replace(line, counts=False) for line in fitted if line.name.startswith("sign of")]
-    return [*check_file(campaign, written).lines, *signs]
+        return None
+
+
+def _of_fits(
+    motion: FreeMotion | None,
+    contact: ContactFit | None,
+    model: Model | None,
+    touching: list[Run],
+    mass: float,
+) -> list[validation.Line]:
+    """Check the fits themselves, where there is no file to check."""
+    frequency = USUAL_FREQUENCY if contact is None else contacts.frequency(contact, mass)
+    lines = []
+    if motion is not None:
+        lines = [*validation.of_motion(motion, frequency), validation.sign_of_delay(motion, frequency)]
+    if contact is not None and model is not None:
+        lag = contacts.lag(contact, model, frequency)
+        every = np.ones(len(touching), bool)
+        lines += [
+            validation.sign_of_force(contact),
+            *validation.of_contact(contact, touching, mass, frequency, lag, every),
+        ]
+    return lines
 
 
 def _at_bounds(found: Mapping[str, np.ndarray]) -> list[str]:

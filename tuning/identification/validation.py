@@ -56,7 +56,7 @@ class Line:
 def of_motion(motion: FreeMotion, frequency: float) -> list[Line]:
     """Checks of the motion simulator's model; `frequency` of contacts [Hz]."""
     lines = [_misfit(motion, frequency), _gain(motion), _hold(motion, frequency)]
-    return [*lines, _sign_of_delay(motion, frequency), *_distortion(motion)]
+    return [*lines, *_distortion(motion)]
 
 
 def _misfit(motion: FreeMotion, frequency: float) -> Line:
@@ -104,7 +104,8 @@ def _hold(motion: FreeMotion, frequency: float) -> Line:
     )
 
 
-def _sign_of_delay(motion: FreeMotion, frequency: float) -> Line:
+def sign_of_delay(motion: FreeMotion, frequency: float) -> Line:
+    """Check that a fitted delay of the motion is not negative."""
     delay, std = motion.model.delay, float(np.sqrt(motion.covariance[-1, -1]))
     return Line(
         "sign of the motion's delay",
