@@ -1,16 +1,19 @@
 """Effect of a mechanism file's uncertainty on the restitution e and on its error e - e*.
 
-e* is the restitution of the ideal contact, e that of the rig under gains which make up for the delays as the
-file states them. To first order a change dF of the contact force changes the rebound by its work,
+e* is the restitution of the ideal contact, e that of the rig. To first order a change dF of the contact force
+changes the rebound by its work,
 
     d e* = -(integral of dF v dt) / (M v_0^2 e*),
 
-and a force that is older by d tau than the file states adds energy, d tau times the integral of F^2 / M:
+and a force that is older by tau adds energy, tau times the integral of F^2 / M:
 
-    d(e - e*) = d tau (integral of F^2 dt) / (M^2 v_0^2 e*),    d e = d e* + d(e - e*).
+    e = e* + J tau,    J = (integral of F^2 dt) / (M^2 v_0^2 e*),
 
-For a linear spring the latter is (pi/2) w d tau. Damping and age of the force thus cancel in e, and do not in
-e - e*: gains that are tuned on too little damping reproduce a contact with too little damping.
+for a linear spring (pi/2) w tau. Damping and age of the force thus cancel in e, and do not in e - e*: gains
+that are tuned on too little damping reproduce a contact with too little damping.
+
+A rig without compensation rebounds faster by a factor c = 1 + J tau / e*, and d e = c (d e* + J d tau); where
+gains make up for the age, c is 1. The larger effect of the two counts.
 """
 
 from __future__ import annotations
@@ -43,7 +46,7 @@ class Effect(NamedTuple):
 
     restitution: float  # change of e
     error: float  # change of e - e*
-    parts: dict[str, float]  # change of e - e* or of e, the larger, by each key alone
+    parts: dict[str, float]  # change by each key alone
 
 
 class _Contact(NamedTuple):
@@ -79,11 +82,12 @@ def uncertain_effect(mechanism: Mechanism) -> Effect:
             continue
         frequencies.append(frequency)
         changes = {key: _change(mechanism, contact, entry, frequency, key, drawn[key]) for key in keys}
+        gain = 1.0 + contact.by_age * _age(mechanism, frequency) / contact.restitution
         ideal, error = (sum(one[i] for one in changes.values()) for i in (0, 1))
         found = Effect(
-            _sure(ideal + error),
-            _sure(error),
-            {key: max(_sure(one + other), _sure(other)) for key, (one, other) in changes.items()},
+            gain * _sure(ideal + error),
+            max(_sure(error), _sure(gain * (ideal + error) - ideal)),
+            {key: _sure(one + other) for key, (one, other) in changes.items()},
         )
         if max(found[:2]) > max(worst[:2]):
             worst = found
@@ -120,7 +124,10 @@ def _change(
     value = getattr(mechanism.rig.simulator, name)
     if not isinstance(value, float):
         return nothing, nothing
-    low, high = (_lag(mechanism, name, value + side, frequency) for side in (0.0, STEP * max(value, 1e-3)))
+    low, high = (
+        _lag(_with_simulator(mechanism, name, value + side), frequency)
+        for side in (0.0, STEP * max(value, 1e-3))
+    )
     return nothing, (values - value) * (high - low) / (STEP * max(value, 1e-3)) * contact.by_age
 
 
@@ -128,13 +135,24 @@ def _with(contact: Contact, name: str, value: Any) -> Contact:
     return msgspec.structs.replace(contact, **{name: value})
 
 
-def _lag(mechanism: Mechanism, name: str, value: float, frequency: float) -> float:
-    """Delay of the motion's phase at a frequency [Hz] with one number of the simulator replaced [s]."""
+def _with_simulator(mechanism: Mechanism, name: str, value: float) -> Mechanism:
     simulator = msgspec.structs.replace(mechanism.rig.simulator, **{name: value})
     rig = msgspec.structs.replace(mechanism.rig, simulator=simulator)
-    model = known.motion_model(msgspec.structs.replace(mechanism, rig=rig))
+    return msgspec.structs.replace(mechanism, rig=rig)
+
+
+def _lag(mechanism: Mechanism, frequency: float) -> float:
+    """Return the delay of the motion's phase at a frequency [Hz], in s, with the position sensor's delay."""
+    model = known.motion_model(mechanism)
     angle = float(np.angle(model.response(np.array([2j * np.pi * frequency]))[0]))
     return -angle / (2.0 * np.pi * frequency)
+
+
+def _age(mechanism: Mechanism, frequency: float) -> float:
+    """Return by how much the force is older than the command at a frequency [Hz], in s."""
+    sensor = mechanism.rig.force_sensor
+    whole = _lag(mechanism, frequency) + sensor.delay + sensor.time_constant
+    return max(whole - mechanism.rig.position_sensor.delay, 0.0)
 
 
 def _sure(values: np.ndarray) -> float:
