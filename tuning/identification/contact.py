@@ -21,7 +21,7 @@ from tuning.identification.motion import Motion
 from tuning.identification.noise import Noise
 from tuning.identification.rational import Model
 from tuning.identification.records import Run, Timing
-from tuning.identification.sensor_lag import sensor_lag
+from tuning.identification.sensor_lag import LIKELY, Lag, sensor_lag
 from tuning.identification.two_clocks import Drift
 
 SETTLING = 0.5  # s, of a motion simulator
@@ -138,9 +138,13 @@ def estimate(
     if law is None or isinstance(law, str):
         judged = tuple(judge(motion, readings, plane, None if law is None else (law,)))
         law, near = judged[0].law, (judged[0].delay, judged[0].plane)
-    problem = Problem(motion, readings, law, plane)
-    posterior = profile(problem, seed, near)
-    lag = None if hidden else sensor_lag(problem, posterior, seed)
+    problem, posterior, lag, evidence = _fitted(motion, readings, law, plane, near, hidden, seed)
+    if judged and law.pulls:
+        # Without a lag in the laws, one of the sensor looks like a contact that pulls.
+        pushing = kelvin_voigt()
+        other = _fitted(motion, readings, pushing, plane, near, hidden, seed)
+        if other[3] >= evidence:
+            law, (problem, posterior, lag, _) = pushing, other
     if lag is not None:
         problem = Problem(motion, readings, law, plane, lag.value)
         posterior = lag.posterior
@@ -151,6 +155,22 @@ def estimate(
     freedom = len(problem.kept) - len(posterior.names)
     error = 0.0 if noise is None or hidden else noise.std_std / max(noise.std, 1e-300)
     return ContactFit(law, judged, problem, posterior, freedom, error, bool(hidden), apart, averaged)
+
+
+def _fitted(
+    motion: Motion,
+    readings: Readings,
+    law: Law,
+    plane: float | None,
+    near: tuple[float, float] | None,
+    hidden: bool,
+    seed: int,
+) -> tuple[Problem, Posterior, Lag | None, float]:
+    """Fit one law, with a lag of the sensor if no dead zone hides the onset; the last is the evidence."""
+    problem = Problem(motion, readings, law, plane)
+    posterior = profile(problem, seed, near)
+    lag = None if hidden else sensor_lag(problem, posterior, seed)
+    return problem, posterior, lag, posterior.evidence + np.log(1.0 - LIKELY) if lag is None else lag.evidence
 
 
 def _readings(runs: Sequence[Run], noise: Noise) -> Readings:

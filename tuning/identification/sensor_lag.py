@@ -27,6 +27,7 @@ NODES, WIDEST = 9, 3.5  # lags at which all else is fitted, and standard deviati
 DELAYS, REACH = 21, 5.0  # of the grid at each lag, and standard deviations of the delay that it reaches
 NARROWEST = 5e-5  # s, least standard deviation that sets this reach
 FEWER_NODES, FEWER_DELAYS = 7, 15  # of the grid where a lag is not asked for
+LIKELY = 0.8  # probability of a lag before the touches: nearly every amplifier has a filter
 RULED_OUT = 8.0  # drop of the log likelihood from its largest, beyond which a lag is ruled out
 
 
@@ -36,7 +37,8 @@ class Lag:
 
     value: float  # s, of greatest posterior density; 0 where the lag stays part of the delay
     posterior: Posterior  # with a value, "time_constant" is the last of its names; its best is at `value`
-    share: float = 1.0  # posterior probability of a lag
+    share: float  # posterior probability of a lag
+    evidence: float  # logarithm of the posterior's integral with a lag or without, as `Posterior.evidence`
 
 
 def sensor_lag(problem: Problem, posterior: Posterior, seed: int = 0) -> Lag | None:
@@ -71,13 +73,14 @@ def sensor_lag(problem: Problem, posterior: Posterior, seed: int = 0) -> Lag | N
     draws, picked = _joined(nodes, each, seed)
     best = int(np.argmax([one.evidence for one in each]))
     names = [*each[best].names, "time_constant"]
-    return Lag(float(nodes[best]), replace(each[best], names=names, draws=np.column_stack([draws, picked])))
+    joined = replace(each[best], names=names, draws=np.column_stack([draws, picked]))
+    return Lag(float(nodes[best]), joined, *_weighed(posterior, each, nodes[1] - nodes[0]))
 
 
 def _averaged(
     problem: Problem, posterior: Posterior, fit: Callable[[float], Fitted], seed: int
 ) -> Lag | None:
-    """Average over a lag that may be there or not, each as likely before the touches.
+    """Average over a lag that may be there or not.
 
     The lag is uniform up to the largest one, and is added to the delay."""
     heights = np.array([posterior.best[2].misfit, *(fit(value)[2] for value in TRIED)]) / -2.0
@@ -88,15 +91,22 @@ def _averaged(
     step = highest / FEWER_NODES
     nodes = step * (np.arange(FEWER_NODES) + 0.5)
     each = _each(problem, posterior, fit, nodes, FEWER_DELAYS, seed)
-    with_lag = special.logsumexp([one.evidence for one in each]) + np.log(step / LARGEST)
-    share = float(special.expit(with_lag - posterior.evidence))
+    share, evidence = _weighed(posterior, each, step)
     draws, picked = _joined(nodes, each, seed)
     draws[:, 0] += picked
     count = round(share * DRAWS)
     mixed = np.random.default_rng([seed, 4]).permutation(
         np.concatenate([draws[:count], posterior.draws[count:]])
     )
-    return Lag(0.0, replace(posterior, draws=mixed), share)
+    return Lag(0.0, replace(posterior, draws=mixed), share, evidence)
+
+
+def _weighed(posterior: Posterior, each: list[Posterior], step: float) -> tuple[float, float]:
+    """Return the probability of a lag, and the evidence of both together; `step` between the lags [s]."""
+    integral: Any = special.logsumexp([one.evidence for one in each])
+    with_lag = float(integral) + np.log(LIKELY * step / LARGEST)
+    without = posterior.evidence + np.log(1.0 - LIKELY)
+    return float(special.expit(with_lag - without)), float(np.logaddexp(with_lag, without))
 
 
 def _each(

@@ -75,15 +75,13 @@ def uncertain_effect(mechanism: Mechanism) -> Effect:
         return Effect(0.0, 0.0, {})
     drawn = draw(mechanism, DRAWS, 0)
     worst = Effect(0.0, 0.0, {})
-    frequencies: list[float] = []
     for entry in range(len(mechanism.contact.stiffness)):
         contact, frequency = _contact(mechanism, law, entry)
         if contact is None:
             continue
-        frequencies.append(frequency)
         changes = {key: _change(mechanism, contact, entry, frequency, key, drawn[key]) for key in keys}
         gain = 1.0 + contact.by_age * _age(mechanism, frequency) / contact.restitution
-        ideal, error = (sum(one[i] for one in changes.values()) for i in (0, 1))
+        ideal, error = np.sum(list(changes.values()), axis=0)
         found = Effect(
             gain * _sure(ideal + error),
             max(_sure(error), _sure(gain * (ideal + error) - ideal)),
@@ -161,12 +159,12 @@ def _sure(values: np.ndarray) -> float:
 
 def _contact(mechanism: Mechanism, law: Law, entry: int) -> tuple[_Contact | None, float]:
     """The ideal contact with one entry of the lists, and its frequency [Hz]; None where it has no rebound."""
-    mass, speed = mechanism.bodies.equivalent_mass, mechanism.approach.velocity
+    mass, speed = mechanism.bodies.mass, mechanism.approach.velocity
     coefficients = np.array(known.coefficients(mechanism.contact, entry))
 
     def force(depth: float, rate: float) -> float:
-        functions = [float(one) for one in law.own(np.float64(max(depth, 0.0)), np.float64(rate))]
-        total = float(np.dot(coefficients, functions))
+        functions = law.own(np.array([max(depth, 0.0)]), np.array([rate]))
+        total = float(sum(c * one[0] for c, one in zip(coefficients, functions, strict=True)))
         return total if law.pulls else max(total, 0.0)
 
     deepest = _deepest(force, 0.5 * mass * speed**2)
