@@ -294,9 +294,12 @@ def _left(document: dict[str, Any], title: str) -> Any:
     rows = []
     for one in document["checks"]:
         found = ", ".join(filter(None, (one["finding"], one["where"])))
-        effects = [one[name] * one["there"] for name in ("effect", "effect_on_error")]
-        rows.append([one["name"], found, *(effects if one["counts"] else ["-", "-"])])
-    return terminal.table(title, ["check", "found", "effect on e", "on e - e*"], rows, (0, 1))
+        effects = [
+            terminal.figure(one[name] * one["there"], 2) if one["counts"] else "-"
+            for name in ("effect", "effect_on_error")
+        ]
+        rows.append([one["name"], found, *effects])
+    return terminal.table(title, ["check", "found", "effect on e", "on e-e*"], rows, (0, 1))
 
 
 def _row(one: dict[str, Any]) -> list[Any]:
