@@ -54,11 +54,16 @@ def truth(name):
     return from_builtins(raw, name)
 
 
-def numbers(mechanism):
-    """Return the numbers that decide e and e*, by key."""
+def numbers(mechanism, position_delay):
+    """Return the numbers that decide e and e*, by key, as if the position sensor had that delay [s].
+
+    Delays d less of the motion and of the force, and d more of the position sensor, are the same rig."""
     rig, contact = mechanism.rig, mechanism.contact
     found = {f"rig.simulator.{key}": getattr(rig.simulator, key) for key in TOLD}
     found |= {f"rig.force_sensor.{key}": getattr(rig.force_sensor, key) for key in ("delay", "time_constant")}
+    share = rig.position_sensor.delay - position_delay
+    found["rig.simulator.delay"] += share
+    found["rig.force_sensor.delay"] = max(found["rig.force_sensor.delay"] - share, 0.0)
     return found | {"contact.stiffness": contact.stiffness[0], "contact.damping": contact.damping[0]}
 
 
@@ -66,15 +71,16 @@ def off(name, written, compensator, gains):
     """Return by how much e and e - e* of each mechanism are off those of the truth, (mechanisms, 2).
 
     All run under the same gains in the loop of `jaxhil`; e is the mean over phases of the contact."""
-    every = [numbers(one) for one in (truth(name), *written)]
+    true = truth(name)
+    every = [numbers(one, true.rig.position_sensor.delay) for one in (true, *written)]
     draws = {
         key: np.repeat([one[key] for one in every], len(PHASES))
         for key in every[0]
         if any(one[key] for one in every)
     }
     draws["approach.phase"] = np.tile(PHASES, len(every))
-    scenarios = build_scenarios(truth(name), draws, 0)
-    found = evaluate(build_loop(truth(name), compensator, scenarios), gains, scenarios)
+    scenarios = build_scenarios(true, draws, 0)
+    found = evaluate(build_loop(true, compensator, scenarios), gains, scenarios)
     assert np.array_equal(found.good, found.wanted)
     e, error = np.asarray(found.metrics.restitution)[0], np.asarray(found.error)[0]
     table = np.array([e, error]).reshape(2, len(every), len(PHASES)).mean(axis=2)
