@@ -87,3 +87,23 @@ def test_the_same_as_alone():
             np.testing.assert_allclose(
                 found[good], wanted[good], rtol=0, atol=1e-9, err_msg=f"{name}: {figure}"
             )
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_lags_beside_none_in_cells(exact):
+    """Contact along the exact motion, because it is asked for or because one of the mechanisms is stiff."""
+    lagging = mechanism(
+        {"law": "kelvin_voigt"}, SECOND_ORDER, period=1e-3, force_sensor={"time_constant": 2e-4}
+    )
+    yielding = mechanism({"law": "elastoplastic", "unloading_ratio": 1.5}, SECOND_ORDER, period=1e-3)
+    stiff = mechanism({"law": "kelvin_voigt", "stiffness": [5e6]}, SECOND_ORDER, period=1e-3)
+    parsed = [validated(one) for one in (lagging, yielding, *([] if exact else [stiff]))]
+    ((_, common),) = common_programs(parsed)
+    assert "has_lag" in common.parts
+    for one in parsed[:2]:
+        scenarios = build_scenarios(one, {"approach.phase": np.arange(4) / 4}, 0)
+        alone = run_rollout(build_loop(one, "none", scenarios, exact=True), {}, scenarios)
+        loop = common.loop(build_loop(one, "none", scenarios, exact=exact))
+        shared = run_rollout(loop, {}, common.scenarios(one, scenarios))
+        assert loop.has_cells
+        np.testing.assert_allclose(shared.restitution, alone.restitution, rtol=1e-9)

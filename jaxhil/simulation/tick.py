@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.compensators.base import Gains, Signals
 from jaxhil.compensators.ring_buffer import depend_on, look_back, write_in_turn
-from jaxhil.simulation.cells import Course, power_series
+from jaxhil.simulation.cells import INSTANT, Course, power_series
 from jaxhil.simulation.contact_force import (
     Contact,
     Motion,
@@ -250,7 +250,11 @@ def _contact_in_cells(loop: Loop, rig: RigConstants, state: LoopState, interval:
     if loop.energies and loop.first_break == 0:
         before = state.sensed.last.position(clearance)
         works = work_of_jump(touch, state.law, before, interval.sample.position)
-    reading = found.reading if loop.has_lag else None
+    reading = None
+    if loop.has_lag:
+        # Cells do not resolve a lag that is none, of a lane beside others that have one.
+        lag = scenario.force_sensor.time_constant
+        reading = jnp.where(lag > INSTANT * period, found.reading, force)
     before, after = found.touched
     assert state.sensed.touched is not None
     signals = PlantSignals(force, works, found.peak, state.sensed.touched + before)

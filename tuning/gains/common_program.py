@@ -20,7 +20,7 @@ from jaxhil.contact.reference import Reference
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import extremes
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.cells import CellCounts, join_counts
+from jaxhil.simulation.cells import NO_CELLS, CellCounts, join_counts
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 
@@ -143,6 +143,14 @@ def _common(mechanisms, group, loops, batches) -> CommonProgram:
         parts=tuple(name for name in _PARTS if any(getattr(loops[i], name) for i in group)),
         first_break=min(loops[i].first_break for i in group),
         ring=max(loops[i].ring for i in group),
-        cells=join_counts([loops[i].cells for i in group]),
+        cells=_cells(mechanisms, [loops[i] for i in group], [batches[i] for i in group]),
         beforehand=not _later(mechanisms[0]) and not all(loops[i].law.closed_form for i in group),
     )
+
+
+def _cells(mechanisms, loops, batches) -> CellCounts:
+    """Cells that serve every mechanism, if any needs them."""
+    if not any(loop.has_cells for loop in loops):
+        return NO_CELLS
+    exact = [build_loop(m, "none", batch, exact=True) for m, batch in zip(mechanisms, batches, strict=True)]
+    return join_counts([loop.cells for loop in exact])
