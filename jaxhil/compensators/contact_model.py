@@ -48,7 +48,7 @@ def prior(stiffness: Array, spreads: tuple[Array, ...]) -> tuple[Array, Array]:
     [1/s^2], of damping [1/s], depth damping [1/s], unloading [1/s^2], friction [1/s] and preload [1/s].
     """
     common, wander, *others = spreads
-    changes = np.diff(np.minimum(KNOTS, BROAD)) / WANDER
+    changes = (np.diff(np.minimum(KNOTS, BROAD)) / WANDER).tolist()
     hinges = [common**2, *(wander**2 * change for change in changes)]
     zeros = jnp.zeros_like(stiffness)
     mean = jnp.stack([stiffness, *[zeros] * (PARAMETERS - 1)])
@@ -62,9 +62,9 @@ def restarted(
     identity = np.eye(PARAMETERS, dtype=bool).reshape(PARAMETERS, PARAMETERS, *[1] * begins.ndim)
     covariance = jnp.where(identity, prior_variances[:, None], 0)
     return Estimate(
-        jnp.where(begins, prior_mean, old.mean),
-        jnp.where(begins, covariance, old.covariance),
-        jnp.where(begins, prior_mean, old.theta),
+        jnp.where(begins[None], prior_mean, old.mean),
+        jnp.where(begins[None, None], covariance, old.covariance),
+        jnp.where(begins[None], prior_mean, old.theta),
     )
 
 
@@ -80,7 +80,7 @@ def features(depth: Array, speed: Array, deepest: Array) -> Float[Array, "parame
         speed / jnp.sqrt(speed * speed + SLOW * SLOW),
         jnp.ones_like(depth),
     ]
-    return jnp.concatenate([hinges, jnp.where(depth > 0, jnp.stack(others), 0)])
+    return jnp.concatenate([hinges, jnp.where((depth > 0)[None], jnp.stack(others), 0)])
 
 
 def force(theta: Array, depth: Array, speed: Array, deepest: Array) -> Float[Array, "*batch"]:
@@ -106,11 +106,12 @@ def learn(
     old: Estimate, phi: Array, force: Array, variance: Array, used: Bool[Array, "*batch"]
 ) -> tuple[Array, Array]:
     """Return mean and covariance with one reading of the force more, where it is `used`."""
-    column = reduce(add, (old.covariance[j] * phi[j] for j in range(PARAMETERS)))
+    column = reduce(add, (old.covariance[j] * phi[j][None] for j in range(PARAMETERS)))
     total = variance + dot(phi, column)
     share = jnp.where(used, 1 / jnp.where(used, total, 1), 0)
     innovation = share * (force - dot(phi, old.mean))
-    return old.mean + column * innovation, old.covariance - (share * column)[:, None] * column[None]
+    scaled = share[None] * column
+    return old.mean + column * innovation[None], old.covariance - scaled[:, None] * column[None]
 
 
 def conclude(mean: Array, covariance: Array, prior_variances: Array) -> Array:
@@ -121,10 +122,10 @@ def conclude(mean: Array, covariance: Array, prior_variances: Array) -> Array:
         uncertain = column[j] > LEAST_VARIANCE
         variance = jnp.where(uncertain, column[j], 1)
         expected = zero_or_positive(mean[j], variance, prior_variances[j])
-        mean = mean + column * jnp.where(uncertain, (expected - mean[j]) / variance, 0)
+        mean = mean + column * jnp.where(uncertain, (expected - mean[j]) / variance, 0)[None]
         for later in range(index + 1, len(DISSIPATIVE)):
             share = jnp.where(uncertain, columns[later][j] / variance, 0)
-            columns[later] = columns[later] - share * column
+            columns[later] = columns[later] - share[None] * column
     signed = mean[DAMPING : FRICTION + 1]
     return jnp.concatenate([mean[:DAMPING], jnp.where(signed > 0, signed, 0), mean[PRELOAD:]])
 

@@ -228,7 +228,7 @@ class ImpulseLedger(Compensator):
         sigma = _sqrt(onset_detection.variance(flight, gains["force_noise"]))
         sigma = sigma + gains["force_noise_floor"] * (gains["equivalent_mass"] * speed)
         sigma = jnp.where(approaches, sigma, 1)
-        settled = approaches & ~(signals.age * period < SETTLING)
+        settled = approaches & ~(signals.age.astype(period.dtype) * period < SETTLING)
         deviation = side * (reading.force - flight.bias) / sigma
         kept = flight._replace(total=jnp.where(side != contact.side, 0, flight.total))
         total = onset_detection.watch(kept, deviation, settled)
@@ -265,7 +265,7 @@ class ImpulseLedger(Compensator):
         learns = follows & tells & (depth > 0)
         mean, covariance = contact_model.learn(estimate, phi, force, variance, learns)
         theta = contact_model.conclude(mean, covariance, prepared.prior[1])
-        theta = jnp.where(learns, theta, estimate.theta)
+        theta = jnp.where(learns[None], theta, estimate.theta)
         moved = reference_trajectory.correct(reference, theta - estimate.theta)
         moved = reference_trajectory.advance(moved, theta, period, force, phi)
         misfit = contact.misfit + period / (period + HOLD_TIME) * (force - dot(theta, phi) - contact.misfit)
@@ -289,7 +289,9 @@ class ImpulseLedger(Compensator):
         later = contact._replace(deepest=deepest, misfit=misfit, peak=largest, outside=outside)
 
         def kept(new, old):
-            return type(old)(*(jnp.where(follows, a, b) for a, b in zip(new, old, strict=True)))
+            wide = {0: follows, 1: follows[None]}
+            pairs = zip(new, old, strict=True)
+            return type(old)(*(jnp.where(wide[a.ndim - follows.ndim], a, b) for a, b in pairs))
 
         return command, kept(later, contact), Estimate(mean, covariance, theta), kept(moved, reference)
 

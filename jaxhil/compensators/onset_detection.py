@@ -35,10 +35,10 @@ def watch(flight: FreeFlight, deviation: Array, settled: Bool[Array, "*batch"]) 
 def learn(flight: FreeFlight, force: Array, free: Bool[Array, "*batch"]) -> FreeFlight:
     """Average bias and noise over one more reading [N], where it is `free`."""
     compared = free & (flight.count > 0)
-    differences = flight.differences + compared
+    differences = flight.differences + jnp.where(compared, 1, 0)
     step = force - flight.before
     change = (0.5 * (step * step) - flight.square) / jnp.where(differences > 0, differences, 1)
-    count = flight.count + free
+    count = flight.count + jnp.where(free, 1, 0)
     number = jnp.where(count > 0, jnp.where(count < LONGEST_MEAN, count, LONGEST_MEAN), 1)
     return FreeFlight(
         count,

@@ -34,8 +34,8 @@ def restarted(old: Reference, depth: Array, begins: Bool[Array, "*batch"]) -> Re
         jnp.where(begins, 0, old.force),
         jnp.where(begins, depth, old.deepest),
         old.released & ~begins,
-        jnp.where(begins, 0, old.depths),
-        jnp.where(begins, 0, old.speeds),
+        jnp.where(begins[None], 0, old.depths),
+        jnp.where(begins[None], 0, old.speeds),
     )
 
 
@@ -59,10 +59,11 @@ def advance(old: Reference, theta: Array, period: Array, reading: Array, measure
     inside = depth > 0
     stiffness = slope(theta, depth)
     damping = jnp.where(inside, theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH, 0)
-    rates = own - measured + stiffness * (old.depths + period * old.speeds) + damping * old.speeds
-    moves = push != 0
-    speeds = old.speeds - jnp.where(moves, period * rates, 0)
-    depths = old.depths + jnp.where(moves, period * speeds, 0)
+    tick, moves = period[None], (push != 0)[None]
+    ahead = old.depths + tick * old.speeds
+    rates = own - measured + stiffness[None] * ahead + damping[None] * old.speeds
+    speeds = old.speeds - jnp.where(moves, tick * rates, 0)
+    depths = old.depths + jnp.where(moves, tick * speeds, 0)
     speed = old.speed - 0.5 * period * (old.force + push)
     return Reference(depth, speed, push, deepest, released, depths, speeds)
 
