@@ -46,7 +46,7 @@ from jaxhil.runtime.laws.impulse_ledger import (
 from jaxhil.runtime.laws.onset_detection import LEVEL, SETTLING
 
 USUAL_PRELOAD = 1.0  # 1/s; prior spread of the preload where the mechanism has less
-VELOCITY_GAIN = 175.0  # 1/s
+VELOCITY_GAIN = 100.0  # 1/s
 
 
 def _known(mechanism) -> bool:
@@ -73,10 +73,10 @@ GAINS: tuple[Gain, ...] = (
     ),
     _prior("force_noise_floor", 1e-4, 10.0, 0.011, lambda m: not m.rig.force_sensor.noise_std),
     _prior("prior_stiffness", 0.1, 1e3, 10.0, _known),
-    _prior("prior_stiffness_spread", 1.0, 5e3, 80.0),
-    _prior("prior_slope_spread", 0.1, 5e3, 80.0),
+    _prior("prior_stiffness_spread", 1.0, 5e3, 50.0),
+    _prior("prior_slope_spread", 0.1, 5e3, 100.0),
     _prior("prior_damping_spread", 0.01, 50.0, 2.0),
-    _prior("prior_depth_damping_spread", 1e-4, 50.0, 0.2),
+    _prior("prior_depth_damping_spread", 1e-4, 50.0, 0.1),
     _prior("prior_unloading_spread", 1e-4, 5e3, 3.0),
     rig_gain("prior_friction_spread", lambda m: 0.0, lambda m: 50.0 + friction(m), friction, tuned=_known),
     rig_gain(

@@ -30,7 +30,7 @@ from .reference_trajectory import ReferenceTrajectory
 RELEASE_TIME = 0.006  # s for which the law acts after the hardware has left the surface
 LEAST_MOMENTUM = 1e-9  # kg m/s; below it forces cannot be scaled
 LONGEST_LAG = 0.2  # s; the lag D is at most that
-ONSET_PLACE = 0.5  # periods from the surface to the last free reading
+ONSET_PLACE = -0.5  # periods from the surface to the last free reading
 MISFIT = 0.003  # of a force, by which the contact model errs for `MISFIT_TIME`
 MISFIT_TIME = 0.001  # s
 OUTLYING = 4.0  # variances; a reading beyond that tells of contact
