@@ -18,19 +18,16 @@ from jaxhil.runtime.laws.contact_model import (
     DEPTH_DAMPING,
     DISSIPATIVE,
     FRICTION,
-    HINGES,
     KNOTS,
     LEAST_VARIANCE,
+    ODDS,
     PARAMETERS,
     PRELOAD,
     REACH,
     SLOW,
     UNLOADING,
     WANDER,
-    ZERO_PROBABILITY,
 )
-
-ODDS = ZERO_PROBABILITY / (2 * (1 - ZERO_PROBABILITY)) * math.sqrt(2 * math.pi)
 
 
 class Estimate(NamedTuple):
@@ -108,6 +105,7 @@ def learn(
     """Return mean and covariance with one reading of the force more, where it is `used`."""
     column = reduce(add, (old.covariance[j] * phi[j][None] for j in range(PARAMETERS)))
     total = variance + dot(phi, column)
+    used = used & (total > 0)  # unless rounding has spoilt the covariance
     share = jnp.where(used, 1 / jnp.where(used, total, 1), 0)
     innovation = share * (force - dot(phi, old.mean))
     scaled = share[None] * column

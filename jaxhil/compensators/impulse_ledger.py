@@ -228,10 +228,11 @@ class ImpulseLedger(Compensator):
         sigma = _sqrt(onset_detection.variance(flight, gains["force_noise"]))
         sigma = sigma + gains["force_noise_floor"] * (gains["equivalent_mass"] * speed)
         sigma = jnp.where(approaches, sigma, 1)
-        settled = approaches & ~(signals.age.astype(period.dtype) * period < SETTLING)
+        # What comes after a reading of free flight, at a speed and towards a side that it is known for.
+        settled = ~(signals.age.astype(period.dtype) * period < SETTLING)
+        settled = settled & approaches & (contact.speed > 0) & (side == contact.side)
         deviation = side * (reading.force - flight.bias) / sigma
-        kept = flight._replace(total=jnp.where(side != contact.side, 0, flight.total))
-        total = onset_detection.watch(kept, deviation, settled)
+        total = onset_detection.watch(flight, deviation, settled)
         flight = flight._replace(total=jnp.where(in_contact, flight.total, total))
         free = ~in_contact & ~(total > 0)
         fresh = free & approaches
@@ -248,7 +249,7 @@ class ImpulseLedger(Compensator):
         return onset_detection.learn(flight, reading.force, free), contact, fresh
 
     def _follow(self, prepared, contact, estimate, reference, signals, reading, flight, follows):
-        """Return the command [N], contact, estimate and reference after a reading, where the law `follows`."""
+        """Return command [N], contact, estimate and reference after a reading, where the law `follows`."""
         gains, period = prepared.gains, prepared.constants.control_period
         side, speed = contact.side, contact.speed
         weight = gains["equivalent_mass"] * speed

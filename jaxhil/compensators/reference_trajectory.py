@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxhil.compensators.contact_model import dot, features, force, slope
 from jaxhil.runtime.laws.contact_model import DAMPING, DEPTH_DAMPING, REACH
-from jaxhil.runtime.laws.reference_trajectory import STEPS
+from jaxhil.runtime.laws.reference_trajectory import FARTHEST, FASTEST, STEPS
 
 
 class Reference(NamedTuple):
@@ -42,7 +42,8 @@ def restarted(old: Reference, depth: Array, begins: Bool[Array, "*batch"]) -> Re
 def correct(old: Reference, changes: Array) -> Reference:
     """Return the trajectory corrected for parameters that have changed."""
     moved = jnp.where(old.released, 0, dot(old.depths, changes))
-    return old._replace(depth=old.depth + moved, speed=old.speed + dot(old.speeds, changes))
+    speed = _within(old.speed + dot(old.speeds, changes), FASTEST)
+    return old._replace(depth=_within(old.depth + moved, FARTHEST), speed=speed)
 
 
 def advance(old: Reference, theta: Array, period: Array, reading: Array, measured: Array) -> Reference:
@@ -59,12 +60,15 @@ def advance(old: Reference, theta: Array, period: Array, reading: Array, measure
     inside = depth > 0
     stiffness = slope(theta, depth)
     damping = jnp.where(inside, theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH, 0)
+    # Stiffer contact is not followed at this period.
+    stiffness = jnp.minimum(stiffness, 1 / (period * period))
+    damping = jnp.minimum(damping, 1 / period)
     tick, moves = period[None], (push != 0)[None]
     ahead = old.depths + tick * old.speeds
     rates = own - measured + stiffness[None] * ahead + damping[None] * old.speeds
     speeds = old.speeds - jnp.where(moves, tick * rates, 0)
     depths = old.depths + jnp.where(moves, tick * speeds, 0)
-    speed = old.speed - 0.5 * period * (old.force + push)
+    speed = _within(old.speed - 0.5 * period * (old.force + push), FASTEST)
     return Reference(depth, speed, push, deepest, released, depths, speeds)
 
 
@@ -82,3 +86,8 @@ def bridge(now: Reference, theta: Array, duration: Array, misfit: Array) -> tupl
         speed = speed - 0.5 * step * (push + later)
         push = later
     return push, speed
+
+
+def _within(value: Array, limit: float) -> Array:
+    """Return the value, limited to -limit and limit."""
+    return jnp.where(value > limit, limit, jnp.where(value < -limit, -limit, value))

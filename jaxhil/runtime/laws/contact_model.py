@@ -15,6 +15,7 @@ zero with a given probability, Mitchell and Beauchamp, "Bayesian variable select
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from math import exp, pi, sqrt
 
 # Depths [s] at which the slope may change.
@@ -28,6 +29,7 @@ BROAD = 0.12  # s; beyond this depth the slope does not change
 REACH = 0.03  # s; depth at which depth_damping counts like damping
 SLOW = 0.03  # speed at which friction changes its sign
 ZERO_PROBABILITY = 0.35  # prior probability that a dissipative parameter is zero
+ODDS = ZERO_PROBABILITY / (2.0 * (1.0 - ZERO_PROBABILITY)) * sqrt(2.0 * pi)
 LEAST_VARIANCE = 1e-12  # of a dissipative parameter; below it the parameter is known
 
 
@@ -39,9 +41,8 @@ def prior_variances(spreads: Sequence[float]) -> list[float]:
     """
     common, wander, *others = spreads
     variances = [common * common]
-    for before, knot in zip(KNOTS, KNOTS[1:], strict=False):
-        change = min(knot, BROAD) - min(before, BROAD)
-        variances.append(wander * wander * (change / WANDER))
+    for before, knot in pairwise(min(knot, BROAD) for knot in KNOTS):
+        variances.append(wander * wander * ((knot - before) / WANDER))
     return variances + [spread * spread for spread in others]
 
 
@@ -110,6 +111,8 @@ class ContactModel:
         covariance = self.covariance
         column = [dot(row, phi) for row in covariance]
         total = variance + dot(phi, column)
+        if not total > 0.0:
+            return  # rounding has spoilt the covariance
         share = 1.0 / total
         innovation = share * (force - dot(phi, self.mean))
         self.mean = [mean + entry * innovation for mean, entry in zip(self.mean, column, strict=True)]
@@ -147,7 +150,9 @@ def zero_or_positive(mean: float, variance: float, prior_variance: float) -> flo
     size = abs(ratio)
     mills = pi / ((pi - 1.0) * size + sqrt(size * size + 2.0 * pi))
     density = exp(-0.5 * (size * size)) / sqrt(2.0 * pi)
-    odds = ZERO_PROBABILITY / (2.0 * (1.0 - ZERO_PROBABILITY)) * sqrt(2.0 * pi) * sqrt(prior_variance / variance)
+    odds = (
+        ZERO_PROBABILITY / (2.0 * (1.0 - ZERO_PROBABILITY)) * sqrt(2.0 * pi) * sqrt(prior_variance / variance)
+    )
     if ratio > 0.0:
         hazard = density / (1.0 - density * mills)
         return spread * (ratio + hazard) / (1.0 + odds * hazard)

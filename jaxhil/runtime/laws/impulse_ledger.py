@@ -2,8 +2,8 @@
 
 A force reading tells what the numerical model should have felt D ago, D being the lag of hardware and force
 behind the model, measured in free flight at the onset. The law fits a contact model to the readings
-(`contact_model`), advances a reference trajectory at the time of the readings (`reference_trajectory`), bridges
-the D seconds to now with the fitted model, and steers the numerical model's velocity onto the result:
+(`contact_model`), advances a reference trajectory at the time of the readings (`reference_trajectory`),
+bridges the D seconds to now with the fitted model, and steers the numerical model's velocity onto the result:
 
     F_c = f_p + clip(c (v_d - T f_p/2 - v_p), -limit p, (1 + limit) p - f_p)
 
@@ -55,8 +55,8 @@ class ImpulseLedger(Compensator):
     """Compensator with contact model, reference trajectory and bridge; see the module's text."""
 
     __slots__ = (
-        "_alignment", "_before_contact", "_clearance", "_correction_limit", "_deepest", "_detector", "_floor",
-        "_gain", "_in_contact", "_lag", "_mass", "_misfit", "_model", "_origin", "_outside", "_peak", "_period",
+        "_alignment", "_clearance", "_correction_limit", "_deepest", "_detector", "_floor", "_gain",
+        "_in_contact", "_lag", "_mass", "_misfit", "_model", "_origin", "_outside", "_peak", "_period",
         "_readings", "_reference", "_side", "_since_start", "_speed", "status",
     )  # fmt: skip
 
@@ -138,9 +138,9 @@ class ImpulseLedger(Compensator):
         speed = side * velocity_desired
         approaches = self._mass * speed > LEAST_MOMENTUM
         detector = self._detector
-        if side != self._side:
-            detector.total = 0.0
-        detector.watch(force, side, self._floor * (self._mass * speed), settled and approaches)
+        # What comes after a reading of free flight, at a speed and towards a side that it is known for.
+        settled = settled and approaches and self._speed > 0.0 and side == self._side
+        detector.watch(force, side, self._floor * (self._mass * speed), settled)
         if detector.total > 0.0:
             return
         self._side = side
@@ -200,7 +200,9 @@ class ImpulseLedger(Compensator):
         """Return the scaled command [1/s], by the bridged force [1/s] and speed and the model's speed."""
         mean = self._model.mean
         secant = dot(phi[:HINGES], mean[:HINGES]) / (depth if depth > SHALLOW else SHALLOW)
-        known = (secant if secant > LEAST_STIFFNESS else LEAST_STIFFNESS) - sqrt(self._model.covariance[0][0])
+        variance = self._model.covariance[0][0]
+        known = secant if secant > LEAST_STIFFNESS else LEAST_STIFFNESS
+        known -= sqrt(variance) if variance > 0.0 else 0.0
         likely = sqrt(known if known > LEAST_STIFFNESS else LEAST_STIFFNESS)
         self._peak = max(self._peak, reading, 1.0)
         peak = likely if rate > 0.0 and likely > self._peak else self._peak

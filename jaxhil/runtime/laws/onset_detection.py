@@ -46,7 +46,8 @@ class OnsetDetector:
     @property
     def variance(self) -> float:
         """Variance of a force reading [N^2]: as specified, or as shown by readings in free flight."""
-        return max(self._known, self._square) if self._differences > FEW else self._known
+        variance = max(self._known, self._square) if self._differences > FEW else self._known
+        return variance if variance > 0.0 else 0.0
 
     def watch(self, force: float, side: float, floor: float, settled: bool) -> None:
         """Add one reading [N] to the cumulative sum; `side` is the sign of a pushing force, `floor` [N] is

@@ -8,8 +8,8 @@ sensitivities s = d x_r/d theta, which are integrated beside it:
 
     x_r += s.d theta,   v_r += s'.d theta,   s'' = -[phi(x_r, v_r) - phi(X, V) + k s + b s']
 
-k and b are slope and damping of the model at x_r. `bridge` continues the trajectory to the present. All values
-are scaled as in `contact_model`.
+k and b are slope and damping of the model at x_r. `bridge` continues the trajectory to the present. All
+values are scaled as in `contact_model`.
 
 Source: sensitivity equations, Khalil, "Nonlinear Systems" (2002), section 3.3.
 """
@@ -20,6 +20,8 @@ from math import sqrt
 from .contact_model import DAMPING, DEPTH_DAMPING, PARAMETERS, REACH, dot, features, force, slope
 
 STEPS = 12  # from the last reading to now
+FASTEST = 2.0  # speed; contact gives back no more than it took
+FARTHEST = 10.0  # s; depth of contact of 0.05 Hz, three times
 
 
 class ReferenceTrajectory:
@@ -52,8 +54,8 @@ class ReferenceTrajectory:
         changes = [new - old for new, old in zip(theta, self._theta, strict=True)]
         self._theta = theta
         if not self.released:
-            self.depth += dot(self._depths, changes)
-        self.speed += dot(self._speeds, changes)
+            self.depth = within(self.depth + dot(self._depths, changes), FARTHEST)
+        self.speed = within(self.speed + dot(self._speeds, changes), FASTEST)
 
     def advance(self, period: float, reading: float, measured: Sequence[float]) -> None:
         """Advance by one control period [s] (velocity Verlet) to the time of a reading [1/s] whose features
@@ -69,7 +71,7 @@ class ReferenceTrajectory:
         push = 0.0 if self.released else (push if push > least else least)
         if push != 0.0:
             self._advance_sensitivities(period, depth, own, measured)
-        self.speed = self.speed - 0.5 * period * (self.force + push)
+        self.speed = within(self.speed - 0.5 * period * (self.force + push), FASTEST)
         self.depth = depth
         self.force = push
 
@@ -102,9 +104,17 @@ class ReferenceTrajectory:
         inside = depth > 0.0
         stiffness = slope(theta, depth)
         damping = theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH if inside else 0.0
+        # Stiffer contact is not followed at this period.
+        stiffness = min(stiffness, 1.0 / (period * period))
+        damping = min(damping, 1.0 / period)
         depths, speeds = self._depths, self._speeds
         for j in range(PARAMETERS):
             here = depths[j] + period * speeds[j]
             rate = own[j] - measured[j] + stiffness * here + damping * speeds[j]
             speeds[j] -= period * rate
             depths[j] += period * speeds[j]
+
+
+def within(value: float, limit: float) -> float:
+    """Return the value, limited to -limit and limit."""
+    return limit if value > limit else (-limit if value < -limit else value)
