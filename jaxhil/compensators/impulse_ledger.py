@@ -263,7 +263,7 @@ class ImpulseLedger(Compensator):
         variance = noise / (weight * weight) + gains["force_noise_floor"] ** 2
         variance = variance + off * off * (MISFIT_TIME / period)
         tells = (rate > 0) | (dot(phi, estimate.mean) > 0) | (force * force > OUTLYING * variance)
-        learns = follows & tells & (depth > 0)
+        learns = follows & tells & (depth > period)
         mean, covariance = contact_model.learn(estimate, phi, force, variance, learns)
         theta = contact_model.conclude(mean, covariance, prepared.prior[1])
         theta = jnp.where(learns[None], theta, estimate.theta)

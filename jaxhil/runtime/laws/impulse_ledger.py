@@ -172,7 +172,7 @@ class ImpulseLedger(Compensator):
         variance = self._detector.variance / (weight * weight) + self._floor * self._floor
         variance += off * off * (MISFIT_TIME / period)
         tells = rate > 0.0 or dot(phi, model.mean) > 0.0 or reading * reading > OUTLYING * variance
-        if tells and depth > 0.0:
+        if tells and depth > period:
             model.learn(phi, reading, variance)
             model.conclude()
             self._readings += 1
