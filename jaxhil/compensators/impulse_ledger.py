@@ -76,8 +76,8 @@ GAINS: tuple[Gain, ...] = (
     _prior("prior_stiffness_spread", 1.0, 5e3, 50.0),
     _prior("prior_slope_spread", 0.1, 5e3, 100.0),
     _prior("prior_damping_spread", 0.01, 50.0, 2.0),
-    _prior("prior_depth_damping_spread", 1e-4, 50.0, 0.1),
-    _prior("prior_unloading_spread", 1e-4, 5e3, 3.0),
+    _prior("prior_depth_damping_spread", 1e-4, 50.0, 0.13),
+    _prior("prior_unloading_spread", 1e-4, 5e3, 0.5),
     rig_gain("prior_friction_spread", lambda m: 0.0, lambda m: 50.0 + friction(m), friction, tuned=_known),
     rig_gain(
         "prior_preload_spread", lambda m: 0.0, lambda m: 50.0 + preload(m),
@@ -88,7 +88,7 @@ GAINS: tuple[Gain, ...] = (
         lambda m: min(VELOCITY_GAIN, 0.7 / m.rig.control_period), logarithmic=True,
     ),
     rig_gain(
-        "correction_limit", lambda m: 0.01, lambda m: 20.0, lambda m: 0.9, logarithmic=True,
+        "correction_limit", lambda m: 0.01, lambda m: 20.0, lambda m: 0.75, logarithmic=True,
         begins=lambda m: 1.0,
     ),
 )  # fmt: skip
