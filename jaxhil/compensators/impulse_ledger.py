@@ -23,6 +23,7 @@ from jaxhil.compensators.estimates import (
     friction,
     peak_force,
     preload,
+    unloading,
 )
 from jaxhil.compensators.onset_detection import FreeFlight
 from jaxhil.compensators.readings import Aligned, align
@@ -41,11 +42,13 @@ from jaxhil.runtime.laws.impulse_ledger import (
     OUTLYING,
     RELEASE_TIME,
     SHALLOW,
+    SLOWEST,
     SPREADS,
 )
 from jaxhil.runtime.laws.onset_detection import LEVEL, SETTLING
 
 USUAL_PRELOAD = 1.0  # 1/s; prior spread of the preload where the mechanism has less
+USUAL_UNLOADING = 0.5  # 1/s^2; prior spread of the unloading parameter, likewise
 VELOCITY_GAIN = 100.0  # 1/s
 
 
@@ -71,13 +74,16 @@ GAINS: tuple[Gain, ...] = (
         "force_noise", lambda m: 0.0, lambda m: m.rig.force_sensor.noise_std + peak_force(m),
         lambda m: m.rig.force_sensor.noise_std, tuned=_known,
     ),
-    _prior("force_noise_floor", 1e-4, 10.0, 0.011, lambda m: not m.rig.force_sensor.noise_std),
+    _prior("force_noise_floor", 1e-3, 10.0, 0.011, lambda m: not m.rig.force_sensor.noise_std),
     _prior("prior_stiffness", 0.1, 1e3, 10.0, _known),
-    _prior("prior_stiffness_spread", 1.0, 5e3, 50.0),
-    _prior("prior_slope_spread", 0.1, 5e3, 100.0),
-    _prior("prior_damping_spread", 0.01, 50.0, 2.0),
-    _prior("prior_depth_damping_spread", 1e-4, 50.0, 0.13),
-    _prior("prior_unloading_spread", 1e-4, 5e3, 0.5),
+    _prior("prior_stiffness_spread", 1.0, 1e3, 50.0),
+    _prior("prior_slope_spread", 1.0, 1e3, 100.0),
+    _prior("prior_damping_spread", 0.01, 20.0, 2.0),
+    _prior("prior_depth_damping_spread", 1e-3, 20.0, 0.12),
+    rig_gain(
+        "prior_unloading_spread", lambda m: 0.01, lambda m: 1e3 + unloading(m),
+        lambda m: max(USUAL_UNLOADING, unloading(m)), logarithmic=True, tuned=lambda m: unloading(m) > 0,
+    ),
     rig_gain("prior_friction_spread", lambda m: 0.0, lambda m: 50.0 + friction(m), friction, tuned=_known),
     rig_gain(
         "prior_preload_spread", lambda m: 0.0, lambda m: 50.0 + preload(m),
@@ -262,7 +268,7 @@ class ImpulseLedger(Compensator):
         noise = onset_detection.variance(flight, gains["force_noise"])
         variance = noise / (weight * weight) + gains["force_noise_floor"] ** 2
         variance = variance + off * off * (MISFIT_TIME / period)
-        tells = (rate > 0) | (dot(phi, estimate.mean) > 0) | (force * force > OUTLYING * variance)
+        tells = (rate > SLOWEST) | (dot(phi, estimate.mean) > 0) | (force * force > OUTLYING * variance)
         learns = follows & tells & (depth > period)
         mean, covariance = contact_model.learn(estimate, phi, force, variance, learns)
         theta = contact_model.conclude(mean, covariance, prepared.prior[1])
@@ -277,7 +283,7 @@ class ImpulseLedger(Compensator):
         likely = jnp.sqrt(jnp.where(known > LEAST_STIFFNESS, known, LEAST_STIFFNESS))
         largest = jnp.where(force > contact.peak, force, contact.peak)
         largest = jnp.where(largest > 1, largest, 1)
-        peak = jnp.where((rate > 0) & (likely > largest), likely, largest)
+        peak = jnp.where((rate > SLOWEST) & (likely > largest), likely, largest)
         push = jnp.where(push < HIGHEST * peak, push, HIGHEST * peak)
         desired = side * signals.velocity_desired / speed
         wanted = gains["velocity_gain"] * (desired - 0.5 * period * push - ahead)

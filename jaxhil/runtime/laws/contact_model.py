@@ -28,7 +28,7 @@ WANDER = 0.03  # s; over this depth the slope changes by its prior spread
 BROAD = 0.12  # s; beyond this depth the slope does not change
 REACH = 0.03  # s; depth at which depth_damping counts like damping
 SLOW = 0.03  # speed at which friction changes its sign
-ZERO_PROBABILITY = 0.35  # prior probability that a dissipative parameter is zero
+ZERO_PROBABILITY = 0.75  # prior probability that a dissipative parameter is zero
 ODDS = ZERO_PROBABILITY / (2.0 * (1.0 - ZERO_PROBABILITY)) * sqrt(2.0 * pi)
 LEAST_VARIANCE = 1e-12  # of a dissipative parameter; below it the parameter is known
 

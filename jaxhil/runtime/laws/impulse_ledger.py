@@ -35,6 +35,7 @@ MISFIT = 0.003  # of a force, by which the contact model errs for `MISFIT_TIME`
 MISFIT_TIME = 0.001  # s
 OUTLYING = 16.0  # variances; a reading beyond that tells of contact
 HOLD_TIME = 0.004  # s; time constant of the misfit that the bridge holds
+SLOWEST = 1e-9  # speed; a slower one is at rest, but for rounding
 SHALLOW = 0.001  # s; depth below which a secant stiffness is not taken
 LEAST_STIFFNESS = 1.0  # 1/s^2; stiffness of the softest contact
 HIGHEST = 1.5  # peak forces that the bridged force is at most
@@ -64,7 +65,7 @@ class ImpulseLedger(Compensator):
         "equivalent_mass": GainSpecification("kg", *MASSES),
         "identification_delay": GainSpecification("s", *TIMES),
         "force_noise": GainSpecification("N", *FORCES),
-        "force_noise_floor": GainSpecification("1/s", 1e-4, 10.0),
+        "force_noise_floor": GainSpecification("1/s", 1e-3, 10.0),
         "prior_stiffness": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
         "prior_stiffness_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
         "prior_slope_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
@@ -171,7 +172,7 @@ class ImpulseLedger(Compensator):
         off = MISFIT * reading
         variance = self._detector.variance / (weight * weight) + self._floor * self._floor
         variance += off * off * (MISFIT_TIME / period)
-        tells = rate > 0.0 or dot(phi, model.mean) > 0.0 or reading * reading > OUTLYING * variance
+        tells = rate > SLOWEST or dot(phi, model.mean) > 0.0 or reading * reading > OUTLYING * variance
         if tells and depth > period:
             model.learn(phi, reading, variance)
             model.conclude()
@@ -205,7 +206,7 @@ class ImpulseLedger(Compensator):
         known -= sqrt(variance) if variance > 0.0 else 0.0
         likely = sqrt(known if known > LEAST_STIFFNESS else LEAST_STIFFNESS)
         self._peak = max(self._peak, reading, 1.0)
-        peak = likely if rate > 0.0 and likely > self._peak else self._peak
+        peak = likely if rate > SLOWEST and likely > self._peak else self._peak
         push = push if push < HIGHEST * peak else HIGHEST * peak
         wanted = self._gain * (desired - 0.5 * self._period * push - ahead)
         least = -self._correction_limit * peak
