@@ -15,11 +15,11 @@ F_c is the measured force.
 """
 
 from collections.abc import Mapping
-from math import inf, sqrt
+from math import inf, pi, sqrt
 from typing import ClassVar
 
 from ..bounds import DAMPINGS_BY_MASS, FORCES, MASSES, STIFFNESSES_BY_MASS, TIMES
-from ..law_status import IDENTIFIED, NOISY, OUT_OF_CONTACT, SATURATED, UNSURE
+from ..law_status import IDENTIFIED, NOISY, OUT_OF_CONTACT, SATURATED, TOO_SHORT, UNEXPLAINED, UNSURE
 from ..registry import Compensator, GainSpecification, register
 from ..surfaces import deflection
 from .contact_model import HINGES, ContactModel, dot, features
@@ -40,6 +40,9 @@ SHALLOW = 0.001  # s; depth below which a secant stiffness is not taken
 LEAST_STIFFNESS = 1.0  # 1/s^2; stiffness of the softest contact
 HIGHEST = 1.5  # peak forces that the bridged force is at most
 FEW_READINGS = 5  # in contact, below which the model is unsure
+LATE = 0.5  # share of the contact that is over at the onset, beyond which little time is left
+UNCERTAIN = 0.006  # standard deviation of the reference's speed, above which restitution is uncertain
+IMBALANCE = 0.014  # energy that the model may leave unexplained [1]
 SPREADS = (
     "prior_stiffness_spread",
     "prior_slope_spread",
@@ -213,15 +216,21 @@ class ImpulseLedger(Compensator):
         most = (1.0 + self._correction_limit) * peak - push
         correction = most if wanted > most else (least if wanted < least else wanted)
         if self._in_contact:
-            self.status = self._judge(correction == wanted)
+            self.status = self._judge(peak, correction == wanted)
         return push + correction
 
-    def _judge(self, free: bool) -> int:
-        """Return the status of a command whose correction is `free` of its limits."""
+    def _judge(self, peak: float, free: bool) -> int:
+        """Return the status of a command whose correction is `free` of its limits, for a peak force [1/s]."""
+        reference = self._reference
         if self._readings < FEW_READINGS:
             return UNSURE
-        if self._reference.spread(self._model.covariance) > 0.01:
+        if self._lag * peak > LATE * pi:
+            return TOO_SHORT
+        spread = reference.spread(self._model.covariance)
+        if spread > UNCERTAIN:
             return NOISY
+        if reference.released and abs(reference.imbalance()) > IMBALANCE + 3.0 * spread:
+            return UNEXPLAINED
         return IDENTIFIED if free else SATURATED
 
     def _pass_on(self, force: float, position_desired: float, position: float) -> float:

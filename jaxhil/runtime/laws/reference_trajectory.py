@@ -17,8 +17,20 @@ Source: sensitivity equations, Khalil, "Nonlinear Systems" (2002), section 3.3.
 from collections.abc import Sequence
 from math import sqrt
 
-from .contact_model import DAMPING, DEPTH_DAMPING, PARAMETERS, REACH, dot, features, force, slope
+from .contact_model import (
+    DAMPING,
+    DEPTH_DAMPING,
+    FRICTION,
+    PARAMETERS,
+    REACH,
+    UNLOADING,
+    dot,
+    features,
+    force,
+    slope,
+)
 
+LOSSES = (DAMPING, DEPTH_DAMPING, UNLOADING, FRICTION)
 STEPS = 12  # from the last reading to now
 FASTEST = 2.0  # speed; contact gives back no more than it took
 FARTHEST = 10.0  # s; depth of contact of 0.05 Hz, three times
@@ -33,7 +45,7 @@ class ReferenceTrajectory:
         released: whether the trajectory has left the surface.
     """
 
-    __slots__ = ("_depths", "_speeds", "_theta", "deepest", "depth", "force", "released", "speed")
+    __slots__ = ("_depths", "_losses", "_speeds", "_theta", "deepest", "depth", "force", "released", "speed")
 
     def __init__(self) -> None:
         self.begin(0.0, [0.0] * PARAMETERS)
@@ -48,6 +60,7 @@ class ReferenceTrajectory:
         self._theta = theta
         self._depths = [0.0] * PARAMETERS  # s
         self._speeds = [0.0] * PARAMETERS  # s'
+        self._losses = [0.0] * len(LOSSES)  # work of each dissipative feature
 
     def correct(self, theta: Sequence[float]) -> None:
         """Correct the trajectory for new parameters."""
@@ -71,14 +84,22 @@ class ReferenceTrajectory:
         push = 0.0 if self.released else (push if push > least else least)
         if push != 0.0:
             self._advance_sensitivities(period, depth, own, measured)
+            self._losses = [
+                loss + period * speed * own[j] for loss, j in zip(self._losses, LOSSES, strict=True)
+            ]
         self.speed = within(self.speed - 0.5 * period * (self.force + push), FASTEST)
         self.depth = depth
         self.force = push
 
     def spread(self, covariance: Sequence[Sequence[float]]) -> float:
-        """Return the standard deviation of the speed, sqrt(s' P s')."""
+        """Return the standard deviation of the speed by the model's uncertainty, sqrt(s' P s')."""
         total = dot(self._speeds, [dot(row, self._speeds) for row in covariance])
         return sqrt(total) if total > 0.0 else 0.0
+
+    def imbalance(self) -> float:
+        """Return the energy that the trajectory lost and the model's dissipation does not explain [1]."""
+        dissipated = sum(self._theta[j] * loss for j, loss in zip(LOSSES, self._losses, strict=True))
+        return 0.5 * (1.0 - self.speed * self.speed) - dissipated
 
     def bridge(self, duration: float, misfit: float) -> tuple[float, float]:
         """Return force [1/s] and speed after a `duration` [s] under the model and a constant misfit [1/s]."""
