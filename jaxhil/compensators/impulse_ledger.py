@@ -49,7 +49,7 @@ from jaxhil.runtime.laws.onset_detection import LEVEL, SETTLING
 
 USUAL_PRELOAD = 1.0  # 1/s; prior spread of the preload where the mechanism has less
 USUAL_UNLOADING = 0.5  # 1/s^2; prior spread of the unloading parameter, likewise
-VELOCITY_GAIN = 100.0  # 1/s
+VELOCITY_GAIN = 105.0  # 1/s
 
 
 def _known(mechanism) -> bool:
@@ -76,9 +76,9 @@ GAINS: tuple[Gain, ...] = (
     ),
     _prior("force_noise_floor", 1e-3, 10.0, 0.011, lambda m: not m.rig.force_sensor.noise_std),
     _prior("prior_stiffness", 0.1, 1e3, 10.0, _known),
-    _prior("prior_stiffness_spread", 1.0, 1e3, 50.0),
-    _prior("prior_slope_spread", 1.0, 1e3, 100.0),
-    _prior("prior_damping_spread", 0.01, 20.0, 2.0),
+    _prior("prior_stiffness_spread", 1.0, 1e3, 80.0),
+    _prior("prior_slope_spread", 1.0, 1e3, 120.0),
+    _prior("prior_damping_spread", 0.01, 20.0, 1.0),
     _prior("prior_depth_damping_spread", 1e-3, 20.0, 0.12),
     rig_gain(
         "prior_unloading_spread", lambda m: 0.01, lambda m: 1e3 + unloading(m),
