@@ -172,7 +172,15 @@ class ImpulseLedger(Compensator):
             in_contact=none,
             contact=Contact(*[zeros] * len(Contact._fields)),
             estimate=Estimate(parameters, jnp.stack([parameters] * len(parameters)), parameters),
-            reference=Reference(*[zeros] * 4, none, parameters, parameters),
+            reference=Reference(
+                depth=zeros,
+                speed=zeros,
+                force=zeros,
+                deepest=zeros,
+                released=none,
+                depths=parameters,
+                speeds=parameters,
+            ),
         )
 
     def restart(self, gains, state, begins, fresh):
@@ -196,7 +204,8 @@ class ImpulseLedger(Compensator):
         passes = in_contact & ~(contact.speed > 0)
 
         flight, contact, fresh = self._approach(prepared, state.flight, contact, signals, reading, in_contact)
-        estimate = contact_model.restarted(state.estimate, *prepared.prior, fresh)
+        mean, variances = prepared.prior
+        estimate = contact_model.restarted(state.estimate, mean, variances, fresh)
         depth = (contact.side * position - contact.origin) / jnp.where(contact.speed > 0, contact.speed, 1)
         reference = reference_trajectory.restarted(state.reference, depth, fresh)
         acts = in_contact | (flight.total > LEVEL)
