@@ -7,6 +7,7 @@ The equations and their source stand there.
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxhil.compensators.contact_model import dot, features, force, slope
@@ -75,16 +76,19 @@ def advance(old: Reference, theta: Array, period: Array, reading: Array, measure
 def bridge(now: Reference, theta: Array, duration: Array, misfit: Array) -> tuple[Array, Array]:
     """Return force [1/s] and speed after a `duration` [s] under the model and a constant misfit [1/s]."""
     step = duration / STEPS
-    depth, speed, push, deepest, released = now[:5]
-    for _ in range(STEPS):
+
+    def advanced(_, old):
+        depth, speed, push, deepest, released = old
         depth = depth + (step * speed - 0.5 * (step * step) * push)
         ahead = speed - step * push
         deepest = jnp.where(depth > deepest, depth, deepest)
         later = force(theta, depth, ahead, deepest) + misfit
         released = released | ((ahead < 0) & ((depth <= 0) | (later <= 0)))
         later = jnp.where(released | (later < 0), 0, later)
-        speed = speed - 0.5 * step * (push + later)
-        push = later
+        return depth, speed - 0.5 * step * (push + later), later, deepest, released
+
+    # A loop, because it is compiled but once.
+    _, speed, push, _, _ = lax.fori_loop(0, STEPS, advanced, now[:5])
     return push, speed
 
 
