@@ -2,8 +2,7 @@
 
 A force reading tells what the numerical model should have felt D ago. The law fits a contact model to the
 readings, advances a reference trajectory at their time, bridges the D seconds to now with the fitted model,
-and steers the numerical model's velocity onto the result. The equations stand there, and in
-notebooks/guide/impulse_ledger.md.
+and steers the numerical model's velocity onto the result. The equations stand there.
 """
 
 from typing import ClassVar, NamedTuple
