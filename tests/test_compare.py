@@ -19,6 +19,11 @@ from tuning.benchmark.tables import HEADINGS, leaderboard, least, mechanism_tabl
 from tuning.statistics.intervals import Estimate
 
 COMMAND = [sys.executable, "-m", "tuning", "compare"]
+# A job in the background of a shell that is not interactive is started deaf to interrupts.
+HEEDING = (
+    "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "from tuning.__main__ import main; sys.exit(main())"
+)
 SMALL = ["rig-300kg", "--set", "approach.contacts=1", "--compensators", "none", "passivity", "--judged", "8"]
 
 
@@ -146,8 +151,8 @@ def test_unusable_input_is_one_line(jaxhil, arguments, said, tmp_path, monkeypat
 def test_interrupted_it_keeps_what_is_finished(tmp_path):
     environment = {**os.environ, "JAXHIL_CACHE": str(tmp_path / "cache"), "XLA_FLAGS": ""}
     process = subprocess.Popen(
-        [*COMMAND, *SMALL, "--json", "-o", "out"], text=True, env=environment, cwd=tmp_path,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=_heed_interrupts,
+        [sys.executable, "-c", HEEDING, "compare", *SMALL, "--json", "-o", "out"],
+        text=True, env=environment, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
     time.sleep(6)
     process.send_signal(signal.SIGINT)
@@ -158,6 +163,16 @@ def test_interrupted_it_keeps_what_is_finished(tmp_path):
     assert "interrupted" in err and "Traceback" not in err
 
 
-def _heed_interrupts():
-    # A job in the background of a shell that is not interactive is started deaf to them.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_killed_it_leaves_no_workers(tmp_path, number):
+    environment = {**os.environ, "JAXHIL_CACHE": str(tmp_path / "cache"), "XLA_FLAGS": ""}
+    process = subprocess.Popen(
+        [*COMMAND, *SMALL, "--json", "-o", "out"], env=environment, cwd=tmp_path,
+        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    time.sleep(6)
+    process.send_signal(number)
+    # Every worker has a copy of the pipe: it ends when all of them have ended.
+    out, _ = process.communicate(timeout=20)
+    assert process.returncode == -number and out == b""

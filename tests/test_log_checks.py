@@ -59,8 +59,10 @@ def test_a_wrong_sign_or_mass_of_the_force_command_is_found(tmp_path):
     )
     coarse = model("zoh", "tick")
     coarse["xd"] = np.round(coarse["xd"], 6)
-    (note,) = read(write_csv(tmp_path / "b.csv", coarse)).notes
-    assert "steps of 1e-06 m are too coarse" in note
+    path = write_csv(tmp_path / "b.csv", coarse)
+    assert read(path).notes == ()
+    assert "(nearest: 175 kg)" in message(path, force_command={"column": "Fc", "scale": 0.5})
+    assert 'in rows that are "tick"' in message(path, timing={"row": "sent"})
 
 
 @pytest.mark.parametrize(

@@ -55,6 +55,8 @@ def test_unusable_stamps():
         (slower[:2900], "row 1537: time: found rows 0.002 s apart, allowed one rate, 0.001 s, all along"),
         (np.where(np.arange(3000) == 9, times[3], times), "row 10: time: found 12.303 s after 12.308 s"),
         (stamps(3000, jitter=4e-4)[0], "time: found"),
+        # Within a tenth of the period, where phases of lots of rows would be taken for their neighbours'.
+        (0.98 * times, "time: found rows 0.00098 s apart, allowed the control period, 0.001 s"),
     ]
     for given, reason in cases:
         with pytest.raises(InputError) as caught:

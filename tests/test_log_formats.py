@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from log_cases import CHANNELS, read, touches, write_csv
+from log_cases import CHANNELS, PERIOD, read, touches, write_csv
 
 from jaxhil.errors import InputError
 from tuning.identification.logs.readers import open_log
@@ -134,3 +134,128 @@ def test_what_is_torn_or_needs_a_library_is_one_line(tmp_path, suffix):
         "cannot be read: " in found
         or "which is not installed: python3 -m pip install 'jaxhil[logs]'" in found
     )
+
+
+def bag_of_topics(path, log, late):
+    """The force a topic of its own, whose first message comes some ticks later."""
+    pytest.importorskip("rosbags")
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.LATEST)
+    plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
+    number, folder = store.types["std_msgs/msg/Float64"], path.with_suffix("")
+    with Writer(folder, version=9, storage_plugin=plugin) as writer:
+        for name, values in log.items():
+            if name == "t":
+                continue
+            connection = writer.add_connection(f"/{name}", number.__msgtype__, typestore=store)
+            for t, value in zip(log["t"] + late * (name == "F"), values, strict=True):
+                raw = store.serialize_cdr(number(data=value), number.__msgtype__)
+                writer.write(connection, 1_700_000_000_000_000_000 + round(1e9 * t), raw)
+    return folder, {name: f"/{column}.data" for name, column in CHANNELS.items()} | {"time": "/xd.time"}
+
+
+def mdf_of_groups(path, log, late):
+    asammdf = pytest.importorskip("asammdf")
+    names = [name for name in log if name != "t"]
+    with asammdf.MDF() as file:
+        for group in ([name for name in names if name != "F"], ["F"]):
+            times = log["t"] + late * (group == ["F"])
+            file.append([asammdf.Signal(samples=log[name], timestamps=times, name=name) for name in group])
+        file.save(path)
+    return path, CHANNELS | {"time": "time"}
+
+
+def tdms_with_offsets(path, log, late):
+    nptdms = pytest.importorskip("nptdms")
+    properties = {"wf_increment": PERIOD, "wf_start_offset": 0.0}
+    with nptdms.TdmsWriter(path) as writer:
+        writer.write_segment([
+            nptdms.ChannelObject(
+                "rig", name, log[name], properties | {"wf_start_offset": late * (name == "F")}
+            )
+            for name in log if name != "t"
+        ])  # fmt: skip
+    return path, {name: f"rig/{column}" for name, column in CHANNELS.items()} | {"time": "rig/xd.time"}
+
+
+def tdms_with_start_times(path, log, late):
+    nptdms = pytest.importorskip("nptdms")
+    begin = np.datetime64("2026-03-01T10:00:00.000000", "us")
+    with nptdms.TdmsWriter(path) as writer:
+        writer.write_segment([
+            nptdms.ChannelObject("rig", name, log[name], {
+                "wf_increment": PERIOD, "wf_start_offset": 0.0,
+                "wf_start_time": begin + np.timedelta64(round(1e6 * late * (name == "F")), "us"),
+            })
+            for name in log if name != "t"
+        ])  # fmt: skip
+    return path, {name: f"rig/{column}" for name, column in CHANNELS.items()} | {"time": "rig/F.time"}
+
+
+OWN_CLOCKS = [
+    ("a.db3", bag_of_topics),
+    ("a.mcap", bag_of_topics),
+    ("a.mf4", mdf_of_groups),
+    ("a.tdms", tdms_with_offsets),
+    ("a.tdms", tdms_with_start_times),
+]
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(("name", "write"), OWN_CLOCKS)
+@pytest.mark.parametrize("late", [0.005, -0.007])
+def test_channels_that_begin_apart_are_read_at_their_own_times(tmp_path, name, write, late):
+    """The force is that of the command's tick, whatever the row in which it is written."""
+    path, columns = write(tmp_path / name, LOG, late)
+    found = read(path, **columns)
+    (run,) = found.runs
+    assert any("F" in note and "has a clock of its own" in note for note in found.notes)
+    shift = round(late / PERIOD)
+    first = np.flatnonzero(LOG["xd"] == run.position_desired[0])[0]
+    rows = np.arange(first, first + len(run.tick))
+    np.testing.assert_array_equal(run.position_desired, LOG["xd"][rows])
+    np.testing.assert_array_equal(run.force_measured, LOG["F"][rows - shift])
+    assert len(rows) == len(LOG["t"]) - abs(shift)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_channels_of_other_rates_lengths_and_clocks_or_one_line(tmp_path):
+    path, columns = mdf_of_groups(tmp_path / "a.mf4", LOG, 0.005)
+    with pytest.raises(InputError, match=r'timing.clock: found "index", allowed "stamps", since '):
+        read(path, **columns, timing={"clock": "index"})
+    with pytest.raises(
+        InputError, match="time: found column 'vd', allowed one of time, since 'F' has a clock"
+    ):
+        read(path, **columns | {"time": "vd", "velocity_desired": None})
+    asammdf = pytest.importorskip("asammdf")
+    fast = np.arange(0.1, 0.55, 1e-4)
+    for place, (times, values) in enumerate(((fast, np.interp(fast, LOG["t"], LOG["F"])),
+                                             (LOG["t"][::2], LOG["F"][::2]))):  # fmt: skip
+        with asammdf.MDF() as file:
+            names = [name for name in LOG if name not in ("t", "F")]
+            file.append([asammdf.Signal(samples=LOG[n], timestamps=LOG["t"], name=n) for n in names])
+            file.append([asammdf.Signal(samples=values, timestamps=times, name="F")])
+            file.save(tmp_path / f"{place}.mf4")
+    (run,) = read(tmp_path / "0.mf4", **columns).runs
+    assert 448 <= len(run.tick) <= 450
+    first = np.flatnonzero(LOG["xd"] == run.position_desired[0])[0]
+    np.testing.assert_allclose(run.force_measured, LOG["F"][first : first + len(run.tick)], atol=1e-9)
+    with pytest.raises(InputError, match=r"stamps of 'F': found readings 0.002 s apart, allowed the control"):
+        read(tmp_path / "1.mf4", **columns)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_waveforms_without_a_start_time_beside_others_are_refused(tmp_path):
+    nptdms = pytest.importorskip("nptdms")
+    begin = {"wf_start_time": np.datetime64("2026-03-01T10:00:00", "us")}
+    with nptdms.TdmsWriter(tmp_path / "a.tdms") as writer:
+        writer.write_segment([
+            nptdms.ChannelObject("rig", name, LOG[name], {"wf_increment": PERIOD, "wf_start_offset": 0.0}
+                                 | (begin if name != "F" else {}))
+            for name in LOG if name != "t"
+        ])  # fmt: skip
+    columns = {name: f"rig/{column}" for name, column in CHANNELS.items()} | {"time": "rig/xd.time"}
+    with pytest.raises(InputError, match="'rig/F': found no wf_start_time, allowed one, as others have"):
+        read(tmp_path / "a.tdms", **columns)

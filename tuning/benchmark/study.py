@@ -7,6 +7,7 @@ which process computes it. What is found of a law on a group is kept at once, wh
 """
 
 import multiprocessing
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
@@ -296,8 +297,19 @@ def _begin(heard: Any) -> None:
 
     global _heard
     _heard = heard
-    # The parent hears of an interruption, and ends the workers.
+    # The parent hears of an interruption, and ends the workers; one that is killed cannot.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     given = os.environ.get("XLA_FLAGS", "")
     os.environ["XLA_FLAGS"] = f"{given} {DEVICES}={FEWEST_DEVICES}".strip()
     prepare()
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent has ended, whatever ended it."""
+    import os
+
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)

@@ -254,7 +254,8 @@ class Sweep:
         str, arg(metavar="NAME", help="float64, or float32: faster, and compared with float64 on a subset.")
     ] = "float64"
     works: Annotated[
-        bool, arg(name="works", metavar="", help="Also the real contact force's works; 3 times the time.")
+        bool,
+        arg(name="works", metavar="", help="Also the real force's works, to 1e-6; tens of times the time."),
     ] = False
     limit: Limit = 0.01
     until_width: Annotated[

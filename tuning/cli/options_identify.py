@@ -15,7 +15,8 @@ class Identify:
     Example: jaxhil identify day1/*.csv --map logs.toml --prior rig-300kg
 
     Writes DIR/mechanism.toml, which tunes as it is, DIR/identification.json and pictures; with --check none.
-    Exit code 1 if what the model leaves unexplained can change a restitution by the limit or more.
+    Exit code 1 if what the model leaves unexplained and the numbers' uncertainty can change e or e - e* by
+    the limit or more.
     """
 
     logs: Annotated[

@@ -190,7 +190,7 @@ def sweep(
         seed: of the draws.
         sampling: "random", or "sobol" (scrambled, several replicates).
         precision: "float64", or "float32": faster, and compared with float64 on a subset.
-        works: also the real contact force's works; 3 times the time.
+        works: also the real contact force's works, to 1e-6; tens of times the time.
         limit: the restitution error [1] beyond which a scenario has failed.
         until_width: stop once the probability's interval is so narrow.
         drivers: also Sobol indices, what drives the error, from so many scenarios for each input: a power of

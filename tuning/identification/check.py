@@ -16,32 +16,46 @@ from tuning.identification import free_motion, known, two_clocks, validation
 from tuning.identification.contact import ContactFit
 from tuning.identification.contact_problem import LONGEST, Inner, Problem, Readings
 from tuning.identification.contact_profile import Posterior
+from tuning.identification.free_motion import FreeMotion
 from tuning.identification.motion import Motion
 from tuning.identification.noise import Noise, at_rest
 from tuning.identification.rational import Model
 from tuning.identification.records import Campaign, Run
-from tuning.identification.result import Identification
+from tuning.identification.result import PRESS, UNCERTAINTY, Identification, experiment
+from tuning.identification.uncertain_effect import uncertain_effect
 
 CLOCK = 2e-5  # s, to which no delay is known better
 USUAL_FREQUENCY = 3.0  # Hz, of contacts, where none was made
-# Lines of fits alone: what is told has no sign to be found.
-OF_FITS = ("sign of the motion's delay", "sign of the force")
 
 
-def check(campaign: Campaign, mechanism: Mechanism, limit: float = 0.01) -> Identification:
-    """What the mechanism leaves of the logs: an identification without estimates, `limit` on its effect on e.
+def check(
+    campaign: Campaign, mechanism: Mechanism, limit: float = 0.01, fitted: FreeMotion | None = None
+) -> Identification:
+    """Set logs against a mechanism as it is; estimate nothing.
 
-    The force's noise is that of the runs at rest, else the mechanism's. Raises `InputError` for logs with
-    neither free motion nor contact, and for a contact law that cannot be set against logs."""
+    The force's noise is that of the runs at rest, else the mechanism's.
+
+    Args:
+        campaign: The logs.
+        mechanism: What they are set against.
+        limit: On the effects on e and on e - e*.
+        fitted: A motion simulator of any order fitted to the free runs, if there is one already. Only a fit
+            shows a wrong hold or latency whose delay the mechanism has taken up.
+
+    Returns:
+        An identification without estimates.
+
+    Raises:
+        InputError: If the logs have neither free motion nor contact, or the contact law cannot be set
+            against logs.
+    """
     two_clocks.refuse(campaign.timing)
     model = known.motion_model(mechanism)
     free = [run for run in campaign.runs if run.kind == "free"]
-    touching = [
-        piece
-        for run in campaign.runs
-        if run.kind in ("contact", "press", "tap")
-        for piece in contacts.pieces(run, campaign.timing.control_period)
-    ]
+    period = campaign.timing.control_period
+    whole = [run for run in campaign.runs if run.kind in ("contact", "press", "tap")]
+    whole = contacts.after_gaps(whole, model, period) if whole else []
+    touching = [piece for run in whole for piece in contacts.pieces(run, period)]
     motion = free_motion.of_known(free, campaign.timing, model)
     contact = None
     if touching:
@@ -49,23 +63,43 @@ def check(campaign: Campaign, mechanism: Mechanism, limit: float = 0.01) -> Iden
     elif motion is None:
         raise InputError("logs: found neither free motion nor contact, allowed runs of either kind")
     frequency = USUAL_FREQUENCY if contact is None else contacts.frequency(contact, campaign.equivalent_mass)
-    lines = [] if motion is None else validation.of_motion(motion, frequency)
+    lines = []
+    if motion is not None:
+        fitted = fitted or free_motion.estimate(free, campaign.timing)
+        assert fitted is not None
+        motion = replace(motion, other_hold=max(motion.other_hold, fitted.other_hold))
+        lines = [*validation.of_motion(motion, frequency), validation.sign_of_delay(fitted, frequency)]
     if contact is not None:
-        s = np.array([2j * np.pi * frequency])
-        lag = -float(np.angle(model.response(s)[0])) / (2.0 * np.pi * frequency) + contact.posterior.best[0]
+        lag = contacts.lag(contact, model, frequency)
         every = np.ones(len(touching), bool)
         lines += validation.of_contact(contact, touching, campaign.equivalent_mass, frequency, lag, every)
+    lines += _uncertainty(mechanism, any(run.kind == "press" for run in campaign.runs))
     return Identification(
         estimates=(),
         draws=np.zeros((0, 0)),
         combinations=(),
         confounded=(),
-        lines=tuple(line for line in lines if line.name not in OF_FITS),
+        lines=tuple(lines),
         mechanism=to_builtins(mechanism),
         limit=limit,
         motion=motion,
         contact=contact,
     )
+
+
+def _uncertainty(mechanism: Mechanism, pressed: bool) -> list[validation.Line]:
+    """Say what the file's own uncertainty can do, if an identification stated it, and what lessens it."""
+    effect = uncertain_effect(mechanism)
+    if not effect.parts:
+        return []
+    largest = sorted(effect.parts, key=lambda key: -effect.parts[key])[:2]
+    found = f"{' and '.join(largest)} above all"
+    if len(largest) == 2:
+        advice = experiment(*largest)
+        if pressed and advice == PRESS:
+            advice = "a longer press run, or a stronger one,"
+        found += f"; {advice} would tell them better"
+    return [validation.Line(UNCERTAINTY, found, True, effect.restitution, on_error=effect.error)]
 
 
 def _known_contact(runs: Sequence[Run], model: Model, campaign: Campaign, mechanism: Mechanism) -> ContactFit:

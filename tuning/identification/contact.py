@@ -19,9 +19,10 @@ from tuning.identification.contact_profile import Posterior, profile
 from tuning.identification.law_choice import Judged, judge, quick
 from tuning.identification.motion import Motion
 from tuning.identification.noise import Noise
+from tuning.identification.press import known_bias
 from tuning.identification.rational import Model
 from tuning.identification.records import Run, Timing
-from tuning.identification.sensor_lag import sensor_lag
+from tuning.identification.sensor_lag import LIKELY, Lag, sensor_lag
 from tuning.identification.two_clocks import Drift
 
 SETTLING = 0.5  # s, of a motion simulator
@@ -31,6 +32,7 @@ FIRST_ROWS, STEADY = 5, 0.01  # rows over which, and share by which, the speed o
 BEYOND = 4.0  # standard deviations beyond the dead zone from which a reading counts
 ROUGH = 21, 5  # delays and planes of the grid for the fit that is only judged
 UNKNOWN_NOISE = 0.01  # of the largest force, where nothing tells it
+LEAST_NOISE = 1e-6  # of the largest force: below it a log without noise differs by rounding alone
 SURE = 3.0  # standard deviations from which a dead zone is there
 UNEXPLAINED = 1.3  # chi-squared per degree of freedom above which intervals are widened by it
 
@@ -89,6 +91,7 @@ class ContactFit:
     noise_error: float  # relative standard deviation of the noise that residuals are weighed by
     dead_zone: bool  # whether readings are those of a dead zone: "bias" is then less by it
     drift: Drift | None = None  # of a clock of the forces' own; the delay is then that and a constant
+    lag_share: float = 0.0  # posterior probability of a sensor's lag that is part of the delay
     resampled: str = ""  # what fits to other contacts say of the draws, in words, where they were asked for
 
     @property
@@ -131,23 +134,47 @@ def estimate(
         readings = _noise_from_contact(motion, readings, plane)
     else:
         readings = _readings(runs, noise)
+    # A dead zone has the plane told, and no bias.
+    bias = None if hidden else known_bias(runs, motion, noise, plane)
+    readings = replace(readings, bias=bias)
     judged: tuple[Judged, ...] = ()
     near = None
     if law is None or isinstance(law, str):
         judged = tuple(judge(motion, readings, plane, None if law is None else (law,)))
         law, near = judged[0].law, (judged[0].delay, judged[0].plane)
-    problem = Problem(motion, readings, law, plane)
-    posterior = profile(problem, seed, near)
-    lag = None if hidden else sensor_lag(problem, posterior, seed)
+    problem, posterior, lag, evidence = _fitted(motion, readings, law, plane, near, hidden, seed)
+    if judged and law.pulls:
+        # Without a lag in the laws, one of the sensor looks like a contact that pulls.
+        pushing = kelvin_voigt()
+        other = _fitted(motion, readings, pushing, plane, near, hidden, seed)
+        if other[3] >= evidence:
+            law, (problem, posterior, lag, _) = pushing, other
     if lag is not None:
         problem = Problem(motion, readings, law, plane, lag.value)
         posterior = lag.posterior
+    averaged = lag.share if lag is not None and not lag.value else 0.0
     if hidden and not _hides(posterior):
         # A channel that is 0 out of contact is no sensor's.
         return estimate(runs, model, timing, None, law, told, seed)
     freedom = len(problem.kept) - len(posterior.names)
     error = 0.0 if noise is None or hidden else noise.std_std / max(noise.std, 1e-300)
-    return ContactFit(law, judged, problem, posterior, freedom, error, bool(hidden), apart)
+    return ContactFit(law, judged, problem, posterior, freedom, error, bool(hidden), apart, averaged)
+
+
+def _fitted(
+    motion: Motion,
+    readings: Readings,
+    law: Law,
+    plane: float | None,
+    near: tuple[float, float] | None,
+    hidden: bool,
+    seed: int,
+) -> tuple[Problem, Posterior, Lag | None, float]:
+    """Fit one law, with a lag of the sensor if no dead zone hides the onset; the last is the evidence."""
+    problem = Problem(motion, readings, law, plane)
+    posterior = profile(problem, seed, near)
+    lag = None if hidden else sensor_lag(problem, posterior, seed)
+    return problem, posterior, lag, posterior.evidence + np.log(1.0 - LIKELY) if lag is None else lag.evidence
 
 
 def _readings(runs: Sequence[Run], noise: Noise) -> Readings:
@@ -182,7 +209,8 @@ def _noise_from_contact(motion: Motion, readings: Readings, plane: float | None)
     for _ in range(3):
         problem = Problem(motion, found, kelvin_voigt(), plane)
         delay, at, misfit = quick(problem)
-        std = found.std * np.sqrt(misfit / max(len(problem.kept) - 5, 1))
+        std = found.std * np.sqrt(max(misfit, 0.0) / max(len(problem.kept) - 5, 1))
+        std = max(std, LEAST_NOISE * peak)
         counts = readings.counts
         if readings.threshold:
             predicted = problem.force(delay, at, problem.at(delay, at).coefficients)
@@ -204,6 +232,12 @@ def frequency(contact: ContactFit, mass: float) -> float:
     # Of a touch that hardly pressed the quotient says nothing.
     secant = np.where(peak > 0.2 * peak.max(), peak / np.maximum(depth[deepest, lanes], 1e-9), 0.0)
     return float(np.sqrt(max(secant.max(), 1e-9) / mass) / (2.0 * np.pi))
+
+
+def lag(contact: ContactFit, model: Model, frequency: float) -> float:
+    """Return the delay of the force's phase behind the command at a frequency [Hz], in s."""
+    angle = float(np.angle(model.response(np.array([2j * np.pi * frequency]))[0]))
+    return contact.posterior.best[0] - angle / (2.0 * np.pi * frequency)
 
 
 def without(fit: ContactFit, held: np.ndarray, seed: int = 0) -> ContactFit:

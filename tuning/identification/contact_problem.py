@@ -37,6 +37,9 @@ class Readings:
     std: float  # N, of the noise
     whitening: tuple[float, ...] = (1.0,)  # filter that makes the noise white
     threshold: float = 0.0  # N: predicted forces below it do not count (a dead zone hides them)
+    bias: tuple[float, float] | None = (
+        None  # N, of the sensor and its standard deviation, where known at rest
+    )
 
     @classmethod
     def of(cls, runs: Sequence[Run], std: float, whitening=(1.0,), threshold: float = 0.0) -> Readings:
@@ -287,6 +290,10 @@ class Problem:
         summed = self.plain and not self.local
         if summed:
             normal[:, -1, -1], right[:, -1] = self.sums[:2]
+        if self.readings.bias is not None:
+            known, error = self.readings.bias
+            normal[:, -1, -1] += error**-2
+            right[:, -1] += known * error**-2
         size = np.sqrt(np.maximum(np.einsum("pii->pi", normal), 1e-60))
         scale = size[:, :, None] * size[:, None]
         covariance = np.linalg.inv(normal / scale + 1e-13 * np.eye(size.shape[1])) / scale
@@ -299,6 +306,9 @@ class Problem:
             misfit = misfit + self.sums[2] - _dot(target, target)
             misfit += bias**2 * (self.sums[0] - len(target) / std**2)
             misfit -= 2.0 * bias * (self.sums[1] - target.sum() / std)
+        if self.readings.bias is not None:
+            known, error = self.readings.bias
+            misfit = misfit + ((coefficients[:, -1] - known) / error) ** 2
         return coefficients, covariance, misfit, residual, design
 
     def _at_kept(self, full: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy import special
 from scipy.ndimage import uniform_filter1d
 
+from tuning.identification import press
 from tuning.identification.contact_problem import COARSE, LONGEST, Inner, Problem
 
 FINE = 2e-5  # s, between the next
@@ -59,14 +60,24 @@ def profile(
     """The posterior of the force delay, the plane and the coefficients.
 
     `near`: a delay [s] and the plane there [m] within some milliseconds of the best, where they are known;
-    else all delays are looked at. `size`: of the final grid, delays and planes."""
-    if near is None:
-        delays = np.arange(problem.shortest, LONGEST + COARSE / 2.0, COARSE)
-        start = first_plane(problem, LONGEST / 4.0) if problem.plane is None else problem.plane
-    else:
-        delays, start = near[0] + np.arange(-REACH, REACH + COARSE / 2.0, COARSE), near[1]
-        delays = np.unique(np.clip(delays, problem.shortest, LONGEST))
-    planes, stds, heights = _scan(problem, delays, start)
+    else, and where delays further away are as likely, all delays are looked at. `size`: of the final grid,
+    delays and planes."""
+    delays, start = np.arange(problem.shortest, LONGEST + COARSE / 2.0, COARSE), 0.0
+    scanned = None
+    if near is not None:
+        close, start = near[0] + np.arange(-REACH, REACH + COARSE / 2.0, COARSE), near[1]
+        close = np.unique(np.clip(close, problem.shortest, LONGEST))
+        scanned = _scan(problem, close, start)
+        likely = 2.0 * (scanned[2].max() - scanned[2][[0, -1]]) <= REGION
+        inner = close[0] > problem.shortest, close[-1] < LONGEST
+        if np.any(likely & inner):
+            scanned = None
+        else:
+            delays = close
+    elif problem.plane is None:
+        start = first_plane(problem, LONGEST / 4.0)
+    start = start if problem.plane is None else problem.plane
+    planes, stds, heights = scanned or _scan(problem, delays, start)
     low, high = _region(problem, delays, heights, ROUGH_REGION)
     finer = np.linspace(low, high, int(np.clip((high - low) / FINE, 21, 151)))
     known = np.interp(finer, delays, planes), np.interp(finer, delays, stds)
@@ -94,6 +105,10 @@ def first_plane(problem: Problem, delay: float) -> float:
     """Where the mechanism was when the force first rose above its noise, the median of the runs [m]."""
     position, _ = problem.motion.at(delay)
     readings = problem.readings
+    if readings.bias is not None:
+        found = press.first_plane(position, readings.force, readings.counts, readings.bias)
+        if found is not None:
+            return found
     level = np.median(readings.force[readings.counts])
     loud = readings.counts & (np.abs(readings.force - level) > 5.0 * readings.std + readings.threshold)
     sustained = loud & np.roll(loud, -1, axis=0) & np.roll(loud, -2, axis=0)
@@ -186,12 +201,18 @@ def _sample(
     picked = np.searchsorted(np.cumsum(weights), (np.arange(DRAWS) + rng.uniform(size=DRAWS)) / DRAWS)
     picked = np.minimum(picked, len(cells) - 1)
     step, rows = delays[1] - delays[0], []
+    slopes = np.zeros((len(cells), len(cells[0].coefficients)))
+    if problem.plane is not None:
+        # Within a cell the coefficients go along with the delay, damping above all.
+        slopes = np.gradient(np.array([cell.coefficients for cell in cells]), step, axis=0)
     for index in np.unique(picked):
         count = int(np.sum(picked == index))
         delay, plane, width = places[index]
         spread = rng.uniform(-0.5, 0.5, (count, 2)) * [step, width * (problem.plane is None)]
         values = _coefficients(cells[index], problem.rate_like, count, rng)
         moved = np.maximum(delay + spread[:, 0], problem.shortest)
+        values = values + (moved - delay)[:, None] * slopes[index]
+        values[:, problem.rate_like] = np.maximum(values[:, problem.rate_like], 0.0)
         rows.append(np.column_stack([moved, plane + spread[:, 1], values]))
     profile = _by_delay(places, cells, len(delays))[0]
     best = int(np.argmax(heights))

@@ -7,19 +7,25 @@ delay is shared with the position sensor's.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
+from jaxhil.errors import InputError
+from jaxhil.mechanism.file import from_builtins
 from jaxhil.mechanism.structs import Mechanism
 from tuning.identification import contact as contacts
 from tuning.identification import free_motion, knowledge, known, parameters, validation
 from tuning.identification.bootstrap import bootstrap
+from tuning.identification.check import check as check_file
 from tuning.identification.contact import ContactFit
 from tuning.identification.contact_profile import DRAWS
-from tuning.identification.estimates import combinations, estimates
+from tuning.identification.estimates import combinations, estimates, unit_of
 from tuning.identification.free_motion import FreeMotion
-from tuning.identification.identified import mechanism_of
+from tuning.identification.identified import mechanism_of, off_bound
+from tuning.identification.mechanism_file import to_toml
 from tuning.identification.noise import Noise, at_rest
 from tuning.identification.options import FIRST, Options, check
 from tuning.identification.order import VAGUE
@@ -58,15 +64,13 @@ def identify(
     say("fitting the motion simulator")
     motion = free_motion.estimate(runs["free"], campaign.timing, options.order)
     model = _told_model(prior) if motion is None else motion.model
-    contact, lines, frequency = None, [], USUAL_FREQUENCY
+    contact, touching, left_out, frequency = None, [], [], USUAL_FREQUENCY
     whole = [run for run in campaign.runs if run.kind in TOUCHING]
     if whole and model is not None:
         whole = contacts.after_gaps(whole, model, period)
         touching = [piece for run in whole for piece in contacts.pieces(run, period)]
-        contact, lines = _contact(touching, model, campaign, force, options, say)
+        contact, left_out = _contact(touching, model, campaign, force, options, say)
         frequency = contacts.frequency(contact, mass)
-    if motion is not None:
-        lines = [*validation.of_motion(motion, frequency), *lines]
     apart = None if contact is None else contact.drift
     share = _position_delay(motion, None if apart else contact, prior, options)
     found = _draws(motion, contact, model, frequency, share, options.seed)
@@ -89,6 +93,9 @@ def identify(
     mechanism, missing = None, _missing(prior, model, told_contact, untold)
     if not missing:
         mechanism = mechanism_of(campaign, prior, model, told_contact, numbers, found, options)
+    lines = _of_file(campaign, mechanism, motion if options.order is None else None)
+    if lines is None:
+        lines = _of_fits(motion, contact, model, touching, mass)
     keys = list(found)
     table = np.array([found[key] for key in keys]).T if keys else np.zeros((DRAWS, 0))
     return Identification(
@@ -96,10 +103,15 @@ def identify(
         draws=table,
         combinations=combinations(found | told, told_contact),
         confounded=confounded(keys, table),
-        lines=tuple(lines),
+        lines=(*lines, *left_out),
         mechanism=mechanism,
         limit=options.limit,
-        notes=(*_notes(motion, contact, told_contact, force, vague), *_moved(fixed, options), *denied),
+        notes=(
+            *_notes(motion, contact, told_contact, force, vague),
+            *_moved(fixed, options),
+            *_at_bounds(found),
+            *denied,
+        ),
         missing=missing,
         motion=motion,
         contact=contact,
@@ -174,12 +186,59 @@ def _contact(
         fit = bootstrap(fit, options.bootstrap, options.seed, options.scheduler, options.kept, say)
     say("judging the fit by touches left out of it")
     held = held_out(runs, options.hold_out)
-    judged = fit if not held.any() else contacts.without(fit, held, options.seed)
-    frequency = contacts.frequency(fit, campaign.equivalent_mass)
-    s = np.array([2j * np.pi * frequency])
-    lag = -float(np.angle(model.response(s)[0])) / (2.0 * np.pi * frequency) + fit.posterior.best[0]
-    judging = held if held.any() else np.ones(len(runs), bool)
-    return fit, validation.of_contact(judged, runs, campaign.equivalent_mass, frequency, lag, judging)
+    if not held.any():
+        return fit, []
+    others = contacts.without(fit, held, options.seed)
+    return fit, validation.of_touches_left_out(others, runs, campaign.equivalent_mass, held)
+
+
+def _of_file(
+    campaign: Campaign, mechanism: dict[str, Any] | None, motion: FreeMotion | None
+) -> list[validation.Line] | None:
+    """Check the mechanism file as it is written, as `identify --check` would.
+
+    `motion`: fitted, of any order. Returns None where no file is written, or none can be checked."""
+    if mechanism is None or campaign.timing.two_clocks:
+        return None
+    if not any(run.kind in (*TOUCHING, "free") for run in campaign.runs):
+        return None
+    try:
+        written = from_builtins(tomllib.loads(to_toml(mechanism)), "identified mechanism")
+        return list(check_file(campaign, written, fitted=motion).lines)
+    except InputError:
+        return None
+
+
+def _of_fits(
+    motion: FreeMotion | None,
+    contact: ContactFit | None,
+    model: Model | None,
+    touching: list[Run],
+    mass: float,
+) -> list[validation.Line]:
+    """Check the fits themselves, where there is no file to check."""
+    frequency = USUAL_FREQUENCY if contact is None else contacts.frequency(contact, mass)
+    lines = []
+    if motion is not None:
+        lines = [*validation.of_motion(motion, frequency), validation.sign_of_delay(motion, frequency)]
+    if contact is not None and model is not None:
+        lag = contacts.lag(contact, model, frequency)
+        every = np.ones(len(touching), bool)
+        lines += [
+            validation.sign_of_force(contact),
+            *validation.of_contact(contact, touching, mass, frequency, lag, every),
+        ]
+    return lines
+
+
+def _at_bounds(found: Mapping[str, np.ndarray]) -> list[str]:
+    """Name the numbers whose values in the file are 0 since the logs say that they are below."""
+    notes = []
+    for key, draws in found.items():
+        if off_bound(key, draws) > 0.0:
+            told = f"the logs say {draws.mean():.4g} +- {draws.std():.2g}, {unit_of(key)}"
+            notes.append(f"{key}: {told}: the file has its least value, 0, and the difference as uncertainty")
+    return notes
 
 
 def held_out(runs: Sequence[Run], share: float) -> np.ndarray:

@@ -11,10 +11,15 @@ from jaxhil.mechanism.structs import numeric_keys
 from tuning.identification.contact import ContactFit
 from tuning.identification.result import Estimate
 
+# Where damping may be 0, its intervals and those of what goes along with it are the shortest ones.
+DAMPED = ("contact.damping", "rig.force_sensor.delay")
+NEAR, CROWD = 0.1, 0.005  # standard deviations from 0, and share of the draws there, that make a crowd
+
 
 def estimates(found, motion, contact, force, position, fixed) -> tuple[Estimate, ...]:
     """Estimates of what has draws, then of what the sensors say at rest and of what was told."""
-    every = [_of_draws(key, values) for key, values in found.items()]
+    bounded = DAMPED if any(at_zero(one) for key, one in found.items() if key.startswith(DAMPED[0])) else ()
+    every = [_of_draws(key, values, key.startswith(bounded)) for key, values in found.items()]
     others = []
     if force is not None and not force.silent:
         others.append(_plain("rig.force_sensor.noise_std", force.std, force.std_std))
@@ -22,6 +27,9 @@ def estimates(found, motion, contact, force, position, fixed) -> tuple[Estimate,
     elif contact is not None:
         std = contact.readings.std
         others.append(_plain("rig.force_sensor.noise_std", std, std / np.sqrt(2.0 * contact.freedom)))
+        if force is None:
+            bias = contact.posterior.draws[:, contact.posterior.names.index("bias")]
+            others.append(_plain("rig.force_sensor.bias", float(bias.mean()), float(bias.std())))
     if force is not None and force.quantum:
         others.append(_plain("rig.force_sensor.quantum", force.quantum, 0.0))
     if position is not None:
@@ -38,8 +46,23 @@ def estimates(found, motion, contact, force, position, fixed) -> tuple[Estimate,
     return (*every, *others)
 
 
-def _of_draws(key: str, values: np.ndarray) -> Estimate:
-    low, high = np.quantile(values, (0.025, 0.975))
+def at_zero(values: np.ndarray) -> bool:
+    """Return whether draws that cannot be negative crowd at 0, so that 0 is as likely as any."""
+    return bool(np.mean(values <= NEAR * values.std()) > CROWD)
+
+
+def shortest(values: np.ndarray) -> tuple[float, float]:
+    """Return the shortest interval with 95 % of the draws; of those that crowd at 0 it has 0."""
+    ordered = np.sort(values)
+    inside = int(np.ceil(0.95 * len(ordered)))
+    first = int(np.argmin(ordered[inside - 1 :] - ordered[: len(ordered) - inside + 1]))
+    return float(ordered[first]), float(ordered[first + inside - 1])
+
+
+def _of_draws(key: str, values: np.ndarray, bounded: bool = False) -> Estimate:
+    low, high = shortest(values) if bounded else np.quantile(values, (0.025, 0.975))
+    if bounded and key.startswith(DAMPED[0]) and at_zero(values):
+        low, high = 0.0, np.quantile(values, 0.95)
     return Estimate(
         key, float(values.mean()), float(values.std(ddof=1)), float(low), float(high), unit_of(key)
     )

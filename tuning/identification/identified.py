@@ -17,6 +17,7 @@ from tuning.identification.parameters import SIMULATOR
 from tuning.identification.rational import Model
 from tuning.identification.records import UNNAMED, Campaign
 from tuning.identification.result import Estimate
+from tuning.identification.uncertain_effect import IDENTIFIED
 
 
 def mechanism_of(
@@ -79,6 +80,12 @@ def mechanism_of(
     return document
 
 
+def off_bound(key: str, draws: np.ndarray) -> float:
+    """Return by how much the file's value exceeds the draws' mean: a delay or a damping is at least 0."""
+    bounded = key.endswith(".delay") or key.startswith("contact.damping")
+    return max(-float(draws.mean()), 0.0) if bounded else 0.0
+
+
 def _uncertainty(document, found: Mapping[str, np.ndarray], options: Options) -> dict[str, Any]:
     """The prior's for what was not found, and what was found, with its correlation."""
     # A damping that is 0 in every draw is no number to draw.
@@ -91,7 +98,8 @@ def _uncertainty(document, found: Mapping[str, np.ndarray], options: Options) ->
         else 0.0
         for key in keys
     ])  # fmt: skip
-    tables = uncertainty_tables(keys, np.array([found[key] for key in keys]).T, floors)
+    off = np.array([off_bound(key, found[key]) for key in keys])
+    tables = uncertainty_tables(keys, np.array([found[key] for key in keys]).T, floors, off)
     # Of a simulator or a contact that was found nothing of the prior's is left.
     sections = {f"{name.rsplit('.', 1)[0]}." for name in tables["uncertainty"]} & {SIMULATOR, "contact."}
     gone = (*sections, *tables["uncertainty"])
@@ -101,4 +109,4 @@ def _uncertainty(document, found: Mapping[str, np.ndarray], options: Options) ->
 
 def _source(campaign: Campaign) -> str:
     files = ", ".join(f"{name} (SHA-256 {digest[:12]})" for name, digest in campaign.sources.items())
-    return f"identified from {files or 'a campaign in memory'}"[:9_000]
+    return f"{IDENTIFIED} {files or 'a campaign in memory'}"[:9_000]

@@ -1,8 +1,13 @@
 """Which contact law a mechanism has: the simplest one that predicts touches it was not fitted to.
 
 Every law is fitted to the odd touches and judged on the even ones, and the other way round, by the log
-likelihood of whole touches. Laws within two standard errors of the best, touch by touch, are as good; the one
-with the fewest numbers is taken. With fewer than four touches the Bayesian information criterion judges.
+likelihood of whole touches. Laws within two standard errors of the best, touch by touch, are as good, and so
+is the one that the Bayesian information criterion prefers over all rows; the one with the fewest numbers is
+taken. With fewer than four touches the criterion alone judges.
+
+A law without damping is taken only where it is named. To first order a contact shows damping less stiffness
+times the age of the force: without damping the delay would take its place, with an interval that is far too
+narrow. Kelvin and Voigt's law contains the linear one.
 """
 
 from __future__ import annotations
@@ -57,8 +62,13 @@ def judge(motion: Motion, readings: Readings, plane: float | None, names=None) -
         behind = best - likelihood
         error = float(np.sqrt(len(behind)) * behind.std(ddof=1)) if len(behind) > 1 else 0.0
         results.append(Judged(law, delay, at, misfit, likelihood, (float(behind.sum()), error)))
-    good = [one for one in results if one.short[0] <= ERRORS * one.short[1] + 1e-9]
-    taken = min(good, key=lambda one: one.law.complexity)
+    rows = np.log(max(readings.counts.sum(), 2))
+    preferred = min(results, key=lambda one: one.misfit + rows * one.law.complexity)
+    # The delay takes the place of a damping that a law lacks: such a law is taken only where it is named.
+    damped = [one for one in results if "damping" in one.law.names] or results
+    good = [one for one in damped if one is preferred or one.short[0] <= ERRORS * one.short[1] + 1e-9]
+    good = good or [min(damped, key=lambda one: one.short[0])]
+    taken = min(good, key=lambda one: (one.law.complexity, one.misfit))
     return [taken, *(one for one in sorted(results, key=lambda one: one.short[0]) if one is not taken)]
 
 

@@ -12,12 +12,17 @@ LEAST_EIGENVALUE = 1e-6  # of the correlation written: rounding must not make it
 FEW_DIGITS = 12  # significant, of numbers in the file
 
 
-def uncertainty_tables(keys: list[str], draws: np.ndarray, floors: np.ndarray) -> dict[str, Any]:
+def uncertainty_tables(
+    keys: list[str], draws: np.ndarray, floors: np.ndarray, off: np.ndarray | None = None
+) -> dict[str, Any]:
     """`[uncertainty]` and `[correlation]` from draws, (draws, keys); no standard deviation below its floor.
+
+    `off`: by how much the file's value is off the mean of the draws, for each key; it counts as uncertainty.
 
     The entries of a list have one standard deviation and are drawn apart; in the correlation one number
     stands for all of them."""
     covariance = np.atleast_2d(np.cov(draws.T))
+    covariance = covariance if off is None else covariance + np.outer(off, off)
     short = np.maximum(floors**2 - np.diag(covariance), 0.0)
     covariance = covariance + np.diag(short)
     names = list(dict.fromkeys(_path(key) for key in keys))

@@ -12,12 +12,16 @@ from tuning.identification.free_motion import FreeMotion
 from tuning.identification.noise import Noise
 from tuning.identification.validation import Line
 
+UNCERTAINTY = "uncertainty of the numbers"  # name of its line
 CONFOUNDED = 0.95  # magnitude of a correlation from which two numbers are told apart badly
 
+PRESS = "a press run with a multisine to 45 Hz"
 WIDER = "a multisine to 1.5 times the bandwidth or more"
 # What would separate a pair, by the keys in it.
 EXPERIMENTS = {
-    ("rig.force_sensor.delay", "contact.damping"): "a press run with a multisine to 45 Hz",
+    ("rig.force_sensor.delay", "contact.damping"): PRESS,
+    ("rig.force_sensor.time_constant", "contact.damping"): PRESS,
+    ("rig.force_sensor.time_constant", "rig.force_sensor.delay"): PRESS,
     ("rig.contact_plane", "rig.force_sensor.delay"): "touches at speeds in the ratio 1:2:4, or a slow press",
     ("contact.stiffness", "rig.contact_plane"): "touches at speeds in the ratio 1:2:4, or a slow press",
     ("rig.simulator.damping_ratio", "rig.simulator.delay"): WIDER,
@@ -52,7 +56,7 @@ class Identification:
     confounded: tuple[tuple[str, str, float, str], ...]  # two keys, correlation, what separates
     lines: tuple[Line, ...]
     mechanism: dict[str, Any] | None  # as a mechanism file has it; None where something is missing
-    limit: float  # on e, of all effects together
+    limit: float  # on e, and on e - e*, of all effects together
     notes: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()  # what neither logs nor prior tell, and the run that would
     motion: FreeMotion | None = field(default=None, repr=False)
@@ -62,18 +66,24 @@ class Identification:
 
     @property
     def effect(self) -> float:
-        """On e, of all defects that are there."""
+        """On e, of all defects that are there and of what the numbers may be off by."""
         return float(sum(line.counted for line in self.lines))
 
     @property
+    def effect_on_error(self) -> float:
+        """On e - e*, of the same."""
+        return float(sum(line.counted_error for line in self.lines))
+
+    @property
     def good(self) -> bool:
-        return not self.missing and bool(self.lines) and self.effect < self.limit
+        """Whether both effects are below the limit, and something was checked."""
+        return not self.missing and bool(self.lines) and max(self.effect, self.effect_on_error) < self.limit
 
     @property
     def worst(self) -> Line | None:
-        """The defect with the largest effect, if there is any."""
-        there = [line for line in self.lines if line.there]
-        return max(there, key=lambda line: line.effect, default=None)
+        """The line with the largest effect, if any counts."""
+        there = [line for line in self.lines if line.there and line.counts]
+        return max(there, key=lambda line: max(line.counted, line.counted_error), default=None)
 
     @property
     def verdict(self) -> str:
@@ -81,16 +91,23 @@ class Identification:
             return f"Bad: neither the logs nor a prior tell {' and '.join(self.missing)}; no file is written"
         if not self.lines:
             return "Bad: neither free motion nor contact is in the logs: nothing shows that the file is right"
+        change = f"can change e by {self.effect:.2g} and e - e* by {self.effect_on_error:.2g}"
         if self.good:
             return (
-                f"Good: what the model leaves can change e by {self.effect:.2g}, allowed below {self.limit:g}"
+                f"Good: what the model leaves and the numbers' uncertainty {change}, "
+                f"allowed below {self.limit:g}"
             )
         worst = self.worst
         assert worst is not None
+        if worst.name == UNCERTAINTY:
+            return (
+                f"Bad: the numbers are too uncertain: {worst.finding}; "
+                f"all together {change}, allowed below {self.limit:g}"
+            )
         place = f" ({worst.where})" if worst.where else ""
         return (
             f"Bad: the model does not explain this rig: {worst.name}{place}: {worst.finding}; "
-            f"all defects can change e by {self.effect:.2g}, allowed below {self.limit:g}"
+            f"all defects {change}, allowed below {self.limit:g}"
         )
 
     def __getitem__(self, key: str) -> Estimate:
@@ -112,9 +129,11 @@ def confounded(keys: list[str], draws: np.ndarray) -> tuple[tuple[str, str, floa
     for i in range(len(keys)):
         for j in range(i):
             if abs(correlation[i, j]) > CONFOUNDED:
-                one, other = (key.rstrip("0123456789").rstrip(".") for key in (keys[i], keys[j]))
-                advice = EXPERIMENTS.get((one, other)) or EXPERIMENTS.get(
-                    (other, one), "longer runs, or wider ones"
-                )
-                pairs.append((keys[j], keys[i], float(correlation[i, j]), advice))
+                pairs.append((keys[j], keys[i], float(correlation[i, j]), experiment(keys[i], keys[j])))
     return tuple(pairs)
+
+
+def experiment(one: str, other: str) -> str:
+    """Return the experiment that separates two numbers, entries of lists by their keys."""
+    one, other = (key.rstrip("0123456789").rstrip(".") for key in (one, other))
+    return EXPERIMENTS.get((one, other)) or EXPERIMENTS.get((other, one), "longer runs, or wider ones")

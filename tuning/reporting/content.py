@@ -194,9 +194,10 @@ def _of_watchdog(results: Results) -> Iterator[Requirement]:
 def _of_identification(results: Results) -> Iterator[Requirement]:
     found = results.identification
     if found is not None:
-        effect, limit = found.effect, found.limit
+        effects = [one for one in (found.effect, found.effect_on_error) if one is not None]
+        effect, limit = max(effects, default=None), found.limit
         margin = number(None if effect is None or limit is None else limit - effect, 3)
-        what = "change of e by what the identified model leaves unexplained"
+        what = "change of e or e - e* by what the identified model leaves unexplained or uncertain"
         # What was identified says nothing of gains that were tuned for something else.
         elsewhere = results.subject is not None and not is_identified(results)
         verdict = UNKNOWN if elsewhere else _known(found.verdict)

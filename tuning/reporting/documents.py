@@ -109,6 +109,7 @@ class Check(Struct):
     there: bool
     effect: float | None = None
     where: str = ""
+    counts: bool = True
 
 
 class Identification(Struct):
@@ -124,6 +125,7 @@ class Identification(Struct):
     sources: dict[str, str]
     seed: int
     versions: dict[str, str]
+    effect_on_error: float | None = None
 
 
 class MonitoredFigure(Struct):

@@ -29,7 +29,12 @@ def identification(results: Results) -> Section | None:
         for one in found.estimates
     ]
     checks = [
-        (one.name, "yes" if one.there else "no", number(one.effect if one.there else 0.0, 3), one.finding)
+        (
+            one.name,
+            "yes" if one.there else "no",
+            number((one.effect if one.there else 0.0) if one.counts else None, 3),
+            one.finding,
+        )
         for one in found.checks
     ]
     tables = [Table(("number", "value", "95 %", "unit", "from"), rows)] if rows else []

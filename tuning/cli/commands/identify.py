@@ -217,11 +217,14 @@ def _document(options: Identify, campaign: Campaign, prior: Mechanism | None, fo
             {
                 **{name: getattr(one, name) for name in ("name", "finding", "where")},
                 "there": bool(one.there),
+                "counts": one.counts,
                 "effect": float(one.effect),
+                "effect_on_error": float(one.effect if one.on_error is None else one.on_error),
             }
             for one in found.lines
         ],
         "effect": found.effect,
+        "effect_on_error": found.effect_on_error,
         "limit": found.limit,
         "verdict": "good" if found.good else "bad",
         "reason": found.verdict,
@@ -288,11 +291,15 @@ def _print(document: dict[str, Any], folder: Path | None) -> None:
 
 def _left(document: dict[str, Any], title: str) -> Any:
     """The checks as a table."""
-    rows = [
-        [one["name"], ", ".join(filter(None, (one["finding"], one["where"]))), one["effect"] * one["there"]]
-        for one in document["checks"]
-    ]
-    return terminal.table(title, ["check", "found", "effect on e"], rows, (0, 1))
+    rows = []
+    for one in document["checks"]:
+        found = ", ".join(filter(None, (one["finding"], one["where"])))
+        effects = [
+            terminal.figure(one[name] * one["there"], 2) if one["counts"] else "-"
+            for name in ("effect", "effect_on_error")
+        ]
+        rows.append([one["name"], found, *effects])
+    return terminal.table(title, ["check", "found", "effect on e", "on e-e*"], rows, (0, 1))
 
 
 def _row(one: dict[str, Any]) -> list[Any]:

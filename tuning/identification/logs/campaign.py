@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -19,27 +19,20 @@ from jaxhil.errors import InputError, one_line, shown
 from jaxhil.mechanism.structs import Mechanism
 from tuning.identification.logs import checks, clock, segments
 from tuning.identification.logs.causality import check_rows_of, integrator_of_all
+from tuning.identification.logs.channels import NUMBERS, columns_of
 from tuning.identification.logs.mapping import (
     KINDS,
-    Channel,
     LogMapping,
     RunFiles,
     masses_of,
     own_mapping,
-    si,
 )
-from tuning.identification.logs.readers import Columns, open_log
+from tuning.identification.logs.model_motion import check_command
+from tuning.identification.logs.readers import open_log
 from tuning.identification.logs.rows import Stretch, stretches
+from tuning.identification.logs.scales import SMOOTH, check_velocity
 from tuning.identification.records import Campaign, Kind, Run, Timing
 
-NUMBERS = (
-    "position_desired",
-    "position_measured",
-    "force_measured",
-    "velocity_desired",
-    "force_command",
-    "contact_index",
-)
 TOUCHING = ("tap", "contact")
 SCRAP = 50  # rows, fewer of which between two gaps say nothing
 JUMP = 0.5  # of the fastest motion, by which the velocity changes from a run to the next one in the same log
@@ -65,21 +58,31 @@ def read_campaign(
             patterns = ", ".join(shown(pattern) for entry in mapping.runs for pattern in entry.files)
             raise InputError(f"{one_line(str(path))}: found a log that no run names, allowed {patterns}")
     runs: list[Run] = []
-    notes: list[str] = []
+    notes: dict[str, list[str]] = {}  # which logs each is of
     clocks = []
     for entry in mapping.runs:
         for path in logs:
             if entry.names(path):
                 reading = _Reading(path, entry, mapping, timing, mass, prior)
                 runs += reading.runs
-                notes += reading.notes
+                for note in reading.notes:
+                    notes.setdefault(note.removeprefix(f"{reading.label}: "), []).append(reading.label)
                 clocks.append(reading.ticks.clock)
     integrator = integrator_of_all(runs, timing.control_period) or (prior and prior.rig.integrator)
     if not timing.two_clocks:
         check_rows_of(runs, timing, integrator)
     timing = replace(timing, clock=max(clocks, key=lambda one: one.jitter))
     sources = {path.name: _sha256(path) for path in logs}
-    return Campaign(tuple(runs), timing, mass, sources, tuple(dict.fromkeys(notes)), integrator)
+    return Campaign(tuple(runs), timing, mass, sources, _joined(notes), integrator)
+
+
+def _joined(notes: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
+    """Return each note once, after the name of the first log that it is of and the number of the others."""
+    found = []
+    for note, labels in notes.items():
+        more = len(set(labels)) - 1
+        found.append(f"{labels[0]}{f' and {more} more' * (more > 0)}: {note}")
+    return tuple(found)
 
 
 class _Reading:
@@ -104,7 +107,8 @@ class _Reading:
         lists = () if prior is None else (prior.contact.stiffness, prior.contact.damping)
         self._last = max(map(len, lists)) - 1 if lists else sys.maxsize
         log = open_log(path, mapping.text)
-        columns, stamps, self._begin = _columns(log, mapping)
+        columns, stamps, self._begin, notes = columns_of(log, mapping, timing.control_period)
+        self.notes += notes
         kept = _kept(stamps, entry, timing.control_period)
         if stamps is not None:
             self._begin += float(stamps[kept][0]) if len(stamps[kept]) else 0.0
@@ -154,18 +158,17 @@ class _Reading:
         """The runs of a stretch, checked: one for each contact, or the whole."""
         period, force = self._timing.control_period, stretch.channels["force_measured"]
         self.notes += checks.check_motion(self.label, kind, stretch, period, self._timing.command_hold)
+        self._ignore(stretch, "velocity_desired", check_velocity(self.label, stretch, period))
         if kind not in ("press", *TOUCHING):
             return [self._run(stretch, kind, slice(None), None, None)]
         if force is None:
             allowed = "one where there is contact"
             raise InputError(f"{self.label}: force_measured: found no such channel, allowed {allowed}")
         touched = self._touched(stretch.tick, force)
-        self.notes += checks.check_force(self.label, kind, stretch, touched, period, self._mass)
+        holds = kind == "contact" and self._command_holds(stretch, touched)
+        self.notes += checks.check_force(self.label, kind, stretch, touched, period, self._mass, holds)
         if kind == "press":
             return [self._run(stretch, kind, slice(None), None, None)]
-        if kind == "contact" and stretch.channels["force_command"] is not None:
-            row = self._timing.row
-            self.notes += checks.check_command(self.label, stretch, period, self._mass, row, self._integrator)
         if not touched:
             self.notes.append(f"{self.label}: {len(stretch.tick)} rows without contact are left out")
         middles = [(one[1] + two[0]) // 2 for one, two in pairwise(touched)]
@@ -175,6 +178,26 @@ class _Reading:
             self._run(stretch, kind, part, one, min(first + number, self._last))
             for number, (part, one) in enumerate(zip(parts, touched, strict=False))
         ]
+
+    def _command_holds(self, stretch: Stretch, touched: list[tuple[int, int]]) -> bool:
+        """Whether there is a force command that moves the model; one that cannot is taken out with a note."""
+        if stretch.channels["force_command"] is None:
+            return False
+        timing = self._timing
+        holds, note = check_command(
+            self.label, stretch, touched, timing.control_period, self._mass, timing.row, self._integrator
+        )
+        if holds:
+            self.notes += [note] if note else []
+        else:
+            self._ignore(stretch, "force_command", note)
+        return holds
+
+    def _ignore(self, stretch: Stretch, channel: str, note: str | None) -> None:
+        """Take a channel out of a stretch where a note says why."""
+        if note is not None:
+            self.notes.append(note)
+            stretch.channels[channel] = None
 
     def _touched(self, tick: np.ndarray, force: np.ndarray) -> list[tuple[int, int]]:
         """The contacts of a stretch, and how many there were so far; one may go on over a gap."""
@@ -233,48 +256,6 @@ def _timing(mapping: LogMapping, prior: Mechanism | None) -> Timing:
     return Timing(period, hold, latency, said.row, None, late, separate)
 
 
-def _columns(log, mapping: LogMapping) -> tuple[Columns, np.ndarray | None, float]:
-    """The channels that are there, in SI units, the stamps [s] from the first, and that one."""
-    channels = mapping.channels
-    wanted: dict[str, str] = {}
-    for name in (*NUMBERS, "mode"):
-        channel = getattr(channels, name)
-        required = name in ("position_desired", "position_measured")
-        if channel is not None and (required or channel.column in log.names):
-            wanted[name] = channel.column
-    time = channels.time
-    read = log.read(list(dict.fromkeys([*wanted.values(), *([time.column] if time.column else [])])))
-    columns: Columns = {}
-    for name, column in wanted.items():
-        values = read[column]
-        if name != "mode":
-            channel: Channel = getattr(channels, name)
-            if values.dtype == object:
-                raise InputError(
-                    f"{log.label}: column {shown(column)}: found {shown(values[0])}, allowed numbers"
-                )
-            factor, offset = si(channel, name)
-            values = values if (factor, offset) == (1.0, 0.0) else factor * values + offset
-        columns[name] = values
-    return columns, *_stamps(log.label, read, mapping)
-
-
-def _stamps(label: str, read: Columns, mapping: LogMapping) -> tuple[np.ndarray | None, float]:
-    time = mapping.channels.time
-    if time.column is None:
-        return None, 0.0
-    stamps = read[time.column]
-    if time.time_format is not None:
-        return clock.parsed(stamps, time.time_format, label)
-    if stamps.dtype == object:
-        allowed = "numbers, or a time_format beside the column"
-        raise InputError(f"{label}: column {shown(time.column)}: found {shown(stamps[0])}, allowed {allowed}")
-    checks.check_rows(label, "time", stamps)
-    # The first stamp may count from an epoch: what is left has digits to spare.
-    factor = si(Channel(column=time.column, unit=time.unit), "time")[0]
-    return factor * (stamps - stamps[:1]), factor * float(stamps[0]) if len(stamps) else 0.0
-
-
 def _kept(stamps: np.ndarray | None, entry: RunFiles, period: float) -> slice:
     """Rows from begin to end."""
     if stamps is None:
@@ -314,10 +295,10 @@ def _jumps(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
 def _speed(x: np.ndarray, begin: int, period: float) -> float | None:
     """Of the approach to a contact [m/s]."""
     # The force was there for some ticks before it was beyond the noise.
-    before = begin - checks.SMOOTH
-    if before < checks.SMOOTH:
+    before = begin - SMOOTH
+    if before < SMOOTH:
         return None
-    return float(x[before] - x[before - checks.SMOOTH]) / (checks.SMOOTH * period)
+    return float(x[before] - x[before - SMOOTH]) / (SMOOTH * period)
 
 
 def _sha256(path: Path) -> str:

@@ -7,25 +7,23 @@ command by Newton's law, and the change of speed in a contact from the measured 
 
 from __future__ import annotations
 
-from itertools import product
-
 import numpy as np
 
 from jaxhil.errors import InputError
-from tuning.identification.logs.rows import Stretch, integrator_of
+from tuning.identification.logs.rows import Stretch
+from tuning.identification.logs.scales import SMOOTH, check_gain, check_impulse
 
 FEWEST_ROWS = 200
+CLIPPED = 10  # repeats of the largest reading, from which it is a limit
 LARGEST_NUMBER = 1e30  # nanoseconds since an epoch are 1e18
 LARGEST_STROKE = 1.0  # m
 SMALLEST_STROKE = 1e-5  # m
 FASTEST = 5.0  # m/s
-SMOOTH = 10  # ticks, over which speeds are taken
 MOST_LAG = 400  # ticks, of a reading behind its command
 HELD = 0.4  # share of rows that repeat a reading, beyond which it is one that is held
 LONGEST_HELD = 20  # rows
 ALWAYS = 0.9  # share of the changes that come as far apart as most
 FOLLOWS = 0.3  # correlation of speeds, below which a reading does not follow its command
-IMPULSE = 0.2, 5.0  # measured over what the change of speed needs
 SAMPLE = 200_000  # rows looked at, where some say as much as all
 
 
@@ -58,15 +56,24 @@ def check_motion(label: str, kind: str, stretch: Stretch, period: float, hold: s
         raise InputError(
             f"{label}: position_desired: found one that changes every {rows} rows, allowed {allowed}"
         )
-    return [*_held(label, x, measured), *_check_following(label, x, measured)]
+    return [*_held(label, x, measured), *_check_following(label, kind, x, measured)]
 
 
 def check_force(
-    label: str, kind: str, stretch: Stretch, touched: list[tuple[int, int]], period: float, mass: float
-):
-    """Sign and unit of the measured force of contacts, by the change of speed that it makes; of a press, by
-    the motion that raises it; whether it is one of every row. Returns notes."""
-    force, x = _of(stretch, "force_measured"), _of(stretch, "position_desired")
+    label: str,
+    kind: str,
+    stretch: Stretch,
+    touched: list[tuple[int, int]],
+    period: float,
+    mass: float,
+    command_holds: bool = False,
+) -> list[str]:
+    """Check sign and unit of the measured force: of contacts by the change of speed, of a press by motion.
+
+    `command_holds`: whether force_command was found to move the model.
+
+    Returns notes, such as that not every row has a reading of its own."""
+    force = _of(stretch, "force_measured")
     found = force[stretch.valid]
     if np.ptp(found) == 0.0:
         raise InputError(f"{label}: force_measured: found {found[0]:g} N in every row, allowed a reading")
@@ -75,24 +82,11 @@ def check_force(
         if np.corrcoef(found, measured)[0, 1] < -0.5:
             raise _wrong_sign(label, "falls where the hardware is pushed deeper")
         return _late(label, found)
-    needed, made = [], []
-    for begin, end in touched:
-        if begin >= SMOOTH and end + SMOOTH <= len(x):
-            before = (x[begin] - x[begin - SMOOTH]) / (SMOOTH * period)
-            after = (x[end + SMOOTH - 1] - x[end - 1]) / (SMOOTH * period)
-            needed.append(mass * (before - after))
-            made.append(period * float(np.nansum(force[begin:end])))
-    ratio = float(np.dot(made, needed) / np.dot(needed, needed)) if np.any(needed) else np.nan
-    if ratio < -IMPULSE[0]:
-        raise _wrong_sign(label, "pulls where the numerical model is pushed back")
-    if ratio > IMPULSE[1] or 0 <= ratio < IMPULSE[0]:
-        allowed = f"about what turns {mass:g} kg round (is its unit right?)"
-        raise InputError(
-            f"{label}: force_measured: found {ratio:.3g} times the impulse that there was, allowed {allowed}"
-        )
-    notes = _late(label, found)
     top = np.abs(found) >= np.max(np.abs(found))
-    if np.count_nonzero(top[1:] & top[:-1]) >= 10:
+    clipped = bool(np.count_nonzero(top[1:] & top[:-1]) >= CLIPPED)
+    check_impulse(label, kind, stretch, touched, period, mass, command_holds, clipped)
+    notes = _late(label, found)
+    if clipped:
         notes.append(
             f"{label}: force_measured: {np.count_nonzero(top)} rows at the largest reading, as if clipped"
         )
@@ -118,65 +112,6 @@ def changes_every(values: np.ndarray) -> int:
     coarse = np.median(np.abs(steps[steps != 0.0])) <= 4 * _resolution(values)
     held = 1 < usual <= LONGEST_HELD and np.mean(apart == usual) > ALWAYS and not coarse
     return usual if held else 1
-
-
-def check_command(
-    label: str,
-    stretch: Stretch,
-    period: float,
-    mass: float,
-    row: str,
-    integrator: str = "semi_implicit_euler",
-) -> list[str]:
-    """That the logged commands are what the force command makes of the numerical model: M x_d'' = -F_c in the
-    row convention `row`. `integrator` holds where no logged velocity tells it. Returns notes."""
-    x, v, force = (stretch.channels[one] for one in ("position_desired", "velocity_desired", "force_command"))
-    assert x is not None and force is not None
-    integrator = integrator_of(x, v, period) or integrator
-    second = x[2:] - 2 * x[1:-1] + x[:-2]
-    fits: dict[tuple[int, str], tuple[float, float, float]] = {}
-    for sign, written in product((1, -1), ("tick", "sent")):
-        pull = _pull(-sign * period**2 / mass * force, integrator, written == "sent")
-        moved = second[: len(pull)]
-        known = np.isfinite(moved) & np.isfinite(pull) & (pull != 0.0)
-        # A rig that is driven back between contacts moves by other commands.
-        known &= np.abs(moved) <= 10 * np.max(np.abs(pull[known]), initial=0.0)
-        if np.count_nonzero(known) >= FEWEST_ROWS // 4:
-            moved, pull = moved[known], pull[known]
-            with np.errstate(all="ignore"):
-                nearest = mass * float(np.dot(pull, pull) / np.dot(pull, moved))
-            fits[sign, written] = _rms(moved - pull), _rms(moved), nearest
-    if not fits:
-        return []
-    best = min(fits, key=lambda way: fits[way][0])
-    scatter, spread, nearest = fits[best]
-    resolution = _resolution(x)
-    if spread <= 4 * resolution:
-        said = f"steps of {resolution:.2g} m are too coarse to check it by force_command"
-        return [f"{label}: position_desired: {said}"]
-    if scatter > 0.05 * spread:
-        raise InputError(
-            f"{label}: position_desired: found commands that force_command does not make of {mass:g} kg "
-            f"(nearest: {nearest:.4g} kg), allowed M x_d'' = -F_c; or leave force_command out"
-        )
-    if best[0] < 0:
-        raise InputError(
-            f"{label}: force_command: found one that pulls the model forward, allowed the other sign"
-        )
-    told = "sent" if row == "sent" else "tick"
-    if fits[1, told][0] > 1.5 * scatter + 1e-12:
-        raise InputError(
-            f'{label}: timing.row: found "{row}", but position_desired is what force_command makes of '
-            f'{mass:g} kg ({integrator}) in rows that are "{best[1]}"'
-        )
-    return []
-
-
-def _pull(unit: np.ndarray, integrator: str, sent: bool) -> np.ndarray:
-    """x(n+1) - 2 x(n) + x(n-1) that the forces make, about rows n = 1, 2, ... that hold x(n), or x(n+1)."""
-    old, new = unit[:-1], unit[1:]
-    made = {"semi_implicit_euler": new, "explicit_euler": old, "zoh": (old + new) / 2}[integrator]
-    return made[1:] if sent else made[: len(unit) - 2]
 
 
 def _resolution(values: np.ndarray) -> float:
@@ -205,7 +140,7 @@ def _check_size(label: str, x: np.ndarray, measured: np.ndarray, period: float) 
         )
 
 
-def _check_following(label: str, x: np.ndarray, measured: np.ndarray) -> list[str]:
+def _check_following(label: str, kind: str, x: np.ndarray, measured: np.ndarray) -> list[str]:
     """The reading follows its command, the same way round."""
     command, reading = ((one[SMOOTH:] - one[:-SMOOTH])[:SAMPLE] for one in (x, measured))
     command, reading = command - np.mean(command), reading - np.mean(reading)
@@ -229,6 +164,7 @@ def _check_following(label: str, x: np.ndarray, measured: np.ndarray) -> list[st
         raise InputError(
             f"{label}: position_measured: found {found}, allowed one that follows (are the two swapped?)"
         )
+    check_gain(label, kind, x, measured)
     return []
 
 
@@ -255,7 +191,3 @@ def _of(stretch: Stretch, name: str) -> np.ndarray:
     values = stretch.channels[name]
     assert values is not None
     return values
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

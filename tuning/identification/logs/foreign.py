@@ -1,8 +1,9 @@
 """Logs in formats of other tools, each read by that format's own library; imported when one is met.
 
-Every function takes a path and returns the names of the columns and a function that reads some of them.
-Fields of structures are joined by a dot (`log.force`); the columns of a matrix are counted from 1
-(`log.signals_2`). Stamps that count from an epoch are in s from the first one.
+Every function takes a path and returns the names of the columns, a function that reads some of them and,
+where the format has stamps for each of them, one that returns these. Fields of structures are joined by a dot
+(`log.force`); the columns of a matrix are counted from 1 (`log.signals_2`). Stamps that count from an epoch
+are in s from the first one of the log.
 """
 
 # Whoever has no such log need not have the library.
@@ -10,16 +11,25 @@ Fields of structures are joined by a dot (`log.force`); the columns of a matrix 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxhil.errors import shown
 
 Columns = dict[str, np.ndarray]
-Reader = tuple[list[str], Callable[[Sequence[str]], Columns]]
+
+
+class Reader(NamedTuple):
+    """A log that was opened."""
+
+    names: list[str]  # of its columns
+    read: Callable[[Sequence[str]], Columns]
+    # Stamps [s] of columns that were read, from one zero; None where the format knows no clocks of columns.
+    clocks: Callable[[Sequence[str]], dict[str, np.ndarray | None]] | None = None
+    stamps: Collection[str] = ()  # columns that are such stamps
 
 
 def mat(path: Path) -> Reader:
@@ -68,7 +78,7 @@ def hdf5(path: Path) -> Reader:
                 found[column] = _numbers(column, values)
             return found
 
-    return list(places), read
+    return Reader(list(places), read)
 
 
 def bag(path: Path) -> Reader:
@@ -84,15 +94,22 @@ def bag(path: Path) -> Reader:
             topic.setdefault("time", []).append(stamp)
             for name, value in _fields(reader.deserialize(raw, connection.msgtype)):
                 topic.setdefault(name, []).append(value)
-    columns = {}
+    columns, topics, stamps = {}, {}, {}
+    zero = min((fields["time"][0] for fields in rows.values()), default=0)
     for topic, fields in rows.items():
+        # Nanoseconds since an epoch have more digits than a float.
+        stamps[topic] = 1e-9 * (np.array(fields["time"]) - zero)
         for name, values in fields.items():
             if len(values) == len(fields["time"]):
-                whole = np.array(values)
-                columns[f"{topic}.{name}"] = (
-                    1e-9 * (whole - whole[0]) if name == "time" else whole.astype(float)
-                )
-    return _kept(columns)
+                column = f"{topic}.{name}"
+                columns[column] = stamps[topic] if name == "time" else np.array(values, float)
+                topics[column] = topic
+    return Reader(
+        list(columns),
+        lambda wanted: {name: columns[name] for name in wanted},
+        lambda wanted: {name: stamps[topics[name]] for name in wanted},
+        {f"{topic}.time" for topic in stamps},
+    )
 
 
 def mdf(path: Path) -> Reader:
@@ -100,42 +117,84 @@ def mdf(path: Path) -> Reader:
     from asammdf import MDF
 
     with MDF(path) as file:
-        names = [name for name in file.channels_db if name != "time"]
+        groups = {name: places[0][0] for name, places in file.channels_db.items() if name != "time"}
+    names = list(groups)
+    masters: dict[int, np.ndarray] = {}  # of each group, once it was read
 
     def read(wanted: Sequence[str]) -> Columns:
         found = {}
         with MDF(path) as file:
-            signals = {name: file.get(name) for name in wanted if name != "time"}
-            for name, signal in signals.items():
-                found[name] = _numbers(name, signal.samples)
+            signals = [name for name in wanted if name != "time"]
+            for name in signals or names[:1]:
+                signal = file.get(name)
+                masters.setdefault(groups[name], np.asarray(signal.timestamps, float))
+                if name in wanted:
+                    found[name] = _numbers(name, signal.samples)
             if "time" in wanted:
-                first = next(iter(signals.values())) if signals else file.get(names[0])
-                found["time"] = np.asarray(first.timestamps, float)
+                found["time"] = masters[groups[(signals or names)[0]]]
         return found
 
-    return ["time", *names], read
+    def clocks(wanted: Sequence[str]) -> dict[str, np.ndarray | None]:
+        return {name: masters[groups[name]] for name in wanted if name != "time"}
+
+    return Reader(["time", *names], read, clocks, {"time"})
 
 
 def tdms(path: Path) -> Reader:
     """NI TDMS: `group/channel`, and `group/channel.time` where the channel has a rate of its own."""
     from nptdms import TdmsFile
 
-    channels = {}
+    channels, group_of = {}, {}
     file = TdmsFile.read(path)
     for group in file.groups():
         for channel in group.channels():
             channels[f"{group.name}/{channel.name}"] = channel
-    timed = [f"{name}.time" for name, one in channels.items() if "wf_increment" in one.properties]
+            group_of[f"{group.name}/{channel.name}"] = group.name
+    waves = {name: one for name, one in channels.items() if one.properties.get("wf_increment")}
+    begins = {name: one.properties.get("wf_start_time") for name, one in waves.items()}
+    begins = {name: _nanoseconds(one) for name, one in begins.items() if one is not None}
+    zero = min(begins.values(), default=0)
+
+    def wave(name: str) -> tuple[float, float, int]:
+        """When a channel's first reading is [s], the distance of the others, and how many there are."""
+        if begins and name not in begins:
+            raise ValueError(f"column {shown(name)}: found no wf_start_time, allowed one, as others have")
+        properties = waves[name].properties
+        begin = 1e-9 * (begins.get(name, 0) - zero) + float(properties.get("wf_start_offset", 0.0))
+        return begin, float(properties["wf_increment"]), len(waves[name])
+
+    def stamps(name: str) -> np.ndarray | None:
+        if name not in waves:
+            # A channel that says nothing goes by the others of its group, where these agree.
+            group = [one for one in waves if group_of[one] == group_of[name]]
+            if len({wave(one) for one in group}) != 1 or len(waves[group[0]]) != len(channels[name]):
+                return None
+            name = group[0]
+        begin, step, rows = wave(name)
+        return begin + step * np.arange(rows)
 
     def read(wanted: Sequence[str]) -> Columns:
-        return {
-            name: channels[name.removesuffix(".time")].time_track()
-            if name in timed
-            else _numbers(name, channels[name][:])
-            for name in wanted
-        }
+        found = {}
+        for name in wanted:
+            own = stamps(name.removesuffix(".time")) if name in timed else None
+            found[name] = own if own is not None else _numbers(name, channels[name][:])
+        return found
 
-    return [*channels, *timed], read
+    timed = [f"{name}.time" for name in waves]
+    return Reader(
+        [*channels, *timed],
+        read,
+        lambda wanted: {
+            name: stamps(name.removesuffix(".time") if name in timed else name) for name in wanted
+        },
+        timed,
+    )
+
+
+def _nanoseconds(stamp: Any) -> int:
+    """Return a date as nanoseconds since 1970."""
+    stamp = stamp.as_datetime64("ns") if hasattr(stamp, "as_datetime64") else stamp
+    return int(np.datetime64(stamp).astype("datetime64[ns]").astype(np.int64))
 
 
 def _joined(name: str, parts: Mapping[str, Any], flat: Callable[[str, Any], Columns]) -> Columns:
@@ -187,4 +246,4 @@ def _numbers(name: str, values: Any) -> np.ndarray:
 
 
 def _kept(columns: Columns) -> Reader:
-    return list(columns), lambda wanted: {name: columns[name] for name in wanted}
+    return Reader(list(columns), lambda wanted: {name: columns[name] for name in wanted})

@@ -117,7 +117,9 @@ def _kind(path: Path, log: Log, columns: Mapping[str, str]) -> str:
 
 def _looked_at(log: Log, names: Sequence[str]) -> Columns:
     """The first rows that are whole."""
-    read = {name: values[:LOOK] for name, values in log.read(names).items()}
+    read = log.read(names)
+    rows = min(LOOK, *(len(values) for values in read.values()))  # columns of other clocks may be longer
+    read = {name: values[:rows] for name, values in read.items()}
     whole = [np.abs(one) <= checks.LARGEST_NUMBER for one in read.values() if one.dtype != object]
     kept = np.all(whole, axis=0) if whole else slice(None)
     read = {name: values[kept] for name, values in read.items()}

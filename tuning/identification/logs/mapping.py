@@ -42,6 +42,7 @@ class Channel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     scale: Annotated[float, says("of the column's number", "")] = 1.0  # in the unit; of counts, in SI units
     sign: Annotated[int, says("of the whole", "", ge=-1, le=1)] = 1
     offset: Annotated[float, says("added to the scaled number", "")] = 0.0  # in the unit
+    time: Name | None = None  # column of its own stamps, in the unit of those of the rows
 
 
 class TimeChannel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -200,6 +201,12 @@ def _check(mapping: LogMapping) -> None:
     if (time.column is None) == (time.rate is None):
         found = "neither" if time.rate is None else "both"
         raise KeyProblem(("channels", "time"), found, "either a column of stamps or the rate of the rows")
+    if time.column is None or time.time_format is not None:
+        for name in channels.__struct_fields__:
+            own = getattr(getattr(channels, name), "time", None)
+            if own is not None:
+                said = "none, since channels.time is no column of numbers"
+                raise KeyProblem(("channels", name, "time"), shown(own), said)
     _check_rest(mapping)
 
 

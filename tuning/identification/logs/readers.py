@@ -10,7 +10,7 @@ import csv
 import importlib
 import io
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +25,8 @@ from jaxhil.mechanism.conversion import close_match
 from tuning.identification.logs.mapping import Text
 
 Columns = dict[str, np.ndarray]  # numbers in float64, texts as objects, stamps in s from the first
+
+Clocks = Callable[[Sequence[str]], Mapping[str, np.ndarray | None]]
 
 PLAIN = Text()
 DELIMITERS = "\t;,"  # that are looked for in the line of names, in this order
@@ -53,6 +55,9 @@ class Log(NamedTuple):
     label: str  # what errors call it
     names: list[str]
     read: Callable[[Sequence[str]], Columns]
+    # Stamps [s] of columns, from one zero, after they were read; None for a column without any of its own.
+    clocks: Clocks = dict.fromkeys
+    stamps: Collection[str] = ()  # columns that are such clocks
 
 
 def open_log(path: Path, text: Text = PLAIN) -> Log:
@@ -80,8 +85,9 @@ def open_log(path: Path, text: Text = PLAIN) -> Log:
             except ImportError:
                 needs = f"{package}, which is not installed: python3 -m pip install 'jaxhil[logs]'"
                 raise InputError(f"{label}: a {suffix} file is read with {needs}") from None
-        names, read = getattr(importlib.import_module("tuning.identification.logs.foreign"), format)(path)
-        return Log(label, names, _checked(label, names, read))
+        opened = getattr(importlib.import_module("tuning.identification.logs.foreign"), format)(path)
+        read = _checked(label, opened.names, opened.read)
+        return Log(label, opened.names, read, _clocks(label, opened.clocks), opened.stamps)
 
 
 @contextmanager
@@ -96,8 +102,19 @@ def reading(label: str) -> Iterator[None]:
         raise InputError(f"{label}: cannot be read: {one_line(reason.splitlines()[0], 200)}") from None
 
 
+def _clocks(label: str, clocks: Clocks | None) -> Clocks:
+    if clocks is None:
+        return dict.fromkeys
+
+    def checked(wanted: Sequence[str]) -> Mapping[str, np.ndarray | None]:
+        with reading(label):
+            return clocks(wanted)
+
+    return checked
+
+
 def _checked(label: str, names: Sequence[str], read: Callable[[Sequence[str]], Columns]):
-    """Reading of columns that are there once, each as long as the others."""
+    """Return a function that reads columns that are there once."""
 
     def checked(wanted: Sequence[str]) -> Columns:
         for name in wanted:
@@ -111,10 +128,6 @@ def _checked(label: str, names: Sequence[str], read: Callable[[Sequence[str]], C
                 raise InputError(f"{label}: column {shown(name)}: found {names.count(name)}, allowed one")
         with reading(label):
             columns = read(wanted)
-        lengths = {len(column) for column in columns.values()}
-        if len(lengths) > 1:
-            found = ", ".join(f"{len(column)} in {shown(name)}" for name, column in columns.items())
-            raise InputError(f"{label}: found columns of unlike length ({found}), allowed one row a tick")
         return columns
 
     return checked

@@ -17,7 +17,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tuning.identification.logs.scale_fit import scale
+
 SHORT = 3  # rows
+WIDE = 32  # rows, over which the integrator shows under rounding and jitter
+CLEAR = 0.2  # of half a period, by which it may seem to be between two integrators
+SURE = 4.0  # standard deviations
+PULLED = 0.1  # of the largest change of the velocity, from which a row tells the integrator
 
 Channels = Mapping[str, np.ndarray | None]
 
@@ -56,7 +62,26 @@ def integrator_of(x: np.ndarray, v: np.ndarray | None, period: float) -> str | N
     known &= pulled <= 10 * np.nanmedian(pulled[known]) if np.any(known) else False
     sums = {name: float(np.nansum(one[known])) for name, one in off.items()}
     best, second, _ = sorted(sums, key=sums.__getitem__)
-    return best if sums[best] < 0.5 * sums[second] else None
+    return best if sums[best] < 0.5 * sums[second] else _over_rows(x, v, period)
+
+
+def _over_rows(x: np.ndarray, v: np.ndarray, period: float) -> str | None:
+    """Return the integrator by motion over `WIDE` rows, where rounding or jitter hide that over one row.
+
+    Integrators differ by which of the velocities at both ends counts."""
+    finite = np.isfinite(v)
+    summed = np.cumsum(np.where(finite, v, 0.0))
+    whole = np.convolve(~finite, np.ones(WIDE + 1, int), "valid") == 0
+    changed = np.where(whole, v[WIDE:] - v[:-WIDE], 0.0)
+    pulled = np.abs(changed) > PULLED * np.max(np.abs(changed), initial=0.0)
+    middle = summed[WIDE:] - summed[:-WIDE] - changed / 2
+    left = (x[WIDE:] - x[:-WIDE] - period * middle)[pulled]
+    fit = scale(left, period / 2 * changed[pulled], WIDE) if np.any(pulled) else None
+    if fit is None:
+        return None
+    places = {"semi_implicit_euler": 1.0, "explicit_euler": -1.0, "zoh": 0.0}
+    best = min(places, key=lambda one: abs(fit.slope - places[one]))
+    return best if abs(fit.slope - places[best]) < CLEAR and SURE * fit.error < 0.5 - CLEAR else None
 
 
 def _whole(tick: np.ndarray, channels: Channels, period: float, mass: float) -> Stretch:

@@ -1,0 +1,87 @@
+"""Campaigns whose touches hardly tell damping from the age of the force, and how far off e and e - e* are."""
+
+import campaign_kinds
+import campaigns
+import numpy as np
+
+from jaxhil.mechanism.file import from_builtins, to_builtins
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.scenario import build_scenarios
+
+SOFT = campaign_kinds.voigt((124355.0,), (264.0,))  # damping over stiffness: 2.1 ms
+RIG = campaign_kinds.rig
+KINDS = {
+    "plain": campaign_kinds.Kind(RIG(), SOFT),
+    "lag": campaign_kinds.Kind(RIG(force_sensor__time_constant=0.0016, position_sensor__delay=0.0011), SOFT),
+    "hidden": campaign_kinds.Kind(RIG(force_sensor__dead_zone=6.0), SOFT),
+    "coloured 2 N": campaign_kinds.Kind(RIG(noise=2.0), SOFT, colour=0.6),
+    "lost rows": campaign_kinds.Kind(RIG(), SOFT, jitter=5e-5, lost=0.01),
+    "undamped": campaign_kinds.Kind(RIG(), campaign_kinds.voigt((124355.0,), (0.0,))),
+    "no delay": campaign_kinds.Kind(RIG(force_sensor__delay=0.0), SOFT),
+}
+PHASES = np.arange(4) / 4.0
+TOLD = ("natural_frequency", "damping_ratio", "delay")
+
+
+def campaign(monkeypatch, name, seed, **changes):
+    """Return a campaign of one of these kinds."""
+    monkeypatch.setitem(campaigns.KINDS, name, KINDS[name])
+    return campaigns.campaign(name, seed, **changes)
+
+
+def prior(name):
+    """Return what is known beforehand: stiffness, a rough motion simulator, the position sensor's delay.
+
+    It has no damping, and no delay, lag or dead zone of the force sensor."""
+    sensor = {"delay": KINDS[name].rig["position_sensor"].get("delay", 0.0)}
+    simulator = {"model": "second_order", "natural_frequency": 12.0, "damping_ratio": 0.8, "delay": 0.004}
+    return from_builtins({
+        "schema": "jaxhil/mechanism/1", "name": "prior", "bodies": {"equivalent_mass": 350.0},
+        "approach": {"velocity": 0.006},
+        "contact": {"law": "kelvin_voigt", "stiffness": [124355.0]},
+        "rig": {"control_period": 0.001, "simulator": simulator, "position_sensor": sensor},
+    }, "prior")  # fmt: skip
+
+
+def truth(name):
+    """Return the rig as a mechanism file has it, without noise and dead zone."""
+    kind = KINDS[name]
+    raw = to_builtins(prior(name))
+    raw["contact"] = {**kind.contact}
+    sensor = {key: one for key, one in kind.rig["force_sensor"].items() if key in ("delay", "time_constant")}
+    raw["rig"] |= {"simulator": {**kind.rig["simulator"]}, "force_sensor": sensor}
+    return from_builtins(raw, name)
+
+
+def numbers(mechanism, position_delay):
+    """Return the numbers that decide e and e*, by key, as if the position sensor had that delay [s].
+
+    Delays d less of the motion and of the force, and d more of the position sensor, are the same rig."""
+    rig, contact = mechanism.rig, mechanism.contact
+    found = {f"rig.simulator.{key}": getattr(rig.simulator, key) for key in TOLD}
+    found |= {f"rig.force_sensor.{key}": getattr(rig.force_sensor, key) for key in ("delay", "time_constant")}
+    share = rig.position_sensor.delay - position_delay
+    found["rig.simulator.delay"] += share
+    found["rig.force_sensor.delay"] = max(found["rig.force_sensor.delay"] - share, 0.0)
+    return found | {"contact.stiffness": contact.stiffness[0], "contact.damping": contact.damping[0]}
+
+
+def off(name, written, compensator, gains):
+    """Return by how much e and e - e* of each mechanism are off those of the truth, (mechanisms, 2).
+
+    All run under the same gains in the loop of `jaxhil`; e is the mean over phases of the contact."""
+    true = truth(name)
+    every = [numbers(one, true.rig.position_sensor.delay) for one in (true, *written)]
+    draws = {
+        key: np.repeat([one[key] for one in every], len(PHASES))
+        for key in every[0]
+        if any(one[key] for one in every)
+    }
+    draws["approach.phase"] = np.tile(PHASES, len(every))
+    scenarios = build_scenarios(true, draws, 0)
+    found = evaluate(build_loop(true, compensator, scenarios), gains, scenarios)
+    assert np.array_equal(found.good, found.wanted)
+    e, error = np.asarray(found.metrics.restitution)[0], np.asarray(found.error)[0]
+    table = np.array([e, error]).reshape(2, len(every), len(PHASES)).mean(axis=2)
+    return (table[:, 1:] - table[:, :1]).T

@@ -1,0 +1,210 @@
+"""Channels with clocks of their own: brought to the rows of the desired position, or refused by name."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from log_cases import CHANNELS, mapping, read, touches, write_csv
+
+from jaxhil.errors import InputError
+from tuning.identification.logs.joining import join
+
+PERIOD, ROWS = 1e-3, 2000
+
+
+def smooth(times):
+    """A signal that is known at any time."""
+    return np.sin(2 * np.pi * 2.3 * times) + 0.3 * np.cos(2 * np.pi * 7.1 * times + 1.0)
+
+
+def scattered(times, jitter, seed=0):
+    return times + np.clip(jitter * np.random.default_rng(seed).standard_normal(len(times)), -4e-4, 4e-4)
+
+
+def joined(sampled, stamps=None, ticks=None, jitter=0.0):
+    """The rows' ticks, readings joined to them, and notes; `sampled`: when readings were taken [s]."""
+    ticks = np.arange(ROWS) if ticks is None else ticks
+    rows = scattered(PERIOD * ticks, jitter, 1)
+    columns = {"position_desired": ticks.astype(float), "force_measured": smooth(sampled)}
+    clocks = {"position_desired": rows, "force_measured": sampled if stamps is None else stamps}
+    named = {"position_desired": "xd", "force_measured": "F"}
+    found, times, notes = join("a", columns, clocks, named, PERIOD)
+    kept = found["position_desired"].astype(int)
+    assert len(times) == len(kept) == len(found["force_measured"])
+    assert np.all(np.isin(times, rows))
+    return kept, found["force_measured"], notes
+
+
+@pytest.mark.parametrize("late", [5.0, -7.0, 0.0])
+@pytest.mark.parametrize("jitter", [0.0, 5e-5])
+def test_channel_that_begins_some_ticks_later_is_shifted_exactly(late, jitter):
+    sampled = PERIOD * (np.arange(ROWS - 40) + late)
+    kept, force, notes = joined(sampled, scattered(sampled, jitter, 2), jitter=jitter)
+    np.testing.assert_array_equal(force, smooth(PERIOD * (late + np.arange(ROWS)))[(kept - int(late))])
+    assert kept[0] == max(late, 0) and kept[-1] == ROWS - 41 + late
+    assert "taken at their own times" in notes[0]
+    assert f"{40 + max(0, -late):.0f} rows at which a channel was not read" in notes[1]
+
+
+@given(
+    late=st.floats(-0.02, 0.3),
+    rate=st.sampled_from([1.0, 1.00003, 0.99995, 0.5, 0.1, 0.37, 0.95]),
+    jitter=st.sampled_from([0.0, 2e-5]),
+    lost=st.sampled_from([0.0, 0.01]),
+    ends=st.integers(500, ROWS),
+    seed=st.integers(0, 99),
+)
+@settings(deadline=None, max_examples=30)
+def test_readings_are_those_of_the_rows_times(late, rate, jitter, lost, ends, seed):
+    random = np.random.default_rng(seed)
+    count = int(ends / rate)
+    sampled = (late + PERIOD * rate * np.arange(count))[random.uniform(size=count) >= lost]
+    ticks = np.flatnonzero(random.uniform(size=ROWS) >= lost)
+    kept, force, _ = joined(sampled, scattered(sampled, jitter * rate, seed), ticks, jitter)
+    # Between readings a period apart the signal bends by T^2 / 8 of its curvature.
+    bent = (2 * np.pi * 7.1) ** 2 * PERIOD**2 / 8
+    moved = (2 * np.pi * 7.1) * (0.02 * PERIOD + jitter)
+    assert np.max(np.abs(force - smooth(PERIOD * kept))) < bent + moved
+    inside = (ticks * PERIOD > sampled[0] + PERIOD) & (ticks * PERIOD < sampled[-1] - PERIOD)
+    assert len(kept) > (0.9 if lost else 0.999) * np.count_nonzero(inside) - 2 and set(kept) <= set(ticks)
+
+
+def test_gap_of_a_channel_loses_its_rows():
+    sampled = np.delete(PERIOD * np.arange(ROWS), slice(1000, 1200)) + 4e-4
+    kept, _, notes = joined(sampled)
+    assert not np.any((kept > 1000) & (kept < 1200)) and "interpolated between their own times" in notes[0]
+    assert len(kept) == ROWS - 200 - 2
+
+
+@pytest.mark.parametrize(
+    ("stamps", "reason"),
+    [
+        (PERIOD * np.arange(ROWS)[::-1], "row 2: stamps of 'F': found 1.998 s after 1.999 s"),
+        (np.repeat(PERIOD * np.arange(ROWS // 2), 2), "row 2: stamps of 'F': found 0 s after 0 s"),
+        (
+            np.where(np.arange(ROWS) == 77, np.nan, PERIOD * np.arange(ROWS)),
+            "row 78: stamps of 'F': found nan s",
+        ),
+        (
+            2 * PERIOD * np.arange(ROWS),
+            "stamps of 'F': found readings 0.002 s apart, allowed the control period",
+        ),
+        (
+            100 + PERIOD * np.arange(ROWS),
+            "found no time at which all channels were read ('xd' 0 to 1.999 s, 'F' 100",
+        ),
+        (PERIOD * np.arange(ROWS - 1), "stamps of 'F': found 1999, allowed 2000, one a row"),
+        (None, "column 'F': found no stamps, allowed some"),
+    ],
+)
+def test_clocks_that_cannot_be_joined_are_refused_by_name(stamps, reason):
+    rows = PERIOD * np.arange(ROWS)
+    columns = {"position_desired": rows, "force_measured": rows}
+    with pytest.raises(InputError) as caught:
+        named = {"position_desired": "xd", "force_measured": "F"}
+        join("a", columns, {"position_desired": rows, "force_measured": stamps}, named, PERIOD)
+    assert str(caught.value).startswith("a: ") and reason in str(caught.value)
+
+
+def test_channels_that_hold_their_value_are_not_interpolated():
+    rows = PERIOD * np.arange(ROWS)
+    columns = {"position_desired": rows, "contact_index": np.repeat([0.0, 3.0], ROWS // 2)}
+    columns["mode"] = np.array(["free"] * (ROWS // 2) + ["contact"] * (ROWS // 2), object)
+    clocks = {"position_desired": rows, "contact_index": rows - 4e-4, "mode": rows + 3e-4}
+    found, _, _ = join("a", columns, clocks, {name: name for name in columns}, PERIOD)
+    assert set(found["contact_index"]) == {0.0, 3.0} and set(found["mode"]) == {"free", "contact"}
+
+
+def separate(late, rows=580):
+    """A log whose force has stamps and a number of rows of its own."""
+    log = touches(1)
+    force = {"tF": 1e3 * (log["t"][:rows] + late), "F": log["F"][:rows]}
+    return log, {"tx": 1e3 * log["t"], **{name: log[name] for name in ("xd", "xm", "vd", "Fc")}}, force
+
+
+TIMES = {
+    "time": {"column": "x/tx", "unit": "ms"},
+    "force_measured": {"column": "f/F", "time": "f/tF"},
+    **{name: f"x/{column}" for name, column in CHANNELS.items() if name not in ("time", "force_measured")},
+}
+
+
+@pytest.mark.parametrize("late", [0.005, -0.012])
+def test_channel_with_stamps_that_the_mapping_names(tmp_path, late):
+    h5py = pytest.importorskip("h5py")
+    log, *groups = separate(late)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for group, columns in zip("xf", groups, strict=True):
+            for name, values in columns.items():
+                file[f"{group}/{name}"] = values
+    campaign = read(tmp_path / "a.h5", **TIMES)
+    (run,) = campaign.runs
+    shift, first = round(1e3 * late), np.flatnonzero(log["xd"] == run.position_desired[0])[0]
+    np.testing.assert_array_equal(run.force_measured, log["F"][first - shift : first - shift + len(run.tick)])
+    assert f"begins {abs(shift)} ms" in campaign.notes[0]
+    # By row numbers they do not go together.
+    with pytest.raises(InputError, match="found columns of unlike length"):
+        read(tmp_path / "a.h5", **TIMES | {"force_measured": "f/F"})
+    with pytest.raises(InputError, match=r"channels.force_measured.time is named"):
+        read(tmp_path / "a.h5", **TIMES, timing={"clock": "index"})
+
+
+def test_stamps_of_one_channel_need_stamps_of_the_rows():
+    with pytest.raises(InputError, match=r"channels.force_measured.time: found 'tF', allowed none"):
+        mapping(time={"rate": 1000.0}, force_measured={"column": "F", "time": "tF"})
+
+
+def test_text_of_the_same_length_is_joined_by_its_own_stamps(tmp_path):
+    log = touches(1)
+    path = write_csv(tmp_path / "a.csv", log | {"tF": log["t"] + 0.003})
+    (run,) = read(path, force_measured={"column": "F", "time": "tF"}).runs
+    np.testing.assert_array_equal(run.force_measured, log["F"][:-3])
+    np.testing.assert_array_equal(run.position_desired, log["xd"][3:])
+
+
+@pytest.mark.parametrize(("unit", "late"), [(1.0, 0.005), (1e3, 0.005), (1.0, 1e-4)])
+def test_stamps_of_a_group_that_are_not_those_of_the_rows_are_refused(tmp_path, unit, late):
+    h5py, log = pytest.importorskip("h5py"), touches(1)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["x/time"], file["f/time"], file["f/count"] = log["t"], unit * (log["t"] + late), 2.0 * log["t"]
+        for name in ("xd", "xm", "vd", "Fc"):
+            file[f"x/{name}"] = log[name]
+        file["f/F"] = log["F"]
+    said = TIMES | {"time": "x/time", "force_measured": "f/F"}
+    with pytest.raises(
+        InputError, match=r"'f/F': found stamps of its own in 'f/time' that are not those in 'x/time'"
+    ):
+        read(tmp_path / "a.h5", **said)
+    if unit == 1.0:
+        assert read(tmp_path / "a.h5", **said | {"force_measured": {"column": "f/F", "time": "f/time"}}).notes
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["f/time"][:] = unit * log["t"]
+    (run,) = read(tmp_path / "a.h5", **said).runs
+    np.testing.assert_array_equal(run.force_measured, log["F"])
+
+
+HOSTILE = st.one_of(
+    st.floats(),
+    st.sampled_from([np.nan, np.inf, -np.inf, 0.0, -0.0, 1e300, -1e300, 5e-324]),
+)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    place=st.integers(0, 299),
+    value=HOSTILE,
+    count=st.integers(0, 300),
+    rate=st.sampled_from([1e-9, 1e-4, 1e-3, 1.4e-3, 1e9]),
+    whose=st.sampled_from(["position_desired", "force_measured"]),
+)
+def test_any_clock_is_joined_or_refused_in_one_line(place, value, count, rate, whose):
+    rows = {"position_desired": PERIOD * np.arange(300), "force_measured": rate * np.arange(count)}
+    if len(rows[whose]):
+        rows[whose][place % len(rows[whose])] = value
+    columns = {name: np.zeros(len(one)) for name, one in rows.items()}
+    try:
+        found, times, _ = join("a", columns, rows, {name: name for name in rows}, PERIOD)
+    except InputError as error:
+        assert str(error).isprintable() and str(error).startswith("a: ")
+        return
+    assert all(len(one) == len(times) and np.all(np.isfinite(one)) for one in found.values())

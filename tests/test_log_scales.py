@@ -1,0 +1,219 @@
+"""Scales of forces, positions and velocities by the model's momentum; logs that are rounded, torn or late."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from log_cases import MASS, PERIOD, mapping, read, touches, write_csv
+
+from jaxhil.errors import InputError
+from tuning.identification.logs.campaign import read_campaign
+from tuning.identification.logs.model_motion import check_command
+from tuning.identification.logs.rows import Stretch, integrator_of
+from tuning.identification.logs.scale_fit import scale
+from tuning.identification.logs.scales import likely_lengths, likely_units
+
+LBF, INCH = 4.4482216152605, 0.0254
+LOG = touches(2, noise=0.3)
+ALL = ("xd", "xm", "vd")
+
+
+def scaled(log, **factors):
+    return log | {name: factor * log[name] for name, factor in factors.items()}
+
+
+def rounded(log, **quanta):
+    return log | {name: quantum * np.round(log[name] / quantum) for name, quantum in quanta.items()}
+
+
+def lose(log, share, seed=0):
+    """Rows lost here and there."""
+    kept = np.random.default_rng(seed).uniform(size=len(log["t"])) >= share
+    return {name: column[kept] for name, column in log.items()}
+
+
+def scatter(log, std, seed=1, samples=False):
+    """Stamps that scatter, and samples where they do."""
+    late = np.clip(std * np.random.default_rng(seed).standard_normal(len(log["t"])), -4e-4, 4e-4)
+    times = log["t"] + late
+    if samples:
+        log = {name: np.interp(times, log["t"], column) for name, column in log.items()}
+    return log | {"t": times}
+
+
+def refused(tmp_path, log, **said):
+    path = write_csv(tmp_path / "a.csv", log)
+    with pytest.raises(InputError) as caught:
+        read(path, **said)
+    found = str(caught.value)
+    assert found.isprintable() and found.startswith(f"{path}: ")
+    return found
+
+
+NO_COMMAND = {"force_command": None}
+
+
+@pytest.mark.parametrize(
+    ("factors", "said", "reason"),
+    [
+        ({"F": 1 / LBF}, {}, "times the impulse that there was, expected 0.5 to 2 "),
+        ({"F": 1 / LBF}, {}, "(force in lbf, read as N?)"),
+        ({"F": 1 / LBF}, NO_COMMAND, "force in lbf, read as N"),
+        ({"F": LBF}, NO_COMMAND, "force in N, read as lbf"),
+        ({"F": 1 / 9.80665}, NO_COMMAND, "force in kgf, read as N"),
+        ({"Fc": 1 / LBF}, {}, "0.2248 times the force that there was"),
+        ({"Fc": 1 / LBF}, {}, "within 1 % (force in lbf, read as N?); or leave force_command out"),
+        ({"F": 1 / LBF, "Fc": 1 / LBF}, {}, "(nearest: 78.68 kg)"),
+        (dict.fromkeys(ALL, 1 / 2.54), {}, "2.54 times the force that there was"),
+        (dict.fromkeys(ALL, 1 / 2.54), {}, "(positions in in, read as cm?)"),
+        (dict.fromkeys(ALL, 1 / 2.54), NO_COMMAND, "positions in in, read as cm"),
+        (dict.fromkeys(ALL, 2.54), {}, "(positions in cm, read as in?)"),
+        (
+            {"xm": 1 / 2.54},
+            {},
+            "times the motion of position_desired, expected 0.5 to 2 (in in, read as cm?)",
+        ),
+        (
+            {"vd": 1 / 2.54},
+            {},
+            "velocity_desired: found 0.3937 times the rate of position_desired, expected 1",
+        ),
+        ({"vd": -1.0}, {}, "velocity_desired: found -1 times the rate"),
+    ],
+)
+def test_channel_in_a_wrong_unit_is_refused_with_factor_and_unit(tmp_path, factors, said, reason):
+    assert reason in refused(tmp_path, scaled(LOG, **factors), **said)
+
+
+def test_wrong_mass_of_a_few_percent_is_found(tmp_path):
+    found = refused(tmp_path, scaled(LOG, Fc=1.03))
+    assert "(nearest: 360.5 kg), 1.03 times the force" in found
+    assert read(write_csv(tmp_path / "b.csv", scaled(LOG, Fc=1.005))).notes == ()
+
+
+REAL = {
+    "lost rows": lambda log: lose(log, 0.01),
+    "lost rows and jitter": lambda log: scatter(lose(log, 0.01), 5e-5),
+    "many lost rows": lambda log: lose(log, 0.05),
+    "samples that scatter": lambda log: lose(scatter(log, 5e-5, samples=True), 0.01),
+    "1 mN and 1 nm": lambda log: rounded(log, Fc=1e-3, xd=1e-9),
+    "0.1 N and 0.1 um": lambda log: rounded(log, Fc=0.1, xd=1e-7, vd=1e-6),
+    "float32": lambda log: (
+        {name: one if name == "t" else one.astype(np.float32) for name, one in log.items()}
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REAL)
+@pytest.mark.parametrize("without", [(), ("velocity_desired",)])
+def test_logs_of_real_loggers_keep_their_force_command(tmp_path, name, without):
+    log, gone = REAL[name](LOG), dict.fromkeys(without)
+    found = read(write_csv(tmp_path / "a.csv", log), **gone)
+    assert found.notes == () and all(run.force_command is not None for run in found.runs)
+    assert 'in rows that are "tick"' in refused(tmp_path, log, timing={"row": "sent"}, **gone)
+    assert "(nearest: 367.5 kg)" in refused(tmp_path, scaled(log, Fc=1.05), **gone)
+    assert "pulls the model forward" in refused(tmp_path, scaled(log, Fc=-1.0), **gone)
+
+
+def test_force_command_that_tells_nothing_is_ignored_with_a_note(tmp_path):
+    noise = LOG | {"Fc": 5.0 * np.random.default_rng(0).standard_normal(len(LOG["t"]))}
+    found = read(write_csv(tmp_path / "a.csv", noise))
+    (note,) = found.notes
+    assert "a.csv: force_command: ignored, since M x_d'' = -F_c leaves" in note
+    assert all(run.force_command is None for run in found.runs)
+    found = read(write_csv(tmp_path / "b.csv", LOG | {"Fc": 0.0 * LOG["Fc"], "vd": 0.0 * LOG["vd"]}))
+    assert "force_command: ignored, since it is 0 N in every contact" in "\n".join(found.notes)
+    # The measured force is then held against the momentum of the positions.
+    assert "force in lbf" in refused(tmp_path, scaled(noise, F=1 / LBF))
+
+
+def test_velocity_that_does_not_follow_is_ignored_with_a_note(tmp_path):
+    noise = LOG | {"vd": 5e-3 * np.random.default_rng(0).standard_normal(len(LOG["t"]))}
+    found = read(write_csv(tmp_path / "a.csv", noise))
+    assert "velocity_desired: ignored, since position_desired does not move by it" in "\n".join(found.notes)
+    assert all(run.velocity_desired is None for run in found.runs)
+
+
+def test_row_that_nothing_tells_is_noted(tmp_path):
+    coarse = rounded(scatter(LOG, 2e-4, samples=True), xd=2e-6, vd=1e-4)
+    assert "timing.row: force_command is too coarse" in "\n".join(
+        read(write_csv(tmp_path / "a.csv", coarse)).notes
+    )
+
+
+def test_damping_compensator_and_dead_zone_are_no_wrong_unit(tmp_path):
+    """The impulse differs by what the compensator adds and the dead zone takes."""
+    log = touches(1, speed=12e-3, noise=0.0)
+    dead = log | {"F": np.sign(log["F"]) * np.maximum(np.abs(log["F"]) - 45.0, 0.0)}
+    impulse = np.sum(dead["F"]) / np.sum(log["F"])
+    assert impulse < 0.5
+    read(write_csv(tmp_path / "a.csv", dead), **NO_COMMAND)
+    assert "times the impulse" in refused(tmp_path, scaled(dead, F=1 / LBF), **NO_COMMAND)
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    factor=st.sampled_from([1.0, 1 / LBF, LBF, 2.54, 1 / 2.54, 1e3, 1.2]),
+    quantum=st.sampled_from([0.0, 1e-10, 1e-9, 1e-8, 1e-7, 1e-6]),
+    noise=st.sampled_from([0.0, 0.3, 3.0]),
+    lost=st.sampled_from([0.0, 0.01, 0.1]),
+    seed=st.integers(0, 99),
+)
+def test_force_command_is_right_or_refused_whatever_the_log(factor, quantum, noise, lost, seed):
+    log = {name: column[:500] for name, column in touches(1, noise=noise, seed=seed).items()}
+    x = quantum * np.round(log["xd"] / quantum) if quantum else log["xd"]
+    valid = np.random.default_rng(seed).uniform(size=len(x)) >= lost
+    force = np.where(valid, factor * log["Fc"], np.nan)
+    channels = {"position_desired": x, "velocity_desired": log["vd"], "force_command": force}
+    stretch = Stretch(np.arange(len(x)), channels, valid)
+    touched = np.flatnonzero(log["Fc"])
+    contacts = [(int(touched[0]), int(touched[-1]) + 1)]
+    try:
+        holds, _ = check_command("a", stretch, contacts, PERIOD, MASS, "tick", "semi_implicit_euler")
+    except InputError as error:
+        found = float(str(error).split("kg), ")[1].split(" times")[0])
+        assert factor != 1.0 and found == pytest.approx(factor, rel=0.05)
+        return
+    assert factor == 1.0 or not holds
+    assert holds or quantum >= 1e-6
+
+
+@pytest.mark.parametrize("quantum", [0.0, 1e-9, 1e-7, 1e-6])
+def test_integrator_shows_under_rounding(quantum):
+    log = touches(1, noise=1.0)
+    v = log["vd"][:500]
+    ways = {"semi_implicit_euler": v[1:], "explicit_euler": v[:-1], "zoh": (v[1:] + v[:-1]) / 2}
+    ways = {name: -1.1e-3 + PERIOD * np.cumsum(np.append(0.0, step)) for name, step in ways.items()}
+    for name, position in ways.items():
+        coarse = quantum * np.round(position / quantum) if quantum else position
+        assert integrator_of(coarse, v, PERIOD) == name
+
+
+def test_scale_and_its_error_cover_the_truth():
+    random, off = np.random.default_rng(0), []
+    unit = np.sin(np.arange(400) / 20.0)
+    for _ in range(300):
+        noise = np.convolve(random.standard_normal(407), np.ones(8), "valid")
+        fit = scale(2.0 * unit + noise, unit, 8)
+        off.append((fit.slope - 2.0) / fit.error)
+    assert 0.6 < np.std(off) < 1.3
+    assert scale(np.zeros(9), np.ones(9)) is None and scale(np.ones(9), np.zeros(9)) is None
+
+
+def test_units_are_named_by_their_factors():
+    assert likely_units((0.225,), 0.02) == " (force in lbf, read as N?)"
+    assert likely_units((1.3,), 0.02) == likely_units((-4.448,), 0.02) == ""
+    assert likely_lengths(1 / 25.4, 0.01) == " (in in, read as mm?)"
+
+
+def test_a_campaign_of_several_files_names_the_wrong_one(tmp_path):
+    good, bad = write_csv(tmp_path / "a.csv", LOG), write_csv(tmp_path / "b.csv", scaled(LOG, F=1 / LBF))
+    with pytest.raises(InputError, match=r"b.csv: force_measured: found 0.2"):
+        read_campaign([good, bad], mapping())
+
+
+def test_a_note_of_several_logs_is_said_once(tmp_path):
+    log = LOG | {"vd": 0.0 * LOG["vd"]}  # as loggers write a channel that is not connected
+    paths = [write_csv(tmp_path / f"{name}.csv", log) for name in "abc"]
+    (note,) = read_campaign(paths, mapping()).notes
+    assert note.startswith(f"{paths[0]} and 2 more: velocity_desired: ignored")

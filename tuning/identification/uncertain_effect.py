@@ -1,0 +1,219 @@
+"""Effect of a mechanism file's uncertainty on the restitution e and on its error e - e*.
+
+e* is the restitution of the ideal contact, e that of the rig. To first order a change dF of the contact force
+changes the rebound by its work,
+
+    d e* = -(integral of dF v dt) / (M v_0^2 e*),
+
+and a force that is older by tau adds energy, tau times the integral of F^2 / M:
+
+    e = e* + J tau,    J = (integral of F^2 dt) / (M^2 v_0^2 e*),
+
+for a linear spring (pi/2) w tau. Damping and age of the force thus cancel in e, and do not in e - e*: gains
+that are tuned on too little damping reproduce a contact with too little damping.
+
+A rig without compensation rebounds faster by a factor c = 1 + J tau / e*, and d e = c (d e* + J d tau); where
+gains make up for the age, c is 1. The larger effect of the two counts.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from jaxhil.errors import InputError
+from jaxhil.mechanism.structs import Contact, Mechanism
+from jaxhil.mechanism.uncertainty import draw
+from tuning.identification import known
+from tuning.identification.contact_laws import Law
+
+DRAWS = 1024
+SURE = 0.99  # share of the draws whose effect is smaller
+STEPS = 400  # of a contact's motion, an estimate of its duration long
+LONGEST_CONTACT = 4.0  # times that estimate, after which a contact that did not end is given up
+STEP = 1e-4  # relative, of differences by a number of the motion simulator
+DEEPEST = 1.0  # m; a contact that gets there ends nowhere
+FORCE_DELAY, SIMULATOR = "rig.force_sensor.delay", "rig.simulator."
+IDENTIFIED = "identified from"  # how the source of a file begins that an identification wrote
+AGES = (FORCE_DELAY, "rig.force_sensor.time_constant")
+CONTACT = ("contact.stiffness", "contact.damping", "contact.reference_depth")
+
+
+class Effect(NamedTuple):
+    """What uncertainty can do, with a probability of 99 %."""
+
+    restitution: float  # change of e
+    error: float  # change of e - e*
+    parts: dict[str, float]  # change by each key alone
+
+
+class _Contact(NamedTuple):
+    """One contact as the file has it, and how it changes."""
+
+    restitution: float  # e*
+    by_coefficient: np.ndarray  # slopes of e*
+    by_age: float  # slope of e - e* [1/s]
+
+
+def uncertain_effect(mechanism: Mechanism) -> Effect:
+    """Compute by how much the numbers that an identification found may change e and e - e*.
+
+    The numbers are those of the file's `[correlation]`, or, if there is none, the normal entries of
+    `[uncertainty]`; what the file says of other numbers are variations, not the identification's doubt.
+
+    Returns:
+        The effects of which 99 % of the draws stay below, of the contact of the lists where they are largest.
+    """
+    keys = _keys(mechanism)
+    if not keys:
+        return Effect(0.0, 0.0, {})
+    try:
+        law = known.contact_law(mechanism.contact)
+    except InputError:
+        return Effect(0.0, 0.0, {})
+    drawn = draw(mechanism, DRAWS, 0)
+    worst = Effect(0.0, 0.0, {})
+    for entry in range(len(mechanism.contact.stiffness)):
+        contact, frequency = _contact(mechanism, law, entry)
+        if contact is None:
+            continue
+        changes = {key: _change(mechanism, contact, entry, frequency, key, drawn[key]) for key in keys}
+        gain = 1.0 + contact.by_age * _age(mechanism, frequency) / contact.restitution
+        ideal, error = np.sum(list(changes.values()), axis=0)
+        found = Effect(
+            gain * _sure(ideal + error),
+            max(_sure(error), _sure(gain * (ideal + error) - ideal)),
+            {key: _sure(one + other) for key, (one, other) in changes.items()},
+        )
+        if max(found[:2]) > max(worst[:2]):
+            worst = found
+    return worst
+
+
+def _keys(mechanism: Mechanism) -> list[str]:
+    """The numbers whose uncertainty is an identification's."""
+    if not mechanism.source.startswith(IDENTIFIED):
+        return []
+    if mechanism.correlation is not None:
+        found = mechanism.correlation.keys
+    else:
+        found = [key for key, one in mechanism.uncertainty.items() if one.distribution == "normal"]
+    return [key for key in found if key in (*AGES, *CONTACT) or key.startswith(SIMULATOR)]
+
+
+def _change(
+    mechanism: Mechanism, contact: _Contact, entry: int, frequency: float, key: str, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Changes of e* and of e - e* by draws of one number."""
+    nothing = np.zeros(len(values))
+    if key in CONTACT:
+        nominal = np.array(known.coefficients(mechanism.contact, entry))
+        moved = np.array([
+            known.coefficients(_with(mechanism.contact, key.removeprefix("contact."), one), entry)
+            for one in values.tolist()
+        ])  # fmt: skip
+        return (moved - nominal) @ contact.by_coefficient, nothing
+    if key in AGES:
+        older = values - getattr(mechanism.rig.force_sensor, key.rpartition(".")[2])
+        return nothing, older * contact.by_age
+    name = key.removeprefix(SIMULATOR)
+    value = getattr(mechanism.rig.simulator, name)
+    if not isinstance(value, float):
+        return nothing, nothing
+    low, high = (
+        _lag(_with_simulator(mechanism, name, value + side), frequency)
+        for side in (0.0, STEP * max(value, 1e-3))
+    )
+    return nothing, (values - value) * (high - low) / (STEP * max(value, 1e-3)) * contact.by_age
+
+
+def _with(contact: Contact, name: str, value: Any) -> Contact:
+    return msgspec.structs.replace(contact, **{name: value})
+
+
+def _with_simulator(mechanism: Mechanism, name: str, value: float) -> Mechanism:
+    simulator = msgspec.structs.replace(mechanism.rig.simulator, **{name: value})
+    rig = msgspec.structs.replace(mechanism.rig, simulator=simulator)
+    return msgspec.structs.replace(mechanism, rig=rig)
+
+
+def _lag(mechanism: Mechanism, frequency: float) -> float:
+    """Return the delay of the motion's phase at a frequency [Hz], in s, with the position sensor's delay."""
+    model = known.motion_model(mechanism)
+    angle = float(np.angle(model.response(np.array([2j * np.pi * frequency]))[0]))
+    return -angle / (2.0 * np.pi * frequency)
+
+
+def _age(mechanism: Mechanism, frequency: float) -> float:
+    """Return by how much the force is older than the command at a frequency [Hz], in s."""
+    sensor = mechanism.rig.force_sensor
+    whole = _lag(mechanism, frequency) + sensor.delay + sensor.time_constant
+    return max(whole - mechanism.rig.position_sensor.delay, 0.0)
+
+
+def _sure(values: np.ndarray) -> float:
+    return float(np.quantile(np.abs(values), SURE))
+
+
+def _contact(mechanism: Mechanism, law: Law, entry: int) -> tuple[_Contact | None, float]:
+    """The ideal contact with one entry of the lists, and its frequency [Hz]; None where it has no rebound."""
+    mass, speed = mechanism.bodies.mass, mechanism.approach.velocity
+    coefficients = np.array(known.coefficients(mechanism.contact, entry))
+
+    def force(depth: float, rate: float) -> float:
+        functions = law.own(np.array([max(depth, 0.0)]), np.array([rate]))
+        total = float(sum(c * one[0] for c, one in zip(coefficients, functions, strict=True)))
+        return total if law.pulls else max(total, 0.0)
+
+    deepest = _deepest(force, 0.5 * mass * speed**2)
+    if deepest is None:
+        return None, 0.0
+    step = np.pi * deepest / speed / STEPS
+    states = [(0.0, speed)]
+    for _ in range(round(LONGEST_CONTACT * STEPS)):
+        states.append(_stepped(force, mass, states[-1], step))
+        if states[-1][0] <= 0.0:
+            break
+    depth, rate = np.array(states).T
+    # The last step ends out of contact: the part of it that is in contact counts.
+    last, past = depth[-2:]
+    weights = np.full(len(depth) - 1, step)
+    weights[-1] *= min(last / max(last - past, 1e-300), 1.0)
+    restitution = -float(rate[-1]) / speed
+    if past > 0.0 or restitution <= 0.0:
+        return None, 0.0
+    middle, moving = (0.5 * (one[1:] + one[:-1]) for one in (depth, rate))
+    middle = np.maximum(middle, 0.0)
+    columns = np.array([np.broadcast_to(one, middle.shape) for one in law.own(middle, moving)])
+    total = coefficients @ columns
+    touching = np.ones(len(middle), bool) if law.pulls else total > 0.0
+    scale = mass * speed**2 * restitution
+    by_coefficient = -(columns * touching) @ (moving * weights) / scale
+    by_age = float(np.sum(np.where(touching, total, 0.0) ** 2 * weights)) / mass / scale
+    return _Contact(restitution, by_coefficient, by_age), speed / deepest / (2.0 * np.pi)
+
+
+def _deepest(force: Any, energy: float) -> float | None:
+    """The depth at which the force without damping has taken up an energy [J], to 1e-3; None if nowhere."""
+    depth, work = 1e-9, 0.0
+    while work < energy:
+        work += force(1.005 * depth, 0.0) * 0.01 * depth
+        depth *= 1.01
+        if depth > DEEPEST:
+            return None
+    return depth
+
+
+def _stepped(force: Any, mass: float, state: tuple[float, float], step: float) -> tuple[float, float]:
+    """The state of depth and rate one step of Runge and Kutta's later."""
+    depth, rate = state
+    one = -force(depth, rate) / mass
+    two = -force(depth + 0.5 * step * rate, rate + 0.5 * step * one) / mass
+    three = -force(depth + 0.5 * step * (rate + 0.5 * step * one), rate + 0.5 * step * two) / mass
+    four = -force(depth + step * (rate + 0.5 * step * two), rate + step * three) / mass
+    return (
+        depth + step * (rate + step * (one + two + three) / 6.0),
+        rate + step * (one + 2.0 * two + 2.0 * three + four) / 6.0,
+    )
