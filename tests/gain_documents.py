@@ -72,6 +72,14 @@ GAINS: dict[str, dict[str, dict[str, Any]]] = {
         "delay_spread": {"value": 0.0008, "unit": "s", "lower": 0.0, "upper": 0.05},
         "sensor_lag": {"value": 0.0012, "unit": "s", "lower": 0.0, "upper": 0.05},
     },
+    "impulse_ledger": {
+        **_entries("impulse_ledger"),
+        "identification_delay": _RETROSPECTIVE["identification_delay"],
+        "velocity_gain": {"value": 10.0, "unit": "1/s", "lower": 1.0, "upper": 1e3},
+        "correction_limit": {"value": 0.9, "unit": "1", "lower": 0.01, "upper": 20.0},
+        "force_noise": {"value": 0.3, "unit": "N", "lower": 0.0, "upper": 100.0},
+        "prior_friction_spread": {"value": 0.5, "unit": "1/s", "lower": 0.0, "upper": 50.0},
+    },
     "response_error": {
         **_LEAD,
         "response_error": {"value": 0.9, "unit": "1", "lower": 0.0, "upper": 2.0},

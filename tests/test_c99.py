@@ -32,12 +32,13 @@ from jaxhil.runtime.bounds import CONTROL_PERIODS, DISTANCES
 from jaxhil.runtime.faults import FAULTS, LAW_IN_DOUBT, names
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
 from jaxhil.runtime.law_status import STATUSES
+from jaxhil.runtime.laws import WITHOUT_C
 from jaxhil.runtime.limits import LIMITS, complete
 from tuning.bundle.c99 import c99_texts
 from tuning.bundle.c99_tables import UNUSABLE, decimal
 
 pytestmark = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
-LAWS = tuple(COMPENSATORS)
+LAWS = tuple(name for name in COMPENSATORS if name not in WITHOUT_C)
 # Most of the C code between them.
 LONG_CODE = ("response_error", "retrospective_delay_bank", "retrospective_reference", "virtual_contact")
 KINDS = ("contact", "random", "hostile")

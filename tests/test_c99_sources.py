@@ -15,10 +15,11 @@ from gain_documents import gain_document, sign
 
 from jaxhil.errors import InputError
 from jaxhil.runtime import COMPENSATORS, GainFileError
+from jaxhil.runtime.laws import WITHOUT_C
 from tuning.bundle.c99 import c99_texts
 
 pytestmark = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
-LAWS = tuple(COMPENSATORS)
+LAWS = tuple(name for name in COMPENSATORS if name not in WITHOUT_C)
 
 
 @pytest.fixture(scope="module")
@@ -170,6 +171,12 @@ def test_law_without_a_c_file_is_named(monkeypatch):
     document = sign(gain_document("none") | {"compensator": "toy"})
     with pytest.raises(InputError, match=r"^jaxhil/c99/laws/toy\.c: found no such file"):
         c99_texts(document)
+
+
+@pytest.mark.parametrize("law", WITHOUT_C)
+def test_law_without_c_sources_is_refused_in_one_line(law):
+    with pytest.raises(InputError, match=rf"^c99: found {law}, which has no C99 sources yet; [^\n]*$"):
+        c99_texts(gain_document(law))
 
 
 def test_document_that_the_runtime_refuses_is_refused():

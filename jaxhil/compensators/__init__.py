@@ -8,6 +8,7 @@ from typing import Any
 
 from jaxhil.compensators.base import Compensator, Constants, Gain, Gains, Signals
 from jaxhil.compensators.dead_zone_observer import DeadZoneObserver
+from jaxhil.compensators.impulse_ledger import ImpulseLedger
 from jaxhil.compensators.multi_parameter_lead import MultiParameterLead
 from jaxhil.compensators.none import NoCompensator
 from jaxhil.compensators.passivity import Passivity
@@ -36,6 +37,7 @@ _BUILT_IN = (
     ResponseError(),
     RetrospectiveReference(),
     RetrospectiveDelayBank(),
+    ImpulseLedger(),
 )
 COMPENSATORS: dict[str, Compensator] = {law.name: law for law in _BUILT_IN}
 # Those of six axes, which work on each channel of the wrench by itself.

@@ -60,6 +60,18 @@ def preload(mechanism: Mechanism) -> float:
     return _size(mechanism, "contact.preload") / (mechanism.bodies.mass * mechanism.approach.velocity)
 
 
+def unloading(mechanism: Mechanism) -> float:
+    """Return by how much the stiffness over the mass [1/s^2] may be larger in unloading than in loading.
+
+    It is 0 where the contact law has no unloading ratio.
+    """
+    ratio = mechanism.contact.unloading_ratio
+    if ratio is None or mechanism.contact.law != "elastoplastic":
+        return 0.0
+    spread = _spread(mechanism, "contact.unloading_ratio") or 0.0
+    return (ratio + spread - 1) * typical_stiffness(mechanism) / mechanism.bodies.mass
+
+
 def simulator_inverse(mechanism: Mechanism) -> tuple[float, float]:
     """a_1 [s] and a_2 [s^2] of 1 + a_1 s + a_2 s^2 + ..., the series of e^(s tau)/G(s).
 

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from jaxhil.errors import InputError, one_line
 from jaxhil.runtime.controller import Controller
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
+from jaxhil.runtime.laws import WITHOUT_C
 from tuning.bundle.c99_tables import Table, constants, faults_table, gains_table, limits_table, statuses_table
 
 HEADER, SOURCE = "jaxhil_controller.h", "jaxhil_controller.c"
@@ -132,6 +133,8 @@ def c99_texts(document: Mapping[str, Any], source: str = "gain document") -> dic
     gain_file = check_gain_document(document, source)
     Controller(gain_file, source)  # refuses delays that no line can hold
     law = gain_file.compensator
+    if law in WITHOUT_C:
+        raise InputError(f"c99: found {law}, which has no C99 sources yet; expected the other formats")
     fragments = _in_order("controller.c", law)
     declarations = "\n".join(part for fragment in fragments if (part := fragment.declarations).strip())
     definitions = "\n".join(part for fragment in fragments if (part := fragment.definitions).strip())

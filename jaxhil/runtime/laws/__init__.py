@@ -17,5 +17,6 @@ PUBLISHED = (
     "passivity",
     "response_error",
 )
-LAWS = (*PUBLISHED, "retrospective_reference", "retrospective_delay_bank")
+LAWS = (*PUBLISHED, "retrospective_reference", "retrospective_delay_bank", "impulse_ledger")
 NEED_NUMPY = ("retrospective_delay_bank",)  # on the rig, in Python
+WITHOUT_C = ("impulse_ledger",)  # has no C sources yet
