@@ -216,7 +216,7 @@ def test_gains_are_chosen_by_dict_setting_and_file(tmp_path):
     ("compensator", "gains", "said"),
     [
         ("phase_led", None, "compensator: found 'phase_led', allowed one of none, phase_lead"),
-        ("phase_led", None, "did you mean phase_lead?"),
+        ("phase_led", None, "did you mean phase_lead"),
         (
             "phase_lead",
             {"phase_led": 1.0},
