@@ -100,7 +100,7 @@ GAINS: tuple[Gain, ...] = (
 
 
 class Contact(NamedTuple):
-    """What the law knows of one contact."""
+    """State that belongs to one contact."""
 
     side: Float[Array, "*batch"]  # direction in which the surface is approached, 1 or -1
     speed: Float[Array, "*batch"]  # approach speed [m/s]; 0: nothing can be scaled
@@ -125,7 +125,7 @@ class LedgerState(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """What is computed once per run."""
+    """Numbers computed once per run."""
 
     gains: Gains  # of the batch shape
     constants: Constants

@@ -9,7 +9,7 @@ from jaxhil.runtime.laws.onset_detection import DRIFT, FEW, LONGEST_MEAN
 
 
 class FreeFlight(NamedTuple):
-    """What readings in free flight show, and the cumulative sum."""
+    """Statistics of readings in free flight, and the cumulative sum."""
 
     count: Float[Array, "*batch"]  # readings that the bias is averaged over
     differences: Float[Array, "*batch"]  # differences that the noise is averaged over

@@ -51,8 +51,8 @@ class ContactLaw(eqx.Module):
 
     @property
     def arcs(self) -> bool:
-        """Whether in contact the force over a quarter of a slow sampling interval is close to a parabola: its
-        slope does not change at a depth, nor the force at a turn, nor does it end at a power of the depth."""
+        """Tell whether in contact the force over a quarter of a slow interval is close to a parabola:
+        no slope that changes at a depth, no jump at a turn, no end at a power of the depth."""
         return False
 
     @property

@@ -33,7 +33,7 @@ def build_loop(
 
     `energies` asks for the works of the real force, `chatter` for the command's excess variation, `exact` for
     restitution, peak force, duration and works to 1e-6 by the motion between samples, where others take what
-    samples say as long as that is enough, in a hundredth of the time.
+    samples say as long as that is enough, in a small part of the time.
     """
     rig, force, position = mechanism.rig, scenarios.force_sensor, scenarios.position_sensor
     simulator = scenarios.simulator

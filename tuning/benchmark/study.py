@@ -7,6 +7,8 @@ which process computes it. What is found of a law on a group is kept at once, wh
 """
 
 import multiprocessing
+import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -292,9 +294,6 @@ _heard: Any = None  # the parent's queue, in a worker
 
 def _begin(heard: Any) -> None:
     """A worker: few devices, so that as many workers as there are cores share the machine."""
-    import os
-    import signal
-
     global _heard
     _heard = heard
     # The parent hears of an interruption, and ends the workers; one that is killed cannot.
@@ -307,8 +306,6 @@ def _begin(heard: Any) -> None:
 
 def _end_with_parent() -> None:
     """End this process when its parent has ended, whatever ended it."""
-    import os
-
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()

@@ -37,9 +37,8 @@ class Readings:
     std: float  # N, of the noise
     whitening: tuple[float, ...] = (1.0,)  # filter that makes the noise white
     threshold: float = 0.0  # N: predicted forces below it do not count (a dead zone hides them)
-    bias: tuple[float, float] | None = (
-        None  # N, of the sensor and its standard deviation, where known at rest
-    )
+    # N, of the sensor, and its standard deviation, where runs at rest tell them
+    bias: tuple[float, float] | None = None
 
     @classmethod
     def of(cls, runs: Sequence[Run], std: float, whitening=(1.0,), threshold: float = 0.0) -> Readings:

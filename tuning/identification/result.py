@@ -76,7 +76,7 @@ class Identification:
 
     @property
     def good(self) -> bool:
-        """Whether both effects are below the limit, and something was checked."""
+        """Tell whether both effects are below the limit, and something was checked."""
         return not self.missing and bool(self.lines) and max(self.effect, self.effect_on_error) < self.limit
 
     @property

@@ -42,7 +42,7 @@ CONTACT = ("contact.stiffness", "contact.damping", "contact.reference_depth")
 
 
 class Effect(NamedTuple):
-    """What uncertainty can do, with a probability of 99 %."""
+    """Effects of the uncertainty, not exceeded with a probability of 99 %."""
 
     restitution: float  # change of e
     error: float  # change of e - e*

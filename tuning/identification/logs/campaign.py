@@ -180,7 +180,7 @@ class _Reading:
         ]
 
     def _command_holds(self, stretch: Stretch, touched: list[tuple[int, int]]) -> bool:
-        """Whether there is a force command that moves the model; one that cannot is taken out with a note."""
+        """Tell whether a force command moves the model; take one that cannot out, with a note."""
         if stretch.channels["force_command"] is None:
             return False
         timing = self._timing

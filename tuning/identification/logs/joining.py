@@ -148,7 +148,7 @@ class _Places:
         return values[self._before] * (1.0 - self._share) + values[self._before + 1] * self._share
 
     def note(self, master: str) -> str:
-        """What was done, in words."""
+        """Say what was done."""
         how = "taken at their own times" if self._exact else "interpolated between their own times"
         begins = f"{abs(1e3 * self._begins):.4g} ms {'after' if self._begins >= 0 else 'before'} that"
         return (
