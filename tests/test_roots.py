@@ -1,0 +1,31 @@
+"""Roots within a bracket: of functions on which Newton's method overshoots, and their derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxhil.simulation.roots import ROUNDING, crossing
+
+POWERS = np.array([1.0, 0.5, 0.2])
+
+
+def root_of(height):
+    """Roots of s^p - height between 0 and 1, of all powers side by side."""
+
+    def function(height, s):
+        touching = s > 0
+        # The inner `where` keeps the derivative finite at 0.
+        power = jnp.where(touching, s, 1) ** jnp.broadcast_to(POWERS, s.shape)
+        return jnp.where(touching, power, 0) - height
+
+    zeros = jnp.zeros_like(POWERS)
+    return crossing(function, height, zeros, zeros + 1, zeros + 1)
+
+
+@pytest.mark.parametrize("height", [0.9, 0.3, 0.1])
+def test_roots_of_powers_are_the_closed_form(height):
+    """A contact whose force ends at a power of the depth has its root next to the surface."""
+    found, slope = jax.jvp(root_of, (jnp.asarray(height),), (jnp.ones(()),))
+    np.testing.assert_allclose(found, height ** (1 / POWERS), rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(slope, height ** (1 / POWERS - 1) / POWERS, rtol=1e-3, atol=1e-6)
