@@ -7,7 +7,7 @@ import pytest
 
 from jaxhil.simulation.roots import ROUNDING, crossing
 
-POWERS = np.array([1.0, 0.5, 0.2])
+POWERS = np.array([1.0, 0.5, 0.2, 0.1])
 
 
 def root_of(height):

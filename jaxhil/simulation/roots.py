@@ -44,25 +44,28 @@ def _root(function: Function, data: Any, low: Array, high: Array) -> tuple[Array
     # A step that is as short as this is followed by one below rounding.
     short = jnp.finfo(at_low.dtype).eps ** 0.6
 
+    def at(place):
+        return jax.jvp(lambda s: function(fixed, s), (place,), (jnp.ones_like(place),))
+
     def is_under_way(carry):
         *_, sought, steps = carry
         return jnp.any(sought) & (steps < MOST_STEPS)
 
     def improve(carry):
-        low, high, place, _, _, steps = carry
-        value, slope = jax.jvp(lambda s: function(fixed, s), (place,), (jnp.ones_like(place),))
+        low, high, place, _, steps = carry
+        value, slope = at(place)
         above = (value > 0) == (change > 0)
         low, high = jnp.where(above, low, place), jnp.where(above, place, high)
         step = place - value / jnp.where(slope != 0, slope, 1)
         # At the root itself rounding may put the step beyond the bracket.
         inside = (slope != 0) & (step >= low - ROUNDING) & (step <= high + ROUNDING)
         nearer = jnp.where(inside, jnp.clip(step, low, high), (low + high) / 2)
-        return low, high, nearer, slope, crosses & (jnp.abs(nearer - place) > short), steps + 1
+        return low, high, nearer, crosses & (jnp.abs(nearer - place) > short), steps + 1
 
     crosses = (at_low > 0) != (at_high > 0)
     secant = jnp.clip(low - at_low * (high - low) / jnp.where(change != 0, change, 1), low, high)
-    carry = low, high, secant, jnp.ones_like(secant), crosses, 0
-    _, _, root, slope, _, _ = lax.while_loop(is_under_way, improve, carry)
+    _, _, root, _, _ = lax.while_loop(is_under_way, improve, (low, high, secant, crosses, 0))
+    _, slope = at(root)
     # The derivative is that of one more step of Newton's method, whose value is left out.
     step = function(data, root) / jnp.where(slope != 0, slope, 1)
     return root - (step - lax.stop_gradient(step)), at_low, at_high
