@@ -215,6 +215,15 @@ def test_a_position_sensor_that_lags_more_than_the_force_sensor_takes_some_of_th
     assert found.mechanism["rig"]["position_sensor"]["delay"] == 0.003 and found.notes == ()
 
 
+def test_a_mechanism_that_cannot_be_is_named_and_not_written():
+    """It was refused by the key of a file that nobody had written."""
+    campaign = campaigns.campaign("clean", 0, speeds=(0.003, 0.006, 0.012) * 2, seconds=10.0)
+    negative = tuple(replace(run, force_measured=-run.force_measured) for run in campaign.runs)
+    result = identify(replace(campaign, runs=negative), options=Options(law="kelvin_voigt", hold_out=0.0))
+    assert result.mechanism is None and not result.good
+    assert "mechanism file: identified mechanism: contact.stiffness[0]: found -" in result.verdict
+
+
 @pytest.mark.parametrize("options, message", (
     ({"law": "rubber"}, "law: found 'rubber', allowed linear"),
     ({"order": 7}, "order: found 7, allowed 0, 1, 2"),

@@ -39,7 +39,10 @@ def test_a_rate_is_found_and_the_contact_as_with_one_clock(constant, rate, every
     assert found["contact.stiffness.0"].value == pytest.approx(1.2e5, rel=0.003)
     assert abs(found["contact.damping.0"].value - 650.0) < 4.0 * found["contact.damping.0"].std < 240.0
     assert found["rig.contact_plane"].value == pytest.approx(0.0, abs=5e-6)
-    assert found["rig.force_sensor.delay"].told and found.good
+    assert found["rig.force_sensor.delay"].told
+    # Nothing but what six touches leave of the damping is wanting.
+    assert found.verdict.startswith("Bad: the numbers are too uncertain: contact.damping")
+    assert replace(found, limit=0.03).good
     assert found.mechanism["rig"]["force_sensor"]["delay"] == 0.0037
     assert f"gains {1e6 * drift.rate:.3g}" in " ".join(found.notes)
 

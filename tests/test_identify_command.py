@@ -54,6 +54,13 @@ def test_a_day_of_logs_becomes_a_mechanism_file(jaxhil, day, tmp_path):
     (delay,) = (one for one in ran.document["estimates"] if one["key"] == "rig.force_sensor.delay")
     assert delay["low"] < 0.0037 < delay["high"] and delay["unit"] == "s" and delay["prior"] is None
 
+    # Without a prior all mechanisms have one name, and logs of another rig must not replace what was written.
+    (tmp_path / "other").mkdir()
+    write(tmp_path / "other", campaigns.campaign("clean", 1, speeds=FEW[:3], seconds=5.0))
+    refused = jaxhil("identify", *logs(tmp_path / "other"), *given[-6:])
+    assert refused.code == 2 and "found results of other logs ('contact_02.csv' and " in refused.err
+    assert ran.document == json.loads((tmp_path / "identification.json").read_text())
+
     # The file explains its own logs, and one of another rig does not.
     told, map = tmp_path / "mechanism.toml", ("--map", drafted(jaxhil, day))
     ran = jaxhil("identify", "--check", *logs(day), told, *map)

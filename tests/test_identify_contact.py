@@ -9,9 +9,9 @@ from scipy.linalg import expm
 
 from tuning.identification import contact_laws, contact_profile
 from tuning.identification.contact import after_gaps, pieces
-from tuning.identification.contact_problem import Problem, Readings
+from tuning.identification.contact_problem import LONGEST, Problem, Readings
 from tuning.identification.contact_profile import profile
-from tuning.identification.law_choice import judge
+from tuning.identification.law_choice import judge, quick
 from tuning.identification.motion import Motion, exponential
 from tuning.identification.rational import STRUCTURES, Model
 from tuning.identification.sensor_filter import lag_weights, onset_weights
@@ -180,3 +180,12 @@ def test_cells_have_their_edges_where_rows_come_into_contact():
     (plane, *_) = exact.onsets_between(0.0037, -3e-6, 3e-6)
     inside = [exact.motion.at(0.0037)[0] > place for place in (plane - 1e-9, plane + 1e-9)]
     assert np.sum(inside[0] != inside[1]) == 1
+
+
+def test_a_search_about_a_delay_beyond_the_longest_stays_within_it():
+    """Where no law fitted it went beyond, and the grid about it had one delay."""
+    clean = problem("clean", contact_laws.kelvin_voigt(), speeds=(0.006, 0.012))
+    late = replace(clean.readings, force=np.roll(clean.readings.force, 40, axis=0))
+    late = Problem(clean.motion, late, clean.law, clean.plane)
+    delay, *_ = quick(late, (LONGEST + 0.002, 0.0, np.inf))
+    assert delay <= LONGEST

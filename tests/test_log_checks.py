@@ -138,3 +138,24 @@ def test_commands_and_forces_of_another_rate(tmp_path, every):
     slow = {"t": PERIOD * np.arange(800), "xd": 1e-5 * (np.arange(800) // every), "xm": sway()["xm"]}
     slow["xm"] = np.concatenate([np.zeros(LAG), slow["xd"][:-LAG]])
     assert read(write_csv(tmp_path / "c.csv", slow), "free").runs[0].kind == "free"
+
+
+def far_side():
+    """A touch, and the flight back to another one on the far side of a clearance of 2 mm."""
+    log = touches(2)
+    back = int(np.flatnonzero(np.diff(np.sign(log["vd"])) > 0)[0]) + 1  # there the touch's log is driven back
+    other = {name: -column for name, column in log.items() if name != "t"}
+    other = other | {name: other[name] - 2e-3 for name in ("xd", "xm")}
+    both = {name: np.concatenate([log[name][:back], other[name]]) for name in other}
+    return both | {"t": PERIOD * np.arange(back + len(log["t"]))}, back
+
+
+@pytest.mark.parametrize("gone", [(), ("velocity_desired", "force_command")])
+def test_contacts_on_the_far_side_of_a_clearance_are_refused(tmp_path, gone):
+    """Their forces were taken for ones in a wrong unit, or ended in an internal error."""
+    log, back = far_side()
+    path = write_csv(tmp_path / "a.csv", log)
+    with pytest.raises(InputError, match=r"row \d+: found a contact on the far side") as caught:
+        read(path, **dict.fromkeys(gone))
+    first = back + int(np.argmax(log["F"][back:] < -2.0))
+    assert int(str(caught.value).split("row ")[1].split(":")[0]) == pytest.approx(first + 1, abs=5)

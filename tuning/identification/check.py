@@ -73,7 +73,7 @@ def check(
         lag = contacts.lag(contact, model, frequency)
         every = np.ones(len(touching), bool)
         lines += validation.of_contact(contact, touching, campaign.equivalent_mass, frequency, lag, every)
-    lines += _uncertainty(mechanism, any(run.kind == "press" for run in campaign.runs))
+    lines += uncertainty(mechanism, any(run.kind == "press" for run in campaign.runs))
     return Identification(
         estimates=(),
         draws=np.zeros((0, 0)),
@@ -87,7 +87,7 @@ def check(
     )
 
 
-def _uncertainty(mechanism: Mechanism, pressed: bool) -> list[validation.Line]:
+def uncertainty(mechanism: Mechanism, pressed: bool) -> list[validation.Line]:
     """Say what the file's own uncertainty can do, if an identification stated it, and what lessens it."""
     effect = uncertain_effect(mechanism)
     if not effect.parts:
@@ -97,7 +97,7 @@ def _uncertainty(mechanism: Mechanism, pressed: bool) -> list[validation.Line]:
     if len(largest) == 2:
         advice = experiment(*largest)
         if pressed and advice == PRESS:
-            advice = "a longer press run, or a stronger one,"
+            advice = "a longer or stronger press run with a multisine to 45 Hz"
         found += f"; {advice} would tell them better"
     return [validation.Line(UNCERTAINTY, found, True, effect.restitution, on_error=effect.error)]
 

@@ -20,6 +20,7 @@ from tuning.identification import contact as contacts
 from tuning.identification import free_motion, knowledge, known, parameters, validation
 from tuning.identification.bootstrap import bootstrap
 from tuning.identification.check import check as check_file
+from tuning.identification.check import uncertainty
 from tuning.identification.contact import ContactFit
 from tuning.identification.contact_profile import DRAWS
 from tuning.identification.estimates import combinations, estimates, unit_of
@@ -93,9 +94,11 @@ def identify(
     mechanism, missing = None, _missing(prior, model, told_contact, untold)
     if not missing:
         mechanism = mechanism_of(campaign, prior, model, told_contact, numbers, found, options)
-    lines = _of_file(campaign, mechanism, motion if options.order is None else None)
+    written, refused = _written(mechanism)
+    lines = _of_file(campaign, written, motion if options.order is None else None)
     if lines is None:
-        lines = _of_fits(motion, contact, model, touching, mass)
+        lines = [*refused, *_of_fits(motion, contact, model, touching, mass)]
+        lines += [] if written is None else uncertainty(written, any(run.kind == "press" for run in whole))
     keys = list(found)
     table = np.array([found[key] for key in keys]).T if keys else np.zeros((DRAWS, 0))
     return Identification(
@@ -104,7 +107,7 @@ def identify(
         combinations=combinations(found | told, told_contact),
         confounded=confounded(keys, table),
         lines=(*lines, *left_out),
-        mechanism=mechanism,
+        mechanism=None if refused else mechanism,
         limit=options.limit,
         notes=(
             *_notes(motion, contact, told_contact, force, vague),
@@ -192,18 +195,27 @@ def _contact(
     return fit, validation.of_touches_left_out(others, runs, campaign.equivalent_mass, held)
 
 
+def _written(mechanism: dict[str, Any] | None) -> tuple[Mechanism | None, list[validation.Line]]:
+    """Return the mechanism as its file has it; or what is wrong with it, as the lines of a verdict."""
+    if mechanism is None:
+        return None, []
+    try:
+        return from_builtins(tomllib.loads(to_toml(mechanism)), "identified mechanism"), []
+    except InputError as error:
+        return None, [validation.Line("mechanism file", str(error), True, 1.0)]
+
+
 def _of_file(
-    campaign: Campaign, mechanism: dict[str, Any] | None, motion: FreeMotion | None
+    campaign: Campaign, written: Mechanism | None, motion: FreeMotion | None
 ) -> list[validation.Line] | None:
-    """Check the mechanism file as it is written, as `identify --check` would.
+    """Check the mechanism as it is written, as `identify --check` would.
 
     `motion`: fitted, of any order. Returns None where no file is written, or none can be checked."""
-    if mechanism is None or campaign.timing.two_clocks:
+    if written is None or campaign.timing.two_clocks:
         return None
     if not any(run.kind in (*TOUCHING, "free") for run in campaign.runs):
         return None
     try:
-        written = from_builtins(tomllib.loads(to_toml(mechanism)), "identified mechanism")
         return list(check_file(campaign, written, fitted=motion).lines)
     except InputError:
         return None

@@ -130,7 +130,8 @@ def quick(problem: Problem, guess: Fitted | None = None, reach: int = 4) -> Fitt
         delays = np.arange(problem.shortest, LONGEST, 2.0 * COARSE)
     else:
         steps = np.array([step for step in (-4, -2, -1, 0, 1, 2, 4) if abs(step) <= reach])
-        start, delays = guess[1], np.maximum(guess[0] + COARSE * steps, problem.shortest)
+        start = guess[1]
+        delays = np.clip(guess[0] + COARSE * steps, problem.shortest, LONGEST)
     best = (0.0, start, np.inf)
     for width in (0.0, COARSE, COARSE / 4.0):
         if width:

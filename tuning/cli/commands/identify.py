@@ -51,7 +51,7 @@ def run(options: Identify) -> int:
     folder = Path(options.output)
     checks.output(folder)
     name = UNNAMED if prior is None else prior.name
-    checks.own_results(folder / DOCUMENT, "estimates", (MECHANISM, *PICTURES), [name])
+    earlier = checks.own_results(folder / DOCUMENT, "estimates", (MECHANISM, *PICTURES), [name])
     from tuning.identification.bootstrap import FITS
     from tuning.identification.estimate import STAGES, Options, identify
     from tuning.identification.mechanism_file import to_toml
@@ -72,6 +72,8 @@ def run(options: Identify) -> int:
     with terminal.stages(STAGES + 2 + -(-options.bootstrap // FITS)) as stages:
         stages.turn_to("reading the logs")
         campaign = _of_stage(read_logs(logs, options.map, prior), options.stage)
+        if prior is None:
+            _refuse_other_logs(folder / DOCUMENT, earlier, campaign)
         found = identify(campaign, prior, asked, stages.turn_to)
         document = _document(options, campaign, prior, found)
         if found.mechanism is not None:
@@ -91,6 +93,18 @@ def run(options: Identify) -> int:
     else:
         _print(document, None if found.mechanism is None else folder)
     return 0 if found.good else 1
+
+
+def _refuse_other_logs(path: Path, earlier: dict[str, Any], campaign: Campaign) -> None:
+    """Raise `InputError` if earlier results are those of other logs: no name of a prior tells rigs apart."""
+    sources = earlier.get("sources")
+    if not isinstance(sources, dict) or not sources or {*sources.values()} & {*campaign.sources.values()}:
+        return
+    log, others = next(iter(sources)), f" and {len(sources) - 1} more" if len(sources) > 1 else ""
+    raise InputError(
+        f"{one_line(str(path))}: found results of other logs ({shown(log)}{others}), expected those of the "
+        "same logs, or none: name another folder by --output, or the mechanism by --prior"
+    )
 
 
 def _guess(options: Identify, logs: list[Path]) -> int:

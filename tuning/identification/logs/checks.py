@@ -10,10 +10,13 @@ from __future__ import annotations
 import numpy as np
 
 from jaxhil.errors import InputError
+from tuning.identification.logs import segments
 from tuning.identification.logs.rows import Stretch
-from tuning.identification.logs.scales import SMOOTH, check_gain, check_impulse
+from tuning.identification.logs.scales import SMOOTH, at_rest, check_gain, check_impulse
 
 FEWEST_ROWS = 200
+APART = 0.01  # s, between two contacts on one side
+PULLED = 0.3  # share of a change of momentum that readings must explain
 CLIPPED = 10  # repeats of the largest reading, from which it is a limit
 LARGEST_NUMBER = 1e30  # nanoseconds since an epoch are 1e18
 LARGEST_STROKE = 1.0  # m
@@ -84,6 +87,9 @@ def check_force(
         return _late(label, found)
     top = np.abs(found) >= np.max(np.abs(found))
     clipped = bool(np.count_nonzero(top[1:] & top[:-1]) >= CLIPPED)
+    if kind == "contact":
+        pull = np.minimum(force - at_rest(force, touched), 0.0)
+        _check_one_side(label, pull, _of(stretch, "position_desired"), period, mass)
     check_impulse(label, kind, stretch, touched, period, mass, command_holds, clipped)
     notes = _late(label, found)
     if clipped:
@@ -91,6 +97,21 @@ def check_force(
             f"{label}: force_measured: {np.count_nonzero(top)} rows at the largest reading, as if clipped"
         )
     return notes
+
+
+def _check_one_side(label: str, pull: np.ndarray, x: np.ndarray, period: float, mass: float) -> None:
+    """Raise `InputError` if a contact turns falling positions round, as the far side of a clearance does."""
+    for begin, end in segments.contacts(pull, period, 0.0, apart=APART):
+        begin, end = begin - SMOOTH, end + SMOOTH
+        if begin < SMOOTH or end + SMOOTH > len(x):
+            continue
+        before, after = ((x[row] - x[row - SMOOTH]) / (SMOOTH * period) for row in (begin, end + SMOOTH))
+        impulse = -period * float(np.nansum(pull[begin:end]))
+        if before < 0.0 < after and impulse > PULLED * mass * (after - before):
+            raise InputError(
+                f"{label}: row {begin + SMOOTH + 1}: found a contact on the far side (F < 0 that turns "
+                "falling positions round), allowed contacts on the side that rising positions press (F > 0)"
+            )
 
 
 def _late(label: str, force: np.ndarray) -> list[str]:

@@ -111,7 +111,7 @@ def check_impulse(
     force, x = stretch.channels["force_measured"], stretch.channels["position_desired"]
     assert force is not None and x is not None
     contacts = contacts[:: len(contacts) // MANY + 1]
-    rest = _at_rest(force, contacts)
+    rest = at_rest(force, contacts)
     needed, made = [], []
     for begin, end in contacts:
         begin, end = begin - SMOOTH, end + SMOOTH  # below the threshold there is some force, too
@@ -149,7 +149,7 @@ def check_impulse(
     )
 
 
-def _at_rest(force: np.ndarray, contacts: list[tuple[int, int]]) -> float:
+def at_rest(force: np.ndarray, contacts: list[tuple[int, int]]) -> float:
     """Return the median reading next to contacts [N]; a log may begin in one."""
     beside = [force[max(0, begin - BESIDE) : max(0, begin - SMOOTH)] for begin, _ in contacts]
     beside += [force[end + SMOOTH : end + BESIDE] for _, end in contacts]

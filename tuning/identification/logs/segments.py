@@ -10,10 +10,13 @@ APART = 0.1  # s, between two contacts; what is nearer is one
 FIRST = 200  # rows at most, from which the force at rest is taken
 
 
-def contacts(force: np.ndarray, period: float, rest: float | None = None) -> list[tuple[int, int]]:
+def contacts(
+    force: np.ndarray, period: float, rest: float | None = None, apart: float = APART
+) -> list[tuple[int, int]]:
     """First row of each contact and the row after its last one.
 
     `force` [N] begins without contact, unless what it is at `rest` is given; NaN where a row was lost.
+    Contacts nearer than `apart` [s] are one.
     """
     touched = np.abs(force - (resting(force) if rest is None else rest)) > threshold(force)
     long = touched.copy()
@@ -26,7 +29,7 @@ def contacts(force: np.ndarray, period: float, rest: float | None = None) -> lis
     # Single rows beyond the threshold belong to a contact only beside one.
     inside = np.flatnonzero(touched)
     inside = inside[inside >= starts[0]]
-    breaks = np.flatnonzero(np.diff(inside) > round(APART / period))
+    breaks = np.flatnonzero(np.diff(inside) > round(apart / period))
     begins, ends = inside[[0, *(breaks + 1)]], inside[[*breaks, len(inside) - 1]] + 1
     has = np.searchsorted(starts, begins) < np.searchsorted(starts, ends)
     return [(int(a), int(b)) for a, b, good in zip(begins, ends, has, strict=True) if good]
