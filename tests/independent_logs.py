@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.csv
-import pyarrow.parquet
 from independent_rig import Rig, drive, touch
-from scipy.signal import butter, lfilter
+from pyarrow import csv, parquet
+from scipy.signal import lfilter
 
 RATES = (1000, 500, 2000)  # Hz
 DECIMALS = (3, 2, 1)  # of forces in N; positions have six more of m
@@ -57,23 +56,27 @@ KINDS = {
     "sweep": Kind(sweep=True),
     "lag": Kind(_lag),
     "dead_zone": Kind(_dead_zone),
-    "damping_unknown": Kind(unknown=("damping",)),
-    "lag_unknown": Kind(_lag, unknown=("time_constant",)),
-    "dead_zone_unknown": Kind(_dead_zone, unknown=("dead_zone",)),
-    "delays_unknown": Kind(unknown=("force_delay", "drive_delay")),
+    "damping_unknown": Kind(unknown=("contact.damping",)),
+    "lag_unknown": Kind(_lag, unknown=("rig.force_sensor.time_constant",)),
+    "dead_zone_unknown": Kind(_dead_zone, unknown=("rig.force_sensor.dead_zone",)),
+    "delays_unknown": Kind(unknown=("rig.force_sensor.delay", "rig.simulator.delay")),
     "coloured": Kind(colour=2.0),
     "lost_rows": Kind(lost=0.0075),
     "force_clock": Kind(force_clock=True),
     "late_position": Kind(late=20),
     "butterworth_2": Kind(_butterworth(2), defect=FILTER),
     "butterworth_4": Kind(_butterworth(4), defect=FILTER),
-    "cut_dead_zone": Kind(lambda rng, rig: {"dead_zone": rng.uniform(1.0, 6.0), "cut": True}, defect=("dead zone",)),
+    "cut_dead_zone": Kind(
+        lambda rng, rig: {"dead_zone": rng.uniform(1.0, 6.0), "cut": True}, defect=("dead zone",)
+    ),
     "bias_walk": Kind(walk=0.7, defect=("bias", "drift", "noise")),
     "mode": Kind(
         lambda rng, rig: {"mode": 40.0, "mode_ratio": rng.uniform(0.01, 0.03)},
         defect=("contact law", "resonance", "mode"),
     ),
-    "friction": Kind(lambda rng, rig: {"friction": rng.uniform(1.0, 4.0)}, defect=("friction", "contact law")),
+    "friction": Kind(
+        lambda rng, rig: {"friction": rng.uniform(1.0, 4.0)}, defect=("friction", "contact law")
+    ),
     "moving_average": Kind(
         lambda rng, rig: {"window": rng.uniform(0.034, 0.050)}, defect=("motion", "order")
     ),
@@ -115,24 +118,25 @@ def draw_rig(rng):
     )
 
 
-class Readings:
-    """Noise of both sensors; every run has noise of its own."""
+class Noise:
+    """Noise of both sensors."""
 
-    def __init__(self, rng, kind, period, lanes=1):
-        self.rng, self.kind, self.period, self.lanes = rng, kind, period, lanes
-        self.force_noise, self.position_noise = 0.3, 3e-6
-        self.bias = 0.2
+    def __init__(self, rng, kind, period):
+        self.rng, self.kind, self.period = rng, kind, period
+        self.force_noise, self.position_noise = rng.uniform(0.1, 0.5), rng.uniform(1e-6, 5e-6)
+        self.bias = rng.uniform(-0.4, 0.4)
 
-    def draw(self, ticks):
-        """Return what is added to force and position, a row per tick, a column per lane."""
-        rng, kind, shape = self.rng, self.kind, (ticks, self.lanes)
+    def draw(self, ticks, runs=1):
+        """Return fresh noise of force and position, a row per tick and a column per run."""
+        rng, kind, shape = self.rng, self.kind, (ticks, runs)
         force = self.bias + rng.normal(0, self.force_noise, shape)
         if kind.walk:
             force += kind.walk * np.sqrt(self.period) * np.cumsum(rng.normal(size=shape), axis=0)
         if kind.colour:
-            b, a = butter(2, 30.0, fs=1 / self.period)
-            noise = lfilter(b, a, rng.normal(size=(ticks + 2000, self.lanes)), axis=0)[2000:]
-            force += kind.colour * noise / noise.std()
+            # First-order low-pass noise to 30 Hz.
+            keep = np.exp(-2 * np.pi * 30.0 * self.period)
+            noise = np.asarray(lfilter([1], [1, -keep], rng.normal(size=(ticks + 2000, runs)), axis=0))
+            force += kind.colour * np.sqrt(1 - keep**2) * noise[2000:]
         return force, rng.normal(0, self.position_noise, shape)
 
 
@@ -154,7 +158,9 @@ def multisine(rng, time, highest):
     frequencies = np.arange(0.2, highest, 0.2)
     size = 1 / np.maximum(frequencies / 3.0, 1.0)
     phases = rng.uniform(0, 2 * np.pi, len(frequencies))
-    return sum(s * np.sin(2 * np.pi * f * time + p) for s, f, p in zip(size, frequencies, phases, strict=True))
+    return sum(
+        s * np.sin(2 * np.pi * f * time + p) for s, f, p in zip(size, frequencies, phases, strict=True)
+    )
 
 
 def _ends(time, duration, rise):
@@ -181,7 +187,7 @@ def _lead(rig, rng, lanes):
         nonlocal state
         slope = (force - state) / (pole + rig.period)
         state = state + rig.period * slope
-        return force + (lead - 0.0) * slope
+        return force + lead * slope
 
     return controller
 
@@ -194,9 +200,7 @@ def write_campaign(kind_name, seed, folder):
     with_press = seed % 2 == 1
     prior_factors = rng.lognormal(0, 0.15, 6)
     rig = replace(rig, **kind.rig(rng, rig))
-    readings = Readings(rng, kind, rig.period)
-    readings.force_noise, readings.position_noise = rng.uniform(0.1, 0.5), rng.uniform(1e-6, 5e-6)
-    readings.bias = rng.uniform(-0.4, 0.4)
+    sensors = Noise(rng, kind, rig.period)
     folder.mkdir(parents=True, exist_ok=True)
     logs = []
 
@@ -205,19 +209,25 @@ def write_campaign(kind_name, seed, folder):
 
     def open_loop(name, commands, plant):
         force, position = drive(plant, commands)
-        noise, position_noise = (values[:, 0] for values in readings.draw(len(commands)))
+        noise, position_noise = (values[:, 0] for values in sensors.draw(len(commands)))
         velocity = np.gradient(commands, rig.period)
-        log(name, rig.read_force(force + noise), np.zeros(len(commands)), commands, velocity, position + position_noise)
+        log(
+            name,
+            rig.read_force(force + noise),
+            np.zeros(len(commands)),
+            commands,
+            velocity,
+            position + position_noise,
+        )
 
     aside = replace(rig, mode=0.0)  # clear of the mechanism, its structure moves with the drive
     open_loop("rest", np.full(round(REST / rig.period), -CLEARANCE), aside)
     open_loop("free", free_motion(rng, kind, rig.period) - CLEARANCE, aside)
     speeds = speed * np.repeat([1.0, 2.0, 4.0], 5)
-    readings.lanes = len(speeds)
     approach = rng.uniform(0.2, 0.3, len(speeds))
     duration = 0.7 + np.pi * np.sqrt(rig.mass / rig.stiffness)
     ticks = round(duration / rig.period)
-    noise, position_noise = readings.draw(ticks)
+    noise, position_noise = sensors.draw(ticks, len(speeds))
     touches = touch(
         rig,
         rig.plane - speeds * approach,
@@ -230,7 +240,6 @@ def write_campaign(kind_name, seed, folder):
         _, force, command, desired, velocity, measured = touches[:, :, index]
         log(f"touch_{len(logs) - 2:02d}", force, command, desired, velocity, measured)
     if with_press:
-        readings.lanes = 1
         open_loop("press", press_motion(rng, rig), rig)
     mapping, prior = folder / "logs.toml", folder / "prior.toml"
     mapping.write_text(form.mapping(rig, with_press))
@@ -279,7 +288,7 @@ class Form:
             columns["F"] = np.interp(at, np.arange(len(force)), force)
         table = pa.table({name: self._rounded(name, values[keep]) for name, values in columns.items()})
         path = path.with_suffix(".parquet" if kind.late else ".csv")
-        (pa.parquet.write_table if kind.late else pa.csv.write_csv)(table, path)
+        (parquet.write_table if kind.late else csv.write_csv)(table, path)
         return path
 
     def _rounded(self, name, values):
@@ -329,42 +338,21 @@ class Form:
 def _prior(rig, speed, kind, factors):
     """Return a mechanism file with rough values that lacks the kind's unknown keys."""
     frequency, ratio = (4.0 / rig.window / np.pi, 0.9) if rig.window else (rig.frequency, rig.ratio)
-    force_sensor = {"delay": rig.force_delay * factors[4]}
-    if rig.filter_order == 1:
-        force_sensor["time_constant"] = 1 / (2 * np.pi * rig.cutoff)
-    if rig.dead_zone:
-        force_sensor["dead_zone"] = rig.dead_zone
-    contact = {"damping": [rig.damping * factors[1]]}
-    simulator = {"delay": rig.drive_delay * factors[5]}
-    unknown = {"damping": contact, "time_constant": force_sensor, "dead_zone": force_sensor}
-    for key in kind.unknown:
-        if key in unknown:
-            del unknown[key][key]
-    if "force_delay" in kind.unknown:
-        del force_sensor["delay"]
-    if "drive_delay" in kind.unknown:
-        del simulator["delay"]
-    tables = {
-        "bodies": {"equivalent_mass": rig.mass},
-        "approach": {"velocity": speed},
-        "contact": {"law": "kelvin_voigt", "stiffness": [rig.stiffness * factors[0]], **contact},
-        "rig": {"control_period": rig.period, "integrator": rig.integrator},
-        "rig.simulator": {
-            "model": "second_order",
-            "natural_frequency": frequency * factors[2],
-            "damping_ratio": ratio * factors[3],
-            **simulator,
-        },
-        "rig.force_sensor": force_sensor,
+    values = {
+        "bodies.equivalent_mass": rig.mass,
+        "approach.velocity": speed,
+        "contact.law": '"kelvin_voigt"',
+        "contact.stiffness": [float(rig.stiffness * factors[0])],
+        "contact.damping": [float(rig.damping * factors[1])],
+        "rig.control_period": rig.period,
+        "rig.integrator": f'"{rig.integrator}"',
+        "rig.simulator.model": '"second_order"',
+        "rig.simulator.natural_frequency": frequency * factors[2],
+        "rig.simulator.damping_ratio": ratio * factors[3],
+        "rig.simulator.delay": rig.drive_delay * factors[5],
+        "rig.force_sensor.delay": rig.force_delay * factors[4],
+        "rig.force_sensor.time_constant": 1 / (2 * np.pi * rig.cutoff) if rig.filter_order == 1 else 0.0,
+        "rig.force_sensor.dead_zone": rig.dead_zone,
     }
     lines = ['schema = "jaxhil/mechanism/1"', 'name = "afternoon"']
-    for table, values in tables.items():
-        lines.append(f"[{table}]")
-        lines += [f"{key} = {_toml(value)}" for key, value in values.items()]
-    return "\n".join(lines) + "\n"
-
-
-def _toml(value):
-    if isinstance(value, str):
-        return f'"{value}"'
-    return f"[{', '.join(str(float(v)) for v in value)}]" if isinstance(value, list) else str(float(value))
+    return "\n".join(lines + [f"{key} = {value}" for key, value in values.items() if key not in kind.unknown])

@@ -5,10 +5,11 @@ commands on a grid of 40 points per control period; contact is evaluated on the 
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
-from scipy.signal import butter, cont2discrete, lfilter
+from scipy.signal import cont2discrete, lfilter
 
 POINTS = 40  # fine points per control period
 WARM_UP = 0.6  # s of uniform motion before the first tick; the slowest drive settles to 1e-9 in it
@@ -46,6 +47,14 @@ class Rig:
         force = self.stiffness * depth + self.damping * velocity + self.friction * np.sign(velocity)
         return np.where((depth > 0) & (force > 0), force, 0.0)
 
+    def push(self, position, velocity):
+        """Return the same force of one position and velocity, in plain floats."""
+        depth = position - self.plane
+        if depth <= 0:
+            return 0.0
+        friction = self.friction if velocity > 0 else -self.friction
+        return max(0.0, self.stiffness * depth + self.damping * velocity + friction)
+
     def read_force(self, force):
         """Return the force reading behind the dead zone."""
         beyond = np.abs(force) > self.dead_zone
@@ -62,7 +71,8 @@ class Filter:
     """Linear filter, exact for inputs that are straight between points; it keeps its state."""
 
     def __init__(self, numerator, denominator, step, lanes):
-        numerator, denominator, _ = cont2discrete((numerator, denominator), step, method="foh")
+        discrete: Any = cont2discrete((numerator, denominator), step, method="foh")
+        numerator, denominator, _ = discrete
         self.numerator, self.denominator = np.ravel(numerator), denominator
         self.state = np.zeros((len(denominator) - 1, lanes))
 
@@ -98,13 +108,15 @@ class Plant:
         self.velocity = Filter([omega**2, 0], denominator, step, lanes)
         self.force_delay = Delay(rig.force_delay, step, lanes)
         self.position_delay = Delay(rig.position_delay, step, lanes)
-        self.command, self.integral = np.zeros(lanes), np.zeros(lanes)
-        self.leaving = [Delay(rig.window, step, lanes) for _ in range(2)]
+        self.command = np.zeros(lanes)
+        self.oldest = (Delay(rig.window, step, lanes), Delay(rig.window, step, lanes))
         self.filter = None
         if rig.filter_order:
-            ratio = butter(rig.filter_order, 2 * np.pi * rig.cutoff, analog=True)
-            self.filter = Filter(*ratio, step, lanes)
-        self.structure = (np.zeros(lanes), np.zeros(lanes))
+            angles = np.pi * (2 * np.arange(rig.filter_order) + rig.filter_order + 1) / (2 * rig.filter_order)
+            poles = 2 * np.pi * rig.cutoff * np.exp(1j * angles)
+            denominator = np.real(np.poly(poles))
+            self.filter = Filter(denominator[-1:], denominator, step, lanes)
+        self.structure = [(0.0, 0.0)] * lanes
 
     def __call__(self, commands):
         """Advance over the ticks of `commands` (rows); return force, its reading and the position reading.
@@ -125,36 +137,37 @@ class Plant:
     def _move(self, inputs):
         if not self.rig.window:
             return self.position(inputs), self.velocity(inputs)
-        before, integral = (delay.line[-1] for delay in self.leaving)
+        before, integral = (delay.line[-1] for delay in self.oldest)
         middle = (inputs + np.concatenate([before[None], inputs[:-1]])) / 2
         integrals = integral + self.step * np.cumsum(middle, axis=0)
-        gone, integral_gone = (d(values) for d, values in zip(self.leaving, (inputs, integrals), strict=True))
-        return (integrals - integral_gone) / self.rig.window, (inputs - gone) / self.rig.window
+        old, old_integral = self.oldest[0](inputs), self.oldest[1](integrals)
+        return (integrals - old_integral) / self.rig.window, (inputs - old) / self.rig.window
 
     def _touch(self, position, velocity):
         rig, step = self.rig, self.step
         if not rig.mode:
             return rig.force(self.start + position, velocity)
-        offset, rate = self.structure
         forces = np.empty_like(position)
-        for point, (x, v) in enumerate(zip(position, velocity, strict=True)):
-            # The midpoint rule, with the drive's motion at the end of the step.
-            acceleration = structure_acceleration(rig, offset, rate, x, v, self.start)
-            half, half_rate = offset + step / 2 * rate, rate + step / 2 * acceleration
-            acceleration = structure_acceleration(
-                rig, half, half_rate, x - step / 2 * v, v, self.start
-            )
-            offset, rate = offset + step * half_rate, rate + step * acceleration
-            forces[point] = rig.force(self.start + offset, rate)
-        self.structure = (offset, rate)
+        for lane, start in enumerate(self.start.tolist()):
+            offset, rate = self.structure[lane]
+            for point, (x, v) in enumerate(
+                zip(position[:, lane].tolist(), velocity[:, lane].tolist(), strict=True)
+            ):
+                # The midpoint rule.
+                acceleration = structure_acceleration(rig, offset, rate, x - step * v, v, start)
+                half, half_rate = offset + step / 2 * rate, rate + step / 2 * acceleration
+                acceleration = structure_acceleration(rig, half, half_rate, x - step / 2 * v, v, start)
+                offset, rate = offset + step * half_rate, rate + step * acceleration
+                forces[point, lane] = rig.push(start + offset, rate)
+            self.structure[lane] = (offset, rate)
         return forces
 
 
 def structure_acceleration(rig, offset, rate, x, v, start):
-    """Return the acceleration of the structure's end, which touches, behind a drive at `x` that moves at `v`."""
+    """Return the acceleration of the structure's end, which touches, behind a drive at `x` with speed `v`."""
     omega = 2 * np.pi * rig.mode
     spring = 2 * rig.mode_ratio * omega * (v - rate) + omega**2 * (x - offset)
-    return spring - rig.force(start + offset, rate) / rig.mode_mass
+    return spring - rig.push(start + offset, rate) / rig.mode_mass
 
 
 def drive(rig, commands):
@@ -205,9 +218,9 @@ def restitution(rig, speed, law):
     ticks = round(LONGEST / rig.period)
     memory = rig.force_delay + 2 * rig.period
     memory += 20 * rig.filter_order / (2 * np.pi * rig.cutoff) if rig.filter_order else 0.0
-    real, _, command, _, velocity, _ = touch(
-        rig, np.array([start]), np.array([speed]), controller, ticks
-    )[:, :, 0]
+    real, _, command, _, velocity, _ = touch(rig, np.array([start]), np.array([speed]), controller, ticks)[
+        :, :, 0
+    ]
     peak = np.maximum.accumulate(np.abs(command))
     last = np.flatnonzero(real > 0)
     # The last touch before the body has gone for good.
@@ -228,12 +241,17 @@ def ideal_restitution(rig, speed):
     def rates(_, state):
         x, v, offset, rate = state
         if not rig.mode:
-            return [v, -float(rig.force(x, v)) / rig.mass, 0.0, 0.0]
+            return [v, -rig.push(x, v) / rig.mass, 0.0, 0.0]
         acceleration = structure_acceleration(rig, offset, rate, x, v, 0.0)
-        return [v, -float(rig.force(offset, rate)) / rig.mass, rate, float(acceleration)]
+        return [v, -rig.push(offset, rate) / rig.mass, rate, acceleration]
 
     duration = 2 * np.pi * np.sqrt(rig.mass / rig.stiffness)
     result = solve_ivp(
-        rates, (0, duration), [0, speed, 0, speed if rig.mode else 0], max_step=duration / 4000, rtol=1e-8, atol=1e-12
+        rates,
+        (0, duration),
+        [0, speed, 0, speed if rig.mode else 0],
+        max_step=duration / 4000,
+        rtol=1e-8,
+        atol=1e-12,
     )
     return float(-result.y[1, -1] / speed)

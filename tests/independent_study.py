@@ -18,7 +18,9 @@ from independent_logs import KINDS, write_campaign
 from independent_rig import ideal_restitution, restitution
 
 LIMIT = 0.01  # error of e or e - e* beyond which a file is wrong
-SILENT = {f"rig.{sensor}_sensor.{key}": 0.0 for sensor in ("force", "position") for key in ("noise_std", "quantum")}
+SILENT = {
+    f"rig.{sensor}_sensor.{key}": 0.0 for sensor in ("force", "position") for key in ("noise_std", "quantum")
+}
 VERDICTS = {0: "good", 1: "bad", 2: "refused"}
 
 
@@ -53,7 +55,7 @@ def run_command(*arguments):
         try:
             code = main([str(argument) for argument in arguments])
         except SystemExit as stop:
-            code = stop.code
+            code = stop.code if isinstance(stop.code, int) else 1
     return code, out.getvalue(), err.getvalue()
 
 
@@ -66,7 +68,10 @@ def errors_of(file, campaign):
     mechanism = jaxhil.load(str(file), {**SILENT, **approach, "rig.force_sensor.bias": 0.0})
     run = jaxhil.simulate(mechanism, "response_error")
     law = COMPENSATORS["response_error"](run.gains, campaign.rig.period, np.inf)
-    e, ideal = restitution(campaign.rig, campaign.speed, law.step), ideal_restitution(campaign.rig, campaign.speed)
+    e, ideal = (
+        restitution(campaign.rig, campaign.speed, law.step),
+        ideal_restitution(campaign.rig, campaign.speed),
+    )
     contact = run.contacts[0]
     return e, contact.restitution - e, contact.error - (e - ideal)
 
@@ -76,16 +81,28 @@ def judge(kind, seed, folder):
     campaign = write_campaign(kind, seed, folder)
     begin, result = time.perf_counter(), folder / "identified"
     code, _, err = run_command(*campaign.arguments, "-o", result)
-    seconds, check, figures = time.perf_counter() - begin, "", (np.nan, np.nan, np.nan)
+    seconds, check = time.perf_counter() - begin, ""
+    e = error = difference = np.nan
     verdict, message = VERDICTS.get(code, str(code)), " ".join(err.split())
     text = message
     if (result / "mechanism.toml").exists():
         document = json.loads((result / "identification.json").read_text())
         message = document["reason"]
-        large = [c for c in document["checks"] if max(c["effect"] or 0, c["effect_on_error"] or 0) > LIMIT / 2]
+        large = [
+            c
+            for c in document["checks"]
+            if c["there"] and max(c["effect"] or 0, c["effect_on_error"] or 0) > LIMIT / 2
+        ]
         text = " ".join([message, *(f"{c['name']} {c['finding']}" for c in large)])
-        figures = errors_of(result / "mechanism.toml", campaign)
-        arguments = ["identify", "--check", *campaign.logs, result / "mechanism.toml", "--map", campaign.mapping]
+        e, error, difference = errors_of(result / "mechanism.toml", campaign)
+        arguments = [
+            "identify",
+            "--check",
+            *campaign.logs,
+            result / "mechanism.toml",
+            "--map",
+            campaign.mapping,
+        ]
         code, _, err_of_check = run_command(*arguments)
         check = VERDICTS.get(code, str(code))
         err += err_of_check
@@ -96,7 +113,9 @@ def judge(kind, seed, folder):
     words = KINDS[kind].defect
     named = any(word in text for word in words) if words else len(text) > 0
     trouble = err if "internal error" in err or "Traceback" in err else ""
-    return Outcome(kind, seed, verdict, message, check, *map(float, figures), named, trouble, seconds)
+    return Outcome(
+        kind, seed, verdict, message, check, e, float(error), float(difference), named, trouble, seconds
+    )
 
 
 def summary(kind, outcomes):
@@ -109,31 +128,30 @@ def summary(kind, outcomes):
     error = max((abs(outcome.error) for outcome in good), default=0.0)
     difference = max((abs(outcome.difference) for outcome in good), default=0.0)
     return (
-        f"{kind:18} good {verdicts['good']:3} bad {verdicts['bad']:3} refused {verdicts['refused']:3}   good and"
-        f" wrong {wrong:3}   worst e {error:.4f} e-e* {difference:.4f}   check differs {differ:3}   defect not"
-        f" named {unnamed:3}   {np.median([outcome.seconds for outcome in outcomes]):.0f} s"
+        f"{kind:18} good {verdicts['good']:3} bad {verdicts['bad']:3} refused {verdicts['refused']:3}"
+        f"   good but wrong {wrong:3}   worst e {error:.4f} e-e* {difference:.4f}   check differs {differ:3}"
+        f"   defect not named {unnamed:3}   {np.median([outcome.seconds for outcome in outcomes]):.0f} s"
     )
 
 
 def main(folder, first, count, *kinds):
-    """Run the study; print a line per campaign and kind, and keep all outcomes in `outcomes.jsonl`."""
-    for kind in kinds or KINDS:
-        outcomes = []
-        for seed in range(int(first), int(first) + int(count)):
+    """Run the study, all kinds of a seed before the next; append outcomes to `outcomes.jsonl`."""
+    outcomes = {kind: [] for kind in kinds or KINDS}
+    for seed in range(int(first), int(first) + int(count)):
+        for kind in outcomes:
             place = Path(folder) / f"{kind}_{seed}"
             shutil.rmtree(place, ignore_errors=True)
             outcome = judge(kind, seed, place)
-            outcomes.append(outcome)
+            outcomes[kind].append(outcome)
             with (Path(folder) / "outcomes.jsonl").open("a") as lines:
                 lines.write(json.dumps(asdict(outcome)) + "\n")
-            print(
-                f"{kind} {seed}: {outcome.verdict}, check {outcome.check}, e off by {outcome.error:+.4f}, e - e* by"
-                f" {outcome.difference:+.4f}; {outcome.message} {outcome.trouble}",
-                flush=True,
-            )
-            for file in place.glob("*.[cp]*"):
-                file.unlink()
-        print(summary(kind, outcomes), flush=True)
+            errors = f"{outcome.error:+.4f}, e - e* by {outcome.difference:+.4f}"
+            print(f"{kind} {seed}: {outcome.verdict}, check {outcome.check}, e off by {errors}", flush=True)
+            print(f"    {outcome.message} {outcome.trouble}", flush=True)
+            for log in [*place.glob("*.csv"), *place.glob("*.parquet")]:
+                log.unlink()
+    for kind, results in outcomes.items():
+        print(summary(kind, results))
 
 
 if __name__ == "__main__":
