@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from independent_rig import Rig, drive, touch
+from independent_rig import LOGGER, POINTS, Rig, drive, touch
 from pyarrow import csv, parquet
 from scipy.signal import lfilter
 
@@ -35,7 +35,7 @@ class Kind:
     walk: float = 0.0  # N/sqrt(s), random walk of the force's bias
     lost: float = 0.0  # share of rows lost; stamps jitter, too
     force_clock: bool = False  # the force has stamps of its own and begins later
-    late: int = 0  # rows by which the measured position begins later; these logs are in Parquet
+    late: int = 0  # rows by which the measured position begins later, with its stamps; logs in Parquet
 
 
 def _lag(rng, rig):
@@ -204,21 +204,17 @@ def write_campaign(kind_name, seed, folder):
     folder.mkdir(parents=True, exist_ok=True)
     logs = []
 
-    def log(name, force, command, desired, velocity, measured):
-        logs.append(form.write(folder / name, rng, rig.period, force, command, desired, velocity, measured))
+    def log(name, force, command, desired, velocity, measured, logger):
+        if kind.force_clock:
+            force = rig.read_force(logger + sensors.draw(len(logger))[0][:, 0])
+        values = {"x_cmd": desired, "x": measured, "F": force, "F_cmd": command, "v_cmd": velocity}
+        logs.append(form.write(folder / name, rng, rig.period, values))
 
     def open_loop(name, commands, plant):
-        force, position = drive(plant, commands)
+        force, logger, position = drive(plant, commands)
         noise, position_noise = (values[:, 0] for values in sensors.draw(len(commands)))
-        velocity = np.gradient(commands, rig.period)
-        log(
-            name,
-            rig.read_force(force + noise),
-            np.zeros(len(commands)),
-            commands,
-            velocity,
-            position + position_noise,
-        )
+        reading, velocity = rig.read_force(force + noise), np.gradient(commands, rig.period)
+        log(name, reading, np.zeros(len(commands)), commands, velocity, position + position_noise, logger)
 
     aside = replace(rig, mode=0.0)  # clear of the mechanism, its structure moves with the drive
     open_loop("rest", np.full(round(REST / rig.period), -CLEARANCE), aside)
@@ -237,8 +233,7 @@ def write_campaign(kind_name, seed, folder):
         lambda tick, force, position: (force + noise[tick], position + position_noise[tick]),
     )
     for index in rng.permutation(len(speeds)):
-        _, force, command, desired, velocity, measured = touches[:, :, index]
-        log(f"touch_{len(logs) - 2:02d}", force, command, desired, velocity, measured)
+        log(f"touch_{len(logs) - 2:02d}", *touches[1:, :, index])
     if with_press:
         open_loop("press", press_motion(rng, rig), rig)
     mapping, prior = folder / "logs.toml", folder / "prior.toml"
@@ -255,37 +250,31 @@ class Form:
         self.small = bool(rng.integers(2))  # mm, kN and ms in place of SI units
         self.decimals = int(rng.choice(DECIMALS))
         self.sent = bool(rng.integers(2))  # a row has the next tick's command
-        self.velocity = rng.random() < 0.3  # the desired velocity is logged
-        self.command = rng.random() < 0.7  # the force command is logged
+        velocity, command = rng.random() < 0.3, rng.random() < 0.7
+        self.columns = ["x_cmd", "x", "F", *["F_cmd"] * command, *["v_cmd"] * velocity]
         self.sign = int(rng.choice([-1, 1]))  # of logged forces
         self.offset = float(rng.choice([0.0, 0.25]))  # m, of logged positions
-        self.clock_shift = rng.uniform(0.1, 0.9)  # periods
+        rng.random()
 
-    def write(self, path, rng, period, force, command, desired, velocity, measured):
+    def write(self, path, rng, period, columns):
         """Write a log and return its path."""
-        kind = self.kind
-        begin = round(rng.uniform(0, 100), 1)
-        stamps = begin + np.arange(len(force)) * period
-        desired = np.append(desired[1:], np.nan) if self.sent else desired
-        velocity = np.append(velocity[1:], np.nan) if self.sent else velocity
-        columns = {"t": stamps, "x_cmd": desired, "x": measured, "F": force}
-        if self.command:
-            columns["F_cmd"] = command
-        if self.velocity:
-            columns["v_cmd"] = velocity
-        keep = np.ones(len(force), bool)
-        keep[-1] = not self.sent
+        kind, rows = self.kind, np.arange(len(columns["F"]))
+        stamps = round(rng.uniform(0, 100), 1) + rows * period
+        columns = {"t": stamps, **{name: values for name, values in columns.items() if name in self.columns}}
+        keep = np.ones(len(rows), bool)
+        if self.sent:
+            keep[-1] = False
+            columns |= {name: np.roll(columns[name], -1) for name in ("x_cmd", "v_cmd") if name in columns}
         if kind.lost:
-            keep[1:] &= rng.random(len(force) - 1) > kind.lost
-            columns["t"] = stamps + np.clip(rng.normal(0, JITTER, len(stamps)), -4 * JITTER, 4 * JITTER)
+            keep[1:] &= rng.random(len(rows) - 1) > kind.lost
+            columns["t"] = stamps + np.clip(rng.normal(0, JITTER, len(rows)), -4 * JITTER, 4 * JITTER)
         if kind.late:
-            columns["x"] = np.where(np.arange(len(force)) < kind.late, np.nan, measured)
+            keep[-kind.late :] = False
+            columns |= {"x": np.roll(columns["x"], -kind.late), "t_x": stamps + kind.late * period}
         if kind.force_clock:
-            # The force logger samples the same signal between the ticks, from the fourth on.
-            at = np.arange(len(force)) + 4 + self.clock_shift
-            keep &= at <= len(force) - 1
-            columns["t_F"] = begin + at * period
-            columns["F"] = np.interp(at, np.arange(len(force)), force)
+            keep[-3:] = False
+            columns["F"] = np.roll(columns["F"], -3)
+            columns["t_F"] = stamps + (3 - LOGGER / POINTS) * period
         table = pa.table({name: self._rounded(name, values[keep]) for name, values in columns.items()})
         path = path.with_suffix(".parquet" if kind.late else ".csv")
         (parquet.write_table if kind.late else csv.write_csv)(table, path)
@@ -300,39 +289,35 @@ class Form:
         if self.small:
             scale, fewer = {"F": (1e-3, -3), "x": (1e3, 3), "v": (1e3, 3), "t": (1e3, 3)}[name[0]]
             decimals -= fewer
-        return pa.array(np.round(values * scale, max(decimals, 0)), from_pandas=True)
+        return pa.array(np.round(values * scale, max(decimals, 0)))
 
     def mapping(self, rig, with_press):
         """Return the mapping file of the logs."""
-        length, force, time, speed = ("mm", "kN", "ms", "mm/s") if self.small else ("m", "N", "s", "m/s")
-        offset = self.offset * (1e3 if self.small else 1)
+        length, force, time = ("mm", "kN", "ms") if self.small else ("m", "N", "s")
+        place = f'unit = "{length}", offset = {-self.offset * (1e3 if self.small else 1)}'
+        push = f'unit = "{force}", sign = {self.sign}'
         clock = ', time = "t_F"' if self.kind.force_clock else ""
-        place = f'unit = "{length}", offset = {-offset}'
-        lines = [
-            'schema = "jaxhil/log/1"',
-            "[channels]",
-            f'time = {{ column = "t", unit = "{time}" }}',
-            f'position_desired = {{ column = "x_cmd", {place} }}',
-            f'position_measured = {{ column = "x", {place} }}',
-            f'force_measured = {{ column = "F", unit = "{force}", sign = {self.sign}{clock} }}',
-        ]
-        if self.command:
-            lines.append(f'force_command = {{ column = "F_cmd", unit = "{force}", sign = {self.sign} }}')
-        if self.velocity:
-            lines.append(f'velocity_desired = {{ column = "v_cmd", unit = "{speed}" }}')
-        lines += [
-            "[timing]",
-            f"control_period = {rig.period}",
-            'command_hold = "linear"',
-            f'row = "{"sent" if self.sent else "tick"}"',
-            "[bodies]",
-            f"equivalent_mass = {rig.mass}",
-        ]
-        runs = {"rest*": "rest", "free*": "free", "touch_*": "contact"}
-        runs |= {"press*": "press"} if with_press else {}
-        for files, run in runs.items():
-            lines += ["[[runs]]", f'files = "{files}"', f'kind = "{run}"']
-        return "\n".join(lines) + "\n"
+        begin = ', time = "t_x"' if self.kind.late else ""
+        channels = {
+            "t": f'time = {{ column = "t", unit = "{time}" }}',
+            "x_cmd": f'position_desired = {{ column = "x_cmd", {place} }}',
+            "x": f'position_measured = {{ column = "x", {place}{begin} }}',
+            "F": f'force_measured = {{ column = "F", {push}{clock} }}',
+            "F_cmd": f'force_command = {{ column = "F_cmd", {push} }}',
+            "v_cmd": f'velocity_desired = {{ column = "v_cmd", unit = "{length}/s" }}',
+        }
+        lines = ['schema = "jaxhil/log/1"', "[channels]", *(channels[name] for name in ["t", *self.columns])]
+        lines += ["[timing]", f"control_period = {rig.period}", 'command_hold = "linear"']
+        lines += [f'row = "{"sent" if self.sent else "tick"}"', f"[bodies]\nequivalent_mass = {rig.mass}"]
+        runs = {
+            "rest*": "rest",
+            "free*": "free",
+            "touch_*": "contact",
+            **({"press*": "press"} if with_press else {}),
+        }
+        return "\n".join(
+            lines + [f'[[runs]]\nfiles = "{files}"\nkind = "{run}"' for files, run in runs.items()]
+        )
 
 
 def _prior(rig, speed, kind, factors):

@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.signal import cont2discrete, lfilter
 
 POINTS = 40  # fine points per control period
+LOGGER = 15  # fine points by which a force logger with its own clock samples before the tick
 WARM_UP = 0.6  # s of uniform motion before the first tick; the slowest drive settles to 1e-9 in it
 LONGEST = 1.5  # s; a contact that lasts longer than that never ends
 
@@ -171,12 +172,13 @@ def structure_acceleration(rig, offset, rate, x, v, start):
 
 
 def drive(rig, commands):
-    """Return force and position readings without noise under open-loop `commands`, a row per tick."""
+    """Return force, force logger and position without noise under open-loop `commands`, a row per tick."""
     plant = Plant(rig, commands[:1])
-    readings = [np.array([[0.0, commands[0]]])]
+    readings = [np.array([[0.0, 0.0, commands[0]]])]
     for begin in range(1, len(commands), 4000):
         _, force, position = plant(commands[begin : begin + 4000, None])
-        readings.append(np.column_stack([force, position])[POINTS - 1 :: POINTS])
+        logger = np.roll(force, LOGGER, axis=0)
+        readings.append(np.column_stack([force, logger, position])[POINTS - 1 :: POINTS])
     return np.concatenate(readings).T
 
 
@@ -186,7 +188,7 @@ def touch(rig, start, speed, controller, ticks, disturb=lambda tick, force, posi
     `controller` maps force, desired position and velocity, and measured position to the force command;
     `disturb` adds noise to the readings of a tick. The result has a row per tick and the columns largest real
     force since the last tick, force reading, force command, desired position, desired velocity, position
-    reading; each has an entry per lane.
+    reading, force logger without noise; each has an entry per lane.
     """
     plant = Plant(rig, start - speed * WARM_UP)
     approach = np.arange(round(WARM_UP / rig.period), 0, -1) - 1
@@ -197,7 +199,7 @@ def touch(rig, start, speed, controller, ticks, disturb=lambda tick, force, posi
         reading, sensed = disturb(tick, force[-1], measured[-1])
         reading = rig.read_force(reading)
         command = controller(reading, position, velocity, sensed)
-        rows.append([real.max(axis=0), reading, command, position, velocity, sensed])
+        rows.append([real.max(axis=0), reading, command, position, velocity, sensed, force[-1 - LOGGER]])
         position, velocity = rig.integrate(position, velocity, command)
         real, force, measured = plant(position[None])
     return np.array(rows).transpose(1, 0, 2)
@@ -218,7 +220,7 @@ def restitution(rig, speed, law):
     ticks = round(LONGEST / rig.period)
     memory = rig.force_delay + 2 * rig.period
     memory += 20 * rig.filter_order / (2 * np.pi * rig.cutoff) if rig.filter_order else 0.0
-    real, _, command, _, velocity, _ = touch(rig, np.array([start]), np.array([speed]), controller, ticks)[
+    real, _, command, _, velocity, *_ = touch(rig, np.array([start]), np.array([speed]), controller, ticks)[
         :, :, 0
     ]
     peak = np.maximum.accumulate(np.abs(command))

@@ -72,7 +72,7 @@ def test_independent_drive_has_the_response_of_its_transfer_function(window, res
     rig = Rig(frequency=12.0, ratio=0.7, window=window, drive_delay=0.0043, position_delay=0.0006)
     time = np.arange(4000) * rig.period
     omega = 2 * np.pi * 7.0
-    _, position = drive(rig, np.sin(omega * time))
+    *_, position = drive(rig, np.sin(omega * time))
     late = response(7.0) * np.exp(1j * omega * (time - 0.0049))
     assert position[2000:] == pytest.approx(np.imag(late)[2000:], abs=1e-3)
 
