@@ -35,6 +35,9 @@ class Kind:
     walk: float = 0.0  # N/sqrt(s), random walk of the force's bias
     lost: float = 0.0  # share of rows lost; stamps jitter, too
     force_clock: bool = False  # the force has stamps of its own and begins later
+    resampled: bool = (
+        False  # its readings are brought to these stamps by straight lines before they are logged
+    )
     late: int = 0  # rows by which the measured position begins later, with its stamps; logs in Parquet
 
 
@@ -76,6 +79,9 @@ KINDS = {
     ),
     "friction": Kind(
         lambda rng, rig: {"friction": rng.uniform(1.0, 4.0)}, defect=("friction", "contact law")
+    ),
+    "resampled_force": Kind(
+        force_clock=True, resampled=True, defect=("noise", "contact law", "interpolated", "lag")
     ),
     "moving_average": Kind(
         lambda rng, rig: {"window": rng.uniform(0.034, 0.050)}, defect=("motion", "order")
@@ -205,7 +211,10 @@ def write_campaign(kind_name, seed, folder):
     logs = []
 
     def log(name, force, command, desired, velocity, measured, logger):
-        if kind.force_clock:
+        if kind.resampled:
+            rows = np.arange(len(force))
+            force = np.interp(rows - LOGGER / POINTS, rows, force)
+        elif kind.force_clock:
             force = rig.read_force(logger + sensors.draw(len(logger))[0][:, 0])
         values = {"x_cmd": desired, "x": measured, "F": force, "F_cmd": command, "v_cmd": velocity}
         logs.append(form.write(folder / name, rng, rig.period, values))
