@@ -247,7 +247,7 @@ def write_campaign(kind_name, seed, folder):
         open_loop("press", press_motion(rng, rig), rig)
     mapping, prior = folder / "logs.toml", folder / "prior.toml"
     mapping.write_text(form.mapping(rig, with_press))
-    prior.write_text(_prior(rig, speed, kind, prior_factors))
+    prior.write_text(mechanism_file(rig, speed, kind, prior_factors))
     return Campaign(kind_name, seed, rig, speed, logs, mapping, prior)
 
 
@@ -329,8 +329,8 @@ class Form:
         )
 
 
-def _prior(rig, speed, kind, factors):
-    """Return a mechanism file with rough values that lacks the kind's unknown keys."""
+def mechanism_file(rig, speed, kind, factors):
+    """Return a mechanism file, the rig's values times `factors`, that lacks the kind's unknown keys."""
     frequency, ratio = (4.0 / rig.window / np.pi, 0.9) if rig.window else (rig.frequency, rig.ratio)
     values = {
         "bodies.equivalent_mass": rig.mass,

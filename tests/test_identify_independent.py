@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from independent_logs import KINDS, write_campaign
+from independent_logs import KINDS, mechanism_file, write_campaign
 from independent_rig import Rig, drive, ideal_restitution, restitution, touch
 from independent_study import LIMIT, errors_of, judge, summary
 
@@ -79,23 +79,9 @@ def test_independent_drive_has_the_response_of_its_transfer_function(window, res
 
 def test_independent_truth_is_that_of_the_true_file_and_of_no_other(tmp_path):
     campaign = write_campaign("plain", 0, tmp_path)
-    rig = campaign.rig
-    lines = campaign.prior.read_text().split("\n")
-    truth = {
-        "stiffness": [rig.stiffness],
-        "damping": [rig.damping],
-        "natural_frequency": rig.frequency,
-        "damping_ratio": rig.ratio,
-    }
-    delays = [rig.drive_delay, rig.force_delay]
-    for index, line in enumerate(lines):
-        key = line.split(" = ")[0]
-        if key in truth:
-            lines[index] = f"{key} = {truth[key]}"
-        if key == "delay":
-            lines[index] = f"delay = {delays.pop(0)}"
-    file = tmp_path / "truth.toml"
-    file.write_text("\n".join(lines).replace("[rig]\n", f"[rig]\ncontact_plane = {rig.plane}\n"))
+    rig, file = campaign.rig, tmp_path / "truth.toml"
+    text = mechanism_file(rig, campaign.speed, KINDS["plain"], np.ones(6))
+    file.write_text(f"{text}\nrig.contact_plane = {rig.plane}\n")
     e, error, difference = errors_of(file, campaign)
     assert 0.3 < e < 1.5
     assert (error, difference) == pytest.approx((0, 0), abs=1e-5)
