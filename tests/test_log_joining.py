@@ -25,14 +25,22 @@ def joined(sampled, stamps=None, ticks=None, jitter=0.0):
     """The rows' ticks, readings joined to them, and notes; `sampled`: when readings were taken [s]."""
     ticks = np.arange(ROWS) if ticks is None else ticks
     rows = scattered(PERIOD * ticks, jitter, 1)
-    columns = {"position_desired": ticks.astype(float), "force_measured": smooth(sampled)}
-    clocks = {"position_desired": rows, "force_measured": sampled if stamps is None else stamps}
-    named = {"position_desired": "xd", "force_measured": "F"}
+    columns = {"position_desired": ticks.astype(float), "position_measured": smooth(sampled)}
+    columns["force_measured"] = columns["position_measured"]
+    clocks = dict.fromkeys(columns, sampled if stamps is None else stamps) | {"position_desired": rows}
+    named = {"position_desired": "xd", "position_measured": "xm", "force_measured": "F"}
     found, times, notes = join("a", columns, clocks, named, PERIOD)
     kept = found["position_desired"].astype(int)
-    assert len(times) == len(kept) == len(found["force_measured"])
+    assert len(times) == len(kept) == len(found["position_measured"])
     assert np.all(np.isin(times, rows))
-    return kept, found["force_measured"], notes
+    if "force_late" in found:
+        # Forces are not interpolated: each is one of the readings, and it is told how late.
+        assert np.all(np.isin(found["force_measured"], columns["force_measured"]))
+        moved = (2 * np.pi * 7.1) * (0.02 * PERIOD + jitter)
+        at = PERIOD * kept + found["force_late"]
+        assert np.max(np.abs(found["force_late"])) <= (0.51 * PERIOD if jitter == 0.0 else 0.7 * PERIOD)
+        assert np.max(np.abs(found["force_measured"] - smooth(at))) < moved
+    return kept, found["position_measured"], notes
 
 
 @pytest.mark.parametrize("late", [5.0, -7.0, 0.0])

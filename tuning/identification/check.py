@@ -16,13 +16,14 @@ from tuning.identification import free_motion, known, two_clocks, validation
 from tuning.identification.contact import ContactFit
 from tuning.identification.contact_problem import LONGEST, Inner, Problem, Readings
 from tuning.identification.contact_profile import Posterior
+from tuning.identification.edges import edges
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.motion import Motion
 from tuning.identification.noise import Noise, at_rest
 from tuning.identification.rational import Model
 from tuning.identification.records import Campaign, Run
 from tuning.identification.result import PRESS, UNCERTAINTY, Identification, experiment
-from tuning.identification.uncertain_effect import uncertain_effect
+from tuning.identification.uncertain_effect import Effect, uncertain_effect
 
 CLOCK = 2e-5  # s, to which no delay is known better
 USUAL_FREQUENCY = 3.0  # Hz, of contacts, where none was made
@@ -73,7 +74,10 @@ def check(
         lag = contacts.lag(contact, model, frequency)
         every = np.ones(len(touching), bool)
         lines += validation.of_contact(contact, touching, campaign.equivalent_mass, frequency, lag, every)
-    lines += uncertainty(mechanism, any(run.kind == "press" for run in campaign.runs))
+    effect = uncertain_effect(mechanism)
+    if contact is not None:
+        lines += edges(contact, touching, effect)
+    lines += uncertainty(effect, any(run.kind == "press" for run in campaign.runs))
     return Identification(
         estimates=(),
         draws=np.zeros((0, 0)),
@@ -87,9 +91,8 @@ def check(
     )
 
 
-def uncertainty(mechanism: Mechanism, pressed: bool) -> list[validation.Line]:
+def uncertainty(effect: Effect, pressed: bool) -> list[validation.Line]:
     """Say what the file's own uncertainty can do, if an identification stated it, and what lessens it."""
-    effect = uncertain_effect(mechanism)
     if not effect.parts:
         return []
     largest = sorted(effect.parts, key=lambda key: -effect.parts[key])[:2]

@@ -1,8 +1,8 @@
 """The contact from runs in contact: law, stiffness, damping, plane, and the force sensor's delay.
 
 Where a dead zone hides small forces, only rows count whose predicted force is well beyond it; what the
-readings lack there is the dead zone, and the plane has to be told, since a spring that begins later lacks as
-much.
+readings lack there is the dead zone. Unless noise at rest reaches beyond it, or it is told, the plane has to
+be told, since a spring that begins later lacks as much.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ SETTLING = 0.5  # s, of a motion simulator
 PIECE = 1.0  # s
 TIME_CONSTANTS = 10.0  # after which what was commanded before is over
 FIRST_ROWS, STEADY = 5, 0.01  # rows over which, and share by which, the speed of uniform motion may change
+TOLD = 1e-3  # of a dead zone that was told, to which it is known
 BEYOND = 4.0  # standard deviations beyond the dead zone from which a reading counts
 ROUGH = 21, 5  # delays and planes of the grid for the fit that is only judged
 UNKNOWN_NOISE = 0.01  # of the largest force, where nothing tells it
@@ -48,7 +49,7 @@ def pieces(run: Run, period: float) -> list[Run]:
     for begin in range(settling, len(run.tick), length):
         part = slice(begin - settling, min(begin + length, len(run.tick)))
         names = ("tick", "position_desired", "position_measured", "force_measured", "velocity_desired",
-                 "force_command", "contact_index")  # fmt: skip
+                 "force_command", "contact_index", "force_late")  # fmt: skip
         cut = {name: None if getattr(run, name) is None else getattr(run, name)[part] for name in names}
         valid = run.valid[part].copy()
         valid[:settling] = False
@@ -119,23 +120,29 @@ def estimate(
     law: Law | str | None = None,
     plane: float | None = None,
     seed: int = 0,
+    dead_zone: float = 0.0,
 ) -> ContactFit:
     """From runs with contact together; `noise` is the force sensor's at rest, where it is known.
 
-    A law as a string is the name of one whose shape is searched; None lets the touches choose.
+    A law as a string is the name of one whose shape is searched; None lets the touches choose. `dead_zone`
+    [N] is one that was told: it counts where readings at rest show one.
     """
     apart = _drift(runs, model, timing, noise, law, plane) if timing.two_clocks else None
     motion = Motion(model, runs, timing, LONGEST + timing.control_period, apart and apart.late)
     told = plane
     hidden = noise is not None and noise.silent
+    known = None
+    if noise is not None and hidden:
+        known = (dead_zone, TOLD * dead_zone) if dead_zone else noise.dead_zone
     if noise is None or hidden:
         readings = Readings.of(runs, 1.0, threshold=1.0 if hidden else 0.0)
-        plane = 0.0 if hidden and plane is None else plane
-        readings = _noise_from_contact(motion, readings, plane)
+        usual = 0.0 if hidden and plane is None else plane
+        readings = _noise_from_contact(motion, readings, usual, 0.0 if noise is None else noise.std)
+        plane = plane if known else usual
     else:
         readings = _readings(runs, noise)
-    # A dead zone has the plane told, and no bias.
-    bias = None if hidden else known_bias(runs, motion, noise, plane)
+    # Under a dead zone there is no bias but what it takes.
+    bias = known_bias(runs, motion, noise, plane) if not hidden else known and (-known[0], known[1])
     readings = replace(readings, bias=bias)
     judged: tuple[Judged, ...] = ()
     near = None
@@ -199,9 +206,15 @@ def _hides(posterior: Posterior) -> bool:
     return bool(lacking.mean() > SURE * lacking.std())
 
 
-def _noise_from_contact(motion: Motion, readings: Readings, plane: float | None) -> Readings:
-    """The noise is what the laws leave; under a dead zone, of the readings well beyond it."""
-    counts = readings.counts & (readings.force != 0.0) if readings.threshold else readings.counts
+def _noise_from_contact(
+    motion: Motion, readings: Readings, plane: float | None, at_rest: float
+) -> Readings:
+    """The noise is what the laws leave; under a dead zone, of the readings well beyond it.
+
+    `at_rest`: noise that reaches beyond the dead zone at rest [N]; 0 where none does."""
+    counts = readings.counts
+    if readings.threshold:
+        counts = counts & (readings.force != 0.0) & (np.abs(readings.force) > BEYOND * at_rest)
     peak = np.abs(readings.force[counts]).max()
     found = replace(
         readings, counts=counts, std=0.01 * peak, threshold=0.02 * peak * (readings.threshold > 0)

@@ -34,13 +34,14 @@ from tuning.identification.parameters import SIMULATOR
 from tuning.identification.rational import Model
 from tuning.identification.records import Campaign, Run
 from tuning.identification.result import Identification, confounded
+from tuning.identification.uncertain_effect import uncertain_effect
 
 SHORTEST_REST = 200  # rows from which a run at rest says what a sensor's noise is
 USUAL_FREQUENCY = 3.0  # Hz, of contacts, where none was made
 TOUCHING = ("contact", "press", "tap")
 STAGES = 3  # free motion, contact, validation; with a bootstrap one more for each piece of its fits
 Say = Callable[[str], None]  # told what begins
-FORCE_DELAY = "rig.force_sensor.delay"
+FORCE_DELAY, DEAD_ZONE = "rig.force_sensor.delay", "rig.force_sensor.dead_zone"
 STIFFNESS, POSITION_DELAY = "contact.stiffness.", "rig.position_sensor.delay"
 CLEAR = 2.0  # standard deviations by which a force delay is taken to be above 0
 
@@ -66,11 +67,12 @@ def identify(
     motion = free_motion.estimate(runs["free"], campaign.timing, options.order)
     model = _told_model(prior) if motion is None else motion.model
     contact, touching, left_out, frequency = None, [], [], USUAL_FREQUENCY
+    dead_zone = options.fixed.get(DEAD_ZONE, 0.0 if prior is None else prior.rig.force_sensor.dead_zone)
     whole = [run for run in campaign.runs if run.kind in TOUCHING]
     if whole and model is not None:
         whole = contacts.after_gaps(whole, model, period)
         touching = [piece for run in whole for piece in contacts.pieces(run, period)]
-        contact, left_out = _contact(touching, model, campaign, force, options, say)
+        contact, left_out = _contact(touching, model, campaign, force, dead_zone, options, say)
         frequency = contacts.frequency(contact, mass)
     apart = None if contact is None else contact.drift
     share = _position_delay(motion, None if apart else contact, prior, options)
@@ -98,7 +100,8 @@ def identify(
     lines = _of_file(campaign, written, motion if options.order is None else None)
     if lines is None:
         lines = [*refused, *_of_fits(motion, contact, model, touching, mass)]
-        lines += [] if written is None else uncertainty(written, any(run.kind == "press" for run in whole))
+        if written is not None:
+            lines += uncertainty(uncertain_effect(written), any(run.kind == "press" for run in whole))
     keys = list(found)
     table = np.array([found[key] for key in keys]).T if keys else np.zeros((DRAWS, 0))
     return Identification(
@@ -111,6 +114,7 @@ def identify(
         limit=options.limit,
         notes=(
             *_notes(motion, contact, told_contact, force, vague),
+            *_no_dead_zone(contact, dead_zone),
             *_moved(fixed, options),
             *_at_bounds(found),
             *denied,
@@ -177,13 +181,14 @@ def _contact(
     model: Model,
     campaign: Campaign,
     force: Noise | None,
+    dead_zone: float,
     options: Options,
     say: Say,
 ) -> tuple[ContactFit, list[validation.Line]]:
     """The fit to all touches, and how one to most of them explains the others."""
     plane = options.fixed.get("rig.contact_plane")
     say(f"fitting the contact to {len(runs)} touches")
-    fit = contacts.estimate(runs, model, campaign.timing, force, options.law, plane, options.seed)
+    fit = contacts.estimate(runs, model, campaign.timing, force, options.law, plane, options.seed, dead_zone)
     if options.bootstrap:
         say(f"fitting {options.bootstrap} times to contacts drawn again")
         fit = bootstrap(fit, options.bootstrap, options.seed, options.scheduler, options.kept, say)
@@ -351,6 +356,13 @@ def _notes(
         notes.append(f"the force's noise is coloured (pole {force.pole:.2f}); tuning weighs it as white")
     if contact is not None and (entries := contact.readings.entries) != tuple(range(len(entries))):
         notes.append(f"of the contact lists only entries {', '.join(map(str, entries))} were met")
-    if contact is not None and contact.dead_zone:
+    if contact is not None and contact.dead_zone and contact.problem.plane is not None:
         notes.append("the force has a dead zone: the contact plane was taken as told")
     return notes
+
+
+def _no_dead_zone(contact: ContactFit | None, told: float) -> list[str]:
+    """Say that the readings have no dead zone though one was told."""
+    if contact is None or contact.dead_zone or not told:
+        return []
+    return [f"{DEAD_ZONE}: {told:g} N were told, but readings at rest show none: taken as none"]

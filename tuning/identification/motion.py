@@ -32,8 +32,11 @@ class Motion:
         late: np.ndarray | None = None,
     ):
         """`longest`: greatest delay after the model's own [s] that `at` will be asked for; `late`: what each
-        run adds to it [s], by a clock of its own."""
+        run adds to it [s], by a clock of its own; what forces were read later than their rows is less."""
         self.delay, self.period = model.delay, timing.control_period
+        if any(run.force_late is not None for run in runs):
+            read = [0.0 if run.force_late is None else np.nanmean(run.force_late) for run in runs]
+            late = -np.array(read) if late is None else late - np.array(read)
         self.late = late if late is not None and np.any(late) else None
         least, most = (0.0, 0.0) if late is None else (min(late.min(), 0.0), max(late.max(), 0.0))
         self.shift = timing.shift
@@ -82,6 +85,12 @@ class Motion:
             for row in (position, rate / self.period)
         )
         return x, v
+
+    def of_positions(self) -> Motion:
+        """Return the same motion at the times of the rows, whenever forces were read."""
+        rows = copy(self)
+        rows.late = None
+        return rows
 
     def of(self, lanes: np.ndarray) -> Motion:
         """The motion of some of the runs, each as often as it is named."""

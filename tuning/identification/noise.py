@@ -15,7 +15,10 @@ from scipy import linalg, optimize, special
 from scipy.signal import lfilter
 
 HIGHEST = 8  # order of the autoregression
+FEWEST_BEYOND = 20  # readings beyond a dead zone, from which they tell it
 REPEATED = 0.2  # distinct values over readings, below which values come in steps
+ROUNDED_TO_0 = 0.02  # share of exact zeros beyond those of rounding, from which a dead zone makes them
+GAP = 0.3  # of the mean reading beyond a dead zone, above which no reading of this kind is the smallest
 SILENT = 0.5  # share of exact zeros from which a reading is that of a dead zone
 
 
@@ -28,10 +31,11 @@ class Noise:
     mean_std: float  # standard error of the mean
     std_std: float  # and of the standard deviation
     quantum: float  # 0 where readings come in no steps
-    silent: bool  # readings are exactly 0 most of the time: mean and std are unknown
+    silent: bool  # a dead zone hides some or all of the readings: the mean is unknown
     filter: tuple[float, ...]  # makes the noise white, its first coefficient 1
     number: int  # readings
     drift: float = 0.0  # of the readings, from the first to the last; 0 where it is lost in the noise
+    dead_zone: tuple[float, float] | None = None  # less the bias, and its standard error, where readings tell
 
     @property
     def pole(self) -> float:
@@ -48,8 +52,9 @@ def at_rest(readings: np.ndarray) -> Noise:
     """Of at least 20 readings on successive ticks, finite."""
     quantum = steps(readings)
     number = len(readings)
-    if np.mean(readings == 0.0) > SILENT and (quantum == 0.0 or np.ptp(readings) < 1.5 * quantum):
-        return Noise(0.0, 0.0, np.inf, np.inf, quantum, True, (1.0,), number)
+    if _is_hidden(readings, quantum):
+        std, dead_zone = _beyond(readings)
+        return Noise(0.0, std, np.inf, np.inf, quantum, True, (1.0,), number, 0.0, dead_zone)
     drift = _drift(readings)
     readings = readings - drift * (np.arange(number) / (number - 1.0) - 0.5)
     rounded = quantum and not drift
@@ -71,6 +76,48 @@ def at_rest(readings: np.ndarray) -> Noise:
         number,
         drift,
     )
+
+
+def _is_hidden(readings: np.ndarray, quantum: float) -> bool:
+    """Tell whether more readings are exactly 0 than noise and rounding would make so."""
+    zero = readings == 0.0
+    if np.mean(zero) > SILENT and (quantum == 0.0 or np.ptp(readings) < 1.5 * quantum):
+        return True
+    size = float(np.sqrt(np.mean(readings[~zero] ** 2))) if not zero.all() else 0.0
+    # Rounding makes at most 0.4 quanta over the standard deviation of normal readings 0.
+    return size > 0.0 and float(np.mean(zero)) > ROUNDED_TO_0 + quantum / size
+
+
+def _beyond(readings: np.ndarray) -> tuple[float, tuple[float, float] | None]:
+    """Return the noise's standard deviation, and the dead zone with its error, by the noise beyond it.
+
+    A normal number n is read as sign(n) max(|n| - D, 0): the maximum of the likelihood over D and the
+    standard deviation, of a bias of 0. Readings that leave a gap around 0 have a dead zone of another kind.
+    """
+    size = np.abs(readings[readings != 0.0])
+    zeros, number = len(readings) - len(size), len(size)
+    if number < FEWEST_BEYOND or size.min() > GAP * size.mean():
+        return 0.0, None
+
+    def cost(parameters):
+        dead_zone, std = np.exp(parameters)
+        hidden = special.log_ndtr(-dead_zone / std)
+        inside = np.log(-np.expm1(np.log(2.0) + hidden)) if hidden < -np.log(2.0) else -np.inf
+        return -zeros * inside + 0.5 * np.sum(((size + dead_zone) / std) ** 2) + number * np.log(std)
+
+    start = np.log([size.mean(), 2.0 * size.mean()])
+    found = optimize.minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-8})
+    dead_zone, std = np.exp(found.x)
+    # The curvature of the likelihood, by central differences.
+    step = 1e-3
+    shifts = step * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1], [1, 0], [-1, 0], [0, 1], [0, -1]])
+    both, up, down, neither, a, b, c, d = (cost(found.x + shift) for shift in shifts)
+    across = (both - up - down + neither) / 4.0
+    curvature = np.array([[a + b - 2 * found.fun, across], [across, c + d - 2 * found.fun]]) / step**2
+    variance = float(np.linalg.inv(curvature)[0, 0])
+    if not variance > 0.0:
+        return 0.0, None
+    return float(std), (float(dead_zone), float(dead_zone * np.sqrt(variance)))
 
 
 def _drift(readings: np.ndarray) -> float:

@@ -48,6 +48,7 @@ class Run:
     contact_index: np.ndarray | None  # int64, which entry of the contact lists is met; -1 for none
     speed: float | None  # m/s, of the approach, where the log tells it
     begin: float = 0.0  # s, of tick 0 by the stamps
+    force_late: np.ndarray | None = None  # s, by which forces were read later than their rows
 
 
 @dataclass(frozen=True)

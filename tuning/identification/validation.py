@@ -162,7 +162,7 @@ def of_touches_left_out(contact: ContactFit, runs: list[Run], mass: float, held:
 def _left(contact: ContactFit, held: np.ndarray) -> Line:
     delay, plane, inner = contact.posterior.best
     readings = contact.readings
-    readings = replace(readings, counts=readings.counts & _certain(contact))
+    readings = replace(readings, counts=readings.counts & certain_rows(contact))
     every = misfits(contact.problem, readings, delay, plane, inner.coefficients)[held]
     count = np.maximum(readings.counts.sum(axis=0)[held], 1)
     ratio = float(every.sum() / count.sum())
@@ -181,7 +181,7 @@ def _left(contact: ContactFit, held: np.ndarray) -> Line:
     )
 
 
-def _certain(contact: ContactFit) -> np.ndarray:
+def certain_rows(contact: ContactFit) -> np.ndarray:
     """Rows that are in contact, or out of it, whatever the delay and the plane are within their uncertainty:
     damped contact begins with a jump, and a row on its other side says nothing of the law."""
     count = len(contact.problem.names)

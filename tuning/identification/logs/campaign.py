@@ -20,6 +20,7 @@ from jaxhil.mechanism.structs import Mechanism
 from tuning.identification.logs import checks, clock, segments
 from tuning.identification.logs.causality import check_rows_of, integrator_of_all
 from tuning.identification.logs.channels import NUMBERS, columns_of
+from tuning.identification.logs.joining import LATE
 from tuning.identification.logs.mapping import (
     KINDS,
     LogMapping,
@@ -123,7 +124,7 @@ class _Reading:
         else:
             self.ticks = clock.ticks_of(stamps, period, self.label)
         modes = _modes(columns.pop("mode", None), mapping, entry.kind, self.label)
-        channels = {name: columns.get(name) for name in NUMBERS}
+        channels = {name: columns.get(name) for name in (*NUMBERS, LATE)}
         for name, values in channels.items():
             if values is not None:
                 checks.check_rows(self.label, name, values)
@@ -235,6 +236,7 @@ class _Reading:
             contact_index=index,
             speed=None if touched is None else _speed(x, touched[0], self._timing.control_period),
             begin=self._begin,
+            force_late=channels[LATE],
         )
 
 

@@ -21,6 +21,7 @@ from tuning.identification.records import Run, Timing
 AHEAD, BEHIND = 2, 6  # rows after and before a command whose readings are tried
 SIGNIFICANT = 6.0  # standard deviations
 LARGE = 0.3  # of the largest coefficient
+SMALL = 0.12  # of the largest coefficient: a filter whose answer rises over more rows does not tell its first
 ALTERNATES = (
     -0.4
 )  # correlation of neighbours in differences of noise (-2/3 if white), above which they are none
@@ -97,7 +98,10 @@ def _first(moved: np.ndarray, columns: np.ndarray) -> int | None:
     lags = slice(0, AHEAD + BEHIND + 1)
     size = np.abs(solution[lags])
     clear = (size > SIGNIFICANT * np.sqrt(variance[lags])) & (size > LARGE * np.max(size))
-    return AHEAD - int(np.argmax(clear)) if np.any(clear) else None
+    first = int(np.argmax(clear))
+    if not np.any(clear) or (first > 0 and size[first - 1] > SMALL * np.max(size)):
+        return None
+    return AHEAD - first
 
 
 def _columns(run: Run) -> tuple[np.ndarray, np.ndarray] | None:

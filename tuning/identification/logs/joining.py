@@ -2,8 +2,10 @@
 
 Some formats stamp every channel, or every group of channels, by itself: such a channel may begin later, be
 sampled faster, or lose rows of its own. Rows are those of the desired position. A reading that was taken at
-a row's time is that row's; between two readings it is the line through them. A row for which a channel has no
-reading, since it begins later, ends earlier or lost rows, counts as lost.
+a row's time is that row's; between two readings it is the line through them. Forces jump at the begin of a
+contact, which such a line would smear: of forces read as often as rows, a row has the nearest one, and by how
+much that is later than the row. A row for which a channel has no reading, since it begins later, ends earlier
+or lost rows, counts as lost.
 """
 
 from __future__ import annotations
@@ -20,6 +22,8 @@ SLOWEST = 1.5  # control periods between readings, beyond which rows would have 
 GAP = 1.5  # times the usual distance of readings, beyond which some were lost
 AT_A_ROW = 0.02  # periods: readings nearer to a row than this are taken at it
 STEPS = "contact_index", "mode"  # channels that hold their value between readings
+JUMPS, LATE = "force_measured", "force_late"  # the channel that jumps, and that of its delay behind rows [s]
+AS_OFTEN = 0.01  # relative difference of a channel's rate from that of the rows, up to which it is the same
 
 
 def same_clock(one: np.ndarray | None, other: np.ndarray | None) -> bool:
@@ -53,7 +57,8 @@ def join(
         period: Control period [s].
 
     Returns:
-        Values of each channel at the rows, the rows' stamps [s], and notes.
+        Values of each channel at the rows, `LATE` among them where forces are those nearest to the rows; the
+        rows' stamps [s]; and notes.
 
     Raises:
         InputError: If a channel has no clock, or one that the rows cannot be found in.
@@ -76,7 +81,10 @@ def join(
             found = _Places(label, named[name], stamps, times, period)
             places.append((stamps, found))
             notes.append(f"{label}: {found.note(named[MASTER])}")
-        joined[name] = found.of(values, name in STEPS or values.dtype == object)
+        if name == JUMPS and found.as_often:
+            joined[name], joined[LATE] = found.nearest(values)
+        else:
+            joined[name] = found.of(values, name in STEPS or values.dtype == object)
         kept &= found.there
     if not kept.any():
         spans = [f"{shown(named[name])} {one[0]:.6g} to {one[-1]:.6g} s" for name, one in clocks.items()
@@ -120,7 +128,7 @@ class _Places:
                 f"{label}: {_stamps_of(column)}: found readings {usual:.4g} s apart, "
                 f"allowed the control period, {period:g} s, or less"
             )
-        self._rate = usual
+        self._rate, self._period = usual, period
         # Where stamps scatter the samples do not.
         stamps = clock.regular(stamps, period, label, _stamps_of(column))
         self._begins = float(stamps[0] - times[0])
@@ -135,9 +143,19 @@ class _Places:
             self._before = nearest.astype(np.int64)
             self._share = np.zeros(0)
             return
+        self._nearest, self._late = nearest.astype(np.int64), stamps[nearest.astype(np.int64)] - times
         before = np.minimum(place.astype(np.int64), len(stamps) - 2)
         self.there &= stamps[before + 1] - stamps[before] <= GAP * usual
         self._before, self._share = before, place - before
+
+    @property
+    def as_often(self) -> bool:
+        """Tell whether readings are as far apart as rows, at other times."""
+        return not self._exact and abs(self._rate / self._period - 1.0) < AS_OFTEN
+
+    def nearest(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the values nearest to the rows, and by how much later they were read [s]."""
+        return values[self._nearest], self._late
 
     def of(self, values: np.ndarray, steps: bool) -> np.ndarray:
         """Values at the rows; `steps`: they hold until the next reading."""
@@ -150,6 +168,7 @@ class _Places:
     def note(self, master: str) -> str:
         """Say what was done."""
         how = "taken at their own times" if self._exact else "interpolated between their own times"
+        how += ", forces taken at the nearest" if self.as_often else ""
         begins = f"{abs(1e3 * self._begins):.4g} ms {'after' if self._begins >= 0 else 'before'} that"
         return (
             f"column {shown(self._column)} has a clock of its own, which begins {begins} of {shown(master)}: "

@@ -62,7 +62,7 @@ def readings(mechanism: Mechanism, runs: Sequence[Run], motion: Motion) -> Readi
     force, elastic, rate, touching = _lagged(columns, period, sensor.time_constant)
     force = force + sensor.bias
     force = np.sign(force) * np.maximum(np.abs(force) - sensor.dead_zone, 0.0)
-    position, velocity = motion.at(rig.position_sensor.delay)
+    position, velocity = motion.of_positions().at(rig.position_sensor.delay)
     return Readings(force, elastic, rate, touching, moved[0][0] - rig.contact_plane, position, velocity)
 
 
