@@ -26,7 +26,7 @@ from .faults import (
 )
 from .gain_file import GainFile, check_gain_document, read_gain_document
 from .inputs import InputGuard, Tare
-from .law_status import STATUSES, UNSTATED, ContactRecord
+from .law_status import STATUS_NAMES, UNSTATED, ContactRecord
 from .outputs import ForceGuard, PositionGuard
 from .registry import COMPENSATORS
 from .watchdog import Watchdog
@@ -133,7 +133,7 @@ class Controller:
     @property
     def law_status(self) -> str:
         """What the law says of the last command (`law_status.STATUSES`); `unstated` if it says nothing."""
-        return STATUSES[self._compensator.status].name
+        return STATUS_NAMES[self._compensator.status]
 
     @property
     def last_contact(self) -> ContactRecord:
