@@ -13,7 +13,7 @@ from tuning.gain_file import build_document
 from tuning.verification.replay import verify
 
 PERIOD = 1e-3
-LAW = "retrospective_reference"
+LAW = "impulse_ledger"
 FREQUENCY = "rig.simulator.natural_frequency"
 
 
