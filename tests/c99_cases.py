@@ -33,7 +33,7 @@ RESULT = (
     *("missed_ticks", "late_ticks", "at_rest", "tripped", "bias", "answer"),
     *("contacts", "restitution", "expected", "balance"),
     *("last_contact", "contact_status", "contact_ticks", "unsure", "saturated", "too_short", "noisy"),
-    *("force_delay", "contact_plane"),
+    "force_delay",
 )
 STATUS_NUMBERS = {status.name: status.number for status in STATUSES}
 TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, COMMAND_FIRST, STEP_ONLY = map(float, range(8))
@@ -359,7 +359,7 @@ def controller_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
             *(controller.bias, answer),
             *(watchdog.contacts, watchdog.restitution, watchdog.expected, watchdog.balance),
             *(number, STATUS_NUMBERS[status], *counts),
-            *(controller.force_delay, controller.contact_plane),
+            controller.force_delay,
         )
     return results
 

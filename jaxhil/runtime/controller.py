@@ -125,12 +125,6 @@ class Controller:
         return self._compensator.force_delay
 
     @property
-    def contact_plane(self) -> float:
-        """By how much [m] the surface that the law met last is deeper than told; 0 before the first, and if
-        the law finds none."""
-        return self._compensator.contact_plane
-
-    @property
     def law_status(self) -> str:
         """What the law says of the last command (`law_status.STATUSES`); `unstated` if it says nothing."""
         return STATUS_NAMES[self._compensator.status]

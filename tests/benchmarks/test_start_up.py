@@ -101,9 +101,7 @@ def test_the_rollouts_of_a_law_compile_soon_with_derivatives(compensator, nothin
     assert took <= COMPILING
 
 
-@pytest.mark.parametrize(
-    "compensator", [name for name, law in COMPENSATORS.items() if law.gains]
-)
+@pytest.mark.parametrize("compensator", [name for name, law in COMPENSATORS.items() if law.gains])
 def test_a_law_with_derivatives_compiles_soon(compensator, tmp_path, capsys):
     """One solver step is enough for all of a tuning's programs."""
     few = "--starts", "1", "--steps", "1", "--validation", "15", "--compensator", compensator
