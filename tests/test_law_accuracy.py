@@ -1,7 +1,8 @@
 """Errors of the impulse ledger on fresh scenarios beyond the standard suites, with one set of gains.
 
-Surface, sensor offset, preload, friction, duration and control period are not those of the suites. `pytest -m slow -s tests/test_law_accuracy.py` prints
-root mean square, 99th percentile and maximum of |e - e*| in %.
+Surface, sensor offset, preload, friction, duration and control period are not those of the suites.
+`pytest -m slow -s tests/test_law_accuracy.py` prints root mean square, 99th percentile and maximum of
+|e - e*| in %.
 """
 
 from collections.abc import Mapping
