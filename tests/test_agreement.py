@@ -222,7 +222,7 @@ def random_readings(name: str, lanes: int, ticks: int, seed: int) -> Readings:
     )
 
 
-LONG_LAWS = ("retrospective_reference", "retrospective_delay_bank", "impulse_ledger")
+LONG_LAWS = ("impulse_ledger",)
 # Its reference trajectory follows readings that no contact makes as far as it may: more lanes magnify it.
 MAGNIFIED = {"impulse_ledger": 0.1}  # share of lanes, where it is not 0.02
 

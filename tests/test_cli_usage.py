@@ -51,7 +51,6 @@ def test_interrupt_anywhere_is_130(jaxhil, monkeypatch):
             ["simulate", "--compensator", "phase_lead", "--setting", "sharp"],
             ["sharp", "none, phase_lead has"],
         ),
-        (["simulate", "--compensator", "retrospective_reference", "--setting", "x"], ["x", "sharp, gentle"]),
         (["simulate", "--gains", "x.json", "--setting", "sharp"], ["--setting", "none beside a gain file"]),
         (["tune", "--setting", "sharp"], ["--setting", "sharp", "none, response_error has"]),
         (["simulate", "--limit", "nan"], ["--limit"]),

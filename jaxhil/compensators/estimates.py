@@ -20,8 +20,6 @@ FORCE_NOISE = "force noise"
 EQUIVALENT_MASS = "equivalent mass"
 
 UNKNOWN_DELAY_SPREAD = 0.001  # s
-UNKNOWN_PLANE_SPREAD = 0.001  # m
-UNKNOWN_BIAS_SPREAD = 5.0  # N
 
 
 def force_delay(mechanism: Mechanism | SixAxisMechanism) -> float:
@@ -35,18 +33,6 @@ def force_delay_spread(mechanism: Mechanism) -> float:
     or two standard deviations; 1 ms where it says nothing of that."""
     told = _spread(mechanism, "rig.force_sensor.delay", deviations=2.0)
     return UNKNOWN_DELAY_SPREAD if told is None else told
-
-
-def contact_plane_spread(mechanism: Mechanism) -> float:
-    """How far [m] the contact plane lies from where the controller takes it to be, and may: 1 mm where the
-    file says nothing of the latter."""
-    return _size(mechanism, "rig.contact_plane", UNKNOWN_PLANE_SPREAD)
-
-
-def force_bias(mechanism: Mechanism) -> float:
-    """How large [N] the force sensor's bias may be: 5 N beyond its nominal value where the file says
-    nothing."""
-    return _size(mechanism, "rig.force_sensor.bias", UNKNOWN_BIAS_SPREAD)
 
 
 def friction(mechanism: Mechanism) -> float:
@@ -170,7 +156,6 @@ def _spread(mechanism: Mechanism, path: str, deviations: float = 1.0) -> float |
     return max(abs(end - nominal) for end in ends)
 
 
-def _size(mechanism: Mechanism, path: str, unknown: float = 0.0) -> float:
-    """How far a number may lie from 0, its spread being `unknown` where the file says nothing of that."""
-    told = _spread(mechanism, path)
-    return abs(value_at(mechanism, path)) + (unknown if told is None else told)
+def _size(mechanism: Mechanism, path: str) -> float:
+    """Return how far a number may lie from 0: its nominal value and its spread."""
+    return abs(value_at(mechanism, path)) + (_spread(mechanism, path) or 0.0)

@@ -71,9 +71,7 @@ GainSource = Annotated[
 ]
 Setting = Annotated[
     str | None,
-    text(
-        "NAME", "Take the compensator's gains for any mechanism: gentle or sharp, of retrospective_reference."
-    ),
+    text("NAME", "Take a set of gains that the compensator has for any mechanism, by its name."),
 ]
 
 
@@ -180,7 +178,7 @@ class Tune:
         text(
             "NUMBER",
             "How many times the limit a command is worth that peaks one ideal peak too high; by default 0.3 "
-            "for retrospective_reference, 0 for others.",
+            "for impulse_ledger, 0 for others.",
         ),
     ] = None
     noise_weight: Annotated[
@@ -203,7 +201,7 @@ class Tune:
         text(
             "NUMBER",
             "How much errors of the same scenarios count with a push on the hardware, and damped; by "
-            "default 1 for retrospective_reference, 0 for others.",
+            "default 1 for impulse_ledger, 0 for others.",
             aliases=("--honesty-weight",),
         ),
     ] = None
@@ -213,7 +211,7 @@ class Tune:
         text(
             "NAME",
             "What --pareto trades the error against: noise, peak (of the command) or honesty; by "
-            "default noise, or peak for retrospective_reference.",
+            "default noise, or peak for impulse_ledger.",
         ),
     ] = None
     global_search: Annotated[

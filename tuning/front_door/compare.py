@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tuning.caches.pieces import Pieces
 
 
-OURS = "retrospective_reference"
+OURS = "impulse_ledger"
 
 
 class Estimated(float):
@@ -103,7 +103,7 @@ def compare(
     Args:
         mechanism: what `jaxhil.load` returns, or a name or path for it; or a list of those.
         compensators: names of laws, built in or registered; by default all that are published and
-            `retrospective_reference`. Laws with settings are judged with these, the others tuned.
+            `impulse_ledger`. Laws with settings are judged with these, the others tuned.
         untuned: tune nothing: judge the literature's gains, and a law's settings, as they are.
         scenarios: how many to tune on.
         judged: how many fresh scenarios to judge on.
