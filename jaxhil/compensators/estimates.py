@@ -8,6 +8,7 @@ import math
 
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism, value_at
+from jaxhil.runtime.laws.impulse_ledger import LARGEST_DELAY_SPREAD
 
 FORCE_DELAY = "force delay"
 ROUGH_FORCE_DELAY = "force delay, roughly"
@@ -19,8 +20,6 @@ DEAD_ZONE = "dead zone"
 FORCE_NOISE = "force noise"
 EQUIVALENT_MASS = "equivalent mass"
 
-UNKNOWN_DELAY_SPREAD = 0.001  # s
-
 
 def force_delay(mechanism: Mechanism | SixAxisMechanism) -> float:
     """The known delay [s] of the force measurement: transport plus first-order lag."""
@@ -28,11 +27,15 @@ def force_delay(mechanism: Mechanism | SixAxisMechanism) -> float:
     return sensor.delay + sensor.time_constant
 
 
-def force_delay_spread(mechanism: Mechanism) -> float:
-    """How far [s] the force delay may lie from what is known of it: half of the range that the file gives it,
-    or two standard deviations; 1 ms where it says nothing of that."""
-    told = _spread(mechanism, "rig.force_sensor.delay", deviations=2.0)
-    return UNKNOWN_DELAY_SPREAD if told is None else told
+def specified_delay_spread(mechanism: Mechanism) -> float:
+    """Return the standard deviation [s] that the file states for the force delay, at most 4 ms; else 0."""
+    stated = mechanism.uncertainty.get("rig.force_sensor.delay")
+    if stated is None:
+        return 0.0
+    spread = stated.std
+    if spread is None:
+        spread = (_spread(mechanism, "rig.force_sensor.delay") or 0.0) / math.sqrt(3)
+    return min(spread, LARGEST_DELAY_SPREAD)
 
 
 def friction(mechanism: Mechanism) -> float:
