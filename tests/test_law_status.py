@@ -63,7 +63,9 @@ KINDS = {
     "8 Hz": Kind("fast", ("contact.stiffness=[884316.0]",), {}, "too_short"),
     "surface 4 mm deeper": Kind("noisy", ("rig.contact_plane=4e-3",), {}, "identified"),
     "noisy force": Kind("noisy", ("rig.force_sensor.noise_std=2.667",), {}, "noisy"),
-    "force 1 ms older than specified": Kind("noisy", (), {"identification_delay": 0.007}, "unexplained"),
+    "force 1 ms older than specified": Kind(
+        "noisy", (), {"identification_delay": 0.007, "delay_spread": 0.0}, "unexplained"
+    ),
     "damped": Kind("damped", ("contact.damping=[600.0]",), {}, "identified"),
 }
 WATCHED = {"settling": 0.02, "free_force": 20.0}

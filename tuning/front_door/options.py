@@ -144,7 +144,7 @@ def _check_one(name: str, value: Any, kind: Any, allowed: Allowed) -> None:
     if not usable or not value >= allowed.least:
         raise ArgumentError(name, str(value) if usable else shown(value), words)
     if value > allowed.most:
-        raise ArgumentError(name, str(value), allowed.words or f"at most {allowed.most:g}")
+        raise ArgumentError(name, str(value), allowed.words or f"at most {allowed.most:.15g}")
 
 
 def takes(options: type) -> Callable[[Function], Function]:
