@@ -63,7 +63,6 @@ GAINS: dict[str, dict[str, dict[str, Any]]] = {
         "correction_limit": {"value": 0.9, "unit": "1", "lower": 0.01, "upper": 20.0},
         "force_noise": {"value": 0.3, "unit": "N", "lower": 0.0, "upper": 100.0},
         "delay_spread": {"value": 0.0008, "unit": "s", "lower": 0.0, "upper": 0.004},
-        "dead_zone": {"value": 0.4, "unit": "N", "lower": 0.0, "upper": 100.0},
         "prior_friction_spread": {"value": 0.5, "unit": "1/s", "lower": 0.0, "upper": 50.0},
         "prior_preload_spread": {"value": 3.0, "unit": "1/s", "lower": 0.0, "upper": 50.0},
     },

@@ -1,4 +1,4 @@
-"""The impulse ledger: unknown force delay, dead zone and status.
+"""The impulse ledger: unknown force delay and status.
 
 `pytest -m slow -s tests/test_impulse_ledger.py` prints what an unknown delay leaves.
 """
@@ -25,7 +25,7 @@ SPREADS = (80.0, 120.0, 1.0, 0.12, 0.5, 0.0, 1.0)
 def fitted(delay: float, damping: float, delay_spread: float) -> ContactModel:
     """Return the model of a contact of 3 Hz whose force is older than specified by `delay` [s]."""
     model = ContactModel()
-    model.restart(10.0, 0.0, SPREADS, delay_spread**2)
+    model.restart(10.0, SPREADS, delay_spread**2)
     omega, deepest = 2 * np.pi * 3, 0.0
     for tick in range(2, 165):
         time = 1e-3 * tick
@@ -74,19 +74,6 @@ def test_second_contact_knows_the_delay():
     law.next_contact()
     assert law.force_delay == pytest.approx(0.009, abs=1e-4)
     assert restitution(late, law, 1) == pytest.approx(1, abs=2e-3)
-
-
-def test_dead_zone_is_added_to_the_readings():
-    """Noise-free contact behind a dead zone of a third of the peak force."""
-    changes = ["rig.force_sensor.noise_std=0.0", "rig.force_sensor.dead_zone=10.0"]
-    mechanism = load("suite-noisy", changes).mechanism
-    gains = literature_gains(mechanism, LAW)
-    assert gains["dead_zone"] == 10.0
-    told, not_told = (
-        abs(restitution(mechanism, controller(mechanism, LAW, gains | {"dead_zone": zone})) - 1)
-        for zone in (10.0, 0.0)
-    )
-    assert told < 0.01 and told < not_told + 1e-3
 
 
 def test_uncertain_delay_of_damped_contact_is_not_called_identified():

@@ -46,16 +46,14 @@ class Estimate(NamedTuple):
     count: Float[Array, "*batch"]  # readings
 
 
-def prior(
-    stiffness: Array, preload: Array, spreads: tuple[Array, ...], delay_variance: Array
-) -> tuple[Array, Array]:
+def prior(stiffness: Array, spreads: tuple[Array, ...], delay_variance: Array) -> tuple[Array, Array]:
     """Return mean and variances before contact; the arguments are those of `restart` there."""
     common, wander, *others = spreads
     changes = (np.diff(np.minimum(KNOTS, BROAD)) / WANDER).tolist()
     variances = [common**2, *(wander**2 * change for change in changes), *(spread**2 for spread in others)]
     variances.append(delay_variance)
-    zeros = jnp.zeros_like(stiffness)
-    return jnp.stack([stiffness, *[zeros] * (PRELOAD - 1), preload, zeros]), jnp.stack(variances)
+    mean = jnp.stack([stiffness, *[jnp.zeros_like(stiffness)] * (PARAMETERS - 1)])
+    return mean, jnp.stack(variances)
 
 
 def begin(mean: Array, variances: Array) -> Estimate:

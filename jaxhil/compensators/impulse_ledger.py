@@ -20,7 +20,7 @@ from jaxhil.compensators.readings import Aligned, align
 from jaxhil.compensators.reference_trajectory import Reference
 from jaxhil.contact.laws import deflection
 from jaxhil.runtime.laws import impulse_ledger as rig
-from jaxhil.runtime.laws.contact_model import HINGES, PRELOAD
+from jaxhil.runtime.laws.contact_model import HINGES
 from jaxhil.runtime.laws.onset_detection import LEVEL, SETTLING
 
 USUAL_UNLOADING = 0.5  # 1/s^2; prior spread of the unloading parameter where the mechanism has less
@@ -47,10 +47,6 @@ GAINS: tuple[Gain, ...] = (
     _known(
         "force_noise", lambda m: m.rig.force_sensor.noise_std + estimates.peak_force(m),
         lambda m: m.rig.force_sensor.noise_std,
-    ),
-    _known(
-        "dead_zone", lambda m: 2 * m.rig.force_sensor.dead_zone + estimates.peak_force(m),
-        lambda m: m.rig.force_sensor.dead_zone,
     ),
     _prior("force_noise_floor", 2e-3, 10.0, 0.011, lambda m: not m.rig.force_sensor.noise_std),
     _prior("prior_stiffness", 0.1, 1e3, 10.0, lambda m: False),
@@ -116,7 +112,6 @@ class Reading(NamedTuple):
     """One tick's readings, as old as the force."""
 
     force: Float[Array, "*batch"]  # [N]
-    hidden: Bool[Array, "*batch"]  # whether the force is within the dead zone
     position: Float[Array, "*batch"]  # [m]
     velocity: Float[Array, "*batch"]  # [m/s]
 
@@ -129,7 +124,6 @@ class ImpulseLedger(Compensator):
         estimates.EQUIVALENT_MASS,
         estimates.FORCE_DELAY,
         estimates.FORCE_NOISE,
-        estimates.DEAD_ZONE,
     )
     anticipates: ClassVar[bool] = True
     estimates_delay: ClassVar[bool] = True
@@ -146,7 +140,7 @@ class ImpulseLedger(Compensator):
 
     def init(self, gains, constants, ring):
         zeros = jnp.zeros_like(constants.control_period)
-        prior = contact_model.prior(zeros, zeros, tuple([zeros] * len(rig.SPREADS)), zeros)
+        prior = contact_model.prior(zeros, tuple([zeros] * len(rig.SPREADS)), zeros)
         estimate = contact_model.begin(*prior)
         return LedgerState(
             line=empty(ring, zeros),
@@ -171,13 +165,7 @@ class ImpulseLedger(Compensator):
         gains, (period, clearance) = prepared.gains, prepared.constants
         newest, line = delayed(prepared.delay, state.line, signals, tick)
         position, velocity, aligned = align(state.aligned, newest, prepared.share, signals, period)
-        measured, zone = signals.force_measured, gains["dead_zone"]
-        reading = Reading(
-            force=measured + jnp.sign(measured) * zone,
-            hidden=(zone > 0) & (measured == 0),
-            position=position - state.delay * velocity,
-            velocity=velocity,
-        )
+        reading = Reading(signals.force_measured, position - state.delay * velocity, velocity)
         begins = signals.age == 0
         reach = deflection(signals.position_desired, clearance)
         contact = state.contact
@@ -194,8 +182,7 @@ class ImpulseLedger(Compensator):
         scaled = contact._replace(speed=jnp.where(usable, contact.speed, 1))
         spreads = [gains[name] for name in rig.SPREADS]
         spreads[-1] = jnp.sqrt(spreads[-1] ** 2 + rig.USUAL_PRELOAD**2)
-        offset = zone / (gains["equivalent_mass"] * scaled.speed)
-        before = contact_model.prior(gains["prior_stiffness"], offset, tuple(spreads), state.variance)
+        before = contact_model.prior(gains["prior_stiffness"], tuple(spreads), state.variance)
         depth = (scaled.side * reading.position - scaled.origin) / scaled.speed
         estimate = _select(fresh, contact_model.begin(*before), state.estimate)
         reference = _select(fresh, reference_trajectory.begin(depth, before[0]), state.reference)
@@ -215,7 +202,7 @@ class ImpulseLedger(Compensator):
         bent = side * deflection(reading.position, clearance)
         passed_outside = jnp.where(bent > 0, 0, contact.outside + 1)
         over = jnp.where(passes, ~inside & (passed_outside * period > rig.RELEASE_TIME), over)
-        passed = jnp.where(inside & ~(bent < 0), measured, 0)
+        passed = jnp.where(inside & ~(bent < 0), signals.force_measured, 0)
         command = jnp.where(acts & ~over, jnp.where(passes, passed, jnp.where(follows, command, 0)), 0)
         outside = jnp.where(passes, passed_outside, later.outside)
         contact = later._replace(speed=jnp.where(over, 0, contact.speed), outside=outside)
@@ -273,24 +260,20 @@ class ImpulseLedger(Compensator):
         rate = side * reading.velocity / speed
         deepest = jnp.where(depth > contact.deepest, depth, contact.deepest)
         phi = features(depth, rate, deepest, contact_model.slope(estimate.mean, depth) * (1 - rate))
-        expected, zone = dot(phi, estimate.theta), gains["dead_zone"] / weight
-        hidden = reading.hidden & (jnp.abs(expected) < zone)
         force = side * (reading.force - flight.bias) / weight
-        force = jnp.where(reading.hidden, jnp.clip(expected, -zone, zone), force)
         off = rig.MISFIT * force
         noise = onset_detection.variance(flight, gains["force_noise"]) / (weight * weight)
         variance = noise + gains["force_noise_floor"] ** 2 + off * off * (rig.MISFIT_TIME / period)
         tells = (
             (rate > rig.SLOWEST) | (dot(phi, estimate.mean) > 0) | (force * force > rig.OUTLYING * variance)
         )
-        learns = tells & (depth > period) & ~hidden
+        learns = tells & (depth > period)
         estimate = contact_model.learn(estimate, phi, force, variance, learns)
 
         stiffness = contact_model.slope(estimate.mean, deepest)
         onset = rig.ONSET_TICKS * period * stiffness + gains["force_noise_floor"] + _sqrt(noise)
         spread = jnp.sqrt(gains["prior_preload_spread"] ** 2 + (rig.ONSET_SPREAD * onset) ** 2)
-        preload = before[0][PRELOAD] + rig.ONSET_MEAN * onset
-        delay = contact_model.estimate_delay(estimate, before[0], before[1], preload, spread)
+        delay = contact_model.estimate_delay(estimate, before[0], before[1], rig.ONSET_MEAN * onset, spread)
         ended = ~(depth > 0) & (rate < 0)
         theta = contact_model.conclude(estimate, before[1], jnp.where(ended, delay[0], 0))
         theta = jnp.where((learns | ended)[None], theta, estimate.theta)

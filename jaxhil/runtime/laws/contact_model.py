@@ -91,13 +91,11 @@ class ContactModel:
 
     __slots__ = ("_count", "_prior_mean", "_squares", "_variances", "covariance", "mean", "theta")
 
-    def restart(
-        self, stiffness: float, preload: float, spreads: Sequence[float], delay_variance: float
-    ) -> None:
+    def restart(self, stiffness: float, spreads: Sequence[float], delay_variance: float) -> None:
         """Return to the prior.
 
-        `stiffness` [1/s^2] and `preload` [1/s] are prior means. `spreads` are the standard deviations of the
-        slope at depth 0 [1/s^2], of its change over `WANDER` [1/s^2], of damping [1/s], depth damping [1/s],
+        `stiffness` [1/s^2] is the prior mean of the slope at depth 0; `spreads` are the standard deviations
+        of that slope [1/s^2], of its change over `WANDER` [1/s^2], of damping [1/s], depth damping [1/s],
         unloading [1/s^2], friction [1/s] and preload [1/s]; `delay_variance` is in s^2.
         """
         common, wander, *others = spreads
@@ -105,7 +103,7 @@ class ContactModel:
         for before, knot in pairwise(min(knot, BROAD) for knot in KNOTS):
             self._variances.append(wander * wander * ((knot - before) / WANDER))
         self._variances += [*(spread * spread for spread in others), delay_variance]
-        self._prior_mean = [stiffness] + [0.0] * (PRELOAD - 1) + [preload, 0.0]
+        self._prior_mean = [stiffness] + [0.0] * (PARAMETERS - 1)
         self.mean = self.theta = self._prior_mean
         self.covariance = [[0.0] * PARAMETERS for _ in range(PARAMETERS)]
         for j, variance in enumerate(self._variances):

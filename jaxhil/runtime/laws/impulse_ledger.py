@@ -13,10 +13,9 @@ and approach speed, so that one set of gains serves every mechanism. In free fli
 detected (`onset_detection`), F_c = 0. A run that begins in contact has no approach speed to scale by: there
 F_c is the measured force.
 
-A specified dead zone is added to the readings; where the sensor reads 0, the force is the model's, within the
-dead zone. Where the force delay is uncertain (`delay_spread` > 0), the delay is estimated when the hardware
-leaves the surface. The estimate corrects the speed at which this contact ends. From the next contact on, it
-also aligns positions with readings and so lengthens D.
+Where the force delay is uncertain (`delay_spread` > 0), the delay is estimated when the hardware leaves the
+surface. The estimate corrects the speed at which this contact ends. From the next contact on, it also aligns
+positions with readings and so lengthens D.
 """
 
 from collections.abc import Mapping
@@ -70,7 +69,7 @@ class ImpulseLedger(Compensator):
     """Compensator with contact model, reference trajectory and bridge; see the module's text."""
 
     __slots__ = (
-        "_alignment", "_clearance", "_correction_limit", "_dead_zone", "_deepest", "_delay", "_delay_spread",
+        "_alignment", "_clearance", "_correction_limit", "_deepest", "_delay", "_delay_spread",
         "_detector", "_estimate", "_floor", "_gain", "_identification_delay", "_in_contact", "_lag", "_mass",
         "_misfit", "_model", "_origin", "_outside", "_peak", "_period", "_readings", "_reference", "_side",
         "_since_start", "_speed", "_spreads", "_stiffness", "_variance", "status",
@@ -81,7 +80,6 @@ class ImpulseLedger(Compensator):
         "identification_delay": GainSpecification("s", *TIMES),
         "delay_spread": GainSpecification("s", 0.0, LARGEST_DELAY_SPREAD),
         "force_noise": GainSpecification("N", *FORCES),
-        "dead_zone": GainSpecification("N", *FORCES),
         "force_noise_floor": GainSpecification("1/s", 2e-3, 10.0),
         "prior_stiffness": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
         "prior_stiffness_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
@@ -102,7 +100,6 @@ class ImpulseLedger(Compensator):
         self._floor = gains["force_noise_floor"]
         self._gain = gains["velocity_gain"]
         self._correction_limit = gains["correction_limit"]
-        self._dead_zone = gains["dead_zone"]
         self._delay_spread = gains["delay_spread"]
         self._stiffness = gains["prior_stiffness"]
         self._spreads = [gains[name] for name in SPREADS]
@@ -147,20 +144,15 @@ class ImpulseLedger(Compensator):
             self._side = 1.0 if reach > 0.0 else -1.0
         if self._in_contact and not self._speed > 0.0:
             return self._pass_on(force_measured, position_desired, position)
-        zone = self._dead_zone
-        hidden = zone > 0.0 and force_measured == 0.0
-        force = force_measured
-        if force_measured != 0.0:
-            force += zone if force_measured > 0.0 else -zone
         detector = self._detector
         if not self._in_contact:
             self.status = OUT_OF_CONTACT
-            self._approach(force, position_desired, velocity_desired, position, settled)
+            self._approach(force_measured, position_desired, velocity_desired, position, settled)
             if not detector.total > 0.0:
-                detector.learn(force)
+                detector.learn(force_measured)
                 return 0.0
             self._in_contact = detector.total > LEVEL
-        command = self._follow(force - detector.bias, hidden, velocity_desired, position, velocity)
+        command = self._follow(force_measured - detector.bias, velocity_desired, position, velocity)
         return command if self._in_contact else 0.0
 
     def _approach(
@@ -191,15 +183,11 @@ class ImpulseLedger(Compensator):
         self._estimate = 0.0, self._variance  # mean and variance of the delay after this contact
         *spreads, preload = self._spreads
         spreads.append(sqrt(preload * preload + USUAL_PRELOAD * USUAL_PRELOAD))
-        offset = self._dead_zone / (self._mass * speed)
-        self._model.restart(self._stiffness, offset, spreads, self._variance)
+        self._model.restart(self._stiffness, spreads, self._variance)
         self._reference.begin((side * position - self._origin) / speed, self._model.theta)
 
-    def _follow(
-        self, force: float, hidden: bool, velocity_desired: float, position: float, velocity: float
-    ) -> float:
-        """Return the command [N] after one reading of force [N], position [m] and velocity [m/s]; the dead
-        zone may have `hidden` the force."""
+    def _follow(self, force: float, velocity_desired: float, position: float, velocity: float) -> float:
+        """Return the command [N] after one reading of force [N], position [m] and velocity [m/s]."""
         period, side, speed = self._period, self._side, self._speed
         model, reference = self._model, self._reference
         weight = self._mass * speed
@@ -208,26 +196,21 @@ class ImpulseLedger(Compensator):
         self._deepest = depth if depth > self._deepest else self._deepest
         phi = features(depth, rate, self._deepest, slope(model.mean, depth) * (1.0 - rate))
         reading = side * force / weight
-        if hidden:
-            zone, expected = self._dead_zone / weight, dot(phi, model.theta)
-            reading = min(max(expected, -zone), zone)
-            hidden = abs(expected) < zone
         off = MISFIT * reading
         noise = self._detector.variance / (weight * weight)
         variance = noise + self._floor * self._floor + off * off * (MISFIT_TIME / period)
         tells = rate > SLOWEST or dot(phi, model.mean) > 0.0 or reading * reading > OUTLYING * variance
         ended = not depth > 0.0 and rate < 0.0
-        learns = tells and depth > period and not hidden
+        learns = tells and depth > period
         if learns:
             model.learn(phi, reading, variance)
             self._readings += 1
         if not depth > 0.0:
             onset = ONSET_TICKS * period * slope(model.mean, self._deepest) + self._floor
             onset += sqrt(noise) if noise > 0.0 else 0.0
-            preload = self._dead_zone / weight + ONSET_MEAN * onset
             known = self._spreads[-1]
             spread = sqrt(known * known + (ONSET_SPREAD * onset) ** 2)
-            self._estimate = model.estimate_delay(preload, spread)
+            self._estimate = model.estimate_delay(ONSET_MEAN * onset, spread)
         if learns or ended:
             model.conclude(self._estimate[0] if ended else 0.0)
         reference.correct(model.theta)
