@@ -32,11 +32,10 @@ RESULT = (
     *("force", "position", "stiffness", "damping", "law_status", "faults", "seen", "cause"),
     *("missed_ticks", "late_ticks", "at_rest", "tripped", "bias", "answer"),
     *("contacts", "restitution", "expected", "balance"),
-    *("last_contact", "contact_status", "contact_ticks", "unsure", "saturated", "too_short"),
-    *("displaced", "noisy"),
-    *("force_delay", "contact_plane"),
+    *("last_contact", "contact_status", "contact_ticks", "unsure", "saturated", "too_short", "noisy"),
+    "force_delay",
 )
-STATUS_NAMES = tuple(status.name for status in STATUSES)
+STATUS_NUMBERS = {status.name: status.number for status in STATUSES}
 TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, COMMAND_FIRST, STEP_ONLY = map(float, range(8))
 EVENTS = (TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, COMMAND_FIRST, STEP_ONLY)
 PERIOD = 0.001
@@ -352,15 +351,15 @@ def controller_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
         result[0] = controller.step(*row[1:5], row[5] if row[6] else None)
         result[1] = 0.0 if row[0] == STEP_ONLY else controller.position_command(*row[7:])
         result[2:4] = controller.identified
-        result[4] = STATUS_NAMES.index(controller.law_status)
+        result[4] = STATUS_NUMBERS[controller.law_status]
         result[5:8] = controller.faults, controller.seen, controller.cause
         number, status, *counts = controller.last_contact
         result[8:] = (
             *(controller.missed_ticks, controller.late_ticks, controller.at_rest, controller.tripped),
             *(controller.bias, answer),
             *(watchdog.contacts, watchdog.restitution, watchdog.expected, watchdog.balance),
-            *(number, STATUS_NAMES.index(status), *counts),
-            *(controller.force_delay, controller.contact_plane),
+            *(number, STATUS_NUMBERS[status], *counts),
+            controller.force_delay,
         )
     return results
 

@@ -10,7 +10,7 @@
 
 /* A row: event, force, desired position and velocity, measured position, time, whether it is given, the
  * model's position, velocity and acceleration. A result: see `result`. */
-enum { ROW = 10, RESULT = 28 };
+enum { ROW = 10, RESULT = 26 };
 enum { TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, COMMAND_FIRST, STEP_ONLY };
 enum { GAINS = sizeof(jaxhil_gains) / sizeof(double), LIMITS = sizeof(jaxhil_limits) / sizeof(double) };
 
@@ -103,10 +103,8 @@ void driver_run(jaxhil_controller *controller, size_t count, const double *rows,
         *result++ = (double)record.unsure;
         *result++ = (double)record.saturated;
         *result++ = (double)record.too_short;
-        *result++ = (double)record.displaced;
         *result++ = (double)record.noisy;
         *result++ = jaxhil_force_delay(controller);
-        *result++ = jaxhil_contact_plane(controller);
     }
 }
 

@@ -39,7 +39,7 @@ CHECKED = [
     if path.stem not in FRONT_DOOR
 ]
 OWN_TESTS = {"test_compensators", "test_contacts", *(f"test_{name.split('.')[1]}" for name in CHECKED)}
-OWN_TESTS -= {"test_rollout", "test_retrospective_reference"}  # the longest; others run the same modules
+OWN_TESTS -= {"test_rollout"}  # the longest; others run the same modules
 jaxtyping.install_import_hook([f"jaxhil.{name}" for name in CHECKED], "beartype.beartype")
 
 # A shared machine has no deadlines to keep, and a test that fails must fail again.

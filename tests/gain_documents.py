@@ -52,33 +52,19 @@ def _entries(compensator: str) -> dict[str, dict[str, Any]]:
     return entries
 
 
-_RETROSPECTIVE = {
-    # Off the ticks, where it may be differentiated.
-    "identification_delay": {"value": 0.0083, "unit": "s", "lower": 0.0, "upper": 0.05},
-    "velocity_gain": {"value": 5.0, "unit": "1/s", "lower": 1.0, "upper": 1e3},
-    "correction_limit": {"value": 0.1, "unit": "1", "lower": 0.01, "upper": 20.0},
-    "replay_noise": {"value": 20.0, "unit": "1/s", "lower": 0.01, "upper": 100.0},
-    "force_noise_floor": {"value": 0.05, "unit": "1/s", "lower": 1e-4, "upper": 10.0},
-    "force_noise": {"value": 3.0, "unit": "N", "lower": 0.0, "upper": 100.0},
-    "dead_zone": {"value": 1.0, "unit": "N", "lower": 0.0, "upper": 100.0},
-}
 GAINS: dict[str, dict[str, dict[str, Any]]] = {
     **{compensator: _entries(compensator) for compensator in COMPENSATORS},
     "phase_lead": _LEAD,
-    "retrospective_reference": {**_entries("retrospective_reference"), **_RETROSPECTIVE},
-    "retrospective_delay_bank": {
-        **_entries("retrospective_delay_bank"),
-        **_RETROSPECTIVE,
-        "delay_spread": {"value": 0.0008, "unit": "s", "lower": 0.0, "upper": 0.05},
-        "sensor_lag": {"value": 0.0012, "unit": "s", "lower": 0.0, "upper": 0.05},
-    },
     "impulse_ledger": {
         **_entries("impulse_ledger"),
-        "identification_delay": _RETROSPECTIVE["identification_delay"],
+        # Off the ticks, where it may be differentiated.
+        "identification_delay": {"value": 0.0083, "unit": "s", "lower": 0.0, "upper": 0.05},
         "velocity_gain": {"value": 10.0, "unit": "1/s", "lower": 1.0, "upper": 1e3},
         "correction_limit": {"value": 0.9, "unit": "1", "lower": 0.01, "upper": 20.0},
         "force_noise": {"value": 0.3, "unit": "N", "lower": 0.0, "upper": 100.0},
+        "delay_spread": {"value": 0.0008, "unit": "s", "lower": 0.0, "upper": 0.004},
         "prior_friction_spread": {"value": 0.5, "unit": "1/s", "lower": 0.0, "upper": 50.0},
+        "prior_preload_spread": {"value": 3.0, "unit": "1/s", "lower": 0.0, "upper": 50.0},
     },
     "response_error": {
         **_LEAD,

@@ -26,13 +26,9 @@ DOUBTFUL = (
     'uncertainty."contact.damping"={distribution = "loguniform", factor = [0.5, 2.0]}',
     'uncertainty."rig.force_sensor.delay"={distribution = "normal", std = 0.0005}',
 )
-UNKNOWN_PLANE = ('uncertainty."rig.contact_plane"={distribution = "uniform", low = -0.0005, high = 0.0005}',)
 CASES = {
     **{name: (name, (), "response_error") for name in (*builtin_names(), *suite_names())},
     "damping and delay": ("claw-350kg", DOUBTFUL, "response_error"),
-    "our law": ("varying", (), "retrospective_reference"),
-    "our law, surface unknown": ("suite-plane", (), "retrospective_reference"),
-    "our law, surface and stiffness unknown": ("varying", UNKNOWN_PLANE, "retrospective_reference"),
 }
 
 

@@ -16,8 +16,9 @@ from jaxhil.mechanism.file import builtin_names, load, six_axis_names, suite_nam
 from jaxhil.mechanism.json_schema import json_schema
 from jaxhil.simulation import environment
 from tuning.cli.commands.tune import folder_name, is_better
-from tuning.cli.options import DEFAULT_DRIVERS, DEFAULT_PLOT
+from tuning.cli.options import DEFAULT_PLOT
 from tuning.cli.parser import complete_bare
+from tuning.front_door.sweep_options import DEFAULT_DRIVERS
 from tuning.gains.tune import ErrorFigures
 
 
@@ -51,7 +52,6 @@ def test_interrupt_anywhere_is_130(jaxhil, monkeypatch):
             ["simulate", "--compensator", "phase_lead", "--setting", "sharp"],
             ["sharp", "none, phase_lead has"],
         ),
-        (["simulate", "--compensator", "retrospective_reference", "--setting", "x"], ["x", "sharp, gentle"]),
         (["simulate", "--gains", "x.json", "--setting", "sharp"], ["--setting", "none beside a gain file"]),
         (["tune", "--setting", "sharp"], ["--setting", "sharp", "none, response_error has"]),
         (["simulate", "--limit", "nan"], ["--limit"]),

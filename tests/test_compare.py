@@ -88,23 +88,21 @@ def test_tables_mark_what_wins(capsys):
 
 def test_one_table_has_all_laws_and_their_settings(capsys):
     """Wider than a page, in whole lines; a law's settings do not compete with it."""
-    ours = LawFigures(
-        "retrospective_reference", "m", {}, {"literature": figures(0.05), "gentle": figures(0.06)}
-    )
+    ours = LawFigures("impulse_ledger", "m", {}, {"literature": figures(0.05), "gentle": figures(0.06)})
     many = [*FOUND, ours, *(LawFigures(f"law_{n}", "m", {}, {"literature": figures(0.5)}) for n in range(12))]
-    better = [*FOUND, LawFigures("retrospective_reference", "n", {}, {"literature": figures(0.2)})]
+    better = [*FOUND, LawFigures("impulse_ledger", "n", {}, {"literature": figures(0.2)})]
     board = {"m": many, "n": better}
     terminal.emit(leaderboard(["m", "n"], board), wrap=False)
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["m", "50", "10", "5*", "6", *["50"] * 12] in rows
     assert ["n", "50", "10*", "20", "-", *["-"] * 12] in rows
-    assert least(["m", "n"], board) == "Least rms error: retrospective_reference (m); phase_lead (n)."
+    assert least(["m", "n"], board) == "Least rms error: impulse_ledger (m); phase_lead (n)."
     assert least(["m"], {"m": FOUND[:1]}) == ""
 
 
 def test_tables_of_what_is_not_tuned_do_not_say_so(capsys):
     both = {"literature": figures(0.4), "gentle": figures(0.3)}
-    found = [FOUND[0], LawFigures("retrospective_reference", "m", {}, both)]
+    found = [FOUND[0], LawFigures("impulse_ledger", "m", {}, both)]
     terminal.emit(mechanism_table("m", found), leaderboard(["m"], {"m": found}))
     out = capsys.readouterr().out
     assert "tuned" not in out and "  gentle  " in out

@@ -28,15 +28,6 @@ WITH_GAINS = tuple(name for name, law in COMPENSATORS.items() if law.gains)
 ON_THE_FORCE = tuple(
     name for name in WITH_GAINS if type(COMPENSATORS[name]).position_command is Compensator.position_command
 )
-# The bank differs from the retrospective reference in what it learns alone, and takes long to trace.
-BANK = "retrospective_delay_bank"
-
-
-def bank_seldom(names):
-    """The names of laws, the bank's with `-m slow` alone."""
-    return [pytest.param(name, marks=pytest.mark.slow if name == BANK else ()) for name in names]
-
-
 PERIOD, TICKS, RING, GAP = 1e-3, 200, 64, 2e-4
 IDEAL = ("uncertainty={}", 'rig.simulator={model="ideal", delay=0.004}')
 HOSTILE = {
@@ -103,7 +94,7 @@ def some_gains(name, shape=()):
     return {gain: jnp.full(shape, entry["value"]) for gain, entry in GAINS[name].items()}
 
 
-@pytest.mark.parametrize("name", bank_seldom(LAWS))
+@pytest.mark.parametrize("name", LAWS)
 def test_what_a_law_reads(name):
     """The measured position, or nothing of it."""
     signals, constants = readings()
@@ -173,7 +164,7 @@ def test_bad_gains_are_refused_with_one_line(name):
         Controller.from_dict(sign(document))
 
 
-@pytest.mark.parametrize("name", bank_seldom(ON_THE_FORCE))
+@pytest.mark.parametrize("name", ON_THE_FORCE)
 def test_derivatives_by_every_gain_are_those_of_differences(name):
     signals, constants = readings((), GAP)
     # A sensor with a bias: there are laws that look for one.
@@ -194,7 +185,7 @@ def test_derivatives_by_every_gain_are_those_of_differences(name):
         np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * scale, err_msg=gain)
 
 
-@pytest.mark.parametrize("name", bank_seldom(LAWS))
+@pytest.mark.parametrize("name", LAWS)
 def test_derivatives_are_finite_at_rest_at_the_surface_and_without_force(name):
     signals, constants = readings((), GAP)
     gains = some_gains(name)
@@ -204,7 +195,7 @@ def test_derivatives_are_finite_at_rest_at_the_surface_and_without_force(name):
         assert jnp.all(jnp.isfinite(derivative(name, given, gains, constants, *ones)))
 
 
-@pytest.mark.parametrize("name", bank_seldom(LAWS))
+@pytest.mark.parametrize("name", LAWS)
 def test_lanes_of_any_batch_shape_are_alone(name):
     """Shapes (), (n,) and (m, n)."""
     signals, constants = readings((2, 3), GAP)
@@ -245,7 +236,7 @@ def test_either_surface_is_the_other_s_mirror_image(name):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected)))
 
 
-@pytest.mark.parametrize("name", bank_seldom(LAWS))
+@pytest.mark.parametrize("name", LAWS)
 def test_runs_begin_anew(name):
     """Where none begins nothing changes; the next contact knows nothing but what was identified; after a
     reset nothing is left."""
@@ -273,7 +264,7 @@ def test_runs_begin_anew(name):
         controllers[1].step(*row)
     controllers[0].reset()
     controllers[1].next_contact()
-    if law.identified(used) is not None or law.estimates_delay or law.finds_plane:
+    if law.identified(used) is not None or law.estimates_delay:
         del controllers[1]
     for row in rows:
         assert len({controller.step(*row) for controller in controllers}) == 1

@@ -43,7 +43,6 @@ BIAS = 0.002  # of the mean restitution, beside three standard errors
 LOUDEST = 5.0  # amplification of noise by the loudest gains
 TICKS = 4000  # of noise a run, as in noisy_plant.c
 PLANT = Path(__file__).with_name("noisy_plant.c")
-PUBLISHED = [name for name in COMPENSATORS if not name.startswith("retrospective")]
 
 
 def heavy(**sensor: float) -> Mechanism:
@@ -141,7 +140,7 @@ def test_mean_restitution_does_not_depend_on_the_noise():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PUBLISHED)
+@pytest.mark.parametrize("name", COMPENSATORS)
 @pytest.mark.parametrize("built_in", builtin_names())
 def test_mean_restitution_of_every_mechanism_and_compensator(built_in, name):
     parsed = jaxhil.load(built_in)

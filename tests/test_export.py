@@ -17,7 +17,7 @@ from jaxhil.errors import InputError
 from jaxhil.files import TEMPORARY
 from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
 from jaxhil.runtime.faults import FAULTS
-from jaxhil.runtime.laws import NEED_NUMPY, WITHOUT_C
+from jaxhil.runtime.laws import WITHOUT_C
 from jaxhil.simulation.gain_file import load_gain_file
 from tuning.bundle.bundle import build_bundle, check_mechanism, check_target, with_limits, write_bundle
 from tuning.bundle.checking import check_bundle
@@ -34,7 +34,7 @@ ALWAYS = {
 }
 # Beside those whose files have something of their own.
 LIKE_OTHERS = {"dead_zone_observer", "multi_parameter_lead", "passivity", "phase_lead", "smith_hybrid"}
-LIKE_OTHERS |= {"retrospective_delay_bank", "retrospective_reference", "smith_predictor", "virtual_contact"}
+LIKE_OTHERS |= {"smith_predictor", "virtual_contact"}
 
 
 @pytest.fixture
@@ -107,9 +107,7 @@ def test_every_compensator_that_can_be_tuned_can_be_exported(compensator, tmp_pa
     write_bundle(tmp_path / "bundle", made.files)
     good, output = run_selftest(tmp_path / "bundle", *(["--c"] if has_c and shutil.which("cc") else []))
     assert good and made.ticks > 300 and not made.reasons, output
-    if compensator in NEED_NUMPY:
-        # Its self-test, of all, is not run without what is installed.
-        assert run_selftest_alone(check_bundle(tmp_path / "bundle"), "bundle")[1] == []
+    assert run_selftest_alone(check_bundle(tmp_path / "bundle"), "bundle")[1] == []
 
 
 def test_equal_gains_and_seed_make_equal_bundles():

@@ -1,5 +1,7 @@
 """Faults injected tick by tick: each raised on its tick, nothing else, outputs finite and in their limits."""
 
+from collections.abc import Iterable
+
 import c99_cases
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from fault_runs import LIMITED, PERIOD, FaultRun, document, fault_run
 from jaxhil.runtime import COMPENSATORS
 from jaxhil.runtime.faults import FAULTS, names
 from jaxhil.runtime.gain_file import check_gain_document
+from jaxhil.runtime.laws import WITHOUT_C
 
 BLOCK = 500_000
 # What needs a closed loop, a law gone wrong or a call: the tests of guards and watchdog have these.
@@ -79,19 +82,23 @@ def test_a_fault_that_is_not_raised_is_found():
 
 
 # Faults are raised around the law, whichever it is.
-FEW = ("none", "response_error", "retrospective_delay_bank")
-few_laws = pytest.mark.parametrize(
-    "law", [pytest.param(law, marks=() if law in FEW else pytest.mark.slow) for law in COMPENSATORS]
-)
+FEW = ("none", "response_error")
+IN_C = [law for law in COMPENSATORS if law not in WITHOUT_C]
 
 
-@few_laws
+def few_of(laws: Iterable[str]) -> pytest.MarkDecorator:
+    """Return the parameter `law`: those in `FEW` every day, the others with the slow tests."""
+    marked = [pytest.param(law, marks=() if law in FEW else pytest.mark.slow) for law in laws]
+    return pytest.mark.parametrize("law", marked)
+
+
+@few_of(COMPENSATORS)
 def test_python_raises_every_fault_on_its_tick(law):
     python_runs(20_000, law, 10)
 
 
 @needs_compiler
-@few_laws
+@few_of(IN_C)
 def test_c_raises_every_fault_on_its_tick(law):
     c_runs(60_000, law, 20)
 
@@ -104,6 +111,6 @@ def test_ten_million_ticks_in_python(law):
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.parametrize("law", COMPENSATORS)
+@pytest.mark.parametrize("law", IN_C)
 def test_a_hundred_million_ticks_in_c(law):
     c_runs(100_000_000 if law == "response_error" else 10_000_000, law, 2000)

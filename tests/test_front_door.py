@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import jaxhil
+from jaxhil.compensators import COMPENSATORS
 from jaxhil.mechanism.structs import value_at
 from tuning.gain_file import build_document
 
@@ -225,7 +226,6 @@ def test_gains_are_chosen_by_dict_setting_and_file(tmp_path):
         ("phase_lead", {"phase_lead": 5.0}, "gains.phase_lead: found 5.0, allowed 0 to 0.028 s"),
         ("phase_lead", {"phase_lead": "5"}, "gains.phase_lead: found '5', allowed 0 to 0.028 s"),
         ("none", {"phase_lead": 5.0}, "gains: found 'phase_lead', allowed none: none has no gains"),
-        ("retrospective_reference", "shrp", "'sharp', 'gentle' (did you mean sharp?)"),
         ("phase_lead", "gains.json", "gains.json: cannot be read"),
         ("phase_lead", "sharp", "no setting's name (phase_lead has none)"),
     ],
@@ -233,6 +233,13 @@ def test_gains_are_chosen_by_dict_setting_and_file(tmp_path):
 def test_wrong_gains_are_refused_with_what_is_allowed(compensator, gains, said, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     assert said in refusal(jaxhil.simulate, "varying", compensator, gains)
+
+
+def test_setting_that_a_law_does_not_have_is_refused_with_those_that_it_has(monkeypatch):
+    settings = {"gentle": {"velocity_gain": 50.0}, "firm": {}}
+    monkeypatch.setattr(type(COMPENSATORS["impulse_ledger"]), "settings", settings)
+    message = refusal(jaxhil.simulate, "varying", "impulse_ledger", "gentl")
+    assert "'gentle', 'firm' (did you mean gentle?)" in message
 
 
 # The caller's own jax.

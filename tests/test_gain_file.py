@@ -206,22 +206,33 @@ def test_what_is_no_gain_file_is_refused(content, tmp_path):
     assert str(caught.value).isprintable()
 
 
-@pytest.mark.parametrize("law", ["retrospective_reference", "retrospective_delay_bank"])
-def test_gains_of_an_earlier_law_are_refused_with_the_way_to_new_ones(law, tmp_path, jaxhil):
-    """Of one that took the surface as told: by the library, on the rig and by the commands."""
-    file, document = tmp_path / "gains.json", make("varying", law)
-    for name in ("plane_spread", "bias_spread", "prior_friction_spread", "prior_preload_spread"):
-        del document["gains"][name]
+def assert_refused_everywhere(file, document, text, jaxhil):
+    """Check that the library, the rig's controller and the commands refuse a document in the same line."""
     file.write_text(json.dumps({**document, "sha256": digest(document)}))
-    with pytest.raises(InputError) as caught:
-        load_gain_file(file)
-    with pytest.raises(GainFileError) as on_the_rig:
-        Controller.from_file(file)
-    text = str(caught.value)
-    assert text.startswith(f"{file}: gains.") and text.isprintable() and text == str(on_the_rig.value)
-    assert f"found nothing, allowed all gains of {law} (" in text and "`jaxhil tune` makes a new file" in text
+    for read, error in ((load_gain_file, InputError), (Controller.from_file, GainFileError)):
+        with pytest.raises(error) as caught:
+            read(file)
+        assert str(caught.value) == text
     for command in (["sweep"], ["export"], ["simulate", "--gains"]):
         assert jaxhil(*command, file) == Ran(2, "", f"jaxhil: {text}\n")
+
+
+def test_gain_file_of_an_earlier_version_is_refused_with_the_way_to_a_new_one(tmp_path, jaxhil):
+    file, document = tmp_path / "gains.json", make("varying", "impulse_ledger")
+    for name in ("prior_friction_spread", "prior_preload_spread"):
+        del document["gains"][name]
+    text = (
+        f"{file}: gains.prior_friction_spread: found nothing, allowed all gains of impulse_ledger "
+        "(is it of an earlier version? `jaxhil tune` makes a new file)"
+    )
+    assert_refused_everywhere(file, document, text, jaxhil)
+
+
+@pytest.mark.parametrize("law", ["retrospective_reference", "retrospective_delay_bank"])
+def test_gain_file_of_a_retired_law_is_refused_with_its_replacement(law, tmp_path, jaxhil):
+    file, document = tmp_path / "gains.json", make("varying", "impulse_ledger")
+    text = f"{file}: compensator: found '{law}', expected 'impulse_ledger', which replaces it"
+    assert_refused_everywhere(file, {**document, "compensator": law}, text, jaxhil)
 
 
 def test_an_edit_without_a_new_digest_is_refused(tmp_path):

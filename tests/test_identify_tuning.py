@@ -54,7 +54,7 @@ def found_age(mechanism):
 @pytest.mark.parametrize(("name", "compensator", "press"), (
     ("clean", "response_error", False), ("third_order", "response_error", False),
     ("stiffnesses", "response_error", False), ("lagging", "response_error", False),
-    ("lagging", "response_error", True), ("clean", "retrospective_reference", False),
+    ("lagging", "response_error", True), ("clean", "impulse_ledger", False),
 ))  # fmt: skip
 def test_gains_tuned_on_the_identified_file_lose_little_on_the_true_rig(name, compensator, press):
     truth = campaign_rigs.mechanism(name)

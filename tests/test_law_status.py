@@ -1,9 +1,11 @@
-"""What the law says of itself, tick by tick and over a contact, and what the watchdog makes of it: in Python
-and in C bit for bit.
+"""Status of the impulse ledger, tick by tick and over a contact, and what the watchdog makes of it.
 
-`pytest -m slow -s tests/test_law_status.py` prints what the shares in `jaxhil.runtime.law_status` rest on.
+`pytest -m slow -s tests/test_law_status.py` prints how often an identified contact errs. The counting in C is
+compared with the one in Python.
 """
 
+import ctypes
+import math
 from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import NamedTuple
@@ -11,23 +13,25 @@ from typing import NamedTuple
 import c99_cases
 import numpy as np
 import pytest
-from c99_cases import RESULT, ROW, assert_same, controller_in_python, packed
+from c99_cases import ROW
+from gain_documents import gain_document
 from rig_lock_step import controller
 
 from jaxhil.compensators import literature_gains
 from jaxhil.mechanism.file import load, to_builtins
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.runtime import COMPENSATORS, Controller
+from jaxhil.runtime import Controller
 from jaxhil.runtime.faults import LAW_IN_DOUBT, RESTITUTION, names
 from jaxhil.runtime.gain_file import GainFile
 from jaxhil.runtime.law_status import (
-    DISPLACED,
     DOUBTFUL,
     IDENTIFIED,
     NOISY,
+    NOT_REACHED,
     OUT_OF_CONTACT,
     SATURATED,
+    STATUS_NAMES,
     STATUSES,
     TOO_SHORT,
     UNEXPLAINED,
@@ -35,11 +39,12 @@ from jaxhil.runtime.law_status import (
     ContactRecord,
     StatusCount,
 )
+from jaxhil.runtime.laws import PUBLISHED
 from jaxhil.runtime.limits import NO_LIMITS
 from tuning.rig.plant import Plant
 from tuning.rig.udp_protocol import NumericalModel
 
-LAW = "retrospective_reference"
+LAW = "impulse_ledger"
 AFTER = 60  # ticks that are run on once both have left the surface
 LONGEST = 2000
 
@@ -56,21 +61,12 @@ class Kind(NamedTuple):
 KINDS = {
     "ordinary": Kind("noisy", (), {}, "identified"),
     "8 Hz": Kind("fast", ("contact.stiffness=[884316.0]",), {}, "too_short"),
-    "hidden by the dead zone": Kind(
-        "dead-zone", ("contact.stiffness=[51000.0]", "rig.force_sensor.dead_zone=40.0"), {}, "noisy"
-    ),
-    "hardly corrected": Kind("noisy", (), {"correction_limit": 1e-3}, "saturated"),
-    "surface 1 mm deeper": Kind("noisy", ("rig.contact_plane=1e-3",), {}, "identified"),
-    "surface 4 mm deeper": Kind("noisy", ("rig.contact_plane=4e-3",), {"plane_spread": 1e-3}, "displaced"),
-    "noisy position": Kind("noisy", ("rig.position_sensor.noise_std=5e-6",), {}, "noisy"),
+    "surface 4 mm deeper": Kind("noisy", ("rig.contact_plane=4e-3",), {}, "identified"),
     "noisy force": Kind("noisy", ("rig.force_sensor.noise_std=2.667",), {}, "noisy"),
-    "dead zone": Kind("noisy", ("rig.force_sensor.dead_zone=12.0",), {}, "noisy"),
-    "force 1 ms older than told": Kind("noisy", (), {"identification_delay": 0.007}, "unexplained"),
-    "damped behind a lag of 3 ms untold": Kind(
-        "damped", ("rig.force_sensor.time_constant=3e-3", "contact.damping=[600.0]"), {}, "unexplained"
+    "force 1 ms older than specified": Kind(
+        "noisy", (), {"identification_delay": 0.007, "delay_spread": 0.0}, "unexplained"
     ),
     "damped": Kind("damped", ("contact.damping=[600.0]",), {}, "identified"),
-    "dry friction untold": Kind("friction", (), {"prior_friction_spread": 0.0}, "unexplained"),
 }
 WATCHED = {"settling": 0.02, "free_force": 20.0}
 LIMITS = {
@@ -129,7 +125,7 @@ def ran(name: str, limits: str) -> tuple[Controller, Ran]:
     return law, run(mechanism, law)
 
 
-# Every kind without the audit, as C says the same of it below; otherwise every day some.
+# Every kind without the audit; otherwise every day some.
 @pytest.mark.parametrize(
     "name, limits",
     [
@@ -148,54 +144,78 @@ def test_a_contact_is_what_the_law_said_of_most_of_it(name, limits):
     assert len(raised) == 1
     said = found.said[: raised[0]]
     assert record.ticks == len(said) - said.count("out_of_contact") > 50
-    for status in ("unsure", "saturated", "too_short", "displaced", "noisy"):
+    for status in ("unsure", "saturated", "too_short", "noisy"):
         assert getattr(record, status) == said.count(status)
 
 
-@pytest.mark.parametrize(("nearer", "status"), [(1e-3, "identified"), (4e-3, "displaced")])
-def test_a_contact_that_never_reaches_the_surface_as_told_is_audited(nearer, status):
+@pytest.mark.parametrize("nearer", [1e-3, 4e-3])
+def test_contact_before_the_specified_surface_is_audited(nearer):
     """It begins when the law acts."""
     changes = (f"rig.contact_plane={-nearer}",)
-    mechanism, made = gain_file(Kind("noisy", changes, {"plane_spread": 1e-3}, status), {"settling": 0.02})
+    mechanism, made = gain_file(Kind("noisy", changes, {}, "identified"), {"settling": 0.02})
     law = Controller(made)
-    found = run(mechanism, law)
-    assert np.all(found.rows[:, 2] < 0) and law.last_contact[:2] == (1, status)
-    assert law.contact_plane == pytest.approx(-nearer, abs=2e-5)
+    rows = run(mechanism, law).rows
+    assert np.all(rows[:, 2] < 0) and law.last_contact[:2] == (1, "identified")
+
+
+# Functions that the controller calls and no exported law reaches yet: none of those in C has a status.
+COUNTED = """
+static jaxhil_contact_record record;
+void count_begin(void) { record = jaxhil_contact_record_begin(7, JAXHIL_UNSTATED); }
+void count_take(int status) { jaxhil_contact_record_take(&record, status); }
+int count_end(int measured) { return jaxhil_contact_record_end(&record, measured != 0); }
+void count_read(long long *numbers) {
+    numbers[0] = record.number, numbers[1] = record.status, numbers[2] = record.ticks;
+    numbers[3] = record.unsure, numbers[4] = record.saturated, numbers[5] = record.too_short;
+    numbers[6] = record.noisy;
+}
+"""
 
 
 @pytest.fixture(scope="module")
-def in_c():
-    """The law, compiled and loaded."""
+def counting_in_c(tmp_path_factory):
+    """Load the counting of statuses in C as a shared library."""
     if c99_cases.COMPILER is None:
         pytest.skip("no C compiler (cc) on this machine")
-    return c99_cases.loaded(LAW)
+    folder = c99_cases.write_sources(tmp_path_factory.mktemp("status"), gain_document("none"))
+    (folder / "counted.c").write_text(f'#include "jaxhil_controller.c"\n{COUNTED}')
+    return ctypes.CDLL(str(c99_cases.compiled(folder, "counted.c", "counted.so", "-shared", "-fPIC")))
 
 
-def test_c_says_the_same_of_every_kind_of_contact(in_c):
-    """To the bit, with resets and new contacts in between; the kinds show every status that there is."""
-    column = {name: place for place, name in enumerate(RESULT)}
-    each = [ran(name, "no energies")[1].rows for name in KINDS]
-    rows, starts = np.concatenate(each), np.cumsum([0, *map(len, each[:-1])])
-    rows[:, ROW.index("timed")] = 0.0
+def test_c_counts_statuses_as_python_does(counting_in_c):
+    """Contacts of 40 ticks in which one or two statuses, drawn by chance, prevail."""
     rng = np.random.default_rng(0)
-    said, contacts = set(), set()
-    for name in KINDS:
-        _, made = gain_file(KINDS[name], LIMITS["energies"])
-        for share in (0.0, 0.01) if name == "ordinary" else (0.01,):
-            events = [c99_cases.TICK, c99_cases.RESET, c99_cases.NEXT_CONTACT]
-            rows[:, 0] = rng.choice(events, len(rows), p=[1 - 2 * share, share, share])
-            rows[starts, 0] = c99_cases.RESET
-            expected = controller_in_python(made, rows)
-            assert in_c.begin(packed(LAW, made))
-            assert_same(in_c.run(rows, True), expected, rows)
-            said |= set(expected[:, column["law_status"]])
-            contacts |= set(expected[:, column["contact_status"]])
-    assert said == {OUT_OF_CONTACT, IDENTIFIED, UNSURE, SATURATED, TOO_SHORT, DISPLACED, NOISY, UNEXPLAINED}
-    assert contacts == {*range(len(STATUSES))} - {OUT_OF_CONTACT}
+    numbers = [status.number for status in STATUSES if status.number != NOT_REACHED]
+    record_type, statuses = ctypes.c_longlong * 7, set()
+    for _ in range(2000):
+        shares = rng.dirichlet(np.full(len(numbers), 0.2))
+        ticks = rng.choice(numbers, 40, p=shares).tolist()
+        measured = bool(rng.random() < 0.9)
+        count = StatusCount()
+        counting_in_c.count_begin()
+        for status in ticks:
+            count.take(status)
+            counting_in_c.count_take(status)
+        in_doubt, values = counting_in_c.count_end(int(measured)), record_type()
+        counting_in_c.count_read(values)
+        record = count.record(7, measured)
+        assert STATUS_NAMES[values[1]] == record.status and in_doubt == record.in_doubt
+        assert [values[0], *values[2:]] == [record.number, *record[2:]]
+        statuses.add(record.status)
+    assert statuses == {*STATUS_NAMES.values()} - {"out_of_contact", "unstated"}
 
 
-@pytest.mark.parametrize("law", [LAW, "retrospective_delay_bank"])
-def test_without_a_measured_force_a_contact_is_not_reached(law):
+def test_kinds_of_contact_show_every_status_of_the_law():
+    records = [ran(name, "no energies") for name in KINDS]
+    statuses = {name for _, contact in records for name in contact.said}
+    never = {"unstated", "not_reached"}
+    assert statuses == {*STATUS_NAMES.values()} - never
+    assert {controller.last_contact.status for controller, _ in records} == {
+        *("identified", "too_short", "noisy", "unexplained")
+    }
+
+
+def test_without_a_measured_force_a_contact_is_not_reached():
     """Whatever the law does: the model passes the surface and comes back, with hardware that never touches,
     with a dead zone that hides its contact, and with a contact of a single reading."""
     mechanism = load("suite-noise-free").mechanism
@@ -210,22 +230,13 @@ def test_without_a_measured_force_a_contact_is_not_reached(law):
         (touching, single, True),
         (touching, -0.01 * np.cos(time), False),
     ):
-        one = controller(mechanism, law, literature_gains(mechanism, law), settling=0.02, fading=0.01)
+        law = controller(mechanism, LAW, literature_gains(mechanism, LAW), settling=0.02, fading=0.01)
         velocity = 5e-3 * np.cos(25.0 * (time - 0.0203))
-        rows = np.zeros((len(time), len(ROW)))
-        rows[:, :5] = np.stack([none, force, motion, velocity, measured], axis=1)
-        for row in rows:
-            one.step(*row[1:5])
-        record = one.last_contact
+        for row in np.stack([force, motion, velocity, measured], axis=1):
+            law.step(*row)
+        record = law.last_contact
         assert record.number == 1 and (record.status == "not_reached") != reached, record
-        assert one.seen == LAW_IN_DOUBT
-        if law == LAW and c99_cases.COMPILER is not None:
-            limits = {**NO_LIMITS, "settling": 0.02, "fading": 0.01}
-            period, clearance = mechanism.rig.control_period, mechanism.contact.clearance
-            made = GainFile(law, literature_gains(mechanism, law), period, clearance)._replace(limits=limits)
-            in_c = c99_cases.loaded(law)
-            assert in_c.begin(packed(law, made))
-            assert_same(in_c.run(rows, True), controller_in_python(made, rows), rows)
+        assert law.seen == LAW_IN_DOUBT
 
 
 def test_the_record_stays_until_the_next_contact_is_audited():
@@ -265,10 +276,7 @@ def test_a_restitution_that_trips_comes_with_what_the_law_said():
     assert law.status.endswith(", law too short)")
 
 
-WITH_STATUS = ("retrospective_reference", "retrospective_delay_bank", "impulse_ledger")
-
-
-@pytest.mark.parametrize("name", [name for name in COMPENSATORS if name not in WITH_STATUS])
+@pytest.mark.parametrize("name", PUBLISHED)
 def test_laws_without_a_status_say_nothing(name):
     mechanism = load("suite-noisy").mechanism
     law = controller(mechanism, name, literature_gains(mechanism, name), **LIMITS["energies"])
@@ -296,10 +304,10 @@ def test_laws_without_a_status_say_nothing(name):
         ({IDENTIFIED: 99, UNEXPLAINED: 1, OUT_OF_CONTACT: 9}, UNEXPLAINED),
         ({NOISY: 41, UNEXPLAINED: 59}, NOISY),
         ({SATURATED: 59, UNSURE: 41}, UNSURE),
-        ({IDENTIFIED: 59, UNSURE: 10, TOO_SHORT: 10, DISPLACED: 11, NOISY: 10}, DISPLACED),
-        ({IDENTIFIED: 59, UNSURE: 10, TOO_SHORT: 10, DISPLACED: 10, NOISY: 11}, NOISY),
-        ({IDENTIFIED: 60, DISPLACED: 20, NOISY: 20}, IDENTIFIED),
-        ({IDENTIFIED: 59, DISPLACED: 20, NOISY: 21}, NOISY),
+        ({IDENTIFIED: 59, UNSURE: 10, TOO_SHORT: 16, NOISY: 15}, TOO_SHORT),
+        ({IDENTIFIED: 59, UNSURE: 10, TOO_SHORT: 15, NOISY: 16}, NOISY),
+        ({IDENTIFIED: 60, TOO_SHORT: 20, NOISY: 20}, IDENTIFIED),
+        ({IDENTIFIED: 59, TOO_SHORT: 20, NOISY: 21}, NOISY),
     ],
 )
 def test_the_status_that_counts(counts, status):
@@ -308,9 +316,9 @@ def test_the_status_that_counts(counts, status):
         for _ in range(number):
             made.take(one)
     record = made.record(7, measured=True)
-    assert (record.number, record.status) == (7, STATUSES[status].name)
+    assert (record.number, record.status) == (7, STATUS_NAMES[status])
     assert record.ticks == sum(counts.values()) - counts.get(OUT_OF_CONTACT, 0)
-    assert record.in_doubt == (status in (UNSURE, SATURATED, TOO_SHORT, DISPLACED, NOISY, UNEXPLAINED))
+    assert record.in_doubt == (status in (UNSURE, SATURATED, TOO_SHORT, NOISY, UNEXPLAINED))
 
 
 def contacts_of(suite: str, seed: int, number: int, changes: tuple[str, ...] = ()) -> Iterator[Mechanism]:
@@ -325,26 +333,25 @@ def contacts_of(suite: str, seed: int, number: int, changes: tuple[str, ...] = (
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("setting", ["sharp", "gentle"])
 @pytest.mark.parametrize("suite", ["noisy", "hertz", "hardening", "layered", "fast"])
-def test_what_the_shares_rest_on(suite, setting):
-    """Of many contacts: the share of ticks in doubt, and the gap that `DOUBTFUL` lies in.
+def test_share_of_doubtful_ticks_tells_short_contacts_apart(suite):
+    """Print the share of ticks in doubt, and check the gap that `DOUBTFUL` lies in.
 
     Too short are those that the law calls so on any tick.
     """
     contacts = 200
     doubt, short = np.empty((2, contacts))
     for place, mechanism in enumerate(contacts_of(suite, 5, contacts)):
-        law = controller(mechanism, LAW, literature_gains(mechanism, LAW, setting))
+        law = controller(mechanism, LAW, literature_gains(mechanism, LAW))
         run(mechanism, law, place)
         record = law.last_contact
         assert record.number == 1
-        doubts = record.unsure + record.too_short + record.displaced + record.noisy
+        doubts = record.unsure + record.too_short + record.noisy
         doubt[place] = doubts / record.ticks
         short[place] = record.too_short > 0
     known = doubt[short == 0]
     print(
-        f"{suite}, {setting}: {len(known)} contacts that are not too short, in doubt on up to "
+        f"{suite}: {len(known)} contacts that are not too short, in doubt on up to "
         f"{np.max(known):.2f} of their ticks"
     )
     assert np.max(known) < DOUBTFUL
@@ -365,10 +372,10 @@ WRONG = {
     "nothing": Wrong(),
     "surface 1 mm deeper": Wrong(("rig.contact_plane=1e-3",)),
     "surface 1 mm nearer": Wrong(("rig.contact_plane=-1e-3",)),
-    "force 1 ms older than told": Wrong(("rig.force_sensor.delay=0.009",)),
-    "sensor lag of 1 ms untold": Wrong(("rig.force_sensor.time_constant=1e-3",)),
-    "sensor lag of 3 ms untold": Wrong(("rig.force_sensor.time_constant=3e-3",)),
-    "sensor lag of 3 ms told": Wrong(known=("rig.force_sensor.time_constant=3e-3",)),
+    "force 1 ms older than specified": Wrong(("rig.force_sensor.delay=0.009",)),
+    "unmodelled sensor lag of 1 ms": Wrong(("rig.force_sensor.time_constant=1e-3",)),
+    "unmodelled sensor lag of 3 ms": Wrong(("rig.force_sensor.time_constant=3e-3",)),
+    "specified sensor lag of 3 ms": Wrong(known=("rig.force_sensor.time_constant=3e-3",)),
     "position noise of 1 ms x v0": Wrong(known=("rig.position_sensor.noise_std=5e-6",)),
     "force noise of 9 %, dead zone of 12 N": Wrong(
         known=("rig.force_sensor.noise_std=2.667", "rig.force_sensor.dead_zone=12.0")
@@ -377,9 +384,8 @@ WRONG = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("law", [LAW, "retrospective_delay_bank"])
 @pytest.mark.parametrize("wrong", WRONG)
-def test_of_what_is_called_identified_hardly_any_errs(wrong, law):
+def test_of_what_is_called_identified_hardly_any_errs(wrong):
     """Whatever is wrong, by more than 1.5 %; and where nothing is, 98 in 100 are identified."""
     (changes, known), contacts = WRONG[wrong], 100
     told = load("suite-noisy", list(known)).mechanism
@@ -387,14 +393,14 @@ def test_of_what_is_called_identified_hardly_any_errs(wrong, law):
     for suite in ("noisy", "hertz", "hardening", "layered"):
         errors, said = np.empty(contacts), []
         for place, mechanism in enumerate(contacts_of(suite, 6, contacts, (*changes, *known))):
-            one = controller(mechanism, law, literature_gains(told, law))
-            velocity = run(mechanism, one, place).rows[:, ROW.index("velocity")]
+            law = controller(mechanism, LAW, literature_gains(told, LAW))
+            velocity = run(mechanism, law, place).rows[:, ROW.index("velocity")]
             errors[place] = 100 * (abs(velocity[-1]) / velocity[0] - 1)
-            said.append(one.last_contact.status)
+            said.append(law.last_contact.status)
         counts = {status: said.count(status) for status in sorted(set(said))}
         passed = np.abs(errors[[status == "identified" for status in said]])
         rms = float(np.sqrt(np.mean(errors**2)))
-        print(f"{law}, {wrong}, {suite}: error {rms:.2f} % rms, {np.max(np.abs(errors)):.2f} % at most")
+        print(f"{wrong}, {suite}: error {rms:.2f} % rms, {np.max(np.abs(errors)):.2f} % at most")
         print(f"  {counts}, identified: {np.max(passed, initial=0.0):.2f} % at most")
         odd, identified = odd + int(np.sum(passed > 1.5)), identified + len(passed)
     assert odd <= 0.01 * 4 * contacts
@@ -402,32 +408,39 @@ def test_of_what_is_called_identified_hardly_any_errs(wrong, law):
         assert identified >= 0.98 * 4 * contacts
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("lag", "most"), [(0.0, 0.0), (1e-3, 0.25), (3e-3, 0.15)])
-def test_of_damped_contacts_behind_a_lag_few_are_called_identified(lag, most):
-    """A damper of which the lag takes all reads like none: those cannot be told (`test_lag_check.py`)."""
-    from test_delay_bank_accuracy import restitution
+def restitution(mechanism: Mechanism) -> float:
+    """Return the restitution of linear damped contact that does not adhere.
 
+    Its force is 0 where the speed is largest.
+    """
+    [stiffness], [damping] = mechanism.contact.stiffness, mechanism.contact.damping
+    ratio = damping / (2 * math.sqrt(stiffness * mechanism.bodies.mass))
+    return math.exp(-ratio / math.sqrt(1 - ratio**2) * (math.pi - 2 * math.asin(ratio)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lag", [0.0, 1e-3, 3e-3])
+def test_identified_contact_with_a_damper_behind_a_lag_does_not_err(lag):
+    """A damper whose loss the unmodelled lag makes up for reads like no damper."""
     contacts, told = 60, load("suite-damped").mechanism
     errors, said = np.empty(contacts), []
     changes = (f"rig.force_sensor.time_constant={lag}",) if lag else ()
     for place, mechanism in enumerate(contacts_of("damped", 6, contacts, changes)):
-        one = controller(mechanism, LAW, literature_gains(told, LAW))
-        velocity = run(mechanism, one, place).rows[:, ROW.index("velocity")]
+        law = controller(mechanism, LAW, literature_gains(told, LAW))
+        velocity = run(mechanism, law, place).rows[:, ROW.index("velocity")]
         errors[place] = 100 * (abs(velocity[-1]) / velocity[0] - restitution(mechanism))
-        said.append(one.last_contact.status)
+        said.append(law.last_contact.status)
     identified = np.array([status == "identified" for status in said])
     wrong = np.sum(identified & (np.abs(errors) > 1.5))
     print(f"damped, lag {lag:g} s: error {np.sqrt(np.mean(errors**2)):.2f} % rms, {np.sum(identified)} of")
     print(f"  {contacts} identified, of these {wrong} wrong by more than 1.5 %")
-    assert wrong <= most * contacts
+    assert wrong <= 0.01 * contacts
     assert lag or np.mean(identified) >= 0.9
 
 
 @pytest.mark.slow
 def test_slow_contacts_are_identified():
-    """Of 0.4 to 1.4 Hz: where the surface was met is known to many ticks, and what a lag would explain of
-    that matters little."""
+    """Contacts of 0.4 to 1.4 Hz."""
     changes = ("contact.stiffness=[8000.0]",)
     told = load("suite-noisy", list(changes)).mechanism
     for place, mechanism in enumerate(contacts_of("noisy", 9, 25, changes)):

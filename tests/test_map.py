@@ -195,9 +195,8 @@ def test_limits_of_a_small_control_period():
 
 @pytest.mark.slow
 @pytest.mark.users_options
-@pytest.mark.parametrize("compensator", sorted({*COMPENSATORS} - {"retrospective_delay_bank"}))
+@pytest.mark.parametrize("compensator", sorted(COMPENSATORS))
 def test_time_of_a_map_of_100_by_100_points(compensator):
-    """The bank of delays, which learns dozens of maps in every lane, takes minutes."""
     axes = "contact.stiffness", "rig.force_sensor.delay=0.001:0.008"
     took = spent = 0.0
     for _ in range(2):

@@ -100,10 +100,7 @@ def test_amplification_is_that_of_the_lead_filter(compensator):
 
 
 # These pass the measured force on as it is.
-NO_TRADE_OFF = [
-    *("none", "position_lead", "virtual_contact", "passivity"),
-    *("retrospective_reference", "retrospective_delay_bank", "impulse_ledger"),
-]
+NO_TRADE_OFF = ["none", "position_lead", "virtual_contact", "passivity", "impulse_ledger"]
 
 
 def test_only_what_amplifies_has_something_to_trade():

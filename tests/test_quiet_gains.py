@@ -16,7 +16,7 @@ from jaxhil.simulation.scenario import build_scenarios
 from tuning.caches import program_cache
 from tuning.caches.pieces import Pieces
 from tuning.front_door import tune_verdict
-from tuning.front_door.tune import TuneOptions
+from tuning.front_door.tune_options import TuneOptions
 from tuning.gains import simulated
 from tuning.gains.noise import amplification
 from tuning.gains.objective import Objective, objective_value

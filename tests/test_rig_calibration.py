@@ -126,6 +126,16 @@ def test_it_audits_the_restitution_that_the_loop_tells():
     assert np.max(judged.audited.imbalance[ended]) < 1e-11
 
 
+def test_audit_of_a_law_with_a_status_begins_when_the_law_acts():
+    """The surface lies 1 mm nearer than specified: neither position ever passes it."""
+    nearer = gains(uncertainty={}, compensator="impulse_ledger", contact_plane=-1e-3)
+    assert watchdog_rules(nearer)[0].has_status and not watchdog_rules(ONE_SIDED)[0].has_status
+    (chunk,) = recorded_chunks(nearer, Scenarios("random", 1, 8))
+    audited = audit_contacts(chunk.signals, watchdog_rules(nearer)[0], 2)
+    assert np.all(chunk.signals.position <= 0) and np.all(chunk.signals.measured <= 0)
+    np.testing.assert_allclose(audited.restitution, chunk.contacts.restitution[:2], atol=1e-6)
+
+
 def test_every_limit_is_there_and_loads(calibrated):
     limits = calibrated[0].limits
     assert list(limits) == list(LIMITS)

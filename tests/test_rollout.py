@@ -275,7 +275,7 @@ def test_padding_is_inert(mixed):
         if name == "status":
             continue
         # There are no limits that a command could fall short by, nothing to probe with, no delay estimated.
-        nothing = "ticks", "position_shortfall", "trajectory_error", "force_delay", "contact_plane"
+        nothing = "ticks", "position_shortfall", "trajectory_error", "force_delay"
         expected = 0 if name in nothing else np.nan
         np.testing.assert_array_equal(values[:, lane], expected, err_msg=name)
     # With nothing but padding the program does not even start.

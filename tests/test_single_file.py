@@ -12,7 +12,6 @@ import pytest
 from gain_documents import gain_document
 
 from jaxhil.runtime import COMPENSATORS, Controller
-from jaxhil.runtime.laws import NEED_NUMPY
 from tuning.bundle.single_file import runtime_source
 
 
@@ -33,16 +32,15 @@ def loaded(folder):
 
 def test_holds_one_law_and_nothing_beside_what_it_says_it_needs(exported):
     compensator, folder = exported
-    needs_numpy = compensator in NEED_NUMPY
     head = (folder / "jaxhil_runtime.py").read_text().partition("# ---- ")[0]
-    assert ("NumPy beside it" in head) == ("nothing else to install" not in head) == needs_numpy
-    foreign = {"jax", "jaxhil", "tuning"} | (set() if needs_numpy else {"numpy"})
+    assert "nothing else to install" in head
+    foreign = {"jax", "jaxhil", "tuning", "numpy"}
     program = (
         "import sys; sys.path.insert(0, sys.argv[1]); import jaxhil_runtime as runtime\n"
         "print(*runtime.COMPENSATORS); runtime.Controller.from_file(sys.argv[1] + '/gains.json')\n"
         f"assert not {foreign} & {{name.split('.')[0] for name in sys.modules}}"
     )
-    command = [sys.executable, "-I", *([] if needs_numpy else ["-S"]), "-c", program, str(folder)]
+    command = [sys.executable, "-I", "-S", "-c", program, str(folder)]
     ran = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (ran.returncode, ran.stdout.split(), ran.stderr) == (0, [compensator], "")
 

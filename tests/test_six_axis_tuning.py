@@ -13,7 +13,7 @@ from jaxhil.errors import InputError
 from jaxhil.mechanism.file import load_any
 from jaxhil.simulation.gain_file import load_gain_file
 from tuning.front_door import arguments
-from tuning.front_door.tune import TuneOptions
+from tuning.front_door.tune_options import TuneOptions
 
 SMALL = {"scenarios": 8, "starts": 2, "steps": 4, "validation": 15}
 

@@ -38,7 +38,6 @@ def rows(errors, status, peak_force=10.0, force_range=np.inf, shortfall=0.0, ide
             ("peak_command", "excess_variation", "duration", "work_in", "work_out", "trajectory_error"), like
         ),
         force_delay=0 * like,
-        contact_plane=0 * like,
         status=status,
         ticks=status,
     )

@@ -7,7 +7,7 @@ import pytest
 
 from tuning import terminal
 
-LAW = "retrospective_reference"
+LAW = "multi_parameter_lead"
 FIGURES = [12.34, 20.15, 200.2, 0.1041, 0.5123, 0.9252, 1.443, 4.125]
 
 

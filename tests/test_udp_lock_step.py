@@ -86,8 +86,8 @@ def test_lost_and_late_packets_are_made_up_for(varying, drops, ticks):
 def test_contacts_that_the_law_did_not_know_are_counted():
     """Too short ones, each reported once by an answer; the process says how many."""
     mechanism = load("suite-fast", ["contact.stiffness=[884316.0]"]).mechanism
-    gains = literature_gains(mechanism, "retrospective_reference")
-    rig, task, answers = packets(mechanism, controller(mechanism, "retrospective_reference", gains), 900)
+    gains = literature_gains(mechanism, "impulse_ledger")
+    rig, task, answers = packets(mechanism, controller(mechanism, "impulse_ledger", gains), 900)
     assert udp_protocol.LAW_IN_DOUBT == faults.LAW_IN_DOUBT and MISSED_TICK == faults.MISSED_TICK
     reported = [answer for answer in answers if answer.faults & faults.LAW_IN_DOUBT]
     assert len(rig.contacts) >= 3 and not rig.tripped

@@ -91,10 +91,6 @@ void jaxhil_identified(const jaxhil_controller *controller, double *stiffness, d
 /* Estimated delay [s] of the force measurement; 0 if the law estimates none. */
 double jaxhil_force_delay(const jaxhil_controller *controller);
 
-/* By how much [m] the surface that the law met last is deeper than told; 0 before the first, and if the law finds
- * none. */
-double jaxhil_contact_plane(const jaxhil_controller *controller);
-
 /* What the law says of the last command; JAXHIL_UNSTATED if it says nothing. */
 int jaxhil_law_status(const jaxhil_controller *controller);
 
@@ -307,6 +303,3 @@ double jaxhil_force_delay(const jaxhil_controller *controller) {
     return controller->usable ? jaxhil_law_force_delay(&controller->law) : 0.0;
 }
 
-double jaxhil_contact_plane(const jaxhil_controller *controller) {
-    return controller->usable ? jaxhil_law_contact_plane(&controller->law) : 0.0;
-}

@@ -1,6 +1,6 @@
 /* The law's functions that it leaves out: a law that does have one says so by defining JAXHIL_LAW_HAS_... beside
  * it. By default a law has no state, commands the numerical model's position, identifies nothing, estimates no
- * delay, finds no surface, says nothing of itself, and keeps nothing from one contact to the next.
+ * delay, says nothing of itself, and keeps nothing from one contact to the next.
  */
 #include <stdbool.h>
 
@@ -28,13 +28,6 @@ static void jaxhil_law_identified(const jaxhil_law *law, double *stiffness, doub
 
 #ifndef JAXHIL_LAW_HAS_FORCE_DELAY
 static double jaxhil_law_force_delay(const jaxhil_law *law) {
-    (void)law;
-    return 0.0;
-}
-#endif
-
-#ifndef JAXHIL_LAW_HAS_CONTACT_PLANE
-static double jaxhil_law_contact_plane(const jaxhil_law *law) {
     (void)law;
     return 0.0;
 }

@@ -16,8 +16,6 @@ from jaxhil.compensators.phase_lead import PhaseLead
 from jaxhil.compensators.phase_lead_per_axis import PhaseLeadPerAxis
 from jaxhil.compensators.position_lead import PositionLead
 from jaxhil.compensators.response_error import ResponseError
-from jaxhil.compensators.retrospective_delay_bank import RetrospectiveDelayBank
-from jaxhil.compensators.retrospective_reference import RetrospectiveReference
 from jaxhil.compensators.smith_hybrid import SmithHybrid
 from jaxhil.compensators.smith_predictor import SmithPredictor
 from jaxhil.compensators.virtual_contact import VirtualContact
@@ -35,8 +33,6 @@ _BUILT_IN = (
     DeadZoneObserver(),
     Passivity(),
     ResponseError(),
-    RetrospectiveReference(),
-    RetrospectiveDelayBank(),
     ImpulseLedger(),
 )
 COMPENSATORS: dict[str, Compensator] = {law.name: law for law in _BUILT_IN}

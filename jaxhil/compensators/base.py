@@ -88,8 +88,6 @@ class Compensator(eqx.Module):
     settings: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType({})
     # Whether it estimates the delay of the force measurement: `force_delay`.
     estimates_delay: ClassVar[bool] = False
-    # Whether it finds where the surface is: `contact_plane`.
-    finds_plane: ClassVar[bool] = False
     # Whether it reads the measured position.
     reads_position: ClassVar[bool] = True
     # Whether, without noise, its F_c is 0 and its state such as a run begins with until the hardware touches:
@@ -139,7 +137,3 @@ class Compensator(eqx.Module):
     def force_delay(self, gains: Gains, state: Any) -> Float[Array, "*batch"]:
         """Estimated delay [s] of the force measurement; of a law that `estimates_delay`."""
         raise NotImplementedError(f"{self.name} estimates no delay")
-
-    def contact_plane(self, state: Any) -> Float[Array, "*batch"]:
-        """By how much [m] the surface met last is deeper than told; of a law that `finds_plane`."""
-        raise NotImplementedError(f"{self.name} finds no surface")

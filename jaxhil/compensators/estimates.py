@@ -8,6 +8,7 @@ import math
 
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism, value_at
+from jaxhil.runtime.laws.impulse_ledger import LARGEST_DELAY_SPREAD
 
 FORCE_DELAY = "force delay"
 ROUGH_FORCE_DELAY = "force delay, roughly"
@@ -19,10 +20,6 @@ DEAD_ZONE = "dead zone"
 FORCE_NOISE = "force noise"
 EQUIVALENT_MASS = "equivalent mass"
 
-UNKNOWN_DELAY_SPREAD = 0.001  # s
-UNKNOWN_PLANE_SPREAD = 0.001  # m
-UNKNOWN_BIAS_SPREAD = 5.0  # N
-
 
 def force_delay(mechanism: Mechanism | SixAxisMechanism) -> float:
     """The known delay [s] of the force measurement: transport plus first-order lag."""
@@ -30,23 +27,15 @@ def force_delay(mechanism: Mechanism | SixAxisMechanism) -> float:
     return sensor.delay + sensor.time_constant
 
 
-def force_delay_spread(mechanism: Mechanism) -> float:
-    """How far [s] the force delay may lie from what is known of it: half of the range that the file gives it,
-    or two standard deviations; 1 ms where it says nothing of that."""
-    told = _spread(mechanism, "rig.force_sensor.delay", deviations=2.0)
-    return UNKNOWN_DELAY_SPREAD if told is None else told
-
-
-def contact_plane_spread(mechanism: Mechanism) -> float:
-    """How far [m] the contact plane lies from where the controller takes it to be, and may: 1 mm where the
-    file says nothing of the latter."""
-    return _size(mechanism, "rig.contact_plane", UNKNOWN_PLANE_SPREAD)
-
-
-def force_bias(mechanism: Mechanism) -> float:
-    """How large [N] the force sensor's bias may be: 5 N beyond its nominal value where the file says
-    nothing."""
-    return _size(mechanism, "rig.force_sensor.bias", UNKNOWN_BIAS_SPREAD)
+def specified_delay_spread(mechanism: Mechanism) -> float:
+    """Return the standard deviation [s] that the file states for the force delay, at most 4 ms; else 0."""
+    stated = mechanism.uncertainty.get("rig.force_sensor.delay")
+    if stated is None:
+        return 0.0
+    spread = stated.std
+    if spread is None:
+        spread = (_spread(mechanism, "rig.force_sensor.delay") or 0.0) / math.sqrt(3)
+    return min(spread, LARGEST_DELAY_SPREAD)
 
 
 def friction(mechanism: Mechanism) -> float:
@@ -170,7 +159,6 @@ def _spread(mechanism: Mechanism, path: str, deviations: float = 1.0) -> float |
     return max(abs(end - nominal) for end in ends)
 
 
-def _size(mechanism: Mechanism, path: str, unknown: float = 0.0) -> float:
-    """How far a number may lie from 0, its spread being `unknown` where the file says nothing of that."""
-    told = _spread(mechanism, path)
-    return abs(value_at(mechanism, path)) + (unknown if told is None else told)
+def _size(mechanism: Mechanism, path: str) -> float:
+    """Return how far a number may lie from 0: its nominal value and its spread."""
+    return abs(value_at(mechanism, path)) + (_spread(mechanism, path) or 0.0)

@@ -27,17 +27,10 @@ class Reference(NamedTuple):
     speeds: Float[Array, "parameters *batch"]  # s'
 
 
-def restarted(old: Reference, depth: Array, begins: Bool[Array, "*batch"]) -> Reference:
-    """Return the trajectory at the onset where contact `begins`, at this depth [s], else the old one."""
-    return Reference(
-        jnp.where(begins, depth, old.depth),
-        jnp.where(begins, 1, old.speed),
-        jnp.where(begins, 0, old.force),
-        jnp.where(begins, depth, old.deepest),
-        old.released & ~begins,
-        jnp.where(begins[None], 0, old.depths),
-        jnp.where(begins[None], 0, old.speeds),
-    )
+def begin(depth: Array, like: Array) -> Reference:
+    """Return the trajectory at the onset, at a depth [s]; `like` has the shape of the parameters."""
+    zeros = jnp.zeros_like(depth)
+    return Reference(depth, zeros + 1, zeros, depth, zeros > 0, jnp.zeros_like(like), jnp.zeros_like(like))
 
 
 def correct(old: Reference, changes: Array) -> Reference:
@@ -54,19 +47,17 @@ def advance(old: Reference, theta: Array, period: Array, reading: Array, measure
     speed = old.speed - period * old.force
     deepest = jnp.where(depth > old.deepest, depth, old.deepest)
     released = old.released | ((depth <= 0) & (speed < 0))
-    own = features(depth, speed, deepest)
+    undelayed = features(depth, speed, deepest, jnp.zeros_like(depth))
     least = jnp.where(reading < 0, reading, 0)
-    push = dot(theta, own) + (reading - dot(theta, measured))
+    push = dot(theta, undelayed) + (reading - dot(theta, measured))
     push = jnp.where(released, 0, jnp.where(push > least, push, least))
-    inside = depth > 0
-    stiffness = slope(theta, depth)
-    damping = jnp.where(inside, theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH, 0)
+    damping = jnp.where(depth > 0, theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH, 0)
     # Stiffer contact is not followed at this period.
-    stiffness = jnp.minimum(stiffness, 1 / (period * period))
+    stiffness = jnp.minimum(slope(theta, depth), 1 / (period * period))
     damping = jnp.minimum(damping, 1 / period)
     tick, moves = period[None], (push != 0)[None]
     ahead = old.depths + tick * old.speeds
-    rates = own - measured + stiffness[None] * ahead + damping[None] * old.speeds
+    rates = undelayed - measured + stiffness[None] * ahead + damping[None] * old.speeds
     speeds = old.speeds - jnp.where(moves, tick * rates, 0)
     depths = old.depths + jnp.where(moves, tick * speeds, 0)
     speed = _within(old.speed - 0.5 * period * (old.force + push), FASTEST)

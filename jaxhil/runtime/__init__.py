@@ -11,15 +11,10 @@ from importlib import import_module
 from .controller import Controller
 from .errors import GainFileError
 from .gain_file import digest
-from .laws import LAWS, NEED_NUMPY
+from .laws import LAWS
 from .registry import COMPENSATORS
 
 for _law in LAWS:
-    try:
-        import_module(f".laws.{_law}", __name__)
-    except ImportError:
-        # A rig without NumPy has all other laws.
-        if _law not in NEED_NUMPY:
-            raise
+    import_module(f".laws.{_law}", __name__)
 
 __all__ = ["COMPENSATORS", "Controller", "GainFileError", "digest"]

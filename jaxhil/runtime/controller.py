@@ -26,7 +26,7 @@ from .faults import (
 )
 from .gain_file import GainFile, check_gain_document, read_gain_document
 from .inputs import InputGuard, Tare
-from .law_status import STATUSES, UNSTATED, ContactRecord
+from .law_status import STATUS_NAMES, UNSTATED, ContactRecord
 from .outputs import ForceGuard, PositionGuard
 from .registry import COMPENSATORS
 from .watchdog import Watchdog
@@ -125,15 +125,9 @@ class Controller:
         return self._compensator.force_delay
 
     @property
-    def contact_plane(self) -> float:
-        """By how much [m] the surface that the law met last is deeper than told; 0 before the first, and if
-        the law finds none."""
-        return self._compensator.contact_plane
-
-    @property
     def law_status(self) -> str:
         """What the law says of the last command (`law_status.STATUSES`); `unstated` if it says nothing."""
-        return STATUSES[self._compensator.status].name
+        return STATUS_NAMES[self._compensator.status]
 
     @property
     def last_contact(self) -> ContactRecord:

@@ -157,8 +157,8 @@ FAULTS = (
     Fault(
         LAW_IN_DOUBT,
         "law_in_doubt",
-        "watchdog: a contact is over of which the law says that it was unsure, too short, displaced or noisy "
-        "on more than two fifths of its ticks, or the correction at its limit on more than half",
+        "watchdog: a contact is over of which the law says that it was unsure, too short or noisy "
+        "on more than two fifths of its ticks, or unexplained or saturated on the last of them",
         "flagged; `last_contact` says which",
     ),
     Fault(

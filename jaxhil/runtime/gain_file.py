@@ -24,6 +24,7 @@ SCHEMA = "jaxhil/gains/1"
 LARGEST = 4 * 1024 * 1024
 DEEPEST = 32
 UNSIGNED = ("created", "timings", "sha256")
+RETIRED = ("retrospective_reference", "retrospective_delay_bank")
 NO_OTHERS: Mapping[str, Mapping[str, GainSpecification]] = {}
 
 
@@ -94,6 +95,9 @@ def check_gain_document(
         allowed = f"{' or '.join(map(str, axes))}: gains of six axes are simulated only so far"
         raise refusal(source, "axes", shown(number), allowed)
     name = _entry(document, "compensator", source, "")
+    if name in RETIRED:
+        message = f"compensator: found {shown(name)}, expected 'impulse_ledger', which replaces it"
+        raise GainFileError(printable(f"{source}: {message}"))
     known = {**others, **{law: compensator.gains for law, compensator in COMPENSATORS.items()}}
     if not isinstance(name, str) or name not in known:
         raise refusal(source, "compensator", shown(name), f"one of {', '.join(known)}")

@@ -49,12 +49,6 @@ class Compensator(Protocol):
         """Estimated delay [s] of the force measurement; 0 if the law estimates none."""
         return 0.0
 
-    @property
-    def contact_plane(self) -> float:
-        """By how much [m] the surface met last is deeper than told; 0 before the first, and if the law finds
-        none."""
-        return 0.0
-
     def step(
         self,
         force_measured: float,

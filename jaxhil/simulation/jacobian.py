@@ -34,7 +34,7 @@ from jaxhil.simulation.scenario import Scenario, build_scenarios
 
 GAINS = "gains."
 # Counted in ticks, found between two of them, or no number: without a derivative.
-WITHOUT = ("duration", "duration_ratio", "contact_plane", "status")
+WITHOUT = ("duration", "duration_ratio", "status")
 FIGURES = tuple(name for name in ContactResult._fields if name not in WITHOUT)
 _ROUNDING = ("rig.force_sensor.quantum", "rig.position_sensor.quantum")
 # At 0 the part of the rig that the key describes is not there: what follows has a corner.

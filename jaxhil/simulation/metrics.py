@@ -58,8 +58,6 @@ class Metrics(NamedTuple):
     trajectory_error: Float[Array, "slots *batch"]
     # of the force measurement as the compensator estimates it by then [s]; 0 unless it does
     force_delay: Float[Array, "slots *batch"]
-    # by how much the surface is deeper than told, as the compensator found it [m]; 0 unless it does
-    contact_plane: Float[Array, "slots *batch"]
     status: Int[Array, "slots *batch"]  # one of `STATUS_NAMES`
     ticks: Int[Array, "slots *batch"]  # run by then, and skipped on approaches
 
@@ -80,7 +78,6 @@ def empty_metrics(loop: Loop, slots: int, like: Array) -> Metrics:
         work_out=numbers,
         trajectory_error=numbers if loop.probed else jnp.zeros_like(numbers),
         force_delay=numbers if loop.compensator.estimates_delay else jnp.zeros_like(numbers),
-        contact_plane=numbers if loop.compensator.finds_plane else jnp.zeros_like(numbers),
         status=counts + NOT_REACHED,
         ticks=counts,
     )
@@ -114,10 +111,9 @@ def collect(
     status: Array,
     ticks: Array,
     force_delay: Array | None = None,
-    contact_plane: Array | None = None,
 ) -> Metrics:
     """Enter the contacts that are `over`, and were reached, at their `index`; `ticks` have run by now, and
-    the law estimates a `force_delay` [s] and finds the `contact_plane` [m], or does not."""
+    the law estimates a `force_delay` [s], or does not."""
     period = scenario.control_period
     none = jnp.zeros_like(period)
     work_in, work_out = watch.works or (none, none)
@@ -128,7 +124,6 @@ def collect(
         "position_shortfall": watch.shortfall,
         "trajectory_error": None if watch.deviation is None else root_mean_square(watch.deviation),
         "force_delay": force_delay,
-        "contact_plane": contact_plane,
     }
     values = Metrics(
         restitution=watch.rebound / jnp.where(watch.approach > 0, watch.approach, jnp.nan),

@@ -149,8 +149,7 @@ def turn_over(
     ticks = run.tick - loop.first_tick + run.skipped
     law = loop.compensator
     delay = law.force_delay(gains, state.controller) if law.estimates_delay else None
-    plane = law.contact_plane(state.controller) if law.finds_plane else None
-    metrics = collect(scenario, run.metrics, watch, run.index, over, status, ticks, delay, plane)
+    metrics = collect(scenario, run.metrics, watch, run.index, over, status, ticks, delay)
     index = run.index + over.astype(jnp.int32)
     ends = (status != OK) | (index >= scenario.contacts)
     if loop.has_limits and not loop.is_two_sided:

@@ -43,8 +43,6 @@ class ContactResult(NamedTuple):
     duration_ratio: float  # duration over the ideal contact's [1]
     approach_velocity: float  # of the numerical model, on the tick before the contact [m/s]
     force_delay: float | None  # of the measurement, as the compensator estimates it [s]; None if it does not
-    # by how much the surface is deeper than told, as the compensator finds it [m]; None if it does not
-    contact_plane: float | None
     # "ok", or why it has no restitution: "timeout" (not over within 10 s), "diverged", "non-finite", "not
     # reached" (the run ended before it, or no force of it was measured)
     status: str
@@ -255,6 +253,5 @@ def _contact(outcome: Outcome, slot: int, law: Compensator) -> ContactResult:
         duration_ratio=value(outcome.duration_ratio, ended),
         approach_velocity=value(metrics.approach_velocity, reached),
         force_delay=value(metrics.force_delay, reached) if law.estimates_delay else None,
-        contact_plane=value(metrics.contact_plane, reached) if law.finds_plane else None,
         status=STATUS_NAMES[status],
     )

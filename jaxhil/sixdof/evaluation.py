@@ -94,7 +94,6 @@ def outcome_of(found: Metrics, scenario: Scenario) -> Outcome:
         work_out=zero,
         trajectory_error=zero,
         force_delay=zero,
-        contact_plane=zero,
         status=status,
         ticks=0 * status,
     )

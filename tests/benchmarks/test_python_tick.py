@@ -18,9 +18,9 @@ from jaxhil.runtime.limits import LIMITS
 pytestmark = pytest.mark.benchmark
 TICKS = 200_000
 BAR = 10.0  # us
-# They integrate a whole contact over again.
-BARS = {"retrospective_reference": 300.0, "retrospective_delay_bank": 600.0}
-TAILS = {"retrospective_reference": 500.0, "retrospective_delay_bank": 2000.0}  # on 999 of 1000 in contact
+# The impulse ledger updates 17 parameters and their covariance on every tick in contact.
+BARS = {"impulse_ledger": 250.0}
+TAILS = {"impulse_ledger": 500.0}  # on 999 of 1000 in contact
 
 
 @pytest.mark.parametrize("guarded", [False, True], ids=["bare", "guarded"])

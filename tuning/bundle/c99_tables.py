@@ -102,7 +102,7 @@ def faults_table() -> Table:
 def statuses_table() -> Table:
     """The statuses of a law, and their names."""
     named = [(f"JAXHIL_{status.name.upper()}", status) for status in STATUSES]
-    lines = [f"{_comment(status.meaning, '    ')}    {name}" for name, status in named]
+    lines = [f"{_comment(status.meaning, '    ')}    {name} = {status.number}" for name, status in named]
     joined = ",\n".join(lines)
     cases = "".join(f'    case {name}:\n        return "{status.name}";\n' for name, status in named)
     return Table(

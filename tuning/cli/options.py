@@ -1,80 +1,33 @@
 """The options of each command of `jaxhil`, as tyro reads them."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
-from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from tuning.front_door.compare import CompareOptions
+from tuning.front_door.options import (
+    CompensatorName,
+    Files,
+    GainSource,
+    Json,
+    Limit,
+    OptionalFile,
+    Overrides,
+    Resume,
+    Setting,
+    Timings,
+    Unset,
+    folder,
+    number,
+    text,
+)
+from tuning.front_door.sweep_options import SweepOptions
+from tuning.front_door.tune_options import TuneOptions
 
 PICTURES = (".png", ".pdf", ".svg")
 DEFAULT_PLOT = "jaxhil-out/simulate.png"
 DEFAULT_REPLAY_PLOT = "jaxhil-out/replay.png"
-DEFAULT_DRIVERS = 1024
-
-
-def number(meaning: str):
-    return arg(metavar="NUMBER", help=meaning)
-
-
-def folder(meaning: str):
-    return arg(aliases=("-o",), metavar="DIR", help=meaning)
-
-
-def text(metavar: str | None, meaning: str, **more: Any):
-    """An option whose help says itself what holds by default."""
-    return arg(metavar=metavar, help=meaning, help_behavior_hint="", **more)
-
-
-OptionalFile = Annotated[
-    Positional[str | None],
-    text("[FILE]", "Mechanism file, or the name of a built-in one; by default 'varying'."),
-]
-Files = Annotated[
-    Positional[tuple[str, ...]],
-    text("[FILE ...]", "Mechanism files, or names of built-in ones; by default 'varying'."),
-]
-Overrides = Annotated[
-    UseAppendAction[tuple[str, ...]],
-    text(
-        "PATH=VALUE",
-        "Any key of the mechanism file by its dotted path, as approach.velocity=0.01; repeatable.",
-        name="set",
-    ),
-]
-Unset = Annotated[
-    UseAppendAction[tuple[str, ...]],
-    text(
-        "PATH",
-        "A key to take out of the mechanism file, and what [uncertainty] says of it, after all --set; "
-        "repeatable.",
-        name="unset",
-    ),
-]
-Limit = Annotated[float, arg(metavar="NUMBER", help="Restitution error beyond which the verdict is bad.")]
-Json = Annotated[
-    FlagCreatePairsOff[bool], text(None, "One JSON document on standard output, nothing else there.")
-]
-Timings = Annotated[FlagCreatePairsOff[bool], text(None, "Say on standard error where the time went.")]
-Scheduler = Annotated[
-    str | None,
-    arg(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster whose workers do the computing."),
-]
-Resume = Annotated[
-    bool,
-    arg(name="resume", metavar="", help="Go on after an interruption: what is finished is not done again."),
-]
-CompensatorName = Annotated[
-    str | None, arg(metavar="NAME", help="Compensator, at the literature's gains; 'none' by default.")
-]
-GainSource = Annotated[
-    str | None,
-    arg(metavar="GAINS", help="Gain file: its compensator and gains and, without FILE, its mechanism."),
-]
-Setting = Annotated[
-    str | None,
-    text(
-        "NAME", "Take the compensator's gains for any mechanism: gentle or sharp, of retrospective_reference."
-    ),
-]
 
 
 @dataclass(frozen=True)
@@ -138,8 +91,8 @@ class Simulate:
     timings: Timings = False
 
 
-@dataclass(frozen=True)
-class Tune:
+@dataclass(frozen=True, kw_only=True)
+class Tune(TuneOptions):
     """Tune a compensator's gains for every mechanism; judge them on scenarios that tuning never saw.
 
     Example: jaxhil tune rig-300kg varying --output study --starts 16
@@ -151,92 +104,16 @@ class Tune:
     """
 
     files: Files = ()
-    compensator: Annotated[str, arg(metavar="NAME", help="Compensator to tune.")] = "response_error"
-    setting: Setting = None
     output: Annotated[str, folder("Folder for what is written.")] = "jaxhil-out"
-    scenarios: Annotated[
-        int | None, text("NUMBER", "Scenarios to tune on; by default 32, or 128 where sensors are noisy.")
-    ] = None
-    starts: Annotated[int, number("Starts of the solver, and of each further lot where they disagree.")] = 4
-    start: Annotated[
-        tuple[str, ...],
-        text(
-            "GAINS [GAINS ...]",
-            "Gain files of the same compensator: each mechanism is tuned from the gains of the nearest "
-            "of their mechanisms too.",
-        ),
-    ] = ()
-    steps: Annotated[int, number("Most solver steps from each start.")] = 25
-    validation: Annotated[int, number("Fresh scenarios to judge on.")] = 511
-    objective: Annotated[
-        str,
-        arg(metavar="NAME", help="Of the errors e - e*: rms, cvar (mean of the worst 5 percent) or worst."),
-    ] = "rms"
-    divergence_weight: Annotated[
-        float, number("How much more a squared divergence (e > e*) counts than a squared convergence.")
-    ] = 1.0
-    command_weight: Annotated[
-        float | None,
-        text(
-            "NUMBER",
-            "How many times the limit a command is worth that peaks one ideal peak too high; by default 0.3 "
-            "for retrospective_reference, 0 for others.",
-        ),
-    ] = None
-    noise_weight: Annotated[
-        float | None,
-        text(
-            "NUMBER",
-            "How many times the limit it is worth to amplify sensor noise once more. Where sensors are noisy "
-            "and no weight is given: the quietest gains within the limit; 0: the least error.",
-        ),
-    ] = None
-    chatter_weight: Annotated[
-        float | None,
-        text(
-            "NUMBER",
-            "How many times the limit a command is worth that swings once too often by the ideal peak force.",
-        ),
-    ] = None
-    transparency_weight: Annotated[
-        float | None,
-        text(
-            "NUMBER",
-            "How much errors of the same scenarios count with a push on the hardware, and damped; by "
-            "default 1 for retrospective_reference, 0 for others.",
-            aliases=("--honesty-weight",),
-        ),
-    ] = None
-    pareto: Annotated[int, number("Points of a trade-off of restitution error, each a gain file.")] = 0
-    pareto_against: Annotated[
-        str | None,
-        text(
-            "NAME",
-            "What --pareto trades the error against: noise, peak (of the command) or honesty; by "
-            "default noise, or peak for retrospective_reference.",
-        ),
-    ] = None
-    global_search: Annotated[
-        bool,
-        arg(
-            name="global-search",
-            aliases=("--certify",),
-            metavar="",
-            help="Also search all gains' whole ranges, with 50 times the evaluations: is there better?",
-        ),
-    ] = False
-    seed: Annotated[int, number("Seed of scenarios and starts.")] = 0
     overrides: Overrides = ()
     unset: Unset = ()
-    limit: Limit = 0.01
     resume: Resume = False
-    scheduler: Scheduler = None
     json: Json = False
     timings: Timings = False
 
 
-@dataclass(frozen=True)
-class Sweep:
+@dataclass(frozen=True, kw_only=True)
+class Sweep(SweepOptions):
     """Monte Carlo robustness: how probable is a failure, how close do the worst scenarios come to one?
 
     Example: jaxhil sweep jaxhil-out/varying/gains.json --scenarios 1000000 --output study/sweep
@@ -245,40 +122,6 @@ class Sweep:
     """
 
     gains: Annotated[Positional[str], arg(metavar="GAINS", help="Gain file, or its folder.")]
-    scenarios: Annotated[int, number("Scenarios to draw and run.")] = 100_000
-    seed: Annotated[int, number("Seed; scenario i depends on it and on i alone.")] = 0
-    sampling: Annotated[
-        str, arg(metavar="NAME", help="random, or sobol (scrambled, several replicates).")
-    ] = "random"
-    precision: Annotated[
-        str, arg(metavar="NAME", help="float64, or float32: faster, and compared with float64 on a subset.")
-    ] = "float64"
-    works: Annotated[
-        bool,
-        arg(name="works", metavar="", help="Also the real force's works, to 1e-6; tens of times the time."),
-    ] = False
-    limit: Limit = 0.01
-    until_width: Annotated[
-        float | None,
-        text("WIDTH", "Stop once the probability's interval is so narrow; --scenarios is then the most."),
-    ] = None
-    drivers: Annotated[
-        int | None,
-        text(
-            "[NUMBER]", f"Also Sobol indices: what drives the error. A power of two; bare: {DEFAULT_DRIVERS}."
-        ),
-    ] = None
-    rare: Annotated[
-        float | None,
-        text("[LIMIT]", "Also subset simulation of an error beyond this, however rare; bare, or 0: --limit."),
-    ] = None
-    acceptable: Annotated[
-        float | None,
-        text(
-            "PROBABILITY",
-            "Failure probability that the interval's upper end may reach; by default no run may fail.",
-        ),
-    ] = None
     output: Annotated[
         str | None,
         text(
@@ -287,9 +130,6 @@ class Sweep:
             aliases=("-o",),
         ),
     ] = None
-    resume: Resume = False
-    chunk: Annotated[int, number("Scenarios computed at a time, and rows of each part.")] = 16384
-    scheduler: Scheduler = None
     json: Json = False
     timings: Timings = False
 
@@ -313,8 +153,8 @@ class Replay:
     timings: Timings = False
 
 
-@dataclass(frozen=True)
-class Compare:
+@dataclass(frozen=True, kw_only=True)
+class Compare(CompareOptions):
     """Compensators, each tuned to its best, on the same fresh scenarios, with intervals.
 
     Those with settings for any mechanism are judged with these, untuned.
@@ -328,23 +168,10 @@ class Compare:
     suites: Annotated[
         FlagCreatePairsOff[bool], text(None, "The standard suites, besides what files are given.")
     ] = False
-    compensators: Annotated[
-        tuple[str, ...],
-        text("NAME [NAME ...]", "Compensators to compare; by default all that are published and our own."),
-    ] = ()
     output: Annotated[str, folder("Folder for what is written.")] = "jaxhil-out/compare"
-    untuned: Annotated[
-        FlagCreatePairsOff[bool],
-        text(None, "Tune nothing: judge the literature's gains, and a compensator's settings, as they are."),
-    ] = False
-    scenarios: Annotated[int, number("Scenarios to tune on.")] = 32
-    judged: Annotated[int, number("Fresh scenarios to judge on.")] = 256
     overrides: Overrides = ()
     unset: Unset = ()
-    limit: Annotated[float, arg(metavar="NUMBER", help="Restitution error that counts as a failure.")] = 0.01
     resume: Resume = False
-    scheduler: Scheduler = None
-    seed: Annotated[int, number("Seed of scenarios, starts and resampling.")] = 0
     json: Json = False
     timings: Timings = False
 

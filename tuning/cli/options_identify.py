@@ -5,7 +5,7 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
-from tuning.cli.options import Json, Timings, folder, number, text
+from tuning.front_door.options import Json, Timings, folder, number, text
 
 
 @dataclass(frozen=True)

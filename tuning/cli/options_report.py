@@ -3,29 +3,27 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
-from tuning.cli.options import (
+from tuning.front_door.map import MapOptions
+from tuning.front_door.options import (
     CompensatorName,
     GainSource,
     Json,
     OptionalFile,
     Overrides,
-    Resume,
-    Scheduler,
     Setting,
     Timings,
     Unset,
     folder,
-    number,
     text,
 )
 
 AXIS = "PATH[=LOW:HIGH]"
 
 
-@dataclass(frozen=True)
-class Map:
+@dataclass(frozen=True, kw_only=True)
+class Map(MapOptions):
     """Stability map: the restitution error over two keys, its contours, and what theory says there.
 
     Example: jaxhil map rig-300kg --x contact.stiffness=5e4:5e5 --y rig.force_sensor.delay
@@ -48,12 +46,7 @@ class Map:
     gains: GainSource = None
     overrides: Overrides = ()
     unset: Unset = ()
-    points: Annotated[int, number("Points along either axis.")] = 100
     output: Annotated[str, folder("Folder for what is written.")] = "jaxhil-out/map"
-    limit: Annotated[float, arg(metavar="NUMBER", help="Restitution error to which margins are told.")] = 0.01
-    resume: Resume = False
-    scheduler: Scheduler = None
-    seed: Annotated[int, number("Seed of the sensor noise, the same at every point.")] = 0
     json: Json = False
     timings: Timings = False
 

@@ -5,13 +5,15 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
-from tuning.cli.options import Json, Limit, Timings, folder, number, text
+from tuning.front_door.export import ExportOptions
+from tuning.front_door.options import Json, Limit, Timings, folder, number, text
+from tuning.front_door.verify import VerifyOptions
 
 DEFAULT_RIG_PLOT = "jaxhil-out/rig.png"
 
 
-@dataclass(frozen=True)
-class Export:
+@dataclass(frozen=True, kw_only=True)
+class Export(ExportOptions):
     """A bundle for the rig: gains, controller, test vectors, self-test; nothing to install there.
 
     Example: jaxhil export jaxhil-out/varying/gains.json -o bundle --sweep jaxhil-out/varying/gains-sweep
@@ -42,27 +44,12 @@ class Export:
             name="set",
         ),
     ] = ()
-    false_alarms: Annotated[
-        float,
-        arg(
-            metavar="PROBABILITY", help="Acceptable share of good runs (error up to half the limit) stopped."
-        ),
-    ] = 0.01
-    missed: Annotated[
-        float,
-        arg(metavar="PROBABILITY", help="Acceptable share of runs to be stopped that the watchdog misses."),
-    ] = 0.02
-    seed: Annotated[int, number("Seed of the test vectors.")] = 0
-    sign: Annotated[
-        str | None,
-        text("KEY", "Sign the bundle with this private key (Ed25519, PEM); needs jaxhil[sign]."),
-    ] = None
     json: Json = False
     timings: Timings = False
 
 
-@dataclass(frozen=True)
-class Verify:
+@dataclass(frozen=True, kw_only=True)
+class Verify(VerifyOptions):
     """Replay recorded signals through the rig's runtime; the exit code is the verdict.
 
     Example: jaxhil verify jaxhil-out/varying/gains.json
@@ -74,12 +61,6 @@ class Verify:
     path: Annotated[
         Positional[str], arg(metavar="BUNDLE_OR_GAINS", help="Bundle, or gain file, or its folder.")
     ]
-    key: Annotated[
-        str | None,
-        text("KEY", "The bundle must be signed by this public key (Ed25519, PEM); needs jaxhil[sign]."),
-    ] = None
-    scenarios: Annotated[int, number("Runs to replay: the nominal one, then draws.")] = 6
-    seed: Annotated[int, number("Seed of the draws.")] = 0
     json: Json = False
     timings: Timings = False
 

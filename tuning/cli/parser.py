@@ -13,7 +13,6 @@ import tyro
 from tyro.conf import subcommand
 
 from tuning.cli.options import (
-    DEFAULT_DRIVERS,
     DEFAULT_PLOT,
     DEFAULT_REPLAY_PLOT,
     PICTURES,
@@ -29,6 +28,7 @@ from tuning.cli.options_identify import Identify, Monitor
 from tuning.cli.options_report import Map, Report
 from tuning.cli.options_rig import DEFAULT_RIG_PLOT, Export, RigOptions, Verify
 from tuning.cli.timings import measured
+from tuning.front_door.sweep_options import DEFAULT_DRIVERS
 
 DESCRIPTION = """Gains that keep hardware-in-the-loop docking tests from diverging.
 

@@ -3,7 +3,9 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import FlagCreatePairsOff, arg
 
 from jaxhil.errors import InputError, shown
 from jaxhil.mechanism.file import LoadedMechanism
@@ -11,13 +13,14 @@ from jaxhil.runtime.laws import PUBLISHED
 from jaxhil.simulation.environment import computing
 from tuning import terminal
 from tuning.front_door import arguments, meaning
+from tuning.front_door.options import Allowed, AnyLimit, Scheduler, Seed, check_options, number, takes, text
 
 if TYPE_CHECKING:
     from tuning.benchmark.study import LawFigures
     from tuning.caches.pieces import Pieces
 
 
-OURS = "retrospective_reference"
+OURS = "impulse_ledger"
 
 
 class Estimated(float):
@@ -54,46 +57,45 @@ class Board:
     winners: dict[str, str | None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CompareOptions:
-    """What `compare` is to do; `compare` says what each means."""
+    """What `compare` can be told."""
 
-    compensators: Sequence[str] = ()
-    untuned: bool = False
-    scenarios: int = 32
-    judged: int = 256
-    limit: float = 0.01
-    seed: int = 0
-    scheduler: str | None = None
+    compensators: Annotated[
+        tuple[str, ...],
+        text("NAME [NAME ...]", "Compensators to compare; by default all that are published and our own."),
+    ] = ()
+    untuned: Annotated[
+        FlagCreatePairsOff[bool],
+        text(None, "Tune nothing: judge the literature's gains, and a compensator's settings, as they are."),
+    ] = False
+    scenarios: Annotated[int, number("Scenarios to tune on."), Allowed(1)] = 32
+    judged: Annotated[int, number("Fresh scenarios to judge on."), Allowed(2)] = 256
+    limit: Annotated[
+        float, arg(metavar="NUMBER", help="Restitution error that counts as a failure."), AnyLimit
+    ] = 0.01
+    seed: Annotated[int, number("Seed of scenarios, starts and resampling."), Seed] = 0
+    scheduler: Scheduler = None
 
     def check(self) -> None:
-        """Raises `InputError` for what will not do."""
-        arguments.limit(self.limit)
-        arguments.integers(1, scenarios=self.scenarios)
-        arguments.integers(2, judged=self.judged)
-        arguments.integers(0, seed=self.seed)
-        arguments.flags(untuned=self.untuned)
+        """Check all options. Raises `InputError`."""
+        check_options(self)
         arguments.compensators(self.laws, "compensators")
 
     @property
     def laws(self) -> tuple[str, ...]:
         """The compensators to compare, each once; if none is named, all that are published and our own."""
-        named = [self.compensators] if isinstance(self.compensators, str) else self.compensators
-        return tuple(dict.fromkeys(named or (*PUBLISHED, OURS)))
+        return tuple(dict.fromkeys(self.compensators or (*PUBLISHED, OURS)))
 
 
 @arguments.entry
+@takes(CompareOptions)
 def compare(
     mechanism: Any,
-    compensators: Sequence[str] = (),
+    compensators: Sequence[str] = CompareOptions.compensators,
     *,
-    untuned: bool = False,
-    scenarios: int = 32,
-    judged: int = 256,
-    limit: float = 0.01,
-    seed: int = 0,
-    scheduler: str | None = None,
     progress: bool = False,
+    **options: Any,
 ) -> Any:
     """Compensators for a mechanism, each tuned to its best, on the same fresh scenarios, with intervals.
 
@@ -102,15 +104,10 @@ def compare(
 
     Args:
         mechanism: what `jaxhil.load` returns, or a name or path for it; or a list of those.
-        compensators: names of laws, built in or registered; by default all that are published and
-            `retrospective_reference`. Laws with settings are judged with these, the others tuned.
-        untuned: tune nothing: judge the literature's gains, and a law's settings, as they are.
-        scenarios: how many to tune on.
-        judged: how many fresh scenarios to judge on.
-        limit: the restitution error [1] that counts as a failure.
-        seed: of scenarios, starts and resampling.
-        scheduler: address of a dask.distributed cluster's scheduler, whose workers then compute the figures.
+        compensators: names of laws, built in or registered; by default all that are published and our own.
+            Laws with settings are judged with these, the others tuned.
         progress: say on standard error what is going on.
+    OPTIONS
 
     Returns:
         A `Board`; a list of them for a list of mechanisms.
@@ -119,15 +116,15 @@ def compare(
         InputError: one line, for an argument that will not do.
     """
     loaded, several = arguments.mechanisms(mechanism)
-    options = CompareOptions(tuple(_names(compensators)), untuned, scenarios, judged, limit, seed, scheduler)
-    options.check()
+    asked = CompareOptions(compensators=tuple(_names(compensators)), **options)
+    asked.check()
     arguments.flags(progress=progress)
     check_names(loaded)
     found: dict[str, dict[str, LawFigures]] = {one.mechanism.name: {} for one in loaded}
-    with computing(), terminal.progress(len(loaded) * len(options.laws), "results", progress) as bar:
-        for one in compare_each(loaded, options, 0, bar):
+    with computing(), terminal.progress(len(loaded) * len(asked.laws), "results", progress) as bar:
+        for one in compare_each(loaded, asked, 0, bar):
             found[one.mechanism][one.law] = one
-        boards = [board(one, options, found[one.mechanism.name]) for one in loaded]
+        boards = [board(one, asked, found[one.mechanism.name]) for one in loaded]
     return boards if several else boards[0]
 
 

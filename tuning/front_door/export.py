@@ -4,9 +4,10 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from msgspec import to_builtins
+from tyro.conf import arg
 
 from jaxhil.errors import shown
 from jaxhil.runtime.limits import LIMITS
@@ -15,6 +16,7 @@ from tuning import terminal
 from tuning.bundle.selftest import SIGNATURE
 from tuning.front_door import arguments
 from tuning.front_door.arguments import ArgumentError
+from tuning.front_door.options import Allowed, Seed, check_options, number, takes, text
 
 if TYPE_CHECKING:
     from tuning.sweeps.store import Store
@@ -53,7 +55,34 @@ class Exported:
         return list(self.document["unknown"])
 
 
+Probability = Allowed(0.0, 1.0, words="0 to 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """What `export` can be told."""
+
+    false_alarms: Annotated[
+        float,
+        arg(
+            metavar="PROBABILITY", help="Acceptable share of good runs (error up to half the limit) stopped."
+        ),
+        Probability,
+    ] = 0.01
+    missed: Annotated[
+        float,
+        arg(metavar="PROBABILITY", help="Acceptable share of runs to be stopped that the watchdog misses."),
+        Probability,
+    ] = 0.02
+    seed: Annotated[int, number("Seed of the test vectors."), Seed] = 0
+    sign: Annotated[
+        str | None,
+        text("KEY", "Sign the bundle with this private key (Ed25519, PEM); needs jaxhil[sign]."),
+    ] = None
+
+
 @arguments.entry
+@takes(ExportOptions)
 def export(
     gains: Any,
     folder: str | os.PathLike[str],
@@ -61,11 +90,8 @@ def export(
     sweep: Any = None,
     formats: Sequence[str] | None = None,
     limits: Mapping[str, float | None] | None = None,
-    false_alarms: float = 0.01,
-    missed: float = 0.02,
-    seed: int = 0,
-    sign: str | os.PathLike[str] | None = None,
     progress: bool = False,
+    **options: Any,
 ) -> Exported:
     """Write a bundle for the rig: gains, controller, test vectors, self-test; nothing to install there.
 
@@ -76,19 +102,16 @@ def export(
             rates come from it.
         formats: also the gains for "ros2", "matlab", "csv", "c99"; None: all that there are for the law.
         limits: limits of the rig's own by name [SI units], None for no limit, instead of those worked out.
-        false_alarms: the share of good runs [1] that the controller may stop.
-        missed: the share of runs to be stopped [1] that its watchdog may miss.
-        seed: of the test vectors.
-        sign: file of the private key (Ed25519, PEM) to sign the bundle with; None: it is not signed.
         progress: say on standard error what is going on.
+    OPTIONS
 
     Raises:
         InputError: one line, for an argument that will not do, a law without a runtime, or a folder that
             cannot be written.
     """
-    arguments.integers(0, seed=seed)
+    asked = ExportOptions(**options)
+    check_options(asked)
     arguments.flags(progress=progress)
-    arguments.probabilities(false_alarms=false_alarms, missed=missed)
     from tuning.bundle.bundle import build_bundle, check_mechanism, check_target, write_bundle
     from tuning.bundle.signing import signer
 
@@ -97,15 +120,17 @@ def export(
     path = gains if hasattr(gains, "document") else arguments.readable_gain_file(gains)
     _check_formats(formats)
     check_target(target)
-    key = None if sign is None else signer(arguments.folder("sign", sign))
+    key = None if asked.sign is None else signer(arguments.folder("sign", asked.sign))
     with computing():
         loaded = arguments.gain_file(path)
         arguments.runtime(loaded.compensator)
         check_mechanism(target, loaded.mechanism.name)
         chosen = _formats(formats, loaded.compensator)
-        found = _calibrated(loaded, sweep, replaced, (false_alarms, missed), progress)
+        found = _calibrated(loaded, sweep, replaced, (asked.false_alarms, asked.missed), progress)
         with terminal.stages(2, progress) as stages:
-            bundle = build_bundle(loaded.document, chosen, found.limits, found.rates, seed, stages.begin, key)
+            bundle = build_bundle(
+                loaded.document, chosen, found.limits, found.rates, asked.seed, stages.begin, key
+            )
             if not bundle.reasons:
                 write_bundle(target, bundle.files)
     document = _document(loaded, bundle, chosen, found.rates)

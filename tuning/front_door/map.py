@@ -4,9 +4,10 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from tyro.conf import arg
 
 from jaxhil.errors import InputError
 from jaxhil.files import write_whole, writing
@@ -16,6 +17,16 @@ from jaxhil.runtime import digest
 from jaxhil.simulation.environment import computing
 from tuning import terminal
 from tuning.front_door import arguments, meaning
+from tuning.front_door.options import (
+    Allowed,
+    AnyLimit,
+    Resume,
+    Scheduler,
+    Seed,
+    check_options,
+    number,
+    takes,
+)
 
 if TYPE_CHECKING:
     from tuning.reporting.map_grid import Map
@@ -47,7 +58,21 @@ class StabilityMap:
             save(map_picture(self.found, title, self.document["limit"]), target)
 
 
+@dataclass(frozen=True, kw_only=True)
+class MapOptions:
+    """What `map` can be told."""
+
+    points: Annotated[int, number("Points along either axis."), Allowed(2, MOST_POINTS)] = 100
+    limit: Annotated[
+        float, arg(metavar="NUMBER", help="Restitution error to which margins are told."), AnyLimit
+    ] = 0.01
+    resume: Resume = False
+    scheduler: Scheduler = None
+    seed: Annotated[int, number("Seed of the sensor noise, the same at every point."), Seed] = 0
+
+
 @arguments.entry
+@takes(MapOptions)
 def map(
     mechanism: Mechanism | str | os.PathLike[str],
     x: str,
@@ -55,13 +80,9 @@ def map(
     compensator: str = "none",
     gains: Mapping[str, float] | str | os.PathLike[str] | None = None,
     *,
-    limit: float = 0.01,
-    points: int = 100,
-    seed: int = 0,
     folder: str | os.PathLike[str] | None = None,
-    resume: bool = False,
-    scheduler: str | None = None,
     progress: bool = False,
+    **options: Any,
 ) -> StabilityMap:
     """The restitution error over two keys of a mechanism, with what theory says there.
 
@@ -77,22 +98,17 @@ def map(
         y: the key along y, likewise.
         compensator: a law's name.
         gains: as those of `jaxhil.simulate`.
-        limit: the restitution error [1] to which margins are told.
-        points: along either axis.
-        seed: of the sensors' noise, the same at every point.
         folder: where to write map.json and map.png; None writes nothing.
-        resume: go on with a map into the folder that was interrupted.
-        scheduler: address of a dask.distributed cluster's scheduler, whose workers then run the contacts.
         progress: say on standard error what is going on.
+    OPTIONS
 
     Raises:
         InputError: one line, for an argument that will not do, or a folder that cannot be written.
     """
-    arguments.integers(2, MOST_POINTS, points=points)
-    arguments.integers(0, seed=seed)
-    arguments.limit(limit)
-    arguments.flags(progress=progress, resume=resume)
-    if resume and folder is None:
+    asked = MapOptions(**options)
+    check_options(asked)
+    arguments.flags(progress=progress)
+    if asked.resume and folder is None:
         raise arguments.ArgumentError("resume", "without a folder", "with that of a map")
     checked, target = as_mechanism(mechanism), None if folder is None else arguments.folder("folder", folder)
     with computing():
@@ -111,10 +127,21 @@ def map(
             error.__dict__.setdefault("option", f"--{error}" if str(error)[:1] in "xy" else str(error))
             raise
         meaning.check(checked)
-        with terminal.progress(runs(points), "runs", progress) as bar:
-            kept = Pieces(None if target is None else target / FOLDER, resume)
-            found = compute_map(checked, name, values, axes, points, limit, seed, bar.tell, scheduler, kept)
-        document = _document(checked, name, values, found, limit, seed)
+        with terminal.progress(runs(asked.points), "runs", progress) as bar:
+            kept = Pieces(None if target is None else target / FOLDER, asked.resume)
+            found = compute_map(
+                checked,
+                name,
+                values,
+                axes,
+                asked.points,
+                asked.limit,
+                asked.seed,
+                bar.tell,
+                asked.scheduler,
+                kept,
+            )
+        document = _document(checked, name, values, found, asked.limit, asked.seed)
         made = StabilityMap(document, found.x, found.y, found.error, found.restitution, found)
         if target is not None:
             _write(made, target)
@@ -190,4 +217,4 @@ def _document(
     return {**document, "sha256": digest(document)}
 
 
-__all__ = ["StabilityMap", "map"]
+__all__ = ["MapOptions", "StabilityMap", "map"]

@@ -4,7 +4,6 @@ The rows are the store's (`tuning.sweeps.store`), in a folder that stays, or in 
 sweep is done. Beside them stands one document, which `jaxhil sweep --json` prints.
 """
 
-import math
 import os
 import tempfile
 from collections.abc import Callable, Iterator
@@ -14,14 +13,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jaxhil.errors import InputError, one_line, shown
+from jaxhil.errors import InputError, one_line
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.runtime import digest
 from jaxhil.simulation.environment import computing
 from tuning import terminal
 from tuning.front_door import arguments, meaning, sweep_studies
 from tuning.front_door.arguments import ArgumentError
-from tuning.sweeps import LARGEST_CHUNK, LARGEST_SEED, MOST, PRECISIONS, SAMPLINGS
+from tuning.front_door.options import takes
+from tuning.front_door.sweep_options import SweepOptions
 
 if TYPE_CHECKING:
     import pyarrow
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from tuning.caches.cluster import Workers
     from tuning.sweeps.manifest import Manifest
     from tuning.sweeps.store import Store
-
-MOST_DRIVERS = 2**20  # scenarios for each input
 
 
 class Interval(NamedTuple):
@@ -109,76 +107,14 @@ class SweepStudy:
             yield store
 
 
-@dataclass(frozen=True)
-class SweepOptions:
-    """What `sweep` is to do; `sweep` says what each means."""
-
-    scenarios: int = 100_000
-    seed: int = 0
-    sampling: str = "random"
-    precision: str = "float64"
-    works: bool = False
-    limit: float = 0.01
-    until_width: float | None = None
-    drivers: int | None = None
-    rare: float | None = None
-    acceptable: float | None = None
-    resume: bool = False
-    chunk: int = 16384
-    scheduler: str | None = None
-
-    def check(self) -> None:
-        """Raises `InputError` for what will not do."""
-        arguments.integers(1, MOST, scenarios=self.scenarios)
-        arguments.integers(1, LARGEST_CHUNK, chunk=self.chunk)
-        arguments.integers(0, LARGEST_SEED, seed=self.seed)
-        arguments.one_of(SAMPLINGS, sampling=self.sampling)
-        arguments.one_of(PRECISIONS, precision=self.precision)
-        arguments.flags(works=self.works, resume=self.resume)
-        arguments.limit(self.limit)
-        self._check_studies()
-        if (width := self.until_width) is not None:
-            if not (arguments.is_number(width) and 0 < width <= 1):
-                raise ArgumentError("until_width", _shown(width), "a width above 0, at most 1")
-            if self.sampling != "random":
-                raise ArgumentError("until_width", f"with --sampling {self.sampling}", "with random")
-        if (probability := self.acceptable) is not None:
-            if not (arguments.is_number(probability) and 0 <= probability <= 1):
-                raise ArgumentError("acceptable", _shown(probability), "a probability, 0 to 1")
-
-    def _check_studies(self) -> None:
-        number, rare = self.drivers, self.rare
-        if number is not None:
-            whole = isinstance(number, int) and not isinstance(number, bool)
-            if not (whole and 2 <= number <= MOST_DRIVERS and number & (number - 1) == 0):
-                raise ArgumentError("drivers", _shown(number), f"a power of two, 2 to {MOST_DRIVERS}")
-        if rare is not None:
-            known = arguments.is_number(rare)
-            if not (known and (rare == 0 or (math.isfinite(rare) and rare >= self.limit))):
-                raise ArgumentError("rare", _shown(rare), "a finite error, at least --limit")
-            if rare == 0 and not math.isfinite(self.limit):
-                raise ArgumentError("rare", "without a limit", "with a finite --limit")
-
-
 @arguments.entry
+@takes(SweepOptions)
 def sweep(
     gains: Any,
     *,
-    scenarios: int = 100_000,
-    seed: int = 0,
-    sampling: str = "random",
-    precision: str = "float64",
-    works: bool = False,
-    limit: float = 0.01,
-    until_width: float | None = None,
-    drivers: int | None = None,
-    rare: float | None = None,
-    acceptable: float | None = None,
     folder: str | os.PathLike[str] | None = None,
-    resume: bool = False,
-    chunk: int = 16384,
-    scheduler: str | None = None,
     progress: bool = False,
+    **options: Any,
 ) -> SweepStudy:
     """Monte Carlo robustness of a gain file: scenarios drawn from its mechanism's uncertainty and run.
 
@@ -186,39 +122,23 @@ def sweep(
 
     Args:
         gains: a gain file's path, or its folder's, or what `tuning.tune` returned.
-        scenarios: how many to draw and run; with `until_width` the most.
-        seed: of the draws.
-        sampling: "random", or "sobol" (scrambled, several replicates).
-        precision: "float64", or "float32": faster, and compared with float64 on a subset.
-        works: also the real contact force's works, to 1e-6; tens of times the time.
-        limit: the restitution error [1] beyond which a scenario has failed.
-        until_width: stop once the probability's interval is so narrow.
-        drivers: also Sobol indices, what drives the error, from so many scenarios for each input: a power of
-            two.
-        rare: also subset simulation of an error beyond this [1], however rare; 0: beyond the limit.
-        acceptable: the failure probability that the interval's upper end may reach; None: no run may fail.
         folder: where to keep the rows, with pictures; None keeps nothing.
-        resume: go on with the sweep in the folder.
-        chunk: scenarios computed at a time, and rows of each part of the store.
-        scheduler: address of a dask.distributed cluster's scheduler, which then computes the parts.
         progress: say on standard error how far it is.
+    OPTIONS
 
     Raises:
         InputError: one line, for an argument that will not do, or a folder that cannot be written.
     """
-    given = {**locals()}
-    for name in ("gains", "folder", "progress"):
-        del given[name]
-    options = SweepOptions(**given)
-    options.check()
+    asked = SweepOptions(**options)
+    asked.check()
     arguments.flags(progress=progress)
     if folder is not None:
         target = arguments.folder("folder", folder)
-        return run_study(gains, options, target, progress)
-    if resume:
+        return run_study(gains, asked, target, progress)
+    if asked.resume:
         raise ArgumentError("resume", "without a folder", "with the folder of a sweep")
     with tempfile.TemporaryDirectory(prefix="jaxhil-sweep-") as temporary:
-        return run_study(gains, options, Path(temporary), progress, keep=False)
+        return run_study(gains, asked, Path(temporary), progress, keep=False)
 
 
 def run_study(
@@ -382,7 +302,3 @@ def _table(store: "Store") -> "pyarrow.Table":
     parts = (kept_part(store, part) for part in range(store.manifest.parts))
     tables = [to_table(store.manifest, rows) for rows in parts if rows is not None]
     return pyarrow.concat_tables(tables) if tables else schema(store.manifest).empty_table()
-
-
-def _shown(value: Any) -> str:
-    return str(value) if arguments.is_number(value) else shown(value)

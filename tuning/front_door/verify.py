@@ -7,13 +7,14 @@ gain file is.
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from jaxhil.errors import InputError, shown
 from jaxhil.simulation.environment import computing
 from tuning import terminal
 from tuning.front_door import arguments
 from tuning.front_door.arguments import ArgumentError
+from tuning.front_door.options import Allowed, Seed, check_options, number, takes, text
 
 
 @dataclass(frozen=True)
@@ -33,15 +34,21 @@ class Verification:
         return list(self.document["reasons"])
 
 
+@dataclass(frozen=True, kw_only=True)
+class VerifyOptions:
+    """What `verify` can be told."""
+
+    key: Annotated[
+        str | None,
+        text("KEY", "The bundle must be signed by this public key (Ed25519, PEM); needs jaxhil[sign]."),
+    ] = None
+    scenarios: Annotated[int, number("Runs to replay: the nominal one, then draws."), Allowed(1)] = 6
+    seed: Annotated[int, number("Seed of the draws."), Seed] = 0
+
+
 @arguments.entry
-def verify(
-    path: Any,
-    *,
-    key: str | os.PathLike[str] | None = None,
-    scenarios: int = 6,
-    seed: int = 0,
-    progress: bool = False,
-) -> Verification:
+@takes(VerifyOptions)
+def verify(path: Any, *, progress: bool = False, **options: Any) -> Verification:
     """Replay recorded signals through the rig's runtime.
 
     Of a bundle, its self-test comes first; nothing is run of one that is not, byte for byte, what this
@@ -49,17 +56,16 @@ def verify(
 
     Args:
         path: of a bundle, a gain file, or the folder of one; or what `tuning.tune` returned.
-        key: file of the public key (Ed25519, PEM) that a bundle must be signed by; None: by none.
-        scenarios: runs to replay: the nominal one, then draws.
-        seed: of the draws.
         progress: say on standard error what is going on.
+    OPTIONS
 
     Raises:
         InputError: one line, if there is nothing to read, or the law has no runtime.
     """
-    arguments.integers(1, scenarios=scenarios)
-    arguments.integers(0, seed=seed)
+    asked = VerifyOptions(**options)
+    check_options(asked)
     arguments.flags(progress=progress)
+    key, scenarios, seed = asked.key, asked.scenarios, asked.seed
     from tuning.bundle.manifest import is_bundle
 
     given = hasattr(path, "document")

@@ -206,9 +206,7 @@ def _hides(posterior: Posterior) -> bool:
     return bool(lacking.mean() > SURE * lacking.std())
 
 
-def _noise_from_contact(
-    motion: Motion, readings: Readings, plane: float | None, at_rest: float
-) -> Readings:
+def _noise_from_contact(motion: Motion, readings: Readings, plane: float | None, at_rest: float) -> Readings:
     """The noise is what the laws leave; under a dead zone, of the readings well beyond it.
 
     `at_rest`: noise that reaches beyond the dead zone at rest [N]; 0 where none does."""

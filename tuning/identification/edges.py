@@ -19,6 +19,7 @@ from tuning.identification.uncertain_effect import SURE, Effect
 from tuning.identification.validation import RARE, Line, certain_rows
 
 BEFORE, AFTER = 3, 15  # rows out of contact and in it that are looked at
+FEWEST = 3  # touches, of which a mean tells more than each of them
 
 
 def edges(contact: ContactFit, runs: Sequence[Run], effect: Effect) -> list[Line]:
@@ -30,7 +31,7 @@ def edges(contact: ContactFit, runs: Sequence[Run], effect: Effect) -> list[Line
         effect: What the numbers' uncertainty can change e and e - e* by.
 
     Returns:
-        One line; none where no number is uncertain or no touch has both edges.
+        One line; none where no number is uncertain or fewer than `FEWEST` touches have both edges.
     """
     means = mean_residuals(contact, runs)
     if not effect.parts or not len(means):
@@ -59,12 +60,14 @@ def mean_residuals(contact: ContactFit, runs: Sequence[Run]) -> np.ndarray:
     # Rows before a contact that went on at the begin of its run, or ends with it, are not there.
     ends = len(inside) - np.argmax(inside[::-1], axis=0) - 1
     whole = (begins > BEFORE) & (ends < len(inside) - BEFORE - 1) & inside.any(axis=0) & (speed > 0.0)
-    means = []
+    means: list[float] = []
+    if whole.sum() < FEWEST:
+        return np.array(means)
     for edge, outward in ((begins, -1), (ends, 1)):
         for place in range(-AFTER, BEFORE + 1):
             row = np.clip(edge + outward * place, 0, len(inside) - 1)
             lanes = np.flatnonzero(whole & counts[row, np.arange(len(row))] & (row > 0))
             if len(lanes):
                 weight = speed[lanes]
-                means.append(weight @ left[row[lanes], lanes] / np.linalg.norm(weight))
+                means.append(float(weight @ left[row[lanes], lanes] / np.linalg.norm(weight)))
     return np.array(means)

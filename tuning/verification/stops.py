@@ -37,7 +37,7 @@ LIMITS_OF: Mapping[int, tuple[str, ...]] = {
 }
 WIDER = 1.25  # times what a run needs: the limit that is proposed for it
 MOST_LIMITS = 24  # changes of limits, tried one after the other until a run passes
-STATUS_NUMBERS = {status.name: number for number, status in enumerate(STATUSES)}
+STATUS_NUMBERS = {status.name: status.number for status in STATUSES}
 
 
 class Stop(msgspec.Struct, frozen=True, kw_only=True):

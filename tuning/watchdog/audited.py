@@ -24,7 +24,7 @@ class Rules(NamedTuple):
     alignment: float  # delay of the force reading against the position reading [s]
     settling: float  # time that force and command need to die out [s]
     fading: float  # force reading that counts as none [N]
-    finds_plane: bool = False  # whether the law looks for the surface, and commands nothing before
+    has_status: bool = False  # whether the law says when it acts, and commands nothing out of contact
 
 
 class Audited(NamedTuple):
@@ -129,7 +129,7 @@ def audit_contacts(signals: Signals, rules: Rules, slots: int) -> Audited:
             deflection = _deflection(alignment.step(measured, velocity, begins), clearance)
             aligned_before = np.where(begins, 0.0, aligned_before)
             in_contact = (_deflection(position, clearance) != 0) | (_deflection(measured, clearance) != 0)
-            in_contact |= rules.finds_plane & (given != 0)
+            in_contact |= rules.has_status & (given != 0)
             side = np.where(position > middle, 1.0, -1.0)
             fresh = live & ~state.open & in_contact
             if np.any(fresh):

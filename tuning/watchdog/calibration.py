@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from jaxhil.compensators import COMPENSATORS
 from jaxhil.errors import InputError
 from jaxhil.mechanism.uncertainty import extremes
+from jaxhil.runtime.law_status import UNSTATED
 from jaxhil.runtime.limits import LIMITS
+from jaxhil.runtime.registry import COMPENSATORS
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.scenario import build_scenarios
@@ -131,7 +132,7 @@ def watchdog_rules(loaded: LoadedGains) -> tuple[Rules, float]:
         alignment=max(0.0, force.delay + force.time_constant - position.delay),
         settling=MARGIN * wait,
         fading=noise,
-        finds_plane=COMPENSATORS[loaded.compensator].finds_plane,
+        has_status=_has_status(loaded),
     )
     error = 6 * drawn["position_noise"] + drawn["position_quantum"] + max(0.0, drawn["nearer"])
     free_distance = error + drawn["velocity"] * (RETREAT + drawn["position_delay"])
@@ -231,6 +232,16 @@ def _largest(loaded: LoadedGains) -> dict[str, float]:
         "nearer": -scenarios.contact_plane,
     }
     return {name: float(np.max(values)) for name, values in largest.items()}
+
+
+def _has_status(loaded: LoadedGains) -> bool:
+    """Return whether the law has a status on the rig, which opens a contact wherever the surface lies."""
+    law = COMPENSATORS.get(loaded.compensator)
+    if law is None:
+        return False
+    mechanism = loaded.mechanism
+    made = law(loaded.gains, mechanism.rig.control_period, mechanism.contact.clearance)
+    return made.status != UNSTATED
 
 
 def _chosen(loaded: LoadedGains, store: Store | None, scenarios: int | None) -> Scenarios:

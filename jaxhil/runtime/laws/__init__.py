@@ -17,6 +17,5 @@ PUBLISHED = (
     "passivity",
     "response_error",
 )
-LAWS = (*PUBLISHED, "retrospective_reference", "retrospective_delay_bank", "impulse_ledger")
-NEED_NUMPY = ("retrospective_delay_bank",)  # on the rig, in Python
+LAWS = (*PUBLISHED, "impulse_ledger")
 WITHOUT_C = ("impulse_ledger",)  # has no C sources yet

@@ -9,20 +9,26 @@ and the equivalent mass M: depth x/v0 [s], speed v/v0 [1], force F/(M v0) [1/s].
 sum of the hinges above it, so that slopes which change by independent amounts from knot to knot have a
 diagonal prior covariance. The parameters theta are estimated by recursive least squares.
 
+A force that is older than specified by d adds d k(x) (1 - v) to the readings, k being the slope; d is the
+last parameter. A damper looks like a force that is newer, so that d counts only once contact is over
+(`estimate_delay`). Then the posterior is a mixture of two models: without dissipation, which energy decides
+on, and with it. Where the model errs, by the squared innovations, the readings tell less.
+
 Sources: recursive least squares, Ljung, "System Identification" (1999), section 11.2; a parameter that is
 zero with a given probability, Mitchell and Beauchamp, "Bayesian variable selection in linear regression"
-(1988).
+(1988); moments of a factor that is not normal, Minka, "Expectation propagation" (2001); the probability of a
+model by the density at zero, Dickey, "The weighted likelihood ratio" (1971).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from math import exp, pi, sqrt
+from math import exp, log, pi, sqrt
 
 # Depths [s] at which the slope may change.
 KNOTS = (0.0, 0.003, 0.008, 0.015, 0.024, 0.034, 0.046, 0.06, 0.076, 0.1, 0.14, 0.2)
 HINGES = len(KNOTS)
-PARAMETERS = HINGES + 5
-DAMPING, DEPTH_DAMPING, UNLOADING, FRICTION, PRELOAD = range(HINGES, PARAMETERS)
+PARAMETERS = HINGES + 6
+DAMPING, DEPTH_DAMPING, UNLOADING, FRICTION, PRELOAD, DELAY = range(HINGES, PARAMETERS)
 DISSIPATIVE = (DAMPING, DEPTH_DAMPING, UNLOADING)  # each zero or positive
 WANDER = 0.03  # s; over this depth the slope changes by its prior spread
 BROAD = 0.12  # s; beyond this depth the slope does not change
@@ -30,30 +36,22 @@ REACH = 0.03  # s; depth at which depth_damping counts like damping
 SLOW = 0.03  # speed at which friction changes its sign
 ZERO_PROBABILITY = 0.75  # prior probability that a dissipative parameter is zero
 ODDS = ZERO_PROBABILITY / (2.0 * (1.0 - ZERO_PROBABILITY)) * sqrt(2.0 * pi)
+DELAY_PARAMETERS = (0, PRELOAD, *DISSIPATIVE, DELAY)  # those that decide on the delay
+ELASTIC_ODDS = 19.0  # prior odds of contact without dissipation
+WIDE_STIFFNESS = (200.0, 300.0)  # 1/s^2; mean and spread of the slope at depth 0 that decide on the delay
+SURPLUS = 1.4  # of the variance of the readings, because the misfits of one contact are alike
+EXACT = 1e18  # precision of a parameter that is known
 LEAST_VARIANCE = 1e-12  # of a dissipative parameter; below it the parameter is known
 
 
-def prior_variances(spreads: Sequence[float]) -> list[float]:
-    """Return the prior variances of theta.
-
-    `spreads` are the standard deviations of the slope at depth 0 [1/s^2], of its change over `WANDER`
-    [1/s^2], of damping [1/s], depth damping [1/s], unloading [1/s^2], friction [1/s] and preload [1/s].
-    """
-    common, wander, *others = spreads
-    variances = [common * common]
-    for before, knot in pairwise(min(knot, BROAD) for knot in KNOTS):
-        variances.append(wander * wander * ((knot - before) / WANDER))
-    return variances + [spread * spread for spread in others]
-
-
-def features(depth: float, speed: float, deepest: float) -> list[float]:
+def features(depth: float, speed: float, deepest: float, delay_effect: float) -> list[float]:
     """Return phi, with which the force is phi.theta; zeros out of contact."""
     if not depth > 0.0:
         return [0.0] * PARAMETERS
     phi = [depth - knot if depth > knot else 0.0 for knot in KNOTS]
     back = depth - deepest
     turning = speed / sqrt(speed * speed + SLOW * SLOW)
-    return [*phi, speed, depth * speed / REACH, back if back < 0.0 else 0.0, turning, 1.0]
+    return [*phi, speed, depth * speed / REACH, back if back < 0.0 else 0.0, turning, 1.0, delay_effect]
 
 
 def force(theta: Sequence[float], depth: float, speed: float, deepest: float) -> float:
@@ -83,28 +81,35 @@ def slope(theta: Sequence[float], depth: float) -> float:
 
 
 class ContactModel:
-    """Estimate of theta: mean and covariance, and the parameters that count.
+    """Estimate of theta.
 
     Attributes:
-        mean: posterior mean of theta without the sign of what dissipates.
-        covariance: posterior covariance of theta.
-        theta: posterior mean of theta with what dissipates zero or positive.
+        mean: posterior mean, dissipative parameters of either sign.
+        covariance: posterior covariance.
+        theta: posterior mean, dissipative parameters zero or positive.
     """
 
-    __slots__ = ("_prior_mean", "_prior_variances", "covariance", "mean", "theta")
+    __slots__ = ("_count", "_prior_mean", "_squares", "_variances", "covariance", "mean", "theta")
 
-    def __init__(self, stiffness: float, spreads: Sequence[float]) -> None:
+    def restart(self, stiffness: float, spreads: Sequence[float], delay_variance: float) -> None:
+        """Return to the prior.
+
+        `stiffness` [1/s^2] is the prior mean of the slope at depth 0; `spreads` are the standard deviations
+        of that slope [1/s^2], of its change over `WANDER` [1/s^2], of damping [1/s], depth damping [1/s],
+        unloading [1/s^2], friction [1/s] and preload [1/s]; `delay_variance` is in s^2.
+        """
+        common, wander, *others = spreads
+        self._variances = [common * common]
+        for before, knot in pairwise(min(knot, BROAD) for knot in KNOTS):
+            self._variances.append(wander * wander * ((knot - before) / WANDER))
+        self._variances += [*(spread * spread for spread in others), delay_variance]
         self._prior_mean = [stiffness] + [0.0] * (PARAMETERS - 1)
-        self._prior_variances = prior_variances(spreads)
-        self.restart()
-
-    def restart(self) -> None:
-        """Return to the prior."""
-        self.mean = list(self._prior_mean)
-        self.theta = list(self._prior_mean)
+        self.mean = self.theta = self._prior_mean
         self.covariance = [[0.0] * PARAMETERS for _ in range(PARAMETERS)]
-        for j, variance in enumerate(self._prior_variances):
+        for j, variance in enumerate(self._variances):
             self.covariance[j][j] = variance
+        self._squares = 0.0  # sum of squared innovations over their variances
+        self._count = 0.0  # readings
 
     def learn(self, phi: Sequence[float], force: float, variance: float) -> None:
         """Update the estimate with one reading of the force [1/s] whose noise has this variance [1/s^2]."""
@@ -114,33 +119,106 @@ class ContactModel:
         if not total > 0.0:
             return  # rounding has spoilt the covariance
         share = 1.0 / total
-        innovation = share * (force - dot(phi, self.mean))
-        self.mean = [mean + entry * innovation for mean, entry in zip(self.mean, column, strict=True)]
+        error = force - dot(phi, self.mean)
+        self.mean = [mean + entry * (share * error) for mean, entry in zip(self.mean, column, strict=True)]
         for row, entry in zip(covariance, column, strict=True):
             scaled = share * entry
             row[:] = [old - scaled * other for old, other in zip(row, column, strict=True)]
+        self._squares += share * (error * error)
+        self._count += 1.0
 
-    def conclude(self) -> None:
-        """Compute `theta`: condition mean and covariance on the expected dissipative parameters."""
-        theta = self.mean
-        columns = [list(self.covariance[j]) for j in DISSIPATIVE]
-        for index, j in enumerate(DISSIPATIVE):
-            column = columns[index]
-            variance = column[j]
-            if not variance > LEAST_VARIANCE:
-                continue
-            change = (zero_or_positive(theta[j], variance, self._prior_variances[j]) - theta[j]) / variance
-            theta = [mean + entry * change for mean, entry in zip(theta, column, strict=True)]
-            for other in columns[index + 1 :]:
-                share = other[j] / variance
-                other[:] = [entry - share * own for entry, own in zip(other, column, strict=True)]
-        self.theta = [
-            value if not DAMPING <= j <= FRICTION or value > 0.0 else 0.0 for j, value in enumerate(theta)
-        ]
+    def conclude(self, delay: float) -> None:
+        """Compute `theta` for a known delay [s]."""
+        indices = (DELAY, *DISSIPATIVE)
+        rows = [self.covariance[j] for j in indices]
+        mean, rows = observe(self.mean, rows, 0, DELAY, EXACT * delay, EXACT)
+        theta, _ = self._dissipate(mean, rows, {j: (place, j) for place, j in enumerate(indices)}, True)
+        for j in range(DAMPING, PRELOAD):
+            theta[j] = theta[j] if theta[j] > 0.0 else 0.0
+        self.theta = theta
+
+    def estimate_delay(self, preload: float, preload_spread: float) -> tuple[float, float]:
+        """Return mean [s] and variance [s^2] of the delay after a contact.
+
+        `preload` and `preload_spread` [1/s] state what is known of the force at the onset.
+        """
+        mean = [self.mean[j] for j in DELAY_PARAMETERS]
+        rows = [[self.covariance[i][j] for j in DELAY_PARAMETERS] for i in DELAY_PARAMETERS]
+        # The prior that steers well pulls a stiff contact's slope down, which would look like a damper.
+        priors = (0, *WIDE_STIFFNESS), (PRELOAD, preload, preload_spread)
+        for place, (j, value, spread) in enumerate(priors):
+            old, new = 1.0 / max(self._variances[j], LEAST_VARIANCE), 1.0 / (spread * spread)
+            information = new * value - old * self._prior_mean[j]
+            mean, rows = observe(mean, rows, place, place, information, new - old)
+        excess = SURPLUS * max(self._squares / max(self._count, 1.0), 1.0)
+        places = {j: (place, place) for place, j in enumerate(DELAY_PARAMETERS)}
+        other, other_rows = self._dissipate(mean, rows, places, False)
+        evidence = 0.0
+        for j in DISSIPATIVE:
+            place, _ = places[j]
+            variance = max(rows[place][place], LEAST_VARIANCE)
+            ratio = max(self._variances[j], LEAST_VARIANCE) / variance
+            evidence += 0.5 * (log(ratio) - mean[place] * mean[place] / (variance * excess))
+            mean, rows = observe(mean, rows, place, place, 0.0, EXACT)
+        odds = exp(min(max(evidence, -50.0), 50.0))  # of elastic contact by the readings alone
+        share = ELASTIC_ODDS * odds / (1.0 + ELASTIC_ODDS * odds)
+        apart = mean[-1] - other[-1]
+        delay = other[-1] + share * apart
+        share = odds / (1.0 + odds)  # the variance does not rely on the prior odds
+        variance = other_rows[-1][-1] + share * (rows[-1][-1] - other_rows[-1][-1])
+        variance += share * (1.0 - share) * (apart * apart)
+        known = self._variances[DELAY]
+        if not 0.0 < variance < known:
+            return 0.0, known
+        weakened = 1.0 / (1.0 / known + (1.0 / variance - 1.0 / known) / (excess * excess))
+        return weakened * delay / variance / (excess * excess), weakened
+
+    def _dissipate(
+        self, mean: list[float], rows: list[list[float]], places: Mapping[int, tuple[int, int]], certain: bool
+    ) -> tuple[list[float], list[list[float]]]:
+        """Return mean and rows of the covariance with dissipative parameters zero or positive.
+
+        `places` are a parameter's row and its index in mean and rows. If `certain`, their variances are left
+        out.
+        """
+        for j in DISSIPATIVE:
+            place, index = places[j]
+            variance = max(rows[place][index], LEAST_VARIANCE)
+            expected, left = zero_or_positive(mean[index], variance, self._variances[j])
+            old, new = 1.0 / variance, EXACT if certain else 1.0 / max(left, 1.0 / EXACT)
+            information = new * expected - old * mean[index]
+            mean, rows = observe(mean, rows, place, index, information, new - old)
+        return mean, rows
 
 
-def zero_or_positive(mean: float, variance: float, prior_variance: float) -> float:
-    """Return the posterior mean of a parameter that is zero with `ZERO_PROBABILITY` or else positive.
+def observe(
+    mean: list[float],
+    rows: list[list[float]],
+    place: int,
+    index: int,
+    information: float,
+    precision: float,
+) -> tuple[list[float], list[list[float]]]:
+    """Return mean and rows of the covariance with more information on one parameter.
+
+    A value with a variance has the precision 1/variance and the information value/variance. Negative
+    ones take a prior back.
+    """
+    row = rows[place]
+    known = 1.0 + precision * row[index]
+    if not known > 0.0:
+        return mean, rows
+    gain = (information - precision * mean[index]) / known
+    weights = [precision / known * other[index] for other in rows]
+    later = [value + entry * gain for value, entry in zip(mean, row, strict=True)]
+    return later, [
+        [value - weight * entry for value, entry in zip(other, row, strict=True)]
+        for weight, other in zip(weights, rows, strict=True)
+    ]
+
+
+def zero_or_positive(mean: float, variance: float, prior_variance: float) -> tuple[float, float]:
+    """Return posterior mean and variance of a parameter that is zero with `ZERO_PROBABILITY` or positive.
 
     `mean` and `variance` are those of the posterior without this knowledge. The tail of the normal
     distribution is Boyd's bound of Mills' ratio, pi/((pi - 1) t + sqrt(t^2 + 2 pi)).
@@ -150,19 +228,16 @@ def zero_or_positive(mean: float, variance: float, prior_variance: float) -> flo
     size = abs(ratio)
     mills = pi / ((pi - 1.0) * size + sqrt(size * size + 2.0 * pi))
     density = exp(-0.5 * (size * size)) / sqrt(2.0 * pi)
-    odds = (
-        ZERO_PROBABILITY / (2.0 * (1.0 - ZERO_PROBABILITY)) * sqrt(2.0 * pi) * sqrt(prior_variance / variance)
-    )
-    if ratio > 0.0:
-        hazard = density / (1.0 - density * mills)
-        return spread * (ratio + hazard) / (1.0 + odds * hazard)
-    hazard = 1.0 / mills
-    return spread * (hazard - size) / (1.0 + odds * hazard)
+    hazard = density / (1.0 - density * mills) if ratio > 0.0 else 1.0 / mills
+    share = 1.0 / (1.0 + ODDS * sqrt(prior_variance / variance) * hazard)
+    positive = ratio + hazard
+    expected = share * spread * positive
+    return expected, share * variance * (1.0 + ratio * positive) - expected * expected
 
 
 def dot(left: Sequence[float], right: Sequence[float]) -> float:
     """Return the sum of products, added from the first to the last."""
     total = 0.0
-    for one, other in zip(left, right, strict=True):
-        total += one * other
+    for factor, other in zip(left, right, strict=True):
+        total += factor * other
     return total

@@ -12,6 +12,10 @@ model's velocity and p the peak force of contact as far as it is known. Forces a
 and approach speed, so that one set of gains serves every mechanism. In free flight, until the onset is
 detected (`onset_detection`), F_c = 0. A run that begins in contact has no approach speed to scale by: there
 F_c is the measured force.
+
+Where the force delay is uncertain (`delay_spread` > 0), the delay is estimated when the hardware leaves the
+surface. The estimate corrects the speed at which this contact ends. From the next contact on, it also aligns
+positions with readings and so lengthens D.
 """
 
 from collections.abc import Mapping
@@ -22,12 +26,12 @@ from ..bounds import DAMPINGS_BY_MASS, FORCES, MASSES, STIFFNESSES_BY_MASS, TIME
 from ..law_status import IDENTIFIED, NOISY, OUT_OF_CONTACT, SATURATED, TOO_SHORT, UNEXPLAINED, UNSURE
 from ..registry import Compensator, GainSpecification, register
 from ..surfaces import deflection
-from .contact_model import HINGES, ContactModel, dot, features
+from .contact_model import HINGES, ContactModel, dot, features, slope
 from .onset_detection import LEVEL, SETTLING, OnsetDetector
 from .readings import Alignment
 from .reference_trajectory import ReferenceTrajectory
 
-RELEASE_TIME = 0.006  # s for which the law acts after the hardware has left the surface
+RELEASE_TIME = 0.03  # s for which the law acts after the hardware has left the surface
 LEAST_MOMENTUM = 1e-9  # kg m/s; below it forces cannot be scaled
 LONGEST_LAG = 0.2  # s; the lag D is at most that
 ONSET_PLACE = -0.5  # periods from the surface to the last free reading
@@ -40,9 +44,15 @@ SHALLOW = 0.001  # s; depth below which a secant stiffness is not taken
 LEAST_STIFFNESS = 1.0  # 1/s^2; stiffness of the softest contact
 HIGHEST = 1.5  # peak forces that the bridged force is at most
 FEW_READINGS = 5  # in contact, below which the model is unsure
-LATE = 0.5  # share of the contact that is over at the onset, beyond which little time is left
+LATE = 0.8  # share of the contact that is over at the onset, beyond which little time is left
 UNCERTAIN = 0.006  # standard deviation of the reference's speed, above which restitution is uncertain
 IMBALANCE = 0.014  # energy that the model may leave unexplained [1]
+USUAL_PRELOAD = 1.0  # 1/s; prior spread of a preload, beside a specified one
+LARGEST_DELAY_SPREAD = 0.004  # s; beyond it the first order in the delay does not hold
+MOST_SPREADS = 3.0  # spreads by which the delay differs from the specified one at most
+ONSET_TICKS = 0.3  # periods by which the onset is uncertain: 1/sqrt(12)
+ONSET_MEAN = 0.25  # of the force at which the onset is detected: by how much contact begins too late
+ONSET_SPREAD = 0.4  # likewise, its standard deviation
 SPREADS = (
     "prior_stiffness_spread",
     "prior_slope_spread",
@@ -59,16 +69,18 @@ class ImpulseLedger(Compensator):
     """Compensator with contact model, reference trajectory and bridge; see the module's text."""
 
     __slots__ = (
-        "_alignment", "_clearance", "_correction_limit", "_deepest", "_detector", "_floor", "_gain",
-        "_in_contact", "_lag", "_mass", "_misfit", "_model", "_origin", "_outside", "_peak", "_period",
-        "_readings", "_reference", "_side", "_since_start", "_speed", "status",
+        "_alignment", "_clearance", "_correction_limit", "_deepest", "_delay", "_delay_spread",
+        "_detector", "_estimate", "_floor", "_gain", "_identification_delay", "_in_contact", "_lag", "_mass",
+        "_misfit", "_model", "_origin", "_outside", "_peak", "_period", "_readings", "_reference", "_side",
+        "_since_start", "_speed", "_spreads", "_stiffness", "_variance", "status",
     )  # fmt: skip
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
         "equivalent_mass": GainSpecification("kg", *MASSES),
         "identification_delay": GainSpecification("s", *TIMES),
+        "delay_spread": GainSpecification("s", 0.0, LARGEST_DELAY_SPREAD),
         "force_noise": GainSpecification("N", *FORCES),
-        "force_noise_floor": GainSpecification("1/s", 1e-3, 10.0),
+        "force_noise_floor": GainSpecification("1/s", 2e-3, 10.0),
         "prior_stiffness": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
         "prior_stiffness_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
         "prior_slope_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
@@ -88,39 +100,48 @@ class ImpulseLedger(Compensator):
         self._floor = gains["force_noise_floor"]
         self._gain = gains["velocity_gain"]
         self._correction_limit = gains["correction_limit"]
+        self._delay_spread = gains["delay_spread"]
+        self._stiffness = gains["prior_stiffness"]
+        self._spreads = [gains[name] for name in SPREADS]
+        self._identification_delay = gains["identification_delay"]
         self._alignment = Alignment(gains["identification_delay"], period)
         self._detector = OnsetDetector(gains["force_noise"])
-        self._model = ContactModel(gains["prior_stiffness"], [gains[name] for name in SPREADS])
+        self._model = ContactModel()
         self._reference = ReferenceTrajectory()
         self.reset()
 
     def reset(self) -> None:
         """Restart everything."""
+        self._delay = 0.0  # by which the force is older than specified, as far as known [s]
+        self._variance = self._delay_spread * self._delay_spread  # of the delay [s^2]
+        self.next_contact()
+
+    def next_contact(self) -> None:
+        """Restart everything but the estimate of the delay."""
         self._since_start = 0.0  # ticks of this run
         self._side = 1.0  # direction in which the surface is approached
         self._speed = 0.0  # approach speed [m/s]; 0: nothing can be scaled
-        self._origin = 0.0  # position of the surface, along the side [m]
-        self._lag = 0.0  # D [s]
-        self._deepest = 0.0  # of the hardware [s]
-        self._misfit = 0.0  # low-passed y - f(X, V) [1/s]
-        self._peak = 0.0  # largest reading so far [1/s]
         self._outside = 0.0  # ticks since the hardware left the surface
-        self._readings = 0  # in contact
         self._in_contact = False
         self._detector.restart()
         self.status = OUT_OF_CONTACT
+
+    @property
+    def force_delay(self) -> float:
+        """Estimated delay [s] of the force measurement."""
+        return self._identification_delay + self._delay
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """Return the force command F_c [N]."""
         begins = self._since_start == 0.0
         position, velocity = self._alignment.step(position_measured, velocity_desired, begins)
+        position -= self._delay * velocity
         settled = not self._since_start * self._period < SETTLING
         self._since_start += 1.0
         if begins:
             reach = deflection(position_desired, self._clearance)
             self._in_contact = reach != 0.0
             self._side = 1.0 if reach > 0.0 else -1.0
-            self._speed = 0.0
         if self._in_contact and not self._speed > 0.0:
             return self._pass_on(force_measured, position_desired, position)
         detector = self._detector
@@ -159,7 +180,10 @@ class ImpulseLedger(Compensator):
         self._peak = 0.0
         self._outside = 0.0
         self._readings = 0
-        self._model.restart()
+        self._estimate = 0.0, self._variance  # mean and variance of the delay after this contact
+        *spreads, preload = self._spreads
+        spreads.append(sqrt(preload * preload + USUAL_PRELOAD * USUAL_PRELOAD))
+        self._model.restart(self._stiffness, spreads, self._variance)
         self._reference.begin((side * position - self._origin) / speed, self._model.theta)
 
     def _follow(self, force: float, velocity_desired: float, position: float, velocity: float) -> float:
@@ -169,17 +193,26 @@ class ImpulseLedger(Compensator):
         weight = self._mass * speed
         depth = (side * position - self._origin) / speed
         rate = side * velocity / speed
-        reading = side * force / weight
         self._deepest = depth if depth > self._deepest else self._deepest
-        phi = features(depth, rate, self._deepest)
+        phi = features(depth, rate, self._deepest, slope(model.mean, depth) * (1.0 - rate))
+        reading = side * force / weight
         off = MISFIT * reading
-        variance = self._detector.variance / (weight * weight) + self._floor * self._floor
-        variance += off * off * (MISFIT_TIME / period)
+        noise = self._detector.variance / (weight * weight)
+        variance = noise + self._floor * self._floor + off * off * (MISFIT_TIME / period)
         tells = rate > SLOWEST or dot(phi, model.mean) > 0.0 or reading * reading > OUTLYING * variance
-        if tells and depth > period:
+        ended = not depth > 0.0 and rate < 0.0
+        learns = tells and depth > period
+        if learns:
             model.learn(phi, reading, variance)
-            model.conclude()
             self._readings += 1
+        if not depth > 0.0:
+            onset = ONSET_TICKS * period * slope(model.mean, self._deepest) + self._floor
+            onset += sqrt(noise) if noise > 0.0 else 0.0
+            known = self._spreads[-1]
+            spread = sqrt(known * known + (ONSET_SPREAD * onset) ** 2)
+            self._estimate = model.estimate_delay(ONSET_MEAN * onset, spread)
+        if learns or ended:
+            model.conclude(self._estimate[0] if ended else 0.0)
         reference.correct(model.theta)
         reference.advance(period, reading, phi)
         missed = reading - dot(model.theta, phi)
@@ -226,10 +259,12 @@ class ImpulseLedger(Compensator):
             return UNSURE
         if self._lag * peak > LATE * pi:
             return TOO_SHORT
-        spread = reference.spread(self._model.covariance)
-        if spread > UNCERTAIN:
+        if reference.spread(self._model.covariance, 0.0) > UNCERTAIN:
             return NOISY
-        if reference.released and abs(reference.imbalance()) > IMBALANCE + 3.0 * spread:
+        spread = reference.spread(self._model.covariance, self._estimate[1])
+        if reference.released and (
+            spread > UNCERTAIN or abs(reference.imbalance()) > IMBALANCE + 3.0 * spread
+        ):
             return UNEXPLAINED
         return IDENTIFIED if free else SATURATED
 
@@ -247,6 +282,11 @@ class ImpulseLedger(Compensator):
 
     def _end(self) -> None:
         """End the contact."""
+        if self._speed > 0.0:
+            limit = MOST_SPREADS * self._delay_spread
+            shift, self._variance = self._estimate
+            self._delay = min(max(self._delay + shift, -limit), limit)
+        self._speed = 0.0
         self._in_contact = False
         self._detector.total = 0.0
         self.status = OUT_OF_CONTACT

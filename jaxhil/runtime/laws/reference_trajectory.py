@@ -19,6 +19,7 @@ from math import sqrt
 
 from .contact_model import (
     DAMPING,
+    DELAY,
     DEPTH_DAMPING,
     FRICTION,
     PARAMETERS,
@@ -78,22 +79,26 @@ class ReferenceTrajectory:
         speed = self.speed - period * self.force
         self.deepest = depth if depth > self.deepest else self.deepest
         self.released = self.released or (depth <= 0.0 and speed < 0.0)
-        own = features(depth, speed, self.deepest)
+        undelayed = features(depth, speed, self.deepest, 0.0)
         least = reading if reading < 0.0 else 0.0
-        push = dot(theta, own) + (reading - dot(theta, measured))
+        push = dot(theta, undelayed) + (reading - dot(theta, measured))
         push = 0.0 if self.released else (push if push > least else least)
         if push != 0.0:
-            self._advance_sensitivities(period, depth, own, measured)
+            self._advance_sensitivities(period, depth, undelayed, measured)
             self._losses = [
-                loss + period * speed * own[j] for loss, j in zip(self._losses, LOSSES, strict=True)
+                loss + period * speed * undelayed[j] for loss, j in zip(self._losses, LOSSES, strict=True)
             ]
         self.speed = within(self.speed - 0.5 * period * (self.force + push), FASTEST)
         self.depth = depth
         self.force = push
 
-    def spread(self, covariance: Sequence[Sequence[float]]) -> float:
-        """Return the standard deviation of the speed by the model's uncertainty, sqrt(s' P s')."""
-        total = dot(self._speeds, [dot(row, self._speeds) for row in covariance])
+    def spread(self, covariance: Sequence[Sequence[float]], delay_variance: float) -> float:
+        """Return the standard deviation of the speed, sqrt(s' P s'), for a delay of this variance [s^2]."""
+        columns = [dot(row, self._speeds) for row in covariance]
+        total, known = dot(self._speeds, columns), covariance[DELAY][DELAY]
+        if known > 0.0:
+            by_delay = columns[DELAY] / known
+            total += by_delay * by_delay * (delay_variance - known)
         return sqrt(total) if total > 0.0 else 0.0
 
     def imbalance(self) -> float:
@@ -119,7 +124,7 @@ class ReferenceTrajectory:
         return push, speed
 
     def _advance_sensitivities(
-        self, period: float, depth: float, own: Sequence[float], measured: Sequence[float]
+        self, period: float, depth: float, undelayed: Sequence[float], measured: Sequence[float]
     ) -> None:
         theta = self._theta
         inside = depth > 0.0
@@ -131,7 +136,7 @@ class ReferenceTrajectory:
         depths, speeds = self._depths, self._speeds
         for j in range(PARAMETERS):
             here = depths[j] + period * speeds[j]
-            rate = own[j] - measured[j] + stiffness * here + damping * speeds[j]
+            rate = undelayed[j] - measured[j] + stiffness * here + damping * speeds[j]
             speeds[j] -= period * rate
             depths[j] += period * speeds[j]
 

@@ -1,7 +1,6 @@
 """`jaxhil compare`: every compensator, each tuned to its own best, on the same scenarios."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.commands.resuming import pieces_in, say_of_pieces
 from tuning.cli.options import Compare
-from tuning.front_door.compare import CompareOptions, board, check_names, compare_each
+from tuning.front_door.compare import board, check_names, compare_each
 
 PICTURES = ("errors.png", "honesty.png")
 
@@ -21,8 +20,7 @@ PICTURES = ("errors.png", "honesty.png")
 def run(options: Compare) -> int:
     """Compare; what is finished is reported and written, also when interrupted; to resume, it is not computed
     again. 0, 1 if a law failed, or 130."""
-    asked = CompareOptions(**{field.name: getattr(options, field.name) for field in fields(CompareOptions)})
-    asked.check()
+    options.check()
     loaded = _load(options)
     folder = Path(options.output)
     checks.output(folder)
@@ -32,13 +30,13 @@ def run(options: Compare) -> int:
     from tuning.benchmark.study import Failed
     from tuning.transparency.pushes import PUSHES
 
-    laws = asked.laws
+    laws = options.laws
     found: dict[str, dict[str, Any]] = {name: {} for name in names}
     interrupted, problems = False, []
     pieces = pieces_in(options.output, options.resume)
     with terminal.progress(len(names) * len(laws), "results") as bar:
         try:
-            for one in compare_each(loaded, asked, usable_cores(), bar, pieces):
+            for one in compare_each(loaded, options, usable_cores(), bar, pieces):
                 if isinstance(one, Failed):
                     problems.append(f"{one.law}: {one.reason}")
                     terminal.note(f"jaxhil: {problems[-1]}")
@@ -52,7 +50,7 @@ def run(options: Compare) -> int:
         **{key: getattr(options, key) for key in ("limit", "seed", "scenarios", "judged")},
         "tuned": not options.untuned,
         "transparency": PUSHES,
-        "mechanisms": [board(one, asked, found[one.mechanism.name]).document for one in loaded],
+        "mechanisms": [board(one, options, found[one.mechanism.name]).document for one in loaded],
         "timings": {"microseconds_per_tick": _costs(loaded[0], ordered)},
         "problems": problems,
         "interrupted": interrupted,

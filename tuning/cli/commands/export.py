@@ -1,6 +1,7 @@
 """`jaxhil export`: gains as a bundle that a rig computer can check and run by itself."""
 
 import math
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from jaxhil.runtime.laws import WITHOUT_C
 from jaxhil.runtime.limits import LIMITS
 from tuning import terminal
 from tuning.cli.options_rig import Export
-from tuning.front_door.export import allowed_values, export
+from tuning.front_door.export import ExportOptions, allowed_values, export
 
 
 def run(options: Export) -> int:
@@ -21,11 +22,8 @@ def run(options: Export) -> int:
         sweep=options.sweep,
         formats=formats or None,
         limits=_replaced(options.limits),
-        false_alarms=options.false_alarms,
-        missed=options.missed,
-        seed=options.seed,
-        sign=options.sign,
         progress=True,
+        **{field.name: getattr(options, field.name) for field in fields(ExportOptions)},
     )
     if options.json:
         terminal.emit_json(found.document)

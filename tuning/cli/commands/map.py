@@ -1,6 +1,7 @@
 """`jaxhil map`: the restitution error over two keys of a mechanism."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -10,26 +11,22 @@ from tuning import terminal
 from tuning.cli.commands import checks
 from tuning.cli.commands.choice import chosen, named
 from tuning.cli.options_report import Map
-from tuning.front_door import arguments, meaning
-from tuning.front_door.map import DOCUMENT, MOST_POINTS, PICTURE, map
+from tuning.front_door import meaning
+from tuning.front_door.map import DOCUMENT, PICTURE, MapOptions, map
+from tuning.front_door.options import check_options
 
 
 def run(options: Map) -> int:
     """Compute, write and report the map; 0."""
-    arguments.limit(options.limit)
-    arguments.integers(2, MOST_POINTS, points=options.points)
-    arguments.integers(0, seed=options.seed)
+    check_options(options)
     mechanism = named(options)
     target = Path(options.output)
     checks.output(target)
     prepare()
     mechanism, compensator, gains = chosen(options, mechanism)
     checks.own_results(target / DOCUMENT, "theory", [PICTURE], [mechanism.name])
-    made = map(
-        mechanism, options.x, options.y, compensator, gains,
-        limit=options.limit, points=options.points, seed=options.seed, folder=target,
-        resume=options.resume, scheduler=options.scheduler, progress=True,
-    )  # fmt: skip
+    asked = {field.name: getattr(options, field.name) for field in fields(MapOptions)}
+    made = map(mechanism, options.x, options.y, compensator, gains, folder=target, progress=True, **asked)
     meaning.say(mechanism, None if options.json else terminal.emit_line)
     if options.json:
         terminal.emit_json(made.document)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jaxhil.simulation.run import ContactResult, Run
 
 # What a law may estimate of the rig: its heading, in thousandths of the unit, and how many digits of those.
-ESTIMATES = {"force_delay": ("force delay [ms]", 2), "contact_plane": ("plane [mm]", 3)}
+ESTIMATES = {"force_delay": ("force delay [ms]", 2)}
 
 
 def run(options: Simulate) -> int:

@@ -1,6 +1,5 @@
 """`jaxhil sweep`: many scenarios, a failure probability with its interval, and the worst of them."""
 
-from dataclasses import fields
 from pathlib import Path
 
 from jaxhil.simulation.environment import prepare
@@ -8,17 +7,16 @@ from tuning import terminal
 from tuning.cli.commands import sweep_tables
 from tuning.cli.options import Sweep
 from tuning.front_door.arguments import readable_gain_file
-from tuning.front_door.sweep import SweepOptions, run_study
+from tuning.front_door.sweep import run_study
 
 
 def run(options: Sweep) -> int:
     """Run what the store lacks, report all of it; 0 if the verdict is good, else 1."""
-    asked = SweepOptions(**{field.name: getattr(options, field.name) for field in fields(SweepOptions)})
-    asked.check()
+    options.check()
     path = readable_gain_file(options.gains)
     prepare()
     folder = path.with_name(f"{path.stem}-sweep") if options.output is None else Path(options.output)
-    study = run_study(path, asked, folder, progress=True)
+    study = run_study(path, options, folder, progress=True)
     if options.json:
         terminal.emit_json(study.document)
     else:

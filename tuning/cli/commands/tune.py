@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,7 @@ from tuning.cli.commands.resuming import pieces_in, say_of_pieces
 from tuning.cli.commands.tune_tables import print_one, print_overview
 from tuning.cli.options import Tune
 from tuning.front_door import meaning
-from tuning.front_door.tune import TunedGains, TuneOptions, tune_each
+from tuning.front_door.tune import TunedGains, tune_each
 
 if TYPE_CHECKING:
     from tuning.caches.pieces import Pieces
@@ -31,25 +30,24 @@ MOST_DRAWN = 4  # mechanisms whose plots are drawn; of more there is one picture
 def run(options: Tune) -> int:
     """Tune file by file. What is finished is written at once and stays, whatever happens to the rest; to
     resume, it is not tuned again."""
-    asked = TuneOptions(**{field.name: getattr(options, field.name) for field in fields(TuneOptions)})
     if options.pareto:
         prepare()
-    asked.check()
+    options.check()
     if options.start or options.setting is not None:
         # What is wrong with these is reported before what is wrong with the files.
         prepare()
-        asked.settings()
-        asked.known()
-    loaded, problems = _load(options, asked)
+        options.settings()
+        options.known()
+    loaded, problems = _load(options)
     entries, interrupted = [], False
     if loaded:
         # Before jax starts: a folder that cannot be written costs no tuning.
         _check_output(Path(options.output), [one.mechanism for one in loaded])
-        loaded = _understood(options, asked, loaded, problems)
+        loaded = _understood(options, loaded, problems)
     if loaded:
         pieces = pieces_in(options.output, options.resume)
         try:
-            entries = _tune_all(options, asked, loaded, problems, pieces)
+            entries = _tune_all(options, loaded, problems, pieces)
         except _Interrupted as stop:
             entries, interrupted = stop.entries, True
         say_of_pieces(pieces)
@@ -100,13 +98,13 @@ class _Interrupted(Exception):
         self.entries = entries
 
 
-def _load(options: Tune, asked: TuneOptions) -> tuple[list[LoadedAny], list[str]]:
+def _load(options: Tune) -> tuple[list[LoadedAny], list[str]]:
     """The files that can be used, and what is wrong with the others."""
     loaded, problems, folders = [], [], {}
     for file in _expand(options.files, problems):
         try:
             one = load_any(file, options.overrides, options.unset)
-            asked.fits(one.mechanism)
+            options.fits(one.mechanism)
             folder = folder_name(one.mechanism.name)
             if (other := folders.get(folder.casefold())) is not None:
                 raise InputError(
@@ -122,12 +120,10 @@ def _load(options: Tune, asked: TuneOptions) -> tuple[list[LoadedAny], list[str]
     return loaded, problems
 
 
-def _understood(
-    options: Tune, asked: TuneOptions, loaded: list[LoadedAny], problems: list[str]
-) -> list[LoadedAny]:
+def _understood(options: Tune, loaded: list[LoadedAny], problems: list[str]) -> list[LoadedAny]:
     """The mechanisms that can be run; of each it is said what it means."""
     prepare()
-    asked.settings()
+    options.settings()
     kept = []
     for one in loaded:
         try:
@@ -158,7 +154,6 @@ def _expand(files: tuple[str, ...], problems: list[str]) -> list[str | None]:
 
 def _tune_all(
     options: Tune,
-    asked: TuneOptions,
     loaded: list[LoadedAny],
     problems: list[str],
     pieces: "Pieces",
@@ -172,7 +167,7 @@ def _tune_all(
                 first = loaded[0].mechanism
                 if isinstance(first, Mechanism):
                     meanwhile.submit(_prepare_drawing, first, options.compensator)
-            for index, result in tune_each(loaded, asked, bar, pieces):
+            for index, result in tune_each(loaded, options, bar, pieces):
                 try:
                     entries[index] = _finish(options, loaded[index], result, drawn, bar.say)
                 except InputError as error:

@@ -1,0 +1,103 @@
+"""The impulse ledger: unknown force delay and status.
+
+`pytest -m slow -s tests/test_impulse_ledger.py` prints what an unknown delay leaves.
+"""
+
+import numpy as np
+import pytest
+from c99_cases import ROW
+from rig_lock_step import controller
+from test_law_status import run
+
+from jaxhil.compensators import literature_gains
+from jaxhil.mechanism.file import load
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.runtime.laws.contact_model import DELAY, PARAMETERS, ContactModel, features, slope
+from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.scenario import build_scenarios
+
+LAW = "impulse_ledger"
+UNCERTAIN = 'uncertainty."rig.force_sensor.delay"={distribution="normal",std=0.001}'
+SPREADS = (80.0, 120.0, 1.0, 0.12, 0.5, 0.0, 1.0)
+
+
+def fitted(delay: float, damping: float, delay_spread: float) -> ContactModel:
+    """Return the model of a contact of 3 Hz whose force is older than specified by `delay` [s]."""
+    model = ContactModel()
+    model.restart(10.0, SPREADS, delay_spread**2)
+    omega, deepest = 2 * np.pi * 3, 0.0
+    for tick in range(2, 165):
+        time = 1e-3 * tick
+        depth, speed = np.sin(omega * time) / omega, np.cos(omega * time)
+        deepest = max(deepest, depth)
+        then = time - delay
+        force = omega**2 * np.sin(omega * then) / omega + omega**2 * delay + damping * np.cos(omega * then)
+        phi = features(depth, speed, deepest, slope(model.mean, depth) * (1 - speed))
+        model.learn(phi, force, 0.02**2)
+    return model
+
+
+@pytest.mark.parametrize("delay", [-1e-3, -2e-4, 5e-4, 1e-3])
+def test_elastic_contact_tells_the_delay(delay):
+    mean, variance = fitted(delay, 0.0, 1e-3).estimate_delay(0.0, 0.1)
+    assert mean == pytest.approx(delay, abs=1e-4)
+    assert 0 < variance < (3e-4) ** 2
+
+
+def test_damper_is_not_taken_for_a_delay():
+    mean, variance = fitted(0.0, 3.0, 1e-3).estimate_delay(0.0, 0.1)
+    assert abs(mean) < 5e-4 < 2 * np.sqrt(variance)
+
+
+def test_no_delay_spread_leaves_the_delay_alone():
+    model = fitted(1e-3, 0.0, 0.0)
+    assert model.estimate_delay(0.0, 0.1) == (0.0, 0.0)
+    model.conclude(0.0)
+    assert model.mean[DELAY] == model.theta[DELAY] == 0.0
+    assert all(model.covariance[DELAY][j] == 0.0 for j in range(PARAMETERS))
+
+
+def restitution(mechanism, law, contact: int = 0) -> float:
+    velocity = run(mechanism, law, contact).rows[:, ROW.index("velocity")]
+    return abs(velocity[-1]) / velocity[0]
+
+
+def test_second_contact_knows_the_delay():
+    changes = ["rig.force_sensor.noise_std=0.0"]
+    mechanism = load("suite-noisy", changes).mechanism
+    late = load("suite-noisy", [*changes, "rig.force_sensor.delay=0.009"]).mechanism
+    gains = literature_gains(mechanism, LAW)
+    assert restitution(late, controller(mechanism, LAW, gains | {"delay_spread": 0.0})) > 1.02
+    law = controller(mechanism, LAW, gains | {"delay_spread": 1e-3})
+    assert restitution(late, law) == pytest.approx(1, abs=8e-3)
+    law.next_contact()
+    assert law.force_delay == pytest.approx(0.009, abs=1e-4)
+    assert restitution(late, law, 1) == pytest.approx(1, abs=2e-3)
+
+
+def test_uncertain_delay_of_damped_contact_is_not_called_identified():
+    mechanism = load("suite-damped", ["contact.damping=[600.0]", UNCERTAIN]).mechanism
+    gains = literature_gains(mechanism, LAW)
+    assert gains["delay_spread"] == 1e-3
+    for spread, status in ((1e-3, "unexplained"), (0.0, "identified")):
+        law = controller(mechanism, LAW, gains | {"delay_spread": spread})
+        run(mechanism, law)
+        law.next_contact()
+        assert law.last_contact.status == status
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("suite", "first", "eighth"),
+    [("noisy", 0.8, 0.3), ("hertz", 1.5, 0.3), ("hardening", 2.0, 0.5), ("damped", 1.6, 1.8)],
+)
+def test_unknown_delay_on_the_standard_suites(suite, first, eighth, capsys):
+    """Eight contacts, each entered at the speed at which the one before was left."""
+    mechanism = load(f"suite-{suite}", ["approach.contacts=8", UNCERTAIN]).mechanism
+    scenarios = build_scenarios(mechanism, draw(mechanism, 200, 77), 77)
+    outcome = evaluate(build_loop(mechanism, LAW, scenarios), literature_gains(mechanism, LAW), scenarios)
+    rms = 100 * np.sqrt(np.mean(np.asarray(outcome.error)[:8] ** 2, axis=1))
+    with capsys.disabled():
+        print(f"\n{suite:10s} delay +-1 ms: rms [%], contacts 1, 2, 4, 8:", *np.round(rms[[0, 1, 3, 7]], 2))
+    assert rms[0] <= first and rms[7] <= eighth

@@ -1,0 +1,178 @@
+"""What commands and functions of the same name can be told: an option's type, range, default and help.
+
+One frozen dataclass per command states its options, once. The command line reads it with tyro, the Python
+function `takes` its fields as keyword arguments, and `check_options` refuses values out of range.
+"""
+
+import dataclasses
+import functools
+import inspect
+import math
+import textwrap
+import typing
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any, TypeVar
+
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
+
+from jaxhil.errors import shown
+from tuning.front_door.arguments import ArgumentError, is_number
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class Allowed:
+    """Values that an option may have; None stands for its default besides."""
+
+    least: float = -math.inf
+    most: float = math.inf
+    names: tuple[str, ...] = ()
+    words: str = ""  # what is allowed, where it is more than the ends say
+
+
+def number(meaning: str):
+    """Return how tyro shows an option that is a number."""
+    return arg(metavar="NUMBER", help=meaning)
+
+
+def folder(meaning: str):
+    """Return how tyro shows an option that is a folder to write to."""
+    return arg(aliases=("-o",), metavar="DIR", help=meaning)
+
+
+def text(metavar: str | None, meaning: str, **more: Any):
+    """Return how tyro shows an option whose help itself says what holds by default."""
+    return arg(metavar=metavar, help=meaning, help_behavior_hint="", **more)
+
+
+OptionalFile = Annotated[
+    Positional[str | None],
+    text("[FILE]", "Mechanism file, or the name of a built-in one; by default 'varying'."),
+]
+Files = Annotated[
+    Positional[tuple[str, ...]],
+    text("[FILE ...]", "Mechanism files, or names of built-in ones; by default 'varying'."),
+]
+Overrides = Annotated[
+    UseAppendAction[tuple[str, ...]],
+    text(
+        "PATH=VALUE",
+        "Any key of the mechanism file by its dotted path, as approach.velocity=0.01; repeatable.",
+        name="set",
+    ),
+]
+Unset = Annotated[
+    UseAppendAction[tuple[str, ...]],
+    text(
+        "PATH",
+        "A key to take out of the mechanism file, and what [uncertainty] says of it, after all --set; "
+        "repeatable.",
+        name="unset",
+    ),
+]
+AnyLimit = Allowed(0.0, words="a number >= 0")
+Limit = Annotated[
+    float, arg(metavar="NUMBER", help="Restitution error beyond which the verdict is bad."), AnyLimit
+]
+Seed = Allowed(0)
+Json = Annotated[
+    FlagCreatePairsOff[bool], text(None, "One JSON document on standard output, nothing else there.")
+]
+Timings = Annotated[FlagCreatePairsOff[bool], text(None, "Say on standard error where the time went.")]
+Scheduler = Annotated[
+    str | None,
+    arg(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster whose workers do the computing."),
+]
+Resume = Annotated[
+    bool,
+    arg(name="resume", metavar="", help="Go on after an interruption: what is finished is not done again."),
+]
+CompensatorName = Annotated[
+    str | None, arg(metavar="NAME", help="Compensator, at the literature's gains; 'none' by default.")
+]
+GainSource = Annotated[
+    str | None,
+    arg(metavar="GAINS", help="Gain file: its compensator and gains and, without FILE, its mechanism."),
+]
+
+
+Setting = Annotated[
+    str | None, text("NAME", "Take a set of gains that the compensator has for any mechanism, by its name.")
+]
+
+
+def check_options(options: Any) -> None:
+    """Check the type and range of every option that states them.
+
+    Raises:
+        InputError: One line, "name: found X, allowed Y".
+    """
+    for name, (kind, allowed) in _stated(type(options)).items():
+        value = getattr(options, name)
+        if value is not None or type(None) not in typing.get_args(kind):
+            _check_one(name, value, kind, allowed)
+
+
+@functools.cache
+def _stated(options: type) -> dict[str, tuple[Any, Allowed]]:
+    """Return kind and allowed values of the options that are flags or state what they allow."""
+    stated = {}
+    for name, hint in typing.get_type_hints(options, include_extras=True).items():
+        kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
+        allowed = [mark for mark in marks if isinstance(mark, Allowed)]
+        if allowed or kind is bool:
+            stated[name] = kind, allowed[0] if allowed else Allowed()
+    return stated
+
+
+def _check_one(name: str, value: Any, kind: Any, allowed: Allowed) -> None:
+    if kind is bool:
+        if not isinstance(value, bool):
+            raise ArgumentError(name, shown(value), "true or false")
+        return
+    if allowed.names:
+        if value not in allowed.names:
+            raise ArgumentError(name, shown(value), ", ".join(allowed.names))
+        return
+    whole = int in (kind, *typing.get_args(kind))
+    words = allowed.words or (
+        f"an integer >= {allowed.least:g}" if whole else f"a number >= {allowed.least:g}"
+    )
+    usable = is_number(value) and (isinstance(value, int) or not whole)
+    if not usable or not value >= allowed.least:
+        raise ArgumentError(name, str(value) if usable else shown(value), words)
+    if value > allowed.most:
+        raise ArgumentError(name, str(value), allowed.words or f"at most {allowed.most:.15g}")
+
+
+def takes(options: type) -> Callable[[Function], Function]:
+    """Let a function state the fields of `options` as its keyword arguments, with their help.
+
+    The function takes them as `**options`; signature and docstring name them one by one.
+    """
+
+    def stated(function: Function) -> Function:
+        signature = inspect.signature(function)
+        *first, _ = signature.parameters.values()
+        taken = {parameter.name for parameter in first}
+        fields = [field for field in dataclasses.fields(options) if field.name not in taken]
+        keyword, kinds = inspect.Parameter.KEYWORD_ONLY, typing.get_type_hints(options)
+        more = [
+            inspect.Parameter(field.name, keyword, default=field.default, annotation=kinds[field.name])
+            for field in fields
+        ]
+        function.__signature__ = signature.replace(parameters=[*first, *more])  # pyright: ignore
+        lines = [_meaning(options, field.name) for field in fields]
+        function.__doc__ = (function.__doc__ or "").replace("    OPTIONS\n", "".join(lines))
+        return function
+
+    return stated
+
+
+def _meaning(options: type, name: str) -> str:
+    """Return the line of a docstring that says what an option means."""
+    hint = typing.get_type_hints(options, include_extras=True)[name]
+    (meaning,) = (mark.help for mark in typing.get_args(hint)[1:] if getattr(mark, "help", None))
+    return textwrap.fill(f"{name}: {meaning}", 110, initial_indent=" " * 8, subsequent_indent=" " * 12) + "\n"
