@@ -183,7 +183,7 @@ def test_cells_have_their_edges_where_rows_come_into_contact():
 
 
 def test_a_search_about_a_delay_beyond_the_longest_stays_within_it():
-    """Where no law fitted it went beyond, and the grid about it had one delay."""
+    """Stay within the longest delay: beyond it the grid about the delay had one place."""
     clean = problem("clean", contact_laws.kelvin_voigt(), speeds=(0.006, 0.012))
     late = replace(clean.readings, force=np.roll(clean.readings.force, 40, axis=0))
     late = Problem(clean.motion, late, clean.law, clean.plane)

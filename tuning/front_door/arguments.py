@@ -77,13 +77,6 @@ def limit(value: Any) -> None:
         raise ArgumentError("limit", str(value) if is_number(value) else shown(value), "a number >= 0")
 
 
-def probabilities(**given: Any) -> None:
-    """Every argument given is a number from 0 to 1."""
-    for name, value in given.items():
-        if not (is_number(value) and 0 <= value <= 1):
-            raise ArgumentError(name, str(value) if is_number(value) else shown(value), "0 to 1")
-
-
 def flags(**given: Any) -> None:
     """Every argument given is true or false."""
     for name, value in given.items():

@@ -59,7 +59,7 @@ class Board:
 
 @dataclass(frozen=True, kw_only=True)
 class CompareOptions:
-    """What `compare` can be told."""
+    """Options of `compare`."""
 
     compensators: Annotated[
         tuple[str, ...],

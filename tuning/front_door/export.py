@@ -60,7 +60,7 @@ Probability = Allowed(0.0, 1.0, words="0 to 1")
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """What `export` can be told."""
+    """Options of `export`."""
 
     false_alarms: Annotated[
         float,

@@ -60,7 +60,7 @@ class StabilityMap:
 
 @dataclass(frozen=True, kw_only=True)
 class MapOptions:
-    """What `map` can be told."""
+    """Options of `map`."""
 
     points: Annotated[int, number("Points along either axis."), Allowed(2, MOST_POINTS)] = 100
     limit: Annotated[

@@ -1,4 +1,4 @@
-"""What commands and functions of the same name can be told: an option's type, range, default and help.
+"""Options of commands and of functions of the same name: type, range, default and help.
 
 One frozen dataclass per command states its options, once. The command line reads it with tyro, the Python
 function `takes` its fields as keyword arguments, and `check_options` refuses values out of range.

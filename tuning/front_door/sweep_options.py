@@ -18,7 +18,7 @@ DEFAULT_DRIVERS = 1024
 
 @dataclass(frozen=True, kw_only=True)
 class SweepOptions:
-    """What `sweep` can be told."""
+    """Options of `sweep`."""
 
     scenarios: Annotated[int, number("Scenarios to draw and run."), Allowed(1, MOST)] = 100_000
     seed: Annotated[

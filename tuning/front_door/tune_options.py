@@ -32,7 +32,7 @@ Weight = float | None
 
 @dataclass(frozen=True, kw_only=True)
 class TuneOptions:
-    """What `tune` can be told."""
+    """Options of `tune`."""
 
     compensator: Annotated[str, arg(metavar="NAME", help="Compensator to tune.")] = "response_error"
     setting: Setting = None
@@ -151,7 +151,7 @@ class TuneOptions:
 
     @property
     def wants_quiet(self) -> bool:
-        """Whether there is a limit, and nothing else is asked to be minimised than what is by default."""
+        """Tell whether there is a limit, and nothing but what is minimised by default is asked for."""
         weights = self.command_weight, self.noise_weight, self.chatter_weight, self.transparency_weight
         usual = self.objective == "rms" and self.divergence_weight == 1 and weights == (None,) * 4
         return usual and 0 < self.limit < math.inf

@@ -36,7 +36,7 @@ class Verification:
 
 @dataclass(frozen=True, kw_only=True)
 class VerifyOptions:
-    """What `verify` can be told."""
+    """Options of `verify`."""
 
     key: Annotated[
         str | None,

@@ -1,0 +1,54 @@
+"""Edges of contact show a filter that the model lacks; forces are taken at the times they were read."""
+
+from dataclasses import replace
+from typing import Any
+
+import ambiguous_campaigns as ambiguous
+import campaigns
+import numpy as np
+import pytest
+
+from jaxhil.mechanism.file import from_builtins, to_builtins
+from tuning.identification.check import check
+from tuning.identification.motion import Motion
+from tuning.identification.noise import at_rest
+from tuning.identification.rational import STRUCTURES, Model
+
+
+def checked(monkeypatch, lag):
+    """Return the check of the edges of a file that has the true lag [s], or has it as a longer delay."""
+    campaign = ambiguous.campaign(monkeypatch, "lag", 0, seconds=5.0)
+    raw: dict[str, Any] = to_builtins(ambiguous.truth("lag")) | {"source": "identified from logs"}
+    sensor = raw["rig"]["force_sensor"]
+    raw["rig"]["force_sensor"] = {**sensor, "time_constant": lag, "delay": sensor["delay"] + 0.0016 - lag}
+    raw["uncertainty"] = {"rig.force_sensor.delay": {"distribution": "normal", "std": 1e-4}}
+    result = check(campaign, from_builtins(raw, "identified"))
+    (line,) = (line for line in result.lines if line.name == "edges of contact")
+    return line
+
+
+@pytest.mark.parametrize(("lag", "there"), [(0.0016, False), (0.0, True)])
+def test_edges_show_a_lag_that_the_file_lacks(monkeypatch, lag, there):
+    line = checked(monkeypatch, lag)
+    assert line.there == there
+    assert not there or line.counted_error > 0.01
+
+
+def test_noise_beyond_a_dead_zone_tells_it():
+    signal = np.random.default_rng(1).standard_normal(20_000)
+    noise = at_rest(np.sign(signal) * np.maximum(np.abs(signal) - 0.7, 0.0))
+    assert noise.silent and noise.dead_zone is not None
+    value, std = noise.dead_zone
+    assert abs(value - 0.7) < 4.0 * std < 0.1 and noise.std == pytest.approx(1.0, rel=0.05)
+    cut = at_rest(np.where(np.abs(signal) > 0.7, signal, 0.0))
+    assert cut.silent and cut.dead_zone is None
+
+
+def test_motion_is_that_of_the_time_at_which_forces_were_read():
+    campaign = campaigns.campaign("clean", 0, speeds=(0.006, 0.012), seconds=0, rest=0)
+    model = Model(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
+    late = [replace(run, force_late=np.full(len(run.tick), 3e-4)) for run in campaign.runs]
+    motion, own = (Motion(model, runs, campaign.timing, 0.022) for runs in (late, campaign.runs))
+    for one, other in zip(motion.at(0.004), own.at(0.0037), strict=True):
+        np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12)
+    np.testing.assert_array_equal(motion.of_positions().at(0.004)[0], own.at(0.004)[0])
