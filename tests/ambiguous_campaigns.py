@@ -3,6 +3,7 @@
 import campaign_kinds
 import campaigns
 import numpy as np
+from msgspec.structs import replace
 
 from jaxhil.mechanism.file import from_builtins, to_builtins
 from jaxhil.simulation.building import build_loop
@@ -55,16 +56,18 @@ def truth(name):
 
 
 def numbers(mechanism, position_delay):
-    """Return the numbers that decide e and e*, by key, as if the position sensor had that delay [s].
+    """Return the rig's numbers that decide e and e*, by key, as if the position sensor had that delay [s].
 
     Delays d less of the motion and of the force, and d more of the position sensor, are the same rig."""
-    rig, contact = mechanism.rig, mechanism.contact
-    found = {f"rig.simulator.{key}": getattr(rig.simulator, key) for key in TOLD}
-    found |= {f"rig.force_sensor.{key}": getattr(rig.force_sensor, key) for key in ("delay", "time_constant")}
+    rig = mechanism.rig
+    values = {f"rig.simulator.{key}": getattr(rig.simulator, key) for key in TOLD}
+    values |= {
+        f"rig.force_sensor.{key}": getattr(rig.force_sensor, key) for key in ("delay", "time_constant")
+    }
     share = rig.position_sensor.delay - position_delay
-    found["rig.simulator.delay"] += share
-    found["rig.force_sensor.delay"] = max(found["rig.force_sensor.delay"] - share, 0.0)
-    return found | {"contact.stiffness": contact.stiffness[0], "contact.damping": contact.damping[0]}
+    values["rig.simulator.delay"] += share
+    values["rig.force_sensor.delay"] = max(values["rig.force_sensor.delay"] - share, 0.0)
+    return values
 
 
 def off(name, written, compensator, gains):
@@ -72,16 +75,31 @@ def off(name, written, compensator, gains):
 
     All run under the same gains in the loop of `jaxhil`; e is the mean over phases of the contact."""
     true = truth(name)
-    every = [numbers(one, true.rig.position_sensor.delay) for one in (true, *written)]
+    voigt = [index for index, one in enumerate(written) if one.contact.law == true.contact.law]
+    table = np.empty((len(written) + 1, 2))
+    table[[0, *(index + 1 for index in voigt)]] = _errors(
+        true, [true, *(written[index] for index in voigt)], compensator, gains
+    )
+    for index in {*range(len(written))} - {*voigt}:
+        other = replace(true, contact=written[index].contact)
+        table[index + 1] = _errors(other, [written[index]], compensator, gains)
+    return table[1:] - table[0]
+
+
+def _errors(template, mechanisms, compensator, gains):
+    """Return e and e - e* of mechanisms with the template's contact law, (mechanisms, 2)."""
+    every = [numbers(one, template.rig.position_sensor.delay) for one in mechanisms]
+    if len(mechanisms) > 1:
+        for values, one in zip(every, mechanisms, strict=True):
+            values |= {f"contact.{key}": getattr(one.contact, key)[0] for key in ("stiffness", "damping")}
     draws = {
-        key: np.repeat([one[key] for one in every], len(PHASES))
+        key: np.repeat([values[key] for values in every], len(PHASES))
         for key in every[0]
-        if any(one[key] for one in every)
+        if any(values[key] for values in every)
     }
     draws["approach.phase"] = np.tile(PHASES, len(every))
-    scenarios = build_scenarios(true, draws, 0)
-    found = evaluate(build_loop(true, compensator, scenarios), gains, scenarios)
+    scenarios = build_scenarios(template, draws, 0)
+    found = evaluate(build_loop(template, compensator, scenarios), gains, scenarios)
     assert np.array_equal(found.good, found.wanted)
     e, error = np.asarray(found.metrics.restitution)[0], np.asarray(found.error)[0]
-    table = np.array([e, error]).reshape(2, len(every), len(PHASES)).mean(axis=2)
-    return (table[:, 1:] - table[:, :1]).T
+    return np.array([e, error]).reshape(2, len(every), len(PHASES)).mean(axis=2).T

@@ -281,3 +281,13 @@ def test_noise_is_passed_on_as_predicted(name):
     noise = np.random.default_rng(5).standard_normal(ticks)
     found = [controller.step(120.0 + one, 1e-3, 0.0, 1e-3) for one in noise.tolist()]
     assert np.std(found[1000:]) == pytest.approx(predicted * np.std(noise[1000:]), rel=0.02)
+
+
+@pytest.mark.parametrize("depth", [1.0, 1e4, 1e9])
+def test_hardening_over_a_great_depth_is_a_linear_contact(depth):
+    """The peak force came out as 0, by cancellation."""
+    linear = load("claw-350kg", ["contact.damping=[0.0]"]).mechanism
+    hardening = load(
+        "claw-350kg", ['contact.law="hardening"', "contact.damping=[0.0]", f"contact.reference_depth={depth}"]
+    ).mechanism
+    assert known.peak_force(hardening) == pytest.approx(known.peak_force(linear), rel=1e-5)

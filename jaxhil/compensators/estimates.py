@@ -92,7 +92,7 @@ def peak_force(mechanism: Mechanism) -> float:
     if contact.law == "hardening" and contact.reference_depth is not None:
         # k d^2/2 + k d^4/(4 d_0^2) = M v^2/2, of every entry.
         energies = [mass * velocity**2 / (k * contact.reference_depth**2) for k in stiffness]
-        depths = [math.sqrt(math.sqrt(1 + 2 * energy) - 1) for energy in energies]
+        depths = [math.sqrt(2 * energy / (1 + math.sqrt(1 + 2 * energy))) for energy in energies]
         forces = [k * depth * (1 + depth**2) for k, depth in zip(stiffness, depths, strict=True)]
         return contact.reference_depth * max(forces)
     if contact.law in ("hunt_crossley", "depth_damped"):

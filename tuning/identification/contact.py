@@ -22,7 +22,7 @@ from tuning.identification.noise import Noise
 from tuning.identification.press import known_bias
 from tuning.identification.rational import Model
 from tuning.identification.records import Run, Timing
-from tuning.identification.sensor_lag import LIKELY, Lag, sensor_lag
+from tuning.identification.sensor_lag import LIKELY, Lag, sensor_lag, with_lag
 from tuning.identification.two_clocks import Drift
 
 SETTLING = 0.5  # s, of a motion simulator
@@ -257,4 +257,9 @@ def without(fit: ContactFit, held: np.ndarray, seed: int = 0) -> ContactFit:
     taught = replace(readings, counts=readings.counts & ~held)
     taught = Problem(problem.motion, taught, fit.law, problem.plane, problem.time_constant)
     freedom = len(taught.kept) - len(fit.posterior.names)
-    return replace(fit, posterior=profile(taught, seed, fit.posterior.best[:2], ROUGH), freedom=freedom)
+    delay, plane, inner = fit.posterior.best
+    if taught.time_constant:
+        posterior = with_lag(taught, quick(taught, (delay, plane, inner.misfit), 2), fit.posterior, seed)
+    else:
+        posterior = profile(taught, seed, (delay, plane), ROUGH)
+    return replace(fit, posterior=posterior, freedom=freedom)

@@ -24,6 +24,7 @@ LONGEST = 0.02  # s, of the delays that are looked at
 COARSE = 0.0005  # s, between the first delays that are looked at
 STEPS = 6  # of Newton's for the plane
 CLOSE = 2.0  # gain of log likelihood below which a step more is not taken
+MEMORY = 40.0  # time constants after which a filter's output has died out, to rounding
 
 
 @dataclass(frozen=True)
@@ -112,9 +113,9 @@ class _Onsets(NamedTuple):
 class Problem:
     """Forces, the motion under them and a law; `plane` is told or None.
 
-    Rows out of contact say something of the bias alone: white noise given, three sums stand for all of them,
-    and the law's functions are computed where the mechanism is in contact. With a lag of the sensor [s] or
-    coloured noise every function is filtered along the rows as the force is."""
+    Rows out of contact say something of the bias alone: three sums stand for all of them, and the law's
+    functions are computed where the mechanism is in contact. With a lag of the sensor [s] or coloured noise
+    every function is filtered along the rows as the force is, until the filter's output has died out."""
 
     def __init__(
         self, motion: Motion, readings: Readings, law: Law, plane: float | None, time_constant: float = 0.0
@@ -131,11 +132,10 @@ class Problem:
         self.rate_like = [i for i, name in enumerate(self.names) if name.startswith("damping")]
         # A dead zone takes its share of every reading beyond it; a bias is in every reading.
         self.local = bool(readings.threshold)
-        self.sums = (
-            len(self.kept) / readings.std**2,
-            self.target.sum() / readings.std,
-            _dot(self.target, self.target),
-        )
+        # What a bias of 1 N is in a reading out of contact, over the noise.
+        self.bias_alone = 0.0 if self.local else float(np.sum(readings.whitening)) / readings.std
+        self.sums = _sums(self.target)
+        self.memory = len(readings.whitening) + int(np.ceil(MEMORY * time_constant / motion.period))
         # Parts of a period before the row at which the force is computed: a lag integrates it.
         self.before = (0.0,) if time_constant == 0.0 else (0.0, 0.5)
         self._at: tuple[float, list[tuple[np.ndarray, np.ndarray]]] | None = None
@@ -161,7 +161,7 @@ class Problem:
         (inner,) = self._inner(fit)
         if self.plane is not None:
             return inner
-        by_plane = self._by_plane(delay, plane, inner.coefficients, near[0], flags[0])
+        by_plane = self._by_plane(delay, plane, inner.coefficients, near, flags[0])
         residual, design = fit[3][0], fit[4][0]
         along = _dot(design, by_plane)
         across = along @ inner.covariance @ along
@@ -248,13 +248,24 @@ class Problem:
         rate = self.motion.period / self.time_constant
         return _Onsets(plane, row, columns, *onset_weights(rate, left[plane, row]))
 
-    def _filtered(self, near: list[_Near], tables: list[np.ndarray], onsets, first) -> np.ndarray:
-        """Columns at their rows, for each part of a period, as the sensor gives them at every row; `first`:
-        the columns just after the onsets, (columns, onsets)."""
-        shape, full = self.readings.force.shape, []
+    def _window(self, near: list[_Near]) -> slice:
+        """Return the rows at which filters show what happens at the rows near contact."""
+        length, lanes = self.readings.force.shape
+        flat = np.concatenate([one.rows for one in near])
+        if not len(flat):
+            return slice(0, 0)
+        return slice(int(flat.min()) // lanes, min(int(flat.max()) // lanes + 1 + self.memory, length))
+
+    def _filtered(
+        self, near: list[_Near], tables: list[np.ndarray], onsets, first, window: slice
+    ) -> np.ndarray:
+        """Columns at their rows, for each part of a period, as the sensor gives them at the rows of a window;
+        `first`: the columns just after the onsets, (columns, onsets)."""
+        lanes, full = self.readings.force.shape[1], []
+        shape, before = (window.stop - window.start, lanes), window.start * lanes
         for columns, one in zip(tables, near, strict=True):
-            table = np.zeros((*columns.shape[:2], self.readings.force.size))
-            table[:, :, one.rows] = columns
+            table = np.zeros((*columns.shape[:2], shape[0] * lanes))
+            table[:, :, one.rows - before] = columns
             full.append(table.reshape(*columns.shape[:2], *shape))
         if onsets is None:
             return full[0]
@@ -263,7 +274,9 @@ class Problem:
         drive[:, :, 1:] += last * full[0][:, :, :-1]
         flat = drive.reshape(*drive.shape[:2], -1)
         then = tables[0][onsets.plane, :, onsets.row].T
-        flat[onsets.plane, :, near[0].rows[onsets.row]] = (onsets.after * first + onsets.end * then).T
+        flat[onsets.plane, :, near[0].rows[onsets.row] - before] = (
+            onsets.after * first + onsets.end * then
+        ).T
         lagged: Any = lfilter([1.0], [1.0, -pole], drive, axis=-2)
         return lagged
 
@@ -281,14 +294,19 @@ class Problem:
         if onsets is not None:
             ones = np.ones((1, len(onsets.row)))
             first = np.vstack([onsets.columns, ones]) * flags[0][onsets.plane, onsets.row] / std
-        design = tables[0] if self.plain else self._at_kept(self._filtered(near, tables, onsets, first))
-        if not self.plain and not self.local:
-            design[:, -1] = float(np.sum(self.readings.whitening)) / std
-        target = self.target[near[0].rows] if self.plain else self.target
+        if self.plain:
+            design, target = tables[0], self.target[near[0].rows]
+        else:
+            window = self._window(near)
+            design = self._at_kept(self._filtered(near, tables, onsets, first, window), window)
+            target = self.target[self._kept_in(window)]
+            if not self.local:
+                design[:, -1] = self.bias_alone
         normal, right = design @ design.swapaxes(1, 2), _dot(design, target)
-        summed = self.plain and not self.local
-        if summed:
-            normal[:, -1, -1], right[:, -1] = self.sums[:2]
+        # Of the rows that the bias alone is in.
+        others, total, square = (whole - part for whole, part in zip(self.sums, _sums(target), strict=True))
+        normal[:, -1, -1] += others * self.bias_alone**2
+        right[:, -1] += total * self.bias_alone
         if self.readings.bias is not None:
             known, error = self.readings.bias
             normal[:, -1, -1] += error**-2
@@ -299,65 +317,83 @@ class Problem:
         coefficients = np.einsum("pij,pj->pi", covariance, right)
         residual = (coefficients[:, None] @ design)[:, 0] - target
         misfit = np.einsum("pm,pm->p", residual, residual)
-        if self.plain:
-            # Rows out of contact have the bias as their residual.
-            bias = coefficients[:, -1] if summed else np.zeros(len(design))
-            misfit = misfit + self.sums[2] - _dot(target, target)
-            misfit += bias**2 * (self.sums[0] - len(target) / std**2)
-            misfit -= 2.0 * bias * (self.sums[1] - target.sum() / std)
+        bias = coefficients[:, -1] * self.bias_alone
+        misfit += square + bias * (others * bias - 2.0 * total)
         if self.readings.bias is not None:
             known, error = self.readings.bias
             misfit = misfit + ((coefficients[:, -1] - known) / error) ** 2
         return coefficients, covariance, misfit, residual, design
 
-    def _at_kept(self, full: np.ndarray) -> np.ndarray:
-        """Values at all rows, (planes, columns, rows, lanes), with white noise and at those that count."""
-        return self.whiten(full).reshape(*full.shape[:2], -1)[:, :, self.kept]
+    def _kept_in(self, window: slice) -> slice:
+        """Return the place of a window's rows among those that count."""
+        lanes = self.readings.force.shape[1]
+        return slice(*np.searchsorted(self.kept, (window.start * lanes, window.stop * lanes)))
+
+    def _at_kept(self, values: np.ndarray, window: slice) -> np.ndarray:
+        """Values of (planes, columns, rows, lanes) of a window, with white noise and at rows that count."""
+        rows = self.kept[self._kept_in(window)] - window.start * self.readings.force.shape[1]
+        return self.whiten(values).reshape(*values.shape[:2], -1)[:, :, rows]
 
     def _by_plane(
-        self, delay: float, plane: float, coefficients, near: _Near, flag: np.ndarray
+        self, delay: float, plane: float, coefficients, near: list[_Near], flag: np.ndarray
     ) -> np.ndarray:
         """Slope of the readings predicted by the one plane, at the rows of the design, over the noise."""
-        step = 1e-7
+        step, window = 1e-7, self._window(near)
         if self.time_constant:
-            high, low = (self.force(delay, plane + d, coefficients) for d in (step, -step))
-            return self._at_kept((high - low)[None, None] / (2.0 * step * self.readings.std))[0, 0]
-        rows = self.where[near.rows]
+            planes = plane + step * np.array([1.0, -1.0])
+            shifted = self._everywhere(self._moved(delay), planes, coefficients)
+            wide = self._window([*near, *shifted[0]])
+            high, low = self._predicted(*shifted, coefficients, wide)
+            change = (high - low)[window.start - wide.start : window.stop - wide.start]
+            return self._at_kept(change[None, None] / (2.0 * step * self.readings.std), window)[0, 0]
+        now = near[0]
+        rows = self.where[now.rows]
         up, down = (
-            _force(coefficients, self._columns(np.maximum(near.depth + d, 0.0), near.rate, rows))
+            _force(coefficients, self._columns(np.maximum(now.depth + d, 0.0), now.rate, rows))
             for d in (step, -step)
         )
         table = ((down - up) * flag / (2.0 * step * self.readings.std))[:, None]
-        return (table if self.plain else self._at_kept(self._filtered([near], [table], None, None)))[0, 0]
+        if not self.plain:
+            table = self._at_kept(self._filtered(near, [table], None, None, window), window)
+        return table[0, 0]
 
     def force(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
         """The readings the law predicts [N], the bias included, (rows, lanes)."""
-        near, flags, onsets = self._everywhere(delay, plane, coefficients)
+        moved = [self.motion.at(delay + part * self.motion.period) for part in self.before]
+        moved = [(position.ravel(), rate.ravel()) for position, rate in moved]
+        near, flags, onsets = self._everywhere(moved, np.array([plane]), coefficients)
+        force = self._predicted(near, flags, onsets, coefficients, slice(0, len(self.readings.force)))[0]
+        return force if self.local else force + coefficients[-1]
+
+    def _predicted(self, near, flags, onsets, coefficients: np.ndarray, window: slice) -> np.ndarray:
+        """Return the readings at a window's rows [N] without a bias of all rows, (planes, rows, lanes)."""
         offset, first = self.local * coefficients[-1], None
         tables = [
-            ((_force(coefficients[None], one.columns) + offset) * flag)[:, None]
+            ((_force(coefficients, one.columns) + offset) * flag)[:, None]
             for one, flag in zip(near, flags, strict=True)
         ]
         if onsets is not None:
             first = (coefficients[:-1] @ onsets.columns + offset) * flags[0][onsets.plane, onsets.row]
-        return self._filtered(near, tables, onsets, first)[0, 0] + (0.0 if self.local else coefficients[-1])
+        return self._filtered(near, tables, onsets, first, window)[:, 0]
 
     def touching(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
         """Whether each row is in contact by the model, (rows, lanes)."""
-        (near, *_), (flag, *_), _ = self._everywhere(delay, plane, coefficients)
+        position, rate = self.motion.at(delay)
+        moved = [(position.ravel(), rate.ravel())]
+        (near,), (flag,), _ = self._everywhere(moved, np.array([plane]), coefficients)
         flags = np.zeros(self.readings.force.shape, bool)
         flags.ravel()[near.rows] = flag[0]
         return flags
 
-    def _everywhere(self, delay: float, plane: float, coefficients):
+    def _everywhere(self, moved, planes: np.ndarray, coefficients: np.ndarray):
         """The rows near contact, whether they count or not, and whether they are in it, for each part of a
-        period; and the onsets."""
-        moved = [self.motion.at(delay + part * self.motion.period) for part in self.before]
-        moved = [(position.ravel(), rate.ravel()) for position, rate in moved]
-        every, planes = np.arange(moved[0][0].size), np.array([plane])
-        near = [self._near(*one, every, planes) for one in moved]
-        flags = [self._touching(one, coefficients[None]) for one in near]
-        return near, flags, self._onsets(near[0], [x for x, _ in moved], planes)
+        period, of which `moved` has position and rate at all rows; and the onsets."""
+        every = np.arange(moved[0][0].size)
+        near = [self._near(position, rate, every, planes) for position, rate in moved]
+        repeated = np.repeat(coefficients[None], len(planes), axis=0)
+        flags = [self._touching(one, repeated) for one in near]
+        onsets = self._onsets(near[0], [x for x, _ in moved], planes) if len(moved) > 1 else None
+        return near, flags, onsets
 
     def settled(self, delay: float, plane: float) -> tuple[float, Inner, float]:
         """The plane of least misfit at a delay, a fit next to it, and by how much the log likelihood there is
@@ -383,3 +419,8 @@ def _force(coefficients: np.ndarray, columns: np.ndarray) -> np.ndarray:
 def _dot(table: np.ndarray, values: np.ndarray) -> Any:
     """Sums of products along the rows. BLAS would add up as many parts as it has threads: other last bits."""
     return np.einsum("...m,m->...", table, values)
+
+
+def _sums(values: np.ndarray) -> tuple[int, float, float]:
+    """Return the number of values, their sum and that of their squares."""
+    return len(values), float(values.sum()), float(_dot(values, values))

@@ -11,15 +11,14 @@ from jaxhil.mechanism.structs import numeric_keys
 from tuning.identification.contact import ContactFit
 from tuning.identification.result import Estimate
 
-# Where damping may be 0, its intervals and those of what goes along with it are the shortest ones.
-DAMPED = ("contact.damping", "rig.force_sensor.delay")
+DAMPING, DELAY = "contact.damping", "rig.force_sensor.delay"
 NEAR, CROWD = 0.1, 0.005  # standard deviations from 0, and share of the draws there, that make a crowd
 
 
 def estimates(found, motion, contact, force, position, fixed) -> tuple[Estimate, ...]:
     """Estimates of what has draws, then of what the sensors say at rest and of what was told."""
-    bounded = DAMPED if any(at_zero(one) for key, one in found.items() if key.startswith(DAMPED[0])) else ()
-    every = [_of_draws(key, values, key.startswith(bounded)) for key, values in found.items()]
+    at_bound = dampings_at_zero(found)
+    every = [_of_draws(key, values, at_bound) for key, values in found.items()]
     others = []
     if force is not None and not force.silent:
         others.append(_plain("rig.force_sensor.noise_std", force.std, force.std_std))
@@ -51,6 +50,18 @@ def at_zero(values: np.ndarray) -> bool:
     return bool(np.mean(values <= NEAR * values.std()) > CROWD)
 
 
+def dampings_at_zero(found: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the draws of the damping coefficients [N s/m] that crowd at 0, by key."""
+    return {key: values for key, values in found.items() if key.startswith(DAMPING) and at_zero(values)}
+
+
+def without_damping(values: np.ndarray, at_bound: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return draws moved to what they would be with these damping coefficients at 0, by linear regression."""
+    damping = np.column_stack(list(at_bound.values()))
+    slope = np.linalg.lstsq(damping - damping.mean(axis=0), values - values.mean(), rcond=None)[0]
+    return values - damping @ slope
+
+
 def shortest(values: np.ndarray) -> tuple[float, float]:
     """Return the shortest interval with 95 % of the draws; of those that crowd at 0 it has 0."""
     ordered = np.sort(values)
@@ -59,10 +70,20 @@ def shortest(values: np.ndarray) -> tuple[float, float]:
     return float(ordered[first]), float(ordered[first + inside - 1])
 
 
-def _of_draws(key: str, values: np.ndarray, bounded: bool = False) -> Estimate:
-    low, high = shortest(values) if bounded else np.quantile(values, (0.025, 0.975))
-    if bounded and key.startswith(DAMPED[0]) and at_zero(values):
+def _of_draws(key: str, values: np.ndarray, at_bound: Mapping[str, np.ndarray] = {}) -> Estimate:
+    """Return the estimate of a number from its draws.
+
+    `at_bound`: the dampings whose draws crowd at 0. Their interval is one-sided, and that of the force delay,
+    which the logs hardly tell from damping, includes the delays that go with no damping.
+    """
+    low, high = np.quantile(values, (0.025, 0.975))
+    if key in at_bound:
         low, high = 0.0, np.quantile(values, 0.95)
+    elif at_bound and key.startswith((DAMPING, DELAY)):
+        low, high = shortest(values)
+    if at_bound and key.startswith(DELAY):
+        ends = np.quantile(without_damping(values, at_bound), (0.025, 0.975))
+        low, high = min(low, ends[0]), max(high, ends[1])
     return Estimate(
         key, float(values.mean()), float(values.std(ddof=1)), float(low), float(high), unit_of(key)
     )
@@ -82,16 +103,14 @@ def unit_of(key: str) -> str:
 
 def combinations(found: Mapping[str, np.ndarray], contact: ContactFit | None) -> tuple[Estimate, ...]:
     """What the logs tell better than its parts: delays together, damping less stiffness times delay."""
-    combined = []
+    combined, at_bound = [], dampings_at_zero(found)
     motion, force = (found.get(key) for key in ("rig.simulator.delay", "rig.force_sensor.delay"))
     lag = found.get("rig.force_sensor.time_constant")
     if force is not None and lag is not None:
         force = force + lag
-        combined.append(replace(_of_draws("rig.force_sensor.delay", force), key="delay and lag of force"))
+        combined.append(replace(_of_draws(DELAY, force, at_bound), key="delay and lag of force"))
     if motion is not None and force is not None:
-        combined.append(
-            replace(_of_draws("rig.force_sensor.delay", motion + force), key="delay of motion and force")
-        )
+        combined.append(replace(_of_draws(DELAY, motion + force, at_bound), key="delay of motion and force"))
     damping, stiffness = found.get("contact.damping.0"), found.get("contact.stiffness.0")
     if contact is None or contact.law.name != "kelvin_voigt":
         return tuple(combined)

@@ -118,13 +118,18 @@ def _each(
     seed: int,
 ) -> list[Posterior]:
     """The posterior at each lag, over so many delays."""
-    spread = max(float(posterior.draws[:, 0].std()), NARROWEST) * np.linspace(-REACH, REACH, count)
-    each = []
-    for one in nodes:
-        at, plane, _ = fit(one)
-        delays = np.unique(np.clip(at + spread, problem.shortest, LONGEST))
-        each.append(around(_lagging(problem, one), delays, plane, seed))
-    return each
+    return [with_lag(_lagging(problem, lag), fit(lag), posterior, seed, count) for lag in nodes]
+
+
+def with_lag(
+    problem: Problem, best: Fitted, like: Posterior, seed: int, count: int = FEWER_DELAYS
+) -> Posterior:
+    """Return the posterior at the problem's lag about the best fit, over `count` delays.
+
+    They reach as far as the delay's standard deviation in a posterior `like` this one."""
+    spread = max(float(like.draws[:, 0].std()), NARROWEST) * np.linspace(-REACH, REACH, count)
+    delays = np.unique(np.clip(best[0] + spread, problem.shortest, LONGEST))
+    return around(problem, delays, best[1], seed)
 
 
 def _joined(nodes: np.ndarray, each: list[Posterior], seed: int) -> tuple[np.ndarray, np.ndarray]:
