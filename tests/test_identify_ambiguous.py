@@ -85,6 +85,7 @@ def test_a_law_that_is_named_is_taken(monkeypatch):
     campaign = ambiguous.campaign(monkeypatch, "undamped", 0, speeds=FEW, seconds=10.0)
     found = identify(campaign, options=Options(law="linear", hold_out=0.0))
     assert found.contact.law.name == "linear" and found["rig.force_sensor.delay"].std < 5e-5
+    assert any(note.startswith("law linear: without damping, as asked for") for note in found.notes)
 
 
 def test_a_delay_below_0_is_named_and_the_file_is_not_good(monkeypatch, tmp_path):

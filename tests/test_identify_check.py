@@ -47,6 +47,15 @@ def test_another_mechanism_is_bad(clean, changed, name):
     assert name in [None, *(line.name for line in found.lines if line.there)]
 
 
+def test_check_names_the_file_and_time_of_a_touch_that_differs(clean):
+    runs = [replace(run, source=f"run_{place}.csv") for place, run in enumerate(clean.runs)]
+    place = next(place for place, run in reversed(list(enumerate(runs))) if run.kind == "contact")
+    runs[place] = replace(runs[place], force_measured=1.1 * runs[place].force_measured, begin=7.0)
+    found = check(replace(clean, runs=tuple(runs)), campaign_rigs.mechanism("clean"))
+    (line,) = (line for line in found.lines if line.name == "contact law")
+    assert line.there and line.where.startswith(f"run_{place}.csv from 7.")
+
+
 def test_the_hold_that_logs_are_told_with_is_checked(clean):
     wrong = replace(clean, timing=replace(clean.timing, command_hold="zoh"))
     assert "command hold" in [

@@ -348,6 +348,11 @@ def _notes(
         rate, std = 1e6 * contact.drift.rate, 1e6 * contact.drift.std
         gains = f"the forces' clock gains {rate:.3g} +- {std:.2g} ppm on the drives'"
         notes.append(f"{gains}; a constant between them and {FORCE_DELAY} are one number: it is as told")
+    if contact is not None and not contact.problem.rate_like:
+        notes.append(
+            f"law {contact.law.name}: without damping, as asked for; a damping b with a force delay longer by "
+            "b over the stiffness may explain the logs as well"
+        )
     if contact is not None and contact.resampled:
         notes.append(contact.resampled)
     if force is not None and force.drift:

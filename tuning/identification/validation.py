@@ -37,7 +37,7 @@ class Line:
     finding: str  # what was found, in words and numbers
     there: bool  # whether the defect is more than chance
     effect: float  # on e, if it is there
-    where: str = ""  # frequency, touch or entry where it is worst
+    where: str = ""  # frequency, file and time, or entry where it is worst
     on_error: float | None = None  # effect on e - e*, where it is not that on e
     counts: bool = True  # whether the verdict adds it up
 
@@ -136,12 +136,12 @@ def of_contact(
     contact: ContactFit, runs: list[Run], mass: float, frequency: float, lag: float, held: np.ndarray
 ) -> list[Line]:
     """Checks of the contact's model on the touches `held`, a flag each."""
-    lines = [_left(contact, held), *_at_the_end(contact)]
+    lines = [_left(contact, runs, held), *_at_the_end(contact)]
     if contact.drift is None:
         errors, stds = restitution_errors(contact, runs, mass)
         usable = held & np.isfinite(errors)
         if usable.any():
-            lines.append(_restitution(errors[usable], stds[usable]))
+            lines.append(_restitution(contact, runs, errors, stds, usable))
     return [*lines, *_trends(contact, len(runs), frequency, lag)]
 
 
@@ -149,17 +149,17 @@ def of_touches_left_out(contact: ContactFit, runs: list[Run], mass: float, held:
     """Check on the touches `held` what a fit to the others leaves of them; the verdict does not count it.
 
     The verdict is that of the file written, whose numbers are those of all touches."""
-    left = _left(contact, held)
+    left = _left(contact, runs, held)
     lines = [replace(left, name="contact law, touches not fitted", counts=False)]
     errors, stds = restitution_errors(contact, runs, mass)
     usable = held & np.isfinite(errors)
     if contact.drift is None and usable.any():
-        line = _restitution(errors[usable], stds[usable])
+        line = _restitution(contact, runs, errors, stds, usable)
         lines.append(replace(line, name="restitution of touches not fitted", counts=False))
     return lines
 
 
-def _left(contact: ContactFit, held: np.ndarray) -> Line:
+def _left(contact: ContactFit, runs: list[Run], held: np.ndarray) -> Line:
     delay, plane, inner = contact.posterior.best
     readings = contact.readings
     readings = replace(readings, counts=readings.counts & certain_rows(contact))
@@ -177,7 +177,7 @@ def _left(contact: ContactFit, held: np.ndarray) -> Line:
             < RARE
         ),
         float(np.sqrt(beyond)),
-        f"touch {int(np.argmax(every / np.maximum(count, 1)))}",
+        _place(contact, runs, held, every / count),
     )
 
 
@@ -246,16 +246,25 @@ def restitution_errors(contact: ContactFit, runs: list[Run], mass: float) -> tup
     return errors, stds
 
 
-def _restitution(errors: np.ndarray, stds: np.ndarray) -> Line:
-    z = errors / stds
+def _restitution(
+    contact: ContactFit, runs: list[Run], errors: np.ndarray, stds: np.ndarray, usable: np.ndarray
+) -> Line:
+    z, errors = errors[usable] / stds[usable], errors[usable]
     mean = float(errors.mean())
     return Line(
         "restitution of touches",
         f"off by {mean:+.2g} on the mean, rms z {np.sqrt(np.mean(z**2)):.2f}",
         bool(stats.chi2.sf(float(np.sum(z**2)), len(z)) < RARE),
         float(np.sqrt(np.mean(errors**2))),
-        f"touch {int(np.argmax(np.abs(z)))}",
+        _place(contact, runs, usable, np.abs(z)),
     )
+
+
+def _place(contact: ContactFit, runs: list[Run], chosen: np.ndarray, values: np.ndarray) -> str:
+    """Return file and time of the run with the largest of values, one for each chosen run."""
+    run = runs[int(np.flatnonzero(chosen)[np.argmax(values)])]
+    first = run.tick[int(np.argmax(run.valid))]
+    return f"{run.source} from {run.begin + first * contact.problem.motion.period:.1f} s on"
 
 
 def _trends(contact: ContactFit, touches: int, frequency: float, lag: float) -> list[Line]:
