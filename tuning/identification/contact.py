@@ -259,7 +259,8 @@ def without(fit: ContactFit, held: np.ndarray, seed: int = 0) -> ContactFit:
     freedom = len(taught.kept) - len(fit.posterior.names)
     delay, plane, inner = fit.posterior.best
     if taught.time_constant:
-        posterior = with_lag(taught, quick(taught, (delay, plane, inner.misfit), 2), fit.posterior, seed)
+        best = quick(taught, (delay, plane, inner.misfit), 2)
+        posterior = with_lag(taught, best, fit.posterior, seed)
     else:
         posterior = profile(taught, seed, (delay, plane), ROUGH)
     return replace(fit, posterior=posterior, freedom=freedom)

@@ -89,6 +89,8 @@ class Inner:
     evidence: float  # log of the posterior density of delay and plane, up to a constant
     slope: float = 0.0  # of misfit / 2 by the plane
     curvature: float = 0.0  # of misfit / 2 by the plane, all else fitted
+    plane: float = 0.0  # m, where it was fitted
+    by_plane: np.ndarray | None = None  # slope of the coefficients by the plane, where that is not told
 
 
 class _Near(NamedTuple):
@@ -160,13 +162,13 @@ class Problem:
         near, flags, fit = self._settle(delay, np.array([plane]))
         (inner,) = self._inner(fit)
         if self.plane is not None:
-            return inner
+            return replace(inner, plane=plane)
         by_plane = self._by_plane(delay, plane, inner.coefficients, near, flags[0])
         residual, design = fit[3][0], fit[4][0]
         along = _dot(design, by_plane)
-        across = along @ inner.covariance @ along
-        slope, curvature = _dot(residual, by_plane), _dot(by_plane, by_plane) - across
-        return replace(inner, slope=float(slope), curvature=float(curvature))
+        change = -inner.covariance @ along
+        slope, curvature = _dot(residual, by_plane), _dot(by_plane, by_plane) + along @ change
+        return replace(inner, slope=float(slope), curvature=float(curvature), plane=plane, by_plane=change)
 
     def across(self, delay: float, planes: np.ndarray) -> list[Inner]:
         """The same at several planes at once, without slopes by the plane."""

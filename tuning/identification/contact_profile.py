@@ -26,7 +26,6 @@ FEW_PLANES = 15  # of the grid that finds the region
 ROUGHLY = 2.0  # times the plane's standard deviation that the first look tells
 DELAYS, PLANES = 61, 13  # of the final grid
 REACH = 0.003  # s, on each side of a delay that is known roughly
-FEW_DELAYS = 5  # of the grid where nothing is rough, and planes
 PLANE_REACH = 3.2  # standard deviations of the plane at a given delay, on each side
 DRAWS = 4000
 
@@ -89,15 +88,6 @@ def profile(
     planes = uniform_filter1d(planes, SMOOTHED, mode="nearest")
     known = np.interp(delays, finer, planes), np.interp(delays, finer, np.maximum(spreads, known[1]))
     places, cells = _grid(problem, delays, known, size[1])
-    return _sample(problem, places, cells, delays, seed)
-
-
-def around(problem: Problem, delays: np.ndarray, plane: float, seed: int) -> Posterior:
-    """The posterior over these delays alone, about this plane; where no jump at the onset makes it rough."""
-    few = np.linspace(delays[0], delays[-1], FEW_DELAYS)
-    planes, stds, _ = _scan(problem, few, plane)
-    known = np.interp(delays, few, planes), np.interp(delays, few, stds)
-    places, cells = _grid(problem, delays, known, FEW_DELAYS)
     return _sample(problem, places, cells, delays, seed)
 
 

@@ -17,7 +17,8 @@ import numpy as np
 from scipy import optimize, special
 
 from tuning.identification.contact_problem import LONGEST, Problem
-from tuning.identification.contact_profile import DRAWS, Posterior, around
+from tuning.identification.contact_profile import DRAWS, Posterior
+from tuning.identification.lag_profile import around
 from tuning.identification.law_choice import Fitted, quick
 
 LARGEST = 0.005  # s
@@ -127,9 +128,9 @@ def with_lag(
     """Return the posterior at the problem's lag about the best fit, over `count` delays.
 
     They reach as far as the delay's standard deviation in a posterior `like` this one."""
-    spread = max(float(like.draws[:, 0].std()), NARROWEST) * np.linspace(-REACH, REACH, count)
-    delays = np.unique(np.clip(best[0] + spread, problem.shortest, LONGEST))
-    return around(problem, delays, best[1], seed)
+    reach = REACH * max(float(like.draws[:, 0].std()), NARROWEST)
+    low, high = np.clip([best[0] - reach, best[0] + reach], problem.shortest, LONGEST)
+    return around(problem, np.linspace(low, high, count), best[1], seed)
 
 
 def _joined(nodes: np.ndarray, each: list[Posterior], seed: int) -> tuple[np.ndarray, np.ndarray]:

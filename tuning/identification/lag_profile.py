@@ -1,0 +1,66 @@
+"""Posterior of a contact behind a lagging sensor, over delays that are known roughly.
+
+A lag blurs the jump at the onset of damped contact, so that no row makes a step in the likelihood as it does
+in `contact_profile`. At each delay the surface and the coefficients then are normal, by linear least squares.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy import special
+
+from tuning.identification.contact_problem import Problem
+from tuning.identification.contact_profile import DRAWS, Posterior
+
+WIDEST = 0.01  # m, largest standard deviation of the surface
+ATTEMPTS = 50  # to draw dampings that are not negative
+
+
+def around(problem: Problem, delays: np.ndarray, plane: float, seed: int) -> Posterior:
+    """Return the posterior over evenly spaced delays alone, about a surface."""
+    step, free = delays[1] - delays[0], problem.plane is None
+    surfaces, fits, deviations, changes, heights = [], [], [], [], []
+    for delay in delays:
+        surface, fit, gain = problem.settled(float(delay), plane)
+        deviation = min(1.0 / np.sqrt(max(fit.curvature, 1e-300)), WIDEST) if free else 0.0
+        change = np.zeros(len(fit.coefficients)) if fit.by_plane is None else fit.by_plane
+        mean = fit.coefficients + change * (surface - fit.plane)
+        spread = np.sqrt(np.diag(fit.covariance) + (change * deviation) ** 2)
+        allowed = sum(special.log_ndtr(mean[i] / spread[i]) for i in problem.rate_like)
+        volume = 0.5 * np.linalg.slogdet(fit.covariance)[1] + np.log(np.sqrt(2.0 * np.pi) * deviation or 1.0)
+        heights.append(gain - 0.5 * fit.misfit + volume + allowed)
+        for values, value in ((surfaces, surface), (fits, fit), (deviations, deviation), (changes, change)):
+            values.append(value)
+    total: Any = special.logsumexp(heights)
+    weights = np.exp(np.array(heights) - total)
+    rng = np.random.default_rng(seed)
+    # Spread evenly over the weights: less luck in the draws.
+    picked = np.searchsorted(np.cumsum(weights), (np.arange(DRAWS) + rng.uniform(size=DRAWS)) / DRAWS)
+    picked = np.minimum(picked, len(delays) - 1)
+    means = np.array([fit.coefficients for fit in fits]) + np.array(changes) * (
+        np.array(surfaces) - [fit.plane for fit in fits]
+    ).reshape(-1, 1)
+    moved = np.maximum(delays[picked] + rng.uniform(-0.5, 0.5, DRAWS) * step, problem.shortest)
+    at = np.column_stack([np.interp(moved, delays, values) for values in (surfaces, *means.T)])
+    factors = np.linalg.cholesky(np.array([fit.covariance for fit in fits]) + 1e-30 * np.eye(means.shape[1]))
+    off, values, left = np.empty(DRAWS), at[:, 1:].copy(), np.arange(DRAWS)
+    for _ in range(ATTEMPTS):
+        cell, noise = picked[left], rng.standard_normal((len(left), means.shape[1] + 1))
+        off[left] = np.array(deviations)[cell] * noise[:, 0]
+        along = off[left, None] * np.array(changes)[cell]
+        values[left] = at[left, 1:] + along + np.einsum("nij,nj->ni", factors[cell], noise[:, 1:])
+        left = np.flatnonzero(np.any(values[:, problem.rate_like] < 0.0, axis=1))
+        if not len(left):
+            break
+    values[:, problem.rate_like] = np.maximum(values[:, problem.rate_like], 0.0)
+    best = int(np.argmax(heights))
+    return Posterior(
+        ["delay", "plane", *problem.names],
+        rng.permutation(np.column_stack([moved, at[:, 0] + off, values])),
+        delays,
+        np.array(heights) - max(heights),
+        (float(delays[best]), surfaces[best], problem.at(float(delays[best]), surfaces[best])),
+        float(total + np.log(step)),
+    )
