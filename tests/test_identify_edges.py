@@ -10,6 +10,7 @@ import pytest
 
 from jaxhil.mechanism.file import from_builtins, to_builtins
 from tuning.identification.check import check
+from tuning.identification.estimate import identify
 from tuning.identification.motion import Motion
 from tuning.identification.noise import at_rest
 from tuning.identification.rational import STRUCTURES, Model
@@ -42,6 +43,16 @@ def test_noise_beyond_a_dead_zone_tells_it():
     assert abs(value - 0.7) < 4.0 * std < 0.1 and noise.std == pytest.approx(1.0, rel=0.05)
     cut = at_rest(np.where(np.abs(signal) > 0.7, signal, 0.0))
     assert cut.silent and cut.dead_zone is None
+
+
+def test_dead_zone_that_cuts_is_noted(monkeypatch):
+    campaign = ambiguous.campaign(monkeypatch, "plain", 0, seconds=5.0)
+    runs = []
+    for run in campaign.runs:
+        force = np.nan_to_num(np.asarray(run.force_measured, float))
+        runs.append(replace(run, force_measured=np.where(np.abs(force) > 3.0, force, 0.0)))
+    result = identify(replace(campaign, runs=tuple(runs)), ambiguous.prior("plain"))
+    assert any("no reading lies between 0 and 3 N: a dead zone that cuts" in note for note in result.notes)
 
 
 def test_motion_is_that_of_the_time_at_which_forces_were_read():

@@ -349,8 +349,8 @@ def _notes(
         rate, std = 1e6 * contact.drift.rate, 1e6 * contact.drift.std
         gains = f"the forces' clock gains {rate:.3g} +- {std:.2g} ppm on the drives'"
         notes.append(f"{gains}; a constant between them and {FORCE_DELAY} are one number: it is as told")
-    if contact is not None and force is not None and force.silent and not contact.dead_zone:
-        readings = np.abs(contact.readings.force[contact.readings.counts])
+    if contact is not None and force is not None and force.silent:
+        readings = np.abs(contact.readings.force)
         least = float(readings[readings > 0.0].min(initial=np.inf))
         if SEEN * contact.readings.std < least < np.inf:
             notes.append(
