@@ -45,14 +45,21 @@ def test_noise_beyond_a_dead_zone_tells_it():
     assert cut.silent and cut.dead_zone is None
 
 
-def test_dead_zone_that_cuts_is_noted(monkeypatch):
+@pytest.mark.parametrize("is_cut", [True, False])
+def test_dead_zone_that_cuts_is_a_defect(monkeypatch, tmp_path, is_cut):
     campaign = ambiguous.campaign(monkeypatch, "plain", 0, seconds=5.0)
     runs = []
     for run in campaign.runs:
         force = np.nan_to_num(np.asarray(run.force_measured, float))
-        runs.append(replace(run, force_measured=np.where(np.abs(force) > 3.0, force, 0.0)))
-    result = identify(replace(campaign, runs=tuple(runs)), ambiguous.prior("plain"))
-    assert any("no reading lies between 0 and 3 N: a dead zone that cuts" in note for note in result.notes)
+        less = 0.0 if is_cut else 3.0 * np.sign(force)
+        runs.append(replace(run, force_measured=np.where(np.abs(force) > 3.0, force - less, 0.0)))
+    campaign = replace(campaign, runs=tuple(runs))
+    prior: dict[str, Any] = to_builtins(ambiguous.prior("plain"))
+    prior["rig"]["force_sensor"]["dead_zone"] = 3.0
+    result = identify(campaign, from_builtins(prior, "prior"))
+    found = [line.finding for line in result.lines if line.name == "dead zone of the force sensor"]
+    assert found == (["no reading lies between 0 and 3 N, as behind a dead zone that cuts"] if is_cut else [])
+    assert not (is_cut and result.good)
 
 
 def test_motion_is_that_of_the_time_at_which_forces_were_read():

@@ -131,9 +131,11 @@ def _known_contact(runs: Sequence[Run], model: Model, campaign: Campaign, mechan
         readings = replace(readings, counts=readings.counts & (predicted > contacts.BEYOND * std))
     problem = Problem(motion, readings, law, plane, lag)
     inner = Inner(values, np.zeros((len(values), len(values))), 0.0, 0.0, 0.0, 0.0)
+    delays, planes = _places(mechanism)
+    delays = np.clip(delays, problem.shortest, max(LONGEST, delay))  # as far as the motion is known
     posterior = Posterior(
         ["delay", "plane", *problem.names],
-        np.column_stack([*_places(mechanism), np.tile(values, (validation.CERTAIN_DRAWS, 1))]),
+        np.column_stack([delays, planes, np.tile(values, (validation.CERTAIN_DRAWS, 1))]),
         np.array([delay]),
         np.zeros(1),
         (delay, plane, inner),

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tuning.identification import two_clocks
+from tuning.identification import two_clocks, undamped
 from tuning.identification.contact_laws import Law, kelvin_voigt
 from tuning.identification.contact_problem import LONGEST, Problem, Readings
 from tuning.identification.contact_profile import Posterior, profile
@@ -155,10 +155,16 @@ def estimate(
         pushing = kelvin_voigt()
         other = _fitted(motion, readings, pushing, plane, near, hidden, seed)
         if other[3] >= evidence:
-            law, (problem, posterior, lag, _) = pushing, other
+            law, (problem, posterior, lag, evidence) = pushing, other
     if lag is not None:
         problem = Problem(motion, readings, law, plane, lag.value)
         posterior = lag.posterior
+
+    def without_damping(law: Law) -> tuple[Posterior, float]:
+        _, alone, lagging, evidence = _fitted(motion, readings, law, plane, near, hidden, seed)
+        return alone if lagging is None else lagging.posterior, evidence
+
+    posterior = undamped.averaged(problem, posterior, evidence, without_damping)
     averaged = lag.share if lag is not None and not lag.value else 0.0
     if hidden and not _hides(posterior):
         # A channel that is 0 out of contact is no sensor's.

@@ -17,6 +17,7 @@ from scipy.ndimage import uniform_filter1d
 
 from tuning.identification import press
 from tuning.identification.contact_problem import COARSE, LONGEST, Inner, Problem
+from tuning.identification.normal_draws import factor
 
 FINE = 2e-5  # s, between the next
 SMOOTHED = 7  # of these delays, over which the plane is averaged
@@ -218,12 +219,12 @@ def _sample(
 
 def _coefficients(cell: Inner, positive: list[int], count: int, rng) -> np.ndarray:
     """Normal draws; those with a negative damping are drawn again."""
-    factor = np.linalg.cholesky(cell.covariance + 1e-30 * np.eye(len(cell.coefficients)))
-    draws = cell.coefficients + rng.standard_normal((count, len(factor))) @ factor.T
+    root = factor(cell.covariance)
+    draws = cell.coefficients + rng.standard_normal((count, len(root))) @ root.T
     for _ in range(50):
         bad = np.any(draws[:, positive] < 0.0, axis=1)
         if not bad.any():
             return draws
-        draws[bad] = cell.coefficients + rng.standard_normal((int(bad.sum()), len(factor))) @ factor.T
+        draws[bad] = cell.coefficients + rng.standard_normal((int(bad.sum()), len(root))) @ root.T
     draws[:, positive] = np.maximum(draws[:, positive], 0.0)
     return draws

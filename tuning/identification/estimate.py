@@ -44,7 +44,6 @@ Say = Callable[[str], None]  # told what begins
 FORCE_DELAY, DEAD_ZONE = "rig.force_sensor.delay", "rig.force_sensor.dead_zone"
 STIFFNESS, POSITION_DELAY = "contact.stiffness.", "rig.position_sensor.delay"
 CLEAR = 2.0  # standard deviations by which a force delay is taken to be above 0
-SEEN = 3.0  # standard deviations of the noise; readings as small would occur without a dead zone
 
 
 def _silent(text: str) -> None:
@@ -349,14 +348,6 @@ def _notes(
         rate, std = 1e6 * contact.drift.rate, 1e6 * contact.drift.std
         gains = f"the forces' clock gains {rate:.3g} +- {std:.2g} ppm on the drives'"
         notes.append(f"{gains}; a constant between them and {FORCE_DELAY} are one number: it is as told")
-    if contact is not None and force is not None and force.silent:
-        readings = np.abs(contact.readings.force)
-        least = float(readings[readings > 0.0].min(initial=np.inf))
-        if SEEN * contact.readings.std < least < np.inf:
-            notes.append(
-                f"the force is 0 at rest and no reading lies between 0 and {least:.2g} N: a dead zone that "
-                "cuts hides how contacts begin and end, and the mechanism file has none of that kind"
-            )
     if contact is not None and not contact.problem.rate_like:
         notes.append(
             f"law {contact.law.name}: without damping, as asked for; a damping b with a force delay longer "

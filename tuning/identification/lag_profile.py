@@ -13,6 +13,7 @@ from scipy import special
 
 from tuning.identification.contact_problem import Problem
 from tuning.identification.contact_profile import DRAWS, Posterior
+from tuning.identification.normal_draws import factor
 
 WIDEST = 0.01  # m, largest standard deviation of the surface
 ATTEMPTS = 50  # to draw dampings that are not negative
@@ -44,7 +45,7 @@ def around(problem: Problem, delays: np.ndarray, plane: float, seed: int) -> Pos
     ).reshape(-1, 1)
     moved = np.maximum(delays[picked] + rng.uniform(-0.5, 0.5, DRAWS) * step, problem.shortest)
     at = np.column_stack([np.interp(moved, delays, values) for values in (surfaces, *means.T)])
-    factors = np.linalg.cholesky(np.array([fit.covariance for fit in fits]) + 1e-30 * np.eye(means.shape[1]))
+    factors = factor(np.array([fit.covariance for fit in fits]))
     off, values, left = np.empty(DRAWS), at[:, 1:].copy(), np.arange(DRAWS)
     for _ in range(ATTEMPTS):
         cell, noise = picked[left], rng.standard_normal((len(left), means.shape[1] + 1))

@@ -8,6 +8,7 @@ import numpy as np
 
 from tuning.identification.contact import ContactFit
 from tuning.identification.contact_laws import Law
+from tuning.identification.normal_draws import factor
 from tuning.identification.rational import Model
 
 SIMULATOR = "rig.simulator."
@@ -47,8 +48,7 @@ def simulator_draws(model: Model, covariance: np.ndarray, frequency: float, coun
 
     First and second order have keys of their own; of other models the delay takes all that is uncertain, the
     lag at the contact's frequency."""
-    factor = np.linalg.cholesky(covariance + 1e-30 * np.eye(len(covariance)))
-    off = rng.standard_normal((count, len(factor))) @ factor.T
+    off = rng.standard_normal((count, len(covariance))) @ factor(covariance).T
     s = np.array([2j * np.pi * frequency])
     slopes = -np.imag(model.slopes(s)[:, 0]) / (2.0 * np.pi * frequency)
     lag = off @ slopes

@@ -214,10 +214,26 @@ def _refine(structure: Structure, start: np.ndarray, lines: Lines) -> Fit:
     covariance = np.linalg.pinv(curvature / np.outer(scales, scales), hermitian=True) / np.outer(
         scales, scales
     )
-    half = len(lines)
-    return Fit(
-        Model(structure, found.x), covariance, (found.fun[:half] + 1j * found.fun[half:]) / np.sqrt(2.0)
-    )
+    half, parameters = len(lines), _with_slow_poles(structure, found.x)
+    left = residual(parameters)
+    return Fit(Model(structure, parameters), covariance, (left[:half] + 1j * left[half:]) / np.sqrt(2.0))
+
+
+def _with_slow_poles(structure: Structure, parameters: np.ndarray) -> np.ndarray:
+    """Return the parameters with poles beyond 1/SHORTEST moved there: no line tells how fast they are."""
+    first, order = structure.first, structure.order
+    times = np.maximum(parameters[:first], np.log(SHORTEST))
+    sections = []
+    fastest = -np.log(SHORTEST)
+    for frequency, ratio in parameters[first:order].reshape(-1, 2):
+        if ratio > 0.0:  # two real poles, here by their logarithms
+            slower = frequency - ratio - np.log1p(np.sqrt(1.0 - np.exp(-2.0 * ratio)))
+            faster, slower = min(2.0 * frequency - slower, fastest), min(slower, fastest)
+            frequency = 0.5 * (slower + faster)
+            ratio = np.logaddexp(slower, faster) - np.log(2.0) - frequency
+        frequency = min(frequency, fastest)
+        sections += [frequency, ratio]
+    return np.array([*times, *sections, *parameters[order:]])
 
 
 def _delays(lines: Lines) -> np.ndarray:

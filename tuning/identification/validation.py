@@ -26,6 +26,9 @@ RARE = 1e-3  # probability under which a defect is taken to be there
 HARMONICS = 4.0  # of the contact's frequency: up to there the motion decides what a contact does
 CERTAIN_DRAWS = 40  # of the posterior, under all of which a row is in contact or under none
 AT_THE_END = 0.93  # of the longest force delay that is looked for
+FEW_TOUCHES = 5  # of which one would show a small reading
+MOSTLY = 0.8  # share of a run's readings that are not 0, beyond which no dead zone hides the others
+SEEN = 3.0  # standard deviations of the noise; readings as small occur where no dead zone cuts
 NEIGHBOURS = 5  # lines over which the motion's misfit is averaged
 
 
@@ -136,7 +139,7 @@ def of_contact(
     contact: ContactFit, runs: list[Run], mass: float, frequency: float, lag: float, held: np.ndarray
 ) -> list[Line]:
     """Checks of the contact's model on the touches `held`, a flag each."""
-    lines = [_left(contact, runs, held), *_at_the_end(contact)]
+    lines = [_left(contact, runs, held), *_at_the_end(contact), *_dead_zone(contact, runs)]
     if contact.drift is None:
         errors, stds = restitution_errors(contact, runs, mass)
         usable = held & np.isfinite(errors)
@@ -213,6 +216,31 @@ def _at_the_end(contact: ContactFit) -> list[Line]:
         return []
     found = f"{1e3 * delay:.4g} ms, the longest that was looked for"
     return [Line("force delay", found, True, 1.0)]
+
+
+def _dead_zone(contact: ContactFit, runs: list[Run]) -> list[Line]:
+    """Check that readings of touches that are 0 out of contact begin and end near 0.
+
+    Where none is small, a dead zone cuts small forces and leaves the others as they are; that of mechanism
+    files takes its size from every force."""
+    smallest, steps, peaks = [], [], []
+    for lane, run in enumerate(runs):
+        force = np.abs(contact.readings.force[: len(run.tick), lane])
+        (felt,) = np.nonzero(force)
+        if run.kind == "contact" and len(felt) > 1 and len(felt) < MOSTLY * len(force):
+            smallest.append(force[felt].min())
+            steps.append(abs(force[felt[-1]] - force[felt[-2]]))
+            peaks.append(force.max())
+    if len(smallest) < FEW_TOUCHES:
+        return []
+    least, std = min(smallest), contact.readings.std
+    quantum = np.diff(np.unique(contact.readings.force)).min(initial=np.inf)
+    # The last reading of a touch that ends smoothly lies anywhere between 0 and the last step.
+    likely = np.prod(np.maximum(1.0 - least / (np.array(steps) + 2.0 * std + 1e-300), 0.0))
+    if least <= max(SEEN * std, 2.5 * quantum) or likely > RARE:
+        return []
+    found = f"no reading lies between 0 and {least:.2g} N, as behind a dead zone that cuts"
+    return [Line("dead zone of the force sensor", found, True, float(least / np.median(peaks)))]
 
 
 def restitution_errors(contact: ContactFit, runs: list[Run], mass: float) -> tuple[np.ndarray, np.ndarray]:
