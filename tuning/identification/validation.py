@@ -28,6 +28,7 @@ CERTAIN_DRAWS = 40  # of the posterior, under all of which a row is in contact o
 AT_THE_END = 0.93  # of the longest force delay that is looked for
 FEW_TOUCHES = 5  # of which one would show a small reading
 MOSTLY = 0.8  # share of a run's readings that are not 0, beyond which no dead zone hides the others
+CUT = 0.01  # probability of such readings below which a dead zone is taken to cut
 SEEN = 3.0  # standard deviations of the noise; readings as small occur where no dead zone cuts
 NEIGHBOURS = 5  # lines over which the motion's misfit is averaged
 
@@ -237,7 +238,7 @@ def _dead_zone(contact: ContactFit, runs: list[Run]) -> list[Line]:
     quantum = np.diff(np.unique(contact.readings.force)).min(initial=np.inf)
     # The last reading of a touch that ends smoothly lies anywhere between 0 and the last step.
     likely = np.prod(np.maximum(1.0 - least / (np.array(steps) + 2.0 * std + 1e-300), 0.0))
-    if least <= max(SEEN * std, 2.5 * quantum) or likely > RARE:
+    if least <= max(SEEN * std, 2.5 * quantum) or likely > CUT:
         return []
     found = f"no reading lies between 0 and {least:.2g} N, as behind a dead zone that cuts"
     return [Line("dead zone of the force sensor", found, True, float(least / np.median(peaks)))]
