@@ -109,10 +109,11 @@ def test_gains_tuned_on_files_that_are_called_good_lose_little(monkeypatch):
             break
     for name in best:
         rows = np.array([loss[1:] for loss in losses if loss[0] == name])
-        within = np.mean(rows[:, 0] <= 1.10 * rows[:, 1] + 0.0005)
-        print(f"{name}: {len(rows)} files, rms e - e* {rows[:, 0].mean():.5f}, at most", end=" ")
+        after, before, _ = rows.T
+        within = np.mean(after <= 1.10 * before + 0.0005)
         print(
-            f"{rows[:, 0].max():.5f}, of gains tuned on the truth {rows[0, 1]:.5f}; {within:.0%} within 10 %"
+            f"{name}: {len(rows)} files, rms e - e* {after.mean():.5f}, at most {after.max():.5f},", end=" "
         )
+        print(f"of gains tuned on the truth {before[0]:.5f}; {within:.0%} within 10 %")
     assert len(losses) == GOOD
     assert all(after <= 1.10 * before + 0.0005 + stated for _, after, before, stated in losses)

@@ -159,3 +159,15 @@ def test_contacts_on_the_far_side_of_a_clearance_are_refused(tmp_path, gone):
         read(path, **dict.fromkeys(gone))
     first = back + int(np.argmax(log["F"][back:] < -2.0))
     assert int(str(caught.value).split("row ")[1].split(":")[0]) == pytest.approx(first + 1, abs=5)
+
+
+def test_log_that_ends_soon_after_a_contact_on_the_far_side_is_read_or_refused(tmp_path):
+    """Of such a log the speed after the contact was sought beyond the last row."""
+    log, back = far_side()
+    last = int(np.flatnonzero(log["F"] < -2.0)[-1])
+    for rows in range(last + 15, last + 26):
+        path = write_csv(tmp_path / f"{rows}.csv", {name: column[:rows] for name, column in log.items()})
+        try:
+            assert read(path).runs
+        except InputError as error:
+            assert "far side" in str(error)

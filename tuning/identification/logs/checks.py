@@ -103,7 +103,7 @@ def _check_one_side(label: str, pull: np.ndarray, x: np.ndarray, period: float, 
     """Raise `InputError` if a contact turns falling positions round, as the far side of a clearance does."""
     for begin, end in segments.contacts(pull, period, 0.0, apart=APART):
         begin, end = begin - SMOOTH, end + SMOOTH
-        if begin < SMOOTH or end + SMOOTH > len(x):
+        if begin < SMOOTH or end + SMOOTH >= len(x):
             continue
         before, after = ((x[row] - x[row - SMOOTH]) / (SMOOTH * period) for row in (begin, end + SMOOTH))
         impulse = -period * float(np.nansum(pull[begin:end]))
