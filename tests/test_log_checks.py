@@ -5,6 +5,7 @@ import pytest
 from log_cases import LAG, MASS, PERIOD, STIFFNESS, read, sway, touches, write_csv
 
 from jaxhil.errors import InputError
+from tuning.identification.logs import checks
 
 LOG = touches(2, noise=0.0)
 
@@ -161,13 +162,8 @@ def test_contacts_on_the_far_side_of_a_clearance_are_refused(tmp_path, gone):
     assert int(str(caught.value).split("row ")[1].split(":")[0]) == pytest.approx(first + 1, abs=5)
 
 
-def test_log_that_ends_soon_after_a_contact_on_the_far_side_is_read_or_refused(tmp_path):
-    """Of such a log the speed after the contact was sought beyond the last row."""
-    log, back = far_side()
-    last = int(np.flatnonzero(log["F"] < -2.0)[-1])
-    for rows in range(last + 15, last + 26):
-        path = write_csv(tmp_path / f"{rows}.csv", {name: column[:rows] for name, column in log.items()})
-        try:
-            assert read(path).runs
-        except InputError as error:
-            assert "far side" in str(error)
+@pytest.mark.parametrize("rows", range(150, 180))
+def test_log_may_end_soon_after_a_force_that_pulls(rows):
+    """The speed after the pull was sought beyond the last row."""
+    pull = np.where((np.arange(rows) > 100) & (np.arange(rows) < 140), -1.0, 0.0)
+    checks._check_one_side("a.csv", pull, np.linspace(0.0, 1e-3, rows), PERIOD, MASS)
