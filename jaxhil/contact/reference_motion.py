@@ -25,7 +25,8 @@ from jaxtyping import Array, Float
 from jaxhil.contact.dormand_prince import Step, along, take_step
 
 if TYPE_CHECKING:
-    from jaxhil.contact.base import ContactLaw, ContactParameters
+    from jaxhil.contact.base import ContactLaw
+    from jaxhil.contact.laws import ContactParameters
 
 TOLERANCE = 1e-10  # of a step, against approach velocity and deepest penetration
 FIRST_STEP = 1e-4  # s, tried first
