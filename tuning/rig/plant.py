@@ -153,6 +153,8 @@ class Plant:
         """Deepest penetration [m] by the end of a stretch; a surface that has been left is as new."""
         if -self._clearance <= end.position <= 0.0:
             return 0.0
+        if duration <= 0.0:  # delays of whole periods: the stretch before ends here
+            return deepest
         return max(deepest, deepest_within(start, end, duration, self._clearance))
 
     def _limit(self, wanted: float) -> float:
