@@ -10,6 +10,11 @@ from laws_from_elsewhere import ScaledLead, ScaledLeadOnTheRig, SquaredSpring
 from test_front_door import KEYS, TWO, refusal
 
 import jaxhil
+from jaxhil.contact.laws import contact_law
+from jaxhil.mechanism.uncertainty import draw
+from tuning.identification import known
+from tuning.rig.plant import Plant
+from tuning.transparency.damping_perturbations import perturb_damping
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +61,19 @@ def test_a_contact_law_from_elsewhere_is_simulated_against_its_integrated_refere
     slope = jaxhil.jacobian(mechanism, "phase_lead", of="reference_peak_force", by=by)[by]
     # F = k (1.5 M v^2/k)^(2/3), hence dF/dk = F/(3 k).
     np.testing.assert_allclose(slope, contact.reference_peak_force / 3e8, rtol=1e-6)
+
+
+def test_what_a_contact_law_does_not_state_is_refused(registered):
+    mechanism = jaxhil.load("rig-300kg", {"contact": {"law": "squared_spring", "stiffness": [1e8]}})
+    for needs, method in (
+        (lambda: perturb_damping(mechanism, draw(mechanism, 4, 0)), "perturb_damping"),
+        (lambda: Plant(mechanism), "in_floats"),
+        (lambda: known.contact_law(mechanism.contact), "regression"),
+    ):
+        said = refusal(needs)
+        assert said.startswith("contact.law: found 'squared_spring', expected a law ")
+        assert said.endswith(f"(ContactLaw.{method})")
+    assert "contact.law: found 'none', expected one of linear, " in refusal(contact_law, "none")
 
 
 def test_what_cannot_be_registered_is_refused(registered):
