@@ -10,7 +10,8 @@ from laws_from_elsewhere import ScaledLead, ScaledLeadOnTheRig, SquaredSpring
 from test_front_door import KEYS, TWO, refusal
 
 import jaxhil
-from jaxhil.contact.laws import contact_law
+from jaxhil.contact import laws
+from jaxhil.contact.keys import Key
 from jaxhil.mechanism.uncertainty import draw
 from tuning.identification import known
 from tuning.rig.plant import Plant
@@ -73,7 +74,12 @@ def test_what_a_contact_law_does_not_state_is_refused(registered):
         said = refusal(needs)
         assert said.startswith("contact.law: found 'squared_spring', expected a law ")
         assert said.endswith(f"(ContactLaw.{method})")
-    assert "contact.law: found 'none', expected one of linear, " in refusal(contact_law, "none")
+    assert "contact.law: found 'none', expected one of linear, " in refusal(laws.contact_law, "none")
+
+
+def test_contact_laws_state_a_key_that_they_share_alike():
+    for law in laws.LAWS.values():
+        assert all(laws.KEYS[key.name] == key for key in law.keys or ())
 
 
 def test_what_cannot_be_registered_is_refused(registered):
@@ -95,6 +101,10 @@ def test_what_cannot_be_registered_is_refused(registered):
         name = "unitless"
         gains = (jaxhil.Gain("toy_lead", "", lambda m: 0.0, lambda m: 1.0, lambda m: 1.0),)
 
+    class OfItsOwnKey(SquaredSpring):
+        name = "of_its_own_key"
+        keys = (Key("toy_depth", "of a toy", "m"),)
+
     class Holding(ScaledLead):
         name = "holding"
         table: jnp.ndarray = eqx.field(default_factory=lambda: jnp.ones(3))
@@ -108,6 +118,7 @@ def test_what_cannot_be_registered_is_refused(registered):
         (Broken(), "gains.toy_lead.lower: found AttributeError"),
         (Unitless(), "gains.toy_lead.unit: found ''"),
         (Holding(), "a law holds no arrays"),
+        (OfItsOwnKey(), "keys: found toy_depth, allowed keys that files have: tension, exponent, "),
     ):
         assert said in refusal(jaxhil.register, law)
     assert "allowed one of none" in refusal(jaxhil.simulate, "varying", "holding")

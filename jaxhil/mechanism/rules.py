@@ -117,9 +117,9 @@ def check_law(
     calls them. Raise `KeyProblem`."""
     law = contact_law(contact.law)
     _check_depths(path, law, contact.depths)
-    entries = contact.stiffness if _has_entries(contact) else [contact.stiffness]
-    for i, entry in enumerate(entries):
-        where = (*path, "stiffness", i) if _has_entries(contact) else (*path, "stiffness")
+    listed = isinstance(contact, Contact)  # on one axis there is an entry for each successive contact
+    for i, entry in enumerate(contact.stiffness if listed else [contact.stiffness]):
+        where = (*path, "stiffness", *[i] * listed)
         if law.segmented and not (isinstance(entry, list) and len(entry) == len(contact.depths) + 1):
             allowed = f"a list of {len(contact.depths) + 1} slopes, one more than depths (law {law.name})"
             raise KeyProblem(where, shown(entry), allowed)
@@ -129,11 +129,6 @@ def check_law(
     if law.dissipates_by and is_damped(path, contact, uncertainties):
         damping = shown(contact.damping) if np.any(contact.damping) else "an uncertain damping"
         raise KeyProblem((*path, "damping"), damping, f"0 (law {law.name} dissipates by {law.dissipates_by})")
-
-
-def _has_entries(contact: Any) -> bool:
-    """Return whether `stiffness` has an entry for each successive contact: on one axis."""
-    return isinstance(contact, Contact)
 
 
 def _check_depths(path: Path, law: ContactLaw, depths: Sequence[float]) -> None:
