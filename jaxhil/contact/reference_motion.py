@@ -181,6 +181,22 @@ def _try(problem, state, length):
     return StepEnd(*tried.end, first=tried.slopes[0][1], last=tried.slopes[-1][1]), tried.error
 
 
+def _first_touch(problem):
+    """Return the state at the first touch."""
+    zeros = jnp.zeros_like(problem.approach)
+    return _State(
+        time=zeros,
+        depth=zeros,
+        velocity=problem.approach,
+        memory=problem.law.init(zeros),
+        phase=jnp.zeros(zeros.shape, jnp.int32),
+        deepest=zeros,
+        peak=zeros,
+        grip=zeros,
+        separated=zeros,
+    )
+
+
 def _follow(problem, records):
     """From the first touch until all is over, at the latest to `LONGEST`; the nodes passed, if recorded."""
     like = problem.approach
@@ -188,7 +204,7 @@ def _follow(problem, records):
     rounding = float(np.finfo(dtype).eps)
     tolerance = jnp.maximum(problem.tolerance, 32 * rounding)
     none = jnp.zeros(like.shape, jnp.int32)
-    start = _State(zeros, zeros, like, problem.law.init(zeros), none, zeros, zeros, zeros, zeros)
+    start = _first_touch(problem)
     search = _Search(zeros + FIRST_STEP, none, *[zeros] * 5)
     nodes = None
     if records:

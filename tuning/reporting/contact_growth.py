@@ -156,11 +156,15 @@ def _shape(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> Shape
 def _lanes(scenarios: Scenario, slot: int) -> Lane:
     sensor, simulator = scenarios.force_sensor, scenarios.simulator
     numbers = Lane(
-        scenarios.equivalent_mass, scenarios.control_period, scenarios.contact.stiffness[slot],
-        scenarios.contact.damping[slot], np.moveaxis(np.asarray(simulator.numerator), 0, -1),
-        np.moveaxis(np.asarray(simulator.denominator), 0, -1), sensor.delay + simulator.delay,
-        sensor.time_constant,
-    )  # fmt: skip
+        mass=scenarios.equivalent_mass,
+        period=scenarios.control_period,
+        stiffness=scenarios.contact.stiffness[slot],
+        damping=scenarios.contact.damping[slot],
+        numerator=np.moveaxis(np.asarray(simulator.numerator), 0, -1),
+        denominator=np.moveaxis(np.asarray(simulator.denominator), 0, -1),
+        delay=sensor.delay + simulator.delay,
+        lag=sensor.time_constant,
+    )
     return jax.tree.map(np.asarray, numbers)
 
 

@@ -109,13 +109,11 @@ def compute_map(
     reason = no_growth(mechanism, compensator)
     radii = on_lines = grown = None
     if reason is None:
-        own, at = batch(middle)
-        grown = growth(mechanism, compensator, {name: float(value) for name, value in gains.items()}, at)
+        plain = {name: float(value) for name, value in gains.items()}
+        grown = growth(mechanism, compensator, plain, batch(middle)[1])
         few = min(points, max(FEWEST, int((MOST_WORK / cost(mechanism, compensator, scenarios)) ** 0.5)))
         grid = [axis.values(few) for axis in axes]
-        values = np.concatenate([_grid(*grid), across, up])
-        own, at = batch(values)
-        every = spectral_radii(mechanism, compensator, own, at)
+        every = spectral_radii(mechanism, compensator, *batch(np.concatenate([_grid(*grid), across, up])))
         radii = Radii(grid[0], grid[1], every[: few**2].reshape(few, few))
         on_lines = every[few**2 :].reshape(2, LINE)
     closed = closed_forms(mechanism, compensator, batch(_grid(x, y))[1])
@@ -125,10 +123,18 @@ def compute_map(
         nominal = nominal._replace(growth=grown, radius_margins=margins)
     shape = points, points
     return Map(
-        axes, x, y, restitution[:size].reshape(shape), error[:size].reshape(shape),
-        force[:size].reshape(shape), duration[:size].reshape(shape), _reshaped(closed, points), radii, reason,
-        nominal,
-    )  # fmt: skip
+        axes=axes,
+        x=x,
+        y=y,
+        restitution=restitution[:size].reshape(shape),
+        error=error[:size].reshape(shape),
+        peak_force_ratio=force[:size].reshape(shape),
+        duration_ratio=duration[:size].reshape(shape),
+        closed=_reshaped(closed, points),
+        radii=radii,
+        no_growth=reason,
+        nominal=nominal,
+    )
 
 
 def _nominal(
@@ -142,7 +148,16 @@ def _nominal(
     are the map's."""
     restitution, error, force, duration, unlike = found
     if not np.isfinite(error[-1]):
-        return Nominal(None, None, None, None, None, None, None, None)
+        return Nominal(
+            restitution=None,
+            error=None,
+            peak_force_ratio=None,
+            duration_ratio=None,
+            growth=None,
+            error_margins=None,
+            contact_margins=None,
+            radius_margins=None,
+        )
     errors = np.nan_to_num(np.abs(error[size:-1]), nan=np.inf).reshape(2, LINE)
     bounds = np.nan_to_num(unlike[size:-1], nan=1.0).reshape(2, LINE)
     return Nominal(
