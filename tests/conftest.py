@@ -68,15 +68,13 @@ def _laws_of_the_package_alone():
     import jaxhil.runtime
     from jaxhil.compensators import COMPENSATORS
     from jaxhil.contact.laws import LAWS
-    from jaxhil.mechanism.structs import CONTACT_LAWS
 
     tables = (COMPENSATORS, LAWS, jaxhil.runtime.COMPENSATORS)
-    before, names = [dict(table) for table in tables], list(CONTACT_LAWS)
+    before = [dict(table) for table in tables]
     yield
     for table, entries in zip(tables, before, strict=True):
         table.clear()
         table.update(entries)
-    CONTACT_LAWS[:] = names
 
 
 @pytest.fixture(scope="session", autouse=True)

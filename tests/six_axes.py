@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhil.contact.laws import LAWS, ContactParameters
+from jaxhil.contact.laws import KEYS, LAWS, ContactParameters
 from jaxhil.simulation.scenario import MotionSimulator
 from jaxhil.sixdof.approach import begin
 from jaxhil.sixdof.bodies import build_body
@@ -64,7 +64,9 @@ def second_order(frequencies, dampings, delays):
 def springs(stiffness, damping, exponent):
     """Parameters of a contact law, each (candidates, *batch)."""
     zero = jnp.zeros_like(stiffness)
-    return ContactParameters(stiffness, damping, exponent, zero[:1], zero > 1, zero, zero, zero, zero)
+    own = {key.name: zero for key in KEYS.values()}
+    own |= {"exponent": exponent, "depths": zero[:1], "tension": zero > 1}
+    return ContactParameters(stiffness, damping, **own)
 
 
 def place(values, batch=()):

@@ -20,7 +20,7 @@ from jaxhil.simulation.evaluation import evaluate
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.benchmark.runs import build_scene, judge_gains
 from tuning.gains.common_program import common_programs
-from tuning.transparency.damped_twins import MOST, damped_twins
+from tuning.transparency.damping_perturbations import LARGEST_RATIO, perturb_damping
 from tuning.transparency.figures import (
     CLOSER_TO_1,
     Estimate,
@@ -118,10 +118,10 @@ def test_without_compensation_the_error_is_the_closed_form():
         pytest.param("suite-hertz", marks=pytest.mark.slow),
     ],
 )
-def test_damped_twins_span_a_third_of_the_speed(name):
+def test_damping_perturbations_span_a_third_of_the_speed(name):
     parsed = load(name).mechanism
     draws = draw(parsed, 24, 0)
-    twin, twin_draws = damped_twins(parsed, draws)
+    twin, twin_draws = perturb_damping(parsed, draws)
     lossy = []
     for one, values in ((parsed, draws), (twin, twin_draws)):
         batch = build_scenarios(one, values)
@@ -135,7 +135,7 @@ def test_damped_twins_span_a_third_of_the_speed(name):
     before, after = lossy
     lost = 1 - after / before
     assert np.all(lost >= -1e-9) and np.min(lost) < 0.02
-    assert 0.2 < np.max(lost) < 1.3 * (1 - np.exp(-np.pi * MOST))
+    assert 0.2 < np.max(lost) < 1.3 * (1 - np.exp(-np.pi * LARGEST_RATIO))
 
 
 def test_transparency_and_slope_are_least_squares():

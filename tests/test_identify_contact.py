@@ -1,14 +1,17 @@
 """The contact from forces over known motion: exact where there is no noise, honest where there is."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import campaigns
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from tuning.identification import contact_laws, contact_profile
+from jaxhil.contact.laws import contact_law
+from tuning.identification import contact_profile
 from tuning.identification.contact import after_gaps, pieces
+from tuning.identification.contact_laws import kelvin_voigt
 from tuning.identification.contact_problem import LONGEST, Problem, Readings
 from tuning.identification.contact_profile import profile
 from tuning.identification.law_choice import judge, quick
@@ -16,6 +19,7 @@ from tuning.identification.motion import Motion, exponential
 from tuning.identification.rational import STRUCTURES, Model
 from tuning.identification.sensor_filter import lag_weights, onset_weights
 
+HERTZ = contact_law("hunt_crossley").regression(SimpleNamespace(exponent=1.5))
 SECOND = Model(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
 
 
@@ -33,9 +37,9 @@ def problem(name, law, noise=0.5, speeds=campaigns.SPEEDS, seed=0, plane=None, t
 
 
 @pytest.mark.parametrize("name, law, plane, expected", (
-    ("clean", contact_laws.kelvin_voigt(), 0.0, [1.2e5, 650.0, 0.0]),
-    ("stiffnesses", contact_laws.kelvin_voigt(), 2e-4, [1.2e5, 2.4e5, 7e4, 650.0, 0.0]),
-    ("hertz", contact_laws.hunt_crossley(1.5), 0.0, [6e6, 1.2e7, 0.0]),
+    ("clean", kelvin_voigt(), 0.0, [1.2e5, 650.0, 0.0]),
+    ("stiffnesses", kelvin_voigt(), 2e-4, [1.2e5, 2.4e5, 7e4, 650.0, 0.0]),
+    ("hertz", HERTZ, 0.0, [6e6, 1.2e7, 0.0]),
 ))  # fmt: skip
 def test_without_noise_the_numbers_are_exact_at_the_true_delay_and_plane(name, law, plane, expected):
     exact = problem(name, law, noise=0.0, speeds=(0.006, 0.012, 0.006))
@@ -50,7 +54,7 @@ def test_without_noise_the_numbers_are_exact_at_the_true_delay_and_plane(name, l
 
 def test_with_a_lag_too():
     """The position sensor's delay is the motion's here, and less of the force's."""
-    lagging = problem("lagging", contact_laws.kelvin_voigt(), 0.0, (0.006, 0.012), 0, 0.0, 0.0016)
+    lagging = problem("lagging", kelvin_voigt(), 0.0, (0.006, 0.012), 0, 0.0, 0.0016)
     inner = lagging.at(0.0037 - 0.0012, 0.0)
     np.testing.assert_allclose(inner.coefficients, [1.2e5, 650.0, 0.0], rtol=2e-4, atol=0.01)
     assert np.abs(lagging.force(0.0025, 0.0, inner.coefficients) - lagging.readings.force).max() < 0.06
@@ -78,7 +82,7 @@ def test_a_lag_is_exact_where_contact_begins_within_the_period():
 
 
 def test_white_noise_and_its_sums_give_what_the_filtered_path_gives():
-    plain = problem("stiffnesses", contact_laws.kelvin_voigt(), speeds=(0.006, 0.012, 0.003))
+    plain = problem("stiffnesses", kelvin_voigt(), speeds=(0.006, 0.012, 0.003))
     filtered = Problem(plain.motion, plain.readings, plain.law, None)
     filtered.plain, filtered.where = False, np.arange(plain.readings.counts.size)
     filtered.entry = plain.readings.entry.ravel()
@@ -95,7 +99,7 @@ def test_the_exponential_is_that_of_scipy():
 
 
 def test_the_posterior_covers_the_truth_and_knows_the_apparent_damping_best():
-    found = profile(problem("clean", contact_laws.kelvin_voigt(), seed=4))
+    found = profile(problem("clean", kelvin_voigt(), seed=4))
     values = dict(zip(found.names, found.draws.T, strict=True))
     for name, truth in (("delay", 0.0037), ("plane", 0.0), ("stiffness.0", 1.2e5), ("damping", 650.0)):
         # 99.99 % of a normal number's draws.
@@ -116,7 +120,7 @@ def test_a_long_press_is_fitted_in_pieces_as_exactly():
     cut = pieces(run, 0.001)
     assert sum(int(piece.valid.sum()) for piece in cut) == len(run.tick) - 500
     timing = campaigns.campaign("clean", 0, speeds=(), seconds=0, rest=0).timing
-    law = contact_laws.kelvin_voigt()
+    law = kelvin_voigt()
     inner = Problem(Motion(SECOND, cut, timing, 0.022), Readings.of(cut, 0.5), law, 0.0).at(0.0037, 0.0)
     np.testing.assert_allclose(inner.coefficients, [1.2e5, 650.0, 0.0], rtol=1e-5, atol=1e-3)
 
@@ -142,7 +146,7 @@ def test_a_contact_cut_by_lost_rows_counts_once_the_motion_has_forgotten_them():
     worst = []
     for cut in (known, halves):
         motion = Motion(SECOND, cut, timing, 0.022)
-        inner = Problem(motion, Readings.of(cut, 0.5), contact_laws.kelvin_voigt(), 0.0).at(0.0037, 0.0)
+        inner = Problem(motion, Readings.of(cut, 0.5), kelvin_voigt(), 0.0).at(0.0037, 0.0)
         worst.append(np.max(np.abs(inner.coefficients - [1.2e5, 650.0, 0.0]) / [1.2e5, 650.0, 1.0]))
     assert worst[0] < 1e-3 < 1e-2 < worst[1]
 
@@ -152,9 +156,7 @@ def test_undamped_contact_has_no_negative_damping():
     soft = replace(kind, contact={**kind.contact, "damping": [0.0]})
     runs = campaigns._touch_runs(soft, np.random.default_rng(0), (0.003, 0.006, 0.012))
     timing = campaigns.campaign("clean", 0, speeds=(), seconds=0, rest=0).timing
-    one = Problem(
-        Motion(SECOND, runs, timing, 0.022), Readings.of(runs, 0.5), contact_laws.kelvin_voigt(), 0.0
-    )
+    one = Problem(Motion(SECOND, runs, timing, 0.022), Readings.of(runs, 0.5), kelvin_voigt(), 0.0)
     found = profile(one, size=(21, 5))
     damping = found.draws[:, found.names.index("damping")]
     assert damping.min() >= 0.0 and damping.mean() < 4.0 * damping.std()
@@ -163,7 +165,7 @@ def test_undamped_contact_has_no_negative_damping():
 
 @pytest.mark.parametrize("name, law", (("clean", "kelvin_voigt"), ("hertz", "hunt_crossley")))
 def test_the_law_is_named(name, law):
-    one = problem(name, contact_laws.kelvin_voigt(), speeds=(0.003, 0.006, 0.012) * 2)
+    one = problem(name, kelvin_voigt(), speeds=(0.003, 0.006, 0.012) * 2)
     judged = judge(one.motion, one.readings, None, ("linear", "kelvin_voigt", "hunt_crossley"))
     assert judged[0].law.name == law and not judged[0].law.pulls
     assert all(other.short[0] > 2.0 * other.short[1] for other in judged[1:] if other.law.name != law)
@@ -176,7 +178,7 @@ def test_cells_have_their_edges_where_rows_come_into_contact():
     np.testing.assert_allclose(contact_profile.cut(0.0, 1.0, at, 6), [0.0, 0.1, 0.15, 0.425, 0.7, 0.85, 1.0])
     np.testing.assert_allclose(contact_profile.cut(0.0, 1.0, at, 3), [0.0, 0.15, 0.7, 1.0])
     np.testing.assert_allclose(contact_profile.cut(0.0, 1.0, at[:0], 4), [0.0, 0.25, 0.5, 0.75, 1.0])
-    exact = problem("clean", contact_laws.kelvin_voigt(), speeds=(0.006, 0.012, 0.003), seed=3)
+    exact = problem("clean", kelvin_voigt(), speeds=(0.006, 0.012, 0.003), seed=3)
     (plane, *_) = exact.onsets_between(0.0037, -3e-6, 3e-6)
     inside = [exact.motion.at(0.0037)[0] > place for place in (plane - 1e-9, plane + 1e-9)]
     assert np.sum(inside[0] != inside[1]) == 1
@@ -184,7 +186,7 @@ def test_cells_have_their_edges_where_rows_come_into_contact():
 
 def test_a_search_about_a_delay_beyond_the_longest_stays_within_it():
     """Stay within the longest delay: beyond it the grid about the delay had one place."""
-    clean = problem("clean", contact_laws.kelvin_voigt(), speeds=(0.006, 0.012))
+    clean = problem("clean", kelvin_voigt(), speeds=(0.006, 0.012))
     late = replace(clean.readings, force=np.roll(clean.readings.force, 40, axis=0))
     late = Problem(clean.motion, late, clean.law, clean.plane)
     delay, *_ = quick(late, (LONGEST + 0.002, 0.0, np.inf))

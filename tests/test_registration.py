@@ -10,6 +10,12 @@ from laws_from_elsewhere import ScaledLead, ScaledLeadOnTheRig, SquaredSpring
 from test_front_door import KEYS, TWO, refusal
 
 import jaxhil
+from jaxhil.contact import laws
+from jaxhil.contact.keys import Key
+from jaxhil.mechanism.uncertainty import draw
+from tuning.identification import known
+from tuning.rig.plant import Plant
+from tuning.transparency.damping_perturbations import perturb_damping
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +64,24 @@ def test_a_contact_law_from_elsewhere_is_simulated_against_its_integrated_refere
     np.testing.assert_allclose(slope, contact.reference_peak_force / 3e8, rtol=1e-6)
 
 
+def test_what_a_contact_law_does_not_state_is_refused(registered):
+    mechanism = jaxhil.load("rig-300kg", {"contact": {"law": "squared_spring", "stiffness": [1e8]}})
+    for needs, method in (
+        (lambda: perturb_damping(mechanism, draw(mechanism, 4, 0)), "perturb_damping"),
+        (lambda: Plant(mechanism), "in_floats"),
+        (lambda: known.contact_law(mechanism.contact), "regression"),
+    ):
+        said = refusal(needs)
+        assert said.startswith("contact.law: found 'squared_spring', expected a law ")
+        assert said.endswith(f"(ContactLaw.{method})")
+    assert "contact.law: found 'none', expected one of linear, " in refusal(laws.contact_law, "none")
+
+
+def test_contact_laws_state_a_key_that_they_share_alike():
+    for law in laws.LAWS.values():
+        assert all(laws.KEYS[key.name] == key for key in law.keys or ())
+
+
 def test_what_cannot_be_registered_is_refused(registered):
     class Unnamed(SquaredSpring):
         name = ""
@@ -77,6 +101,10 @@ def test_what_cannot_be_registered_is_refused(registered):
         name = "unitless"
         gains = (jaxhil.Gain("toy_lead", "", lambda m: 0.0, lambda m: 1.0, lambda m: 1.0),)
 
+    class OfItsOwnKey(SquaredSpring):
+        name = "of_its_own_key"
+        keys = (Key("toy_depth", "of a toy", "m"),)
+
     class Holding(ScaledLead):
         name = "holding"
         table: jnp.ndarray = eqx.field(default_factory=lambda: jnp.ones(3))
@@ -90,6 +118,7 @@ def test_what_cannot_be_registered_is_refused(registered):
         (Broken(), "gains.toy_lead.lower: found AttributeError"),
         (Unitless(), "gains.toy_lead.unit: found ''"),
         (Holding(), "a law holds no arrays"),
+        (OfItsOwnKey(), "keys: found toy_depth, allowed keys that files have: tension, exponent, "),
     ):
         assert said in refusal(jaxhil.register, law)
     assert "allowed one of none" in refusal(jaxhil.simulate, "varying", "holding")

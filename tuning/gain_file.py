@@ -14,12 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxhil.compensators import Gain
-from jaxhil.contact.laws import LAWS
-from jaxhil.contact.reference_motion import integrate_contact
+from jaxhil.contact.laws import contact_law
 from jaxhil.errors import InputError, shown
 from jaxhil.files import write_whole, writing
 from jaxhil.mechanism.file import AnyMechanism, to_builtins
@@ -142,48 +140,10 @@ def plain(value: Any) -> Any:
 
 
 def _peak_forces(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
-    """Peak force [N] of every contact, (slots, lanes), entered undamped at the approach speed."""
-    contact = scenarios.contact
-    stiffness = np.asarray(contact.stiffness)
-    energy = np.asarray(scenarios.equivalent_mass) * np.asarray(scenarios.velocity) ** 2 / 2
-    law = mechanism.contact.law
-    if law == "hardening":
-        # M v^2/2 = k d^2/2 + k d^4/(4 d_0^2), in units of d_0
-        unit = np.asarray(contact.reference_depth)
-        square = np.sqrt(1 + 4 * energy / (stiffness * unit**2)) - 1
-        return stiffness * unit * np.sqrt(square) * (1 + square)
-    if law in ("hunt_crossley", "depth_damped"):
-        # M v^2/2 = k d^(n+1)/(n+1)
-        exponent = np.asarray(contact.exponent)
-        depth = ((exponent + 1) * energy / stiffness) ** (1 / (exponent + 1))
-        return stiffness * depth**exponent
-    if law in ("linear", "kelvin_voigt", "elastoplastic"):
-        return np.sqrt(2 * energy * stiffness)
-    if law != "piecewise_linear":
-        return _integrated_peaks(mechanism, scenarios)
-    # Segment by segment: the force F at its beginning becomes sqrt(F^2 + 2 k E) if the energy E ends in it.
-    depths = np.asarray(contact.depths)
-    slots, segments = stiffness.shape[:2]
-    energy = np.broadcast_to(energy, (slots, stiffness.shape[-1]))
-    force, begin = np.zeros_like(energy), np.zeros_like(energy)
-    for segment in range(segments):
-        slope = stiffness[:, segment]
-        width = depths[:, segment] - begin if segment < segments - 1 else np.inf
-        whole = force * width + slope * width**2 / 2
-        spent = np.minimum(whole, energy)
-        force = np.sqrt(force**2 + 2 * slope * spent)
-        energy, begin = energy - spent, begin + width
-    return force
-
-
-def _integrated_peaks(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
-    """The same for a law from elsewhere, whose motion is integrated."""
-    contact, shape = scenarios.contact, np.shape(scenarios.contact.stiffness)
-    parameters = jax.tree.map(jnp.asarray, contact._replace(damping=np.zeros_like(contact.damping)))
-    motion = scenarios.equivalent_mass, scenarios.velocity
-    mass, velocity = (jnp.broadcast_to(jnp.asarray(one), shape) for one in motion)
-    law = LAWS[mechanism.contact.law]
-    return np.asarray(integrate_contact(law, parameters, mass, velocity).peak_force)
+    """Return the peak force [N] of every contact, (slots, lanes), entered undamped at the approach speed."""
+    contact = jax.tree.map(np.asarray, scenarios.contact)
+    motion = np.asarray(scenarios.equivalent_mass), np.asarray(scenarios.velocity)
+    return contact_law(mechanism.contact.law).undamped_peak_force(contact, *motion)
 
 
 def _span(values: np.ndarray, unit: str) -> dict[str, Any]:

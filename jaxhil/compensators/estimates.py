@@ -6,6 +6,7 @@ is wrong by. A law names what it must know in `Compensator.knows`.
 
 import math
 
+from jaxhil.contact.laws import contact_law
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.runtime.laws.impulse_ledger import LARGEST_DELAY_SPREAD
@@ -55,7 +56,7 @@ def unloading(mechanism: Mechanism) -> float:
     It is 0 where the contact law has no unloading ratio.
     """
     ratio = mechanism.contact.unloading_ratio
-    if ratio is None or mechanism.contact.law != "elastoplastic":
+    if ratio is None:
         return 0.0
     spread = _spread(mechanism, "contact.unloading_ratio") or 0.0
     return (ratio + spread - 1) * typical_stiffness(mechanism) / mechanism.bodies.mass
@@ -81,25 +82,15 @@ def simulator_lag(mechanism: Mechanism) -> float:
 
 def is_damped(mechanism: Mechanism) -> bool:
     """Whether the mechanism's contact law dissipates, so that damping is worth identifying."""
-    return mechanism.contact.law != "linear" and any(b > 0 for b in mechanism.contact.damping)
+    return contact_law(mechanism.contact.law).damped and any(b > 0 for b in mechanism.contact.damping)
 
 
 def peak_force(mechanism: Mechanism) -> float:
-    """Order of the contact force [N]: v sqrt(k M) with the stiffest entry, as of a linear contact."""
+    """Return the order of the contact force [N], of the stiffest entry."""
     contact = mechanism.contact
     stiffness = [max(k) if isinstance(k, list | tuple) else k for k in contact.stiffness]
     mass, velocity = mechanism.bodies.mass, mechanism.approach.velocity
-    if contact.law == "hardening" and contact.reference_depth is not None:
-        # k d^2/2 + k d^4/(4 d_0^2) = M v^2/2, of every entry.
-        energies = [mass * velocity**2 / (k * contact.reference_depth**2) for k in stiffness]
-        depths = [math.sqrt(2 * energy / (1 + math.sqrt(1 + 2 * energy))) for energy in energies]
-        forces = [k * depth * (1 + depth**2) for k, depth in zip(stiffness, depths, strict=True)]
-        return contact.reference_depth * max(forces)
-    if contact.law in ("hunt_crossley", "depth_damped"):
-        order = contact.exponent + 1
-        deepest = (order * mass * velocity**2 / (2 * min(stiffness))) ** (1 / order)
-        return max(stiffness) * deepest**contact.exponent
-    return velocity * math.sqrt(max(stiffness) * mass)
+    return contact_law(contact.law).nominal_peak_force(contact, stiffness, mass, velocity)
 
 
 def typical_stiffness(mechanism: Mechanism) -> float:

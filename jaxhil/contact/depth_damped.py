@@ -1,11 +1,19 @@
 """Hertz's contact with a damper that works by depth: F = k d^n + b d' d/d_0, clamped at 0."""
 
-import jax.numpy as jnp
+from typing import ClassVar
 
-from jaxhil.contact.base import ContactLaw
+import numpy as np
+
+from jaxhil.contact.arrays import jnp
+from jaxhil.contact.float_law import FloatLaw
+from jaxhil.contact.keys import EXPONENT, REFERENCE_DEPTH
+from jaxhil.contact.power_law import COMMON_EXPONENTS, PowerLaw
+from jaxhil.contact.regression import Family, Regression
+
+DEPTH = 1e-3  # m, reference depth that identification writes
 
 
-class DepthDamped(ContactLaw):
+class DepthDamped(PowerLaw):
     """F = max(0, k d^n + b d' d/d_0): `stiffness` k [N/m^n], n the `exponent` (1.5 for Hertz), `damping`
     b [N s/m] at the depth d_0, `reference_depth` [m]. There is no jump at the touch; on the way out the
     surfaces part inside, where k d^(n-1) = b |d'|/d_0.
@@ -13,6 +21,9 @@ class DepthDamped(ContactLaw):
     The reference is integrated. Without damping it is that of Hunt and Crossley's law; with n = 1 their law
     with chi = 2 b/(3 k d_0), whose reference has a closed form.
     """
+
+    name: ClassVar[str] = "depth_damped"
+    keys: ClassVar = (EXPONENT, REFERENCE_DEPTH)
 
     def step(self, parameters, state, penetration, rate):
         # The inner `where` keeps the derivative of d^n finite at d <= 0.
@@ -31,3 +42,40 @@ class DepthDamped(ContactLaw):
         power = jnp.where(touching, penetration, 1) ** (parameters.exponent - 1)
         power = jnp.where(touching | (parameters.exponent == 1), power, 0)
         return parameters.stiffness * power + parameters.damping * rate / parameters.reference_depth
+
+    def perturb_damping(self, drawn, ratio, mass, velocity):
+        """Add the b that dissipates as much at the deepest point."""
+        stiffness, order = drawn("stiffness"), drawn("exponent")[:, None] + 1
+        depth = (order * mass * velocity**2 / (2 * stiffness)) ** (1 / order)
+        reach = drawn("reference_depth")[:, None]
+        added = 1.5 * np.pi * ratio / velocity * stiffness * depth ** (order - 2) * reach
+        return "damping", drawn("damping") + added
+
+    def in_floats(self, contact, stiffness, damping):
+        exponent, reference_depth = contact.exponent, contact.reference_depth
+
+        def hold(depth: float, rate: float) -> float:
+            """F/d; outside, its damping's part alone, but for a linear spring, which has no end there."""
+            return stiffness * max(depth, 0.0) ** (exponent - 1.0) + damping * rate / reference_depth
+
+        def force(depth: float, rate: float) -> float:
+            value = stiffness * depth**exponent + damping * rate * (depth / reference_depth)
+            return value if value > 0.0 else 0.0
+
+        return FloatLaw(force, hold, lambda rate: 0.0)
+
+    def regression(self, contact):
+        return _regression(contact.exponent, contact.reference_depth)
+
+    def families(self, deepest, entries):
+        return [Family(lambda exponent: _regression(exponent, DEPTH), 1.0, 3.0, COMMON_EXPONENTS)]
+
+
+def _regression(exponent: float, reference_depth: float) -> Regression:
+    return Regression(
+        "depth_damped",
+        lambda d, v: [d**exponent],
+        ("stiffness", "damping"),
+        lambda d, v: [d * v / reference_depth],
+        shape={"exponent": exponent, "reference_depth": reference_depth},
+    )

@@ -1,15 +1,20 @@
-"""One step of Dormand and Prince's pair of order 5(4) for d'' = a(t, d, d'), and the motion within it."""
+"""One step of Dormand and Prince's pair of order 5(4) for y' = f(t, y), and the motion within a step."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jax import lax
+from jaxtyping import Array, Float
+
+__all__ = ["StepEnd", "StepResult", "along", "take_rolled_step", "take_step"]
 
 # Dormand and Prince 1980: nodes, coefficients of the stages, the last of which is the solution of order 5,
 # and the error, solution of order 5 less that of order 4.
 _NODES = (0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)
 _STAGES = (
+    (),
     (1 / 5,),
     (3 / 40, 9 / 40),
     (44 / 45, -56 / 15, 32 / 9),
@@ -19,41 +24,76 @@ _STAGES = (
 )
 _ERROR = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
 
+# Of the time since the step's start [s] and y, a tree of arrays: y' and whatever else is asked for there.
+Slope = Callable[[Array, Any], tuple[Any, Any]]
 
-class Step(NamedTuple):
-    """Motion at a step's end."""
+
+class StepResult(NamedTuple):
+    """The end of a step."""
+
+    end: Any  # y
+    slopes: Any  # y' at each stage: of the first at the start, of the last at the end
+    found: Any  # what else the slope's function returned at the end
+    error: Any  # of y
+
+
+def take_step(slope: Slope, start: Any, length: Array) -> StepResult:
+    """Take a step of `length` [s] from y = `start`."""
+
+    def moved(row, slopes):
+        terms = [(a, one) for a, one in zip(row, slopes, strict=True) if a]
+        return jax.tree.map(
+            lambda *leaves: length * sum((a * leaf for (a, _), leaf in zip(terms, leaves, strict=True)), 0.0),
+            *(one for _, one in terms),
+        )
+
+    end, slopes, found = start, [], None
+    for node, row in zip(_NODES, _STAGES, strict=True):
+        if row:
+            end = jax.tree.map(lambda leaf, more: leaf + more, start, moved(row, slopes))
+        one, found = slope(node * length, end)
+        slopes.append(one)
+    return StepResult(end, slopes, found, moved(_ERROR, slopes))
+
+
+def take_rolled_step(slope: Slope, start: Any, length: Float[Array, "*batch"]) -> StepResult:
+    """Take the same step with its stages in a loop, which takes a fraction of the time to compile."""
+    stages, lanes = len(_NODES), [1] * length.ndim
+
+    def moved(row: Array, slopes: Any) -> Any:
+        weights = row.reshape(-1, *lanes)
+        return jax.tree.map(lambda leaf: length * jnp.sum(weights * leaf, axis=0), slopes)
+
+    def stage(carry, given):
+        slopes, *_ = carry
+        index, row, node = given
+        at = jax.tree.map(jnp.add, start, moved(row, slopes))
+        one, found = slope(node * length, at)
+        slopes = jax.tree.map(lambda every, leaf: every.at[index].set(leaf), slopes, one)
+        return (slopes, at, found), None
+
+    def empty(tree: Any, *before: int) -> Any:
+        return jax.tree.map(lambda leaf: jnp.zeros((*before, *leaf.shape), leaf.dtype), tree)
+
+    rows = [(*row, *[0.0] * (stages - len(row))) for row in _STAGES]
+    given = jnp.arange(stages), jnp.asarray(rows, length.dtype), jnp.asarray(_NODES, length.dtype)
+    found = empty(jax.eval_shape(lambda: slope(length, start)[1]))
+    (slopes, end, found), _ = lax.scan(stage, (empty(start, stages), start, found), given)
+    return StepResult(end, slopes, found, moved(jnp.asarray(_ERROR, length.dtype), slopes))
+
+
+class StepEnd(NamedTuple):
+    """Motion of one coordinate at a step's end."""
 
     depth: Array  # penetration [m]
     velocity: Array  # its rate [m/s]
     first: Array  # acceleration at the step's start [m/s^2]
     last: Array  # acceleration at its end [m/s^2]
-    errors: tuple[Array, Array]  # of penetration and rate
 
 
-def take_step(
-    acceleration: Callable[[Array, Array, Array], Array],
-    time: Array,
-    depth: Array,
-    rate: Array,
-    length: Array,
-) -> Step:
-    """A step of `length` [s] from penetration `depth` [m] and `rate` [m/s] at `time` [s]."""
-
-    def total(row, slopes):
-        return sum((a * slope for a, slope in zip(row, slopes, strict=True) if a), 0.0)
-
-    end, end_rate = depth, rate
-    rates, slopes = [rate], [acceleration(time, depth, rate)]
-    for node, row in zip(_NODES[1:], _STAGES, strict=True):
-        end = depth + length * total(row, rates)
-        end_rate = rate + length * total(row, slopes)
-        rates.append(end_rate)
-        slopes.append(acceleration(time + node * length, end, end_rate))
-    errors = length * total(_ERROR, rates), length * total(_ERROR, slopes)
-    return Step(end, end_rate, slopes[0], slopes[-1], errors)
-
-
-def along(s: Array | float, length: Array, depth: Array, velocity: Array, tried: Step) -> tuple[Array, Array]:
+def along(
+    s: Array | float, length: Array, depth: Array, velocity: Array, tried: StepEnd
+) -> tuple[Array, Array]:
     """Position and velocity at the fraction s of a step, by its quintic (Hermite)."""
     speed, bend = velocity * length, tried.first * length**2 / 2
     moved = tried.depth - depth - speed - bend

@@ -1,9 +1,13 @@
 """A mechanism that yields: it loads along one slope and unloads from its deepest point along a steeper."""
 
-import jax.numpy as jnp
+from typing import ClassVar
 
+import numpy as np
+
+from jaxhil.contact.arrays import jnp
 from jaxhil.contact.base import ContactLaw
-from jaxhil.contact.reference import Reference
+from jaxhil.contact.float_law import FloatLaw, clamped
+from jaxhil.contact.keys import Key
 
 
 class Elastoplastic(ContactLaw):
@@ -17,6 +21,19 @@ class Elastoplastic(ContactLaw):
     A surface that the mechanism has left (d <= 0) has forgotten its dent: every contact meets a fresh
     element, either surface of two has its own, and only a touch before the dent is left meets the dent.
     """
+
+    name: ClassVar[str] = "elastoplastic"
+    keys: ClassVar = (
+        Key(
+            "unloading_ratio",
+            "slope of unloading over that of loading, for {laws}",
+            "1",
+            {"ge": 1.0},
+            neutral=1.0,
+        ),
+    )
+    damped: ClassVar[bool] = False
+    dissipates_by: ClassVar[str] = "yielding"
 
     @property
     def remembers(self):
@@ -49,7 +66,9 @@ class Elastoplastic(ContactLaw):
         return parameters.stiffness * deepest - jnp.where(above > 0, slope, parameters.stiffness) * above
 
     def reference(self, parameters, mass, velocity):
-        """In closed form: a quarter of a period of sqrt(k/M) in, of sqrt(k_u/M) out."""
+        """Return a quarter of a period of sqrt(k/M) in, of sqrt(k_u/M) out."""
+        from jaxhil.contact.reference import Reference
+
         frequency = jnp.sqrt(parameters.stiffness / mass)
         restitution = 1 / jnp.sqrt(parameters.unloading_ratio)
         return Reference(
@@ -57,3 +76,30 @@ class Elastoplastic(ContactLaw):
             peak_force=mass * velocity * frequency,
             duration=jnp.pi / 2 / frequency * (1 + restitution),
         )
+
+    def undamped_peak_force(self, parameters, mass, velocity):
+        return np.sqrt(2 * (mass * velocity**2 / 2) * parameters.stiffness)
+
+    def tangent_stiffness(self, parameters, mass, velocity):
+        return parameters.stiffness * parameters.unloading_ratio
+
+    def perturb_damping(self, drawn, ratio, mass, velocity):
+        """Multiply the unloading ratio by exp(2 pi zeta), as e* is its power -1/2."""
+        return "unloading_ratio", drawn("unloading_ratio") * np.exp(2 * np.pi * ratio[:, 0])
+
+    def in_floats(self, contact, stiffness, damping):
+        return _in_floats(stiffness, contact.unloading_ratio, 0.0)
+
+
+def _in_floats(stiffness: float, unloading_ratio: float, deepest: float) -> FloatLaw:
+    """Return F = k d_max - k_u (d_max - d) >= 0 after the penetration d_max; k d beyond it."""
+
+    def spring(depth: float, rate: float) -> float:
+        if depth >= deepest:
+            return stiffness * depth
+        return stiffness * deepest - stiffness * unloading_ratio * (deepest - depth)
+
+    def loaded(depth: float) -> FloatLaw:
+        return _in_floats(stiffness, unloading_ratio, depth)
+
+    return clamped(spring, lambda rate: 0.0)._replace(loaded=loaded)

@@ -1,8 +1,15 @@
 """A spring that stiffens with depth, and a damper: F = k d (1 + (d/d_0)^2) + b d', clamped at 0."""
 
-import jax.numpy as jnp
+import math
+from typing import ClassVar
 
+import numpy as np
+
+from jaxhil.contact.arrays import jnp
 from jaxhil.contact.base import ContactLaw
+from jaxhil.contact.float_law import clamped
+from jaxhil.contact.keys import REFERENCE_DEPTH
+from jaxhil.contact.regression import Family, Regression
 
 
 class Hardening(ContactLaw):
@@ -12,6 +19,9 @@ class Hardening(ContactLaw):
     The reference is integrated. Without damping e = 1, and k d^2/2 + k d^4/(4 d_0^2) = M v^2/2 at the
     deepest point, where the force is largest.
     """
+
+    name: ClassVar[str] = "hardening"
+    keys: ClassVar = (REFERENCE_DEPTH,)
 
     @property
     def arcs(self):
@@ -28,3 +38,48 @@ class Hardening(ContactLaw):
     def hold(self, parameters, state, penetration, rate):
         stiffening = 1 + (penetration / parameters.reference_depth) ** 2
         return parameters.stiffness * penetration * stiffening + parameters.damping * rate
+
+    def undamped_peak_force(self, parameters, mass, velocity):
+        """Return the force where M v^2/2 = k d^2/2 + k d^4/(4 d_0^2), in units of d_0."""
+        energy, unit = mass * velocity**2 / 2, parameters.reference_depth
+        square = np.sqrt(1 + 4 * energy / (parameters.stiffness * unit**2)) - 1
+        return parameters.stiffness * unit * np.sqrt(square) * (1 + square)
+
+    def tangent_stiffness(self, parameters, mass, velocity):
+        energy = mass * velocity**2 / (parameters.stiffness * parameters.reference_depth**2)
+        return parameters.stiffness * (1 + 3 * (np.sqrt(1 + 2 * energy) - 1))
+
+    def nominal_peak_force(self, contact, stiffness, mass, velocity):
+        energies = [mass * velocity**2 / (k * contact.reference_depth**2) for k in stiffness]
+        depths = [math.sqrt(2 * energy / (1 + math.sqrt(1 + 2 * energy))) for energy in energies]
+        forces = [k * depth * (1 + depth**2) for k, depth in zip(stiffness, depths, strict=True)]
+        return contact.reference_depth * max(forces)
+
+    def perturb_damping(self, drawn, ratio, mass, velocity):
+        """Add 2 zeta sqrt(k M)."""
+        return "damping", drawn("damping") + 2 * ratio * np.sqrt(drawn("stiffness") * mass)
+
+    def in_floats(self, contact, stiffness, damping):
+        reference_depth = contact.reference_depth
+
+        def spring(depth: float, rate: float) -> float:
+            return stiffness * depth * (1.0 + (depth / reference_depth) ** 2) + damping * rate
+
+        return clamped(spring, lambda rate: damping * rate)
+
+    def regression(self, contact):
+        """Return F = k d + k d^3/d_0^2 + b d' with the coefficients k, k/d_0^2 and b."""
+        names = ("stiffness", "cubic", "damping")
+        return Regression("hardening", lambda d, v: [d, d**3], names, lambda d, v: [v])
+
+    def families(self, deepest, entries):
+        return [Family(lambda _: self.regression(None))] if entries == 1 else []
+
+    def coefficients(self, contact, stiffness, damping):
+        return [stiffness, stiffness / contact.reference_depth**2, damping]
+
+    def file_values(self, fitted, entry):
+        # Where the cubic part is nothing, the depth at which it matters has no end.
+        ratio = fitted["stiffness"] / np.maximum(fitted["cubic"], 1e-12)
+        depth = np.sqrt(np.maximum(ratio, 1e-12))
+        return {**super().file_values(fitted, entry), "contact.reference_depth": depth}

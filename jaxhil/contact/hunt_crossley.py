@@ -2,24 +2,31 @@
 
 from typing import ClassVar
 
-import equinox as eqx
-import jax.numpy as jnp
+import numpy as np
 
-from jaxhil.contact.base import ContactLaw
-from jaxhil.contact.reference import hunt_crossley
+from jaxhil.contact.arrays import jnp
+from jaxhil.contact.float_law import FloatLaw
+from jaxhil.contact.power_law import COMMON_EXPONENTS, PowerLaw
+from jaxhil.contact.regression import Family, Regression
 
 
-class HuntCrossley(ContactLaw):
+class HuntCrossley(PowerLaw):
     """F = k d^n (1 + (3/2) chi d'), n = 1.5 for Hertz (Hunt and Crossley 1975)."""
 
+    name: ClassVar[str] = "hunt_crossley"
+    damping_unit: ClassVar[str] = "s/m"
     QUICK: ClassVar = (1.0, 1.5)  # n that need no powers, which are worked out number by number
 
     # n where it is one of those in every lane and nothing is differentiated by it
-    exponent: float | None = eqx.field(static=True, default=None)
+    exponent: float | None = None
 
     @property
     def arcs(self):
         return True
+
+    def specialised(self, contact, drawn):
+        known = not drawn("exponent") and contact.exponent in self.QUICK
+        return HuntCrossley(contact.exponent) if known else self
 
     def step(self, parameters, state, penetration, rate):
         # The inner `where` keeps the derivative of d^n finite at d <= 0.
@@ -36,9 +43,54 @@ class HuntCrossley(ContactLaw):
         return 1 + 1.5 * parameters.damping * rate
 
     def reference(self, parameters, mass, velocity):
+        from jaxhil.contact.reference import hunt_crossley
+
         return hunt_crossley(mass, parameters.stiffness, parameters.exponent, parameters.damping, velocity)
+
+    def damping_ratio(self, damping, mass, velocity, frequency):
+        """Return chi v/pi, from e = 1 - chi v."""
+        return damping * velocity / np.pi
+
+    def perturb_damping(self, drawn, ratio, mass, velocity):
+        """Add pi zeta/v, as e* is about 1 - chi v."""
+        return "damping", drawn("damping") + np.pi * ratio / velocity * np.ones_like(drawn("stiffness"))
+
+    def in_floats(self, contact, stiffness, damping):
+        exponent = contact.exponent
+
+        def hold(depth: float, rate: float) -> float:
+            return 1.0 + 1.5 * damping * rate
+
+        def force(depth: float, rate: float) -> float:
+            factor = 1.0 + 1.5 * damping * rate
+            return stiffness * depth**exponent * factor if factor > 0.0 else 0.0
+
+        return FloatLaw(force, hold, lambda rate: 0.0)
+
+    def regression(self, contact):
+        return _regression(contact.exponent)
+
+    def families(self, deepest, entries):
+        return [Family(_regression, 1.05, 3.0, COMMON_EXPONENTS[1:])]
+
+    def coefficients(self, contact, stiffness, damping):
+        return [stiffness, stiffness * damping]
+
+    def file_values(self, fitted, entry):
+        found = super().file_values(fitted, entry)
+        return {**found, f"contact.damping.{entry}": fitted["damping"] / fitted["stiffness"]}
 
     def _power(self, depth, parameters):
         if self.exponent == 1.0:
             return depth
         return depth * jnp.sqrt(depth) if self.exponent == 1.5 else depth**parameters.exponent
+
+
+def _regression(exponent: float) -> Regression:
+    """Return F = k d^n (1 + 1.5 chi d') with the coefficients k and k chi."""
+    return Regression(
+        "hunt_crossley",
+        lambda d, v: [d**exponent, 1.5 * v * d**exponent],
+        ("stiffness", "damping"),
+        shape={"exponent": exponent},
+    )

@@ -1,13 +1,22 @@
-"""Spring and damper; with no damping the linear law."""
+"""Spring and damper, and the linear law without the damper."""
 
-import jax.numpy as jnp
+from typing import ClassVar
 
+import numpy as np
+
+from jaxhil.contact.arrays import jnp
 from jaxhil.contact.base import ContactLaw
-from jaxhil.contact.reference import kelvin_voigt
+from jaxhil.contact.float_law import FloatLaw, clamped
+from jaxhil.contact.keys import Key
+from jaxhil.contact.regression import Family, Regression
 
 
 class KelvinVoigt(ContactLaw):
-    """F = k d + b d', clamped at 0 unless tension is allowed; with b = 0 the linear law F = k d."""
+    """F = k d + b d', clamped at 0 unless tension is allowed."""
+
+    name: ClassVar[str] = "kelvin_voigt"
+    keys: ClassVar = (Key("tension", "whether {laws} may pull", default=False),)
+    is_linear: ClassVar[bool] = True
 
     @property
     def arcs(self):
@@ -27,4 +36,63 @@ class KelvinVoigt(ContactLaw):
         return jnp.where(parameters.tension, 1, force)
 
     def reference(self, parameters, mass, velocity):
+        from jaxhil.contact.reference import kelvin_voigt
+
         return kelvin_voigt(mass, parameters.stiffness, parameters.damping, velocity, parameters.tension)
+
+    def undamped_peak_force(self, parameters, mass, velocity):
+        return np.sqrt(2 * (mass * velocity**2 / 2) * parameters.stiffness)
+
+    def perturb_damping(self, drawn, ratio, mass, velocity):
+        """Add 2 zeta sqrt(k M)."""
+        return "damping", drawn("damping") + 2 * ratio * np.sqrt(drawn("stiffness") * mass)
+
+    def in_floats(self, contact, stiffness, damping):
+        def spring(depth: float, rate: float) -> float:
+            return stiffness * depth + damping * rate
+
+        if contact.tension:
+            return FloatLaw(spring, lambda depth, rate: 1.0, lambda rate: damping * rate)
+        return clamped(spring, lambda rate: damping * rate)
+
+    def regression(self, contact):
+        return _kelvin_voigt(contact.tension)
+
+    def families(self, deepest, entries):
+        return [Family(lambda _, pulls=pulls: _kelvin_voigt(pulls)) for pulls in (False, True)]
+
+
+class Linear(KelvinVoigt):
+    """F = k d."""
+
+    name: ClassVar[str] = "linear"
+    keys: ClassVar = ()
+    damped: ClassVar[bool] = False
+    damped_as: ClassVar[str] = "kelvin_voigt"
+
+    @property
+    def simulated(self):
+        return KelvinVoigt()
+
+    def in_floats(self, contact, stiffness, damping):
+        return super().in_floats(contact, stiffness, 0.0)
+
+    def regression(self, contact):
+        return Regression("linear", lambda d, v: [d], ("stiffness",))
+
+    def families(self, deepest, entries):
+        return [Family(lambda _: self.regression(None))]
+
+    def coefficients(self, contact, stiffness, damping):
+        return [stiffness]
+
+
+def _kelvin_voigt(pulls: bool) -> Regression:
+    return Regression(
+        "kelvin_voigt",
+        lambda d, v: [d],
+        ("stiffness", "damping"),
+        lambda d, v: [v],
+        pulls,
+        {"tension": True} if pulls else {},
+    )

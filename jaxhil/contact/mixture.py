@@ -7,11 +7,10 @@ program to compile for each law.
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxhil.contact.laws import ContactLaw, ContactParameters, PiecewiseLinear
+from jaxhil.contact.laws import ContactLaw, ContactParameters
 from jaxhil.contact.reference import Reference
 
 
@@ -26,8 +25,8 @@ class AnyOf(ContactLaw):
     here they are then NaN.
     """
 
-    laws: tuple[ContactLaw, ...] = eqx.field(static=True)
-    beforehand: bool = eqx.field(static=True, default=False)
+    laws: tuple[ContactLaw, ...]
+    beforehand: bool = False
 
     @property
     def closed_form(self):
@@ -77,7 +76,7 @@ class AnyOf(ContactLaw):
         every = []
         for kind, law in enumerate(self.laws):
             damping = jnp.where(parameters.kind == kind, parameters.damping, 0)
-            stiffness = parameters.stiffness if isinstance(law, PiecewiseLinear) else parameters.stiffness[0]
+            stiffness = parameters.stiffness if law.segmented else parameters.stiffness[0]
             every.append(parameters._replace(stiffness=stiffness, damping=damping, kind=None))
         return every
 

@@ -1,9 +1,15 @@
 """Stiffness that varies within a contact: buffers and hard stops."""
 
-import jax.numpy as jnp
+from itertools import pairwise
+from typing import ClassVar
 
+import numpy as np
+
+from jaxhil.contact.arrays import jnp
 from jaxhil.contact.base import ContactLaw
-from jaxhil.contact.reference import piecewise_linear
+from jaxhil.contact.float_law import clamped
+from jaxhil.contact.keys import DEPTHS
+from jaxhil.contact.regression import Family, Regression
 
 
 class PiecewiseLinear(ContactLaw):
@@ -11,6 +17,10 @@ class PiecewiseLinear(ContactLaw):
 
     Segment i spans d_{i-1} to d_i (d_0 = 0); the last slope goes on.
     """
+
+    name: ClassVar[str] = "piecewise_linear"
+    keys: ClassVar = (DEPTHS,)
+    segmented: ClassVar[bool] = True
 
     def step(self, parameters, state, penetration, rate):
         force = self.hold(parameters, state, penetration, rate)
@@ -36,4 +46,63 @@ class PiecewiseLinear(ContactLaw):
         return jnp.where(force > 0, force, 0)
 
     def reference(self, parameters, mass, velocity):
+        from jaxhil.contact.reference import piecewise_linear
+
         return piecewise_linear(mass, parameters.stiffness, parameters.depths, parameters.damping, velocity)
+
+    def undamped_peak_force(self, parameters, mass, velocity):
+        """Go on by segments: a force F at the start is sqrt(F^2 + 2 k E) where the energy E ends in one."""
+        stiffness, depths = parameters.stiffness, parameters.depths
+        slots, segments = stiffness.shape[:2]
+        energy = np.broadcast_to(mass * velocity**2 / 2, (slots, stiffness.shape[-1]))
+        force, begin = np.zeros_like(energy), np.zeros_like(energy)
+        for segment in range(segments):
+            slope = stiffness[:, segment]
+            width = depths[:, segment] - begin if segment < segments - 1 else np.inf
+            whole = force * width + slope * width**2 / 2
+            spent = np.minimum(whole, energy)
+            force = np.sqrt(force**2 + 2 * slope * spent)
+            energy, begin = energy - spent, begin + width
+        return force
+
+    def perturb_damping(self, drawn, ratio, mass, velocity):
+        """Add 2 zeta sqrt(k M), k the first slope."""
+        return "damping", drawn("damping") + 2 * ratio * np.sqrt(drawn("stiffness") * mass)
+
+    def in_floats(self, contact, stiffness, damping):
+        pieces, start, level = [], 0.0, 0.0
+        for slope, end in zip(stiffness, [*contact.depths, float("inf")], strict=True):
+            pieces.append((end, start, level, slope))
+            level += slope * (end - start)
+            start = end
+
+        def spring(depth: float, rate: float) -> float:
+            for end, start, level, slope in pieces:
+                if depth <= end:
+                    return level + slope * (depth - start) + damping * rate
+            raise ValueError("the penetration is not a number")
+
+        return clamped(spring, lambda rate: damping * rate)
+
+    def regression(self, contact):
+        return _regression(tuple(contact.depths))
+
+    def families(self, deepest, entries):
+        return [Family(lambda depth: _regression((depth,)), 0.1 * deepest, 0.9 * deepest)]
+
+    def coefficients(self, contact, stiffness, damping):
+        return [*stiffness, damping]
+
+    def file_values(self, fitted, entry):
+        return {f"contact.stiffness.{entry}.{i}": slope for i, slope in enumerate(fitted.values())}
+
+
+def _regression(depths: tuple[float, ...]) -> Regression:
+    edges = np.array([0.0, *depths, np.inf])
+
+    def own(d, v):
+        return [np.clip(d - low, 0.0, high - low) for low, high in pairwise(edges)]
+
+    slopes = tuple(f"slope{i + 1}" for i in range(len(depths) + 1))
+    names, shape = (*slopes, "damping"), {"depths": list(depths)}
+    return Regression("piecewise_linear", own, names, lambda d, v: [v], shape=shape)

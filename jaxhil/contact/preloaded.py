@@ -1,9 +1,13 @@
 """A preloaded spring with dry friction: F = F_0 + k d + F_r sign(d'), clamped at 0."""
 
-import jax.numpy as jnp
+from typing import ClassVar
 
+import numpy as np
+
+from jaxhil.contact.arrays import jnp
 from jaxhil.contact.base import ContactLaw
-from jaxhil.contact.reference import Reference
+from jaxhil.contact.float_law import clamped
+from jaxhil.contact.keys import Key
 
 
 class Preloaded(ContactLaw):
@@ -16,6 +20,22 @@ class Preloaded(ContactLaw):
     separation, where d or F goes through 0, e v/omega = sqrt((d + r)^2 - max(r, 0)^2). What friction holds at
     its deepest point, F_0 + k d <= F_r, stays there.
     """
+
+    name: ClassVar[str] = "preloaded"
+    keys: ClassVar = (
+        Key("preload", "of the spring at the touch, for {laws}", "N", {"ge": 0.0}, default=0.0),
+        Key(
+            "friction",
+            "dry friction against the motion, for {laws}",
+            "N",
+            {"ge": 0.0},
+            default=0.0,
+            name_in_six_axes="dry_friction",
+            meaning_in_six_axes="against the depth's motion, for {laws}",
+        ),
+    )
+    damped: ClassVar[bool] = False
+    dissipates_by: ClassVar[str] = "friction"
 
     @property
     def jumps(self):
@@ -33,6 +53,8 @@ class Preloaded(ContactLaw):
         return self._constant(parameters, rate) + parameters.stiffness * penetration
 
     def reference(self, parameters, mass, velocity):
+        from jaxhil.contact.reference import Reference
+
         frequency = jnp.sqrt(parameters.stiffness / mass)
         inward = (parameters.preload + parameters.friction) / parameters.stiffness
         outward = (parameters.preload - parameters.friction) / parameters.stiffness
@@ -50,6 +72,24 @@ class Preloaded(ContactLaw):
             peak_force=parameters.stiffness * turning,
             duration=jnp.where(sticks, jnp.inf, lasts),
         )
+
+    def perturb_damping(self, drawn, ratio, mass, velocity):
+        """Add the friction that takes 1 - e*^2 of the energy on the way to the deepest point without it, and
+        back."""
+        preload, friction, stiffness = drawn("preload"), drawn("friction"), drawn("stiffness")[:, 0]
+        energy = (mass * velocity**2)[:, 0] / 2
+        deepest = 2 * energy / (preload + np.sqrt(preload**2 + 2 * stiffness * energy))
+        lost = energy * -np.expm1(-2 * np.pi * ratio[:, 0])
+        return "friction", friction + lost / (2 * deepest)
+
+    def in_floats(self, contact, stiffness, damping):
+        def constant(rate: float) -> float:
+            return contact.preload + contact.friction * ((rate > 0.0) - (rate < 0.0))
+
+        def spring(depth: float, rate: float) -> float:
+            return constant(rate) + stiffness * depth
+
+        return clamped(spring, constant)
 
     def _constant(self, parameters, rate):
         return parameters.preload + parameters.friction * jnp.sign(rate)

@@ -14,7 +14,7 @@ step.
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -22,10 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxhil.contact.dormand_prince import Step, along, take_step
-
-if TYPE_CHECKING:
-    from jaxhil.contact.base import ContactLaw, ContactParameters
+from jaxhil.contact.dormand_prince import StepEnd, along, take_step
 
 TOLERANCE = 1e-10  # of a step, against approach velocity and deepest penetration
 FIRST_STEP = 1e-4  # s, tried first
@@ -33,6 +30,19 @@ LONGEST = 10.0  # s: later the bodies stick to each other
 MOST_STEPS = 1000  # rejected ones included
 ROOT_STEPS = 16  # of the false position method (Illinois) towards an event
 INWARD, OUTWARD, FREE, OVER = range(4)  # phases of the motion, the last but one with a push only
+
+
+@runtime_checkable
+class ForceLaw(Protocol):
+    """What the integration needs of a contact law (`jaxhil.contact.base.ContactLaw`)."""
+
+    def init(self, penetration: Any) -> tuple[Any, ...]: ...
+
+    def step(self, parameters: Any, state: Any, penetration: Any, rate: Any) -> tuple[Any, Any]: ...
+
+    def edge(self, parameters: Any, rate: Any) -> Any: ...
+
+    def hold(self, parameters: Any, state: Any, penetration: Any, rate: Any) -> Any: ...
 
 
 class ReferenceMotion(NamedTuple):
@@ -48,8 +58,8 @@ class ReferenceMotion(NamedTuple):
 
 
 def integrate_contact(
-    law: "ContactLaw",
-    parameters: "ContactParameters",
+    law: ForceLaw,
+    parameters: Any,
     mass: Float[Array, "*batch"],
     velocity: Float[Array, "*batch"],
     push: Callable[[Array], Array] | None = None,
@@ -95,7 +105,7 @@ class _Problem(NamedTuple):
     """What `integrate_contact` is asked for."""
 
     law: Any  # contact law
-    parameters: Any  # its parameters
+    parameters: Any  # its parameters (`jaxhil.contact.laws.ContactParameters`)
     mass: Array  # M [kg]
     approach: Array  # v [m/s]
     push: Any  # p, or None
@@ -158,16 +168,33 @@ def _contact_force(problem, state, depth, rate):
 
 
 def _try(problem, state, length):
-    """One step of a `length` [s]."""
+    """Return the motion after a step of a `length` [s], and the errors of penetration and rate."""
     pushes = state.time < problem.until
 
-    def acceleration(time, depth, rate):
-        force = _contact_force(problem, state, depth, rate)
+    def slope(offset, motion):
+        force = _contact_force(problem, state, *motion)
         if problem.push is not None:
-            force = force + jnp.where(pushes, problem.push(time), 0)
-        return -force / problem.mass
+            force = force + jnp.where(pushes, problem.push(state.time + offset), 0)
+        return (motion[1], -force / problem.mass), None
 
-    return take_step(acceleration, state.time, state.depth, state.velocity, length)
+    tried = take_step(slope, (state.depth, state.velocity), length)
+    return StepEnd(*tried.end, first=tried.slopes[0][1], last=tried.slopes[-1][1]), tried.error
+
+
+def _first_touch(problem):
+    """Return the state at the first touch."""
+    zeros = jnp.zeros_like(problem.approach)
+    return _State(
+        time=zeros,
+        depth=zeros,
+        velocity=problem.approach,
+        memory=problem.law.init(zeros),
+        phase=jnp.zeros(zeros.shape, jnp.int32),
+        deepest=zeros,
+        peak=zeros,
+        grip=zeros,
+        separated=zeros,
+    )
 
 
 def _follow(problem, records):
@@ -177,7 +204,7 @@ def _follow(problem, records):
     rounding = float(np.finfo(dtype).eps)
     tolerance = jnp.maximum(problem.tolerance, 32 * rounding)
     none = jnp.zeros(like.shape, jnp.int32)
-    start = _State(zeros, zeros, like, problem.law.init(zeros), none, zeros, zeros, zeros, zeros)
+    start = _first_touch(problem)
     search = _Search(zeros + FIRST_STEP, none, *[zeros] * 5)
     nodes = None
     if records:
@@ -188,13 +215,13 @@ def _follow(problem, records):
         active = (state.phase < OVER) & (state.time < LONGEST)
         searching = search.tries > 0
         step = _proposed(problem, state, search)
-        tried = _try(problem, state, step)
+        tried, error = _try(problem, state, step)
         if nodes is not None:
             here = state.time, state.depth, state.velocity, tried.first, tried.last
             nodes = _Nodes(*(leaf.at[count].set(value) for leaf, value in zip(nodes, here, strict=True)))
 
         deepest = jnp.maximum(state.deepest, jnp.abs(tried.depth))
-        errors = jnp.abs(tried.errors[0]) / deepest, jnp.abs(tried.errors[1]) / problem.approach
+        errors = jnp.abs(error[0]) / deepest, jnp.abs(error[1]) / problem.approach
         ratio = lax.stop_gradient(jnp.maximum(*errors) / tolerance)
         fine = (ratio <= 1) | (step <= 8 * rounding * state.time)
 
@@ -317,12 +344,11 @@ def _at_times(nodes, end, approach, times):
 
     time, depth, velocity = (pick(leaf, index) for leaf in lines[:3])
     step = pick(lines.time, index + 1) - time
-    tried = Step(
+    tried = StepEnd(
         depth=pick(lines.depth, index + 1),
         velocity=pick(lines.velocity, index + 1),
         first=pick(lines.first, index),
         last=pick(lines.last, index),
-        errors=(step, step),
     )
     s = (asked - time) / jnp.where(step > 0, step, 1)
     position, rate = along(s, step, depth, velocity, tried)

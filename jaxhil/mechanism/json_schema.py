@@ -10,9 +10,10 @@ from typing import Any
 
 import msgspec
 
+from jaxhil.contact.laws import LAWS
 from jaxhil.mechanism.conversion import NUMBER_FOR_LIST
 from jaxhil.mechanism.six_axes import SCHEMA_SIX, SixAxisMechanism
-from jaxhil.mechanism.structs import CONTACT_LAWS, Mechanism, numeric_keys
+from jaxhil.mechanism.structs import Mechanism, numeric_keys
 
 __all__ = ["json_schema"]
 
@@ -48,7 +49,7 @@ def _six_axes() -> dict[str, Any]:
 
 def _tables(kind: type[msgspec.Struct]) -> dict[str, Any]:
     tables = {name: _tidy(table) for name, table in msgspec.json.schema(kind)["$defs"].items()}
-    tables["Contact"]["properties"]["law"]["enum"] = list(CONTACT_LAWS)
+    tables["Contact"]["properties"]["law"]["enum"] = list(LAWS)
     return tables
 
 

@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import msgspec
 from msgspec import NODEFAULT, inspect
 
+from jaxhil.contact.laws import KEYS, LAWS, laws_with
 from jaxhil.mechanism.conversion import allowed_of
-from jaxhil.mechanism.rules import KEYS_OF_MODELS, LAWS_OF_KEYS, UNDAMPED
-from jaxhil.mechanism.structs import CONTACT_LAWS, Mechanism
+from jaxhil.mechanism.rules import KEYS_OF_MODELS
+from jaxhil.mechanism.structs import Mechanism
 
 __all__ = ["Key", "Table", "tables"]
 
@@ -128,8 +129,9 @@ def _unit(kind: inspect.Type, path: str, extra: Mapping[str, Any] | None = None)
 def _users(path: str) -> tuple[str, ...]:
     table, _, name = path.rpartition(".")
     if table == "contact":
-        damped = tuple(law for law in CONTACT_LAWS if law not in UNDAMPED)
-        return damped if name == "damping" else LAWS_OF_KEYS.get(name, ())
+        if name == "damping":
+            return tuple(law.name for law in LAWS.values() if not law.dissipates_by)
+        return laws_with(KEYS[name]) if name in KEYS else ()
     if table == "rig.simulator":
         return tuple(model for model, keys in KEYS_OF_MODELS.items() if name in keys)
     return ()

@@ -13,17 +13,18 @@ from fractions import Fraction
 from itertools import pairwise
 from typing import Any
 
-import msgspec
 import numpy as np
 
+from jaxhil.contact.keys import Key
+from jaxhil.contact.laws import KEYS, ContactLaw, contact_law, laws_with
 from jaxhil.errors import shown
 from jaxhil.mechanism.conversion import KeyProblem, Path, allowed_at
 from jaxhil.mechanism.correlation import check_correlation
 from jaxhil.mechanism.structs import (
-    BUILT_IN_LAWS,
     Contact,
     Mechanism,
     Simulator,
+    Uncertainty,
     numeric_keys,
     value_at,
 )
@@ -32,13 +33,11 @@ from jaxhil.mechanism.uncertainty_rules import Span, check_uncertainty
 __all__ = [
     "FIXED",
     "KEYS_OF_MODELS",
-    "LAWS_OF_KEYS",
-    "UNDAMPED",
     "check",
-    "check_depths",
-    "check_keys_of_law",
+    "check_law",
     "check_model",
     "check_texts",
+    "is_damped",
     "is_hurwitz",
     "velocity_limit_allowed",
 ]
@@ -52,18 +51,6 @@ KEYS_OF_MODELS = {
     "transfer_function": ("numerator", "denominator"),
 }
 _OF_SOME_MODEL = sorted({key for keys in KEYS_OF_MODELS.values() for key in keys})
-# Keys of some contact laws alone; all others are at their defaults in a contact that states none of them.
-LAWS_OF_KEYS = {
-    "tension": ("kelvin_voigt",),
-    "exponent": ("hunt_crossley", "depth_damped"),
-    "depths": ("piecewise_linear",),
-    "reference_depth": ("hardening", "depth_damped"),
-    "unloading_ratio": ("elastoplastic",),
-    "preload": ("preloaded",),
-    "friction": ("preloaded",),
-}
-# Laws without damping, and what they dissipate by.
-UNDAMPED = {"elastoplastic": "yielding", "preloaded": "friction"}
 FIXED = ("rig.simulator.numerator", "rig.simulator.denominator")
 
 
@@ -71,8 +58,7 @@ def check(mechanism: Mechanism) -> None:
     """Every rule in turn; raises `KeyProblem` for the first one broken."""
     check_texts(mechanism)
     _check_bodies(mechanism)
-    _check_contact(mechanism.contact)
-    _check_keys_of_laws(mechanism)
+    check_law(("contact",), mechanism.contact, mechanism.uncertainty, KEYS.values())
     check_model(mechanism.rig.simulator)
     _check_hold(mechanism)
     spans = {path: _check_uncertainty(mechanism, path) for path in mechanism.uncertainty}
@@ -124,10 +110,31 @@ def _check_bodies(mechanism: Mechanism) -> None:
         raise KeyProblem(("bodies",), shown(bodies.mass), allowed)
 
 
-def check_depths(path: Path, law: str, depths: Sequence[float]) -> None:
-    """Where the slope changes is there for the law that needs it, and in order. Raises `KeyProblem`."""
-    if law == "piecewise_linear" and not depths:
-        allowed = "a list of at least one depth (law piecewise_linear needs it)"
+def check_law(
+    path: Path, contact: Any, uncertainties: Mapping[str, Uncertainty], keys: Collection[Key]
+) -> None:
+    """Check that a contact's keys are those of its law; `keys` are those of some laws alone, as this schema
+    calls them. Raise `KeyProblem`."""
+    law = contact_law(contact.law)
+    _check_depths(path, law, contact.depths)
+    listed = isinstance(contact, Contact)  # on one axis there is an entry for each successive contact
+    for i, entry in enumerate(contact.stiffness if listed else [contact.stiffness]):
+        where = (*path, "stiffness", *[i] * listed)
+        if law.segmented and not (isinstance(entry, list) and len(entry) == len(contact.depths) + 1):
+            allowed = f"a list of {len(contact.depths) + 1} slopes, one more than depths (law {law.name})"
+            raise KeyProblem(where, shown(entry), allowed)
+        if isinstance(entry, list) and not law.segmented:
+            raise KeyProblem(where, shown(entry), f"a number > 0 N/m (law {law.name})")
+    _check_keys(path, law, contact, uncertainties, keys)
+    if law.dissipates_by and is_damped(path, contact, uncertainties):
+        damping = shown(contact.damping) if np.any(contact.damping) else "an uncertain damping"
+        raise KeyProblem((*path, "damping"), damping, f"0 (law {law.name} dissipates by {law.dissipates_by})")
+
+
+def _check_depths(path: Path, law: ContactLaw, depths: Sequence[float]) -> None:
+    """Check that the depths at which the slope changes are there if the law needs them, and in order."""
+    if law.segmented and not depths:
+        allowed = f"a list of at least one depth (law {law.name} needs it)"
         raise KeyProblem((*path, "depths"), "no entries", allowed)
     for i, (depth, deeper) in enumerate(pairwise(depths)):
         if deeper <= depth:
@@ -136,54 +143,31 @@ def check_depths(path: Path, law: str, depths: Sequence[float]) -> None:
             )
 
 
-def check_keys_of_law(
-    path: Path, contact: Any, uncertain: Collection[str], laws_of_keys: Mapping[str, tuple[str, ...]]
+def _check_keys(
+    path: Path, law: ContactLaw, contact: Any, uncertain: Collection[str], keys: Collection[Key]
 ) -> None:
-    """Of the keys of some laws alone the contact at a path has those of its law. Raises `KeyProblem`."""
-    kind, law = type(contact), contact.law
-    defaults = {one.name: one.default for one in msgspec.structs.fields(kind)}
-    for key, laws in laws_of_keys.items():
-        value, default = getattr(contact, key), defaults[key]
-        default = [] if default is msgspec.NODEFAULT else default
-        if law in laws and value is None:
-            raise KeyProblem((*path, key), "nothing", f"{allowed_at(kind, key)} (law {law} needs it)")
-        if law not in laws and law in BUILT_IN_LAWS:
+    """Check that of the keys of some laws alone the contact has those of its law."""
+    for key in keys:
+        value = getattr(contact, key.name)
+        laws = laws_with(key)
+        if law.name in laws and value is None:
+            allowed = f"{allowed_at(type(contact), key.name)} (law {law.name} needs it)"
+            raise KeyProblem((*path, key.name), "nothing", allowed)
+        if law.keys is not None and law.name not in laws:
             only = f"only for law {' or '.join(laws)}"
-            if value != default:
-                raise KeyProblem((*path, key), shown(value), f"nothing ({only})")
-            where = ".".join((*map(str, path), key))
+            if value != key.default:
+                raise KeyProblem((*path, key.name), shown(value), f"nothing ({only})")
+            where = ".".join((*map(str, path), key.name))
             if where in uncertain and value not in (None, []):
                 raise KeyProblem(("uncertainty", where), f"a key {only}", "keys that the law uses")
 
 
-def _check_contact(contact: Contact) -> None:
-    nested = contact.law == "piecewise_linear"
-    check_depths(("contact",), contact.law, contact.depths)
-    for i, entry in enumerate(contact.stiffness):
-        path = ("contact", "stiffness", i)
-        if nested:
-            length = len(contact.depths) + 1
-            allowed = f"a list of {length} slopes, one more than depths (law piecewise_linear)"
-            if not isinstance(entry, list) or len(entry) != length:
-                raise KeyProblem(path, shown(entry), allowed)
-        elif isinstance(entry, list):
-            raise KeyProblem(path, shown(entry), f"a number > 0 N/m (law {contact.law})")
-
-
-def _check_keys_of_laws(mechanism: Mechanism) -> None:
-    contact = mechanism.contact
-    check_keys_of_law(("contact",), contact, mechanism.uncertainty, LAWS_OF_KEYS)
-    if contact.law in UNDAMPED and _is_damped(mechanism):
-        damping = shown(contact.damping) if any(contact.damping) else "an uncertain damping"
-        allowed = f"0 (law {contact.law} dissipates by {UNDAMPED[contact.law]})"
-        raise KeyProblem(("contact", "damping"), damping, allowed)
-
-
-def _is_damped(mechanism: Mechanism, *, by: str = "damping") -> bool:
-    """Whether the contact has damping, or what else is named, or may have some where it is drawn."""
-    uncertain = mechanism.uncertainty.get(f"contact.{by}")
-    some = np.any(getattr(mechanism.contact, by))
-    return bool(some) or (uncertain is not None and uncertain.factor is None)
+def is_damped(
+    path: Path, contact: Any, uncertainties: Mapping[str, Uncertainty], by: str = "damping"
+) -> bool:
+    """Return whether the contact has damping, or what else is named, or may have some where it is drawn."""
+    uncertain = uncertainties.get(".".join((*map(str, path), by)))
+    return bool(np.any(getattr(contact, by))) or (uncertain is not None and uncertain.factor is None)
 
 
 def check_model(simulator: Any) -> None:
@@ -227,8 +211,9 @@ def _check_transfer_function(numerator: list[float], denominator: list[float]) -
 def _check_hold(mechanism: Mechanism) -> None:
     # The ideal simulator jumps between ticks and rests otherwise: damping would see no velocity.
     rig, contact = mechanism.rig, mechanism.contact
-    damped = _is_damped(mechanism) or _is_damped(mechanism, by="friction")
-    if rig.simulator.model == "ideal" and rig.command_hold == "zoh" and damped and contact.law != "linear":
+    law, given = contact_law(contact.law), (("contact",), contact, mechanism.uncertainty)
+    damped = (law.damped and is_damped(*given)) or is_damped(*given, "friction")
+    if rig.simulator.model == "ideal" and rig.command_hold == "zoh" and damped:
         allowed = '"linear" for an ideal simulator with contact damping (or another model)'
         raise KeyProblem(("rig", "command_hold"), shown(rig.command_hold), allowed)
 

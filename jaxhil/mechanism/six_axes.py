@@ -11,30 +11,28 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
-from msgspec import Meta, Struct, field
+from msgspec import Meta, Struct, defstruct, field
 
+from jaxhil.contact.keys import says
+from jaxhil.contact.laws import KEYS, laws_with
 from jaxhil.mechanism.six_axes_rig import Inertia, Length, Metre, Radian, Rig, six, three, zeros
 from jaxhil.mechanism.structs import (
+    DAMPING_UNITS,
+    STIFFNESS_UNITS,
     Correlation,
-    Depths,
-    Exponent,
     Law,
-    Preload,
     Range,
-    ReferenceDepth,
     Slopes,
     Stiffness,
-    Tension,
     Uncertainty,
-    UnloadingRatio,
     ranges_of,
-    says,
 )
 
 __all__ = [
+    "KEYS_IN_SIX_AXES",
     "SCHEMA_SIX",
     "Approach",
     "BodyState",
@@ -163,29 +161,43 @@ class Friction(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     damping: Annotated[float, says("of the bristle", "N s/m", ge=0.0)] | None = None
 
 
-class Contact(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A pair of shapes that may touch, or a pattern of such pairs, and its laws."""
+class ContactOfAnyLaw(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Keys of a contact that all contact laws have."""
 
     chaser: Annotated[Shape, says("the chaser's shape, in C axes")]
     target: Annotated[Shape, says("the target's shape, in T axes")]
     pattern: Annotated[Pattern, says("copies of both")] | None = None
     target_pattern: Annotated[TargetPattern, says("how the target's copies are turned")] | None = None
     law: Law
-    stiffness: Annotated[
-        Stiffness | Slopes, says("in N/m^exponent for hunt_crossley and depth_damped", "N/m")
-    ]
-    damping: Annotated[
-        float,
-        says("in s/m for hunt_crossley, none for elastoplastic and preloaded", "N s/m", ge=0.0),
-    ] = 0.0
-    tension: Tension = False
-    exponent: Exponent = 1.5
-    depths: Depths = field(default_factory=list)
-    reference_depth: ReferenceDepth | None = None
-    unloading_ratio: UnloadingRatio | None = None
-    preload: Preload = 0.0
-    dry_friction: Annotated[float, says("against the depth's motion, for preloaded", "N", ge=0.0)] = 0.0
-    friction: Annotated[Friction, says("along the surface")] | None = None
+    stiffness: Annotated[Stiffness | Slopes, says(STIFFNESS_UNITS, "N/m")]
+    damping: Annotated[float, says(DAMPING_UNITS, "N s/m", ge=0.0)] = 0.0
+
+
+KEYS_IN_SIX_AXES = {key.name: key.in_six_axes() for key in KEYS.values()}  # by their names on one axis
+
+if TYPE_CHECKING:
+
+    class Contact(ContactOfAnyLaw, frozen=True):
+        """The contact, with a field for each of `KEYS_IN_SIX_AXES`."""
+
+        friction: Friction | None = None
+
+        def __getattr__(self, key: str) -> Any: ...
+
+else:
+    Contact = defstruct(
+        "Contact",
+        [
+            *(key.struct_field(" and ".join(laws_with(key))) for key in KEYS_IN_SIX_AXES.values()),
+            ("friction", Annotated[Friction, says("along the surface")] | None, None),
+        ],
+        bases=(ContactOfAnyLaw,),
+        module=__name__,
+        namespace={"__doc__": "A pair of shapes that may touch, or a pattern of such pairs, and its laws."},
+        frozen=True,
+        forbid_unknown_fields=True,
+        kw_only=True,
+    )
 
 
 class Latch(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -8,10 +8,18 @@ from typing import Any
 
 import numpy as np
 
+from jaxhil.contact.laws import contact_law
 from jaxhil.errors import shown
 from jaxhil.mechanism.conversion import KeyProblem, Path, allowed_at
-from jaxhil.mechanism.rules import LAWS_OF_KEYS, UNDAMPED, check_depths, check_keys_of_law
-from jaxhil.mechanism.six_axes import Contact, Friction, Latch, Shape, SixAxisMechanism
+from jaxhil.mechanism.rules import check_law
+from jaxhil.mechanism.six_axes import (
+    KEYS_IN_SIX_AXES,
+    Contact,
+    Friction,
+    Latch,
+    Shape,
+    SixAxisMechanism,
+)
 
 __all__ = ["check_contact", "check_latch"]
 
@@ -27,9 +35,6 @@ KEYS_OF_FRICTION: Mapping[str, tuple[str, ...]] = {
     "regularised": ("slip",),
     "bristle": ("stiffness", "damping"),
 }
-# Keys of some contact laws alone, as they are called here.
-_LAWS_OF_KEYS = {**LAWS_OF_KEYS, "dry_friction": LAWS_OF_KEYS["friction"]}
-del _LAWS_OF_KEYS["friction"]
 
 
 def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> None:
@@ -42,7 +47,11 @@ def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> N
         raise KeyProblem(
             (*path, "target_pattern"), "a table", "nothing, or pattern = { count = N } beside it"
         )
-    _check_law(mechanism, path, contact)
+    check_law(path, contact, mechanism.uncertainty, KEYS_IN_SIX_AXES.values())
+    law = contact_law(contact.law)
+    if not (law.damped or law.dissipates_by) and contact.damping:
+        allowed = f"0 (law {law.name} has none), or {law.damped_as}"
+        raise KeyProblem((*path, "damping"), shown(contact.damping), allowed)
     if contact.friction is not None:
         _check_friction((*path, "friction"), contact.friction)
 
@@ -115,26 +124,6 @@ def _check_pair(path: Path, contact: Contact) -> None:
         if narrow is not None and not (ball.radius or 0.0) < narrow:
             allowed = f"a number < {narrow:g} m, the radius that it is to fit into"
             raise KeyProblem((*path, body, "radius"), shown(ball.radius), allowed)
-
-
-def _check_law(mechanism: SixAxisMechanism, path: Path, contact: Contact) -> None:
-    law, nested = contact.law, contact.law == "piecewise_linear"
-    check_depths(path, law, contact.depths)
-    slopes = contact.stiffness if isinstance(contact.stiffness, list) else []
-    if nested and len(slopes) != len(contact.depths) + 1:
-        allowed = f"a list of {len(contact.depths) + 1} slopes, one more than depths (law piecewise_linear)"
-        raise KeyProblem((*path, "stiffness"), shown(contact.stiffness), allowed)
-    if slopes and not nested:
-        raise KeyProblem((*path, "stiffness"), shown(contact.stiffness), f"a number > 0 N/m (law {law})")
-    check_keys_of_law(path, contact, mechanism.uncertainty, _LAWS_OF_KEYS)
-    uncertain = mechanism.uncertainty.get(f"contact.{path[1]}.damping")
-    if law in UNDAMPED and (contact.damping or (uncertain is not None and uncertain.factor is None)):
-        found = shown(contact.damping) if contact.damping else "an uncertain damping"
-        raise KeyProblem((*path, "damping"), found, f"0 (law {law} dissipates by {UNDAMPED[law]})")
-    if law == "linear" and contact.damping:
-        raise KeyProblem(
-            (*path, "damping"), shown(contact.damping), "0 (law linear has none), or kelvin_voigt"
-        )
 
 
 def _check_friction(path: Path, friction: Friction) -> None:

@@ -13,14 +13,15 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import msgspec
-from msgspec import Meta, Struct, field
+from msgspec import Meta, Struct, defstruct, field
+
+from jaxhil.contact.keys import says
+from jaxhil.contact.laws import KEYS, LAWS, laws_with
 
 __all__ = [
-    "BUILT_IN_LAWS",
-    "CONTACT_LAWS",
     "MAGNITUDES",
     "MAX_CONTACTS",
     "SCHEMA",
@@ -48,28 +49,8 @@ MAX_CONTACTS = 1000
 MAGNITUDES = 1e-100, 1e100  # of numbers other than 0: a product of three neither overflows nor vanishes
 PLAIN: Mapping[str, Any] = {}  # what a type without metadata says
 
-BUILT_IN_LAWS = (
-    "linear",
-    "kelvin_voigt",
-    "hunt_crossley",
-    "piecewise_linear",
-    "hardening",
-    "depth_damped",
-    "elastoplastic",
-    "preloaded",
-)
-CONTACT_LAWS = [*BUILT_IN_LAWS]  # and those that `jaxhil.register` enters
-
-
-def says(meaning: str, unit: str | None = None, **limits: Any) -> Meta:
-    """What a key's type says of it: a line of meaning, a number's unit ("1" if it has none), and the allowed
-    values."""
-    stated = {} if unit is None else {"unit": unit}
-    extra = {"infinite": limits.pop("infinite", False), **stated}
-    return Meta(description=meaning, extra=extra, extra_json_schema=stated, **limits)
-
-
-Law = Annotated[str, Meta(description="which force the mechanism gives", extra={"one_of": CONTACT_LAWS})]
+# `jaxhil.register` enters further laws.
+Law = Annotated[str, Meta(description="which force the mechanism gives", extra={"one_of": LAWS})]
 SimulatorModel = Literal["ideal", "first_order", "second_order", "third_order", "transfer_function"]
 Integrator = Literal["semi_implicit_euler", "zoh", "explicit_euler"]
 CommandHold = Literal["linear", "zoh"]
@@ -79,21 +60,14 @@ Distribution = Literal["uniform", "loguniform", "normal"]
 Stiffness = Annotated[float, says("slope of the force", "N/m", gt=0.0)]
 Slopes = Annotated[list[Stiffness], Meta(min_length=1, max_length=21)]
 Damping = Annotated[float, says("damping of the contact", "N s/m", ge=0.0)]
-Depth = Annotated[float, says("where the slope changes", "m", gt=0.0)]
-# Keys of some contact laws alone.
-Tension = Annotated[bool, says("whether kelvin_voigt may pull")]
-Exponent = Annotated[float, says("of the depth, for hunt_crossley and depth_damped", "1", ge=1.0)]
-Depths = Annotated[
-    list[Depth], Meta(max_length=20, description="where the slope changes, for piecewise_linear")
-]
-ReferenceDepth = Annotated[
-    float,
-    says("at which hardening has four times its first slope, and depth_damped its damping", "m", gt=0.0),
-]
-UnloadingRatio = Annotated[
-    float, says("slope of unloading over that of loading, for elastoplastic", "1", ge=1.0)
-]
-Preload = Annotated[float, says("of the spring at the touch, for preloaded", "N", ge=0.0)]
+# What the descriptions of stiffness and damping say of laws with other units.
+STIFFNESS_UNITS = "in N/m^exponent for " + " and ".join(
+    law.name for law in LAWS.values() if law.stiffness_unit == "N/m^n"
+)
+DAMPING_UNITS = "in s/m for {}, none for {}".format(
+    " and ".join(law.name for law in LAWS.values() if law.damping_unit == "s/m"),
+    " and ".join(law.name for law in LAWS.values() if law.dissipates_by),
+)
 Factor = Annotated[float, says("share of the nominal value", "1", gt=0.0)]
 Coefficient = Annotated[float, says("of the n-th power of s", "s^n", gt=0.0)]
 Polynomial = Annotated[
@@ -137,11 +111,8 @@ class Approach(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     )
 
 
-class Contact(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The contact law and its parameters, one entry per successive contact; the last repeats.
-
-    For piecewise_linear `stiffness` has one list of slopes per contact, one slope more than there are depths.
-    """
+class ContactOfAnyLaw(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Keys of a contact that all contact laws have."""
 
     law: Law
     stiffness: Annotated[
@@ -149,7 +120,7 @@ class Contact(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         Meta(
             min_length=1,
             max_length=MAX_CONTACTS,
-            description="of each contact; in N/m^exponent for hunt_crossley and depth_damped",
+            description=f"of each contact; {STIFFNESS_UNITS}",
         ),
     ]
     damping: Annotated[
@@ -157,19 +128,37 @@ class Contact(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         Meta(
             min_length=1,
             max_length=MAX_CONTACTS,
-            description="of each contact; in s/m for hunt_crossley, none for elastoplastic and preloaded",
+            description=f"of each contact; {DAMPING_UNITS}",
         ),
     ] = field(default_factory=_only(0.0))
-    tension: Tension = False
     clearance: Annotated[
         float, says("between two surfaces; infinite where there is one", "m", gt=0.0, infinite=True)
     ] = math.inf
-    exponent: Exponent = 1.5
-    depths: Depths = field(default_factory=list)
-    reference_depth: ReferenceDepth | None = None
-    unloading_ratio: UnloadingRatio | None = None
-    preload: Preload = 0.0
-    friction: Annotated[float, says("dry friction against the motion, for preloaded", "N", ge=0.0)] = 0.0
+
+
+CONTACT = """The contact law and its parameters, one entry per successive contact; the last repeats.
+
+For piecewise_linear `stiffness` has one list of slopes per contact, one slope more than there are depths.
+"""
+
+if TYPE_CHECKING:
+
+    class Contact(ContactOfAnyLaw, frozen=True):
+        """The contact, with a field for each of `jaxhil.contact.laws.KEYS`."""
+
+        def __getattr__(self, key: str) -> Any: ...
+
+else:
+    Contact = defstruct(
+        "Contact",
+        [key.struct_field(" and ".join(laws_with(key))) for key in KEYS.values()],
+        bases=(ContactOfAnyLaw,),
+        module=__name__,
+        namespace={"__doc__": CONTACT},
+        frozen=True,
+        forbid_unknown_fields=True,
+        kw_only=True,
+    )
 
 
 class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxhil.compensators import COMPENSATORS
-from jaxhil.contact.laws import LAWS
+from jaxhil.contact.laws import contact_law
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.cells import FASTEST_POLE, NO_CELLS, CellCounts, count_cells, fastest_pole
 from jaxhil.simulation.loop import Loop
@@ -48,7 +48,7 @@ def build_loop(
 
     is_two_sided = bool(np.any(np.isfinite(scenarios.clearance)))
     return Loop(
-        law=LAWS[mechanism.contact.law],
+        law=contact_law(mechanism.contact.law).simulated,
         compensator=law,
         integrator=rig.integrator,
         hold=rig.command_hold,
@@ -83,7 +83,7 @@ def _cells(mechanism: Mechanism, scenarios: Scenario, exact: bool) -> CellCounts
     period = float(np.max(scenarios.control_period))
     fastest = float(np.max(fastest_pole(scenarios.simulator.denominator))) * period
     lags = np.asarray(scenarios.force_sensor.time_constant) / period
-    law, lagging = LAWS[mechanism.contact.law], bool(np.any(lags > 0))
+    law, lagging = contact_law(mechanism.contact.law), bool(np.any(lags > 0))
     pole, contact = SLOW_BETWEEN if law.remembers or lagging else SLOW
     slow = fastest <= pole and _fastest_contact(mechanism, scenarios) * period <= contact
     if slow and (law.arcs or not lagging) and not exact:
@@ -95,24 +95,12 @@ def _fastest_contact(mechanism: Mechanism, scenarios: Scenario) -> float:
     """The largest frequency sqrt(F'/M) [rad/s] of a contact at its deepest, or rate F_d/(2 M) of its damping,
     F_d the slope of the force against the rate at the touch; of any lane, entered at its first speed."""
     # Whatever arrays the scenarios are of: slots and lanes meet here.
-    law, contact = mechanism.contact.law, jax.tree.map(np.asarray, scenarios.contact)
+    law, contact = contact_law(mechanism.contact.law), jax.tree.map(np.asarray, scenarios.contact)
     mass, velocity = np.asarray(scenarios.equivalent_mass), np.asarray(scenarios.velocity)
-    stiffness, damping = contact.stiffness, contact.damping
-    if stiffness.ndim > damping.ndim:  # segments between slots and lanes
-        stiffness = np.max(stiffness, axis=1)
+    if contact.stiffness.ndim > contact.damping.ndim:  # segments between slots and lanes
+        contact = contact._replace(stiffness=np.max(contact.stiffness, axis=1))
     with np.errstate(all="ignore"):
-        if law in ("hunt_crossley", "depth_damped"):
-            power = contact.exponent
-            depth = ((power + 1) * mass * velocity**2 / (2 * stiffness)) ** (1 / (power + 1))
-            slope, damping = power * stiffness * depth ** (power - 1), 0 * damping
-        elif law == "hardening":
-            scale = contact.reference_depth
-            energy = mass * velocity**2 / (stiffness * scale**2)
-            slope = stiffness * (1 + 3 * (np.sqrt(1 + 2 * energy) - 1))
-        elif law == "elastoplastic":
-            slope = stiffness * contact.unloading_ratio
-        else:
-            slope = stiffness
+        slope, damping = law.tangent_stiffness(contact, mass, velocity), law.onset_damping(contact)
         frequency = np.max(np.sqrt(slope / mass), initial=0.0)
         return float(max(frequency, DAMPED * np.max(damping / mass)))
 

@@ -9,7 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxhil.contact.laws import LAWS, ContactLaw, ContactParameters, two_sided
+from jaxhil.contact.laws import ContactLaw, ContactParameters, contact_law, two_sided
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation import kept_programs
 from jaxhil.simulation.free_flight import APPROACH
@@ -121,7 +121,7 @@ def _in_space(mechanism: Mechanism, scenarios: Scenario, entered: list[Curve]) -
     step = (np.array([curve.time[-1] for curve in entered]) + APPROACH) / STEPS
     forces, positions = kept_programs.run(
         _integrate,
-        LAWS[mechanism.contact.law],
+        contact_law(mechanism.contact.law).simulated,
         jax.tree.map(lambda leaf: leaf[..., 0], scenarios.contact),
         scenarios.clearance[0],
         scenarios.equivalent_mass[0],

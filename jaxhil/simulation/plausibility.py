@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxhil.contact.laws import LAWS, ContactLaw, ContactParameters
+from jaxhil.contact.laws import ContactLaw, ContactParameters, contact_law
 from jaxhil.contact.reference import Reference
 from jaxhil.errors import InputError
 from jaxhil.mechanism.rules import velocity_limit_allowed
@@ -31,7 +31,6 @@ FASTEST = 0.1  # contact frequency over control rate, likewise
 LARGEST_VELOCITY = 1.0  # m/s, likewise
 SHOWN = 4  # contact frequencies in the line, beyond which only their range is said
 
-_SPRINGS = ("linear", "kelvin_voigt")  # laws with a frequency sqrt(k/M)/(2 pi) whatever the speed
 _RARELY = 1e-9  # the share of draws beyond either end of what is taken to be drawn
 # Keys that decide on the number of ticks, and on the motion simulator's poles.
 _TICKS = ("bodies.", "approach.velocity", "contact.", "rig.contact_plane", "rig.control_period")
@@ -188,7 +187,7 @@ def _in_space(mechanism: Mechanism, scenarios: Scenario) -> Reference:
     """The contacts in space, (contacts, lanes), each entered at the speed of the first approach."""
     shape = scenarios.phase.shape
     mass, velocity = (np.broadcast_to(one, shape) for one in (scenarios.equivalent_mass, scenarios.velocity))
-    law = LAWS[mechanism.contact.law]
+    law = contact_law(mechanism.contact.law).simulated
     found = kept_programs.run(_reference, law, scenarios.contact, mass, velocity)
     numbers: Any = [np.asarray(leaf)[: mechanism.approach.contacts] for leaf in found]
     return Reference(*numbers)
@@ -204,7 +203,7 @@ def _contacts(mechanism: Mechanism, reference: Reference) -> tuple[ContactFigure
     contacts: dict[tuple[float, ...], ContactFigures] = {}
     for slot, duration in enumerate(durations):
         frequency = 1 / (2 * duration)
-        if mechanism.contact.law in _SPRINGS:
+        if contact_law(mechanism.contact.law).is_linear:
             entries: Any = mechanism.contact.stiffness
             stiffness = entries[min(slot, len(entries) - 1)]
             frequency = math.sqrt(stiffness / mechanism.bodies.mass) / (2 * math.pi)
@@ -275,9 +274,11 @@ def _warnings(mechanism: Mechanism, contacts: tuple[ContactFigures, ...]) -> lis
     if strongest.peak_force > rig.force_sensor.range:
         peak = f"the {strongest.peak_force:.3g} N of contact {strongest.number} in space"
         found.append(f"rig.force_sensor.range: found {rig.force_sensor.range:.4g} N, expected beyond {peak}")
-    if contact.law == "linear" and any(contact.damping):
+    if not contact_law(contact.law).damped and any(contact.damping):
         largest = max(contact.damping)
-        found.append(f"contact.damping: found {largest:.4g} N s/m, expected 0: law linear has no damping")
+        found.append(
+            f"contact.damping: found {largest:.4g} N s/m, expected 0: law {contact.law} has no damping"
+        )
     return found + _late(mechanism, min(contacts, key=lambda one: one.duration))
 
 

@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from jaxhil.compensators import COMPENSATORS, Compensator, Gain
-from jaxhil.contact.laws import LAWS, ContactLaw
+from jaxhil.contact.laws import KEYS, LAWS, ContactLaw
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.mechanism.file import DEFAULT, load
-from jaxhil.mechanism.structs import CONTACT_LAWS, Mechanism
+from jaxhil.mechanism.structs import Mechanism
 from jaxhil.runtime.registry import COMPENSATORS as RUNTIME_COMPENSATORS
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,59}")
@@ -48,8 +48,8 @@ def register(law: Compensator | ContactLaw, runtime: type | None = None) -> None
             RUNTIME_COMPENSATORS.pop(law.name, None)
     elif runtime is not None:
         raise _refusal(law, "runtime", shown(runtime), "none: a contact law runs in the simulation alone")
-    elif law.name not in CONTACT_LAWS:
-        CONTACT_LAWS.append(law.name)
+    elif unknown := [key.name for key in law.keys or () if key not in KEYS.values()]:
+        raise _refusal(law, "keys", unknown[0], f"keys that files have: {', '.join(KEYS)}")
     table[law.name] = law
 
 

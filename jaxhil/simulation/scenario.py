@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
-from jaxhil.contact.laws import ContactParameters
+from jaxhil.contact.keys import Key
+from jaxhil.contact.laws import KEYS, ContactParameters, contact_law
 from jaxhil.contact.reference import Reference
-from jaxhil.mechanism.structs import BUILT_IN_LAWS, Mechanism, value_at
+from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.simulation.probe import Probe
 
 LONGEST_CONTACT = 10.0  # s
-_PUSH_ONLY = frozenset(BUILT_IN_LAWS) - {"kelvin_voigt"}  # laws to which tension means nothing
 
 
 class MotionSimulator(NamedTuple):
@@ -100,14 +100,8 @@ def build_scenarios(
         clearance=table.scalar("contact.clearance"),
         contact=ContactParameters(
             stiffness=table.successive("contact.stiffness"),
-            damping=table.successive("contact.damping") * float(contact.law != "linear"),
-            exponent=table.repeated(table.scalar("contact.exponent")),
-            depths=table.repeated(table.entries("contact.depths")),
-            tension=table.repeated(np.full(number, contact.tension and contact.law not in _PUSH_ONLY)),
-            reference_depth=table.repeated(table.scalar("contact.reference_depth", 1.0)),
-            unloading_ratio=table.repeated(table.scalar("contact.unloading_ratio", 1.0)),
-            preload=table.repeated(table.scalar("contact.preload")),
-            friction=table.repeated(table.scalar("contact.friction")),
+            damping=table.successive("contact.damping") * float(contact_law(contact.law).damped),
+            **{key.name: table.repeated(table.of_law(key)) for key in KEYS.values()},
         ),
         control_period=table.scalar("rig.control_period"),
         contact_plane=table.scalar("rig.contact_plane"),
@@ -150,6 +144,13 @@ class _Table:
         repeated = np.broadcast_to(nominal, (self.number, *nominal.shape))
         value = self.np.asarray(self._draws.get(path, repeated))
         return self.np.moveaxis(value.reshape(self.number, *nominal.shape), 0, -1)
+
+    def of_law(self, key: Key) -> Any:
+        """A key of some contact laws alone, (..., number)."""
+        path = f"contact.{key.name}"
+        if isinstance(key.default, bool):
+            return np.full(self.number, value_at(self._mechanism, path))
+        return self.entries(path) if isinstance(key.default, list) else self.scalar(path, key.neutral)
 
     def successive(self, path: str) -> Any:
         """A list as one entry per slot, the last repeated."""

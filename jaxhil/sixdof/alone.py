@@ -69,7 +69,21 @@ def _judged(scenario: Scenario) -> Metrics:
     start = jax.tree.map(lambda leaf: leaf[None], scenario.start)
     zero = jnp.zeros_like(scenario.duration)[None]
     none = zero.astype(jnp.int32)
-    return judge(scenario, Episode(start, start, zero, zero, none, zero, zero, zero, zero, none + REBOUNDED))
+    return judge(
+        scenario,
+        Episode(
+            entry=start,
+            end=start,
+            entry_time=zero,
+            end_time=zero,
+            touches=none,
+            duration=zero,
+            peak_force=zero,
+            peak_moment=zero,
+            penetration=zero,
+            status=none + REBOUNDED,
+        ),
+    )
 
 
 @cache

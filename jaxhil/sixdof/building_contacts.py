@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhil.contact.laws import LAWS, ContactLaw, ContactParameters, HuntCrossley
+from jaxhil.contact.keys import Key
+from jaxhil.contact.laws import ContactLaw, ContactParameters, contact_law
 from jaxhil.mechanism import six_axes
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.sixdof.candidates import Candidates, Capsules, ChaserSpheres, TargetSpheres
@@ -149,23 +150,21 @@ def _shape(shape: six_axes.Shape, numbers: Values, path: str, turn: Any) -> Shap
 
 
 def _law(contact: six_axes.Contact, numbers: Values, path: str) -> ContactLaw:
-    known = not numbers.drawn(f"{path}.exponent") and contact.exponent in HuntCrossley.QUICK
-    return HuntCrossley(contact.exponent) if known and contact.law == "hunt_crossley" else LAWS[contact.law]
+    return contact_law(contact.law).specialised(contact, lambda key: numbers.drawn(f"{path}.{key}"))
 
 
 def _parameters(contact: six_axes.Contact, numbers: Values, path: str) -> ContactParameters:
-    """Of one candidate, (number,) each; slopes and depths (segments, number)."""
-    tension: Any = np.full(numbers.number, contact.tension)
+    """Return the parameters of one candidate, (number,) each; slopes and depths (segments, number)."""
+
+    def of_law(key: Key) -> Any:
+        if isinstance(key.default, bool):
+            return np.full(numbers.number, getattr(contact, key.name))
+        return numbers(f"{path}.{key.name}", key.neutral)
+
     return ContactParameters(
         stiffness=numbers(f"{path}.stiffness"),
         damping=numbers(f"{path}.damping"),
-        exponent=numbers(f"{path}.exponent"),
-        depths=numbers(f"{path}.depths"),
-        tension=tension,
-        reference_depth=numbers(f"{path}.reference_depth", 1.0),
-        unloading_ratio=numbers(f"{path}.unloading_ratio", 1.0),
-        preload=numbers(f"{path}.preload"),
-        friction=numbers(f"{path}.dry_friction"),
+        **{name: of_law(key) for name, key in six_axes.KEYS_IN_SIX_AXES.items()},
     )
 
 

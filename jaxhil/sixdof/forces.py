@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxhil.contact.base import ContactLaw, ContactParameters
+from jaxhil.contact.laws import ContactLaw, ContactParameters
 from jaxhil.sixdof.candidates import Candidates, Touch, motion_at
 from jaxhil.sixdof.friction import Friction, Touching
 from jaxhil.sixdof.relative import Pose, Twist, Wrench

@@ -141,9 +141,16 @@ def build_rig(loop: Loop, gains: Gains, scenario: Scenario) -> Rig:
     weighed = loop.side == "moving"
     axes = build_axes(scenario.simulator, sensor.delay, sensor.position_delay, period, loop.hold, weighed)
     return Rig(
-        scenario.bodies, axes, scenario.kinematics, scenario.groups, scenario.latches, sensor, period,
-        scenario.key, {name: _six(jnp.asarray(value), period) for name, value in gains.items()},
-    )  # fmt: skip
+        bodies=scenario.bodies,
+        axes=axes,
+        kinematics=scenario.kinematics,
+        groups=scenario.groups,
+        latches=scenario.latches,
+        sensor=sensor,
+        period=period,
+        key=scenario.key,
+        gains={name: _six(jnp.asarray(value), period) for name, value in gains.items()},
+    )
 
 
 def begin(loop: Loop, rig: Rig, states: States) -> RunState:

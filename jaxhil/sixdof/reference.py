@@ -52,7 +52,16 @@ def pass_through(
     depths = tuple(jnp.zeros_like(group.parameters.damping) for group in space.groups)
     touching = tuple(depth > 0 for depth in depths)
     start = Passage(
-        flight, touching, none, zero, zero, states, depths, no_peak(zero), no_peak(zero), until > 0
+        flight=flight,
+        touching=touching,
+        touches=none,
+        touched=zero,
+        left=zero,
+        before=states,
+        depths=depths,
+        force=no_peak(zero),
+        moment=no_peak(zero),
+        active=until > 0,
     )
 
     def body(passage: Passage) -> Passage:

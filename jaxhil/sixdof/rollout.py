@@ -117,7 +117,16 @@ def _start(loop: Loop, rig: Rig, states: States) -> Progress:
     numbers = jnp.zeros((loop.episodes, *like.shape), like.dtype)
     counts = numbers.astype(jnp.int32)
     episodes = Episode(
-        slots, slots, numbers, numbers, counts, numbers, numbers, numbers, numbers, counts + MISS
+        entry=slots,
+        end=slots,
+        entry_time=numbers,
+        end_time=numbers,
+        touches=counts,
+        duration=numbers,
+        peak_force=numbers,
+        peak_moment=numbers,
+        penetration=numbers,
+        status=counts + MISS,
     )
     return Progress(run, watch, episodes, none, none == 0, none)
 
@@ -127,9 +136,23 @@ def _fresh(rig: Rig, states: States, now: Array, energy: Array) -> Watch:
     peak = no_peak(zero)
     touching = tuple(group.parameters.damping > jnp.inf for group in rig.groups)
     return Watch(
-        none > 0, states, now, energy, touching, none, none, none, none > 0, peak, peak,
-        (zero, zero), none, states, zero, none > 0,
-    )  # fmt: skip
+        begun=none > 0,
+        entry=states,
+        entry_tick=now,
+        entry_energy=energy,
+        touching=touching,
+        touches=none,
+        touched=none,
+        quiet=none,
+        caught=none > 0,
+        force=peak,
+        moment=peak,
+        highest=(zero, zero),
+        faded=none,
+        end=states,
+        penetration=zero,
+        beyond=none > 0,
+    )
 
 
 def _tick(loop: Loop, rig: Rig, last: Array, progress: Progress) -> tuple[Progress, Wrench]:
@@ -247,10 +270,17 @@ def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progres
         ticks.astype(period.dtype) * period for ticks in (watch.entry_tick, age - jnp.where(over, since, 0))
     )
     found = Episode(
-        watch.entry, choose(over, watch.end, run.states), entry_time, end_time, watch.touches,
-        watch.touched.astype(period.dtype) * period, watch.force.largest, watch.moment.largest,
-        watch.penetration, status,
-    )  # fmt: skip
+        entry=watch.entry,
+        end=choose(over, watch.end, run.states),
+        entry_time=entry_time,
+        end_time=end_time,
+        touches=watch.touches,
+        duration=watch.touched.astype(period.dtype) * period,
+        peak_force=watch.force.largest,
+        peak_moment=watch.moment.largest,
+        penetration=watch.penetration,
+        status=status,
+    )
     slot = jnp.arange(loop.episodes, dtype=jnp.int32).reshape(-1, *[1] * period.ndim)
     here = (slot == progress.index[None]) & (ends & (status != MISS))[None]
     episodes = jax.tree.map(lambda one, all_: jnp.where(here, one[None], all_), found, progress.episodes)

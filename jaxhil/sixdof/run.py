@@ -148,7 +148,14 @@ def _result(
         means = means._replace(warnings=(*means.warnings, warning))
     status = [*bad, episodes[-1].status][0]
     return SixAxisRun(
-        mechanism, compensator, gains, seed, episodes, status, _final(float(time[0]), final), means
+        mechanism=mechanism,
+        compensator=compensator,
+        gains=gains,
+        seed=seed,
+        episodes=episodes,
+        status=status,
+        final=_final(float(time[0]), final),
+        meaning=means,
     )
 
 

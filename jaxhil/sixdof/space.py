@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxhil.contact.dormand_prince import take_rolled_step
 from jaxhil.sixdof.bodies import Body, Load, State, angular_velocity
 from jaxhil.sixdof.forces import ContactGroup, Forces, Memory, contact_wrench
 from jaxhil.sixdof.latch import Held, Latch, init_latch, latch_wrench
@@ -35,19 +36,6 @@ EVENT = 1e-6  # s: within which the time is found at which something begins or c
 REMEMBERING = 1e-4  # s: longest step of laws with a memory
 MOST_STEPS = 200_000  # of a motion, unless its steps are long
 SMALLEST, LARGEST = 0.1, 4.0  # change of the length from one step to the next
-# Dormand and Prince 1980: nodes, coefficients of the stages, the last of which is the solution of order 5,
-# and the error, solution of order 5 less that of order 4.
-NODES = (0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)
-STAGES = (
-    (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-    (1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-    (3 / 40, 9 / 40, 0.0, 0.0, 0.0, 0.0, 0.0),
-    (44 / 45, -56 / 15, 32 / 9, 0.0, 0.0, 0.0, 0.0),
-    (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0.0, 0.0, 0.0),
-    (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0, 0.0),
-    (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84, 0.0),
-)
-ERROR = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
 
 
 class Space(NamedTuple):
@@ -127,7 +115,7 @@ def advance_flight(
     if _remembers(space):
         longest = jnp.minimum(longest, REMEMBERING)
     length = lax.stop_gradient(jnp.minimum(flight.length, longest))
-    now, memories, error = take_step(space, flight, length, speed)
+    now, memories, error = _try(space, flight, length, speed)
     touching = tuple(forces.touch.depth > 0 for forces in now.forces)
     before = (*flight.touching, *(held.caught for held in flight.memories.held))
     happens = jnp.zeros(length.shape, bool)
@@ -152,35 +140,19 @@ def advance_flight(
     return after._replace(time=time), Step(now, memories, accepted | endless)
 
 
-def take_step(
+def _try(
     space: Space, flight: Flight, length: Float[Array, "*batch"], speed: Array
 ) -> tuple[Instant, Memories, Array]:
-    """A step of `length` [s]: what is at its end, and its error over what is allowed."""
-    states, lanes = flight.states, [1] * length.ndim
+    """Return what is at the end of a step of `length` [s], and its error over what is allowed."""
 
-    def combined(row: Array, slopes: Any) -> Any:
-        weights = row.reshape(-1, *lanes)
-        return jax.tree.map(lambda leaf: length * jnp.sum(weights * leaf, axis=0), slopes)
+    def slope(offset, states):
+        now, memories = instant(space, states, flight.memories, offset)
+        return slope_at(space, now), (now._replace(states=None), memories)
 
-    def stage(carry, given):
-        slopes, *_ = carry
-        index, row, node = given
-        at: States = jax.tree.map(jnp.add, states, combined(row, slopes))
-        now, memories = instant(space, at, flight.memories, node * length)
-        slope = slope_at(space, now)
-        slopes = jax.tree.map(lambda all_, one: all_.at[index].set(one), slopes, slope)
-        return (slopes, now, memories), None
-
-    stages = len(NODES)
-    none = jax.tree.map(lambda leaf: jnp.zeros((stages, *leaf.shape), leaf.dtype), states)
-    given = jnp.arange(stages), jnp.asarray(STAGES, length.dtype), jnp.asarray(NODES, length.dtype)
-    # A loop, not unrolled: a fraction to compile.
-    blank = jax.eval_shape(lambda: instant(space, states, flight.memories, length)[0])
-    empty: Any = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), blank)
-    (slopes, now, memories), _ = lax.scan(stage, (none, empty, flight.memories), given)
-    error = combined(jnp.asarray(ERROR, length.dtype), slopes)
-    level: Any = States(*(one._replace(attitude=normalise(one.attitude)) for one in now.states))
-    return now._replace(states=level), memories, _size(space, error, speed) / TOLERANCE
+    step = take_rolled_step(slope, flight.states, length)
+    now, memories = step.found
+    level: Any = States(*(one._replace(attitude=normalise(one.attitude)) for one in step.end))
+    return now._replace(states=level), memories, _size(space, step.error, speed) / TOLERANCE
 
 
 def slope_at(space: Space, now: Instant) -> States:

@@ -19,7 +19,7 @@ from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.batches import cut, join
 from tuning.gains.common_program import CommonProgram
 from tuning.statistics.intervals import Estimate
-from tuning.transparency.damped_twins import damped_twins
+from tuning.transparency.damping_perturbations import perturb_damping
 from tuning.transparency.figures import Runs, judge
 from tuning.transparency.pushes import EARLY, LATE, Space, in_space, probed
 
@@ -30,14 +30,14 @@ class Scene(NamedTuple):
     mechanism: Mechanism
     common: CommonProgram  # the program that it shares with others
     plain: Scenario  # its scenarios
-    twins: Scenario  # their damped twins (`tuning.transparency.damped_twins`)
+    twins: Scenario  # with damping added (`tuning.transparency.damping_perturbations`)
     space: Space  # the scenarios' first contacts in space
 
 
 def build_scene(mechanism: Mechanism, common: CommonProgram, scenarios: int, seed: int) -> Scene:
     """So many fresh scenarios of a mechanism."""
     draws = draw(mechanism, scenarios, seed)
-    twin, twin_draws = damped_twins(mechanism, draws)
+    twin, twin_draws = perturb_damping(mechanism, draws)
     plain = common.scenarios(mechanism, build_scenarios(mechanism, draws, seed))
     twins = common.scenarios(twin, build_scenarios(twin, twin_draws, seed))
     return Scene(

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from jaxhil.contact.laws import LAWS, ContactLaw, ContactParameters
+from jaxhil.contact.laws import ContactLaw, ContactParameters, contact_law
 from jaxhil.contact.mixture import AnyOf
 from jaxhil.contact.reference import Reference
 from jaxhil.mechanism.structs import Mechanism
@@ -55,7 +55,7 @@ class CommonProgram:
     @property
     def _kinds(self) -> tuple[ContactLaw, ...]:
         """Laws of two names may be of one kind."""
-        return tuple(dict.fromkeys(LAWS[name] for name in self.laws))
+        return tuple(dict.fromkeys(contact_law(name).simulated for name in self.laws))
 
     def loop(self, loop: Loop) -> Loop:
         """The loop of one mechanism, as this program takes it."""
@@ -87,11 +87,11 @@ class CommonProgram:
         deepest = depths[:, -1:] if depths.shape[1] else np.full((self.slots, 1, number), UNREACHED)
         further = deepest * (1 + np.arange(1, self.segments))[None, :, None]
         depths = np.concatenate([depths, further], axis=1)[:, : self.segments - 1]
-        kind: Any = np.full((self.slots, number), self._kinds.index(LAWS[mechanism.contact.law]), np.int32)
+        law = contact_law(mechanism.contact.law).simulated
+        kind: Any = np.full((self.slots, number), self._kinds.index(law), np.int32)
         contact = contact._replace(stiffness=stiffness, depths=depths, kind=kind)
         reference: Any = None
         if self.beforehand:
-            law = LAWS[mechanism.contact.law]
             unknown: Any = np.full((self.slots, number), np.nan)
             reference = Reference(*[unknown] * 3) if law.closed_form else self._first(law, batch)
         return batch._replace(contact=contact, phase=by_slot(batch.phase), reference=reference)
@@ -131,7 +131,7 @@ def common_programs(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], Co
 
 def _later(mechanism: Mechanism) -> bool:
     """Whether there are contacts whose reference has to be integrated at a speed not known beforehand."""
-    return mechanism.approach.contacts > 1 and not LAWS[mechanism.contact.law].closed_form
+    return mechanism.approach.contacts > 1 and not contact_law(mechanism.contact.law).closed_form
 
 
 def _common(mechanisms, group, loops, batches) -> CommonProgram:

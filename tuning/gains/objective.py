@@ -161,15 +161,15 @@ def common_terms(objectives: Sequence[Objective], probed: bool = False, contacts
     [(name, function)] = {(objective.name, objective.function) for objective in objectives}
     tolerance = any(objective.tolerance is not None for objective in objectives)
     return Terms(
-        name,
+        name=name,
         # What is tolerated makes room for a quieter command.
-        tolerance or any(objective.command_weight > 0 for objective in objectives),
-        tolerance or any(objective.noise_weight > 0 for objective in objectives),
-        any(objective.chatter_weight > 0 for objective in objectives),
-        probed,
-        function,
-        contacts if function else 0,
-        tolerance,
+        command=tolerance or any(objective.command_weight > 0 for objective in objectives),
+        noise=tolerance or any(objective.noise_weight > 0 for objective in objectives),
+        chatter=any(objective.chatter_weight > 0 for objective in objectives),
+        transparency=probed,
+        function=function,
+        contacts=contacts if function else 0,
+        tolerance=tolerance,
     )
 
 

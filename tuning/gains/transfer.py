@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxhil.compensators import COMPENSATORS, literature_gains
+from jaxhil.contact.laws import contact_law
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.scenario import build_scenarios
@@ -78,18 +79,16 @@ def traits(mechanism: Mechanism) -> Traits:
     ]
     held = rig.command_latency - (0.5 if rig.command_hold == "zoh" else 0.0)
     damping = float(np.max(nominal.contact.damping))
-    if mechanism.contact.law == "hunt_crossley":
-        ratio = damping * mechanism.approach.velocity / math.pi
-    else:
-        ratio = damping / (2 * mechanism.bodies.mass * math.sqrt(slowest * fastest))
+    mass, velocity = mechanism.bodies.mass, mechanism.approach.velocity
+    law = contact_law(mechanism.contact.law)
     return Traits(
         slowest=slowest,
         fastest=fastest,
         force_delay=float(sensor.delay[0] + sensor.time_constant[0]),
         simulator_delay=float(simulator.delay[0]) + slopes[0] - slopes[1] + held * rig.control_period,
         control_period=rig.control_period,
-        damping_ratio=ratio,
-        law=mechanism.contact.law,
+        damping_ratio=law.damping_ratio(damping, mass, velocity, math.sqrt(slowest * fastest)),
+        law=law.name,
         two_sided=math.isfinite(mechanism.contact.clearance),
     )
 

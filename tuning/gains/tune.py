@@ -237,7 +237,9 @@ def figures(outcome: Outcome) -> ErrorFigures:
     failed = int(np.sum(outcome.wanted & ~outcome.good))
     if not len(errors):
         nan = float("nan")
-        return ErrorFigures(nan, nan, nan, nan, nan, nan, nan, failed)
+        return ErrorFigures(
+            rms=nan, p99=nan, max=nan, mean=nan, diverging=nan, peak_ratio=nan, chatter=nan, failed=failed
+        )
     size = np.abs(errors)
     return ErrorFigures(
         rms=float(np.sqrt(np.mean(errors**2))),

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from jaxhil.contact.laws import contact_law
 from jaxhil.mechanism.structs import numeric_keys
 from tuning.identification.contact import ContactFit
 from tuning.identification.result import Estimate
@@ -112,7 +113,7 @@ def combinations(found: Mapping[str, np.ndarray], contact: ContactFit | None) ->
     if motion is not None and force is not None:
         combined.append(replace(_of_draws(DELAY, motion + force, at_bound), key="delay of motion and force"))
     damping, stiffness = found.get("contact.damping.0"), found.get("contact.stiffness.0")
-    if contact is None or contact.law.name != "kelvin_voigt":
+    if contact is None or not contact_law(contact.law.name).is_linear:
         return tuple(combined)
     if force is not None and damping is not None and stiffness is not None:
         apparent = replace(_of_draws("contact.damping", damping - stiffness * force), key="apparent damping")

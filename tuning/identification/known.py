@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxhil.errors import InputError, shown
+from jaxhil.contact import laws
 from jaxhil.mechanism.structs import Contact, Mechanism, Simulator
-from tuning.identification import contact_laws as laws
 from tuning.identification.contact_laws import Law
 from tuning.identification.rational import Model, Structure
 
@@ -45,20 +44,10 @@ def _fraction(simulator: Simulator) -> tuple[list[float], list[float]]:
 
 
 def contact_law(contact: Contact) -> Law:
-    """The law with its shape; every entry of the lists has all coefficients of its own.
+    """Return the law with its shape; every entry of the lists has all coefficients of its own.
 
-    Raises `InputError` for a law whose force is no sum of known functions of depth and rate."""
-    made = {
-        "linear": laws.linear,
-        "kelvin_voigt": lambda: laws.kelvin_voigt(contact.tension),
-        "hunt_crossley": lambda: laws.hunt_crossley(contact.exponent),
-        "depth_damped": lambda: laws.depth_damped(contact.exponent, contact.reference_depth or np.inf),
-        "hardening": laws.hardening,
-        "piecewise_linear": lambda: laws.piecewise_linear(tuple(contact.depths)),
-    }
-    if contact.law not in made:
-        raise InputError(f"contact.law: found {shown(contact.law)}, allowed {', '.join(made)}")
-    law = made[contact.law]()
+    Raise `InputError` for a law whose force is no sum of known functions of depth and rate."""
+    law = laws.contact_law(contact.law).regression(contact)
 
     def every(depth, rate):
         return [*law.own(depth, rate), *law.shared(depth, rate)]
@@ -67,15 +56,7 @@ def contact_law(contact: Contact) -> Law:
 
 
 def coefficients(contact: Contact, entry: int) -> list[float]:
-    """Of `contact_law`'s functions, in their order, for an entry of the lists; the last one repeats."""
+    """Return the coefficients of `contact_law` for an entry of the lists, the last of which repeats."""
     stiffness = contact.stiffness[min(entry, len(contact.stiffness) - 1)]
     damping = contact.damping[min(entry, len(contact.damping) - 1)]
-    if isinstance(stiffness, list):
-        return [*stiffness, damping]
-    if contact.law == "linear":
-        return [stiffness]
-    if contact.law == "hunt_crossley":
-        return [stiffness, stiffness * damping]
-    if contact.law == "hardening":
-        return [stiffness, stiffness / (contact.reference_depth or np.inf) ** 2, damping]
-    return [stiffness, damping]
+    return laws.contact_law(contact.law).coefficients(contact, stiffness, damping)

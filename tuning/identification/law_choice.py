@@ -12,15 +12,16 @@ narrow. Kelvin and Voigt's law contains the linear one.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy import optimize
 
-from tuning.identification import contact_laws as laws
-from tuning.identification.contact_laws import Law
+from jaxhil.contact.laws import LAWS
+from jaxhil.contact.regression import Family
+from tuning.identification.contact_laws import Law, kelvin_voigt
 from tuning.identification.contact_problem import COARSE, LONGEST, Problem, Readings
 from tuning.identification.contact_profile import first_plane
 from tuning.identification.motion import Motion
@@ -28,8 +29,6 @@ from tuning.identification.motion import Motion
 FEWEST = 4  # touches for judging on others than those fitted
 ERRORS = 2.0  # standard errors within which laws are as good
 ONSET = 1e-3  # s, before and after a touch's begin, by which laws are not judged
-DEPTH = 1e-3  # m, reference depth that is written for a law which needs some
-COMMON_EXPONENTS = (1.0, 1.5, 2.0, 3.0)
 
 
 @dataclass(frozen=True)
@@ -47,13 +46,11 @@ class Judged:
 def judge(motion: Motion, readings: Readings, plane: float | None, names=None) -> list[Judged]:
     """All laws (or those named), the one to take first."""
     judged = []
-    _, plane_there, _ = guess = _fit(motion, readings, laws.kelvin_voigt(), plane, None)
+    _, plane_there, _ = guess = _fit(motion, readings, kelvin_voigt(), plane, None)
     judging = replace(readings, counts=readings.counts & ~at_onset(motion, readings, guess))
     deepest = float(np.max(motion.at(guess[0])[0][readings.counts])) - plane_there
-    for name, build in families(readings, deepest):
-        if names is not None and name not in names:
-            continue
-        law, found = build(lambda one: _fit(motion, readings, one, plane, guess), readings)
+    for family in families(deepest, len(readings.entries), names):
+        law, found = _search(family, lambda one: _fit(motion, readings, one, plane, guess))
         judged.append((law, found, _by_others(motion, readings, judging, law, plane, found)))
     totals = [likelihood.sum() for _, _, likelihood in judged]
     best = judged[int(np.argmax(totals))][2]
@@ -73,48 +70,31 @@ def judge(motion: Motion, readings: Readings, plane: float | None, names=None) -
 
 
 Fitted = tuple[float, float, float]  # delay, plane, misfit
-Build = Callable[[Callable[[Law], Fitted], Readings], tuple[Law, Fitted]]
+# Laws that fits can find; `families` has the same order.
+NAMES = tuple(name for name, law in LAWS.items() if law.families(1.0, 1))
 
 
-NAMES = ("linear", "kelvin_voigt", "hunt_crossley", "depth_damped", "piecewise_linear", "hardening")
+def families(deepest: float, entries: int, names: Sequence[str] | None = None) -> list[Family]:
+    """Return what to try of every law, or of those named; `deepest`: of all touches [m]."""
+    laws = [LAWS[name] for name in NAMES if names is None or name in names]
+    return [family for law in laws for family in law.families(deepest, entries)]
 
 
-def families(readings: Readings, deepest: float) -> list[tuple[str, Build]]:
-    """Each law by its name, with the search for its shape; `deepest`: of all touches [m]."""
-
-    def plain(law: Law) -> Build:
-        return lambda fit, _: (law, fit(law))
-
-    def searched(make: Callable[[float], Law], low: float, high: float, usual=()) -> Build:
-        def build(fit, _):
-            found: Any = optimize.minimize_scalar(
-                lambda shape: fit(make(shape))[2],
-                bounds=(low, high),
-                method="bounded",
-                options={"xatol": 0.001 * (high - low)},
-            )
-            shape = float(found.x)
-            # A usual value that explains as much is meant.
-            for value in usual:
-                if fit(make(value))[2] - found.fun < 4.0:
-                    shape = value
-                    break
-            return make(shape), fit(make(shape))
-
-        return build
-
-    found = [
-        ("linear", plain(laws.linear())),
-        ("kelvin_voigt", plain(laws.kelvin_voigt())),
-        ("kelvin_voigt", plain(laws.kelvin_voigt(pulls=True))),
-        ("hunt_crossley", searched(laws.hunt_crossley, 1.05, 3.0, COMMON_EXPONENTS[1:])),
-        ("depth_damped", searched(lambda n: laws.depth_damped(n, DEPTH), 1.0, 3.0, COMMON_EXPONENTS)),
-    ]
-    middle = 0.1 * deepest, 0.9 * deepest
-    found.append(("piecewise_linear", searched(lambda depth: laws.piecewise_linear((depth,)), *middle)))
-    if len(readings.entries) == 1:
-        found.append(("hardening", plain(laws.hardening())))
-    return found
+def _search(family: Family, fit: Callable[[Law], Fitted]) -> tuple[Law, Fitted]:
+    """Return the law of the family that fits best, and its fit."""
+    if family.low == family.high:
+        law = family.make(family.low)
+        return law, fit(law)
+    found: Any = optimize.minimize_scalar(
+        lambda shape: fit(family.make(shape))[2],
+        bounds=(family.low, family.high),
+        method="bounded",
+        options={"xatol": 0.001 * (family.high - family.low)},
+    )
+    # A usual value that explains as much is meant.
+    as_good = (value for value in family.usual if fit(family.make(value))[2] - found.fun < 4.0)
+    law = family.make(next(as_good, float(found.x)))
+    return law, fit(law)
 
 
 def _fit(motion, readings, law, plane, guess: Fitted | None) -> Fitted:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxhil.contact.laws import KEYS, contact_law
 from tuning.identification.contact import ContactFit
 from tuning.identification.contact_laws import Law
 from tuning.identification.normal_draws import factor
@@ -74,19 +75,10 @@ def contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
         found["rig.force_sensor.time_constant"] = own["time_constant"]
     if contact.problem.plane is None:
         found["rig.contact_plane"] = own["plane"]
-    law, entries = contact.law, contact.readings.entries
-    for i in entries:
-        if law.name == "piecewise_linear":
-            for name in law.names[:-1]:
-                found[f"contact.stiffness.{i}.{int(name[5:]) - 1}"] = own[f"{name}.{i}"]
-            continue
-        found[f"contact.stiffness.{i}"] = own[f"stiffness.{i}"]
-        if law.name == "hunt_crossley":
-            found[f"contact.damping.{i}"] = own[f"damping.{i}"] / own[f"stiffness.{i}"]
-        if law.name == "hardening":
-            # Where the cubic part is nothing, the depth at which it matters has no end.
-            ratio = own[f"stiffness.{i}"] / np.maximum(own[f"cubic.{i}"], 1e-12)
-            found["contact.reference_depth"] = np.sqrt(np.maximum(ratio, 1e-12))
+    law = contact_law(contact.law.name)
+    for i in contact.readings.entries:
+        fitted = {name: own[f"{name}.{i}"] for name in contact.law.names if f"{name}.{i}" in own}
+        found |= law.file_values(fitted, i)
     if "damping" in own:
         found["contact.damping.0"] = own["damping"]
     if contact.dead_zone:
@@ -98,12 +90,11 @@ def contact_section(law: Law, values: dict[str, float]) -> dict[str, Any]:
     """`contact` of a mechanism file from values by key."""
     section: dict[str, Any] = {"law": law.name, **law.shape}
     stiffness = _entries(values, "contact.stiffness.")
-    section["stiffness"] = stiffness if law.name == "piecewise_linear" else [one for (one,) in stiffness]
+    segmented = contact_law(law.name).segmented
+    section["stiffness"] = stiffness if segmented else [one for (one,) in stiffness]
     if damping := _entries(values, "contact.damping."):
         section["damping"] = [max(one, 0.0) for (one,) in damping]
-    if "contact.reference_depth" in values:
-        section["reference_depth"] = values["contact.reference_depth"]
-    return section
+    return section | {key: values[f"contact.{key}"] for key in KEYS if f"contact.{key}" in values}
 
 
 def _entries(values: dict[str, float], prefix: str) -> list[list[float]]:

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from jaxhil.contact.laws import KEYS
 from jaxhil.errors import InputError
 from jaxhil.mechanism.structs import Contact, Mechanism
 from jaxhil.mechanism.uncertainty import draw
@@ -38,7 +39,10 @@ DEEPEST = 1.0  # m; a contact that gets there ends nowhere
 FORCE_DELAY, SIMULATOR = "rig.force_sensor.delay", "rig.simulator."
 IDENTIFIED = "identified from"  # how the source of a file begins that an identification wrote
 AGES = (FORCE_DELAY, "rig.force_sensor.time_constant")
-CONTACT = ("contact.stiffness", "contact.damping", "contact.reference_depth")
+CONTACT = (
+    *("contact.stiffness", "contact.damping"),
+    *(f"contact.{key.name}" for key in KEYS.values() if key.default is None),
+)
 
 
 class Effect(NamedTuple):

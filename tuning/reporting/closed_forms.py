@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import lambertw
 
+from jaxhil.contact.laws import contact_law
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.scenario import Scenario
 
@@ -90,7 +91,7 @@ def _reason(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> str 
     damping = np.asarray(scenarios.contact.damping)[: mechanism.approach.contacts]
     if compensator != "none":
         return "there is a compensation"
-    if mechanism.contact.law not in ("linear", "kelvin_voigt"):
+    if not contact_law(mechanism.contact.law).is_linear:
         return f"the contact law is {mechanism.contact.law}"
     if mechanism.rig.simulator.model != "ideal":
         return f"the motion simulator is {mechanism.rig.simulator.model}"

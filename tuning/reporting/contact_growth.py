@@ -23,6 +23,7 @@ from jax.flatten_util import ravel_pytree
 
 from jaxhil.compensators import COMPENSATORS, Gains
 from jaxhil.compensators.base import Compensator, Constants, Signals
+from jaxhil.contact.laws import contact_law
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.integrators import INTEGRATORS
 from jaxhil.simulation.scenario import Scenario
@@ -31,7 +32,6 @@ LINEAR_COMPENSATORS = (
     "none", "phase_lead", "multi_parameter_lead", "virtual_contact", "position_lead", "smith_predictor",
     "smith_hybrid",
 )  # fmt: skip
-LINEAR_CONTACTS = ("linear", "kelvin_voigt")
 SHORTEST_LAG = 1e-3  # control periods; where a batch has lags, one without has this much
 SQUARINGS, TERMS = 12, 12  # of the exponential: to 1e-12 for norms up to 1000
 DEEP = 1e-3  # m, where the loop is linearised: well in contact
@@ -76,7 +76,7 @@ def no_growth(mechanism: Mechanism, compensator: str) -> str | None:
     """Why the loop in contact is not linear, if it is not."""
     if compensator not in LINEAR_COMPENSATORS:
         return f"{compensator} is not linear"
-    if mechanism.contact.law not in LINEAR_CONTACTS:
+    if not contact_law(mechanism.contact.law).is_linear:
         return f"the contact law {mechanism.contact.law} is not linear"
     return None
 
@@ -156,11 +156,15 @@ def _shape(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> Shape
 def _lanes(scenarios: Scenario, slot: int) -> Lane:
     sensor, simulator = scenarios.force_sensor, scenarios.simulator
     numbers = Lane(
-        scenarios.equivalent_mass, scenarios.control_period, scenarios.contact.stiffness[slot],
-        scenarios.contact.damping[slot], np.moveaxis(np.asarray(simulator.numerator), 0, -1),
-        np.moveaxis(np.asarray(simulator.denominator), 0, -1), sensor.delay + simulator.delay,
-        sensor.time_constant,
-    )  # fmt: skip
+        mass=scenarios.equivalent_mass,
+        period=scenarios.control_period,
+        stiffness=scenarios.contact.stiffness[slot],
+        damping=scenarios.contact.damping[slot],
+        numerator=np.moveaxis(np.asarray(simulator.numerator), 0, -1),
+        denominator=np.moveaxis(np.asarray(simulator.denominator), 0, -1),
+        delay=sensor.delay + simulator.delay,
+        lag=sensor.time_constant,
+    )
     return jax.tree.map(np.asarray, numbers)
 
 

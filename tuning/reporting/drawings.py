@@ -223,7 +223,15 @@ def _map_of(found: MapDocument) -> Map:
     ratios = nominal.peak_force_ratio, nominal.duration_ratio
     point = Nominal(nominal.restitution, nominal.error, *ratios, grown, *margins)  # pyright: ignore[reportArgumentType]
     return Map(
-        (axis(found.x), axis(found.y)), table(found.x.values), table(found.y.values),
-        table(found.restitution), table(found.error), table(found.peak_force_ratio),
-        table(found.duration_ratio), closed, radii, radius.none_because, point,
-    )  # pyright: ignore[reportArgumentType]  # fmt: skip
+        axes=(axis(found.x), axis(found.y)),
+        x=table(found.x.values),
+        y=table(found.y.values),
+        restitution=table(found.restitution),
+        error=table(found.error),
+        peak_force_ratio=table(found.peak_force_ratio),
+        duration_ratio=table(found.duration_ratio),
+        closed=closed,
+        radii=radii,
+        no_growth=radius.none_because,
+        nominal=point,
+    )

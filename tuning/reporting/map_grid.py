@@ -102,49 +102,74 @@ def compute_map(
     across[:, 0], up[:, 1] = lines
     own, scenarios = batch(np.concatenate([_grid(x, y), across, up, middle]))
     found = _run(mechanism, compensator, own, scenarios, tell, scheduler, kept)
-    restitution, error, force, duration, unlike = found
+    restitution, error, force, duration, _ = found
     size = points**2
 
     tell("eigenvalues of the loop in contact", runs(points))
     reason = no_growth(mechanism, compensator)
     radii = on_lines = grown = None
     if reason is None:
-        own, at = batch(middle)
-        grown = growth(mechanism, compensator, {name: float(value) for name, value in gains.items()}, at)
+        plain = {name: float(value) for name, value in gains.items()}
+        grown = growth(mechanism, compensator, plain, batch(middle)[1])
         few = min(points, max(FEWEST, int((MOST_WORK / cost(mechanism, compensator, scenarios)) ** 0.5)))
         grid = [axis.values(few) for axis in axes]
-        values = np.concatenate([_grid(*grid), across, up])
-        own, at = batch(values)
-        every = spectral_radii(mechanism, compensator, own, at)
+        every = spectral_radii(mechanism, compensator, *batch(np.concatenate([_grid(*grid), across, up])))
         radii = Radii(grid[0], grid[1], every[: few**2].reshape(few, few))
         on_lines = every[few**2 :].reshape(2, LINE)
     closed = closed_forms(mechanism, compensator, batch(_grid(x, y))[1])
-    ended = np.isfinite(error[-1])
-    sizes = np.nan_to_num(np.abs(error[size:-1]), nan=np.inf).reshape(2, LINE)
-    nominal = Nominal(
-        restitution=float(restitution[-1]) if ended else None,
-        error=float(error[-1]) if ended else None,
-        peak_force_ratio=float(force[-1]) if ended else None,
-        duration_ratio=float(duration[-1]) if ended else None,
-        growth=grown,
-        error_margins=_margins(axes, lines, sizes, limit) if ended and abs(error[-1]) <= limit else None,
-        contact_margins=(
-            _margins(axes, lines, np.nan_to_num(unlike[size:-1], nan=1.0).reshape(2, LINE), 0.5)
-            if ended and not unlike[-1]
-            else None
-        ),
-        radius_margins=(
-            _margins(axes, lines, on_lines, 1.0)
-            if on_lines is not None and grown is not None and grown.spectral_radius <= 1
-            else None
-        ),
-    )
+    nominal = _nominal(found, size, axes, lines, limit)
+    if on_lines is not None and grown is not None:
+        margins = _margins(axes, lines, on_lines, 1.0) if grown.spectral_radius <= 1 else None
+        nominal = nominal._replace(growth=grown, radius_margins=margins)
     shape = points, points
     return Map(
-        axes, x, y, restitution[:size].reshape(shape), error[:size].reshape(shape),
-        force[:size].reshape(shape), duration[:size].reshape(shape), _reshaped(closed, points), radii, reason,
-        nominal,
-    )  # fmt: skip
+        axes=axes,
+        x=x,
+        y=y,
+        restitution=restitution[:size].reshape(shape),
+        error=error[:size].reshape(shape),
+        peak_force_ratio=force[:size].reshape(shape),
+        duration_ratio=duration[:size].reshape(shape),
+        closed=_reshaped(closed, points),
+        radii=radii,
+        no_growth=reason,
+        nominal=nominal,
+    )
+
+
+def _nominal(
+    found: np.ndarray,
+    size: int,
+    axes: tuple[MapAxis, MapAxis],
+    lines: list[np.ndarray],
+    limit: float,
+) -> Nominal:
+    """Return the nominal point, the last of all runs, and its margins along the lines; the first `size` runs
+    are the map's."""
+    restitution, error, force, duration, unlike = found
+    if not np.isfinite(error[-1]):
+        return Nominal(
+            restitution=None,
+            error=None,
+            peak_force_ratio=None,
+            duration_ratio=None,
+            growth=None,
+            error_margins=None,
+            contact_margins=None,
+            radius_margins=None,
+        )
+    errors = np.nan_to_num(np.abs(error[size:-1]), nan=np.inf).reshape(2, LINE)
+    bounds = np.nan_to_num(unlike[size:-1], nan=1.0).reshape(2, LINE)
+    return Nominal(
+        restitution=float(restitution[-1]),
+        error=float(error[-1]),
+        peak_force_ratio=float(force[-1]),
+        duration_ratio=float(duration[-1]),
+        growth=None,
+        error_margins=_margins(axes, lines, errors, limit) if abs(error[-1]) <= limit else None,
+        contact_margins=_margins(axes, lines, bounds, 0.5) if not unlike[-1] else None,
+        radius_margins=None,
+    )
 
 
 def runs(points: int) -> int:

@@ -45,7 +45,17 @@ class EmptyTask:
     def reading(self) -> Reading:
         """A packet of zeros."""
         self._sequence += 1
-        return Reading(TICK, self._sequence, 0, self._sequence & 0xFFFF, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return Reading(
+            event=TICK,
+            sequence=self._sequence,
+            run=0,
+            tick=self._sequence & 0xFFFF,
+            time=0.0,
+            force=0.0,
+            position=0.0,
+            start_position=0.0,
+            start_velocity=0.0,
+        )
 
     def take(self, answer: Answer) -> bool:
         """Whether it answers the last packet."""

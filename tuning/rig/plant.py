@@ -13,8 +13,9 @@ linear parts are discretised exactly, once; delays are read at their places with
 import math
 from random import Random
 
-from jaxhil.mechanism.structs import Mechanism
-from tuning.rig.contact_laws import contact_law
+from jaxhil.contact.float_law import FloatLaw
+from jaxhil.contact.laws import contact_law
+from jaxhil.mechanism.structs import Contact, Mechanism
 from tuning.rig.propagation import WHOLE, Place, apply, propagation, split_delay
 from tuning.rig.sensor_lag import Motion, deepest_within, lagged
 
@@ -51,7 +52,7 @@ class Plant:
         The numerical model is at `position` [m] with `velocity` [m/s], the position command of this tick is
         `command` [m]; before it, all have been in that motion for ever, and there was no force.
         """
-        self._law, self._number, self._wanted_number = contact_law(self._contact, number), number, number
+        self._law, self._number, self._wanted_number = _law(self._contact, number), number, number
         stride = self._period * velocity
         self._commands = [command - back * stride for back in range(self._latency + 1)]
         self._wanted, self._step, self.shortfall = command, stride, 0.0
@@ -119,7 +120,7 @@ class Plant:
         """The next contact of the run is `number` (from 0): its law holds once the mechanism is free."""
         self._wanted_number = number
         if number != self._number and not self._in_contact:
-            self._law, self._number = contact_law(self._contact, number), number
+            self._law, self._number = _law(self._contact, number), number
 
     def _contact_force(self, interval: SamplingInterval | None) -> float:
         """What happens in the interval whose motion arrives now; what the sensor makes of its force [N]."""
@@ -152,6 +153,8 @@ class Plant:
         """Deepest penetration [m] by the end of a stretch; a surface that has been left is as new."""
         if -self._clearance <= end.position <= 0.0:
             return 0.0
+        if duration <= 0.0:  # delays of whole periods: the stretch before ends here
+            return deepest
         return max(deepest, deepest_within(start, end, duration, self._clearance))
 
     def _limit(self, wanted: float) -> float:
@@ -174,6 +177,13 @@ class Plant:
             command = previous + step
         self._wanted, self._step, self.shortfall = wanted, step, abs(wanted - command)
         return command
+
+
+def _law(contact: Contact, number: int) -> FloatLaw:
+    """Return the law of successive contact `number` (from 0); the last entry of every list repeats."""
+    stiffness = contact.stiffness[min(number, len(contact.stiffness) - 1)]
+    damping = contact.damping[min(number, len(contact.damping) - 1)]
+    return contact_law(contact.law).in_floats(contact, stiffness, damping)
 
 
 def _quantised(value: float, quantum: float) -> float:

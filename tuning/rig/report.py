@@ -21,7 +21,7 @@ def reference_restitutions(mechanism: Mechanism, contacts: Sequence[ContactResul
     prepare()
     import jax
 
-    from jaxhil.contact.laws import LAWS
+    from jaxhil.contact.laws import contact_law
     from jaxhil.simulation.evaluation import parameters_by_slot
     from jaxhil.simulation.scenario import build_scenarios
 
@@ -31,7 +31,7 @@ def reference_restitutions(mechanism: Mechanism, contacts: Sequence[ContactResul
     speeds = [one.approach_velocity for one in contacts]
     velocity = np.array([speed if speed > 0.0 else 1.0 for speed in speeds])[:, None]
     mass = np.broadcast_to(scenario.equivalent_mass, velocity.shape)
-    law = LAWS[mechanism.contact.law]
+    law = contact_law(mechanism.contact.law).simulated
     in_space = jax.jit(lambda contact, *entered: law.reference(parameters_by_slot(contact), *entered))
     return [float(value) for value in np.asarray(in_space(parameters, mass, velocity).restitution)[:, 0]]
 

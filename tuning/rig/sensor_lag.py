@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from tuning.rig.contact_laws import ContactLaw
+from jaxhil.contact.float_law import FloatLaw
 
 ARCS = 2  # parabolas that stand for the force of one stretch
 MOST_STEPS = 50  # of false position
@@ -25,7 +25,7 @@ class Motion(NamedTuple):
 
 def lagged(
     reading: float,
-    law: ContactLaw,
+    law: FloatLaw,
     clearance: float,
     start: Motion,
     end: Motion,
@@ -76,7 +76,7 @@ class _Stretch:
     A law that remembers holds, at s, after the deepest penetration so far.
     """
 
-    def __init__(self, path: "_Cubic", side: float, surface: float, law: ContactLaw, deepest: float) -> None:
+    def __init__(self, path: "_Cubic", side: float, surface: float, law: FloatLaw, deepest: float) -> None:
         self._path, self._side, self._surface, self._law = path, side, surface, law
         self._turn, bottom = _turn(path, self._depth, side) if law.loaded else (1.0, 0.0)
         self._before = max(deepest, self._depth(0.0))
@@ -99,7 +99,7 @@ class _Stretch:
     def _depth(self, s: float) -> float:
         return self._side * (self._path.position(s) - self._surface)
 
-    def _law_at(self, s: float) -> ContactLaw:
+    def _law_at(self, s: float) -> FloatLaw:
         if self._law.loaded is None:
             return self._law
         return self._law.loaded(self._bottom if s > self._turn else max(self._before, self._depth(s)))

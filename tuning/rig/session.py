@@ -44,7 +44,17 @@ ENDING = 120.0  # s in which it has to end, going through its packets again incl
 SILENCE = 2.0  # s without a packet, after which it ends by itself
 
 SOURCE = Path(__file__).parent
-LAST = Reading(STOP, 0xFFFFFFFF, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
+LAST = Reading(
+    event=STOP,
+    sequence=0xFFFFFFFF,
+    run=0,
+    tick=0,
+    time=0.0,
+    force=0.0,
+    position=0.0,
+    start_position=0.0,
+    start_velocity=0.0,
+)
 
 
 class Quantiles(NamedTuple):

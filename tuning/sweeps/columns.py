@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 import msgspec
 import numpy as np
 
+from jaxhil.contact.laws import KEYS, contact_law
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.six_axes import SixAxisMechanism, numeric_keys_of
 from jaxhil.mechanism.structs import Mechanism, value_at
@@ -97,8 +98,8 @@ _UNITS = {
     "natural_frequency": "Hz",
     **dict.fromkeys(("control_period", "delay", "time_constant"), "s"),
     **dict.fromkeys(("dead_zone", "bias", "range"), "N"),
-    **dict.fromkeys(("depths", "clearance", "reference_depth", "contact_plane"), "m"),
-    **dict.fromkeys(("phase", "damping_ratio", "exponent", "unloading_ratio"), "1"),
+    **dict.fromkeys(("clearance", "contact_plane"), "m"),
+    **dict.fromkeys(("phase", "damping_ratio"), "1"),
 }
 
 
@@ -172,13 +173,14 @@ def unit_of(mechanism: AnyMechanism, path: str) -> str:
     table, _, key = path.rpartition(".")
     name = table.removeprefix("contact.")
     if not isinstance(mechanism, SixAxisMechanism):
-        law = mechanism.contact.law if table == "contact" else None
+        contact = mechanism.contact if table == "contact" else None
     else:
-        law = mechanism.contact[name].law if name in mechanism.contact and name != table else None
-    if law is not None and key == "stiffness":
-        return "N/m^n" if law in ("hunt_crossley", "depth_damped") else "N/m"
-    if law is not None and key == "damping":
-        return "s/m" if law == "hunt_crossley" else "N s/m"
+        contact = mechanism.contact.get(name) if name != table else None
+    if contact is not None and key in ("stiffness", "damping"):
+        law = contact_law(contact.law)
+        return law.stiffness_unit if key == "stiffness" else law.damping_unit
+    if contact is not None and key in KEYS:
+        return KEYS[key].unit or ""
     if isinstance(mechanism, SixAxisMechanism):
         return numeric_keys_of(mechanism)[path].unit
     if key in ("noise_std", "quantum"):

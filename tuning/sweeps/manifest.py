@@ -15,7 +15,7 @@ import msgspec
 from msgspec import Meta
 
 from jaxhil.compensators import compensator_of
-from jaxhil.contact.laws import LAWS
+from jaxhil.contact.laws import contact_law
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.files import open_plain
 from jaxhil.runtime import digest
@@ -190,7 +190,7 @@ def unlike_here(manifest: Manifest) -> list[str]:
 def _sources(loaded: LoadedGains) -> str:
     contact = loaded.mechanism.contact
     several = contact.values() if isinstance(contact, dict) else [contact]
-    return sources_sha256(compensator_of(loaded.compensator), *(LAWS[one.law] for one in several))
+    return sources_sha256(compensator_of(loaded.compensator), *(contact_law(one.law) for one in several))
 
 
 def _other_versions(manifest: Manifest, sources: str, here: Mapping[str, str]) -> list[str]:

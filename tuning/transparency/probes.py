@@ -5,7 +5,7 @@ contacts are alike, that is the most accurate. So each scenario comes with three
 law cannot know beforehand:
 
     early, late   a push on the hardware, which no model knows of (`tuning.transparency.pushes`)
-    damped        the same contact with more dissipation than it has (`tuning.transparency.damped_twins`)
+    damped        the same contact with more dissipation (`tuning.transparency.damping_perturbations`)
 
 Each has its own true restitution e*: that of the pushed, or damped, contact in space. A law that swallows the
 push, or gives back energy that is not there, errs by e - e* as in any other contact: transparency and slope
@@ -23,13 +23,13 @@ import jax
 import numpy as np
 
 from jaxhil.compensators import compensator_of
-from jaxhil.contact.laws import LAWS
+from jaxhil.contact.laws import contact_law
 from jaxhil.contact.reference import Reference
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.evaluation import Outcome
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.statistics.intervals import Estimate
-from tuning.transparency.damped_twins import damped_twins
+from tuning.transparency.damping_perturbations import perturb_damping
 from tuning.transparency.figures import Runs, transparency_figures
 from tuning.transparency.pushes import EARLY, LATE, in_space, probed
 
@@ -68,11 +68,11 @@ def probed_scenarios(
     """The scenarios of `jaxhil.simulation.scenario.build_scenarios`, each with its probes."""
     plain = build_scenarios(mechanism, draws, seed)
     number = len(plain.velocity)
-    twin, damped = damped_twins(mechanism, draws or {"approach.phase": np.asarray(plain.phase).T})
+    perturbed, damped = perturb_damping(mechanism, draws or {"approach.phase": np.asarray(plain.phase).T})
     slots = plain.phase.shape[0]
     velocity: Any = np.broadcast_to(plain.velocity, (slots, number))
-    space = in_space(LAWS[mechanism.contact.law], plain, velocity, 1)
-    own = build_scenarios(twin, damped, seed)
+    space = in_space(contact_law(mechanism.contact.law).simulated, plain, velocity, 1)
+    own = build_scenarios(perturbed, damped, seed)
     pushes = [_pushed(plain, space, share, e) for share, e in ((EARLY, space.early), (LATE, space.late))]
     batches = [_pushed(plain, space), *pushes, _pushed(own, space)]
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves, axis=-1), *batches)

@@ -33,17 +33,7 @@ def run(options: Identify) -> int:
         return _guess(options, logs)
     if options.design:
         return identify_design.run(options)
-    arguments.limit(options.limit)
-    arguments.integers(0, seed=options.seed, bootstrap=options.bootstrap)
-    if not 0.0 <= options.hold_out < 1.0:
-        raise InputError(f"--hold-out: found {options.hold_out}, allowed a share from 0 to below 1")
-    if options.bayes and options.prior is None:
-        raise InputError("--bayes: found no prior, allowed --prior with a normal entry in [uncertainty]")
-    for name in ("scheduler", "resume"):
-        if getattr(options, name) and not options.bootstrap:
-            raise InputError(
-                f"--{name}: found no --bootstrap, allowed beside one: its fits are what takes long"
-            )
+    _check_options(options)
     if options.check:
         return _check(options, logs)
     fixed, order = _fixed(options), _order(options)
@@ -54,7 +44,6 @@ def run(options: Identify) -> int:
     earlier = checks.own_results(folder / DOCUMENT, "estimates", (MECHANISM, *PICTURES), [name])
     from tuning.identification.bootstrap import FITS
     from tuning.identification.estimate import STAGES, Options, identify
-    from tuning.identification.mechanism_file import to_toml
 
     kept = pieces_in(options.output, options.resume)
     asked = Options(
@@ -77,12 +66,7 @@ def run(options: Identify) -> int:
         found = identify(campaign, prior, asked, stages.turn_to)
         document = _document(options, campaign, prior, found)
         if found.mechanism is not None:
-            from_builtins(found.mechanism, "identified mechanism")
-            # In this order: the document tells the next run that what lies beside it is its own.
-            with writing(folder / DOCUMENT):
-                write_whole(folder / DOCUMENT, terminal.as_json(document).encode("ascii"))
-            with writing(folder / MECHANISM):
-                write_whole(folder / MECHANISM, to_toml(found.mechanism, found.verdict).encode())
+            _write(found.mechanism, found.verdict, document, folder)
             stages.turn_to("drawing")
             _draw(found, document, folder)
         kept.remove()
@@ -93,6 +77,33 @@ def run(options: Identify) -> int:
     else:
         _print(document, None if found.mechanism is None else folder)
     return 0 if found.good else 1
+
+
+def _check_options(options: Identify) -> None:
+    """Check numbers and combinations of options. Raise `InputError` for what cannot be."""
+    arguments.limit(options.limit)
+    arguments.integers(0, seed=options.seed, bootstrap=options.bootstrap)
+    if not 0.0 <= options.hold_out < 1.0:
+        raise InputError(f"--hold-out: found {options.hold_out}, allowed a share from 0 to below 1")
+    if options.bayes and options.prior is None:
+        raise InputError("--bayes: found no prior, allowed --prior with a normal entry in [uncertainty]")
+    for name in ("scheduler", "resume"):
+        if getattr(options, name) and not options.bootstrap:
+            raise InputError(
+                f"--{name}: found no --bootstrap, allowed beside one: its fits are what takes long"
+            )
+
+
+def _write(mechanism: dict[str, Any], verdict: str, document: dict[str, Any], folder: Path) -> None:
+    """Write the mechanism and the document; the document first, which tells the next run that the mechanism
+    beside it is its own."""
+    from tuning.identification.mechanism_file import to_toml
+
+    from_builtins(mechanism, "identified mechanism")
+    with writing(folder / DOCUMENT):
+        write_whole(folder / DOCUMENT, terminal.as_json(document).encode("ascii"))
+    with writing(folder / MECHANISM):
+        write_whole(folder / MECHANISM, to_toml(mechanism, verdict).encode())
 
 
 def _refuse_other_logs(path: Path, earlier: dict[str, Any], campaign: Campaign) -> None:

@@ -3,6 +3,7 @@
 import math
 from typing import Any
 
+from jaxhil.contact.laws import contact_law
 from jaxhil.mechanism.file import (
     DEFAULT,
     builtin_names,
@@ -89,7 +90,7 @@ def _entry_in_space(name: str) -> dict[str, Any]:
 
 def _frequencies(mechanism: Mechanism) -> list[float]:
     """sqrt(k/M)/(2 pi) [Hz] of every stiffness in the file, each once; none for a power law."""
-    if mechanism.contact.law in ("hunt_crossley", "depth_damped"):
+    if contact_law(mechanism.contact.law).stiffness_unit != "N/m":
         return []
     stiffness: list[float] = []
     for entry in mechanism.contact.stiffness:

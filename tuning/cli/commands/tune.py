@@ -17,7 +17,8 @@ from tuning.cli.commands.resuming import pieces_in, say_of_pieces
 from tuning.cli.commands.tune_tables import print_one, print_overview
 from tuning.cli.options import Tune
 from tuning.front_door import meaning
-from tuning.front_door.tune import TunedGains, tune_each
+from tuning.front_door.tune import tune_each
+from tuning.front_door.tuned_gains import TunedGains
 
 if TYPE_CHECKING:
     from tuning.caches.pieces import Pieces

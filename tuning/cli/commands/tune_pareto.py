@@ -9,8 +9,7 @@ from jaxhil.files import make_folder, open_plain, remove_stale, writing
 from tuning import terminal
 from tuning.cli.options import Tune
 from tuning.front_door import tune_pareto
-from tuning.front_door.tune import TunedGains
-from tuning.front_door.tune_pareto import TradedGains
+from tuning.front_door.tuned_gains import TradedGains, TunedGains
 
 if TYPE_CHECKING:
     from tuning.caches.pieces import Pieces

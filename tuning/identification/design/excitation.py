@@ -16,6 +16,7 @@ import numpy as np
 from scipy import optimize
 
 import jaxhil
+from jaxhil.contact.laws import contact_law
 from jaxhil.errors import InputError, shown
 from jaxhil.mechanism.file import from_builtins, to_builtins
 from jaxhil.mechanism.structs import Mechanism
@@ -191,7 +192,7 @@ class _Plan:
         document, simulator = to_builtins(mechanism), mechanism.rig.simulator.model
         keys = [*(f"rig.simulator.{name}" for name in OWN_KEYS[simulator]), "rig.simulator.delay"]
         keys += ["rig.force_sensor.delay", *_slope_keys(mechanism, self.depth)]
-        if mechanism.contact.law != "linear":
+        if contact_law(mechanism.contact.law).damped:
             keys.append("contact.damping.0")
         return {key: _get(document, key) for key in keys}
 
@@ -251,7 +252,7 @@ def _get(document: dict, key: str) -> float:
 def _slope_keys(mechanism: Mechanism, depth: float) -> list[str]:
     """The stiffness that a press at this depth feels."""
     contact = mechanism.contact
-    if contact.law != "piecewise_linear":
+    if not contact_law(contact.law).segmented:
         return ["contact.stiffness.0"]
     return [f"contact.stiffness.0.{np.searchsorted(contact.depths, depth)}"]
 

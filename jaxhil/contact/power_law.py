@@ -1,0 +1,34 @@
+"""What contact laws with a power of the depth have in common, F = k d^n without damping."""
+
+from typing import ClassVar
+
+from jaxhil.contact.base import ContactLaw
+from jaxhil.contact.keys import EXPONENT, Key
+
+COMMON_EXPONENTS = (1.0, 1.5, 2.0, 3.0)
+
+
+class PowerLaw(ContactLaw):
+    """F = k d^n without damping: `stiffness` k [N/m^n], n the `exponent` (1.5 for Hertz)."""
+
+    keys: ClassVar[tuple[Key, ...] | None] = (EXPONENT,)
+    stiffness_unit: ClassVar[str] = "N/m^n"
+
+    def undamped_peak_force(self, parameters, mass, velocity):
+        """Return k d^n, with k d^(n + 1)/(n + 1) = M v^2/2."""
+        exponent, energy = parameters.exponent, mass * velocity**2 / 2
+        depth = ((exponent + 1) * energy / parameters.stiffness) ** (1 / (exponent + 1))
+        return parameters.stiffness * depth**exponent
+
+    def tangent_stiffness(self, parameters, mass, velocity):
+        power = parameters.exponent
+        depth = ((power + 1) * mass * velocity**2 / (2 * parameters.stiffness)) ** (1 / (power + 1))
+        return power * parameters.stiffness * depth ** (power - 1)
+
+    def onset_damping(self, parameters):
+        return 0 * parameters.damping
+
+    def nominal_peak_force(self, contact, stiffness, mass, velocity):
+        order = contact.exponent + 1
+        deepest = (order * mass * velocity**2 / (2 * min(stiffness))) ** (1 / order)
+        return max(stiffness) * deepest**contact.exponent

@@ -1,0 +1,68 @@
+"""Damping perturbations: the same mechanism with more dissipation than it has, by up to a third of the speed.
+
+How a compensator answers to dissipation that it was not tuned for is the slope of e against e*; an elastic
+mechanism alone, whose e* is always 1, does not show it. The perturbation of scenario i has the dissipation of
+an oscillator whose damping ratio zeta_i goes evenly through [0, `LARGEST_RATIO`], e* = exp(-pi zeta), in the
+terms of its own contact law (`ContactLaw.perturb_damping`).
+"""
+
+from collections.abc import Mapping
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from jaxhil.contact.laws import contact_law
+from jaxhil.mechanism.structs import Mechanism, value_at
+
+LARGEST_RATIO = 0.15  # damping ratio: e* = 0.62
+
+
+def perturb_damping(
+    mechanism: Mechanism, draws: Mapping[str, np.ndarray]
+) -> tuple[Mechanism, dict[str, np.ndarray]]:
+    """Return the mechanism and its draws with damping ratios added that are spread over the draws in order.
+
+    Raise `InputError` if the contact law does not state how it dissipates.
+    """
+    number = len(next(iter(draws.values())))
+    # Neighbouring draws get ratios far apart, so that nothing that goes with their order goes with the ratio.
+    ratio = LARGEST_RATIO * ((np.arange(number) * 0.6180339887498949) % 1)[:, None]
+    contact, law = mechanism.contact, contact_law(mechanism.contact.law)
+    mass = _mass(mechanism, draws)[:, None]
+    velocity = np.broadcast_to(draws.get("approach.velocity", mechanism.approach.velocity), (number,))[
+        :, None
+    ]
+    entries = max(len(contact.stiffness), len(contact.damping))
+
+    def drawn(key: str) -> np.ndarray:
+        nominal = np.asarray(value_at(mechanism, f"contact.{key}"), float)
+        values = draws.get(f"contact.{key}", np.broadcast_to(nominal, (number, *nominal.shape)))
+        if key == "stiffness":
+            return _entries(np.asarray(values).reshape(number, len(contact.stiffness), -1)[:, :, 0], entries)
+        return _entries(values, entries) * law.damped if key == "damping" else np.asarray(values)
+
+    key, values = law.perturb_damping(drawn, ratio, mass, velocity)
+    # Entries as many as there are draws for.
+    listed = list(contact.damping) + [contact.damping[-1]] * (entries - len(contact.damping))
+    changed = {"law": law.damped_as or law.name, "damping": listed} if key == "damping" else {}
+    perturbed = msgspec.structs.replace(mechanism, contact=msgspec.structs.replace(contact, **changed))
+    return perturbed, {**draws, f"contact.{key}": values}
+
+
+def _mass(mechanism: Mechanism, draws: Mapping[str, np.ndarray]) -> Float[np.ndarray, "draws"]:
+    number = len(next(iter(draws.values())))
+    bodies = mechanism.bodies
+
+    def drawn(name):
+        return np.broadcast_to(draws.get(f"bodies.{name}", getattr(bodies, name)), (number,))
+
+    if bodies.equivalent_mass is not None:
+        return drawn("equivalent_mass")
+    chaser, target = drawn("chaser_mass"), drawn("target_mass")
+    return chaser * target / (chaser + target)
+
+
+def _entries(values: np.ndarray, entries: int) -> np.ndarray:
+    """Return (draws, entries), the last entry repeated."""
+    return values[:, np.minimum(np.arange(entries), values.shape[1] - 1)]
