@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from .printing import comment, indented
+from .source import definition_of
 from .subset import FLOAT, INT, RESERVED, SubsetError, Type, Value, type_of_hint
 
 if TYPE_CHECKING:
@@ -90,9 +91,17 @@ class Records:
         if not isinstance(static, (bool, int, float)):
             return None
         owners = [one for one in class_.__mro__ if one.__module__ not in ("builtins", "typing")]
-        source = "\n".join(inspect.getsource(one) for one in owners)
-        if re.search(rf"self\.{name}\b[^=\n]*(?<![=!<>])=(?!=)", source):
+        methods = [one for owner in owners for one in vars(owner).values() if inspect.isfunction(one)]
+        nodes = (node for one in methods for node in ast.walk(definition_of(one)[0]))
+        if any(
+            isinstance(one, ast.Attribute) and one.attr == name and isinstance(one.ctx, ast.Store)
+            for one in nodes
+        ):
             return None
+        try:
+            source = inspect.getsource(next(one for one in owners if name in vars(one)))
+        except (OSError, TypeError):
+            source = ""
         named = re.search(rf"^    {name}\b.*= ([A-Z_]+)$", source, re.MULTILINE)
         if named and self.enumerators.get(named[1]) == static:
             return Value(f"{self.prefix}{named[1]}".upper(), INT, constant=static)
